@@ -1,0 +1,170 @@
+//! Single measurements, and how a series of them is shown.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::{Report, Summary};
+use gleaner_tests::drive::{IMAGE, image, one_topic};
+use gleaner_tests::{Folder, program, replay, root, sample_drive};
+
+/// Which of two twins.
+#[derive(Clone, Copy)]
+pub enum Kind {
+    Rust,
+    Python,
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Rust => "wasm",
+            Self::Python => "Python",
+        })
+    }
+}
+
+impl Kind {
+    fn folder(self, example: &str) -> PathBuf {
+        let kind = match self {
+            Self::Rust => "rust",
+            Self::Python => "python",
+        };
+        root().join("examples").join(example).join(kind)
+    }
+}
+
+/// Binds this process and its children to the first core that it may use.
+pub fn stay_on_one_core() -> std::io::Result<()> {
+    let allowed = rustix::thread::sched_getaffinity(None)?;
+    let first = (0..rustix::thread::CpuSet::MAX_CPU).find(|core| allowed.is_set(*core)).unwrap_or(0);
+    let mut one = rustix::thread::CpuSet::new();
+    one.set(first);
+    Ok(rustix::thread::sched_setaffinity(None, &one)?)
+}
+
+/// The drives that are measured on.
+pub struct Setting {
+    sample: PathBuf,
+    frames: PathBuf,
+    _folder: Folder,
+}
+
+impl Setting {
+    pub fn new() -> Self {
+        let folder = Folder::new();
+        let pixels = vec![99; 1920 * 1080 * 3];
+        let frames = (0..4).map(|i| (i * 100_000_000, image(1920, 1080, "bgr8", 5760, &pixels))).collect::<Vec<_>>();
+        let frames = one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &frames);
+        Self { sample: sample_drive(), frames, _folder: folder }
+    }
+
+    /// `hello` over the sample drive: a wake for each of 4,170 IMU samples.
+    pub fn hello(&self, kind: Kind) -> Summary {
+        self.run(&kind.folder("hello"), &["--set", "brake_mps2=-1.4"])
+    }
+
+    /// `brake-dark` over the sample drive, brought to look at each of its 400 pictures.
+    pub fn every_frame_decoded(&self, kind: Kind) -> Summary {
+        self.run(&kind.folder("brake-dark"), &["--set", "brake_mps2=1000", "--set", "dark_luma=0"])
+    }
+
+    fn run(&self, lambda: &Path, args: &[&str]) -> Summary {
+        replay(lambda, std::slice::from_ref(&self.sample), args).must_exit(0).summary.clone().expect("a summary")
+    }
+
+    /// By how many per cent memory after the 10th replay in one process exceeds that after the 2nd.
+    pub fn growth_from_2nd_to_10th(&self, kind: Kind) -> f64 {
+        let out = Folder::new();
+        let output = Command::new(program("gleaner-runtime"))
+            .arg("replay")
+            .arg(kind.folder("hello"))
+            .arg(&self.sample)
+            .args(["--set", "brake_mps2=-1.4", "--repeat", "10", "--out"])
+            .arg(out.path())
+            .output()
+            .expect("gleaner-runtime starts");
+        let lines = String::from_utf8_lossy(&output.stdout).into_owned();
+        let reports = lines.lines().filter_map(|line| serde_json::from_str(line).ok());
+        let rounds = reports.filter_map(|report| match report {
+            Report::Round(round) => Some(round.rss_bytes as f64),
+            Report::Progress { .. } | Report::Summary(_) => None,
+        });
+        let rounds = rounds.collect::<Vec<_>>();
+        assert_eq!(rounds.len(), 10, "{}", String::from_utf8_lossy(&output.stderr));
+        100.0 * (rounds[9] / rounds[1] - 1.0)
+    }
+
+    /// Nanoseconds for one array over a frame of 6.2 MB, one figure for each frame, as the lambda measures it.
+    pub fn array_ns(&self) -> Vec<f64> {
+        let lambda = root().join("bench/lambdas/ndarray/python");
+        let run = replay(&lambda, std::slice::from_ref(&self.frames), &[]);
+        let triggers = run.must_exit(0).decisions.iter().flat_map(|decision| &decision.triggers);
+        triggers.filter_map(|trigger| trigger.score).collect()
+    }
+}
+
+/// One row of the table.
+pub struct Figure {
+    name: String,
+    unit: &'static str,
+    goal: Option<(f64, bool)>,
+    median: f64,
+    spread: (f64, f64),
+    runs: usize,
+}
+
+impl Figure {
+    pub fn at_least(name: &str, unit: &'static str, goal: f64, values: &[f64]) -> Self {
+        Self { goal: Some((goal, true)), ..Self::told(name, unit, values) }
+    }
+
+    pub fn at_most(name: &str, unit: &'static str, goal: f64, values: &[f64]) -> Self {
+        Self { goal: Some((goal, false)), ..Self::told(name, unit, values) }
+    }
+
+    /// A figure without a goal.
+    pub fn told(name: &str, unit: &'static str, values: &[f64]) -> Self {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let at = |index: usize| sorted.get(index).copied().unwrap_or(f64::NAN);
+        let last = sorted.len().saturating_sub(1);
+        Self {
+            name: name.to_owned(),
+            unit,
+            goal: None,
+            median: f64::midpoint(at(last / 2), at(last.div_ceil(2))),
+            spread: (at(0), at(last)),
+            runs: sorted.len(),
+        }
+    }
+
+    pub fn is_met(&self) -> bool {
+        match self.goal {
+            Some((goal, true)) => self.median >= goal,
+            Some((goal, false)) => self.median <= goal,
+            None => true,
+        }
+    }
+}
+
+impl fmt::Display for Figure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { name, unit, median, spread: (low, high), runs, .. } = self;
+        let goal = match self.goal {
+            Some((goal, true)) => format!(">= {goal} {unit}"),
+            Some((goal, false)) => format!("<= {goal} {unit}"),
+            None => "-".to_owned(),
+        };
+        let verdict = match (self.goal.is_some(), self.is_met()) {
+            (false, _) => "",
+            (true, true) => "met",
+            (true, false) => "not met",
+        };
+        let digits = if median.abs() < 100.0 { 2 } else { 0 };
+        write!(
+            f,
+            "| {name} | {goal} | {median:.digits$} {unit} | {low:.digits$} to {high:.digits$} | {runs} | {verdict} |"
+        )
+    }
+}

@@ -1,0 +1,112 @@
+//! Rust: cargo compiles the package in the lambda's folder, and says which file came out.
+
+use std::env;
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use serde_json::Value;
+
+use super::error::{BuildError, TARGET};
+
+/// Cargo's own variable for what is left out of a component.
+const STRIP: &str = "CARGO_PROFILE_RELEASE_STRIP";
+
+/// Compiles the package in `dir`. The result is the component, in cargo's target folder.
+pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
+    let package = dir.join("Cargo.toml");
+    if !package.is_file() {
+        return Err(BuildError::NoPackage { path: package });
+    }
+    let read = |source| BuildError::File { action: "read", path: package.clone(), source };
+    // Cargo names manifests by their full path.
+    let package = fs::canonicalize(&package).map_err(read)?;
+
+    let cargo = program("CARGO", "cargo");
+    let no_cargo = |source| BuildError::NoCargo { program: cargo.clone(), source };
+    let mut build = Command::new(&cargo);
+    if env::var_os(STRIP).is_none() {
+        // The standard library's line tables are most of a component: 2.6 MB with them, a tenth without. Names stay.
+        build.env(STRIP, "debuginfo");
+    }
+    let mut child = build
+        .args(["build", "--release", "--target", TARGET, "--message-format=json-render-diagnostics", "--manifest-path"])
+        .arg(&package)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .spawn()
+        .map_err(no_cargo)?;
+    let mut component = None;
+    if let Some(messages) = child.stdout.take() {
+        // A line that cannot be read ends the list; cargo's exit status says the rest.
+        for line in BufReader::new(messages).lines().map_while(Result::ok) {
+            component = component_in(&line, &package).or(component);
+        }
+    }
+    let status = child.wait().map_err(no_cargo)?;
+    if !status.success() {
+        return Err(if target_is_missing() { BuildError::NoTarget } else { BuildError::Compile { status } });
+    }
+    component.ok_or(BuildError::NoComponent { package })
+}
+
+/// The component that this message of cargo announces, if it does and `package` made it.
+fn component_in(message: &str, package: &Path) -> Option<PathBuf> {
+    let message: Value = serde_json::from_str(message).ok()?;
+    let of_package = message["manifest_path"].as_str().is_some_and(|path| Path::new(path) == package);
+    if message["reason"] != "compiler-artifact" || !of_package {
+        return None;
+    }
+    let kinds = message["target"]["kind"].as_array()?;
+    if !kinds.iter().any(|kind| kind == "cdylib") {
+        return None;
+    }
+    let files = message["filenames"].as_array()?;
+    files.iter().filter_map(Value::as_str).map(PathBuf::from).find(|file| file.extension().is_some_and(|e| e == "wasm"))
+}
+
+/// Whether the compiler lacks the target's libraries. Cargo's own message about it is long, and its way out depends on
+/// how Rust was installed; so this is asked only after a failure.
+fn target_is_missing() -> bool {
+    let output =
+        Command::new(program("RUSTC", "rustc")).args(["--print", "target-libdir", "--target", TARGET]).output();
+    output.is_ok_and(|output| {
+        let libraries = String::from_utf8_lossy(&output.stdout);
+        output.status.success() && !Path::new(libraries.trim()).is_dir()
+    })
+}
+
+fn program(variable: &str, name: &str) -> PathBuf {
+    env::var_os(variable).filter(|value| !value.is_empty()).unwrap_or_else(|| name.into()).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MESSAGE: &str = r#"{"reason":"compiler-artifact","manifest_path":"/l/Cargo.toml",
+        "target":{"kind":["cdylib","rlib"],"name":"hello"},
+        "filenames":["/t/wasm32-wasip2/release/hello.wasm","/t/wasm32-wasip2/release/libhello.rlib"]}"#;
+
+    #[test]
+    fn the_component_is_the_wasm_file_of_the_packages_cdylib() {
+        let found = component_in(MESSAGE, Path::new("/l/Cargo.toml"));
+        assert_eq!(found, Some("/t/wasm32-wasip2/release/hello.wasm".into()));
+    }
+
+    #[test]
+    fn other_messages_announce_no_component() {
+        let package = Path::new("/l/Cargo.toml");
+        for message in [
+            MESSAGE.replace("/l/", "/dependency/"),
+            MESSAGE.replace("cdylib", "lib"),
+            MESSAGE.replace("compiler-artifact", "build-script-executed"),
+            MESSAGE.replace(".wasm", ".so"),
+            "{}".to_owned(),
+            "no json".to_owned(),
+        ] {
+            assert_eq!(component_in(&message, package), None, "{message}");
+        }
+    }
+}

@@ -1,0 +1,66 @@
+use std::io;
+use std::path::PathBuf;
+use std::process::ExitStatus;
+
+use gleaner_protocol::manifest::Kind;
+use gleaner_protocol::{Exit, Explain, LayoutError};
+
+/// Why a lambda cannot be built.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum BuildError {
+    #[error("`entry` is `{entry}`, and the entry of a {} lambda ends with `.{extension}`", kind.as_str())]
+    EntryName { entry: String, kind: Kind, extension: &'static str },
+    #[error("`{}`, which {named_by} names, is not there", path.display())]
+    Missing { path: PathBuf, named_by: &'static str },
+    #[error("there is no `{}`", path.display())]
+    NoPackage { path: PathBuf },
+    #[error("cannot start `{}`", program.display())]
+    NoCargo { program: PathBuf, source: io::Error },
+    #[error("the target {TARGET} is not installed")]
+    NoTarget,
+    #[error("cargo ended with {status}; its messages are above")]
+    Compile { status: ExitStatus },
+    #[error("the package `{}` makes no component", package.display())]
+    NoComponent { package: PathBuf },
+    #[error("cannot {action} `{}`", path.display())]
+    File { action: &'static str, path: PathBuf, source: io::Error },
+    #[error("`{}` is newer than the build that was just made of it", source_file.display())]
+    Changed { source_file: PathBuf },
+    #[error("the new build cannot be checked")]
+    Layout(#[source] LayoutError),
+}
+
+/// What a component is compiled for.
+pub(super) const TARGET: &str = "wasm32-wasip2";
+
+impl Explain for BuildError {
+    fn help(&self) -> Option<String> {
+        Some(match self {
+            BuildError::EntryName { kind: Kind::Wasm, .. } => {
+                "write entry = \"NAME.wasm\", or kind = \"python\"".to_owned()
+            }
+            BuildError::EntryName { .. } => "write entry = \"main.py\", or kind = \"wasm\"".to_owned(),
+            BuildError::Missing { named_by, .. } => format!("add the file, or correct {named_by} in lambda.toml"),
+            BuildError::NoPackage { .. } => {
+                "kind = \"wasm\" is a Rust package: `cargo init --lib` makes one; for Python write kind = \"python\""
+                    .to_owned()
+            }
+            BuildError::NoCargo { .. } => "install Rust with rustup, or set CARGO to the cargo to use".to_owned(),
+            BuildError::NoTarget => format!("run `rustup target add {TARGET}`"),
+            BuildError::NoComponent { .. } => {
+                "write crate-type = [\"cdylib\", \"rlib\"] below [lib] in its Cargo.toml".to_owned()
+            }
+            BuildError::Changed { .. } => {
+                "it changed meanwhile: build again; if its date lies in the future, `touch` it first".to_owned()
+            }
+            BuildError::Compile { .. } | BuildError::File { .. } | BuildError::Layout(_) => return None,
+        })
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            BuildError::File { .. } | BuildError::Layout(_) => Exit::Internal,
+            _ => Exit::Usage,
+        }
+    }
+}

@@ -1,0 +1,162 @@
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use super::*;
+
+const PYTHON: &str =
+    "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
+
+/// A lambda's folder, removed when the test ends.
+struct Lambda(PathBuf);
+
+impl Lambda {
+    fn new(manifest: &str) -> Lambda {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("gleaner-cli-{}-{}", process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let lambda = Lambda(std::env::temp_dir().join(name));
+        lambda.write("lambda.toml", manifest);
+        lambda
+    }
+
+    fn write(&self, relative: &str, text: &str) {
+        let path = self.0.join(relative);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+
+    fn build(&self) -> Result<Built, BuildError> {
+        let started = SystemTime::now();
+        build(&self.0, &Manifest::load(&self.0).unwrap(), started)
+    }
+
+    fn read(&self, relative: &str) -> Option<String> {
+        fs::read_to_string(self.0.join(relative)).ok()
+    }
+
+    /// Everything in the folder `relative`, in order.
+    fn files(&self, relative: &str) -> Vec<String> {
+        fn walk(root: &Path, folder: &Path, found: &mut Vec<String>) {
+            for entry in fs::read_dir(folder).unwrap().map(Result::unwrap) {
+                match entry.path().is_dir() {
+                    true => walk(root, &entry.path(), found),
+                    false => found.push(entry.path().strip_prefix(root).unwrap().display().to_string()),
+                }
+            }
+        }
+        let mut found = Vec::new();
+        walk(&self.0.join(relative), &self.0.join(relative), &mut found);
+        found.sort();
+        found
+    }
+}
+
+impl Drop for Lambda {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+#[test]
+fn a_python_build_holds_the_manifest_the_sources_and_the_messages() {
+    let lambda = Lambda::new(PYTHON);
+    for file in [
+        "main.py",
+        "part/of.py",
+        "part/build/deep.py",
+        "msg/a/msg/B.msg",
+        "msg/README.md",
+        "README.md",
+        "tests/test.py",
+        "out/x.py",
+        ".venv/lib/y.py",
+        "part/__pycache__/z.py",
+        "target/t.py",
+    ] {
+        lambda.write(file, "123");
+    }
+    let built = lambda.build().unwrap();
+    let files = ["lambda.toml", "main.py", "msg/a/msg/B.msg", "part/build/deep.py", "part/of.py"];
+    assert_eq!(lambda.files("build"), files);
+    assert_eq!(built, Built { files: 5, bytes: 4 * 3 + PYTHON.len() as u64 });
+}
+
+#[test]
+fn a_second_build_replaces_the_first_and_leaves_nothing_else() {
+    let lambda = Lambda::new(PYTHON);
+    lambda.write("main.py", "1");
+    lambda.write("gone.py", "");
+    lambda.build().unwrap();
+    fs::remove_file(lambda.0.join("gone.py")).unwrap();
+    lambda.write("main.py", "2");
+    lambda.build().unwrap();
+    assert_eq!(lambda.files(""), ["build/lambda.toml", "build/main.py", "lambda.toml", "main.py"]);
+    assert_eq!(lambda.read("build/main.py").as_deref(), Some("2"));
+    assert!(BuildDir::check_fresh(&lambda.0).is_ok());
+}
+
+#[test]
+fn a_build_that_fails_leaves_the_old_one_as_it_was() {
+    let lambda = Lambda::new(PYTHON);
+    lambda.write("main.py", "1");
+    lambda.build().unwrap();
+    fs::remove_file(lambda.0.join("main.py")).unwrap();
+    let error = lambda.build().unwrap_err();
+    assert!(matches!(&error, BuildError::Missing { path, .. } if path.ends_with("main.py")), "{error}");
+    assert_eq!(lambda.files(""), ["build/lambda.toml", "build/main.py", "lambda.toml"]);
+}
+
+#[test]
+fn what_a_killed_build_left_is_in_nobodys_way() {
+    let lambda = Lambda::new(PYTHON);
+    lambda.write("main.py", "1");
+    lambda.write(".build.partial/half.py", "");
+    lambda.write(".build.old/main.py", "");
+    lambda.build().unwrap();
+    assert_eq!(lambda.files(""), ["build/lambda.toml", "build/main.py", "lambda.toml", "main.py"]);
+}
+
+#[test]
+fn a_source_from_the_future_is_named() {
+    let lambda = Lambda::new(PYTHON);
+    lambda.write("main.py", "1");
+    let file = File::options().write(true).open(lambda.0.join("main.py")).unwrap();
+    file.set_modified(SystemTime::now() + Duration::from_secs(3600)).unwrap();
+    let error = lambda.build().unwrap_err();
+    assert_eq!(error.to_string(), "`main.py` is newer than the build that was just made of it");
+}
+
+#[test]
+fn an_entry_has_the_extension_of_its_kind() {
+    for (kind, entry, said) in [
+        ("python", "lambda.toml", "the entry of a python lambda ends with `.py`"),
+        ("wasm", "main.py", "the entry of a wasm lambda ends with `.wasm`"),
+    ] {
+        let lambda = Lambda::new(&PYTHON.replace("python", kind).replace("main.py", entry));
+        let error = lambda.build().unwrap_err();
+        assert!(error.to_string().contains(said), "{error}");
+    }
+}
+
+#[test]
+fn a_wasm_lambda_without_a_package_is_told_how_to_make_one() {
+    use gleaner_protocol::Explain;
+    let lambda = Lambda::new(&PYTHON.replace("python", "wasm").replace("main.py", "x.wasm"));
+    let error = lambda.build().unwrap_err();
+    assert_eq!(error.to_string(), format!("there is no `{}`", lambda.0.join("Cargo.toml").display()));
+    assert!(error.help().unwrap().contains("cargo init --lib"));
+}
+
+#[test]
+fn messages_may_be_absent_but_a_model_that_is_named_may_not() {
+    let model = format!("[[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n", "0".repeat(64));
+    let lambda = Lambda::new(&format!("{PYTHON}{model}"));
+    lambda.write("main.py", "1");
+    let error = lambda.build().unwrap_err();
+    assert!(error.to_string().contains("models/m.onnx"), "{error}");
+    lambda.write("models/m.onnx", "1");
+    lambda.build().unwrap();
+    assert_eq!(lambda.files("build"), ["lambda.toml", "main.py", "models/m.onnx"]);
+}

@@ -1,0 +1,15 @@
+//! `gleaner`: what people type. See `gleaner --help`.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    match gleaner_cli::run(gleaner_cli::args::Cli::parse()) {
+        Ok(exit) => exit.into(),
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit.into()
+        }
+    }
+}

@@ -1,0 +1,193 @@
+//! What a replay left in its folder, read back and put into the form that people and `expected.txt` share.
+//!
+//! Nothing is written here, and no file is held in memory as a whole: `decisions.jsonl` may have a line per wake.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Lines};
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::{Decision, Exit, Explain, Trigger};
+
+/// Why results cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ResultsError {
+    /// A file cannot be read.
+    #[error("cannot read `{}`", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// A line is no decision.
+    #[error("`{}`, line {line}, is no decision", path.display())]
+    Decision {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+        /// Why not.
+        source: serde_json::Error,
+    },
+}
+
+impl Explain for ResultsError {
+    fn help(&self) -> Option<String> {
+        Some("replay again; nothing else may write into the folder of the results meanwhile".to_owned())
+    }
+
+    fn exit(&self) -> Exit {
+        Exit::Internal
+    }
+}
+
+/// The decisions of a replay, in the order of its wakes.
+#[derive(Debug)]
+pub struct Decisions {
+    path: PathBuf,
+    lines: Lines<BufReader<File>>,
+    line: usize,
+}
+
+impl Decisions {
+    /// The decisions in `out/decisions.jsonl`.
+    ///
+    /// # Errors
+    ///
+    /// [`ResultsError::Read`] if the file cannot be opened.
+    pub fn open(out: &Path) -> Result<Decisions, ResultsError> {
+        let path = out.join("decisions.jsonl");
+        match File::open(&path) {
+            Ok(file) => Ok(Decisions { path, lines: BufReader::new(file).lines(), line: 0 }),
+            Err(source) => Err(ResultsError::Read { path, source }),
+        }
+    }
+}
+
+impl Iterator for Decisions {
+    type Item = Result<Decision, ResultsError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let text = self.lines.next()?;
+        self.line += 1;
+        let path = || self.path.clone();
+        Some(text.map_err(|source| ResultsError::Read { path: path(), source }).and_then(|text| {
+            serde_json::from_str(&text).map_err(|source| ResultsError::Decision {
+                path: path(),
+                line: self.line,
+                source,
+            })
+        }))
+    }
+}
+
+/// A line of `expected.txt` for each trigger of `decision`: `<seconds %.3f> <label> <score %.3g>`; no score is `-`.
+///
+/// `start_ns` is [`Summary::start_ns`](gleaner_protocol::Summary::start_ns): seconds count from the first message of
+/// the topics that the lambda reads, so that a drive can be cut to those topics and still be compared.
+pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item = String> {
+    let seconds = seconds(decision.at_ns, start_ns);
+    decision
+        .triggers
+        .iter()
+        .map(move |trigger| format!("{seconds:.3} {} {}", printable(&trigger.label), score(trigger)))
+}
+
+/// The score of `trigger` in three significant digits, `-` if it has none.
+pub fn score(trigger: &Trigger) -> String {
+    trigger.score.map_or("-".to_owned(), three_digits)
+}
+
+/// Log time `at_ns` in s after `start_ns`.
+pub fn seconds(at_ns: i64, start_ns: i64) -> f64 {
+    at_ns.saturating_sub(start_ns) as f64 / 1e9
+}
+
+/// `value` as C's `printf("%.3g")` writes it: three significant digits, without zeros at the end, in scientific
+/// notation from 1000 on and below 0.0001.
+///
+/// Source: ISO C, `fprintf`, conversion `g`: with precision P and exponent X it is `%f` if P > X >= -4, else `%e`.
+pub fn three_digits(value: f64) -> String {
+    if !value.is_finite() {
+        return value.to_string().to_lowercase();
+    }
+    // Rounding may carry into the next power of ten, so the exponent is read from the rounded value.
+    let scientific = format!("{value:.2e}");
+    let (digits, exponent) = scientific.split_once('e').unwrap_or((&scientific, "0"));
+    let exponent: i32 = exponent.parse().unwrap_or(0);
+    let trimmed = |text: &str| match text.contains('.') {
+        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
+        false => text.to_owned(),
+    };
+    match exponent {
+        -4..=2 => trimmed(&format!("{value:.*}", (2 - exponent) as usize)),
+        _ => format!("{}e{}{:02}", trimmed(digits), if exponent < 0 { '-' } else { '+' }, exponent.abs()),
+    }
+}
+
+/// `text` from a lambda or a file, on one line and without characters that would act on a terminal.
+pub fn printable(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character.is_control() {
+            true => shown.extend(character.escape_default()),
+            false => shown.push(character),
+        }
+    }
+    shown
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn three_digits_are_those_of_printf() {
+        // Right column: `printf '%.3g'` of a C library.
+        for (value, text) in [
+            (0.0, "0"),
+            (-0.0, "-0"),
+            (1.0, "1"),
+            (1.5, "1.5"),
+            (1.456, "1.46"),
+            (-1.456, "-1.46"),
+            (1.125, "1.12"),
+            (1.375, "1.38"),
+            (0.1, "0.1"),
+            (9.996, "10"),
+            (99.96, "100"),
+            (999.4, "999"),
+            (999.6, "1e+03"),
+            (1234.0, "1.23e+03"),
+            (0.000123456, "0.000123"),
+            (0.00009999, "0.0001"),
+            (0.0000999, "9.99e-05"),
+            (0.00001, "1e-05"),
+            (1e100, "1e+100"),
+            (5e-324, "4.94e-324"),
+            (f64::NAN, "nan"),
+            (f64::INFINITY, "inf"),
+            (f64::NEG_INFINITY, "-inf"),
+        ] {
+            assert_eq!(three_digits(value), text, "of {value:?}");
+        }
+    }
+
+    #[test]
+    fn a_trigger_is_a_line_with_its_time_after_the_start() {
+        let decision: Decision = serde_json::from_str(concat!(
+            r#"{"at_ns":1700000010810000000,"cause":"event","input":"imu","topic":"/imu","writer":null,"seq":1,"#,
+            r#""triggers":[{"kind":"event","label":"hard-brake","score":1.456,"attributes":{}},"#,
+            r#"{"kind":"stop","label":"a\u001b[2J","score":null,"attributes":{}}],"fault":null,"fuel":1,"run_ns":2}"#
+        ))
+        .unwrap();
+        let lines: Vec<_> = trigger_lines(&decision, 1_700_000_000_000_000_000).collect();
+        assert_eq!(lines, ["10.810 hard-brake 1.46", "10.810 a\\u{1b}[2J -"]);
+    }
+
+    #[test]
+    fn times_at_the_ends_of_the_range_do_not_overflow() {
+        assert!(seconds(i64::MIN, i64::MAX) < 0.0);
+        assert_eq!(seconds(1_500_000_000, 0), 1.5);
+    }
+}

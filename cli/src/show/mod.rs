@@ -1,0 +1,231 @@
+//! What a person sees after a replay. Text in, text out: nothing is read or printed here.
+
+use std::fmt::{self, Write};
+
+use gleaner_protocol::{Decision, Fault, FaultKind, Summary, TopicReport};
+
+use crate::results::{ResultsError, printable, score, seconds};
+
+/// As many triggers, and as many causes of faults, are shown; the rest is counted.
+const SHOWN: usize = 20;
+
+/// The part of the decisions that is shown. It stays small, however many decisions there are.
+#[derive(Debug, Default)]
+pub(crate) struct Digest {
+    triggers: Vec<Shown>,
+    causes: Vec<Cause>,
+    other_faults: u64,
+}
+
+#[derive(Debug)]
+struct Shown {
+    seconds: f64,
+    label: String,
+    score: String,
+}
+
+/// Faults with one cause.
+#[derive(Debug)]
+struct Cause {
+    kind: FaultKind,
+    message: String,
+    count: u64,
+    first_seconds: f64,
+}
+
+impl Digest {
+    /// The digest of `decisions` of a drive that starts at `start_ns`.
+    pub(crate) fn of(
+        decisions: impl Iterator<Item = Result<Decision, ResultsError>>,
+        start_ns: i64,
+    ) -> Result<Digest, ResultsError> {
+        let mut digest = Digest::default();
+        for decision in decisions {
+            let decision = decision?;
+            let seconds = seconds(decision.at_ns, start_ns);
+            let room = SHOWN - digest.triggers.len();
+            digest.triggers.extend(decision.triggers.iter().take(room).map(|trigger| Shown {
+                seconds,
+                label: printable(&trigger.label),
+                score: score(trigger),
+            }));
+            if let Some(fault) = decision.fault {
+                digest.count(&fault, seconds);
+            }
+        }
+        Ok(digest)
+    }
+
+    fn count(&mut self, fault: &Fault, first_seconds: f64) {
+        let (kind, message) = (fault.kind, printable(gist(&fault.message)));
+        if let Some(cause) = self.causes.iter_mut().find(|cause| cause.kind == kind && cause.message == message) {
+            cause.count += 1;
+        } else if self.causes.len() < SHOWN {
+            self.causes.push(Cause { kind, message, count: 1, first_seconds });
+        } else {
+            self.other_faults += 1;
+        }
+    }
+}
+
+/// The line of a fault's message that says most: the first, but the last of a Python traceback.
+fn gist(message: &str) -> &str {
+    let mut lines = message.lines().map(str::trim).filter(|line| !line.is_empty());
+    let traceback = message.contains("Traceback (most recent call last)");
+    let line = if traceback { lines.next_back() } else { lines.next() };
+    line.unwrap_or_default()
+}
+
+/// The summary of a replay, for a person.
+pub(crate) fn summary(summary: &Summary, digest: &Digest, paint: Paint) -> String {
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write_summary(&mut text, summary, digest, paint);
+    text
+}
+
+fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: Paint) -> fmt::Result {
+    let name = format!("{} {}", printable(&summary.lambda), printable(&summary.version));
+    let span_s = seconds(summary.end_ns, summary.start_ns);
+    writeln!(
+        text,
+        "{} ({}): {} in {}, {span_s:.1} s of drive",
+        paint.bold(&name),
+        summary.kind.as_str(),
+        counted(summary.triggers, "trigger"),
+        counted(summary.wakes, "wake"),
+    )?;
+
+    for shown in &digest.triggers {
+        let time = format!("{:>10.3} s", shown.seconds);
+        writeln!(text, "{}  {}  {}", paint.green(&time), shown.label, shown.score)?;
+    }
+    more(text, summary.triggers.saturating_sub(digest.triggers.len() as u64))?;
+
+    if summary.faults > 0 {
+        writeln!(text, "  {}", paint.red(&counted(summary.faults, "fault")))?;
+        for cause in &digest.causes {
+            let kind = word(cause.kind);
+            writeln!(text, "{:>10.3} s  {}x {kind}: {}", cause.first_seconds, grouped(cause.count), cause.message)?;
+        }
+        more(text, digest.other_faults)?;
+    }
+    for loss in losses(summary) {
+        writeln!(text, "  {}", paint.yellow(&format!("lost: {loss}")))?;
+    }
+    if let Some(damage) = &summary.damaged {
+        writeln!(text, "  {}", paint.red("the drive is damaged; the results end there"))?;
+        for line in damage.lines() {
+            writeln!(text, "    {}", printable(line))?;
+        }
+    }
+
+    write!(text, "  {} wakes/s", grouped(summary.wakes_per_s.round() as u64))?;
+    if summary.wall_s > 0.0 && span_s > 0.0 {
+        write!(text, " ({}x real time)", grouped((span_s / summary.wall_s).round() as u64))?;
+    }
+    write!(text, ", {:.3} s in the lambda", summary.run_s)?;
+    if summary.decode_s > 0.0 {
+        write!(text, " ({:.0} % decoding)", 100.0 * summary.decode_s / summary.run_s.max(summary.decode_s))?;
+    }
+    writeln!(text, ", {:.1} MiB at most", mib(summary.peak_rss_bytes))?;
+    let files = format!("{}: decisions.jsonl, log.jsonl, summary.json", summary.out.display());
+    writeln!(text, "  {}", paint.dim(&files))
+}
+
+fn more(text: &mut String, count: u64) -> fmt::Result {
+    if count > 0 {
+        writeln!(text, "{:>12}  and {} more", "", grouped(count))?;
+    }
+    Ok(())
+}
+
+/// What was lost, by cause. A sample that a newer one pushed out is none: that is how a ring works.
+fn losses(summary: &Summary) -> Vec<String> {
+    let of_topic = |topic: &TopicReport| {
+        let causes = [
+            (topic.lost.unwrap_or(0), "before they reached us"),
+            (topic.no_slot, "found no free slot, as the lambda held too many"),
+            (topic.too_big, "larger than `max_size`"),
+        ];
+        let name = printable(&topic.topic);
+        causes.map(|(count, why)| (count, format!("{} of {name}, {why}", counted(count, "sample"))))
+    };
+    let overall = [
+        (summary.skipped, format!("{}, skipped", counted(summary.skipped, "event sample"))),
+        (summary.missed_ticks, format!("{}, missed", counted(summary.missed_ticks, "tick"))),
+        (summary.log_dropped, format!("{}, over the rate limit", counted(summary.log_dropped, "log line"))),
+    ];
+    let all = summary.topics.iter().flat_map(of_topic).chain(overall);
+    all.filter(|(count, _)| *count > 0).map(|(_, loss)| loss).collect()
+}
+
+/// The word of `decisions.jsonl`.
+fn word(kind: FaultKind) -> String {
+    let word = serde_json::to_value(kind).ok();
+    word.as_ref().and_then(|word| word.as_str()).unwrap_or("fault").to_owned()
+}
+
+/// `1 wake`, `2,000 wakes`.
+fn counted(count: u64, thing: &str) -> String {
+    format!("{} {thing}{}", grouped(count), if count == 1 { "" } else { "s" })
+}
+
+/// `count` with a comma between thousands.
+fn grouped(count: u64) -> String {
+    let digits = count.to_string();
+    let mut text = String::new();
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+fn mib(bytes: u64) -> f64 {
+    bytes as f64 / (1024.0 * 1024.0)
+}
+
+/// Colours, or none.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Paint {
+    on: bool,
+}
+
+impl Paint {
+    /// Colours on a terminal, unless the user does not want any.
+    ///
+    /// Source: no-color.org, by which `NO_COLOR` counts if it is not empty.
+    pub(crate) fn new(terminal: bool) -> Paint {
+        Paint { on: terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()) }
+    }
+
+    fn bold(self, text: &str) -> String {
+        self.with("1", text)
+    }
+
+    fn dim(self, text: &str) -> String {
+        self.with("2", text)
+    }
+
+    fn red(self, text: &str) -> String {
+        self.with("31", text)
+    }
+
+    fn green(self, text: &str) -> String {
+        self.with("32", text)
+    }
+
+    fn yellow(self, text: &str) -> String {
+        self.with("33", text)
+    }
+
+    fn with(self, code: &str, text: &str) -> String {
+        if self.on { format!("\u{1b}[{code}m{text}\u{1b}[0m") } else { text.to_owned() }
+    }
+}
+
+#[cfg(test)]
+mod tests;

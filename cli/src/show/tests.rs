@@ -1,0 +1,148 @@
+use gleaner_protocol::manifest::Kind;
+use gleaner_protocol::{Cause as Woken, Trigger, TriggerKind};
+
+use super::*;
+
+const START_NS: i64 = 1_700_000_000_000_000_000;
+const PLAIN: Paint = Paint { on: false };
+
+fn replay() -> Summary {
+    Summary {
+        lambda: "brake-dark".to_owned(),
+        version: "0.1.0".to_owned(),
+        kind: Kind::Wasm,
+        drive: vec!["a.mcap".into()],
+        out: "out/demo".into(),
+        wakes: 1200,
+        triggers: 1,
+        faults: 0,
+        skipped: 0,
+        missed_ticks: 0,
+        log_lines: 0,
+        log_dropped: 0,
+        start_ns: START_NS,
+        end_ns: START_NS + 40_000_000_000,
+        wall_s: 0.5,
+        run_s: 0.4,
+        decode_s: 0.1,
+        wakes_per_s: 2400.4,
+        peak_rss_bytes: 12 << 20,
+        topics: vec![TopicReport {
+            name: "imu".to_owned(),
+            topic: "/imu/data".to_owned(),
+            type_name: "sensor_msgs/msg/Imu".to_owned(),
+            received: 1200,
+            lost: None,
+            overwritten: 700,
+            no_slot: 0,
+            too_big: 0,
+        }],
+        damaged: None,
+    }
+}
+
+fn decision(milliseconds: i64, label: Option<&str>, fault: Option<(FaultKind, &str)>) -> Decision {
+    let trigger = |label: &str| Trigger {
+        kind: TriggerKind::Event,
+        label: label.to_owned(),
+        score: Some(1.4567),
+        attributes: serde_json::Map::new(),
+    };
+    Decision {
+        at_ns: START_NS + milliseconds * 1_000_000,
+        cause: Woken::Event,
+        input: None,
+        topic: None,
+        writer: None,
+        seq: None,
+        triggers: label.map(trigger).into_iter().collect(),
+        fault: fault.map(|(kind, message)| Fault { kind, message: message.to_owned(), used: None, allowed: None }),
+        fuel: None,
+        run_ns: 0,
+    }
+}
+
+fn digest(decisions: Vec<Decision>) -> Digest {
+    Digest::of(decisions.into_iter().map(Ok), START_NS).unwrap()
+}
+
+#[test]
+fn a_summary_says_what_was_found_when_how_fast_and_where_the_files_are() {
+    let digest = digest(vec![decision(10_810, Some("brake-dark"), None), decision(11_000, None, None)]);
+    assert_eq!(
+        summary(&replay(), &digest, PLAIN),
+        "brake-dark 0.1.0 (wasm): 1 trigger in 1,200 wakes, 40.0 s of drive\n    \
+            10.810 s  brake-dark  1.46\n  \
+          2,400 wakes/s (80x real time), 0.400 s in the lambda (25 % decoding), 12.0 MiB at most\n  \
+          out/demo: decisions.jsonl, log.jsonl, summary.json\n"
+    );
+}
+
+#[test]
+fn of_many_triggers_twenty_are_shown_and_the_others_counted() {
+    let digest = digest((0..1500).map(|n| decision(n, Some("x"), None)).collect());
+    let text = summary(&Summary { triggers: 1500, ..replay() }, &digest, PLAIN);
+    assert_eq!(text.matches(" s  x  1.46\n").count(), 20);
+    assert!(text.contains("              and 1,480 more\n"), "{text}");
+}
+
+#[test]
+fn faults_are_shown_once_per_cause_with_the_line_that_says_most() {
+    let traceback = "Traceback (most recent call last):\n  File \"main.py\", line 3\nValueError: no\n";
+    let faults = [(500, FaultKind::Trap, "unreachable\nat f"), (600, FaultKind::Exception, traceback)];
+    let mut decisions: Vec<_> = faults.map(|(at, kind, message)| decision(at, None, Some((kind, message)))).into();
+    decisions.push(decision(700, None, Some((FaultKind::Trap, "unreachable\nat g"))));
+    let text = summary(&Summary { faults: 3, ..replay() }, &digest(decisions), PLAIN);
+    assert!(
+        text.contains("  3 faults\n     0.500 s  2x trap: unreachable\n     0.600 s  1x exception: ValueError: no\n"),
+        "{text}"
+    );
+}
+
+#[test]
+fn faults_with_ever_new_messages_take_no_more_room() {
+    let message = |n: i64| format!("message {n}");
+    let digest = digest((0..50).map(|n| decision(n, None, Some((FaultKind::HostCall, &message(n))))).collect());
+    assert_eq!((digest.causes.len(), digest.other_faults), (20, 30));
+}
+
+#[test]
+fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
+    assert!(losses(&replay()).is_empty());
+    let mut lossy = Summary { skipped: 1, log_dropped: 3000, ..replay() };
+    lossy.topics[0].lost = Some(2);
+    lossy.topics[0].too_big = 4;
+    assert_eq!(
+        losses(&lossy),
+        [
+            "2 samples of /imu/data, before they reached us",
+            "4 samples of /imu/data, larger than `max_size`",
+            "1 event sample, skipped",
+            "3,000 log lines, over the rate limit",
+        ]
+    );
+}
+
+#[test]
+fn what_a_lambda_writes_cannot_act_on_the_terminal() {
+    let fault = Some((FaultKind::Trap, "\u{1b}[2J"));
+    let digest = digest(vec![decision(0, Some("a\u{1b}[2J\nb"), fault)]);
+    let damaged = Some("error: \u{7}\n  cause: x".to_owned());
+    let text = summary(&Summary { faults: 1, damaged, ..replay() }, &digest, PLAIN);
+    assert!(!text.contains('\u{1b}') && !text.contains('\u{7}'), "{text}");
+    assert!(text.contains("    error: \\u{7}\n      cause: x\n"), "{text}");
+}
+
+#[test]
+fn colours_come_only_where_they_are_wanted() {
+    assert_eq!(Paint { on: true }.red("x"), "\u{1b}[31mx\u{1b}[0m");
+    assert_eq!(PLAIN.red("x"), "x");
+    assert!(!Paint::new(false).on);
+}
+
+#[test]
+fn thousands_are_grouped() {
+    for (count, text) in [(0, "0"), (999, "999"), (1000, "1,000"), (123_456, "123,456"), (1_234_567, "1,234,567")] {
+        assert_eq!(grouped(count), text);
+    }
+}

@@ -1,0 +1,109 @@
+//! `gleaner replay` as it is started by people, with a runtime that is a script.
+#![cfg(unix)]
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::PathBuf;
+use std::process::{self, Command, Output};
+
+const SUMMARY: &str = concat!(
+    r#"{"lambda":"x","version":"0.1.0","kind":"wasm","drive":["a.mcap"],"out":"OUT","wakes":2,"triggers":1,"faults":0,"#,
+    r#""skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"start_ns":0,"end_ns":3000000000,"wall_s":0.5,"#,
+    r#""run_s":0.25,"decode_s":0.0,"wakes_per_s":4.0,"peak_rss_bytes":1048576,"topics":[],"damaged":null}"#
+);
+const DECISION: &str = concat!(
+    r#"{"at_ns":1500000000,"cause":"tick","input":null,"topic":null,"writer":null,"seq":null,"#,
+    r#""triggers":[{"kind":"event","label":"seen","score":0.5,"attributes":{}}],"fault":null,"fuel":1,"run_ns":2}"#
+);
+
+/// A folder with `gleaner-runtime`, removed when the test ends.
+struct Installation(PathBuf);
+
+impl Installation {
+    fn new(test: &str, runtime: &str) -> Installation {
+        let folder = std::env::temp_dir().join(format!("gleaner-replay-{}-{test}", process::id()));
+        fs::create_dir(&folder).unwrap();
+        let program = folder.join("gleaner-runtime");
+        let report = SUMMARY.replacen('{', r#"{"report":"summary","#, 1).replace("OUT", folder.to_str().unwrap());
+        fs::write(folder.join("report"), report + "\n").unwrap();
+        fs::write(folder.join("decisions.jsonl"), format!("{DECISION}\n")).unwrap();
+        fs::write(&program, format!("#!/bin/sh\ncd '{}'\n{runtime}\n", folder.display())).unwrap();
+        fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
+        Installation(folder)
+    }
+
+    fn replay(&self, arguments: &[&str]) -> Output {
+        let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
+        gleaner.args(["replay", "dir", "a.mcap"]).args(arguments).env("GLEANER_HOME", &self.0).output().unwrap()
+    }
+}
+
+impl Drop for Installation {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+fn text(bytes: &[u8]) -> &str {
+    str::from_utf8(bytes).unwrap()
+}
+
+#[test]
+fn a_replay_ends_with_a_summary_and_without_colours_in_a_pipe() {
+    let runtime = r#"echo '{"report":"progress","done":1,"total":2,"at_ns":5}'; cat report"#;
+    let output = Installation::new("summary", runtime).replay(&[]);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert!(
+        text(&output.stdout)
+            .starts_with("x 0.1.0 (wasm): 1 trigger in 2 wakes, 3.0 s of drive\n     1.500 s  seen  0.5\n")
+    );
+    assert!(!text(&output.stdout).contains('\u{1b}'));
+    assert_eq!(text(&output.stderr), "");
+}
+
+#[test]
+fn json_is_the_summary_alone() {
+    let installation = Installation::new("json", "cat report");
+    let output = installation.replay(&["--json"]);
+    let expected = SUMMARY.replace("OUT", installation.0.to_str().unwrap()) + "\n";
+    assert_eq!(text(&output.stdout), expected);
+}
+
+#[test]
+fn the_runtimes_exit_code_and_what_it_says_are_passed_on() {
+    let output = Installation::new("fails", "echo 'error: no such drive' >&2; exit 2").replay(&[]);
+    assert_eq!(output.status.code(), Some(2));
+    assert_eq!(text(&output.stderr), "error: no such drive\n");
+    let output = Installation::new("faulted", "cat report; exit 6").replay(&[]);
+    assert_eq!(output.status.code(), Some(6));
+    assert!(text(&output.stdout).contains("seen"));
+}
+
+#[test]
+fn a_runtime_that_is_killed_is_told_apart_from_one_that_fails() {
+    let output = Installation::new("killed", "kill -9 $$").replay(&[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(text(&output.stderr).starts_with("error: gleaner-runtime was killed by signal 9\n  help:  "));
+}
+
+#[test]
+fn a_runtime_of_another_version_is_stopped() {
+    // It would go on for ever.
+    let output = Installation::new("version", r#"while echo '{"report":"weather"}'; do :; done"#).replay(&[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(text(&output.stderr).contains("install gleaner and gleaner-runtime of one version"));
+}
+
+#[test]
+fn a_runtime_that_says_nothing_has_not_replayed() {
+    let output = Installation::new("nothing", "exit 0").replay(&[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(text(&output.stderr).contains("without a summary"));
+}
+
+#[test]
+fn a_value_without_an_equals_sign_is_refused_before_anything_starts() {
+    let output = Installation::new("refused", "touch started").replay(&["--set", "brake_mps2"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("write KEY=VALUE"));
+}

@@ -1,0 +1,38 @@
+"""Hard braking in the dark: the car brakes while the newest camera frame is dark."""
+
+from __future__ import annotations
+
+from gleaner import Column, Context, Sample
+
+WINDOW_NS = 500_000_000
+FULL_NS = 450_000_000
+REFRACTORY_NS = 3_000_000_000
+
+
+class Lambda:
+    def __init__(self, ctx: Context) -> None:
+        self.imu = ctx.input("imu")
+        self.forward = self.imu.field("linear_acceleration.x")
+        self.brake_mps2: float = ctx.config["brake_mps2"]
+        self.dark_luma: float = ctx.config["dark_luma"]
+        self.last_ns: int | None = None
+
+    def on_event(self, ctx: Context, event: Sample) -> None:
+        now = ctx.now_ns()
+        mean = braking(self.imu.column_since(self.forward, now - WINDOW_NS), now, self.brake_mps2)
+        rested = self.last_ns is None or now - self.last_ns >= REFRACTORY_NS
+        if mean is None or not rested:
+            return
+        # Only now is the image decoded: most frames cost nothing.
+        luma = event.as_frame().mean_luma()
+        if luma < self.dark_luma:
+            self.last_ns = now
+            ctx.event("brake-dark", -mean, luma=luma)
+
+
+def braking(window: Column, now: int, brake_mps2: float) -> float | None:
+    """Mean of the window in m/s², if the window is full and its mean is below `brake_mps2`."""
+    if len(window.at_ns) == 0 or now - window.at_ns[0] < FULL_NS:
+        return None
+    mean = float(window.values.mean())
+    return mean if mean < brake_mps2 else None

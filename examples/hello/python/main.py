@@ -1,0 +1,33 @@
+"""Hard braking: the mean forward acceleration of the last half second is below a threshold."""
+
+from __future__ import annotations
+
+from gleaner import Column, Context, Sample
+
+WINDOW_NS = 500_000_000
+FULL_NS = 450_000_000
+REFRACTORY_NS = 3_000_000_000
+
+
+class Lambda:
+    def __init__(self, ctx: Context) -> None:
+        self.imu = ctx.input("imu")
+        self.forward = self.imu.field("linear_acceleration.x")
+        self.brake_mps2: float = ctx.config["brake_mps2"]
+        self.last_ns: int | None = None
+
+    def on_event(self, ctx: Context, event: Sample) -> None:
+        now = ctx.now_ns()
+        mean = braking(self.imu.column_since(self.forward, now - WINDOW_NS), now, self.brake_mps2)
+        rested = self.last_ns is None or now - self.last_ns >= REFRACTORY_NS
+        if mean is not None and rested:
+            self.last_ns = now
+            ctx.event("hard-brake", -mean)
+
+
+def braking(window: Column, now: int, brake_mps2: float) -> float | None:
+    """Mean of the window in m/s², if the window is full and its mean is below `brake_mps2`."""
+    if len(window.at_ns) == 0 or now - window.at_ns[0] < FULL_NS:
+        return None
+    mean = float(window.values.mean())
+    return mean if mean < brake_mps2 else None

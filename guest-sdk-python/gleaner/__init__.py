@@ -1,0 +1,75 @@
+"""What a Gleaner lambda in Python sees of the vehicle.
+
+A lambda is a class, or plain functions, in the file that ``entry`` of its ``lambda.toml`` names::
+
+    from gleaner import Context, Sample
+
+    class Lambda:
+        def __init__(self, ctx: Context) -> None:
+            self.limit: float = ctx.config["limit"]
+
+        def on_event(self, ctx: Context, event: Sample) -> None:    # [schedule] event = "imu"
+            if event.number("linear_acceleration.x") < self.limit:
+                ctx.event("hard-brake", 1.0)
+
+        # or, with [schedule] period = "100ms":  def on_tick(self, ctx: Context) -> None
+
+    # without a class:  def on_event(ctx, event)  or  def on_tick(ctx), and optionally  def init(ctx)
+
+An exception that leaves a handler is a fault of that wake. The lambda is then made anew; the globals of its module stay.
+
+The classes here describe what the host hands out. Importing them needs no host, so a lambda can be checked and tested at
+a desk. The names are those of the WIT package ``gleaner:lambda``, with ``_`` for ``-``.
+"""
+
+from .context import Context
+from .data import (
+    Column,
+    Counts,
+    DataError,
+    Encoding,
+    Field,
+    Frame,
+    FrameInfo,
+    Guid,
+    Identity,
+    Roi,
+    Sample,
+    Stamps,
+    Topic,
+    Value,
+)
+from .error import Error
+from .inference import Detection, DetectOptions, InferenceError, Model, Preprocess, Tensor
+from .log import Level
+from .trigger import AttributeValue, TriggerError
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AttributeValue",
+    "Column",
+    "Context",
+    "Counts",
+    "DataError",
+    "DetectOptions",
+    "Detection",
+    "Encoding",
+    "Error",
+    "Field",
+    "Frame",
+    "FrameInfo",
+    "Guid",
+    "Identity",
+    "InferenceError",
+    "Level",
+    "Model",
+    "Preprocess",
+    "Roi",
+    "Sample",
+    "Stamps",
+    "Tensor",
+    "Topic",
+    "TriggerError",
+    "Value",
+]

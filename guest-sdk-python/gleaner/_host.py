@@ -1,0 +1,119 @@
+"""The part of hosting that is written in Python: finding a lambda in its file, telling its exceptions, and keeping the
+garbage collector out of its wakes. `_gleaner` calls it; no lambda imports it."""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import os
+import sys
+import traceback
+from types import ModuleType, TracebackType
+from typing import Any, Callable, Dict
+
+from .context import Context
+
+Handler = Callable[..., object]
+
+# A message has room for about so many entries of a traceback. Without a bound an endless recursion, a thousand entries
+# deep, would take 16 ms to tell.
+TRACE_ENTRIES = 40
+
+HANDLERS: Dict[str, str] = {"on_event": "on_event(ctx, event)", "on_tick": "on_tick(ctx)"}
+
+
+class LambdaError(Exception):
+    """A file in which there is no lambda for its schedule. The text is for its author, who needs no traceback."""
+
+
+def load(entry: str, handler: str) -> Callable[[Context], Handler]:
+    """Imports the file ``entry``; returns what makes a fresh lambda and gives its ``handler``: ``on_event`` or ``on_tick``.
+
+    Raises LambdaError, and whatever the file raises."""
+    module = _import(entry)
+    lambda_class = getattr(module, "Lambda", None)
+    owner: Any = module if lambda_class is None else lambda_class
+    if not callable(getattr(owner, handler, None)):
+        raise LambdaError(_missing(owner, entry, handler))
+
+    def make(ctx: Context) -> Handler:
+        if lambda_class is None:
+            getattr(module, "init", _nothing)(ctx)
+            made: Any = module
+        else:
+            made = lambda_class(ctx)
+        bound: Handler = getattr(made, handler)
+        return bound
+
+    return make
+
+
+def _nothing(ctx: Context) -> None:
+    """What a module without ``init`` does."""
+
+
+def _import(entry: str) -> ModuleType:
+    folder = os.path.dirname(entry)
+    # A replay that is repeated begins with fresh globals, those of the lambda's own modules included.
+    for name, known in list(sys.modules.items()):
+        if str(getattr(known, "__file__", None)).startswith(folder + os.sep):
+            del sys.modules[name]
+    # As for any script, what lies beside the file can be imported.
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    # A build folder is what was built, and nothing else.
+    sys.dont_write_bytecode = True
+    spec = importlib.util.spec_from_file_location("main", entry)
+    if spec is None or spec.loader is None:
+        raise LambdaError(f"`{os.path.basename(entry)}` is no Python file: its name must end with `.py`")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["main"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _missing(owner: Any, entry: str, handler: str) -> str:
+    where, wanted = f"`{os.path.basename(entry)}`", HANDLERS[handler]
+    if not isinstance(owner, ModuleType):
+        where, wanted = f"`Lambda` of {where}", wanted.replace("(", "(self, ")
+    schedule = "event" if handler == "on_event" else "period"
+    found = " and ".join(f"`{name}`" for name in HANDLERS if callable(getattr(owner, name, None)))
+    return f"{where} has no `{wanted}`, which `{schedule}` in [schedule] asks for; found {found or 'no handler'}"
+
+
+def explain(error: BaseException) -> str:
+    """The traceback of an exception: the last entries, and none of ours."""
+    if isinstance(error, LambdaError):
+        return str(error)
+    trace = error.__traceback__
+    while trace is not None and _is_ours(trace):
+        trace = trace.tb_next
+    lines = traceback.format_exception(type(error), error, trace, limit=-TRACE_ENTRIES)
+    return "".join(lines).rstrip()
+
+
+def _is_ours(trace: TracebackType) -> bool:
+    file = trace.tb_frame.f_code.co_filename
+    return file == __file__ or file.startswith("<frozen importlib")
+
+
+def settle() -> None:
+    """Puts all that lives now out of the collector's sight and switches it off; from then on `tidy` calls it.
+
+    Most of what a process holds are the modules it imported. Looking through them takes tens of milliseconds, and the
+    collector would do that in the middle of a wake. The price: cycles of what lives now are not collected before the next
+    call, so if the first lambda of a process is one and faults, it stays, and its successors do not."""
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def tidy(wakes: int) -> None:
+    """Collects between two wakes, the young objects often and all of them seldom: a cycle that holds a frame holds a slot."""
+    if wakes % 1000 == 0:
+        gc.collect()
+    elif wakes % 100 == 0:
+        gc.collect(1)
+    else:
+        gc.collect(0)

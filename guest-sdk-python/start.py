@@ -1,0 +1,66 @@
+"""Makes this interpreter the host of a Python lambda.
+
+`gleaner-runtime` becomes `python3 -I start.py LIB_GLEANER ARGUMENTS...`, with its own arguments, its name first. The module
+`_gleaner` is loaded from LIB_GLEANER, so that nothing has to be installed and any virtual environment will do.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import sys
+from importlib.machinery import ExtensionFileLoader
+from types import ModuleType
+from typing import NoReturn
+
+USAGE = 2
+
+
+def main() -> NoReturn:
+    # Ctrl-C ends the process. As an exception it would be a fault of the wake that it happens to meet.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+    try:
+        import numpy  # noqa: F401
+    except ImportError as error:
+        refuse(str(error), f"{sys.executable} -m pip install numpy, or name another interpreter: GLEANER_PYTHON")
+    extension = load(sys.argv[1])
+    import gleaner
+    from gleaner import _host
+
+    if gleaner.__version__ != extension.__version__:
+        refuse(
+            f"the package gleaner is {gleaner.__version__}, and {sys.argv[1]} is {extension.__version__}",
+            "take both from one installation",
+        )
+    # What a lambda prints goes the way of its log, line by line.
+    sys.stdout = sys.stderr
+    code: int = extension.main(sys.argv[2:], _host)
+    # All results are written; a thread that the lambda left behind must not keep the process.
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def load(path: str) -> ModuleType:
+    """The extension module in the file `path`, which need not have the name that Python expects."""
+    loader = ExtensionFileLoader("_gleaner", path)
+    spec = importlib.util.spec_from_file_location("_gleaner", path, loader=loader)
+    try:
+        assert spec is not None, "a spec is made whenever a loader is given"
+        module = importlib.util.module_from_spec(spec)
+        loader.exec_module(module)
+    except ImportError as error:
+        refuse(str(error), "build it again: cargo build --release")
+    sys.modules["_gleaner"] = module
+    return module
+
+
+def refuse(cause: str, help: str) -> NoReturn:
+    print(f"error: cannot host lambdas in {sys.executable}", file=sys.stderr)
+    print(f"  cause: {cause}\n  help:  {help}", file=sys.stderr)
+    sys.exit(USAGE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""Where the tests find what they test. Importing this makes `gleaner` and `start` importable."""
+
+from __future__ import annotations
+
+import os
+import sys
+import unittest
+from pathlib import Path
+from types import ModuleType
+
+SDK = Path(__file__).resolve().parents[1]
+CHECKOUT = SDK.parent
+sys.path.insert(0, str(SDK))
+
+
+def extension_path() -> str:
+    """The file of `_gleaner`, from GLEANER_EXTENSION; skips the test without."""
+    path = os.environ.get("GLEANER_EXTENSION")
+    if not path:
+        raise unittest.SkipTest("GLEANER_EXTENSION does not name lib_gleaner.so")
+    return os.path.abspath(path)
+
+
+def extension() -> ModuleType:
+    """The module `_gleaner`; skips the test where it is not built."""
+    if "_gleaner" not in sys.modules:
+        import start
+
+        start.load(extension_path())
+    return sys.modules["_gleaner"]

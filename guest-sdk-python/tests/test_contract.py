@@ -1,0 +1,154 @@
+"""The WIT package, the classes of `_gleaner` and those of the package `gleaner` have the same names.
+
+The rules: `-` becomes `_`, types are in CamelCase. The functions of the interfaces `data`, `trigger` and `log` are methods
+of `Context`; resources are classes, records are named tuples, an error's variant is the `kind` of an exception, an enum is a
+set of words. What never changes while a handle lives is a property; what asks the host is a method.
+"""
+
+from __future__ import annotations
+
+import inspect
+import typing
+import unittest
+from typing import Any, Dict, Iterable, List, Set, Tuple
+
+import home
+import wit
+
+import gleaner
+from gleaner import data, inference, log, trigger
+
+INTERFACES = wit.read(home.CHECKOUT / "wit")
+OF_CONTEXT = ("data", "trigger", "log")
+
+PROPERTIES: Dict[str, Set[str]] = {
+    "Context": {"config", "missed"},
+    "Topic": {"name", "ros_topic", "type_name"},
+    "Field": {"path"},
+    "Sample": {"identity", "stamps", "size", "big_endian"},
+    "Frame": {"info", "identity", "stamps"},
+    "Tensor": {"shape"},
+    "Model": set(),
+}
+
+# What Python has and the WIT has not: `config` comes with `init` there, and `missed` with the tick.
+ONLY_PYTHON: Dict[str, Set[str]] = {
+    "Context": {"config", "missed"},
+    "Frame": {"array", "__array__", "__dlpack__", "__dlpack_device__"},
+}
+
+KINDS: Dict[str, Any] = {
+    "data-error": data.DataErrorKind,
+    "trigger-error": trigger.TriggerErrorKind,
+    "inference-error": inference.InferenceErrorKind,
+}
+ENUMS: Dict[str, Any] = {"encoding": data.Encoding, "level": log.Level}
+
+# Values of Python say by their type what these say by their case.
+PLAIN_VARIANTS = {"value", "attribute-value", "config-value", "wake"}
+# An attribute is a keyword argument; an entry of the configuration is one of `ctx.config`; `tick` is `ctx.missed`.
+PLAIN_RECORDS = {"attribute", "config-entry", "tick"}
+
+
+def snake(name: str) -> str:
+    return name.replace("-", "_")
+
+
+def camel(name: str) -> str:
+    return "".join(word.capitalize() for word in name.split("-"))
+
+
+def wanted() -> Dict[str, Dict[str, wit.Function]]:
+    """The functions of each class, by their names in Python."""
+    functions = {name: function for of in OF_CONTEXT for name, function in INTERFACES[of].functions.items()}
+    classes = {"Context": functions}
+    for interface in INTERFACES.values():
+        classes.update({camel(name): functions for name, functions in interface.resources.items()})
+    return {cls: {snake(name): function for name, function in of.items()} for cls, of in classes.items()}
+
+
+def members(cls: type) -> Set[str]:
+    """What a class offers beyond any object: public names, and the special ones that are listed above."""
+    special = ONLY_PYTHON.get(cls.__name__, set())
+    return {name for name in dir(cls) if not name.startswith("_") or name in special}
+
+
+def parameters(cls: type, name: str) -> List[Tuple[str, Any, bool]]:
+    """Name, kind, and whether there is a default, of each parameter but `self`."""
+    given = inspect.signature(getattr(cls, name)).parameters.values()
+    return [
+        (parameter.name, parameter.kind, parameter.default is not parameter.empty)
+        for parameter in given
+        if parameter.name != "self"
+    ]
+
+
+class Surface(unittest.TestCase):
+    def holds(self, module: Any) -> None:
+        for name, functions in wanted().items():
+            cls = getattr(module, name)
+            with self.subTest(cls=name):
+                self.assertEqual(members(cls), set(functions) | ONLY_PYTHON.get(name, set()))
+                for function, declared in functions.items():
+                    self.function_holds(cls, function, declared)
+
+    def function_holds(self, cls: type, name: str, declared: wit.Function) -> None:
+        given = inspect.getattr_static(cls, name)
+        if name in PROPERTIES[cls.__name__]:
+            self.assertTrue(inspect.isdatadescriptor(given), f"{cls.__name__}.{name} is a property")
+            self.assertEqual(declared.parameters, [])
+            return
+        self.assertTrue(callable(getattr(cls, name)), f"{cls.__name__}.{name} is a method")
+        self.assertEqual(isinstance(given, staticmethod), declared.static, f"{cls.__name__}.{name}")
+        names = [name for name, _, _ in parameters(cls, name)]
+        self.assertEqual(names, [snake(name) for name in declared.parameters], f"{cls.__name__}.{name}")
+
+    def test_the_package_has_the_names_of_the_wit(self) -> None:
+        self.holds(gleaner)
+
+    def test_the_extension_has_the_names_of_the_wit(self) -> None:
+        self.holds(home.extension())
+
+    def test_the_extension_takes_arguments_as_the_package_says(self) -> None:
+        extension = home.extension()
+        for cls, functions in wanted().items():
+            for name in set(functions) - PROPERTIES[cls]:
+                with self.subTest(cls=cls, name=name):
+                    given, described = getattr(extension, cls), getattr(gleaner, cls)
+                    self.assertEqual(parameters(given, name), parameters(described, name))
+
+    def test_there_is_something_to_compare(self) -> None:
+        self.assertEqual(set(wanted()), set(PROPERTIES))
+        self.assertEqual(wanted()["Topic"]["column_since"].parameters, ["field", "since-ns"])
+        self.assertEqual(wanted()["Context"]["event"].parameters, ["label", "score", "attributes"])
+
+
+class Values(unittest.TestCase):
+    def test_records_are_named_tuples_with_the_same_fields(self) -> None:
+        for name, fields in self.all("records"):
+            if name not in PLAIN_RECORDS:
+                with self.subTest(record=name):
+                    named_tuple = getattr(gleaner, camel(name))
+                    # `class` is a keyword of Python.
+                    self.assertEqual(named_tuple._fields, tuple(f"{f}_" if f == "class" else snake(f) for f in fields))
+
+    def test_the_kinds_of_an_error_are_the_cases_of_its_variant(self) -> None:
+        for name, cases in self.all("variants"):
+            if name not in PLAIN_VARIANTS:
+                with self.subTest(variant=name):
+                    self.assertEqual(typing.get_args(KINDS[name]), tuple(cases))
+                    self.assertTrue(issubclass(getattr(gleaner, camel(name)), gleaner.Error))
+
+    def test_enums_are_words(self) -> None:
+        for name, cases in self.all("enums"):
+            with self.subTest(enum=name):
+                self.assertEqual(typing.get_args(ENUMS[name]), tuple(map(snake, cases)))
+
+    def all(self, kind: str) -> Iterable[Tuple[str, List[str]]]:
+        found = [item for interface in INTERFACES.values() for item in getattr(interface, kind).items()]
+        self.assertTrue(found)
+        return found
+
+
+if __name__ == "__main__":
+    unittest.main()

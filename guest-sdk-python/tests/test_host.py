@@ -1,0 +1,139 @@
+"""Finding a lambda in its file and telling its exceptions, without a host."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import textwrap
+import unittest
+from pathlib import Path
+from typing import Any, Dict
+
+import home  # noqa: F401
+
+from gleaner import Context, DataError, InferenceError, Model, _host
+
+
+class Files(unittest.TestCase):
+    def setUp(self) -> None:
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name).resolve()
+        self.addCleanup(setattr, sys, "path", list(sys.path))
+        self.addCleanup(setattr, sys, "dont_write_bytecode", sys.dont_write_bytecode)
+
+    def write(self, source: str, name: str = "main.py") -> str:
+        path = self.folder / name
+        path.write_text(textwrap.dedent(source), encoding="utf-8")
+        return str(path)
+
+    def explained(self, *load: str) -> str:
+        try:
+            _host.load(*load)
+        except BaseException as error:
+            # The host calls from Rust, which leaves no entry; this function does.
+            outermost = error.__traceback__
+            return _host.explain(error.with_traceback(outermost and outermost.tb_next))
+        raise AssertionError("nothing was raised")
+
+
+class Loading(Files):
+    ctx: Any = None
+
+    def test_a_class_is_made_and_its_handler_bound(self) -> None:
+        source = """
+            class Lambda:
+                def __init__(self, ctx):
+                    self.seen = []
+
+                def on_event(self, ctx, event):
+                    self.seen.append(event)
+                    return self.seen
+        """
+        make = _host.load(self.write(source), "on_event")
+        handler = make(self.ctx)
+        handler(self.ctx, 1)
+        self.assertEqual(handler(self.ctx, 2), [1, 2])
+        self.assertEqual(make(self.ctx)(self.ctx, 3), [3], "a lambda made anew remembers nothing")
+
+    def test_plain_functions_work_and_init_is_optional(self) -> None:
+        entry = self.write("def on_tick(ctx): return 'tick'")
+        self.assertEqual(_host.load(entry, "on_tick")(self.ctx)(self.ctx), "tick")
+        entry = self.write("made = []\ndef init(ctx): made.append(ctx)\ndef on_tick(ctx): return made")
+        self.assertEqual(_host.load(entry, "on_tick")(self.ctx)(self.ctx), [self.ctx])
+
+    def test_a_lambda_imports_what_lies_beside_it_and_leaves_nothing_there(self) -> None:
+        self.write("state = []", "beside.py")
+        entry = self.write("import beside\ndef on_tick(ctx): beside.state.append(1); return len(beside.state)")
+        for _ in range(2):
+            handler = _host.load(entry, "on_tick")(self.ctx)
+            self.assertEqual(handler(self.ctx), 1, "loaded again, it begins with fresh globals")
+        self.assertEqual(sorted(path.name for path in self.folder.iterdir()), ["beside.py", "main.py"])
+
+    def test_a_missing_handler_is_named_with_what_there_is(self) -> None:
+        refusals: Dict[str, str] = {
+            "def on_tick(ctx): pass": "`main.py` has no `on_event(ctx, event)`, which `event` in [schedule] asks for; "
+            "found `on_tick`",
+            "class Lambda:\n    def on_tick(self, ctx): pass": "`Lambda` of `main.py` has no `on_event(self, ctx, event)`, "
+            "which `event` in [schedule] asks for; found `on_tick`",
+            "": "`main.py` has no `on_event(ctx, event)`, which `event` in [schedule] asks for; found no handler",
+        }
+        for source, refusal in refusals.items():
+            self.assertEqual(self.explained(self.write(source), "on_event"), refusal)
+
+    def test_a_file_that_is_no_python_is_refused(self) -> None:
+        entry = self.write("", "main.wasm")
+        self.assertEqual(
+            self.explained(entry, "on_event"), "`main.wasm` is no Python file: its name must end with `.py`"
+        )
+
+
+class Telling(Files):
+    def test_a_traceback_begins_in_the_file_of_the_lambda(self) -> None:
+        entry = self.write("\nraise RuntimeError('no')\n")
+        self.assertEqual(
+            self.explained(entry, "on_event"),
+            f'Traceback (most recent call last):\n  File "{entry}", line 2, in <module>\n'
+            "    raise RuntimeError('no')\nRuntimeError: no",
+        )
+
+    def test_a_syntax_error_names_file_and_line(self) -> None:
+        entry = self.write("x = 1\ndef on_event(:\n")
+        told = self.explained(entry, "on_event")
+        self.assertIn(f'File "{entry}", line 2', told)
+        self.assertNotIn("importlib", told)
+
+    def test_the_cause_of_an_exception_is_told_too(self) -> None:
+        source = "try:\n    {}['key']\nexcept KeyError as error:\n    raise ValueError('no key') from error\n"
+        told = self.explained(self.write(source), "on_event")
+        self.assertIn("KeyError: 'key'", told)
+        self.assertTrue(told.endswith("ValueError: no key"))
+
+    def test_an_endless_recursion_is_told_briefly(self) -> None:
+        told = self.explained(self.write("def deeper(): deeper()\ndeeper()"), "on_event")
+        self.assertLess(len(told.splitlines()), 20)
+        self.assertIn("RecursionError", told)
+
+
+class AtADesk(unittest.TestCase):
+    def test_an_error_says_its_kind_to_programs_and_the_rest_to_people(self) -> None:
+        error = DataError("no input `imo`; the manifest has `imu`", "no-such-input")
+        self.assertEqual((str(error), error.kind), ("no input `imo`; the manifest has `imu`", "no-such-input"))
+        self.assertIsInstance(error, ValueError)
+
+    def test_without_a_host_there_are_no_models(self) -> None:
+        hosted = sys.modules.pop("_gleaner", None)
+        if hosted is not None:
+            self.addCleanup(sys.modules.__setitem__, "_gleaner", hosted)
+        with self.assertRaises(InferenceError) as refused:
+            Model.open("detector")
+        self.assertEqual(refused.exception.kind, "no-runtime")
+
+    def test_a_context_can_be_named_in_a_type_hint(self) -> None:
+        def on_tick(ctx: Context) -> None: ...
+
+        self.assertEqual(on_tick.__annotations__["ctx"], "Context")
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,371 @@
+"""Lambdas in the real host: each test replays a small drive through `start.py` and looks at what was decided.
+
+What a lambda asserts and does not find is an exception, so a fault, and fails the test with its traceback.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import textwrap
+import unittest
+from pathlib import Path
+from typing import Any, Dict, List, Optional
+
+import drive
+import home
+from drive import Image
+
+import gleaner
+
+MANIFEST = """
+[lambda]
+name = "probe"
+version = "0.1.0"
+kind = "python"
+entry = "main.py"
+[schedule]
+{schedule}
+[[input]]
+name = "camera"
+topic = "/camera"
+type = "sensor_msgs/msg/Image"
+depth = {depth}
+[config]
+text = {{ default = "a" }}
+number = {{ default = 1.5 }}
+whole = {{ default = 2 }}
+flag = {{ default = true }}
+"""
+
+GREY = Image(2, 1, "mono8", 2, b"\x07\x09")
+
+
+class Hosted(unittest.TestCase):
+    def setUp(self) -> None:
+        self.extension = home.extension_path()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name).resolve()
+
+    def start(self, source: str, images: List[Image], schedule: str, depth: int) -> "subprocess.CompletedProcess[str]":
+        build = self.folder / "build"
+        build.mkdir(exist_ok=True)
+        (build / "main.py").write_text(textwrap.dedent(source), encoding="utf-8")
+        (build / "lambda.toml").write_text(MANIFEST.format(schedule=schedule, depth=depth), encoding="utf-8")
+        drive.write(self.folder / "drive.mcap", images)
+        arguments = ["gleaner-runtime", "replay", str(self.folder), str(self.folder / "drive.mcap"), "--all"]
+        command = [sys.executable, "-I", str(home.SDK / "start.py"), self.extension, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+    def replay(
+        self, source: str, images: List[Image], schedule: str = 'event = "camera"\nbacklog = "each"', depth: int = 4
+    ) -> List[Dict[str, Any]]:
+        """The decision of each wake; none may have faulted."""
+        ended = self.start(source, images, schedule, depth)
+        decisions = self.decisions()
+        faults = [decision["fault"]["message"] for decision in decisions if decision["fault"]]
+        self.assertEqual((ended.returncode, faults), (0, []), ended.stderr)
+        return decisions
+
+    def decisions(self) -> List[Dict[str, Any]]:
+        path = self.folder / "out" / "decisions.jsonl"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def fault(self, source: str, wake: int = 0) -> str:
+        self.start(source, [GREY, GREY], 'event = "camera"\nbacklog = "each"', 4)
+        fault: Optional[Dict[str, Any]] = self.decisions()[wake]["fault"]
+        assert fault is not None, "the wake faulted"
+        self.assertEqual(fault["kind"], "exception")
+        return str(fault["message"])
+
+
+class Arrays(Hosted):
+    def array_of(self, image: Image, *checks: str) -> None:
+        """Holds `checks` on `array`, the pixels of `image`."""
+        source = "import numpy as np\ndef on_event(ctx, event):\n    frame = event.as_frame()\n    array = frame.array()\n"
+        lines = [f"    assert {check}, (array.dtype, array.shape, array.strides, array.tolist())\n" for check in checks]
+        self.replay(source + "".join(lines), [image])
+
+    def test_colour_has_a_channel_axis(self) -> None:
+        image = Image(2, 2, "bgr8", 6, bytes(range(12)))
+        self.array_of(image, "array.dtype == np.uint8", "array.tobytes() == bytes(range(12))", "array.shape == (2, 2, 3)")
+        image = Image(1, 2, "rgba8", 4, bytes(range(8)))
+        self.array_of(image, "array.shape == (2, 1, 4)", "array[1, 0].tolist() == [4, 5, 6, 7]")
+
+    def test_padding_behind_rows_is_stepped_over(self) -> None:
+        image = Image(2, 2, "rgb8", 8, bytes(range(16)))
+        self.array_of(image, "array.strides == (8, 3, 1)", "array[1].tolist() == [[8, 9, 10], [11, 12, 13]]")
+
+    def test_grey_and_bayer_have_two_axes(self) -> None:
+        self.array_of(GREY, "array.tolist() == [[7, 9]]", "array.dtype == np.uint8")
+        self.array_of(Image(2, 1, "bayer_rggb8", 2, b"\x01\x02"), "array.tolist() == [[1, 2]]")
+
+    def test_sixteen_bits_keep_their_byte_order(self) -> None:
+        self.array_of(Image(2, 1, "mono16", 4, b"\x01\x00\x00\x01"), "array.tolist() == [[1, 256]]")
+        image = Image(2, 1, "mono16", 4, b"\x01\x00\x00\x01", big_endian=True)
+        self.array_of(image, "array.tolist() == [[256, 1]]", "array.dtype == np.dtype('>u2')", "(array + 1).sum() == 259")
+        # Behind an odd number of bytes the pixels lie at an odd address.
+        image = Image(2, 2, "bayer_gbrg16", 5, bytes([1, 0, 2, 0, 9, 3, 0, 4, 0, 9]))
+        self.array_of(image, "array.tolist() == [[1, 2], [3, 4]]", "not array.flags.aligned")
+
+    def test_yuv422_has_two_numbers_for_each_pixel(self) -> None:
+        self.array_of(Image(2, 1, "yuv422", 4, b"\x01\x02\x03\x04"), "array.tolist() == [[[1, 2], [3, 4]]]")
+
+    def test_an_array_cannot_be_written_to(self) -> None:
+        source = """
+            def on_event(ctx, event):
+                array = event.as_frame().array()
+                for write in (lambda: array.fill(0), lambda: array.setflags(write=True), lambda: array.__setitem__(0, 0)):
+                    try:
+                        write()
+                    except ValueError:
+                        pass
+                    else:
+                        raise AssertionError("it was written to")
+        """
+        self.replay(source, [GREY])
+
+    def test_numpy_and_dlpack_share_the_memory(self) -> None:
+        source = """
+            import numpy as np
+
+            def on_event(ctx, event):
+                frame = event.as_frame()
+                array = frame.array()
+                assert np.shares_memory(array, np.asarray(frame))
+                assert np.asarray(frame, dtype=float).tolist() == [[7.0, 9.0]]
+                assert not np.shares_memory(array, np.array(frame, copy=True))
+                assert tuple(frame.__dlpack_device__()) == (1, 0)
+                if np.lib.NumpyVersion(np.__version__) >= "2.1.0":
+                    shared = np.from_dlpack(frame)
+                    assert np.shares_memory(array, shared) and not shared.flags.writeable
+                else:
+                    try:
+                        np.from_dlpack(frame)
+                    except BufferError:
+                        pass
+        """
+        self.replay(source, [GREY])
+
+    def test_the_last_view_keeps_the_slot_and_gives_it_back(self) -> None:
+        source = """
+            kept = []
+
+            def on_event(ctx, event):
+                kept.append(event.as_frame().array()[:, 1:])
+                if len(kept) == 3:
+                    assert [view.tolist() for view in kept] == [[[0]], [[1]], [[2]]]
+                    kept.clear()
+                ctx.event("no-slot", ctx.input("camera").counts().no_slot)
+        """
+        images = [Image(2, 1, "mono8", 2, bytes([99, n % 3])) for n in range(60)]
+        decisions = self.replay(source, images, depth=1)
+        self.assertEqual([decision["triggers"][0]["score"] for decision in decisions], [0.0] * 60)
+
+
+class Data(Hosted):
+    def test_a_sample_says_what_it_is(self) -> None:
+        source = """
+            import gleaner
+
+            def on_event(ctx, event):
+                assert event.stamps == gleaner.Stamps(1_000_000_000, 999_999_995, 7_000_000_500), event.stamps
+                assert event.stamps.at_ns == ctx.now_ns()
+                assert (event.identity.topic, event.identity.seq) == ("/camera", 1), event.identity
+                assert event.get("encoding") == "mono8" and event.get("is_bigendian") == 0
+                assert event.get("data") == b"\\x07\\x09" and event.number("header.stamp.sec") == 7.0
+                assert event.size == len(event.cdr()) and not event.big_endian
+                assert event.cdr(event.size - 2) == b"\\x07\\x09" and event.cdr(8, 4) == b"\\x04\\x00\\x00\\x00"
+                assert repr(event) == "<Sample /camera seq 1, at 1000000000 ns>", repr(event)
+                frame = event.as_frame()
+                assert frame.info == gleaner.FrameInfo(2, 1, "mono8", 2, False, 2), frame.info
+                assert frame.identity == event.identity and frame.stamps == event.stamps
+                assert (frame.mean_luma(), frame.mean_luma((1, 0, 1, 1))) == (8.0, 9.0)
+                assert frame.mean_luma(gleaner.Roi(0, 0, 1, 1)) == 7.0
+                assert frame.histogram()[7:10].tolist() == [1, 0, 1]
+                assert frame.resize(4, 2).info.size == 8 and frame.to_gray().read(1) == b"\\x09"
+                ctx.event(str(event.identity.writer), 0.0)
+        """
+        decision = self.replay(source, [GREY])[0]
+        self.assertEqual(decision["triggers"][0]["label"], decision["writer"])
+
+    def test_a_topic_shows_its_ring(self) -> None:
+        source = """
+            import numpy as np
+
+            def on_event(ctx, event):
+                camera = ctx.input("camera")
+                assert camera is ctx.input("camera") and ctx.inputs() == ["camera"]
+                assert (camera.name, camera.ros_topic, camera.type_name) == ("camera", "/camera", "sensor_msgs/msg/Image")
+                assert camera.field("step") is camera.field("step") and camera.field("step").path == "step"
+                seq = event.identity.seq
+                assert camera.newest().identity == event.identity
+                assert [sample.identity.seq for sample in camera.last(2)] == [s for s in (seq - 1, seq) if s]
+                assert [sample.identity.seq for sample in camera.since(ctx.now_ns() - 1)] == [seq]
+                at_ns, values = camera.column("width", 10)
+                assert at_ns.dtype == np.int64 and values.dtype == np.float64 and at_ns[-1] == ctx.now_ns()
+                assert camera.column_since(camera.field("width"), ctx.now_ns() - 1).values.tolist() == [float(seq)]
+                assert camera.counts().received == seq and camera.counts().lost is None
+        """
+        self.replay(source, [Image(n, 1, "mono8", n, bytes(n)) for n in (1, 2, 3)])
+
+    def test_configuration_has_the_types_of_the_manifest(self) -> None:
+        source = """
+            def on_event(ctx, event):
+                assert ctx.config == {"text": "a", "number": 1.5, "whole": 2, "flag": True}, ctx.config
+                assert ctx.config["flag"] is True and ctx.missed == 0
+        """
+        self.replay(source, [GREY])
+
+    def test_a_refusal_has_a_kind(self) -> None:
+        source = """
+            import gleaner
+
+            def refused(call, *arguments):
+                try:
+                    call(*arguments)
+                except gleaner.Error as error:
+                    return type(error).__name__, error.kind
+                return None
+
+            def on_event(ctx, event):
+                frame = event.as_frame()
+                found = [
+                    refused(ctx.input, "imo"),
+                    refused(ctx.input("camera").field, "with"),
+                    refused(event.number, "encoding"),
+                    refused(frame.mean_luma, (5, 5, 1, 1)),
+                    refused(frame.resize, 0, 1),
+                    refused(ctx.event, "", 1.0),
+                    refused(gleaner.Model.open, "detector"),
+                ]
+                assert found == [
+                    ("DataError", "no-such-input"),
+                    ("DataError", "no-such-field"),
+                    ("DataError", "wrong-field"),
+                    ("DataError", "out-of-range"),
+                    ("DataError", "out-of-range"),
+                    ("TriggerError", "invalid"),
+                    ("InferenceError", "no-runtime"),
+                ], found
+        """
+        self.replay(source, [GREY])
+
+
+class Triggers(Hosted):
+    def test_keyword_arguments_become_attributes_of_plain_types(self) -> None:
+        source = """
+            import numpy as np
+
+            def on_event(ctx, event):
+                ctx.event("e", np.float32(0.5), label="l", score=-1, whole=np.int64(3), flag=np.bool_(True), **{"a key": 2.5})
+                ctx.start("s", why="rain")
+                ctx.stop("s")
+        """
+        triggers = self.replay(source, [GREY])[0]["triggers"]
+        attributes = {"label": "l", "score": -1, "whole": 3, "flag": True, "a key": 2.5}
+        self.assertEqual(triggers[0], {"kind": "event", "label": "e", "score": 0.5, "attributes": attributes})
+        self.assertIs(triggers[0]["attributes"]["flag"], True)
+        self.assertEqual([(t["kind"], t["label"], t["attributes"]) for t in triggers[1:]], [
+            ("start", "s", {"why": "rain"}),
+            ("stop", "s", {}),
+        ])
+
+    def test_an_attribute_of_another_type_is_named(self) -> None:
+        told = self.fault("def on_event(ctx, event): ctx.event('e', 1, boxes=[1, 2])")
+        self.assertTrue(told.endswith("attribute `boxes` of `e` is of type `list`; give bool, int, float or str"), told)
+
+    def test_ticks_come_with_the_number_of_those_missed(self) -> None:
+        source = "class Lambda:\n    def __init__(self, ctx): pass\n    def on_tick(self, ctx): ctx.event('t', ctx.missed)"
+        decisions = self.replay(source, [GREY] * 4, schedule='period = "100ms"')
+        self.assertTrue(decisions)
+        self.assertEqual({decision["cause"] for decision in decisions}, {"tick"})
+        self.assertEqual({decision["triggers"][0]["score"] for decision in decisions}, {0.0})
+
+
+class Faults(Hosted):
+    def test_a_fault_says_where_and_the_lambda_begins_anew(self) -> None:
+        source = """
+            made = []
+
+            class Lambda:
+                def __init__(self, ctx):
+                    self.wakes = 0
+                    made.append(1)
+
+                def on_event(self, ctx, event):
+                    self.wakes += 1
+                    ctx.event("seen", self.wakes * 10 + len(made))
+                    raise RuntimeError("no")
+        """
+        told = self.fault(source, wake=1)
+        self.assertEqual(
+            told,
+            f'Traceback (most recent call last):\n  File "{self.folder}/build/main.py", line 12, in on_event\n'
+            '    raise RuntimeError("no")\nRuntimeError: no',
+        )
+        scores = [decision["triggers"][0]["score"] for decision in self.decisions()]
+        self.assertEqual(scores, [11, 12], "a new object, and the module as it was")
+
+    def test_leaving_the_process_is_a_fault_too(self) -> None:
+        self.assertTrue(self.fault("import sys\ndef on_event(ctx, event): sys.exit(3)").endswith("SystemExit: 3"))
+        self.assertTrue(self.fault("def on_event(ctx, event): raise KeyboardInterrupt").endswith("KeyboardInterrupt"))
+
+    def test_a_long_message_keeps_its_end(self) -> None:
+        told = self.fault("def on_event(ctx, event): raise RuntimeError('é' * 9000 + ' at last')")
+        self.assertTrue(told.endswith("é at last"))
+        self.assertIn(len(told.encode()), (4095, 4096))
+
+    def test_what_fails_before_the_first_wake_ends_the_replay(self) -> None:
+        for source, cause in {
+            "raise RuntimeError('no')": "in import: Traceback",
+            "def init(ctx): raise RuntimeError('no')\ndef on_event(ctx, event): pass": "in init: Traceback",
+            "def on_tick(ctx): pass": "in import: `main.py` has no `on_event(ctx, event)`",
+        }.items():
+            ended = self.start(source, [GREY], 'event = "camera"', 4)
+            self.assertEqual(ended.returncode, 6, ended.stderr)
+            self.assertIn(f"error: cannot start lambda `probe`\n  cause: {cause}", ended.stderr)
+
+    def test_what_a_lambda_prints_is_no_report(self) -> None:
+        source = "import os\ndef on_event(ctx, event): print('hello'); os.system('echo there')"
+        ended = self.start(source, [GREY], 'event = "camera"', 4)
+        self.assertEqual([json.loads(line)["report"] for line in ended.stdout.splitlines()], ["summary"])
+        self.assertEqual(ended.stderr, "hello\nthere\n")
+
+    def test_a_thread_left_behind_does_not_keep_the_process(self) -> None:
+        source = """
+            import threading
+            threading.Thread(target=threading.Event().wait).start()
+            def on_event(ctx, event): pass
+        """
+        self.replay(source, [GREY])
+
+
+class Starting(Hosted):
+    def refusal(self, *arguments: str, home_folder: Path = home.SDK) -> str:
+        command = [sys.executable, "-I", str(home_folder / "start.py"), *arguments]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        self.assertEqual(ended.returncode, 2, ended.stderr)
+        return ended.stderr
+
+    def test_another_version_of_the_package_is_refused(self) -> None:
+        package = self.folder / "gleaner"
+        package.mkdir()
+        os.symlink(home.SDK / "start.py", self.folder / "start.py")
+        (package / "__init__.py").write_text('__version__ = "9.9.9"')
+        (package / "_host.py").write_text("")
+        told = self.refusal(self.extension, home_folder=self.folder)
+        self.assertIn(f"  cause: the package gleaner is 9.9.9, and {self.extension} is {gleaner.__version__}\n  help:  ", told)
+
+    def test_an_extension_that_cannot_be_loaded_is_refused(self) -> None:
+        told = self.refusal(str(self.folder / "lib_gleaner.so"))
+        self.assertIn("lib_gleaner.so: cannot open shared object file", told)
+        self.assertIn("help:", told)
+
+
+if __name__ == "__main__":
+    unittest.main()

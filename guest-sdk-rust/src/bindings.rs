@@ -1,0 +1,10 @@
+//! What wit-bindgen generates from `wit/`. Only this crate's other files use it.
+#![allow(unsafe_code, missing_docs, clippy::undocumented_unsafe_blocks)]
+
+wit_bindgen::generate!({
+    path: "../wit",
+    world: "lambda",
+    pub_export_macro: true,
+    export_macro_name: "export_lambda",
+    default_bindings_module: "gleaner_sdk::bindings",
+});

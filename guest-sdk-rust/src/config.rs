@@ -1,0 +1,108 @@
+//! The lambda's `[config]`, as the deployment set it.
+
+use crate::bindings;
+use crate::{Error, Result};
+
+/// A value of `[config]`.
+#[derive(Clone, Debug, PartialEq)]
+#[allow(missing_docs)]
+pub enum ConfigValue {
+    Boolean(bool),
+    Integer(i64),
+    Real(f64),
+    Text(String),
+}
+
+/// The values of `[config]`, by key, in the manifest's order.
+///
+/// ```
+/// use gleaner_sdk::{Config, ConfigValue};
+///
+/// let config = Config::new([("brake_mps2", ConfigValue::Real(-3.0))]);
+/// assert_eq!(config.real("brake_mps2").unwrap(), -3.0);
+/// assert!(config.text("colour").is_err());
+/// ```
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Config(Vec<(String, ConfigValue)>);
+
+impl Config {
+    /// A configuration with these values, for tests.
+    pub fn new<'a>(values: impl IntoIterator<Item = (&'a str, ConfigValue)>) -> Self {
+        Self(values.into_iter().map(|(key, value)| (key.to_owned(), value)).collect())
+    }
+
+    /// The value of `key`, if the manifest has it.
+    pub fn get(&self, key: &str) -> Option<&ConfigValue> {
+        self.0.iter().find(|(name, _)| name == key).map(|(_, value)| value)
+    }
+
+    /// A number; an integer is taken as one.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such key, or its value is no number.
+    pub fn real(&self, key: &str) -> Result<f64> {
+        match self.need(key)? {
+            ConfigValue::Real(value) => Ok(*value),
+            ConfigValue::Integer(value) => Ok(*value as f64),
+            _ => Err(wrong(key, "a number")),
+        }
+    }
+
+    /// An integer.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such key, or its value is no integer.
+    pub fn integer(&self, key: &str) -> Result<i64> {
+        match self.need(key)? {
+            ConfigValue::Integer(value) => Ok(*value),
+            _ => Err(wrong(key, "an integer")),
+        }
+    }
+
+    /// True or false.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such key, or its value is neither.
+    pub fn boolean(&self, key: &str) -> Result<bool> {
+        match self.need(key)? {
+            ConfigValue::Boolean(value) => Ok(*value),
+            _ => Err(wrong(key, "true or false")),
+        }
+    }
+
+    /// A text.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such key, or its value is no text.
+    pub fn text(&self, key: &str) -> Result<&str> {
+        match self.need(key)? {
+            ConfigValue::Text(value) => Ok(value),
+            _ => Err(wrong(key, "a text")),
+        }
+    }
+
+    fn need(&self, key: &str) -> Result<&ConfigValue> {
+        self.get(key).ok_or_else(|| Error::new(format!("[config] has no `{key}`")))
+    }
+}
+
+fn wrong(key: &str, wanted: &str) -> Error {
+    Error::new(format!("`{key}` in [config] is not {wanted}"))
+}
+
+impl From<Vec<bindings::ConfigEntry>> for Config {
+    fn from(entries: Vec<bindings::ConfigEntry>) -> Self {
+        use bindings::ConfigValue as Wit;
+        let value = |value| match value {
+            Wit::Boolean(value) => ConfigValue::Boolean(value),
+            Wit::Integer(value) => ConfigValue::Integer(value),
+            Wit::Real(value) => ConfigValue::Real(value),
+            Wit::Text(value) => ConfigValue::Text(value),
+        };
+        Self(entries.into_iter().map(|entry| (entry.key, value(entry.value))).collect())
+    }
+}

@@ -1,0 +1,54 @@
+//! Write Gleaner lambdas in Rust.
+//!
+//! A lambda is a type that implements [`Lambda`], exported once with [`lambda!`], in a crate of type `cdylib`:
+//!
+//! ```
+//! use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input};
+//!
+//! struct Dip {
+//!     imu: Topic,
+//!     ax: Field,
+//!     brake: f64,
+//! }
+//!
+//! impl Lambda for Dip {
+//!     fn init(config: &Config) -> Result<Self> {
+//!         let imu = input("imu")?;
+//!         let ax = imu.field("linear_acceleration.x")?;
+//!         Ok(Self { imu, ax, brake: config.real("brake_mps2")? })
+//!     }
+//!
+//!     fn on_event(&mut self, _sample: Sample) -> Result<()> {
+//!         let recent = self.imu.column(&self.ax, 50)?;
+//!         if let Some(mean) = recent.mean().filter(|mean| *mean < self.brake) {
+//!             event("dip", -mean).send()?;
+//!         }
+//!         Ok(())
+//!     }
+//! }
+//!
+//! gleaner_sdk::lambda!(Dip);
+//! ```
+//!
+//! The functions of this crate reach the host only on the vehicle (and in replay); called natively they panic. So keep the
+//! judgement in plain functions over plain numbers: those are tested natively, as any Rust code.
+//!
+//! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same four names as the modules here.
+
+#[doc(hidden)]
+pub mod bindings;
+mod config;
+pub mod data;
+mod error;
+pub mod inference;
+mod lambda;
+pub mod log;
+pub mod trigger;
+
+pub use config::{Config, ConfigValue};
+pub use data::{Column, Field, Frame, Sample, Tick, Topic, input, inputs, now_ns};
+pub use error::{Error, Result};
+pub use lambda::Lambda;
+#[doc(hidden)]
+pub use lambda::{Exported, Instance};
+pub use trigger::{event, start, stop};

@@ -1,0 +1,190 @@
+//! The two handles on one slot: a draft, which its owner writes, and a lease, which many read.
+#![allow(unsafe_code)]
+
+use std::{
+    fmt,
+    mem::ManuallyDrop,
+    ops::{Deref, DerefMut},
+    process, ptr, slice,
+};
+
+use crate::{
+    HEADROOM,
+    pool::{MOST_HOLDS, Seal, Slots, Stamp},
+    sync::{Arc, Ordering},
+};
+
+/// A slot to fill, owned by one: the bytes are a `&mut [u8]` of exactly the length asked for.
+///
+/// They hold what the slot's last sample left there: write all of them, or [`truncate`](Self::truncate). Dropping the
+/// draft gives the slot back.
+pub struct Draft<M> {
+    slots: Arc<Slots<M>>,
+    index: u32,
+    len: usize,
+}
+
+impl<M> Draft<M> {
+    /// # Safety
+    ///
+    /// The slot is out of the free set, its count is 0, and no other draft is of it: it is the caller's, who hands it
+    /// over. `len <= slot_bytes`.
+    pub(crate) unsafe fn new(slots: Arc<Slots<M>>, index: u32, len: usize) -> Self {
+        let mut draft = Self { slots, index, len };
+        draft.headroom_mut().fill(0);
+        draft
+    }
+
+    pub(crate) fn is_of(&self, slots: &Arc<Slots<M>>) -> bool {
+        Arc::ptr_eq(&self.slots, slots)
+    }
+
+    /// Keeps the first `len` bytes; does nothing if there are no more.
+    pub fn truncate(&mut self, len: usize) {
+        self.len = self.len.min(len);
+    }
+
+    /// The bytes in front of the sample; 0 in a new draft.
+    pub fn headroom_mut(&mut self) -> &mut [u8; HEADROOM] {
+        let payload = self.slots.payload(self.index);
+        // SAFETY: the bytes before each payload belong to its slot, the slot to this draft, and the draft is borrowed.
+        unsafe { payload.sub(HEADROOM).cast().as_mut() }
+    }
+
+    /// Ends writing and starts reading.
+    pub fn seal(self, meta: M) -> Lease<M> {
+        let (slots, index) = self.sealed(None, meta);
+        // SAFETY: `sealed` left us the one hold.
+        unsafe { Lease::new(slots, index) }
+    }
+
+    /// Seals the sample for a ring, which from now on owns the one hold on the slot of this index.
+    pub(crate) fn into_hold(self, stamp: Stamp, meta: M) -> u32 {
+        self.sealed(Some(stamp), meta).1
+    }
+
+    /// Raises the count to 1; that hold is the caller's.
+    fn sealed(self, stamp: Option<Stamp>, meta: M) -> (Arc<Slots<M>>, u32) {
+        let draft = ManuallyDrop::new(self);
+        let (index, len) = (draft.index, draft.len);
+        // SAFETY: moves the field out of a draft that is never dropped.
+        let slots = unsafe { ptr::read(&draft.slots) };
+        let slot = slots.slot(index);
+        slot.seal.with_mut(|seal| {
+            // SAFETY: the count is 0 and the slot was this draft's, so nobody else looks at the seal.
+            unsafe { (*seal).write(Seal { len, stamp, meta }) };
+        });
+        // Release pairs with `pin`: who sees the count above 0 sees the seal and the bytes.
+        slot.count.store(1, Ordering::Release);
+        (slots, index)
+    }
+}
+
+impl<M> Deref for Draft<M> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        let payload = self.slots.payload(self.index);
+        // SAFETY: a slot holds `slot_bytes >= len` initialised bytes, and only this draft can write to this one.
+        unsafe { slice::from_raw_parts(payload.as_ptr(), self.len) }
+    }
+}
+
+impl<M> DerefMut for Draft<M> {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        let payload = self.slots.payload(self.index);
+        // SAFETY: as in `deref`, and the draft is borrowed mutably.
+        unsafe { slice::from_raw_parts_mut(payload.as_ptr(), self.len) }
+    }
+}
+
+impl<M> Drop for Draft<M> {
+    fn drop(&mut self) {
+        self.slots.free.give(self.index);
+    }
+}
+
+impl<M> fmt::Debug for Draft<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Draft").field("len", &self.len).finish_non_exhaustive()
+    }
+}
+
+/// A read-only hold on a sealed sample, whose bytes never change while it lives.
+///
+/// Clones are further holds; the last one to go frees the slot. More than 2^31 holds at once, which takes leaked
+/// leases, abort the process, as they do for `Arc`.
+pub struct Lease<M> {
+    slots: Arc<Slots<M>>,
+    index: u32,
+}
+
+impl<M> Lease<M> {
+    /// # Safety
+    ///
+    /// The caller owns a hold on the slot, and hands it over.
+    pub(crate) unsafe fn new(slots: Arc<Slots<M>>, index: u32) -> Self {
+        Self { slots, index }
+    }
+
+    /// What the sample carries besides its bytes.
+    pub fn meta(&self) -> &M {
+        &self.seal().meta
+    }
+
+    /// Where the sample stands in the ring that published it; `None` if none did.
+    pub fn position(&self) -> Option<u64> {
+        self.stamp().map(|stamp| stamp.position)
+    }
+
+    pub(crate) fn stamp(&self) -> Option<Stamp> {
+        self.seal().stamp
+    }
+
+    /// The [`HEADROOM`] bytes and the sample as one slice.
+    pub fn with_headroom(&self) -> &[u8] {
+        let payload = self.slots.payload(self.index);
+        // SAFETY: the headroom and the `len` bytes after it are one initialised stretch of the region, and our hold
+        // keeps writers away until `self` is dropped.
+        unsafe { slice::from_raw_parts(payload.sub(HEADROOM).as_ptr(), HEADROOM + self.seal().len) }
+    }
+
+    fn seal(&self) -> &Seal<M> {
+        let seal = &self.slots.slot(self.index).seal;
+        // SAFETY: our hold keeps the count above 0: the seal is initialised, visible to us since we saw that count,
+        // and nobody writes to it until `self` is dropped.
+        seal.with(|seal| unsafe { (*seal).assume_init_ref() })
+    }
+}
+
+impl<M> Deref for Lease<M> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.with_headroom()[HEADROOM..]
+    }
+}
+
+impl<M> Clone for Lease<M> {
+    fn clone(&self) -> Self {
+        // Relaxed: our own hold keeps the slot as it is, and hands on what we see.
+        let before = self.slots.slot(self.index).count.fetch_add(1, Ordering::Relaxed);
+        if before >= MOST_HOLDS {
+            process::abort();
+        }
+        Self { slots: Arc::clone(&self.slots), index: self.index }
+    }
+}
+
+impl<M> Drop for Lease<M> {
+    fn drop(&mut self) {
+        // SAFETY: a lease owns one hold, and ends here.
+        unsafe { self.slots.release(self.index) }
+    }
+}
+
+impl<M> fmt::Debug for Lease<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Lease").field("len", &self.len()).field("position", &self.position()).finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,315 @@
+//! The newest samples of one writer, by position.
+//!
+//! A ring of depth `d` has `d + 1` places. A place names a slot on which the ring owns one hold, or none. The writer
+//! fills the spare place, then raises `head`, and only then empties the place of the sample that leaves. A reader that
+//! misses the newest sample therefore sees a higher `head`, or knows that the sample was evicted.
+#![allow(unsafe_code)]
+
+use std::{error::Error, fmt};
+
+use crate::{
+    Draft, Lease, Pool, PoolError, Refusal,
+    pool::Stamp,
+    sync::{Arc, AtomicU32, AtomicU64, Ordering},
+};
+
+/// A place without a slot. Pools have fewer than 2^31 slots.
+const EMPTY: u32 = u32::MAX;
+
+/// A ring that shows the newest `depth` samples, over slots of `pool`.
+///
+/// Rings may share a pool; each evicts only its own samples. See the crate's page for how many slots are enough.
+///
+/// # Errors
+///
+/// [`PoolError::Depth`] unless `depth` is 1 to `pool.slots()`.
+pub fn ring<M>(pool: Pool<M>, depth: usize) -> Result<(RingWriter<M>, RingReader<M>), PoolError> {
+    let slots = pool.slots();
+    if depth == 0 || depth > slots {
+        return Err(PoolError::Depth { depth, slots });
+    }
+    let shared = Arc::new(Shared {
+        id: pool.next_ring(),
+        pool,
+        places: (0..=depth).map(|_| AtomicU32::new(EMPTY)).collect(),
+        head: AtomicU64::new(0),
+        overwritten: AtomicU64::new(0),
+        no_slot: AtomicU64::new(0),
+        too_big: AtomicU64::new(0),
+    });
+    let writer = RingWriter { shared: Arc::clone(&shared), head: 0 };
+    Ok((writer, RingReader(shared)))
+}
+
+/// What a ring has received and lost since it was built. No count ever falls.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct RingCounts {
+    /// Samples published.
+    pub received: u64,
+    /// Published samples that have left the ring, replaced or evicted; never more than `received`.
+    pub overwritten: u64,
+    /// Drafts refused because every slot was in use.
+    pub no_slot: u64,
+    /// Drafts refused because the sample was larger than a slot.
+    pub too_big: u64,
+}
+
+/// A draft of another pool than the ring's: it is handed back, and nothing was published.
+pub struct ForeignDraft<M>(pub Draft<M>);
+
+impl<M> fmt::Debug for ForeignDraft<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("ForeignDraft").field(&self.0).finish()
+    }
+}
+
+impl<M> fmt::Display for ForeignDraft<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "draft belongs to another pool than the ring")
+    }
+}
+
+impl<M> Error for ForeignDraft<M> {}
+
+struct Shared<M> {
+    id: u64,
+    pool: Pool<M>,
+    /// Changed by the one writer only, and after it by drop.
+    places: Box<[AtomicU32]>,
+    /// Number of samples published. Changed by the writer only, as are the counts.
+    head: AtomicU64,
+    overwritten: AtomicU64,
+    no_slot: AtomicU64,
+    too_big: AtomicU64,
+}
+
+impl<M> Shared<M> {
+    fn depth(&self) -> u64 {
+        self.places.len() as u64 - 1
+    }
+
+    fn place(&self, position: u64) -> &AtomicU32 {
+        &self.places[(position % self.places.len() as u64) as usize]
+    }
+
+    /// The sample of a position below a `head` that the caller has loaded, if it is still there.
+    fn at(&self, position: u64) -> Option<Lease<M>> {
+        // That load of `head` shows the place as it was filled, or later. Acquire shows why the sample left: see
+        // `newest_at`.
+        let index = self.place(position).load(Ordering::Acquire);
+        let stamp = Stamp { ring: self.id, position };
+        (index != EMPTY).then(|| self.pool.pin(index, stamp))?
+    }
+
+    /// Counts a sample that has left. Release, so that who sees the count sees the `head` that it belongs to.
+    fn count_overwritten(&self) {
+        self.overwritten.fetch_add(1, Ordering::Release);
+    }
+}
+
+impl<M> Drop for Shared<M> {
+    fn drop(&mut self) {
+        for place in &self.places {
+            let index = place.load(Ordering::Relaxed);
+            if index != EMPTY {
+                // SAFETY: a place that is not empty stands for one hold, and nobody uses the places any more.
+                unsafe { self.pool.release(index) };
+            }
+        }
+    }
+}
+
+/// The writing end of a ring. There is one, so every method that writes takes `&mut self`.
+///
+/// Samples stay readable after it is dropped.
+pub struct RingWriter<M> {
+    shared: Arc<Shared<M>>,
+    /// The writer's own copy of the shared `head`.
+    head: u64,
+}
+
+impl<M> RingWriter<M> {
+    /// A slot for the next sample, `len` bytes: a free one, else that of the oldest sample which nobody holds.
+    ///
+    /// A sample evicted in this way is counted and gone, even if the draft is dropped.
+    ///
+    /// # Errors
+    ///
+    /// [`Refusal::TooBig`] and, if none is free and all samples of this ring are held, [`Refusal::NoSlot`]; both are
+    /// counted. A reader that looks at a sample holds it for an instant.
+    pub fn draft(&mut self, len: usize) -> Result<Draft<M>, Refusal> {
+        let drafted = self.shared.pool.draft(len).or_else(|refusal| match refusal {
+            Refusal::NoSlot => self.evict(len).ok_or(refusal),
+            Refusal::TooBig { .. } => Err(refusal),
+        });
+        let counter = match drafted {
+            Ok(_) => return drafted,
+            Err(Refusal::NoSlot) => &self.shared.no_slot,
+            Err(Refusal::TooBig { .. }) => &self.shared.too_big,
+        };
+        counter.fetch_add(1, Ordering::Relaxed);
+        drafted
+    }
+
+    /// Drafts the slot of the oldest sample of this ring that nobody holds.
+    fn evict(&mut self, len: usize) -> Option<Draft<M>> {
+        let ring = &*self.shared;
+        for position in self.head.saturating_sub(ring.depth())..self.head {
+            let place = ring.place(position);
+            let index = place.load(Ordering::Relaxed);
+            if index == EMPTY {
+                continue;
+            }
+            // SAFETY: a place that is not empty stands for one hold, we are the only writer, and the place is emptied
+            // as soon as that hold is gone. `Pool::draft` has checked `len`.
+            if let Some(draft) = unsafe { ring.pool.reclaim(index, len) } {
+                place.store(EMPTY, Ordering::Release);
+                ring.count_overwritten();
+                return Some(draft);
+            }
+        }
+        None
+    }
+
+    /// Shows a sample to the readers, and answers its position: 0, 1, 2, ...
+    ///
+    /// The sample `depth` positions before it leaves the ring, and is counted unless it was evicted before. Its slot
+    /// returns to the pool with the last lease on it.
+    ///
+    /// # Errors
+    ///
+    /// [`ForeignDraft`] if the draft is of another pool.
+    pub fn publish(&mut self, draft: Draft<M>, meta: M) -> Result<u64, ForeignDraft<M>> {
+        let ring = &*self.shared;
+        if !ring.pool.made(&draft) {
+            return Err(ForeignDraft(draft));
+        }
+        let position = self.head;
+        let stamp = Stamp { ring: ring.id, position };
+        let index = draft.into_hold(stamp, meta);
+        // The spare place: its last sample left when `position - 1` was published. Release pairs with `at`: a reader
+        // that still looks for that sample, and finds this one, also finds the `head` of then.
+        ring.place(position).store(index, Ordering::Release);
+        self.head = position + 1;
+        ring.head.store(self.head, Ordering::Release);
+        if let Some(leaving) = position.checked_sub(ring.depth()) {
+            // Release pairs with `at`: who finds the place empty also finds the `head` of now.
+            let index = ring.place(leaving).swap(EMPTY, Ordering::Release);
+            if index != EMPTY {
+                // SAFETY: the place stood for one hold, and has just been emptied.
+                unsafe { ring.pool.release(index) };
+                ring.count_overwritten();
+            }
+        }
+        Ok(position)
+    }
+}
+
+impl<M> fmt::Debug for RingWriter<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RingWriter")
+            .field("depth", &self.shared.depth())
+            .field("head", &self.head)
+            .finish_non_exhaustive()
+    }
+}
+
+/// A reading end of a ring; clones read the same ring, each from any thread.
+pub struct RingReader<M>(Arc<Shared<M>>);
+
+impl<M> RingReader<M> {
+    /// Number of samples published so far: the position that the next one will have.
+    pub fn head(&self) -> u64 {
+        self.0.head.load(Ordering::Acquire)
+    }
+
+    /// Number of samples that the ring shows at most.
+    pub fn depth(&self) -> usize {
+        self.0.places.len() - 1
+    }
+
+    /// The sample at `position`; `None` if it has left the ring, or is not published yet.
+    pub fn get(&self, position: u64) -> Option<Lease<M>> {
+        let age = self.head().checked_sub(position)?;
+        (1..=self.0.depth()).contains(&age).then(|| self.0.at(position))?
+    }
+
+    /// The newest sample; `None` only if there was a moment during the call at which the ring showed none.
+    ///
+    /// A sample that leaves while we look for it either was evicted, and then the one before it is the newest, or was
+    /// followed by others; then we see a higher `head` and start there. Each new start is paid for by a sample that
+    /// was published during the call, and at most `depth` looks lie between two, so the call ends unless the writer
+    /// is forever as fast as the few instructions of one look.
+    pub fn newest(&self) -> Option<Lease<M>> {
+        self.newest_at().map(|(lease, _)| lease)
+    }
+
+    fn newest_at(&self) -> Option<(Lease<M>, u64)> {
+        let mut head = self.head();
+        let mut back = 1;
+        while back <= head.min(self.0.depth()) {
+            let position = head - back;
+            if let Some(lease) = self.0.at(position) {
+                return Some((lease, position));
+            }
+            // Place or count told us, by an Acquire load, that the sample is gone. What the writer did before it took
+            // the sample away is therefore visible: a publication that replaced it, or went before its eviction, had
+            // raised `head`, and this load sees it.
+            let now = self.head();
+            back = if now == head { back + 1 } else { 1 };
+            head = now;
+        }
+        None
+    }
+
+    /// Fills `out` with the newest `n` samples, fewer if the ring has fewer, oldest first.
+    ///
+    /// Samples that leave the ring during the call may be missing, the newest one never is.
+    pub fn last(&self, n: usize, out: &mut Vec<Lease<M>>) {
+        self.newest_while(n, |_| true, out);
+    }
+
+    /// Fills `out` with the newest samples, at most `max`, back to the first one that `keep` refuses; oldest first.
+    ///
+    /// Positions that were evicted are passed over. `keep` is asked newest first.
+    pub fn newest_while(&self, max: usize, mut keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
+        out.clear();
+        if max == 0 {
+            return;
+        }
+        let Some((newest, position)) = self.newest_at() else {
+            return;
+        };
+        let oldest = (position + 1).saturating_sub(self.0.depth());
+        let older = (oldest..position).rev().filter_map(|older| self.0.at(older));
+        out.extend(std::iter::once(newest).chain(older).take_while(|lease| keep(lease.meta())).take(max));
+        out.reverse();
+    }
+
+    /// What the ring has received and lost.
+    pub fn counts(&self) -> RingCounts {
+        // First `overwritten`, then `received`, so that the difference is never negative.
+        let overwritten = self.0.overwritten.load(Ordering::Acquire);
+        RingCounts {
+            received: self.head(),
+            overwritten,
+            no_slot: self.0.no_slot.load(Ordering::Relaxed),
+            too_big: self.0.too_big.load(Ordering::Relaxed),
+        }
+    }
+}
+
+impl<M> Clone for RingReader<M> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+}
+
+impl<M> fmt::Debug for RingReader<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RingReader")
+            .field("depth", &self.depth())
+            .field("counts", &self.counts())
+            .finish_non_exhaustive()
+    }
+}

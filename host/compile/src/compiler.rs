@@ -1,0 +1,43 @@
+//! From a component to its entry in the cache: compiled, written beside its place, synced and renamed.
+
+use std::fs::{self, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use super::{CompileError, cache_entry, engine, make_cache, read_component};
+
+/// Compiles the component at `path` into `cache` and returns the entry; an entry that exists is left as it is.
+///
+/// # Errors
+///
+/// [`CompileError`] names the component and the cause.
+pub fn compile(path: &Path, cache: &Path) -> Result<PathBuf, CompileError> {
+    let component = read_component(path)?;
+    make_cache(cache)?;
+    let entry = cache_entry(cache, &component);
+    if entry.exists() {
+        return Ok(entry);
+    }
+    let code = engine()?
+        .precompile_component(&component)
+        .map_err(|source| CompileError::Compile { path: path.to_owned(), source: source.into() })?;
+    write_whole(&entry, &code).map_err(|source| CompileError::Write { path: entry.clone(), source })?;
+    Ok(entry)
+}
+
+/// Writes a file that is either absent or whole, whenever the power fails.
+fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    // The name is our own, so two processes that compile the same component do not write into one file.
+    let partial = path.with_extension(format!("{}.part", std::process::id()));
+    let written = (|| {
+        let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&partial)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&partial, path)
+    })();
+    if written.is_err() {
+        let _ = fs::remove_file(&partial);
+    }
+    written
+}

@@ -1,0 +1,113 @@
+//! What a lambda is given at each call: the functions of the WIT interfaces `data`, `trigger` and `log`.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use gleaner_host::api::Session;
+use gleaner_host::api::data;
+use gleaner_protocol::manifest::ConfigValue;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::data::{Sample, Topic, refused};
+use crate::{log, trigger};
+
+/// The session of one lambda. A lambda that starts afresh after a fault gets a new one.
+#[pyclass(frozen, module = "_gleaner")]
+pub(crate) struct Context {
+    session: Session,
+    topics: Vec<Py<Topic>>,
+    config: Py<PyDict>,
+    missed: AtomicU64,
+}
+
+impl Context {
+    pub(crate) fn new(py: Python<'_>, session: Session) -> PyResult<Self> {
+        let topics = session.inputs().into_iter().map(|topic| Py::new(py, Topic::new(py, topic)));
+        let topics = topics.collect::<PyResult<Vec<_>>>()?;
+        let config = PyDict::new(py);
+        for (key, value) in session.config() {
+            match value {
+                ConfigValue::Bool(value) => config.set_item(key, value)?,
+                ConfigValue::Int(value) => config.set_item(key, value)?,
+                ConfigValue::Float(value) => config.set_item(key, value)?,
+                ConfigValue::Text(value) => config.set_item(key, value)?,
+            }
+        }
+        Ok(Self { session, topics, config: config.unbind(), missed: AtomicU64::new(0) })
+    }
+
+    /// What the lambda will see as `missed`.
+    pub(crate) fn set_missed(&self, ticks: u64) {
+        self.missed.store(ticks, Ordering::Relaxed);
+    }
+
+    /// A sample of one of the inputs, as the lambda sees it.
+    pub(crate) fn sample(&self, py: Python<'_>, sample: data::Sample) -> PyResult<Sample> {
+        let topic = self.topic(py, sample.topic())?;
+        Ok(topic.get().sample(py, sample))
+    }
+
+    /// The same object for every call, so that it compiles each path once.
+    fn topic<'py>(&self, py: Python<'py>, wanted: &Arc<data::Topic>) -> PyResult<&Bound<'py, Topic>> {
+        let mut topics = self.topics.iter().map(|topic| topic.bind(py));
+        let found = topics.find(|topic| Arc::ptr_eq(topic.get().host(), wanted));
+        Ok(found.expect("the session's inputs never change"))
+    }
+}
+
+#[pymethods]
+impl Context {
+    /// Values of `[config]` by key, after the deployment's were laid over the manifest's.
+    #[getter]
+    fn config<'py>(&self, py: Python<'py>) -> &Bound<'py, PyDict> {
+        self.config.bind(py)
+    }
+
+    #[getter]
+    fn missed(&self) -> u64 {
+        self.missed.load(Ordering::Relaxed)
+    }
+
+    fn input<'py>(&self, py: Python<'py>, name: Cow<'_, str>) -> PyResult<Bound<'py, Topic>> {
+        let topic = self.session.input(&name).map_err(|error| refused(py, error))?;
+        self.topic(py, &topic).cloned()
+    }
+
+    fn inputs(&self) -> Vec<String> {
+        self.session.inputs().iter().map(|topic| topic.name().to_owned()).collect()
+    }
+
+    fn now_ns(&self) -> i64 {
+        self.session.now_ns()
+    }
+
+    #[pyo3(signature = (label, score, /, **attributes))]
+    fn event(
+        &self,
+        py: Python<'_>,
+        label: Cow<'_, str>,
+        score: f64,
+        attributes: Option<&Bound<'_, PyDict>>,
+    ) -> PyResult<()> {
+        let attributes = trigger::attributes(&label, attributes)?;
+        self.session.event(&label, score, attributes).map_err(|error| trigger::refused(py, &error))
+    }
+
+    #[pyo3(signature = (label, /, **attributes))]
+    fn start(&self, py: Python<'_>, label: Cow<'_, str>, attributes: Option<&Bound<'_, PyDict>>) -> PyResult<()> {
+        let attributes = trigger::attributes(&label, attributes)?;
+        self.session.start(&label, attributes).map_err(|error| trigger::refused(py, &error))
+    }
+
+    #[pyo3(signature = (label, /))]
+    fn stop(&self, py: Python<'_>, label: Cow<'_, str>) -> PyResult<()> {
+        self.session.stop(&label).map_err(|error| trigger::refused(py, &error))
+    }
+
+    fn log(&self, level: Cow<'_, str>, message: Cow<'_, str>) -> PyResult<()> {
+        self.session.log(log::level(&level)?, &message);
+        Ok(())
+    }
+}

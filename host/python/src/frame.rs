@@ -1,0 +1,130 @@
+//! Frames of `gleaner:lambda/data` over `gleaner_host::api::frame`.
+
+use gleaner_host::api::frame::{self, Info};
+use gleaner_host::image::{Bayer, Encoding, Roi};
+use numpy::PyArray1;
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict, PyTuple};
+
+use crate::array;
+use crate::data::{identity, refused, stamps};
+use crate::sdk::SdkClass;
+
+static FRAME_INFO: SdkClass = SdkClass::new("gleaner.data", "FrameInfo");
+
+/// A sample seen as an image. Nothing can replace what is inside while the object lives: arrays over its pixels rely on it.
+#[pyclass(frozen, module = "_gleaner")]
+pub(crate) struct Frame(frame::Frame);
+
+/// `x`, `y`, `width`, `height`: a `gleaner.Roi` is such a tuple.
+type RoiFields = (u32, u32, u32, u32);
+
+impl Frame {
+    pub(crate) fn new(inner: frame::Frame) -> Self {
+        Self(inner)
+    }
+
+    pub(crate) fn host(&self) -> &frame::Frame {
+        &self.0
+    }
+}
+
+// The operations on pixels take up to milliseconds, in which other threads of the lambda may go on.
+#[pymethods]
+impl Frame {
+    #[getter]
+    fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let Info { width, height, encoding, step, big_endian } = self.0.info();
+        let size = self.0.bytes().len();
+        FRAME_INFO.make(py, (width, height, name(encoding), step, big_endian, size))
+    }
+
+    #[getter]
+    fn identity<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        identity(py, self.0.identity())
+    }
+
+    #[getter]
+    fn stamps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        stamps(py, self.0.stamps())
+    }
+
+    #[pyo3(signature = (roi = None))]
+    fn mean_luma(&self, py: Python<'_>, roi: Option<RoiFields>) -> PyResult<f64> {
+        let roi = roi.map(region);
+        py.detach(|| self.0.mean_luma(roi)).map_err(|error| refused(py, error))
+    }
+
+    #[pyo3(signature = (roi = None))]
+    fn histogram<'py>(&self, py: Python<'py>, roi: Option<RoiFields>) -> PyResult<Bound<'py, PyArray1<u32>>> {
+        let roi = roi.map(region);
+        let counts = py.detach(|| self.0.histogram(roi)).map_err(|error| refused(py, error))?;
+        Ok(PyArray1::from_slice(py, &counts))
+    }
+
+    fn resize(&self, py: Python<'_>, width: u32, height: u32) -> PyResult<Self> {
+        py.detach(|| self.0.resize(width, height)).map(Self).map_err(|error| refused(py, error))
+    }
+
+    fn to_gray(&self, py: Python<'_>) -> PyResult<Self> {
+        py.detach(|| self.0.to_gray()).map(Self).map_err(|error| refused(py, error))
+    }
+
+    #[pyo3(signature = (offset = 0, len = None))]
+    fn read<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.0.read(offset, len.unwrap_or(u32::MAX)))
+    }
+
+    fn array<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        array::over(slf)
+    }
+
+    #[pyo3(signature = (*arguments, **named))]
+    fn __array__<'py>(
+        slf: &Bound<'py, Self>,
+        arguments: &Bound<'py, PyTuple>,
+        named: Option<&Bound<'py, PyDict>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        array::over(slf)?.call_method("__array__", arguments, named)
+    }
+
+    #[pyo3(signature = (**named))]
+    fn __dlpack__<'py>(slf: &Bound<'py, Self>, named: Option<&Bound<'py, PyDict>>) -> PyResult<Bound<'py, PyAny>> {
+        array::over(slf)?.call_method("__dlpack__", (), named)
+    }
+
+    fn __dlpack_device__<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        array::over(slf)?.call_method0("__dlpack_device__")
+    }
+
+    fn __repr__(&self) -> String {
+        let Info { width, height, encoding, .. } = self.0.info();
+        format!("<Frame {}, {width}x{height} {}>", self.0.identity().topic, name(encoding))
+    }
+}
+
+fn region((x, y, width, height): RoiFields) -> Roi {
+    Roi { x, y, width, height }
+}
+
+/// The name of an encoding in the WIT, with `_` for `-`.
+fn name(encoding: Encoding) -> &'static str {
+    match encoding {
+        Encoding::Rgb8 => "rgb8",
+        Encoding::Bgr8 => "bgr8",
+        Encoding::Rgba8 => "rgba8",
+        Encoding::Bgra8 => "bgra8",
+        Encoding::Mono8 => "mono8",
+        Encoding::Mono16 => "mono16",
+        Encoding::Yuv422Uyvy => "yuv422",
+        Encoding::Yuv422Yuyv => "yuv422_yuy2",
+        Encoding::Bayer8(Bayer::Rggb) => "bayer_rggb8",
+        Encoding::Bayer8(Bayer::Bggr) => "bayer_bggr8",
+        Encoding::Bayer8(Bayer::Gbrg) => "bayer_gbrg8",
+        Encoding::Bayer8(Bayer::Grbg) => "bayer_grbg8",
+        Encoding::Bayer16(Bayer::Rggb) => "bayer_rggb16",
+        Encoding::Bayer16(Bayer::Bggr) => "bayer_bggr16",
+        Encoding::Bayer16(Bayer::Gbrg) => "bayer_gbrg16",
+        Encoding::Bayer16(Bayer::Grbg) => "bayer_grbg16",
+    }
+}

@@ -1,0 +1,72 @@
+//! `gleaner:lambda/inference` over `gleaner_host::api::inference`.
+//!
+//! This build has no model runtime: nothing can be opened or made, and what would work on it is never reached.
+
+use std::borrow::Cow;
+
+use gleaner_host::api::inference::{self, InferenceError};
+use pyo3::prelude::*;
+
+use crate::sdk::SdkClass;
+
+static INFERENCE_ERROR: SdkClass = SdkClass::new("gleaner.inference", "InferenceError");
+
+/// Numbers on the host.
+#[pyclass(frozen, module = "_gleaner")]
+pub(crate) struct Tensor(inference::Tensor);
+
+/// A loaded model.
+#[pyclass(frozen, module = "_gleaner")]
+pub(crate) struct Model(inference::Model);
+
+fn refused(py: Python<'_>, error: &InferenceError) -> PyErr {
+    let kind = match error {
+        InferenceError::NoRuntime => "no-runtime",
+    };
+    INFERENCE_ERROR.error(py, error.to_string(), kind)
+}
+
+#[pymethods]
+impl Tensor {
+    #[staticmethod]
+    #[expect(unused_variables)]
+    fn from_values(py: Python<'_>, shape: &Bound<'_, PyAny>, values: &Bound<'_, PyAny>) -> PyResult<Self> {
+        inference::Tensor::new().map(Self).map_err(|error| refused(py, &error))
+    }
+
+    #[staticmethod]
+    #[expect(unused_variables)]
+    fn from_frame(py: Python<'_>, frame: &Bound<'_, PyAny>, how: &Bound<'_, PyAny>) -> PyResult<Self> {
+        inference::Tensor::new().map(Self).map_err(|error| refused(py, &error))
+    }
+
+    #[getter]
+    fn shape(&self) -> Vec<u32> {
+        match self.0 {}
+    }
+
+    #[pyo3(signature = (offset = 0, len = None))]
+    #[expect(unused_variables)]
+    fn read(&self, offset: u64, len: Option<u32>) -> Vec<f32> {
+        match self.0 {}
+    }
+}
+
+#[pymethods]
+impl Model {
+    #[staticmethod]
+    fn open(py: Python<'_>, name: Cow<'_, str>) -> PyResult<Self> {
+        inference::Model::open(&name).map(Self).map_err(|error| refused(py, &error))
+    }
+
+    #[expect(unused_variables)]
+    fn run(&self, inputs: &Bound<'_, PyAny>) -> Vec<Tensor> {
+        match self.0 {}
+    }
+
+    #[pyo3(signature = (frame, options = None))]
+    #[expect(unused_variables)]
+    fn detect(&self, frame: &Bound<'_, PyAny>, options: Option<&Bound<'_, PyAny>>) -> Vec<Tensor> {
+        match self.0 {}
+    }
+}

@@ -1,0 +1,20 @@
+//! `gleaner:lambda/log` over `gleaner_host::api::log`.
+
+use gleaner_host::api::log::Level;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+/// The level of that name in the WIT.
+pub(crate) fn level(name: &str) -> PyResult<Level> {
+    Ok(match name {
+        "error" => Level::Error,
+        "warn" => Level::Warn,
+        "info" => Level::Info,
+        "debug" => Level::Debug,
+        "trace" => Level::Trace,
+        _ => {
+            let message = "the level of a log line is `error`, `warn`, `info`, `debug` or `trace`";
+            return Err(PyValueError::new_err(message));
+        }
+    })
+}

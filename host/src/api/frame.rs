@@ -1,0 +1,315 @@
+//! A sample seen as an image: raw pixels in place, JPEG and PNG decoded lazily into slots of their own.
+
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use gleaner_buffers::{Lease, Pool, Refusal};
+use gleaner_transport::SampleMeta;
+use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
+
+use super::data::{DataError, Identity, Sample, Stamps, piece};
+use crate::image::{self, Encoding, ImageError, Roi, View, ops};
+
+/// Shape of a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Info {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// Layout of a pixel.
+    pub encoding: Encoding,
+    /// Bytes from one row to the next.
+    pub step: u32,
+    /// Byte order of the 16-bit encodings.
+    pub big_endian: bool,
+}
+
+impl Info {
+    fn tight(width: u32, height: u32, encoding: Encoding) -> Self {
+        let step = width * encoding.bytes_per_pixel() as u32;
+        Self { width, height, encoding, step, big_endian: false }
+    }
+}
+
+/// A message of an image type, taken apart but not yet believed.
+pub(super) enum Picture<'a> {
+    Raw(ImageView<'a>),
+    Compressed(CompressedView<'a>),
+}
+
+impl<'a> Picture<'a> {
+    /// None if the type is no image.
+    pub(super) fn of(type_name: &str, cdr: &'a [u8], endian: Endian) -> Result<Option<Self>, CdrError> {
+        Ok(match type_name {
+            "sensor_msgs/msg/Image" => Some(Self::Raw(ImageView::read(cdr, endian)?)),
+            "sensor_msgs/msg/CompressedImage" => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
+            _ => None,
+        })
+    }
+}
+
+/// Room for the images of one input, beyond the ring: decoded ones in slots, made ones out of a budget.
+pub struct Images {
+    decoded: Option<Pool<Info>>,
+    made: Budget,
+    /// The newest decoded image, so that each is decoded once.
+    newest: Mutex<Option<(u64, Lease<Info>)>>,
+    decode_ns: AtomicU64,
+}
+
+impl Images {
+    /// `decoded` holds what JPEG and PNG become (none for raw images); `made` is shared by all inputs of a lambda.
+    pub fn new(decoded: Option<Pool<Info>>, made: Budget) -> Self {
+        Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
+    }
+
+    pub(super) fn decode_ns(&self) -> u64 {
+        self.decode_ns.load(Ordering::Relaxed)
+    }
+}
+
+/// Bytes that the frames made by `resize` and `to_gray` may take together.
+#[derive(Clone)]
+pub struct Budget(Arc<AtomicUsize>);
+
+struct Taken {
+    budget: Budget,
+    bytes: usize,
+}
+
+impl Budget {
+    /// A budget of that many bytes.
+    pub fn new(bytes: usize) -> Self {
+        Self(Arc::new(AtomicUsize::new(bytes)))
+    }
+
+    fn take(&self, bytes: usize) -> Result<Taken, DataError> {
+        self.0
+            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes))
+            .map(|_| Taken { budget: self.clone(), bytes })
+            .map_err(|left| DataError::NoMemory { asked: bytes, left })
+    }
+}
+
+impl Drop for Taken {
+    fn drop(&mut self) {
+        self.budget.0.fetch_add(self.bytes, Ordering::Relaxed);
+    }
+}
+
+/// A sample seen as an image. Holds its pixels until dropped.
+pub struct Frame {
+    source: Source,
+    info: Info,
+    pixels: Pixels,
+}
+
+/// What a frame remembers of its sample without holding it.
+#[derive(Clone)]
+struct Source {
+    topic: Arc<super::data::Topic>,
+    identity: Identity,
+    stamps: Stamps,
+}
+
+enum Pixels {
+    /// Within a cell of the ring.
+    Raw {
+        lease: Lease<SampleMeta>,
+        start: usize,
+        len: usize,
+    },
+    Decoded(Lease<Info>),
+    Made {
+        bytes: Box<[u8]>,
+        _taken: Taken,
+    },
+}
+
+impl Frame {
+    pub(super) fn of(sample: &Sample) -> Result<Self, DataError> {
+        let source = Source { topic: Arc::clone(sample.topic()), identity: sample.identity(), stamps: sample.stamps() };
+        match sample.picture()? {
+            Picture::Raw(raw) => Self::raw(source, sample, &raw),
+            Picture::Compressed(compressed) => Self::decoded(source, sample, compressed.data),
+        }
+    }
+
+    fn raw(source: Source, sample: &Sample, raw: &ImageView<'_>) -> Result<Self, DataError> {
+        let encoding = Encoding::from_ros(raw.encoding).map_err(|error| source.not_a_frame(error))?;
+        let info =
+            Info { width: raw.width, height: raw.height, encoding, step: raw.step, big_endian: raw.is_bigendian };
+        let view = info.view(raw.data).map_err(|error| source.not_a_frame(error))?;
+        let len = view.step() * (view.height() as usize - 1) + view.width() as usize * encoding.bytes_per_pixel();
+        // The pixels were borrowed from the message, so they lie within it.
+        let start = raw.data.as_ptr().addr() - sample.bytes().as_ptr().addr();
+        Ok(Self { source, info, pixels: Pixels::Raw { lease: sample.lease().clone(), start, len } })
+    }
+
+    fn decoded(source: Source, sample: &Sample, data: &[u8]) -> Result<Self, DataError> {
+        let owner = Arc::clone(&source.topic);
+        let images = &owner.images;
+        let Some(pool) = &images.decoded else {
+            let (topic, type_name) = (source.identity.topic.clone(), source.topic.type_name().to_owned());
+            return Err(DataError::NoImageType { topic, type_name });
+        };
+        let mut newest = images.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        let position = sample.lease().position();
+        if let Some((_, lease)) = newest.as_ref().filter(|(at, _)| Some(*at) == position) {
+            return Ok(Self::of_decoded(source, lease.clone()));
+        }
+        // The older image's slot may be the one that is needed now.
+        *newest = None;
+        let started = Instant::now();
+        let lease = decode(&source, pool, data)?;
+        images.decode_ns.fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
+        *newest = position.map(|position| (position, lease.clone()));
+        Ok(Self::of_decoded(source, lease))
+    }
+
+    fn of_decoded(source: Source, lease: Lease<Info>) -> Self {
+        Self { source, info: *lease.meta(), pixels: Pixels::Decoded(lease) }
+    }
+
+    /// The shape.
+    pub fn info(&self) -> Info {
+        self.info
+    }
+
+    /// Identity of the sample behind it.
+    pub fn identity(&self) -> &Identity {
+        &self.source.identity
+    }
+
+    /// Stamps of the sample behind it.
+    pub fn stamps(&self) -> Stamps {
+        self.source.stamps
+    }
+
+    /// Bytes that had to be decoded for this frame; 0 for raw images.
+    pub fn decoded_bytes(&self) -> usize {
+        match &self.pixels {
+            Pixels::Decoded(lease) => lease.len(),
+            Pixels::Raw { .. } | Pixels::Made { .. } => 0,
+        }
+    }
+
+    /// Bytes that one pass over the frame touches, and one that makes a frame of `made` pixels from it.
+    pub fn work(&self, roi: Option<Roi>, made: Option<(u32, u32)>) -> u64 {
+        let view = self.view();
+        let whole = self.bytes().len() as u64;
+        match (view, made) {
+            (Ok(view), Some((width, height))) => ops::resize_work(&view, width, height).unwrap_or(whole),
+            (Ok(view), None) => ops::work(&view, roi).unwrap_or(whole),
+            (Err(_), _) => whole,
+        }
+    }
+
+    /// All pixel bytes: `step * (height - 1)` and the last row.
+    pub fn bytes(&self) -> &[u8] {
+        match &self.pixels {
+            Pixels::Raw { lease, start, len } => &lease[*start..*start + *len],
+            Pixels::Decoded(lease) => lease,
+            Pixels::Made { bytes, .. } => bytes,
+        }
+    }
+
+    /// Bytes from `offset`, `len` at most, clamped to the frame and to [`super::data::BYTES_PER_CALL`].
+    pub fn read(&self, offset: u64, len: u32) -> &[u8] {
+        piece(self.bytes(), offset, len)
+    }
+
+    /// Mean BT.601 luma, 0 to 255, computed in integers.
+    ///
+    /// # Errors
+    ///
+    /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer encodings.
+    pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
+        ops::mean_luma(&self.view()?, roi).map_err(|error| self.source.refused(error))
+    }
+
+    /// Counts of the 256 luma levels.
+    ///
+    /// # Errors
+    ///
+    /// As [`Frame::mean_luma`].
+    pub fn histogram(&self, roi: Option<Roi>) -> Result<[u32; 256], DataError> {
+        ops::histogram(&self.view()?, roi).map_err(|error| self.source.refused(error))
+    }
+
+    /// A new frame of that size: rgb8, or mono8 for grey encodings.
+    ///
+    /// # Errors
+    ///
+    /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`]; [`DataError::NoMemory`]; as [`Frame::mean_luma`].
+    pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
+        let (encoding, _) = ops::resized(&self.view()?, width, height).map_err(|error| self.source.refused(error))?;
+        let info = Info::tight(width, height, encoding);
+        self.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
+    }
+
+    /// A new mono8 frame of the same size.
+    ///
+    /// # Errors
+    ///
+    /// [`DataError::NoMemory`]; as [`Frame::mean_luma`].
+    pub fn to_gray(&self) -> Result<Self, DataError> {
+        let info = Info::tight(self.info.width, self.info.height, Encoding::Mono8);
+        self.make(info, ops::to_gray)
+    }
+
+    fn make(
+        &self,
+        info: Info,
+        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), ImageError>,
+    ) -> Result<Self, DataError> {
+        let len = info.step as usize * info.height as usize;
+        let taken = self.source.topic.images.made.take(len)?;
+        let mut bytes = vec![0; len].into_boxed_slice();
+        fill(&self.view()?, &mut bytes).map_err(|error| self.source.refused(error))?;
+        Ok(Self { source: self.source.clone(), info, pixels: Pixels::Made { bytes, _taken: taken } })
+    }
+
+    fn view(&self) -> Result<View<'_>, DataError> {
+        self.info.view(self.bytes()).map_err(|error| self.source.not_a_frame(error))
+    }
+}
+
+impl Info {
+    fn view<'a>(&self, data: &'a [u8]) -> Result<View<'a>, ImageError> {
+        View::new(self.width, self.height, self.step, self.encoding, self.big_endian, data)
+    }
+}
+
+impl Source {
+    fn not_a_frame(&self, source: ImageError) -> DataError {
+        DataError::NotAFrame { topic: self.identity.topic.clone(), source }
+    }
+
+    fn refused(&self, error: ImageError) -> DataError {
+        match error {
+            ImageError::Roi { .. } | ImageError::ResizeTo { .. } => DataError::OutOfRange(error),
+            error => self.not_a_frame(error),
+        }
+    }
+}
+
+fn decode(source: &Source, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<Info>, DataError> {
+    let topic = || source.identity.topic.clone();
+    let header = image::probe(data).map_err(|error| source.not_a_frame(error))?;
+    let allowed = pool.slot_bytes();
+    let too_large = || {
+        let (width, height) = (header.width, header.height);
+        let needed = 3 * u64::from(width) * u64::from(height);
+        DataError::TooLarge { topic: topic(), source: ImageError::Bomb { width, height, needed, allowed } }
+    };
+    let len = header.rgb8_len().ok_or_else(too_large)?;
+    let mut draft = pool.draft(len).map_err(|refusal| match refusal {
+        Refusal::NoSlot => DataError::NoSlot { topic: topic(), input: source.topic.name().to_owned() },
+        Refusal::TooBig { .. } => too_large(),
+    })?;
+    image::decode_rgb8(data, &header, allowed, &mut draft).map_err(|error| source.not_a_frame(error))?;
+    Ok(draft.seal(Info::tight(header.width, header.height, Encoding::Rgb8)))
+}

@@ -1,0 +1,101 @@
+//! What a lambda may do, written once, in plain Rust.
+//!
+//! The four files beside this one carry the names of the four WIT interfaces. WebAssembly (`guest::wasm`) and Python
+//! (`host/python`) are thin skins over them: they convert arguments and errors, and decide nothing. What is here knows neither.
+
+pub mod data;
+mod error;
+pub mod frame;
+pub mod inference;
+pub mod log;
+pub mod trigger;
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use gleaner_protocol::Trigger;
+use gleaner_protocol::manifest::ConfigValue;
+
+use data::{DataError, Topic};
+use log::{Line, Log};
+use trigger::Triggers;
+
+/// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call, by one thread.
+#[derive(Clone)]
+pub struct Session(Arc<Mutex<State>>);
+
+struct State {
+    inputs: Vec<Arc<Topic>>,
+    config: Vec<(String, ConfigValue)>,
+    now_ns: i64,
+    triggers: Triggers,
+    log: Log,
+}
+
+impl Session {
+    /// A session over these inputs, in the manifest's order, and this configuration.
+    pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>) -> Self {
+        Self(Arc::new(Mutex::new(State {
+            inputs,
+            config,
+            now_ns: 0,
+            triggers: Triggers::default(),
+            log: Log::default(),
+        })))
+    }
+
+    /// Begins a wake at `now_ns`: what an earlier wake left behind is dropped.
+    pub fn begin(&self, now_ns: i64) {
+        let mut state = self.lock();
+        state.now_ns = now_ns;
+        state.triggers = Triggers::default();
+    }
+
+    /// Ends a wake and takes what it caused, in the order of the calls.
+    pub fn take_triggers(&self) -> Vec<Trigger> {
+        std::mem::take(&mut self.lock().triggers).into_list()
+    }
+
+    /// Takes the log lines written since the last call.
+    pub fn take_log(&self) -> Vec<Line> {
+        self.lock().log.take()
+    }
+
+    /// Log lines dropped by the rate limit, since the start.
+    pub fn log_dropped(&self) -> u64 {
+        self.lock().log.dropped()
+    }
+
+    /// Time of this wake, in nanoseconds.
+    pub fn now_ns(&self) -> i64 {
+        self.lock().now_ns
+    }
+
+    /// The configuration, in the manifest's order.
+    pub fn config(&self) -> Vec<(String, ConfigValue)> {
+        self.lock().config.clone()
+    }
+
+    /// All inputs, in the manifest's order.
+    pub fn inputs(&self) -> Vec<Arc<Topic>> {
+        self.lock().inputs.clone()
+    }
+
+    /// The input of that name.
+    ///
+    /// # Errors
+    ///
+    /// [`DataError::NoSuchInput`] names those that exist.
+    pub fn input(&self, name: &str) -> Result<Arc<Topic>, DataError> {
+        let state = self.lock();
+        let found = state.inputs.iter().find(|topic| topic.name() == name);
+        found.cloned().ok_or_else(|| DataError::NoSuchInput {
+            asked: name.chars().take(64).collect(),
+            known: state.inputs.iter().map(|topic| topic.name().to_owned()).collect(),
+        })
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // No call leaves the state half changed, so a poisoned lock holds nothing worse than a shorter list.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

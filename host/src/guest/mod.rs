@@ -1,0 +1,34 @@
+//! Where lambdas run. One thread owns a guest; nothing outside this room knows which kind it is.
+//!
+//! A guest that faults is never entered again: the next wake finds a fresh one, after its `init`.
+
+#[cfg(feature = "wasm")]
+pub mod wasm;
+
+#[cfg(feature = "python")]
+pub mod python;
+
+use gleaner_protocol::Fault;
+
+use crate::api::data::Wake;
+
+/// A lambda that can be woken.
+pub trait Guest {
+    /// Runs `init`. Called once before the first wake; a guest repeats it by itself after a fault.
+    ///
+    /// # Errors
+    ///
+    /// The fault that ended `init`.
+    fn init(&mut self) -> Result<(), Fault>;
+
+    /// Runs one wake to its end.
+    fn wake(&mut self, wake: Wake) -> Outcome;
+}
+
+/// How a wake ended.
+pub struct Outcome {
+    /// What went wrong, if anything did.
+    pub result: Result<(), Fault>,
+    /// Fuel used by this wake, where the kind counts it.
+    pub fuel: Option<u64>,
+}

@@ -1,0 +1,63 @@
+//! Python lambdas: this process becomes the interpreter of the lambda's environment.
+//!
+//! `gleaner-runtime` links no libpython. It replaces itself by `python3 -I start.py`, which loads `_gleaner` (crate
+//! `host/python`), and that runs the same library again, now inside the interpreter. So any virtual environment works.
+
+use std::ffi::OsString;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::{Exit, Explain, Parts, PartsError};
+
+/// Threads of numpy's linear algebra, unless the user says otherwise: receivers share the cores, and with its default
+/// OpenBLAS hangs where memory is capped.
+const ONE_THREAD: [&str; 4] = ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"];
+
+/// Why Python cannot be started.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
+pub enum PythonError {
+    #[error(transparent)]
+    Parts(#[from] PartsError),
+    #[error("cannot start `{}`", python.display())]
+    Start { python: PathBuf, source: std::io::Error },
+}
+
+impl Explain for PythonError {
+    fn help(&self) -> Option<String> {
+        match self {
+            Self::Parts(error) => error.help(),
+            Self::Start { .. } => Some("name another interpreter: GLEANER_PYTHON=/path/to/python3".to_owned()),
+        }
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            Self::Parts(error) => error.exit(),
+            Self::Start { .. } => Exit::Usage,
+        }
+    }
+}
+
+/// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for our library in it. Returns only errors.
+pub fn become_interpreter(lambda_dir: &Path, args: &[OsString]) -> PythonError {
+    match interpreter(lambda_dir, args) {
+        Ok((python, mut command)) => PythonError::Start { python, source: command.exec() },
+        Err(error) => error.into(),
+    }
+}
+
+fn interpreter(lambda_dir: &Path, args: &[OsString]) -> Result<(PathBuf, Command), PartsError> {
+    let parts = Parts::find()?;
+    let python = parts.python(Some(lambda_dir))?;
+    let mut command = Command::new(&python);
+    // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.
+    command.arg("-I").arg(parts.python_home()?.join("start.py")).arg(parts.extension()?).args(args);
+    for name in ONE_THREAD {
+        if std::env::var_os(name).is_none() {
+            command.env(name, "1");
+        }
+    }
+    Ok((python, command))
+}

@@ -1,0 +1,311 @@
+//! `gleaner:lambda/data` and `types` over [`api::data`](crate::api::data) and [`api::frame`](crate::api::frame).
+
+use wasmtime::component::Resource;
+
+use super::Hosted;
+use super::bindings::gleaner::lambda::data::{Host, HostField, HostFrame, HostSample, HostTopic};
+use super::bindings::gleaner::lambda::types::{
+    self, Column, Counts, DataError, Encoding, FrameInfo, Guid, Identity, Roi, Stamps, Value,
+};
+use super::bindings::handles::{Field, Frame, Sample, Topic};
+use crate::api::{data, frame};
+use crate::image;
+
+type Answer<T> = wasmtime::Result<Result<T, DataError>>;
+
+/// Bytes that a value of a column costs: two numbers of eight bytes and the walk to the field.
+const COLUMN_VALUE_BYTES: usize = 64;
+
+impl types::Host for Hosted {}
+
+impl Host for Hosted {
+    fn input(&mut self, name: String) -> Answer<Resource<Topic>> {
+        self.meter.charge(name.len())?;
+        let input = self.session.input(&name);
+        self.hand_out(input)
+    }
+
+    fn inputs(&mut self) -> wasmtime::Result<Vec<String>> {
+        let inputs = self.session.inputs();
+        self.meter.charge(inputs.len() * COLUMN_VALUE_BYTES)?;
+        Ok(inputs.iter().map(|topic| topic.name().to_owned()).collect())
+    }
+
+    fn now_ns(&mut self) -> wasmtime::Result<i64> {
+        self.meter.charge(0)?;
+        Ok(self.session.now_ns())
+    }
+}
+
+impl HostTopic for Hosted {
+    fn name(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
+        self.text(&topic, |topic| topic.name())
+    }
+
+    fn ros_topic(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
+        self.text(&topic, |topic| topic.ros_topic())
+    }
+
+    fn type_name(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
+        self.text(&topic, |topic| topic.type_name())
+    }
+
+    fn newest(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Option<Resource<Sample>>> {
+        self.meter.charge(0)?;
+        let newest = self.handles.get(&topic)?.newest();
+        newest.map(|sample| Ok(self.handles.push(sample)?)).transpose()
+    }
+
+    fn last(&mut self, topic: Resource<Topic>, n: u32) -> wasmtime::Result<Vec<Resource<Sample>>> {
+        let samples = self.handles.get(&topic)?.last(n as usize);
+        self.hand_out_all(samples)
+    }
+
+    fn since(&mut self, topic: Resource<Topic>, since_ns: i64) -> wasmtime::Result<Vec<Resource<Sample>>> {
+        let samples = self.handles.get(&topic)?.since(since_ns);
+        self.hand_out_all(samples)
+    }
+
+    fn counts(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Counts> {
+        self.meter.charge(0)?;
+        let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } =
+            self.handles.get(&topic)?.counts();
+        Ok(Counts { received, lost, overwritten, no_slot, too_big, skipped })
+    }
+
+    fn field(&mut self, topic: Resource<Topic>, path: String) -> Answer<Resource<Field>> {
+        self.meter.charge(path.len())?;
+        let field = self.handles.get(&topic)?.field(&path);
+        self.hand_out(field)
+    }
+
+    fn column(&mut self, topic: Resource<Topic>, field: Resource<Field>, n: u32) -> Answer<Column> {
+        let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
+        let column = topic.column(field, n as usize);
+        self.column_out(column)
+    }
+
+    fn column_since(&mut self, topic: Resource<Topic>, field: Resource<Field>, since_ns: i64) -> Answer<Column> {
+        let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
+        let column = topic.column_since(field, since_ns);
+        self.column_out(column)
+    }
+
+    fn drop(&mut self, topic: Resource<Topic>) -> wasmtime::Result<()> {
+        self.handles.delete(topic)?;
+        Ok(())
+    }
+}
+
+impl HostField for Hosted {
+    fn path(&mut self, field: Resource<Field>) -> wasmtime::Result<String> {
+        self.text(&field, |field| field.path())
+    }
+
+    fn drop(&mut self, field: Resource<Field>) -> wasmtime::Result<()> {
+        self.handles.delete(field)?;
+        Ok(())
+    }
+}
+
+impl HostSample for Hosted {
+    fn identity(&mut self, sample: Resource<Sample>) -> wasmtime::Result<Identity> {
+        self.meter.charge(0)?;
+        Ok(identity(&self.handles.get(&sample)?.identity()))
+    }
+
+    fn stamps(&mut self, sample: Resource<Sample>) -> wasmtime::Result<Stamps> {
+        self.meter.charge(0)?;
+        Ok(stamps(self.handles.get(&sample)?.stamps()))
+    }
+
+    fn get(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<Value> {
+        let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
+        // A path may walk over the whole message, and the value may be most of it.
+        self.meter.charge(sample.bytes().len())?;
+        Ok(sample.get(field).map(value).map_err(refused))
+    }
+
+    fn number(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<f64> {
+        self.meter.charge(COLUMN_VALUE_BYTES)?;
+        let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
+        Ok(sample.number(field).map_err(refused))
+    }
+
+    fn size(&mut self, sample: Resource<Sample>) -> wasmtime::Result<u64> {
+        self.meter.charge(0)?;
+        Ok(self.handles.get(&sample)?.bytes().len() as u64)
+    }
+
+    fn big_endian(&mut self, sample: Resource<Sample>) -> wasmtime::Result<bool> {
+        self.meter.charge(0)?;
+        Ok(self.handles.get(&sample)?.big_endian())
+    }
+
+    fn cdr(&mut self, sample: Resource<Sample>, offset: u64, len: u32) -> wasmtime::Result<Vec<u8>> {
+        let bytes = self.handles.get(&sample)?.cdr(offset, len);
+        self.meter.charge(bytes.len())?;
+        Ok(bytes.to_vec())
+    }
+
+    fn as_frame(&mut self, sample: Resource<Sample>) -> Answer<Resource<Frame>> {
+        self.meter.charge(0)?;
+        let frame = self.handles.get(&sample)?.as_frame();
+        if let Ok(frame) = &frame {
+            self.meter.charge(frame.decoded_bytes())?;
+        }
+        self.hand_out(frame)
+    }
+
+    fn drop(&mut self, sample: Resource<Sample>) -> wasmtime::Result<()> {
+        self.handles.delete(sample)?;
+        Ok(())
+    }
+}
+
+impl HostFrame for Hosted {
+    fn info(&mut self, frame: Resource<Frame>) -> wasmtime::Result<FrameInfo> {
+        self.meter.charge(0)?;
+        let frame = self.handles.get(&frame)?;
+        let frame::Info { width, height, encoding, step, big_endian } = frame.info();
+        let size = frame.bytes().len() as u64;
+        Ok(FrameInfo { width, height, encoding: encoding_out(encoding), step, big_endian, size })
+    }
+
+    fn identity(&mut self, frame: Resource<Frame>) -> wasmtime::Result<Identity> {
+        self.meter.charge(0)?;
+        Ok(identity(self.handles.get(&frame)?.identity()))
+    }
+
+    fn stamps(&mut self, frame: Resource<Frame>) -> wasmtime::Result<Stamps> {
+        self.meter.charge(0)?;
+        Ok(stamps(self.handles.get(&frame)?.stamps()))
+    }
+
+    fn mean_luma(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<f64> {
+        let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
+        self.meter.charge(frame.work(roi, None) as usize)?;
+        Ok(frame.mean_luma(roi).map_err(refused))
+    }
+
+    fn histogram(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<Vec<u32>> {
+        let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
+        self.meter.charge(frame.work(roi, None) as usize)?;
+        Ok(frame.histogram(roi).map(Vec::from).map_err(refused))
+    }
+
+    fn resize(&mut self, frame: Resource<Frame>, width: u32, height: u32) -> Answer<Resource<Frame>> {
+        let frame = self.handles.get(&frame)?;
+        self.meter.charge(frame.work(None, Some((width, height))) as usize)?;
+        let resized = frame.resize(width, height);
+        self.hand_out(resized)
+    }
+
+    fn to_gray(&mut self, frame: Resource<Frame>) -> Answer<Resource<Frame>> {
+        let frame = self.handles.get(&frame)?;
+        self.meter.charge(frame.bytes().len())?;
+        let gray = frame.to_gray();
+        self.hand_out(gray)
+    }
+
+    fn read(&mut self, frame: Resource<Frame>, offset: u64, len: u32) -> wasmtime::Result<Vec<u8>> {
+        let bytes = self.handles.get(&frame)?.read(offset, len);
+        self.meter.charge(bytes.len())?;
+        Ok(bytes.to_vec())
+    }
+
+    fn drop(&mut self, frame: Resource<Frame>) -> wasmtime::Result<()> {
+        self.handles.delete(frame)?;
+        Ok(())
+    }
+}
+
+impl Hosted {
+    fn hand_out<T: Send + 'static>(&mut self, made: Result<T, data::DataError>) -> Answer<Resource<T>> {
+        Ok(match made {
+            Ok(value) => Ok(self.handles.push(value)?),
+            Err(error) => Err(refused(error)),
+        })
+    }
+
+    fn hand_out_all(&mut self, samples: Vec<Sample>) -> wasmtime::Result<Vec<Resource<Sample>>> {
+        self.meter.charge(samples.len() * COLUMN_VALUE_BYTES)?;
+        samples.into_iter().map(|sample| Ok(self.handles.push(sample)?)).collect()
+    }
+
+    fn column_out(&mut self, column: Result<data::Column, data::DataError>) -> Answer<Column> {
+        let len = column.as_ref().map_or(0, |column| column.values.len());
+        self.meter.charge(len * COLUMN_VALUE_BYTES)?;
+        Ok(column.map(|data::Column { at_ns, values }| Column { at_ns, values }).map_err(refused))
+    }
+
+    fn text<T: 'static>(&mut self, handle: &Resource<T>, text: impl FnOnce(&T) -> &str) -> wasmtime::Result<String> {
+        self.meter.charge(0)?;
+        Ok(text(self.handles.get(handle)?).to_owned())
+    }
+}
+
+fn identity(data::Identity { topic, writer, seq }: &data::Identity) -> Identity {
+    let bytes = u128::from_be_bytes(writer.0);
+    let writer = Guid { high: (bytes >> 64) as u64, low: bytes as u64 };
+    Identity { topic: topic.clone(), writer, seq: *seq }
+}
+
+fn stamps(data::Stamps { at_ns, publish_ns, header_ns }: data::Stamps) -> Stamps {
+    Stamps { at_ns, publish_ns, header_ns }
+}
+
+fn roi_in(Roi { x, y, width, height }: Roi) -> image::Roi {
+    image::Roi { x, y, width, height }
+}
+
+fn value(value: gleaner_transport::message::Value<'_>) -> Value {
+    use gleaner_transport::message::Value as Read;
+    match value {
+        Read::Bool(value) => Value::Boolean(value),
+        Read::Signed(value) => Value::Signed(value),
+        Read::Unsigned(value) => Value::Unsigned(value),
+        Read::Real(value) => Value::Real(value),
+        Read::Text(value) => Value::Text(value.to_owned()),
+        Read::Bytes(value) => Value::Bytes(value.to_vec()),
+        Read::Numbers(value) => Value::Numbers(value),
+        Read::Texts(value) => Value::Texts(value.into_iter().map(str::to_owned).collect()),
+    }
+}
+
+fn refused(error: data::DataError) -> DataError {
+    let message = error.to_string();
+    match error {
+        data::DataError::NoSuchInput { .. } => DataError::NoSuchInput(message),
+        data::DataError::NoSuchField(_) => DataError::NoSuchField(message),
+        data::DataError::WrongField { .. } => DataError::WrongField(message),
+        data::DataError::Malformed { .. } => DataError::Malformed(message),
+        data::DataError::NoImageType { .. } | data::DataError::NotAFrame { .. } => DataError::NotAFrame(message),
+        data::DataError::TooLarge { .. } | data::DataError::NoSlot { .. } | data::DataError::NoMemory { .. } => {
+            DataError::NoRoom(message)
+        }
+        data::DataError::OutOfRange(_) => DataError::OutOfRange(message),
+    }
+}
+
+fn encoding_out(encoding: image::Encoding) -> Encoding {
+    use image::{Bayer, Encoding as E};
+    match encoding {
+        E::Rgb8 => Encoding::Rgb8,
+        E::Bgr8 => Encoding::Bgr8,
+        E::Rgba8 => Encoding::Rgba8,
+        E::Bgra8 => Encoding::Bgra8,
+        E::Mono8 => Encoding::Mono8,
+        E::Mono16 => Encoding::Mono16,
+        E::Yuv422Uyvy => Encoding::Yuv422,
+        E::Yuv422Yuyv => Encoding::Yuv422Yuy2,
+        E::Bayer8(Bayer::Rggb) => Encoding::BayerRggb8,
+        E::Bayer8(Bayer::Bggr) => Encoding::BayerBggr8,
+        E::Bayer8(Bayer::Gbrg) => Encoding::BayerGbrg8,
+        E::Bayer8(Bayer::Grbg) => Encoding::BayerGrbg8,
+        E::Bayer16(Bayer::Rggb) => Encoding::BayerRggb16,
+        E::Bayer16(Bayer::Bggr) => Encoding::BayerBggr16,
+        E::Bayer16(Bayer::Gbrg) => Encoding::BayerGbrg16,
+        E::Bayer16(Bayer::Grbg) => Encoding::BayerGrbg16,
+    }
+}

@@ -1,0 +1,69 @@
+//! `gleaner:lambda/inference` over [`api::inference`](crate::api::inference).
+
+use wasmtime::component::Resource;
+
+use super::Hosted;
+use super::bindings::gleaner::lambda::inference::{
+    DetectOptions, Detection, Host, HostModel, HostTensor, InferenceError, Preprocess,
+};
+use crate::api::frame::Frame;
+use crate::api::inference::{self, Model, Tensor};
+
+type Answer<T> = wasmtime::Result<Result<T, InferenceError>>;
+
+impl Host for Hosted {}
+
+impl HostTensor for Hosted {
+    fn from_values(&mut self, _shape: Vec<u32>, _values: Vec<f32>) -> Answer<Resource<Tensor>> {
+        self.answer(Tensor::new())
+    }
+
+    fn from_frame(&mut self, _frame: Resource<Frame>, _how: Preprocess) -> Answer<Resource<Tensor>> {
+        self.answer(Tensor::new())
+    }
+
+    fn shape(&mut self, tensor: Resource<Tensor>) -> wasmtime::Result<Vec<u32>> {
+        match *self.handles.get(&tensor)? {}
+    }
+
+    fn read(&mut self, tensor: Resource<Tensor>, _offset: u64, _len: u32) -> wasmtime::Result<Vec<f32>> {
+        match *self.handles.get(&tensor)? {}
+    }
+
+    fn drop(&mut self, tensor: Resource<Tensor>) -> wasmtime::Result<()> {
+        match self.handles.delete(tensor)? {}
+    }
+}
+
+impl HostModel for Hosted {
+    fn open(&mut self, name: String) -> Answer<Resource<Model>> {
+        self.answer(Model::open(&name))
+    }
+
+    fn run(&mut self, model: Resource<Model>, _inputs: Vec<Resource<Tensor>>) -> Answer<Vec<Resource<Tensor>>> {
+        match *self.handles.get(&model)? {}
+    }
+
+    fn detect(
+        &mut self,
+        model: Resource<Model>,
+        _frame: Resource<Frame>,
+        _options: DetectOptions,
+    ) -> Answer<Vec<Detection>> {
+        match *self.handles.get(&model)? {}
+    }
+
+    fn drop(&mut self, model: Resource<Model>) -> wasmtime::Result<()> {
+        match self.handles.delete(model)? {}
+    }
+}
+
+impl Hosted {
+    fn answer<T: Send + 'static>(&mut self, made: Result<T, inference::InferenceError>) -> Answer<Resource<T>> {
+        self.meter.charge(0)?;
+        Ok(match made {
+            Ok(value) => Ok(self.handles.push(value)?),
+            Err(error @ inference::InferenceError::NoRuntime) => Err(InferenceError::NoRuntime(error.to_string())),
+        })
+    }
+}

@@ -1,0 +1,132 @@
+//! From a component to code that can be instantiated: found in the cache, or compiled there by `gleaner-compile`.
+#![allow(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_compile::{CompileError, cache_entry, check_entry, read_component};
+use gleaner_protocol::{Exit, Explain, Parts, PartsError};
+use sha2::{Digest, Sha256};
+use wasmtime::component::{Component, Linker};
+use wasmtime::{Engine, Store};
+
+use super::Hosted;
+use super::bindings::{Lambda, LambdaPre};
+use super::wasi;
+
+/// Why a component cannot be run.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
+pub enum WasmError {
+    #[error(transparent)]
+    Compile(#[from] CompileError),
+    #[error(transparent)]
+    Parts(#[from] PartsError),
+    #[error("cannot start `{}`", program.display())]
+    Start { program: PathBuf, source: std::io::Error },
+    #[error("cannot compile component `{}`", path.display())]
+    Compiler { path: PathBuf, source: CompilerSaid },
+    #[error("cannot load native code `{}`", path.display())]
+    Load { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
+    #[error("component `{}` does not fit the world `gleaner:lambda/lambda`", path.display())]
+    World { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
+}
+
+/// What `gleaner-compile` wrote when it failed.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct CompilerSaid(String);
+
+impl Explain for WasmError {
+    fn help(&self) -> Option<String> {
+        match self {
+            Self::Compile(error) => error.help(),
+            Self::Parts(error) => error.help(),
+            Self::World { .. } => Some(
+                "build it against this version's SDK: implement `Lambda` and export it with `gleaner_sdk::lambda!`; \
+                 a component may import `gleaner:lambda` and WASI 0.2, nothing else"
+                    .to_owned(),
+            ),
+            Self::Compiler { .. } => Some("build the lambda again: gleaner build DIR".to_owned()),
+            Self::Load { path, .. } => Some(format!("delete it, it will be made again: rm '{}'", path.display())),
+            Self::Start { .. } => None,
+        }
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            Self::Compile(error) => error.exit(),
+            Self::Parts(error) => error.exit(),
+            Self::Compiler { .. } | Self::World { .. } => Exit::Usage,
+            Self::Start { .. } | Self::Load { .. } => Exit::Internal,
+        }
+    }
+}
+
+/// A component that was checked against the world and is ready to be instantiated.
+#[derive(Clone)]
+pub struct Loaded {
+    engine: Engine,
+    lambda: LambdaPre<Hosted>,
+    seed: [u8; 32],
+}
+
+impl Loaded {
+    /// Loads the component at `path`, compiling it into `cache` first if it is not there.
+    ///
+    /// # Errors
+    ///
+    /// [`WasmError`] names the component and what does not fit.
+    pub fn open(path: &Path, cache: &Path) -> Result<Self, WasmError> {
+        let component = read_component(path)?;
+        let engine = gleaner_compile::engine()?;
+        let entry = cache_entry(cache, &component);
+        if !entry.exists() {
+            compile(path, cache)?;
+        }
+        check_entry(&entry)?;
+        // SAFETY: `check_entry` found that the file and its folder belong to this user and that nobody else may write to
+        // them, and only `gleaner-compile` writes there, under a name made from the component, the engine and the CPU.
+        let code = unsafe { Component::deserialize_file(&engine, &entry) }
+            .map_err(|source| WasmError::Load { path: entry, source: source.into() })?;
+        Self::check(path, engine, &code, Sha256::digest(&component).into())
+    }
+
+    fn check(path: &Path, engine: Engine, code: &Component, seed: [u8; 32]) -> Result<Self, WasmError> {
+        let world = |source: wasmtime::Error| WasmError::World { path: path.to_owned(), source: source.into() };
+        let mut linker = Linker::new(&engine);
+        wasi::add_to_linker(&mut linker).map_err(world)?;
+        Lambda::add_to_linker::<_, wasmtime::component::HasSelf<_>>(&mut linker, |hosted| hosted).map_err(world)?;
+        let lambda = linker.instantiate_pre(code).and_then(LambdaPre::new).map_err(world)?;
+        Ok(Self { engine, lambda, seed })
+    }
+
+    /// The engine it runs on.
+    pub fn engine(&self) -> &Engine {
+        &self.engine
+    }
+
+    pub(super) fn seed(&self) -> [u8; 32] {
+        self.seed
+    }
+
+    pub(super) fn instantiate(&self, store: &mut Store<Hosted>) -> wasmtime::Result<Lambda> {
+        self.lambda.instantiate(store)
+    }
+}
+
+fn compile(path: &Path, cache: &Path) -> Result<(), WasmError> {
+    let program = Parts::find()?.program("gleaner-compile")?;
+    let output = Command::new(&program)
+        .arg(path)
+        .arg("--cache")
+        .arg(cache)
+        .output()
+        .map_err(|source| WasmError::Start { program, source })?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = String::from_utf8_lossy(&output.stderr);
+    let said = said.trim().trim_start_matches("error: ").to_owned();
+    Err(WasmError::Compiler { path: path.to_owned(), source: CompilerSaid(said) })
+}

@@ -1,0 +1,217 @@
+//! WebAssembly components: one store on one thread, fuel and a memory cap always on, a deadline where the clock is real.
+//!
+//! The four files named as the WIT interfaces are thin: they convert, charge fuel for the bytes that the host touches, and
+//! leave everything else to `api`. A trap ends the store; the next wake gets a new one. Nothing here compiles code.
+
+mod bindings;
+mod data;
+mod deadline;
+mod fault;
+mod inference;
+mod limits;
+mod load;
+mod log;
+mod trigger;
+mod wasi;
+
+pub use deadline::Deadline;
+pub use load::{Loaded, WasmError};
+
+use gleaner_protocol::manifest::ConfigValue;
+use gleaner_protocol::{Fault, FaultKind};
+use wasmtime::Store;
+use wasmtime::component::ResourceTable;
+use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
+
+use self::bindings::gleaner::lambda::data as wit;
+use self::bindings::{ConfigEntry, ConfigValue as WitConfigValue, Lambda};
+use self::limits::{Limits, Meter};
+use self::wasi::Stderr;
+use super::{Guest, Outcome};
+use crate::api::Session;
+use crate::api::data::Wake;
+
+/// `init` may use so many times the fuel of a wake: it builds tables once.
+pub const INIT_FUEL_FACTOR: u64 = 20;
+
+/// Handles that a guest may hold at a time, of all kinds.
+pub const HANDLES: usize = 4096;
+
+/// Bytes that a guest may pass to the host in one call.
+const HOST_CALL_BYTES: usize = 64 << 20;
+
+/// What a guest is allowed, from `[limits]`.
+#[derive(Clone, Copy, Debug)]
+pub struct Allowance {
+    /// Fuel for each wake.
+    pub fuel: u64,
+    /// Linear memory, in bytes.
+    pub memory_bytes: u64,
+}
+
+/// A component and the session that it works on.
+pub struct WasmGuest {
+    loaded: Loaded,
+    session: Session,
+    allowance: Allowance,
+    deadline: Option<Deadline>,
+    live: Option<Live>,
+}
+
+struct Live {
+    store: Store<Hosted>,
+    lambda: Lambda,
+}
+
+/// What the host keeps for one instance; gone with its store.
+struct Hosted {
+    session: Session,
+    handles: ResourceTable,
+    wasi: WasiCtx,
+    stderr: Stderr,
+    limits: Limits,
+    meter: Meter,
+}
+
+impl WasiView for Hosted {
+    fn ctx(&mut self) -> WasiCtxView<'_> {
+        WasiCtxView { ctx: &mut self.wasi, table: &mut self.handles }
+    }
+}
+
+impl WasmGuest {
+    /// A guest without an instance yet. With `deadline`, each call must end in time; in replay there is none.
+    pub fn new(loaded: Loaded, session: Session, allowance: Allowance, deadline: Option<Deadline>) -> Self {
+        Self { loaded, session, allowance, deadline, live: None }
+    }
+
+    fn start(&mut self) -> Result<Live, Fault> {
+        let mut store = self.new_store();
+        let mut call = Call::begin(&mut store, self.init_fuel(), self.deadline.as_ref());
+        let lambda = self.loaded.instantiate(call.store());
+        let result = lambda.and_then(|lambda| {
+            let config = self.session.config().into_iter().map(config_entry).collect::<Vec<_>>();
+            Ok((lambda.call_init(call.store(), &config)?, lambda))
+        });
+        let (answer, lambda) = call.end(result).1.map_err(in_init)?;
+        answer.map_err(|message| in_init(exception(message)))?;
+        Ok(Live { store, lambda })
+    }
+
+    fn new_store(&self) -> Store<Hosted> {
+        let stderr = Stderr::default();
+        let hosted = Hosted {
+            session: self.session.clone(),
+            handles: handle_table(),
+            wasi: wasi::context(&self.session, &stderr, self.loaded.seed()),
+            stderr,
+            limits: Limits::new(self.allowance.memory_bytes),
+            meter: Meter::default(),
+        };
+        let mut store = Store::new(self.loaded.engine(), hosted);
+        store.limiter(|hosted| &mut hosted.limits);
+        store.set_hostcall_fuel(HOST_CALL_BYTES);
+        store.set_max_component_handles(HANDLES);
+        store
+    }
+
+    fn init_fuel(&self) -> u64 {
+        self.allowance.fuel.saturating_mul(INIT_FUEL_FACTOR)
+    }
+}
+
+impl Guest for WasmGuest {
+    fn init(&mut self) -> Result<(), Fault> {
+        self.live = None;
+        self.live = Some(self.start()?);
+        Ok(())
+    }
+
+    fn wake(&mut self, wake: Wake) -> Outcome {
+        let mut live = match self.live.take().map_or_else(|| self.start(), Ok) {
+            Ok(live) => live,
+            Err(fault) => return Outcome { result: Err(fault), fuel: None },
+        };
+        let mut call = Call::begin(&mut live.store, self.allowance.fuel, self.deadline.as_ref());
+        let result = call.hand_over(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
+        let (fuel, result) = call.end(result);
+        let result = result.and_then(|answer| answer.map_err(exception));
+        if result.is_ok() {
+            self.live = Some(live);
+        }
+        Outcome { result, fuel: Some(fuel) }
+    }
+}
+
+fn handle_table() -> ResourceTable {
+    let mut table = ResourceTable::new();
+    table.set_max_capacity(HANDLES);
+    table
+}
+
+/// One call into a guest: fuel and deadline are set at its beginning, accounts are made at its end.
+struct Call<'a> {
+    store: &'a mut Store<Hosted>,
+    fuel: u64,
+    armed: Option<deadline::Armed<'a>>,
+}
+
+impl<'a> Call<'a> {
+    fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<&'a Deadline>) -> Self {
+        store.set_fuel(fuel).expect("the engine counts fuel");
+        let hosted = store.data_mut();
+        hosted.meter = Meter::new(fuel);
+        hosted.limits.forget_refusal();
+        hosted.stderr.clear();
+        let armed = deadline.map(|deadline| deadline.arm(store));
+        if armed.is_none() {
+            store.set_epoch_deadline(u64::MAX / 2);
+        }
+        Self { store, fuel, armed }
+    }
+
+    fn store(&mut self) -> &mut Store<Hosted> {
+        self.store
+    }
+
+    fn hand_over(&mut self, wake: Wake) -> wasmtime::Result<wit::Wake> {
+        Ok(match wake {
+            Wake::Event(sample) => wit::Wake::Event(self.store.data_mut().handles.push(sample)?),
+            Wake::Tick(tick) => wit::Wake::Tick(wit::Tick { at_ns: tick.at_ns, missed: tick.missed }),
+        })
+    }
+
+    /// Fuel used, and the result with its trap turned into a fault.
+    fn end<T>(self, result: wasmtime::Result<T>) -> (u64, Result<T, Fault>) {
+        let late = self.armed.as_ref().map(deadline::Armed::elapsed_and_allowed);
+        drop(self.armed);
+        let left = self.store.get_fuel().unwrap_or(0);
+        let used = (self.fuel - left.min(self.fuel)).saturating_add(self.store.data().meter.used());
+        let result = match result {
+            // Guest and host each kept within the allowance; together they must as well.
+            Ok(_) if used > self.fuel => Err(fault::fuel(used, self.fuel)),
+            Ok(value) => Ok(value),
+            Err(error) => Err(fault::from_error(&error, self.store.data(), (used, self.fuel), late)),
+        };
+        (used, result)
+    }
+}
+
+fn exception(message: String) -> Fault {
+    let message = crate::api::log::cut(&message, crate::api::log::LINE_BYTES).to_owned();
+    Fault { kind: FaultKind::Exception, message, used: None, allowed: None }
+}
+
+fn in_init(fault: Fault) -> Fault {
+    Fault { message: format!("in init: {}", fault.message), ..fault }
+}
+
+fn config_entry((key, value): (String, ConfigValue)) -> ConfigEntry {
+    let value = match value {
+        ConfigValue::Bool(value) => WitConfigValue::Boolean(value),
+        ConfigValue::Int(value) => WitConfigValue::Integer(value),
+        ConfigValue::Float(value) => WitConfigValue::Real(value),
+        ConfigValue::Text(value) => WitConfigValue::Text(value),
+    };
+    ConfigEntry { key, value }
+}

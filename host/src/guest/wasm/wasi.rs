@@ -1,0 +1,158 @@
+//! WASI as far as a lambda needs it: output becomes log lines, the clock is the wake's, random numbers are seeded.
+//!
+//! There are no files, no environment, no arguments and no sockets: such calls answer with an error. Sleeping is a fault,
+//! since neither fuel nor a deadline could end it.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use bytes::Bytes;
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+use wasmtime::component::{HasData, Linker, Resource};
+use wasmtime_wasi::cli::{IsTerminal, StdoutStream};
+use wasmtime_wasi::p2::bindings::clocks::monotonic_clock;
+use wasmtime_wasi::p2::{DynPollable, OutputStream, Pollable, StreamResult};
+use wasmtime_wasi::{HostWallClock, WasiCtx};
+
+use super::Hosted;
+use crate::api::Session;
+use crate::api::log::{LINE_BYTES, Level, cut};
+
+/// The lambda tried to sleep.
+#[derive(Debug, thiserror::Error)]
+#[error("a lambda cannot sleep: it is woken by samples or by a period")]
+pub(super) struct Asleep;
+
+pub(super) fn add_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
+    wasmtime_wasi::p2::add_to_linker_sync(linker)?;
+    linker.allow_shadowing(true);
+    monotonic_clock::add_to_linker::<Hosted, VirtualClock>(linker, |hosted| hosted)?;
+    linker.allow_shadowing(false);
+    Ok(())
+}
+
+/// A context that grants nothing but output, the wake's time and numbers from `seed`.
+pub(super) fn context(session: &Session, stderr: &Stderr, seed: [u8; 32]) -> WasiCtx {
+    WasiCtx::builder()
+        .stdout(Lines { session: session.clone(), level: Level::Info, tail: None })
+        .stderr(Lines { session: session.clone(), level: Level::Warn, tail: Some(stderr.clone()) })
+        .wall_clock(Wall(session.clone()))
+        .secure_random(StdRng::from_seed(seed))
+        .insecure_random(StdRng::from_seed(seed))
+        .insecure_random_seed(u128::from_le_bytes(std::array::from_fn(|i| seed[i])))
+        .allow_blocking_current_thread(true)
+        .build()
+}
+
+struct Wall(Session);
+
+impl HostWallClock for Wall {
+    fn resolution(&self) -> Duration {
+        Duration::from_nanos(1)
+    }
+
+    fn now(&self) -> Duration {
+        Duration::from_nanos(u64::try_from(self.0.now_ns()).unwrap_or(0))
+    }
+}
+
+/// `wasi:clocks/monotonic-clock`, standing still within a wake.
+struct VirtualClock;
+
+impl HasData for VirtualClock {
+    type Data<'a> = &'a mut Hosted;
+}
+
+impl monotonic_clock::Host for Hosted {
+    fn now(&mut self) -> wasmtime::Result<u64> {
+        Ok(u64::try_from(self.session.now_ns()).unwrap_or(0))
+    }
+
+    fn resolution(&mut self) -> wasmtime::Result<u64> {
+        Ok(1)
+    }
+
+    fn subscribe_instant(&mut self, _when: u64) -> wasmtime::Result<Resource<DynPollable>> {
+        Err(Asleep.into())
+    }
+
+    fn subscribe_duration(&mut self, _duration: u64) -> wasmtime::Result<Resource<DynPollable>> {
+        Err(Asleep.into())
+    }
+}
+
+/// What the guest wrote to standard error in this call: the reason of a panic.
+#[derive(Clone, Default)]
+pub(super) struct Stderr(Arc<Mutex<String>>);
+
+impl Stderr {
+    pub(super) fn clear(&self) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    }
+
+    /// The last lines, if there are any, without the standard library's hint about backtraces.
+    pub(super) fn message(&self) -> Option<String> {
+        let text = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let lines = text.lines().filter(|line| !line.trim().is_empty() && !line.starts_with("note: run with"));
+        let message = lines.collect::<Vec<_>>().join("\n");
+        (!message.is_empty()).then_some(message)
+    }
+
+    fn add(&self, text: &str) {
+        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let room = LINE_BYTES.saturating_sub(kept.len());
+        kept.push_str(cut(text, room));
+    }
+}
+
+/// Output of a guest, line by line into its log.
+#[derive(Clone)]
+struct Lines {
+    session: Session,
+    level: Level,
+    tail: Option<Stderr>,
+}
+
+impl IsTerminal for Lines {
+    fn is_terminal(&self) -> bool {
+        false
+    }
+}
+
+impl StdoutStream for Lines {
+    fn async_stream(&self) -> Box<dyn tokio::io::AsyncWrite + Send + Sync> {
+        // Only WASI 0.3 asks for this one, and it is not linked.
+        Box::new(tokio::io::sink())
+    }
+
+    fn p2_stream(&self) -> Box<dyn OutputStream> {
+        Box::new(self.clone())
+    }
+}
+
+impl OutputStream for Lines {
+    fn write(&mut self, bytes: Bytes) -> StreamResult<()> {
+        let text = String::from_utf8_lossy(&bytes);
+        if let Some(tail) = &self.tail {
+            tail.add(&text);
+        }
+        for line in text.lines().filter(|line| !line.trim().is_empty()) {
+            self.session.log(self.level, line);
+        }
+        Ok(())
+    }
+
+    fn flush(&mut self) -> StreamResult<()> {
+        Ok(())
+    }
+
+    fn check_write(&mut self) -> StreamResult<usize> {
+        Ok(LINE_BYTES)
+    }
+}
+
+#[wasmtime_wasi::async_trait]
+impl Pollable for Lines {
+    async fn ready(&mut self) {}
+}

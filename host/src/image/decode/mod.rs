@@ -1,0 +1,131 @@
+//! JPEG and PNG bytes become rgb8.
+//!
+//! Inside: what a file is and how large its image claims to be ([`probe`]), by its first bytes
+//! alone, and the decoding into memory of the caller ([`decode_rgb8`]). The pixels are worked out by
+//! `zune-jpeg` and `png`; what this room adds is the price, which is known before it is paid.
+//!
+//! Never: an allocation before the size has been compared with the caller's limit; a file that is
+//! cut off passed as a whole image; pixels of an earlier image left in the output.
+
+mod jpeg;
+mod png;
+#[cfg(test)]
+mod samples;
+#[cfg(test)]
+mod tests;
+
+use std::fmt;
+
+use super::ImageError;
+
+/// What the bytes of a file are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// JPEG (ITU-T T.81), baseline or progressive.
+    Jpeg,
+    /// PNG (ISO/IEC 15948).
+    Png,
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Jpeg => "JPEG",
+            Self::Png => "PNG",
+        })
+    }
+}
+
+/// What a file says of its image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Header {
+    /// What the bytes are.
+    pub format: Format,
+    /// Pixels per row, 1 to [`MAX_SIDE`](super::MAX_SIDE).
+    pub width: u32,
+    /// Rows, 1 to [`MAX_SIDE`](super::MAX_SIDE).
+    pub height: u32,
+}
+
+impl Header {
+    /// Bytes of the image as rgb8, or `None` where this machine cannot count them.
+    pub fn rgb8_len(&self) -> Option<usize> {
+        usize::try_from(self.width).ok()?.checked_mul(usize::try_from(self.height).ok()?)?.checked_mul(3)
+    }
+}
+
+impl fmt::Display for Header {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} of {}x{}", self.format, self.width, self.height)
+    }
+}
+
+/// What `data` is, by its magic bytes and its header. Nothing is allocated or decoded.
+///
+/// # Errors
+///
+/// [`ImageError::NotAnImage`] for other bytes, [`ImageError::Size`] for an image without pixels,
+/// [`ImageError::Unsupported`] for a kind of JPEG that cameras do not send, and
+/// [`ImageError::CutOff`] or [`ImageError::Damaged`] if there is no readable header.
+pub fn probe(data: &[u8]) -> Result<Header, ImageError> {
+    match format_of(data)? {
+        Format::Jpeg => jpeg::header(data),
+        Format::Png => png::header(data),
+    }
+}
+
+/// Decodes `data`, whose header [`probe`] gave, into `out`: rows from the top, without padding,
+/// [`Header::rgb8_len`] bytes. Grey becomes equal red, green and blue; alpha is dropped; 16 bit
+/// values keep their high byte.
+///
+/// `max_bytes` is what an image of this input may have as rgb8, its `decoded_size`. It also bounds
+/// what the decoder allocates while it runs: 4 MiB plus four times `max_bytes`, and copies of the
+/// file's own metadata.
+///
+/// A JPEG has no checksum: bytes that were changed on the way can decode to a wrong picture. So can
+/// one whose camera wrote the end too early: the rest is then made up. A PNG whose pixels were
+/// changed is refused. After an error the content of `out` means nothing.
+///
+/// # Errors
+///
+/// [`ImageError::Bomb`] if the image is larger than `max_bytes`, before any memory is touched;
+/// [`ImageError::WorkingMemory`] if the decoder would need too much; [`ImageError::Output`] if `out`
+/// has another length; [`ImageError::OtherImage`] if `header` is not that of `data`;
+/// [`ImageError::CutOff`], [`ImageError::Damaged`], [`ImageError::Unsupported`],
+/// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken, or not of a kind that we read.
+pub fn decode_rgb8(data: &[u8], header: &Header, max_bytes: usize, out: &mut [u8]) -> Result<(), ImageError> {
+    let found = probe(data)?;
+    if found != *header {
+        return Err(ImageError::OtherImage { expected: *header, found });
+    }
+    let Header { format, width, height } = found;
+    let needed = match found.rgb8_len() {
+        Some(needed) if needed <= max_bytes => needed,
+        _ => {
+            let needed = 3 * u64::from(width) * u64::from(height);
+            return Err(ImageError::Bomb { width, height, needed, allowed: max_bytes });
+        }
+    };
+    if out.len() != needed {
+        return Err(ImageError::Output { operation: "decoding", needed, found: out.len() });
+    }
+    let allowed = max_bytes.saturating_mul(4).saturating_add(4 << 20);
+    // What a broken file leaves unwritten is black, not a piece of whatever was here before.
+    out.fill(0);
+    match format {
+        Format::Jpeg => jpeg::decode(data, &found, allowed, out),
+        Format::Png => png::decode(data, &found, allowed, out),
+    }
+}
+
+/// The format of `data` by its magic bytes.
+fn format_of(data: &[u8]) -> Result<Format, ImageError> {
+    if data.starts_with(&jpeg::MAGIC) {
+        Ok(Format::Jpeg)
+    } else if data.starts_with(&png::MAGIC) {
+        Ok(Format::Png)
+    } else {
+        let start = data.iter().take(8).copied().collect();
+        Err(ImageError::NotAnImage { len: data.len(), start })
+    }
+}

@@ -1,0 +1,220 @@
+//! PNG: rows come from the crate `png` one by one and become rgb8.
+
+use std::io::{Cursor, ErrorKind};
+
+use png::{ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformations};
+
+use super::{Format, Header};
+use crate::image::error::ImageError;
+use crate::image::view::check_size;
+
+/// The signature of PNG.
+pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
+
+/// The header of `data`, which starts with [`MAGIC`].
+pub(super) fn header(data: &[u8]) -> Result<Header, ImageError> {
+    let Some((chunk, _)) = data.get(MAGIC.len()..).and_then(|rest| rest.split_first_chunk::<16>()) else {
+        return Err(cut_off(data));
+    };
+    let [start @ .., w3, w2, w1, w0, h3, h2, h1, h0] = chunk;
+    if start != b"\0\0\0\x0dIHDR" {
+        return Err(damaged(MAGIC.len(), "no header where one must be"));
+    }
+    let width = u32::from_be_bytes([*w3, *w2, *w1, *w0]);
+    let height = u32::from_be_bytes([*h3, *h2, *h1, *h0]);
+    check_size(width, height)?;
+    Ok(Header { format: Format::Png, width, height })
+}
+
+/// Decodes `data` into `out`, as long as `header` says, with at most `allowed` bytes of memory for
+/// chunks. The decoder holds a few rows of at most 8 bytes per pixel, so it needs no more.
+pub(super) fn decode(data: &[u8], header: &Header, allowed: usize, out: &mut [u8]) -> Result<(), ImageError> {
+    let &Header { width, height, .. } = header;
+    let refused = |source| match source {
+        DecodingError::IoError(error) if error.kind() == ErrorKind::UnexpectedEof => cut_off(data),
+        source => ImageError::Png { width, height, source },
+    };
+    let mut decoder = Decoder::new_with_limits(Cursor::new(data), Limits { bytes: allowed });
+    // To 8 bits, and from a palette to its colours.
+    decoder.set_transformations(Transformations::normalize_to_color8());
+    decoder.set_ignore_text_chunk(true);
+    decoder.set_ignore_iccp_chunk(true);
+    let mut reader = decoder.read_info().map_err(refused)?;
+    let (color, _) = reader.output_color_type();
+    let stride = 3 * width as usize;
+    // Its reading of the header and ours must be the same.
+    let len = match reader.output_line_size(width) {
+        Some(len) if reader.info().size() == (width, height) => len,
+        _ => return Err(damaged(MAGIC.len(), "its header can be read in two ways")),
+    };
+    let mut line = vec![0; len];
+    let mut rgb = vec![0; stride];
+    let mut rows = 0;
+    while let Some(interlace) = reader.read_row(&mut line).map_err(refused)? {
+        match interlace {
+            InterlaceInfo::Null(_) => {
+                let Some(row) = out.chunks_exact_mut(stride).nth(rows) else {
+                    break;
+                };
+                to_rgb(color, &line, row);
+                rows += 1;
+            }
+            InterlaceInfo::Adam7(pass) => {
+                to_rgb(color, &line, &mut rgb);
+                png::expand_interlaced_row(out, stride, &rgb, &pass, 24);
+            }
+        }
+    }
+    // The checksums of the last chunks count too.
+    reader.finish().map_err(refused)
+}
+
+/// Writes the pixels of `line`, of 8 bits per value, to `rgb`.
+fn to_rgb(color: ColorType, line: &[u8], rgb: &mut [u8]) {
+    match color {
+        ColorType::Grayscale => spread::<1>(line, rgb, |pixel| [pixel[0]; 3]),
+        ColorType::GrayscaleAlpha => spread::<2>(line, rgb, |pixel| [pixel[0]; 3]),
+        ColorType::Rgb | ColorType::Indexed => spread::<3>(line, rgb, |pixel| *pixel),
+        ColorType::Rgba => spread::<4>(line, rgb, |pixel| [pixel[0], pixel[1], pixel[2]]),
+    }
+}
+
+/// Writes the colour of each pixel of `BYTES` bytes.
+fn spread<const BYTES: usize>(line: &[u8], rgb: &mut [u8], colour: impl Fn(&[u8; BYTES]) -> [u8; 3]) {
+    for (rgb, pixel) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(line.as_chunks::<BYTES>().0) {
+        *rgb = colour(pixel);
+    }
+}
+
+fn cut_off(data: &[u8]) -> ImageError {
+    ImageError::CutOff { format: Format::Png, len: data.len() }
+}
+
+fn damaged(at: usize, what: &'static str) -> ImageError {
+    ImageError::Damaged { format: Format::Png, at, what }
+}
+
+#[cfg(test)]
+mod tests {
+    use png::{BitDepth, Encoder};
+
+    use super::*;
+    use crate::image::decode::samples::{self, HEIGHT, WIDTH, colour};
+    use crate::image::decode::tests::{assert_close, decoded};
+    use crate::image::decode::{decode_rgb8, probe};
+
+    /// A PNG of `WIDTH` x `HEIGHT` pixels.
+    fn png(color: ColorType, depth: BitDepth, palette: Option<&'static [u8]>, data: &[u8]) -> Vec<u8> {
+        let mut file = Vec::new();
+        let mut encoder = Encoder::new(&mut file, WIDTH, HEIGHT);
+        encoder.set_color(color);
+        encoder.set_depth(depth);
+        if let Some(palette) = palette {
+            encoder.set_palette(palette);
+        }
+        let mut writer = encoder.write_header().unwrap();
+        writer.write_image_data(data).unwrap();
+        writer.finish().unwrap();
+        file
+    }
+
+    fn pixels<const N: usize>(of: impl Fn(usize, usize) -> [u8; N]) -> Vec<u8> {
+        let (width, height) = (WIDTH as usize, HEIGHT as usize);
+        (0..width * height).flat_map(|at| of(at % width, at / width)).collect()
+    }
+
+    #[test]
+    fn a_png_of_any_kind_becomes_rgb8() {
+        use BitDepth::{Eight, Four, One, Sixteen};
+        let full = |value: u8| [value, 0x55];
+        let red = |x, y| colour(x, y)[0];
+        let grey = |x, y| [red(x, y); 3];
+        type Expected<'a> = &'a dyn Fn(usize, usize) -> [u8; 3];
+        let cases: [(ColorType, BitDepth, Vec<u8>, Expected<'_>); 8] = [
+            (ColorType::Rgb, Eight, pixels(colour), &colour),
+            (
+                ColorType::Rgba,
+                Eight,
+                pixels(|x, y| {
+                    let [r, g, b] = colour(x, y);
+                    [r, g, b, x as u8]
+                }),
+                &colour,
+            ),
+            (
+                ColorType::Rgb,
+                Sixteen,
+                pixels(|x, y| {
+                    let [r, g, b] = colour(x, y);
+                    [r, 1, g, 2, b, 0xff]
+                }),
+                &colour,
+            ),
+            (ColorType::Grayscale, Eight, pixels(|x, y| [red(x, y)]), &grey),
+            (ColorType::Grayscale, Sixteen, pixels(|x, y| full(red(x, y))), &grey),
+            (ColorType::GrayscaleAlpha, Eight, pixels(|x, y| full(red(x, y))), &grey),
+            // 0101… and 0 to 15, 0 to 15: eight and two pixels per byte.
+            (ColorType::Grayscale, One, vec![0x55; 48], &|x, _| [(x % 2 * 255) as u8; 3]),
+            (ColorType::Grayscale, Four, (0..192).map(|at| (at % 12) as u8).collect(), &|x, _| {
+                [(x % 2 * (x / 2) * 17) as u8; 3]
+            }),
+        ];
+        for (color, depth, data, expected) in cases {
+            let file = png(color, depth, None, &data);
+            let header = Header { format: Format::Png, width: WIDTH, height: HEIGHT };
+            assert_eq!(probe(&file).unwrap(), header);
+            assert_close(&decoded(&file).unwrap(), 0, expected);
+        }
+    }
+
+    #[test]
+    fn a_png_with_a_palette_becomes_its_colours() {
+        static PALETTE: [u8; 9] = [1, 2, 3, 40, 50, 60, 255, 254, 253];
+        let data = pixels(|x, y| [((x + y) % 3) as u8]);
+        let file = png(ColorType::Indexed, BitDepth::Eight, Some(&PALETTE), &data);
+        assert_close(&decoded(&file).unwrap(), 0, |x, y| {
+            let at = (x + y) % 3 * 3;
+            [PALETTE[at], PALETTE[at + 1], PALETTE[at + 2]]
+        });
+    }
+
+    #[test]
+    fn an_interlaced_png_is_put_together() {
+        assert_close(&decoded(&samples::INTERLACED).unwrap(), 0, colour);
+    }
+
+    #[test]
+    fn a_png_cut_off_anywhere_is_refused() {
+        for file in [&png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour)), &samples::INTERLACED[..]] {
+            for len in 0..file.len() {
+                let error = decoded(&file[..len]).unwrap_err();
+                let expected = if len < 8 { "NotAnImage" } else { "CutOff" };
+                assert!(format!("{error:?}").starts_with(expected), "{len}: {error:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_png_with_any_pixel_byte_changed_is_refused() {
+        let file = png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour));
+        let start = file.windows(4).position(|name| name == b"IDAT").unwrap();
+        for at in start + 4..file.len() {
+            let mut changed = file.clone();
+            changed[at] ^= 0x10;
+            assert!(decoded(&changed).is_err(), "byte {at}");
+        }
+    }
+
+    #[test]
+    fn a_png_bomb_is_refused_before_memory_is_touched() {
+        let mut bomb = png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour));
+        bomb[16..24].copy_from_slice(&[0, 0, 0xff, 0xff, 0, 0, 0xff, 0xff]);
+        let header = probe(&bomb).unwrap();
+        let error = decode_rgb8(&bomb, &header, 1 << 20, &mut []).unwrap_err();
+        assert!(matches!(error, ImageError::Bomb { needed: 12_884_508_675, .. }), "{error}");
+        bomb[16] = 0x80;
+        assert!(matches!(probe(&bomb), Err(ImageError::Size { .. })));
+        bomb[12] = b'X';
+        assert!(matches!(probe(&bomb), Err(ImageError::Damaged { .. })));
+    }
+}

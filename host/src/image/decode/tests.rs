@@ -1,0 +1,227 @@
+//! What becomes of whole, broken and hostile files.
+
+use super::samples::{self, HEIGHT, WIDTH, colour};
+use super::*;
+
+/// The pixels of `data`, by the two steps that the host takes.
+pub(super) fn decoded(data: &[u8]) -> Result<Vec<u8>, ImageError> {
+    let header = probe(data)?;
+    let len = header.rgb8_len().unwrap();
+    // Full of something, so that pixels which are not written are seen.
+    let mut out = vec![0xaa; len];
+    decode_rgb8(data, &header, len, &mut out)?;
+    Ok(out)
+}
+
+/// Every pixel of `rgb` is within `tolerance` of what `expected` says for it.
+pub(super) fn assert_close(rgb: &[u8], tolerance: u8, expected: impl Fn(usize, usize) -> [u8; 3]) {
+    for (at, pixel) in rgb.chunks(3).enumerate() {
+        let (x, y) = (at % WIDTH as usize, at / WIDTH as usize);
+        for (ours, theirs) in pixel.iter().zip(expected(x, y)) {
+            assert!(ours.abs_diff(theirs) <= tolerance, "({x}, {y}): {ours}, not {theirs}");
+        }
+    }
+}
+
+#[test]
+fn a_jpeg_gives_back_the_colours_that_went_in() {
+    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
+        let header = Header { format: Format::Jpeg, width: WIDTH, height: HEIGHT };
+        assert_eq!(probe(file).unwrap(), header);
+        // Pillow reads them back with errors of up to 6, and differs from us by up to 2.
+        assert_close(&decoded(file).unwrap(), 8, colour);
+    }
+}
+
+#[test]
+fn a_grey_jpeg_becomes_equal_red_green_and_blue() {
+    assert_close(&decoded(&samples::GREY).unwrap(), 2, |x, y| [colour(x, y)[0]; 3]);
+}
+
+#[test]
+fn a_jpeg_for_print_is_refused() {
+    assert_eq!(
+        probe(&samples::CMYK).unwrap_err().to_string(),
+        "JPEG is neither grey nor of three components (CMYK?), which is not supported"
+    );
+}
+
+#[test]
+fn a_jpeg_cut_off_anywhere_is_refused() {
+    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY] {
+        for len in 0..file.len() {
+            let error = decoded(&file[..len]).unwrap_err();
+            let expected = if len < 3 { "NotAnImage" } else { "CutOff" };
+            assert!(format!("{error:?}").starts_with(expected), "{len}: {error:?}");
+        }
+    }
+    assert_eq!(
+        decoded(&samples::BASELINE[..300]).unwrap_err().to_string(),
+        "JPEG is cut off: its 300 bytes end before the image does"
+    );
+}
+
+#[test]
+fn bytes_behind_the_end_of_a_jpeg_do_not_matter() {
+    let mut padded = samples::BASELINE.to_vec();
+    padded.extend([0; 100]);
+    assert_eq!(decoded(&padded).unwrap(), decoded(&samples::BASELINE).unwrap());
+}
+
+/// Where the first marker `marker` of a JPEG is.
+fn first(file: &[u8], marker: u8) -> usize {
+    file.windows(2).position(|pair| pair == [0xff, marker]).unwrap()
+}
+
+/// `file` with `replacement` for the bytes behind the first marker `marker`.
+fn patched(file: &[u8], marker: u8, replacement: &[u8]) -> Vec<u8> {
+    let at = first(file, marker) + 2;
+    let mut file = file.to_vec();
+    file[at..at + replacement.len()].copy_from_slice(replacement);
+    file
+}
+
+#[test]
+fn a_bomb_is_refused_before_memory_is_touched() {
+    let bomb = patched(&samples::BASELINE, 0xc0, &[0, 17, 8, 0xff, 0xdc, 0xff, 0xdc]);
+    let header = probe(&bomb).unwrap();
+    assert_eq!(
+        decode_rgb8(&bomb, &header, 8 << 20, &mut []).unwrap_err().to_string(),
+        "image says it is 65500x65500 (12274.6 MiB as rgb8); this input's decoded_size is 8 MiB"
+    );
+}
+
+#[test]
+fn a_bomb_for_the_decoder_itself_is_refused() {
+    // Small as rgb8, but 32 rows of blocks high where the factors are 4.
+    let thin = patched(&samples::PROGRESSIVE, 0xc2, &[0, 17, 8, 0, 1, 0xff, 0xff, 3, 1, 0x44]);
+    let header = probe(&thin).unwrap();
+    let mut out = vec![0; header.rgb8_len().unwrap()];
+    let message = decode_rgb8(&thin, &header, out.len(), &mut out).unwrap_err().to_string();
+    assert!(message.starts_with("JPEG of 65535x1 needs "), "{message}");
+    assert!(message.ends_with("to decode, besides its pixels; 4.7 MiB is allowed"), "{message}");
+}
+
+#[test]
+fn a_limit_that_is_just_enough_is_enough() {
+    let header = probe(&samples::BASELINE).unwrap();
+    let len = header.rgb8_len().unwrap();
+    let mut out = vec![0; len];
+    let mut decode = |max_bytes| decode_rgb8(&samples::BASELINE, &header, max_bytes, &mut out);
+    assert!(decode(len).is_ok());
+    assert_eq!(
+        decode(len - 1).unwrap_err().to_string(),
+        "image says it is 24x16 (1152 bytes as rgb8); this input's decoded_size is 1151 bytes"
+    );
+}
+
+#[test]
+fn the_header_must_be_that_of_the_data_and_the_place_that_of_the_header() {
+    let header = probe(&samples::GREY).unwrap();
+    let other = Header { width: 23, ..header };
+    assert_eq!(
+        decode_rgb8(&samples::GREY, &other, 9_999, &mut [0; 1104]).unwrap_err().to_string(),
+        "JPEG of 24x16 where a JPEG of 23x16 was announced"
+    );
+    assert_eq!(
+        decode_rgb8(&samples::GREY, &header, 9_999, &mut [0; 1151]).unwrap_err().to_string(),
+        "decoding makes 1152 bytes; the place for them has 1151"
+    );
+}
+
+#[test]
+fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
+    for (marker, kind) in [(0xc3, "lossless"), (0xc5, "hierarchical"), (0xc9, "arithmetic-coded")] {
+        let mut file = samples::BASELINE.to_vec();
+        let at = first(&file, 0xc0);
+        file[at + 1] = marker;
+        assert_eq!(probe(&file).unwrap_err().to_string(), format!("JPEG is {kind}, which is not supported"));
+    }
+    let twelve = patched(&samples::BASELINE, 0xc0, &[0, 17, 12]);
+    assert!(matches!(probe(&twelve), Err(ImageError::Unsupported { .. })));
+    let no_height = patched(&samples::BASELINE, 0xc0, &[0, 17, 8, 0, 0]);
+    assert!(matches!(probe(&no_height), Err(ImageError::Size { width: 24, height: 0 })));
+}
+
+#[test]
+fn a_jpeg_with_scans_without_end_is_refused() {
+    // The scans of an image, again and again: cheap to send, dear to decode.
+    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
+        let (start, scans) = file[..file.len() - 2].split_at(first(file, 0xda));
+        let mut endless = start.to_vec();
+        for _ in 0..70 {
+            endless.extend(scans);
+        }
+        endless.extend([0xff, 0xd9]);
+        let error = decoded(&endless).unwrap_err().to_string();
+        assert!(error.starts_with("JPEG is damaged at byte "), "{error}");
+        assert!(error.ends_with("more scans than such an image can need"), "{error}");
+    }
+}
+
+#[test]
+fn a_jpeg_without_pixels_is_refused() {
+    let mut file = samples::BASELINE.to_vec();
+    file.truncate(first(&file, 0xda));
+    file.extend([0xff, 0xd9]);
+    let error = decoded(&file).unwrap_err().to_string();
+    assert!(error.ends_with("an end before any pixels"), "{error}");
+}
+
+#[test]
+fn kinds_of_jpeg_that_the_decoder_gets_wrong_are_refused() {
+    let one_of_three = patched(&samples::BASELINE, 0xda, &[0, 8, 1, 1, 0, 0, 63, 0]);
+    assert_eq!(
+        decoded(&one_of_three).unwrap_err().to_string(),
+        "JPEG is sequential with components in scans of their own, which is not supported"
+    );
+    for factors in [[0x11, 0x21, 0x21], [0x21, 0x12, 0x12], [0x22, 0x11, 0x21], [0x33, 0x11, 0x11]] {
+        let mut file = samples::BASELINE.to_vec();
+        let parts = first(&file, 0xc0) + 10;
+        for (part, factors) in file[parts..].chunks_mut(3).zip(factors) {
+            part[1] = factors;
+        }
+        let error = probe(&file).unwrap_err().to_string();
+        assert!(error.contains("subsampled in a way that cameras do not use"), "{error}");
+    }
+}
+
+#[test]
+fn other_bytes_are_refused_by_their_start() {
+    for (data, len, start) in
+        [(&b""[..], 0, "[]"), (b"\xff\xd8", 2, "[ff, d8]"), (b"jpeg; rgb8", 10, "[6a, 70, 65, 67, 3b, 20, 72, 67]")]
+    {
+        assert_eq!(
+            probe(data).unwrap_err().to_string(),
+            format!("data is neither JPEG nor PNG: its {len} bytes start with {start}")
+        );
+    }
+}
+
+#[test]
+fn no_mutation_of_a_file_leads_to_a_panic() {
+    let files = [
+        samples::BASELINE.to_vec(),
+        samples::PROGRESSIVE.to_vec(),
+        samples::GREY.to_vec(),
+        samples::INTERLACED.to_vec(),
+    ];
+    let mut state = 1_u32;
+    let mut random = |below: usize| {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as usize % below
+    };
+    for _ in 0..2_000 {
+        let mut file = files[random(files.len())].clone();
+        for _ in 0..=random(4) {
+            let at = random(file.len());
+            file[at] = random(256) as u8;
+        }
+        if let Ok(header) = probe(&file) {
+            let mut out = vec![0; header.rgb8_len().unwrap().min(1 << 20)];
+            let _ = decode_rgb8(&file, &header, 1 << 20, &mut out);
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! What the host computes on frames for lambdas.
+//!
+//! Inside: grey levels (`luma`), size (`resize`), and how a pixel of each encoding is read
+//! (`pixels`). All of it is exact integer arithmetic on a checked [`View`], so that every CPU and
+//! every call gives the same result, however the compiler arranges the loops.
+//!
+//! Never: memory that grows with anything but the width of the image; a result for raw (Bayer)
+//! images, whose pixels have no colour until someone has chosen how to debayer them.
+
+mod luma;
+mod pixels;
+mod resize;
+
+pub use luma::{histogram, mean_luma, to_gray};
+pub use resize::{MAX_RESIZED_SIDE, resize, resize_work, resized};
+
+use super::{ImageError, Roi, View};
+
+/// Bytes that [`mean_luma`], [`histogram`] or [`to_gray`] reads, the measure of its cost.
+///
+/// # Errors
+///
+/// [`ImageError::Roi`] if no pixel of the image is in `roi`.
+pub fn work(view: &View<'_>, roi: Option<Roi>) -> Result<u64, ImageError> {
+    let roi = view.clip(roi)?;
+    Ok(u64::from(roi.width) * u64::from(roi.height) * view.encoding().bytes_per_pixel() as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::Encoding;
+
+    #[test]
+    fn work_is_the_bytes_of_the_pixels_without_padding() {
+        let view = View::new(4, 3, 100, Encoding::Rgb8, false, &[0; 300]).unwrap();
+        let roi = |x, y, width, height| Some(Roi { x, y, width, height });
+        assert_eq!(work(&view, None).unwrap(), 36);
+        assert_eq!(work(&view, roi(2, 1, 9, 1)).unwrap(), 6);
+        assert!(work(&view, roi(4, 0, 1, 1)).is_err());
+    }
+}

@@ -1,0 +1,308 @@
+//! An image in another size.
+//!
+//! Each axis is resampled by weights that are whole numbers, so that a result is an exact fraction,
+//! rounded once:
+//!
+//! - smaller or equal: the mean of the area that a new pixel covers. Cut the axis of `from` pixels
+//!   into `from * to` pieces: an old pixel is `to` of them, a new one is `from`, and the weight of an
+//!   old pixel is the number of pieces that they share.
+//! - larger: linear between the two old pixels around the middle of the new one, with the middle
+//!   measured in 1 / (2 `to`) of an old pixel. Beyond the outermost middles the edge is repeated.
+
+use super::pixels::Pixels;
+use crate::image::{Encoding, ImageError, View};
+
+/// Largest width and height of a resized image, in pixels.
+pub const MAX_RESIZED_SIDE: u32 = 16_384;
+
+/// What [`resize`] of `view` to `width` x `height` makes: rgb8 of a colour image and mono8 of a grey
+/// one, and how many bytes.
+///
+/// # Errors
+///
+/// [`ImageError::ResizeTo`] if a side is 0 or above [`MAX_RESIZED_SIDE`], [`ImageError::Raw`] for a
+/// Bayer image.
+pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, usize), ImageError> {
+    Pixels::of(view, "resize")?;
+    let fits = |side| (1..=MAX_RESIZED_SIDE).contains(&side);
+    if !fits(width) || !fits(height) {
+        return Err(ImageError::ResizeTo { width, height });
+    }
+    let encoding = if view.encoding().is_grey() { Encoding::Mono8 } else { Encoding::Rgb8 };
+    // At most 3 * 2^28.
+    Ok((encoding, width as usize * height as usize * encoding.bytes_per_pixel()))
+}
+
+/// Bytes that [`resize`] reads and writes, the measure of its cost. An enlarged image reads rows of
+/// the old one twice for every new row.
+///
+/// # Errors
+///
+/// As for [`resized`].
+pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, ImageError> {
+    let (_, out) = resized(view, width, height)?;
+    let rows = u64::from(view.height()) + 2 * u64::from(height);
+    Ok(rows * view.row(0).len() as u64 + out as u64)
+}
+
+/// Writes the image in `width` x `height` pixels to `out`, without padding, in the encoding that
+/// [`resized`] names and this returns.
+///
+/// Each axis on its own: the mean of the covered area where the image shrinks, linear interpolation
+/// where it grows, both exact and rounded to nearest (a half goes up). mono16 counts by its high
+/// byte, yuv422 is taken to be BT.601 of full range, alpha is ignored. It allocates 5 bytes per
+/// number in one row of the old image.
+///
+/// # Errors
+///
+/// As for [`resized`], and [`ImageError::Output`] if `out` has another length.
+pub fn resize(view: &View<'_>, width: u32, height: u32, out: &mut [u8]) -> Result<Encoding, ImageError> {
+    let pixels = Pixels::of(view, "resize")?;
+    let (encoding, needed) = resized(view, width, height)?;
+    if out.len() != needed {
+        return Err(ImageError::Output { operation: "resize", needed, found: out.len() });
+    }
+    let across = Axis { from: view.width(), to: width };
+    let down = Axis { from: view.height(), to: height };
+    let channels = encoding.bytes_per_pixel();
+    let mut row = vec![0_u8; view.width() as usize * channels];
+    let mut columns = vec![0_u32; row.len()];
+    for (y, line) in (0..height).zip(out.chunks_exact_mut(width as usize * channels)) {
+        columns.fill(0);
+        let taps = down.taps(y);
+        for source in taps.first..=taps.last {
+            if channels == 1 {
+                pixels.grey(view.row(source), &mut row);
+            } else {
+                pixels.rgb(view.row(source), &mut row);
+            }
+            let weight = taps.weight(source);
+            for (sum, value) in columns.iter_mut().zip(&row) {
+                // Weights add up to less than 2^16, so the sum stays below 2^24 and cannot wrap; a
+                // checked addition would not vectorise.
+                *sum = sum.wrapping_add(weight.wrapping_mul(u32::from(*value)));
+            }
+        }
+        let total = u64::from(down.total());
+        if channels == 1 {
+            blend::<1>(&columns, across, total, line);
+        } else {
+            blend::<3>(&columns, across, total, line);
+        }
+    }
+    Ok(encoding)
+}
+
+/// Writes a row of `CHANNELS` numbers per pixel from `columns`, sums over weights of `total`.
+fn blend<const CHANNELS: usize>(columns: &[u32], across: Axis, total: u64, line: &mut [u8]) {
+    let (columns, _) = columns.as_chunks::<CHANNELS>();
+    let (line, _) = line.as_chunks_mut::<CHANNELS>();
+    let total = total * u64::from(across.total());
+    for (x, pixel) in (0_u32..).zip(line) {
+        let taps = across.taps(x);
+        // Below 2^24 * 2^16.
+        let mut sums = [0_u64; CHANNELS];
+        let sources = &columns[taps.first as usize..=taps.last as usize];
+        for (source, values) in (taps.first..).zip(sources) {
+            let weight = u64::from(taps.weight(source));
+            for (sum, value) in sums.iter_mut().zip(values) {
+                *sum += weight * u64::from(*value);
+            }
+        }
+        *pixel = sums.map(|sum| ((sum + total / 2) / total) as u8);
+    }
+}
+
+/// One axis of an image and its new length.
+#[derive(Debug, Clone, Copy)]
+struct Axis {
+    from: u32,
+    to: u32,
+}
+
+/// Old pixels `first..=last` and their weights in a new pixel.
+#[derive(Debug, Clone, Copy)]
+struct Taps {
+    first: u32,
+    last: u32,
+    head: u32,
+    middle: u32,
+    tail: u32,
+}
+
+impl Taps {
+    fn weight(self, source: u32) -> u32 {
+        if source == self.first {
+            self.head
+        } else if source == self.last {
+            self.tail
+        } else {
+            self.middle
+        }
+    }
+}
+
+impl Axis {
+    /// The sum of the weights of any new pixel: at most 65,535.
+    fn total(self) -> u32 {
+        if self.to <= self.from { self.from } else { 2 * self.to }
+    }
+
+    /// What new pixel `at` is made of. All products stay below 65,535 * 16,384 or 2 * 16,384^2, so
+    /// they fit a `u32`.
+    fn taps(self, at: u32) -> Taps {
+        let Self { from, to } = self;
+        if to <= from {
+            let (start, end) = (at * from, (at + 1) * from);
+            let (first, last) = (start / to, (end - 1) / to);
+            let head = end.min((first + 1) * to) - start;
+            return Taps { first, last, head, middle: to, tail: end - last * to };
+        }
+        // The middle of the new pixel, from the middle of the first old one.
+        let middle = ((2 * at + 1) * from).saturating_sub(to);
+        let (first, past) = (middle / (2 * to), middle % (2 * to));
+        let last = (first + 1).min(from - 1);
+        let head = if last == first { 2 * to } else { 2 * to - past };
+        Taps { first, last, head, middle: 0, tail: past }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn noise(len: usize) -> Vec<u8> {
+        let mut state = 7_u32;
+        std::iter::repeat_with(|| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 24) as u8
+        })
+        .take(len)
+        .collect()
+    }
+
+    fn mono(width: u32, height: u32, data: &[u8]) -> View<'_> {
+        View::new(width, height, width, Encoding::Mono8, false, data).unwrap()
+    }
+
+    fn resized_to(view: &View<'_>, width: u32, height: u32) -> Vec<u8> {
+        let mut out = vec![0; resized(view, width, height).unwrap().1];
+        resize(view, width, height, &mut out).unwrap();
+        out
+    }
+
+    /// Weight of old pixel `i` in new pixel `o`, in floating point and without sharing a line with
+    /// the code above: the overlap of two intervals, or the distance to the middle.
+    fn reference_weight(from: u32, to: u32, i: u32, o: u32) -> f64 {
+        let scale = f64::from(from) / f64::from(to);
+        let i = f64::from(i);
+        if to <= from {
+            let (start, end) = (f64::from(o) * scale, f64::from(o + 1) * scale);
+            return (end.min(i + 1.0) - start.max(i)).max(0.0) / scale;
+        }
+        let middle = (f64::from(o) + 0.5) * scale - 0.5;
+        let middle = middle.clamp(0.0, f64::from(from - 1));
+        (1.0 - (middle - i).abs()).max(0.0)
+    }
+
+    #[test]
+    fn every_size_agrees_with_floating_point() {
+        let data = noise(7 * 5);
+        let view = mono(7, 5, &data);
+        for (width, height) in [(3, 2), (7, 5), (1, 1), (6, 4), (14, 10), (20, 3), (2, 17), (8, 6)] {
+            let ours = resized_to(&view, width, height);
+            for y in 0..height {
+                for x in 0..width {
+                    let mut value = 0.0;
+                    for (sy, row) in (0..5).zip(data.chunks(7)) {
+                        for (sx, level) in (0..7).zip(row) {
+                            value += reference_weight(7, width, sx, x)
+                                * reference_weight(5, height, sy, y)
+                                * f64::from(*level);
+                        }
+                    }
+                    let got = f64::from(ours[(y * width + x) as usize]);
+                    assert!((got - value).abs() <= 0.5 + 1e-9, "{width}x{height}: {got}, {value}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn half_the_size_is_the_mean_of_four_rounded_to_nearest() {
+        let view_data = [0, 1, 10, 20, 0, 1, 30, 41];
+        assert_eq!(resized_to(&mono(4, 2, &view_data), 2, 1), [1, 25]); // 0.5 and 25.25
+    }
+
+    #[test]
+    fn twice_the_size_is_linear_between_the_middles() {
+        assert_eq!(resized_to(&mono(2, 1, &[0, 100]), 4, 1), [0, 25, 75, 100]);
+        assert_eq!(resized_to(&mono(1, 2, &[0, 100]), 1, 4), [0, 25, 75, 100]);
+        assert_eq!(resized_to(&mono(1, 1, &[7]), 3, 2), [7; 6]);
+    }
+
+    #[test]
+    fn the_same_size_is_the_same_image_without_its_padding() {
+        let data = noise(3 * 20);
+        let view = View::new(5, 3, 20, Encoding::Rgb8, false, &data).unwrap();
+        let expected: Vec<u8> = data.chunks(20).flat_map(|row| &row[..15]).copied().collect();
+        assert_eq!(resized_to(&view, 5, 3), expected);
+    }
+
+    #[test]
+    fn every_encoding_comes_out_as_rgb8_or_mono8() {
+        for (name, data, encoding, expected) in [
+            ("rgb8", &[1, 2, 3, 1, 2, 3][..], Encoding::Rgb8, &[1, 2, 3][..]),
+            ("bgr8", &[1, 2, 3, 1, 2, 3], Encoding::Rgb8, &[3, 2, 1]),
+            ("rgba8", &[1, 2, 3, 9, 1, 2, 3, 9], Encoding::Rgb8, &[1, 2, 3]),
+            ("bgra8", &[1, 2, 3, 9, 1, 2, 3, 9], Encoding::Rgb8, &[3, 2, 1]),
+            ("mono8", &[4, 6], Encoding::Mono8, &[5]),
+            ("mono16", &[200, 4, 200, 6], Encoding::Mono8, &[5]),
+            ("uyvy", &[128, 10, 128, 20], Encoding::Rgb8, &[15, 15, 15]),
+            ("yuyv", &[0, 128, 0, 255], Encoding::Rgb8, &[178, 0, 0]), // 1.402 * 127, -90, 0
+        ] {
+            let from = Encoding::from_ros(name).unwrap();
+            let step = data.len() as u32;
+            let view = View::new(2, 1, step, from, false, data).unwrap();
+            assert_eq!(resized(&view, 1, 1).unwrap(), (encoding, expected.len()), "{name}");
+            assert_eq!(resized_to(&view, 1, 1), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn the_longest_axes_do_not_overflow() {
+        let data = vec![255; 65_535];
+        let (wide, high) = (mono(65_535, 1, &data), mono(1, 65_535, &data));
+        for to in [1, 2, 16_383, 16_384] {
+            assert!(resized_to(&wide, to, 1).iter().all(|level| *level == 255));
+            assert!(resized_to(&high, 1, to).iter().all(|level| *level == 255));
+        }
+        let small = mono(16_383, 1, &data[..16_383]);
+        assert!(resized_to(&small, 16_384, 1).iter().all(|level| *level == 255));
+    }
+
+    #[test]
+    fn absurd_sizes_raw_images_and_wrong_places_are_refused() {
+        let view = mono(2, 2, &[0; 4]);
+        for (width, height) in [(0, 1), (1, 0), (16_385, 1), (1, u32::MAX)] {
+            assert_eq!(
+                resize(&view, width, height, &mut []).unwrap_err().to_string(),
+                format!("resize to {width}x{height}: each side must be 1 to 16384")
+            );
+            assert!(resize_work(&view, width, height).is_err());
+        }
+        assert_eq!(
+            resize(&view, 3, 1, &mut [0; 9]).unwrap_err().to_string(),
+            "resize makes 3 bytes; the place for them has 9"
+        );
+        let bayer = Encoding::from_ros("bayer_bggr8").unwrap();
+        let raw = View::new(2, 2, 2, bayer, false, &[0; 4]).unwrap();
+        assert!(matches!(resize(&raw, 1, 1, &mut [0; 3]), Err(ImageError::Raw { .. })));
+    }
+
+    #[test]
+    fn work_counts_old_rows_and_new_bytes() {
+        let view = View::new(4, 6, 12, Encoding::Rgb8, false, &[0; 72]).unwrap();
+        assert_eq!(resize_work(&view, 2, 3).unwrap(), (6 + 2 * 3) * 12 + 18);
+    }
+}

@@ -1,0 +1,14 @@
+//! Hosts one lambda. The rooms follow the path of a sample: `input` holds it, `schedule` notices it, `judge` lets the
+//! guest decide over `api`, `replay` drives the whole from a recorded drive and writes down what was decided.
+//!
+//! The same library runs in `gleaner-runtime` (WebAssembly) and, loaded as `_gleaner`, in a Python interpreter. Nothing
+//! outside `guest` knows which kind of lambda it runs.
+
+pub mod api;
+pub mod guest;
+pub mod image;
+pub mod input;
+pub mod judge;
+pub mod program;
+pub mod replay;
+pub mod schedule;

@@ -1,0 +1,7 @@
+//! `gleaner-runtime`: the process that hosts one lambda. `gleaner` starts it; see `gleaner-runtime --help`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    gleaner_host::program::main()
+}

@@ -1,0 +1,147 @@
+//! The program `gleaner-runtime`: reads its arguments, chooses the guest by the manifest's kind, ends with an exit code.
+
+use std::ffi::OsString;
+use std::io;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+use gleaner_protocol::manifest::{Kind, Manifest};
+use gleaner_protocol::{Exit, Failure};
+
+use crate::api::Session;
+use crate::guest::Guest;
+use crate::input::Remap;
+use crate::replay::{self, Options};
+
+/// Hosts one lambda. Writes reports, a JSON object a line, to standard output.
+#[derive(Parser)]
+#[command(name = "gleaner-runtime", version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Runs a built lambda over recorded drives.
+    Replay(ReplayArgs),
+}
+
+/// Arguments of `replay`.
+#[derive(Args, Clone, Debug)]
+pub struct ReplayArgs {
+    /// The lambda's folder, built by `gleaner build`.
+    pub lambda: PathBuf,
+    /// MCAP files; several are merged by time.
+    #[arg(required = true)]
+    pub drives: Vec<PathBuf>,
+    /// A value of [config].
+    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
+    pub set: Vec<(String, String)>,
+    /// Another name for a topic of the manifest.
+    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
+    pub remap: Vec<Remap>,
+    /// Where the results go; `DIR/out` if not given.
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Write every decision, not only those with a trigger or a fault.
+    #[arg(long)]
+    pub all: bool,
+    /// Replay so many times in this process, each time from the start.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub repeat: u32,
+}
+
+fn assignment(text: &str) -> Result<(String, String), String> {
+    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, as in brake_mps2=-1.4")?;
+    Ok((key.trim().to_owned(), value.trim().to_owned()))
+}
+
+fn remap(text: &str) -> Result<Remap, String> {
+    let (from, to) = text.split_once(":=").ok_or("write FROM:=TO, as in /imu/data:=/car/imu")?;
+    Ok(Remap { from: from.trim().to_owned(), to: to.trim().to_owned() })
+}
+
+/// Makes the guest of a lambda whose kind the caller can host.
+pub type Load<'a> = &'a mut dyn FnMut(&Options, &Manifest, Session) -> Result<Box<dyn Guest>, Failure>;
+
+/// `main` of `gleaner-runtime`.
+pub fn main() -> ExitCode {
+    log_to_stderr();
+    let Cli { command: Command::Replay(args) } = Cli::parse();
+    end(replay_any(args))
+}
+
+/// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: replays with the guest
+/// that `load` makes. Returns the exit code.
+pub fn replay_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
+    log_to_stderr();
+    let Cli { command: Command::Replay(args) } = match Cli::try_parse_from(args) {
+        Ok(cli) => cli,
+        Err(error) => {
+            let _ = error.print();
+            return Exit::Usage.code();
+        }
+    };
+    code(Options::new(args).and_then(|(options, manifest)| run(&options, &manifest, load)))
+}
+
+fn replay_any(args: ReplayArgs) -> Result<Exit, Failure> {
+    let (options, manifest) = Options::new(args)?;
+    match manifest.lambda.kind {
+        #[cfg(feature = "wasm")]
+        Kind::Wasm => run(&options, &manifest, &mut load_wasm),
+        #[cfg(feature = "python")]
+        Kind::Python => {
+            let args = std::env::args_os().collect::<Vec<_>>();
+            let error = crate::guest::python::become_interpreter(&options.lambda, &args);
+            Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
+        }
+        #[allow(unreachable_patterns)]
+        kind => Err(Failure::new(
+            Exit::Usage,
+            format!("this gleaner-runtime was built without lambdas of kind {}", kind.as_str()),
+        )),
+    }
+}
+
+/// Replays with reports on what was standard output; whatever a lambda prints goes to standard error.
+fn run(options: &Options, manifest: &Manifest, load: Load<'_>) -> Result<Exit, Failure> {
+    let internal = |error: io::Error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error);
+    let reports = io::stdout();
+    let reports = rustix::io::dup(&reports).map_err(io::Error::from).map_err(internal)?;
+    rustix::stdio::dup2_stdout(io::stderr()).map_err(io::Error::from).map_err(internal)?;
+    replay::run(options, manifest, load, &mut std::fs::File::from(reports))
+}
+
+#[cfg(feature = "wasm")]
+fn load_wasm(options: &Options, manifest: &Manifest, session: Session) -> Result<Box<dyn Guest>, Failure> {
+    use crate::guest::wasm::{Allowance, Loaded, WasmError, WasmGuest};
+    let cannot = |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
+    let cache = gleaner_protocol::parts::cache_dir().map_err(|error| cannot(&error.into()))?;
+    let loaded = Loaded::open(&options.build.entry_path(manifest), &cache).map_err(|error| cannot(&error))?;
+    let allowance = Allowance { fuel: manifest.limits.fuel, memory_bytes: manifest.limits.memory.bytes() };
+    // In replay only fuel and memory bound a lambda: a deadline would make decisions depend on the machine.
+    Ok(Box::new(WasmGuest::new(loaded, session, allowance, None)))
+}
+
+fn log_to_stderr() {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("GLEANER_LOG").unwrap_or_else(|_| "warn".into());
+    // Fails only where a subscriber is set already, which then stays.
+    let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).try_init();
+}
+
+fn end(result: Result<Exit, Failure>) -> ExitCode {
+    code(result).into()
+}
+
+fn code(result: Result<Exit, Failure>) -> u8 {
+    match result {
+        Ok(exit) => exit.code(),
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit.code()
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! The files of a replay: `decisions.jsonl`, `log.jsonl`, `summary.json`.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::{Decision, Exit, Explain, Summary};
+use serde::Serialize;
+
+use crate::api::log::Line;
+
+/// Why results could not be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write `{}`", path.display())]
+pub struct OutputError {
+    path: PathBuf,
+    source: io::Error,
+}
+
+impl Explain for OutputError {
+    fn help(&self) -> Option<String> {
+        Some("make room or choose another folder: --out DIR".to_owned())
+    }
+
+    fn exit(&self) -> Exit {
+        Exit::Internal
+    }
+}
+
+/// Open result files.
+pub struct Output {
+    folder: PathBuf,
+    decisions: Lines,
+    log: Lines,
+    all: bool,
+}
+
+impl Output {
+    /// Makes `folder` and starts its files anew. With `all`, decisions without trigger and fault are written too.
+    pub fn create(folder: &Path, all: bool) -> Result<Self, OutputError> {
+        fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
+        let decisions = Lines::create(folder.join("decisions.jsonl"))?;
+        let log = Lines::create(folder.join("log.jsonl"))?;
+        Ok(Self { folder: folder.to_owned(), decisions, log, all })
+    }
+
+    /// Writes a decision, if it is one to keep.
+    pub fn decision(&mut self, decision: &Decision) -> Result<(), OutputError> {
+        if self.all || !decision.triggers.is_empty() || decision.fault.is_some() {
+            self.decisions.write(decision)?;
+        }
+        Ok(())
+    }
+
+    /// Writes what the lambda said.
+    pub fn log(&mut self, lines: &[Line]) -> Result<(), OutputError> {
+        lines.iter().try_for_each(|line| self.log.write(line))
+    }
+
+    /// Completes the files and adds the summary.
+    pub fn finish(mut self, summary: &Summary) -> Result<(), OutputError> {
+        self.decisions.flush()?;
+        self.log.flush()?;
+        let path = self.folder.join("summary.json");
+        let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
+        text.push(b'\n');
+        fs::write(&path, text).map_err(|source| OutputError { path, source })
+    }
+}
+
+struct Lines {
+    path: PathBuf,
+    file: BufWriter<File>,
+}
+
+impl Lines {
+    fn create(path: PathBuf) -> Result<Self, OutputError> {
+        match File::create(&path) {
+            Ok(file) => Ok(Self { path, file: BufWriter::new(file) }),
+            Err(source) => Err(OutputError { path, source }),
+        }
+    }
+
+    fn write(&mut self, line: &impl Serialize) -> Result<(), OutputError> {
+        serde_json::to_writer(&mut self.file, line)
+            .map_err(io::Error::from)
+            .and_then(|()| self.file.write_all(b"\n"))
+            .map_err(|source| OutputError { path: self.path.clone(), source })
+    }
+
+    fn flush(&mut self) -> Result<(), OutputError> {
+        self.file.flush().map_err(|source| OutputError { path: self.path.clone(), source })
+    }
+}

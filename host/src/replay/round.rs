@@ -1,0 +1,223 @@
+//! One pass of a lambda over its drives.
+
+use std::io::Write;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::manifest::Manifest;
+use gleaner_protocol::{Exit, Explain, Failure, Report, Round, Summary, TopicReport};
+use gleaner_transport::TransportError;
+use gleaner_transport::replay::{Replay, ReplayError};
+
+use super::output::Output;
+use super::{Options, report as send};
+use crate::api::Session;
+use crate::api::data::{Topic, Wake};
+use crate::input::{InputError, open_inputs};
+use crate::judge::Judge;
+use crate::program::Load;
+use crate::schedule::Schedule;
+
+/// How often progress is reported; a person sees no more.
+const PROGRESS: Duration = Duration::from_millis(100);
+/// The clock is read once in so many samples.
+const SAMPLES_PER_LOOK: u64 = 256;
+
+struct Pass<'a> {
+    judge: Judge,
+    schedule: Schedule,
+    session: Session,
+    output: &'a mut Output,
+    wakes: u64,
+    triggers: u64,
+    faults: u64,
+    log_lines: u64,
+}
+
+impl Pass<'_> {
+    fn wake(&mut self, wake: Wake) -> Result<(), Failure> {
+        let decision = self.judge.judge(wake);
+        self.wakes += 1;
+        self.triggers += decision.triggers.len() as u64;
+        self.faults += u64::from(decision.fault.is_some());
+        self.output.decision(&decision)?;
+        self.keep_log()
+    }
+
+    fn keep_log(&mut self) -> Result<(), Failure> {
+        let lines = self.session.take_log();
+        self.log_lines += lines.len() as u64;
+        Ok(self.output.log(&lines)?)
+    }
+
+    /// Runs the ticks that are due before a sample of `at_ns`.
+    fn ticks(&mut self, at_ns: i64) -> Result<(), Failure> {
+        while let Some(tick) = self.schedule.next_tick(at_ns) {
+            self.wake(tick)?;
+        }
+        Ok(())
+    }
+}
+
+pub(super) fn replay(
+    options: &Options,
+    manifest: &Manifest,
+    load: Load<'_>,
+    output: &mut Output,
+    reports: &mut dyn Write,
+) -> Result<Summary, Failure> {
+    let name = manifest.lambda.name.as_str();
+    let mut drive = Replay::open(&options.drives).map_err(|error| Failure::from(OpenError(error)))?;
+    let inputs = open_inputs(manifest, &options.remaps, &mut drive)
+        .map_err(|error| Failure::because(format!("cannot start lambda `{name}`"), &error))?;
+    let session = Session::new(inputs.clone(), options.config.clone());
+    let mut guest = load(options, manifest, session.clone())?;
+    let initialised = guest.init();
+    let mut pass = Pass {
+        schedule: Schedule::new(manifest, &inputs),
+        judge: Judge::new(session.clone(), guest),
+        session,
+        output,
+        wakes: 0,
+        triggers: 0,
+        faults: 0,
+        log_lines: 0,
+    };
+    pass.keep_log()?;
+    if let Err(fault) = initialised {
+        let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{name}`"));
+        failure.causes = vec![fault.message];
+        return Err(failure);
+    }
+
+    let started = Instant::now();
+    let damaged = drain(&mut drive, &mut pass, reports)?;
+    let wall_s = started.elapsed().as_secs_f64();
+    Ok(Summary {
+        lambda: name.to_owned(),
+        version: manifest.lambda.version.to_string(),
+        kind: manifest.lambda.kind,
+        drive: options.drives.clone(),
+        out: options.out.clone(),
+        wakes: pass.wakes,
+        triggers: pass.triggers,
+        faults: pass.faults,
+        skipped: inputs.iter().map(|topic| topic.counts().skipped).sum(),
+        missed_ticks: pass.schedule.missed(),
+        log_lines: pass.log_lines,
+        log_dropped: pass.session.log_dropped(),
+        start_ns: drive.start_ns().unwrap_or(0),
+        end_ns: drive.end_ns().unwrap_or(0),
+        wall_s,
+        run_s: pass.judge.run().as_secs_f64(),
+        decode_s: inputs.iter().map(|topic| topic.decode_ns()).sum::<u64>() as f64 / 1e9,
+        wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
+        peak_rss_bytes: memory("VmHWM:"),
+        topics: inputs.iter().map(topic_report).collect(),
+        damaged: damaged.map(|error| Failure::from(OpenError(error)).to_string()),
+    })
+}
+
+/// Delivers every sample of the drive and runs what it wakes. Ends with the damage, if there is one.
+fn drain(drive: &mut Replay, pass: &mut Pass<'_>, reports: &mut dyn Write) -> Result<Option<ReplayError>, Failure> {
+    let mut at_ns = 0;
+    let mut looked = Instant::now();
+    let mut samples = 0_u64;
+    let damaged = loop {
+        match drive.peek_at_ns() {
+            Ok(Some(next_ns)) => pass.ticks(next_ns)?,
+            Ok(None) => break None,
+            Err(error) => break Some(error),
+        }
+        match drive.step() {
+            Ok(Some(step)) => at_ns = step.at_ns,
+            Ok(None) => break None,
+            Err(error) => break Some(error),
+        }
+        while let Some(wake) = pass.schedule.next_event() {
+            pass.wake(wake)?;
+        }
+        samples += 1;
+        if samples.is_multiple_of(SAMPLES_PER_LOOK) && looked.elapsed() >= PROGRESS {
+            looked = Instant::now();
+            let progress = drive.progress();
+            send(reports, &Report::Progress { done: progress.done, total: Some(progress.total), at_ns });
+        }
+    };
+    if samples > 0 {
+        // A tick of the very last instant is still due.
+        pass.ticks(at_ns.saturating_add(1))?;
+    }
+    Ok(damaged)
+}
+
+pub(super) fn report(n: u32, summary: &Summary) -> Round {
+    Round {
+        n,
+        wakes: summary.wakes,
+        faults: summary.faults,
+        wall_s: summary.wall_s,
+        wakes_per_s: summary.wakes_per_s,
+        rss_bytes: memory("VmRSS:"),
+    }
+}
+
+fn topic_report(topic: &Arc<Topic>) -> TopicReport {
+    let counts = topic.counts();
+    TopicReport {
+        name: topic.name().to_owned(),
+        topic: topic.ros_topic().to_owned(),
+        type_name: topic.type_name().to_owned(),
+        received: counts.received,
+        lost: counts.lost,
+        overwritten: counts.overwritten,
+        no_slot: counts.no_slot,
+        too_big: counts.too_big,
+    }
+}
+
+/// A line of `/proc/self/status`, in bytes; 0 where there is none.
+fn memory(name: &str) -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix(name));
+    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<u64>().ok());
+    kib.unwrap_or(0) * 1024
+}
+
+/// A drive that cannot be read.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+struct OpenError(ReplayError);
+
+impl Explain for OpenError {
+    fn help(&self) -> Option<String> {
+        matches!(self.0, ReplayError::Damaged { .. })
+            .then(|| "the results up to the damage are kept; copy the file again if you can".to_owned())
+    }
+
+    fn exit(&self) -> Exit {
+        if matches!(self.0, ReplayError::Damaged { .. }) { Exit::DriveDamaged } else { Exit::Usage }
+    }
+}
+
+impl Explain for InputError {
+    fn help(&self) -> Option<String> {
+        let Self::Subscribe { source, .. } = self else {
+            return Some("lower depth, hold or max_size of this [[input]]".to_owned());
+        };
+        Some(match source {
+            TransportError::NoSuchTopic { .. } => "correct `topic` in lambda.toml, or pass --remap FROM:=TO".to_owned(),
+            TransportError::WrongType { found, .. } => {
+                format!("write type = \"{found}\" in lambda.toml, or choose another topic")
+            }
+            _ => return None,
+        })
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            Self::Subscribe { .. } => Exit::Usage,
+            Self::Memory { .. } => Exit::Internal,
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! When a lambda runs: for each new sample of one input, or every so often.
+//!
+//! A schedule only looks at rings and times; it never runs anything, and it counts what it passes over.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_protocol::manifest::{Backlog, Manifest, Schedule as Declared};
+
+use crate::api::data::{Tick, Topic, Wake};
+
+/// Ticks made up for in one gap between two samples. A longer gap (a clock that jumped, two drives far apart) is counted as
+/// missed, so that a bad stamp cannot keep a replay busy for years.
+const CATCH_UP_TICKS: u64 = 100_000;
+
+/// The schedule of one lambda.
+pub enum Schedule {
+    /// One wake for each sample, or for the newest one.
+    Event(Event),
+    /// One wake for each period.
+    Periodic(Periodic),
+}
+
+/// Wakes on new samples of one topic.
+pub struct Event {
+    topic: Arc<Topic>,
+    backlog: Backlog,
+    /// Position in the ring of the first sample that has not been considered.
+    next: u64,
+}
+
+/// Wakes on a period, counted from the first sample of the drive.
+pub struct Periodic {
+    period_ns: i64,
+    due_ns: Option<i64>,
+    missed: u64,
+    missed_total: u64,
+}
+
+impl Schedule {
+    /// The schedule that `manifest` declares, over its inputs in the manifest's order.
+    pub fn new(manifest: &Manifest, inputs: &[Arc<Topic>]) -> Self {
+        match &manifest.schedule {
+            Declared::Event { input, backlog } => {
+                let topic =
+                    inputs.iter().find(|topic| topic.name() == input.as_str()).expect("the manifest was checked");
+                Self::Event(Event { topic: Arc::clone(topic), backlog: *backlog, next: topic.reader().head() })
+            }
+            Declared::Periodic { period } => Self::Periodic(Periodic::new(*period)),
+        }
+    }
+
+    /// The next wake caused by samples that have arrived.
+    pub fn next_event(&mut self) -> Option<Wake> {
+        match self {
+            Self::Event(event) => event.next(),
+            Self::Periodic(_) => None,
+        }
+    }
+
+    /// The next wake that is due before `now_ns`; call again until there is none.
+    pub fn next_tick(&mut self, now_ns: i64) -> Option<Wake> {
+        match self {
+            Self::Event(_) => None,
+            Self::Periodic(periodic) => periodic.next(now_ns).map(Wake::Tick),
+        }
+    }
+
+    /// Ticks that were due and did not happen.
+    pub fn missed(&self) -> u64 {
+        match self {
+            Self::Event(_) => 0,
+            Self::Periodic(periodic) => periodic.missed_total,
+        }
+    }
+}
+
+impl Event {
+    fn next(&mut self) -> Option<Wake> {
+        let reader = self.topic.reader();
+        let head = reader.head();
+        if self.next >= head {
+            return None;
+        }
+        let lease = match self.backlog {
+            Backlog::Each => {
+                // What left the ring before this schedule came to it cannot wake any more.
+                let oldest = head.saturating_sub(reader.depth() as u64).max(self.next);
+                (oldest..head).find_map(|position| reader.get(position))
+            }
+            Backlog::Latest => reader.newest(),
+        };
+        let Some(lease) = lease else {
+            self.topic.add_skipped(head - self.next);
+            self.next = head;
+            return None;
+        };
+        let position = lease.position().unwrap_or(head - 1);
+        self.topic.add_skipped(position.saturating_sub(self.next));
+        self.next = position + 1;
+        Some(Wake::Event(self.topic.sample(lease)))
+    }
+}
+
+impl Periodic {
+    fn new(period: Duration) -> Self {
+        let period_ns = i64::try_from(period.as_nanos()).unwrap_or(i64::MAX).max(1);
+        Self { period_ns, due_ns: None, missed: 0, missed_total: 0 }
+    }
+
+    fn next(&mut self, now_ns: i64) -> Option<Tick> {
+        let Some(due_ns) = self.due_ns else {
+            self.due_ns = Some(now_ns.saturating_add(self.period_ns));
+            return None;
+        };
+        // Strictly before: a tick sees all samples of its own instant.
+        if due_ns >= now_ns {
+            return None;
+        }
+        let behind = now_ns.abs_diff(due_ns) / self.period_ns as u64;
+        if behind > CATCH_UP_TICKS {
+            self.missed += behind;
+            self.missed_total += behind;
+            self.due_ns = Some(now_ns.saturating_add(self.period_ns));
+            return None;
+        }
+        self.due_ns = Some(due_ns.saturating_add(self.period_ns));
+        Some(Tick { at_ns: due_ns, missed: std::mem::take(&mut self.missed) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ticks(periodic: &mut Periodic, now_ns: i64) -> Vec<i64> {
+        std::iter::from_fn(|| periodic.next(now_ns)).map(|tick| tick.at_ns).collect()
+    }
+
+    #[test]
+    fn ticks_come_before_the_sample_that_is_later_and_after_the_one_of_the_same_instant() {
+        let mut periodic = Periodic::new(Duration::from_nanos(100));
+        assert!(ticks(&mut periodic, 1000).is_empty());
+        assert!(ticks(&mut periodic, 1100).is_empty());
+        assert_eq!(ticks(&mut periodic, 1350), [1100, 1200, 1300]);
+    }
+
+    #[test]
+    fn a_jump_of_the_clock_counts_missed_ticks_instead_of_running_them() {
+        let mut periodic = Periodic::new(Duration::from_nanos(1));
+        assert!(ticks(&mut periodic, 0).is_empty());
+        assert!(ticks(&mut periodic, i64::MAX - 10).is_empty());
+        assert!(periodic.missed_total > CATCH_UP_TICKS);
+        assert_eq!(ticks(&mut periodic, i64::MAX).first(), Some(&(i64::MAX - 9)));
+    }
+
+    #[test]
+    fn a_clock_that_goes_back_causes_no_tick() {
+        let mut periodic = Periodic::new(Duration::from_nanos(100));
+        assert!(ticks(&mut periodic, 1000).is_empty());
+        assert!(ticks(&mut periodic, -5000).is_empty());
+        assert_eq!(ticks(&mut periodic, 1101), [1100]);
+    }
+}

@@ -1,0 +1,50 @@
+//! What a field path reads.
+
+/// What kind of value a field path leads to, known before any message is seen.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
+pub enum Kind {
+    /// `bool`.
+    Bool,
+    /// `int8` to `int64`.
+    Signed,
+    /// `uint8` to `uint64`, `byte`, `char`.
+    Unsigned,
+    /// `float32`, `float64`.
+    Real,
+    /// `string`.
+    Text,
+    /// An array or sequence of `uint8`, `byte` or `char`.
+    Bytes,
+    /// An array or sequence of any other primitive.
+    Numbers,
+    /// An array or sequence of `string`.
+    Texts,
+}
+
+impl Kind {
+    /// Whether [`super::FieldPath::number`] can read it.
+    pub fn is_number(self) -> bool {
+        matches!(self, Self::Bool | Self::Signed | Self::Unsigned | Self::Real)
+    }
+}
+
+/// A field's value, borrowed from the message where possible.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Value<'a> {
+    /// Any byte but 0 reads as true.
+    Bool(bool),
+    /// A signed integer.
+    Signed(i64),
+    /// An unsigned integer.
+    Unsigned(u64),
+    /// A floating-point number; `float32` is widened, which is exact.
+    Real(f64),
+    /// A string.
+    Text(&'a str),
+    /// Bytes.
+    Bytes(&'a [u8]),
+    /// Numbers as `f64`. 64-bit integers beyond 2^53 are rounded; booleans are 0 and 1.
+    Numbers(Vec<f64>),
+    /// Strings.
+    Texts(Vec<&'a str>),
+}

@@ -1,0 +1,73 @@
+//! The two image messages, read whole and borrowed.
+
+use super::cdr::{CdrError, Cursor, Endian};
+
+/// A `sensor_msgs/msg/Image` without its header.
+///
+/// Nothing is checked but the bounds of the message: `data` may be shorter or longer than
+/// `height * step`.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct ImageView<'a> {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Pixel format, such as `rgb8`.
+    pub encoding: &'a str,
+    /// Byte order of pixels wider than a byte.
+    pub is_bigendian: bool,
+    /// Bytes from one row to the next.
+    pub step: u32,
+    /// Pixels, row by row.
+    pub data: &'a [u8],
+}
+
+/// A `sensor_msgs/msg/CompressedImage` without its header.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct CompressedView<'a> {
+    /// What the writer says of `data`, such as `jpeg` or `rgb8; jpeg compressed bgr8`.
+    pub format: &'a str,
+    /// The compressed file.
+    pub data: &'a [u8],
+}
+
+impl<'a> ImageView<'a> {
+    /// Reads a whole `sensor_msgs/msg/Image`.
+    ///
+    /// # Errors
+    ///
+    /// [`CdrError`] if the bytes are no such message.
+    pub fn read(cdr: &'a [u8], endian: Endian) -> Result<Self, CdrError> {
+        let mut cursor = Cursor::new(cdr, endian);
+        skip_header(&mut cursor)?;
+        let (height, width) = (cursor.u32()?, cursor.u32()?);
+        let encoding = cursor.text()?;
+        let is_bigendian = cursor.u8()? != 0;
+        let step = cursor.u32()?;
+        Ok(Self { width, height, encoding, is_bigendian, step, data: bytes(&mut cursor)? })
+    }
+}
+
+impl<'a> CompressedView<'a> {
+    /// Reads a whole `sensor_msgs/msg/CompressedImage`.
+    ///
+    /// # Errors
+    ///
+    /// [`CdrError`] if the bytes are no such message.
+    pub fn read(cdr: &'a [u8], endian: Endian) -> Result<Self, CdrError> {
+        let mut cursor = Cursor::new(cdr, endian);
+        skip_header(&mut cursor)?;
+        Ok(Self { format: cursor.text()?, data: bytes(&mut cursor)? })
+    }
+}
+
+/// `std_msgs/Header`: a stamp of eight bytes and the frame's name.
+fn skip_header(cursor: &mut Cursor<'_>) -> Result<(), CdrError> {
+    cursor.skip(8)?;
+    cursor.skip_text()
+}
+
+fn bytes<'a>(cursor: &mut Cursor<'a>) -> Result<&'a [u8], CdrError> {
+    let n = cursor.count(1)?;
+    cursor.take(n)
+}

@@ -1,0 +1,247 @@
+//! Chunks in memory: read, decompressed, checked, and sorted by log time.
+
+use std::io::{self, Read};
+
+use zstd::stream::raw::{Decoder as ZstdDecoder, Operation};
+
+use super::drive::Limits;
+use super::error::{Damage, ReplayError};
+use super::records::{ChunkHead, HEAD, MessageHead, Record, Records, op};
+use super::source::Source;
+
+/// Where a chunk, or a run of messages outside chunks, lies in a file.
+pub(super) struct Segment {
+    /// Of the first byte of the first record's head.
+    pub(super) offset: u64,
+    /// Of all its records, heads included.
+    pub(super) len: u64,
+    pub(super) start_time: u64,
+    pub(super) end_time: u64,
+    pub(super) kind: SegmentKind,
+    /// The channels with messages in it, if known.
+    pub(super) channels: Option<Box<[u16]>>,
+}
+
+#[derive(Copy, Clone, PartialEq, Eq)]
+pub(super) enum SegmentKind {
+    Chunk,
+    Run,
+}
+
+/// One message of an open segment, in the order of delivery.
+#[derive(Copy, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Entry {
+    pub(super) log_time: u64,
+    pub(super) channel: u16,
+    /// Where the message record's body starts in [`OpenSegment::bytes`]; its length stands before.
+    at: u32,
+}
+
+/// A segment in memory. Its buffers are reused for the next one.
+#[derive(Default)]
+pub(super) struct OpenSegment {
+    /// The records; what lies beyond `len` is left over from an earlier, longer segment.
+    bytes: Vec<u8>,
+    len: usize,
+    entries: Vec<Entry>,
+    next: usize,
+}
+
+impl OpenSegment {
+    /// The next message to deliver.
+    #[inline]
+    pub(super) fn head(&self) -> Option<Entry> {
+        self.entries.get(self.next).copied()
+    }
+
+    #[inline]
+    pub(super) fn advance(&mut self) {
+        self.next += 1;
+    }
+
+    /// The body of a message record of this segment.
+    #[inline]
+    pub(super) fn body(&self, entry: Entry) -> &[u8] {
+        let at = entry.at as usize;
+        // `sort` took `at` from a record that lies within `bytes`, length included.
+        let len = self.bytes[..at].last_chunk().map_or(0, |len| u64::from_le_bytes(*len));
+        &self.bytes[at..at + len as usize]
+    }
+
+    /// Bytes of records held.
+    pub(super) fn len(&self) -> usize {
+        self.len
+    }
+
+    pub(super) fn records(&self) -> Records<'_> {
+        Records::new(&self.bytes[..self.len])
+    }
+
+    /// Collects the messages of the channels that `wanted` accepts, and sorts them.
+    ///
+    /// `wanted` answers `None` for a channel that does not exist.
+    fn sort(&mut self, wanted: impl Fn(u16) -> Option<bool>) -> Result<(), Damage> {
+        let mut entries = std::mem::take(&mut self.entries);
+        entries.clear();
+        self.next = 0;
+        for record in self.records() {
+            let Record { opcode: op::MESSAGE, at, body } = record? else {
+                continue;
+            };
+            let head = message_head(body)?;
+            if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))? {
+                // Fits: `Opener::new` clamps the size of a segment.
+                entries.push(Entry { log_time: head.log_time, channel: head.channel, at: at as u32 });
+            }
+        }
+        if !entries.is_sorted() {
+            entries.sort_unstable();
+        }
+        self.entries = entries;
+        Ok(())
+    }
+}
+
+pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
+    MessageHead::parse(body).ok_or(Damage::Malformed("a message record is shorter than its header"))
+}
+
+/// Reads segments, with the state that decompression keeps between them.
+pub(super) struct Opener {
+    limits: Limits,
+    zstd: Option<ZstdDecoder<'static>>,
+    compressed: Vec<u8>,
+}
+
+impl Opener {
+    pub(super) fn new(limits: Limits) -> Self {
+        // Positions in a segment are kept in 32 bits.
+        let limits = Limits { chunk_bytes: limits.chunk_bytes.min(1 << 31), ..limits };
+        Self { limits, zstd: None, compressed: Vec::new() }
+    }
+
+    /// Reads a segment into `into` and sorts the wanted messages in it.
+    pub(super) fn open(
+        &mut self,
+        source: &mut Source,
+        segment: &Segment,
+        wanted: impl Fn(u16) -> Option<bool>,
+        into: &mut OpenSegment,
+    ) -> Result<(), ReplayError> {
+        self.read(source, segment.offset, segment.len, segment.kind, into)?;
+        into.sort(wanted).map_err(|what| source.damaged(segment.offset, what))
+    }
+
+    /// Reads a segment's records into `into`, unsorted.
+    pub(super) fn read(
+        &mut self,
+        source: &mut Source,
+        offset: u64,
+        len: u64,
+        kind: SegmentKind,
+        into: &mut OpenSegment,
+    ) -> Result<(), ReplayError> {
+        into.entries.clear();
+        into.next = 0;
+        into.len = 0;
+        let allowed = self.limits.chunk_bytes;
+        let too_large = |claimed| Damage::ChunkTooLarge { claimed, allowed };
+        // `len` was checked against the file's length, so it is no mere claim.
+        let size = usize::try_from(len).ok().filter(|_| len <= allowed.saturating_add(HEAD + 4096));
+        let size = size.ok_or_else(|| source.damaged(offset, too_large(len)))?;
+        match kind {
+            SegmentKind::Run => {
+                into.bytes.resize(size.max(into.bytes.len()), 0);
+                source.read(offset, &mut into.bytes[..size])?;
+                into.len = size;
+                Ok(())
+            }
+            SegmentKind::Chunk => {
+                let mut record = std::mem::take(&mut self.compressed);
+                record.resize(size.max(record.len()), 0);
+                let result = source
+                    .read(offset, &mut record[..size])
+                    .and_then(|()| self.unpack(&record[..size], into).map_err(|what| source.damaged(offset, what)));
+                self.compressed = record;
+                result
+            }
+        }
+    }
+
+    /// Decompresses and checks the chunk record in `record`, head included.
+    fn unpack(&mut self, record: &[u8], into: &mut OpenSegment) -> Result<(), Damage> {
+        let Some(Ok(Record { opcode: op::CHUNK, body, .. })) = Records::new(record).next() else {
+            return Err(Damage::Malformed("there is no chunk where the index says"));
+        };
+        let head = ChunkHead::parse(body).ok_or(Damage::Malformed("a chunk's header is cut off"))?;
+        let allowed = self.limits.chunk_bytes;
+        let size = usize::try_from(head.uncompressed).ok().filter(|size| *size as u64 <= allowed);
+        let size = size.ok_or(Damage::ChunkTooLarge { claimed: head.uncompressed, allowed })?;
+        let packed = usize::try_from(head.compressed).ok().and_then(|n| body[head.len..].get(..n));
+        let packed = packed.ok_or(Damage::Malformed("a chunk is shorter than its header says"))?;
+        match head.compression {
+            "" if packed.len() == size => {
+                into.bytes.resize(size.max(into.bytes.len()), 0);
+                into.bytes[..size].copy_from_slice(packed);
+            }
+            "" => return Err(Damage::Malformed("an uncompressed chunk has two sizes")),
+            "zstd" => self.unzstd(packed, size, &mut into.bytes).map_err(Damage::Inflate)?,
+            "lz4" => unlz4(packed, size, &mut into.bytes).map_err(Damage::Inflate)?,
+            other => return Err(Damage::Compression(other.chars().take(32).collect())),
+        }
+        // 0 means that the writer left it out.
+        let found = if head.crc == 0 { 0 } else { crc32fast::hash(&into.bytes[..size]) };
+        if found != head.crc {
+            return Err(Damage::ChunkCrc { expected: head.crc, found });
+        }
+        into.len = size;
+        Ok(())
+    }
+
+    fn unzstd(&mut self, mut packed: &[u8], size: usize, out: &mut Vec<u8>) -> io::Result<()> {
+        let decoder = match &mut self.zstd {
+            Some(decoder) => {
+                decoder.reinit()?;
+                decoder
+            }
+            none => none.insert(ZstdDecoder::new()?),
+        };
+        fill(out, size, packed.len(), |space| {
+            let status = decoder.run_on_buffers(packed, space)?;
+            packed = &packed[status.bytes_read..];
+            // A frame may end, or its head be read, without output: then input was consumed.
+            Ok((status.bytes_written, status.bytes_read > 0))
+        })
+    }
+}
+
+fn unlz4(packed: &[u8], size: usize, out: &mut Vec<u8>) -> io::Result<()> {
+    let mut decoder = lz4::Decoder::new(packed)?;
+    fill(out, size, packed.len(), |space| decoder.read(space).map(|n| (n, false)))
+}
+
+/// Fills the first `size` bytes of `out` by calling `inflate`, which gives the bytes it wrote and
+/// whether it got on without writing.
+///
+/// `out` grows as data really comes: `size` is a claim until then.
+fn fill(
+    out: &mut Vec<u8>,
+    size: usize,
+    packed: usize,
+    mut inflate: impl FnMut(&mut [u8]) -> io::Result<(usize, bool)>,
+) -> io::Result<()> {
+    let mut filled = 0;
+    while filled < size {
+        if filled == out.len() {
+            let room = (out.len() * 2).max(packed.saturating_mul(4)).max(64 * 1024);
+            out.resize(room.min(size).max(out.len()), 0);
+        }
+        let end = out.len().min(size);
+        let (wrote, moved) = inflate(&mut out[filled..end])?;
+        if wrote == 0 && !moved {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        filled += wrote;
+    }
+    Ok(())
+}

@@ -1,0 +1,22 @@
+//! Recorded drives, pulled message by message in log-time order.
+//!
+//! [`Replay`] opens MCAP files, merges them by log time and gives the next message of a subscribed
+//! topic to its sink each time [`Replay::step`] is called. Nothing runs on its own: the caller's
+//! loop is the clock.
+//!
+//! What never happens here: holding a whole file in memory, delivering a chunk whose checksum is
+//! wrong, losing a message silently. rosbag2 directories and sqlite3 are not read yet.
+
+mod catalog;
+mod chunk;
+mod drive;
+mod error;
+mod file;
+mod records;
+mod scan;
+mod source;
+mod summary;
+mod track;
+
+pub use drive::{Limits, Progress, Replay, Step};
+pub use error::{Damage, ReplayError};

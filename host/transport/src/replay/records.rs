@@ -1,0 +1,232 @@
+//! The MCAP records that a replay needs, parsed by hand.
+//!
+//! The `mcap` crate's readers are not used: its parser reserves whatever length a string claims,
+//! its indexed reader never checks a chunk's checksum, and neither gives up a chunk's bytes. Eight
+//! record kinds are little enough to read directly. Source: the MCAP specification, version 0.
+
+use super::error::Damage;
+
+/// What every MCAP file begins and ends with.
+pub(super) const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
+/// Opcode and length in front of every record.
+pub(super) const HEAD: u64 = 9;
+/// Bytes of a message record in front of the message's data.
+pub(super) const MESSAGE_HEAD: usize = 22;
+/// Footer record and closing magic.
+pub(super) const FOOTER: u64 = HEAD + 20 + 8;
+
+/// Record kinds.
+pub(super) mod op {
+    pub(in super::super) const FOOTER: u8 = 0x02;
+    pub(in super::super) const SCHEMA: u8 = 0x03;
+    pub(in super::super) const CHANNEL: u8 = 0x04;
+    pub(in super::super) const MESSAGE: u8 = 0x05;
+    pub(in super::super) const CHUNK: u8 = 0x06;
+    pub(in super::super) const CHUNK_INDEX: u8 = 0x08;
+    pub(in super::super) const STATISTICS: u8 = 0x0b;
+    pub(in super::super) const DATA_END: u8 = 0x0f;
+}
+
+/// Opcode and body length of the record whose head is `bytes`.
+pub(super) fn head(bytes: &[u8]) -> Option<(u8, u64)> {
+    let (opcode, rest) = bytes.split_first()?;
+    Some((*opcode, u64::from_le_bytes(*rest.first_chunk()?)))
+}
+
+/// Walks the records in `bytes`, giving opcode, and the range of the body.
+pub(super) struct Records<'a> {
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Records<'a> {
+    pub(super) fn new(bytes: &'a [u8]) -> Self {
+        Self { bytes, at: 0 }
+    }
+}
+
+/// One record inside a buffer.
+#[derive(Copy, Clone)]
+pub(super) struct Record<'a> {
+    pub(super) opcode: u8,
+    /// Where the body starts in the buffer.
+    pub(super) at: usize,
+    pub(super) body: &'a [u8],
+}
+
+impl<'a> Iterator for Records<'a> {
+    type Item = Result<Record<'a>, Damage>;
+
+    #[inline]
+    fn next(&mut self) -> Option<Self::Item> {
+        let rest = self.bytes.get(self.at..).filter(|rest| !rest.is_empty())?;
+        let record = head(rest).and_then(|(opcode, len)| {
+            let start = self.at + HEAD as usize;
+            let end = start.checked_add(usize::try_from(len).ok()?)?;
+            Some(Record { opcode, at: start, body: self.bytes.get(start..end)? })
+        });
+        // After a record that does not fit, nothing can be found any more.
+        self.at = record.map_or(self.bytes.len(), |record| record.at + record.body.len());
+        Some(record.ok_or(Damage::Malformed("a record is longer than the chunk it is in")))
+    }
+}
+
+/// The front of a message record.
+#[derive(Copy, Clone)]
+pub(super) struct MessageHead {
+    pub(super) channel: u16,
+    pub(super) sequence: u32,
+    pub(super) log_time: u64,
+    pub(super) publish_time: u64,
+}
+
+impl MessageHead {
+    #[inline]
+    pub(super) fn parse(body: &[u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        Some(Self {
+            channel: fields.u16()?,
+            sequence: fields.u32()?,
+            log_time: fields.u64()?,
+            publish_time: fields.u64()?,
+        })
+    }
+}
+
+/// The front of a chunk record.
+pub(super) struct ChunkHead<'a> {
+    pub(super) uncompressed: u64,
+    pub(super) crc: u32,
+    pub(super) compression: &'a str,
+    pub(super) compressed: u64,
+    /// Bytes in front of the compressed data.
+    pub(super) len: usize,
+}
+
+impl<'a> ChunkHead<'a> {
+    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        // Start and end time: the messages themselves say.
+        fields.u64()?;
+        fields.u64()?;
+        let (uncompressed, crc) = (fields.u64()?, fields.u32()?);
+        let (compression, compressed) = (fields.text()?, fields.u64()?);
+        let len = body.len() - fields.0.len();
+        Some(Self { uncompressed, crc, compression, compressed, len })
+    }
+}
+
+/// A schema record.
+pub(super) struct Schema<'a> {
+    pub(super) id: u16,
+    pub(super) name: &'a str,
+    pub(super) encoding: &'a str,
+    pub(super) data: &'a [u8],
+}
+
+impl<'a> Schema<'a> {
+    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        Some(Self { id: fields.u16()?, name: fields.text()?, encoding: fields.text()?, data: fields.bytes()? })
+    }
+}
+
+/// A channel record, without its metadata.
+pub(super) struct Channel<'a> {
+    pub(super) id: u16,
+    pub(super) schema: u16,
+    pub(super) topic: &'a str,
+    pub(super) encoding: &'a str,
+}
+
+impl<'a> Channel<'a> {
+    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        Some(Self { id: fields.u16()?, schema: fields.u16()?, topic: fields.text()?, encoding: fields.text()? })
+    }
+}
+
+/// Where a chunk is and what is in it, from the summary.
+pub(super) struct ChunkIndex {
+    pub(super) start_time: u64,
+    pub(super) end_time: u64,
+    pub(super) offset: u64,
+    /// Of the chunk record, head included.
+    pub(super) len: u64,
+    /// Of the message index records behind it.
+    pub(super) index_len: u64,
+    /// The channels with messages in it; empty if the writer did not say.
+    pub(super) channels: Vec<u16>,
+}
+
+impl ChunkIndex {
+    pub(super) fn parse(body: &[u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        let (start_time, end_time) = (fields.u64()?, fields.u64()?);
+        let (offset, len) = (fields.u64()?, fields.u64()?);
+        let (entries, _) = fields.bytes()?.as_chunks::<10>();
+        let channels = entries.iter().map(|e| u16::from_le_bytes([e[0], e[1]])).collect();
+        let index_len = fields.u64()?;
+        Some(Self { start_time, end_time, offset, len, index_len, channels })
+    }
+}
+
+/// The counts in the summary.
+pub(super) struct Statistics {
+    pub(super) channels: u32,
+    pub(super) chunks: u32,
+    /// Messages per channel.
+    pub(super) messages: Vec<(u16, u64)>,
+}
+
+impl Statistics {
+    pub(super) fn parse(body: &[u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        let (_messages, _schemas) = (fields.u64()?, fields.u16()?);
+        let (channels, _attachments) = (fields.u32()?, fields.u32()?);
+        let (_metadata, chunks) = (fields.u32()?, fields.u32()?);
+        let (_start, _end) = (fields.u64()?, fields.u64()?);
+        let mut counts = Fields(fields.bytes()?);
+        let mut messages = Vec::new();
+        while let (Some(channel), Some(count)) = (counts.u16(), counts.u64()) {
+            messages.push((channel, count));
+        }
+        Some(Self { channels, chunks, messages })
+    }
+}
+
+/// What is left of a record's body.
+struct Fields<'a>(&'a [u8]);
+
+impl<'a> Fields<'a> {
+    #[inline]
+    fn array<const N: usize>(&mut self) -> Option<[u8; N]> {
+        let (found, rest) = self.0.split_first_chunk()?;
+        self.0 = rest;
+        Some(*found)
+    }
+
+    fn u16(&mut self) -> Option<u16> {
+        self.array().map(u16::from_le_bytes)
+    }
+
+    fn u32(&mut self) -> Option<u32> {
+        self.array().map(u32::from_le_bytes)
+    }
+
+    fn u64(&mut self) -> Option<u64> {
+        self.array().map(u64::from_le_bytes)
+    }
+
+    /// Bytes behind their length.
+    fn bytes(&mut self) -> Option<&'a [u8]> {
+        let len = self.u32()? as usize;
+        let (found, rest) = self.0.split_at_checked(len)?;
+        self.0 = rest;
+        Some(found)
+    }
+
+    fn text(&mut self) -> Option<&'a str> {
+        str::from_utf8(self.bytes()?).ok()
+    }
+}

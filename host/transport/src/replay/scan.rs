@@ -1,0 +1,237 @@
+//! Finding out what a file contains, without holding it.
+//!
+//! The data section is walked record by record from its start. The summary at the end of a finished
+//! file saves most of that: a chunk that its index lists is stepped over unread. What the index does
+//! not list, for want of a summary or by the writer's choice, is opened and looked into. So every
+//! file is read the same way, whether it is indexed, cut off, or has no chunks at all, and an index
+//! that leaves a chunk out costs time but no messages.
+
+use std::collections::{BTreeSet, HashMap};
+
+use tracing::warn;
+
+use super::chunk::{OpenSegment, Opener, Segment, SegmentKind, message_head};
+use super::error::{Damage, ReplayError};
+use super::file::Contents;
+use super::records::{ChunkIndex, HEAD, MAGIC, MESSAGE_HEAD, MessageHead, head, op};
+use super::source::Source;
+use super::summary::read_tail;
+
+/// Messages outside chunks are read in runs of about this many bytes.
+const RUN: u64 = 1 << 20;
+/// The largest schema or channel record outside chunks that is looked at.
+const MAX_RECORD: u64 = 16 << 20;
+
+/// Finds out what `source` contains. Damage is part of the answer; only a file that is no MCAP file
+/// or that the system cannot read is an error.
+pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents, ReplayError> {
+    if source.peek(0, MAGIC.len())? != MAGIC {
+        return Err(ReplayError::NotMcap { path: source.path().to_owned() });
+    }
+    let tail = read_tail(source)?;
+    let mut contents = Contents::default();
+    let mut index = HashMap::new();
+    if let Some(summary) = tail.summary {
+        contents.channels = summary.channels;
+        contents.messages = summary.messages;
+        contents.claimed = true;
+        index = summary.chunks;
+    }
+    let mut walk = Walk { source, opener, contents, index, buffer: OpenSegment::default(), data_crc: None };
+    let mut damage = walk.data_section()?;
+    if damage.is_none() && !tail.finished {
+        damage = Some((walk.source.len(), Damage::NoFooter));
+    }
+    if damage.is_none() {
+        damage = walk.check_runs()?.or(tail.damage);
+    }
+    let mut contents = walk.contents;
+    if let Some((offset, what)) = &damage {
+        warn!(path = %walk.source.path().display(), offset, %what, "drive is damaged");
+    }
+    contents.damage = damage;
+    Ok(contents)
+}
+
+struct Walk<'a> {
+    source: &'a mut Source,
+    opener: &'a mut Opener,
+    contents: Contents,
+    /// Chunks that the summary lists, by offset.
+    index: HashMap<u64, ChunkIndex>,
+    buffer: OpenSegment,
+    /// Where the data section ends, and the checksum that stands there.
+    data_crc: Option<(u64, u32)>,
+}
+
+/// What to do after a record.
+enum Step {
+    GoOn(u64),
+    End,
+    Damaged(Damage),
+}
+
+impl Walk<'_> {
+    /// Walks to the end of the data section, or to the damage it returns.
+    fn data_section(&mut self) -> Result<Option<(u64, Damage)>, ReplayError> {
+        let mut at = MAGIC.len() as u64;
+        loop {
+            let step = match self.indexed_chunk(at) {
+                Some(behind) => Step::GoOn(behind),
+                None => match self.record(at) {
+                    Ok(step) => step,
+                    Err(ReplayError::Damaged { what, .. }) => Step::Damaged(what),
+                    Err(error) => return Err(error),
+                },
+            };
+            match step {
+                Step::GoOn(behind) => at = behind,
+                Step::End => return Ok(None),
+                Step::Damaged(what) => return Ok(Some((at, what))),
+            }
+        }
+    }
+
+    /// Notes the chunk at `at` if the summary lists one there, and returns the position behind it
+    /// and its message indexes.
+    fn indexed_chunk(&mut self, at: u64) -> Option<u64> {
+        let chunk = self.index.remove(&at)?;
+        let behind = at.checked_add(chunk.len)?.checked_add(chunk.index_len)?;
+        if chunk.len < HEAD || behind > self.source.len() {
+            return None;
+        }
+        self.contents.segments.push(Segment {
+            offset: at,
+            len: chunk.len,
+            start_time: chunk.start_time,
+            end_time: chunk.end_time,
+            kind: SegmentKind::Chunk,
+            channels: (!chunk.channels.is_empty()).then(|| chunk.channels.into()),
+        });
+        Some(behind)
+    }
+
+    fn record(&mut self, at: u64) -> Result<Step, ReplayError> {
+        let file_end = self.source.len();
+        if at == file_end {
+            return Ok(Step::Damaged(Damage::NoFooter));
+        }
+        let Some((opcode, len)) = head(self.source.peek(at, HEAD as usize)?) else {
+            return Ok(Step::Damaged(Damage::Truncated("the head of a record")));
+        };
+        let end = at.saturating_add(HEAD).saturating_add(len);
+        if end > file_end {
+            return Ok(Step::Damaged(Damage::Truncated("a record")));
+        }
+        match opcode {
+            0 => Ok(Step::Damaged(Damage::Malformed("a record has kind 0, which does not exist"))),
+            op::DATA_END => {
+                let body = self.source.peek(at + HEAD, 4)?;
+                let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
+                self.data_crc = Some((at, crc));
+                Ok(Step::End)
+            }
+            op::FOOTER => Ok(Step::End),
+            op::SCHEMA | op::CHANNEL if len <= MAX_RECORD => {
+                let mut body = vec![0; len as usize];
+                self.source.read(at + HEAD, &mut body)?;
+                let learned = self.contents.channels.learn(opcode, &body);
+                Ok(learned.map_or_else(Step::Damaged, |()| Step::GoOn(end)))
+            }
+            op::MESSAGE => self.message(at, end),
+            op::CHUNK => self.chunk(at, end),
+            _ => Ok(Step::GoOn(end)),
+        }
+    }
+
+    /// A message outside a chunk: joins the run before it, or begins one.
+    fn message(&mut self, at: u64, end: u64) -> Result<Step, ReplayError> {
+        let body = self.source.peek(at + HEAD, MESSAGE_HEAD.min((end - at - HEAD) as usize))?;
+        let head = match message_head(body) {
+            Ok(head) => head,
+            Err(what) => return Ok(Step::Damaged(what)),
+        };
+        if self.contents.channels.get(head.channel).is_none() {
+            return Ok(Step::Damaged(Damage::UnknownChannel(head.channel)));
+        }
+        let len = end - at;
+        match self.contents.segments.last_mut() {
+            Some(run) if run.kind == SegmentKind::Run && run.offset + run.len == at && run.len + len <= RUN => {
+                run.len += len;
+                run.start_time = run.start_time.min(head.log_time);
+                run.end_time = run.end_time.max(head.log_time);
+            }
+            _ => self.contents.segments.push(Segment {
+                offset: at,
+                len,
+                start_time: head.log_time,
+                end_time: head.log_time,
+                kind: SegmentKind::Run,
+                channels: None,
+            }),
+        }
+        self.count([head]);
+        Ok(Step::GoOn(end))
+    }
+
+    /// A chunk that no index lists: opens it to see which channels and times are in it.
+    fn chunk(&mut self, at: u64, end: u64) -> Result<Step, ReplayError> {
+        let kind = SegmentKind::Chunk;
+        self.opener.read(self.source, at, end - at, kind, &mut self.buffer)?;
+        let heads = match self.look_into_buffer() {
+            Ok(heads) => heads,
+            Err(what) => return Ok(Step::Damaged(what)),
+        };
+        if heads.is_empty() {
+            return Ok(Step::GoOn(end));
+        }
+        let channels: BTreeSet<u16> = heads.iter().map(|head| head.channel).collect();
+        let times = || heads.iter().map(|head| head.log_time);
+        self.contents.segments.push(Segment {
+            offset: at,
+            len: end - at,
+            start_time: times().min().unwrap_or(0),
+            end_time: times().max().unwrap_or(0),
+            kind,
+            channels: Some(channels.into_iter().collect()),
+        });
+        self.count(heads);
+        Ok(Step::GoOn(end))
+    }
+
+    fn look_into_buffer(&mut self) -> Result<Vec<MessageHead>, Damage> {
+        let mut heads = Vec::new();
+        for record in self.buffer.records() {
+            let record = record?;
+            if record.opcode == op::MESSAGE {
+                let head = message_head(record.body)?;
+                if self.contents.channels.get(head.channel).is_none() {
+                    return Err(Damage::UnknownChannel(head.channel));
+                }
+                heads.push(head);
+            } else {
+                self.contents.channels.learn(record.opcode, record.body)?;
+            }
+        }
+        Ok(heads)
+    }
+
+    /// Counts messages, unless the summary already did.
+    fn count(&mut self, heads: impl IntoIterator<Item = MessageHead>) {
+        if !self.contents.claimed {
+            for head in heads {
+                *self.contents.messages.entry(head.channel).or_default() += 1;
+            }
+        }
+    }
+
+    /// Messages outside chunks are covered by one checksum only, that of the whole data section.
+    fn check_runs(&mut self) -> Result<Option<(u64, Damage)>, ReplayError> {
+        let has_runs = self.contents.segments.iter().any(|s| s.kind == SegmentKind::Run);
+        let Some((end, expected)) = self.data_crc.filter(|(_, crc)| has_runs && *crc != 0) else {
+            return Ok(None);
+        };
+        let found = self.source.checksum(end)?;
+        Ok((found != expected).then_some((end, Damage::DataCrc { expected, found })))
+    }
+}

@@ -1,0 +1,103 @@
+//! The end of a file: footer and summary, believed only when they agree with each other.
+
+use std::collections::HashMap;
+
+use super::error::{Damage, ReplayError};
+use super::file::Channels;
+use super::records::{ChunkIndex, FOOTER, HEAD, MAGIC, Records, Statistics, head, op};
+use super::source::Source;
+
+/// The largest summary that is looked at: an index of two million chunks. A file with a larger one
+/// is read without it.
+const MAX_SUMMARY: u64 = 256 << 20;
+
+/// A complete summary.
+pub(super) struct Summary {
+    pub(super) channels: Channels,
+    /// By their offset in the file.
+    pub(super) chunks: HashMap<u64, ChunkIndex>,
+    /// Messages per channel.
+    pub(super) messages: HashMap<u16, u64>,
+}
+
+/// What stands at the end of a file.
+#[derive(Default)]
+pub(super) struct Tail {
+    /// Whether footer and closing magic are in place: the file was finished.
+    pub(super) finished: bool,
+    /// A summary that names every channel and every chunk. Writers may leave it out.
+    pub(super) summary: Option<Summary>,
+    /// There is a summary, but it is damaged.
+    pub(super) damage: Option<(u64, Damage)>,
+}
+
+pub(super) fn read_tail(source: &mut Source) -> Result<Tail, ReplayError> {
+    let Some(footer_at) = source.len().checked_sub(FOOTER) else {
+        return Ok(Tail::default());
+    };
+    let footer = source.peek(footer_at, FOOTER as usize)?;
+    let Some((start, crc)) = parse_footer(footer) else {
+        return Ok(Tail::default());
+    };
+    let finished = Tail { finished: true, ..Tail::default() };
+    if start == 0 {
+        return Ok(finished);
+    }
+    let damaged =
+        |why| Tail { finished: true, summary: None, damage: Some((start.min(footer_at), Damage::Summary(why))) };
+    let Some(len) = footer_at.checked_sub(start) else {
+        return Ok(damaged("it starts beyond its end"));
+    };
+    if len > MAX_SUMMARY {
+        return Ok(finished);
+    }
+    // The checksum also covers the footer up to the checksum itself.
+    let mut bytes = vec![0; (len + HEAD + 16) as usize];
+    source.read(start, &mut bytes)?;
+    if crc != 0 && crc32fast::hash(&bytes) != crc {
+        return Ok(damaged("it has the wrong checksum"));
+    }
+    bytes.truncate(len as usize);
+    Ok(match parse_summary(&bytes) {
+        Ok(summary) => Tail { summary, ..finished },
+        Err(_) => damaged("a record in it is malformed"),
+    })
+}
+
+/// Start of the summary and its checksum, if `bytes` are a footer and the closing magic.
+fn parse_footer(bytes: &[u8]) -> Option<(u64, u32)> {
+    let (record, magic) = bytes.split_at_checked(bytes.len().checked_sub(MAGIC.len())?)?;
+    let body = record.get(HEAD as usize..)?;
+    if magic != MAGIC || head(record)? != (op::FOOTER, body.len() as u64) {
+        return None;
+    }
+    Some((u64::from_le_bytes(*body.first_chunk()?), u32::from_le_bytes(*body.last_chunk()?)))
+}
+
+/// `None` if the writer left out what would make the summary complete.
+fn parse_summary(bytes: &[u8]) -> Result<Option<Summary>, Damage> {
+    let malformed = || Damage::Malformed("a summary record is malformed");
+    let mut channels = Channels::default();
+    let mut chunks = HashMap::new();
+    let mut statistics = None;
+    for record in Records::new(bytes) {
+        let record = record?;
+        match record.opcode {
+            op::CHUNK_INDEX => {
+                let chunk = ChunkIndex::parse(record.body).ok_or_else(malformed)?;
+                chunks.insert(chunk.offset, chunk);
+            }
+            op::STATISTICS => {
+                statistics = Some(Statistics::parse(record.body).ok_or_else(malformed)?);
+            }
+            opcode => channels.learn(opcode, record.body)?,
+        }
+    }
+    let complete = statistics.filter(|statistics| {
+        statistics.channels as usize == channels.len() && statistics.chunks as usize == chunks.len()
+    });
+    Ok(complete.map(|statistics| {
+        let messages = statistics.messages.into_iter().collect();
+        Summary { channels, chunks, messages }
+    }))
+}

@@ -1,0 +1,205 @@
+//! The trait every source of samples implements, and what it hands over.
+
+use std::fmt;
+use std::sync::Arc;
+
+use crate::message::{Definitions, Endian, MessageError};
+use crate::nearest::hint;
+
+/// One topic that a caller wants to receive.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TopicSpec {
+    /// Absolute topic name, for example `/imu/data`.
+    pub topic: String,
+    /// Message type, `pkg/msg/Type` or `pkg/Type`; the two spellings are equal.
+    pub type_name: String,
+    /// How many samples a live transport may hold back before it drops the oldest. A replay is
+    /// pulled and holds none.
+    pub queue: usize,
+    /// The largest sample, in bytes of CDR, that the sink will take. A live transport sizes its
+    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`].
+    pub max_bytes: usize,
+}
+
+/// The identity of whoever wrote a sample: 16 bytes, equal for all samples of one writer.
+#[derive(Copy, Clone, PartialEq, Eq, Hash, Debug, Default, PartialOrd, Ord)]
+pub struct Guid(pub [u8; 16]);
+
+impl fmt::Display for Guid {
+    /// 32 lower-case hex digits.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+/// What is known of a sample besides its bytes.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct SampleMeta {
+    /// The clock that orders everything, in ns. Replay: log time. Live: receive time.
+    pub at_ns: i64,
+    /// When the writer published the sample, in ns of the writer's clock.
+    pub publish_ns: i64,
+    /// Who wrote it.
+    pub writer: Guid,
+    /// Strictly increasing per writer, at least 1. A gap is a loss before us.
+    pub seq: u64,
+    /// Byte order of the CDR payload.
+    pub endian: Endian,
+}
+
+/// What a sink did with a sample.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
+pub enum Verdict {
+    /// Copied and held.
+    Taken,
+    /// Dropped: no free memory to hold it.
+    NoSlot,
+    /// Dropped: larger than the sink's limit.
+    TooBig,
+}
+
+/// Takes samples of one topic.
+pub trait Sink: Send + Sync {
+    /// Takes one sample; `cdr` is the payload without the four bytes of encapsulation.
+    ///
+    /// Runs on the transport's thread: one copy, no lock that a lambda can hold, never blocks.
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict;
+}
+
+/// A topic that a transport knows of.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DiscoveredTopic {
+    /// Absolute topic name.
+    pub topic: String,
+    /// Message type as the source spells it.
+    pub type_name: String,
+    /// ros2msg text of the type and all it refers to, where the source carries it.
+    pub definitions_text: Option<Arc<str>>,
+    /// How many messages the source holds, where it knows.
+    pub messages: Option<u64>,
+}
+
+/// Names one successful [`Transport::subscribe`]: 0 for the first of a transport, then counting up.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Subscription(pub usize);
+
+/// A source of samples. Object safe and synchronous.
+pub trait Transport {
+    /// The topics known now, sorted by name. A live transport may learn of more later.
+    fn topics(&self) -> Vec<DiscoveredTopic>;
+
+    /// Sends each sample of a topic to `sink` from now on. A topic may be subscribed several times;
+    /// every subscription gets every sample, in the order of subscribing.
+    ///
+    /// # Errors
+    ///
+    /// [`TransportError`] if the topic does not exist, has another type or an encoding that we do
+    /// not read, or if the transport can take no more subscriptions.
+    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError>;
+
+    /// The parsed message definitions of a topic, shared by all who ask.
+    ///
+    /// # Errors
+    ///
+    /// [`TransportError`] if there is no such topic, or its definitions are missing or malformed.
+    fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError>;
+}
+
+/// Why a topic cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum TransportError {
+    /// The source has no topic of that name.
+    #[error("no topic `{topic}`{}; there are: {}", hint(nearest), list(known))]
+    NoSuchTopic {
+        /// The name asked for.
+        topic: String,
+        /// The topics there are, sorted.
+        known: Vec<String>,
+        /// The closest of them, if one is close.
+        nearest: Option<String>,
+    },
+    /// The topic carries another type.
+    #[error("topic `{topic}` has type `{found}`, not `{wanted}`")]
+    WrongType {
+        /// The topic.
+        topic: String,
+        /// The type asked for.
+        wanted: String,
+        /// The type it has.
+        found: String,
+    },
+    /// The topic is written in an encoding that we do not read.
+    #[error("topic `{topic}` has {what} `{found}`; only `{wanted}` can be read")]
+    Encoding {
+        /// The topic.
+        topic: String,
+        /// Which encoding: "message encoding" or "schema encoding".
+        what: &'static str,
+        /// What the source uses.
+        found: String,
+        /// What we read.
+        wanted: &'static str,
+    },
+    /// The source does not carry the definitions of this topic's type.
+    #[error("topic `{topic}` has no message definitions for its type `{type_name}`")]
+    NoDefinitions {
+        /// The topic.
+        topic: String,
+        /// Its type.
+        type_name: String,
+    },
+    /// The definitions that the source carries cannot be used.
+    #[error("the message definitions of topic `{topic}` cannot be used")]
+    BadDefinitions {
+        /// The topic.
+        topic: String,
+        /// What is wrong with them.
+        source: MessageError,
+    },
+    /// Replay: subscriptions are made before the first step.
+    #[error("topic `{topic}` was subscribed after the replay started")]
+    AlreadyStarted {
+        /// The topic.
+        topic: String,
+    },
+}
+
+fn list(names: &[String]) -> String {
+    if names.is_empty() {
+        return "none".to_owned();
+    }
+    names.join(", ")
+}
+
+/// Whether two message type names mean the same type: `pkg/msg/Type` equals `pkg/Type`.
+pub(crate) fn same_type(a: &str, b: &str) -> bool {
+    crate::message::short_name(a) == crate::message::short_name(b)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_guid_prints_as_32_hex_digits() {
+        let mut bytes = [0; 16];
+        bytes[..4].copy_from_slice(b"mcap");
+        assert_eq!(Guid(bytes).to_string(), "6d636170000000000000000000000000");
+    }
+
+    #[test]
+    fn both_spellings_of_a_type_are_equal() {
+        assert!(same_type("sensor_msgs/msg/Imu", "sensor_msgs/Imu"));
+        assert!(!same_type("sensor_msgs/msg/Imu", "sensor_msgs/msg/Image"));
+    }
+
+    #[test]
+    fn a_missing_topic_is_explained() {
+        let error = TransportError::NoSuchTopic {
+            topic: "/imu/dat".to_owned(),
+            known: vec!["/imu/data".to_owned(), "/speed".to_owned()],
+            nearest: Some("/imu/data".to_owned()),
+        };
+        assert_eq!(error.to_string(), "no topic `/imu/dat` (did you mean `/imu/data`?); there are: /imu/data, /speed");
+    }
+}

@@ -1,0 +1,269 @@
+use serde::{Deserialize, Serialize};
+
+/// The outcome of one wake of a lambda: one line of `decisions.jsonl`.
+///
+/// The order of the fields is the order of the keys in the file. JSON has no number for infinities and NaN: whoever
+/// makes a decision refuses such scores and attributes first (a trigger with one is a fault of the lambda), because
+/// a line with one would carry `null` in its place.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Decision {
+    /// Log time of the sample or tick that woke the lambda, in ns since the epoch of the drive.
+    pub at_ns: i64,
+    /// What woke the lambda.
+    pub cause: Cause,
+    /// Name of the input that woke it; `None` for a tick.
+    pub input: Option<String>,
+    /// Topic of the waking sample; `None` for a tick.
+    pub topic: Option<String>,
+    /// GUID of the sample's writer, 32 hexadecimal digits; `None` for a tick, or if the drive does not know it.
+    pub writer: Option<String>,
+    /// Sequence number of the waking sample among those of its writer.
+    pub seq: Option<u64>,
+    /// What the lambda caused, in the order in which it did.
+    pub triggers: Vec<Trigger>,
+    /// Why the wake ended early, if it did. Triggers that came before the fault still count.
+    pub fault: Option<Fault>,
+    /// Fuel that the wake burnt; `None` for Python, which has none.
+    pub fuel: Option<u64>,
+    /// Time in the lambda, in ns. It differs from run to run, so twins are not compared by it.
+    pub run_ns: u64,
+}
+
+/// What woke a lambda.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Cause {
+    /// A sample on the input that `schedule.event` names.
+    Event,
+    /// The clock, by `schedule.period`.
+    Tick,
+}
+
+/// An action that a lambda took.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Trigger {
+    /// What the recorder does about it.
+    pub kind: TriggerKind,
+    /// The lambda's word for what it saw, for example `hard-brake`.
+    pub label: String,
+    /// How sure or how strong, as the lambda defines it; always finite.
+    pub score: Option<f64>,
+    /// Further values for whoever reads the clip, in the order in which the lambda gave them.
+    pub attributes: serde_json::Map<String, serde_json::Value>,
+}
+
+/// What a trigger asks of the recorder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TriggerKind {
+    /// Open the `[record]` window around the waking sample.
+    Event,
+    /// Begin a clip that lasts until `stop`.
+    Start,
+    /// End the clip that `start` began.
+    Stop,
+}
+
+impl TriggerKind {
+    /// The word of the file: `event`, `start` or `stop`.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            TriggerKind::Event => "event",
+            TriggerKind::Start => "start",
+            TriggerKind::Stop => "stop",
+        }
+    }
+}
+
+/// Why a wake ended early.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Fault {
+    /// The cause, for programs.
+    pub kind: FaultKind,
+    /// The cause, for people.
+    pub message: String,
+    /// What the lambda used, in the unit of the limit: fuel units, ns for a deadline, bytes for memory.
+    pub used: Option<u64>,
+    /// What it was allowed, in the same unit.
+    pub allowed: Option<u64>,
+}
+
+/// The causes of a fault.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FaultKind {
+    /// The fuel of the wake was burnt.
+    Fuel,
+    /// The wake outlasted its deadline.
+    Deadline,
+    /// More memory was asked for than is allowed.
+    Memory,
+    /// The call stack overflowed.
+    Stack,
+    /// WebAssembly trapped: a panic, a division by zero, an access out of bounds.
+    Trap,
+    /// A host function was called in a way it refuses.
+    HostCall,
+    /// Python raised an exception that the lambda did not catch.
+    Exception,
+    /// The process was killed, for example at the hard deadline.
+    Killed,
+}
+
+/// How far apart the scores of twins may be, relative to the larger magnitude of the two.
+pub const SCORE_TOLERANCE: f64 = 1e-5;
+
+/// What differs between the decisions of two twins on the same wake, for a person; `None` if they agree.
+///
+/// Twins agree when `at_ns`, `topic`, `seq`, and the kinds and labels of the triggers are equal and scores are within
+/// [`SCORE_TOLERANCE`] of the larger one. Fuel, time and attributes may differ: they belong to the language.
+pub fn twins_differ(a: &Decision, b: &Decision) -> Option<String> {
+    if a.at_ns != b.at_ns {
+        return Some(format!("at_ns is {} and {}", a.at_ns, b.at_ns));
+    }
+    if a.topic != b.topic {
+        let name = |topic: &Option<String>| topic.as_ref().map_or("none".to_owned(), |topic| format!("`{topic}`"));
+        return Some(format!("topic is {} and {}", name(&a.topic), name(&b.topic)));
+    }
+    if a.seq != b.seq {
+        let number = |seq: Option<u64>| seq.map_or("none".to_owned(), |seq| seq.to_string());
+        return Some(format!("seq is {} and {}", number(a.seq), number(b.seq)));
+    }
+    if a.triggers.len() != b.triggers.len() {
+        return Some(format!("the number of triggers is {} and {}", a.triggers.len(), b.triggers.len()));
+    }
+    let mut pairs = a.triggers.iter().zip(&b.triggers).enumerate();
+    pairs.find_map(|(index, (a, b))| {
+        triggers_differ(a, b).map(|difference| format!("trigger {}: {difference}", index + 1))
+    })
+}
+
+fn triggers_differ(a: &Trigger, b: &Trigger) -> Option<String> {
+    if a.kind != b.kind {
+        return Some(format!("kind is {} and {}", a.kind.as_str(), b.kind.as_str()));
+    }
+    if a.label != b.label {
+        return Some(format!("label is `{}` and `{}`", a.label, b.label));
+    }
+    let agree = match (a.score, b.score) {
+        (Some(a), Some(b)) => a == b || (a - b).abs() <= SCORE_TOLERANCE * a.abs().max(b.abs()),
+        (None, None) => true,
+        _ => false,
+    };
+    let number = |score: Option<f64>| score.map_or("none".to_owned(), |score| score.to_string());
+    (!agree).then(|| format!("score is {} and {}", number(a.score), number(b.score)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn decision() -> Decision {
+        Decision {
+            at_ns: 1_700_000_000_000_000_000,
+            cause: Cause::Event,
+            input: Some("camera".to_owned()),
+            topic: Some("/camera/front".to_owned()),
+            writer: Some("0123456789abcdef0123456789abcdef".to_owned()),
+            seq: Some(7),
+            triggers: vec![Trigger {
+                kind: TriggerKind::Event,
+                label: "hard-brake".to_owned(),
+                score: Some(0.5),
+                attributes: serde_json::Map::from_iter([
+                    ("mps2".to_owned(), serde_json::json!(-4.5)),
+                    ("luma".to_owned(), serde_json::json!(12)),
+                ]),
+            }],
+            fault: None,
+            fuel: Some(1234),
+            run_ns: 5600,
+        }
+    }
+
+    fn changed(change: impl FnOnce(&mut Decision)) -> Option<String> {
+        let mut other = decision();
+        change(&mut other);
+        twins_differ(&decision(), &other)
+    }
+
+    #[test]
+    fn a_decision_is_one_line_with_the_keys_in_the_order_of_the_design() {
+        let line = serde_json::to_string(&decision()).unwrap();
+        assert_eq!(
+            line,
+            concat!(
+                r#"{"at_ns":1700000000000000000,"cause":"event","input":"camera","topic":"/camera/front","#,
+                r#""writer":"0123456789abcdef0123456789abcdef","seq":7,"triggers":[{"kind":"event","#,
+                r#""label":"hard-brake","score":0.5,"attributes":{"mps2":-4.5,"luma":12}}],"#,
+                r#""fault":null,"fuel":1234,"run_ns":5600}"#
+            )
+        );
+        assert_eq!(serde_json::from_str::<Decision>(&line).unwrap(), decision());
+    }
+
+    #[test]
+    fn a_tick_with_a_fault_reads_back_as_it_was_written() {
+        let fault = Fault {
+            kind: FaultKind::HostCall,
+            message: "offset 9 is beyond the frame".to_owned(),
+            used: None,
+            allowed: Some(8),
+        };
+        let tick = Decision {
+            cause: Cause::Tick,
+            input: None,
+            topic: None,
+            writer: None,
+            seq: None,
+            triggers: Vec::new(),
+            fault: Some(fault),
+            fuel: None,
+            ..decision()
+        };
+        let line = serde_json::to_string(&tick).unwrap();
+        assert!(line.contains(r#""cause":"tick","input":null,"topic":null,"writer":null,"seq":null,"triggers":[]"#));
+        assert!(line.contains(
+            r#""fault":{"kind":"host_call","message":"offset 9 is beyond the frame","used":null,"allowed":8}"#
+        ));
+        assert_eq!(serde_json::from_str::<Decision>(&line).unwrap(), tick);
+    }
+
+    #[test]
+    fn twins_agree_whatever_their_fuel_time_and_attributes() {
+        let difference = changed(|twin| {
+            twin.fuel = None;
+            twin.run_ns = 1;
+            twin.writer = None;
+            twin.triggers[0].attributes.clear();
+        });
+        assert_eq!(difference, None);
+    }
+
+    #[test]
+    fn scores_of_twins_agree_within_their_tolerance() {
+        assert_eq!(changed(|twin| twin.triggers[0].score = Some(0.500_004)), None);
+        let difference = changed(|twin| twin.triggers[0].score = Some(0.500_006));
+        assert_eq!(difference.as_deref(), Some("trigger 1: score is 0.5 and 0.500006"));
+        let difference = changed(|twin| twin.triggers[0].score = None);
+        assert_eq!(difference.as_deref(), Some("trigger 1: score is 0.5 and none"));
+        let difference = changed(|twin| twin.triggers[0].score = Some(f64::NAN));
+        assert_eq!(difference.as_deref(), Some("trigger 1: score is 0.5 and NaN"));
+    }
+
+    #[test]
+    fn what_differs_between_twins_is_said() {
+        type Change = fn(&mut Decision);
+        let cases: [(Change, &str); 6] = [
+            (|twin| twin.at_ns = 5, "at_ns is 1700000000000000000 and 5"),
+            (|twin| twin.topic = None, "topic is `/camera/front` and none"),
+            (|twin| twin.seq = Some(8), "seq is 7 and 8"),
+            (|twin| twin.triggers.clear(), "the number of triggers is 1 and 0"),
+            (|twin| twin.triggers[0].kind = TriggerKind::Stop, "trigger 1: kind is event and stop"),
+            (|twin| twin.triggers[0].label = "x".to_owned(), "trigger 1: label is `hard-brake` and `x`"),
+        ];
+        for (change, difference) in cases {
+            assert_eq!(changed(change).as_deref(), Some(difference));
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! The default, minimum and maximum of every number in a manifest, and why.
+
+use std::ops::RangeInclusive;
+use std::time::Duration;
+
+use super::ByteSize;
+
+/// What a number may be, and what it is when the manifest does not say.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bounds<T> {
+    /// The smallest value that is accepted.
+    pub min: T,
+    /// The value of a manifest that does not name the key.
+    pub default: T,
+    /// The largest value that is accepted.
+    pub max: T,
+}
+
+impl<T: Copy> Bounds<T> {
+    /// From the smallest to the largest value.
+    pub fn range(&self) -> RangeInclusive<T> {
+        self.min..=self.max
+    }
+}
+
+/// `input.depth` of small samples: how many the ring shows. Over a second of a typical IMU; the maximum is over a
+/// minute at 1 kHz.
+pub const DEPTH_SMALL: Bounds<u64> = Bounds { min: 1, default: 64, max: 65_536 };
+
+/// `input.depth` of large samples, that is frames and point clouds.
+pub const DEPTH_LARGE: Bounds<u64> = Bounds { default: 4, ..DEPTH_SMALL };
+
+/// `input.hold`: how many samples a lambda may hold on to beyond the ring. At least the one that woke it.
+pub const HOLD_SMALL: Bounds<u64> = Bounds { min: 1, default: 8, max: 1024 };
+
+/// `input.hold` of large samples.
+pub const HOLD_LARGE: Bounds<u64> = Bounds { default: 2, ..HOLD_SMALL };
+
+/// `input.max_size` of small samples, as CDR.
+pub const MAX_SIZE_SMALL: Bounds<ByteSize> =
+    Bounds { min: ByteSize::new(1), default: ByteSize::kib(4), max: ByteSize::mib(256) };
+
+/// `input.max_size` of large samples: a raw 1080p frame takes 6 MiB.
+pub const MAX_SIZE_LARGE: Bounds<ByteSize> = Bounds { default: ByteSize::mib(8), ..MAX_SIZE_SMALL };
+
+/// `input.decoded_size`: the largest compressed image, once decoded to rgb8. 1080p takes 6 MiB.
+pub const DECODED_SIZE: Bounds<ByteSize> = MAX_SIZE_LARGE;
+
+/// Most memory that the inputs of one lambda may ask for together. It is allocated before the first sample.
+pub const INPUTS_MEMORY_MAX: ByteSize = ByteSize::gib(2);
+
+/// `input.qos.depth`: the history that DDS keeps.
+pub const QOS_DEPTH: Bounds<u64> = Bounds { min: 1, default: 10, max: 65_536 };
+
+/// `schedule.period`; it has no default. Faster than 1 ms is no job for a function that is called per tick.
+pub const PERIOD: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_secs(3600);
+
+/// `record.preroll` and `record.postroll`.
+pub const ROLL: Bounds<Duration> =
+    Bounds { min: Duration::ZERO, default: Duration::from_secs(5), max: Duration::from_secs(600) };
+
+/// `record.cooldown`: how long after a trigger the next ones open no new window.
+pub const COOLDOWN: Bounds<Duration> =
+    Bounds { min: Duration::ZERO, default: Duration::ZERO, max: Duration::from_secs(3600) };
+
+/// `limits.fuel`: about one unit per WebAssembly instruction, so that the default is some 20 ms.
+pub const FUEL: Bounds<u64> = Bounds { min: 1_000, default: 50_000_000, max: 1_000_000_000_000 };
+
+/// `limits.deadline`.
+pub const DEADLINE: Bounds<Duration> =
+    Bounds { min: Duration::from_millis(1), default: Duration::from_millis(50), max: Duration::from_secs(60) };
+
+/// `limits.memory`: what the lambda itself may allocate, beyond the rings.
+pub const MEMORY: Bounds<ByteSize> =
+    Bounds { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) };
+
+/// `model.threads`; without it the vehicle chooses.
+pub const THREADS: RangeInclusive<u64> = 1..=64;
+
+/// Longest manifest that is read. The longest in use has 3 KiB.
+pub const MANIFEST_MAX: ByteSize = ByteSize::mib(1);
+
+/// Most inputs, models, config items or recorded topics of one lambda.
+pub const ITEMS_MAX: usize = 256;

@@ -1,0 +1,67 @@
+use std::path::{Path, PathBuf};
+
+use super::PartsError;
+
+/// The folders in which parts may lie.
+#[derive(Debug, Clone)]
+pub(super) struct Places {
+    /// In the order in which they are looked at.
+    folders: Vec<PathBuf>,
+    /// The checkout around the cargo target folder with the program, if it is in one.
+    checkout: Option<PathBuf>,
+}
+
+impl Places {
+    /// The places of the program `exe`, of which `home` comes first if the user set it.
+    pub(super) fn around(exe: &Path, home: Option<PathBuf>) -> Places {
+        let mut folders = Vec::new();
+        if let Some(home) = home {
+            folders.push(home.join("lib/gleaner"));
+            folders.push(home);
+        }
+        let beside = exe.parent().unwrap_or(Path::new(""));
+        // A program that lies in `lib/gleaner` itself was started by one in `bin`: its parts are beside it.
+        if beside.ends_with("lib/gleaner") {
+            folders.push(beside.to_owned());
+        }
+        if let Some(prefix) = beside.parent() {
+            folders.push(prefix.join("lib/gleaner"));
+        }
+        let mut checkout = None;
+        if let Some(target) = cargo_target(beside) {
+            folders.push(beside.to_owned());
+            // Cargo puts test programs into `deps`, one below the programs they test.
+            if beside.ends_with("deps") {
+                folders.extend(beside.parent().map(Path::to_owned));
+            }
+            checkout = target.ancestors().skip(1).find(|folder| is_checkout(folder)).map(Path::to_owned);
+            folders.extend(checkout.as_ref().map(|checkout| checkout.join("guest-sdk-python")));
+        }
+        Places { folders, checkout }
+    }
+
+    pub(super) fn checkout(&self) -> Option<&Path> {
+        self.checkout.as_deref()
+    }
+
+    /// What `part` finds in the first folder where it finds something.
+    pub(super) fn first(
+        &self,
+        name: &str,
+        made_by: &'static str,
+        part: impl Fn(&Path) -> Option<PathBuf>,
+    ) -> Result<PathBuf, PartsError> {
+        let found = self.folders.iter().find_map(|folder| part(folder));
+        found.ok_or_else(|| PartsError::Missing { part: name.to_owned(), folders: self.folders.clone(), made_by })
+    }
+}
+
+/// The cargo target folder around `folder`, known by the tag that cargo leaves in it. Programs are at most
+/// `target/<triple>/<profile>/deps` deep.
+fn cargo_target(folder: &Path) -> Option<&Path> {
+    folder.ancestors().take(4).find(|folder| folder.join("CACHEDIR.TAG").is_file())
+}
+
+fn is_checkout(folder: &Path) -> bool {
+    folder.join("Cargo.toml").is_file() && folder.join("guest-sdk-python").is_dir()
+}

@@ -1,0 +1,64 @@
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use super::{Looked, PartsError};
+use crate::words::excerpt;
+
+/// Prints the version and the path of the interpreter itself: `python3` is often a script that chooses one, and would
+/// choose again at every start. Fails where the system's Python comes in pieces and lacks the two modules.
+const PROBE: &str = "import sys, venv, ensurepip; print(*sys.version_info[:2]); print(sys.executable)";
+
+/// The interpreters to try, in order. Those with a folder are paths, the others are searched for in `PATH`.
+pub(super) fn candidates(wanted: Option<&Path>, lambda_dir: Option<&Path>, checkout: Option<&Path>) -> Vec<PathBuf> {
+    let mut candidates: Vec<PathBuf> = wanted.map(Path::to_owned).into_iter().collect();
+    candidates.extend([lambda_dir, checkout].into_iter().flatten().map(|dir| dir.join(".venv/bin/python3")));
+    candidates.push("python3".into());
+    candidates.extend((9..=13).rev().map(|minor| PathBuf::from(format!("python3.{minor}"))));
+    candidates
+}
+
+/// The first of `candidates` that runs.
+pub(super) fn first_that_runs(candidates: Vec<PathBuf>) -> Result<PathBuf, PartsError> {
+    let mut tried = Vec::new();
+    for candidate in candidates {
+        match probe(&candidate) {
+            Ok(interpreter) => return Ok(interpreter),
+            Err(why) => tried.push(Looked { at: candidate, why }),
+        }
+    }
+    Err(PartsError::NoPython { tried })
+}
+
+/// The interpreter that `candidate` starts, or why it will not do.
+fn probe(candidate: &Path) -> Result<PathBuf, String> {
+    // Isolated: else a `venv.py` in the current folder would be run.
+    let output = Command::new(candidate).args(["-I", "-c", PROBE]).stdin(Stdio::null()).output();
+    let output = output.map_err(|error| match error.kind() {
+        std::io::ErrorKind::NotFound => "not found".to_owned(),
+        _ => error.to_string(),
+    })?;
+    if !output.status.success() {
+        return Err(complaint(&output));
+    }
+    let text = String::from_utf8_lossy(&output.stdout);
+    let answer = || {
+        let (version, path) = text.trim_end().split_once('\n')?;
+        let (major, minor) = version.trim_end().split_once(' ')?;
+        let version: (u32, u32) = (major.parse().ok()?, minor.parse().ok()?);
+        Some((version, PathBuf::from(path))).filter(|(_, path)| path.is_absolute())
+    };
+    match answer() {
+        Some((version, path)) if version >= (3, 9) => Ok(path),
+        Some(((major, minor), _)) => Err(format!("is Python {major}.{minor}")),
+        None => Err("does not answer as Python does".to_owned()),
+    }
+}
+
+/// The last line that a program wrote before it failed: Python ends a traceback with the error.
+fn complaint(output: &Output) -> String {
+    let text = String::from_utf8_lossy(&output.stderr);
+    match text.lines().map(str::trim).rfind(|line| !line.is_empty()) {
+        Some(line) => excerpt(line),
+        None => format!("ends with {}", output.status),
+    }
+}

@@ -1,0 +1,187 @@
+use std::sync::{Mutex, PoisonError};
+
+use super::*;
+use crate::scratch::Scratch;
+use crate::{Exit, Explain};
+
+/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another test is about to
+/// start. Tests that write programs and start them take turns.
+static TURN: Mutex<()> = Mutex::new(());
+
+/// A program that answers the probe as Python of this version would.
+fn python(dir: &Scratch, relative: &str, version: &str) -> PathBuf {
+    let path = dir.path(relative);
+    dir.write_program(relative, &format!("#!/bin/sh\necho '{version}'\necho '{}'\n", path.display()))
+}
+
+/// An installation with `bin/gleaner` and everything else in `lib/gleaner`.
+fn installation() -> Scratch {
+    let dir = Scratch::new();
+    dir.write_program("bin/gleaner", "");
+    dir.write_program("lib/gleaner/gleaner-runtime", "");
+    dir.write("lib/gleaner/lib_gleaner.so", "");
+    dir.write("lib/gleaner/start.py", "");
+    dir.write("lib/gleaner/gleaner/__init__.py", "");
+    dir
+}
+
+/// A checkout after `cargo build --release`.
+fn checkout() -> Scratch {
+    let dir = Scratch::new();
+    dir.write("Cargo.toml", "");
+    dir.write("guest-sdk-python/start.py", "");
+    dir.write("guest-sdk-python/gleaner/__init__.py", "");
+    dir.write("target/CACHEDIR.TAG", "");
+    dir.write_program("target/release/gleaner-runtime", "");
+    dir.write("target/release/lib_gleaner.so", "");
+    dir
+}
+
+#[track_caller]
+fn finds_everything(parts: &Parts, programs: &Path, python_home: &Path) {
+    assert_eq!(parts.program("gleaner-runtime").unwrap(), programs.join("gleaner-runtime"));
+    assert_eq!(parts.extension().unwrap(), programs.join("lib_gleaner.so"));
+    assert_eq!(parts.python_home().unwrap(), python_home);
+}
+
+#[test]
+fn an_installed_program_finds_its_parts_in_lib_gleaner() {
+    let dir = installation();
+    let lib = dir.path("lib/gleaner");
+    for exe in ["bin/gleaner", "lib/gleaner/gleaner-runtime"] {
+        finds_everything(&Parts::around(&dir.path(exe), None, None), &lib, &lib);
+    }
+}
+
+#[test]
+fn gleaner_home_comes_first_as_a_prefix_or_as_the_folder_itself() {
+    let (dir, other) = (installation(), installation());
+    let lib = dir.path("lib/gleaner");
+    for home in [dir.root(), &lib] {
+        let parts = Parts::around(&other.path("bin/gleaner"), Some(home.to_owned()), None);
+        finds_everything(&parts, &lib, &lib);
+    }
+}
+
+#[test]
+fn a_program_in_a_cargo_target_folder_finds_its_parts_beside_it_and_in_the_checkout() {
+    let dir = checkout();
+    for exe in ["target/release/gleaner", "target/release/deps/replay-0123456789abcdef"] {
+        let parts = Parts::around(&dir.path(exe), None, None);
+        finds_everything(&parts, &dir.path("target/release"), &dir.path("guest-sdk-python"));
+        assert_eq!(parts.places.checkout(), Some(dir.root()));
+    }
+}
+
+#[test]
+fn outside_of_a_target_folder_nothing_beside_the_program_is_taken() {
+    let dir = checkout();
+    std::fs::remove_file(dir.path("target/CACHEDIR.TAG")).unwrap();
+    let parts = Parts::around(&dir.path("target/release/gleaner"), None, None);
+    assert!(parts.program("gleaner-runtime").is_err());
+    assert!(parts.python_home().is_err());
+}
+
+#[test]
+fn a_missing_program_is_reported_with_every_place_and_the_way_out() {
+    let dir = checkout();
+    let root = dir.root().display();
+    // There, but nothing that could be started.
+    dir.write("target/release/gleaner-shim", "");
+    let parts = Parts::around(&dir.path("target/release/deps/x"), Some(dir.path("home")), None);
+    let error = parts.program("gleaner-shim").unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        format!(
+            "cannot find gleaner-shim; looked in\n{root}/home/lib/gleaner\n{root}/home\n{root}/target/release/lib/gleaner\n\
+             {root}/target/release/deps\n{root}/target/release\n{root}/guest-sdk-python"
+        )
+    );
+    let help = "in a checkout run `cargo build --release`, else set GLEANER_HOME to the folder of the installation";
+    assert_eq!(error.help().as_deref(), Some(help));
+    assert_eq!(error.exit(), Exit::Internal);
+}
+
+#[test]
+fn a_missing_python_side_is_reported_with_the_command_that_makes_it() {
+    let dir = installation();
+    std::fs::remove_file(dir.path("lib/gleaner/gleaner/__init__.py")).unwrap();
+    let error = Parts::around(&dir.path("bin/gleaner"), None, None).python_home().unwrap_err();
+    let lib = dir.path("lib/gleaner");
+    assert_eq!(
+        error.to_string(),
+        format!("cannot find start.py with the package gleaner; looked in\n{}", lib.display())
+    );
+    let help = "in a checkout run `cargo xtask demo`, else set GLEANER_HOME to the folder of the installation";
+    assert_eq!(error.help().as_deref(), Some(help));
+}
+
+#[test]
+fn the_python_that_the_user_wants_comes_before_those_of_lambda_and_checkout() {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let dir = checkout();
+    let exe = dir.path("target/release/gleaner");
+    let wanted = python(&dir, "wanted/python", "3 9");
+    let own = python(&dir, "lambda/.venv/bin/python3", "3 12");
+    let shared = python(&dir, ".venv/bin/python3", "4 0");
+    let lambda = dir.path("lambda");
+
+    let parts = Parts::around(&exe, None, Some(wanted.clone()));
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), wanted);
+    let parts = Parts::around(&exe, None, None);
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), own);
+    assert_eq!(parts.python(None).unwrap(), shared);
+    assert_eq!(parts.python(Some(&dir.path("another"))).unwrap(), shared);
+}
+
+#[test]
+fn the_pythons_of_path_are_tried_last_and_newest_first() {
+    let names = python::candidates(None, None, None);
+    let expected = ["python3", "python3.13", "python3.12", "python3.11", "python3.10", "python3.9"];
+    assert_eq!(names, expected.map(PathBuf::from));
+}
+
+#[test]
+fn without_a_python_that_runs_each_candidate_is_named_with_its_fault() {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let dir = Scratch::new();
+    let old = python(&dir, "old", "3 8");
+    let silent = dir.write_program("silent", "#!/bin/sh\nexit 3\n");
+    let split = dir.write_program(
+        "split",
+        "#!/bin/sh\necho 'Traceback (most recent call last):' >&2\necho \"ModuleNotFoundError: No module named 'ensurepip'\" >&2\nexit 1\n",
+    );
+    let other = dir.write_program("other", "#!/bin/sh\necho hello\n");
+    let locked = dir.write("locked", "");
+    let missing = dir.path("missing");
+    let root = dir.root().display().to_string();
+    let error = python::first_that_runs(vec![old, silent, split, other, locked, missing]).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        format!(
+            "found no Python 3.9 or newer that runs; tried\n\
+             {root}/old: is Python 3.8\n\
+             {root}/silent: ends with exit status: 3\n\
+             {root}/split: ModuleNotFoundError: No module named 'ensurepip'\n\
+             {root}/other: does not answer as Python does\n\
+             {root}/locked: Permission denied (os error 13)\n\
+             {root}/missing: not found"
+        )
+    );
+    let help = "in a checkout run `cargo xtask demo`, or set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip";
+    assert_eq!(error.help().as_deref(), Some(help));
+}
+
+#[test]
+fn the_cache_follows_xdg_and_ignores_relative_paths() {
+    let path = |text: &str| Some(PathBuf::from(text));
+    assert_eq!(cache_below(path("/x"), path("/home/u")).unwrap(), Path::new("/x/gleaner"));
+    assert_eq!(cache_below(path("x"), path("/home/u")).unwrap(), Path::new("/home/u/.cache/gleaner"));
+    assert_eq!(cache_below(None, path("/home/u")).unwrap(), Path::new("/home/u/.cache/gleaner"));
+    let error = cache_below(None, path("u")).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "there is no folder for the cache: neither XDG_CACHE_HOME nor HOME is set to an absolute path"
+    );
+    assert_eq!(error.help().as_deref(), Some("set XDG_CACHE_HOME"));
+}

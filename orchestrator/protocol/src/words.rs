@@ -1,0 +1,76 @@
+//! Words in messages: lists of them, the nearest to a misspelt one, and foreign text made fit to print.
+
+/// The one of `known` that `word` was most likely meant to be.
+pub(crate) fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
+    // The distance takes time in proportion to both lengths, and nobody misspells a key with a page of text.
+    if word.len() > 64 {
+        return None;
+    }
+    let allowed = (word.chars().count() / 3).max(1);
+    known
+        .into_iter()
+        .map(|candidate| (strsim::damerau_levenshtein(word, candidate), candidate))
+        .filter(|(distance, _)| *distance <= allowed)
+        .min_by_key(|(distance, _)| *distance)
+        .map(|(_, candidate)| candidate)
+}
+
+/// `` `a` ``, `` `a` and `b` ``, `` `a`, `b` and `c` `` with `and` or another last word.
+pub(crate) fn list<W: AsRef<str>>(words: &[W], last: &str) -> String {
+    let quoted: Vec<String> = words.iter().map(|word| format!("`{}`", word.as_ref())).collect();
+    match quoted.split_last() {
+        Some((end, rest)) if !rest.is_empty() => format!("{} {last} {end}", rest.join(", ")),
+        _ => quoted.concat(),
+    }
+}
+
+/// A text from a file, short enough for a message and without characters that would act on a terminal.
+pub(crate) fn excerpt(text: &str) -> String {
+    const SHOWN: usize = 80;
+    match text.char_indices().nth(SHOWN) {
+        Some((end, _)) => visible(&text[..end]) + "…",
+        None => visible(text),
+    }
+}
+
+/// `text` with its control characters written out, so that none acts on a terminal.
+pub(crate) fn visible(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character.is_control() {
+            true => shown.extend(character.escape_default()),
+            false => shown.push(character),
+        }
+    }
+    shown
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_nearest_word_is_offered_only_if_it_is_near() {
+        let known = ["event", "period", "backlog"];
+        assert_eq!(nearest("evnt", known), Some("event"));
+        assert_eq!(nearest("peroid", known), Some("period"));
+        assert_eq!(nearest("colour", known), None);
+        assert_eq!(nearest("", known), None);
+        assert_eq!(nearest(&"event".repeat(100), known), None);
+    }
+
+    #[test]
+    fn lists_end_with_their_last_word() {
+        assert_eq!(list::<&str>(&[], "and"), "");
+        assert_eq!(list(&["a"], "and"), "`a`");
+        assert_eq!(list(&["a", "b"], "or"), "`a` or `b`");
+        assert_eq!(list(&["a", "b", "c"], "and"), "`a`, `b` and `c`");
+    }
+
+    #[test]
+    fn foreign_text_is_cut_and_cannot_act_on_a_terminal() {
+        assert_eq!(excerpt("plain"), "plain");
+        assert_eq!(excerpt("\u{1b}[2J\n"), "\\u{1b}[2J\\n");
+        assert_eq!(excerpt(&"ä".repeat(81)), format!("{}…", "ä".repeat(80)));
+    }
+}

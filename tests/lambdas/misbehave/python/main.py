@@ -1,0 +1,80 @@
+"""A lambda that does what its configuration says a lambda must not do. The host has to stay whole."""
+
+from __future__ import annotations
+
+import sys
+
+from gleaner import Context, Sample
+
+
+class Lambda:
+    def __init__(self, ctx: Context) -> None:
+        self.behaviour: str = ctx.config["behaviour"]
+        self.held: list[object] = []
+        self.wakes = 0
+        if self.behaviour == "error_in_init":
+            raise RuntimeError("no, not today")
+        elif self.behaviour == "bad_input":
+            ctx.input("imo")
+        elif self.behaviour == "bad_field":
+            ctx.input("imu").field("linear_acceleration.w")
+        elif self.behaviour == "struct_field":
+            ctx.input("imu").field("linear_acceleration")
+
+    def on_event(self, ctx: Context, event: Sample) -> None:
+        self.wakes += 1
+        behaviour = getattr(self, self.behaviour, None)
+        if behaviour is None:
+            raise ValueError(f"unknown behaviour `{self.behaviour}`")
+        behaviour(ctx, event)
+
+    def ok(self, ctx: Context, event: Sample) -> None:
+        pass
+
+    def error(self, ctx: Context, event: Sample) -> None:
+        raise RuntimeError("I do not want to")
+
+    def recurse(self, ctx: Context, event: Sample) -> None:
+        self.recurse(ctx, event)
+
+    def exit(self, ctx: Context, event: Sample) -> None:
+        sys.exit(3)
+
+    def interrupt(self, ctx: Context, event: Sample) -> None:
+        raise KeyboardInterrupt
+
+    def not_a_frame(self, ctx: Context, event: Sample) -> None:
+        event.as_frame()
+
+    def huge_label(self, ctx: Context, event: Sample) -> None:
+        ctx.event("x" * 1000, 1.0)
+
+    def too_many_triggers(self, ctx: Context, event: Sample) -> None:
+        for _ in range(17):
+            ctx.event("x", 1.0)
+
+    def event_then_error(self, ctx: Context, event: Sample) -> None:
+        ctx.event("seen", 1.0)
+        raise RuntimeError("after the event")
+
+    def nan_score(self, ctx: Context, event: Sample) -> None:
+        ctx.event("x", float("nan"))
+
+    def long_message(self, ctx: Context, event: Sample) -> None:
+        raise RuntimeError("é" * 10_000 + " and that is all")
+
+    def hold(self, ctx: Context, event: Sample) -> None:
+        self.held.append(event)
+
+    def swallow(self, ctx: Context, event: Sample) -> None:
+        try:
+            ctx.input("imo")
+        except BaseException:
+            pass
+
+    def log_flood(self, ctx: Context, event: Sample) -> None:
+        for i in range(1000):
+            ctx.log("info", f"line {i}")
+
+    def print(self, ctx: Context, event: Sample) -> None:
+        print(f"hello from {self.wakes}")

@@ -1,0 +1,3 @@
+"""A lambda that cannot be imported."""
+
+raise RuntimeError("no, not today")

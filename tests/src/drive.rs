@@ -1,0 +1,109 @@
+//! Drives made by a test: MCAP files with chosen messages, and their CDR.
+
+use std::collections::BTreeMap;
+use std::io::Cursor;
+use std::path::PathBuf;
+
+use mcap::records::MessageHeader;
+
+use crate::{Folder, sample_drive};
+
+/// `sensor_msgs/msg/Image` as ROS 2 defines it.
+pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
+uint32 step\nuint8[] data\n\
+================================================================================\n\
+MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
+================================================================================\n\
+MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+
+/// `sensor_msgs/msg/CompressedImage` as ROS 2 defines it.
+pub const COMPRESSED: &str = "std_msgs/Header header\nstring format\nuint8[] data\n\
+================================================================================\n\
+MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
+================================================================================\n\
+MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+
+/// Writes a drive of one topic; each message is its log time in nanoseconds and its CDR without encapsulation.
+pub fn one_topic(folder: &Folder, topic: &str, type_name: &str, schema: &str, messages: &[(u64, Vec<u8>)]) -> PathBuf {
+    let mut file = Cursor::new(Vec::new());
+    let mut writer =
+        mcap::WriteOptions::new().profile("ros2").compression(None).create(&mut file).expect("a drive in memory");
+    let schema = writer.add_schema(type_name, "ros2msg", schema.as_bytes()).expect("a schema");
+    let channel = writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel");
+    for (sequence, (log_time, cdr)) in (1..).zip(messages) {
+        let header = MessageHeader { channel_id: channel, sequence, log_time: *log_time, publish_time: *log_time };
+        let data = [&[0, 1, 0, 0], cdr.as_slice()].concat();
+        writer.write_to_known_channel(&header, &data).expect("a message");
+    }
+    writer.finish().expect("a whole drive");
+    drop(writer);
+    folder.write("made.mcap", file.into_inner())
+}
+
+/// Little-endian CDR, field by field.
+#[derive(Default)]
+pub struct Cdr(Vec<u8>);
+
+impl Cdr {
+    /// A `std_msgs/msg/Header` with stamp 0 and no frame.
+    pub fn header() -> Self {
+        Self::default().u32(0).u32(0).text("")
+    }
+
+    /// A 32-bit number.
+    pub fn u32(mut self, value: u32) -> Self {
+        self.0.resize(self.0.len().next_multiple_of(4), 0);
+        self.0.extend(value.to_le_bytes());
+        self
+    }
+
+    /// A byte.
+    pub fn u8(mut self, value: u8) -> Self {
+        self.0.push(value);
+        self
+    }
+
+    /// A string.
+    pub fn text(self, text: &str) -> Self {
+        let mut cdr = self.u32(text.len() as u32 + 1);
+        cdr.0.extend(text.as_bytes());
+        cdr.u8(0)
+    }
+
+    /// A sequence of bytes.
+    pub fn bytes(self, bytes: &[u8]) -> Self {
+        let mut cdr = self.u32(bytes.len() as u32);
+        cdr.0.extend(bytes);
+        cdr
+    }
+
+    /// The message.
+    pub fn done(self) -> Vec<u8> {
+        self.0
+    }
+}
+
+/// An image message with whatever numbers a test wants it to claim.
+pub fn image(width: u32, height: u32, encoding: &str, step: u32, data: &[u8]) -> Vec<u8> {
+    Cdr::header().u32(height).u32(width).text(encoding).u8(0).u32(step).bytes(data).done()
+}
+
+/// A compressed image message.
+pub fn compressed(data: &[u8]) -> Vec<u8> {
+    Cdr::header().text("jpeg").bytes(data).done()
+}
+
+/// The sample drive cut after `part` of its bytes.
+pub fn truncated(folder: &Folder, part: f64) -> PathBuf {
+    let whole = std::fs::read(sample_drive()).expect("the sample drive is there");
+    let len = (whole.len() as f64 * part) as usize;
+    folder.write("truncated.mcap", &whole[..len])
+}
+
+/// The sample drive with one byte changed in the middle of its data.
+pub fn corrupted(folder: &Folder) -> PathBuf {
+    let mut whole = std::fs::read(sample_drive()).expect("the sample drive is there");
+    let middle = whole.len() / 2;
+    whole[middle] ^= 0x55;
+    folder.write("corrupted.mcap", whole)
+}

@@ -1,0 +1,193 @@
+//! What the suites share: where things are, running a replay, and drives made by a test.
+
+pub mod drive;
+pub mod rooms;
+pub mod tree;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use gleaner_cli::results::{seconds, trigger_lines};
+use gleaner_protocol::{Decision, Report, Summary};
+
+/// The checkout.
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the checkout").to_owned()
+}
+
+/// The recorded drive that comes with the project.
+pub fn sample_drive() -> PathBuf {
+    root().join("examples/data/highway_drive.mcap")
+}
+
+/// Drives that may not come with the project, in the folder beside the checkout; the reason where there are none.
+pub fn shared_drive(name: &str) -> Result<PathBuf, String> {
+    let path = root().join("../shared/data").join(name);
+    if path.is_file() { Ok(path) } else { Err(format!("no `{name}` in ../shared/data")) }
+}
+
+/// A program of ours, beside this test.
+///
+/// # Panics
+///
+/// If it is not built.
+pub fn program(name: &str) -> PathBuf {
+    let test = std::env::current_exe().expect("a test has a path");
+    // target/release/deps/test-0123
+    let folder = test.parent().and_then(Path::parent).expect("a test lies in target/release/deps");
+    let path = folder.join(name);
+    assert!(path.is_file(), "{} is not built; run: cargo xtask test", path.display());
+    path
+}
+
+/// A folder of this test's own, removed with it.
+pub struct Folder(PathBuf);
+
+impl Folder {
+    /// A new empty folder.
+    #[allow(clippy::new_without_default)]
+    pub fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("gleaner-test-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let path = std::env::temp_dir().join(name);
+        std::fs::create_dir_all(&path).expect("the temporary folder is writable");
+        Self(path)
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+
+    /// Writes a file into it.
+    pub fn write(&self, name: &str, content: impl AsRef<[u8]>) -> PathBuf {
+        let path = self.0.join(name);
+        std::fs::create_dir_all(path.parent().expect("a file has a folder")).expect("the folder is writable");
+        std::fs::write(&path, content).expect("the folder is writable");
+        path
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// What a replay left.
+pub struct Run {
+    /// Exit code; 128 and more for a signal.
+    pub exit: i32,
+    /// What it said to people.
+    pub stderr: String,
+    /// `decisions.jsonl`.
+    pub decisions: Vec<Decision>,
+    /// `log.jsonl`.
+    pub log: Vec<serde_json::Value>,
+    /// The last report; none if it did not come so far.
+    pub summary: Option<Summary>,
+}
+
+/// Replays the built lambda in `lambda` over `drives`.
+pub fn replay(lambda: &Path, drives: &[PathBuf], args: &[&str]) -> Run {
+    let out = Folder::new();
+    let output = Command::new(program("gleaner-runtime"))
+        .arg("replay")
+        .arg(lambda)
+        .args(drives)
+        .args(args)
+        .arg("--out")
+        .arg(out.path())
+        // The tests' own: nothing that a user compiled before is trusted or touched.
+        .env("XDG_CACHE_HOME", root().join("target/test-cache"))
+        .output()
+        .expect("gleaner-runtime starts");
+    let read = |name: &str| std::fs::read_to_string(out.path().join(name)).unwrap_or_default();
+    Run {
+        exit: output.status.code().unwrap_or(128),
+        stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+        decisions: read("decisions.jsonl").lines().map(parsed).collect(),
+        log: read("log.jsonl").lines().map(parsed).collect(),
+        summary: String::from_utf8_lossy(&output.stdout).lines().map(parsed).find_map(|report| match report {
+            Report::Summary(summary) => Some(*summary),
+            Report::Progress { .. } | Report::Round(_) => None,
+        }),
+    }
+}
+
+fn parsed<T: serde::de::DeserializeOwned>(line: &str) -> T {
+    serde_json::from_str(line).unwrap_or_else(|error| panic!("{error} in {line}"))
+}
+
+impl Run {
+    /// A line for each trigger, as in `expected.txt`.
+    pub fn rows(&self) -> String {
+        let lines = self.decisions.iter().flat_map(|decision| trigger_lines(decision, self.start_ns()));
+        lines.map(|line| line + "\n").collect()
+    }
+
+    /// Seconds from the start of the drive of each trigger.
+    pub fn seconds(&self) -> Vec<f64> {
+        let causing = self.decisions.iter().flat_map(|decision| decision.triggers.iter().map(|_| decision.at_ns));
+        causing.map(|at_ns| seconds(at_ns, self.start_ns())).collect()
+    }
+
+    /// Label of each trigger.
+    pub fn labels(&self) -> Vec<String> {
+        let triggers = self.decisions.iter().flat_map(|decision| &decision.triggers);
+        triggers.map(|trigger| trigger.label.clone()).collect()
+    }
+
+    fn start_ns(&self) -> i64 {
+        self.summary.as_ref().map_or(0, |summary| summary.start_ns)
+    }
+
+    /// The first fault's kind and message.
+    pub fn first_fault(&self) -> Option<(gleaner_protocol::FaultKind, String)> {
+        let fault = self.decisions.iter().find_map(|decision| decision.fault.as_ref())?;
+        Some((fault.kind, fault.message.clone()))
+    }
+
+    /// Asserts the exit code, showing what was said if it differs.
+    pub fn must_exit(&self, code: u8) -> &Self {
+        assert_eq!(self.exit, i32::from(code), "{}", self.stderr);
+        self
+    }
+}
+
+/// A copy of a built lambda whose manifest a test may change.
+pub struct Copy {
+    folder: Folder,
+}
+
+impl Copy {
+    /// Copies the lambda in `lambda`, a folder of the checkout, with `change` applied to its manifest.
+    pub fn of(lambda: &str, change: impl Fn(String) -> String) -> Self {
+        let (folder, source) = (Folder::new(), root().join(lambda).join("build"));
+        let files = std::fs::read_dir(&source)
+            .unwrap_or_else(|error| panic!("{}: {error}; run: cargo xtask test", source.display()));
+        for file in files {
+            let file = file.expect("the folder can be read");
+            if file.file_name() != "lambda.toml" && file.path().is_file() {
+                let name = format!("build/{}", file.file_name().to_string_lossy());
+                folder.write(&name, std::fs::read(file.path()).expect("a build can be read"));
+            }
+        }
+        let manifest = std::fs::read_to_string(source.join("lambda.toml")).expect("a build has a manifest");
+        // The build's manifest is written last: it must not be older than any source.
+        folder.write("lambda.toml", change(manifest.clone()));
+        folder.write("build/lambda.toml", change(manifest));
+        Self { folder }
+    }
+
+    /// The lambda's folder.
+    pub fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// Replaces a file of the build.
+    pub fn replace(&self, name: &str, content: impl AsRef<[u8]>) {
+        self.folder.write(&format!("build/{name}"), content);
+    }
+}

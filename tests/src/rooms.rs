@@ -1,0 +1,146 @@
+//! The order of the house: which room may name which, and where unsafe code has its address. See ARCHITECTURE.md.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::tree::File;
+
+/// The files that may hold unsafe code. Each says so below its `//!` lines, and states the fact that makes each block
+/// sound.
+pub const UNSAFE_FILES: &[&str] = &[
+    "guest-sdk-rust/src/bindings.rs",
+    "host/buffers/src/lease.rs",
+    "host/buffers/src/pool.rs",
+    "host/buffers/src/region.rs",
+    "host/buffers/src/ring.rs",
+    "host/python/src/array.rs",
+    "host/src/guest/wasm/load.rs",
+];
+
+/// The crates of ours that a crate may depend on. A crate that is not listed may depend on what it likes: tests, benches
+/// and lambdas stand outside of the house.
+pub const CRATES: &[(&str, &[&str])] = &[
+    ("gleaner-buffers", &[]),
+    ("gleaner-cli", &["gleaner-protocol"]),
+    ("gleaner-compile", &["gleaner-protocol"]),
+    ("gleaner-host", &["gleaner-buffers", "gleaner-compile", "gleaner-protocol", "gleaner-transport"]),
+    ("gleaner-protocol", &[]),
+    ("gleaner-python", &["gleaner-host", "gleaner-protocol", "gleaner-transport"]),
+    ("gleaner-sdk", &[]),
+    ("gleaner-transport", &[]),
+];
+
+/// Crates that a program must not contain, whatever the features: a program, and what it does without.
+pub const WITHOUT: &[(&str, &[&str])] = &[("gleaner-cli", &["wasmtime", "pyo3"]), ("gleaner-transport", &["pyo3"])];
+
+/// Inside of `host/src`: a room, and the rooms that it must not name.
+pub const ROOMS: &[(&str, &[&str])] = &[
+    ("api", &["guest", "input", "judge", "program", "replay", "schedule"]),
+    ("image", &["api", "guest", "input", "judge", "program", "replay", "schedule"]),
+    ("input", &["guest", "judge", "program", "replay", "schedule"]),
+    ("schedule", &["guest", "judge", "program", "replay"]),
+    ("judge", &["program", "replay", "schedule"]),
+    ("guest", &["judge", "replay", "schedule"]),
+];
+
+/// Whether `file` declares that it holds unsafe code.
+pub fn allows_unsafe(file: &File) -> bool {
+    file.text.lines().map(str::trim).any(|line| line.starts_with('#') && line.contains("allow(unsafe_code"))
+}
+
+/// The lines of a Rust file that hold unsafe code, from 1.
+pub fn unsafe_lines(file: &File) -> Vec<usize> {
+    // Put together here, so that this file does not hold what it looks for.
+    let signs = ["{", "impl", "fn", "extern"].map(|what| ["unsafe", what].join(" "));
+    let lines = code(&file.text).enumerate();
+    lines
+        .filter(|(_, line)| signs.iter().any(|sign| line.contains(sign.as_str())))
+        .map(|(index, _)| index + 1)
+        .collect()
+}
+
+/// The lines of a Rust file without what follows `//`; good enough to tell code from comments.
+pub fn code(text: &str) -> impl Iterator<Item = &str> {
+    text.lines().map(|line| line.split_once("//").map_or(line, |(code, _)| code))
+}
+
+/// The room in `host/src` that a file belongs to: `guest` of `host/src/guest/mod.rs`.
+pub fn room_of(path: &str) -> Option<&str> {
+    let inside = path.strip_prefix("host/src/")?;
+    let room = inside.split('/').next()?;
+    Some(room.strip_suffix(".rs").unwrap_or(room))
+}
+
+/// The rooms of its crate that a Rust file names, as in `crate::api::Session` or `use crate::{api, input::Remap}`.
+pub fn rooms_named(text: &str) -> BTreeSet<String> {
+    let code: String = code(text).flat_map(|line| [line, "\n"]).collect();
+    let mut named = BTreeSet::new();
+    for (at, start) in code.match_indices("crate::") {
+        let begins_a_word = !code[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == '$');
+        if begins_a_word {
+            named.extend(first_words(&code[at + start.len()..]));
+        }
+    }
+    named
+}
+
+/// The first word of a path, or those of each path in a group in braces.
+fn first_words(path: &str) -> Vec<String> {
+    let word = |text: &str| {
+        let text = text.trim_start();
+        let end = text.find(|c: char| !(c.is_alphanumeric() || c == '_')).unwrap_or(text.len());
+        text[..end].to_owned()
+    };
+    let Some(group) = path.strip_prefix('{') else {
+        return vec![word(path)];
+    };
+    let (mut words, mut depth, mut start) = (Vec::new(), 0, 0);
+    for (at, character) in group.char_indices() {
+        match character {
+            '{' => depth += 1,
+            '}' | ',' if depth == 0 => {
+                words.push(word(&group[start..at]));
+                start = at + 1;
+                if character == '}' {
+                    break;
+                }
+            }
+            '}' => depth -= 1,
+            _ => {}
+        }
+    }
+    words.retain(|word| !word.is_empty());
+    words
+}
+
+/// The packages that a `Cargo.toml` depends on for what it makes, on any platform; not those of its own tests.
+pub fn dependencies(manifest: &toml::Table) -> BTreeSet<String> {
+    let platforms = manifest.get("target").and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::values);
+    let sections = platforms.filter_map(toml::Value::as_table).chain([manifest]);
+    let tables = sections.flat_map(|section| ["dependencies", "build-dependencies"].map(|key| section.get(key)));
+    let entries = tables.flatten().filter_map(toml::Value::as_table).flatten();
+    // An entry may give the package another name; then the package is what counts.
+    let package = |(name, entry): (&String, &toml::Value)| {
+        entry.get("package").and_then(toml::Value::as_str).unwrap_or(name).to_owned()
+    };
+    entries.map(package).collect()
+}
+
+/// Everything that `package` may contain by `Cargo.lock`, directly or not, whatever the features.
+pub fn contents(lock: &toml::Table, package: &str) -> BTreeSet<String> {
+    let mut edges: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    for entry in lock.get("package").and_then(toml::Value::as_array).into_iter().flatten() {
+        let name = entry.get("name").and_then(toml::Value::as_str).unwrap_or_default();
+        let needs = entry.get("dependencies").and_then(toml::Value::as_array).into_iter().flatten();
+        // "name" or "name version".
+        let needs = needs.filter_map(toml::Value::as_str).filter_map(|need| need.split(' ').next());
+        edges.entry(name).or_default().extend(needs);
+    }
+    let mut contents = BTreeSet::new();
+    let mut next = vec![package];
+    while let Some(name) = next.pop() {
+        if contents.insert(name.to_owned()) {
+            next.extend(edges.get(name).into_iter().flatten());
+        }
+    }
+    contents
+}

@@ -1,0 +1,332 @@
+//! Everything that a user can get wrong, and what Gleaner says about it: the message names the thing, the cause and the
+//! way out, and the exit code tells scripts which kind of mistake it was.
+
+use std::path::PathBuf;
+
+use gleaner_protocol::FaultKind;
+use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, corrupted, image, one_topic, truncated};
+use gleaner_tests::{Copy, Folder, Run, replay, root, sample_drive};
+
+const USAGE: u8 = 2;
+const FAULTED: u8 = 6;
+const DAMAGED: u8 = 7;
+
+/// Replays a copy of `hello` with a changed manifest over the sample drive.
+fn hello(change: impl Fn(String) -> String, args: &[&str]) -> Run {
+    replay(Copy::of("examples/hello/rust", change).path(), &[sample_drive()], args)
+}
+
+fn replaced(from: &'static str, to: &'static str) -> impl Fn(String) -> String {
+    move |manifest| {
+        assert!(manifest.contains(from), "the manifest has no {from}");
+        manifest.replace(from, to)
+    }
+}
+
+/// Asserts that each of `said` stands in the message, in this order.
+#[track_caller]
+fn says(run: &Run, said: &[&str]) {
+    let mut rest = run.stderr.as_str();
+    for part in said {
+        let at = rest.find(part).unwrap_or_else(|| panic!("no `{part}` in:\n{}", run.stderr));
+        rest = &rest[at + part.len()..];
+    }
+}
+
+#[test]
+fn an_unknown_key_is_named_with_its_line_and_the_nearest_one() {
+    let run = hello(replaced("depth = 512", "dept = 512"), &[]);
+    says(
+        run.must_exit(USAGE),
+        &["error: ", "lambda.toml, line 16: unknown key `dept` in [[input]]", "help:  did you mean `depth`?"],
+    );
+}
+
+#[test]
+fn depth_zero_is_refused_with_its_bounds() {
+    let run = hello(replaced("depth = 512", "depth = 0"), &[]);
+    says(
+        run.must_exit(USAGE),
+        &["line 16: `input.depth` is 0, below the minimum of 1", "help:  give a value from 1 to 65536"],
+    );
+}
+
+#[test]
+fn a_missing_topic_is_named_with_the_nearest_and_with_remap() {
+    let run = hello(replaced("topic = \"/imu/data\"", "topic = \"/imu/dta\""), &[]);
+    says(
+        run.must_exit(USAGE),
+        &[
+            "error: cannot start lambda `hello`",
+            "cause: cannot subscribe input `imu`",
+            "no topic `/imu/dta` (did you mean `/imu/data`?)",
+            "/vehicle/speed",
+            "help:",
+            "--remap FROM:=TO",
+        ],
+    );
+}
+
+#[test]
+fn remap_finds_a_topic_of_another_name() {
+    let run = hello(
+        replaced("topic = \"/imu/data\"", "topic = \"/car/imu\""),
+        &["--remap", "/car/imu:=/imu/data", "--set", "brake_mps2=-1.4"],
+    );
+    assert_eq!(run.must_exit(0).labels(), ["hard-brake"; 3]);
+    assert_eq!(run.decisions[0].topic.as_deref(), Some("/car/imu"));
+}
+
+#[test]
+fn a_remap_of_a_topic_that_no_input_has_is_refused() {
+    let run = hello(|manifest| manifest, &["--remap", "/imu:=/imu/data"]);
+    says(run.must_exit(USAGE), &["no input has the topic `/imu` of --remap", "`/imu/data`"]);
+}
+
+#[test]
+fn a_wrong_type_is_named_with_the_one_found() {
+    let run = hello(replaced("type = \"sensor_msgs/msg/Imu\"", "type = \"sensor_msgs/msg/NavSatFix\""), &[]);
+    says(
+        run.must_exit(USAGE),
+        &[
+            "topic `/imu/data` has type `sensor_msgs/msg/Imu`, not `sensor_msgs/msg/NavSatFix`",
+            "help:",
+            "type = \"sensor_msgs/msg/Imu\"",
+        ],
+    );
+}
+
+#[test]
+fn set_of_an_unknown_key_names_the_nearest() {
+    let run = hello(|manifest| manifest, &["--set", "brake_mps=-1.4"]);
+    says(run.must_exit(USAGE), &["lambda `hello` has no config value `brake_mps`", "brake_mps2"]);
+}
+
+#[test]
+fn set_of_a_wrong_type_says_what_is_wanted() {
+    let run = hello(|manifest| manifest, &["--set", "brake_mps2=hard"]);
+    says(run.must_exit(USAGE), &["`brake_mps2`", "`hard`", "a number"]);
+}
+
+#[test]
+fn a_truncated_drive_keeps_what_was_decided_before_the_cut() {
+    let folder = Folder::new();
+    let lambda = root().join("examples/hello/rust");
+    let run = replay(&lambda, &[truncated(&folder, 0.5)], &["--set", "brake_mps2=-1.4"]);
+    let summary = run.must_exit(DAMAGED).summary.as_ref().expect("a summary of what was read");
+    assert!(summary.wakes > 1000, "{summary:?}");
+    assert_eq!(run.labels().first().map(String::as_str), Some("hard-brake"));
+    let damaged = summary.damaged.as_deref().expect("the damage is named");
+    assert!(damaged.contains("truncated.mcap` is damaged at byte"), "{damaged}");
+    assert!(damaged.contains("results up to the damage are kept"), "{damaged}");
+}
+
+#[test]
+fn a_corrupt_chunk_ends_the_drive_and_is_named() {
+    let folder = Folder::new();
+    let run = replay(&root().join("examples/hello/rust"), &[corrupted(&folder)], &["--set", "brake_mps2=-1.4"]);
+    let summary = run.must_exit(DAMAGED).summary.as_ref().expect("a summary of what was read");
+    assert!(summary.wakes > 0 && summary.wakes < 4170, "{summary:?}");
+    let damaged = summary.damaged.as_deref().expect("the damage is named");
+    assert!(damaged.contains("is damaged at byte") && damaged.contains("chunk"), "{damaged}");
+}
+
+#[test]
+fn a_drive_that_is_none_is_refused() {
+    let folder = Folder::new();
+    let text = folder.write("notes.mcap", "this is no drive");
+    let lambda = root().join("examples/hello/rust");
+    says(replay(&lambda, &[text], &[]).must_exit(USAGE), &["notes.mcap` is not an MCAP file"]);
+    let missing = folder.path().join("missing.mcap");
+    says(replay(&lambda, &[missing], &[]).must_exit(USAGE), &["cannot open drive", "missing.mcap", "No such file"]);
+}
+
+#[test]
+fn a_component_of_another_world_is_refused_by_name() {
+    let run = with_component("(component)");
+    says(
+        run.must_exit(USAGE),
+        &[
+            "error: cannot load lambda `hello`",
+            "does not fit the world `gleaner:lambda/lambda`",
+            "init",
+            "help:",
+            "gleaner_sdk::lambda!",
+        ],
+    );
+}
+
+#[test]
+fn an_import_that_the_host_does_not_have_is_named() {
+    let run = with_component(
+        r#"(component (import "acme:radar/sweep@1.0.0" (instance)) (import "acme:radar/scan@1.0.0" (func)))"#,
+    );
+    says(run.must_exit(USAGE), &["does not fit the world", "acme:radar/s"]);
+}
+
+#[test]
+fn bytes_that_are_no_component_are_refused() {
+    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+    copy.replace("hello.wasm", b"\0asm but not really");
+    let run = replay(copy.path(), &[sample_drive()], &[]);
+    says(run.must_exit(USAGE), &["cannot compile component", "hello.wasm", "help:", "gleaner build"]);
+}
+
+fn with_component(text: &str) -> Run {
+    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+    copy.replace("hello.wasm", wat::parse_str(text).expect("the test's own component"));
+    replay(copy.path(), &[sample_drive()], &[])
+}
+
+#[test]
+fn a_lambda_that_is_not_built_names_the_command() {
+    let folder = Folder::new();
+    folder.write("lambda.toml", std::fs::read(root().join("examples/hello/rust/lambda.toml")).unwrap());
+    let run = replay(folder.path(), &[sample_drive()], &[]);
+    says(run.must_exit(USAGE), &["help:", "gleaner build"]);
+}
+
+#[test]
+fn a_build_older_than_its_sources_names_the_source() {
+    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+    std::fs::create_dir_all(copy.path().join("src")).unwrap();
+    let source = std::fs::File::create(copy.path().join("src/lib.rs")).unwrap();
+    source.set_modified(std::time::SystemTime::now() + std::time::Duration::from_secs(60)).unwrap();
+    let run = replay(copy.path(), &[sample_drive()], &[]);
+    says(run.must_exit(USAGE), &["src/lib.rs", "help:", "gleaner build"]);
+}
+
+#[test]
+fn a_path_that_names_no_field_ends_the_start_with_the_fields_there_are() {
+    for kind in ["rust", "python"] {
+        let run = misbehave(kind, "bad_field");
+        says(run.must_exit(FAULTED), &["cannot start lambda `misbehave`", "in init: ", "has no field `w`", "x, y, z"]);
+    }
+}
+
+#[test]
+fn python_that_raises_in_import_ends_the_start_with_its_traceback() {
+    let run = replay(&root().join("tests/lambdas/raise-in-import/python"), &[sample_drive()], &[]);
+    says(run.must_exit(FAULTED), &["error: cannot start lambda", "in import", "main.py"]);
+}
+
+#[test]
+fn python_that_raises_in_init_ends_the_start_with_its_traceback() {
+    let run = misbehave("python", "raise_in_init");
+    says(run.must_exit(FAULTED), &["cannot start lambda `misbehave`", "in init", "main.py", "line"]);
+}
+
+#[test]
+fn python_that_raises_in_an_event_has_the_traceback_in_its_decision() {
+    let run = misbehave("python", "raise_in_event");
+    let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
+    assert_eq!(kind, FaultKind::Exception);
+    assert!(message.contains("main.py") && message.contains("in on_event"), "{message}");
+    // Every wake raised, and every wake has its decision: the lambda went on.
+    assert_eq!(run.decisions.len(), 4170);
+}
+
+#[test]
+fn an_exit_of_python_code_is_a_fault_and_not_the_end() {
+    let run = misbehave("python", "exit");
+    let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
+    assert_eq!(kind, FaultKind::Exception);
+    assert!(message.contains("SystemExit"), "{message}");
+    assert_eq!(run.decisions.len(), 4170);
+}
+
+#[test]
+fn twins_are_refused_with_the_same_words() {
+    for behaviour in ["huge_label", "too_many_triggers", "not_a_frame", "nan_score"] {
+        let [rust, python] =
+            ["rust", "python"].map(|kind| misbehave(kind, behaviour).first_fault().expect("a fault").1);
+        let said = rust.lines().next().unwrap_or_default();
+        assert!(python.contains(said), "{behaviour}: {rust:?} and {python:?}");
+    }
+}
+
+fn misbehave(kind: &str, behaviour: &str) -> Run {
+    let lambda = root().join("tests/lambdas/misbehave").join(kind);
+    replay(&lambda, &[sample_drive()], &["--set", &format!("behaviour={behaviour}")])
+}
+
+/// Replays `pixels`, of both kinds, over a drive of one raw image.
+fn pixels_of(message: Vec<u8>) -> [Run; 2] {
+    let folder = Folder::new();
+    let drive = one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &[(1, message)]);
+    pixels_over(&[drive])
+}
+
+fn pixels_over(drives: &[PathBuf]) -> [Run; 2] {
+    ["rust", "python"].map(|kind| replay(&root().join("tests/lambdas/pixels").join(kind), drives, &[]))
+}
+
+#[test]
+fn an_image_whose_size_its_bytes_cannot_hold_is_refused_with_the_numbers() {
+    for run in pixels_of(image(4000, 3000, "rgb8", 12000, &[0; 100])) {
+        let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
+        assert!(message.contains("4000x3000") && message.contains("it has 100"), "{message}");
+    }
+}
+
+#[test]
+fn an_image_whose_rows_overlap_is_refused_with_the_numbers() {
+    for run in pixels_of(image(10, 2, "bgr8", 29, &[0; 100])) {
+        let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
+        assert!(message.contains("a row has 29 bytes; it needs 30"), "{message}");
+    }
+}
+
+#[test]
+fn an_image_of_no_size_or_unknown_encoding_is_refused() {
+    for run in pixels_of(image(0, 10, "mono8", 0, &[])) {
+        assert!(run.first_fault().expect("a fault").1.contains("image says it is 0x10"));
+    }
+    for run in pixels_of(image(1, 1, "rgb565", 2, &[0; 2])) {
+        assert!(run.first_fault().expect("a fault").1.contains("encoding `rgb565` is not supported"));
+    }
+}
+
+#[test]
+fn a_message_that_ends_too_early_is_malformed_and_not_the_end() {
+    let mut cut = image(10, 10, "mono8", 10, &[0; 100]);
+    cut.truncate(40);
+    for run in pixels_of(cut) {
+        let message = run.must_exit(FAULTED).first_fault().expect("a fault").1;
+        assert!(message.contains("contradicts its type `sensor_msgs/msg/Image`"), "{message}");
+    }
+}
+
+#[test]
+fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
+    // A header of 65,500 x 65,500 pixels, and nothing behind it.
+    let mut bomb = vec![0xFF, 0xD8, 0xFF, 0xC0, 0, 17, 8];
+    bomb.extend([0xFF, 0xDC, 0xFF, 0xDC, 3, 1, 0x11, 0, 2, 0x11, 0, 3, 0x11, 0]);
+    bomb.extend([0xFF, 0xDA, 0, 12, 3, 1, 0, 2, 0, 3, 0, 0, 63, 0, 0xFF, 0xD9]);
+    let folder = Folder::new();
+    let topic = "/camera/front/image_raw";
+    let drive = one_topic(&folder, topic, "sensor_msgs/msg/CompressedImage", COMPRESSED, &[(1, compressed(&bomb))]);
+    for kind in ["rust", "python"] {
+        let copy = Copy::of(
+            &format!("tests/lambdas/pixels/{kind}"),
+            replaced("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+        );
+        let run = replay(copy.path(), &[drive.clone()], &[]);
+        let message = run.must_exit(FAULTED).first_fault().expect("a fault").1;
+        assert!(message.contains("65500x65500") && message.contains("8 MiB"), "{message}");
+        let peak = run.summary.as_ref().expect("a summary").peak_rss_bytes;
+        assert!(peak < 256 << 20, "{peak} bytes of memory for a message of 60");
+    }
+}
+
+#[test]
+fn a_sample_larger_than_max_size_is_counted_and_said() {
+    let folder = Folder::new();
+    let message = image(1000, 1000, "rgb8", 3000, &vec![7; 3_000_000]);
+    let drive = one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &[(1, message)]);
+    for run in pixels_over(&[drive]) {
+        let summary = run.must_exit(0).summary.as_ref().expect("a summary");
+        assert_eq!((summary.wakes, summary.topics[0].too_big, summary.topics[0].received), (0, 1, 0));
+        says(&run, &["sample dropped: larger than max_size", "camera", "1048576"]);
+    }
+}

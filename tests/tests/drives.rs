@@ -1,0 +1,114 @@
+//! The examples and test lambdas over recorded drives: decisions as expected, and twins that agree.
+//!
+//! Drives that cannot come with the project lie in `../shared/data`; where they are missing, their tests are ignored with
+//! that reason.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use gleaner_protocol::twins_differ;
+use gleaner_tests::{Run, replay, root, sample_drive, shared_drive};
+use libtest_mimic::{Arguments, Failed, Trial};
+
+const KINDS: [&str; 2] = ["rust", "python"];
+
+fn main() -> ExitCode {
+    let mut trials = Vec::new();
+    for example in ["hello", "brake-dark"] {
+        for kind in KINDS {
+            trials
+                .push(Trial::test(format!("{example}_in_{kind}_decides_as_expected"), move || expected(example, kind)));
+        }
+        trials.push(Trial::test(format!("the_twins_of_{example}_agree_on_every_wake"), move || {
+            twins(&format!("examples/{example}"), &sample_drive(), &["--all", "--set", "brake_mps2=-1.4"])
+        }));
+    }
+    for kind in KINDS {
+        trials.push(shared(format!("brake_dark_in_{kind}_finds_both_brakings_at_night"), "rec_brake_dark.mcap", {
+            move |drive| at(&drive, "examples/brake-dark", kind, &[15.84, 30.25])
+        }));
+        trials.push(shared(format!("hello_in_{kind}_finds_six_of_six_brakings"), "rec_brake_imu_trip17.mcap", {
+            move |drive| within_truth(&drive, kind)
+        }));
+        trials.push(shared(format!("pixels_in_{kind}_sees_the_recorded_pixels"), "rec_raw_image_bgr8_320x180.mcap", {
+            move |drive| pixels(&drive, kind)
+        }));
+    }
+    trials.push(shared("the_twins_of_pixels_agree".to_owned(), "rec_raw_image_bgr8_320x180.mcap", |drive| {
+        twins("tests/lambdas/pixels", &drive, &["--all"])
+    }));
+    libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+}
+
+/// A test on a drive beside the checkout; ignored, with the reason in its name, where that is missing.
+fn shared(name: String, drive: &str, test: impl FnOnce(PathBuf) -> Result<(), Failed> + Send + 'static) -> Trial {
+    match shared_drive(drive) {
+        Ok(path) => Trial::test(name, move || test(path)),
+        Err(reason) => Trial::test(format!("{name} [{reason}]"), || Ok(())).with_ignored_flag(true),
+    }
+}
+
+fn run(lambda: &str, kind: &str, drive: &Path, args: &[&str]) -> Result<Run, Failed> {
+    let run = replay(&root().join(lambda).join(kind), &[drive.to_owned()], args);
+    if run.exit == 0 { Ok(run) } else { Err(format!("exit {}: {}", run.exit, run.stderr).into()) }
+}
+
+fn expected(example: &str, kind: &str) -> Result<(), Failed> {
+    let run = run(&format!("examples/{example}"), kind, &sample_drive(), &["--set", "brake_mps2=-1.4"])?;
+    let expected = std::fs::read_to_string(root().join("examples").join(example).join("expected.txt"))?;
+    same(&run.rows(), &expected)
+}
+
+fn twins(lambda: &str, drive: &Path, args: &[&str]) -> Result<(), Failed> {
+    let (rust, python) = (run(lambda, "rust", drive, args)?, run(lambda, "python", drive, args)?);
+    same(&rust.decisions.len(), &python.decisions.len())?;
+    if rust.decisions.is_empty() {
+        return Err("no wake at all".into());
+    }
+    match rust.decisions.iter().zip(&python.decisions).find_map(|(a, b)| twins_differ(a, b)) {
+        Some(difference) => Err(difference.into()),
+        None => Ok(()),
+    }
+}
+
+fn at(drive: &Path, lambda: &str, kind: &str, onsets: &[f64]) -> Result<(), Failed> {
+    let run = run(lambda, kind, drive, &["--set", "brake_mps2=-3.0"])?;
+    let seconds = run.seconds();
+    let near = |(found, onset): (&f64, &f64)| (onset - 0.3..=onset + 1.5).contains(found);
+    if seconds.len() == onsets.len() && seconds.iter().zip(onsets).all(near) {
+        return Ok(());
+    }
+    Err(format!("triggers at {seconds:?}, expected near {onsets:?}").into())
+}
+
+/// One trigger in each labelled hard braking, and none elsewhere.
+fn within_truth(drive: &Path, kind: &str) -> Result<(), Failed> {
+    let truth = truth(drive)?;
+    let events = truth["labelled_events"].as_array().ok_or("the truth has no labelled events")?;
+    let second = |event: &serde_json::Value, key: &str| event[key].as_f64().unwrap_or(f64::NAN);
+    let brakings = events.iter().filter(|event| event["type"] == "hard_brake");
+    let spans = brakings.map(|event| (second(event, "start_s"), second(event, "end_s"))).collect::<Vec<_>>();
+    let seconds = run("examples/hello", kind, drive, &["--set", "brake_mps2=-3.0"])?.seconds();
+    let inside = |(found, (start, end)): (&f64, &(f64, f64))| (start - 0.3..=end + 1.5).contains(found);
+    if spans.len() == 6 && seconds.len() == 6 && seconds.iter().zip(&spans).all(inside) {
+        return Ok(());
+    }
+    Err(format!("triggers at {seconds:?}, labelled {spans:?}").into())
+}
+
+fn pixels(drive: &Path, kind: &str) -> Result<(), Failed> {
+    let truth = truth(drive)?;
+    let hashes = truth["fnv1a32_of_pixels"].as_array().ok_or("the truth has no hashes")?;
+    let hashes = hashes.iter().map(|hash| format!("{:08x}", hash.as_u64().unwrap_or(0))).collect::<Vec<_>>();
+    let found = run("tests/lambdas/pixels", kind, drive, &[])?;
+    same(&found.decisions.len(), &21)?;
+    same(&found.labels(), &hashes)
+}
+
+fn truth(drive: &Path) -> Result<serde_json::Value, Failed> {
+    Ok(serde_json::from_str(&std::fs::read_to_string(drive.with_extension("truth.json"))?)?)
+}
+
+fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), Failed> {
+    if found == expected { Ok(()) } else { Err(format!("found {found:?}, expected {expected:?}").into()) }
+}

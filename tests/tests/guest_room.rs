@@ -1,0 +1,225 @@
+//! The WebAssembly guest by itself: every limit is hit, every cause is named, and a fresh guest follows.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_host::api::Session;
+use gleaner_host::api::data::{Topic, Wake};
+use gleaner_host::guest::wasm::{Allowance, Deadline, Loaded, WasmGuest};
+use gleaner_host::guest::{Guest, Outcome};
+use gleaner_host::input::open_inputs;
+use gleaner_protocol::FaultKind;
+use gleaner_protocol::manifest::{ConfigValue, Manifest};
+use gleaner_tests::root;
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+const FUEL: u64 = 5_000_000;
+const MEMORY: u64 = 16 << 20;
+const IMU: &str = "std_msgs/Header header\nfloat64 x\n\
+================================================================================\n\
+MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
+================================================================================\n\
+MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+
+/// A misbehaving lambda and the transport that feeds it.
+struct Room {
+    guest: WasmGuest,
+    session: Session,
+    transport: Loopback,
+    topic: Arc<Topic>,
+    sent: u64,
+}
+
+impl Room {
+    fn new(behaviour: &str, fuel: u64, deadline: Option<Duration>) -> Self {
+        let lambda = root().join("tests/lambdas/misbehave/rust/build");
+        let manifest = Manifest::load(&lambda).expect("misbehave is built; run: cargo xtask test");
+        let mut transport = Loopback::new();
+        transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", IMU);
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
+        let topic = Arc::clone(&inputs[0]);
+        let config = vec![("behaviour".to_owned(), ConfigValue::Text(behaviour.to_owned()))];
+        let session = Session::new(inputs, config);
+        let cache = root().join("target/test-cache/gleaner");
+        let loaded = Loaded::open(&lambda.join("misbehave.wasm"), &cache).unwrap();
+        let deadline = deadline.map(|allowed| Deadline::new(loaded.engine(), allowed).unwrap());
+        let guest = WasmGuest::new(loaded, session.clone(), Allowance { fuel, memory_bytes: MEMORY }, deadline);
+        Self { guest, session, transport, topic, sent: 0 }
+    }
+
+    fn of(behaviour: &str) -> Self {
+        let mut room = Self::new(behaviour, FUEL, None);
+        room.guest.init().unwrap();
+        room
+    }
+
+    fn wake(&mut self) -> Outcome {
+        self.sent += 1;
+        let at_ns = self.sent as i64 * 1_000_000;
+        let meta =
+            SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq: self.sent, endian: Endian::Little };
+        self.transport.publish("/imu/data", &meta, &[0; 24]).unwrap();
+        self.session.begin(at_ns);
+        let sample = self.topic.newest().unwrap();
+        self.guest.wake(Wake::Event(sample))
+    }
+
+    /// Kind and message of the fault of one wake.
+    fn fault(&mut self) -> (FaultKind, String) {
+        let fault = self.wake().result.expect_err("a fault");
+        (fault.kind, fault.message)
+    }
+}
+
+#[test]
+fn a_good_wake_uses_some_fuel_and_causes_nothing() {
+    let mut room = Room::of("ok");
+    let outcome = room.wake();
+    assert!(outcome.result.is_ok());
+    assert!((1..100_000).contains(&outcome.fuel.unwrap()), "{:?}", outcome.fuel);
+    assert!(room.session.take_triggers().is_empty());
+}
+
+#[test]
+fn an_endless_loop_ends_with_its_fuel() {
+    let outcome = Room::of("endless").wake();
+    let fault = outcome.result.unwrap_err();
+    assert_eq!((fault.kind, fault.allowed), (FaultKind::Fuel, Some(FUEL)));
+    assert_eq!(fault.message, format!("used {FUEL} of {FUEL} units of fuel"));
+}
+
+#[test]
+fn an_endless_loop_of_host_calls_ends_as_well() {
+    let (kind, _) = Room::of("host_calls").fault();
+    assert_eq!(kind, FaultKind::Fuel);
+}
+
+#[test]
+fn the_same_wake_uses_the_same_fuel_also_after_a_trap() {
+    let used = |room: &mut Room| room.wake().fuel.unwrap();
+    let mut room = Room::of("ok");
+    let (first, second) = (used(&mut room), used(&mut room));
+    let mut again = Room::of("ok");
+    assert_eq!((used(&mut again), used(&mut again)), (first, second));
+    let mut faulty = Room::of("error");
+    let faults = [faulty.wake(), faulty.wake()].map(|outcome| (outcome.result.is_err(), outcome.fuel));
+    assert_eq!(faults[0], faults[1]);
+}
+
+#[test]
+fn a_deadline_ends_what_fuel_would_allow() {
+    let deadline = Duration::from_millis(20);
+    let mut room = Room::new("endless", 1_000_000_000_000, Some(deadline));
+    room.guest.init().unwrap();
+    let fault = room.wake().result.unwrap_err();
+    assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(20_000_000)));
+    assert!(fault.used.unwrap() >= 20_000_000, "{fault:?}");
+    assert!(fault.message.ends_with("the deadline is 20.0 ms"), "{}", fault.message);
+    // The next guest has a deadline of its own.
+    assert_eq!(room.wake().result.unwrap_err().kind, FaultKind::Deadline);
+}
+
+#[test]
+fn memory_beyond_the_cap_is_named_with_both_numbers() {
+    let fault = Room::of("memory").wake().result.unwrap_err();
+    assert_eq!((fault.kind, fault.allowed), (FaultKind::Memory, Some(MEMORY)));
+    assert!(fault.used.unwrap() > MEMORY, "{fault:?}");
+}
+
+#[test]
+fn a_panic_says_what_and_where() {
+    let (kind, message) = Room::of("panic").fault();
+    assert_eq!(kind, FaultKind::Trap);
+    assert!(message.contains("wake 1 is one too many") && message.contains("lib.rs"), "{message}");
+}
+
+#[test]
+fn deep_recursion_ends_as_a_fault() {
+    let (kind, message) = Room::of("recurse").fault();
+    assert!(matches!(kind, FaultKind::Stack | FaultKind::Trap | FaultKind::Fuel), "{kind:?}: {message}");
+}
+
+#[test]
+fn exit_and_sleep_are_faults_with_their_names() {
+    assert_eq!(Room::of("exit").fault(), (FaultKind::Trap, "the lambda called exit".to_owned()));
+    let asleep = "a lambda cannot sleep: it is woken by samples or by a period".to_owned();
+    assert_eq!(Room::of("sleep").fault(), (FaultKind::HostCall, asleep));
+}
+
+#[test]
+fn files_and_sockets_do_not_exist() {
+    for behaviour in ["read_file", "connect"] {
+        let (kind, message) = Room::of(behaviour).fault();
+        assert_eq!(kind, FaultKind::Exception, "{behaviour}: {message}");
+    }
+}
+
+#[test]
+fn refusals_of_the_host_reach_the_lambda_as_errors() {
+    for (behaviour, said) in [
+        ("error", "I do not want to"),
+        ("huge_label", "the label has 1000 bytes; at most 128 are allowed"),
+        ("nan_score", "the score of `x` is NaN; it must be finite"),
+        ("too_many_triggers", "this wake has caused 16 triggers already; further ones are refused"),
+        ("not_a_frame", "a sample of `/imu/data` is no image: its type is `sensor_msgs/msg/Imu`"),
+    ] {
+        let (kind, message) = Room::of(behaviour).fault();
+        assert_eq!(kind, FaultKind::Exception);
+        assert!(message.contains(said), "{behaviour}: {message}");
+    }
+}
+
+#[test]
+fn a_refusal_in_init_ends_the_start() {
+    for (behaviour, said) in [
+        ("error_in_init", "in init: no, not today"),
+        ("bad_input", "no input `imo`; the manifest has `imu`"),
+        ("bad_field", "linear_acceleration"),
+    ] {
+        let fault = Room::new(behaviour, FUEL, None).guest.init().unwrap_err();
+        assert_eq!(fault.kind, FaultKind::Exception);
+        assert!(fault.message.contains(said), "{behaviour}: {}", fault.message);
+    }
+    let fault = Room::new("panic_in_init", FUEL, None).guest.init().unwrap_err();
+    assert_eq!(fault.kind, FaultKind::Trap);
+    assert!(fault.message.starts_with("in init: ") && fault.message.contains("no, not today"), "{}", fault.message);
+}
+
+#[test]
+fn a_trigger_before_a_panic_still_counts() {
+    let mut room = Room::of("event_then_panic");
+    assert_eq!(room.fault().0, FaultKind::Trap);
+    assert_eq!(room.session.take_triggers()[0].label, "seen");
+}
+
+#[test]
+fn a_fresh_guest_follows_each_fault_and_nothing_stays_held() {
+    let mut room = Room::of("panic");
+    for _ in 0..1000 {
+        // The count starts anew with each guest.
+        assert!(room.fault().1.contains("wake 1 is one too many"));
+    }
+    assert_eq!(room.topic.counts().no_slot, 0);
+}
+
+#[test]
+fn a_guest_that_keeps_every_sample_makes_the_ring_refuse_and_count() {
+    let mut room = Room::of("hold");
+    // depth 16 and hold 8, and one cell to write into: the 26th sample finds no place.
+    for _ in 0..40 {
+        assert!(room.wake().result.is_ok());
+    }
+    let counts = room.topic.counts();
+    assert_eq!((counts.received, counts.no_slot), (25, 15));
+}
+
+#[test]
+fn what_a_lambda_prints_becomes_log_lines_and_a_flood_is_counted() {
+    let mut room = Room::of("print");
+    assert!(room.wake().result.is_ok());
+    assert_eq!(room.session.take_log()[0].message, "hello from 1");
+    let mut room = Room::of("log_flood");
+    assert!(room.wake().result.is_ok());
+    assert_eq!((room.session.take_log().len(), room.session.log_dropped()), (100, 900));
+}

@@ -1,0 +1,82 @@
+//! Where things are: the checkout, its target folder, and the cargo that started us.
+
+use std::env;
+use std::ffi::{OsStr, OsString};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::{Exit, Failure};
+
+pub(crate) struct Checkout {
+    root: PathBuf,
+    target: PathBuf,
+    cargo: OsString,
+}
+
+impl Checkout {
+    /// The checkout that this program was built in.
+    pub(crate) fn find() -> Result<Checkout, Failure> {
+        let lost =
+            |what| Failure::new(Exit::Usage, what).with_help("start it as `cargo xtask`, inside of the checkout");
+        // Cargo tells a program that it runs where its package is and which cargo it is.
+        let package = env::var_os("CARGO_MANIFEST_DIR").ok_or_else(|| lost("cannot tell where the checkout is"))?;
+        let root = Path::new(&package).parent().ok_or_else(|| lost("cannot tell where the checkout is"))?.to_owned();
+        let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        // TARGET/release/xtask: so every other cargo builds where this one did, whatever the user configured.
+        let exe = env::current_exe().ok().filter(|exe| exe.is_absolute());
+        let target = exe.as_deref().and_then(|exe| exe.ancestors().nth(2));
+        let target = target.ok_or_else(|| lost("cannot tell where cargo builds"))?.to_owned();
+        Ok(Checkout { root, target, cargo })
+    }
+
+    pub(crate) fn path(&self, relative: impl AsRef<Path>) -> PathBuf {
+        self.root.join(relative)
+    }
+
+    pub(crate) fn target(&self) -> &Path {
+        &self.target
+    }
+
+    /// The interpreter of `.venv`, made by [`setup`](crate::setup).
+    pub(crate) fn python(&self) -> PathBuf {
+        self.path(".venv/bin/python3")
+    }
+
+    /// A program that cargo built.
+    pub(crate) fn program(&self, name: &str) -> PathBuf {
+        self.target.join("release").join(name)
+    }
+
+    /// `program`, to be run in the checkout; it and what it starts use our cargo, target folder and Python, and the
+    /// checkout's parts even if the target folder lies elsewhere or another Gleaner is installed.
+    pub(crate) fn command(&self, program: impl AsRef<OsStr>) -> Command {
+        let mut command = Command::new(program);
+        command
+            .current_dir(&self.root)
+            .env("CARGO", &self.cargo)
+            .env("CARGO_TARGET_DIR", &self.target)
+            .env("GLEANER_HOME", self.path("guest-sdk-python"))
+            .env("GLEANER_PYTHON", self.python());
+        command
+    }
+
+    /// Cargo, as [`command`](Self::command).
+    pub(crate) fn cargo(&self) -> Command {
+        self.command(&self.cargo)
+    }
+
+    /// The folders of all lambdas, relative to the checkout: both twins of each example and test lambda.
+    pub(crate) fn lambdas(&self) -> Vec<PathBuf> {
+        let below = |folder: &PathBuf| {
+            let entries = fs::read_dir(self.path(folder)).into_iter().flatten().filter_map(Result::ok);
+            let folder = folder.clone();
+            entries.map(move |entry| folder.join(entry.file_name())).collect::<Vec<_>>()
+        };
+        let families = [PathBuf::from("examples"), PathBuf::from("tests/lambdas")];
+        let twins = families.iter().flat_map(below).flat_map(|lambda| below(&lambda));
+        let mut lambdas: Vec<_> = twins.filter(|twin| self.path(twin).join("lambda.toml").is_file()).collect();
+        lambdas.sort();
+        lambdas
+    }
+}

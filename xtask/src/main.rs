@@ -1,0 +1,67 @@
+//! `cargo xtask`: everything a fresh machine needs beyond cargo, a C compiler and Python is fetched and built here.
+//!
+//! `checkout` knows where things are, `setup` makes what is missing, `examples` replays the sample drive, and each
+//! command is a file that says what it does after that. Nothing here is part of what is installed.
+
+mod bless;
+mod checkout;
+mod demo;
+mod examples;
+mod setup;
+mod steps;
+mod suites;
+mod venv;
+
+use std::env;
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use gleaner_protocol::{Exit, Failure};
+
+use checkout::Checkout;
+use steps::Steps;
+
+const USAGE: &str = "usage: cargo xtask COMMAND
+  demo   run both twins of every example over the sample drive, and show what they decided
+  test   run all tests; the last line is `N passed, M failed, K skipped`
+  bless  write what the examples decide on the sample drive to examples/*/expected.txt
+  bench  measure what is promised; what follows goes to gleaner-bench
+  build  only set up: wasm target, Python environment, programs, lambdas";
+
+fn main() -> ExitCode {
+    match run(env::args_os().skip(1).collect()) {
+        Ok(exit) => exit.into(),
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit.into()
+        }
+    }
+}
+
+fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
+    let (command, rest) = match arguments.split_first() {
+        Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
+        None => ("", &[][..]),
+    };
+    if !rest.is_empty() && command != "bench" {
+        return Err(Failure::new(Exit::Usage, format!("`cargo xtask {command}` takes no arguments")).with_help(USAGE));
+    }
+    let checkout = Checkout::find()?;
+    match command {
+        "demo" => demo::run(&checkout),
+        "test" => suites::run(&checkout),
+        "bless" => bless::run(&checkout),
+        "bench" => bench(&checkout, rest),
+        "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS)).map(|()| Exit::Ok),
+        _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
+    }
+}
+
+fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let mut steps = Steps::of(setup::STEPS + 1);
+    setup::run(checkout, &mut steps)?;
+    steps.begin("measurements");
+    let mut bench = checkout.command(checkout.program("gleaner-bench"));
+    bench.args(arguments);
+    steps::run(&mut bench, "look at what it says above").map(|()| Exit::Ok)
+}

@@ -1,0 +1,59 @@
+//! What every command needs first. Each step looks first, and does nothing where nothing is missing.
+
+use std::path::Path;
+
+use gleaner_protocol::Failure;
+
+use crate::checkout::Checkout;
+use crate::steps::{self, Steps};
+use crate::venv;
+
+/// The number of steps that [`run`] takes.
+pub(crate) const STEPS: usize = 4;
+
+const TARGET: &str = "wasm32-wasip2";
+
+/// Sets up: the wasm target, `.venv`, all programs, all lambdas.
+pub(crate) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<(), Failure> {
+    steps.begin(&format!("compilation target {TARGET}"));
+    target(checkout)?;
+    steps.begin("Python environment .venv with numpy and mypy");
+    venv::set_up(checkout)?;
+    steps.begin("programs (the first time this takes minutes)");
+    programs(checkout)?;
+    steps.begin("example and test lambdas");
+    lambdas(checkout)
+}
+
+fn target(checkout: &Checkout) -> Result<(), Failure> {
+    // Asked of the compiler: it need not come from rustup.
+    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let mut rustc = checkout.command(rustc);
+    rustc.args(["--print", "target-libdir", "--target", TARGET]);
+    let libraries = steps::output(&mut rustc, "install Rust with rustup")?;
+    if Path::new(libraries.trim()).is_dir() {
+        return Ok(());
+    }
+    let mut add = checkout.command("rustup");
+    add.args(["target", "add", TARGET]);
+    let help =
+        format!("install the standard library for {TARGET}: `rustup target add {TARGET}`, or your system's package");
+    steps::run(&mut add, &help)
+}
+
+/// All in one call, as each test run needs them: features of shared crates are then the same everywhere, and nothing
+/// heavy compiles twice.
+fn programs(checkout: &Checkout) -> Result<(), Failure> {
+    let mut build = checkout.cargo();
+    build.args(["build", "--release", "--workspace"]);
+    steps::run(&mut build, "if a linker or a C compiler is missing, install one (`cc`); else see the first error above")
+}
+
+fn lambdas(checkout: &Checkout) -> Result<(), Failure> {
+    for lambda in checkout.lambdas() {
+        let mut build = checkout.command(checkout.program("gleaner"));
+        build.arg("build").arg(&lambda);
+        steps::run(&mut build, "see the error above")?;
+    }
+    Ok(())
+}

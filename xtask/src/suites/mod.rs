@@ -1,0 +1,157 @@
+//! `cargo xtask test`: every suite of the project, one after the other, and one count at the end.
+//!
+//! A suite that fails does not keep the next from running. `tally` counts from what a suite prints; nothing else
+//! knows how the different test runners speak.
+
+mod tally;
+
+use std::env;
+use std::io::{self, BufRead, BufReader, Write};
+use std::path::PathBuf;
+use std::process::{Command, ExitStatus, Stdio};
+use std::time::Instant;
+
+use gleaner_protocol::{Exit, Failure};
+
+use crate::checkout::Checkout;
+use crate::setup;
+use crate::steps::{Steps, succeeds};
+use tally::{Speech, Tally};
+
+struct Suite {
+    name: String,
+    how: How,
+}
+
+enum How {
+    Run(Command, Speech),
+    /// What is missing. It counts as one skipped test.
+    Skip(&'static str),
+}
+
+/// Sets up and runs all tests. The last line says `N passed, M failed, K skipped`.
+pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
+    let suites = suites(checkout);
+    let mut steps = Steps::of(setup::STEPS + suites.len());
+    setup::run(checkout, &mut steps)?;
+    let mut total = Tally::new(Speech::None);
+    let mut table = format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
+    for suite in suites {
+        steps.begin(&suite.name);
+        let started = Instant::now();
+        let tally = suite.how.run();
+        let seconds = started.elapsed().as_secs_f64();
+        let Tally { passed, failed, skipped, .. } = &tally;
+        table += &format!("{:<44} {passed:>7} {failed:>7} {skipped:>7} {seconds:>7.1}\n", suite.name);
+        total.add(tally, &suite.name);
+    }
+    print!("{table}");
+    for name in &total.names {
+        println!("FAILED {name}");
+    }
+    println!("{} passed, {} failed, {} skipped", total.passed, total.failed, total.skipped);
+    Ok(if total.failed == 0 { Exit::Ok } else { Exit::Internal })
+}
+
+fn suites(checkout: &Checkout) -> Vec<Suite> {
+    let suite = |name: &str, command, speech| Suite { name: name.to_owned(), how: How::Run(command, speech) };
+
+    let mut tests = checkout.cargo();
+    tests.args(["test", "--release", "--workspace", "--no-fail-fast"]);
+
+    // In target folders of their own: their flags would have everything else compiled anew.
+    let mut loom = checkout.cargo();
+    loom.args(["test", "--release", "-p", "gleaner-buffers", "--test", "loom"])
+        .env("CARGO_TARGET_DIR", checkout.target().join("loom"))
+        .env("RUSTFLAGS", "--cfg loom")
+        .env("LOOM_MAX_PREEMPTIONS", "3");
+
+    let mut unittest = checkout.command(checkout.python());
+    unittest
+        .args(["-m", "unittest", "discover", "-v", "guest-sdk-python/tests"])
+        .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"));
+
+    let mut suites = vec![
+        suite("cargo test", tests, Speech::Libtest),
+        suite("loom: orders of threads in gleaner-buffers", loom, Speech::Libtest),
+        Suite { name: "miri: memory in gleaner-buffers".to_owned(), how: miri(checkout) },
+        suite("unittest: Python SDK", unittest, Speech::Unittest),
+    ];
+    suites.extend(typed(checkout).into_iter().map(|file| {
+        let mut mypy = checkout.command(checkout.python());
+        mypy.args(["-m", "mypy", "--strict", "--cache-dir"])
+            .arg(checkout.target().join("mypy"))
+            .arg(&file)
+            .env("MYPYPATH", checkout.path("guest-sdk-python"));
+        suite(&format!("mypy: {}", file.display()), mypy, Speech::None)
+    }));
+    suites
+}
+
+/// What mypy checks, relative to the checkout: the SDK, and each example by itself, as all are called `main`.
+fn typed(checkout: &Checkout) -> Vec<PathBuf> {
+    let examples = checkout.lambdas().into_iter().filter(|lambda| lambda.starts_with("examples"));
+    let mains = examples.map(|lambda| lambda.join("main.py")).filter(|main| checkout.path(main).is_file());
+    [PathBuf::from("guest-sdk-python/gleaner")].into_iter().chain(mains).collect()
+}
+
+fn miri(checkout: &Checkout) -> How {
+    // Only rustup's cargo understands `+nightly`; ours is the cargo of one toolchain, and names it to its children.
+    let cargo = || {
+        let mut cargo = checkout.command("cargo");
+        cargo.arg("+nightly").arg("miri").env_remove("CARGO").env_remove("RUSTUP_TOOLCHAIN");
+        cargo
+    };
+    if !succeeds(cargo().arg("--version")) {
+        return How::Skip("needs miri: `rustup +nightly component add miri rust-src`");
+    }
+    let mut tests = cargo();
+    tests
+        .args(["test", "-p", "gleaner-buffers", "--no-fail-fast"])
+        .env("CARGO_TARGET_DIR", checkout.target().join("miri"));
+    // No pointer may be made up from a number; unless the user wants other checks.
+    if env::var_os("MIRIFLAGS").is_none() {
+        tests.env("MIRIFLAGS", "-Zmiri-strict-provenance");
+    }
+    How::Run(tests, Speech::Libtest)
+}
+
+impl How {
+    fn run(self) -> Tally {
+        match self {
+            How::Skip(why) => {
+                println!("skipped: {why}");
+                let mut tally = Tally::new(Speech::None);
+                tally.skipped = 1;
+                tally
+            }
+            How::Run(command, speech) => {
+                let program = command.get_program().display().to_string();
+                let mut tally = Tally::new(speech);
+                match listen(command, &mut tally) {
+                    Ok(status) => tally.end(status.success(), &format!("ended with {status}")),
+                    Err(error) => tally.end(false, &format!("cannot run `{program}`: {error}")),
+                }
+                tally
+            }
+        }
+    }
+}
+
+/// Runs a suite and shows what it says, on both streams in the order in which it does, while `tally` listens.
+fn listen(mut command: Command, tally: &mut Tally) -> io::Result<ExitStatus> {
+    let (said, speak) = io::pipe()?;
+    let mut child = command.stdin(Stdio::null()).stdout(speak.try_clone()?).stderr(speak).spawn()?;
+    // It holds our ends for writing: with them open, reading would never come to an end.
+    drop(command);
+    let mut said = BufReader::new(said);
+    let mut line = Vec::new();
+    while said.read_until(b'\n', &mut line)? > 0 {
+        let mut out = io::stdout().lock();
+        out.write_all(&line)?;
+        out.flush()?;
+        tally.hear(String::from_utf8_lossy(&line).trim_end());
+        line.clear();
+    }
+    child.wait()
+}

@@ -1,0 +1,219 @@
+use std::path::Path;
+
+/// How a suite says what became of its tests.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Speech {
+    /// As Rust's test programs do, several after each other, and cargo between them.
+    Libtest,
+    /// As Python's unittest does with `-v`.
+    Unittest,
+    /// Not at all: the exit status stands for one test.
+    None,
+}
+
+/// What became of the tests of a suite.
+#[derive(Debug)]
+pub(super) struct Tally {
+    pub(super) passed: u64,
+    pub(super) failed: u64,
+    pub(super) skipped: u64,
+    /// The tests that failed.
+    pub(super) names: Vec<String>,
+    speech: Speech,
+    /// The test program that cargo started last.
+    program: String,
+    /// Whether that program began with tests and has not given its result yet.
+    open: bool,
+    /// The tests that unittest ran.
+    ran: u64,
+}
+
+impl Tally {
+    pub(super) fn new(speech: Speech) -> Tally {
+        Tally {
+            passed: 0,
+            failed: 0,
+            skipped: 0,
+            names: Vec::new(),
+            speech,
+            program: String::new(),
+            open: false,
+            ran: 0,
+        }
+    }
+
+    /// Counts what this line tells.
+    pub(super) fn hear(&mut self, line: &str) {
+        match self.speech {
+            Speech::Libtest => self.hear_libtest(line),
+            Speech::Unittest => self.hear_unittest(line),
+            Speech::None => {}
+        }
+    }
+
+    /// Ends the suite. One that does not succeed has at least one failed test, named by `how_it_ended` if it did not
+    /// tell one; one that counts its tests and had none is blind, which is a failure too.
+    pub(super) fn end(&mut self, success: bool, how_it_ended: &str) {
+        self.close();
+        if self.speech == Speech::None && success {
+            self.passed = 1;
+        }
+        if !success && self.failed == 0 {
+            self.fail(how_it_ended);
+        } else if self.passed + self.failed + self.skipped == 0 {
+            self.fail("there are no tests");
+        }
+    }
+
+    /// Adds what became of the tests of `suite`.
+    pub(super) fn add(&mut self, tally: Tally, suite: &str) {
+        self.passed += tally.passed;
+        self.failed += tally.failed;
+        self.skipped += tally.skipped;
+        self.names.extend(tally.names.into_iter().map(|name| format!("{suite}: {name}")));
+    }
+
+    fn hear_libtest(&mut self, line: &str) {
+        let line = line.trim_start();
+        if let Some((_, program)) = line.strip_prefix("Running ").and_then(|rest| rest.rsplit_once(" (")) {
+            self.close();
+            self.program = program_name(program.trim_end_matches(')'));
+        } else if let Some(package) = line.strip_prefix("Doc-tests ") {
+            self.close();
+            self.program = format!("docs of {package}");
+        } else if line.strip_prefix("running ").is_some_and(|rest| rest.ends_with(" test") || rest.ends_with(" tests"))
+        {
+            self.close();
+            self.open = true;
+        } else if let Some(counts) = line.strip_prefix("test result: ") {
+            self.open = false;
+            self.passed += count_before(counts, " passed");
+            self.failed += count_before(counts, " failed");
+            self.skipped += count_before(counts, " ignored");
+        } else if let Some(name) = line.strip_prefix("test ").and_then(|rest| rest.strip_suffix("... FAILED")) {
+            self.names.push(format!("{}: {}", self.program, name.trim_end()));
+        }
+    }
+
+    fn hear_unittest(&mut self, line: &str) {
+        if let Some(name) = line.strip_prefix("FAIL: ").or_else(|| line.strip_prefix("ERROR: ")) {
+            self.names.push(name.to_owned());
+        } else if let Some(ran) = line.strip_prefix("Ran ") {
+            self.ran = count_before(ran, " test");
+        } else if line == "OK" || line.starts_with("OK (") || line.starts_with("FAILED (") {
+            let count = |what| count_after(line, what);
+            self.failed = count("failures=") + count("errors=") + count("unexpected successes=");
+            self.skipped = count("skipped=");
+            // An error in a fixture counts as an error, but its tests were not run.
+            self.passed = self.ran.saturating_sub(self.failed + self.skipped);
+        }
+    }
+
+    /// A test program that began and gave no result was killed, or ended itself.
+    fn close(&mut self) {
+        if std::mem::take(&mut self.open) {
+            let name = format!("{}: ended in the midst of its tests", self.program);
+            self.fail(&name);
+        }
+    }
+
+    fn fail(&mut self, name: &str) {
+        self.failed += 1;
+        self.names.push(name.to_owned());
+    }
+}
+
+/// `rooms` of `target/release/deps/rooms-0123456789abcdef`.
+fn program_name(path: &str) -> String {
+    let file = Path::new(path).file_name().unwrap_or_default().to_string_lossy();
+    file.rsplit_once('-').map_or(file.to_string(), |(name, _)| name.to_owned())
+}
+
+/// The number in front of `what`; 0 if it is not there.
+fn count_before(text: &str, what: &str) -> u64 {
+    let before = text.find(what).map_or("", |at| &text[..at]);
+    let digits = before.trim_end_matches(|c: char| c.is_ascii_digit()).len();
+    before[digits..].parse().unwrap_or(0)
+}
+
+/// The number behind `what`; 0 if it is not there.
+fn count_after(text: &str, what: &str) -> u64 {
+    let after = text.find(what).map_or("", |at| &text[at + what.len()..]);
+    let digits = after.find(|c: char| !c.is_ascii_digit()).unwrap_or(after.len());
+    after[..digits].parse().unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn heard(speech: Speech, success: bool, text: &str) -> Tally {
+        let mut tally = Tally::new(speech);
+        text.lines().for_each(|line| tally.hear(line));
+        tally.end(success, "ended with exit status: 1");
+        tally
+    }
+
+    fn counts(tally: &Tally) -> [u64; 3] {
+        [tally.passed, tally.failed, tally.skipped]
+    }
+
+    #[test]
+    fn the_results_of_several_test_programs_are_added() {
+        let text = "     Running unittests src/lib.rs (target/release/deps/gleaner_cli-0a1b)\n\nrunning 12 tests\n\
+                    test a::b ... ok\ntest result: ok. 12 passed; 0 failed; 1 ignored; 0 measured; 0 filtered out\n\
+                    \x20    Running tests/rooms.rs (target/release/deps/rooms-77)\n\nrunning 1 test\n\
+                    test the_house   ... FAILED\n\
+                    test result: FAILED. 3 passed; 1 failed; 2 ignored; 0 measured; 0 filtered out\n\
+                    \x20  Doc-tests gleaner_sdk\n\nrunning 0 tests\n\n\
+                    test result: ok. 0 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out\n";
+        let tally = heard(Speech::Libtest, false, text);
+        assert_eq!(counts(&tally), [15, 1, 3]);
+        assert_eq!(tally.names, ["rooms: the_house"]);
+    }
+
+    #[test]
+    fn a_test_program_that_is_killed_counts_as_a_failure() {
+        let text = "     Running tests/a.rs (target/release/deps/a-1)\nrunning 2 tests\ntest x ... ok\n\
+                    \x20    Running tests/b.rs (target/release/deps/b-2)\nrunning 1 test\n\
+                    test result: ok. 1 passed; 0 failed\n";
+        let tally = heard(Speech::Libtest, false, text);
+        assert_eq!(counts(&tally), [1, 1, 0]);
+        assert_eq!(tally.names, ["a: ended in the midst of its tests"]);
+    }
+
+    #[test]
+    fn a_suite_that_does_not_compile_counts_as_a_failure() {
+        let tally = heard(Speech::Libtest, false, "error: could not compile `x`");
+        assert_eq!(counts(&tally), [0, 1, 0]);
+        assert_eq!(tally.names, ["ended with exit status: 1"]);
+    }
+
+    #[test]
+    fn unittest_counts_its_skipped_and_failed_tests_among_those_it_ran() {
+        let text =
+            "FAIL: test_a (m.C)\nERROR: test_b (m.C)\nRan 9 tests in 0.1s\n\nFAILED (failures=1, errors=1, skipped=2)";
+        let tally = heard(Speech::Unittest, false, text);
+        assert_eq!(counts(&tally), [5, 2, 2]);
+        assert_eq!(tally.names, ["test_a (m.C)", "test_b (m.C)"]);
+        assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 1 test in 0.1s\n\nOK")), [1, 0, 0]);
+        assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 3 tests in 0.1s\n\nOK (skipped=1)")), [2, 0, 1]);
+    }
+
+    #[test]
+    fn a_suite_without_any_test_is_a_failure() {
+        // Up to Python 3.11 it calls that a success.
+        assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 0 tests in 0.000s\n\nOK")), [0, 1, 0]);
+        assert_eq!(counts(&heard(Speech::Unittest, false, "Ran 0 tests in 0.000s\n\nNO TESTS RAN")), [0, 1, 0]);
+        assert_eq!(
+            counts(&heard(Speech::Libtest, true, "running 0 tests\n\ntest result: ok. 0 passed; 0 failed")),
+            [0, 1, 0]
+        );
+    }
+
+    #[test]
+    fn a_suite_that_says_nothing_is_one_test() {
+        assert_eq!(counts(&heard(Speech::None, true, "Success: no issues found in 5 source files")), [1, 0, 0]);
+        assert_eq!(counts(&heard(Speech::None, false, "Found 1 error")), [0, 1, 0]);
+    }
+}

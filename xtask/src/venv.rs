@@ -1,0 +1,41 @@
+//! `.venv`: Python with numpy, for Python lambdas, and mypy, for the check of the SDK's types. No version is pinned:
+//! the newest that this Python takes, so that a user's environment is the one that is tested.
+
+use std::fs;
+
+use gleaner_protocol::{Exit, Failure, Parts};
+
+use crate::checkout::Checkout;
+use crate::steps::{run, succeeds};
+
+const PACKAGES: [&str; 2] = ["numpy", "mypy"];
+
+/// Makes the environment, or completes it. One whose Python does not run, since the system's Python went, is made anew.
+pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
+    let python = |code: &str| {
+        let mut python = checkout.command(checkout.python());
+        python.args(["-I", "-c", code]);
+        python
+    };
+    if succeeds(&mut python(&format!("import {}", PACKAGES.join(", ")))) {
+        return Ok(());
+    }
+    if !succeeds(&mut python("import pip")) {
+        let folder = checkout.path(".venv");
+        if folder.exists() {
+            println!("making it anew: its Python does not run");
+            fs::remove_dir_all(&folder).map_err(|error| {
+                Failure::caused_by(Exit::Internal, format!("cannot remove `{}`", folder.display()), &error)
+            })?;
+        }
+        // By the rule by which Python is found for a lambda; what is in `.venv` comes first, and there is nothing.
+        let interpreter = Parts::find()?.python(None)?;
+        println!("made by {}", interpreter.display());
+        let mut make = checkout.command(interpreter);
+        make.args(["-m", "venv"]).arg(folder);
+        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
+    }
+    let mut install = checkout.command(checkout.python());
+    install.args(["-m", "pip", "install", "--disable-pip-version-check", "-q"]).args(PACKAGES);
+    run(&mut install, "pip fetches numpy and mypy: see that the network is there, or configure pip for a mirror")
+}
