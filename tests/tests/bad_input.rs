@@ -212,13 +212,13 @@ fn python_that_raises_in_import_ends_the_start_with_its_traceback() {
 
 #[test]
 fn python_that_raises_in_init_ends_the_start_with_its_traceback() {
-    let run = misbehave("python", "raise_in_init");
+    let run = misbehave("python", "error_in_init");
     says(run.must_exit(FAULTED), &["cannot start lambda `misbehave`", "in init", "main.py", "line"]);
 }
 
 #[test]
 fn python_that_raises_in_an_event_has_the_traceback_in_its_decision() {
-    let run = misbehave("python", "raise_in_event");
+    let run = misbehave("python", "error");
     let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
     assert_eq!(kind, FaultKind::Exception);
     assert!(message.contains("main.py") && message.contains("in on_event"), "{message}");
