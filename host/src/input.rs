@@ -5,7 +5,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_buffers::{HeapRegion, Pool, PoolError, Refusal, RingWriter, ring};
+use gleaner_buffers::{Pool, PoolError, Refusal, RingWriter, ring};
 use gleaner_protocol::manifest::{Input, Manifest};
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, TransportError, Verdict};
 
@@ -13,6 +13,7 @@ use tracing::warn;
 
 use crate::api::data::Topic;
 use crate::api::frame::{Budget, Images};
+use crate::memory::Mapping;
 
 /// Why an input could not be set up.
 #[derive(Debug, thiserror::Error)]
@@ -80,7 +81,7 @@ fn open_input(
 
 fn pool<M: Copy + Send + Sync + 'static>(slots: usize, slot_bytes: usize) -> Result<Pool<M>, PoolError> {
     let bytes = Pool::<M>::bytes_needed(slots, slot_bytes).ok_or(PoolError::TooLarge { slots, slot_bytes })?;
-    let region = HeapRegion::zeroed(bytes)?;
+    let region = Mapping::populated(bytes).map_err(|_| PoolError::OutOfMemory { bytes })?;
     Pool::new(region, slots, slot_bytes)
 }
 

@@ -9,6 +9,7 @@ pub mod guest;
 pub mod image;
 pub mod input;
 pub mod judge;
+pub mod memory;
 pub mod program;
 pub mod replay;
 pub mod schedule;

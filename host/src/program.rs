@@ -68,7 +68,7 @@ pub type Load<'a> = &'a mut dyn FnMut(&Options, &Manifest, Session) -> Result<Bo
 
 /// `main` of `gleaner-runtime`.
 pub fn main() -> ExitCode {
-    log_to_stderr();
+    prepare();
     let Cli { command: Command::Replay(args) } = Cli::parse();
     end(replay_any(args))
 }
@@ -76,7 +76,7 @@ pub fn main() -> ExitCode {
 /// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: replays with the guest
 /// that `load` makes. Returns the exit code.
 pub fn replay_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
-    log_to_stderr();
+    prepare();
     let Cli { command: Command::Replay(args) } = match Cli::try_parse_from(args) {
         Ok(cli) => cli,
         Err(error) => {
@@ -126,7 +126,8 @@ fn load_wasm(options: &Options, manifest: &Manifest, session: Session) -> Result
     Ok(Box::new(WasmGuest::new(loaded, session, allowance, None)))
 }
 
-fn log_to_stderr() {
+fn prepare() {
+    crate::memory::give_large_blocks_back();
     let filter = tracing_subscriber::EnvFilter::try_from_env("GLEANER_LOG").unwrap_or_else(|_| "warn".into());
     // Fails only where a subscriber is set already, which then stays.
     let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).try_init();

@@ -311,7 +311,7 @@ fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
             &format!("tests/lambdas/pixels/{kind}"),
             replaced("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
         );
-        let run = replay(copy.path(), &[drive.clone()], &[]);
+        let run = replay(copy.path(), std::slice::from_ref(&drive), &[]);
         let message = run.must_exit(FAULTED).first_fault().expect("a fault").1;
         assert!(message.contains("65500x65500") && message.contains("8 MiB"), "{message}");
         let peak = run.summary.as_ref().expect("a summary").peak_rss_bytes;

@@ -212,7 +212,7 @@ impl Topic {
 
     fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {
         match error {
-            CdrError::NotANumber { .. } => DataError::WrongField {
+            CdrError::NotANumber => DataError::WrongField {
                 path: path.path().to_owned(),
                 why: format!("of `{}` is no number", self.type_name),
             },
