@@ -36,7 +36,7 @@ pub struct ReplayArgs {
     /// MCAP files; several are merged by time.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
-    /// A value of [config].
+    /// A value of the table `config` of the manifest.
     #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
     pub set: Vec<(String, String)>,
     /// Another name for a topic of the manifest.
