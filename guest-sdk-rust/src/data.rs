@@ -259,6 +259,33 @@ impl Frame {
     }
 }
 
+/// The encoding's name in ROS.
+///
+/// ```
+/// use gleaner_sdk::data::{Encoding, encoding_name};
+/// assert_eq!(encoding_name(Encoding::Yuv422Yuy2), "yuv422_yuy2");
+/// ```
+pub fn encoding_name(encoding: Encoding) -> &'static str {
+    match encoding {
+        Encoding::Rgb8 => "rgb8",
+        Encoding::Bgr8 => "bgr8",
+        Encoding::Rgba8 => "rgba8",
+        Encoding::Bgra8 => "bgra8",
+        Encoding::Mono8 => "mono8",
+        Encoding::Mono16 => "mono16",
+        Encoding::Yuv422 => "yuv422",
+        Encoding::Yuv422Yuy2 => "yuv422_yuy2",
+        Encoding::BayerRggb8 => "bayer_rggb8",
+        Encoding::BayerBggr8 => "bayer_bggr8",
+        Encoding::BayerGbrg8 => "bayer_gbrg8",
+        Encoding::BayerGrbg8 => "bayer_grbg8",
+        Encoding::BayerRggb16 => "bayer_rggb16",
+        Encoding::BayerBggr16 => "bayer_bggr16",
+        Encoding::BayerGbrg16 => "bayer_gbrg16",
+        Encoding::BayerGrbg16 => "bayer_grbg16",
+    }
+}
+
 /// Bytes that one pixel takes.
 pub fn bytes_per_pixel(encoding: Encoding) -> u32 {
     match encoding {

@@ -23,6 +23,7 @@ fn main() -> ExitCode {
             twins(&format!("examples/{example}"), &sample_drive(), &["--all", "--set", "brake_mps2=-1.4"])
         }));
     }
+    trials.push(Trial::test("every_function_answers_both_twins_the_same", every_answer));
     for kind in KINDS {
         trials.push(shared(format!("brake_dark_in_{kind}_finds_both_brakings_at_night"), "rec_brake_dark.mcap", {
             move |drive| at(&drive, "examples/brake-dark", kind, &[15.84, 30.25])
@@ -70,6 +71,41 @@ fn twins(lambda: &str, drive: &Path, args: &[&str]) -> Result<(), Failed> {
         None => Ok(()),
     }
 }
+
+/// What `probe` is answered, attribute by attribute, to the last digit.
+fn every_answer() -> Result<(), Failed> {
+    let [rust, python] = KINDS.map(|kind| run("tests/lambdas/probe", kind, &sample_drive(), &[]));
+    let (rust, python) = (rust?, python?);
+    same(&rust.decisions.len(), &10)?;
+    for (a, b) in rust.decisions.iter().zip(&python.decisions) {
+        same(&a.triggers.iter().map(|trigger| trigger.label.as_str()).collect(), &PROBED.to_vec())?;
+        same(&a.triggers, &b.triggers)?;
+    }
+    let kept = |run: &Run| run.log.iter().map(|line| line["message"].clone()).collect::<Vec<_>>();
+    same(&kept(&rust), &kept(&python))?;
+    same(&rust.log.len(), &10)?;
+    // The first picture is of the day; and no refusal was an answer.
+    let first = &rust.decisions[0].triggers;
+    same(&first[2].score.is_some_and(|luma| (75.0..132.0).contains(&luma)), &true)?;
+    let refusals = first[3].attributes.values().map(|kind| kind.as_str().unwrap_or_default());
+    same(&refusals.collect::<Vec<_>>(), &REFUSALS.to_vec())
+}
+
+/// What `probe` triggers at each wake, and which refusals it provokes, in its order.
+const PROBED: [&str; 6] = ["topic", "sample", "frame", "refusals", "recording", "recording"];
+const REFUSALS: [&str; 11] = [
+    "no-such-input",
+    "no-such-field",
+    "wrong-field",
+    "wrong-field",
+    "not-a-frame",
+    "out-of-range",
+    "out-of-range",
+    "no-room",
+    "invalid",
+    "invalid",
+    "no-runtime",
+];
 
 fn at(drive: &Path, lambda: &str, kind: &str, onsets: &[f64]) -> Result<(), Failed> {
     let run = run(lambda, kind, drive, &["--set", "brake_mps2=-3.0"])?;
