@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 use std::thread;
 
-use gleaner_protocol::{Exit, Explain, Failure, Parts, Report, Summary};
+use gleaner_protocol::{Exit, Explain, Failure, Parts, Report, Summary, visible};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::args::ReplayArgs;
-use crate::results::{Decisions, printable};
+use crate::results::Decisions;
 use crate::show::{self, Digest, Paint};
 
 /// Why the runtime did not do what it was asked for, where it could not say so itself.
@@ -122,7 +122,7 @@ fn follow(reports: ChildStdout, bar: &ProgressBar) -> Result<Option<Summary>, Re
             Ok(Report::Round(_)) => {}
             Ok(Report::Summary(found)) => summary = Some(*found),
             Err(source) => {
-                let line = printable(&line.chars().take(200).collect::<String>());
+                let line = visible(&line.chars().take(200).collect::<String>());
                 return Err(ReplayError::Report { line, source });
             }
         }

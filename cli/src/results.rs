@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, Lines};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Decision, Exit, Explain, Trigger};
+use gleaner_protocol::{Decision, Exit, Explain, Trigger, visible};
 
 /// Why results cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -84,13 +84,10 @@ impl Iterator for Decisions {
 /// A line of `expected.txt` for each trigger of `decision`: `<seconds %.3f> <label> <score %.3g>`; no score is `-`.
 ///
 /// `start_ns` is [`Summary::start_ns`](gleaner_protocol::Summary::start_ns): seconds count from the first message of
-/// the topics that the lambda reads, so that a drive can be cut to those topics and still be compared.
+/// the drive, of whatever topic.
 pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item = String> {
     let seconds = seconds(decision.at_ns, start_ns);
-    decision
-        .triggers
-        .iter()
-        .map(move |trigger| format!("{seconds:.3} {} {}", printable(&trigger.label), score(trigger)))
+    decision.triggers.iter().map(move |trigger| format!("{seconds:.3} {} {}", visible(&trigger.label), score(trigger)))
 }
 
 /// The score of `trigger` in three significant digits, `-` if it has none.
@@ -123,18 +120,6 @@ pub fn three_digits(value: f64) -> String {
         -4..=2 => trimmed(&format!("{value:.*}", (2 - exponent) as usize)),
         _ => format!("{}e{}{:02}", trimmed(digits), if exponent < 0 { '-' } else { '+' }, exponent.abs()),
     }
-}
-
-/// `text` from a lambda or a file, on one line and without characters that would act on a terminal.
-pub fn printable(text: &str) -> String {
-    let mut shown = String::with_capacity(text.len());
-    for character in text.chars() {
-        match character.is_control() {
-            true => shown.extend(character.escape_default()),
-            false => shown.push(character),
-        }
-    }
-    shown
 }
 
 #[cfg(test)]

@@ -2,17 +2,15 @@
 
 use std::ffi::OsString;
 use std::io;
-use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Parser, Subcommand};
 use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
 
 use crate::api::Session;
 use crate::guest::Guest;
-use crate::input::Remap;
-use crate::replay::{self, Options};
+use crate::replay::{self, Load, Options, ReplayArgs};
 
 /// Hosts one lambda. Writes reports, a JSON object a line, to standard output.
 #[derive(Parser)]
@@ -27,44 +25,6 @@ enum Command {
     /// Runs a built lambda over recorded drives.
     Replay(ReplayArgs),
 }
-
-/// Arguments of `replay`.
-#[derive(Args, Clone, Debug)]
-pub struct ReplayArgs {
-    /// The lambda's folder, built by `gleaner build`.
-    pub lambda: PathBuf,
-    /// MCAP files; several are merged by time.
-    #[arg(required = true)]
-    pub drives: Vec<PathBuf>,
-    /// A value of the table `config` of the manifest.
-    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
-    pub set: Vec<(String, String)>,
-    /// Another name for a topic of the manifest.
-    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
-    pub remap: Vec<Remap>,
-    /// Where the results go; `DIR/out` if not given.
-    #[arg(long, value_name = "DIR")]
-    pub out: Option<PathBuf>,
-    /// Write every decision, not only those with a trigger or a fault.
-    #[arg(long)]
-    pub all: bool,
-    /// Replay so many times in this process, each time from the start.
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    pub repeat: u32,
-}
-
-fn assignment(text: &str) -> Result<(String, String), String> {
-    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, as in brake_mps2=-1.4")?;
-    Ok((key.trim().to_owned(), value.trim().to_owned()))
-}
-
-fn remap(text: &str) -> Result<Remap, String> {
-    let (from, to) = text.split_once(":=").ok_or("write FROM:=TO, as in /imu/data:=/car/imu")?;
-    Ok(Remap { from: from.trim().to_owned(), to: to.trim().to_owned() })
-}
-
-/// Makes the guest of a lambda whose kind the caller can host.
-pub type Load<'a> = &'a mut dyn FnMut(&Options, &Manifest, Session) -> Result<Box<dyn Guest>, Failure>;
 
 /// `main` of `gleaner-runtime`.
 pub fn main() -> ExitCode {

@@ -2,9 +2,9 @@
 
 use std::fmt::{self, Write};
 
-use gleaner_protocol::{Decision, Fault, FaultKind, Summary, TopicReport};
+use gleaner_protocol::{Decision, Fault, FaultKind, Summary, TopicReport, visible};
 
-use crate::results::{ResultsError, printable, score, seconds};
+use crate::results::{ResultsError, score, seconds};
 
 /// As many triggers, and as many causes of faults, are shown; the rest is counted.
 const SHOWN: usize = 20;
@@ -46,7 +46,7 @@ impl Digest {
             let room = SHOWN - digest.triggers.len();
             digest.triggers.extend(decision.triggers.iter().take(room).map(|trigger| Shown {
                 seconds,
-                label: printable(&trigger.label),
+                label: visible(&trigger.label),
                 score: score(trigger),
             }));
             if let Some(fault) = decision.fault {
@@ -57,7 +57,7 @@ impl Digest {
     }
 
     fn count(&mut self, fault: &Fault, first_seconds: f64) {
-        let (kind, message) = (fault.kind, printable(gist(&fault.message)));
+        let (kind, message) = (fault.kind, visible(gist(&fault.message)));
         if let Some(cause) = self.causes.iter_mut().find(|cause| cause.kind == kind && cause.message == message) {
             cause.count += 1;
         } else if self.causes.len() < SHOWN {
@@ -85,7 +85,7 @@ pub(crate) fn summary(summary: &Summary, digest: &Digest, paint: Paint) -> Strin
 }
 
 fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: Paint) -> fmt::Result {
-    let name = format!("{} {}", printable(&summary.lambda), printable(&summary.version));
+    let name = format!("{} {}", visible(&summary.lambda), visible(&summary.version));
     let span_s = seconds(summary.end_ns, summary.start_ns);
     writeln!(
         text,
@@ -116,7 +116,7 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: P
     if let Some(damage) = &summary.damaged {
         writeln!(text, "  {}", paint.red("the drive is damaged; the results end there"))?;
         for line in damage.lines() {
-            writeln!(text, "    {}", printable(line))?;
+            writeln!(text, "    {}", visible(line))?;
         }
     }
 
@@ -148,7 +148,7 @@ fn losses(summary: &Summary) -> Vec<String> {
             (topic.no_slot, "found no free slot, as the lambda held too many"),
             (topic.too_big, "larger than `max_size`"),
         ];
-        let name = printable(&topic.topic);
+        let name = visible(&topic.topic);
         causes.map(|(count, why)| (count, format!("{} of {name}, {why}", counted(count, "sample"))))
     };
     let overall = [

@@ -3,70 +3,23 @@
 //! Time is the drive's. A sample is delivered, the lambda runs if its schedule says so, then the next: nothing is skipped,
 //! and nothing depends on how fast the machine is.
 
+mod options;
 mod output;
 mod round;
 
+pub use options::{Options, ReplayArgs};
+
 use std::io::Write;
-use std::path::PathBuf;
 
-use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
-use gleaner_protocol::{BuildDir, Exit, Failure, Report};
+use gleaner_protocol::manifest::Manifest;
+use gleaner_protocol::{Exit, Failure, Report};
 
-use crate::input::Remap;
-use crate::program::{Load, ReplayArgs};
+use crate::api::Session;
+use crate::guest::Guest;
 use output::Output;
 
-/// What to replay, checked.
-pub struct Options {
-    /// The lambda's folder.
-    pub lambda: PathBuf,
-    /// Its build, not older than its sources.
-    pub build: BuildDir,
-    /// The drives, merged by time.
-    pub drives: Vec<PathBuf>,
-    /// All of `[config]`, with the overrides laid over the defaults.
-    pub config: Vec<(String, ConfigValue)>,
-    /// Other names for topics of the manifest.
-    pub remaps: Vec<Remap>,
-    /// Where results are written.
-    pub out: PathBuf,
-    /// Whether every decision is written.
-    pub all: bool,
-    /// How often to replay.
-    pub repeat: u32,
-}
-
-impl Options {
-    /// Checks `args` against the build folder and the manifest in it.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the manifest's line, the key or the topic, and the way out.
-    pub fn new(args: ReplayArgs) -> Result<(Self, Manifest), Failure> {
-        let build = BuildDir::check_fresh(&args.lambda)?;
-        let manifest = Manifest::load(build.path())?;
-        let config = ConfigSet::resolve(&manifest, &args.set)?;
-        for remap in &args.remap {
-            if !manifest.inputs.iter().any(|input| input.topic.as_str() == remap.from) {
-                let known = manifest.inputs.iter().map(|input| input.topic.as_str()).collect::<Vec<_>>().join("`, `");
-                let failure = Failure::new(Exit::Usage, format!("no input has the topic `{}` of --remap", remap.from));
-                return Err(failure.with_help(format!("the manifest has `{known}`")));
-            }
-        }
-        let out = args.out.unwrap_or_else(|| args.lambda.join("out"));
-        let options = Self {
-            lambda: args.lambda,
-            build,
-            drives: args.drives,
-            config,
-            remaps: args.remap,
-            out,
-            all: args.all,
-            repeat: args.repeat,
-        };
-        Ok((options, manifest))
-    }
-}
+/// Makes the guest of a lambda whose kind the caller can host.
+pub type Load<'a> = &'a mut dyn FnMut(&Options, &Manifest, Session) -> Result<Box<dyn Guest>, Failure>;
 
 /// Replays, writes results to `options.out` and reports to `reports`.
 ///

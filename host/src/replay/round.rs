@@ -10,12 +10,11 @@ use gleaner_transport::TransportError;
 use gleaner_transport::replay::{Replay, ReplayError};
 
 use super::output::Output;
-use super::{Options, report as send};
+use super::{Load, Options, report as send};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
 use crate::input::{InputError, open_inputs};
 use crate::judge::Judge;
-use crate::program::Load;
 use crate::schedule::Schedule;
 
 /// How often progress is reported; a person sees no more.

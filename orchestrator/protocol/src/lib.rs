@@ -22,3 +22,4 @@ pub use layout::{BuildDir, LayoutError};
 pub use manifest::{Manifest, ManifestError};
 pub use parts::{Parts, PartsError};
 pub use report::{Report, Round, Summary, TopicReport};
+pub use words::visible;

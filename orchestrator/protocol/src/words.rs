@@ -34,7 +34,7 @@ pub(crate) fn excerpt(text: &str) -> String {
 }
 
 /// `text` with its control characters written out, so that none acts on a terminal.
-pub(crate) fn visible(text: &str) -> String {
+pub fn visible(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     for character in text.chars() {
         match character.is_control() {
