@@ -34,10 +34,16 @@ impl fmt::Display for Error {
     }
 }
 
-/// Any error of Rust becomes one with `?`. (`Error` itself is none, or this would overlap.)
+/// Any error of Rust becomes one with `?`, its causes behind it. (`Error` itself is none, or this would overlap.)
 impl<E: std::error::Error> From<E> for Error {
     fn from(error: E) -> Self {
-        Self::new(error.to_string())
+        let mut message = error.to_string();
+        let mut cause = error.source();
+        while let Some(error) = cause {
+            message = format!("{message}: {error}");
+            cause = error.source();
+        }
+        Self::new(message)
     }
 }
 

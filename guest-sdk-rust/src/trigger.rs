@@ -15,18 +15,17 @@ pub fn event(label: &str, score: f64) -> Event<'_> {
 
 /// Starts a recording that lasts until [`stop`] with the same label.
 ///
-/// # Errors
-///
-/// If the label is empty or over 128 bytes, or this wake has caused 16 triggers.
-pub fn start(label: &str) -> Result<()> {
-    answer(wit::start(label, &[]))
+/// Nothing happens before [`Start::send`].
+#[must_use = "a recording starts once this is sent"]
+pub fn start(label: &str) -> Start<'_> {
+    Start { label, attributes: Vec::new() }
 }
 
 /// Ends the recording that [`start`] began.
 ///
 /// # Errors
 ///
-/// As [`start`].
+/// As [`Start::send`].
 pub fn stop(label: &str) -> Result<()> {
     answer(wit::stop(label))
 }
@@ -41,7 +40,7 @@ pub struct Event<'a> {
 impl Event<'_> {
     /// Adds a named fact that travels into the clip; 16 at most.
     pub fn with(mut self, key: &str, value: impl Into<Value>) -> Self {
-        self.attributes.push(wit::Attribute { key: key.to_owned(), value: value.into().0 });
+        self.attributes.push(attribute(key, value));
         self
     }
 
@@ -49,11 +48,38 @@ impl Event<'_> {
     ///
     /// # Errors
     ///
-    /// If the label is empty or over 128 bytes, a number is not finite, a key is given twice, or this wake has caused 16
-    /// triggers. Nothing is caused then.
+    /// If the label is empty or over 128 bytes, a number is not finite, a key is given twice, this wake has caused 16 triggers,
+    /// or there is no wake, as in `init`. Nothing is caused then.
     pub fn send(self) -> Result<()> {
         answer(wit::event(self.label, self.score, &self.attributes))
     }
+}
+
+/// The start of a recording, being described.
+pub struct Start<'a> {
+    label: &'a str,
+    attributes: Vec<wit::Attribute>,
+}
+
+impl Start<'_> {
+    /// Adds a named fact that travels into the clip; 16 at most.
+    pub fn with(mut self, key: &str, value: impl Into<Value>) -> Self {
+        self.attributes.push(attribute(key, value));
+        self
+    }
+
+    /// Starts the recording.
+    ///
+    /// # Errors
+    ///
+    /// As [`Event::send`].
+    pub fn send(self) -> Result<()> {
+        answer(wit::start(self.label, &self.attributes))
+    }
+}
+
+fn attribute(key: &str, value: impl Into<Value>) -> wit::Attribute {
+    wit::Attribute { key: key.to_owned(), value: value.into().0 }
 }
 
 /// Value of an attribute; made from `bool`, `i64`, `f64` and `&str`.

@@ -2,6 +2,7 @@
 //!
 //! All memory is taken and touched here, before the first sample. Delivering copies a sample once and never waits for a lambda.
 
+use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -19,8 +20,10 @@ use crate::memory::Mapping;
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum InputError {
-    #[error("cannot reserve memory for input `{input}`")]
-    Memory { input: String, source: PoolError },
+    #[error("cannot lay out the memory of input `{input}`")]
+    Layout { input: String, source: PoolError },
+    #[error("cannot reserve {bytes} bytes of memory for input `{input}`")]
+    Memory { input: String, bytes: usize, source: io::Error },
     #[error("cannot subscribe input `{input}`")]
     Subscribe { input: String, source: TransportError },
 }
@@ -54,7 +57,7 @@ fn open_input(
     transport: &mut dyn Transport,
     made: &Budget,
 ) -> Result<Arc<Topic>, InputError> {
-    let memory = |source| InputError::Memory { input: input.name.to_string(), source };
+    let layout = |source| InputError::Layout { input: input.name.to_string(), source };
     let subscribe = |source| InputError::Subscribe { input: input.name.to_string(), source };
 
     let topic = input.topic.as_str();
@@ -66,10 +69,10 @@ fn open_input(
         max_bytes: input.max_size.as_usize(),
     };
 
-    let samples = pool(input.slots(), spec.max_bytes).map_err(memory)?;
-    let (writer, reader) = ring(samples, input.depth).map_err(memory)?;
+    let samples = pool(input, input.slots(), spec.max_bytes)?;
+    let (writer, reader) = ring(samples, input.depth).map_err(layout)?;
     let decoded = match input.decoded_size {
-        Some(bytes) => Some(pool(input.decoded_slots(), bytes.as_usize()).map_err(memory)?),
+        Some(bytes) => Some(pool(input, input.decoded_slots(), bytes.as_usize())?),
         None => None,
     };
     let images = Images::new(decoded, made.clone());
@@ -79,10 +82,17 @@ fn open_input(
     Ok(Topic::new(input.name.as_str(), topic, &spec.type_name, reader, definitions, images))
 }
 
-fn pool<M: Copy + Send + Sync + 'static>(slots: usize, slot_bytes: usize) -> Result<Pool<M>, PoolError> {
-    let bytes = Pool::<M>::bytes_needed(slots, slot_bytes).ok_or(PoolError::TooLarge { slots, slot_bytes })?;
-    let region = Mapping::populated(bytes).map_err(|_| PoolError::OutOfMemory { bytes })?;
-    Pool::new(region, slots, slot_bytes)
+fn pool<M: Copy + Send + Sync + 'static>(
+    input: &Input,
+    slots: usize,
+    slot_bytes: usize,
+) -> Result<Pool<M>, InputError> {
+    let name = || input.name.to_string();
+    let layout = |source| InputError::Layout { input: name(), source };
+    let bytes = Pool::<M>::bytes_needed(slots, slot_bytes).ok_or(PoolError::TooLarge { slots, slot_bytes });
+    let bytes = bytes.map_err(layout)?;
+    let region = Mapping::populated(bytes).map_err(|source| InputError::Memory { input: name(), bytes, source })?;
+    Pool::new(region, slots, slot_bytes).map_err(layout)
 }
 
 /// The transport's end of a ring. The lock is only ever taken by the transport's own thread.

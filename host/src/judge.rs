@@ -32,7 +32,7 @@ impl Judge {
         self.run += run;
         decision.run_ns = run.as_nanos() as u64;
         decision.fuel = outcome.fuel;
-        decision.triggers = self.session.take_triggers();
+        decision.triggers = self.session.end();
         decision.fault = outcome.result.err();
         decision
     }

@@ -31,7 +31,7 @@ pub struct Mapping {
 }
 
 impl Mapping {
-    /// Maps `len` bytes, 1 at least, and touches every page.
+    /// Maps `len` bytes, 1 at least, and has the kernel bring in every page.
     ///
     /// # Errors
     ///

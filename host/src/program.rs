@@ -70,7 +70,8 @@ fn replay_any(args: ReplayArgs) -> Result<Exit, Failure> {
 fn run(options: &Options, manifest: &Manifest, load: Load<'_>) -> Result<Exit, Failure> {
     let internal = |error: io::Error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error);
     let reports = io::stdout();
-    let reports = rustix::io::dup(&reports).map_err(io::Error::from).map_err(internal)?;
+    // Not for processes that a lambda starts: whoever reads the reports waits for their end.
+    let reports = rustix::io::fcntl_dupfd_cloexec(&reports, 3).map_err(io::Error::from).map_err(internal)?;
     rustix::stdio::dup2_stdout(io::stderr()).map_err(io::Error::from).map_err(internal)?;
     replay::run(options, manifest, load, &mut std::fs::File::from(reports))
 }

@@ -90,12 +90,13 @@ impl Event {
             }
             Backlog::Latest => reader.newest(),
         };
-        let Some(lease) = lease else {
+        // While the newest sample is being replaced, a reader may find an older one: what was judged is not judged again.
+        let considered = lease.and_then(|lease| Some((lease.position()?, lease)));
+        let Some((position, lease)) = considered.filter(|(position, _)| *position >= self.next) else {
             self.topic.add_skipped(head - self.next);
             self.next = head;
             return None;
         };
-        let position = lease.position().unwrap_or(head - 1);
         self.topic.add_skipped(position.saturating_sub(self.next));
         self.next = position + 1;
         Some(Wake::Event(self.topic.sample(lease)))
@@ -117,7 +118,7 @@ impl Periodic {
         if due_ns >= now_ns {
             return None;
         }
-        let behind = now_ns.abs_diff(due_ns) / self.period_ns as u64;
+        let behind = (now_ns.abs_diff(due_ns) - 1) / self.period_ns as u64 + 1;
         if behind > CATCH_UP_TICKS {
             self.missed += behind;
             self.missed_total += behind;
@@ -150,8 +151,19 @@ mod tests {
         let mut periodic = Periodic::new(Duration::from_nanos(1));
         assert!(ticks(&mut periodic, 0).is_empty());
         assert!(ticks(&mut periodic, i64::MAX - 10).is_empty());
-        assert!(periodic.missed_total > CATCH_UP_TICKS);
-        assert_eq!(ticks(&mut periodic, i64::MAX).first(), Some(&(i64::MAX - 9)));
+        // Due at 1, 2, and so on up to, not including, `i64::MAX - 10`.
+        assert_eq!(periodic.missed_total, i64::MAX as u64 - 11);
+        let tick = periodic.next(i64::MAX).unwrap();
+        assert_eq!((tick.at_ns, tick.missed), (i64::MAX - 9, periodic.missed_total));
+    }
+
+    #[test]
+    fn missed_ticks_are_those_before_now_and_no_more() {
+        let mut periodic = Periodic::new(Duration::from_nanos(100));
+        assert!(ticks(&mut periodic, 1000).is_empty());
+        // Due at 1100, 1200, ..., 20,001,100.
+        assert!(ticks(&mut periodic, 20_001_150).is_empty());
+        assert_eq!(periodic.missed_total, 200_001);
     }
 
     #[test]

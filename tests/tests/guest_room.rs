@@ -78,7 +78,7 @@ fn a_good_wake_uses_some_fuel_and_causes_nothing() {
     let outcome = room.wake();
     assert!(outcome.result.is_ok());
     assert!((1..100_000).contains(&outcome.fuel.unwrap()), "{:?}", outcome.fuel);
-    assert!(room.session.take_triggers().is_empty());
+    assert!(room.session.end().is_empty());
 }
 
 #[test]
@@ -176,6 +176,7 @@ fn a_refusal_in_init_ends_the_start() {
         ("error_in_init", "in init: no, not today"),
         ("bad_input", "no input `imo`; the manifest has `imu`"),
         ("bad_field", "linear_acceleration"),
+        ("event_in_init", "triggers belong to a wake"),
     ] {
         let fault = Room::new(behaviour, FUEL, None).guest.init().unwrap_err();
         assert_eq!(fault.kind, FaultKind::Exception);
@@ -190,7 +191,7 @@ fn a_refusal_in_init_ends_the_start() {
 fn a_trigger_before_a_panic_still_counts() {
     let mut room = Room::of("event_then_panic");
     assert_eq!(room.fault().0, FaultKind::Trap);
-    assert_eq!(room.session.take_triggers()[0].label, "seen");
+    assert_eq!(room.session.end()[0].label, "seen");
 }
 
 #[test]
@@ -219,6 +220,10 @@ fn what_a_lambda_prints_becomes_log_lines_and_a_flood_is_counted() {
     let mut room = Room::of("print");
     assert!(room.wake().result.is_ok());
     assert_eq!(room.session.take_log()[0].message, "hello from 1");
+    let mut room = Room::of("print_in_pieces");
+    assert!(room.wake().result.is_ok());
+    let lines = room.session.take_log().into_iter().map(|line| line.message).collect::<Vec<_>>();
+    assert_eq!(lines, ["wake 1 of print_in_pieces"]);
     let mut room = Room::of("log_flood");
     assert!(room.wake().result.is_ok());
     assert_eq!((room.session.take_log().len(), room.session.log_dropped()), (100, 900));

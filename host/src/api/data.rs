@@ -11,6 +11,7 @@ use gleaner_transport::{Guid, SampleMeta};
 
 pub use super::error::DataError;
 use super::frame::{Frame, Images, Picture};
+use super::log::cut;
 
 /// Most samples that one call hands out.
 pub const SAMPLES_PER_CALL: usize = 256;
@@ -18,6 +19,8 @@ pub const SAMPLES_PER_CALL: usize = 256;
 pub const COLUMN_LEN: usize = 65_536;
 /// Most bytes that one call copies out.
 pub const BYTES_PER_CALL: usize = 1 << 20;
+/// Longest path of a field, in bytes.
+pub const PATH_BYTES: usize = 1024;
 /// Longest list of strings in one field.
 pub const TEXTS_PER_FIELD: usize = 4096;
 
@@ -166,6 +169,10 @@ impl Topic {
     ///
     /// [`DataError::NoSuchField`] names the nearest field.
     pub fn field(self: &Arc<Self>, path: &str) -> Result<Field, DataError> {
+        if path.len() > PATH_BYTES {
+            let why = format!("has {} bytes; a path has {PATH_BYTES} at most", path.len());
+            return Err(DataError::WrongField { path: cut(path, 64).to_owned(), why });
+        }
         let path = FieldPath::compile(&self.definitions, path).map_err(DataError::NoSuchField)?;
         Ok(Field { topic: Arc::clone(self), path })
     }
@@ -218,6 +225,11 @@ impl Topic {
             },
             source => DataError::Malformed { topic: self.topic.clone(), type_name: self.type_name.clone(), source },
         }
+    }
+
+    /// Samples that the ring shows at most.
+    pub fn depth(&self) -> usize {
+        self.reader.depth()
     }
 
     pub(crate) fn reader(&self) -> &RingReader<SampleMeta> {
@@ -322,6 +334,16 @@ impl Sample {
     /// Bytes from `offset`, `len` at most, clamped to the message and to [`BYTES_PER_CALL`].
     pub fn cdr(&self, offset: u64, len: u32) -> &[u8] {
         piece(&self.lease, offset, len)
+    }
+
+    /// Bytes that [`Sample::as_frame`] would have to decode: by the header, and none if that is done already.
+    pub fn undecoded_bytes(&self) -> usize {
+        match self.picture() {
+            Ok(Picture::Compressed(compressed)) => {
+                self.topic.images.undecoded_bytes(self.lease.position(), compressed.data)
+            }
+            Ok(Picture::Raw(_)) | Err(_) => 0,
+        }
     }
 
     /// The message as an image; JPEG and PNG are decoded now, once for each sample.

@@ -65,6 +65,16 @@ impl Images {
         Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
     }
 
+    /// Bytes that decoding `data` fills, by its header, unless it is the newest decoded image already.
+    pub(super) fn undecoded_bytes(&self, position: Option<u64>, data: &[u8]) -> usize {
+        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {
+            return 0;
+        }
+        let room = self.decoded.as_ref().map_or(0, Pool::slot_bytes);
+        image::probe(data).ok().and_then(|header| header.rgb8_len()).map_or(0, |len| len.min(room))
+    }
+
     pub(super) fn decode_ns(&self) -> u64 {
         self.decode_ns.load(Ordering::Relaxed)
     }
@@ -186,14 +196,6 @@ impl Frame {
     /// Stamps of the sample behind it.
     pub fn stamps(&self) -> Stamps {
         self.source.stamps
-    }
-
-    /// Bytes that had to be decoded for this frame; 0 for raw images.
-    pub fn decoded_bytes(&self) -> usize {
-        match &self.pixels {
-            Pixels::Decoded(lease) => lease.len(),
-            Pixels::Raw { .. } | Pixels::Made { .. } => 0,
-        }
     }
 
     /// Bytes that one pass over the frame touches, and one that makes a frame of `made` pixels from it.

@@ -27,32 +27,35 @@ struct State {
     inputs: Vec<Arc<Topic>>,
     config: Vec<(String, ConfigValue)>,
     now_ns: i64,
-    triggers: Triggers,
+    /// What the wake has caused; none outside of a wake, where nothing can be caused.
+    triggers: Option<Triggers>,
     log: Log,
 }
 
 impl Session {
     /// A session over these inputs, in the manifest's order, and this configuration.
     pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>) -> Self {
-        Self(Arc::new(Mutex::new(State {
-            inputs,
-            config,
-            now_ns: 0,
-            triggers: Triggers::default(),
-            log: Log::default(),
-        })))
+        Self(Arc::new(Mutex::new(State { inputs, config, now_ns: 0, triggers: None, log: Log::default() })))
     }
 
     /// Begins a wake at `now_ns`: what an earlier wake left behind is dropped.
     pub fn begin(&self, now_ns: i64) {
         let mut state = self.lock();
         state.now_ns = now_ns;
-        state.triggers = Triggers::default();
+        state.triggers = Some(Triggers::default());
     }
 
     /// Ends a wake and takes what it caused, in the order of the calls.
-    pub fn take_triggers(&self) -> Vec<Trigger> {
-        std::mem::take(&mut self.lock().triggers).into_list()
+    pub fn end(&self) -> Vec<Trigger> {
+        self.lock().triggers.take().map(Triggers::into_list).unwrap_or_default()
+    }
+
+    /// Runs an `init`, which may come in the middle of a wake but is no part of it: it can cause nothing.
+    pub fn during_init<R>(&self, init: impl FnOnce() -> R) -> R {
+        let triggers = self.lock().triggers.take();
+        let result = init();
+        self.lock().triggers = triggers;
+        result
     }
 
     /// Takes the log lines written since the last call.

@@ -51,6 +51,8 @@ pub enum TriggerError {
     Attributes { label: String, given: usize },
     #[error("attribute `{key}` of `{label}`: {why}")]
     Attribute { label: String, key: String, why: &'static str },
+    #[error("triggers belong to a wake: in init, and between two wakes, there are none")]
+    NoWake,
     #[error("this wake has caused {PER_WAKE} triggers already; further ones are refused")]
     TooMany,
 }
@@ -127,7 +129,7 @@ impl Session {
     ///
     /// [`TriggerError`] if a limit of this file is passed; nothing is caused then.
     pub fn event(&self, label: &str, score: f64, attributes: Vec<Attribute>) -> Result<(), TriggerError> {
-        self.lock().triggers.add(TriggerKind::Event, label, Some(score), attributes)
+        self.cause(TriggerKind::Event, label, Some(score), attributes)
     }
 
     /// Starts a recording that lasts until [`Session::stop`] with the same label.
@@ -136,7 +138,7 @@ impl Session {
     ///
     /// As [`Session::event`].
     pub fn start(&self, label: &str, attributes: Vec<Attribute>) -> Result<(), TriggerError> {
-        self.lock().triggers.add(TriggerKind::Start, label, None, attributes)
+        self.cause(TriggerKind::Start, label, None, attributes)
     }
 
     /// Ends the recording that [`Session::start`] began.
@@ -145,7 +147,17 @@ impl Session {
     ///
     /// As [`Session::event`].
     pub fn stop(&self, label: &str) -> Result<(), TriggerError> {
-        self.lock().triggers.add(TriggerKind::Stop, label, None, Vec::new())
+        self.cause(TriggerKind::Stop, label, None, Vec::new())
+    }
+
+    fn cause(
+        &self,
+        kind: TriggerKind,
+        label: &str,
+        score: Option<f64>,
+        attributes: Vec<Attribute>,
+    ) -> Result<(), TriggerError> {
+        self.lock().triggers.as_mut().ok_or(TriggerError::NoWake)?.add(kind, label, score, attributes)
     }
 }
 
@@ -153,8 +165,11 @@ impl Session {
 mod tests {
     use super::*;
 
+    /// A session in the middle of a wake.
     fn session() -> Session {
-        Session::new(Vec::new(), Vec::new())
+        let session = Session::new(Vec::new(), Vec::new());
+        session.begin(0);
+        session
     }
 
     fn real(key: &str, value: f64) -> Attribute {
@@ -166,7 +181,7 @@ mod tests {
         let session = session();
         session.start("rain", vec![real("wet", 0.5)]).unwrap();
         session.event("brake", 3.5, Vec::new()).unwrap();
-        let triggers = session.take_triggers();
+        let triggers = session.end();
         assert_eq!(triggers.iter().map(|trigger| trigger.label.as_str()).collect::<Vec<_>>(), ["rain", "brake"]);
         assert_eq!(triggers[0].attributes["wet"], 0.5);
         assert_eq!((triggers[0].score, triggers[1].score), (None, Some(3.5)));
@@ -181,6 +196,16 @@ mod tests {
         assert_eq!(session.event("x", 1.0, Vec::new()), Err(TriggerError::TooMany));
         session.begin(1);
         assert_eq!(session.event("x", 1.0, Vec::new()), Ok(()));
+    }
+
+    #[test]
+    fn outside_of_a_wake_nothing_can_be_caused() {
+        let session = session();
+        session.event("before", 1.0, Vec::new()).unwrap();
+        assert_eq!(session.during_init(|| session.event("init", 1.0, Vec::new())), Err(TriggerError::NoWake));
+        session.event("after", 1.0, Vec::new()).unwrap();
+        assert_eq!(session.end().len(), 2);
+        assert_eq!(session.stop("late"), Err(TriggerError::NoWake));
     }
 
     #[test]
@@ -205,6 +230,6 @@ mod tests {
             refused(session.event("a", 1.0, (0..17).map(|i| real(&i.to_string(), 0.0)).collect())),
             "`a` has 17 attributes; at most 16 are allowed"
         );
-        assert!(session.take_triggers().is_empty());
+        assert!(session.end().is_empty());
     }
 }

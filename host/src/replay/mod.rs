@@ -16,38 +16,32 @@ use gleaner_protocol::{Exit, Failure, Report};
 
 use crate::api::Session;
 use crate::guest::Guest;
-use output::Output;
 
 /// Makes the guest of a lambda whose kind the caller can host.
 pub type Load<'a> = &'a mut dyn FnMut(&Options, &Manifest, Session) -> Result<Box<dyn Guest>, Failure>;
 
 /// Replays, writes results to `options.out` and reports to `reports`.
 ///
-/// The exit is [`Exit::DriveDamaged`] if the drive ended in damage (results up to there are kept), else
-/// [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
+/// The exit is [`Exit::DriveDamaged`] if the drive ended in damage, or [`Exit::Internal`] if it could not be read further
+/// (results up to there are kept); else [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
 ///
 /// # Errors
 ///
 /// A failure if the replay cannot start, or results cannot be written.
 pub fn run(options: &Options, manifest: &Manifest, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
-    let mut last = None;
-    for n in 1..=options.repeat {
-        let mut output = Output::create(&options.out, options.all)?;
-        let summary = round::replay(options, manifest, &mut *load, &mut output, reports)?;
-        output.finish(&summary)?;
+    let mut n = 1;
+    let (summary, broken) = loop {
+        let (summary, broken) = round::replay(options, manifest, &mut *load, reports)?;
         if options.repeat > 1 {
             report(reports, &Report::Round(round::report(n, &summary)));
         }
-        last = Some(summary);
-    }
-    let summary = last.expect("at least one round");
-    let exit = if summary.damaged.is_some() {
-        Exit::DriveDamaged
-    } else if summary.faults > 0 {
-        Exit::LambdaFaulted
-    } else {
-        Exit::Ok
+        if n >= options.repeat {
+            break (summary, broken);
+        }
+        n += 1;
     };
+    let faulted = if summary.faults > 0 { Exit::LambdaFaulted } else { Exit::Ok };
+    let exit = broken.unwrap_or(faulted);
     report(reports, &Report::Summary(Box::new(summary)));
     Ok(exit)
 }

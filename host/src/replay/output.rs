@@ -9,6 +9,8 @@ use serde::Serialize;
 
 use crate::api::log::Line;
 
+const SUMMARY: &str = "summary.json";
+
 /// Why results could not be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write `{}`", path.display())]
@@ -39,6 +41,14 @@ impl Output {
     /// Makes `folder` and starts its files anew. With `all`, decisions without trigger and fault are written too.
     pub fn create(folder: &Path, all: bool) -> Result<Self, OutputError> {
         fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
+        // A summary says that the files beside it are whole.
+        let summary = folder.join(SUMMARY);
+        match fs::remove_file(&summary) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => {
+                return Err(OutputError { path: summary, source });
+            }
+            _ => {}
+        }
         let decisions = Lines::create(folder.join("decisions.jsonl"))?;
         let log = Lines::create(folder.join("log.jsonl"))?;
         Ok(Self { folder: folder.to_owned(), decisions, log, all })
@@ -61,7 +71,7 @@ impl Output {
     pub fn finish(mut self, summary: &Summary) -> Result<(), OutputError> {
         self.decisions.flush()?;
         self.log.flush()?;
-        let path = self.folder.join("summary.json");
+        let path = self.folder.join(SUMMARY);
         let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
         text.push(b'\n');
         fs::write(&path, text).map_err(|source| OutputError { path, source })

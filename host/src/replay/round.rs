@@ -62,21 +62,22 @@ pub(super) fn replay(
     options: &Options,
     manifest: &Manifest,
     load: Load<'_>,
-    output: &mut Output,
     reports: &mut dyn Write,
-) -> Result<Summary, Failure> {
+) -> Result<(Summary, Option<Exit>), Failure> {
     let name = manifest.lambda.name.as_str();
     let mut drive = Replay::open(&options.drives).map_err(|error| Failure::from(OpenError(error)))?;
     let inputs = open_inputs(manifest, &options.remaps, &mut drive)
         .map_err(|error| Failure::because(format!("cannot start lambda `{name}`"), &error))?;
     let session = Session::new(inputs.clone(), options.config.clone());
     let mut guest = load(options, manifest, session.clone())?;
+    // Only now does it cost the results of an earlier replay: what could not start must not touch them.
+    let mut output = Output::create(&options.out, options.all)?;
     let initialised = guest.init();
     let mut pass = Pass {
         schedule: Schedule::new(manifest, &inputs),
         judge: Judge::new(session.clone(), guest),
         session,
-        output,
+        output: &mut output,
         wakes: 0,
         triggers: 0,
         faults: 0,
@@ -90,9 +91,9 @@ pub(super) fn replay(
     }
 
     let started = Instant::now();
-    let damaged = drain(&mut drive, &mut pass, reports)?;
+    let broken = drain(&mut drive, &mut pass, reports)?.map(OpenError);
     let wall_s = started.elapsed().as_secs_f64();
-    Ok(Summary {
+    let summary = Summary {
         lambda: name.to_owned(),
         version: manifest.lambda.version.to_string(),
         kind: manifest.lambda.kind,
@@ -103,6 +104,7 @@ pub(super) fn replay(
         faults: pass.faults,
         skipped: inputs.iter().map(|topic| topic.counts().skipped).sum(),
         missed_ticks: pass.schedule.missed(),
+        out_of_order: drive.out_of_order(),
         log_lines: pass.log_lines,
         log_dropped: pass.session.log_dropped(),
         start_ns: drive.start_ns().unwrap_or(0),
@@ -113,8 +115,12 @@ pub(super) fn replay(
         wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
         peak_rss_bytes: memory("VmHWM:"),
         topics: inputs.iter().map(topic_report).collect(),
-        damaged: damaged.map(|error| Failure::from(OpenError(error)).to_string()),
-    })
+        damaged: broken
+            .as_ref()
+            .map(|error| Failure::because("the drive could not be read to its end", error).to_string()),
+    };
+    output.finish(&summary)?;
+    Ok((summary, broken.map(|error| error.exit())))
 }
 
 /// Delivers every sample of the drive and runs what it wakes. Ends with the damage, if there is one.
@@ -195,7 +201,11 @@ impl Explain for OpenError {
     }
 
     fn exit(&self) -> Exit {
-        if matches!(self.0, ReplayError::Damaged { .. }) { Exit::DriveDamaged } else { Exit::Usage }
+        match self.0 {
+            ReplayError::Damaged { .. } => Exit::DriveDamaged,
+            ReplayError::Read { .. } => Exit::Internal,
+            _ => Exit::Usage,
+        }
     }
 }
 
@@ -216,7 +226,7 @@ impl Explain for InputError {
     fn exit(&self) -> Exit {
         match self {
             Self::Subscribe { .. } => Exit::Usage,
-            Self::Memory { .. } => Exit::Internal,
+            Self::Layout { .. } | Self::Memory { .. } => Exit::Internal,
         }
     }
 }

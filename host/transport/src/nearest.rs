@@ -3,6 +3,10 @@
 /// The one of `known` with the fewest edits from `wanted`, if it is close enough to be a guess
 /// worth showing: at most a third of the longer name may differ.
 pub(crate) fn nearest<'a>(wanted: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
+    // Edits take time in proportion to both lengths, and nobody mistypes a name of a page.
+    if wanted.len() > 64 {
+        return None;
+    }
     known
         .into_iter()
         .map(|name| (strsim::levenshtein(wanted, name), name))
@@ -25,5 +29,12 @@ mod tests {
         let known = ["linear_acceleration", "angular_velocity", "orientation"];
         assert_eq!(nearest("linear_aceleration", known), Some("linear_acceleration"));
         assert_eq!(nearest("zzzzzz", known), None);
+    }
+
+    #[test]
+    fn a_text_longer_than_any_name_is_no_typo() {
+        let (longest, longer) = ("n".repeat(64), "n".repeat(65));
+        assert_eq!(nearest(&longest, [longer.as_str()]), Some(longer.as_str()));
+        assert_eq!(nearest(&longer, [longer.as_str()]), None);
     }
 }

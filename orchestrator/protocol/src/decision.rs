@@ -104,7 +104,7 @@ pub enum FaultKind {
     Trap,
     /// A host function was called in a way it refuses.
     HostCall,
-    /// Python raised an exception that the lambda did not catch.
+    /// Python raised an exception, or a WebAssembly lambda returned an error.
     Exception,
     /// The process was killed, for example at the hard deadline.
     Killed,

@@ -1,15 +1,14 @@
 //! The build folder of a lambda, `DIR/build/`: what `gleaner build DIR` leaves and every other command uses.
 //!
-//! It is complete: manifest, entry, models and `msg/`. Nothing here builds, and no reader of a build folder writes
-//! into it.
+//! It is complete: manifest, entry, models, and the message definitions in `msg/`, for when a transport cannot tell
+//! them. Nothing here builds, and no reader of a build folder writes into it.
 
-use std::ffi::OsStr;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use crate::{Exit, Explain, Manifest};
+use crate::{Exit, Explain, Manifest, ManifestError, Sources};
 
 /// `DIR/build/` of one lambda.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -25,17 +24,17 @@ impl BuildDir {
 
     /// The build folder of the lambda in `lambda_dir`, if it is there and no source is newer.
     ///
-    /// The age of a build is that of its `lambda.toml`, which whoever builds writes last. Sources are `lambda.toml`,
-    /// `Cargo.toml`, everything in `src/` and `msg/`, and every `.py` file; not what lies in `DIR/build/`, `DIR/target/`,
-    /// or anywhere in a `__pycache__/` or a hidden folder such as `.venv/`. Links to folders are not followed.
+    /// The age of a build is that of its `lambda.toml`, which whoever builds writes last. What its sources are,
+    /// [`Sources`] says; one that is gone since makes no build old.
     ///
     /// # Errors
     ///
-    /// [`LayoutError::Missing`], [`LayoutError::Older`], or [`LayoutError::Read`] if a folder cannot be listed.
+    /// [`LayoutError::Missing`], [`LayoutError::Older`], [`LayoutError::Manifest`] if the build's manifest is refused, or
+    /// [`LayoutError::Read`] if a folder cannot be listed.
     pub fn check_fresh(lambda_dir: impl AsRef<Path>) -> Result<BuildDir, LayoutError> {
         let dir = lambda_dir.as_ref();
         let build = BuildDir::of(dir);
-        let built = match fs::metadata(build.manifest_path()).and_then(|data| data.modified()) {
+        let built = match modified(&build.manifest_path()) {
             Ok(time) => time,
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 return Err(LayoutError::Missing { dir: dir.to_owned() });
@@ -44,11 +43,18 @@ impl BuildDir {
                 return Err(LayoutError::Read { path: build.manifest_path(), source });
             }
         };
-        match newest_source(dir)? {
-            Some((modified, source)) if modified > built => {
-                Err(LayoutError::Older { dir: dir.to_owned(), source_file: source })
-            }
-            _ => Ok(build),
+        // An editor may have removed a file meanwhile: then it is no source.
+        let age = |source: &Path| modified(&dir.join(source)).ok().filter(|age| *age > built);
+        let older = |source: &Path| LayoutError::Older { dir: dir.to_owned(), source_file: source.to_owned() };
+        // Before what it says: a newer manifest may name other sources, and the old one need not suit this Gleaner.
+        let manifest = Path::new("lambda.toml");
+        if age(manifest).is_some() {
+            return Err(older(manifest));
+        }
+        let sources = Sources::of(dir, &Manifest::load(build.path())?)?;
+        match sources.iter().filter_map(|source| age(source).map(|age| (age, source))).max() {
+            Some((_, source)) => Err(older(source)),
+            None => Ok(build),
         }
     }
 
@@ -66,11 +72,6 @@ impl BuildDir {
     pub fn entry_path(&self, manifest: &Manifest) -> PathBuf {
         self.path.join(manifest.lambda.entry.as_path())
     }
-
-    /// Its `msg/`, the message definitions that came with the lambda; it need not exist.
-    pub fn messages_path(&self) -> PathBuf {
-        self.path.join("msg")
-    }
 }
 
 /// Why a build folder cannot be used.
@@ -87,9 +88,12 @@ pub enum LayoutError {
     Older {
         /// The lambda's folder.
         dir: PathBuf,
-        /// The newest source, relative to it.
+        /// The manifest, or else the newest source, relative to it.
         source_file: PathBuf,
     },
+    /// The manifest of the build is refused.
+    #[error(transparent)]
+    Manifest(#[from] ManifestError),
     /// A file or folder of the lambda cannot be read.
     #[error("cannot read `{}`", path.display())]
     Read {
@@ -106,6 +110,7 @@ impl Explain for LayoutError {
             LayoutError::Missing { dir } | LayoutError::Older { dir, .. } => {
                 Some(format!("run `gleaner build {}`", dir.display()))
             }
+            LayoutError::Manifest(error) => error.help(),
             LayoutError::Read { .. } => None,
         }
     }
@@ -115,43 +120,8 @@ impl Explain for LayoutError {
     }
 }
 
-/// The newest source of the lambda in `dir`, relative to it, and its time.
-fn newest_source(dir: &Path) -> Result<Option<(SystemTime, PathBuf)>, LayoutError> {
-    let mut newest = None;
-    let mut folders = vec![PathBuf::new()];
-    while let Some(folder) = folders.pop() {
-        let path = dir.join(&folder);
-        let failed = |source| LayoutError::Read { path: path.clone(), source };
-        for entry in fs::read_dir(&path).map_err(failed)? {
-            let entry = entry.map_err(failed)?;
-            let relative = folder.join(entry.file_name());
-            // Of the entry itself, so that a link back into the folder makes no circle.
-            if entry.file_type().map_err(failed)?.is_dir() {
-                if may_have_sources(&relative) {
-                    folders.push(relative);
-                }
-            } else if is_source(&relative) {
-                // Of what a link leads to. An editor may have removed the file meanwhile: then it is no source.
-                let modified = fs::metadata(entry.path()).and_then(|data| data.modified());
-                newest = newest.max(modified.ok().map(|modified| (modified, relative)));
-            }
-        }
-    }
-    Ok(newest)
-}
-
-fn may_have_sources(folder: &Path) -> bool {
-    let name = folder.file_name().unwrap_or_default();
-    let made = folder == Path::new("build") || folder == Path::new("target") || name == "__pycache__";
-    !made && !name.as_encoded_bytes().starts_with(b".")
-}
-
-fn is_source(relative: &Path) -> bool {
-    relative == Path::new("lambda.toml")
-        || relative == Path::new("Cargo.toml")
-        || relative.starts_with("src")
-        || relative.starts_with("msg")
-        || relative.extension() == Some(OsStr::new("py"))
+fn modified(file: &Path) -> io::Result<SystemTime> {
+    fs::metadata(file).and_then(|data| data.modified())
 }
 
 #[cfg(test)]
@@ -163,23 +133,36 @@ mod tests {
     use crate::scratch::Scratch;
 
     /// A lambda's folder with these files, each of a second more than the one before.
-    fn lambda(files: &[&str]) -> Scratch {
+    fn lambda(kind: &str, files: &[&str]) -> Scratch {
+        let entry = if kind == "python" { "main.py" } else { "x.wasm" };
+        let manifest = format!(
+            "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\nschedule.period = '1s'\n\
+             [[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n",
+            "0".repeat(64)
+        );
         let dir = Scratch::new();
         for (age, file) in files.iter().enumerate() {
-            dir.write(file, "");
+            dir.write(file, if file.ends_with("lambda.toml") { &manifest } else { "" });
             let time = SystemTime::UNIX_EPOCH + Duration::from_secs(1000 + age as u64);
             File::options().write(true).open(dir.path(file)).unwrap().set_modified(time).unwrap();
         }
         dir
     }
 
+    #[track_caller]
+    fn is_older_than(dir: &Scratch, source: &str) {
+        let error = BuildDir::check_fresh(dir.root()).unwrap_err();
+        let shown = dir.root().display();
+        assert_eq!(error.to_string(), format!("the build of lambda `{shown}` is older than its source `{source}`"));
+        assert_eq!(error.help(), Some(format!("run `gleaner build {shown}`")));
+    }
+
     #[test]
     fn a_build_newer_than_every_source_is_used() {
-        let dir = lambda(&["lambda.toml", "Cargo.toml", "src/lib.rs", "msg/a/msg/B.msg", "build/lambda.toml"]);
+        let dir = lambda("wasm", &["lambda.toml", "Cargo.toml", "src/lib.rs", "msg/a/msg/B.msg", "build/lambda.toml"]);
         let build = BuildDir::check_fresh(dir.root()).unwrap();
         assert_eq!(build.path(), dir.path("build"));
         assert_eq!(build.manifest_path(), dir.path("build/lambda.toml"));
-        assert_eq!(build.messages_path(), dir.path("build/msg"));
     }
 
     #[test]
@@ -192,7 +175,7 @@ mod tests {
 
     #[test]
     fn a_lambda_without_a_build_is_refused() {
-        let dir = lambda(&["lambda.toml"]);
+        let dir = lambda("wasm", &["lambda.toml"]);
         let error = BuildDir::check_fresh(dir.root()).unwrap_err();
         assert_eq!(error.to_string(), format!("lambda `{}` is not built", dir.root().display()));
         assert_eq!(error.help(), Some(format!("run `gleaner build {}`", dir.root().display())));
@@ -201,35 +184,35 @@ mod tests {
 
     #[test]
     fn a_build_older_than_a_source_is_refused_and_names_the_newest() {
-        for source in ["lambda.toml", "Cargo.toml", "src/build/b.rs", "msg/a/msg/B.msg", "main.py", "package/part.py"] {
-            let dir = lambda(&["other.py", "build/lambda.toml", "old/middle.py", source]);
-            let error = BuildDir::check_fresh(dir.root()).unwrap_err();
-            let shown = dir.root().display();
-            assert_eq!(error.to_string(), format!("the build of lambda `{shown}` is older than its source `{source}`"));
-            assert_eq!(error.help(), Some(format!("run `gleaner build {shown}`")));
+        for source in ["lambda.toml", "Cargo.toml", "build.rs", "src/a/b.rs", "msg/a/msg/B.msg", "models/m.onnx"] {
+            is_older_than(&lambda("wasm", &["build/lambda.toml", "src/lib.rs", source]), source);
+        }
+        for source in ["lambda.toml", "main.py", "package/part.py", "msg/a/msg/B.msg", "models/m.onnx"] {
+            is_older_than(&lambda("python", &["build/lambda.toml", "other.py", source]), source);
         }
     }
 
     #[test]
-    fn what_is_no_source_may_be_newer() {
-        let dir = lambda(&[
-            "lambda.toml",
-            "build/lambda.toml",
-            "build/main.py",
-            "target/x.py",
-            ".venv/x.py",
-            "__pycache__/x.py",
-            "package/__pycache__/x.py",
-            "README.md",
-        ]);
-        assert!(BuildDir::check_fresh(dir.root()).is_ok());
+    fn what_is_not_built_in_may_be_newer() {
+        for file in ["README.md", "tests/test_main.py", "out/x.py", ".venv/x.py", "build/main.py", "Cargo.toml"] {
+            let dir = lambda("python", &["lambda.toml", "main.py", "build/lambda.toml", file]);
+            assert!(BuildDir::check_fresh(dir.root()).is_ok(), "{file}");
+        }
+        for file in ["README.md", "tests/all.rs", "plot.py", "target/x.rs", "Cargo.lock"] {
+            let dir = lambda("wasm", &["lambda.toml", "src/lib.rs", "build/lambda.toml", file]);
+            assert!(BuildDir::check_fresh(dir.root()).is_ok(), "{file}");
+        }
     }
 
-    #[cfg(unix)]
     #[test]
-    fn a_link_back_into_the_folder_makes_no_circle() {
-        let dir = lambda(&["lambda.toml", "src/lib.rs", "build/lambda.toml"]);
-        std::os::unix::fs::symlink(dir.root(), dir.path("again")).unwrap();
-        assert!(BuildDir::check_fresh(dir.root()).is_ok());
+    fn an_old_build_may_have_a_manifest_that_is_refused_today_but_a_fresh_one_may_not() {
+        let dir = lambda("wasm", &["lambda.toml", "build/lambda.toml"]);
+        dir.write("build/lambda.toml", "colour = 1");
+        let error = BuildDir::check_fresh(dir.root()).unwrap_err();
+        assert!(matches!(error, LayoutError::Manifest(_)), "{error}");
+        assert!(error.help().is_some());
+        let later = SystemTime::now() + Duration::from_secs(60);
+        File::options().write(true).open(dir.path("lambda.toml")).unwrap().set_modified(later).unwrap();
+        is_older_than(&dir, "lambda.toml");
     }
 }

@@ -13,6 +13,7 @@ pub mod parts;
 mod report;
 #[cfg(test)]
 mod scratch;
+mod sources;
 mod words;
 
 pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ};
@@ -22,4 +23,5 @@ pub use layout::{BuildDir, LayoutError};
 pub use manifest::{Manifest, ManifestError};
 pub use parts::{Parts, PartsError};
 pub use report::{Report, Round, Summary, TopicReport};
+pub use sources::Sources;
 pub use words::visible;

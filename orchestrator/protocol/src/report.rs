@@ -65,6 +65,8 @@ pub struct Summary {
     pub skipped: u64,
     /// Ticks of a periodic lambda that passed while it was still running.
     pub missed_ticks: u64,
+    /// Messages of the drive that came after one with a later log time: the index of a file lied, or was not there.
+    pub out_of_order: u64,
     /// Log lines that the lambda wrote and that were kept.
     pub log_lines: u64,
     /// Log lines over the rate limit, thrown away.
@@ -154,6 +156,7 @@ mod tests {
             faults: 0,
             skipped: 0,
             missed_ticks: 0,
+            out_of_order: 4,
             log_lines: 3,
             log_dropped: 0,
             start_ns: 1,
@@ -170,7 +173,7 @@ mod tests {
             &Report::Summary(Box::new(summary)),
             concat!(
                 r#"{"report":"summary","lambda":"brake-dark","version":"0.1.0","kind":"wasm","drive":["a.mcap","b"],"#,
-                r#""out":"out","wakes":50,"triggers":2,"faults":0,"skipped":0,"missed_ticks":0,"log_lines":3,"#,
+                r#""out":"out","wakes":50,"triggers":2,"faults":0,"skipped":0,"missed_ticks":0,"out_of_order":4,"log_lines":3,"#,
                 r#""log_dropped":0,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
                 r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,

@@ -81,14 +81,14 @@ impl HostTopic for Hosted {
 
     fn column(&mut self, topic: Resource<Topic>, field: Resource<Field>, n: u32) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        let column = topic.column(field, n as usize);
-        self.column_out(column)
+        let (depth, column) = (topic.depth(), topic.column(field, n as usize));
+        self.column_out(depth, column)
     }
 
     fn column_since(&mut self, topic: Resource<Topic>, field: Resource<Field>, since_ns: i64) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        let column = topic.column_since(field, since_ns);
-        self.column_out(column)
+        let (depth, column) = (topic.depth(), topic.column_since(field, since_ns));
+        self.column_out(depth, column)
     }
 
     fn drop(&mut self, topic: Resource<Topic>) -> wasmtime::Result<()> {
@@ -149,11 +149,9 @@ impl HostSample for Hosted {
     }
 
     fn as_frame(&mut self, sample: Resource<Sample>) -> Answer<Resource<Frame>> {
-        self.meter.charge(0)?;
-        let frame = self.handles.get(&sample)?.as_frame();
-        if let Ok(frame) = &frame {
-            self.meter.charge(frame.decoded_bytes())?;
-        }
+        let sample = self.handles.get(&sample)?;
+        self.meter.charge(sample.undecoded_bytes())?;
+        let frame = sample.as_frame();
         self.hand_out(frame)
     }
 
@@ -233,8 +231,9 @@ impl Hosted {
         samples.into_iter().map(|sample| Ok(self.handles.push(sample)?)).collect()
     }
 
-    fn column_out(&mut self, column: Result<data::Column, data::DataError>) -> Answer<Column> {
-        let len = column.as_ref().map_or(0, |column| column.values.len());
+    /// One column is little work, so it is charged once its length is known; a refused one as if it were the whole ring.
+    fn column_out(&mut self, depth: usize, column: Result<data::Column, data::DataError>) -> Answer<Column> {
+        let len = column.as_ref().map_or(depth, |column| column.values.len());
         self.meter.charge(len * COLUMN_VALUE_BYTES)?;
         Ok(column.map(|data::Column { at_ns, values }| Column { at_ns, values }).map_err(refused))
     }

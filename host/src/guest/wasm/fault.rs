@@ -34,8 +34,12 @@ pub(super) fn from_error(
         let allowed = Some(gleaner_compile::GUEST_STACK_BYTES as u64);
         return Fault { kind: FaultKind::Stack, message: "the call stack is full".to_owned(), used: None, allowed };
     }
-    // A guest that is refused memory aborts: the cause is the refusal, not the abort.
-    if let Some((used, allowed)) = hosted.limits.refused() {
+    let said = hosted.printed.reason();
+    // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is the cause. But a guest may
+    // also survive the refusal and panic for another reason.
+    let aborted = matches!(trap, None | Some(Trap::UnreachableCodeReached));
+    let for_memory = said.as_ref().is_none_or(|said| said.contains("memory allocation of"));
+    if let Some((used, allowed)) = hosted.limits.refused().filter(|_| aborted && for_memory) {
         let message = format!("asked for {used} bytes of memory; {allowed} are allowed");
         return Fault { kind: FaultKind::Memory, message, used: Some(used), allowed: Some(allowed) };
     }
@@ -48,7 +52,7 @@ pub(super) fn from_error(
     }
     match trap {
         // A panic says why on standard error, and the trap only says that it happened.
-        Some(trap) => plain(FaultKind::Trap, hosted.stderr.message().unwrap_or_else(|| trap.to_string())),
+        Some(trap) => plain(FaultKind::Trap, said.unwrap_or_else(|| trap.to_string())),
         None => plain(FaultKind::HostCall, format!("{}", error.root_cause())),
     }
 }

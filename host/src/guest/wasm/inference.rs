@@ -14,7 +14,8 @@ type Answer<T> = wasmtime::Result<Result<T, InferenceError>>;
 impl Host for Hosted {}
 
 impl HostTensor for Hosted {
-    fn from_values(&mut self, _shape: Vec<u32>, _values: Vec<f32>) -> Answer<Resource<Tensor>> {
+    fn from_values(&mut self, shape: Vec<u32>, values: Vec<f32>) -> Answer<Resource<Tensor>> {
+        self.meter.charge(size_of_val(&*shape) + size_of_val(&*values))?;
         self.answer(Tensor::new())
     }
 

@@ -12,13 +12,18 @@ const FUEL_PER_CALL: u64 = 20;
 
 /// Caps memory and remembers what it refused, since a guest only traps afterwards.
 pub(super) struct Limits {
+    allowed_bytes: usize,
+    /// Of all linear memories together: a component may have several.
     memory_bytes: usize,
+    /// Of all tables together.
+    table_elements: usize,
     refused: Option<usize>,
 }
 
 impl Limits {
     pub(super) fn new(memory_bytes: u64) -> Self {
-        Self { memory_bytes: usize::try_from(memory_bytes).unwrap_or(usize::MAX), refused: None }
+        let allowed_bytes = usize::try_from(memory_bytes).unwrap_or(usize::MAX);
+        Self { allowed_bytes, memory_bytes: 0, table_elements: 0, refused: None }
     }
 
     pub(super) fn forget_refusal(&mut self) {
@@ -27,21 +32,29 @@ impl Limits {
 
     /// Bytes asked for beyond the cap, and the cap.
     pub(super) fn refused(&self) -> Option<(u64, u64)> {
-        self.refused.map(|asked| (asked as u64, self.memory_bytes as u64))
+        self.refused.map(|asked| (asked as u64, self.allowed_bytes as u64))
     }
 }
 
 impl ResourceLimiter for Limits {
-    fn memory_growing(&mut self, _now: usize, desired: usize, _max: Option<usize>) -> wasmtime::Result<bool> {
-        let fits = desired <= self.memory_bytes;
-        if !fits {
-            self.refused = Some(desired);
+    fn memory_growing(&mut self, now: usize, desired: usize, _max: Option<usize>) -> wasmtime::Result<bool> {
+        let total = self.memory_bytes.saturating_add(desired.saturating_sub(now));
+        let fits = total <= self.allowed_bytes;
+        if fits {
+            self.memory_bytes = total;
+        } else {
+            self.refused = Some(total);
         }
         Ok(fits)
     }
 
-    fn table_growing(&mut self, _now: usize, desired: usize, _max: Option<usize>) -> wasmtime::Result<bool> {
-        Ok(desired <= TABLE_ELEMENTS)
+    fn table_growing(&mut self, now: usize, desired: usize, _max: Option<usize>) -> wasmtime::Result<bool> {
+        let total = self.table_elements.saturating_add(desired.saturating_sub(now));
+        let fits = total <= TABLE_ELEMENTS;
+        if fits {
+            self.table_elements = total;
+        }
+        Ok(fits)
     }
 
     fn instances(&self) -> usize {
@@ -104,5 +117,15 @@ mod tests {
         assert_eq!(limits.refused(), None);
         assert!(!limits.memory_growing(100, 101, None).unwrap());
         assert_eq!(limits.refused(), Some((101, 100)));
+    }
+
+    #[test]
+    fn several_memories_and_tables_count_together() {
+        let mut limits = Limits::new(100);
+        assert!(limits.memory_growing(0, 60, None).unwrap());
+        assert!(!limits.memory_growing(0, 60, None).unwrap());
+        assert!(limits.memory_growing(60, 100, None).unwrap());
+        assert!(limits.table_growing(0, TABLE_ELEMENTS, None).unwrap());
+        assert!(!limits.table_growing(0, 1, None).unwrap());
     }
 }

@@ -26,7 +26,7 @@ use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
 use self::bindings::gleaner::lambda::data as wit;
 use self::bindings::{ConfigEntry, ConfigValue as WitConfigValue, Lambda};
 use self::limits::{Limits, Meter};
-use self::wasi::Stderr;
+use self::wasi::Printed;
 use super::{Guest, Outcome};
 use crate::api::Session;
 use crate::api::data::Wake;
@@ -68,7 +68,7 @@ struct Hosted {
     session: Session,
     handles: ResourceTable,
     wasi: WasiCtx,
-    stderr: Stderr,
+    printed: Printed,
     limits: Limits,
     meter: Meter,
 }
@@ -99,12 +99,12 @@ impl WasmGuest {
     }
 
     fn new_store(&self) -> Store<Hosted> {
-        let stderr = Stderr::default();
+        let printed = Printed::new(&self.session);
         let hosted = Hosted {
             session: self.session.clone(),
             handles: handle_table(),
-            wasi: wasi::context(&self.session, &stderr, self.loaded.seed()),
-            stderr,
+            wasi: wasi::context(&self.session, &printed, self.loaded.seed()),
+            printed,
             limits: Limits::new(self.allowance.memory_bytes),
             meter: Meter::default(),
         };
@@ -128,7 +128,7 @@ impl Guest for WasmGuest {
     }
 
     fn wake(&mut self, wake: Wake) -> Outcome {
-        let mut live = match self.live.take().map_or_else(|| self.start(), Ok) {
+        let mut live = match self.live.take().map_or_else(|| self.session.clone().during_init(|| self.start()), Ok) {
             Ok(live) => live,
             Err(fault) => return Outcome { result: Err(fault), fuel: None },
         };
@@ -162,7 +162,7 @@ impl<'a> Call<'a> {
         let hosted = store.data_mut();
         hosted.meter = Meter::new(fuel);
         hosted.limits.forget_refusal();
-        hosted.stderr.clear();
+        hosted.printed.begin();
         let armed = deadline.map(|deadline| deadline.arm(store));
         if armed.is_none() {
             store.set_epoch_deadline(u64::MAX / 2);
@@ -185,6 +185,7 @@ impl<'a> Call<'a> {
     fn end<T>(self, result: wasmtime::Result<T>) -> (u64, Result<T, Fault>) {
         let late = self.armed.as_ref().map(deadline::Armed::elapsed_and_allowed);
         drop(self.armed);
+        self.store.data().printed.end();
         let left = self.store.get_fuel().unwrap_or(0);
         let used = (self.fuel - left.min(self.fuel)).saturating_add(self.store.data().meter.used());
         let result = match result {

@@ -8,12 +8,12 @@ type Answer = wasmtime::Result<Result<(), TriggerError>>;
 
 impl Host for Hosted {
     fn event(&mut self, label: String, score: f64, attributes: Vec<Attribute>) -> Answer {
-        self.meter.charge(label.len())?;
+        self.meter.charge(label.len() + bytes(&attributes))?;
         Ok(self.session.event(&label, score, attributes.into_iter().map(attribute).collect()).map_err(refused))
     }
 
     fn start(&mut self, label: String, attributes: Vec<Attribute>) -> Answer {
-        self.meter.charge(label.len())?;
+        self.meter.charge(label.len() + bytes(&attributes))?;
         Ok(self.session.start(&label, attributes.into_iter().map(attribute).collect()).map_err(refused))
     }
 
@@ -21,6 +21,14 @@ impl Host for Hosted {
         self.meter.charge(label.len())?;
         Ok(self.session.stop(&label).map_err(refused))
     }
+}
+
+fn bytes(attributes: &[Attribute]) -> usize {
+    let text = |value: &AttributeValue| match value {
+        AttributeValue::Text(text) => text.len(),
+        AttributeValue::Boolean(_) | AttributeValue::Signed(_) | AttributeValue::Real(_) => 8,
+    };
+    attributes.iter().map(|attribute| attribute.key.len() + text(&attribute.value)).sum()
 }
 
 fn attribute(Attribute { key, value }: Attribute) -> trigger::Attribute {

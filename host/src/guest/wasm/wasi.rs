@@ -3,7 +3,7 @@
 //! There are no files, no environment, no arguments and no sockets: such calls answer with an error. Sleeping is a fault,
 //! since neither fuel nor a deadline could end it.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -33,10 +33,10 @@ pub(super) fn add_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()>
 }
 
 /// A context that grants nothing but output, the wake's time and numbers from `seed`.
-pub(super) fn context(session: &Session, stderr: &Stderr, seed: [u8; 32]) -> WasiCtx {
+pub(super) fn context(session: &Session, printed: &Printed, seed: [u8; 32]) -> WasiCtx {
     WasiCtx::builder()
-        .stdout(Lines { session: session.clone(), level: Level::Info, tail: None })
-        .stderr(Lines { session: session.clone(), level: Level::Warn, tail: Some(stderr.clone()) })
+        .stdout(printed.stdout.clone())
+        .stderr(printed.stderr.clone())
         .wall_clock(Wall(session.clone()))
         .secure_random(StdRng::from_seed(seed))
         .insecure_random(StdRng::from_seed(seed))
@@ -82,27 +82,35 @@ impl monotonic_clock::Host for Hosted {
     }
 }
 
-/// What the guest wrote to standard error in this call: the reason of a panic.
-#[derive(Clone, Default)]
-pub(super) struct Stderr(Arc<Mutex<String>>);
+/// Standard output and standard error of a guest.
+pub(super) struct Printed {
+    stdout: Lines,
+    stderr: Lines,
+}
 
-impl Stderr {
-    pub(super) fn clear(&self) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).clear();
+impl Printed {
+    pub(super) fn new(session: &Session) -> Self {
+        Self { stdout: Lines::new(session, Level::Info), stderr: Lines::new(session, Level::Warn) }
     }
 
-    /// The last lines, if there are any, without the standard library's hint about backtraces.
-    pub(super) fn message(&self) -> Option<String> {
-        let text = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let lines = text.lines().filter(|line| !line.trim().is_empty() && !line.starts_with("note: run with"));
+    /// Forgets what an earlier call said on standard error.
+    pub(super) fn begin(&self) {
+        self.stderr.lock().said.clear();
+    }
+
+    /// Writes down what did not end with a newline.
+    pub(super) fn end(&self) {
+        for lines in [&self.stdout, &self.stderr] {
+            lines.lock().flush(&lines.session, lines.level);
+        }
+    }
+
+    /// What this call said on standard error, without the standard library's hint about backtraces: the reason of a panic.
+    pub(super) fn reason(&self) -> Option<String> {
+        let state = self.stderr.lock();
+        let lines = state.said.lines().filter(|line| !line.trim().is_empty() && !line.starts_with("note: run with"));
         let message = lines.collect::<Vec<_>>().join("\n");
         (!message.is_empty()).then_some(message)
-    }
-
-    fn add(&self, text: &str) {
-        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let room = LINE_BYTES.saturating_sub(kept.len());
-        kept.push_str(cut(text, room));
     }
 }
 
@@ -111,7 +119,47 @@ impl Stderr {
 struct Lines {
     session: Session,
     level: Level,
-    tail: Option<Stderr>,
+    state: Arc<Mutex<Unfinished>>,
+}
+
+#[derive(Default)]
+struct Unfinished {
+    /// Bytes since the last newline, at most [`LINE_BYTES`]: a line is rarely written in one piece.
+    line: Vec<u8>,
+    /// Beginning of what this call wrote, at most [`LINE_BYTES`].
+    said: String,
+}
+
+impl Lines {
+    fn new(session: &Session, level: Level) -> Self {
+        Self { session: session.clone(), level, state: Arc::default() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Unfinished> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Unfinished {
+    fn write(&mut self, bytes: &[u8], session: &Session, level: Level) {
+        for piece in bytes.split_inclusive(|byte| *byte == b'\n') {
+            self.line.extend_from_slice(piece);
+            if piece.ends_with(b"\n") || self.line.len() >= LINE_BYTES {
+                self.flush(session, level);
+            }
+        }
+    }
+
+    fn flush(&mut self, session: &Session, level: Level) {
+        let line = std::mem::take(&mut self.line);
+        let line = String::from_utf8_lossy(&line);
+        let room = LINE_BYTES.saturating_sub(self.said.len());
+        self.said.push_str(cut(&line, room));
+        let line = line.trim_end();
+        if !line.is_empty() {
+            session.log(level, line);
+        }
+    }
 }
 
 impl IsTerminal for Lines {
@@ -133,13 +181,7 @@ impl StdoutStream for Lines {
 
 impl OutputStream for Lines {
     fn write(&mut self, bytes: Bytes) -> StreamResult<()> {
-        let text = String::from_utf8_lossy(&bytes);
-        if let Some(tail) = &self.tail {
-            tail.add(&text);
-        }
-        for line in text.lines().filter(|line| !line.trim().is_empty()) {
-            self.session.log(self.level, line);
-        }
+        self.lock().write(&bytes, &self.session, self.level);
         Ok(())
     }
 

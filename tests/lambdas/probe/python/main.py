@@ -28,7 +28,7 @@ class Lambda:
         self.frames(ctx, sample)
         self.refusals(ctx, sample)
         ctx.log("info", f"{self.forward.path} {ctx.now_ns()}")
-        ctx.start("recording")
+        ctx.start("recording", why="probing")
         ctx.stop("recording")
 
     def topics(self, ctx: Context) -> None:

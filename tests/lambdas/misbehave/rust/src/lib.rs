@@ -13,6 +13,7 @@ impl Lambda for Misbehave {
         let behaviour = config.text("behaviour")?.to_owned();
         match behaviour.as_str() {
             "error_in_init" => return Err(Error::new("no, not today")),
+            "event_in_init" => event("too early", 1.0).send()?,
             "panic_in_init" => panic!("no, not today"),
             "bad_input" => drop(input("imo")?),
             "bad_field" => drop(input("imu")?.field("linear_acceleration.w")?),
@@ -45,6 +46,11 @@ impl Lambda for Misbehave {
             "not_a_frame" => drop(sample.as_frame()?),
             "huge_label" => event(&"x".repeat(1000), 1.0).send()?,
             "too_many_triggers" => (0..17).try_for_each(|_| event("x", 1.0).send())?,
+            "event_then_error" => {
+                event("seen", 1.0).send()?;
+                return Err(Error::new("after the event"));
+            }
+            "print_in_pieces" => eprintln!("wake {} of {}", self.wakes, self.behaviour),
             "event_then_panic" => {
                 event("seen", 1.0).send()?;
                 panic!("after the event");

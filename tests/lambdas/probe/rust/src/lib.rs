@@ -44,7 +44,7 @@ impl Lambda for Probe {
         self.frames(&sample)?;
         self.refusals(&sample)?;
         log::info(&format!("{} {}", self.forward.path(), now_ns()));
-        start("recording")?;
+        start("recording").with("why", "probing").send()?;
         stop("recording")
     }
 }

@@ -1,0 +1,237 @@
+//! When a lambda runs: ticks over a drive, and samples over a transport that the test feeds by hand.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use gleaner_host::api::data::{Sample, Topic, Wake};
+use gleaner_host::input::open_inputs;
+use gleaner_host::schedule::Schedule;
+use gleaner_protocol::manifest::Manifest;
+use gleaner_protocol::{Cause, Decision, twins_differ};
+use gleaner_tests::drive::{Cdr, one_topic};
+use gleaner_tests::{Folder, Run, replay, root, sample_drive};
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+const MS: i64 = 1_000_000;
+const PERIOD: i64 = 100 * MS;
+
+/// As much of `sensor_msgs/msg/Imu` as `ticker` reads.
+const IMU: &str = "std_msgs/Header header\ngeometry_msgs/Vector3 linear_acceleration\n\
+================================================================================\n\
+MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n\
+================================================================================\n\
+MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
+================================================================================\n\
+MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+
+/// Both twins of `ticker` over one drive; they must agree, also in what they say beside the score.
+fn tick(drive: PathBuf) -> Run {
+    let [rust, python] = ["rust", "python"].map(|kind| {
+        let lambda = root().join("tests/lambdas/ticker").join(kind);
+        replay(&lambda, std::slice::from_ref(&drive), &["--all"])
+    });
+    assert_eq!(rust.must_exit(0).decisions.len(), python.must_exit(0).decisions.len());
+    for (a, b) in rust.decisions.iter().zip(&python.decisions) {
+        assert_eq!(twins_differ(a, b), None);
+        assert_eq!(a.triggers[0].attributes, b.triggers[0].attributes);
+    }
+    rust
+}
+
+fn said(decision: &Decision, attribute: &str) -> i64 {
+    decision.triggers[0].attributes[attribute].as_i64().unwrap()
+}
+
+#[test]
+fn the_twins_tick_every_100_ms_of_the_drive() {
+    let run = tick(sample_drive());
+    assert_eq!(run.decisions.len(), 399);
+    for decision in &run.decisions {
+        assert_eq!((decision.cause, decision.triggers.len()), (Cause::Tick, 1));
+        assert_eq!((&decision.input, &decision.topic, decision.seq), (&None, &None, None));
+        assert_eq!((said(decision, "at"), said(decision, "missed")), (decision.at_ns, 0));
+    }
+    assert!(run.decisions.windows(2).all(|pair| pair[1].at_ns - pair[0].at_ns == PERIOD));
+    // What a tick sees is the drive: the car brakes.
+    assert!(run.decisions.iter().any(|decision| decision.triggers[0].score.unwrap() < -1.0));
+}
+
+#[test]
+fn ticks_of_a_gap_that_is_too_long_to_catch_up_are_missed_and_counted_to_the_last() {
+    let folder = Folder::new();
+    // Eight hours of nothing, and 50 ms.
+    let [before, after] = [1_000 * MS, 30_000_050 * MS];
+    let messages = [0, before, after, after + 1_000 * MS].map(|at_ns| {
+        // The header, and three numbers from the next multiple of 8.
+        let mut cdr = Cdr::header().done();
+        cdr.resize(cdr.len().next_multiple_of(8), 0);
+        cdr.extend([0.5_f64, 0.0, 9.8].iter().flat_map(|value| value.to_le_bytes()));
+        (at_ns as u64, cdr)
+    });
+    let run = tick(one_topic(&folder, "/imu/data", "sensor_msgs/msg/Imu", IMU, &messages));
+    let summary = run.summary.as_ref().unwrap();
+    // From the one at 1.0 s to the one at 30,000.0 s.
+    let missed = (after - before) / PERIOD + 1;
+    assert_eq!(missed, 299_991);
+    assert_eq!(summary.missed_ticks, missed as u64);
+    let told: Vec<_> = run.decisions.iter().map(|decision| said(decision, "missed")).filter(|n| *n != 0).collect();
+    assert_eq!(told, [missed]);
+    let (early, late): (Vec<_>, Vec<_>) = run.decisions.iter().partition(|decision| decision.at_ns < before);
+    assert_eq!((early.len(), late.len()), (9, 10));
+    assert!(said(late[0], "missed") == missed && late[0].at_ns > after);
+}
+
+/// One input that wakes, and the transport that feeds it.
+struct Feed {
+    transport: Loopback,
+    topic: Arc<Topic>,
+    schedule: Schedule,
+    sent: u64,
+}
+
+impl Feed {
+    /// `depth` samples are shown, and one more can be held; each may have `max_size`.
+    fn new(backlog: &str, depth: usize, max_size: &str) -> Self {
+        let manifest = format!(
+            "[lambda]\nname = \"fed\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"fed.wasm\"\n\
+             [schedule]\nevent = \"imu\"\nbacklog = \"{backlog}\"\n\
+             [[input]]\nname = \"imu\"\ntopic = \"/imu/data\"\ntype = \"sensor_msgs/msg/Imu\"\n\
+             depth = {depth}\nhold = 1\nmax_size = \"{max_size}\"\n"
+        );
+        let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
+        let mut transport = Loopback::new();
+        transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", IMU);
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
+        Self { transport, topic: Arc::clone(&inputs[0]), schedule: Schedule::new(&manifest, &inputs), sent: 0 }
+    }
+
+    /// Publishes so many samples, numbered from 1.
+    fn publish(&mut self, samples: u64) {
+        for _ in 0..samples {
+            self.sent += 1;
+            send(&mut self.transport, self.sent, &[0; 64]);
+        }
+    }
+
+    fn next(&mut self) -> Option<Sample> {
+        self.schedule.next_event().map(sample)
+    }
+
+    /// Numbers of the samples that wake until there is none.
+    fn wakes(&mut self) -> Vec<u64> {
+        std::iter::from_fn(|| self.next()).map(|sample| sample.identity().seq).collect()
+    }
+
+    fn skipped(&self) -> u64 {
+        self.topic.counts().skipped
+    }
+}
+
+fn send(transport: &mut Loopback, seq: u64, cdr: &[u8]) {
+    let at_ns = seq as i64 * MS;
+    let meta = SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian: Endian::Little };
+    transport.publish("/imu/data", &meta, cdr).unwrap();
+}
+
+fn sample(wake: Wake) -> Sample {
+    match wake {
+        Wake::Event(sample) => sample,
+        Wake::Tick(tick) => panic!("{tick:?} without a period"),
+    }
+}
+
+#[test]
+fn each_sample_wakes_once_and_in_order() {
+    let mut feed = Feed::new("each", 4, "4 KiB");
+    assert!(feed.wakes().is_empty());
+    feed.publish(3);
+    assert_eq!(feed.wakes(), [1, 2, 3]);
+    assert!(feed.wakes().is_empty());
+    feed.publish(2);
+    assert_eq!((feed.wakes(), feed.skipped()), (vec![4, 5], 0));
+}
+
+#[test]
+fn what_left_the_ring_before_it_could_wake_is_counted_as_skipped() {
+    let mut feed = Feed::new("each", 4, "4 KiB");
+    feed.publish(10);
+    assert_eq!((feed.wakes(), feed.skipped()), (vec![7, 8, 9, 10], 6));
+}
+
+#[test]
+fn the_latest_sample_wakes_once_and_those_before_it_are_counted_as_skipped() {
+    let mut feed = Feed::new("latest", 4, "4 KiB");
+    feed.publish(3);
+    assert_eq!((feed.wakes(), feed.skipped()), (vec![3], 2));
+    assert!(feed.wakes().is_empty());
+    feed.publish(10);
+    assert_eq!((feed.wakes(), feed.skipped()), (vec![13], 11));
+}
+
+#[test]
+fn a_period_is_not_woken_by_samples_and_an_event_not_by_time() {
+    let mut feed = Feed::new("each", 4, "4 KiB");
+    feed.publish(1);
+    assert!(feed.schedule.next_tick(i64::MAX).is_none());
+    assert_eq!(feed.schedule.missed(), 0);
+    let manifest = Manifest::load(root().join("tests/lambdas/ticker/rust")).unwrap();
+    assert!(Schedule::new(&manifest, &[]).next_event().is_none());
+}
+
+#[test]
+fn a_lambda_that_holds_every_sample_is_woken_by_none_twice_and_by_newer_ones_once_it_lets_go() {
+    for backlog in ["each", "latest"] {
+        let mut feed = Feed::new(backlog, 2, "4 KiB");
+        let mut held = Vec::new();
+        for _ in 0..10 {
+            feed.publish(1);
+            held.extend(feed.next());
+        }
+        let seqs: Vec<_> = held.iter().map(|sample| sample.identity().seq).collect();
+        let counts = feed.topic.counts();
+        assert_eq!(seqs, (1..=counts.received).collect::<Vec<_>>(), "{backlog}");
+        assert_eq!((counts.received + counts.no_slot, counts.skipped), (10, 0), "{backlog}");
+        assert!(counts.no_slot > 0, "{backlog}");
+        held.clear();
+        feed.publish(1);
+        assert_eq!((feed.wakes(), feed.skipped()), (vec![11], 0), "{backlog}");
+    }
+}
+
+#[test]
+fn no_sample_wakes_twice_or_after_a_newer_one_while_the_ring_takes_back_what_nobody_holds() {
+    const DEPTH: u64 = 64;
+    for backlog in ["each", "latest"].repeat(4) {
+        let mut feed = Feed::new(backlog, DEPTH as usize, "1 MiB");
+        let mut held = Vec::new();
+        // All cells but one are held, so each sample is written over the one before it. As long as that takes, the
+        // newest sample that the ring shows is one that has been judged.
+        while feed.topic.counts().no_slot == 0 {
+            feed.publish(1);
+            held.extend(feed.next());
+        }
+        held.pop();
+        let (first, received) = (feed.sent + 1, feed.topic.counts().received);
+        let mut transport = std::mem::take(&mut feed.transport);
+        let writer = thread::spawn(move || {
+            let cdr = vec![0; 1 << 20];
+            (first..first + DEPTH).for_each(|seq| send(&mut transport, seq, &cdr));
+        });
+        let mut seqs = Vec::new();
+        while !writer.is_finished() {
+            seqs.extend(feed.next().map(|sample| sample.identity().seq));
+            // Judging takes time, in which samples come and go.
+            thread::sleep(Duration::from_micros(50));
+        }
+        writer.join().unwrap();
+        seqs.extend(feed.wakes());
+        assert!(seqs.first().is_some_and(|seq| *seq >= first), "{backlog}: {seqs:?}");
+        assert!(seqs.is_sorted_by(|a, b| a < b), "{backlog}: {seqs:?}");
+        // Each that was received has woken the lambda, or is counted.
+        let counts = feed.topic.counts();
+        assert_eq!(seqs.len() as u64 + counts.skipped, counts.received - received, "{backlog}");
+    }
+}
