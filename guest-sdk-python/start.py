@@ -14,6 +14,7 @@ from importlib.machinery import ExtensionFileLoader
 from types import ModuleType
 from typing import NoReturn
 
+INTERNAL = 1
 USAGE = 2
 
 
@@ -34,12 +35,15 @@ def main() -> NoReturn:
             f"the package gleaner is {gleaner.__version__}, and {sys.argv[1]} is {extension.__version__}",
             "take both from one installation",
         )
-    # What a lambda prints goes the way of its log, line by line.
+    # Standard output is for reports. What a lambda prints becomes its log, from its import on, and all else comes here.
     sys.stdout = sys.stderr
-    code: int = extension.main(sys.argv[2:], _host)
-    # All results are written; a thread that the lambda left behind must not keep the process.
-    sys.stderr.flush()
-    os._exit(code)
+    code = INTERNAL
+    try:
+        code = extension.main(sys.argv[2:], _host)
+    finally:
+        # All is written; a thread that the lambda left behind must not keep the process. An exception that comes here was a
+        # panic of ours, which has told its reason.
+        os._exit(code)
 
 
 def load(path: str) -> ModuleType:

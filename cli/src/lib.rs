@@ -6,6 +6,7 @@
 
 pub mod args;
 mod build;
+mod listen;
 mod replay;
 pub mod results;
 mod show;

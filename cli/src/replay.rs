@@ -3,13 +3,13 @@
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, IsTerminal, Read, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
-use std::thread;
+use std::process::{Child, Command, ExitStatus, Stdio};
 
 use gleaner_protocol::{Exit, Explain, Failure, Parts, Report, Summary, visible};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::args::ReplayArgs;
+use crate::listen::Listener;
 use crate::results::Decisions;
 use crate::show::{self, Digest, Paint};
 
@@ -47,16 +47,26 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     let program = Parts::find()?.program("gleaner-runtime")?;
     let bar = progress_bar();
     let mut child = start(&program, args, &bar)?;
-    let summary = match child.stdout.take() {
-        Some(reports) => follow(reports, &bar),
-        None => Ok(None),
-    };
+    // Both streams are heard on threads of their own: a lambda may leave processes behind that hold them open for ever.
+    let says = child.stderr.take().map(|says| {
+        let bar = bar.clone();
+        // Nobody is left to tell if standard error is gone.
+        Listener::start(move || pass_on(says, |piece| drop(bar.suspend(|| io::stderr().write_all(piece)))))
+    });
+    let reports = child.stdout.take().map(|reports| {
+        let bar = bar.clone();
+        Listener::start(move || follow(reports, &bar))
+    });
+    let heard = reports.and_then(|reports| reports.until_the_end_of(&mut child));
     bar.finish_and_clear();
+    let summary = heard.unwrap_or(Ok(None));
     if summary.is_err() {
         // Nobody listens to it any more. It may have ended meanwhile, which is as good.
         let _ = child.kill();
     }
     let status = child.wait().map_err(|source| ReplayError::Read { source })?;
+    // The last it says is why it failed.
+    says.and_then(Listener::rest);
     let summary = summary?;
     let exit = exit_of(status)?;
     match (&summary, exit) {
@@ -72,18 +82,13 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
 fn start(program: &Path, args: &ReplayArgs, bar: &ProgressBar) -> Result<Child, ReplayError> {
     // While a bar is drawn, what the runtime says has to be put above it.
     let says = if bar.is_hidden() { Stdio::inherit() } else { Stdio::piped() };
-    let mut child = Command::new(program)
+    Command::new(program)
         .args(arguments(args))
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(says)
         .spawn()
-        .map_err(|source| ReplayError::Start { program: program.to_owned(), source })?;
-    if let Some(says) = child.stderr.take() {
-        let bar = bar.clone();
-        thread::spawn(move || pass_on(says, &bar));
-    }
-    Ok(child)
+        .map_err(|source| ReplayError::Start { program: program.to_owned(), source })
 }
 
 /// The runtime's arguments: ours, less what only concerns showing.
@@ -107,9 +112,8 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
     line
 }
 
-/// Reads reports to their end. The result is the summary, if there was one.
-fn follow(reports: ChildStdout, bar: &ProgressBar) -> Result<Option<Summary>, ReplayError> {
-    let mut summary = None;
+/// Reads reports up to the summary, which is the last. The result is `None` if they end before.
+fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Summary>, ReplayError> {
     for line in BufReader::new(reports).lines() {
         let line = line.map_err(|source| ReplayError::Read { source })?;
         match serde_json::from_str(&line) {
@@ -120,24 +124,23 @@ fn follow(reports: ChildStdout, bar: &ProgressBar) -> Result<Option<Summary>, Re
                 bar.set_position(done);
             }
             Ok(Report::Round(_)) => {}
-            Ok(Report::Summary(found)) => summary = Some(*found),
+            Ok(Report::Summary(summary)) => return Ok(Some(*summary)),
             Err(source) => {
                 let line = visible(&line.chars().take(200).collect::<String>());
                 return Err(ReplayError::Report { line, source });
             }
         }
     }
-    Ok(summary)
+    Ok(None)
 }
 
-/// Copies lines to standard error, above the bar. A line is cut into pieces rather than held whole, however long it is.
-fn pass_on(says: impl Read, bar: &ProgressBar) {
+/// Gives lines to `show`. A line is cut into pieces rather than held whole, however long it is.
+fn pass_on(says: impl Read, mut show: impl FnMut(&[u8])) {
     const PIECE: u64 = 8192;
     let mut says = BufReader::new(says);
     let mut line = Vec::new();
     while matches!((&mut says).take(PIECE).read_until(b'\n', &mut line), Ok(1..)) {
-        // Nobody is left to tell if standard error is gone.
-        let _ = bar.suspend(|| io::stderr().write_all(&line));
+        show(&line);
         line.clear();
     }
 }
@@ -196,6 +199,16 @@ mod tests {
         let line =
             ["replay", "--set", "x=-1", "--remap", "/a:=/b", "--out", "out", "--all", "--", "-dir", "a.mcap", "b"];
         assert_eq!(arguments(&args), line);
+    }
+
+    #[test]
+    fn what_the_runtime_says_is_passed_on_line_by_line_and_to_the_end() {
+        let long = "x".repeat(10_000);
+        let mut shown = Vec::new();
+        pass_on(format!("one\n{long}\nno line end").as_bytes(), |piece| shown.push(piece.to_vec()));
+        assert_eq!(shown[0], b"one\n");
+        assert_eq!(shown.concat(), format!("one\n{long}\nno line end").as_bytes());
+        assert!(shown.iter().all(|piece| piece.len() <= 8192));
     }
 
     #[cfg(unix)]

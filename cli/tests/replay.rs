@@ -8,8 +8,8 @@ use std::process::{self, Command, Output};
 
 const SUMMARY: &str = concat!(
     r#"{"lambda":"x","version":"0.1.0","kind":"wasm","drive":["a.mcap"],"out":"OUT","wakes":2,"triggers":1,"faults":0,"#,
-    r#""skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"start_ns":0,"end_ns":3000000000,"wall_s":0.5,"#,
-    r#""run_s":0.25,"decode_s":0.0,"wakes_per_s":4.0,"peak_rss_bytes":1048576,"topics":[],"damaged":null}"#
+    r#""skipped":0,"missed_ticks":0,"out_of_order":0,"log_lines":0,"log_dropped":0,"start_ns":0,"#,
+    r#""end_ns":3000000000,"wall_s":0.5,"run_s":0.25,"decode_s":0.0,"wakes_per_s":4.0,"peak_rss_bytes":1048576,"topics":[],"damaged":null}"#
 );
 const DECISION: &str = concat!(
     r#"{"at_ns":1500000000,"cause":"tick","input":null,"topic":null,"writer":null,"seq":null,"#,
@@ -84,6 +84,27 @@ fn a_runtime_that_is_killed_is_told_apart_from_one_that_fails() {
     let output = Installation::new("killed", "kill -9 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
     assert!(text(&output.stderr).starts_with("error: gleaner-runtime was killed by signal 9\n  help:  "));
+}
+
+/// What a lambda may leave running: it holds the stream of reports, notes if it lived to its end, and ends early once
+/// the test has removed the folder.
+const ORPHAN: &str =
+    "(n=0; while [ -e report ] && [ $n -lt 300 ]; do sleep 0.1; n=$((n+1)); done; touch waited) 2>/dev/null &";
+
+#[test]
+fn what_a_lambda_leaves_running_does_not_hold_up_the_summary() {
+    let installation = Installation::new("orphan", &format!("{ORPHAN} cat report"));
+    let output = installation.replay(&[]);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert!(text(&output.stdout).contains("seen"));
+    assert!(!installation.0.join("waited").exists());
+}
+
+#[test]
+fn what_a_lambda_leaves_running_does_not_hold_up_a_failure() {
+    let installation = Installation::new("orphan-fails", &format!("{ORPHAN} exit 6"));
+    assert_eq!(installation.replay(&[]).status.code(), Some(6));
+    assert!(!installation.0.join("waited").exists());
 }
 
 #[test]

@@ -1,5 +1,5 @@
-"""The part of hosting that is written in Python: finding a lambda in its file, telling its exceptions, and keeping the
-garbage collector out of its wakes. `_gleaner` calls it; no lambda imports it."""
+"""The part of hosting that is written in Python: finding a lambda in its file, telling its exceptions, taking down what it
+prints, and keeping the garbage collector out of its wakes. `_gleaner` calls it; no lambda imports it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import os
 import sys
 import traceback
 from types import ModuleType, TracebackType
-from typing import Any, Callable, Dict
+from typing import Any, Callable, Dict, Optional, Tuple
 
+from ._printed import end_call, print_to
 from .context import Context
+
+__all__ = ["attempt", "load", "print_to", "settle", "tidy"]
 
 Handler = Callable[..., object]
 
@@ -79,6 +82,17 @@ def _missing(owner: Any, entry: str, handler: str) -> str:
     schedule = "event" if handler == "on_event" else "period"
     found = " and ".join(f"`{name}`" for name in HANDLERS if callable(getattr(owner, name, None)))
     return f"{where} has no `{wanted}`, which `{schedule}` in [schedule] asks for; found {found or 'no handler'}"
+
+
+def attempt(call: Callable[..., object], *arguments: object) -> Tuple[object, Optional[str]]:
+    """What ``call`` returns, or the text of what it raises: even of what asks to leave the process, and of a panic in the
+    host's own code, which comes as an exception, too."""
+    try:
+        return call(*arguments), None
+    except BaseException as error:
+        return None, explain(error)
+    finally:
+        end_call()
 
 
 def explain(error: BaseException) -> str:

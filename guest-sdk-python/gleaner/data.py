@@ -285,7 +285,7 @@ class Frame(Protocol):
         Raises as :meth:`mean_luma`."""
 
     def resize(self, width: int, height: int) -> Frame:
-        """A new frame of that many pixels, rgb8, or mono8 for grey encodings. At most 4,096 a side.
+        """A new frame of that many pixels, rgb8, or mono8 for grey encodings. Each side 1 to 16,384.
 
         Raises DataError: ``out-of-range``; ``no-room``; ``not-a-frame`` for Bayer encodings."""
 

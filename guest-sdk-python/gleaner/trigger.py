@@ -1,6 +1,7 @@
 """What a lambda causes: interface ``trigger`` of the WIT package.
 
-A trigger counts from the moment of the call, even if the same wake faults later.
+A trigger counts from the moment of the call, even if the same wake faults later. It belongs to a wake: in ``init``, which is
+``__init__`` of a class, and in threads between two wakes, a call is refused.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ TriggerErrorKind = Literal["invalid", "too-many"]
 class TriggerError(Error):
     """The call is refused and had no effect; the message names the limit.
 
-    ``invalid``: label empty or over 128 bytes, score or value not finite, too many attributes (16), or a key that has not
-    1 to 64 bytes. ``too-many``: more than 16 triggers in one wake.
+    ``invalid``: no wake; label empty or over 128 bytes; score or value not finite; key empty or over 64 bytes; text over
+    1,024 bytes; more than 16 attributes. ``too-many``: more than 16 triggers in one wake.
     """
 
     kind: TriggerErrorKind

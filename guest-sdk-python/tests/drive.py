@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import List
+from typing import List, Sequence
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x0F
@@ -72,15 +72,15 @@ class _Cdr:
         self.bytes += data
 
 
-def write(path: Path, images: List[Image]) -> None:
-    """A drive with one image each 100 ms, from log time 1 s."""
+def write(path: Path, images: List[Image], at_ms: Sequence[int]) -> None:
+    """A drive with these images, each at its log time."""
     records = [
         _record(HEADER, _text("ros2") + _text("tests")),
         _record(SCHEMA, struct.pack("<H", 1) + _text("sensor_msgs/msg/Image") + _text("ros2msg") + _text(DEFINITION)),
         _record(CHANNEL, struct.pack("<HH", 1, 1) + _text(TOPIC) + _text("cdr") + struct.pack("<I", 0)),
     ]
-    for n, image in enumerate(images):
-        at_ns = 1_000_000_000 + n * 100_000_000
+    for n, (image, ms) in enumerate(zip(images, at_ms)):
+        at_ns = ms * 1_000_000
         records.append(_record(MESSAGE, struct.pack("<HIQQ", 1, n + 1, at_ns, at_ns - 5) + image.cdr()))
     records += [_record(DATA_END, bytes(4)), _record(FOOTER, bytes(20))]
     path.write_bytes(MAGIC + b"".join(records) + MAGIC)

@@ -5,11 +5,9 @@ use std::io;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use gleaner_protocol::manifest::{Kind, Manifest};
+use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure};
 
-use crate::api::Session;
-use crate::guest::Guest;
 use crate::replay::{self, Load, Options, ReplayArgs};
 
 /// Hosts one lambda. Writes reports, a JSON object a line, to standard output.
@@ -48,12 +46,13 @@ pub fn replay_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
 }
 
 fn replay_any(args: ReplayArgs) -> Result<Exit, Failure> {
+    #[cfg_attr(not(any(feature = "wasm", feature = "python")), expect(unused_variables))]
     let (options, manifest) = Options::new(args)?;
     match manifest.lambda.kind {
         #[cfg(feature = "wasm")]
-        Kind::Wasm => run(&options, &manifest, &mut load_wasm),
+        gleaner_protocol::manifest::Kind::Wasm => run(&options, &manifest, &mut wasm::load),
         #[cfg(feature = "python")]
-        Kind::Python => {
+        gleaner_protocol::manifest::Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
             let error = crate::guest::python::become_interpreter(&options.lambda, &args);
             Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
@@ -77,19 +76,35 @@ fn run(options: &Options, manifest: &Manifest, load: Load<'_>) -> Result<Exit, F
 }
 
 #[cfg(feature = "wasm")]
-fn load_wasm(options: &Options, manifest: &Manifest, session: Session) -> Result<Box<dyn Guest>, Failure> {
+mod wasm {
+    use gleaner_protocol::manifest::Manifest;
+    use gleaner_protocol::{Exit, Failure};
+
+    use crate::api::Session;
+    use crate::guest::Guest;
     use crate::guest::wasm::{Allowance, Loaded, WasmError, WasmGuest};
-    let cannot = |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
-    let cache = gleaner_protocol::parts::cache_dir().map_err(|error| cannot(&error.into()))?;
-    let loaded = Loaded::open(&options.build.entry_path(manifest), &cache).map_err(|error| cannot(&error))?;
-    let allowance = Allowance { fuel: manifest.limits.fuel, memory_bytes: manifest.limits.memory.bytes() };
-    // In replay only fuel and memory bound a lambda: a deadline would make decisions depend on the machine.
-    Ok(Box::new(WasmGuest::new(loaded, session, allowance, None)))
+    use crate::replay::Options;
+
+    pub(super) fn load(options: &Options, manifest: &Manifest, session: Session) -> Result<Box<dyn Guest>, Failure> {
+        let cannot =
+            |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
+        let cache = gleaner_protocol::parts::cache_dir().map_err(|error| cannot(&error.into()))?;
+        let loaded = Loaded::open(&options.build.entry_path(manifest), &cache).map_err(|error| cannot(&error))?;
+        let allowance = Allowance { fuel: manifest.limits.fuel, memory_bytes: manifest.limits.memory.bytes() };
+        // In replay only fuel and memory bound a lambda: a deadline would make decisions depend on the machine.
+        let guest = WasmGuest::new(loaded, session, allowance, None);
+        let guest = guest.map_err(|error| Failure::caused_by(Exit::Internal, "cannot make a guest", &error))?;
+        Ok(Box::new(guest))
+    }
 }
 
 fn prepare() {
     crate::memory::give_large_blocks_back();
-    let filter = tracing_subscriber::EnvFilter::try_from_env("GLEANER_LOG").unwrap_or_else(|_| "warn".into());
+    let wanted = std::env::var("GLEANER_LOG").unwrap_or_else(|_| "warn".to_owned());
+    let filter = tracing_subscriber::EnvFilter::try_new(&wanted).unwrap_or_else(|error| {
+        eprintln!("warning: GLEANER_LOG=`{wanted}` is no filter, `warn` is used: {error}");
+        "warn".into()
+    });
     // Fails only where a subscriber is set already, which then stays.
     let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).try_init();
 }

@@ -122,7 +122,9 @@ impl Periodic {
         if behind > CATCH_UP_TICKS {
             self.missed += behind;
             self.missed_total += behind;
-            self.due_ns = Some(now_ns.saturating_add(self.period_ns));
+            // In step with the ticks before; the next one is due at `now_ns` or later.
+            let passed = i64::try_from(behind).unwrap_or(i64::MAX).saturating_mul(self.period_ns);
+            self.due_ns = Some(due_ns.saturating_add(passed));
             return None;
         }
         self.due_ns = Some(due_ns.saturating_add(self.period_ns));
@@ -154,7 +156,7 @@ mod tests {
         // Due at 1, 2, and so on up to, not including, `i64::MAX - 10`.
         assert_eq!(periodic.missed_total, i64::MAX as u64 - 11);
         let tick = periodic.next(i64::MAX).unwrap();
-        assert_eq!((tick.at_ns, tick.missed), (i64::MAX - 9, periodic.missed_total));
+        assert_eq!((tick.at_ns, tick.missed), (i64::MAX - 10, periodic.missed_total));
     }
 
     #[test]

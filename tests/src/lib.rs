@@ -27,15 +27,16 @@ pub fn shared_drive(name: &str) -> Result<PathBuf, String> {
     if path.is_file() { Ok(path) } else { Err(format!("no `{name}` in ../shared/data")) }
 }
 
-/// A program of ours, beside this test.
+/// A program of ours, beside this one.
 ///
 /// # Panics
 ///
 /// If it is not built.
 pub fn program(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test has a path");
-    // target/release/deps/test-0123
-    let folder = test.parent().and_then(Path::parent).expect("a test lies in target/release/deps");
+    // target/release/deps/test-0123, or target/release/bench
+    let folder = test.parent().expect("a program lies in a folder");
+    let folder = if folder.ends_with("deps") { folder.parent().unwrap_or(folder) } else { folder };
     let path = folder.join(name);
     assert!(path.is_file(), "{} is not built; run: cargo xtask test", path.display());
     path

@@ -31,16 +31,19 @@ pub const CRATES: &[(&str, &[&str])] = &[
 ];
 
 /// Crates that a program must not contain, whatever the features: a program, and what it does without.
-pub const WITHOUT: &[(&str, &[&str])] = &[("gleaner-cli", &["wasmtime", "pyo3"]), ("gleaner-transport", &["pyo3"])];
+pub const WITHOUT: &[(&str, &[&str])] =
+    &[("gleaner-cli", &["wasmtime", "pyo3"]), ("gleaner-host", &["pyo3"]), ("gleaner-transport", &["pyo3"])];
 
 /// Inside of `host/src`: a room, and the rooms that it must not name.
 pub const ROOMS: &[(&str, &[&str])] = &[
+    ("memory", &["api", "guest", "image", "input", "judge", "program", "replay", "schedule"]),
     ("api", &["guest", "input", "judge", "program", "replay", "schedule"]),
     ("image", &["api", "guest", "input", "judge", "program", "replay", "schedule"]),
     ("input", &["guest", "judge", "program", "replay", "schedule"]),
     ("schedule", &["guest", "judge", "program", "replay"]),
     ("judge", &["program", "replay", "schedule"]),
-    ("guest", &["judge", "replay", "schedule"]),
+    ("guest", &["input", "judge", "program", "replay", "schedule"]),
+    ("replay", &["program"]),
 ];
 
 /// Whether `file` declares that it holds unsafe code.

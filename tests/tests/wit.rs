@@ -20,7 +20,8 @@ fn the_rust_sdk_calls_every_function_of_the_interface() {
         let read = |path: String| std::fs::read_to_string(root().join(&path)).unwrap_or_else(|_| panic!("no {path}"));
         let sdk = read(format!("guest-sdk-rust/src/{interface}.rs"));
         for function in functions(&read(format!("wit/{interface}.wit"))) {
-            let called = [format!("self.0.{function}("), format!("::{function}(")].iter().any(|call| sdk.contains(call));
+            let called =
+                [format!("self.0.{function}("), format!("::{function}(")].iter().any(|call| sdk.contains(call));
             assert!(called, "guest-sdk-rust/src/{interface}.rs does not call `{function}` of wit/{interface}.wit");
             found += 1;
         }

@@ -66,14 +66,14 @@ impl Checkout {
         self.command(&self.cargo)
     }
 
-    /// The folders of all lambdas, relative to the checkout: both twins of each example and test lambda.
+    /// The folders of all lambdas, relative to the checkout: the twins of each example, test lambda and bench lambda.
     pub(crate) fn lambdas(&self) -> Vec<PathBuf> {
         let below = |folder: &PathBuf| {
             let entries = fs::read_dir(self.path(folder)).into_iter().flatten().filter_map(Result::ok);
             let folder = folder.clone();
             entries.map(move |entry| folder.join(entry.file_name())).collect::<Vec<_>>()
         };
-        let families = [PathBuf::from("examples"), PathBuf::from("tests/lambdas")];
+        let families = ["bench/lambdas", "examples", "tests/lambdas"].map(PathBuf::from);
         let twins = families.iter().flat_map(below).flat_map(|lambda| below(&lambda));
         let mut lambdas: Vec<_> = twins.filter(|twin| self.path(twin).join("lambda.toml").is_file()).collect();
         lambdas.sort();

@@ -21,7 +21,7 @@ pub(crate) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<(), Failure>
     venv::set_up(checkout)?;
     steps.begin("programs (the first time this takes minutes)");
     programs(checkout)?;
-    steps.begin("example and test lambdas");
+    steps.begin("lambdas of examples, tests and benches");
     lambdas(checkout)
 }
 

@@ -26,6 +26,8 @@ pub(super) enum BuildError {
     File { action: &'static str, path: PathBuf, source: io::Error },
     #[error("`{}` is newer than the build that was just made of it", source_file.display())]
     Changed { source_file: PathBuf },
+    #[error("the lambda's files cannot be listed")]
+    Sources(#[source] LayoutError),
     #[error("the new build cannot be checked")]
     Layout(#[source] LayoutError),
 }
@@ -53,13 +55,15 @@ impl Explain for BuildError {
             BuildError::Changed { .. } => {
                 "it changed meanwhile: build again; if its date lies in the future, `touch` it first".to_owned()
             }
-            BuildError::Compile { .. } | BuildError::File { .. } | BuildError::Layout(_) => return None,
+            BuildError::Compile { .. } | BuildError::File { .. } | BuildError::Sources(_) | BuildError::Layout(_) => {
+                return None;
+            }
         })
     }
 
     fn exit(&self) -> Exit {
         match self {
-            BuildError::File { .. } | BuildError::Layout(_) => Exit::Internal,
+            BuildError::File { .. } | BuildError::Sources(_) | BuildError::Layout(_) => Exit::Internal,
             _ => Exit::Usage,
         }
     }

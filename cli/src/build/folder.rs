@@ -41,28 +41,6 @@ impl Partial {
         fs::copy(from, &to).map(drop).map_err(failed("copy", from))
     }
 
-    /// Copies the message definitions that came with the lambda, `msg/PACKAGE/msg/TYPE.msg`, if it has any.
-    pub(super) fn add_messages(&mut self) -> Result<(), BuildError> {
-        let mut folders = vec![PathBuf::from("msg")];
-        while let Some(folder) = folders.pop() {
-            let path = self.dir.join(&folder);
-            let entries = match fs::read_dir(&path) {
-                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-                entries => entries.map_err(failed("list", &path))?,
-            };
-            for entry in entries {
-                let entry = entry.map_err(failed("list", &path))?;
-                let relative = folder.join(entry.file_name());
-                if entry.file_type().map_err(failed("list", &path))?.is_dir() {
-                    folders.push(relative);
-                } else if relative.extension().is_some_and(|extension| extension == "msg") {
-                    self.add(&entry.path(), &relative)?;
-                }
-            }
-        }
-        Ok(())
-    }
-
     /// Adds the manifest, by whose time the age of a build is told, and puts the build into its place. `started` is
     /// when its first source was read.
     pub(super) fn finish(self, started: SystemTime) -> Result<Built, BuildError> {

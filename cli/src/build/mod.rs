@@ -1,13 +1,12 @@
 //! `gleaner build DIR`: a lambda's sources become its build folder, which every other command uses.
 //!
-//! `component` compiles Rust, `python` chooses the files of a Python lambda, `folder` puts everything together beside
-//! the old build and swaps the two, so that a build that fails leaves the old one as it was. Nothing here runs a
-//! lambda or looks into a component.
+//! `component` compiles Rust, `folder` puts everything together beside the old build and swaps the two, so that a build
+//! that fails leaves the old one as it was. Which files make up a lambda is said by `gleaner_protocol::Sources`. Nothing
+//! here runs a lambda or looks into a component.
 
 mod component;
 mod error;
 mod folder;
-mod python;
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -15,7 +14,7 @@ use std::path::Path;
 use std::time::SystemTime;
 
 use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest};
+use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, Sources};
 
 use error::BuildError;
 use folder::{Built, Partial};
@@ -40,29 +39,15 @@ fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, 
     // Two builds of one lambda take turns. Where a folder cannot be locked, they are on their own.
     let turn = File::open(dir).and_then(|folder| folder.lock().map(|()| folder));
 
+    let sources = Sources::of(dir, manifest).map_err(BuildError::Sources)?;
+    check_named(dir, manifest)?;
     let mut partial = Partial::begin(dir)?;
-    let entry = manifest.lambda.entry.as_path();
-    match manifest.lambda.kind {
-        Kind::Wasm => partial.add(&component::compile(dir)?, entry)?,
-        Kind::Python => {
-            let sources = python::sources(dir)?;
-            if !dir.join(entry).is_file() {
-                return Err(BuildError::Missing { path: dir.join(entry), named_by: "`entry`" });
-            }
-            for source in sources {
-                partial.add(&dir.join(&source), &source)?;
-            }
-            partial.add(&dir.join(entry), entry)?;
-        }
+    if manifest.lambda.kind == Kind::Wasm {
+        partial.add(&component::compile(dir)?, manifest.lambda.entry.as_path())?;
     }
-    for model in &manifest.models {
-        let file = model.file.as_path();
-        if !dir.join(file).is_file() {
-            return Err(BuildError::Missing { path: dir.join(file), named_by: "`file` of a [[model]]" });
-        }
-        partial.add(&dir.join(file), file)?;
+    for source in &sources.copied {
+        partial.add(&dir.join(source), source)?;
     }
-    partial.add_messages()?;
     let built = partial.finish(started)?;
 
     drop(turn);
@@ -84,6 +69,16 @@ fn check_entry(manifest: &Manifest) -> Result<(), BuildError> {
         return Ok(());
     }
     Err(BuildError::EntryName { entry: entry.to_string(), kind: manifest.lambda.kind, extension })
+}
+
+/// What the manifest names is there, except for the entry that a compiler makes.
+fn check_named(dir: &Path, manifest: &Manifest) -> Result<(), BuildError> {
+    let entry = (manifest.lambda.kind == Kind::Python).then(|| (manifest.lambda.entry.as_path(), "`entry`"));
+    let models = manifest.models.iter().map(|model| (model.file.as_path(), "`file` of a [[model]]"));
+    match entry.into_iter().chain(models).find(|(file, _)| !dir.join(file).is_file()) {
+        Some((file, named_by)) => Err(BuildError::Missing { path: dir.join(file), named_by }),
+        None => Ok(()),
+    }
 }
 
 #[cfg(test)]

@@ -119,6 +119,21 @@ fn what_a_killed_build_left_is_in_nobodys_way() {
 }
 
 #[test]
+fn a_build_is_as_fresh_as_what_it_is_made_of_and_no_more() {
+    let lambda = Lambda::new(PYTHON);
+    lambda.write("main.py", "1");
+    lambda.build().unwrap();
+    let later = |relative: &str| {
+        lambda.write(relative, "2");
+        let file = File::options().write(true).open(lambda.0.join(relative)).unwrap();
+        file.set_modified(SystemTime::now() + Duration::from_secs(60)).unwrap();
+        BuildDir::check_fresh(&lambda.0).is_ok()
+    };
+    assert!(later("tests/test_main.py") && later("out/decisions.py"));
+    assert!(!later("part/of.py"));
+}
+
+#[test]
 fn a_source_from_the_future_is_named() {
     let lambda = Lambda::new(PYTHON);
     lambda.write("main.py", "1");

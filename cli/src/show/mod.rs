@@ -113,6 +113,14 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: P
     for loss in losses(summary) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {loss}")))?;
     }
+    if summary.out_of_order > 0 {
+        let messages = counted(summary.out_of_order, "message");
+        writeln!(
+            text,
+            "  {}",
+            paint.yellow(&format!("out of order: {messages} came after one with a later log time"))
+        )?;
+    }
     if let Some(damage) = &summary.damaged {
         writeln!(text, "  {}", paint.red("the drive is damaged; the results end there"))?;
         for line in damage.lines() {

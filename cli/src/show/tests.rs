@@ -18,6 +18,7 @@ fn replay() -> Summary {
         faults: 0,
         skipped: 0,
         missed_ticks: 0,
+        out_of_order: 0,
         log_lines: 0,
         log_dropped: 0,
         start_ns: START_NS,
@@ -121,6 +122,15 @@ fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
             "3,000 log lines, over the rate limit",
         ]
     );
+}
+
+#[test]
+fn messages_that_came_out_of_order_are_said_and_are_no_loss() {
+    let disordered = Summary { out_of_order: 2, ..replay() };
+    let text = summary(&disordered, &digest(Vec::new()), PLAIN);
+    assert!(text.contains("\n  out of order: 2 messages came after one with a later log time\n"), "{text}");
+    assert!(losses(&disordered).is_empty());
+    assert!(!summary(&replay(), &digest(Vec::new()), PLAIN).contains("order"));
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use super::{CompileError, cache_entry, engine, make_cache, read_component};
+use super::{CODE_BYTES, CompileError, cache_entry, check_folder, engine, make_cache, read_component};
 
 /// Compiles the component at `path` into `cache` and returns the entry; an entry that exists is left as it is.
 ///
@@ -15,6 +15,7 @@ use super::{CompileError, cache_entry, engine, make_cache, read_component};
 pub fn compile(path: &Path, cache: &Path) -> Result<PathBuf, CompileError> {
     let component = read_component(path)?;
     make_cache(cache)?;
+    check_folder(cache)?;
     let entry = cache_entry(cache, &component);
     if entry.exists() {
         return Ok(entry);
@@ -22,16 +23,21 @@ pub fn compile(path: &Path, cache: &Path) -> Result<PathBuf, CompileError> {
     let code = engine()?
         .precompile_component(&component)
         .map_err(|source| CompileError::Compile { path: path.to_owned(), source: source.into() })?;
+    if code.len() > CODE_BYTES {
+        return Err(CompileError::CodeTooLarge { path: path.to_owned(), bytes: code.len() });
+    }
     write_whole(&entry, &code).map_err(|source| CompileError::Write { path: entry.clone(), source })?;
     Ok(entry)
 }
 
 /// Writes a file that is either absent or whole, whenever the power fails.
 fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    // The name is our own, so two processes that compile the same component do not write into one file.
+    // The name is our own, so two processes that compile the same component do not write into one file. What an earlier
+    // process of the same number left is in the way.
     let partial = path.with_extension(format!("{}.part", std::process::id()));
+    let _ = fs::remove_file(&partial);
     let written = (|| {
-        let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&partial)?;
+        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&partial)?;
         file.write_all(bytes)?;
         file.sync_all()?;
         fs::rename(&partial, path)

@@ -3,11 +3,12 @@
 //! Compiling takes a second and 40 MB, loading 0.3 ms and 11 MB; so a component is compiled once, in a process of its own
 //! (`gleaner-compile`), and every runtime loads what that left. Loading native code means trusting it: entries are bound to
 //! the component's digest, to wasmtime's version, to the settings below and to the CPU, and must belong to this user alone.
+//! A component is hostile until proven otherwise, so compiling has a limit of memory and of time.
 
 use std::fmt::Write as _;
-use std::fs;
+use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::{Exit, Explain};
@@ -16,6 +17,15 @@ use wasmtime::{Config, Engine};
 
 /// Largest component that is compiled, in bytes.
 pub const COMPONENT_BYTES: u64 = 64 << 20;
+
+/// Largest native code that is kept, in bytes.
+pub const CODE_BYTES: usize = 256 << 20;
+
+/// Memory that compiling may take, in bytes; an ordinary lambda takes some 50 MB. A small component can be made to take any.
+pub const COMPILE_MEMORY_BYTES: u64 = 4 << 30;
+
+/// Seconds of CPU time that compiling may take; an ordinary lambda takes one.
+pub const COMPILE_CPU_SECONDS: u64 = 120;
 
 /// Stack of a guest, in bytes. The thread that runs it needs some more.
 pub const GUEST_STACK_BYTES: usize = 512 << 10;
@@ -33,6 +43,8 @@ pub enum CompileError {
     TooLarge { path: PathBuf, bytes: u64 },
     #[error("cannot compile component `{}`", path.display())]
     Compile { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
+    #[error("component `{}` becomes {bytes} bytes of native code; at most {CODE_BYTES} are kept", path.display())]
+    CodeTooLarge { path: PathBuf, bytes: usize },
     #[error("cannot set up the engine")]
     Engine { source: Box<dyn std::error::Error + Send + Sync> },
     #[error("cannot write native code to `{}`", path.display())]
@@ -45,7 +57,7 @@ impl Explain for CompileError {
     fn help(&self) -> Option<String> {
         match self {
             Self::Read { .. } | Self::Compile { .. } => Some("build the lambda again: gleaner build DIR".to_owned()),
-            Self::TooLarge { .. } => {
+            Self::TooLarge { .. } | Self::CodeTooLarge { .. } => {
                 Some("leave out what the lambda does not need, or move data to files of a model".to_owned())
             }
             Self::Write { .. } => Some("make the folder writable, or set XDG_CACHE_HOME to one that is".to_owned()),
@@ -58,7 +70,7 @@ impl Explain for CompileError {
 
     fn exit(&self) -> Exit {
         match self {
-            Self::Read { .. } | Self::TooLarge { .. } | Self::Compile { .. } => Exit::Usage,
+            Self::Read { .. } | Self::TooLarge { .. } | Self::CodeTooLarge { .. } | Self::Compile { .. } => Exit::Usage,
             Self::Untrusted { .. } => Exit::Denied,
             Self::Write { .. } | Self::Engine { .. } => Exit::Internal,
         }
@@ -122,27 +134,61 @@ fn cpu_features() -> String {
     features.unwrap_or_default().to_owned()
 }
 
-/// Checks that nobody else could have written `entry`: it and its folder belong to this user, and only the user may write.
+/// Opens `entry` for loading, if nobody else could have written it: it and the folders above it belong to this user or to
+/// root, and nobody else may write to them. What is checked is what was opened.
 ///
 /// # Errors
 ///
 /// [`CompileError::Untrusted`] says what is wrong; [`CompileError::Read`] if there is no entry.
-pub fn check_entry(entry: &Path) -> Result<(), CompileError> {
-    let folder = entry.parent().unwrap_or(entry);
-    for path in [folder, entry] {
-        let untrusted = |why| CompileError::Untrusted { path: path.to_owned(), why };
-        let meta = fs::symlink_metadata(path).map_err(|source| CompileError::Read { path: path.to_owned(), source })?;
-        if meta.is_symlink() {
-            return Err(untrusted("it is a link"));
-        }
-        if meta.uid() != rustix::process::geteuid().as_raw() {
-            return Err(untrusted("it belongs to another user"));
-        }
-        if meta.mode() & 0o022 != 0 {
-            return Err(untrusted("others may write to it"));
+pub fn open_entry(entry: &Path) -> Result<File, CompileError> {
+    check_folder(entry.parent().unwrap_or(entry))?;
+    let read = |source| CompileError::Read { path: entry.to_owned(), source };
+    let file = OpenOptions::new().read(true).custom_flags(NO_FOLLOW).open(entry).map_err(read)?;
+    let meta = file.metadata().map_err(read)?;
+    let wrong = if meta.is_file() { foreign(&meta) } else { Some("it is no file") };
+    match wrong {
+        Some(why) => Err(CompileError::Untrusted { path: entry.to_owned(), why }),
+        None => Ok(file),
+    }
+}
+
+/// Checks that only this user can put files into `folder`, or replace it.
+///
+/// # Errors
+///
+/// As [`open_entry`].
+pub fn check_folder(folder: &Path) -> Result<(), CompileError> {
+    let read = |source| CompileError::Read { path: folder.to_owned(), source };
+    let untrusted = |path: &Path, why| Err(CompileError::Untrusted { path: path.to_owned(), why });
+    let whole = fs::canonicalize(folder).map_err(read)?;
+    for (above, path) in whole.ancestors().enumerate() {
+        let meta = fs::symlink_metadata(path).map_err(read)?;
+        let root_owns = meta.uid() == 0;
+        let wrong = match foreign(&meta) {
+            // Folders above may be root's; in one that all may write to, like /tmp, the sticky bit protects what is ours.
+            Some(NOT_OURS) if above > 0 && root_owns && meta.mode() & 0o022 == 0 => None,
+            Some(_) if above > 0 && root_owns && meta.mode() & 0o1000 != 0 => None,
+            wrong => wrong,
+        };
+        if let Some(why) = wrong {
+            return untrusted(path, why);
         }
     }
     Ok(())
+}
+
+const NOT_OURS: &str = "it belongs to another user";
+/// `O_NOFOLLOW`.
+const NO_FOLLOW: i32 = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
+
+fn foreign(meta: &Metadata) -> Option<&'static str> {
+    if meta.uid() != rustix::process::geteuid().as_raw() {
+        Some(NOT_OURS)
+    } else if meta.mode() & 0o022 != 0 {
+        Some("others may write to it")
+    } else {
+        None
+    }
 }
 
 /// Makes the cache folder, for this user alone.
@@ -192,10 +238,19 @@ mod tests {
         let entry = cache.join("x.cwasm");
         fs::write(&entry, b"code").unwrap();
         fs::set_permissions(&entry, fs::Permissions::from_mode(0o600)).unwrap();
-        check_entry(&entry).unwrap();
-        fs::set_permissions(&entry, fs::Permissions::from_mode(0o620)).unwrap();
-        let refused = check_entry(&entry).unwrap_err().to_string();
-        assert!(refused.ends_with("others may write to it"), "{refused}");
+        open_entry(&entry).unwrap();
+        let refused = |path: &Path, mode| {
+            fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+            open_entry(&entry).unwrap_err().to_string()
+        };
+        let said = refused(&entry, 0o620);
+        assert!(said.contains("x.cwasm` is not loaded: others may write to it"), "{said}");
+        let said = refused(&cache, 0o770);
+        assert!(said.ends_with("others may write to it") && !said.contains("x.cwasm"), "{said}");
+        fs::set_permissions(&cache, fs::Permissions::from_mode(0o700)).unwrap();
+        let link = cache.join("link.cwasm");
+        std::os::unix::fs::symlink(&entry, &link).unwrap();
+        assert!(matches!(open_entry(&link), Err(CompileError::Read { .. })));
         fs::remove_dir_all(&cache).unwrap();
     }
 }

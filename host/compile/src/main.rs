@@ -4,7 +4,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
+use gleaner_compile::{COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES};
 use gleaner_protocol::{Exit, Failure};
+use rustix::process::{Resource, Rlimit, setrlimit};
 
 /// Compiles a WebAssembly component to native code for this machine.
 #[derive(Parser)]
@@ -19,6 +21,7 @@ struct Args {
 
 fn main() -> ExitCode {
     let args = Args::parse();
+    bound_this_process();
     match gleaner_compile::compile(&args.component, &args.cache) {
         Ok(entry) => {
             println!("{}", entry.display());
@@ -30,4 +33,12 @@ fn main() -> ExitCode {
             failure.exit.into()
         }
     }
+}
+
+/// Past these limits an allocation fails, or the kernel ends this process; whoever started it says so.
+fn bound_this_process() {
+    let limit = |value| Rlimit { current: Some(value), maximum: Some(value) };
+    // They only tighten, so they fail only where something tighter holds already.
+    let _ = setrlimit(Resource::As, limit(COMPILE_MEMORY_BYTES));
+    let _ = setrlimit(Resource::Cpu, limit(COMPILE_CPU_SECONDS));
 }

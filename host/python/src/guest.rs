@@ -10,6 +10,8 @@ use gleaner_host::guest::{Guest, Outcome};
 use gleaner_host::program;
 use gleaner_protocol::manifest::{Manifest, Schedule};
 use gleaner_protocol::{Fault, FaultKind};
+use pyo3::call::PyCallArgs;
+use pyo3::intern;
 use pyo3::prelude::*;
 use pyo3::types::PyString;
 
@@ -63,35 +65,72 @@ impl PythonGuest {
         Self { host, entry, handler, session, make: None, live: None, wakes: 0 }
     }
 
+    /// From now on what the lambda prints is its log, what it prints while it is imported included.
+    fn listen(&self, py: Python<'_>) -> PyResult<()> {
+        let context = Py::new(py, Context::new(py, self.session.clone())?)?;
+        self.host.call_method1(py, "print_to", (context.getattr(py, "log")?,)).map(drop)
+    }
+
     fn start(&mut self, py: Python<'_>) -> Result<Live, Fault> {
         let make = match &self.make {
             Some(make) => make.clone_ref(py),
-            None => self.import(py).map_err(|error| self.fault(py, "in import: ", error))?,
+            None => self.import(py).map_err(|raised| raised.fault("in import: "))?,
         };
         self.make = Some(make.clone_ref(py));
-        self.make_live(make.bind(py)).map_err(|error| self.fault(py, "in init: ", error))
+        self.make_live(py, &make).map_err(|raised| raised.fault("in init: "))
     }
 
-    fn import(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
-        let entry = path::absolute(&self.entry)?;
-        self.host.call_method1(py, "load", (entry, self.handler))
+    fn import(&self, py: Python<'_>) -> Result<Py<PyAny>, Raised> {
+        self.listen(py)?;
+        let entry = path::absolute(&self.entry).map_err(PyErr::from)?;
+        let make = self.attempt(py, (self.host.getattr(py, "load")?, entry, self.handler))?;
+        Ok(make.unbind())
     }
 
-    fn make_live(&self, make: &Bound<'_, PyAny>) -> PyResult<Live> {
-        let py = make.py();
+    fn make_live(&self, py: Python<'_>, make: &Py<PyAny>) -> Result<Live, Raised> {
         let context = Py::new(py, Context::new(py, self.session.clone())?)?;
-        let handler = make.call1((&context,))?.unbind();
+        let handler = self.attempt(py, (make, &context))?.unbind();
         Ok(Live { context, handler })
     }
 
     fn run(&mut self, py: Python<'_>, wake: Wake) -> Result<(), Fault> {
         let live = match self.live.take() {
             Some(live) => live,
-            None => self.start(py)?,
+            None => {
+                let session = self.session.clone();
+                session.during_init(|| self.start(py))?
+            }
         };
-        live.run(py, wake).map_err(|error| self.fault(py, "", error))?;
+        self.call(py, &live, wake).map_err(|raised| raised.fault(""))?;
         self.live = Some(live);
         Ok(())
+    }
+
+    fn call(&self, py: Python<'_>, live: &Live, wake: Wake) -> Result<(), Raised> {
+        let Live { context, handler } = live;
+        match wake {
+            Wake::Event(sample) => {
+                let event = context.get().sample(py, sample)?;
+                self.attempt(py, (handler, context, event))?;
+            }
+            Wake::Tick(tick) => {
+                context.get().set_missed(tick.missed);
+                self.attempt(py, (handler, context))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Calls the first of `call` with the others, all of it code of the lambda.
+    ///
+    /// `gleaner._host` catches what it raises, since a panic of ours below it must not come back here as an exception: where
+    /// an exception enters Rust, one that was made of a panic becomes a panic again, and would end the process.
+    fn attempt<'py>(&self, py: Python<'py>, call: impl PyCallArgs<'py>) -> Result<Bound<'py, PyAny>, Raised> {
+        let ended = self.host.bind(py).call_method1(intern!(py, "attempt"), call)?;
+        match ended.extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>)>()? {
+            (result, None) => Ok(result),
+            (_, Some(told)) => Err(Raised(told.to_string_lossy().into_owned())),
+        }
     }
 
     /// The collector is off during wakes and runs between them, see `gleaner._host`.
@@ -102,32 +141,23 @@ impl PythonGuest {
             let _ = self.host.call_method1(py, "tidy", (self.wakes,));
         }
     }
+}
 
-    fn fault(&self, py: Python<'_>, when: &str, error: PyErr) -> Fault {
-        // What is in the text is all that is kept: a traceback holds the frames of a call, and these the sample.
-        let told = self.host.call_method1(py, "explain", (error.into_value(py),));
-        let text = match told.and_then(|text| Ok(text.extract::<Bound<'_, PyString>>(py)?)) {
-            Ok(text) => text.to_string_lossy().into_owned(),
-            Err(error) => error.to_string(),
-        };
-        let message = format!("{when}{}", ending(&text, LINE_BYTES - when.len()));
+/// What ended a call into the lambda, told. Nothing else is kept of it: a traceback holds the frames of a call, and these
+/// the sample.
+struct Raised(String);
+
+impl Raised {
+    fn fault(&self, when: &str) -> Fault {
+        let message = format!("{when}{}", ending(&self.0, LINE_BYTES - when.len()));
         Fault { kind: FaultKind::Exception, message, used: None, allowed: None }
     }
 }
 
-impl Live {
-    fn run(&self, py: Python<'_>, wake: Wake) -> PyResult<()> {
-        match wake {
-            Wake::Event(sample) => {
-                let event = self.context.get().sample(py, sample)?;
-                self.handler.call1(py, (&self.context, event))?;
-            }
-            Wake::Tick(tick) => {
-                self.context.get().set_missed(tick.missed);
-                self.handler.call1(py, (&self.context,))?;
-            }
-        }
-        Ok(())
+/// An exception in what surrounds the call, such as a lack of memory.
+impl From<PyErr> for Raised {
+    fn from(error: PyErr) -> Self {
+        Self(error.to_string())
     }
 }
 
@@ -137,7 +167,7 @@ impl Guest for PythonGuest {
             self.live = None;
             self.live = Some(self.start(py)?);
             let settled = self.host.call_method0(py, "settle");
-            settled.map(drop).map_err(|error| self.fault(py, "in init: ", error))
+            settled.map(drop).map_err(|error| Raised::from(error).fault("in init: "))
         })
     }
 
@@ -153,7 +183,9 @@ impl Guest for PythonGuest {
 impl Drop for PythonGuest {
     fn drop(&mut self) {
         // What a detached thread lets go of lives on until the next one attaches; the slots should be free now.
-        Python::attach(|_| {
+        Python::attach(|py| {
+            // The log is written: what is printed from now on, if only by what goes away here, is for standard error.
+            let _ = self.host.call_method1(py, "print_to", (py.None(),));
             self.live = None;
             self.make = None;
         });

@@ -6,12 +6,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_buffers::{Lease, RingCounts, RingReader};
+use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{CdrError, Definitions, Endian, FieldPath, HeaderStamp, Value, header_stamp};
-use gleaner_transport::{Guid, SampleMeta};
 
 pub use super::error::DataError;
 use super::frame::{Frame, Images, Picture};
 use super::log::cut;
+pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
 /// Most samples that one call hands out.
 pub const SAMPLES_PER_CALL: usize = 256;
@@ -19,58 +20,12 @@ pub const SAMPLES_PER_CALL: usize = 256;
 pub const COLUMN_LEN: usize = 65_536;
 /// Most bytes that one call copies out.
 pub const BYTES_PER_CALL: usize = 1 << 20;
+/// What reading a field at a fixed place costs, in bytes: the walk to it, and its value.
+pub const FIELD_BYTES: usize = 64;
 /// Longest path of a field, in bytes.
 pub const PATH_BYTES: usize = 1024;
 /// Longest list of strings in one field.
 pub const TEXTS_PER_FIELD: usize = 4096;
-
-/// What became of a topic's samples since the lambda started.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Counts {
-    /// Entered the ring.
-    pub received: u64,
-    /// Known to be lost before they reached this process; none where the transport cannot know.
-    pub lost: Option<u64>,
-    /// Left the ring to make room for newer ones.
-    pub overwritten: u64,
-    /// Refused because every cell was held.
-    pub no_slot: u64,
-    /// Refused because they exceed `max_size`.
-    pub too_big: u64,
-    /// Should have woken the lambda and did not.
-    pub skipped: u64,
-}
-
-/// What makes a sample different from every other one.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Identity {
-    /// ROS topic as the manifest names it.
-    pub topic: String,
-    /// Who sent it.
-    pub writer: Guid,
-    /// Rises strictly for each writer.
-    pub seq: u64,
-}
-
-/// When a sample came to be, in nanoseconds of three clocks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stamps {
-    /// When the vehicle received it: the clock that orders everything.
-    pub at_ns: i64,
-    /// When the writer published it.
-    pub publish_ns: i64,
-    /// `header.stamp`, where the type starts with a header.
-    pub header_ns: Option<i64>,
-}
-
-/// One field of the newest samples, oldest first; both lists have the same length.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Column {
-    /// [`Stamps::at_ns`] of each sample.
-    pub at_ns: Vec<i64>,
-    /// The field's values.
-    pub values: Vec<f64>,
-}
 
 /// The ring of one input, as its lambda sees it.
 pub struct Topic {
@@ -227,9 +182,12 @@ impl Topic {
         }
     }
 
-    /// Samples that the ring shows at most.
-    pub fn depth(&self) -> usize {
-        self.reader.depth()
+    /// Bytes that a column of `field` over `n` samples may touch, judged by the newest sample; the ring holds no more than
+    /// its depth.
+    pub fn column_work(&self, field: &Field, n: usize) -> usize {
+        let held = usize::try_from(self.reader.head()).unwrap_or(usize::MAX).min(self.reader.depth());
+        let message_bytes = self.reader.newest().map_or(0, |lease| lease.len());
+        n.min(held).saturating_mul(field.work(message_bytes))
     }
 
     pub(crate) fn reader(&self) -> &RingReader<SampleMeta> {
@@ -250,13 +208,17 @@ impl Topic {
     }
 }
 
-impl Column {
-    fn with_capacity(len: usize) -> Self {
-        Self { at_ns: Vec::with_capacity(len), values: Vec::with_capacity(len) }
-    }
-}
-
 impl Field {
+    /// Whether elements of varying size lie before it, so that reading it walks over much of a message.
+    pub fn walks(&self) -> bool {
+        self.path.walks()
+    }
+
+    /// Bytes that reading it from a message of `message_bytes` may touch: all of them if elements of varying size lie before it.
+    pub fn work(&self, message_bytes: usize) -> usize {
+        if self.walks() { message_bytes.max(FIELD_BYTES) } else { FIELD_BYTES }
+    }
+
     /// The path as it was written.
     pub fn path(&self) -> &str {
         self.path.path()
@@ -381,15 +343,6 @@ pub(super) fn piece(bytes: &[u8], offset: u64, len: u32) -> &[u8] {
     let start = usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
     let len = (len as usize).min(BYTES_PER_CALL).min(bytes.len() - start);
     &bytes[start..start + len]
-}
-
-/// A periodic wake.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Tick {
-    /// When it was due, in nanoseconds.
-    pub at_ns: i64,
-    /// Ticks that were due since the previous wake and did not happen.
-    pub missed: u64,
 }
 
 /// Why a lambda runs.

@@ -9,6 +9,7 @@ pub mod frame;
 pub mod inference;
 pub mod log;
 pub mod trigger;
+mod values;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 

@@ -80,6 +80,10 @@ impl Options {
                 return Err(failure.with_help(format!("the manifest has `{known}`")));
             }
         }
+        if let Some(twice) = given_twice(&args.drives) {
+            let failure = Failure::new(Exit::Usage, format!("drive `{}` is given twice", twice.display()));
+            return Err(failure.with_help("its samples would count twice; give each file once"));
+        }
         let out = args.out.unwrap_or_else(|| args.lambda.join("out"));
         let options = Self {
             lambda: args.lambda,
@@ -93,4 +97,10 @@ impl Options {
         };
         Ok((options, manifest))
     }
+}
+
+/// A file that is the same as an earlier one, under whatever name.
+fn given_twice(drives: &[PathBuf]) -> Option<&PathBuf> {
+    let mut seen = std::collections::HashSet::new();
+    drives.iter().find(|drive| std::fs::canonicalize(drive).is_ok_and(|path| !seen.insert(path)))
 }

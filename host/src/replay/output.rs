@@ -1,7 +1,7 @@
 //! The files of a replay: `decisions.jsonl`, `log.jsonl`, `summary.json`.
 
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::{Decision, Exit, Explain, Summary};
@@ -67,10 +67,15 @@ impl Output {
         lines.iter().try_for_each(|line| self.log.write(line))
     }
 
+    /// Writes what waits, so that a reader sees how far the replay is.
+    pub fn flush(&mut self) -> Result<(), OutputError> {
+        self.decisions.flush()?;
+        self.log.flush()
+    }
+
     /// Completes the files and adds the summary.
     pub fn finish(mut self, summary: &Summary) -> Result<(), OutputError> {
-        self.decisions.flush()?;
-        self.log.flush()?;
+        self.flush()?;
         let path = self.folder.join(SUMMARY);
         let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
         text.push(b'\n');
@@ -78,27 +83,34 @@ impl Output {
     }
 }
 
+/// A file of lines. It grows by whole lines only, so that it can be read whenever this process ends.
 struct Lines {
     path: PathBuf,
-    file: BufWriter<File>,
+    file: File,
+    pending: Vec<u8>,
 }
+
+/// Bytes that wait for the next write.
+const PENDING_BYTES: usize = 64 << 10;
 
 impl Lines {
     fn create(path: PathBuf) -> Result<Self, OutputError> {
         match File::create(&path) {
-            Ok(file) => Ok(Self { path, file: BufWriter::new(file) }),
+            Ok(file) => Ok(Self { path, file, pending: Vec::new() }),
             Err(source) => Err(OutputError { path, source }),
         }
     }
 
     fn write(&mut self, line: &impl Serialize) -> Result<(), OutputError> {
-        serde_json::to_writer(&mut self.file, line)
-            .map_err(io::Error::from)
-            .and_then(|()| self.file.write_all(b"\n"))
-            .map_err(|source| OutputError { path: self.path.clone(), source })
+        let failed = |source| OutputError { path: self.path.clone(), source };
+        serde_json::to_writer(&mut self.pending, line).map_err(io::Error::from).map_err(failed)?;
+        self.pending.push(b'\n');
+        if self.pending.len() < PENDING_BYTES { Ok(()) } else { self.flush() }
     }
 
     fn flush(&mut self) -> Result<(), OutputError> {
-        self.file.flush().map_err(|source| OutputError { path: self.path.clone(), source })
+        let written = self.file.write_all(&self.pending);
+        self.pending.clear();
+        written.map_err(|source| OutputError { path: self.path.clone(), source })
     }
 }

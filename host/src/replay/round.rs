@@ -1,6 +1,7 @@
 //! One pass of a lambda over its drives.
 
 use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -97,8 +98,8 @@ pub(super) fn replay(
         lambda: name.to_owned(),
         version: manifest.lambda.version.to_string(),
         kind: manifest.lambda.kind,
-        drive: options.drives.clone(),
-        out: options.out.clone(),
+        drive: options.drives.iter().map(|drive| shown(drive)).collect(),
+        out: shown(&options.out),
         wakes: pass.wakes,
         triggers: pass.triggers,
         faults: pass.faults,
@@ -145,6 +146,7 @@ fn drain(drive: &mut Replay, pass: &mut Pass<'_>, reports: &mut dyn Write) -> Re
         samples += 1;
         if samples.is_multiple_of(SAMPLES_PER_LOOK) && looked.elapsed() >= PROGRESS {
             looked = Instant::now();
+            pass.output.flush()?;
             let progress = drive.progress();
             send(reports, &Report::Progress { done: progress.done, total: Some(progress.total), at_ns });
         }
@@ -179,6 +181,11 @@ fn topic_report(topic: &Arc<Topic>) -> TopicReport {
         no_slot: counts.no_slot,
         too_big: counts.too_big,
     }
+}
+
+/// A path as JSON can hold it: what is no UTF-8 is replaced.
+fn shown(path: &Path) -> PathBuf {
+    PathBuf::from(path.to_string_lossy().into_owned())
 }
 
 /// A line of `/proc/self/status`, in bytes; 0 where there is none.

@@ -88,10 +88,10 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
     suites
 }
 
-/// What mypy checks, relative to the checkout: the SDK, and each example by itself, as all are called `main`.
+/// What mypy checks, relative to the checkout: the SDK, and each lambda by itself, as all are called `main`.
 fn typed(checkout: &Checkout) -> Vec<PathBuf> {
-    let examples = checkout.lambdas().into_iter().filter(|lambda| lambda.starts_with("examples"));
-    let mains = examples.map(|lambda| lambda.join("main.py")).filter(|main| checkout.path(main).is_file());
+    let mains = checkout.lambdas().into_iter().map(|lambda| lambda.join("main.py"));
+    let mains = mains.filter(|main| checkout.path(main).is_file());
     [PathBuf::from("guest-sdk-python/gleaner")].into_iter().chain(mains).collect()
 }
 

@@ -13,9 +13,6 @@ use crate::image;
 
 type Answer<T> = wasmtime::Result<Result<T, DataError>>;
 
-/// Bytes that a value of a column costs: two numbers of eight bytes and the walk to the field.
-const COLUMN_VALUE_BYTES: usize = 64;
-
 impl types::Host for Hosted {}
 
 impl Host for Hosted {
@@ -27,7 +24,7 @@ impl Host for Hosted {
 
     fn inputs(&mut self) -> wasmtime::Result<Vec<String>> {
         let inputs = self.session.inputs();
-        self.meter.charge(inputs.len() * COLUMN_VALUE_BYTES)?;
+        self.meter.charge(inputs.len() * data::FIELD_BYTES)?;
         Ok(inputs.iter().map(|topic| topic.name().to_owned()).collect())
     }
 
@@ -81,14 +78,24 @@ impl HostTopic for Hosted {
 
     fn column(&mut self, topic: Resource<Topic>, field: Resource<Field>, n: u32) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        let (depth, column) = (topic.depth(), topic.column(field, n as usize));
-        self.column_out(depth, column)
+        self.meter.charge(topic.column_work(field, n as usize))?;
+        Ok(column_out(topic.column(field, n as usize)))
     }
 
     fn column_since(&mut self, topic: Resource<Topic>, field: Resource<Field>, since_ns: i64) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        let (depth, column) = (topic.depth(), topic.column_since(field, since_ns));
-        self.column_out(depth, column)
+        // How many samples it is shows only on the way. At fixed places they cost little, and are charged afterwards.
+        let whole_ring = topic.column_work(field, usize::MAX);
+        let column = if field.walks() {
+            self.meter.charge(whole_ring)?;
+            topic.column_since(field, since_ns)
+        } else {
+            let column = topic.column_since(field, since_ns);
+            let read = column.as_ref().map_or(whole_ring, |column| column.values.len() * data::FIELD_BYTES);
+            self.meter.charge(read)?;
+            column
+        };
+        Ok(column_out(column))
     }
 
     fn drop(&mut self, topic: Resource<Topic>) -> wasmtime::Result<()> {
@@ -127,8 +134,8 @@ impl HostSample for Hosted {
     }
 
     fn number(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<f64> {
-        self.meter.charge(COLUMN_VALUE_BYTES)?;
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
+        self.meter.charge(field.work(sample.bytes().len()))?;
         Ok(sample.number(field).map_err(refused))
     }
 
@@ -227,21 +234,18 @@ impl Hosted {
     }
 
     fn hand_out_all(&mut self, samples: Vec<Sample>) -> wasmtime::Result<Vec<Resource<Sample>>> {
-        self.meter.charge(samples.len() * COLUMN_VALUE_BYTES)?;
+        self.meter.charge(samples.len() * data::FIELD_BYTES)?;
         samples.into_iter().map(|sample| Ok(self.handles.push(sample)?)).collect()
-    }
-
-    /// One column is little work, so it is charged once its length is known; a refused one as if it were the whole ring.
-    fn column_out(&mut self, depth: usize, column: Result<data::Column, data::DataError>) -> Answer<Column> {
-        let len = column.as_ref().map_or(depth, |column| column.values.len());
-        self.meter.charge(len * COLUMN_VALUE_BYTES)?;
-        Ok(column.map(|data::Column { at_ns, values }| Column { at_ns, values }).map_err(refused))
     }
 
     fn text<T: 'static>(&mut self, handle: &Resource<T>, text: impl FnOnce(&T) -> &str) -> wasmtime::Result<String> {
         self.meter.charge(0)?;
         Ok(text(self.handles.get(handle)?).to_owned())
     }
+}
+
+fn column_out(column: Result<data::Column, data::DataError>) -> Result<Column, DataError> {
+    column.map(|data::Column { at_ns, values }| Column { at_ns, values }).map_err(refused)
 }
 
 fn identity(data::Identity { topic, writer, seq }: &data::Identity) -> Identity {

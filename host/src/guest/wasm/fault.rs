@@ -1,12 +1,13 @@
 //! From a trap to a fault with a named cause.
 
 use gleaner_protocol::{Fault, FaultKind};
-use wasmtime::Trap;
+use wasmtime::component::ResourceTableError;
+use wasmtime::{Trap, WasmBacktrace};
 use wasmtime_wasi::I32Exit;
 
-use super::Hosted;
 use super::limits::OutOfFuel;
 use super::wasi::Asleep;
+use super::{HANDLES, Hosted};
 
 pub(super) fn fuel(used: u64, allowed: u64) -> Fault {
     let message = format!("used {used} of {allowed} units of fuel");
@@ -34,21 +35,28 @@ pub(super) fn from_error(
         let allowed = Some(gleaner_compile::GUEST_STACK_BYTES as u64);
         return Fault { kind: FaultKind::Stack, message: "the call stack is full".to_owned(), used: None, allowed };
     }
-    let said = hosted.printed.reason();
-    // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is the cause. But a guest may
-    // also survive the refusal and panic for another reason.
-    let aborted = matches!(trap, None | Some(Trap::UnreachableCodeReached));
-    let for_memory = said.as_ref().is_none_or(|said| said.contains("memory allocation of"));
-    if let Some((used, allowed)) = hosted.limits.refused().filter(|_| aborted && for_memory) {
-        let message = format!("asked for {used} bytes of memory; {allowed} are allowed");
-        return Fault { kind: FaultKind::Memory, message, used: Some(used), allowed: Some(allowed) };
-    }
     let plain = |kind, message| Fault { kind, message, used: None, allowed: None };
     if error.downcast_ref::<Asleep>().is_some() {
         return plain(FaultKind::HostCall, Asleep.to_string());
     }
     if error.downcast_ref::<I32Exit>().is_some() {
         return plain(FaultKind::Trap, "the lambda called exit".to_owned());
+    }
+    if let Some(ResourceTableError::Full) = error.downcast_ref() {
+        let message =
+            format!("the lambda holds {HANDLES} handles; drop samples, frames, fields and topics that are not needed");
+        return plain(FaultKind::HostCall, message);
+    }
+    let said = hosted.printed.reason();
+    // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is the cause. But a guest may
+    // also survive the refusal and panic for another reason.
+    // A guest is on the stack if it called the host, and not yet while its memories are made.
+    let starting = trap.is_none() && error.downcast_ref::<WasmBacktrace>().is_none();
+    let aborted = starting || trap == Some(&Trap::UnreachableCodeReached);
+    let for_memory = said.as_ref().is_none_or(|said| said.contains("memory allocation of"));
+    if let Some((used, allowed)) = hosted.limits.refused().filter(|_| aborted && for_memory) {
+        let message = format!("asked for {used} bytes of memory; {allowed} are allowed");
+        return Fault { kind: FaultKind::Memory, message, used: Some(used), allowed: Some(allowed) };
     }
     match trap {
         // A panic says why on standard error, and the trap only says that it happened.

@@ -37,24 +37,27 @@ impl Limits {
 }
 
 impl ResourceLimiter for Limits {
-    fn memory_growing(&mut self, now: usize, desired: usize, _max: Option<usize>) -> wasmtime::Result<bool> {
+    fn memory_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
         let total = self.memory_bytes.saturating_add(desired.saturating_sub(now));
-        let fits = total <= self.allowed_bytes;
-        if fits {
-            self.memory_bytes = total;
-        } else {
+        if total > self.allowed_bytes {
             self.refused = Some(total);
+            return Ok(false);
         }
-        Ok(fits)
+        // Beyond its own maximum it does not grow, and must not be counted as if it had.
+        let grows = max.is_none_or(|max| desired <= max);
+        if grows {
+            self.memory_bytes = total;
+        }
+        Ok(grows)
     }
 
-    fn table_growing(&mut self, now: usize, desired: usize, _max: Option<usize>) -> wasmtime::Result<bool> {
+    fn table_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
         let total = self.table_elements.saturating_add(desired.saturating_sub(now));
-        let fits = total <= TABLE_ELEMENTS;
-        if fits {
+        let grows = total <= TABLE_ELEMENTS && max.is_none_or(|max| desired <= max);
+        if grows {
             self.table_elements = total;
         }
-        Ok(fits)
+        Ok(grows)
     }
 
     fn instances(&self) -> usize {

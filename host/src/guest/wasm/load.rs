@@ -1,10 +1,13 @@
 //! From a component to code that can be instantiated: found in the cache, or compiled there by `gleaner-compile`.
 #![allow(unsafe_code)]
 
+use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_compile::{CompileError, cache_entry, check_entry, read_component};
+use gleaner_compile::{
+    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, cache_entry, open_entry, read_component,
+};
 use gleaner_protocol::{Exit, Explain, Parts, PartsError};
 use sha2::{Digest, Sha256};
 use wasmtime::component::{Component, Linker};
@@ -84,10 +87,12 @@ impl Loaded {
         if !entry.exists() {
             compile(path, cache)?;
         }
-        check_entry(&entry)?;
-        // SAFETY: `check_entry` found that the file and its folder belong to this user and that nobody else may write to
-        // them, and only `gleaner-compile` writes there, under a name made from the component, the engine and the CPU.
-        let code = unsafe { Component::deserialize_file(&engine, &entry) }
+        let file = open_entry(&entry)?;
+        let opened = format!("/proc/self/fd/{}", file.as_raw_fd());
+        // SAFETY: `open_entry` found that this very file and the folders above it belong to this user or to root, and that
+        // nobody else may write to them; and only `gleaner-compile` writes there, under a name made from the component, the
+        // engine and the CPU.
+        let code = unsafe { Component::deserialize_file(&engine, opened) }
             .map_err(|source| WasmError::Load { path: entry, source: source.into() })?;
         Self::check(path, engine, &code, Sha256::digest(&component).into())
     }
@@ -125,6 +130,12 @@ fn compile(path: &Path, cache: &Path) -> Result<(), WasmError> {
         .map_err(|source| WasmError::Start { program, source })?;
     if output.status.success() {
         return Ok(());
+    }
+    if output.status.code().is_none() {
+        // Ended by a signal: it ran into its limits.
+        let memory = COMPILE_MEMORY_BYTES >> 20;
+        let said = format!("it takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s to compile");
+        return Err(WasmError::Compiler { path: path.to_owned(), source: CompilerSaid(said) });
     }
     let said = String::from_utf8_lossy(&output.stderr);
     let said = said.trim().trim_start_matches("error: ").to_owned();

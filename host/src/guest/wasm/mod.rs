@@ -19,6 +19,7 @@ pub use load::{Loaded, WasmError};
 
 use gleaner_protocol::manifest::ConfigValue;
 use gleaner_protocol::{Fault, FaultKind};
+use tokio::runtime::{self, Runtime};
 use wasmtime::Store;
 use wasmtime::component::ResourceTable;
 use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
@@ -38,7 +39,7 @@ pub const INIT_FUEL_FACTOR: u64 = 20;
 pub const HANDLES: usize = 4096;
 
 /// Bytes that a guest may pass to the host in one call.
-const HOST_CALL_BYTES: usize = 64 << 20;
+const HOST_CALL_BYTES: usize = 1 << 20;
 
 /// What a guest is allowed, from `[limits]`.
 #[derive(Clone, Copy, Debug)]
@@ -55,6 +56,8 @@ pub struct WasmGuest {
     session: Session,
     allowance: Allowance,
     deadline: Option<Deadline>,
+    /// For the few calls of WASI that wait. Without one, the first print would start a thread for each core.
+    waiting: Runtime,
     live: Option<Live>,
 }
 
@@ -81,8 +84,18 @@ impl WasiView for Hosted {
 
 impl WasmGuest {
     /// A guest without an instance yet. With `deadline`, each call must end in time; in replay there is none.
-    pub fn new(loaded: Loaded, session: Session, allowance: Allowance, deadline: Option<Deadline>) -> Self {
-        Self { loaded, session, allowance, deadline, live: None }
+    ///
+    /// # Errors
+    ///
+    /// If the system has no more descriptors or memory.
+    pub fn new(
+        loaded: Loaded,
+        session: Session,
+        allowance: Allowance,
+        deadline: Option<Deadline>,
+    ) -> std::io::Result<Self> {
+        let waiting = runtime::Builder::new_current_thread().build()?;
+        Ok(Self { loaded, session, allowance, deadline, waiting, live: None })
     }
 
     fn start(&mut self) -> Result<Live, Fault> {
@@ -111,7 +124,8 @@ impl WasmGuest {
         let mut store = Store::new(self.loaded.engine(), hosted);
         store.limiter(|hosted| &mut hosted.limits);
         store.set_hostcall_fuel(HOST_CALL_BYTES);
-        store.set_max_component_handles(HANDLES);
+        // Our table refuses first, by name: a call lends some handles beside those that are held.
+        store.set_max_component_handles(2 * HANDLES);
         store
     }
 
@@ -122,12 +136,16 @@ impl WasmGuest {
 
 impl Guest for WasmGuest {
     fn init(&mut self) -> Result<(), Fault> {
+        let waiting = self.waiting.handle().clone();
+        let _waiting = waiting.enter();
         self.live = None;
         self.live = Some(self.start()?);
         Ok(())
     }
 
     fn wake(&mut self, wake: Wake) -> Outcome {
+        let waiting = self.waiting.handle().clone();
+        let _waiting = waiting.enter();
         let mut live = match self.live.take().map_or_else(|| self.session.clone().during_init(|| self.start()), Ok) {
             Ok(live) => live,
             Err(fault) => return Outcome { result: Err(fault), fuel: None },

@@ -23,12 +23,15 @@ impl Host for Hosted {
     }
 }
 
+/// What an attribute costs besides its texts: it was lifted out of the guest before it could be refused.
+const ATTRIBUTE_BYTES: usize = 64;
+
 fn bytes(attributes: &[Attribute]) -> usize {
     let text = |value: &AttributeValue| match value {
         AttributeValue::Text(text) => text.len(),
         AttributeValue::Boolean(_) | AttributeValue::Signed(_) | AttributeValue::Real(_) => 8,
     };
-    attributes.iter().map(|attribute| attribute.key.len() + text(&attribute.value)).sum()
+    attributes.iter().map(|attribute| ATTRIBUTE_BYTES + attribute.key.len() + text(&attribute.value)).sum()
 }
 
 fn attribute(Attribute { key, value }: Attribute) -> trigger::Attribute {

@@ -12,12 +12,18 @@ use rand::rngs::StdRng;
 use wasmtime::component::{HasData, Linker, Resource};
 use wasmtime_wasi::cli::{IsTerminal, StdoutStream};
 use wasmtime_wasi::p2::bindings::clocks::monotonic_clock;
-use wasmtime_wasi::p2::{DynPollable, OutputStream, Pollable, StreamResult};
+use wasmtime_wasi::p2::{DynPollable, OutputStream, Pollable, StreamError, StreamResult};
 use wasmtime_wasi::{HostWallClock, WasiCtx};
 
 use super::Hosted;
 use crate::api::Session;
 use crate::api::log::{LINE_BYTES, Level, cut};
+
+/// How the standard library begins to tell a panic, behind the name of the thread.
+const PANICKED: &str = "panicked at ";
+
+/// Random bytes that one call hands out.
+const RANDOM_BYTES: u64 = 4096;
 
 /// The lambda tried to sleep.
 #[derive(Debug, thiserror::Error)]
@@ -40,6 +46,8 @@ pub(super) fn context(session: &Session, printed: &Printed, seed: [u8; 32]) -> W
         .wall_clock(Wall(session.clone()))
         .secure_random(StdRng::from_seed(seed))
         .insecure_random(StdRng::from_seed(seed))
+        // Neither fuel nor a deadline ends a call, so no call may be long.
+        .max_random_size(RANDOM_BYTES)
         .insecure_random_seed(u128::from_le_bytes(std::array::from_fn(|i| seed[i])))
         .allow_blocking_current_thread(true)
         .build()
@@ -95,7 +103,9 @@ impl Printed {
 
     /// Forgets what an earlier call said on standard error.
     pub(super) fn begin(&self) {
-        self.stderr.lock().said.clear();
+        let mut stderr = self.stderr.lock();
+        stderr.said.clear();
+        stderr.panicking = false;
     }
 
     /// Writes down what did not end with a newline.
@@ -105,11 +115,16 @@ impl Printed {
         }
     }
 
-    /// What this call said on standard error, without the standard library's hint about backtraces: the reason of a panic.
+    /// What this call said last on standard error: the reason of a panic, without what the standard library adds to it.
     pub(super) fn reason(&self) -> Option<String> {
         let state = self.stderr.lock();
         let lines = state.said.lines().filter(|line| !line.trim().is_empty() && !line.starts_with("note: run with"));
         let message = lines.collect::<Vec<_>>().join("\n");
+        // `thread '<unnamed>' (1) panicked at src/lib.rs:17:9:`, and the message in the next line.
+        let message = match message.find(PANICKED) {
+            Some(at) => message[at..].replacen(":\n", ": ", 1),
+            None => message,
+        };
         (!message.is_empty()).then_some(message)
     }
 }
@@ -128,6 +143,8 @@ struct Unfinished {
     line: Vec<u8>,
     /// Beginning of what this call wrote, at most [`LINE_BYTES`].
     said: String,
+    /// The standard library is telling a panic in this call.
+    panicking: bool,
 }
 
 impl Lines {
@@ -156,7 +173,9 @@ impl Unfinished {
         let room = LINE_BYTES.saturating_sub(self.said.len());
         self.said.push_str(cut(&line, room));
         let line = line.trim_end();
-        if !line.is_empty() {
+        // A panic is told by the fault; in the log it would only take the room of other lines.
+        self.panicking |= line.contains(PANICKED);
+        if !line.is_empty() && !self.panicking {
             session.log(level, line);
         }
     }
@@ -181,6 +200,9 @@ impl StdoutStream for Lines {
 
 impl OutputStream for Lines {
     fn write(&mut self, bytes: Bytes) -> StreamResult<()> {
+        if bytes.len() > LINE_BYTES {
+            return Err(StreamError::trap("a lambda wrote more than its stream had said to take"));
+        }
         self.lock().write(&bytes, &self.session, self.level);
         Ok(())
     }

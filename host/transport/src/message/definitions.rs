@@ -117,11 +117,7 @@ impl Definitions {
         }
         let mut resolver = Resolver { parts, structs: Vec::new(), known: HashMap::new(), open: Vec::new() };
         resolver.resolve(&root)?;
-        let type_name = match root.split_once('/') {
-            Some((package, name)) => format!("{package}/msg/{name}"),
-            None => root,
-        };
-        Ok(Self { type_name, structs: resolver.structs })
+        Ok(Self { type_name: full_name(&root), structs: resolver.structs })
     }
 
     /// The type's full name, `pkg/msg/Type`.
@@ -149,6 +145,14 @@ pub(crate) fn short_name(type_name: &str) -> String {
     match type_name.split_once("/msg/") {
         Some((package, name)) => format!("{package}/{name}"),
         None => type_name.to_owned(),
+    }
+}
+
+/// `pkg/Type` as `pkg/msg/Type`, the spelling of manifests and messages to people.
+pub(super) fn full_name(short_name: &str) -> String {
+    match short_name.split_once('/') {
+        Some((package, name)) => format!("{package}/msg/{name}"),
+        None => short_name.to_owned(),
     }
 }
 

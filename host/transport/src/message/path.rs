@@ -1,7 +1,7 @@
 //! Field paths: `a.b[3].c` to a skip program, with errors that say what would have been right.
 
 use super::cdr::{CdrError, Cursor, Endian};
-use super::definitions::{Definitions, Struct};
+use super::definitions::{Definitions, Struct, full_name};
 use super::layout::{Layout, Table};
 use super::parse::{Count, Element, Field};
 use super::program::{Leaf, Op, walk};
@@ -105,6 +105,11 @@ impl FieldPath {
         })
     }
 
+    /// Whether reading it may walk over much of a message, because elements of varying size lie before the field.
+    pub fn walks(&self) -> bool {
+        self.ops.iter().any(|op| matches!(op, Op::Each { .. } | Op::Times { .. }))
+    }
+
     /// The path as it was written.
     pub fn path(&self) -> &str {
         &self.path
@@ -194,7 +199,7 @@ impl Compiler<'_> {
         let Some(position) = position else {
             let names = owner.fields.iter().map(|field| field.name.as_str());
             return Err(PathError::NoSuchField {
-                type_name: owner.name.clone(),
+                type_name: full_name(&owner.name),
                 field: (*name).to_owned(),
                 fields: names.clone().map(str::to_owned).collect(),
                 nearest: nearest(name, names).map(str::to_owned),
@@ -331,7 +336,7 @@ impl Compiler<'_> {
     fn whole(&self, owner: &Struct) -> PathError {
         PathError::WholeStruct {
             path: self.path.to_owned(),
-            type_name: owner.name.clone(),
+            type_name: full_name(&owner.name),
             fields: owner.fields.iter().map(|field| field.name.clone()).collect(),
         }
     }

@@ -32,7 +32,7 @@ pub struct Limits {
 impl Default for Limits {
     /// 1 GiB for a chunk, 2 GiB for all open ones. Usual chunks have 1 to 4 MiB.
     fn default() -> Self {
-        Self { chunk_bytes: 1 << 30, open_bytes: 2 << 30 }
+        Self { chunk_bytes: 256 << 20, open_bytes: 512 << 20 }
     }
 }
 

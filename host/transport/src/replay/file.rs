@@ -28,7 +28,13 @@ struct SchemaInfo {
 pub(super) struct Channels {
     schemas: HashMap<u16, SchemaInfo>,
     by_id: HashMap<u16, ChannelInfo>,
+    /// Bytes of the schemas and channels that were kept.
+    bytes: usize,
 }
+
+/// What all schemas and channels of a file may take; a drive with a hundred topics has some 100 KiB.
+const KNOWN_BYTES: usize = 64 << 20;
+const TOO_MUCH: Damage = Damage::Malformed("its schemas and channels take more than 64 MiB");
 
 impl Channels {
     pub(super) fn len(&self) -> usize {
@@ -46,12 +52,21 @@ impl Channels {
         all.into_iter()
     }
 
+    fn make_room(&mut self, bytes: usize) -> Result<(), Damage> {
+        self.bytes = self.bytes.saturating_add(bytes);
+        if self.bytes > KNOWN_BYTES { Err(TOO_MUCH) } else { Ok(()) }
+    }
+
     /// Learns from a record; other records are passed over. Writers repeat schemas and channels:
     /// the first of an id counts.
     pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
         match opcode {
             op::SCHEMA => {
                 let schema = Schema::parse(body).ok_or(Damage::Malformed("a schema record is malformed"))?;
+                if self.schemas.contains_key(&schema.id) {
+                    return Ok(());
+                }
+                self.make_room(body.len())?;
                 self.schemas.entry(schema.id).or_insert_with(|| SchemaInfo {
                     name: schema.name.to_owned(),
                     encoding: schema.encoding.to_owned(),
@@ -66,6 +81,7 @@ impl Channels {
                 if self.by_id.contains_key(&channel.id) {
                     return Ok(());
                 }
+                self.make_room(body.len())?;
                 let schema = self.schemas.get(&channel.schema);
                 if schema.is_none() && channel.schema != 0 {
                     return Err(Damage::Malformed("a channel names a schema that is not defined"));

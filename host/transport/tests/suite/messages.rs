@@ -190,12 +190,12 @@ fn wrong_paths_say_what_would_be_right() {
     let refuse = |path: &str| FieldPath::compile(&definitions(), path).unwrap_err();
     assert_eq!(
         refuse("items[0].wieght").to_string(),
-        "type `test_msgs/Item` has no field `wieght` (did you mean `weight`?); \
+        "type `test_msgs/msg/Item` has no field `wieght` (did you mean `weight`?); \
          it has: id, text, weight, codes"
     );
     assert_eq!(
         refuse("pair[0]").to_string(),
-        "`pair[0]` is a whole `test_msgs/Item`; name one of its fields: id, text, weight, codes"
+        "`pair[0]` is a whole `test_msgs/msg/Item`; name one of its fields: id, text, weight, codes"
     );
     assert!(matches!(refuse("items"), PathError::NeedsIndex { .. }));
     assert!(matches!(refuse("items.id"), PathError::NeedsIndex { .. }));

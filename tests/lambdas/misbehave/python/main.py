@@ -14,6 +14,8 @@ class Lambda:
         self.wakes = 0
         if self.behaviour == "error_in_init":
             raise RuntimeError("no, not today")
+        elif self.behaviour == "event_in_init":
+            ctx.event("too early", 1.0)
         elif self.behaviour == "bad_input":
             ctx.input("imo")
         elif self.behaviour == "bad_field":
@@ -40,9 +42,6 @@ class Lambda:
     def exit(self, ctx: Context, event: Sample) -> None:
         sys.exit(3)
 
-    def interrupt(self, ctx: Context, event: Sample) -> None:
-        raise KeyboardInterrupt
-
     def not_a_frame(self, ctx: Context, event: Sample) -> None:
         event.as_frame()
 
@@ -60,17 +59,8 @@ class Lambda:
     def nan_score(self, ctx: Context, event: Sample) -> None:
         ctx.event("x", float("nan"))
 
-    def long_message(self, ctx: Context, event: Sample) -> None:
-        raise RuntimeError("é" * 10_000 + " and that is all")
-
     def hold(self, ctx: Context, event: Sample) -> None:
         self.held.append(event)
-
-    def swallow(self, ctx: Context, event: Sample) -> None:
-        try:
-            ctx.input("imo")
-        except BaseException:
-            pass
 
     def log_flood(self, ctx: Context, event: Sample) -> None:
         for i in range(1000):
@@ -78,3 +68,6 @@ class Lambda:
 
     def print(self, ctx: Context, event: Sample) -> None:
         print(f"hello from {self.wakes}")
+
+    def print_in_pieces(self, ctx: Context, event: Sample) -> None:
+        print("wake", self.wakes, "of", self.behaviour, file=sys.stderr)

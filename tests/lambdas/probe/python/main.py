@@ -65,10 +65,10 @@ class Lambda:
             big_endian=sample.big_endian,
             cdr=fnv1a(sample.cdr(10, 100)),
             end=len(sample.cdr(sample.size - 1, 100)),
-            covariance=float(imu.get(self.covariance)[0]),  # type: ignore[index,arg-type]
-            frame_id=imu.get(self.frame_id),
-            nanosec=imu.get(self.stamp),
-            data=fnv1a(sample.get(self.data)),  # type: ignore[arg-type]
+            covariance=float(imu.get(self.covariance)[0]),  # type: ignore[index]
+            frame_id=str(imu.get(self.frame_id)),
+            nanosec=int(imu.number(self.stamp)),
+            data=fnv1a(bytes(sample.get(self.data))),  # type: ignore[arg-type]
         )
 
     def frames(self, ctx: Context, sample: Sample) -> None:

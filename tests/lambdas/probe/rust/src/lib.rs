@@ -36,7 +36,7 @@ impl Lambda for Probe {
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         // Hashing is slow in Python: some of the pictures will do.
-        if sample.identity().seq % 40 != 0 {
+        if !sample.identity().seq.is_multiple_of(40) {
             return Ok(());
         }
         self.topics()?;

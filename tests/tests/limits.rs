@@ -1,0 +1,399 @@
+//! What a lambda may have at most, limit by limit: a greedy guest is stopped with the cause, and the host stays small.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use gleaner_host::api::Session;
+use gleaner_host::api::data::{
+    BYTES_PER_CALL, COLUMN_LEN, DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD, Topic, Wake,
+};
+use gleaner_host::guest::wasm::{Allowance, HANDLES, INIT_FUEL_FACTOR, Loaded, WasmGuest};
+use gleaner_host::guest::{Guest, Outcome};
+use gleaner_host::input::open_inputs;
+use gleaner_protocol::manifest::{ConfigValue, Manifest};
+use gleaner_protocol::{Fault, FaultKind};
+use gleaner_tests::drive::{Cdr, IMAGE, image};
+use gleaner_tests::{Folder, root};
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+const FUEL: u64 = 5_000_000;
+const MEMORY: u64 = 16 << 20;
+const PAGE: u64 = 64 << 10;
+const CAMERA: &str = "/camera/front/image_raw";
+/// Bytes of the pixels of each picture that wakes a guest.
+const PICTURE: u32 = 300_000;
+
+/// A guest, and the transport that feeds it.
+struct Room {
+    guest: WasmGuest,
+    session: Session,
+    transport: Loopback,
+    topic: Arc<Topic>,
+    sent: u64,
+}
+
+impl Room {
+    /// `greedy`, with its configuration.
+    fn greedy(behaviour: &str, bytes: u32) -> Self {
+        let component = root().join("tests/lambdas/greedy/rust/build/greedy.wasm");
+        assert!(component.is_file(), "greedy is not built; run: cargo xtask test");
+        let behaviour = ("behaviour".to_owned(), ConfigValue::Text(behaviour.to_owned()));
+        Self::new(&component, vec![behaviour, ("bytes".to_owned(), ConfigValue::Int(bytes.into()))])
+    }
+
+    /// A component written by hand, for what no compiler makes.
+    fn written(text: &str) -> Self {
+        let folder = Folder::new();
+        let component = wat::parse_str(text).unwrap_or_else(|error| panic!("{error}"));
+        Self::new(&folder.write("written.wasm", component), Vec::new())
+    }
+
+    fn new(component: &Path, config: Vec<(String, ConfigValue)>) -> Self {
+        let manifest = Manifest::load(root().join("tests/lambdas/greedy/rust")).unwrap();
+        let (transport, topic) = subscribed(&manifest, IMAGE);
+        let session = Session::new(vec![Arc::clone(&topic)], config);
+        let loaded = Loaded::open(component, &root().join("target/test-cache/gleaner")).unwrap();
+        let allowance = Allowance { fuel: FUEL, memory_bytes: MEMORY };
+        let guest = WasmGuest::new(loaded, session.clone(), allowance, None).unwrap();
+        Self { guest, session, transport, topic, sent: 0 }
+    }
+
+    fn wake(&mut self) -> Outcome {
+        self.sent += 1;
+        let cdr = image(400, 250, "rgb8", 1200, &[9; PICTURE as usize]);
+        publish(&mut self.transport, CAMERA, self.sent, &cdr);
+        self.session.begin(self.sent as i64);
+        self.guest.wake(Wake::Event(self.topic.newest().unwrap()))
+    }
+
+    fn fault(&mut self) -> Fault {
+        self.wake().result.expect_err("a fault")
+    }
+
+    /// Fuel of a wake that follows a first one, in which the guest still grows.
+    fn fuel(&mut self) -> u64 {
+        self.wake().result.unwrap();
+        let outcome = self.wake();
+        outcome.result.unwrap();
+        outcome.fuel.unwrap()
+    }
+}
+
+/// The one input of `manifest`, whose type has this definition, and the transport that feeds it.
+fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic>) {
+    let (mut transport, input) = (Loopback::new(), &manifest.inputs[0]);
+    transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
+    let topic = open_inputs(manifest, &[], &mut transport).unwrap().remove(0);
+    (transport, topic)
+}
+
+fn publish(transport: &mut Loopback, topic: &str, seq: u64, cdr: &[u8]) {
+    let (at_ns, writer, endian) = (seq as i64, Guid::default(), Endian::Little);
+    transport.publish(topic, &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian }, cdr).unwrap();
+}
+
+#[test]
+fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
+    for behaviour in ["topics", "fields"] {
+        let mut room = Room::greedy(behaviour, 0);
+        room.guest.init().unwrap();
+        let owners = Arc::strong_count(&room.topic);
+        let first = room.fault();
+        assert_eq!(first.kind, FaultKind::HostCall, "{behaviour}: {first:?}");
+        assert!(first.message.contains(&format!("{HANDLES} handles")), "{behaviour}: {}", first.message);
+        // What the guest held went with it, so the second one comes as far as the first.
+        assert!(Arc::strong_count(&room.topic) < owners, "{behaviour}");
+        assert_eq!(room.fault(), first, "{behaviour}");
+    }
+}
+
+#[test]
+fn an_endless_init_ends_with_the_fuel_of_so_many_wakes() {
+    let fault = Room::greedy("endless_init", 0).guest.init().unwrap_err();
+    let allowed = FUEL * INIT_FUEL_FACTOR;
+    assert_eq!((fault.kind, fault.allowed), (FaultKind::Fuel, Some(allowed)));
+    assert_eq!(fault.message, format!("in init: used {allowed} of {allowed} units of fuel"));
+}
+
+#[test]
+fn the_work_of_the_host_costs_fuel_by_the_byte() {
+    for behaviour in ["read_cdr", "read_frame"] {
+        let [some, more, most] = [50_000, 100_000, 200_000].map(|bytes| Room::greedy(behaviour, bytes).fuel());
+        // A unit for each eight bytes, and what the guest does itself does not depend on them.
+        let near = |fuel: u64, bytes: u64| fuel.abs_diff(bytes / 8) < 500;
+        assert!(near(more - some, 50_000) && near(most - more, 100_000), "{behaviour}: {some} {more} {most}");
+    }
+    let (luma, idle) = (Room::greedy("mean_luma", 0).fuel(), Room::greedy("ok", 0).fuel());
+    assert!(luma - idle >= u64::from(PICTURE) / 8, "{luma} and {idle}");
+}
+
+#[test]
+fn a_long_text_is_refused_by_its_length_and_paid_for() {
+    let mut room = Room::greedy("long_label", 100_000);
+    let outcome = room.wake();
+    let fault = outcome.result.unwrap_err();
+    assert_eq!(fault.kind, FaultKind::Exception);
+    assert!(fault.message.contains("the label has 100000 bytes"), "{}", fault.message);
+    assert!(outcome.fuel.unwrap() >= 100_000 / 8);
+}
+
+/// A component of this world, by hand. `parts` come before the module `lambda`, which has `body` and gets `with`.
+fn component(parts: &str, with: &str, body: &str) -> String {
+    format!(
+        r#"(component
+            (import "gleaner:lambda/data@0.1.0" (instance $data
+                (export "sample" (type $sample (sub resource)))
+                (type $a-tick (record (field "at-ns" s64) (field "missed" u64)))
+                (export "tick" (type $tick (eq $a-tick)))
+                (type $a-wake (variant (case "event" (own $sample)) (case "tick" $tick)))
+                (export "wake" (type (eq $a-wake)))))
+            (alias export $data "wake" (type $wake))
+            (type $a-value (variant (case "boolean" bool) (case "integer" s64) (case "real" f64) (case "text" string)))
+            (import "config-value" (type $value (eq $a-value)))
+            (type $an-entry (record (field "key" string) (field "value" $value)))
+            (import "config-entry" (type $entry (eq $an-entry)))
+            {parts}
+            (core module $lambda
+                {body}
+                (memory (export "memory") 1)
+                (func (export "realloc") (param i32 i32 i32 i32) (result i32) (i32.const 1024))
+                ;; An answer at 0 is one without an error, as long as nobody writes there.
+                (func (export "init") (param i32 i32) (result i32) (i32.const 0))
+                (func (export "on-wake") (param i32 i64 i64) (result i32) (call $wake) (i32.const 0)))
+            (core instance $lambda (instantiate $lambda {with}))
+            (alias core export $lambda "memory" (core memory $memory))
+            (alias core export $lambda "realloc" (core func $realloc))
+            (type $answer (result (error string)))
+            (func (export "init") (param "config" (list $entry)) (result $answer)
+                (canon lift (core func $lambda "init") (memory $memory) (realloc $realloc)))
+            (func (export "on-wake") (param "wake" $wake) (result $answer)
+                (canon lift (core func $lambda "on-wake") (memory $memory) (realloc $realloc))))"#
+    )
+}
+
+/// A component with two more memories or tables, each in a module of its own, that `$a` and `$b` grow.
+fn two_stores([a, b]: [&str; 2], wake: &str) -> String {
+    let parts = format!(
+        r#"(core module $a {a}) (core instance $a (instantiate $a))
+           (core module $b {b}) (core instance $b (instantiate $b))"#
+    );
+    let body = format!(
+        r#"(import "a" "grow" (func $a (param i32) (result i32)))
+           (import "b" "grow" (func $b (param i32) (result i32)))
+           (func $wake {wake})"#
+    );
+    component(&parts, r#"(with "a" (instance $a)) (with "b" (instance $b))"#, &body)
+}
+
+/// A store of `pages`, as in `1` or `1 2`.
+fn memory(pages: &str) -> String {
+    format!(r#"(memory {pages}) (func (export "grow") (param i32) (result i32) (memory.grow (local.get 0)))"#)
+}
+
+/// A store of elements, likewise.
+fn table(elements: &str) -> String {
+    let grow = "(param i32) (result i32) (table.grow (ref.null func) (local.get 0))";
+    format!(r#"(table {elements} funcref) (func (export "grow") {grow})"#)
+}
+
+/// What a growth answers must not, or must, be a refusal.
+const MUST: &str = "(if (i32.eq (i32.const -1)) (then (unreachable)))";
+const MUST_NOT: &str = "(if (i32.ne (i32.const -1)) (then (unreachable)))";
+
+#[test]
+fn the_memories_of_a_component_count_together() {
+    // 100 pages for each are within the cap of 256; 200 for the one and then for the other are not.
+    let grow = |pages| format!("(call $a (i32.const {pages})) {MUST} (call $b (i32.const {pages})) {MUST}");
+    let stores = [memory("1"), memory("1")];
+    let wake = |pages| Room::written(&two_stores(stores.each_ref().map(String::as_str), &grow(pages))).wake();
+    wake(100).result.unwrap();
+    let fault = wake(200).result.unwrap_err();
+    let asked = (200 + 200 + 3) * PAGE;
+    assert_eq!((fault.kind, fault.used, fault.allowed), (FaultKind::Memory, Some(asked), Some(MEMORY)));
+}
+
+#[test]
+fn a_component_that_starts_with_more_memory_than_it_may_have_does_not_start() {
+    let large = memory("200");
+    let fault = Room::written(&two_stores([&large, &large], "")).guest.init().unwrap_err();
+    assert_eq!((fault.kind, fault.used, fault.allowed), (FaultKind::Memory, Some(400 * PAGE), Some(MEMORY)));
+    assert!(fault.message.starts_with("in init: asked for 26214400 bytes"), "{}", fault.message);
+}
+
+#[test]
+fn memory_that_was_asked_for_and_not_given_is_not_counted() {
+    // Beyond its own maximum no memory grows, whatever the cap: 250 pages stay for the other one.
+    let wake = format!("(call $a (i32.const 200)) {MUST_NOT} (call $b (i32.const 250)) {MUST}");
+    Room::written(&two_stores([&memory("1 2"), &memory("1")], &wake)).wake().result.unwrap();
+}
+
+#[test]
+fn the_tables_of_a_component_count_together() {
+    let grow = |n| format!("(call $a (i32.const {n})) {MUST} (call $b (i32.const {n}))");
+    let wake = |wake: String| Room::written(&two_stores([&table("1"), &table("1")], &wake)).wake().result;
+    wake(grow(9000) + MUST).unwrap();
+    wake(grow(15_000) + MUST_NOT).unwrap();
+}
+
+#[test]
+fn elements_that_were_asked_for_and_not_given_are_not_counted() {
+    let wake = format!("(call $a (i32.const 15000)) {MUST_NOT} (call $b (i32.const 15000)) {MUST}");
+    Room::written(&two_stores([&table("1 2"), &table("1")], &wake)).wake().result.unwrap();
+}
+
+/// A component that at each wake does `first`, and then causes an event with 4,096 attributes whose keys are all the same:
+/// the second mebibyte of a memory that is zero.
+fn four_gibibytes(first: &str) -> String {
+    let parts = r#"
+        (import "gleaner:lambda/trigger@0.1.0" (instance $trigger
+            (type $a-value (variant (case "boolean" bool) (case "signed" s64) (case "real" f64) (case "text" string)))
+            (export "attribute-value" (type $value (eq $a-value)))
+            (type $an-attribute (record (field "key" string) (field "value" $value)))
+            (export "attribute" (type $attribute (eq $an-attribute)))
+            (type $an-error (variant (case "invalid" string) (case "too-many" string)))
+            (export "trigger-error" (type $error (eq $an-error)))
+            (export "event" (func (param "label" string) (param "score" f64) (param "attributes" (list $attribute))
+                (result (result (error $error)))))))
+        (core module $heap
+            (memory (export "memory") 32)
+            (func (export "realloc") (param i32 i32 i32 i32) (result i32) (i32.const 1024)))
+        (core instance $heap (instantiate $heap))
+        (alias core export $heap "memory" (core memory $heap-memory))
+        (alias core export $heap "realloc" (core func $heap-realloc))
+        (core func $event (canon lower (func $trigger "event") (memory $heap-memory) (realloc $heap-realloc)))
+        (core instance $host (export "event" (func $event)))"#;
+    let body = format!(
+        r#"(import "heap" "memory" (memory $heap 32))
+        (import "host" "event" (func $event (param i32 i32 f64 i32 i32 i32)))
+        (func $wake (local $at i32)
+            {first}
+            (local.set $at (i32.const 4096))
+            (loop $next
+                (i32.store $heap (local.get $at) (i32.const 0x100000))
+                (i32.store $heap offset=4 (local.get $at) (i32.const 0x100000))
+                (local.set $at (i32.add (local.get $at) (i32.const 24)))
+                (br_if $next (i32.lt_u (local.get $at) (i32.const 102400))))
+            (call $event (i32.const 0) (i32.const 1) (f64.const 0) (i32.const 4096) (i32.const 4096) (i32.const 16)))"#
+    );
+    component(parts, r#"(with "heap" (instance $heap)) (with "host" (instance $host))"#, &body)
+}
+
+#[test]
+fn one_mebibyte_named_four_thousand_times_never_becomes_four_gibibytes() {
+    let mut room = Room::written(&four_gibibytes(""));
+    room.guest.init().unwrap();
+    let before = peak_rss_bytes();
+    let fault = room.fault();
+    assert_eq!(fault.kind, FaultKind::HostCall);
+    assert!(fault.message.contains("too much data"), "{}", fault.message);
+    assert!(peak_rss_bytes() - before < 1 << 30);
+    assert_eq!(room.fault(), fault);
+}
+
+#[test]
+fn a_refusal_of_memory_that_a_guest_survives_is_not_the_cause_of_what_the_host_refuses_later() {
+    let refused = format!("(memory.grow $heap (i32.const 1000)) {MUST_NOT}");
+    let fault = Room::written(&four_gibibytes(&refused)).fault();
+    assert_eq!(fault.kind, FaultKind::HostCall, "{}", fault.message);
+}
+
+/// Most memory that this process has had. Other tests run in it too, and none has a gigabyte.
+fn peak_rss_bytes() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    line.trim().strip_suffix(" kB").unwrap().trim().parse::<u64>().unwrap() * 1024
+}
+
+/// An input without a guest, and so many of the same message in its ring. Of a type its name and definition are needed.
+fn topic((name, text): (&str, &str), depth: usize, max_size: &str, messages: u64, cdr: &[u8]) -> Arc<Topic> {
+    let manifest = format!(
+        "[lambda]\nname = \"many\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"many.wasm\"\n\
+         [schedule]\nevent = \"many\"\nbacklog = \"each\"\n\
+         [[input]]\nname = \"many\"\ntopic = \"/many\"\ntype = \"{name}\"\ndepth = {depth}\nmax_size = \"{max_size}\"\n"
+    );
+    let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
+    let (mut transport, topic) = subscribed(&manifest, text);
+    (1..=messages).for_each(|seq| publish(&mut transport, "/many", seq, cdr));
+    topic
+}
+
+/// A type with one field, `x`.
+fn only(definition: &str) -> (&str, &str) {
+    ("test_msgs/msg/Only", definition)
+}
+
+#[test]
+fn one_call_hands_out_the_newest_256_samples() {
+    let topic = topic(only("uint8 x\n"), 300, "16 B", 300, &[7]);
+    let newest: Vec<_> = (300 - SAMPLES_PER_CALL as u64 + 1..=300).collect();
+    for samples in [topic.last(usize::MAX), topic.since(0)] {
+        assert_eq!(samples.iter().map(|sample| sample.identity().seq).collect::<Vec<_>>(), newest);
+    }
+}
+
+#[test]
+fn a_column_has_the_newest_65_536_values() {
+    let sent = COLUMN_LEN as u64 + 100;
+    let topic = topic(only("uint8 x\n"), COLUMN_LEN, "16 B", sent, &[7]);
+    let field = topic.field("x").unwrap();
+    for column in [topic.column(&field, usize::MAX).unwrap(), topic.column_since(&field, 0).unwrap()] {
+        assert_eq!((column.values.len(), column.at_ns.len()), (COLUMN_LEN, COLUMN_LEN));
+        assert_eq!((column.at_ns[0], column.at_ns[COLUMN_LEN - 1]), (101, sent as i64));
+    }
+}
+
+#[test]
+fn one_call_hands_out_one_mebibyte_of_a_message() {
+    let bytes = vec![7; BYTES_PER_CALL + 1];
+    let topic = topic(only("uint8[] x\n"), 1, "2 MiB", 1, &Cdr::default().bytes(&bytes).done());
+    let sample = topic.newest().unwrap();
+    let size = sample.bytes().len() as u64;
+    assert_eq!(sample.cdr(0, u32::MAX).len(), BYTES_PER_CALL);
+    for (offset, left) in [(size - 3, 3), (size, 0), (size + 1, 0), (u64::MAX, 0)] {
+        assert_eq!(sample.cdr(offset, u32::MAX).len(), left);
+    }
+    refused(&sample.get(&topic.field("x").unwrap()), "has 1048577 items, one call hands out 1048576");
+}
+
+#[test]
+fn one_call_hands_out_one_mebibyte_of_a_frame() {
+    let cdr = image(700, 600, "rgb8", 2100, &vec![9; 1_260_000]);
+    let frame = topic(("sensor_msgs/msg/Image", IMAGE), 1, "2 MiB", 1, &cdr).newest().unwrap().as_frame().unwrap();
+    let size = 1_260_000;
+    assert_eq!(frame.read(0, u32::MAX).len(), BYTES_PER_CALL);
+    for (offset, left) in [(size - 3, 3), (size, 0), (u64::MAX, 0)] {
+        assert_eq!(frame.read(offset, u32::MAX).len(), left);
+    }
+}
+
+#[test]
+fn a_list_that_is_longer_than_one_call_hands_out_is_refused_and_not_cut() {
+    let texts = |n: usize| (0..n).fold(Cdr::default().u32(n as u32), |cdr, _| cdr.text("x")).done();
+    let numbers = |n: usize| [&(n as u32).to_le_bytes(), vec![0_u8; 2 * n].as_slice()].concat();
+    let get = |definition, cdr: &[u8]| {
+        let topic = topic(only(definition), 1, "1 MiB", 1, cdr);
+        let (field, sample) = (topic.field("x").unwrap(), topic.newest().unwrap());
+        sample.get(&field).map(drop)
+    };
+    get("string[] x\n", &texts(TEXTS_PER_FIELD)).unwrap();
+    refused(&get("string[] x\n", &texts(TEXTS_PER_FIELD + 1)), "has 4097 items, one call hands out 4096");
+    get("uint16[] x\n", &numbers(COLUMN_LEN)).unwrap();
+    refused(&get("uint16[] x\n", &numbers(COLUMN_LEN + 1)), "has 65537 items, one call hands out 65536");
+}
+
+#[test]
+fn a_path_is_not_read_if_it_is_too_long() {
+    let topic = topic(only("uint8 x\n"), 1, "16 B", 0, &[]);
+    let path = "x".repeat(PATH_BYTES + 1);
+    refused(&topic.field(&path), "has 1025 bytes; a path has 1024 at most");
+    assert!(matches!(topic.field(&path[1..]), Err(DataError::NoSuchField(_))));
+}
+
+fn refused<T>(answer: &Result<T, DataError>, why: &str) {
+    match answer {
+        Err(error @ DataError::WrongField { .. }) => assert!(error.to_string().contains(why), "{error}"),
+        Err(error) => panic!("{error}"),
+        Ok(_) => panic!("an answer"),
+    }
+}
