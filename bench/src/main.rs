@@ -18,7 +18,8 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let rounds = if Args::parse().quick { 2 } else { 9 };
+    let Args { quick } = Args::parse();
+    let rounds = if quick { 2 } else { 9 };
     if let Err(error) = measure::stay_on_one_core() {
         eprintln!("cannot stay on one core, figures are of all: {error}");
     }
@@ -41,10 +42,12 @@ fn main() -> ExitCode {
     figures.push(Figure::told("replay, 640x360 JPEG, every frame decoded, Python", "frames/s", &camera[1].1));
     figures.push(Figure::told("share of JPEG decoding in these", "%", &shares));
 
-    for kind in [Kind::Rust, Kind::Python] {
-        let growth = (0..rounds.min(3)).map(|_| setting.growth_from_2nd_to_10th(kind)).collect::<Vec<_>>();
-        let name = format!("memory after the 10th replay in one process against the 2nd, {kind}");
-        figures.push(Figure::at_most(&name, "%", 2.0, &growth));
+    for example in ["hello", "brake-dark"] {
+        for kind in [Kind::Rust, Kind::Python] {
+            let growth = (0..rounds.min(3)).map(|_| setting.growth_from_2nd_to_10th(example, kind));
+            let name = format!("memory after the 10th replay of {example} in one process against the 2nd, {kind}");
+            figures.push(Figure::at_most(&name, "%", 2.0, &growth.collect::<Vec<_>>()));
+        }
     }
     let arrays = (0..rounds.min(5)).flat_map(|_| setting.array_ns()).collect::<Vec<_>>();
     figures.push(Figure::at_most("slot to ndarray, 1920x1080 bgr8 (6.2 MB)", "ns", 1000.0, &arrays));
@@ -53,7 +56,8 @@ fn main() -> ExitCode {
     for figure in &figures {
         println!("{figure}");
     }
-    if figures.iter().all(Figure::is_met) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    // Two rounds on a busy machine say nothing about a promise.
+    if quick || figures.iter().all(Figure::is_met) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
 /// Runs `measure` for each kind in turn, `rounds` times, so that a change of the machine's mood meets all alike.

@@ -73,12 +73,12 @@ impl Setting {
         replay(lambda, std::slice::from_ref(&self.sample), args).must_exit(0).summary.clone().expect("a summary")
     }
 
-    /// By how many per cent memory after the 10th replay in one process exceeds that after the 2nd.
-    pub fn growth_from_2nd_to_10th(&self, kind: Kind) -> f64 {
+    /// By how many per cent memory after the 10th replay of `example` in one process exceeds that after the 2nd.
+    pub fn growth_from_2nd_to_10th(&self, example: &str, kind: Kind) -> f64 {
         let out = Folder::new();
         let output = Command::new(program("gleaner-runtime"))
             .arg("replay")
-            .arg(kind.folder("hello"))
+            .arg(kind.folder(example))
             .arg(&self.sample)
             .args(["--set", "brake_mps2=-1.4", "--repeat", "10", "--out"])
             .arg(out.path())
