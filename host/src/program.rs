@@ -65,7 +65,8 @@ fn replay_any(args: ReplayArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Replays with reports on what was standard output; whatever a lambda prints goes to standard error.
+/// Replays with reports on what was standard output. What a library writes there by itself goes to standard error; what a
+/// lambda prints is in its log.
 fn run(options: &Options, manifest: &Manifest, load: Load<'_>) -> Result<Exit, Failure> {
     let internal = |error: io::Error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error);
     let reports = io::stdout();

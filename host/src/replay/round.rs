@@ -86,6 +86,8 @@ pub(super) fn replay(
     };
     pass.keep_log()?;
     if let Err(fault) = initialised {
+        // What it said on the way may be why.
+        pass.output.flush()?;
         let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{name}`"));
         failure.causes = vec![fault.message];
         return Err(failure);
