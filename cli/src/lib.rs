@@ -9,6 +9,7 @@ mod build;
 mod listen;
 mod replay;
 pub mod results;
+mod say;
 mod show;
 
 use gleaner_protocol::{Exit, Failure};

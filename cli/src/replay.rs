@@ -4,6 +4,8 @@ use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, IsTerminal, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use gleaner_protocol::{Exit, Explain, Failure, Parts, Report, Summary, visible};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -11,6 +13,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use crate::args::ReplayArgs;
 use crate::listen::Listener;
 use crate::results::Decisions;
+use crate::say::say;
 use crate::show::{self, Digest, Paint};
 
 /// Why the runtime did not do what it was asked for, where it could not say so itself.
@@ -22,22 +25,24 @@ enum ReplayError {
     Read { source: io::Error },
     #[error("gleaner-runtime reports what this gleaner does not understand: {line}")]
     Report { line: String, source: serde_json::Error },
-    #[error("gleaner-runtime was killed by signal {signal}")]
-    Killed { signal: i32 },
-    #[error("gleaner-runtime ended with {status}, which is no exit code of Gleaner")]
+    #[error("the lambda's process ended without a result ({status})")]
+    NoResult { status: ExitStatus },
+    #[error("the lambda's process did not end well after its result ({status})")]
     Code { status: ExitStatus },
-    #[error("gleaner-runtime ended without a summary")]
-    NoSummary,
 }
 
 impl Explain for ReplayError {
     fn help(&self) -> Option<String> {
         match self {
             ReplayError::Report { .. } => Some("install gleaner and gleaner-runtime of one version".to_owned()),
-            ReplayError::Killed { signal: 9 } => {
+            ReplayError::NoResult { status } | ReplayError::Code { status } if signal_of(*status) == Some(9) => {
                 Some("the system kills the largest process when memory runs out; see `dmesg`".to_owned())
             }
-            _ => None,
+            ReplayError::NoResult { .. } | ReplayError::Code { .. } => Some(
+                "the lambda or a library that it uses may have ended the process, as `os._exit` does, or crashed it"
+                    .to_owned(),
+            ),
+            ReplayError::Start { .. } | ReplayError::Read { .. } => None,
         }
     }
 }
@@ -46,12 +51,15 @@ impl Explain for ReplayError {
 pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     let program = Parts::find()?.program("gleaner-runtime")?;
     let bar = progress_bar();
-    let mut child = start(&program, args, &bar)?;
+    let mut child = start(&program, args)?;
     // Both streams are heard on threads of their own: a lambda may leave processes behind that hold them open for ever.
+    let explained = Arc::new(AtomicBool::new(false));
     let says = child.stderr.take().map(|says| {
-        let bar = bar.clone();
-        // Nobody is left to tell if standard error is gone.
-        Listener::start(move || pass_on(says, |piece| drop(bar.suspend(|| io::stderr().write_all(piece)))))
+        let (bar, explained) = (bar.clone(), explained.clone());
+        // While a bar is drawn, what the runtime says has to be put above it. Nobody is left to tell if standard error
+        // is gone.
+        let show = move |piece: &[u8]| drop(bar.suspend(|| io::stderr().write_all(piece)));
+        Listener::start(move || pass_on(says, &explained, show))
     });
     let reports = child.stdout.take().map(|reports| {
         let bar = bar.clone();
@@ -68,25 +76,26 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     // The last it says is why it failed.
     says.and_then(Listener::rest);
     let summary = summary?;
-    let exit = exit_of(status)?;
-    match (&summary, exit) {
-        (Some(summary), _) => print(summary, args.json)?,
-        (None, Exit::Ok) => return Err(ReplayError::NoSummary.into()),
-        // It has said on standard error why.
-        (None, _) => {}
+    let exit = status.code().and_then(Exit::from_code);
+    match (summary, exit) {
+        (Some(summary), Some(exit)) => {
+            print(&summary, args.json)?;
+            Ok(exit)
+        }
+        (Some(_), None) => Err(ReplayError::Code { status }.into()),
+        // An exit code alone is not trusted: a lambda can end the process with any.
+        (None, Some(exit)) if exit != Exit::Ok && explained.load(Ordering::Relaxed) => Ok(exit),
+        (None, _) => Err(ReplayError::NoResult { status }.into()),
     }
-    Ok(exit)
 }
 
 /// The one place where `gleaner` starts the runtime.
-fn start(program: &Path, args: &ReplayArgs, bar: &ProgressBar) -> Result<Child, ReplayError> {
-    // While a bar is drawn, what the runtime says has to be put above it.
-    let says = if bar.is_hidden() { Stdio::inherit() } else { Stdio::piped() };
+fn start(program: &Path, args: &ReplayArgs) -> Result<Child, ReplayError> {
     Command::new(program)
         .args(arguments(args))
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
-        .stderr(says)
+        .stderr(Stdio::piped())
         .spawn()
         .map_err(|source| ReplayError::Start { program: program.to_owned(), source })
 }
@@ -134,13 +143,20 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Summary>, Repl
     Ok(None)
 }
 
-/// Gives lines to `show`. A line is cut into pieces rather than held whole, however long it is.
-fn pass_on(says: impl Read, mut show: impl FnMut(&[u8])) {
+/// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed. A line is cut into
+/// pieces rather than held whole, however long it is.
+fn pass_on(says: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
     const PIECE: u64 = 8192;
     let mut says = BufReader::new(says);
     let mut line = Vec::new();
+    let mut at_start = true;
     while matches!((&mut says).take(PIECE).read_until(b'\n', &mut line), Ok(1..)) {
+        // As a `Failure` begins; a lambda and its libraries write here too.
+        if at_start && line.starts_with(b"error: ") {
+            explained.store(true, Ordering::Relaxed);
+        }
         show(&line);
+        at_start = line.ends_with(b"\n");
         line.clear();
     }
 }
@@ -150,13 +166,6 @@ fn progress_bar() -> ProgressBar {
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
     let style = "{bar:30} {percent:>3} %  {human_pos} of {human_len} messages, {eta} left";
     bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
-}
-
-fn exit_of(status: ExitStatus) -> Result<Exit, ReplayError> {
-    if let Some(signal) = signal_of(status) {
-        return Err(ReplayError::Killed { signal });
-    }
-    status.code().and_then(Exit::from_code).ok_or(ReplayError::Code { status })
 }
 
 #[cfg(unix)]
@@ -176,9 +185,7 @@ fn print(summary: &Summary, json: bool) -> Result<(), Failure> {
         let digest = Digest::of(Decisions::open(&summary.out)?, summary.start_ns)?;
         show::summary(summary, &digest, Paint::new(io::stdout().is_terminal()))
     };
-    // Whoever reads this may have gone; the results are in files.
-    let _ = io::stdout().write_all(text.as_bytes());
-    Ok(())
+    say(&text)
 }
 
 #[cfg(test)]
@@ -205,21 +212,22 @@ mod tests {
     fn what_the_runtime_says_is_passed_on_line_by_line_and_to_the_end() {
         let long = "x".repeat(10_000);
         let mut shown = Vec::new();
-        pass_on(format!("one\n{long}\nno line end").as_bytes(), |piece| shown.push(piece.to_vec()));
+        let text = format!("one\n{long}\nno line end");
+        pass_on(text.as_bytes(), &AtomicBool::new(false), |piece| shown.push(piece.to_vec()));
         assert_eq!(shown[0], b"one\n");
-        assert_eq!(shown.concat(), format!("one\n{long}\nno line end").as_bytes());
+        assert_eq!(shown.concat(), text.as_bytes());
         assert!(shown.iter().all(|piece| piece.len() <= 8192));
     }
 
-    #[cfg(unix)]
     #[test]
-    fn a_runtime_that_was_killed_is_an_internal_failure_that_names_the_signal() {
-        use std::os::unix::process::ExitStatusExt;
-        let failure = Failure::from(exit_of(ExitStatus::from_raw(9)).unwrap_err());
-        assert_eq!(failure.exit, Exit::Internal);
-        assert_eq!(failure.message, "gleaner-runtime was killed by signal 9");
-        assert!(failure.help.is_some());
-        assert_eq!(exit_of(ExitStatus::from_raw(7 << 8)).unwrap(), Exit::DriveDamaged);
-        assert!(matches!(exit_of(ExitStatus::from_raw(101 << 8)), Err(ReplayError::Code { .. })));
+    fn only_a_line_that_begins_as_a_failure_explains_an_exit_code() {
+        let inside = format!("{}error: x", "y".repeat(8192));
+        for (text, expected) in
+            [("error: x", true), ("a\nerror: x\n", true), ("an error: x\n", false), (&inside, false), ("", false)]
+        {
+            let explained = AtomicBool::new(false);
+            pass_on(text.as_bytes(), &explained, |_| {});
+            assert_eq!(explained.into_inner(), expected);
+        }
     }
 }

@@ -100,6 +100,19 @@ pub fn seconds(at_ns: i64, start_ns: i64) -> f64 {
     at_ns.saturating_sub(start_ns) as f64 / 1e9
 }
 
+/// `count` with a comma between thousands.
+pub fn grouped(count: u64) -> String {
+    let digits = count.to_string();
+    let mut text = String::new();
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
 /// `value` as C's `printf("%.3g")` writes it: three significant digits, without zeros at the end, in scientific
 /// notation from 1000 on and below 0.0001.
 ///
@@ -155,6 +168,13 @@ mod tests {
             (f64::NEG_INFINITY, "-inf"),
         ] {
             assert_eq!(three_digits(value), text, "of {value:?}");
+        }
+    }
+
+    #[test]
+    fn thousands_are_grouped() {
+        for (count, text) in [(0, "0"), (999, "999"), (1000, "1,000"), (123_456, "123,456"), (1_234_567, "1,234,567")] {
+            assert_eq!(grouped(count), text);
         }
     }
 

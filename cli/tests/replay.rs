@@ -32,9 +32,14 @@ impl Installation {
         Installation(folder)
     }
 
-    fn replay(&self, arguments: &[&str]) -> Output {
+    fn command(&self, arguments: &[&str]) -> Command {
         let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
-        gleaner.args(["replay", "dir", "a.mcap"]).args(arguments).env("GLEANER_HOME", &self.0).output().unwrap()
+        gleaner.args(["replay", "dir", "a.mcap"]).args(arguments).env("GLEANER_HOME", &self.0);
+        gleaner
+    }
+
+    fn replay(&self, arguments: &[&str]) -> Output {
+        self.command(arguments).output().unwrap()
     }
 }
 
@@ -80,10 +85,14 @@ fn the_runtimes_exit_code_and_what_it_says_are_passed_on() {
 }
 
 #[test]
-fn a_runtime_that_is_killed_is_told_apart_from_one_that_fails() {
+fn a_runtime_that_is_killed_has_a_cause_of_its_own() {
     let output = Installation::new("killed", "kill -9 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(text(&output.stderr).starts_with("error: gleaner-runtime was killed by signal 9\n  help:  "));
+    let said = text(&output.stderr);
+    assert!(
+        said.starts_with("error: the lambda's process ended without a result (signal: 9 (SIGKILL))\n  help:  the ")
+    );
+    assert!(said.contains("dmesg"), "{said}");
 }
 
 /// What a lambda may leave running: it holds the stream of reports, notes if it lived to its end, and ends early once
@@ -102,8 +111,8 @@ fn what_a_lambda_leaves_running_does_not_hold_up_the_summary() {
 
 #[test]
 fn what_a_lambda_leaves_running_does_not_hold_up_a_failure() {
-    let installation = Installation::new("orphan-fails", &format!("{ORPHAN} exit 6"));
-    assert_eq!(installation.replay(&[]).status.code(), Some(6));
+    let installation = Installation::new("orphan-fails", &format!("{ORPHAN} echo error: no >&2; exit 5"));
+    assert_eq!(installation.replay(&[]).status.code(), Some(5));
     assert!(!installation.0.join("waited").exists());
 }
 
@@ -116,10 +125,35 @@ fn a_runtime_of_another_version_is_stopped() {
 }
 
 #[test]
-fn a_runtime_that_says_nothing_has_not_replayed() {
-    let output = Installation::new("nothing", "exit 0").replay(&[]);
+fn an_exit_code_that_nothing_explains_is_not_trusted() {
+    // As `os._exit` of a lambda ends the process, whatever the lambda wrote before.
+    for (code, said) in [(0, ""), (3, ""), (6, ""), (3, "warning: an error: is near\n"), (101, "error: x\n")] {
+        let test = format!("unexplained-{code}-{}", said.len());
+        let output = Installation::new(&test, &format!("printf '{said}' >&2; exit {code}")).replay(&[]);
+        assert_eq!(output.status.code(), Some(1));
+        let ended =
+            format!("error: the lambda's process ended without a result (exit status: {code})\n  help:  the lambda ");
+        assert!(text(&output.stderr).starts_with(&format!("{said}{ended}")), "{}", text(&output.stderr));
+    }
+}
+
+#[test]
+fn a_crash_names_its_signal() {
+    let output = Installation::new("crash", "kill -11 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(text(&output.stderr).contains("without a summary"));
+    assert!(text(&output.stderr).contains("without a result (signal: 11 (SIGSEGV)"), "{}", text(&output.stderr));
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn an_output_that_takes_nothing_is_a_failure() {
+    let installation = Installation::new("full", "cat report");
+    for arguments in [&[][..], &["--json"]] {
+        let full = fs::File::options().write(true).open("/dev/full").unwrap();
+        let output = installation.command(arguments).stdout(full).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        assert!(text(&output.stderr).starts_with("error: cannot write to standard output\n  cause: No space left"));
+    }
 }
 
 #[test]

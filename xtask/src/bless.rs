@@ -13,7 +13,7 @@ use crate::steps::Steps;
 /// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin. Twins that differ write nothing.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps)?;
+    setup::run(checkout, &mut steps, &["examples"])?;
     steps.begin(&format!("expected decisions on {DRIVE}"));
     for example in &EXAMPLES {
         let twins = example.replay(checkout)?;

@@ -8,6 +8,9 @@ use std::process::Command;
 
 use gleaner_protocol::{Exit, Failure};
 
+/// The folders with a folder for each lambda, which holds one for each of its twins.
+pub(crate) const FAMILIES: [&str; 3] = ["bench/lambdas", "examples", "tests/lambdas"];
+
 pub(crate) struct Checkout {
     root: PathBuf,
     target: PathBuf,
@@ -66,15 +69,15 @@ impl Checkout {
         self.command(&self.cargo)
     }
 
-    /// The folders of all lambdas, relative to the checkout: the twins of each example, test lambda and bench lambda.
-    pub(crate) fn lambdas(&self) -> Vec<PathBuf> {
+    /// The folders of the lambdas in `families`, relative to the checkout: all twins of each.
+    pub(crate) fn lambdas(&self, families: &[&str]) -> Vec<PathBuf> {
         let below = |folder: &PathBuf| {
             let entries = fs::read_dir(self.path(folder)).into_iter().flatten().filter_map(Result::ok);
             let folder = folder.clone();
             entries.map(move |entry| folder.join(entry.file_name())).collect::<Vec<_>>()
         };
-        let families = ["bench/lambdas", "examples", "tests/lambdas"].map(PathBuf::from);
-        let twins = families.iter().flat_map(below).flat_map(|lambda| below(&lambda));
+        let twins =
+            families.iter().map(PathBuf::from).flat_map(|family| below(&family)).flat_map(|lambda| below(&lambda));
         let mut lambdas: Vec<_> = twins.filter(|twin| self.path(twin).join("lambda.toml").is_file()).collect();
         lambdas.sort();
         lambdas

@@ -1,7 +1,9 @@
 //! `cargo xtask demo`: the main job, end to end.
 
-use gleaner_cli::results::seconds;
-use gleaner_protocol::{Exit, Failure};
+use std::collections::BTreeMap;
+
+use gleaner_cli::results::{grouped, seconds};
+use gleaner_protocol::{Decision, Exit, Failure, visible};
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Replayed, difference};
@@ -11,9 +13,9 @@ use crate::steps::Steps;
 /// Replays the sample drive through both twins of every example, and compares them.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps)?;
+    setup::run(checkout, &mut steps, &["examples"])?;
     steps.begin(&format!("replay of {DRIVE}"));
-    let mut rows = vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers at"].map(str::to_owned)];
+    let mut rows = vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
     let mut verdicts = Vec::new();
     let mut agree = true;
     for example in &EXAMPLES {
@@ -21,9 +23,10 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         rows.extend(twins.iter().map(|twin| row(example.name, twin)));
         let difference = difference(&twins);
         agree &= difference.is_none();
+        let settings: String = example.set.iter().map(|set| format!(" --set {set}")).collect();
         verdicts.push(match difference {
-            None => format!("{}: twins agree", example.name),
-            Some(what) => format!("{}: TWINS DIFFER: {what}", example.name),
+            None => format!("{} with{settings}: the Rust and the Python lambda decide the same", example.name),
+            Some(what) => format!("{} with{settings}: the Rust and the Python lambda DIFFER: {what}", example.name),
         });
     }
     println!("\n{}", table(&rows));
@@ -31,21 +34,34 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         println!("{verdict}");
     }
     println!("files: out/demo/EXAMPLE-KIND/ with decisions.jsonl, log.jsonl and summary.json");
+    let gleaner = checkout.program("gleaner");
+    let gleaner = gleaner.strip_prefix(checkout.path("")).unwrap_or(&gleaner).display();
+    println!("try next, with another limit: {gleaner} replay examples/hello/rust {DRIVE} --set brake_mps2=-1.2");
     Ok(if agree { Exit::Ok } else { Exit::Differs })
 }
 
 fn row(name: &str, Replayed { summary, decisions }: &Replayed) -> [String; 6] {
-    let triggering = decisions.iter().filter(|decision| !decision.triggers.is_empty());
-    let times: Vec<_> =
-        triggering.map(|decision| format!("{:.2} s", seconds(decision.at_ns, summary.start_ns))).collect();
     [
         name.to_owned(),
         summary.kind.as_str().to_owned(),
-        summary.wakes.to_string(),
-        format!("{:.0}", summary.wakes_per_s),
+        grouped(summary.wakes),
+        grouped(summary.wakes_per_s.round() as u64),
         format!("{:.1}", summary.peak_rss_bytes as f64 / (1024.0 * 1024.0)),
-        if times.is_empty() { "none".to_owned() } else { times.join(", ") },
+        triggers(decisions, summary.start_ns),
     ]
+}
+
+/// Each label once, with the times of its triggers in s: `hard-brake at 4.14, 10.80 s`.
+fn triggers(decisions: &[Decision], start_ns: i64) -> String {
+    let mut times: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    for decision in decisions {
+        for trigger in &decision.triggers {
+            let time = format!("{:.2}", seconds(decision.at_ns, start_ns));
+            times.entry(&trigger.label).or_default().push(time);
+        }
+    }
+    let labels = times.iter().map(|(label, times)| format!("{} at {} s", visible(label), times.join(", ")));
+    if times.is_empty() { "none".to_owned() } else { labels.collect::<Vec<_>>().join("; ") }
 }
 
 /// Columns as wide as their widest cell: words to the left, numbers to the right.
@@ -74,5 +90,19 @@ mod tests {
             "example  kind    wakes   w/s  MiB  at\n\
              a        python     10  9999  1.0  none\n"
         );
+    }
+
+    #[test]
+    fn each_label_stands_once_before_its_times() {
+        let decision = |at_ns: i64, label: &str| -> Decision {
+            let trigger = format!(r#"{{"kind":"event","label":"{label}","score":null,"attributes":{{}}}}"#);
+            let rest = r#""fault":null,"fuel":null,"run_ns":0"#;
+            let woken = r#""cause":"tick","input":null,"topic":null,"writer":null,"seq":null"#;
+            serde_json::from_str(&format!(r#"{{"at_ns":{at_ns},{woken},"triggers":[{trigger}],{rest}}}"#)).unwrap()
+        };
+        let decisions = [(5_136_000_000, "brake"), (6_000_000_000, "dark"), (11_801_000_000, "brake")];
+        let decisions = decisions.map(|(at_ns, label)| decision(at_ns, label));
+        assert_eq!(triggers(&decisions, 1_000_000_000), "brake at 4.14, 10.80 s; dark at 5.00 s");
+        assert_eq!(triggers(&[], 0), "none");
     }
 }

@@ -14,7 +14,7 @@ pub(crate) const DRIVE: &str = "examples/data/highway_drive.mcap";
 /// An example, with the values that suit the sample drive: its braking is gentle.
 pub(crate) struct Example {
     pub(crate) name: &'static str,
-    set: &'static [&'static str],
+    pub(crate) set: &'static [&'static str],
 }
 
 pub(crate) const EXAMPLES: [Example; 2] = [

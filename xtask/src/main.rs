@@ -18,7 +18,7 @@ use std::process::ExitCode;
 
 use gleaner_protocol::{Exit, Failure};
 
-use checkout::Checkout;
+use checkout::{Checkout, FAMILIES};
 use steps::Steps;
 
 const USAGE: &str = "usage: cargo xtask COMMAND
@@ -52,14 +52,14 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "bench" => bench(&checkout, rest),
-        "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS)).map(|()| Exit::Ok),
+        "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS), &FAMILIES).map(|()| Exit::Ok),
         _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
     }
 }
 
 fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps)?;
+    setup::run(checkout, &mut steps, &FAMILIES)?;
     steps.begin("measurements");
     let mut bench = checkout.command(checkout.program("gleaner-bench"));
     bench.args(arguments);

@@ -13,16 +13,16 @@ pub(crate) const STEPS: usize = 4;
 
 const TARGET: &str = "wasm32-wasip2";
 
-/// Sets up: the wasm target, `.venv`, all programs, all lambdas.
-pub(crate) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<(), Failure> {
+/// Sets up: the wasm target, `.venv`, all programs, the lambdas in `families`.
+pub(crate) fn run(checkout: &Checkout, steps: &mut Steps, families: &[&str]) -> Result<(), Failure> {
     steps.begin(&format!("compilation target {TARGET}"));
     target(checkout)?;
     steps.begin("Python environment .venv with numpy and mypy");
     venv::set_up(checkout)?;
     steps.begin("programs (the first time this takes minutes)");
     programs(checkout)?;
-    steps.begin("lambdas of examples, tests and benches");
-    lambdas(checkout)
+    steps.begin(&format!("lambdas in {}", families.join(", ")));
+    lambdas(checkout, families)
 }
 
 fn target(checkout: &Checkout) -> Result<(), Failure> {
@@ -49,8 +49,8 @@ fn programs(checkout: &Checkout) -> Result<(), Failure> {
     steps::run(&mut build, "if a linker or a C compiler is missing, install one (`cc`); else see the first error above")
 }
 
-fn lambdas(checkout: &Checkout) -> Result<(), Failure> {
-    for lambda in checkout.lambdas() {
+fn lambdas(checkout: &Checkout, families: &[&str]) -> Result<(), Failure> {
+    for lambda in checkout.lambdas(families) {
         let mut build = checkout.command(checkout.program("gleaner"));
         build.arg("build").arg(&lambda);
         steps::run(&mut build, "see the error above")?;

@@ -9,7 +9,6 @@ mod error;
 mod folder;
 
 use std::fs::File;
-use std::io::{self, Write};
 use std::path::Path;
 use std::time::SystemTime;
 
@@ -18,6 +17,8 @@ use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, Sources};
 
 use error::BuildError;
 use folder::{Built, Partial};
+
+use crate::say::say;
 
 /// Builds the lambda in `dir` and says so.
 pub(crate) fn run(dir: &Path) -> Result<Exit, Failure> {
@@ -29,8 +30,7 @@ pub(crate) fn run(dir: &Path) -> Result<Exit, Failure> {
     })?;
     let (path, files, kb) = (BuildDir::of(dir), built.files, built.bytes.div_ceil(1000));
     let files = if files == 1 { "1 file".to_owned() } else { format!("{files} files") };
-    // Whoever reads this may have gone; the build is there.
-    let _ = writeln!(io::stdout(), "built {} ({files}, {kb} kB)", path.path().display());
+    say(&format!("built {} ({files}, {kb} kB)\n", path.path().display()))?;
     Ok(Exit::Ok)
 }
 

@@ -2,26 +2,33 @@
 
 use std::fmt::{self, Write};
 
-use gleaner_protocol::{Decision, Fault, FaultKind, Summary, TopicReport, visible};
+use gleaner_protocol::{Decision, Fault, FaultKind, Summary, TopicReport, Trigger, visible};
 
-use crate::results::{ResultsError, score, seconds};
+use crate::results::{ResultsError, grouped, seconds, three_digits};
 
-/// As many triggers, and as many causes of faults, are shown; the rest is counted.
+/// As many bursts of triggers, and as many causes of faults, are shown; the rest is counted.
 const SHOWN: usize = 20;
+
+/// Triggers of one label that are less than this apart are one burst: most lambdas see an event in several samples.
+const BURST_GAP_S: f64 = 1.0;
 
 /// The part of the decisions that is shown. It stays small, however many decisions there are.
 #[derive(Debug, Default)]
 pub(crate) struct Digest {
-    triggers: Vec<Shown>,
+    triggers: Vec<Burst>,
+    other_triggers: u64,
     causes: Vec<Cause>,
     other_faults: u64,
 }
 
+/// Triggers of one label that follow each other at once, with no other in between.
 #[derive(Debug)]
-struct Shown {
-    seconds: f64,
+struct Burst {
     label: String,
-    score: String,
+    count: u64,
+    first_seconds: f64,
+    last_seconds: f64,
+    highest_score: Option<f64>,
 }
 
 /// Faults with one cause.
@@ -43,17 +50,38 @@ impl Digest {
         for decision in decisions {
             let decision = decision?;
             let seconds = seconds(decision.at_ns, start_ns);
-            let room = SHOWN - digest.triggers.len();
-            digest.triggers.extend(decision.triggers.iter().take(room).map(|trigger| Shown {
-                seconds,
-                label: visible(&trigger.label),
-                score: score(trigger),
-            }));
+            for trigger in &decision.triggers {
+                digest.add(trigger, seconds);
+            }
             if let Some(fault) = decision.fault {
                 digest.count(&fault, seconds);
             }
         }
         Ok(digest)
+    }
+
+    fn add(&mut self, trigger: &Trigger, seconds: f64) {
+        if self.other_triggers > 0 {
+            self.other_triggers += 1;
+            return;
+        }
+        let label = visible(&trigger.label);
+        let full = self.triggers.len() == SHOWN;
+        match self.triggers.last_mut() {
+            Some(burst) if burst.label == label && seconds - burst.last_seconds < BURST_GAP_S => {
+                burst.count += 1;
+                burst.last_seconds = seconds;
+                burst.highest_score = burst.highest_score.into_iter().chain(trigger.score).reduce(f64::max);
+            }
+            _ if full => self.other_triggers = 1,
+            _ => self.triggers.push(Burst {
+                label,
+                count: 1,
+                first_seconds: seconds,
+                last_seconds: seconds,
+                highest_score: trigger.score,
+            }),
+        }
     }
 
     fn count(&mut self, fault: &Fault, first_seconds: f64) {
@@ -64,6 +92,23 @@ impl Digest {
             self.causes.push(Cause { kind, message, count: 1, first_seconds });
         } else {
             self.other_faults += 1;
+        }
+    }
+}
+
+impl Burst {
+    fn time(&self) -> String {
+        let [first, last] = [self.first_seconds, self.last_seconds].map(|seconds| format!("{seconds:.3}"));
+        if first == last { format!("{first:>10} s") } else { format!("{first:>10} to {last} s") }
+    }
+
+    /// The score of a single trigger; how many they are, and the highest of their scores.
+    fn size(&self) -> String {
+        let score = self.highest_score.map(three_digits);
+        match (self.count, score) {
+            (1, score) => score.unwrap_or("-".to_owned()),
+            (count, None) => format!("{}x", grouped(count)),
+            (count, Some(score)) => format!("{}x, {score} at most", grouped(count)),
         }
     }
 }
@@ -96,11 +141,10 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: P
         counted(summary.wakes, "wake"),
     )?;
 
-    for shown in &digest.triggers {
-        let time = format!("{:>10.3} s", shown.seconds);
-        writeln!(text, "{}  {}  {}", paint.green(&time), shown.label, shown.score)?;
+    for burst in &digest.triggers {
+        writeln!(text, "{}  {}  {}", paint.green(&burst.time()), burst.label, burst.size())?;
     }
-    more(text, summary.triggers.saturating_sub(digest.triggers.len() as u64))?;
+    more(text, digest.other_triggers)?;
 
     if summary.faults > 0 {
         writeln!(text, "  {}", paint.red(&counted(summary.faults, "fault")))?;
@@ -177,19 +221,6 @@ fn word(kind: FaultKind) -> String {
 /// `1 wake`, `2,000 wakes`.
 fn counted(count: u64, thing: &str) -> String {
     format!("{} {thing}{}", grouped(count), if count == 1 { "" } else { "s" })
-}
-
-/// `count` with a comma between thousands.
-fn grouped(count: u64) -> String {
-    let digits = count.to_string();
-    let mut text = String::new();
-    for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
 }
 
 fn mib(bytes: u64) -> f64 {

@@ -1,5 +1,5 @@
 use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Cause as Woken, Trigger, TriggerKind};
+use gleaner_protocol::{Cause as Woken, TriggerKind};
 
 use super::*;
 
@@ -81,10 +81,48 @@ fn a_summary_says_what_was_found_when_how_fast_and_where_the_files_are() {
 
 #[test]
 fn of_many_triggers_twenty_are_shown_and_the_others_counted() {
-    let digest = digest((0..1500).map(|n| decision(n, Some("x"), None)).collect());
+    let digest = digest((0..1500).map(|n| decision(1000 * n, Some("x"), None)).collect());
     let text = summary(&Summary { triggers: 1500, ..replay() }, &digest, PLAIN);
     assert_eq!(text.matches(" s  x  1.46\n").count(), 20);
     assert!(text.contains("              and 1,480 more\n"), "{text}");
+}
+
+#[test]
+fn triggers_of_one_label_less_than_a_second_apart_are_one_line() {
+    let mut decisions: Vec<_> = (0..1500).map(|n| decision(4000 + n, Some("dip"), None)).collect();
+    decisions[7].triggers[0].score = Some(2.0);
+    decisions[8].triggers[0].score = None;
+    decisions.push(decision(5600, Some("brake"), None));
+    decisions.push(decision(5700, Some("dip"), None));
+    decisions.push(decision(6700, Some("dip"), None));
+    let mut twice = decision(9000, Some("turn"), None);
+    twice.triggers[0].score = None;
+    twice.triggers.extend_from_within(..);
+    decisions.push(twice);
+    let text = summary(&Summary { triggers: 1505, ..replay() }, &digest(decisions), PLAIN);
+    let lines: Vec<_> = text.lines().skip(1).take(5).collect();
+    assert_eq!(
+        lines,
+        [
+            "     4.000 to 5.499 s  dip  1,500x, 2 at most",
+            "     5.600 s  brake  1.46",
+            "     5.700 s  dip  1.46",
+            "     6.700 s  dip  1.46",
+            "     9.000 s  turn  2x",
+        ]
+    );
+    assert!(!text.contains("more"), "{text}");
+}
+
+#[test]
+fn where_a_panic_was_and_what_it_said_are_both_shown() {
+    let message = "panicked at src/lib.rs:17:9: ouch\nerror while executing at wasm backtrace:\n    0: 0x1";
+    let text = summary(
+        &Summary { faults: 1, ..replay() },
+        &digest(vec![decision(0, None, Some((FaultKind::Trap, message)))]),
+        PLAIN,
+    );
+    assert!(text.contains("1x trap: panicked at src/lib.rs:17:9: ouch\n"), "{text}");
 }
 
 #[test]
@@ -148,11 +186,4 @@ fn colours_come_only_where_they_are_wanted() {
     assert_eq!(Paint { on: true }.red("x"), "\u{1b}[31mx\u{1b}[0m");
     assert_eq!(PLAIN.red("x"), "x");
     assert!(!Paint::new(false).on);
-}
-
-#[test]
-fn thousands_are_grouped() {
-    for (count, text) in [(0, "0"), (999, "999"), (1000, "1,000"), (123_456, "123,456"), (1_234_567, "1,234,567")] {
-        assert_eq!(grouped(count), text);
-    }
 }

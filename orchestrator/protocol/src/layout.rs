@@ -8,6 +8,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use crate::words::shell_word;
 use crate::{Exit, Explain, Manifest, ManifestError, Sources};
 
 /// `DIR/build/` of one lambda.
@@ -29,15 +30,16 @@ impl BuildDir {
     ///
     /// # Errors
     ///
-    /// [`LayoutError::Missing`], [`LayoutError::Older`], [`LayoutError::Manifest`] if the build's manifest is refused, or
-    /// [`LayoutError::Read`] if a folder cannot be listed.
+    /// [`LayoutError::NoFolder`], [`LayoutError::File`] or [`LayoutError::IsBuild`] if `lambda_dir` is no lambda's
+    /// folder, [`LayoutError::Missing`], [`LayoutError::Older`], [`LayoutError::Manifest`] if the build's manifest is
+    /// refused, or [`LayoutError::Read`] if a folder cannot be listed.
     pub fn check_fresh(lambda_dir: impl AsRef<Path>) -> Result<BuildDir, LayoutError> {
         let dir = lambda_dir.as_ref();
         let build = BuildDir::of(dir);
         let built = match modified(&build.manifest_path()) {
             Ok(time) => time,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                return Err(LayoutError::Missing { dir: dir.to_owned() });
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+                return Err(missing(dir));
             }
             Err(source) => {
                 return Err(LayoutError::Read { path: build.manifest_path(), source });
@@ -77,6 +79,26 @@ impl BuildDir {
 /// Why a build folder cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum LayoutError {
+    /// What should be a lambda's folder is not there.
+    #[error("there is no folder `{}`", dir.display())]
+    NoFolder {
+        /// The folder.
+        dir: PathBuf,
+    },
+    /// What should be a lambda's folder is a file.
+    #[error("`{}` is no folder", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+    },
+    /// What should be a lambda's folder is the build in it.
+    #[error("`{}` is the build folder of a lambda", build.display())]
+    IsBuild {
+        /// The build folder.
+        build: PathBuf,
+        /// The lambda's folder.
+        dir: PathBuf,
+    },
     /// There is none.
     #[error("lambda `{}` is not built", dir.display())]
     Missing {
@@ -107,8 +129,12 @@ pub enum LayoutError {
 impl Explain for LayoutError {
     fn help(&self) -> Option<String> {
         match self {
+            LayoutError::NoFolder { .. } | LayoutError::File { .. } => {
+                Some("name the lambda's folder; it comes before the drives".to_owned())
+            }
+            LayoutError::IsBuild { dir, .. } => Some(format!("did you mean `{}`?", dir.display())),
             LayoutError::Missing { dir } | LayoutError::Older { dir, .. } => {
-                Some(format!("run `gleaner build {}`", dir.display()))
+                Some(format!("run `gleaner build {}`", shell_word(dir)))
             }
             LayoutError::Manifest(error) => error.help(),
             LayoutError::Read { .. } => None,
@@ -118,6 +144,24 @@ impl Explain for LayoutError {
     fn exit(&self) -> Exit {
         Exit::Usage
     }
+}
+
+/// Why there is no build in `dir`.
+fn missing(dir: &Path) -> LayoutError {
+    if dir.is_file() {
+        return LayoutError::File { path: dir.to_owned() };
+    }
+    if !dir.is_dir() {
+        return LayoutError::NoFolder { dir: dir.to_owned() };
+    }
+    let named_build = dir.file_name().is_some_and(|name| name == "build");
+    if let Some(parent) = dir.parent().filter(|_| named_build) {
+        let parent = if parent.as_os_str().is_empty() { Path::new(".") } else { parent };
+        if [dir, parent].iter().all(|folder| folder.join("lambda.toml").is_file()) {
+            return LayoutError::IsBuild { build: dir.to_owned(), dir: parent.to_owned() };
+        }
+    }
+    LayoutError::Missing { dir: dir.to_owned() }
 }
 
 fn modified(file: &Path) -> io::Result<SystemTime> {
@@ -180,6 +224,28 @@ mod tests {
         assert_eq!(error.to_string(), format!("lambda `{}` is not built", dir.root().display()));
         assert_eq!(error.help(), Some(format!("run `gleaner build {}`", dir.root().display())));
         assert_eq!(error.exit(), Exit::Usage);
+    }
+
+    #[test]
+    fn what_is_no_lambdas_folder_is_told_apart_from_one_that_is_not_built() {
+        let dir = lambda("wasm", &["lambda.toml", "build/lambda.toml"]);
+        let root = dir.root().display();
+        let folder_first = "name the lambda's folder; it comes before the drives".to_owned();
+        for (name, message, help) in [
+            ("nowhere", format!("there is no folder `{root}/nowhere`"), folder_first.clone()),
+            ("lambda.toml", format!("`{root}/lambda.toml` is no folder"), folder_first),
+            ("build", format!("`{root}/build` is the build folder of a lambda"), format!("did you mean `{root}`?")),
+        ] {
+            let error = BuildDir::check_fresh(dir.path(name)).unwrap_err();
+            assert_eq!((error.to_string(), error.help()), (message, Some(help)));
+            assert_eq!(error.exit(), Exit::Usage);
+        }
+    }
+
+    #[test]
+    fn a_folder_with_a_space_is_quoted_in_the_command_that_is_suggested() {
+        let help = LayoutError::Missing { dir: "my lambda".into() }.help();
+        assert_eq!(help.as_deref(), Some("run `gleaner build 'my lambda'`"));
     }
 
     #[test]

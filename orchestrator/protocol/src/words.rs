@@ -1,5 +1,7 @@
 //! Words in messages: lists of them, the nearest to a misspelt one, and foreign text made fit to print.
 
+use std::path::Path;
+
 /// The one of `known` that `word` was most likely meant to be.
 pub(crate) fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     // The distance takes time in proportion to both lengths, and nobody misspells a key with a page of text.
@@ -30,6 +32,16 @@ pub(crate) fn excerpt(text: &str) -> String {
     match text.char_indices().nth(SHOWN) {
         Some((end, _)) => visible(&text[..end]) + "…",
         None => visible(text),
+    }
+}
+
+/// `path` as a word of a shell command: quoted where a shell would take it apart.
+pub(crate) fn shell_word(path: &Path) -> String {
+    let text = path.to_string_lossy();
+    let plain = |character: char| character.is_alphanumeric() || "/._-+=:,@%".contains(character);
+    match !text.is_empty() && text.chars().all(plain) {
+        true => text.into_owned(),
+        false => format!("'{}'", text.replace('\'', r"'\''")),
     }
 }
 
@@ -65,6 +77,21 @@ mod tests {
         assert_eq!(list(&["a"], "and"), "`a`");
         assert_eq!(list(&["a", "b"], "or"), "`a` or `b`");
         assert_eq!(list(&["a", "b", "c"], "and"), "`a`, `b` and `c`");
+    }
+
+    #[test]
+    fn a_path_that_a_shell_would_take_apart_is_quoted() {
+        for (path, word) in [
+            ("examples/hello/rust-2", "examples/hello/rust-2"),
+            ("föhr/a", "föhr/a"),
+            ("my lambda", "'my lambda'"),
+            ("it's", r"'it'\''s'"),
+            ("a;b", "'a;b'"),
+            ("~", "'~'"),
+            ("", "''"),
+        ] {
+            assert_eq!(shell_word(Path::new(path)), word);
+        }
     }
 
     #[test]

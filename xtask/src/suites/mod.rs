@@ -13,7 +13,7 @@ use std::time::Instant;
 
 use gleaner_protocol::{Exit, Failure};
 
-use crate::checkout::Checkout;
+use crate::checkout::{Checkout, FAMILIES};
 use crate::setup;
 use crate::steps::{Steps, succeeds};
 use tally::{Speech, Tally};
@@ -33,7 +33,7 @@ enum How {
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let suites = suites(checkout);
     let mut steps = Steps::of(setup::STEPS + suites.len());
-    setup::run(checkout, &mut steps)?;
+    setup::run(checkout, &mut steps, &FAMILIES)?;
     let mut total = Tally::new(Speech::None);
     let mut table = format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
     for suite in suites {
@@ -90,7 +90,7 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
 
 /// What mypy checks, relative to the checkout: the SDK, and each lambda by itself, as all are called `main`.
 fn typed(checkout: &Checkout) -> Vec<PathBuf> {
-    let mains = checkout.lambdas().into_iter().map(|lambda| lambda.join("main.py"));
+    let mains = checkout.lambdas(&FAMILIES).into_iter().map(|lambda| lambda.join("main.py"));
     let mains = mains.filter(|main| checkout.path(main).is_file());
     [PathBuf::from("guest-sdk-python/gleaner")].into_iter().chain(mains).collect()
 }

@@ -21,6 +21,18 @@ pub enum PartsError {
         /// Why not.
         source: io::Error,
     },
+    /// The folder that the user wants is no installation.
+    #[error("GLEANER_HOME is `{}`, where nothing of Gleaner lies", home.display())]
+    Home {
+        /// The folder.
+        home: PathBuf,
+    },
+    /// The interpreter that the user wants will not do.
+    #[error("GLEANER_PYTHON is `{}`, which cannot be used: {}", wanted.at.display(), wanted.why)]
+    WantedPython {
+        /// The interpreter, and why not.
+        wanted: Looked,
+    },
     /// A part is in none of its places.
     #[error("cannot find {part}; looked in{}", lines(folders.iter().map(|folder| folder.display().to_string())))]
     Missing {
@@ -49,6 +61,10 @@ impl Explain for PartsError {
     fn help(&self) -> Option<String> {
         match self {
             PartsError::NoExecutable { .. } => None,
+            PartsError::Home { .. } => Some("set GLEANER_HOME to the folder of the installation, or unset it".to_owned()),
+            PartsError::WantedPython { .. } => Some(
+                "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip, or unset it".to_owned(),
+            ),
             PartsError::Missing { made_by, .. } => {
                 Some(format!("in a checkout run `{made_by}`, else set GLEANER_HOME to the folder of the installation"))
             }
@@ -61,7 +77,10 @@ impl Explain for PartsError {
     }
 
     fn exit(&self) -> Exit {
-        Exit::Internal
+        match self {
+            PartsError::Home { .. } | PartsError::WantedPython { .. } => Exit::Usage,
+            _ => Exit::Internal,
+        }
     }
 }
 

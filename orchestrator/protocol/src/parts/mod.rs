@@ -27,12 +27,17 @@ impl Parts {
     ///
     /// # Errors
     ///
-    /// [`PartsError::NoExecutable`] if the system does not tell where the running program lies.
+    /// [`PartsError::NoExecutable`] if the system does not tell where the running program lies, [`PartsError::Home`] if
+    /// there is no part at all in `GLEANER_HOME`.
     pub fn find() -> Result<Parts, PartsError> {
         let exe = env::current_exe().map_err(|source| PartsError::NoExecutable { source })?;
         // Absolute, since what is found may be used by a program with another working folder.
         let home = variable("GLEANER_HOME").map(|home| path::absolute(&home).unwrap_or(home));
-        Ok(Parts::around(&exe, home, variable("GLEANER_PYTHON")))
+        match home {
+            // Else other parts than the wanted ones would be taken, and nobody told.
+            Some(home) if !places::has_parts(&home) => Err(PartsError::Home { home }),
+            home => Ok(Parts::around(&exe, home, variable("GLEANER_PYTHON"))),
+        }
     }
 
     fn around(exe: &Path, home: Option<PathBuf>, wanted_python: Option<PathBuf>) -> Parts {
@@ -75,18 +80,21 @@ impl Parts {
         })
     }
 
-    /// The Python interpreter for the lambda in `lambda_dir`, as an absolute path: the first that runs, is 3.9 or
-    /// newer and has `venv` and `ensurepip`, of `GLEANER_PYTHON`, `lambda_dir/.venv`, the checkout's `.venv`, and
-    /// `python3`, `python3.13` … `python3.9` of `PATH`.
+    /// The Python interpreter for the lambda in `lambda_dir`, as an absolute path: it runs, is 3.9 or newer and has
+    /// `venv` and `ensurepip`. That is `GLEANER_PYTHON` if it is set, else the first such of `lambda_dir/.venv`, the
+    /// checkout's `.venv`, and `python3`, `python3.13` … `python3.9` of `PATH`.
     ///
     /// Each candidate is started once: a program that can be found may still not run.
     ///
     /// # Errors
     ///
-    /// [`PartsError::NoPython`] with every candidate and why it was refused.
+    /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` will not do, [`PartsError::NoPython`] with every candidate and
+    /// why it was refused.
     pub fn python(&self, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
-        let checkout = self.places.checkout();
-        python::first_that_runs(python::candidates(self.wanted_python.as_deref(), lambda_dir, checkout))
+        match &self.wanted_python {
+            Some(wanted) => python::wanted(wanted),
+            None => python::first_that_runs(python::candidates(lambda_dir, self.places.checkout())),
+        }
     }
 }
 

@@ -56,6 +56,14 @@ impl Places {
     }
 }
 
+/// There is something of Gleaner in `home`, or in `lib/gleaner` of it.
+pub(super) fn has_parts(home: &Path) -> bool {
+    let parts = ["gleaner-runtime", "lib_gleaner.so", "start.py"];
+    [home.join("lib/gleaner"), home.to_owned()]
+        .iter()
+        .any(|folder| parts.iter().any(|part| folder.join(part).is_file()))
+}
+
 /// The cargo target folder around `folder`, known by the tag that cargo leaves in it. Programs are at most
 /// `target/<triple>/<profile>/deps` deep.
 fn cargo_target(folder: &Path) -> Option<&Path> {

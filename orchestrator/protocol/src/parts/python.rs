@@ -8,10 +8,15 @@ use crate::words::excerpt;
 /// choose again at every start. Fails where the system's Python comes in pieces and lacks the two modules.
 const PROBE: &str = "import sys, venv, ensurepip; print(*sys.version_info[:2]); print(sys.executable)";
 
+/// The interpreter that the user wants: if it will not do, another would hide that.
+pub(super) fn wanted(python: &Path) -> Result<PathBuf, PartsError> {
+    probe(python).map_err(|why| PartsError::WantedPython { wanted: Looked { at: python.to_owned(), why } })
+}
+
 /// The interpreters to try, in order. Those with a folder are paths, the others are searched for in `PATH`.
-pub(super) fn candidates(wanted: Option<&Path>, lambda_dir: Option<&Path>, checkout: Option<&Path>) -> Vec<PathBuf> {
-    let mut candidates: Vec<PathBuf> = wanted.map(Path::to_owned).into_iter().collect();
-    candidates.extend([lambda_dir, checkout].into_iter().flatten().map(|dir| dir.join(".venv/bin/python3")));
+pub(super) fn candidates(lambda_dir: Option<&Path>, checkout: Option<&Path>) -> Vec<PathBuf> {
+    let folders = [lambda_dir, checkout].into_iter().flatten();
+    let mut candidates: Vec<PathBuf> = folders.map(|dir| dir.join(".venv/bin/python3")).collect();
     candidates.push("python3".into());
     candidates.extend((9..=13).rev().map(|minor| PathBuf::from(format!("python3.{minor}"))));
     candidates

@@ -135,8 +135,37 @@ fn the_python_that_the_user_wants_comes_before_those_of_lambda_and_checkout() {
 }
 
 #[test]
+fn a_wanted_python_that_will_not_do_is_refused_and_no_other_taken() {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let dir = checkout();
+    python(&dir, ".venv/bin/python3", "3 12");
+    let old = python(&dir, "old", "3 8");
+    for (wanted, why) in [(dir.path("nope"), "not found"), (old, "is Python 3.8")] {
+        let parts = Parts::around(&dir.path("target/release/gleaner"), None, Some(wanted.clone()));
+        let error = parts.python(None).unwrap_err();
+        let message = format!("GLEANER_PYTHON is `{}`, which cannot be used: {why}", wanted.display());
+        assert_eq!(error.to_string(), message);
+        assert_eq!(error.exit(), Exit::Usage);
+    }
+}
+
+#[test]
+fn a_folder_with_any_part_will_do_as_home_and_another_will_not() {
+    let (installed, dir) = (installation(), checkout());
+    for home in [installed.root(), &installed.path("lib/gleaner"), &dir.path("guest-sdk-python")] {
+        assert!(places::has_parts(home), "{}", home.display());
+    }
+    for home in [dir.root(), &dir.path("nope"), &installed.path("bin")] {
+        assert!(!places::has_parts(home), "{}", home.display());
+    }
+    let error = PartsError::Home { home: "/nope".into() };
+    assert_eq!(error.to_string(), "GLEANER_HOME is `/nope`, where nothing of Gleaner lies");
+    assert_eq!(error.exit(), Exit::Usage);
+}
+
+#[test]
 fn the_pythons_of_path_are_tried_last_and_newest_first() {
-    let names = python::candidates(None, None, None);
+    let names = python::candidates(None, None);
     let expected = ["python3", "python3.13", "python3.12", "python3.11", "python3.10", "python3.9"];
     assert_eq!(names, expected.map(PathBuf::from));
 }
