@@ -172,6 +172,18 @@ fn bytes_that_are_no_component_are_refused() {
     says(run.must_exit(USAGE), &["cannot compile component", "hello.wasm", "help:", "gleaner build"]);
 }
 
+#[test]
+fn a_small_component_that_grows_while_it_is_compiled_is_refused() {
+    // Each component holds sixty instances of the one before: a few kilobytes that stand for thirteen million.
+    let mut text = "(component (component $c0 (core module $m) (core instance (instantiate $m)))".to_owned();
+    for level in 1..=4 {
+        let instances = format!("(instance (instantiate $c{}))", level - 1).repeat(60);
+        text += &format!("(component $c{level} {instances})");
+    }
+    let run = with_component(&(text + "(instance (instantiate $c4)))"));
+    says(run.must_exit(USAGE), &["cannot compile component", "hello.wasm", "it takes more than 2048 MiB of memory"]);
+}
+
 fn with_component(text: &str) -> Run {
     let copy = Copy::of("examples/hello/rust", |manifest| manifest);
     copy.replace("hello.wasm", wat::parse_str(text).expect("the test's own component"));

@@ -22,7 +22,7 @@ pub const COMPONENT_BYTES: u64 = 64 << 20;
 pub const CODE_BYTES: usize = 256 << 20;
 
 /// Memory that compiling may take, in bytes; an ordinary lambda takes some 50 MB. A small component can be made to take any.
-pub const COMPILE_MEMORY_BYTES: u64 = 4 << 30;
+pub const COMPILE_MEMORY_BYTES: u64 = 2 << 30;
 
 /// Seconds of CPU time that compiling may take; an ordinary lambda takes one.
 pub const COMPILE_CPU_SECONDS: u64 = 120;
