@@ -85,13 +85,13 @@ impl HostTopic for Hosted {
     fn column_since(&mut self, topic: Resource<Topic>, field: Resource<Field>, since_ns: i64) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
         // How many samples it is shows only on the way. At fixed places they cost little, and are charged afterwards.
-        let whole_ring = topic.column_work(field, usize::MAX);
+        let whole_ring = || topic.column_work(field, usize::MAX);
         let column = if field.walks() {
-            self.meter.charge(whole_ring)?;
+            self.meter.charge(whole_ring())?;
             topic.column_since(field, since_ns)
         } else {
             let column = topic.column_since(field, since_ns);
-            let read = column.as_ref().map_or(whole_ring, |column| column.values.len() * data::FIELD_BYTES);
+            let read = column.as_ref().map_or_else(|_| whole_ring(), |column| column.values.len() * data::FIELD_BYTES);
             self.meter.charge(read)?;
             column
         };
