@@ -6,7 +6,6 @@
 
 pub mod api;
 pub mod guest;
-pub mod image;
 pub mod input;
 pub mod judge;
 pub mod memory;

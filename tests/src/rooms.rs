@@ -23,9 +23,21 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-buffers", &[]),
     ("gleaner-cli", &["gleaner-protocol"]),
     ("gleaner-compile", &["gleaner-protocol"]),
-    ("gleaner-host", &["gleaner-buffers", "gleaner-compile", "gleaner-protocol", "gleaner-transport"]),
+    (
+        "gleaner-host",
+        &[
+            "gleaner-buffers",
+            "gleaner-compile",
+            "gleaner-image",
+            "gleaner-protocol",
+            "gleaner-recorder",
+            "gleaner-transport",
+        ],
+    ),
+    ("gleaner-image", &[]),
     ("gleaner-protocol", &[]),
-    ("gleaner-python", &["gleaner-host", "gleaner-protocol", "gleaner-transport"]),
+    ("gleaner-python", &["gleaner-host", "gleaner-image", "gleaner-protocol", "gleaner-transport"]),
+    ("gleaner-recorder", &["gleaner-image", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-sdk", &[]),
     ("gleaner-transport", &[]),
 ];
@@ -36,9 +48,8 @@ pub const WITHOUT: &[(&str, &[&str])] =
 
 /// Inside of `host/src`: a room, and the rooms that it must not name.
 pub const ROOMS: &[(&str, &[&str])] = &[
-    ("memory", &["api", "guest", "image", "input", "judge", "program", "replay", "schedule"]),
+    ("memory", &["api", "guest", "input", "judge", "program", "replay", "schedule"]),
     ("api", &["guest", "input", "judge", "program", "replay", "schedule"]),
-    ("image", &["api", "guest", "input", "judge", "program", "replay", "schedule"]),
     ("input", &["guest", "judge", "program", "replay", "schedule"]),
     ("schedule", &["guest", "judge", "program", "replay"]),
     ("judge", &["program", "replay", "schedule"]),

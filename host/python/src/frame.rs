@@ -1,7 +1,7 @@
 //! Frames of `gleaner:lambda/data` over `gleaner_host::api::frame`.
 
 use gleaner_host::api::frame::{self, Info};
-use gleaner_host::image::{Bayer, Encoding, Roi};
+use gleaner_image::{Bayer, Encoding, Roi};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyTuple};

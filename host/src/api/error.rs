@@ -2,7 +2,7 @@
 
 use gleaner_transport::message::{CdrError, PathError};
 
-use crate::image::ImageError;
+use gleaner_image::ImageError;
 
 /// Why a read of data failed.
 #[derive(Debug, thiserror::Error)]

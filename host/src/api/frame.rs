@@ -9,7 +9,7 @@ use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
 
 use super::data::{DataError, Identity, Sample, Stamps, piece};
-use crate::image::{self, Encoding, ImageError, Roi, View, ops};
+use gleaner_image::{self as image, Encoding, ImageError, Roi, View, ops};
 
 /// Shape of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -9,7 +9,7 @@ use super::bindings::gleaner::lambda::types::{
 };
 use super::bindings::handles::{Field, Frame, Sample, Topic};
 use crate::api::{data, frame};
-use crate::image;
+use gleaner_image as image;
 
 type Answer<T> = wasmtime::Result<Result<T, DataError>>;
 

@@ -1,7 +1,7 @@
 //! How bright an image is.
 
 use super::pixels::Pixels;
-use crate::image::{ImageError, Roi, View};
+use crate::{ImageError, Roi, View};
 
 /// Byte positions that are summed side by side. 48 bytes are whole pixels of 1, 2, 3 and 4 bytes and
 /// whole vector registers of 16 bytes, so that one loop serves every encoding and vectorises.
@@ -115,8 +115,8 @@ pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::Encoding;
-    use crate::image::ops::work;
+    use crate::Encoding;
+    use crate::ops::work;
 
     const WHOLE: Option<Roi> = None;
 

@@ -1,6 +1,6 @@
 //! How a pixel of each encoding is read as grey or as red, green and blue.
 
-use crate::image::{Encoding, ImageError, View};
+use crate::{Encoding, ImageError, View};
 
 /// The pixels of an image that are not raw: every encoding that has a grey level.
 #[derive(Debug, Clone, Copy)]

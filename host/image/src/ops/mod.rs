@@ -29,7 +29,7 @@ pub fn work(view: &View<'_>, roi: Option<Roi>) -> Result<u64, ImageError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::Encoding;
+    use crate::Encoding;
 
     #[test]
     fn work_is_the_bytes_of_the_pixels_without_padding() {

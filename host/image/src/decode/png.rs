@@ -5,8 +5,8 @@ use std::io::{Cursor, ErrorKind};
 use png::{ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformations};
 
 use super::{Format, Header};
-use crate::image::error::ImageError;
-use crate::image::view::check_size;
+use crate::error::ImageError;
+use crate::view::check_size;
 
 /// The signature of PNG.
 pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
@@ -99,9 +99,9 @@ mod tests {
     use png::{BitDepth, Encoder};
 
     use super::*;
-    use crate::image::decode::samples::{self, HEIGHT, WIDTH, colour};
-    use crate::image::decode::tests::{assert_close, decoded};
-    use crate::image::decode::{decode_rgb8, probe};
+    use crate::decode::samples::{self, HEIGHT, WIDTH, colour};
+    use crate::decode::tests::{assert_close, decoded};
+    use crate::decode::{decode_rgb8, probe};
 
     /// A PNG of `WIDTH` x `HEIGHT` pixels.
     fn png(color: ColorType, depth: BitDepth, palette: Option<&'static [u8]>, data: &[u8]) -> Vec<u8> {

@@ -10,7 +10,7 @@
 //!   measured in 1 / (2 `to`) of an old pixel. Beyond the outermost middles the edge is repeated.
 
 use super::pixels::Pixels;
-use crate::image::{Encoding, ImageError, View};
+use crate::{Encoding, ImageError, View};
 
 /// Largest width and height of a resized image, in pixels.
 pub const MAX_RESIZED_SIDE: u32 = 16_384;

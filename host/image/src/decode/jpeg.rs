@@ -15,8 +15,8 @@ use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
 use super::{Format, Header};
-use crate::image::error::ImageError;
-use crate::image::view::check_size;
+use crate::error::ImageError;
+use crate::view::check_size;
 
 /// Start of image, and the start of the marker that must follow.
 pub(super) const MAGIC: [u8; 3] = [0xff, 0xd8, 0xff];
