@@ -3,10 +3,12 @@
 //! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the spread of its runs.
 
 mod measure;
+mod record;
 
 use std::process::ExitCode;
 
 use clap::Parser;
+use gleaner_protocol::manifest::Store;
 use measure::{Figure, Kind, Setting};
 
 /// Prints a table of promises with what was measured, in Markdown.
@@ -52,6 +54,31 @@ fn main() -> ExitCode {
     let arrays = (0..rounds.min(5)).flat_map(|_| setting.array_ns()).collect::<Vec<_>>();
     figures.push(Figure::at_most("slot to ndarray, 1920x1080 bgr8 (6.2 MB)", "ns", 1000.0, &arrays));
 
+    let without = [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
+    let replays = alternate(rounds, without, |what| setting.hello_rounds(what));
+    let slower = |with: &[f64]| replays[0].1.iter().zip(with).map(|(a, b)| 100.0 * (a / b - 1.0)).collect::<Vec<_>>();
+    figures.push(Figure::at_most("replay slower by a journal, IMU only, wasm", "%", 5.0, &slower(&replays[1].1)));
+    figures.push(Figure::told("replay slower by recording, IMU only, wasm", "%", &slower(&replays[2].1)));
+    let sizes = [("hello", 14.0), ("brake-dark", 20.0)];
+    for (example, goal) in sizes {
+        let name = format!("journal of {example}");
+        figures.push(Figure::at_most(&name, "bytes/wake", goal, &[setting.journal_bytes_per_wake(example)]));
+    }
+
+    for (name, store) in [("memory", Store::Ram), ("disk", Store::Disk)] {
+        let load = record::record(if quick { 3 } else { 60 }, store);
+        let mut tell = |what: &str, unit, value| {
+            figures.push(Figure::told(&format!("recorder at 20 MB/s, preroll in {name}: {what}"), unit, &[value]));
+        };
+        tell("arrived", "MB/s", load.megabytes_per_s);
+        tell("part of the time in clips", "%", load.recorded_percent);
+        tell("share of a core", "%", load.cpu_percent);
+        tell("memory", "MiB", load.memory_mib);
+        tell("longest time to take a sample", "ms", load.longest_ms);
+        let name = format!("recorder at 20 MB/s, preroll in {name}: preroll against its bound");
+        figures.push(Figure::at_most(&name, "%", 100.0, &[load.preroll_percent]));
+    }
+
     println!("| promise | goal | median | spread | runs | |\n|---|---|---|---|---|---|");
     for figure in &figures {
         println!("{figure}");
@@ -60,12 +87,12 @@ fn main() -> ExitCode {
     if quick || figures.iter().all(Figure::is_met) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Runs `measure` for each kind in turn, `rounds` times, so that a change of the machine's mood meets all alike.
-fn alternate<const N: usize>(
+/// Runs `measure` for each of `series` in turn, `rounds` times, so that a change of the machine's mood meets all alike.
+fn alternate<K: Copy, const N: usize>(
     rounds: usize,
-    mut series: [(Kind, Vec<f64>); N],
-    mut measure: impl FnMut(Kind) -> f64,
-) -> [(Kind, Vec<f64>); N] {
+    mut series: [(K, Vec<f64>); N],
+    mut measure: impl FnMut(K) -> f64,
+) -> [(K, Vec<f64>); N] {
     for _ in 0..rounds {
         for (kind, values) in &mut series {
             values.push(measure(*kind));

@@ -4,7 +4,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::{Report, Summary};
+use gleaner_protocol::{Report, Round, Summary};
 use gleaner_tests::drive::{IMAGE, image, one_topic};
 use gleaner_tests::{Folder, program, replay, root, sample_drive};
 
@@ -61,12 +61,12 @@ impl Setting {
 
     /// `hello` over the sample drive: a wake for each of 4,170 IMU samples.
     pub fn hello(&self, kind: Kind) -> Summary {
-        self.run(&kind.folder("hello"), &["--set", "brake_mps2=-1.4"])
+        self.run(&kind.folder("hello"), &["--set", "brake_mps2=-1.4", "--no-record"])
     }
 
     /// `brake-dark` over the sample drive, brought to look at each of its 400 pictures.
     pub fn every_frame_decoded(&self, kind: Kind) -> Summary {
-        self.run(&kind.folder("brake-dark"), &["--set", "brake_mps2=1000", "--set", "dark_luma=0"])
+        self.run(&kind.folder("brake-dark"), &["--set", "brake_mps2=1000", "--set", "dark_luma=0", "--no-record"])
     }
 
     fn run(&self, lambda: &Path, args: &[&str]) -> Summary {
@@ -75,24 +75,56 @@ impl Setting {
 
     /// By how many per cent memory after the 10th replay of `example` in one process exceeds that after the 2nd.
     pub fn growth_from_2nd_to_10th(&self, example: &str, kind: Kind) -> f64 {
+        let rounds = self.rounds(&kind.folder(example), &["--set", "brake_mps2=-1.4", "--repeat", "10"]);
+        100.0 * (rounds[9].rss_bytes as f64 / rounds[1].rss_bytes as f64 - 1.0)
+    }
+
+    /// Wakes per second of `hello` in wasm that judges alone, or writes a `journal`, or makes `clips`: the median of so many
+    /// passes in one process that a pass of 20 ms is no matter of luck.
+    pub fn hello_rounds(&self, what: &str) -> f64 {
+        let folder = Folder::new();
+        let journal = folder.path().join("wakes.journal");
+        let mut args = vec!["--set", "brake_mps2=-1.4", "--repeat", "20"];
+        match what {
+            "journal" => args.extend(["--no-record", "--journal", journal.to_str().expect("a plain name")]),
+            "clips" => {}
+            _ => args.push("--no-record"),
+        }
+        let rounds = self.rounds(&Kind::Rust.folder("hello"), &args);
+        let mut rates = rounds.iter().map(|round| round.wakes_per_s).collect::<Vec<_>>();
+        rates.sort_by(f64::total_cmp);
+        rates[rates.len() / 2]
+    }
+
+    /// Bytes of the journal of `example` in wasm, for each wake.
+    pub fn journal_bytes_per_wake(&self, example: &str) -> f64 {
+        let folder = Folder::new();
+        let journal = folder.path().join("wakes.journal");
+        let args = ["--set", "brake_mps2=-1.4", "--no-record", "--journal", journal.to_str().expect("a plain name")];
+        let summary = self.run(&Kind::Rust.folder(example), &args);
+        std::fs::metadata(&journal).expect("a journal").len() as f64 / summary.wakes as f64
+    }
+
+    fn rounds(&self, lambda: &Path, args: &[&str]) -> Vec<Round> {
         let out = Folder::new();
         let output = Command::new(program("gleaner-runtime"))
             .arg("replay")
-            .arg(kind.folder(example))
+            .arg(lambda)
             .arg(&self.sample)
-            .args(["--set", "brake_mps2=-1.4", "--repeat", "10", "--out"])
+            .args(args)
+            .arg("--out")
             .arg(out.path())
             .output()
             .expect("gleaner-runtime starts");
         let lines = String::from_utf8_lossy(&output.stdout).into_owned();
         let reports = lines.lines().filter_map(|line| serde_json::from_str(line).ok());
         let rounds = reports.filter_map(|report| match report {
-            Report::Round(round) => Some(round.rss_bytes as f64),
-            Report::Progress { .. } | Report::Summary(_) => None,
+            Report::Round(round) => Some(round),
+            _ => None,
         });
         let rounds = rounds.collect::<Vec<_>>();
-        assert_eq!(rounds.len(), 10, "{}", String::from_utf8_lossy(&output.stderr));
-        100.0 * (rounds[9] / rounds[1] - 1.0)
+        assert!(rounds.len() >= 10, "{}", String::from_utf8_lossy(&output.stderr));
+        rounds
     }
 
     /// Nanoseconds for one array over a frame of 6.2 MB, one figure for each frame, as the lambda measures it.

@@ -20,8 +20,13 @@ pub enum Command {
     Build(BuildArgs),
     /// Run a built lambda over recorded drives
     ///
-    /// Writes OUT/decisions.jsonl, OUT/log.jsonl and OUT/summary.json, and shows a summary.
+    /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json and the clips that the manifest asks for, and shows a
+    /// summary.
     Replay(ReplayArgs),
+    /// Make the decisions in a clip again, and compare them with its journal
+    ///
+    /// Ends with 0 if all are the same, and with 4 at the first that is not.
+    Verify(VerifyArgs),
 }
 
 /// Arguments of `gleaner build`.
@@ -53,7 +58,29 @@ pub struct ReplayArgs {
     /// Write every decision, not only those with a trigger or a fault
     #[arg(long)]
     pub all: bool,
+    /// Leave out the clips that [record] of the manifest asks for
+    #[arg(long)]
+    pub no_record: bool,
+    /// Write a journal: of every wake, what the lambda saw and decided
+    #[arg(long, value_name = "FILE")]
+    pub journal: Option<PathBuf>,
+    /// Make every decision of a journal again and compare, instead of writing results; exit code 4 at the first difference
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["out", "all", "no_record", "journal"])]
+    pub verify: Option<PathBuf>,
     /// Print the summary as one JSON object
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `gleaner verify`.
+#[derive(Args, Debug)]
+pub struct VerifyArgs {
+    /// A clip that gleaner made
+    pub clip: PathBuf,
+    /// The lambda's folder, built by `gleaner build DIR`
+    #[arg(long, value_name = "DIR")]
+    pub lambda: PathBuf,
+    /// Print the result as one JSON object
     #[arg(long)]
     pub json: bool,
 }
@@ -82,7 +109,7 @@ mod tests {
         let line = ["gleaner", "replay"].iter().chain(arguments);
         match Cli::try_parse_from(line).map_err(|error| error.to_string())?.command {
             Command::Replay(args) => Ok(args),
-            Command::Build(_) => Err("build".to_owned()),
+            other => Err(format!("{other:?}")),
         }
     }
 

@@ -1,5 +1,5 @@
-//! The command `gleaner`: `build` makes a lambda's build folder, `replay` starts the runtime on it and shows what came
-//! out, `results` reads back what a replay left.
+//! The command `gleaner`: `build` makes a lambda's build folder, `runtime` starts `gleaner-runtime` for `replay` and
+//! `verify`, `results` reads back what a replay left, and `show` is what people see of it.
 //!
 //! It is thin. No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts its
 //! sibling programs and speaks to them through `gleaner-protocol`.
@@ -9,6 +9,7 @@ mod build;
 mod listen;
 mod replay;
 pub mod results;
+mod runtime;
 mod say;
 mod show;
 
@@ -25,5 +26,6 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
     match cli.command {
         Command::Build(args) => build::run(&args.lambda),
         Command::Replay(args) => replay::run(&args),
+        Command::Verify(args) => replay::verify(&args),
     }
 }

@@ -4,9 +4,11 @@
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Lines};
+use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Decision, Exit, Explain, Trigger, visible};
+use gleaner_protocol::{Clip, Decision, Exit, Explain, Trigger, visible};
+use serde::de::DeserializeOwned;
 
 /// Why results cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -19,9 +21,9 @@ pub enum ResultsError {
         /// Why not.
         source: io::Error,
     },
-    /// A line is no decision.
-    #[error("`{}`, line {line}, is no decision", path.display())]
-    Decision {
+    /// A line is no decision, or no clip.
+    #[error("`{}`, line {line}, is not what a replay writes", path.display())]
+    Line {
         /// The file.
         path: PathBuf,
         /// The line, from 1.
@@ -41,13 +43,17 @@ impl Explain for ResultsError {
     }
 }
 
-/// The decisions of a replay, in the order of its wakes.
+/// A file of JSON lines, read one by one.
 #[derive(Debug)]
-pub struct Decisions {
+pub struct JsonLines<T> {
     path: PathBuf,
     lines: Lines<BufReader<File>>,
     line: usize,
+    of: PhantomData<T>,
 }
+
+/// The decisions of a replay, in the order of its wakes.
+pub type Decisions = JsonLines<Decision>;
 
 impl Decisions {
     /// The decisions in `out/decisions.jsonl`.
@@ -56,27 +62,37 @@ impl Decisions {
     ///
     /// [`ResultsError::Read`] if the file cannot be opened.
     pub fn open(out: &Path) -> Result<Decisions, ResultsError> {
-        let path = out.join("decisions.jsonl");
+        JsonLines::read(out.join("decisions.jsonl"))
+    }
+}
+
+/// The clips in `out/clips.jsonl`, in the order in which they were finished.
+///
+/// # Errors
+///
+/// [`ResultsError`] if the file cannot be read.
+pub fn clips(out: &Path) -> Result<Vec<Clip>, ResultsError> {
+    JsonLines::read(out.join("clips.jsonl"))?.collect()
+}
+
+impl<T> JsonLines<T> {
+    fn read(path: PathBuf) -> Result<Self, ResultsError> {
         match File::open(&path) {
-            Ok(file) => Ok(Decisions { path, lines: BufReader::new(file).lines(), line: 0 }),
+            Ok(file) => Ok(Self { path, lines: BufReader::new(file).lines(), line: 0, of: PhantomData }),
             Err(source) => Err(ResultsError::Read { path, source }),
         }
     }
 }
 
-impl Iterator for Decisions {
-    type Item = Result<Decision, ResultsError>;
+impl<T: DeserializeOwned> Iterator for JsonLines<T> {
+    type Item = Result<T, ResultsError>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let text = self.lines.next()?;
         self.line += 1;
         let path = || self.path.clone();
         Some(text.map_err(|source| ResultsError::Read { path: path(), source }).and_then(|text| {
-            serde_json::from_str(&text).map_err(|source| ResultsError::Decision {
-                path: path(),
-                line: self.line,
-                source,
-            })
+            serde_json::from_str(&text).map_err(|source| ResultsError::Line { path: path(), line: self.line, source })
         }))
     }
 }
@@ -93,6 +109,19 @@ pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item =
 /// The score of `trigger` in three significant digits, `-` if it has none.
 pub fn score(trigger: &Trigger) -> String {
     trigger.score.map_or("-".to_owned(), three_digits)
+}
+
+/// What is in a clip: `9.1 s, 0.3 MiB: /imu/data 950, /vehicle/speed 757`.
+pub fn clip_contents(clip: &Clip) -> String {
+    let [from, to] = clip_span(clip);
+    let topics = clip.topics.iter().map(|topic| format!("{} {}", visible(&topic.topic), grouped(topic.messages)));
+    let mib = clip.bytes as f64 / (1024.0 * 1024.0);
+    format!("{:.1} s, {mib:.1} MiB: {}", seconds(to, from), topics.collect::<Vec<_>>().join(", "))
+}
+
+/// Log times of a clip's first and last message; of what was asked for, if it has none.
+pub fn clip_span(clip: &Clip) -> [i64; 2] {
+    [clip.first_ns.unwrap_or(clip.from_ns), clip.last_ns.unwrap_or(clip.to_ns)]
 }
 
 /// Log time `at_ns` in s after `start_ns`.

@@ -14,6 +14,7 @@ use tracing::warn;
 
 use crate::api::data::Topic;
 use crate::api::frame::{Budget, Images};
+use crate::api::trace::Arrivals;
 use crate::memory::Mapping;
 
 /// Why an input could not be set up.
@@ -35,6 +36,13 @@ pub struct Remap {
     pub from: String,
     /// Topic in the drive or on the wire.
     pub to: String,
+}
+
+impl Remap {
+    /// The name of `topic` in the drive or on the wire.
+    pub fn apply<'a>(remaps: &'a [Remap], topic: &'a str) -> &'a str {
+        remaps.iter().find(|remap| remap.from == topic).map_or(topic, |remap| &remap.to)
+    }
 }
 
 /// Subscribes every input of `manifest` and returns its topics, in the manifest's order.
@@ -61,7 +69,7 @@ fn open_input(
     let subscribe = |source| InputError::Subscribe { input: input.name.to_string(), source };
 
     let topic = input.topic.as_str();
-    let wire_topic = remaps.iter().find(|remap| remap.from == topic).map_or(topic, |remap| &remap.to);
+    let wire_topic = Remap::apply(remaps, topic);
     let spec = TopicSpec {
         topic: wire_topic.to_owned(),
         type_name: input.type_name.to_string(),
@@ -76,10 +84,16 @@ fn open_input(
         None => None,
     };
     let images = Images::new(decoded, made.clone());
-    let ingest = Arc::new(Ingest { ring: Mutex::new(writer), input: input.name.to_string(), said: Default::default() });
+    let arrivals = Arc::<Arrivals>::default();
+    let ingest = Arc::new(Ingest {
+        ring: Mutex::new(writer),
+        arrivals: arrivals.clone(),
+        input: input.name.to_string(),
+        said: Default::default(),
+    });
     transport.subscribe(&spec, ingest).map_err(subscribe)?;
     let definitions = transport.definitions(&spec.topic).map_err(subscribe)?;
-    Ok(Topic::new(input.name.as_str(), topic, &spec.type_name, reader, definitions, images))
+    Ok(Topic::new(input.name.as_str(), topic, &spec.type_name, reader, arrivals, definitions, images))
 }
 
 fn pool<M: Copy + Send + Sync + 'static>(
@@ -98,6 +112,7 @@ fn pool<M: Copy + Send + Sync + 'static>(
 /// The transport's end of a ring. The lock is only ever taken by the transport's own thread.
 struct Ingest {
     ring: Mutex<RingWriter<SampleMeta>>,
+    arrivals: Arc<Arrivals>,
     input: String,
     /// Each loss is counted; each kind is said once, and what counts then is in the status.
     said: [AtomicBool; 2],
@@ -109,6 +124,7 @@ impl Sink for Ingest {
         match writer.draft(cdr.len()) {
             Ok(mut draft) => {
                 draft.copy_from_slice(cdr);
+                self.arrivals.add(meta, cdr);
                 match writer.publish(draft, *meta) {
                     Ok(_) => Verdict::Taken,
                     Err(_) => unreachable!("the draft is this ring's own"),

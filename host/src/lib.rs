@@ -7,6 +7,7 @@
 pub mod api;
 pub mod guest;
 pub mod input;
+pub mod journal;
 pub mod judge;
 pub mod memory;
 pub mod program;

@@ -5,10 +5,9 @@ use std::io;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure};
 
-use crate::replay::{self, Load, Options, ReplayArgs};
+use crate::replay::{Job, Load, ReplayArgs, VerifyArgs};
 
 /// Hosts one lambda. Writes reports, a JSON object a line, to standard output.
 #[derive(Parser)]
@@ -22,40 +21,48 @@ struct Cli {
 enum Command {
     /// Runs a built lambda over recorded drives.
     Replay(ReplayArgs),
+    /// Makes the decisions in a clip again and compares.
+    Verify(VerifyArgs),
+}
+
+impl Command {
+    fn job(self) -> Result<Job, Failure> {
+        match self {
+            Self::Replay(args) => Job::replay(args),
+            Self::Verify(args) => Job::verify(args),
+        }
+    }
 }
 
 /// `main` of `gleaner-runtime`.
 pub fn main() -> ExitCode {
     prepare();
-    let Cli { command: Command::Replay(args) } = Cli::parse();
-    end(replay_any(args))
+    end(Cli::parse().command.job().and_then(run_any))
 }
 
-/// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: replays with the guest
+/// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: their job, with the guest
 /// that `load` makes. Returns the exit code.
-pub fn replay_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
+pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
     prepare();
-    let Cli { command: Command::Replay(args) } = match Cli::try_parse_from(args) {
-        Ok(cli) => cli,
+    let command = match Cli::try_parse_from(args) {
+        Ok(cli) => cli.command,
         Err(error) => {
             let _ = error.print();
             return Exit::Usage.code();
         }
     };
-    code(Options::new(args).and_then(|(options, manifest)| run(&options, &manifest, load)))
+    code(command.job().and_then(|job| run(job, load)))
 }
 
-fn replay_any(args: ReplayArgs) -> Result<Exit, Failure> {
-    #[cfg_attr(not(any(feature = "wasm", feature = "python")), expect(unused_variables))]
-    let (options, manifest) = Options::new(args)?;
-    match manifest.lambda.kind {
+fn run_any(job: Job) -> Result<Exit, Failure> {
+    match job.manifest.lambda.kind {
         #[cfg(feature = "wasm")]
-        gleaner_protocol::manifest::Kind::Wasm => run(&options, &manifest, &mut wasm::load),
+        gleaner_protocol::manifest::Kind::Wasm => run(job, &mut wasm::load),
         #[cfg(feature = "python")]
         gleaner_protocol::manifest::Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(&options.lambda, &args);
-            Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
+            let error = crate::guest::python::become_interpreter(&job.options.lambda, &args);
+            Err(Failure::because(format!("cannot start lambda `{}`", job.manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]
         kind => Err(Failure::new(
@@ -65,15 +72,15 @@ fn replay_any(args: ReplayArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Replays with reports on what was standard output. What a library writes there by itself goes to standard error; what a
+/// Does the job with reports on what was standard output. What a library writes there by itself goes to standard error; what a
 /// lambda prints is in its log.
-fn run(options: &Options, manifest: &Manifest, load: Load<'_>) -> Result<Exit, Failure> {
+fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
     let internal = |error: io::Error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error);
     let reports = io::stdout();
     // Not for processes that a lambda starts: whoever reads the reports waits for their end.
     let reports = rustix::io::fcntl_dupfd_cloexec(&reports, 3).map_err(io::Error::from).map_err(internal)?;
     rustix::stdio::dup2_stdout(io::stderr()).map_err(io::Error::from).map_err(internal)?;
-    replay::run(options, manifest, load, &mut std::fs::File::from(reports))
+    job.run(load, &mut std::fs::File::from(reports))
 }
 
 #[cfg(feature = "wasm")]

@@ -4,12 +4,13 @@ pub mod drive;
 pub mod rooms;
 pub mod tree;
 
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use gleaner_cli::results::{seconds, trigger_lines};
-use gleaner_protocol::{Decision, Report, Summary};
+use gleaner_protocol::{Clip, Decision, Report, Summary, Verified};
 
 /// The checkout.
 pub fn root() -> PathBuf {
@@ -86,35 +87,68 @@ pub struct Run {
     pub decisions: Vec<Decision>,
     /// `log.jsonl`.
     pub log: Vec<serde_json::Value>,
+    /// `clips.jsonl`.
+    pub clips: Vec<Clip>,
     /// The last report; none if it did not come so far.
     pub summary: Option<Summary>,
 }
 
+/// `gleaner-runtime`, which compiles into the tests' own cache: nothing that a user compiled before is trusted or touched.
+pub fn runtime() -> Command {
+    let mut runtime = Command::new(program("gleaner-runtime"));
+    runtime.env("XDG_CACHE_HOME", root().join("target/test-cache"));
+    runtime
+}
+
 /// Replays the built lambda in `lambda` over `drives`.
 pub fn replay(lambda: &Path, drives: &[PathBuf], args: &[&str]) -> Run {
-    let out = Folder::new();
-    let output = Command::new(program("gleaner-runtime"))
-        .arg("replay")
-        .arg(lambda)
-        .args(drives)
-        .args(args)
-        .arg("--out")
-        .arg(out.path())
-        // The tests' own: nothing that a user compiled before is trusted or touched.
-        .env("XDG_CACHE_HOME", root().join("target/test-cache"))
-        .output()
-        .expect("gleaner-runtime starts");
-    let read = |name: &str| std::fs::read_to_string(out.path().join(name)).unwrap_or_default();
+    replay_to(Folder::new().path(), lambda, drives, args)
+}
+
+/// As [`replay`], with results that stay in `out`.
+pub fn replay_to(out: &Path, lambda: &Path, drives: &[PathBuf], args: &[&str]) -> Run {
+    let mut replay = runtime();
+    replay.arg("replay").arg(lambda).args(drives).args(args).arg("--out").arg(out);
+    let output = replay.output().expect("gleaner-runtime starts");
+    let read = |name: &str| std::fs::read_to_string(out.join(name)).unwrap_or_default();
     Run {
         exit: output.status.code().unwrap_or(128),
         stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
         decisions: read("decisions.jsonl").lines().map(parsed).collect(),
         log: read("log.jsonl").lines().map(parsed).collect(),
-        summary: String::from_utf8_lossy(&output.stdout).lines().map(parsed).find_map(|report| match report {
+        clips: read("clips.jsonl").lines().map(parsed).collect(),
+        summary: reports(&output.stdout).find_map(|report| match report {
             Report::Summary(summary) => Some(*summary),
-            Report::Progress { .. } | Report::Round(_) => None,
+            _ => None,
         }),
     }
+}
+
+/// What came of a comparison.
+pub struct Verification {
+    /// Exit code; 128 and more for a signal.
+    pub exit: i32,
+    /// What it said to people: the first difference, both sides.
+    pub stderr: String,
+    /// The result; none if something differs.
+    pub verified: Option<Verified>,
+}
+
+/// Runs `gleaner-runtime` with `args`, which ask for a comparison.
+pub fn verify(args: &[&OsStr]) -> Verification {
+    let output = runtime().args(args).output().expect("gleaner-runtime starts");
+    Verification {
+        exit: output.status.code().unwrap_or(128),
+        stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+        verified: reports(&output.stdout).find_map(|report| match report {
+            Report::Verified(verified) => Some(verified),
+            _ => None,
+        }),
+    }
+}
+
+fn reports(stdout: &[u8]) -> impl Iterator<Item = Report> {
+    String::from_utf8_lossy(stdout).lines().map(parsed).collect::<Vec<_>>().into_iter()
 }
 
 fn parsed<T: serde::de::DeserializeOwned>(line: &str) -> T {

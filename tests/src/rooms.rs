@@ -51,6 +51,7 @@ pub const ROOMS: &[(&str, &[&str])] = &[
     ("memory", &["api", "guest", "input", "judge", "program", "replay", "schedule"]),
     ("api", &["guest", "input", "judge", "program", "replay", "schedule"]),
     ("input", &["guest", "judge", "program", "replay", "schedule"]),
+    ("journal", &["guest", "judge", "program", "replay", "schedule"]),
     ("schedule", &["guest", "judge", "program", "replay"]),
     ("judge", &["program", "replay", "schedule"]),
     ("guest", &["input", "judge", "program", "replay", "schedule"]),

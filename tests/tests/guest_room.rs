@@ -58,8 +58,14 @@ impl Room {
     fn wake(&mut self) -> Outcome {
         self.sent += 1;
         let at_ns = self.sent as i64 * 1_000_000;
-        let meta =
-            SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq: self.sent, endian: Endian::Little };
+        let meta = SampleMeta {
+            at_ns,
+            publish_ns: at_ns,
+            writer: Guid::default(),
+            seq: self.sent,
+            endian: Endian::Little,
+            options: [0; 2],
+        };
         self.transport.publish("/imu/data", &meta, &[0; 24]).unwrap();
         self.session.begin(at_ns);
         let sample = self.topic.newest().unwrap();

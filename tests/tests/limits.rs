@@ -89,8 +89,8 @@ fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic>) {
 }
 
 fn publish(transport: &mut Loopback, topic: &str, seq: u64, cdr: &[u8]) {
-    let (at_ns, writer, endian) = (seq as i64, Guid::default(), Endian::Little);
-    transport.publish(topic, &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian }, cdr).unwrap();
+    let (at_ns, writer, endian, options) = (seq as i64, Guid::default(), Endian::Little, [0; 2]);
+    transport.publish(topic, &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian, options }, cdr).unwrap();
 }
 
 #[test]

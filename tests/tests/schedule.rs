@@ -132,7 +132,8 @@ impl Feed {
 
 fn send(transport: &mut Loopback, seq: u64, cdr: &[u8]) {
     let at_ns = seq as i64 * MS;
-    let meta = SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian: Endian::Little };
+    let meta =
+        SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian: Endian::Little, options: [0; 2] };
     transport.publish("/imu/data", &meta, cdr).unwrap();
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_cli::results::{grouped, seconds};
+use gleaner_cli::results::{clip_contents, clip_span, grouped, seconds};
 use gleaner_protocol::{Decision, Exit, Failure, visible};
 
 use crate::checkout::Checkout;
@@ -10,17 +10,22 @@ use crate::examples::{DRIVE, EXAMPLES, Replayed, difference};
 use crate::setup;
 use crate::steps::Steps;
 
-/// Replays the sample drive through both twins of every example, and compares them.
+/// Replays the sample drive through both twins of every example, compares them, and makes every decision a second time: from
+/// the journal, and from the clips alone.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
     setup::run(checkout, &mut steps, &["examples"])?;
     steps.begin(&format!("replay of {DRIVE}"));
     let mut rows = vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
-    let mut verdicts = Vec::new();
+    let (mut verdicts, mut proofs, mut clips) = (Vec::new(), Vec::new(), Vec::new());
     let mut agree = true;
     for example in &EXAMPLES {
         let twins = example.replay(checkout)?;
         rows.extend(twins.iter().map(|twin| row(example.name, twin)));
+        for twin in &twins {
+            proofs.push(prove(checkout, example.name, twin)?);
+        }
+        clips.extend(twins.first().into_iter().flat_map(clip_lines));
         let difference = difference(&twins);
         agree &= difference.is_none();
         let settings: String = example.set.iter().map(|set| format!(" --set {set}")).collect();
@@ -33,14 +38,54 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     for verdict in verdicts {
         println!("{verdict}");
     }
-    println!("files: out/demo/EXAMPLE-KIND/ with decisions.jsonl, log.jsonl and summary.json");
+    println!("\nclips of the Rust lambdas (the Python ones make the same):");
+    for line in clips {
+        println!("{line}");
+    }
+    println!("\ndecisions made a second time:");
+    for proof in proofs {
+        println!("{proof}");
+    }
+    println!(
+        "\nfiles: out/demo/EXAMPLE-KIND/ with clips/, clips.jsonl, decisions.jsonl, log.jsonl, summary.json and wakes.journal"
+    );
     let gleaner = checkout.program("gleaner");
     let gleaner = gleaner.strip_prefix(checkout.path("")).unwrap_or(&gleaner).display();
     println!("try next, with another limit: {gleaner} replay examples/hello/rust {DRIVE} --set brake_mps2=-1.2");
     Ok(if agree { Exit::Ok } else { Exit::Differs })
 }
 
-fn row(name: &str, Replayed { summary, decisions }: &Replayed) -> [String; 6] {
+/// Two lines for each clip: where it is, what is in it, and its thumbnail.
+fn clip_lines(twin: &Replayed) -> Vec<String> {
+    let lines = twin.clips.iter().map(|clip| {
+        let [from, to] = clip_span(clip).map(|at_ns| seconds(at_ns, twin.summary.start_ns));
+        let thumbnail = clip.thumbnail.as_ref().map_or("no camera in it".to_owned(), |path| twin.path(path));
+        let short = clip.short.iter().map(|why| format!("\n    short: {}", visible(why))).collect::<String>();
+        format!(
+            "  {}\n    {from:.2} to {to:.2} s: {}\n    thumbnail: {thumbnail}{short}",
+            twin.path(&clip.file),
+            clip_contents(clip)
+        )
+    });
+    lines.collect()
+}
+
+/// Verifies the journal and every clip, and says how many decisions were the same.
+fn prove(checkout: &Checkout, name: &str, twin: &Replayed) -> Result<String, Failure> {
+    let whole = twin.verify(checkout)?;
+    let parts = twin.clips.iter().map(|clip| twin.verify_clip(checkout, clip)).collect::<Result<Vec<_>, _>>()?;
+    let (wakes, uncovered) = parts.iter().fold((0, 0), |sum, part| (sum.0 + part.wakes, sum.1 + part.uncovered));
+    Ok(format!(
+        "  {name}, {}: all {} from the journal and the drive; {} of {} from {} alone",
+        twin.summary.kind.as_str(),
+        grouped(whole.wakes),
+        grouped(wakes - uncovered),
+        grouped(wakes),
+        if parts.len() == 1 { "one clip".to_owned() } else { format!("{} clips", parts.len()) },
+    ))
+}
+
+fn row(name: &str, Replayed { summary, decisions, .. }: &Replayed) -> [String; 6] {
     [
         name.to_owned(),
         summary.kind.as_str().to_owned(),

@@ -1,15 +1,17 @@
 //! The examples on the sample drive: what `demo` shows and `bless` writes down.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use gleaner_cli::results::{Decisions, ResultsError};
-use gleaner_protocol::{Decision, Exit, Failure, Summary, twins_differ};
+use gleaner_cli::results::{Decisions, ResultsError, clips};
+use gleaner_protocol::{Clip, Decision, Exit, Failure, Summary, Verified, twins_differ};
 
 use crate::checkout::Checkout;
 use crate::steps;
 
 /// The drive that comes with the checkout.
 pub(crate) const DRIVE: &str = "examples/data/highway_drive.mcap";
+
+const JOURNAL: &str = "wakes.journal";
 
 /// An example, with the values that suit the sample drive: its braking is gentle.
 pub(crate) struct Example {
@@ -27,6 +29,10 @@ pub(crate) struct Replayed {
     pub(crate) summary: Summary,
     /// Those with a trigger or a fault.
     pub(crate) decisions: Vec<Decision>,
+    /// Made around its triggers.
+    pub(crate) clips: Vec<Clip>,
+    lambda: PathBuf,
+    out: PathBuf,
 }
 
 impl Example {
@@ -38,17 +44,50 @@ impl Example {
     fn replay_twin(&self, checkout: &Checkout, language: &str) -> Result<Replayed, Failure> {
         let kind = if language == "rust" { "wasm" } else { language };
         let out = Path::new("out/demo").join(format!("{}-{kind}", self.name));
+        let lambda = Path::new("examples").join(self.name).join(language);
         let mut replay = checkout.command(checkout.program("gleaner"));
-        replay.arg("replay").arg(Path::new("examples").join(self.name).join(language)).arg(DRIVE);
+        replay.arg("replay").arg(&lambda).arg(DRIVE);
         for set in self.set {
             replay.args(["--set", set]);
         }
         replay.arg("--out").arg(&out).arg("--json");
-        let json = steps::output(&mut replay, "see the error above; what was decided until then is in out/demo")?;
-        let summary = serde_json::from_str(&json)
-            .map_err(|error| Failure::caused_by(Exit::Internal, "`gleaner replay --json` gave no summary", &error))?;
-        Ok(Replayed { summary, decisions: decisions(&checkout.path(out))? })
+        // The folder may not be there yet, and a journal of an earlier demo is replaced.
+        std::fs::create_dir_all(checkout.path(&out))
+            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make `out/demo`", &error))?;
+        replay.arg("--journal").arg(out.join(JOURNAL));
+        let summary: Summary = report(&mut replay)?;
+        let folder = checkout.path(&out);
+        let clips = if summary.clips > 0 { clips(&folder)? } else { Vec::new() };
+        Ok(Replayed { decisions: decisions(&folder)?, clips, summary, lambda, out })
     }
+}
+
+impl Replayed {
+    /// Makes every decision of the journal again, from the drive.
+    pub(crate) fn verify(&self, checkout: &Checkout) -> Result<Verified, Failure> {
+        let mut verify = checkout.command(checkout.program("gleaner"));
+        verify.arg("replay").arg(&self.lambda).arg(DRIVE).arg("--verify").arg(self.out.join(JOURNAL)).arg("--json");
+        report(&mut verify)
+    }
+
+    /// Makes the decisions in a clip again, from the clip alone.
+    pub(crate) fn verify_clip(&self, checkout: &Checkout, clip: &Clip) -> Result<Verified, Failure> {
+        let mut verify = checkout.command(checkout.program("gleaner"));
+        verify.arg("verify").arg(self.out.join(&clip.file)).arg("--lambda").arg(&self.lambda).arg("--json");
+        report(&mut verify)
+    }
+
+    /// A file of its results, as a person would name it.
+    pub(crate) fn path(&self, file: &Path) -> String {
+        self.out.join(file).display().to_string()
+    }
+}
+
+/// What `gleaner --json` reports.
+fn report<T: serde::de::DeserializeOwned>(gleaner: &mut std::process::Command) -> Result<T, Failure> {
+    let json = steps::output(gleaner, "see the error above; what was decided until then is in out/demo")?;
+    serde_json::from_str(&json)
+        .map_err(|error| Failure::caused_by(Exit::Internal, "`gleaner --json` gave no report", &error))
 }
 
 fn decisions(out: &Path) -> Result<Vec<Decision>, ResultsError> {

@@ -17,7 +17,7 @@ const TARGET: &str = "wasm32-wasip2";
 pub(crate) fn run(checkout: &Checkout, steps: &mut Steps, families: &[&str]) -> Result<(), Failure> {
     steps.begin(&format!("compilation target {TARGET}"));
     target(checkout)?;
-    steps.begin("Python environment .venv with numpy and mypy");
+    steps.begin("Python environment .venv with numpy, mypy and readers of MCAP");
     venv::set_up(checkout)?;
     steps.begin("programs (the first time this takes minutes)");
     programs(checkout)?;

@@ -1,5 +1,6 @@
-//! `.venv`: Python with numpy, for Python lambdas, and mypy, for the check of the SDK's types. No version is pinned:
-//! the newest that this Python takes, so that a user's environment is the one that is tested.
+//! `.venv`: Python with numpy, for Python lambdas; mypy, for the check of the SDK's types; and the readers of others, by which
+//! tests read our clips. No version is pinned: the newest that this Python takes, so that a user's environment is the one that
+//! is tested.
 
 use std::fs;
 
@@ -8,7 +9,14 @@ use gleaner_protocol::{Exit, Failure, Parts};
 use crate::checkout::Checkout;
 use crate::steps::{run, succeeds};
 
-const PACKAGES: [&str; 2] = ["numpy", "mypy"];
+/// What pip calls each, and what Python does.
+const PACKAGES: [(&str, &str); 5] = [
+    ("numpy", "numpy"),
+    ("mypy", "mypy"),
+    ("mcap", "mcap"),
+    ("mcap-ros2-support", "mcap_ros2"),
+    ("rosbags", "rosbags"),
+];
 
 /// Makes the environment, or completes it. One whose Python does not run, since the system's Python went, is made anew.
 pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
@@ -17,7 +25,7 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
         python.args(["-I", "-c", code]);
         python
     };
-    if succeeds(&mut python(&format!("import {}", PACKAGES.join(", ")))) {
+    if succeeds(&mut python(&format!("import {}", PACKAGES.map(|(_, module)| module).join(", ")))) {
         return Ok(());
     }
     if !succeeds(&mut python("import pip")) {
@@ -36,6 +44,11 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
         run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
     }
     let mut install = checkout.command(checkout.python());
-    install.args(["-m", "pip", "install", "--disable-pip-version-check", "-q"]).args(PACKAGES);
-    run(&mut install, "pip fetches numpy and mypy: see that the network is there, or configure pip for a mirror")
+    install
+        .args(["-m", "pip", "install", "--disable-pip-version-check", "-q"])
+        .args(PACKAGES.map(|(package, _)| package));
+    run(
+        &mut install,
+        "pip fetches numpy, mypy and readers of MCAP: see that the network is there, or configure pip for a mirror",
+    )
 }

@@ -2,9 +2,11 @@
 
 use std::fmt::{self, Write};
 
-use gleaner_protocol::{Decision, Fault, FaultKind, Summary, TopicReport, Trigger, visible};
+use gleaner_protocol::{Clip, Decision, Fault, FaultKind, Summary, TopicReport, Trigger, Verified, visible};
 
 use crate::results::{ResultsError, grouped, seconds, three_digits};
+
+mod clips;
 
 /// As many bursts of triggers, and as many causes of faults, are shown; the rest is counted.
 const SHOWN: usize = 20;
@@ -122,14 +124,41 @@ fn gist(message: &str) -> &str {
 }
 
 /// The summary of a replay, for a person.
-pub(crate) fn summary(summary: &Summary, digest: &Digest, paint: Paint) -> String {
+pub(crate) fn summary(summary: &Summary, digest: &Digest, clips: &[Clip], paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
-    let _ = write_summary(&mut text, summary, digest, paint);
+    let _ = write_summary(&mut text, summary, digest, clips, paint);
     text
 }
 
-fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: Paint) -> fmt::Result {
+/// How far a journal was proved, for a person.
+pub(crate) fn verified(verified: &Verified, paint: Paint) -> String {
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write_verified(&mut text, verified, paint);
+    text
+}
+
+fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::Result {
+    let name = visible(&verified.lambda);
+    let compared = counted(verified.wakes - verified.uncovered.min(verified.wakes), "decision");
+    writeln!(text, "{}: {}", paint.bold(&name), paint.green(&format!("{compared} made again, all the same")))?;
+    if verified.uncovered > 0 {
+        let wakes = counted(verified.uncovered, "wake");
+        let why = "not compared: the lambda looked at samples from before the clip";
+        writeln!(text, "  {}", paint.yellow(&format!("{wakes} {why}")))?;
+    }
+    if verified.cut_off {
+        let why = "the journal has no end: its writer died, or the drive was damaged; what it holds was compared";
+        writeln!(text, "  {}", paint.yellow(why))?;
+    }
+    for note in &verified.notes {
+        writeln!(text, "  {}", paint.yellow(&visible(note)))?;
+    }
+    writeln!(text, "  {:.3} s", verified.wall_s)
+}
+
+fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &[Clip], paint: Paint) -> fmt::Result {
     let name = format!("{} {}", visible(&summary.lambda), visible(&summary.version));
     let span_s = seconds(summary.end_ns, summary.start_ns);
     writeln!(
@@ -154,6 +183,7 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: P
         }
         more(text, digest.other_faults)?;
     }
+    clips::write(text, clips, summary, paint)?;
     for loss in losses(summary) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {loss}")))?;
     }
@@ -181,7 +211,8 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, paint: P
         write!(text, " ({:.0} % decoding)", 100.0 * summary.decode_s / summary.run_s.max(summary.decode_s))?;
     }
     writeln!(text, ", {:.1} MiB at most", mib(summary.peak_rss_bytes))?;
-    let files = format!("{}: decisions.jsonl, log.jsonl, summary.json", summary.out.display());
+    let clips = if clips.is_empty() { "" } else { ", clips.jsonl, clips/" };
+    let files = format!("{}: decisions.jsonl, log.jsonl, summary.json{clips}", summary.out.display());
     writeln!(text, "  {}", paint.dim(&files))
 }
 

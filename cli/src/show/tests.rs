@@ -1,5 +1,5 @@
 use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Cause as Woken, TriggerKind};
+use gleaner_protocol::{Cause as Woken, Recovered, TriggerKind};
 
 use super::*;
 
@@ -38,6 +38,7 @@ fn replay() -> Summary {
             no_slot: 0,
             too_big: 0,
         }],
+        clips: 0,
         damaged: None,
     }
 }
@@ -71,7 +72,7 @@ fn digest(decisions: Vec<Decision>) -> Digest {
 fn a_summary_says_what_was_found_when_how_fast_and_where_the_files_are() {
     let digest = digest(vec![decision(10_810, Some("brake-dark"), None), decision(11_000, None, None)]);
     assert_eq!(
-        summary(&replay(), &digest, PLAIN),
+        summary(&replay(), &digest, &[], PLAIN),
         "brake-dark 0.1.0 (wasm): 1 trigger in 1,200 wakes, 40.0 s of drive\n    \
             10.810 s  brake-dark  1.46\n  \
           2,400 wakes/s (80x real time), 0.400 s in the lambda (25 % decoding), 12.0 MiB at most\n  \
@@ -82,7 +83,7 @@ fn a_summary_says_what_was_found_when_how_fast_and_where_the_files_are() {
 #[test]
 fn of_many_triggers_twenty_are_shown_and_the_others_counted() {
     let digest = digest((0..1500).map(|n| decision(1000 * n, Some("x"), None)).collect());
-    let text = summary(&Summary { triggers: 1500, ..replay() }, &digest, PLAIN);
+    let text = summary(&Summary { triggers: 1500, ..replay() }, &digest, &[], PLAIN);
     assert_eq!(text.matches(" s  x  1.46\n").count(), 20);
     assert!(text.contains("              and 1,480 more\n"), "{text}");
 }
@@ -99,7 +100,7 @@ fn triggers_of_one_label_less_than_a_second_apart_are_one_line() {
     twice.triggers[0].score = None;
     twice.triggers.extend_from_within(..);
     decisions.push(twice);
-    let text = summary(&Summary { triggers: 1505, ..replay() }, &digest(decisions), PLAIN);
+    let text = summary(&Summary { triggers: 1505, ..replay() }, &digest(decisions), &[], PLAIN);
     let lines: Vec<_> = text.lines().skip(1).take(5).collect();
     assert_eq!(
         lines,
@@ -120,6 +121,7 @@ fn where_a_panic_was_and_what_it_said_are_both_shown() {
     let text = summary(
         &Summary { faults: 1, ..replay() },
         &digest(vec![decision(0, None, Some((FaultKind::Trap, message)))]),
+        &[],
         PLAIN,
     );
     assert!(text.contains("1x trap: panicked at src/lib.rs:17:9: ouch\n"), "{text}");
@@ -131,7 +133,7 @@ fn faults_are_shown_once_per_cause_with_the_line_that_says_most() {
     let faults = [(500, FaultKind::Trap, "unreachable\nat f"), (600, FaultKind::Exception, traceback)];
     let mut decisions: Vec<_> = faults.map(|(at, kind, message)| decision(at, None, Some((kind, message)))).into();
     decisions.push(decision(700, None, Some((FaultKind::Trap, "unreachable\nat g"))));
-    let text = summary(&Summary { faults: 3, ..replay() }, &digest(decisions), PLAIN);
+    let text = summary(&Summary { faults: 3, ..replay() }, &digest(decisions), &[], PLAIN);
     assert!(
         text.contains("  3 faults\n     0.500 s  2x trap: unreachable\n     0.600 s  1x exception: ValueError: no\n"),
         "{text}"
@@ -165,10 +167,10 @@ fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
 #[test]
 fn messages_that_came_out_of_order_are_said_and_are_no_loss() {
     let disordered = Summary { out_of_order: 2, ..replay() };
-    let text = summary(&disordered, &digest(Vec::new()), PLAIN);
+    let text = summary(&disordered, &digest(Vec::new()), &[], PLAIN);
     assert!(text.contains("\n  out of order: 2 messages came after one with a later log time\n"), "{text}");
     assert!(losses(&disordered).is_empty());
-    assert!(!summary(&replay(), &digest(Vec::new()), PLAIN).contains("order"));
+    assert!(!summary(&replay(), &digest(Vec::new()), &[], PLAIN).contains("order"));
 }
 
 #[test]
@@ -176,7 +178,7 @@ fn what_a_lambda_writes_cannot_act_on_the_terminal() {
     let fault = Some((FaultKind::Trap, "\u{1b}[2J"));
     let digest = digest(vec![decision(0, Some("a\u{1b}[2J\nb"), fault)]);
     let damaged = Some("error: \u{7}\n  cause: x".to_owned());
-    let text = summary(&Summary { faults: 1, damaged, ..replay() }, &digest, PLAIN);
+    let text = summary(&Summary { faults: 1, damaged, ..replay() }, &digest, &[], PLAIN);
     assert!(!text.contains('\u{1b}') && !text.contains('\u{7}'), "{text}");
     assert!(text.contains("    error: \\u{7}\n      cause: x\n"), "{text}");
 }
@@ -186,4 +188,59 @@ fn colours_come_only_where_they_are_wanted() {
     assert_eq!(Paint { on: true }.red("x"), "\u{1b}[31mx\u{1b}[0m");
     assert_eq!(PLAIN.red("x"), "x");
     assert!(!Paint::new(false).on);
+}
+
+/// A clip from 5.8 to 9.0 s, asked for up to 15.8 s.
+fn clip() -> Clip {
+    let at = |seconds: f64| START_NS + (seconds * 1e9) as i64;
+    let line = format!(
+        r#"{{"file":"clips/x.mcap","thumbnail":"clips/x.jpg","bytes":1048576,"from_ns":{},"to_ns":{},"first_ns":{},
+        "last_ns":{},"lambdas":[],"triggers":1,"moments":[],"topics":[{{"topic":"/imu/data","type_name":null,"messages":1646,
+        "received":1650,"lost":null,"overwritten":3,"too_big":1}}],"short":["the drive ended 6.8 s before the window did"],
+        "recovered":null}}"#,
+        at(5.8),
+        at(15.8),
+        at(5.801),
+        at(9.0),
+    );
+    serde_json::from_str(&line).unwrap()
+}
+
+#[test]
+fn a_clip_is_shown_with_its_length_topics_thumbnail_and_what_is_missing() {
+    let text = summary(&Summary { clips: 1, ..replay() }, &digest(Vec::new()), &[clip()], PLAIN);
+    let shown = "  1 clip\n     \
+                    5.801 to 9.000 s  clips/x.mcap\n              \
+                    3.2 s, 1.0 MiB: /imu/data 1,646; clips/x.jpg\n              \
+                    short: the drive ended 6.8 s before the window did\n              \
+                    lost: 3 messages of /imu/data, pushed out of the preroll\n              \
+                    lost: 1 message of /imu/data, larger than the preroll\n";
+    assert!(text.contains(shown), "{text}");
+    assert!(text.ends_with("out/demo: decisions.jsonl, log.jsonl, summary.json, clips.jsonl, clips/\n"), "{text}");
+}
+
+#[test]
+fn a_recovered_clip_says_what_was_lost_with_its_recorder() {
+    let recovered = Some(Recovered { lost_bytes: 1200, what: "the recorder died".to_owned() });
+    let text = summary(&replay(), &digest(Vec::new()), &[Clip { recovered, ..clip() }], PLAIN);
+    assert!(text.contains("recovered: the recorder died (1,200 bytes lost)\n"), "{text}");
+}
+
+#[test]
+fn a_verified_journal_says_how_many_decisions_are_the_same_and_what_was_not_compared() {
+    let mut proved = Verified {
+        lambda: "hello".to_owned(),
+        wakes: 4170,
+        uncovered: 0,
+        cut_off: false,
+        wall_s: 0.25,
+        notes: Vec::new(),
+    };
+    assert_eq!(verified(&proved, PLAIN), "hello: 4,170 decisions made again, all the same\n  0.250 s\n");
+    proved.uncovered = 50;
+    proved.cut_off = true;
+    proved.notes = vec!["machine: aarch64 in the journal, x86_64 now".to_owned()];
+    let text = verified(&proved, PLAIN);
+    assert!(text.starts_with("hello: 4,120 decisions made again, all the same\n  50 wakes not compared"), "{text}");
+    assert!(text.contains("the journal has no end") && text.contains("machine: aarch64"), "{text}");
 }

@@ -31,7 +31,7 @@ pub const COMPILE_CPU_SECONDS: u64 = 120;
 pub const GUEST_STACK_BYTES: usize = 512 << 10;
 
 /// Wasmtime's version and the settings of [`engine`]; a change of either makes new entries.
-const SETTINGS: &str = "wasmtime 48.0.8, fuel, epochs, speed, 1";
+pub const SETTINGS: &str = "wasmtime 48.0.8, fuel, epochs, speed, 1";
 
 /// Why native code could not be made or found.
 #[derive(Debug, thiserror::Error)]

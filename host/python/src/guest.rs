@@ -27,7 +27,7 @@ const WAKES_PER_TIDY: u64 = 10;
 pub(crate) fn main(py: Python<'_>, args: Vec<OsString>, host: Py<PyAny>) -> u8 {
     // Attached only for the length of a call into the lambda, so that its own threads run between two wakes.
     py.detach(|| {
-        program::replay_in_python(args, &mut |options, manifest, session| {
+        program::run_in_python(args, &mut |options, manifest, session| {
             let host = Python::attach(|py| host.clone_ref(py));
             let entry = options.build.entry_path(manifest);
             Ok(Box::new(PythonGuest::new(host, entry, handler(manifest), session)))
@@ -176,6 +176,15 @@ impl Guest for PythonGuest {
             let result = self.run(py, wake);
             self.tidy(py);
             Outcome { result, fuel: None }
+        })
+    }
+
+    fn engine(&self) -> String {
+        Python::attach(|py| {
+            let version = Python::version_str();
+            let python = version.split(' ').next().unwrap_or(version);
+            let numpy = py.import("numpy").and_then(|numpy| numpy.getattr("__version__")).map(|it| it.to_string());
+            format!("Python {python}, numpy {}", numpy.as_deref().unwrap_or("unknown"))
         })
     }
 }

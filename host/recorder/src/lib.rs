@@ -1,1 +1,22 @@
-//! Keeps the moments around triggers.
+//! Keeps the moments around triggers: the preroll, the windows that triggers open, and the clips that are cut there.
+//!
+//! - `preroll`: what came lately, in memory or on disk, within a bound.
+//! - `window`: from triggers to windows, from windows to clips; pure bookkeeping.
+//! - `recorder`: the two together, sample by sample and wake by wake.
+//! - `file`: clips as MCAP files that are whole or not there, the list of them, and what a death leaves.
+//! - `thumbnail`: a small picture of a moment.
+//!
+//! Synchronous and without threads: what is recorded depends on the stamps of samples and wakes only. What never happens
+//! here: running a lambda, subscribing a topic, deciding what is worth keeping.
+
+mod error;
+mod file;
+mod preroll;
+mod recorder;
+mod thumbnail;
+mod window;
+
+pub use error::RecordError;
+pub use file::{About, Ending, Folder, Topic, TopicCounts, Unfinished};
+pub use recorder::{Counts, LambdaId, Member, Recorder, Settings, TopicId};
+pub use thumbnail::thumbnail;

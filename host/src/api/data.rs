@@ -12,6 +12,7 @@ use gleaner_transport::message::{CdrError, Definitions, Endian, FieldPath, Heade
 pub use super::error::DataError;
 use super::frame::{Frame, Images, Picture};
 use super::log::cut;
+use super::trace::{Arrivals, Looked};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
 /// Most samples that one call hands out.
@@ -37,6 +38,8 @@ pub struct Topic {
     header: Option<HeaderStamp>,
     pub(super) images: Images,
     skipped: AtomicU64,
+    pub(super) arrivals: Arc<Arrivals>,
+    pub(super) looked: Looked,
     /// Reused between column reads, so that they allocate nothing but their result.
     scratch: Mutex<Vec<Lease<SampleMeta>>>,
 }
@@ -55,12 +58,13 @@ pub struct Sample {
 }
 
 impl Topic {
-    /// The topic behind input `input`, whose samples arrive through `reader`.
+    /// The topic behind input `input`, whose samples arrive through `reader` and are summed up in `arrivals`.
     pub fn new(
         input: &str,
         topic: &str,
         type_name: &str,
         reader: RingReader<SampleMeta>,
+        arrivals: Arc<Arrivals>,
         definitions: Arc<Definitions>,
         images: Images,
     ) -> Arc<Self> {
@@ -73,6 +77,8 @@ impl Topic {
             definitions,
             images,
             skipped: AtomicU64::new(0),
+            arrivals,
+            looked: Looked::default(),
             scratch: Mutex::default(),
         })
     }
@@ -94,13 +100,16 @@ impl Topic {
 
     /// Newest sample; none before the first.
     pub fn newest(self: &Arc<Self>) -> Option<Sample> {
-        self.reader.newest().map(|lease| self.sample(lease))
+        let newest = self.reader.newest();
+        self.looked.at(newest.as_ref());
+        newest.map(|lease| self.sample(lease))
     }
 
     /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`].
     pub fn last(self: &Arc<Self>, n: usize) -> Vec<Sample> {
         let mut leases = Vec::new();
         self.reader.last(n.min(SAMPLES_PER_CALL), &mut leases);
+        self.looked.at(leases.first());
         leases.into_iter().map(|lease| self.sample(lease)).collect()
     }
 
@@ -108,6 +117,7 @@ impl Topic {
     pub fn since(self: &Arc<Self>, since_ns: i64) -> Vec<Sample> {
         let mut leases = Vec::new();
         self.reader.newest_while(SAMPLES_PER_CALL, |meta| meta.at_ns > since_ns, &mut leases);
+        self.looked.at(leases.first());
         leases.into_iter().map(|lease| self.sample(lease)).collect()
     }
 
@@ -158,6 +168,7 @@ impl Topic {
         field.must_belong_to(self)?;
         let mut leases = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
         select(&self.reader, &mut leases);
+        self.looked.at(leases.first());
         let column = leases.iter().try_fold(Column::with_capacity(leases.len()), |mut column, lease| {
             column.values.push(self.number(&field.path, lease)?);
             column.at_ns.push(lease.meta().at_ns);
@@ -322,6 +333,11 @@ impl Sample {
         Picture::of(type_name, &self.lease, self.lease.meta().endian)
             .map_err(|source| DataError::Malformed { topic: topic.clone(), type_name: type_name.clone(), source })?
             .ok_or_else(|| DataError::NoImageType { topic: topic.clone(), type_name: type_name.clone() })
+    }
+
+    /// Where it stands in its ring.
+    pub(crate) fn position(&self) -> Option<u64> {
+        self.lease.position()
     }
 
     pub(crate) fn meta(&self) -> &SampleMeta {

@@ -23,6 +23,9 @@ pub trait Guest {
 
     /// Runs one wake to its end.
     fn wake(&mut self, wake: Wake) -> Outcome;
+
+    /// What runs the lambda, with its version: a decision is only the same again on the same.
+    fn engine(&self) -> String;
 }
 
 /// How a wake ended.

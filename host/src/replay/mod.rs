@@ -3,39 +3,69 @@
 //! Time is the drive's. A sample is delivered, the lambda runs if its schedule says so, then the next: nothing is skipped,
 //! and nothing depends on how fast the machine is.
 
+mod claim;
+mod digests;
 mod options;
 mod output;
+mod paced;
+mod record;
 mod round;
+mod stage;
+mod verify;
 
-pub use options::{Options, ReplayArgs};
+pub use options::{Job, Options, ReplayArgs, VerifyArgs};
 
 use std::io::Write;
 
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure, Report};
 
+use self::options::{Results, Task};
 use crate::api::Session;
 use crate::guest::Guest;
+
+/// What the times of a replay are.
+const CLOCK: &str = "log time of the drive";
 
 /// Makes the guest of a lambda whose kind the caller can host.
 pub type Load<'a> = &'a mut dyn FnMut(&Options, &Manifest, Session) -> Result<Box<dyn Guest>, Failure>;
 
-/// Replays, writes results to `options.out` and reports to `reports`.
-///
-/// The exit is [`Exit::DriveDamaged`] if the drive ended in damage, or [`Exit::Internal`] if it could not be read further
-/// (results up to there are kept); else [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
-///
-/// # Errors
-///
-/// A failure if the replay cannot start, or results cannot be written.
-pub fn run(options: &Options, manifest: &Manifest, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
+impl Job {
+    /// Does it, and writes reports to `reports`.
+    ///
+    /// For a replay, the exit is [`Exit::DriveDamaged`] if the drive ended in damage, or [`Exit::Internal`] if it could not be
+    /// read further (results up to there are kept); else [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
+    ///
+    /// # Errors
+    ///
+    /// A failure if it cannot start, or results cannot be written; of a comparison, the first difference.
+    pub fn run(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
+        let Self { options, manifest, task } = self;
+        match task {
+            Task::Replay(results) => replay(&options, &results, &manifest, load, reports),
+            Task::Verify(mut claim) => {
+                let verified = verify::run(&options, &manifest, &mut claim, load)?;
+                report(reports, &Report::Verified(verified));
+                Ok(Exit::Ok)
+            }
+        }
+    }
+}
+
+fn replay(
+    options: &Options,
+    results: &Results,
+    manifest: &Manifest,
+    load: Load<'_>,
+    reports: &mut dyn Write,
+) -> Result<Exit, Failure> {
     let mut n = 1;
     let (summary, broken) = loop {
-        let (summary, broken) = round::replay(options, manifest, &mut *load, reports)?;
-        if options.repeat > 1 {
+        let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports)?;
+        if results.repeat > 1 {
             report(reports, &Report::Round(round::report(n, &summary)));
         }
-        if n >= options.repeat {
+        if n >= results.repeat {
             break (summary, broken);
         }
         n += 1;

@@ -1,4 +1,4 @@
-//! What to replay: the arguments as typed, and what they mean once checked against the build.
+//! What to do: the arguments as typed, and what they mean once checked against the build.
 
 use std::path::PathBuf;
 
@@ -6,6 +6,7 @@ use clap::Args;
 use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
 use gleaner_protocol::{BuildDir, Exit, Failure};
 
+use super::claim::Claim;
 use crate::input::Remap;
 
 /// Arguments of `replay`.
@@ -28,9 +29,28 @@ pub struct ReplayArgs {
     /// Write every decision, not only those with a trigger or a fault.
     #[arg(long)]
     pub all: bool,
+    /// Leave out the clips that the table `record` of the manifest asks for.
+    #[arg(long)]
+    pub no_record: bool,
+    /// Write a journal of every wake.
+    #[arg(long, value_name = "FILE")]
+    pub journal: Option<PathBuf>,
+    /// Make every decision of this journal again and compare, instead of writing results.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["out", "all", "no_record", "journal", "repeat"])]
+    pub verify: Option<PathBuf>,
     /// Replay so many times in this process, each time from the start.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub repeat: u32,
+}
+
+/// Arguments of `verify`.
+#[derive(Args, Clone, Debug)]
+pub struct VerifyArgs {
+    /// A clip, with the part of the journal that made it.
+    pub clip: PathBuf,
+    /// The lambda's folder, built by `gleaner build`.
+    #[arg(long, value_name = "DIR")]
+    pub lambda: PathBuf,
 }
 
 fn assignment(text: &str) -> Result<(String, String), String> {
@@ -43,7 +63,7 @@ fn remap(text: &str) -> Result<Remap, String> {
     Ok(Remap { from: from.trim().to_owned(), to: to.trim().to_owned() })
 }
 
-/// What to replay, checked.
+/// Which lambda judges which drives.
 pub struct Options {
     /// The lambda's folder.
     pub lambda: PathBuf,
@@ -55,47 +75,98 @@ pub struct Options {
     pub config: Vec<(String, ConfigValue)>,
     /// Other names for topics of the manifest.
     pub remaps: Vec<Remap>,
-    /// Where results are written.
-    pub out: PathBuf,
-    /// Whether every decision is written.
-    pub all: bool,
-    /// How often to replay.
-    pub repeat: u32,
 }
 
-impl Options {
-    /// Checks `args` against the build folder and the manifest in it.
+/// What a replay leaves.
+pub(super) struct Results {
+    /// Where results are written.
+    pub(super) out: PathBuf,
+    /// Whether every decision is written.
+    pub(super) all: bool,
+    /// Whether clips are made.
+    pub(super) record: bool,
+    /// Where the journal is written.
+    pub(super) journal: Option<PathBuf>,
+    /// How often to replay.
+    pub(super) repeat: u32,
+}
+
+/// What to do with the decisions.
+pub(super) enum Task {
+    Replay(Results),
+    Verify(Box<Claim>),
+}
+
+/// A lambda, its drives, and what to do with its decisions.
+pub struct Job {
+    /// Which lambda judges which drives.
+    pub options: Options,
+    /// The lambda's manifest.
+    pub manifest: Manifest,
+    pub(super) task: Task,
+}
+
+impl Job {
+    /// A replay, or with `--verify` a comparison with an earlier one, checked against the build and its manifest.
     ///
     /// # Errors
     ///
-    /// A failure that names the manifest's line, the key or the topic, and the way out.
-    pub fn new(args: ReplayArgs) -> Result<(Self, Manifest), Failure> {
+    /// A failure that names the manifest's line, the key, the topic or what differs from the journal, and the way out.
+    pub fn replay(args: ReplayArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.lambda)?;
         let manifest = Manifest::load(build.path())?;
-        let config = ConfigSet::resolve(&manifest, &args.set)?;
-        for remap in &args.remap {
-            if !manifest.inputs.iter().any(|input| input.topic.as_str() == remap.from) {
-                let known = manifest.inputs.iter().map(|input| input.topic.as_str()).collect::<Vec<_>>().join("`, `");
-                let failure = Failure::new(Exit::Usage, format!("no input has the topic `{}` of --remap", remap.from));
-                return Err(failure.with_help(format!("the manifest has `{known}`")));
-            }
-        }
         if let Some(twice) = given_twice(&args.drives) {
             let failure = Failure::new(Exit::Usage, format!("drive `{}` is given twice", twice.display()));
             return Err(failure.with_help("its samples would count twice; give each file once"));
         }
-        let out = args.out.unwrap_or_else(|| args.lambda.join("out"));
-        let options = Self {
-            lambda: args.lambda,
-            build,
-            drives: args.drives,
-            config,
-            remaps: args.remap,
-            out,
+        if let Some(journal) = args.verify {
+            let claim = Claim::journal(&journal)?;
+            let options = claim.options(args.lambda, build, &manifest, args.drives, args.set, args.remap)?;
+            return Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) });
+        }
+        let config = ConfigSet::resolve(&manifest, &args.set)?;
+        known_topics(&args.remap, &manifest)?;
+        let results = Results {
+            out: args.out.unwrap_or_else(|| args.lambda.join("out")),
             all: args.all,
+            record: !args.no_record,
+            journal: args.journal,
             repeat: args.repeat,
         };
-        Ok((options, manifest))
+        let options = Options { lambda: args.lambda, build, drives: args.drives, config, remaps: args.remap };
+        Ok(Self { options, manifest, task: Task::Replay(results) })
+    }
+
+    /// A comparison of a clip with the part of the journal in it.
+    ///
+    /// # Errors
+    ///
+    /// As [`Job::replay`].
+    pub fn verify(args: VerifyArgs) -> Result<Self, Failure> {
+        let build = BuildDir::check_fresh(&args.lambda)?;
+        let manifest = Manifest::load(build.path())?;
+        let claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
+        let options = claim.options(args.lambda, build, &manifest, vec![args.clip], Vec::new(), Vec::new())?;
+        Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
+    }
+}
+
+/// Refuses a remap of a topic that the manifest does not have.
+fn known_topics(remaps: &[Remap], manifest: &Manifest) -> Result<(), Failure> {
+    let inputs = manifest.inputs.iter().map(|input| input.topic.as_str());
+    let recorded = manifest.record.iter().flat_map(|record| &record.topics).map(|topic| topic.as_str());
+    let mut known: Vec<&str> = Vec::new();
+    for topic in inputs.chain(recorded) {
+        if !known.contains(&topic) {
+            known.push(topic);
+        }
+    }
+    match remaps.iter().find(|remap| !known.contains(&remap.from.as_str())) {
+        None => Ok(()),
+        Some(remap) => {
+            let failure = Failure::new(Exit::Usage, format!("no input has the topic `{}` of --remap", remap.from));
+            Err(failure.with_help(format!("the manifest has `{}`", known.join("`, `"))))
+        }
     }
 }
 

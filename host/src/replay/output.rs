@@ -1,10 +1,11 @@
-//! The files of a replay: `decisions.jsonl`, `log.jsonl`, `summary.json`.
+//! The files of a replay: `decisions.jsonl`, `log.jsonl`, `summary.json`, and the journal where one is wanted.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Decision, Exit, Explain, Summary};
+use gleaner_protocol::journal::{self, End, Entry, Header, Reader};
+use gleaner_protocol::{Decision, Exit, Explain, Failure, Summary};
 use serde::Serialize;
 
 use crate::api::log::Line;
@@ -112,5 +113,51 @@ impl Lines {
         let written = self.file.write_all(&self.pending);
         self.pending.clear();
         written.map_err(|source| OutputError { path: self.path.clone(), source })
+    }
+}
+
+/// The journal of a replay.
+pub struct JournalFile {
+    path: PathBuf,
+    writer: journal::Writer<File>,
+}
+
+impl JournalFile {
+    /// Begins the journal `path` anew. A file there that is no journal is left alone: it may be a drive, named by mistake.
+    pub fn create(path: &Path, header: &Header) -> Result<Self, Failure> {
+        let failed = |source| OutputError { path: path.to_owned(), source };
+        match File::open(path) {
+            Ok(mut file) => {
+                let is_empty = file.metadata().map_err(failed)?.len() == 0;
+                if !is_empty && Reader::open(&mut file).is_err() {
+                    let message = format!("`{}` is there and is no journal of this version", path.display());
+                    return Err(Failure::new(Exit::Usage, message).with_help("choose another name: --journal FILE"));
+                }
+            }
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(failed(error).into()),
+        }
+        let file = File::create(path).map_err(failed)?;
+        let writer = journal::Writer::begin(file, header).map_err(failed)?;
+        Ok(Self { path: path.to_owned(), writer })
+    }
+
+    /// Adds a wake.
+    pub fn wake(&mut self, entry: &Entry) -> Result<(), OutputError> {
+        self.writer.wake(entry).map_err(|source| OutputError { path: self.path.clone(), source })
+    }
+
+    /// Writes what waits.
+    pub fn flush(&mut self) -> Result<(), OutputError> {
+        self.writer.flush().map_err(|source| OutputError { path: self.path.clone(), source })
+    }
+
+    /// Ends the journal, and waits until it is on the disk. Without `end` it reads like one whose writer died.
+    pub fn finish(mut self, end: Option<&End>) -> Result<(), OutputError> {
+        let failed = |source| OutputError { path: self.path.clone(), source };
+        match end {
+            Some(end) => self.writer.finish(end).and_then(|file| file.sync_all()).map_err(failed),
+            None => self.flush(),
+        }
     }
 }

@@ -5,16 +5,21 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use gleaner_protocol::journal::End;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Explain, Failure, Report, Round, Summary, TopicReport};
-use gleaner_transport::TransportError;
 use gleaner_transport::replay::{Replay, ReplayError};
 
-use super::output::Output;
-use super::{Load, Options, report as send};
+use super::digests::Digests;
+use super::options::Results;
+use super::output::{JournalFile, Output};
+use super::record::Recording;
+use super::stage::{DriveError, Stage};
+use super::{CLOCK, Load, Options, report as send};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
-use crate::input::{InputError, open_inputs};
+use crate::api::log::Line;
+use crate::journal::{Identity, Scribe};
 use crate::judge::Judge;
 use crate::schedule::Schedule;
 
@@ -28,6 +33,10 @@ struct Pass<'a> {
     schedule: Schedule,
     session: Session,
     output: &'a mut Output,
+    /// Fills in what the journal and the clips say of a wake; none where there is neither.
+    scribe: Option<Scribe>,
+    journal: Option<JournalFile>,
+    recording: Option<Recording>,
     wakes: u64,
     triggers: u64,
     faults: u64,
@@ -36,18 +45,36 @@ struct Pass<'a> {
 
 impl Pass<'_> {
     fn wake(&mut self, wake: Wake) -> Result<(), Failure> {
+        if let Some(scribe) = &mut self.scribe {
+            scribe.begin(&wake);
+        }
         let decision = self.judge.judge(wake);
         self.wakes += 1;
         self.triggers += decision.triggers.len() as u64;
         self.faults += u64::from(decision.fault.is_some());
         self.output.decision(&decision)?;
-        self.keep_log()
+        let log = self.session.take_log();
+        if let Some(scribe) = &mut self.scribe {
+            let entry = scribe.end(&decision, &log);
+            if let Some(journal) = &mut self.journal {
+                journal.wake(entry)?;
+            }
+            if let Some(recording) = &self.recording {
+                recording.wake(entry)?;
+            }
+        }
+        self.keep(&log)
     }
 
-    fn keep_log(&mut self) -> Result<(), Failure> {
-        let lines = self.session.take_log();
-        self.log_lines += lines.len() as u64;
-        Ok(self.output.log(&lines)?)
+    fn keep(&mut self, log: &[Line]) -> Result<(), Failure> {
+        self.log_lines += log.len() as u64;
+        Ok(self.output.log(log)?)
+    }
+
+    /// Writes what waits, so that a reader sees how far the replay is.
+    fn flush(&mut self) -> Result<(), Failure> {
+        self.output.flush()?;
+        Ok(self.journal.as_mut().map_or(Ok(()), JournalFile::flush)?)
     }
 
     /// Runs the ticks that are due before a sample of `at_ns`.
@@ -61,47 +88,69 @@ impl Pass<'_> {
 
 pub(super) fn replay(
     options: &Options,
+    results: &Results,
     manifest: &Manifest,
     load: Load<'_>,
     reports: &mut dyn Write,
 ) -> Result<(Summary, Option<Exit>), Failure> {
     let name = manifest.lambda.name.as_str();
-    let mut drive = Replay::open(&options.drives).map_err(|error| Failure::from(OpenError(error)))?;
-    let inputs = open_inputs(manifest, &options.remaps, &mut drive)
-        .map_err(|error| Failure::because(format!("cannot start lambda `{name}`"), &error))?;
-    let session = Session::new(inputs.clone(), options.config.clone());
-    let mut guest = load(options, manifest, session.clone())?;
+    let drive = Replay::open(&options.drives).map_err(|error| Failure::from(DriveError(error)))?;
+    let Stage { mut drive, inputs, session, mut guest } = Stage::set(drive, options, manifest, load)?;
+    let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
     // Only now does it cost the results of an earlier replay: what could not start must not touch them.
-    let mut output = Output::create(&options.out, options.all)?;
+    let mut output = Output::create(&results.out, results.all)?;
     let initialised = guest.init();
+    let said = session.take_log();
+    if let Err(fault) = initialised {
+        // What it said on the way may be why.
+        output.log(&said)?;
+        output.flush()?;
+        let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{name}`"));
+        failure.causes = vec![fault.message];
+        return Err(failure);
+    }
+    let mut journal = None;
+    let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.clone()));
+    if results.journal.is_some() || recording.is_some() {
+        let Options { build, config, remaps, .. } = options;
+        let header = Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK }.header()?;
+        journal = results.journal.as_deref().map(|path| JournalFile::create(path, &header)).transpose()?;
+        if let Some(recording) = &mut recording {
+            recording.start(&results.out, &header)?;
+        }
+    }
     let mut pass = Pass {
         schedule: Schedule::new(manifest, &inputs),
         judge: Judge::new(session.clone(), guest),
         session,
         output: &mut output,
+        scribe: (journal.is_some() || recording.is_some()).then(|| Scribe::new(&inputs)),
+        journal,
+        recording,
         wakes: 0,
         triggers: 0,
         faults: 0,
         log_lines: 0,
     };
-    pass.keep_log()?;
-    if let Err(fault) = initialised {
-        // What it said on the way may be why.
-        pass.output.flush()?;
-        let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{name}`"));
-        failure.causes = vec![fault.message];
-        return Err(failure);
-    }
+    pass.keep(&said)?;
 
     let started = Instant::now();
-    let broken = drain(&mut drive, &mut pass, reports)?.map(OpenError);
+    let broken = drain(&mut drive, &mut pass, reports)?.map(DriveError);
+    let end_ns = drive.end_ns().unwrap_or(0);
+    let clips = pass.recording.as_ref().map_or(Ok(Vec::new()), |recording| recording.finish(end_ns))?;
     let wall_s = started.elapsed().as_secs_f64();
+    if let (Some(journal), Some(digests)) = (pass.journal.take(), digests) {
+        let samples = inputs.iter().map(|topic| topic.counts().received).collect();
+        // A journal of a damaged drive has no end: it cannot say what comes there.
+        let end = End { wakes: pass.wakes, samples, drives: digests.take()? };
+        journal.finish(broken.is_none().then_some(&end))?;
+    }
     let summary = Summary {
         lambda: name.to_owned(),
         version: manifest.lambda.version.to_string(),
         kind: manifest.lambda.kind,
         drive: options.drives.iter().map(|drive| shown(drive)).collect(),
-        out: shown(&options.out),
+        out: shown(&results.out),
         wakes: pass.wakes,
         triggers: pass.triggers,
         faults: pass.faults,
@@ -111,13 +160,14 @@ pub(super) fn replay(
         log_lines: pass.log_lines,
         log_dropped: pass.session.log_dropped(),
         start_ns: drive.start_ns().unwrap_or(0),
-        end_ns: drive.end_ns().unwrap_or(0),
+        end_ns,
         wall_s,
         run_s: pass.judge.run().as_secs_f64(),
         decode_s: inputs.iter().map(|topic| topic.decode_ns()).sum::<u64>() as f64 / 1e9,
         wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
         peak_rss_bytes: memory("VmHWM:"),
         topics: inputs.iter().map(topic_report).collect(),
+        clips: clips.len() as u64,
         damaged: broken
             .as_ref()
             .map(|error| Failure::because("the drive could not be read to its end", error).to_string()),
@@ -142,13 +192,16 @@ fn drain(drive: &mut Replay, pass: &mut Pass<'_>, reports: &mut dyn Write) -> Re
             Ok(None) => break None,
             Err(error) => break Some(error),
         }
+        if let Some(recording) = &pass.recording {
+            recording.check()?;
+        }
         while let Some(wake) = pass.schedule.next_event() {
             pass.wake(wake)?;
         }
         samples += 1;
         if samples.is_multiple_of(SAMPLES_PER_LOOK) && looked.elapsed() >= PROGRESS {
             looked = Instant::now();
-            pass.output.flush()?;
+            pass.flush()?;
             let progress = drive.progress();
             send(reports, &Report::Progress { done: progress.done, total: Some(progress.total), at_ns });
         }
@@ -196,46 +249,4 @@ fn memory(name: &str) -> u64 {
     let line = status.lines().find_map(|line| line.strip_prefix(name));
     let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<u64>().ok());
     kib.unwrap_or(0) * 1024
-}
-
-/// A drive that cannot be read.
-#[derive(Debug, thiserror::Error)]
-#[error(transparent)]
-struct OpenError(ReplayError);
-
-impl Explain for OpenError {
-    fn help(&self) -> Option<String> {
-        matches!(self.0, ReplayError::Damaged { .. })
-            .then(|| "the results up to the damage are kept; copy the file again if you can".to_owned())
-    }
-
-    fn exit(&self) -> Exit {
-        match self.0 {
-            ReplayError::Damaged { .. } => Exit::DriveDamaged,
-            ReplayError::Read { .. } => Exit::Internal,
-            _ => Exit::Usage,
-        }
-    }
-}
-
-impl Explain for InputError {
-    fn help(&self) -> Option<String> {
-        let Self::Subscribe { source, .. } = self else {
-            return Some("lower depth, hold or max_size of this [[input]]".to_owned());
-        };
-        Some(match source {
-            TransportError::NoSuchTopic { .. } => "correct `topic` in lambda.toml, or pass --remap FROM:=TO".to_owned(),
-            TransportError::WrongType { found, .. } => {
-                format!("write type = \"{found}\" in lambda.toml, or choose another topic")
-            }
-            _ => return None,
-        })
-    }
-
-    fn exit(&self) -> Exit {
-        match self {
-            Self::Subscribe { .. } => Exit::Usage,
-            Self::Layout { .. } | Self::Memory { .. } => Exit::Internal,
-        }
-    }
 }

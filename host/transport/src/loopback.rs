@@ -84,6 +84,7 @@ impl Transport for Loopback {
             type_name: topic.type_name.clone(),
             definitions_text: topic.text.clone(),
             messages: Some(topic.messages),
+            offered_qos: None,
         };
         self.topics.iter().map(discovered).collect()
     }

@@ -25,6 +25,24 @@ pub struct TopicSpec {
 #[derive(Copy, Clone, PartialEq, Eq, Hash, Debug, Default, PartialOrd, Ord)]
 pub struct Guid(pub [u8; 16]);
 
+impl Guid {
+    /// The identity that `text` spells as [`fmt::Display`] does: exactly 32 lower-case hex digits.
+    pub fn from_hex(text: &str) -> Option<Self> {
+        let digit = |byte: u8| match byte {
+            b'0'..=b'9' => Some(byte - b'0'),
+            b'a'..=b'f' => Some(byte - b'a' + 10),
+            _ => None,
+        };
+        let (pairs, []) = text.as_bytes().as_chunks::<2>() else { return None };
+        let pairs: &[[u8; 2]; 16] = pairs.try_into().ok()?;
+        let mut bytes = [0; 16];
+        for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
+            *byte = digit(*high)? << 4 | digit(*low)?;
+        }
+        Some(Self(bytes))
+    }
+}
+
 impl fmt::Display for Guid {
     /// 32 lower-case hex digits.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -45,6 +63,9 @@ pub struct SampleMeta {
     pub seq: u64,
     /// Byte order of the CDR payload.
     pub endian: Endian,
+    /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Nothing reads them; with them
+    /// a recorder can write the message again as it was, byte for byte.
+    pub options: [u8; 2],
 }
 
 /// What a sink did with a sample.
@@ -77,6 +98,9 @@ pub struct DiscoveredTopic {
     pub definitions_text: Option<Arc<str>>,
     /// How many messages the source holds, where it knows.
     pub messages: Option<u64>,
+    /// The quality of service that the topic's writers offered, as rosbag2 notes it: YAML under the
+    /// key `offered_qos_profiles`, at most 64 KiB. `None` where the source does not carry it.
+    pub offered_qos: Option<String>,
 }
 
 /// Names one successful [`Transport::subscribe`]: 0 for the first of a transport, then counting up.
@@ -185,6 +209,18 @@ mod tests {
         let mut bytes = [0; 16];
         bytes[..4].copy_from_slice(b"mcap");
         assert_eq!(Guid(bytes).to_string(), "6d636170000000000000000000000000");
+    }
+
+    #[test]
+    fn a_guid_is_read_back_from_exactly_what_it_prints() {
+        let guid = Guid(std::array::from_fn(|n| (n * 17) as u8));
+        let text = guid.to_string();
+        assert_eq!(Guid::from_hex(&text), Some(guid));
+        for wrong in
+            ["", &text[1..], &format!("{text}0"), &text.to_uppercase(), &text.replace('0', "+"), &"é".repeat(16)]
+        {
+            assert_eq!(Guid::from_hex(wrong), None, "{wrong}");
+        }
     }
 
     #[test]

@@ -4,7 +4,7 @@
 mod support;
 
 use gleaner_transport::Transport;
-use gleaner_transport::replay::Replay;
+use gleaner_transport::replay::{Replay, read_extras};
 use mcap::{Compression, WriteOptions};
 use support::{drive, file, listen, run, small_chunks, ticking};
 
@@ -66,6 +66,7 @@ fn random_byte_flips_never_panic_hang_or_take_much_memory() {
             let (steps, _) = run(&mut replay);
             assert!(steps.len() <= messages.len(), "case {case}");
         }
+        let _ = read_extras(&path, 1 << 20);
         std::fs::remove_file(path).unwrap();
     }
     if let (Some(before), Some(after)) = (before, peak_kib()) {

@@ -1,12 +1,14 @@
-//! What Gleaner's programs share, and the only thing they share: the manifest, decisions, reports, exit codes, how an
-//! error looks to a user, and where the parts of an installation are found.
+//! What Gleaner's programs share, and the only thing they share: the manifest, decisions, journals, clips, reports,
+//! exit codes, how an error looks to a user, and where the parts of an installation are found.
 //!
 //! Nothing here runs a lambda, opens a socket, or needs more than a few small dependencies, so that the smallest
 //! program can afford it. Programs talk to each other through these types; they never link each other.
 
+mod clip;
 mod decision;
 mod exit;
 mod failure;
+pub mod journal;
 pub mod layout;
 pub mod manifest;
 pub mod parts;
@@ -16,12 +18,13 @@ mod scratch;
 mod sources;
 mod words;
 
+pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
 pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ};
 pub use exit::Exit;
 pub use failure::{Explain, Failure};
 pub use layout::{BuildDir, LayoutError};
 pub use manifest::{Manifest, ManifestError};
 pub use parts::{Parts, PartsError};
-pub use report::{Report, Round, Summary, TopicReport};
+pub use report::{Report, Round, Summary, TopicReport, Verified};
 pub use sources::Sources;
 pub use words::visible;

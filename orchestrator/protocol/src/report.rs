@@ -23,6 +23,25 @@ pub enum Report {
     Round(Round),
     /// Sent once, last.
     Summary(Box<Summary>),
+    /// Sent once, last, instead of a summary: a journal was compared, and every decision was the same.
+    Verified(Verified),
+}
+
+/// How far a journal was proved.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Verified {
+    /// Name of the lambda.
+    pub lambda: String,
+    /// Wakes in the journal.
+    pub wakes: u64,
+    /// Those of them that were not compared: the lambda had looked at samples from before the clip.
+    pub uncovered: u64,
+    /// The journal has no end: its writer died, or its drive was damaged. What it holds was compared.
+    pub cut_off: bool,
+    /// Duration, in s.
+    pub wall_s: f64,
+    /// What was not the same around the lambda, such as another version of its engine.
+    pub notes: Vec<String>,
 }
 
 /// One pass over a drive, of several: what shows a leak or a slowdown.
@@ -87,6 +106,8 @@ pub struct Summary {
     pub peak_rss_bytes: u64,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<TopicReport>,
+    /// Clips made; `clips.jsonl` has a line for each.
+    pub clips: u64,
     /// What is wrong with the drive, if it is damaged; the results end there.
     pub damaged: Option<String>,
 }
@@ -167,6 +188,7 @@ mod tests {
             wakes_per_s: 200.0,
             peak_rss_bytes: 1 << 20,
             topics: vec![topic],
+            clips: 2,
             damaged: None,
         };
         reads_back(
@@ -177,7 +199,7 @@ mod tests {
                 r#""log_dropped":0,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
                 r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,
-                r#""damaged":null}"#
+                r#""clips":2,"damaged":null}"#
             ),
         );
     }

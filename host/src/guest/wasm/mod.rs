@@ -159,6 +159,10 @@ impl Guest for WasmGuest {
         }
         Outcome { result, fuel: Some(fuel) }
     }
+
+    fn engine(&self) -> String {
+        gleaner_compile::SETTINGS.to_owned()
+    }
 }
 
 fn handle_table() -> ResourceTable {

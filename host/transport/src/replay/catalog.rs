@@ -21,6 +21,8 @@ struct Topic {
     channels: Vec<(usize, u16)>,
     /// What is encoded in a way we do not read, and how.
     foreign: Option<(&'static str, String, &'static str)>,
+    /// Of the first channel that has it.
+    offered_qos: Option<String>,
     definitions: OnceLock<Arc<Definitions>>,
 }
 
@@ -46,6 +48,7 @@ impl Catalog {
                     messages: 0,
                     channels: Vec::new(),
                     foreign: None,
+                    offered_qos: None,
                     definitions: OnceLock::new(),
                 });
                 if !same_type(&topic.type_name, &channel.type_name) {
@@ -61,6 +64,9 @@ impl Catalog {
                 topic.messages = topic.messages.saturating_add(messages);
                 topic.channels.push((file, id));
                 topic.foreign = topic.foreign.take().or_else(|| foreign(channel));
+                if topic.offered_qos.is_none() {
+                    topic.offered_qos.clone_from(&channel.offered_qos);
+                }
                 if topic.text.is_none() && channel.schema_encoding == "ros2msg" {
                     topic.text.clone_from(&channel.definitions_text);
                 }
@@ -75,6 +81,7 @@ impl Catalog {
             type_name: topic.type_name.clone(),
             definitions_text: topic.text.clone(),
             messages: Some(topic.messages),
+            offered_qos: topic.offered_qos.clone(),
         };
         self.0.iter().map(discovered).collect()
     }

@@ -11,7 +11,8 @@ use super::chunk::{OpenSegment, Opener};
 use super::error::{Damage, ReplayError};
 use super::scan::scan;
 use super::source::Source;
-use super::track::{Routed, Track};
+use super::track::{Routed, Track, nanoseconds};
+use super::writers::Writers;
 use crate::message::Definitions;
 use crate::transport::{
     DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict,
@@ -30,7 +31,7 @@ pub struct Limits {
 }
 
 impl Default for Limits {
-    /// 1 GiB for a chunk, 2 GiB for all open ones. Usual chunks have 1 to 4 MiB.
+    /// 256 MiB for a chunk, 512 MiB for all open ones. Usual chunks have 1 to 4 MiB.
     fn default() -> Self {
         Self { chunk_bytes: 256 << 20, open_bytes: 512 << 20 }
     }
@@ -145,11 +146,12 @@ impl Replay {
             return Err(ReplayError::NoFiles);
         }
         let mut opener = Opener::new(limits);
+        let mut writers = Writers::default();
         let mut tracks = Vec::new();
-        for (index, path) in paths.iter().enumerate() {
+        for path in paths {
             let mut source = Source::open(path)?;
             let contents = scan(&mut source, &mut opener)?;
-            tracks.push(Track::new(index, source, contents));
+            tracks.push(Track::new(source, contents, &mut writers));
         }
         let files: Vec<_> = tracks.iter().map(Track::path_and_contents).collect();
         let catalog = Catalog::build(&files)?;
@@ -386,9 +388,4 @@ fn keep_earlier(damage: &mut Option<(u64, ReplayError)>, before: u64, error: Rep
     if damage.as_ref().is_none_or(|(known, _)| before < *known) {
         *damage = Some((before, error));
     }
-}
-
-/// Log times are unsigned; one beyond the year 2262 reads as the end of time.
-pub(super) fn nanoseconds(log_time: u64) -> i64 {
-    i64::try_from(log_time).unwrap_or(i64::MAX)
 }

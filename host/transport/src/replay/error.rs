@@ -112,6 +112,32 @@ pub enum Damage {
         /// That of its content.
         found: u32,
     },
+    /// An attachment does not have its checksum.
+    #[error("attachment `{name}` has checksum {found:08x}, it should have {expected:08x}")]
+    AttachmentCrc {
+        /// The attachment; a long name is cut.
+        name: String,
+        /// The checksum behind its data.
+        expected: u32,
+        /// That of its content.
+        found: u32,
+    },
+    /// Metadata records and attachments are larger than the caller is ready to hold.
+    #[error("its metadata and attachments take more than {allowed} bytes")]
+    ExtrasTooLarge {
+        /// The limit given to [`super::read_extras`].
+        allowed: u64,
+    },
+    /// There are fewer metadata records or attachments than the summary counts.
+    #[error("the file should have {expected} {what}; {found} were found")]
+    MissingExtras {
+        /// "metadata records" or "attachments".
+        what: &'static str,
+        /// The number in the summary.
+        expected: u32,
+        /// The number found.
+        found: usize,
+    },
     /// A message names a channel that the file does not define.
     #[error("a message belongs to channel {0}, which is not defined")]
     UnknownChannel(u16),

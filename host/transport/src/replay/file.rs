@@ -3,9 +3,12 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use tracing::warn;
+
 use super::chunk::Segment;
 use super::error::Damage;
 use super::records::{Channel, Schema, op};
+use crate::transport::Guid;
 
 /// A channel of a file.
 pub(super) struct ChannelInfo {
@@ -15,6 +18,9 @@ pub(super) struct ChannelInfo {
     pub(super) message_encoding: String,
     pub(super) schema_encoding: String,
     pub(super) definitions_text: Option<Arc<str>>,
+    pub(super) offered_qos: Option<String>,
+    /// Who wrote its messages, if the file says so. Clips do.
+    pub(super) writer: Option<Guid>,
 }
 
 struct SchemaInfo {
@@ -34,6 +40,8 @@ pub(super) struct Channels {
 
 /// What all schemas and channels of a file may take; a drive with a hundred topics has some 100 KiB.
 const KNOWN_BYTES: usize = 64 << 20;
+/// The longest description of offered qualities of service that is kept; a usual one has 200 bytes.
+const QOS_BYTES: usize = 64 << 10;
 const TOO_MUCH: Damage = Damage::Malformed("its schemas and channels take more than 64 MiB");
 
 impl Channels {
@@ -93,6 +101,8 @@ impl Channels {
                     message_encoding: channel.encoding.to_owned(),
                     schema_encoding: of(|schema| &schema.encoding).unwrap_or_default(),
                     definitions_text: schema.and_then(|schema| schema.text.clone()),
+                    offered_qos: offered_qos(&channel),
+                    writer: channel.metadata.get("gleaner.writer").and_then(Guid::from_hex),
                 };
                 self.by_id.insert(channel.id, info);
             }
@@ -100,6 +110,16 @@ impl Channels {
         }
         Ok(())
     }
+}
+
+/// What rosbag2 notes of a channel's writers; it is nothing to fail over if it cannot be kept.
+fn offered_qos(channel: &Channel<'_>) -> Option<String> {
+    let found = channel.metadata.get("offered_qos_profiles").filter(|text| !text.is_empty())?;
+    if found.len() > QOS_BYTES {
+        warn!(topic = channel.topic, bytes = found.len(), "offered_qos_profiles is longer than 64 KiB, passed over");
+        return None;
+    }
+    Some(found.to_owned())
 }
 
 /// Everything a scan found out about a file.

@@ -1,7 +1,7 @@
 //! The MCAP records that a replay needs, parsed by hand.
 //!
 //! The `mcap` crate's readers are not used: its parser reserves whatever length a string claims,
-//! its indexed reader never checks a chunk's checksum, and neither gives up a chunk's bytes. Eight
+//! its indexed reader never checks a chunk's checksum, and neither gives up a chunk's bytes. Ten
 //! record kinds are little enough to read directly. Source: the MCAP specification, version 0.
 
 use super::error::Damage;
@@ -23,7 +23,9 @@ pub(super) mod op {
     pub(in super::super) const MESSAGE: u8 = 0x05;
     pub(in super::super) const CHUNK: u8 = 0x06;
     pub(in super::super) const CHUNK_INDEX: u8 = 0x08;
+    pub(in super::super) const ATTACHMENT: u8 = 0x09;
     pub(in super::super) const STATISTICS: u8 = 0x0b;
+    pub(in super::super) const METADATA: u8 = 0x0c;
     pub(in super::super) const DATA_END: u8 = 0x0f;
 }
 
@@ -131,18 +133,77 @@ impl<'a> Schema<'a> {
     }
 }
 
-/// A channel record, without its metadata.
+/// A channel record.
 pub(super) struct Channel<'a> {
     pub(super) id: u16,
     pub(super) schema: u16,
     pub(super) topic: &'a str,
     pub(super) encoding: &'a str,
+    pub(super) metadata: Map<'a>,
 }
 
 impl<'a> Channel<'a> {
     pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
-        Some(Self { id: fields.u16()?, schema: fields.u16()?, topic: fields.text()?, encoding: fields.text()? })
+        let (id, schema) = (fields.u16()?, fields.u16()?);
+        let (topic, encoding) = (fields.text()?, fields.text()?);
+        // A channel that ends here says all that a replay cannot do without.
+        let metadata = if fields.0.is_empty() { Map(Fields(&[])) } else { fields.map()? };
+        Some(Self { id, schema, topic, encoding, metadata })
+    }
+}
+
+/// A map of texts: its pairs are whole, but need not be UTF-8.
+#[derive(Copy, Clone)]
+pub(super) struct Map<'a>(Fields<'a>);
+
+impl<'a> Map<'a> {
+    /// The value of the first pair with this key, if it is text.
+    pub(super) fn get(&self, key: &str) -> Option<&'a str> {
+        let (_, value) = self.pairs().find(|(found, _)| *found == key.as_bytes())?;
+        str::from_utf8(value).ok()
+    }
+
+    /// Key and value of each pair, in order.
+    pub(super) fn pairs(&self) -> impl Iterator<Item = (&'a [u8], &'a [u8])> + use<'a> {
+        let mut rest = self.0;
+        std::iter::from_fn(move || Some((rest.bytes()?, rest.bytes()?)))
+    }
+}
+
+/// A metadata record.
+pub(super) struct Metadata<'a> {
+    pub(super) name: &'a str,
+    pub(super) map: Map<'a>,
+}
+
+impl<'a> Metadata<'a> {
+    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        Some(Self { name: fields.text()?, map: fields.map()? })
+    }
+}
+
+/// An attachment record.
+pub(super) struct Attachment<'a> {
+    pub(super) name: &'a str,
+    pub(super) media_type: &'a str,
+    pub(super) data: &'a [u8],
+    /// Of everything in front of it; 0 if the writer left it out.
+    pub(super) crc: u32,
+    /// Bytes in front of the checksum; the data are the last of them.
+    pub(super) len: usize,
+}
+
+impl<'a> Attachment<'a> {
+    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+        let mut fields = Fields(body);
+        let (_log_time, _create_time) = (fields.u64()?, fields.u64()?);
+        let (name, media_type) = (fields.text()?, fields.text()?);
+        let len = usize::try_from(fields.u64()?).ok()?;
+        let data = fields.take(len)?;
+        let len = body.len() - fields.0.len();
+        Some(Self { name, media_type, data, crc: fields.u32()?, len })
     }
 }
 
@@ -175,6 +236,8 @@ impl ChunkIndex {
 pub(super) struct Statistics {
     pub(super) channels: u32,
     pub(super) chunks: u32,
+    pub(super) attachments: u32,
+    pub(super) metadata: u32,
     /// Messages per channel.
     pub(super) messages: Vec<(u16, u64)>,
 }
@@ -183,19 +246,20 @@ impl Statistics {
     pub(super) fn parse(body: &[u8]) -> Option<Self> {
         let mut fields = Fields(body);
         let (_messages, _schemas) = (fields.u64()?, fields.u16()?);
-        let (channels, _attachments) = (fields.u32()?, fields.u32()?);
-        let (_metadata, chunks) = (fields.u32()?, fields.u32()?);
+        let (channels, attachments) = (fields.u32()?, fields.u32()?);
+        let (metadata, chunks) = (fields.u32()?, fields.u32()?);
         let (_start, _end) = (fields.u64()?, fields.u64()?);
         let mut counts = Fields(fields.bytes()?);
         let mut messages = Vec::new();
         while let (Some(channel), Some(count)) = (counts.u16(), counts.u64()) {
             messages.push((channel, count));
         }
-        Some(Self { channels, chunks, messages })
+        Some(Self { channels, chunks, attachments, metadata, messages })
     }
 }
 
 /// What is left of a record's body.
+#[derive(Copy, Clone)]
 struct Fields<'a>(&'a [u8]);
 
 impl<'a> Fields<'a> {
@@ -218,12 +282,28 @@ impl<'a> Fields<'a> {
         self.array().map(u64::from_le_bytes)
     }
 
-    /// Bytes behind their length.
-    fn bytes(&mut self) -> Option<&'a [u8]> {
-        let len = self.u32()? as usize;
+    /// The next `len` bytes.
+    fn take(&mut self, len: usize) -> Option<&'a [u8]> {
         let (found, rest) = self.0.split_at_checked(len)?;
         self.0 = rest;
         Some(found)
+    }
+
+    /// Bytes behind their length.
+    fn bytes(&mut self) -> Option<&'a [u8]> {
+        let len = self.u32()? as usize;
+        self.take(len)
+    }
+
+    /// A map, whose pairs have to fill it.
+    fn map(&mut self) -> Option<Map<'a>> {
+        let pairs = Fields(self.bytes()?);
+        let mut rest = pairs;
+        while !rest.0.is_empty() {
+            rest.bytes()?;
+            rest.bytes()?;
+        }
+        Some(Map(pairs))
     }
 
     fn text(&mut self) -> Option<&'a str> {

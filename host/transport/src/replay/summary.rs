@@ -32,11 +32,7 @@ pub(super) struct Tail {
 }
 
 pub(super) fn read_tail(source: &mut Source) -> Result<Tail, ReplayError> {
-    let Some(footer_at) = source.len().checked_sub(FOOTER) else {
-        return Ok(Tail::default());
-    };
-    let footer = source.peek(footer_at, FOOTER as usize)?;
-    let Some((start, crc)) = parse_footer(footer) else {
+    let Some(Footer { at: footer_at, start, crc }) = footer(source)? else {
         return Ok(Tail::default());
     };
     let finished = Tail { finished: true, ..Tail::default() };
@@ -62,6 +58,24 @@ pub(super) fn read_tail(source: &mut Source) -> Result<Tail, ReplayError> {
         Ok(summary) => Tail { summary, ..finished },
         Err(_) => damaged("a record in it is malformed"),
     })
+}
+
+/// The last record of a finished file.
+pub(super) struct Footer {
+    pub(super) at: u64,
+    /// Where the summary starts; 0 if there is none.
+    start: u64,
+    /// Of the summary.
+    crc: u32,
+}
+
+/// The footer of `source`; `None` if the file was cut off or never finished.
+pub(super) fn footer(source: &mut Source) -> Result<Option<Footer>, ReplayError> {
+    let Some(at) = source.len().checked_sub(FOOTER) else {
+        return Ok(None);
+    };
+    let found = parse_footer(source.peek(at, FOOTER as usize)?);
+    Ok(found.map(|(start, crc)| Footer { at, start, crc }))
 }
 
 /// Start of the summary and its checksum, if `bytes` are a footer and the closing magic.

@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use super::chunk::{OpenSegment, Opener, Segment, message_head};
-use super::drive::nanoseconds;
 use super::error::{Damage, ReplayError};
 use super::file::Contents;
 use super::records::MESSAGE_HEAD;
 use super::source::Source;
+use super::writers::{Writer, Writers};
 use crate::message::Endian;
-use crate::transport::{Guid, SampleMeta, Subscription};
+use crate::transport::{SampleMeta, Subscription};
 
 /// A file of a drive.
 pub(super) struct Track {
@@ -20,15 +20,14 @@ pub(super) struct Track {
     routes: Vec<Channel>,
     /// The segments still to open, the next one last.
     queue: Vec<Segment>,
-    writer: Guid,
 }
 
 /// What a replay knows of one channel id.
 #[derive(Default)]
 struct Channel {
-    is_defined: bool,
+    /// `None` if the file does not define the channel.
+    writer: Option<Writer>,
     subscriptions: Vec<Subscription>,
-    last_seq: u64,
     seen: u64,
 }
 
@@ -42,17 +41,14 @@ pub(super) struct Routed<'a> {
 }
 
 impl Track {
-    pub(super) fn new(index: usize, source: Source, contents: Contents) -> Self {
+    pub(super) fn new(source: Source, contents: Contents, writers: &mut Writers) -> Self {
         let mut routes = Vec::new();
-        for (id, _) in contents.channels.iter() {
+        for (id, writer) in writers.of_next_file(source.path(), &contents.channels) {
             // Ids come in order, and are 16 bits wide.
             routes.resize_with(usize::from(id) + 1, Channel::default);
-            routes[usize::from(id)].is_defined = true;
+            routes[usize::from(id)].writer = Some(writer);
         }
-        let mut writer = [0; 16];
-        writer[..4].copy_from_slice(b"mcap");
-        writer[4..8].copy_from_slice(&u32::try_from(index).unwrap_or(u32::MAX).to_be_bytes());
-        Self { span: contents.span(), source, contents, routes, queue: Vec::new(), writer: Guid(writer) }
+        Self { span: contents.span(), source, contents, routes, queue: Vec::new() }
     }
 
     pub(super) fn path_and_contents(&self) -> (&Path, &Contents) {
@@ -119,9 +115,10 @@ impl Track {
         let head = message_head(body)?;
         let channel = self.routes.get_mut(usize::from(head.channel)).ok_or(Damage::UnknownChannel(head.channel))?;
         let &subscription = channel.subscriptions.get(fan).ok_or(Damage::UnknownChannel(head.channel))?;
-        let (endian, cdr) = match &body[MESSAGE_HEAD..] {
-            [0, 0, _, _, cdr @ ..] => (Endian::Big, cdr),
-            [0, 1, _, _, cdr @ ..] => (Endian::Little, cdr),
+        let writer = channel.writer.as_ref().ok_or(Damage::UnknownChannel(head.channel))?;
+        let (endian, options, cdr) = match &body[MESSAGE_HEAD..] {
+            &[0, 0, a, b, ref cdr @ ..] => (Endian::Big, [a, b], cdr),
+            &[0, 1, a, b, ref cdr @ ..] => (Endian::Little, [a, b], cdr),
             other => {
                 let topic = self.contents.channels.get(head.channel);
                 let topic = topic.map(|info| info.topic.clone()).unwrap_or_default();
@@ -129,22 +126,19 @@ impl Track {
             }
         };
         if fan == 0 {
-            // Recorders that do not count write 0; sequence numbers that fall back after a restart
-            // of the writer would make two samples equal.
-            channel.last_seq = u64::from(head.sequence).max(channel.last_seq + 1);
+            writer.count(head.sequence);
             channel.seen += 1;
         }
-        let mut writer = self.writer;
-        writer.0[8..12].copy_from_slice(&u32::from(head.channel).to_be_bytes());
         Ok(Routed {
             subscription,
             is_last: fan + 1 == channel.subscriptions.len(),
             meta: SampleMeta {
                 at_ns: nanoseconds(head.log_time),
                 publish_ns: nanoseconds(head.publish_time),
-                writer,
-                seq: channel.last_seq,
+                writer: writer.guid(),
+                seq: writer.last_seq(),
                 endian,
+                options,
             },
             cdr,
         })
@@ -168,8 +162,13 @@ impl Track {
     }
 }
 
+/// Log times are unsigned; one beyond the year 2262 reads as the end of time.
+pub(super) fn nanoseconds(log_time: u64) -> i64 {
+    i64::try_from(log_time).unwrap_or(i64::MAX)
+}
+
 /// Whether a channel is subscribed; `None` if the file does not define it.
 fn wanted(routes: &[Channel], id: u16) -> Option<bool> {
-    let channel = routes.get(usize::from(id)).filter(|channel| channel.is_defined)?;
+    let channel = routes.get(usize::from(id)).filter(|channel| channel.writer.is_some())?;
     Some(!channel.subscriptions.is_empty())
 }

@@ -8,7 +8,7 @@ use gleaner_transport::{Endian, Guid, SampleMeta, Subscription, Transport, Trans
 use crate::support::{Memory, TEXT, TYPE, spec};
 
 fn meta(at_ns: i64) -> SampleMeta {
-    SampleMeta { at_ns, publish_ns: 0, writer: Guid([7; 16]), seq: 1, endian: Endian::Little }
+    SampleMeta { at_ns, publish_ns: 0, writer: Guid([7; 16]), seq: 1, endian: Endian::Little, options: [0; 2] }
 }
 
 #[test]

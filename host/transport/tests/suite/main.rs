@@ -1,6 +1,8 @@
-//! The crate through its public interface: messages, replay, damage, loopback.
+//! The crate through its public interface: messages, replay, channels, damage, extras, loopback.
 
+mod channels;
 mod damage;
+mod extras;
 mod loopback;
 mod messages;
 mod replay;

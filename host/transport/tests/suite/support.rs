@@ -138,6 +138,11 @@ pub fn write(writer: &mut Writer<Cursor<Vec<u8>>>, channel_id: u16, message: &Wr
     writer.write_to_known_channel(&header, &data).unwrap();
 }
 
+/// A record as it stands in a file, for those that no sound writer writes.
+pub fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
+    [&[opcode][..], &(body.len() as u64).to_le_bytes(), body].concat()
+}
+
 /// Writes `bytes` to a new file.
 pub fn file(bytes: &[u8]) -> PathBuf {
     static NEXT: AtomicUsize = AtomicUsize::new(0);

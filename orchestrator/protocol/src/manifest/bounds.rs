@@ -63,6 +63,19 @@ pub const ROLL: Bounds<Duration> =
 pub const COOLDOWN: Bounds<Duration> =
     Bounds { min: Duration::ZERO, default: Duration::ZERO, max: Duration::from_secs(3600) };
 
+/// `record.preroll_size` in memory: the most that waits there for a trigger. It holds 5 s at 12 MiB/s.
+pub const PREROLL_SIZE_RAM: Bounds<ByteSize> =
+    Bounds { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) };
+
+/// `record.preroll_size` on disk. A sixteenth of it is one chunk, which should be worth a file.
+pub const PREROLL_SIZE_DISK: Bounds<ByteSize> =
+    Bounds { min: ByteSize::mib(16), default: ByteSize::gib(1), max: ByteSize::gib(256) };
+
+/// `record.max_length`: the longest clip; what is longer goes on in a next one. So a `start` that no `stop` follows
+/// leaves files that can be moved and opened.
+pub const MAX_LENGTH: Bounds<Duration> =
+    Bounds { min: Duration::from_secs(1), default: Duration::from_secs(600), max: Duration::from_secs(3600) };
+
 /// `limits.fuel`: about one unit per WebAssembly instruction, so that the default is some 20 ms.
 pub const FUEL: Bounds<u64> = Bounds { min: 1_000, default: 50_000_000, max: 1_000_000_000_000 };
 

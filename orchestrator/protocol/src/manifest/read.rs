@@ -193,7 +193,8 @@ fn providers(value: &Value) -> Result<Vec<String>> {
 }
 
 fn record(document: &Document, value: &Value) -> Result<Record> {
-    let table = value.table("[record]", &["topics", "preroll", "postroll", "store", "cooldown"])?;
+    let known = &["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
+    let table = value.table("[record]", known)?;
     let list = table.need("topics", "topics = [\"/imu/data\"]: what a clip holds")?;
     let mut unique = Unique::new(document, "topic", "list each topic of [record] once");
     let mut topics = Vec::new();
@@ -205,12 +206,19 @@ fn record(document: &Document, value: &Value) -> Result<Record> {
     if topics.is_empty() {
         return Err(list.misplaced("is empty", "list what a clip holds, or remove [record]"));
     }
+    let store = table.choice("store", &[("ram", Store::Ram), ("disk", Store::Disk)], Store::Ram)?;
+    let preroll_size = match store {
+        Store::Ram => bounds::PREROLL_SIZE_RAM,
+        Store::Disk => bounds::PREROLL_SIZE_DISK,
+    };
     Ok(Record {
         topics,
         preroll: table.duration("preroll", &bounds::ROLL)?,
         postroll: table.duration("postroll", &bounds::ROLL)?,
-        store: table.choice("store", &[("ram", Store::Ram), ("disk", Store::Disk)], Store::Ram)?,
+        store,
+        preroll_size: table.size("preroll_size", &preroll_size)?,
         cooldown: table.duration("cooldown", &bounds::COOLDOWN)?,
+        max_length: table.duration("max_length", &bounds::MAX_LENGTH)?,
     })
 }
 

@@ -204,9 +204,14 @@ pub struct Record {
     pub postroll: Duration,
     /// Where the preroll waits.
     pub store: Store,
+    /// The most that waits there; beyond it the oldest goes, and is counted.
+    pub preroll_size: ByteSize,
     /// How long after a trigger the next ones open no new window.
     #[serde(rename = "cooldown_ns", serialize_with = "nanoseconds")]
     pub cooldown: Duration,
+    /// The longest clip; what is longer goes on in a next one.
+    #[serde(rename = "max_length_ns", serialize_with = "nanoseconds")]
+    pub max_length: Duration,
 }
 
 /// Where the preroll waits for a trigger.

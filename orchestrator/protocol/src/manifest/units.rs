@@ -60,7 +60,7 @@ impl ByteSize {
         self.0
     }
 
-    /// The number of bytes as a length in memory. No size in a manifest exceeds 2 GiB, so that none saturates.
+    /// The number of bytes as a length in memory. No size of memory in a manifest exceeds 2 GiB, so that none saturates.
     pub fn as_usize(self) -> usize {
         usize::try_from(self.0).unwrap_or(usize::MAX)
     }

@@ -37,9 +37,31 @@ fn recording_and_models_have_bounds() {
     }
     let problem = "`record.cooldown` is 61min, above the maximum of 1h";
     out_of_bounds("[record]\ntopics = [\"/a\"]\ncooldown = \"61min\"", 10, problem, "give a value from 0s to 1h");
+    let help = "give a value from 1s to 1h";
+    for (length, problem) in [("999ms", "999ms, below the minimum of 1s"), ("61min", "61min, above the maximum of 1h")]
+    {
+        let problem = format!("`record.max_length` is {problem}");
+        out_of_bounds(&format!("[record]\ntopics = [\"/a\"]\nmax_length = \"{length}\""), 10, &problem, help);
+    }
     let sha256 = "0".repeat(64);
     let model = format!("[[model]]\nname = \"m\"\nfile = \"m\"\nsha256 = \"{sha256}\"\nthreads = 65");
     out_of_bounds(&model, 12, "`model.threads` is 65, above the maximum of 64", "give a value from 1 to 64");
+}
+
+#[test]
+fn the_bounds_of_the_preroll_size_are_those_of_its_store() {
+    let (ram, disk) = ("give a value from 1 MiB to 1 GiB", "give a value from 16 MiB to 256 GiB");
+    for (store, size, problem, help) in [
+        ("ram", "1023 KiB", "1023 KiB, below the minimum of 1 MiB", ram),
+        ("ram", "1025 MiB", "1025 MiB, above the maximum of 1 GiB", ram),
+        ("disk", "15 MiB", "15 MiB, below the minimum of 16 MiB", disk),
+        ("disk", "257 GiB", "257 GiB, above the maximum of 256 GiB", disk),
+    ] {
+        let more = format!("[record]\ntopics = [\"/a\"]\npreroll_size = \"{size}\"\nstore = \"{store}\"");
+        out_of_bounds(&more, 10, &format!("`record.preroll_size` is {problem}"), help);
+    }
+    let more = "[record]\ntopics = [\"/a\"]\npreroll_size = -1";
+    out_of_bounds(more, 10, "`record.preroll_size` is -1, below the minimum of 1 MiB", ram);
 }
 
 #[test]

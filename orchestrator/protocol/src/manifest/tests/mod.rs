@@ -122,6 +122,32 @@ fn a_periodic_lambda_needs_no_input_and_every_limit_has_a_default() {
 }
 
 #[test]
+fn the_default_of_the_preroll_size_is_that_of_its_store() {
+    let record = |more: &str| {
+        let text = format!("{TICKER}[record]\ntopics = [\"/a\"]\n{more}");
+        Manifest::parse(&text, "lambda.toml").unwrap().record.unwrap()
+    };
+    let plain = record("");
+    assert_eq!((plain.preroll_size, plain.max_length), (ByteSize::mib(64), Duration::from_secs(600)));
+    assert_eq!(record("store = \"disk\"").preroll_size, ByteSize::gib(1));
+    let given = record("store = \"disk\"\npreroll_size = \"256 GiB\"\nmax_length = \"1s\"");
+    assert_eq!((given.preroll_size, given.max_length), (ByteSize::gib(256), Duration::from_secs(1)));
+    assert_eq!(record("preroll_size = \"1 MiB\"\nmax_length = \"1h\"").preroll_size, ByteSize::mib(1));
+}
+
+#[test]
+fn as_json_a_record_has_its_sizes_in_bytes_and_its_times_in_nanoseconds() {
+    let manifest = Manifest::parse(&format!("{TICKER}[record]\ntopics = [\"/a\"]"), "lambda.toml").unwrap();
+    assert_eq!(
+        manifest.to_json()["record"].to_string(),
+        concat!(
+            r#"{"topics":["/a"],"preroll_ns":5000000000,"postroll_ns":5000000000,"store":"ram","#,
+            r#""preroll_size":67108864,"cooldown_ns":0,"max_length_ns":600000000000}"#
+        )
+    );
+}
+
+#[test]
 fn the_backlog_is_each_for_small_samples_and_latest_for_large_ones() {
     for (type_name, backlog, depth) in [
         ("sensor_msgs/msg/Imu", Backlog::Each, 64),

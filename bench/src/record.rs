@@ -1,0 +1,209 @@
+//! The recorder under load: 20 MB/s from the loopback transport, at the pace of a vehicle.
+
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::journal::{Entry, Header, Said, Seen, Woken};
+use gleaner_protocol::manifest::{Manifest, Store};
+use gleaner_protocol::{Trigger, TriggerKind};
+use gleaner_recorder::{Folder as Clips, Member, Recorder, Settings, Topic, TopicId};
+use gleaner_tests::Folder;
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Endian, Guid, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+
+/// Of the camera: with it, all topics together make 20 MB/s.
+const FRAME_BYTES: usize = 652_000;
+const FRAMES_PER_S: u64 = 30;
+const IMU_BYTES: usize = 324;
+const IMU_PER_FRAME: u64 = 10;
+const STATUS_BYTES: usize = 1000;
+const STATUS_TOPICS: usize = 8;
+const PREROLL_BYTES: u64 = 64 << 20;
+
+/// What a vehicle would feel of a recorder.
+pub struct Load {
+    /// MB/s that arrived.
+    pub megabytes_per_s: f64,
+    /// Time on a core, in % of the time that passed.
+    pub cpu_percent: f64,
+    /// Memory of the process beyond what it had before, in MiB, at most.
+    pub memory_mib: f64,
+    /// Most bytes that the preroll held, in % of its bound.
+    pub preroll_percent: f64,
+    /// Longest time in which a sample was taken, in ms: a recorder of one thread writes within it.
+    pub longest_ms: f64,
+    /// Part of the time that is in a clip, in %.
+    pub recorded_percent: f64,
+}
+
+struct Lane {
+    recorder: Arc<Mutex<Recorder>>,
+    topic: TopicId,
+}
+
+impl Sink for Lane {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        self.recorder.lock().expect("one thread").sample(self.topic, meta, cdr).expect("the disk has room");
+        Verdict::Taken
+    }
+}
+
+/// Records for `seconds`, with a trigger every 15 s and windows of 5 s and 5 s; checks the bound of the preroll at each frame.
+pub fn record(seconds: u64, store: Store) -> Load {
+    let out = Folder::new();
+    let before = resident();
+    let (folder, _) = Clips::open(out.path()).expect("an empty folder");
+    let settings = Settings {
+        store,
+        preroll_bytes: PREROLL_BYTES * if store == Store::Disk { 4 } else { 1 },
+        max_length: Duration::from_secs(600),
+        folder: out.path().to_owned(),
+        clock: "monotonic".to_owned(),
+        prefault: true,
+    };
+    let recorder = Arc::new(Mutex::new(Recorder::new(folder, settings).expect("a recorder")));
+    let mut loopback = Loopback::new();
+    let names: Vec<String> = ["/camera".to_owned(), "/imu".to_owned()]
+        .into_iter()
+        .chain((0..STATUS_TOPICS).map(|n| format!("/status/{n}")))
+        .collect();
+    let topics = names.iter().map(|name| subscribe(&mut loopback, &recorder, name)).collect::<Vec<_>>();
+    let header = header();
+    let rules = Manifest::parse(MANIFEST, "lambda.toml").expect("a manifest").record.expect("with [record]");
+    let lambda = {
+        let mut recorder = recorder.lock().expect("one thread");
+        recorder.add_lambda(Member { header, rules, digest: "0".repeat(64), topics })
+    };
+
+    // Like a JPEG, it cannot be made smaller.
+    let mut noise = 0x2545_f491_4f6c_dd1d_u64;
+    let frame: Vec<u8> = std::iter::repeat_with(|| {
+        noise ^= noise << 13;
+        noise ^= noise >> 7;
+        noise ^= noise << 17;
+        noise as u8
+    })
+    .take(FRAME_BYTES)
+    .collect();
+    let (imu, status) = (&frame[..IMU_BYTES], vec![7; STATUS_BYTES]);
+    let (started, cpu) = (Instant::now(), cpu());
+    let (mut bytes, mut longest, mut peak, mut preroll) = (0, Duration::ZERO, before, 0.0_f64);
+    for n in 0..seconds * FRAMES_PER_S {
+        let at_ns = (n * 1_000_000_000 / FRAMES_PER_S) as i64;
+        // Until the moment of this frame.
+        if let Some(early) = Duration::from_nanos(at_ns as u64).checked_sub(started.elapsed()) {
+            thread::sleep(early);
+        }
+        let mut publish = |name: &str, at_ns: i64, seq: u64, cdr: &[u8]| {
+            let meta = SampleMeta {
+                at_ns,
+                publish_ns: at_ns,
+                writer: Guid::default(),
+                seq,
+                endian: Endian::Little,
+                options: [0; 2],
+            };
+            let taken = Instant::now();
+            loopback.publish(name, &meta, cdr).expect("the topic is there");
+            longest = longest.max(taken.elapsed());
+            bytes += cdr.len();
+        };
+        publish("/camera", at_ns, n + 1, &frame);
+        for i in 0..IMU_PER_FRAME {
+            publish("/imu", at_ns + i as i64 * 3_000_000, n * IMU_PER_FRAME + i + 1, imu);
+        }
+        for name in &names[2..] {
+            publish(name, at_ns + 30_000_000, n + 1, &status);
+        }
+        let mut recorder = recorder.lock().expect("one thread");
+        recorder.wake(lambda, &wake(n, at_ns + 30_000_000)).expect("the disk has room");
+        let counts = recorder.counts();
+        assert!(counts.preroll_highest <= counts.preroll_bound, "the preroll outgrew its bound: {counts:?}");
+        preroll = 100.0 * counts.preroll_highest as f64 / counts.preroll_bound as f64;
+        peak = peak.max(resident());
+    }
+    let passed = started.elapsed().as_secs_f64();
+    let cpu_s = self::cpu() - cpu;
+    let mut recorder = recorder.lock().expect("one thread");
+    recorder.finish((seconds * 1_000_000_000) as i64).expect("the disk has room");
+    let recorded: i64 =
+        recorder.clips().iter().map(|clip| clip.last_ns.unwrap_or(0) - clip.first_ns.unwrap_or(0)).sum();
+    Load {
+        megabytes_per_s: bytes as f64 / 1e6 / passed,
+        cpu_percent: 100.0 * cpu_s / passed,
+        memory_mib: (peak - before) / f64::from(1 << 20),
+        preroll_percent: preroll,
+        longest_ms: longest.as_secs_f64() * 1e3,
+        recorded_percent: 100.0 * recorded as f64 / 1e9 / seconds as f64,
+    }
+}
+
+const MANIFEST: &str = r#"
+[lambda]
+name = "load"
+version = "0.1.0"
+kind = "wasm"
+entry = "load.wasm"
+[schedule]
+period = "33ms"
+[record]
+topics = ["/camera"]
+preroll = "5s"
+postroll = "5s"
+"#;
+
+fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &str) -> TopicId {
+    let type_name = "std_msgs/msg/ByteMultiArray";
+    loopback.add_topic(name, type_name, "");
+    let topic = Topic { name: name.to_owned(), type_name: type_name.to_owned(), definitions: None, offered_qos: None };
+    let topic = recorder.lock().expect("one thread").add_topic(topic).expect("few topics");
+    let spec = TopicSpec { topic: name.to_owned(), type_name: type_name.to_owned(), queue: 1, max_bytes: 1 << 20 };
+    loopback.subscribe(&spec, Arc::new(Lane { recorder: recorder.clone(), topic })).expect("the topic is there");
+    topic
+}
+
+fn header() -> Header {
+    Header {
+        gleaner: env!("CARGO_PKG_VERSION").to_owned(),
+        engine: "none".to_owned(),
+        machine: std::env::consts::ARCH.to_owned(),
+        lambda: "load".to_owned(),
+        version: "0.1.0".to_owned(),
+        kind: gleaner_protocol::manifest::Kind::Wasm,
+        files: Vec::new(),
+        models: Vec::new(),
+        inputs: Vec::new(),
+        event_input: None,
+        config: serde_json::Map::new(),
+        remaps: Vec::new(),
+        clock: "monotonic".to_owned(),
+        wakes_before: 0,
+    }
+}
+
+fn wake(n: u64, at_ns: i64) -> Entry {
+    let trigger =
+        Trigger { kind: TriggerKind::Event, label: "load".to_owned(), score: None, attributes: serde_json::Map::new() };
+    Entry {
+        at_ns,
+        cause: Woken::Tick { missed: 0 },
+        seen: Vec::<Seen>::new(),
+        triggers: if n % (15 * FRAMES_PER_S) == 5 * FRAMES_PER_S { vec![trigger] } else { Vec::new() },
+        fault: None,
+        fuel: Some(1000),
+        log: Said::default(),
+    }
+}
+
+fn cpu() -> f64 {
+    let times = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    times.tv_sec as f64 + times.tv_nsec as f64 / 1e9
+}
+
+fn resident() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<f64>().ok());
+    kib.unwrap_or(0.0) * 1024.0
+}

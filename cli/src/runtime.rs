@@ -1,0 +1,187 @@
+//! Starting `gleaner-runtime`, showing how far it is and what it says, and hearing its result.
+
+use std::ffi::OsString;
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::path::PathBuf;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use gleaner_protocol::{Exit, Explain, Failure, Parts, Report, Summary, Verified, visible};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use crate::listen::Listener;
+
+/// Why the runtime did not do what it was asked for, where it could not say so itself.
+#[derive(Debug, thiserror::Error)]
+enum RuntimeError {
+    #[error("cannot start `{}`", program.display())]
+    Start { program: PathBuf, source: io::Error },
+    #[error("cannot read the reports of gleaner-runtime")]
+    Read { source: io::Error },
+    #[error("gleaner-runtime reports what this gleaner does not understand: {line}")]
+    Report { line: String, source: serde_json::Error },
+    #[error("the lambda's process ended without a result ({status})")]
+    NoResult { status: ExitStatus },
+    #[error("the lambda's process did not end well after its result ({status})")]
+    Code { status: ExitStatus },
+}
+
+impl Explain for RuntimeError {
+    fn help(&self) -> Option<String> {
+        match self {
+            RuntimeError::Report { .. } => Some("install gleaner and gleaner-runtime of one version".to_owned()),
+            RuntimeError::NoResult { status } | RuntimeError::Code { status } if signal_of(*status) == Some(9) => {
+                Some("the system kills the largest process when memory runs out; see `dmesg`".to_owned())
+            }
+            RuntimeError::NoResult { .. } | RuntimeError::Code { .. } => Some(
+                "the lambda or a library that it uses may have ended the process, as `os._exit` does, or crashed it"
+                    .to_owned(),
+            ),
+            RuntimeError::Start { .. } | RuntimeError::Read { .. } => None,
+        }
+    }
+}
+
+/// What the runtime reports last.
+#[derive(Debug)]
+pub(crate) enum Heard {
+    Summary(Box<Summary>),
+    Verified(Verified),
+}
+
+/// Runs the runtime with these arguments to its end. Gives its result and how it ended; no result if it has said why there
+/// is none.
+pub(crate) fn run(arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Failure> {
+    let program = Parts::find()?.program("gleaner-runtime")?;
+    let bar = progress_bar();
+    let mut child = start(program, arguments)?;
+    // Both streams are heard on threads of their own: a lambda may leave processes behind that hold them open for ever.
+    let explained = Arc::new(AtomicBool::new(false));
+    let says = child.stderr.take().map(|says| {
+        let (bar, explained) = (bar.clone(), explained.clone());
+        // While a bar is drawn, what the runtime says has to be put above it. Nobody is left to tell if standard error
+        // is gone.
+        let show = move |piece: &[u8]| drop(bar.suspend(|| io::stderr().write_all(piece)));
+        Listener::start(move || pass_on(says, &explained, show))
+    });
+    let reports = child.stdout.take().map(|reports| {
+        let bar = bar.clone();
+        Listener::start(move || follow(reports, &bar))
+    });
+    let heard = reports.and_then(|reports| reports.until_the_end_of(&mut child));
+    bar.finish_and_clear();
+    let result = heard.unwrap_or(Ok(None));
+    if result.is_err() {
+        // Nobody listens to it any more. It may have ended meanwhile, which is as good.
+        let _ = child.kill();
+    }
+    let status = child.wait().map_err(|source| RuntimeError::Read { source })?;
+    // The last it says is why it failed.
+    says.and_then(Listener::rest);
+    let result = result?;
+    match (result, status.code().and_then(Exit::from_code)) {
+        (Some(result), Some(exit)) => Ok((Some(result), exit)),
+        (Some(_), None) => Err(RuntimeError::Code { status }.into()),
+        // An exit code alone is not trusted: a lambda can end the process with any.
+        (None, Some(exit)) if exit != Exit::Ok && explained.load(Ordering::Relaxed) => Ok((None, exit)),
+        (None, _) => Err(RuntimeError::NoResult { status }.into()),
+    }
+}
+
+/// The one place where `gleaner` starts the runtime.
+fn start(program: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
+    Command::new(&program)
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .map_err(|source| RuntimeError::Start { program, source })
+}
+
+/// Reads reports up to the result, which is the last; `None` if they end before.
+fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, RuntimeError> {
+    for line in BufReader::new(reports).lines() {
+        let line = line.map_err(|source| RuntimeError::Read { source })?;
+        match serde_json::from_str(&line) {
+            Ok(Report::Progress { done, total, .. }) => {
+                if let Some(total) = total {
+                    bar.set_length(total);
+                }
+                bar.set_position(done);
+            }
+            Ok(Report::Round(_)) => {}
+            Ok(Report::Summary(summary)) => return Ok(Some(Heard::Summary(summary))),
+            Ok(Report::Verified(verified)) => return Ok(Some(Heard::Verified(verified))),
+            Err(source) => {
+                let line = visible(&line.chars().take(200).collect::<String>());
+                return Err(RuntimeError::Report { line, source });
+            }
+        }
+    }
+    Ok(None)
+}
+
+/// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed. A line is cut into
+/// pieces rather than held whole, however long it is.
+fn pass_on(says: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
+    const PIECE: u64 = 8192;
+    let mut says = BufReader::new(says);
+    let mut line = Vec::new();
+    let mut at_start = true;
+    while matches!((&mut says).take(PIECE).read_until(b'\n', &mut line), Ok(1..)) {
+        // As a `Failure` begins; a lambda and its libraries write here too.
+        if at_start && line.starts_with(b"error: ") {
+            explained.store(true, Ordering::Relaxed);
+        }
+        show(&line);
+        at_start = line.ends_with(b"\n");
+        line.clear();
+    }
+}
+
+fn progress_bar() -> ProgressBar {
+    // Hidden by itself where standard error is no terminal.
+    let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+    let style = "{bar:30} {percent:>3} %  {human_pos} of {human_len} messages, {eta} left";
+    bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+#[cfg(unix)]
+fn signal_of(status: ExitStatus) -> Option<i32> {
+    std::os::unix::process::ExitStatusExt::signal(&status)
+}
+
+#[cfg(not(unix))]
+fn signal_of(_: ExitStatus) -> Option<i32> {
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_runtime_says_is_passed_on_line_by_line_and_to_the_end() {
+        let long = "x".repeat(10_000);
+        let mut shown = Vec::new();
+        let text = format!("one\n{long}\nno line end");
+        pass_on(text.as_bytes(), &AtomicBool::new(false), |piece| shown.push(piece.to_vec()));
+        assert_eq!(shown[0], b"one\n");
+        assert_eq!(shown.concat(), text.as_bytes());
+        assert!(shown.iter().all(|piece| piece.len() <= 8192));
+    }
+
+    #[test]
+    fn only_a_line_that_begins_as_a_failure_explains_an_exit_code() {
+        let inside = format!("{}error: x", "y".repeat(8192));
+        for (text, expected) in
+            [("error: x", true), ("a\nerror: x\n", true), ("an error: x\n", false), (&inside, false), ("", false)]
+        {
+            let explained = AtomicBool::new(false);
+            pass_on(text.as_bytes(), &explained, |_| {});
+            assert_eq!(explained.into_inner(), expected);
+        }
+    }
+}

@@ -1,0 +1,51 @@
+//! Clips as people see them.
+
+use std::fmt::{self, Write};
+
+use gleaner_protocol::{Clip, Summary, visible};
+
+use super::{Paint, SHOWN, counted, more};
+use crate::results::{clip_contents, clip_span, seconds};
+
+/// A block for each clip: when it is, what is in it, and what is missing.
+pub(super) fn write(text: &mut String, clips: &[Clip], summary: &Summary, paint: Paint) -> fmt::Result {
+    if clips.is_empty() {
+        return Ok(());
+    }
+    writeln!(text, "  {}", paint.bold(&counted(clips.len() as u64, "clip")))?;
+    for clip in clips.iter().take(SHOWN) {
+        let [from, to] = clip_span(clip).map(|at_ns| seconds(at_ns, summary.start_ns));
+        let file = visible(&clip.file.to_string_lossy());
+        writeln!(text, "{}  {file}", paint.green(&format!("{from:>10.3} to {to:.3} s")))?;
+        let thumbnail = clip.thumbnail.as_ref().map(|path| format!("; {}", visible(&path.to_string_lossy())));
+        writeln!(text, "{:>14}{}{}", "", clip_contents(clip), thumbnail.unwrap_or_default())?;
+        for why in &clip.short {
+            writeln!(text, "{:>14}{}", "", paint.yellow(&format!("short: {}", visible(why))))?;
+        }
+        for loss in losses(clip) {
+            writeln!(text, "{:>14}{}", "", paint.yellow(&format!("lost: {loss}")))?;
+        }
+        if let Some(recovered) = &clip.recovered {
+            let what =
+                format!("recovered: {} ({} lost)", visible(&recovered.what), counted(recovered.lost_bytes, "byte"));
+            writeln!(text, "{:>14}{}", "", paint.yellow(&what))?;
+        }
+    }
+    more(text, (clips.len() as u64).saturating_sub(SHOWN as u64))
+}
+
+fn losses(clip: &Clip) -> Vec<String> {
+    let of_topic = |topic: &gleaner_protocol::ClipTopic| {
+        let causes = [
+            (topic.lost, "before they reached the recorder"),
+            (topic.overwritten, "pushed out of the preroll"),
+            (topic.too_big, "larger than the preroll"),
+        ];
+        let name = visible(&topic.topic);
+        causes.map(|(count, why)| {
+            (count.unwrap_or(0), format!("{} of {name}, {why}", counted(count.unwrap_or(0), "message")))
+        })
+    };
+    let all = clip.topics.iter().flat_map(of_topic);
+    all.filter(|(count, _)| *count > 0).map(|(_, loss)| loss).collect()
+}

@@ -1,0 +1,203 @@
+//! Why something cannot be recorded, in the words that a user sees.
+
+use std::error::Error;
+use std::io;
+use std::path::PathBuf;
+
+use gleaner_protocol::{Exit, Explain};
+use gleaner_transport::TransportError;
+use gleaner_transport::replay::ReplayError;
+
+/// Why something cannot be recorded, or kept, or found again.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// A folder or a file cannot be made.
+    #[error("cannot create `{}`", path.display())]
+    Create {
+        /// What was to be made.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The folder's lock cannot be taken, for a reason other than that somebody has it.
+    #[error("cannot lock `{}`", path.display())]
+    Lock {
+        /// The lock.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Another process records into the folder.
+    #[error("another process records into `{}`", folder.display())]
+    Busy {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// A file or a folder cannot be read.
+    #[error("cannot read `{}`", path.display())]
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file cannot be written.
+    #[error("cannot write `{}`", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// What was written may not be on the disk.
+    #[error("cannot make sure that `{}` is on the disk", path.display())]
+    Sync {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A whole file cannot be given its name.
+    #[error("cannot rename `{}` to `{}`", from.display(), to.display())]
+    Rename {
+        /// Its name until then.
+        from: PathBuf,
+        /// The name that it should have.
+        to: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file that is not needed any more cannot be removed.
+    #[error("cannot remove `{}`", path.display())]
+    Remove {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A clip is whole, but the list of clips does not name it; it will when the folder is opened the next time.
+    #[error("cannot list a clip in `{}`", path.display())]
+    List {
+        /// The list.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The MCAP writer refuses something.
+    #[error("cannot write clip `{}`", path.display())]
+    Format {
+        /// The clip.
+        path: PathBuf,
+        /// Why.
+        source: Box<mcap::McapError>,
+    },
+    /// An unfinished clip of a recorder that died cannot be saved. It is left as it is.
+    #[error("cannot recover the unfinished clip `{}`", path.display())]
+    Recover {
+        /// The unfinished clip.
+        path: PathBuf,
+        /// Why.
+        source: Box<RecordError>,
+    },
+    /// A clip that was found cannot be read.
+    #[error("cannot read clip `{}`", path.display())]
+    Unreadable {
+        /// The clip.
+        path: PathBuf,
+        /// Why.
+        source: Box<ReplayError>,
+    },
+    /// A topic of a clip that was found cannot be read.
+    #[error("cannot read a topic of clip `{}`", path.display())]
+    Topic {
+        /// The clip.
+        path: PathBuf,
+        /// Why.
+        source: Box<TransportError>,
+    },
+    /// A file of the preroll cannot be written, read or removed.
+    #[error("cannot keep the preroll in `{}`", path.display())]
+    Preroll {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// More topics than a recorder holds.
+    #[error("a recorder holds at most {most} topics")]
+    TooManyTopics {
+        /// How many it holds.
+        most: usize,
+    },
+}
+
+impl RecordError {
+    /// What the system said, wherever in the chain of causes it stands.
+    fn system(&self) -> Option<io::ErrorKind> {
+        let mut cause: Option<&(dyn Error + 'static)> = Some(self);
+        while let Some(error) = cause {
+            if let Some(error) = error.downcast_ref::<io::Error>().filter(|error| error.raw_os_error().is_some()) {
+                return Some(error.kind());
+            }
+            cause = error.source();
+        }
+        None
+    }
+}
+
+impl Explain for RecordError {
+    fn help(&self) -> Option<String> {
+        let help = match (self, self.system()) {
+            (Self::Busy { .. }, _) => "wait until it ends, or choose another folder: --out DIR",
+            (Self::TooManyTopics { .. }, _) => "record fewer topics: [record] topics in lambda.toml",
+            (_, Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)) => {
+                "make room on the disk, or choose another folder: --out DIR"
+            }
+            (_, Some(io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem)) => {
+                "choose a folder that you may write to: --out DIR"
+            }
+            _ => return None,
+        };
+        Some(help.to_owned())
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            Self::TooManyTopics { .. } => Exit::Usage,
+            _ => Exit::Internal,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ENOSPC: i32 = 28;
+
+    fn full() -> io::Error {
+        io::Error::from_raw_os_error(ENOSPC)
+    }
+
+    #[test]
+    fn a_full_disk_is_explained_however_deep_it_lies() {
+        let write = RecordError::Write { path: "clips/a.mcap.part".into(), source: full() };
+        assert_eq!(write.to_string(), "cannot write `clips/a.mcap.part`");
+        let format = RecordError::Format { path: "a".into(), source: Box::new(mcap::McapError::Io(full())) };
+        let recover = RecordError::Recover {
+            path: "a".into(),
+            source: Box::new(RecordError::Write { path: "b".into(), source: full() }),
+        };
+        for error in [write, format, recover] {
+            assert_eq!(error.help().as_deref(), Some("make room on the disk, or choose another folder: --out DIR"));
+            assert_eq!(error.exit(), Exit::Internal);
+        }
+    }
+
+    #[test]
+    fn a_folder_in_use_is_named() {
+        let error = RecordError::Busy { folder: "out".into() };
+        assert_eq!(error.to_string(), "another process records into `out`");
+        assert!(error.help().is_some_and(|help| help.contains("--out DIR")));
+    }
+}

@@ -1,0 +1,132 @@
+//! The folder that a recorder writes into.
+
+use std::collections::HashSet;
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use gleaner_protocol::Clip;
+use tracing::warn;
+
+use super::list::{List, Listed};
+use super::part::{Origin, origin};
+use super::place::{AGAIN, CLIP, CLIPS, PART, Place};
+use super::unfinished::Unfinished;
+use super::{About, durable, recover};
+use crate::error::RecordError;
+
+/// A folder of clips with their list, held by one process at a time.
+pub struct Folder {
+    pub(super) place: Arc<Place>,
+}
+
+impl Folder {
+    /// Opens the folder `out`, which is made if there is none, and takes it for this process. Whatever an earlier process
+    /// left unfinished is completed first: the clips that came back by that are returned, and listed already.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Busy`] if another process records into it; [`RecordError::Recover`] if a clip cannot be recovered,
+    /// for example because the disk is full: it is left as it is then; other [`RecordError`]s if the folder cannot be
+    /// made, locked or read.
+    pub fn open(out: &Path) -> Result<(Self, Vec<Clip>), RecordError> {
+        let clips = out.join(CLIPS);
+        fs::create_dir_all(&clips).map_err(|source| RecordError::Create { path: clips.clone(), source })?;
+        let lock = lock(&clips, out)?;
+        let list = List::of(out);
+        let taken: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
+        let place = Arc::new(Place::new(clips, list, taken, lock));
+        let mut found = Vec::new();
+        for name in files(place.folder(), AGAIN)? {
+            discard_copy(&place, &name)?;
+        }
+        for name in files(place.folder(), PART)? {
+            found.extend(recover::recover(&place, &name)?);
+        }
+        for name in files(place.folder(), CLIP)? {
+            if !place.is_taken(&format!("{name}{CLIP}")) {
+                found.extend(recover::list(&place, &name)?);
+            }
+        }
+        Ok((Self { place }, found))
+    }
+
+    /// Starts anew with the clips in `keep`: deletes the others that are listed, with their thumbnails, and says how
+    /// many clips these were.
+    ///
+    /// Only plain files in the folder of clips are deleted, whatever the list names.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the list cannot be written, and nothing is deleted then, or if a file cannot be.
+    pub fn replace(&mut self, keep: &[Clip]) -> Result<u64, RecordError> {
+        let place = &self.place;
+        let listed = place.list().read()?;
+        // The list first: it may leave out a whole clip, which is found at the next start, but never names one that
+        // is gone.
+        place.list().replace(keep)?;
+        let kept: HashSet<PathBuf> = keep.iter().map(|clip| clip.file.clone()).collect();
+        let is_kept = |file: &str| kept.contains(Path::new(CLIPS).join(file).as_path());
+        let mut deleted = 0;
+        for Listed { file, thumbnail } in listed.iter().filter(|listed| !is_kept(&listed.file)) {
+            // The thumbnail first: one without its clip would belong to nobody.
+            if let Some(thumbnail) = thumbnail {
+                durable::remove(&place.folder().join(thumbnail))?;
+            }
+            deleted += u64::from(durable::remove(&place.folder().join(file))?);
+        }
+        durable::sync_folder(place.folder())?;
+        place.take_only(listed.into_iter().map(|listed| listed.file).filter(|file| is_kept(file)).collect());
+        Ok(deleted)
+    }
+
+    /// Begins a clip named `stem`, or `stem-2`, `stem-3` and so on if there is one.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if its file cannot be made or written.
+    pub fn begin(&mut self, stem: &str, about: &About) -> Result<Unfinished, RecordError> {
+        let name = self.place.free_name(stem);
+        Unfinished::create(Arc::clone(&self.place), name, PART, Some(about))
+    }
+}
+
+fn lock(clips: &Path, out: &Path) -> Result<File, RecordError> {
+    let path = clips.join(".lock");
+    let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
+    let file = file.map_err(|source| RecordError::Create { path: path.clone(), source })?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(RecordError::Busy { folder: out.to_owned() }),
+        Err(TryLockError::Error(source)) => Err(RecordError::Lock { path, source }),
+    }
+}
+
+/// The files in `folder` that end so, without the ending, sorted. What has another name, or is no file, is not ours.
+fn files(folder: &Path, ending: &str) -> Result<Vec<String>, RecordError> {
+    let cannot_read = |source| RecordError::Read { path: folder.to_owned(), source };
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder).map_err(cannot_read)? {
+        let entry = entry.map_err(cannot_read)?;
+        if !entry.file_type().is_ok_and(|kind| kind.is_file()) {
+            continue;
+        }
+        if let Some(name) = entry.file_name().to_str().and_then(|name| name.strip_suffix(ending)) {
+            names.push(name.to_owned());
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+/// Removes the copy that a recovery had begun; what it was copied from is still there.
+fn discard_copy(place: &Place, name: &str) -> Result<(), RecordError> {
+    let path = place.path(name, AGAIN);
+    match origin(&path).map_err(|source| RecordError::Read { path: path.clone(), source })? {
+        Origin::Foreign => {
+            warn!(path = %path.display(), "file is not of this program, left alone");
+            Ok(())
+        }
+        Origin::Ours | Origin::Nothing => durable::remove(&path).map(drop),
+    }
+}

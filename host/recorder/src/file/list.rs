@@ -1,0 +1,160 @@
+//! `clips.jsonl`: a line for each whole clip.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::path::{Component, Path, PathBuf};
+
+use gleaner_protocol::Clip;
+use serde::Deserialize;
+use tracing::warn;
+
+use super::durable;
+use super::place::{CLIP, CLIPS, JPG};
+use crate::error::RecordError;
+
+/// Our lines have some 30 KB at most: 100 moments and 256 topics.
+const LINE_MAX: u64 = 4 << 20;
+
+/// The list of clips.
+pub(super) struct List {
+    path: PathBuf,
+    folder: PathBuf,
+}
+
+/// What a line says of the files of a clip; whatever else it says is left alone.
+#[derive(Deserialize)]
+struct Line {
+    file: PathBuf,
+    thumbnail: Option<PathBuf>,
+}
+
+/// File names of a listed clip, in the folder of clips.
+pub(super) struct Listed {
+    pub(super) file: String,
+    pub(super) thumbnail: Option<String>,
+}
+
+impl List {
+    /// The list in `folder`, which may not exist yet.
+    pub(super) fn of(folder: &Path) -> Self {
+        Self { path: folder.join("clips.jsonl"), folder: folder.to_owned() }
+    }
+
+    /// What the list names. A line that was torn when its writer died is cut off.
+    pub(super) fn read(&self) -> Result<Vec<Listed>, RecordError> {
+        let failed = |source| RecordError::List { path: self.path.clone(), source };
+        let file = match OpenOptions::new().read(true).write(true).open(&self.path) {
+            Ok(file) => file,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            Err(error) => return Err(failed(error)),
+        };
+        let (listed, whole, len) = read_lines(&file).map_err(failed)?;
+        if whole < len {
+            warn!(path = %self.path.display(), bytes = len - whole, "last line of the list was torn, cut off");
+            file.set_len(whole).and_then(|()| file.sync_all()).map_err(failed)?;
+        }
+        Ok(listed)
+    }
+
+    /// Adds a clip. After an error the list is as it was.
+    pub(super) fn append(&self, clip: &Clip) -> Result<(), RecordError> {
+        let failed = |source| RecordError::List { path: self.path.clone(), source };
+        let is_new = !self.path.exists();
+        let mut file = OpenOptions::new().append(true).create(true).open(&self.path).map_err(failed)?;
+        let before = file.metadata().map_err(failed)?.len();
+        if let Err(error) = file.write_all(&line(clip)).and_then(|()| file.sync_all()) {
+            // A torn line would swallow the next one. If this fails as well, the next start cuts it off.
+            let _ = file.set_len(before);
+            return Err(failed(error));
+        }
+        if is_new { durable::sync_folder(&self.folder) } else { Ok(()) }
+    }
+
+    /// Starts anew with these clips.
+    pub(super) fn replace(&self, clips: &[Clip]) -> Result<(), RecordError> {
+        let content = clips.iter().flat_map(line).collect::<Vec<u8>>();
+        durable::write(&self.folder.join("clips.jsonl.part"), &self.path, &self.folder, &content)
+    }
+}
+
+fn line(clip: &Clip) -> Vec<u8> {
+    let mut line = serde_json::to_vec(clip).expect("a clip is plain data");
+    line.push(b'\n');
+    line
+}
+
+/// The clips in `file`, how many of its bytes are whole lines, and how many there are.
+fn read_lines(file: &File) -> io::Result<(Vec<Listed>, u64, u64)> {
+    let mut reader = BufReader::new(file);
+    let mut listed = Vec::new();
+    let (mut at, mut whole, mut malformed) = (0, 0, 0_u64);
+    let (mut line, mut too_long) = (Vec::new(), false);
+    loop {
+        line.clear();
+        let read = reader.by_ref().take(LINE_MAX).read_until(b'\n', &mut line)? as u64;
+        if read == 0 {
+            break;
+        }
+        at += read;
+        if !line.ends_with(b"\n") {
+            too_long = true;
+            continue;
+        }
+        whole = at;
+        match serde_json::from_slice::<Line>(&line).ok().filter(|_| !too_long).and_then(names) {
+            Some(names) => listed.push(names),
+            None => malformed += 1,
+        }
+        too_long = false;
+    }
+    if malformed > 0 {
+        warn!(malformed, "lines of clips.jsonl name no clip of ours, left alone");
+    }
+    Ok((listed, whole, at))
+}
+
+fn names(line: Line) -> Option<Listed> {
+    let thumbnail = line.thumbnail.and_then(|path| plain_name(&path, JPG));
+    Some(Listed { file: plain_name(&line.file, CLIP)?, thumbnail })
+}
+
+/// The file name of `path` if it is `clips/NAME` with that ending and nothing else: what a list says is deleted, and
+/// nobody but us may say so of other files.
+fn plain_name(path: &Path, ending: &str) -> Option<String> {
+    let mut components = path.components();
+    let (folder, name) = (components.next()?, components.next()?);
+    let (Component::Normal(folder), Component::Normal(name), None) = (folder, name, components.next()) else {
+        return None;
+    };
+    let name = name.to_str().filter(|name| name.ends_with(ending) && name.len() > ending.len())?;
+    (folder == CLIPS && path.to_str()? == format!("{CLIPS}/{name}")).then(|| name.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_plain_names_in_the_folder_of_clips_are_ours() {
+        assert_eq!(plain_name(Path::new("clips/a.mcap"), CLIP).as_deref(), Some("a.mcap"));
+        let hostile = [
+            "a.mcap",
+            "../x.mcap",
+            "clips/../x.mcap",
+            "/clips/a.mcap",
+            "clips//a.mcap",
+            "clips/b/a.mcap",
+            "clips/./a.mcap",
+            "./clips/a.mcap",
+            "clips/a.mcap/",
+            "clips/a.jpg",
+            "clips/.mcap",
+            "other/a.mcap",
+            "clips/..",
+            "",
+        ];
+        for path in hostile {
+            assert_eq!(plain_name(Path::new(path), CLIP), None, "{path}");
+        }
+    }
+}

@@ -1,0 +1,125 @@
+//! The names of files in a folder of clips.
+
+use std::collections::HashSet;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use gleaner_protocol::Clip;
+
+use super::list::List;
+use crate::error::RecordError;
+
+/// The folder of the clips, within that of the list.
+pub(super) const CLIPS: &str = "clips";
+/// A whole clip.
+pub(super) const CLIP: &str = ".mcap";
+/// An unfinished clip.
+pub(super) const PART: &str = ".mcap.part";
+/// What is being saved out of an unfinished clip.
+pub(super) const AGAIN: &str = ".mcap.part2";
+/// A thumbnail.
+pub(super) const JPG: &str = ".jpg";
+/// An unfinished thumbnail.
+pub(super) const JPG_PART: &str = ".jpg.part";
+
+/// Most bytes of a name without its ending; file systems take 255 with it.
+const STEM_MAX: usize = 160;
+
+/// The folder, as an unfinished clip shares it. Its lock is held as long as one of them lives.
+pub(super) struct Place {
+    folder: PathBuf,
+    list: List,
+    /// File names that the list holds or will: none is given twice, even after its clip was fetched and deleted.
+    taken: Mutex<HashSet<String>>,
+    _lock: File,
+}
+
+impl Place {
+    pub(super) fn new(folder: PathBuf, list: List, taken: HashSet<String>, lock: File) -> Self {
+        Self { folder, list, taken: Mutex::new(taken), _lock: lock }
+    }
+
+    /// `OUT/clips`.
+    pub(super) fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    pub(super) fn list(&self) -> &List {
+        &self.list
+    }
+
+    pub(super) fn path(&self, name: &str, ending: &str) -> PathBuf {
+        self.folder.join(format!("{name}{ending}"))
+    }
+
+    pub(super) fn exists(&self, name: &str, ending: &str) -> bool {
+        self.path(name, ending).symlink_metadata().is_ok()
+    }
+
+    /// Adds a whole clip to the list.
+    pub(super) fn add(&self, name: &str, clip: &Clip) -> Result<(), RecordError> {
+        self.list.append(clip)?;
+        self.taken().insert(format!("{name}{CLIP}"));
+        Ok(())
+    }
+
+    pub(super) fn is_taken(&self, file: &str) -> bool {
+        self.taken().contains(file)
+    }
+
+    /// Starts again with the names of these files.
+    pub(super) fn take_only(&self, files: HashSet<String>) {
+        *self.taken() = files;
+    }
+
+    /// A name that no file has: `stem`, or the first of `stem-2`, `stem-3` and so on.
+    pub(super) fn free_name(&self, stem: &str) -> String {
+        let stem = plain(stem);
+        names(&stem)
+            .find(|name| {
+                let is_file = |ending: &&str| self.exists(name, ending);
+                ![CLIP, PART, AGAIN, JPG, JPG_PART].iter().any(is_file) && !self.is_taken(&format!("{name}{CLIP}"))
+            })
+            .expect("numbers do not end before the files do")
+    }
+
+    fn taken(&self) -> MutexGuard<'_, HashSet<String>> {
+        self.taken.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// `stem`, `stem-2`, `stem-3` and so on.
+pub(super) fn names(stem: &str) -> impl Iterator<Item = String> + '_ {
+    (1_u64..).map(move |n| if n == 1 { stem.to_owned() } else { format!("{stem}-{n}") })
+}
+
+/// `stem` as the begin of a file name on any system.
+fn plain(stem: &str) -> String {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
+    let name: String = stem.chars().map(|c| if allowed(c) { c } else { '-' }).take(STEM_MAX).collect();
+    match name.trim_start_matches('.') {
+        "" => "clip".to_owned(),
+        name => name.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_stays_within_the_folder() {
+        assert_eq!(plain("hello-20180802T083451.136Z"), "hello-20180802T083451.136Z");
+        assert_eq!(plain("../../etc/passwd"), "-..-etc-passwd");
+        assert_eq!(plain(""), "clip");
+        assert_eq!(plain(".."), "clip");
+        assert_eq!(plain("é\0\n"), "---");
+        assert_eq!(plain(&"x".repeat(1000)).len(), STEM_MAX);
+    }
+
+    #[test]
+    fn names_count_up() {
+        assert_eq!(names("a").take(3).collect::<Vec<_>>(), ["a", "a-2", "a-3"]);
+    }
+}

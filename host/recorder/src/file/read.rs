@@ -1,0 +1,94 @@
+//! Reading a clip back, whole or cut off.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use gleaner_protocol::Clip;
+use gleaner_transport::replay::{Damage, Limits, Replay, ReplayError, read_extras};
+use gleaner_transport::{SampleMeta, TopicSpec, Transport, Verdict};
+
+use super::ending::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};
+use super::{About, Topic};
+use crate::error::RecordError;
+
+/// The largest chunk: one message of any size that a lambda may ask for.
+const LIMITS: Limits = Limits { chunk_bytes: 1 << 30, open_bytes: 1 << 30 };
+/// Most that the metadata and attachments of a clip may take: the journals of 16 lambdas.
+const EXTRAS_BYTES: u64 = 1 << 30;
+
+/// Where a file ends early, and why.
+pub(super) struct End {
+    pub(super) at: u64,
+    pub(super) why: Damage,
+}
+
+/// Gives each message of the clip `path` to `act`, in the order of their stamps, up to the end or to the damage that
+/// it returns.
+pub(super) fn each_message(
+    path: &Path,
+    mut act: impl FnMut(&Topic, &SampleMeta, &[u8]) -> Result<(), RecordError>,
+) -> Result<Option<End>, RecordError> {
+    let cannot_read = |source| RecordError::Unreadable { path: path.to_owned(), source: Box::new(source) };
+    let mut replay = Replay::open_with(&[path.to_owned()], LIMITS).map_err(cannot_read)?;
+    let held = Arc::new(Held::default());
+    let mut topics = Vec::new();
+    for found in replay.topics() {
+        let spec = TopicSpec { topic: found.topic, type_name: found.type_name, queue: 1, max_bytes: usize::MAX };
+        replay
+            .subscribe(&spec, Arc::clone(&held) as Arc<dyn gleaner_transport::Sink>)
+            .map_err(|source| RecordError::Topic { path: path.to_owned(), source: Box::new(source) })?;
+        topics.push(Topic {
+            name: spec.topic,
+            type_name: spec.type_name,
+            definitions: found.definitions_text,
+            offered_qos: found.offered_qos,
+        });
+    }
+    loop {
+        match replay.step() {
+            Ok(Some(step)) => {
+                let cdr = held.0.lock().unwrap_or_else(PoisonError::into_inner);
+                act(&topics[step.subscription.0], &step.meta, &cdr)?;
+            }
+            Ok(None) => return Ok(None),
+            Err(ReplayError::Damaged { offset, what, .. }) => return Ok(Some(End { at: offset, why: what })),
+            Err(error) => return Err(cannot_read(error)),
+        }
+    }
+}
+
+/// The message that was delivered last.
+#[derive(Default)]
+struct Held(Mutex<Vec<u8>>);
+
+impl gleaner_transport::Sink for Held {
+    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Verdict {
+        let mut held = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        held.clear();
+        held.extend_from_slice(cdr);
+        Verdict::Taken
+    }
+}
+
+/// The line of the clip `path` if it is whole, found out by reading all of it.
+pub(super) fn whole(path: &Path) -> Result<Option<Clip>, RecordError> {
+    if each_message(path, |_, _, _| Ok(()))?.is_some() {
+        return Ok(None);
+    }
+    let extras = read_extras(path, EXTRAS_BYTES)
+        .map_err(|source| RecordError::Unreadable { path: path.to_owned(), source: Box::new(source) })?;
+    Ok(extras.metadata.iter().find(|(name, _)| name == CLIP_RECORD).and_then(|(_, metadata)| read_line(metadata)))
+}
+
+/// What the clip `path` says of its begin; `None` if that cannot be read.
+pub(super) fn about(path: &Path) -> Option<About> {
+    let extras = read_extras(path, EXTRAS_BYTES).ok()?;
+    extras.metadata.iter().find(|(name, _)| name == BEGIN).and_then(|(_, metadata)| read_begin(metadata))
+}
+
+/// The file that the clip `path` was saved from, if it was.
+pub(super) fn recovered_from(path: &Path) -> Option<String> {
+    let extras = read_extras(path, EXTRAS_BYTES).ok()?;
+    let (_, metadata) = extras.metadata.iter().find(|(name, _)| name == CLIP_RECORD)?;
+    read_recovered_from(metadata).map(str::to_owned)
+}

@@ -1,0 +1,183 @@
+//! What a recorder that died left behind becomes whole clips.
+//!
+//! Every step may be the last one of this process, too. So each leaves the folder in a state that the next attempt
+//! reads as it was meant: the unfinished file goes last, and a clip that was saved says from which file.
+
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+use gleaner_protocol::{Clip, Recovered};
+use gleaner_transport::replay::Damage;
+use tracing::{info, warn};
+
+use super::part::{Origin, origin};
+use super::place::{AGAIN, CLIP, CLIPS, JPG, JPG_PART, PART, Place, names};
+use super::read::{self, End};
+use super::unfinished::{CHUNK_SPAN_NS, Saved, Unfinished};
+use super::{Ending, durable};
+use crate::error::RecordError;
+
+/// Makes a clip of the unfinished clip `name`, if there is anything in it, and lists it.
+pub(super) fn recover(place: &Arc<Place>, name: &str) -> Result<Option<Clip>, RecordError> {
+    let part = place.path(name, PART);
+    let recovered = attempt(place, name, &part);
+    recovered.map_err(|source| RecordError::Recover { path: part, source: Box::new(source) })
+}
+
+/// Lists the clip `name`, which has its name and no line, if it is one of ours and whole.
+pub(super) fn list(place: &Place, name: &str) -> Result<Option<Clip>, RecordError> {
+    let path = place.path(name, CLIP);
+    match origin(&path) {
+        Ok(Origin::Ours) => {}
+        Ok(_) => return Ok(None),
+        Err(error) => {
+            warn!(path = %path.display(), %error, "cannot read a file, left alone");
+            return Ok(None);
+        }
+    }
+    match read::whole(&path) {
+        Ok(Some(clip)) => add(place, name, clip).map(Some),
+        Ok(None) => {
+            warn!(path = %path.display(), "clip is damaged and not listed, left alone");
+            Ok(None)
+        }
+        Err(error) => {
+            warn!(path = %path.display(), error = &error as &dyn std::error::Error, "cannot read a clip, left alone");
+            Ok(None)
+        }
+    }
+}
+
+fn attempt(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, RecordError> {
+    match origin(part).map_err(|source| RecordError::Read { path: part.to_owned(), source })? {
+        Origin::Foreign => {
+            warn!(path = %part.display(), "file is not of this program, left alone");
+            return Ok(None);
+        }
+        Origin::Nothing => return discard(place, name).map(|()| None),
+        Origin::Ours => {}
+    }
+    // What an earlier attempt wrote, and did not complete.
+    durable::remove(&place.path(name, AGAIN))?;
+    if was_saved(place, name) {
+        durable::remove(part)?;
+        return Ok(None);
+    }
+    match read::whole(part)? {
+        // It died just before the rename.
+        Some(clip) => adopt(place, name, part, clip).map(Some),
+        None => save(place, name, part),
+    }
+}
+
+/// Whether an earlier attempt got as far as a whole clip.
+fn was_saved(place: &Place, name: &str) -> bool {
+    let part = format!("{name}{PART}");
+    let existing = names(name).take_while(|name| place.exists(name, CLIP));
+    existing
+        .map(|name| read::recovered_from(&place.path(&name, CLIP)))
+        .any(|from| from.is_some_and(|from| from == part))
+}
+
+/// The name for the clip of the unfinished file `name`: its own, as it was free when the file was begun, unless
+/// somebody has put another file there since.
+fn name_for(place: &Place, name: &str) -> String {
+    let is_free = |name: &String| !place.exists(name, CLIP) && !place.is_taken(&format!("{name}{CLIP}"));
+    names(name).find(is_free).expect("numbers do not end before the files do")
+}
+
+fn adopt(place: &Place, name: &str, part: &Path, clip: Clip) -> Result<Clip, RecordError> {
+    let free = name_for(place, name);
+    durable::sync_file(part)?;
+    durable::rename(part, &place.path(&free, CLIP), place.folder())?;
+    add(place, &free, clip)
+}
+
+/// Lists a whole clip whose line is that of its own record.
+fn add(place: &Place, name: &str, mut clip: Clip) -> Result<Clip, RecordError> {
+    let path = place.path(name, CLIP);
+    let metadata = fs::metadata(&path).map_err(|source| RecordError::Read { path: path.clone(), source })?;
+    clip.file = format!("{CLIPS}/{name}{CLIP}").into();
+    clip.thumbnail = place.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
+    clip.bytes = metadata.len();
+    place.add(name, &clip)?;
+    info!(path = %path.display(), "clip was whole but not listed, now it is");
+    Ok(clip)
+}
+
+/// Removes an unfinished clip without a message. Nothing that was acknowledged is lost by that.
+fn discard(place: &Place, name: &str) -> Result<(), RecordError> {
+    durable::remove(&place.path(name, JPG_PART))?;
+    if !place.exists(name, CLIP) {
+        durable::remove(&place.path(name, JPG))?;
+    }
+    let part = place.path(name, PART);
+    let bytes = fs::metadata(&part).map_or(0, |metadata| metadata.len());
+    warn!(path = %part.display(), bytes, "unfinished clip has no message, removed");
+    durable::remove(&part).map(drop)
+}
+
+/// Copies the messages of `part` into a clip of their own.
+fn save(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, RecordError> {
+    let again = place.path(name, AGAIN);
+    let saved = copy(place, name, part);
+    if saved.as_ref().is_ok_and(Option::is_some) {
+        durable::remove(&place.path(name, JPG_PART))?;
+        durable::remove(part)?;
+        return saved;
+    }
+    // A copy that did not come to its end; on a full disk, its room is wanted.
+    durable::remove(&again)?;
+    if saved.is_ok() {
+        discard(place, name)?;
+    }
+    saved
+}
+
+fn copy(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, RecordError> {
+    let len = fs::metadata(part).map_err(|source| RecordError::Read { path: part.to_owned(), source })?.len();
+    let about = read::about(part);
+    let free = name_for(place, name);
+    let mut clip = Unfinished::create(Arc::clone(place), name.to_owned(), AGAIN, about.as_ref())?;
+    let end = read::each_message(part, |topic, meta, cdr| clip.message(topic, meta, cdr))?;
+    let Some((first_ns, last_ns)) = clip.span() else {
+        return Ok(None);
+    };
+    let from_ns = about.as_ref().map_or(first_ns, |about| about.from_ns);
+    if free != name {
+        // It belongs to no clip now.
+        durable::remove(&place.path(name, JPG))?;
+    }
+    let has_thumbnail = place.exists(&free, JPG);
+    let what = what(end.as_ref(), last_ns.saturating_sub(from_ns), has_thumbnail);
+    let ending = Ending {
+        from_ns,
+        to_ns: last_ns,
+        triggers: u64::from(about.is_some()),
+        moments: about.iter().map(|about| about.moment.clone()).collect(),
+        lambdas: about.map(|about| about.lambdas).unwrap_or_default(),
+        short: vec![what.clone()],
+        ..Ending::default()
+    };
+    let lost_bytes = end.map_or(0, |end| len.saturating_sub(end.at));
+    warn!(path = %part.display(), messages = clip.messages(), lost_bytes, "unfinished clip of a dead recorder saved");
+    let saved = Saved { recovered: Recovered { lost_bytes, what }, from: format!("{name}{PART}") };
+    clip.close(ending, &free, Some(saved)).map(Some)
+}
+
+/// What happened and what is missing, for a person.
+fn what(end: Option<&End>, kept_ns: i64, has_thumbnail: bool) -> String {
+    let kept = kept_ns.max(0) as f64 / 1e9;
+    let most = CHUNK_SPAN_NS / 1_000_000_000;
+    let also = if has_thumbnail { "so is the journal" } else { "so are journal and thumbnail" };
+    match end.map(|end| &end.why) {
+        None | Some(Damage::Truncated(_) | Damage::NoFooter) => format!(
+            "the recorder died; messages after {kept:.3} s of the window are lost, at most {most} s of them unless the \
+             power failed; {also}"
+        ),
+        Some(why) => format!(
+            "the recorder died and its file is damaged ({why}); messages after {kept:.3} s of the window are lost; {also}"
+        ),
+    }
+}

@@ -1,0 +1,85 @@
+//! The file under an MCAP writer.
+
+use std::fs::File;
+use std::io::{self, Seek, SeekFrom, Write};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Records around chunks are written in many small pieces; they are collected up to this size.
+const BUFFER: usize = 64 << 10;
+
+/// A file that only grows, and that nothing more is written to once a write has failed: behind a torn record nothing
+/// could be read.
+pub(super) struct Sink {
+    file: File,
+    buffer: Vec<u8>,
+    position: Arc<AtomicU64>,
+    failed: bool,
+}
+
+impl Sink {
+    /// A sink that writes to the new file `file`.
+    pub(super) fn new(file: File) -> Self {
+        Self { file, buffer: Vec::with_capacity(BUFFER), position: Arc::default(), failed: false }
+    }
+
+    /// The file, once everything was written.
+    pub(super) fn into_file(mut self) -> io::Result<File> {
+        self.flush()?;
+        Ok(self.file)
+    }
+
+    /// Bytes written so far, to be read while an MCAP writer has the sink.
+    pub(super) fn position(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.position)
+    }
+
+    fn check(&self) -> io::Result<()> {
+        if self.failed { Err(io::Error::other("an earlier write to this file failed")) } else { Ok(()) }
+    }
+
+    fn through(&mut self, bytes: &[u8]) -> io::Result<()> {
+        let written = self.file.write_all(bytes);
+        self.failed |= written.is_err();
+        written
+    }
+
+    fn empty(&mut self) -> io::Result<()> {
+        let mut buffer = std::mem::take(&mut self.buffer);
+        let written = if buffer.is_empty() { Ok(()) } else { self.through(&buffer) };
+        buffer.clear();
+        self.buffer = buffer;
+        written
+    }
+}
+
+impl Write for Sink {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.check()?;
+        if self.buffer.len() + bytes.len() > BUFFER {
+            self.empty()?;
+        }
+        if bytes.len() > BUFFER {
+            self.through(bytes)?;
+        } else {
+            self.buffer.extend_from_slice(bytes);
+        }
+        self.position.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.check()?;
+        self.empty()
+    }
+}
+
+impl Seek for Sink {
+    /// The writer asks where it is, and never goes elsewhere.
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        match to {
+            SeekFrom::Current(0) => Ok(self.position.load(Ordering::Relaxed)),
+            _ => Err(io::ErrorKind::Unsupported.into()),
+        }
+    }
+}

@@ -1,0 +1,140 @@
+use std::fs::{self, OpenOptions};
+use std::io::Write;
+
+use super::super::Folder;
+use super::*;
+use crate::error::RecordError;
+
+fn record(folder: &mut Folder, stem: &str) -> Clip {
+    let mut clip = folder.begin(stem, &about()).unwrap();
+    add(&mut clip, 0, 6);
+    clip.finish(ending()).unwrap()
+}
+
+#[test]
+fn a_name_is_given_once() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let files = [record(&mut folder, "a"), record(&mut folder, "a"), record(&mut folder, "../a")].map(|clip| clip.file);
+    assert_eq!(
+        files.map(|file| file.to_str().unwrap().to_owned()),
+        ["clips/a.mcap", "clips/a-2.mcap", "clips/-a.mcap"]
+    );
+    // Not even after it was fetched and deleted.
+    fs::remove_file(scratch.path("clips/a.mcap")).unwrap();
+    fs::remove_file(scratch.path("clips/a.jpg")).unwrap();
+    assert_eq!(record(&mut folder, "a").file.to_str(), Some("clips/a-3.mcap"));
+}
+
+#[test]
+fn a_folder_is_held_by_one_recorder_until_its_last_clip_is_closed() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let clip = folder.begin("a", &about()).unwrap();
+    drop(folder);
+    let error = Folder::open(&scratch.0).err().expect("it is held");
+    assert!(matches!(&error, RecordError::Busy { folder } if *folder == scratch.0), "{error:?}");
+    clip.finish(ending()).unwrap();
+    assert!(scratch.open().1.is_empty());
+}
+
+#[test]
+fn a_torn_last_line_is_cut_off_and_its_clip_listed_again() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let clips = [record(&mut folder, "a"), record(&mut folder, "b")];
+    drop(folder);
+    let list = fs::read(scratch.path("clips.jsonl")).unwrap();
+    let first = list.iter().position(|byte| *byte == b'\n').unwrap() + 1;
+    for len in [0, 1, first - 1, first, first + 1, list.len() - 1, list.len()] {
+        fs::write(scratch.path("clips.jsonl"), &list[..len]).unwrap();
+        let (_, found) = scratch.open();
+        let whole = list[..len].iter().filter(|byte| **byte == b'\n').count();
+        assert_eq!(found, clips[whole..], "{len} bytes");
+        assert_eq!(scratch.listed(), clips, "{len} bytes");
+    }
+    fs::remove_file(scratch.path("clips.jsonl")).unwrap();
+    assert_eq!(scratch.open().1, clips);
+    assert_eq!(scratch.listed(), clips);
+}
+
+#[test]
+fn a_whole_clip_that_is_damaged_or_of_somebody_else_is_not_listed() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    record(&mut folder, "a");
+    drop(folder);
+    let clip = fs::read(scratch.path("clips/a.mcap")).unwrap();
+    fs::remove_file(scratch.path("clips.jsonl")).unwrap();
+    for damaged in [clip[..clip.len() - 9].to_vec(), b"no clip".to_vec(), Vec::new()] {
+        fs::write(scratch.path("clips/a.mcap"), &damaged).unwrap();
+        assert!(scratch.open().1.is_empty());
+        assert!(scratch.listed().is_empty());
+        assert_eq!(fs::read(scratch.path("clips/a.mcap")).unwrap(), damaged);
+    }
+}
+
+#[test]
+fn files_of_others_are_left_alone() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    record(&mut folder, "a");
+    drop(folder);
+    let foreign = ["notes.txt", "b.jpg", "b.jpg.part", "b.mcap", "c.mcap.part2", "c.mcap.part", ".mcap.part.swp"];
+    for name in foreign {
+        fs::write(scratch.path("clips").join(name), b"precious").unwrap();
+    }
+    fs::create_dir(scratch.path("clips/d.mcap.part")).unwrap();
+    let before = scratch.files();
+    let (mut folder, found) = scratch.open();
+    assert!(found.is_empty());
+    assert_eq!(scratch.files(), before);
+    assert_eq!(folder.replace(&[]).unwrap(), 1);
+    for name in foreign {
+        assert_eq!(fs::read(scratch.path("clips").join(name)).unwrap(), b"precious", "{name}");
+    }
+}
+
+#[test]
+fn replacing_keeps_what_is_to_be_kept() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let [_, keep, _] = ["a", "b", "c"].map(|stem| record(&mut folder, stem));
+    assert_eq!(folder.replace(std::slice::from_ref(&keep)).unwrap(), 2);
+    assert_eq!(scratch.listed(), std::slice::from_ref(&keep));
+    assert_eq!(scratch.files(), ["b.jpg", "b.mcap"]);
+    let next = record(&mut folder, "a");
+    assert_eq!(scratch.listed(), [keep, next]);
+    assert_eq!(folder.replace(&[]).unwrap(), 2);
+    assert_eq!(folder.replace(&[]).unwrap(), 0);
+    assert!(scratch.files().is_empty() && scratch.listed().is_empty());
+}
+
+#[test]
+fn a_hostile_list_deletes_nothing_outside() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let clip = record(&mut folder, "a");
+    let victims = ["x.mcap", "x.jpg", "clips/notes.txt", "clips/deep/y.mcap"].map(|name| scratch.path(name));
+    fs::create_dir(scratch.path("clips/deep")).unwrap();
+    for victim in &victims {
+        fs::write(victim, b"precious").unwrap();
+    }
+    let absolute = scratch.path("x.mcap").to_str().unwrap().to_owned();
+    let inside = scratch.path("clips/a.mcap").to_str().unwrap().to_owned();
+    let mut list = OpenOptions::new().append(true).open(scratch.path("clips.jsonl")).unwrap();
+    for file in ["clips/../x.mcap", "../x.mcap", "x.mcap", "clips/notes.txt", "clips/deep/y.mcap", &absolute, &inside] {
+        let line = serde_json::json!({ "file": file, "thumbnail": "clips/../x.jpg" });
+        writeln!(list, "{line}").unwrap();
+    }
+    writeln!(list, r#"{{"file":"clips/none.mcap","thumbnail":"../x.jpg"}}"#).unwrap();
+    writeln!(list, "no line at all\n{{}}\n[]\n{}", "[".repeat(5 << 20)).unwrap();
+    drop((list, folder));
+    let (mut folder, found) = scratch.open();
+    assert!(found.is_empty());
+    assert_eq!(folder.replace(&[]).unwrap(), 1);
+    assert!(!scratch.path(clip.file.to_str().unwrap()).exists());
+    for victim in &victims {
+        assert_eq!(fs::read(victim).unwrap(), b"precious", "{}", victim.display());
+    }
+}

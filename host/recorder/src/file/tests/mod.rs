@@ -1,0 +1,156 @@
+//! Clips are written, read back by two readers, torn at every byte, and recovered.
+
+mod folder;
+mod recover;
+mod write;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use gleaner_protocol::manifest::Kind;
+use gleaner_protocol::{Clip, ClipLambda, Moment, TriggerKind};
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+use super::{About, Ending, Folder, Topic, TopicCounts, Unfinished};
+
+/// A folder for one test, removed when the test ends.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("gleaner-recorder-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let folder = std::env::temp_dir().join(name);
+        fs::create_dir(&folder).unwrap();
+        Self(folder)
+    }
+
+    fn path(&self, relative: &str) -> PathBuf {
+        self.0.join(relative)
+    }
+
+    fn open(&self) -> (Folder, Vec<Clip>) {
+        Folder::open(&self.0).unwrap()
+    }
+
+    /// The clips that the list names.
+    fn listed(&self) -> Vec<Clip> {
+        let text = fs::read_to_string(self.path("clips.jsonl")).unwrap_or_default();
+        text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    }
+
+    /// Names in the folder of clips, sorted, without the lock.
+    fn files(&self) -> Vec<String> {
+        let entries = fs::read_dir(self.path("clips")).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.filter(|name| name != ".lock").collect();
+        names.sort();
+        names
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+const SECOND: i64 = 1_000_000_000;
+
+fn lambda() -> ClipLambda {
+    let (name, version, digest) = ("hello".to_owned(), "0.1.0".to_owned(), "ab".repeat(32));
+    ClipLambda { name, version, kind: Kind::Wasm, digest, windows: 1 }
+}
+
+fn moment(at_ns: i64) -> Moment {
+    let (lambda, label) = ("hello".to_owned(), "hard-brake".to_owned());
+    Moment { lambda, kind: TriggerKind::Event, label, score: Some(0.5), at_ns }
+}
+
+fn about() -> About {
+    let clock = "log time of the drive".to_owned();
+    About { clock, from_ns: 10 * SECOND, lambdas: vec![lambda()], moment: moment(12 * SECOND) }
+}
+
+fn imu() -> Topic {
+    Topic {
+        name: "/imu/data".to_owned(),
+        type_name: "sensor_msgs/msg/Imu".to_owned(),
+        definitions: Some("float64 x".into()),
+        offered_qos: Some("- history: 3".to_owned()),
+    }
+}
+
+fn camera() -> Topic {
+    let (name, type_name) = ("/camera".to_owned(), "sensor_msgs/msg/Image".to_owned());
+    Topic { name, type_name, definitions: None, offered_qos: None }
+}
+
+fn meta(at_ns: i64, seq: u64) -> SampleMeta {
+    let writer = Guid(*b"a writer of imus");
+    SampleMeta { at_ns, publish_ns: at_ns - 7, writer, seq, endian: Endian::Little, options: [0; 2] }
+}
+
+/// The payload of message `n`: no two are equal.
+fn payload(n: u64) -> Vec<u8> {
+    [&n.to_le_bytes()[..], &[n as u8; 13]].concat()
+}
+
+fn ending() -> Ending {
+    Ending {
+        from_ns: 10 * SECOND,
+        to_ns: 20 * SECOND,
+        lambdas: vec![lambda()],
+        triggers: 2,
+        moments: vec![moment(12 * SECOND), Moment { score: None, ..moment(13 * SECOND) }],
+        topics: vec![
+            TopicCounts {
+                topic: "/imu/data".to_owned(),
+                type_name: Some("sensor_msgs/msg/Imu".to_owned()),
+                received: Some(9),
+                lost: None,
+                overwritten: Some(1),
+                too_big: Some(0),
+            },
+            TopicCounts { topic: "/gone".to_owned(), received: Some(0), ..TopicCounts::default() },
+        ],
+        short: vec!["the drive ended 2.1 s before the window did".to_owned()],
+        thumbnail: Some(b"a picture".to_vec()),
+        journals: vec![("hello".to_owned(), b"a journal".to_vec())],
+        metadata: vec![("extra".to_owned(), BTreeMap::from([("key".to_owned(), "value".to_owned())]))],
+    }
+}
+
+/// Adds messages `from..to` of the IMU, four a second from second 10 on.
+fn add(clip: &mut Unfinished, from: u64, to: u64) {
+    for n in from..to {
+        clip.message(&imu(), &meta(stamp(n), n + 1), &payload(n)).unwrap();
+    }
+}
+
+fn stamp(n: u64) -> i64 {
+    10 * SECOND + n as i64 * SECOND / 4
+}
+
+/// What a replay of `path` delivers, in its order; it must be a whole file.
+fn replayed(path: &Path) -> Vec<(Topic, SampleMeta, Vec<u8>)> {
+    let mut all = Vec::new();
+    let end = super::read::each_message(path, |topic, meta, cdr| {
+        all.push((topic.clone(), *meta, cdr.to_vec()));
+        Ok(())
+    });
+    assert!(end.unwrap().is_none(), "{} is not whole", path.display());
+    all
+}
+
+/// The numbers of the messages in `path`, as [`add`] wrote them.
+fn numbers(path: &Path) -> Vec<u64> {
+    let number = |(_, meta, cdr): (Topic, SampleMeta, Vec<u8>)| {
+        let n = u64::from_le_bytes(*cdr.first_chunk().unwrap());
+        assert_eq!((cdr, meta.at_ns, meta.seq), (payload(n), stamp(n), n + 1));
+        n
+    };
+    replayed(path).into_iter().map(number).collect()
+}

@@ -1,0 +1,212 @@
+use std::fs;
+use std::path::Path;
+
+use super::super::Unfinished;
+use super::super::place::{AGAIN, CLIP, PART};
+use super::*;
+
+/// The bytes of an unfinished clip of `messages` messages, some of them in a chunk that was not closed.
+fn part(messages: u64) -> Vec<u8> {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let mut clip = folder.begin("a", &about()).unwrap();
+    add(&mut clip, 0, messages);
+    clip.abandon();
+    fs::read(scratch.path("clips/a.mcap.part")).unwrap()
+}
+
+/// A folder in which a recorder died that had written `part`.
+fn died(part: &[u8]) -> Scratch {
+    let scratch = Scratch::new();
+    fs::create_dir(scratch.path("clips")).unwrap();
+    fs::write(scratch.path("clips/a.mcap.part"), part).unwrap();
+    scratch
+}
+
+/// How many messages the closed chunks of an unfinished clip of `messages` messages hold: five to a second.
+fn closed(messages: u64) -> u64 {
+    messages.saturating_sub(1) / 5 * 5
+}
+
+fn is_begin(numbers: &[u64]) -> bool {
+    numbers.iter().enumerate().all(|(at, number)| at as u64 == *number)
+}
+
+#[test]
+fn an_abandoned_clip_has_every_closed_chunk_after_any_number_of_messages() {
+    for messages in 0..23 {
+        let scratch = died(&part(messages));
+        let (_, found) = scratch.open();
+        assert_eq!(scratch.listed(), found);
+        if closed(messages) == 0 {
+            assert!(found.is_empty() && scratch.files().is_empty(), "{messages} messages");
+            continue;
+        }
+        assert_eq!(scratch.files(), ["a.mcap"]);
+        assert_eq!(numbers(&scratch.path("clips/a.mcap")).len() as u64, closed(messages));
+    }
+}
+
+#[test]
+fn a_recovered_clip_says_what_it_was_and_what_is_missing() {
+    let torn = [part(13), vec![9; 3]].concat();
+    let scratch = died(&torn);
+    let (_, found) = scratch.open();
+    let [clip] = found.as_slice() else { panic!("one clip, not {}", found.len()) };
+    assert_eq!(clip.lambdas, [lambda()]);
+    assert_eq!((clip.from_ns, clip.to_ns), (10 * SECOND, stamp(9)));
+    assert_eq!((clip.first_ns, clip.last_ns), (Some(stamp(0)), Some(stamp(9))));
+    assert_eq!((clip.triggers, clip.moments.as_slice()), (1, &[moment(12 * SECOND)][..]));
+    assert_eq!((clip.topics[0].messages, clip.topics[0].received, clip.topics[0].too_big), (10, None, None));
+    assert_eq!(clip.bytes, fs::metadata(scratch.path("clips/a.mcap")).unwrap().len());
+    let recovered = clip.recovered.as_ref().unwrap();
+    assert_eq!(recovered.lost_bytes, 3);
+    assert_eq!(
+        recovered.what,
+        "the recorder died; messages after 2.250 s of the window are lost, at most 1 s of them unless the power failed; \
+         so are journal and thumbnail"
+    );
+    assert_eq!(clip.short, std::slice::from_ref(&recovered.what));
+    let messages = replayed(&scratch.path("clips/a.mcap"));
+    assert_eq!((&messages[0].0, messages[0].1.writer), (&imu(), meta(0, 1).writer));
+}
+
+#[test]
+fn a_file_torn_at_any_byte_becomes_a_whole_clip_or_nothing() {
+    let whole = part(14);
+    let mut most = 0;
+    for len in 0..=whole.len() {
+        let scratch = died(&whole[..len]);
+        let (folder, found) = scratch.open();
+        assert_eq!(scratch.listed(), found, "{len} bytes");
+        if found.is_empty() {
+            assert!(scratch.files().is_empty(), "{len} bytes: {:?}", scratch.files());
+            assert_eq!(most, 0, "{len} bytes");
+            continue;
+        }
+        assert_eq!(scratch.files(), ["a.mcap"], "{len} bytes");
+        let numbers = numbers(&scratch.path("clips/a.mcap"));
+        assert!(is_begin(&numbers) && numbers.len() >= most, "{len} bytes: {numbers:?}");
+        most = numbers.len();
+        drop(folder);
+        let (_, again) = scratch.open();
+        assert!(again.is_empty(), "{len} bytes");
+    }
+    assert_eq!(most, 10);
+}
+
+#[test]
+fn a_byte_flipped_anywhere_never_gives_a_broken_clip() {
+    let whole = part(11);
+    for at in 0..whole.len() {
+        let mut flipped = whole.clone();
+        flipped[at] ^= 0x41;
+        let scratch = died(&flipped);
+        let (_, found) = scratch.open();
+        for clip in &found {
+            let numbers = numbers(&scratch.path(clip.file.to_str().unwrap()));
+            assert!(is_begin(&numbers), "byte {at}: {numbers:?}");
+        }
+        assert_eq!(scratch.listed(), found, "byte {at}");
+    }
+}
+
+/// A whole clip, torn at every byte on its way through the disk: with its footer it is taken as it is.
+#[test]
+fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
+    let source = Scratch::new();
+    let (mut folder, _) = source.open();
+    let mut clip = folder.begin("a", &about()).unwrap();
+    add(&mut clip, 0, 6);
+    let finished = clip.finish(ending()).unwrap();
+    let whole = fs::read(source.path("clips/a.mcap")).unwrap();
+    for len in (0..whole.len()).step_by(7).chain([whole.len()]) {
+        let scratch = died(&whole[..len]);
+        fs::write(scratch.path("clips/a.jpg"), b"a picture").unwrap();
+        fs::write(scratch.path("clips/a.jpg.part"), b"a pic").unwrap();
+        let (_, found) = scratch.open();
+        assert_eq!(scratch.listed(), found, "{len} bytes");
+        match found.as_slice() {
+            [] => assert!(scratch.files().is_empty(), "{len} bytes"),
+            [clip] => {
+                assert!(is_begin(&numbers(&scratch.path("clips/a.mcap"))), "{len} bytes");
+                assert_eq!(clip.thumbnail, finished.thumbnail);
+                assert_eq!(*clip == finished, len == whole.len(), "{len} bytes");
+                assert!(!scratch.path("clips/a.mcap.part").exists(), "{len} bytes");
+            }
+            more => panic!("{} clips", more.len()),
+        }
+    }
+}
+
+/// The folder as it is after each step of a recovery that dies there.
+#[test]
+fn a_recovery_that_dies_at_any_step_is_done_again_without_doubles() {
+    let part = part(14);
+    let done = died(&part);
+    let (_, found) = done.open();
+    let saved = fs::read(done.path("clips/a.mcap")).unwrap();
+
+    // While it copies: the copy is cut off anywhere.
+    for len in (0..saved.len()).step_by(11) {
+        let scratch = died(&part);
+        fs::write(scratch.path(&format!("clips/a{AGAIN}")), &saved[..len]).unwrap();
+        let (_, again) = scratch.open();
+        assert_eq!((again, scratch.listed()), (found.clone(), found.clone()));
+        assert_eq!(scratch.files(), ["a.mcap"]);
+    }
+    // After the rename, before the list; then after the list.
+    for is_listed in [false, true] {
+        let scratch = died(&part);
+        fs::write(scratch.path(&format!("clips/a{CLIP}")), &saved).unwrap();
+        if is_listed {
+            fs::copy(done.path("clips.jsonl"), scratch.path("clips.jsonl")).unwrap();
+        }
+        let (_, again) = scratch.open();
+        assert_eq!(again, if is_listed { Vec::new() } else { found.clone() });
+        assert_eq!(scratch.listed(), found);
+        assert_eq!(scratch.files(), ["a.mcap"]);
+    }
+}
+
+#[test]
+fn a_file_that_somebody_put_in_the_place_of_the_clip_stays() {
+    let scratch = died(&part(14));
+    fs::write(scratch.path("clips/a.mcap"), b"not a clip").unwrap();
+    let (_, found) = scratch.open();
+    assert_eq!(found[0].file, Path::new("clips/a-2.mcap"));
+    assert_eq!(fs::read(scratch.path("clips/a.mcap")).unwrap(), b"not a clip");
+    assert_eq!(scratch.files(), ["a-2.mcap", "a.mcap"]);
+    assert_eq!(numbers(&scratch.path("clips/a-2.mcap")).len(), 10);
+}
+
+#[test]
+fn an_unfinished_clip_without_content_is_removed_and_one_of_somebody_else_is_not() {
+    for nothing in [&[][..], &[0; 10_000], b"\x89MCAP0\r\n"] {
+        let scratch = died(nothing);
+        assert!(scratch.open().1.is_empty());
+        assert!(scratch.files().is_empty());
+    }
+    let mut foreign = part(14);
+    let library = foreign.windows(8).position(|bytes| bytes == b"gleaner ").unwrap();
+    foreign[library] = b'b';
+    for foreign in [foreign.as_slice(), b"half a download", &[&[0; 9000][..], b"x"].concat()] {
+        let scratch = died(foreign);
+        assert!(scratch.open().1.is_empty());
+        assert_eq!(fs::read(scratch.path(&format!("clips/a{PART}"))).unwrap(), foreign);
+    }
+}
+
+#[test]
+fn several_unfinished_clips_are_recovered_in_the_order_of_their_names() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let mut open: Vec<Unfinished> = ["b", "a", "b"].map(|stem| folder.begin(stem, &about()).unwrap()).into();
+    for clip in &mut open {
+        add(clip, 0, 8);
+    }
+    drop((folder, open));
+    let (_, found) = scratch.open();
+    let files: Vec<_> = found.iter().map(|clip| clip.file.to_str().unwrap()).collect();
+    assert_eq!(files, ["clips/a.mcap", "clips/b.mcap", "clips/b-2.mcap"]);
+}

@@ -1,0 +1,210 @@
+use std::collections::BTreeMap;
+use std::fs::{self, OpenOptions};
+
+use gleaner_protocol::{Clip, Explain};
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+use super::super::place::PART;
+use super::super::sink::Sink;
+use super::super::{Ending, Unfinished};
+use super::*;
+use crate::error::RecordError;
+
+/// All metadata records of a finished clip, read by the `mcap` crate.
+fn metadata(file: &[u8]) -> Vec<(String, BTreeMap<String, String>)> {
+    let records = mcap::read::LinearReader::new(file).unwrap();
+    let metadata = records.filter_map(|record| match record.unwrap() {
+        mcap::records::Record::Metadata(metadata) => Some((metadata.name, metadata.metadata)),
+        _ => None,
+    });
+    metadata.collect()
+}
+
+fn named<'a>(
+    records: &'a [(String, BTreeMap<String, String>)],
+    name: &'a str,
+) -> impl Iterator<Item = &'a BTreeMap<String, String>> {
+    records.iter().filter(move |(of, _)| of == name).map(|(_, metadata)| metadata)
+}
+
+#[test]
+fn a_clip_reads_back_byte_for_byte() {
+    let scratch = Scratch::new();
+    let (mut folder, found) = scratch.open();
+    assert!(found.is_empty());
+    let mut clip = folder.begin("hello-1", &about()).unwrap();
+    let other = Guid(*b"a second writer!");
+    let messages = [
+        (imu(), meta(10 * SECOND, 1), payload(1)),
+        (camera(), SampleMeta { endian: Endian::Big, options: [3, 4], ..meta(11 * SECOND, 5) }, vec![7; 3 << 20]),
+        (imu(), SampleMeta { writer: other, ..meta(12 * SECOND, 1) }, payload(2)),
+        (imu(), meta(13 * SECOND, 2), Vec::new()),
+    ];
+    for (topic, meta, cdr) in &messages {
+        clip.message(topic, meta, cdr).unwrap();
+    }
+    assert!(clip.bytes() > 0);
+    let clip = clip.finish(ending()).unwrap();
+    let path = scratch.path("clips/hello-1.mcap");
+    let file = fs::read(&path).unwrap();
+    assert_eq!(clip.bytes, file.len() as u64);
+
+    let back = replayed(&path);
+    assert_eq!(back.len(), messages.len());
+    for ((topic, meta, cdr), (found_topic, found_meta, found_cdr)) in messages.iter().zip(&back) {
+        assert_eq!(topic, found_topic);
+        assert_eq!(cdr, found_cdr);
+        assert_eq!(meta, found_meta);
+    }
+
+    let read: Vec<_> = mcap::MessageStream::new(&file).unwrap().map(Result::unwrap).collect();
+    assert_eq!(read.len(), messages.len());
+    for ((topic, meta, cdr), found) in messages.iter().zip(&read) {
+        let endian = u8::from(meta.endian == Endian::Little);
+        assert_eq!(*found.data, [&[0, endian, meta.options[0], meta.options[1]], cdr.as_slice()].concat());
+        assert_eq!((found.log_time, found.publish_time), (meta.at_ns as u64, meta.publish_ns as u64));
+        assert_eq!(u64::from(found.sequence), meta.seq);
+        assert_eq!(found.channel.topic, topic.name);
+        assert_eq!(found.channel.message_encoding, "cdr");
+        assert_eq!(found.channel.metadata["gleaner.writer"], meta.writer.to_string());
+        assert_eq!(found.channel.metadata.get("offered_qos_profiles"), topic.offered_qos.as_ref());
+        let schema = found.channel.schema.as_ref().unwrap();
+        assert_eq!((schema.name.as_str(), schema.encoding.as_str()), (topic.type_name.as_str(), "ros2msg"));
+        assert_eq!(*schema.data, *topic.definitions.as_deref().unwrap_or_default().as_bytes());
+    }
+}
+
+#[test]
+fn a_clip_says_what_it_is() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let mut writing = folder.begin("hello-1", &about()).unwrap();
+    add(&mut writing, 0, 8);
+    writing.message(&camera(), &meta(12 * SECOND, 1), &[1]).unwrap();
+    let clip = writing.finish(ending()).unwrap();
+    assert_eq!(scratch.listed(), std::slice::from_ref(&clip));
+    assert_eq!(scratch.files(), ["hello-1.jpg", "hello-1.mcap"]);
+    assert_eq!(fs::read(scratch.path("clips/hello-1.jpg")).unwrap(), b"a picture");
+    assert_eq!(clip.file.to_str(), Some("clips/hello-1.mcap"));
+    assert_eq!(clip.thumbnail.as_deref().and_then(|path| path.to_str()), Some("clips/hello-1.jpg"));
+    assert_eq!((clip.from_ns, clip.to_ns), (10 * SECOND, 20 * SECOND));
+    assert_eq!((clip.first_ns, clip.last_ns), (Some(10 * SECOND), Some(12 * SECOND)));
+    assert_eq!((clip.triggers, clip.moments.len(), &clip.recovered), (2, 2, &None));
+    let topics: Vec<_> = clip.topics.iter().map(|t| (t.topic.as_str(), t.messages, t.received, t.lost)).collect();
+    assert_eq!(topics, [("/imu/data", 8, Some(9), None), ("/gone", 0, Some(0), None), ("/camera", 1, None, None)]);
+    assert_eq!(clip.topics[1].type_name, None);
+
+    let file = fs::read(scratch.path("clips/hello-1.mcap")).unwrap();
+    let records = metadata(&file);
+    assert_eq!(records[0].0, "gleaner.begin");
+    assert_eq!(records[0].1["clock"], "log time of the drive");
+    let about = named(&records, "gleaner.clip").next().unwrap();
+    assert_eq!(about["short"], "the drive ended 2.1 s before the window did");
+    assert_eq!(about["file"], "clips/hello-1.mcap");
+    let line: Clip = serde_json::from_str(&about["line"]).unwrap();
+    assert_eq!(Clip { bytes: clip.bytes, ..line }, clip);
+    let topics: Vec<_> = named(&records, "gleaner.topic").collect();
+    assert_eq!((topics[0]["topic"].as_str(), topics[0]["lost"].as_str()), ("/imu/data", "unknown"));
+    assert_eq!((topics[1]["type"].as_str(), topics[1]["messages"].as_str()), ("unknown", "0"));
+    let lambda = named(&records, "gleaner.lambda").next().unwrap();
+    assert_eq!((lambda["name"].as_str(), lambda["kind"].as_str()), ("hello", "wasm"));
+    let decisions: Vec<_> = named(&records, "gleaner.decision").collect();
+    assert_eq!(decisions[0]["score"], "0.5");
+    assert!(!decisions[1].contains_key("score"));
+    assert_eq!(named(&records, "extra").next().unwrap()["key"], "value");
+
+    let summary = mcap::Summary::read(&file).unwrap().unwrap();
+    let attachments = summary.attachment_indexes.iter().map(|index| mcap::read::attachment(&file, index).unwrap());
+    let attachments: Vec<_> = attachments.map(|a| (a.name, a.media_type, a.data.into_owned())).collect();
+    let journal = ("journal/hello.journal".to_owned(), "application/octet-stream".to_owned(), b"a journal".to_vec());
+    let thumbnail = ("thumbnail.jpg".to_owned(), "image/jpeg".to_owned(), b"a picture".to_vec());
+    assert_eq!(attachments, [journal, thumbnail]);
+}
+
+#[test]
+fn the_line_of_a_clip_keeps_a_hundred_moments_and_the_file_all() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let moments = (0..300).map(moment).collect();
+    let clip = folder.begin("many", &about()).unwrap().finish(Ending { moments, triggers: 500, ..ending() }).unwrap();
+    assert_eq!((clip.moments.len(), clip.triggers), (Clip::MOMENTS_MAX, 500));
+    let records = metadata(&fs::read(scratch.path("clips/many.mcap")).unwrap());
+    assert_eq!(named(&records, "gleaner.decision").count(), 300);
+}
+
+#[test]
+fn the_recorder_s_own_record_of_a_lambda_takes_the_place_of_ours() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let own = BTreeMap::from([("name", "hello"), ("engine", "wasmtime")].map(|(k, v)| (k.to_owned(), v.to_owned())));
+    let metadata_of = vec![("gleaner.lambda".to_owned(), own.clone())];
+    folder.begin("a", &about()).unwrap().finish(Ending { metadata: metadata_of, ..ending() }).unwrap();
+    let records = metadata(&fs::read(scratch.path("clips/a.mcap")).unwrap());
+    assert_eq!(named(&records, "gleaner.lambda").collect::<Vec<_>>(), [&own]);
+}
+
+#[test]
+fn a_chunk_spans_a_second_at_most() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let mut clip = folder.begin("a", &about()).unwrap();
+    add(&mut clip, 0, 41);
+    clip.finish(ending()).unwrap();
+    let file = fs::read(scratch.path("clips/a.mcap")).unwrap();
+    let chunks = mcap::Summary::read(&file).unwrap().unwrap().chunk_indexes;
+    // Five messages fit in a second, both ends included.
+    assert_eq!(chunks.len(), 9);
+    assert!(chunks.iter().all(|chunk| chunk.message_end_time - chunk.message_start_time <= SECOND as u64));
+}
+
+#[test]
+fn stamps_before_the_epoch_become_its_begin() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let mut clip = folder.begin("a", &about()).unwrap();
+    clip.message(&imu(), &SampleMeta { publish_ns: -5, ..meta(3, 1) }, &[]).unwrap();
+    clip.finish(ending()).unwrap();
+    assert_eq!(replayed(&scratch.path("clips/a.mcap"))[0].1.publish_ns, 0);
+}
+
+#[test]
+fn more_writers_than_channels_share_one_and_no_message_is_lost() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let mut clip = folder.begin("a", &about()).unwrap();
+    let writers = super::super::unfinished::CHANNELS_MAX as u64 + 3;
+    for n in 0..writers {
+        let mut writer = Guid([0; 16]);
+        writer.0[..8].copy_from_slice(&n.to_le_bytes());
+        clip.message(&imu(), &SampleMeta { writer, ..meta(10 * SECOND, 1) }, &payload(n)).unwrap();
+    }
+    assert_eq!(clip.finish(ending()).unwrap().topics[0].messages, writers);
+    let file = fs::read(scratch.path("clips/a.mcap")).unwrap();
+    let channels = mcap::Summary::read(&file).unwrap().unwrap().channels;
+    let nameless: Vec<_> = channels.values().filter(|c| !c.metadata.contains_key("gleaner.writer")).collect();
+    assert_eq!((channels.len() as u64, nameless.len()), (writers - 2, 1));
+    assert_eq!(replayed(&scratch.path("clips/a.mcap")).len() as u64, writers);
+}
+
+/// `/dev/full` takes no byte.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_disk_is_named_and_nothing_follows_it() {
+    let scratch = Scratch::new();
+    let (folder, _) = scratch.open();
+    let path = scratch.path("clips/a.mcap.part");
+    let full = || Sink::new(OpenOptions::new().write(true).open("/dev/full").unwrap());
+    let place = std::sync::Arc::clone(&folder.place);
+    let begun = Unfinished::begin(place, "a".to_owned(), path.clone(), full(), Some(&about()));
+    let error = begun.err().expect("the disk is full");
+    assert!(matches!(&error, RecordError::Write { path: named, .. } if *named == path), "{error:?}");
+    assert_eq!(error.help().as_deref(), Some("make room on the disk, or choose another folder: --out DIR"));
+
+    let mut sink = full();
+    std::io::Write::write_all(&mut sink, b"some").unwrap();
+    assert_eq!(std::io::Write::flush(&mut sink).unwrap_err().kind(), std::io::ErrorKind::StorageFull);
+    let again = std::io::Write::write_all(&mut sink, b"more").unwrap_err();
+    assert_eq!(again.to_string(), "an earlier write to this file failed");
+    assert!(scratch.listed().is_empty());
+    assert!(!scratch.path(&format!("clips/a{PART}")).exists());
+}

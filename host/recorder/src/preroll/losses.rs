@@ -1,0 +1,118 @@
+//! What a source has lost from the preroll, so that a window which reaches over it can say so.
+
+use std::collections::VecDeque;
+
+/// Stamps that are remembered of each source and cause. A window that reaches further back cannot be told how many.
+const REMEMBERED: usize = 4096;
+
+/// What one source has lost.
+#[derive(Debug, Default)]
+pub struct Losses {
+    /// Pushed out for want of bytes.
+    pub overwritten: Gone,
+    /// Larger than the store.
+    pub too_big: Gone,
+    /// Older than any window reaches, unless its trigger comes late.
+    pub aged: Horizon,
+}
+
+/// Stamps of what went for one cause.
+#[derive(Debug, Default)]
+pub struct Gone {
+    stamps: VecDeque<(i64, u64)>,
+    forgotten: Horizon,
+}
+
+impl Gone {
+    /// Something of stamp `at` went; it is in the clips of group `chain`, 0 for none.
+    pub fn add(&mut self, at: i64, chain: u64) {
+        if self.stamps.len() == REMEMBERED
+            && let Some((at, chain)) = self.stamps.pop_front()
+        {
+            self.forgotten.add(at, chain);
+        }
+        self.stamps.push_back((at, chain));
+    }
+
+    /// How many of those that `covered` wants are missing from the clips of group `chain`. They are counted once.
+    pub fn count(&mut self, chain: u64, covered: impl Fn(i64) -> bool) -> u64 {
+        let missing = self.stamps.iter_mut().filter(|(at, in_clip)| *in_clip != chain && covered(*at));
+        missing.map(|(_, in_clip)| *in_clip = chain).count() as u64
+    }
+
+    /// Whether more may have gone, from `from` on, than is remembered.
+    pub fn is_unknown(&self, from: i64, chain: u64) -> bool {
+        self.forgotten.hides(from, chain)
+    }
+}
+
+/// Up to where something is missing.
+#[derive(Debug)]
+pub struct Horizon {
+    /// Newest stamp of what is in no clip.
+    unwritten: i64,
+    /// The group into whose clips something went last, and its newest stamp.
+    written: (u64, i64),
+}
+
+impl Default for Horizon {
+    fn default() -> Horizon {
+        Horizon { unwritten: i64::MIN, written: (0, i64::MIN) }
+    }
+}
+
+impl Horizon {
+    /// Something of stamp `at` is gone; it is in the clips of group `chain`, 0 for none.
+    pub fn add(&mut self, at: i64, chain: u64) {
+        if chain == 0 {
+            self.unwritten = self.unwritten.max(at);
+        } else if chain == self.written.0 {
+            self.written.1 = self.written.1.max(at);
+        } else {
+            // For any later group, what is in the clips of an earlier one is missing as well.
+            self.unwritten = self.unwritten.max(self.written.1);
+            self.written = (chain, at);
+        }
+    }
+
+    /// Whether a window of group `chain` that begins at `from` reaches over something that is in none of its clips.
+    pub fn hides(&self, from: i64, chain: u64) -> bool {
+        from <= self.unwritten || (chain != self.written.0 && from <= self.written.1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_missing_is_counted_once_for_each_group_of_windows() {
+        let mut gone = Gone::default();
+        for at in 0..10 {
+            gone.add(at, if at < 3 { 7 } else { 0 });
+        }
+        assert_eq!(gone.count(7, |at| at < 5), 2, "three of five are in its clips");
+        assert_eq!(gone.count(7, |at| at < 6), 1);
+        assert_eq!(gone.count(8, |at| at < 6), 6);
+        assert!(!gone.is_unknown(0, 7));
+    }
+
+    #[test]
+    fn beyond_what_is_remembered_nobody_knows() {
+        let mut gone = Gone::default();
+        for at in 0..REMEMBERED as i64 + 10 {
+            gone.add(at, 0);
+        }
+        assert!(gone.is_unknown(9, 1) && !gone.is_unknown(10, 1));
+    }
+
+    #[test]
+    fn what_is_in_a_clip_is_not_missing_from_it_when_it_ages() {
+        let mut aged = Horizon::default();
+        aged.add(5, 0);
+        aged.add(9, 2);
+        assert!(!aged.hides(6, 2) && aged.hides(5, 2) && aged.hides(6, 3) && !aged.hides(10, 3));
+        aged.add(12, 3);
+        assert!(aged.hides(9, 3) && !aged.hides(10, 3));
+    }
+}

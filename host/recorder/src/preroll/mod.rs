@@ -1,0 +1,241 @@
+//! What came lately, in order of arrival, within a bound of bytes and of time: where clips begin before their trigger.
+//!
+//! One store for everything. It knows nothing of windows; who reads it walks from the oldest to the newest and marks what
+//! was written to a clip, so that nothing is written to it twice.
+
+mod disk;
+mod losses;
+mod ram;
+
+use std::path::PathBuf;
+
+use gleaner_protocol::manifest::Store;
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+pub use losses::Losses;
+
+use crate::RecordError;
+use disk::Disk;
+use ram::Ram;
+
+/// What every entry costs beside its bytes.
+pub const OVERHEAD: usize = 64;
+
+/// Where an entry comes from: a topic, or the wakes of a lambda.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Source(u32);
+
+/// The bit that tells wakes from topics.
+const WAKES: u32 = 1 << 31;
+
+impl Source {
+    /// A topic, by its number.
+    pub fn topic(index: usize) -> Source {
+        // Topics and lambdas are counted in hundreds.
+        Source(u32::try_from(index).unwrap_or(WAKES - 1) & !WAKES)
+    }
+
+    /// The wakes of a lambda, by its number.
+    pub fn wakes(lambda: usize) -> Source {
+        Source(Source::topic(lambda).0 | WAKES)
+    }
+
+    /// The number of the lambda, if these are wakes.
+    pub fn lambda(self) -> Option<usize> {
+        (self.0 & WAKES != 0).then_some((self.0 & !WAKES) as usize)
+    }
+
+    /// The number of the topic, if it is one.
+    pub fn as_topic(self) -> Option<usize> {
+        (self.0 & WAKES == 0).then_some(self.0 as usize)
+    }
+}
+
+/// What is known of an entry besides its bytes.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Held {
+    /// Where it comes from.
+    pub source: Source,
+    /// Length of its bytes.
+    pub len: u32,
+    /// The stamp that windows go by.
+    pub at_ns: i64,
+    /// When the writer published it; for a wake 0.
+    pub publish_ns: i64,
+    /// Sequence number, or the number of the wake.
+    pub seq: u64,
+    /// The group of windows in whose clips it is, 0 for none.
+    pub chain: u64,
+    /// Who wrote it; for a wake zeros.
+    pub writer: [u8; 16],
+    /// Options of the encapsulation.
+    pub options: [u8; 2],
+    /// Byte order.
+    pub is_big_endian: bool,
+}
+
+impl Held {
+    /// A sample of a topic.
+    pub fn sample(topic: usize, meta: &SampleMeta, chain: u64) -> Held {
+        Held {
+            source: Source::topic(topic),
+            len: 0,
+            at_ns: meta.at_ns,
+            publish_ns: meta.publish_ns,
+            seq: meta.seq,
+            chain,
+            writer: meta.writer.0,
+            options: meta.options,
+            is_big_endian: meta.endian == Endian::Big,
+        }
+    }
+
+    /// A wake of a lambda, the `number`-th from 0.
+    pub fn wake(lambda: usize, number: u64, at_ns: i64, chain: u64) -> Held {
+        Held {
+            source: Source::wakes(lambda),
+            len: 0,
+            at_ns,
+            publish_ns: 0,
+            seq: number,
+            chain,
+            writer: [0; 16],
+            options: [0; 2],
+            is_big_endian: false,
+        }
+    }
+
+    /// As the transport said it.
+    pub fn meta(&self) -> SampleMeta {
+        SampleMeta {
+            at_ns: self.at_ns,
+            publish_ns: self.publish_ns,
+            writer: Guid(self.writer),
+            seq: self.seq,
+            endian: if self.is_big_endian { Endian::Big } else { Endian::Little },
+            options: self.options,
+        }
+    }
+}
+
+/// Names an entry until the store changes.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Place(u64);
+
+/// The store.
+pub struct Preroll {
+    kind: Kind,
+    highest: u64,
+}
+
+enum Kind {
+    Ram(Ram),
+    Disk(Disk),
+}
+
+impl Preroll {
+    /// An empty store of at most `bytes`. On disk it is in `folder`, where what an earlier process left is deleted. In
+    /// memory, `prefault` takes it from the system at once.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Preroll`] if the folder cannot be made or emptied.
+    pub fn open(store: Store, bytes: u64, folder: PathBuf, prefault: bool) -> Result<Preroll, RecordError> {
+        let kind = match store {
+            Store::Ram => Kind::Ram(Ram::new(usize::try_from(bytes).unwrap_or(usize::MAX), prefault)),
+            Store::Disk => Kind::Disk(Disk::open(folder, bytes)?),
+        };
+        Ok(Preroll { kind, highest: 0 })
+    }
+
+    /// Adds an entry; the oldest go to make room for it, and are told to `gone`. `false` if it is larger than the store.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Preroll`] if the disk fails.
+    pub fn push(&mut self, held: Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
+        let Ok(len) = u32::try_from(bytes.len()) else { return Ok(false) };
+        let held = Held { len, ..held };
+        let taken = match &mut self.kind {
+            Kind::Ram(ram) => ram.push(&held, bytes, gone),
+            Kind::Disk(disk) => disk.push(&held, bytes, gone)?,
+        };
+        self.highest = self.highest.max(self.bytes_held());
+        Ok(taken)
+    }
+
+    /// Gives up what is older than `before`, from the oldest on, and tells it to `aged`.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Preroll`] if the disk fails.
+    pub fn trim(&mut self, before: i64, aged: &mut dyn FnMut(&Held)) -> Result<(), RecordError> {
+        match &mut self.kind {
+            Kind::Ram(ram) => {
+                ram.trim(before, aged);
+                Ok(())
+            }
+            Kind::Disk(disk) => disk.trim(before, aged),
+        }
+    }
+
+    /// The oldest entry.
+    pub fn oldest(&self) -> Option<Place> {
+        match &self.kind {
+            Kind::Ram(ram) => ram.oldest(),
+            Kind::Disk(disk) => disk.oldest(),
+        }
+    }
+
+    /// The entry that came after this one.
+    pub fn after(&self, place: Place) -> Option<Place> {
+        match &self.kind {
+            Kind::Ram(ram) => ram.after(place),
+            Kind::Disk(disk) => disk.after(place),
+        }
+    }
+
+    /// What is known of an entry.
+    pub fn held(&self, place: Place) -> Held {
+        match &self.kind {
+            Kind::Ram(ram) => ram.held(place),
+            Kind::Disk(disk) => disk.held(place),
+        }
+    }
+
+    /// The bytes of an entry.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Preroll`] if the disk fails.
+    pub fn bytes(&mut self, place: Place) -> Result<&[u8], RecordError> {
+        match &mut self.kind {
+            Kind::Ram(ram) => Ok(ram.bytes(place)),
+            Kind::Disk(disk) => disk.bytes(place),
+        }
+    }
+
+    /// Remembers that an entry is in the clips of a group of windows.
+    pub fn mark(&mut self, place: Place, chain: u64) {
+        match &mut self.kind {
+            Kind::Ram(ram) => ram.mark(place, chain),
+            Kind::Disk(disk) => disk.mark(place, chain),
+        }
+    }
+
+    /// Bytes held now, the overhead of entries included.
+    pub fn bytes_held(&self) -> u64 {
+        match &self.kind {
+            Kind::Ram(ram) => ram.bytes_held(),
+            Kind::Disk(disk) => disk.bytes_held(),
+        }
+    }
+
+    /// The most bytes held so far.
+    pub fn bytes_highest(&self) -> u64 {
+        self.highest
+    }
+}
+
+#[cfg(test)]
+mod tests;

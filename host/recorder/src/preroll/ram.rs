@@ -1,0 +1,178 @@
+//! A preroll in memory: one block, in which entries follow each other, each behind a head of [`OVERHEAD`] bytes.
+
+use std::hint::black_box;
+
+use super::{Held, OVERHEAD, Place, Source};
+
+/// Entries begin at multiples of this.
+const ALIGN: usize = 8;
+
+/// Distance at which memory is touched, so that the system gives it; no page is smaller.
+const PAGE: usize = 4096;
+
+pub(super) struct Ram {
+    arena: Vec<u8>,
+    /// Where the oldest entry begins.
+    head: usize,
+    /// Where the next one will.
+    tail: usize,
+    /// Where the entries before the end of the block end, if those after them are at its beginning.
+    wrapped: Option<usize>,
+    entries: usize,
+    bytes: u64,
+}
+
+impl Ram {
+    pub(super) fn new(bytes: usize, prefault: bool) -> Ram {
+        // Zeroed memory comes from the system untouched, so that a large block costs nothing before it is filled.
+        let mut arena = vec![0; bytes];
+        if prefault {
+            arena.iter_mut().step_by(PAGE).for_each(|byte| *black_box(byte) = 0);
+        }
+        Ram { arena, head: 0, tail: 0, wrapped: None, entries: 0, bytes: 0 }
+    }
+
+    pub(super) fn push(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> bool {
+        let need = size(bytes.len());
+        if need > self.arena.len() {
+            return false;
+        }
+        let at = loop {
+            if let Some(at) = self.room(need) {
+                break at;
+            }
+            gone(&self.pop());
+        };
+        let (head, rest) = self.arena[at..at + need].split_at_mut(OVERHEAD);
+        write_head(head, held);
+        rest[..bytes.len()].copy_from_slice(bytes);
+        self.tail = at + need;
+        self.entries += 1;
+        self.bytes += need as u64;
+        true
+    }
+
+    /// Where `need` bytes fit without giving up anything.
+    fn room(&mut self, need: usize) -> Option<usize> {
+        if self.entries == 0 {
+            (self.head, self.tail, self.wrapped) = (0, 0, None);
+        }
+        if self.wrapped.is_some() {
+            return (self.head - self.tail >= need).then_some(self.tail);
+        }
+        if self.arena.len() - self.tail >= need {
+            return Some(self.tail);
+        }
+        if self.head < need {
+            return None;
+        }
+        self.wrapped = Some(self.tail);
+        self.tail = 0;
+        Some(0)
+    }
+
+    /// Takes out the oldest entry, of which there is one: a store without entries has room for all that fits into it.
+    fn pop(&mut self) -> Held {
+        let held = self.held(Place(self.head as u64));
+        let size = size(held.len as usize);
+        self.head += size;
+        self.entries -= 1;
+        self.bytes -= size as u64;
+        if self.wrapped == Some(self.head) {
+            (self.head, self.wrapped) = (0, None);
+        }
+        held
+    }
+
+    pub(super) fn trim(&mut self, before: i64, aged: &mut dyn FnMut(&Held)) {
+        while self.entries > 0 && self.at_ns(self.head) < before {
+            aged(&self.pop());
+        }
+    }
+
+    pub(super) fn oldest(&self) -> Option<Place> {
+        (self.entries > 0).then_some(Place(self.head as u64))
+    }
+
+    pub(super) fn after(&self, place: Place) -> Option<Place> {
+        let at = place.0 as usize;
+        let end = at + size(u32_at(&self.arena, at + LEN) as usize);
+        if self.wrapped == Some(end) && at >= self.head {
+            return Some(Place(0));
+        }
+        (end != self.tail).then_some(Place(end as u64))
+    }
+
+    pub(super) fn held(&self, place: Place) -> Held {
+        read_head(&self.arena[place.0 as usize..][..OVERHEAD])
+    }
+
+    pub(super) fn bytes(&self, place: Place) -> &[u8] {
+        let at = place.0 as usize;
+        &self.arena[at + OVERHEAD..][..u32_at(&self.arena, at + LEN) as usize]
+    }
+
+    pub(super) fn mark(&mut self, place: Place, chain: u64) {
+        self.arena[place.0 as usize + CHAIN..][..8].copy_from_slice(&chain.to_le_bytes());
+    }
+
+    pub(super) fn bytes_held(&self) -> u64 {
+        self.bytes
+    }
+
+    fn at_ns(&self, at: usize) -> i64 {
+        i64::from_le_bytes(bytes_at(&self.arena, at + AT))
+    }
+}
+
+/// What an entry of `len` bytes takes.
+fn size(len: usize) -> usize {
+    OVERHEAD + len.next_multiple_of(ALIGN)
+}
+
+// Places within the head of an entry.
+const AT: usize = 0;
+const PUBLISH: usize = 8;
+const SEQ: usize = 16;
+const CHAIN: usize = 24;
+const WRITER: usize = 32;
+const SOURCE: usize = 48;
+const LEN: usize = 52;
+const OPTIONS: usize = 56;
+const BIG: usize = 58;
+
+fn write_head(head: &mut [u8], held: &Held) {
+    head[AT..][..8].copy_from_slice(&held.at_ns.to_le_bytes());
+    head[PUBLISH..][..8].copy_from_slice(&held.publish_ns.to_le_bytes());
+    head[SEQ..][..8].copy_from_slice(&held.seq.to_le_bytes());
+    head[CHAIN..][..8].copy_from_slice(&held.chain.to_le_bytes());
+    head[WRITER..][..16].copy_from_slice(&held.writer);
+    head[SOURCE..][..4].copy_from_slice(&held.source.0.to_le_bytes());
+    head[LEN..][..4].copy_from_slice(&held.len.to_le_bytes());
+    head[OPTIONS..][..2].copy_from_slice(&held.options);
+    head[BIG] = u8::from(held.is_big_endian);
+}
+
+fn read_head(head: &[u8]) -> Held {
+    Held {
+        at_ns: i64::from_le_bytes(bytes_at(head, AT)),
+        publish_ns: i64::from_le_bytes(bytes_at(head, PUBLISH)),
+        seq: u64::from_le_bytes(bytes_at(head, SEQ)),
+        chain: u64::from_le_bytes(bytes_at(head, CHAIN)),
+        writer: bytes_at(head, WRITER),
+        source: Source(u32_at(head, SOURCE)),
+        len: u32_at(head, LEN),
+        options: bytes_at(head, OPTIONS),
+        is_big_endian: head[BIG] != 0,
+    }
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes_at(bytes, at))
+}
+
+fn bytes_at<const N: usize>(bytes: &[u8], at: usize) -> [u8; N] {
+    let mut found = [0; N];
+    found.copy_from_slice(&bytes[at..][..N]);
+    found
+}

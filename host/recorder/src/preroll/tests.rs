@@ -1,0 +1,148 @@
+use std::fs;
+
+use super::*;
+
+fn held(topic: usize, at: i64) -> Held {
+    let meta = SampleMeta {
+        at_ns: at,
+        publish_ns: at - 1,
+        writer: Guid([topic as u8; 16]),
+        seq: at as u64 + 1,
+        endian: if at % 2 == 0 { Endian::Little } else { Endian::Big },
+        options: [0, at as u8],
+    };
+    Held::sample(topic, &meta, 0)
+}
+
+/// Bytes that can be told apart, of a length that differs from sample to sample.
+fn payload(at: i64, most: u64) -> Vec<u8> {
+    let len = (at as u64).wrapping_mul(2_654_435_761) % (most + 1);
+    (0..len).map(|n| (n as i64 * 7 + at) as u8).collect()
+}
+
+fn everything(preroll: &mut Preroll) -> Vec<(Held, Vec<u8>)> {
+    let mut all = Vec::new();
+    let mut next = preroll.oldest();
+    while let Some(place) = next {
+        all.push((preroll.held(place), preroll.bytes(place).unwrap().to_vec()));
+        next = preroll.after(place);
+    }
+    all
+}
+
+fn scratch(name: &str) -> PathBuf {
+    let path = std::env::temp_dir().join(format!("gleaner-preroll-{}-{name}", std::process::id()));
+    let _ = fs::remove_dir_all(&path);
+    path
+}
+
+/// Each store, with the most that it may hold.
+fn stores(name: &str, bytes: u64) -> [Preroll; 2] {
+    [Store::Ram, Store::Disk].map(|store| Preroll::open(store, bytes, scratch(name), false).unwrap())
+}
+
+#[test]
+fn what_goes_in_comes_out_in_order_and_the_bound_is_never_passed() {
+    for (bound, most) in [(4_096, 300), (1_000, 900), (100_000, 4_000), (2 << 20, 300_000)] {
+        for mut preroll in stores("bound", bound) {
+            let mut first = 0;
+            for at in 0..3_000 {
+                let bytes = payload(at, most);
+                let taken = preroll.push(held(3, at), &bytes, &mut |gone| {
+                    assert_eq!(gone.at_ns, first, "the oldest goes first");
+                    first += 1;
+                });
+                assert_eq!((taken.unwrap(), preroll.bytes_held() <= bound), (true, true));
+                if at % 97 == 0 || at > 2_990 {
+                    let all = everything(&mut preroll);
+                    let stamps: Vec<_> = all.iter().map(|(held, _)| held.at_ns).collect();
+                    assert_eq!(stamps, (first..=at).collect::<Vec<_>>());
+                    for (found, bytes) in all {
+                        assert_eq!(bytes, payload(found.at_ns, most));
+                        assert_eq!(found, Held { len: bytes.len() as u32, ..held(3, found.at_ns) });
+                    }
+                }
+            }
+            assert!(preroll.bytes_highest() <= bound && preroll.bytes_highest() > bound / 3);
+        }
+    }
+}
+
+#[test]
+fn what_is_larger_than_the_store_is_refused_and_harms_nothing() {
+    for mut preroll in stores("large", 1 << 10) {
+        assert!(preroll.push(held(0, 1), &[1; 100], &mut |_| panic!()).unwrap());
+        assert!(!preroll.push(held(0, 2), &[2; 1 << 10], &mut |_| panic!()).unwrap());
+        assert_eq!(everything(&mut preroll).len(), 1);
+        let mut gone = 0;
+        assert!(preroll.push(held(0, 3), &[3; 952], &mut |_| gone += 1).unwrap(), "it just fits");
+        assert_eq!((gone, everything(&mut preroll).len()), (1, 1));
+    }
+}
+
+#[test]
+fn the_old_are_trimmed_and_marks_stay() {
+    for mut preroll in stores("trim", 3 << 20) {
+        for at in 0..1_000 {
+            preroll.push(held(1, at), &payload(at, 9_000), &mut |_| {}).unwrap();
+        }
+        let first = everything(&mut preroll)[0].0.at_ns;
+        let mut next = preroll.oldest();
+        while let Some(place) = next {
+            let at = preroll.held(place).at_ns;
+            preroll.mark(place, at as u64 % 5);
+            next = preroll.after(place);
+        }
+        let mut aged = Vec::new();
+        preroll.trim(900, &mut |held| aged.push(held.at_ns)).unwrap();
+        assert_eq!(aged, (first..900).collect::<Vec<_>>());
+        let all = everything(&mut preroll);
+        assert_eq!(all.len(), 100);
+        assert!(all.iter().all(|(held, _)| held.chain == held.at_ns as u64 % 5));
+        preroll.trim(5_000, &mut |_| {}).unwrap();
+        assert_eq!((preroll.oldest(), everything(&mut preroll)), (None, Vec::new()));
+        preroll.push(held(1, 6_000), b"later", &mut |_| {}).unwrap();
+        assert_eq!(everything(&mut preroll)[0].1, b"later");
+    }
+}
+
+#[test]
+fn the_disk_holds_no_more_files_than_are_needed_and_none_at_the_end() {
+    let folder = scratch("files");
+    fs::create_dir_all(&folder).unwrap();
+    for name in ["7.chunk", "x.chunk", "notes.txt"] {
+        fs::write(folder.join(name), "earlier").unwrap();
+    }
+    let names = || {
+        let mut names: Vec<_> =
+            fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    };
+    let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
+    assert_eq!(names(), ["notes.txt", "x.chunk"], "chunks of an earlier process go, other files stay");
+    for at in 0..1_000 {
+        preroll.push(held(1, at), &[at as u8; 100_000], &mut |_| {}).unwrap();
+        preroll.trim(at - 30, &mut |_| {}).unwrap();
+    }
+    let chunks = names().len() - 2;
+    assert!((3..=5).contains(&chunks), "31 samples of 100 kB are in 1 MiB each: {chunks}");
+    let bytes: u64 = names().iter().map(|name| fs::metadata(folder.join(name)).unwrap().len()).sum();
+    assert!(bytes <= preroll.bytes_held());
+    drop(preroll);
+    assert_eq!(names(), ["notes.txt", "x.chunk"]);
+    fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn a_disk_that_fails_is_named() {
+    let folder = scratch("fails");
+    let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
+    fs::remove_dir_all(&folder).unwrap();
+    let error = preroll.push(held(0, 1), b"x", &mut |_| {}).unwrap_err();
+    assert!(matches!(&error, RecordError::Preroll { path, .. } if path.ends_with("0.chunk")), "{error:?}");
+    fs::write(&folder, "a file").unwrap();
+    let refused = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).err().unwrap();
+    assert!(matches!(&refused, RecordError::Preroll { path, .. } if *path == folder), "{refused:?}");
+    fs::remove_file(folder).unwrap();
+}

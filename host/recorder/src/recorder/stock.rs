@@ -1,0 +1,260 @@
+//! What is held and known while no clip is written: the preroll and its losses, topics, lambdas, triggers that wait.
+
+use gleaner_protocol::journal::{Encoder, Header};
+use gleaner_protocol::manifest::Record;
+use gleaner_protocol::{ClipLambda, Moment};
+
+use super::draft::Draft;
+use super::waiting::Waiting;
+use crate::RecordError;
+use crate::file::{Folder, Topic};
+use crate::preroll::{Held, Losses, Preroll};
+use crate::window::{Group, Window};
+
+/// A lambda that records.
+#[derive(Clone, Debug)]
+pub struct Member {
+    /// What it is, as its journal says it.
+    pub header: Header,
+    /// Its `[record]`.
+    pub rules: Record,
+    /// SHA-256 over the digests of its files, in hexadecimal digits.
+    pub digest: String,
+    /// What its clips hold, in the order of `[record]`.
+    pub topics: Vec<super::TopicId>,
+}
+
+/// A topic, and who records it.
+#[derive(Debug)]
+pub(super) struct Lane {
+    pub(super) topic: Topic,
+    pub(super) is_missing: bool,
+    pub(super) lambdas: Vec<usize>,
+}
+
+impl Lane {
+    pub(super) fn is_image(&self) -> bool {
+        let name = self.topic.type_name.as_str();
+        !self.is_missing
+            && ["Image", "CompressedImage"].iter().any(|image| {
+                name.strip_prefix("sensor_msgs/").is_some_and(|name| name.trim_start_matches("msg/") == *image)
+            })
+    }
+}
+
+/// One lambda, its windows aside.
+pub(super) struct Crew {
+    pub(super) member: Member,
+    pub(super) encoder: Encoder,
+    pub(super) wakes: u64,
+}
+
+/// What every clip is written with.
+pub(super) struct Desk {
+    pub(super) folder: Folder,
+    pub(super) clock: String,
+    pub(super) lanes: Vec<Lane>,
+    pub(super) crews: Vec<Crew>,
+}
+
+impl Desk {
+    /// Whether a window of a lambda that records this topic contains `at`.
+    pub(super) fn covers(&self, group: &Group, topic: usize, at: i64) -> bool {
+        self.lanes[topic].lambdas.iter().any(|lambda| group.covers(*lambda, at))
+    }
+
+    /// The topics of the lambdas of a clip, each once, in their order.
+    pub(super) fn topics_of(&self, group: &Group) -> Vec<usize> {
+        let mut topics = Vec::new();
+        for topic in group.lambdas.iter().flat_map(|lambda| &self.crews[*lambda].member.topics) {
+            if !topics.contains(&topic.0) {
+                topics.push(topic.0);
+            }
+        }
+        topics
+    }
+
+    /// The lambdas of a clip.
+    pub(super) fn lambdas_of(&self, group: &Group) -> Vec<ClipLambda> {
+        let lambda = |lambda: &usize| {
+            let Member { header, digest, .. } = &self.crews[*lambda].member;
+            ClipLambda {
+                name: header.lambda.clone(),
+                version: header.version.clone(),
+                kind: header.kind,
+                digest: digest.clone(),
+                windows: group.windows(*lambda),
+            }
+        };
+        group.lambdas.iter().map(lambda).collect()
+    }
+}
+
+/// Everything that clips are made from.
+pub(super) struct Stock {
+    pub(super) preroll: Preroll,
+    /// By topic.
+    pub(super) losses: Vec<Losses>,
+    /// By lambda.
+    pub(super) wake_losses: Vec<Losses>,
+    pub(super) waiting: Waiting,
+    pub(super) desk: Desk,
+    /// When the recorder first heard of anything.
+    pub(super) began_at: i64,
+}
+
+impl Stock {
+    /// Keeps an entry. `pushed_out` counts samples that have to go for it, `too_big` is raised if it cannot be kept.
+    pub(super) fn keep(
+        &mut self,
+        held: Held,
+        bytes: &[u8],
+        pushed_out: &mut u64,
+        too_big: &mut u64,
+    ) -> Result<(), RecordError> {
+        let Stock { preroll, losses, wake_losses, .. } = self;
+        let mut gone = |gone: &Held| {
+            *pushed_out += u64::from(gone.source.as_topic().is_some());
+            if let Some(losses) = losses_of(losses, wake_losses, gone) {
+                losses.overwritten.add(gone.at_ns, gone.chain);
+            }
+        };
+        if preroll.push(held, bytes, &mut gone)? {
+            return Ok(());
+        }
+        *too_big += u64::from(held.source.as_topic().is_some());
+        if let Some(losses) = losses_of(losses, wake_losses, &held) {
+            losses.too_big.add(held.at_ns, held.chain);
+        }
+        Ok(())
+    }
+
+    /// Gives up what is older than `before`.
+    pub(super) fn trim(&mut self, before: i64) -> Result<(), RecordError> {
+        let Stock { preroll, losses, wake_losses, .. } = self;
+        preroll.trim(before, &mut |held| {
+            if let Some(losses) = losses_of(losses, wake_losses, held) {
+                losses.aged.add(held.at_ns, held.chain);
+            }
+        })
+    }
+
+    /// Brings a clip up to what its group covers and what is held, not after `limit`. `windows` are those that have just
+    /// joined the group.
+    pub(super) fn settle(
+        &mut self,
+        draft: &mut Draft,
+        group: &Group,
+        windows: &[Window],
+        limit: i64,
+    ) -> Result<(), RecordError> {
+        windows.iter().for_each(|window| self.reach_back(draft, window));
+        self.count_losses(draft, group, limit);
+        draft.picture.look(&self.desk, &mut self.preroll, group, draft.continues)?;
+        let mut next = self.preroll.oldest();
+        while let Some(place) = next {
+            let held = self.preroll.held(place);
+            if self.wants(draft, group, &held, limit) {
+                let bytes = self.preroll.bytes(place)?;
+                match held.source.lambda() {
+                    Some(lambda) => draft.wake(lambda, held.seq, bytes),
+                    None => {
+                        let topic = held.source.as_topic().unwrap_or_default();
+                        draft.message(&mut self.desk, group, topic, &held.meta(), bytes)?;
+                    }
+                }
+                self.preroll.mark(place, draft.chain);
+            }
+            next = self.preroll.after(place);
+        }
+        self.gather(draft, group, limit);
+        Ok(())
+    }
+
+    /// Whether an entry belongs into a clip that ends at `limit` at the latest, and is not in it.
+    fn wants(&self, draft: &Draft, group: &Group, held: &Held, limit: i64) -> bool {
+        if held.chain == draft.chain || held.at_ns > limit {
+            return false;
+        }
+        match held.source.as_topic() {
+            Some(topic) => self.desk.covers(group, topic, held.at_ns),
+            None => (group.begin..=group.to).contains(&held.at_ns),
+        }
+    }
+
+    /// The stamp of the earliest sample that is covered, but in none of the clips of the group.
+    pub(super) fn earliest(&self, draft: &Draft, group: &Group) -> Option<i64> {
+        let mut earliest = None;
+        let mut next = self.preroll.oldest();
+        while let Some(place) = next {
+            let held = self.preroll.held(place);
+            if held.source.as_topic().is_some() && self.wants(draft, group, &held, i64::MAX) {
+                earliest = Some(earliest.map_or(held.at_ns, |at: i64| at.min(held.at_ns)));
+            }
+            next = self.preroll.after(place);
+        }
+        earliest
+    }
+
+    /// The triggers within the clip.
+    pub(super) fn gather(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
+        let untold = self.waiting.take(group, limit, |moment| draft.moment(moment));
+        draft.triggers += untold;
+    }
+
+    /// The trigger that names a clip.
+    pub(super) fn opening(&self, group: &Group) -> Moment {
+        let (lambda, at_ns) = group.first;
+        self.waiting.find(lambda, at_ns).cloned().unwrap_or_else(|| Moment {
+            lambda: self.desk.crews[lambda].member.header.lambda.clone(),
+            kind: gleaner_protocol::TriggerKind::Event,
+            label: String::new(),
+            score: None,
+            at_ns,
+        })
+    }
+
+    /// What a window asks for and nobody can give.
+    fn reach_back(&mut self, draft: &mut Draft, window: &Window) {
+        draft.begins_late_ns = draft.begins_late_ns.max(self.began_at.saturating_sub(window.from));
+        let chain = draft.chain;
+        for topic in &self.desk.crews[window.lambda].member.topics {
+            let losses = &self.losses[topic.0];
+            let tally = draft.tally(topic.0);
+            tally.is_aged |= losses.aged.hides(window.from, chain);
+            if losses.overwritten.is_unknown(window.from, chain) {
+                tally.overwritten = None;
+            }
+            if losses.too_big.is_unknown(window.from, chain) {
+                tally.too_big = None;
+            }
+        }
+    }
+
+    fn count_losses(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
+        let chain = draft.chain;
+        for topic in self.desk.topics_of(group) {
+            let desk = &self.desk;
+            let covered = |at: i64| at <= limit && desk.covers(group, topic, at);
+            let losses = &mut self.losses[topic];
+            let (overwritten, too_big) =
+                (losses.overwritten.count(chain, covered), losses.too_big.count(chain, covered));
+            let tally = draft.tally(topic);
+            tally.overwritten = tally.overwritten.map(|count| count + overwritten);
+            tally.too_big = tally.too_big.map(|count| count + too_big);
+        }
+        let inside = group.begin..=group.to.min(limit);
+        for (lambda, losses) in self.wake_losses.iter_mut().enumerate() {
+            let covered = |at: i64| inside.contains(&at);
+            let lost = losses.overwritten.count(chain, covered) + losses.too_big.count(chain, covered);
+            draft.lose_wakes(lambda, lost);
+        }
+    }
+}
+
+fn losses_of<'a>(topics: &'a mut [Losses], wakes: &'a mut [Losses], held: &Held) -> Option<&'a mut Losses> {
+    match held.source.lambda() {
+        Some(lambda) => wakes.get_mut(lambda),
+        None => topics.get_mut(held.source.as_topic()?),
+    }
+}

@@ -1,0 +1,210 @@
+//! A small JPEG of an image message, for lists of clips.
+
+use gleaner_image::{self as image, Encoding, View, ops};
+use gleaner_transport::Endian;
+use gleaner_transport::message::{CompressedView, ImageView};
+use jpeg_encoder::{ColorType, Encoder};
+
+/// Most pixels in a row of a thumbnail.
+const WIDTH: u32 = 320;
+/// Most rows: a phone held upright makes 320x569, and what is still taller is made narrower.
+const HEIGHT: u32 = 640;
+const QUALITY: u8 = 80;
+/// Most bytes that a compressed image may have as rgb8; 21 megapixels.
+const DECODED_BYTES: usize = 64 << 20;
+
+/// A JPEG of the image message `cdr`, 320x640 pixels at most and never larger than the image.
+///
+/// `None` if the type is no image, or if the message or its image is broken, of a kind that we do not read, or larger
+/// than 64 MiB once it is decoded. Images without colour, among them those of raw sensors, become grey.
+pub fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>> {
+    match type_name {
+        "sensor_msgs/msg/Image" | "sensor_msgs/Image" => raw(&ImageView::read(cdr, endian).ok()?),
+        "sensor_msgs/msg/CompressedImage" | "sensor_msgs/CompressedImage" => {
+            compressed(CompressedView::read(cdr, endian).ok()?.data)
+        }
+        _ => None,
+    }
+}
+
+fn raw(message: &ImageView<'_>) -> Option<Vec<u8>> {
+    // The colours of a raw sensor lie side by side. Their mean over an area is its grey level, near enough to know the
+    // place by.
+    let encoding = match Encoding::from_ros(message.encoding).ok()? {
+        Encoding::Bayer8(_) => Encoding::Mono8,
+        Encoding::Bayer16(_) => Encoding::Mono16,
+        encoding => encoding,
+    };
+    let (width, height, step) = (message.width, message.height, message.step);
+    small(&View::new(width, height, step, encoding, message.is_bigendian, message.data).ok()?)
+}
+
+fn compressed(data: &[u8]) -> Option<Vec<u8>> {
+    let header = image::probe(data).ok()?;
+    let len = header.rgb8_len().filter(|len| *len <= DECODED_BYTES)?;
+    let mut pixels = vec![0; len];
+    image::decode_rgb8(data, &header, DECODED_BYTES, &mut pixels).ok()?;
+    let step = header.width.checked_mul(3)?;
+    small(&View::new(header.width, header.height, step, Encoding::Rgb8, false, &pixels).ok()?)
+}
+
+fn small(view: &View<'_>) -> Option<Vec<u8>> {
+    let (width, height) = fit(view.width(), view.height());
+    let (encoding, len) = ops::resized(view, width, height).ok()?;
+    let mut pixels = vec![0; len];
+    ops::resize(view, width, height, &mut pixels).ok()?;
+    let color = if encoding.is_grey() { ColorType::Luma } else { ColorType::Rgb };
+    let mut jpeg = Vec::new();
+    let (width, height) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
+    Encoder::new(&mut jpeg, QUALITY).encode(&pixels, width, height, color).ok()?;
+    Some(jpeg)
+}
+
+/// The largest size in the box of a thumbnail that has the ratio of `width` x `height`, and is not larger.
+fn fit(width: u32, height: u32) -> (u32, u32) {
+    let scaled = |side: u32, to: u32, from: u32| {
+        let exact = (u64::from(side) * u64::from(to) + u64::from(from) / 2) / u64::from(from.max(1));
+        u32::try_from(exact).unwrap_or(u32::MAX).max(1)
+    };
+    let (mut fit_width, mut fit_height) = (width, height);
+    if fit_width > WIDTH {
+        (fit_width, fit_height) = (WIDTH, scaled(height, WIDTH, width));
+    }
+    if fit_height > HEIGHT {
+        (fit_width, fit_height) = (scaled(width, HEIGHT, height), HEIGHT);
+    }
+    (fit_width, fit_height)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const IMAGE: &str = "sensor_msgs/msg/Image";
+    const COMPRESSED: &str = "sensor_msgs/msg/CompressedImage";
+
+    /// Little-endian CDR, field by field.
+    #[derive(Default)]
+    struct Cdr(Vec<u8>);
+
+    impl Cdr {
+        fn u32(mut self, value: u32) -> Self {
+            self.0.resize(self.0.len().next_multiple_of(4), 0);
+            self.0.extend(value.to_le_bytes());
+            self
+        }
+
+        fn byte(mut self, value: u8) -> Self {
+            self.0.push(value);
+            self
+        }
+
+        fn bytes(self, data: &[u8]) -> Self {
+            let mut cdr = self.u32(u32::try_from(data.len()).unwrap());
+            cdr.0.extend(data);
+            cdr
+        }
+
+        fn text(self, text: &str) -> Self {
+            self.bytes(format!("{text}\0").as_bytes())
+        }
+    }
+
+    fn image(width: u32, height: u32, encoding: &str, step: u32, data: &[u8]) -> Vec<u8> {
+        let header = Cdr::default().u32(1).u32(2).text("camera").u32(height).u32(width);
+        header.text(encoding).byte(0).u32(step).bytes(data).0
+    }
+
+    fn packed(data: &[u8]) -> Vec<u8> {
+        Cdr::default().u32(1).u32(2).text("camera").text("jpeg").bytes(data).0
+    }
+
+    /// Width, height and mean colour of a JPEG.
+    fn seen(jpeg: &[u8]) -> (u32, u32, [u8; 3]) {
+        let header = gleaner_image::probe(jpeg).unwrap();
+        let mut pixels = vec![0; header.rgb8_len().unwrap()];
+        gleaner_image::decode_rgb8(jpeg, &header, pixels.len(), &mut pixels).unwrap();
+        let mut sums = [0_u64; 3];
+        for pixel in pixels.as_chunks::<3>().0 {
+            for (sum, value) in sums.iter_mut().zip(pixel) {
+                *sum += u64::from(*value);
+            }
+        }
+        let count = u64::from(header.width) * u64::from(header.height);
+        (header.width, header.height, sums.map(|sum| u8::try_from(sum / count).unwrap()))
+    }
+
+    fn near(found: [u8; 3], wanted: [u8; 3]) -> bool {
+        found.iter().zip(wanted).all(|(found, wanted)| found.abs_diff(wanted) <= 4)
+    }
+
+    #[test]
+    fn a_raw_image_keeps_its_colour_and_its_ratio() {
+        let rgb: Vec<u8> = [200, 100, 50].repeat(640 * 480);
+        let (width, height, mean) =
+            seen(&thumbnail(IMAGE, &image(640, 480, "rgb8", 1920, &rgb), Endian::Little).unwrap());
+        assert_eq!((width, height), (320, 240));
+        assert!(near(mean, [200, 100, 50]), "{mean:?}");
+        let (_, _, mean) = seen(&thumbnail(IMAGE, &image(640, 480, "bgr8", 1920, &rgb), Endian::Little).unwrap());
+        assert!(near(mean, [50, 100, 200]), "{mean:?}");
+    }
+
+    #[test]
+    fn a_small_image_is_not_enlarged() {
+        let (width, height, mean) =
+            seen(&thumbnail(IMAGE, &image(20, 10, "mono8", 20, &[90; 200]), Endian::Little).unwrap());
+        assert_eq!((width, height), (20, 10));
+        assert!(near(mean, [90; 3]), "{mean:?}");
+    }
+
+    #[test]
+    fn a_raw_sensor_becomes_grey() {
+        let mosaic = [[100, 200].repeat(8), [0, 100].repeat(8)].concat().repeat(4);
+        let (width, height, mean) =
+            seen(&thumbnail(IMAGE, &image(16, 8, "bayer_rggb8", 16, &mosaic), Endian::Little).unwrap());
+        assert_eq!((width, height), (16, 8));
+        assert!(near(mean, [100; 3]), "{mean:?}");
+    }
+
+    #[test]
+    fn a_compressed_image_is_made_smaller() {
+        let rgb: Vec<u8> = [10, 220, 30].repeat(800 * 400);
+        let mut jpeg = Vec::new();
+        Encoder::new(&mut jpeg, 90).encode(&rgb, 800, 400, ColorType::Rgb).unwrap();
+        let (width, height, mean) = seen(&thumbnail(COMPRESSED, &packed(&jpeg), Endian::Little).unwrap());
+        assert_eq!((width, height), (320, 160));
+        assert!(near(mean, [10, 220, 30]), "{mean:?}");
+    }
+
+    #[test]
+    fn the_size_keeps_the_ratio_within_its_box() {
+        assert_eq!(fit(320, 240), (320, 240));
+        assert_eq!(fit(1920, 1080), (320, 180));
+        assert_eq!(fit(1080, 1920), (320, 569));
+        assert_eq!(fit(65_535, 1), (320, 1));
+        assert_eq!(fit(1, 65_535), (1, 640));
+        assert_eq!(fit(100, 1000), (64, 640));
+    }
+
+    #[test]
+    fn what_is_no_image_has_no_thumbnail() {
+        let good = image(20, 10, "mono8", 20, &[90; 200]);
+        assert!(thumbnail("sensor_msgs/msg/Imu", &good, Endian::Little).is_none());
+        assert!(thumbnail(COMPRESSED, &good, Endian::Little).is_none());
+        assert!(thumbnail(IMAGE, &image(20, 10, "nv12", 20, &[90; 200]), Endian::Little).is_none());
+        assert!(thumbnail(IMAGE, &image(20, 10, "mono8", 20, &[90; 199]), Endian::Little).is_none());
+        assert!(thumbnail(IMAGE, &image(u32::MAX, u32::MAX, "rgb8", u32::MAX, &[0; 9]), Endian::Little).is_none());
+        for len in 0..good.len() {
+            assert!(thumbnail(IMAGE, &good[..len], Endian::Little).is_none(), "{len} bytes");
+        }
+    }
+
+    #[test]
+    fn a_file_that_claims_a_huge_image_is_not_decoded() {
+        let mut jpeg = Vec::new();
+        Encoder::new(&mut jpeg, 90).encode(&[0; 3 * 64], 8, 8, ColorType::Rgb).unwrap();
+        let sof = jpeg.windows(2).position(|pair| pair == [0xff, 0xc0]).unwrap();
+        jpeg[sof + 5..sof + 9].copy_from_slice(&[0xff; 4]);
+        assert!(thumbnail(COMPRESSED, &packed(&jpeg), Endian::Little).is_none());
+    }
+}

@@ -1,0 +1,83 @@
+//! Sorted stretches of time that do not touch each other, both ends inclusive.
+
+/// A set of instants, as stretches of time.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Intervals(Vec<(i64, i64)>);
+
+/// With more stretches than this, those that nobody can ask for any more are forgotten.
+const MANY: usize = 4096;
+
+impl Intervals {
+    /// Adds `from..=to`; what it touches becomes one with it. Nobody will ask for instants before `horizon`.
+    pub fn insert(&mut self, from: i64, to: i64, horizon: i64) {
+        if self.0.len() >= MANY {
+            let old = self.0.partition_point(|(_, end)| *end < horizon);
+            self.0.drain(..old);
+        }
+        let first = self.0.partition_point(|(_, end)| *end < from);
+        let last = self.0.partition_point(|(begin, _)| *begin <= to);
+        let merged = self.0[first..last].iter().fold((from, to), |(a, b), (from, to)| (a.min(*from), b.max(*to)));
+        self.0.splice(first..last, [merged]);
+    }
+
+    /// Whether `at` is one of the instants.
+    pub fn contains(&self, at: i64) -> bool {
+        self.0.get(self.0.partition_point(|(_, end)| *end < at)).is_some_and(|(begin, _)| *begin <= at)
+    }
+
+    /// Whether every instant of `from..=to` is one of them.
+    pub fn contains_all(&self, from: i64, to: i64) -> bool {
+        let found = self.0.get(self.0.partition_point(|(_, end)| *end < from));
+        found.is_some_and(|(begin, end)| *begin <= from && to <= *end)
+    }
+
+    /// The latest instant.
+    pub fn end(&self) -> Option<i64> {
+        self.0.last().map(|(_, end)| *end)
+    }
+
+    /// How many stretches end after `at`.
+    pub fn beyond(&self, at: i64) -> u64 {
+        (self.0.len() - self.0.partition_point(|(_, end)| *end <= at)) as u64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stretches_that_share_an_instant_become_one() {
+        let mut intervals = Intervals::default();
+        intervals.insert(10, 20, 0);
+        intervals.insert(30, 40, 0);
+        intervals.insert(50, 60, 0);
+        assert_eq!(intervals.0, [(10, 20), (30, 40), (50, 60)]);
+        intervals.insert(20, 30, 0);
+        assert_eq!(intervals.0, [(10, 40), (50, 60)]);
+        intervals.insert(1, 2, 0);
+        intervals.insert(0, 100, 0);
+        assert_eq!(intervals.0, [(0, 100)]);
+    }
+
+    #[test]
+    fn both_ends_belong_to_a_stretch() {
+        let mut intervals = Intervals::default();
+        intervals.insert(10, 20, 0);
+        intervals.insert(30, 30, 0);
+        let inside: Vec<_> = (8..32).filter(|at| intervals.contains(*at)).collect();
+        assert_eq!(inside, (10..=20).chain([30]).collect::<Vec<_>>());
+        assert!(intervals.contains_all(10, 20) && !intervals.contains_all(10, 21) && !intervals.contains_all(20, 30));
+        assert_eq!((intervals.end(), intervals.beyond(20), intervals.beyond(30)), (Some(30), 1, 0));
+    }
+
+    #[test]
+    fn many_stretches_are_forgotten_once_nobody_can_ask_for_them() {
+        let mut intervals = Intervals::default();
+        for at in 0..100_000 {
+            intervals.insert(at * 10, at * 10, at * 10 - 1000);
+        }
+        assert!(intervals.0.len() <= MANY, "{}", intervals.0.len());
+        assert!(intervals.contains(999_990) && intervals.contains(999_000));
+    }
+}

@@ -1,0 +1,250 @@
+//! The state of all windows, and what is to be done next.
+
+use std::collections::BTreeSet;
+
+use gleaner_protocol::TriggerKind;
+
+use super::{Group, Rules, Window};
+
+/// What became of a trigger.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Heard {
+    /// It opened a window.
+    Opened,
+    /// It ended the window that a start had opened.
+    Stopped,
+    /// It came too soon after the last one that opened a window.
+    InCooldown,
+    /// A start while one of its label is open, or [`STARTED_MAX`] are; or a stop while none of its label is.
+    Ignored,
+}
+
+/// What is to be done next.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Step {
+    /// A clip begins, with these windows; [`Windows::open`] has their group.
+    Begin(Vec<Window>),
+    /// These windows have joined the open clip. If `reaches_back`, they cover instants up to now that it did not.
+    Join {
+        /// The windows.
+        windows: Vec<Window>,
+        /// Whether samples that came before now have to be looked through.
+        reaches_back: bool,
+    },
+    /// The clip is full: it ends at `boundary`, and a next one goes on after it. The open group is already that of the next;
+    /// `before` is the one that ends.
+    Roll {
+        /// Last instant of the full clip.
+        boundary: i64,
+        /// The group as it was.
+        before: Box<Group>,
+    },
+    /// No window can touch the open clip any more: it is complete.
+    Finish(Box<Group>),
+    /// A trigger came so late that its windows lie before the open clip: a clip that is made at once.
+    Stray(Vec<Window>, Box<Group>),
+}
+
+/// The windows of all lambdas.
+#[derive(Debug)]
+pub struct Windows {
+    lambdas: Vec<Lambda>,
+    longest_preroll_ns: i64,
+    max_length_ns: i64,
+    pub(super) now: i64,
+    open: Option<Group>,
+    /// Windows that touch nothing that is open. They wait at most for the longest preroll, unless they came late.
+    pending: Vec<Window>,
+}
+
+#[derive(Debug)]
+struct Lambda {
+    rules: Rules,
+    /// Anchor of the last trigger that opened a window.
+    opened_at: Option<i64>,
+    /// Labels of the recordings that were started and not stopped. Together they are one window: it lasts until the last stop.
+    started: BTreeSet<String>,
+}
+
+/// Recordings of one lambda that may run at once, by their labels.
+pub const STARTED_MAX: usize = 64;
+
+/// What a late trigger may lag behind the samples even if no window has a preroll.
+const LATE_NS: i64 = 1_000_000_000;
+
+impl Windows {
+    /// No lambda, no window. A clip covers `max_length_ns` at most.
+    pub fn new(max_length_ns: i64) -> Windows {
+        Windows {
+            lambdas: Vec::new(),
+            longest_preroll_ns: 0,
+            max_length_ns,
+            now: i64::MIN,
+            open: None,
+            pending: Vec::new(),
+        }
+    }
+
+    /// Adds a lambda; they are numbered from 0.
+    pub fn add(&mut self, rules: Rules) -> usize {
+        self.longest_preroll_ns = self.longest_preroll_ns.max(rules.preroll_ns);
+        self.lambdas.push(Lambda { rules, opened_at: None, started: BTreeSet::new() });
+        self.lambdas.len() - 1
+    }
+
+    /// How far back from now samples have to be held.
+    ///
+    /// Let P be the longest preroll. A trigger whose anchor is now covers nothing before `now - P`. A window that waits,
+    /// because it lies behind the end `to` of the open clip, begins after `to`; and it waits no longer than until
+    /// `now > to + P`, when that clip is finished: till then its begin is after `now - P`. (A step that does both at once
+    /// is made before samples are given up, see `Recorder::pass`.) So P is enough for triggers that come at once. Twice that
+    /// and a second lets a trigger be late by a preroll and a second.
+    pub fn retention_ns(&self) -> i64 {
+        self.longest_preroll_ns.saturating_mul(2).saturating_add(LATE_NS)
+    }
+
+    /// Nobody will ask for instants before this one.
+    pub fn horizon(&self) -> i64 {
+        self.now.saturating_sub(self.retention_ns())
+    }
+
+    /// The group of the open clip.
+    pub fn open(&self) -> Option<&Group> {
+        self.open.as_ref()
+    }
+
+    /// Last instant that fits into the open clip.
+    pub fn limit(&self) -> i64 {
+        self.open.as_ref().map_or(i64::MAX, |open| open.from.saturating_add(self.max_length_ns))
+    }
+
+    /// Time passes; it never goes back.
+    pub fn pass(&mut self, now: i64) {
+        self.now = self.now.max(now);
+    }
+
+    /// Lambda `lambda` triggered in a wake at `anchor`. A stop ends the recording that was started with the same label.
+    pub fn trigger(&mut self, lambda: usize, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
+        let Some(state) = self.lambdas.get_mut(lambda) else { return Heard::Ignored };
+        let rules = state.rules;
+        match kind {
+            TriggerKind::Start if state.started.contains(label) || state.started.len() >= STARTED_MAX => {
+                return Heard::Ignored;
+            }
+            TriggerKind::Stop if !state.started.remove(label) => return Heard::Ignored,
+            TriggerKind::Stop => {
+                if state.started.is_empty() {
+                    self.stop(lambda, anchor.saturating_add(rules.postroll_ns));
+                }
+                return Heard::Stopped;
+            }
+            TriggerKind::Event | TriggerKind::Start => {}
+        }
+        if state.opened_at.is_some_and(|last| last.abs_diff(anchor) < rules.cooldown_ns.unsigned_abs()) {
+            return Heard::InCooldown;
+        }
+        state.opened_at = Some(anchor);
+        if kind == TriggerKind::Start {
+            let is_covered = !state.started.is_empty();
+            state.started.insert(label.to_owned());
+            if is_covered {
+                return Heard::Opened;
+            }
+        }
+        let to = (kind == TriggerKind::Event).then(|| anchor.saturating_add(rules.postroll_ns));
+        self.wait(Window { lambda, anchor, from: anchor.saturating_sub(rules.preroll_ns), to, windows: 1 });
+        Heard::Opened
+    }
+
+    /// Joins overlapping windows of one lambda, so that a lambda that triggers in every wake does not fill the memory.
+    fn wait(&mut self, window: Window) {
+        let same = |other: &&mut Window| {
+            other.lambda == window.lambda && other.to.is_some() && window.to.is_some() && other.touches(&window)
+        };
+        match self.pending.iter_mut().find(same) {
+            Some(other) => {
+                other.anchor = other.anchor.min(window.anchor);
+                other.from = other.from.min(window.from);
+                other.to = other.to.max(window.to);
+                other.windows += 1;
+            }
+            None => self.pending.push(window),
+        }
+    }
+
+    fn stop(&mut self, lambda: usize, to: i64) {
+        // A late stop cannot take back what is already written: its window ends now.
+        let (horizon, written) = (self.horizon(), to.max(self.now));
+        if self.open.as_mut().is_some_and(|open| open.stop(lambda, written, horizon)) {
+            return;
+        }
+        if let Some(window) = self.pending.iter_mut().find(|window| window.lambda == lambda && window.to.is_none()) {
+            window.to = Some(to.max(window.from));
+        }
+    }
+
+    /// What is to be done next; `None` until time passes or a trigger comes.
+    pub fn step(&mut self) -> Option<Step> {
+        let horizon = self.horizon();
+        let Some(open) = &mut self.open else {
+            let first = (0..self.pending.len()).min_by_key(|index| self.pending[*index].from)?;
+            let windows = take_group(&mut self.pending, first);
+            self.open = Group::new(&windows, horizon);
+            return Some(Step::Begin(windows));
+        };
+        if !self.pending.is_empty() {
+            let mut reaches_back = false;
+            let mut joined = Vec::new();
+            while let Some(index) = self.pending.iter().position(|window| open.touches(window)) {
+                let window = self.pending.swap_remove(index);
+                let to = window.to.unwrap_or(i64::MAX).min(self.now);
+                reaches_back |= window.from <= self.now && !open.covers_all(window.lambda, window.from, to);
+                open.add(&window, horizon);
+                joined.push(window);
+            }
+            if !joined.is_empty() {
+                return Some(Step::Join { windows: joined, reaches_back });
+            }
+            if let Some(index) =
+                self.pending.iter().position(|window| window.to.is_some_and(|to| to < open.begin && to < self.now))
+            {
+                let windows = take_group(&mut self.pending, index);
+                let group = Group::new(&windows, horizon)?;
+                return Some(Step::Stray(windows, Box::new(group)));
+            }
+        }
+        let limit = open.from.saturating_add(self.max_length_ns);
+        if limit < self.now && limit < open.to {
+            let before = Box::new(open.clone());
+            open.roll(limit);
+            return Some(Step::Roll { boundary: limit, before });
+        }
+        if self.now > open.to.saturating_add(self.longest_preroll_ns) {
+            return self.open.take().map(|group| Step::Finish(Box::new(group)));
+        }
+        None
+    }
+
+    /// Lets the open clip begin later, at `from`: there is nothing to write before. Without this, a jump in time would cost
+    /// a step for each clip that could have been in between.
+    pub fn slide(&mut self, from: i64) {
+        if let Some(open) = &mut self.open {
+            open.from = open.from.max(from.min(open.to));
+        }
+    }
+
+    /// At the end: closes the open group, whatever may come. Starts are over.
+    pub fn close(&mut self) -> Option<Group> {
+        self.lambdas.iter_mut().for_each(|lambda| lambda.started.clear());
+        self.open.take()
+    }
+}
+
+/// Takes out the window at `index` and all that hang together with it.
+fn take_group(pending: &mut Vec<Window>, index: usize) -> Vec<Window> {
+    let mut group = vec![pending.swap_remove(index)];
+    while let Some(index) = pending.iter().position(|window| group.iter().any(|other| other.touches(window))) {
+        group.push(pending.swap_remove(index));
+    }
+    group
+}

@@ -1,0 +1,62 @@
+//! Which stretches of time are kept: from triggers to windows, from windows to clips.
+//!
+//! - An `event` trigger at anchor `a` opens the window `[a - preroll, a + postroll]`, both ends inclusive. `start` opens
+//!   one at `a - preroll`, `stop` ends it at its own anchor `+ postroll`.
+//! - Windows that share an instant are of one [`Group`], whichever lambdas they are of. A group is one clip, or several in
+//!   turn if it grows longer than a clip may be.
+//! - One group is open at a time. It stays open until no trigger can come whose window would touch it; a window that does
+//!   not touch it waits meanwhile. So the groups do not depend on how soon a trigger comes after its anchor, as long as it
+//!   comes before the next sample.
+//!
+//! Pure bookkeeping: nothing here knows of samples or files, and time is what the caller says.
+
+mod group;
+mod intervals;
+mod machine;
+
+use std::time::Duration;
+
+pub use group::Group;
+#[cfg(test)]
+use machine::STARTED_MAX;
+pub use machine::{Heard, Step, Windows};
+
+/// What one lambda's `[record]` says of its windows, in ns.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Rules {
+    /// How far a window reaches back from its anchor.
+    pub preroll_ns: i64,
+    /// How far it reaches beyond.
+    pub postroll_ns: i64,
+    /// How long after a trigger that opened a window the next ones open none.
+    pub cooldown_ns: i64,
+}
+
+/// A stretch of time that one lambda wants to keep.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Window {
+    /// Whose it is.
+    pub lambda: usize,
+    /// Stamp of the trigger.
+    pub anchor: i64,
+    /// Its first instant.
+    pub from: i64,
+    /// Its last instant; `None` until the stop.
+    pub to: Option<i64>,
+    /// How many windows this one is made of: overlapping ones of one lambda wait as one.
+    pub windows: u64,
+}
+
+impl Window {
+    fn touches(&self, other: &Window) -> bool {
+        other.to.is_none_or(|to| self.from <= to) && self.to.is_none_or(|to| other.from <= to)
+    }
+}
+
+/// `duration` in ns; no duration in a manifest comes near to the largest one.
+pub fn nanoseconds(duration: Duration) -> i64 {
+    i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,305 @@
+use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
+
+use super::*;
+
+/// Numbers that look random and are the same in each run (SplitMix64).
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, n: u64) -> i64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) % n) as i64
+    }
+}
+
+fn rules(preroll_ns: i64, postroll_ns: i64, cooldown_ns: i64) -> Rules {
+    Rules { preroll_ns, postroll_ns, cooldown_ns }
+}
+
+const LONG: i64 = i64::MAX / 4;
+
+fn machine(max_length_ns: i64, rules: &[Rules]) -> Windows {
+    let mut windows = Windows::new(max_length_ns);
+    rules.iter().for_each(|rules| {
+        windows.add(*rules);
+    });
+    windows
+}
+
+/// Does all that is to be done; the groups that are finished.
+fn drain(windows: &mut Windows) -> Vec<Group> {
+    let mut finished = Vec::new();
+    while let Some(step) = windows.step() {
+        match step {
+            Step::Finish(group) | Step::Stray(_, group) => finished.push(*group),
+            Step::Begin(_) | Step::Join { .. } | Step::Roll { .. } => {}
+        }
+    }
+    finished
+}
+
+/// The begins and ends of the groups that come of triggers of lambda 0, each at its anchor.
+fn groups(windows: &mut Windows, triggers: &[(i64, TriggerKind)]) -> Vec<(i64, i64)> {
+    let mut finished = Vec::new();
+    for (at, kind) in triggers {
+        windows.pass(*at);
+        finished.extend(drain(windows));
+        windows.trigger(0, *kind, "x", *at);
+        finished.extend(drain(windows));
+    }
+    windows.pass(LONG);
+    finished.extend(drain(windows));
+    finished.iter().map(|group| (group.begin, group.to)).collect()
+}
+
+#[test]
+fn windows_that_overlap_share_a_clip_and_others_do_not() {
+    let cases = [
+        (vec![8, 12], vec![(3, 17)]),
+        (vec![8, 16], vec![(3, 21)]),
+        (vec![8, 18], vec![(3, 23)]),
+        (vec![8, 19], vec![(3, 13), (14, 24)]),
+        (vec![8, 8, 8], vec![(3, 13)]),
+    ];
+    for (anchors, expected) in cases {
+        let triggers: Vec<_> = anchors.iter().map(|at| (*at, Event)).collect();
+        assert_eq!(groups(&mut machine(LONG, &[rules(5, 5, 0)]), &triggers), expected, "{anchors:?}");
+    }
+}
+
+#[test]
+fn a_start_lasts_until_its_stop_and_others_are_ignored() {
+    let mut windows = machine(LONG, &[rules(5, 2, 0)]);
+    let triggers = [(3, Stop), (10, Start), (11, Start), (12, Event), (500, Stop), (501, Stop)];
+    assert_eq!(groups(&mut windows, &triggers), [(5, 502)]);
+    let mut windows = machine(LONG, &[rules(5, 2, 0)]);
+    let heard = triggers.map(|(at, kind)| windows.trigger(0, kind, "x", at));
+    use Heard::{Ignored, Opened, Stopped};
+    assert_eq!(heard, [Ignored, Opened, Ignored, Opened, Stopped, Ignored]);
+}
+
+#[test]
+fn the_end_of_an_event_may_be_later_than_the_stop() {
+    let mut windows = machine(LONG, &[rules(0, 100, 0)]);
+    assert_eq!(groups(&mut windows, &[(10, Start), (50, Event), (20, Stop)]), [(10, 150)]);
+}
+
+#[test]
+fn a_cooldown_keeps_windows_shut_for_as_long_as_it_says() {
+    let mut windows = machine(LONG, &[rules(1, 1, 10)]);
+    let heard = [0, 9, 10, 19, 25].map(|at| windows.trigger(0, Event, "x", at));
+    use Heard::{InCooldown, Opened};
+    assert_eq!(heard, [Opened, InCooldown, Opened, InCooldown, Opened]);
+    assert_eq!(windows.trigger(0, Start, "x", 30), InCooldown);
+    assert_eq!(windows.trigger(0, Stop, "x", 31), Heard::Ignored);
+}
+
+#[test]
+fn a_late_trigger_without_a_cooldown_opens_its_window() {
+    let mut windows = machine(LONG, &[rules(1, 1, 0)]);
+    assert_eq!([20, 10].map(|at| windows.trigger(0, Event, "x", at)), [Heard::Opened; 2]);
+}
+
+#[test]
+fn a_window_that_touches_neither_clip_may_still_join_two() {
+    // Lambda 1 reaches back over the gap between the windows of lambda 0 only later.
+    let mut windows = machine(LONG, &[rules(1, 1, 0), rules(50, 1, 0)]);
+    for (at, lambda) in [(100, 0), (120, 0), (140, 1)] {
+        windows.pass(at);
+        assert_eq!(drain(&mut windows), []);
+        windows.trigger(lambda, Event, "x", at);
+        assert_eq!(drain(&mut windows), []);
+    }
+    windows.pass(1000);
+    let finished = drain(&mut windows);
+    assert_eq!(finished.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(90, 141)]);
+    let covered: Vec<_> = (80..130).filter(|at| finished[0].covers(0, *at)).collect();
+    assert_eq!(covered, [99, 100, 101, 119, 120, 121], "what lambda 0 does not want is not in it for its sake");
+}
+
+#[test]
+fn a_late_trigger_before_the_open_clip_makes_a_clip_of_its_own() {
+    let mut windows = machine(LONG, &[rules(5, 5, 0), rules(2, 2, 0)]);
+    windows.pass(100);
+    windows.trigger(0, Start, "x", 100);
+    assert_eq!(drain(&mut windows), []);
+    windows.trigger(1, Event, "x", 60);
+    let stray = drain(&mut windows);
+    assert_eq!(stray.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(58, 62)]);
+    windows.trigger(1, Event, "x", 93);
+    assert_eq!(drain(&mut windows), []);
+    assert_eq!(windows.open().map(|group| (group.begin, group.from)), Some((91, 91)));
+}
+
+#[test]
+fn a_late_stop_ends_its_window_now() {
+    let mut windows = machine(LONG, &[rules(5, 5, 0)]);
+    windows.pass(100);
+    windows.trigger(0, Start, "x", 100);
+    drain(&mut windows);
+    windows.pass(200);
+    windows.trigger(0, Stop, "x", 150);
+    assert_eq!(windows.open().map(|group| group.to), Some(200));
+}
+
+#[test]
+fn a_long_clip_is_cut_without_a_gap() {
+    let mut windows = machine(100, &[rules(5, 0, 0)]);
+    windows.pass(50);
+    windows.trigger(0, Start, "x", 50);
+    drain(&mut windows);
+    let mut boundaries = Vec::new();
+    for now in 51..400 {
+        windows.pass(now);
+        while let Some(step) = windows.step() {
+            let Step::Roll { boundary, before } = step else { panic!("{step:?}") };
+            assert_eq!((now, before.from + 100), (boundary + 1, boundary));
+            assert_eq!(windows.open().map(|group| (group.from, group.windows(0))), Some((boundary + 1, 1)));
+            boundaries.push(boundary);
+        }
+    }
+    assert_eq!(boundaries, [145, 246, 347]);
+}
+
+#[test]
+fn extreme_times_do_not_overflow() {
+    let mut windows = machine(LONG, &[rules(i64::MAX, i64::MAX, i64::MAX)]);
+    for at in [0, i64::MAX, 5] {
+        windows.pass(at);
+        for kind in [Event, Start, Stop, Event] {
+            windows.trigger(0, kind, "x", at);
+            drain(&mut windows);
+        }
+    }
+    assert!(windows.close().is_some());
+}
+
+/// A window as the model sees it: lambda, first and last instant.
+type Plain = (usize, i64, i64);
+
+/// The model: all windows at once, then those that hang together. No state, no order of arrival.
+fn model(rules: &[Rules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Plain>> {
+    let mut windows: Vec<Plain> = Vec::new();
+    for (lambda, rules) in rules.iter().enumerate() {
+        let mut opened_at = None;
+        let mut started: Option<i64> = None;
+        for (at, _, kind) in triggers.iter().filter(|(_, whose, _)| *whose == lambda) {
+            let cool = opened_at.is_none_or(|opened: i64| *at >= opened + rules.cooldown_ns);
+            match (kind, started) {
+                (Stop, Some(from)) => {
+                    windows.push((lambda, from, at + rules.postroll_ns));
+                    started = None;
+                }
+                (Event, _) if cool => {
+                    windows.push((lambda, at - rules.preroll_ns, at + rules.postroll_ns));
+                    opened_at = Some(*at);
+                }
+                (Start, None) if cool => {
+                    started = Some(at - rules.preroll_ns);
+                    opened_at = Some(*at);
+                }
+                _ => {}
+            }
+        }
+        windows.extend(started.map(|from| (lambda, from, i64::MAX)));
+    }
+    windows.sort_by_key(|(_, from, _)| *from);
+    let mut groups: Vec<Vec<Plain>> = Vec::new();
+    let mut end = i64::MIN;
+    for window in windows {
+        match groups.last_mut() {
+            Some(group) if window.1 <= end => group.push(window),
+            _ => groups.push(vec![window]),
+        }
+        end = end.max(window.2);
+    }
+    groups
+}
+
+#[test]
+fn random_triggers_make_the_groups_of_the_model() {
+    for seed in 0..3_000 {
+        let mut random = Random(seed);
+        let lambdas = 1 + random.below(3) as usize;
+        let mut roll = || [0, random.below(5), random.below(40)][random.below(3) as usize];
+        let rules: Vec<_> = (0..lambdas).map(|_| rules(roll(), roll(), roll())).collect();
+        let mut windows = machine(LONG, &rules);
+        let (mut triggers, mut finished, mut now) = (Vec::new(), Vec::new(), 100);
+        let mut trimmed = i64::MIN;
+        let mut act = |windows: &mut Windows| {
+            while let Some(step) = windows.step() {
+                match step {
+                    Step::Finish(group) => finished.push(*group),
+                    Step::Begin(new) | Step::Join { windows: new, .. } => {
+                        assert!(new.iter().all(|window| window.from >= trimmed), "what it needs is gone: {seed}");
+                    }
+                    step => panic!("{step:?}"),
+                }
+            }
+            // Tighter than the recorder is: one preroll, and no second for the late.
+            let longest = rules.iter().map(|rules| rules.preroll_ns).max().unwrap_or(0);
+            trimmed = windows.now - longest;
+        };
+        for _ in 0..random.below(30) {
+            now += [0, 1, random.below(10), random.below(100)][random.below(4) as usize];
+            windows.pass(now);
+            act(&mut windows);
+            if random.below(4) > 0 {
+                let lambda = random.below(lambdas as u64) as usize;
+                let kind = [Event, Event, Start, Stop][random.below(4) as usize];
+                triggers.push((now, lambda, kind));
+                windows.trigger(lambda, kind, "x", now);
+                act(&mut windows);
+            }
+        }
+        now += random.below(200);
+        windows.pass(now);
+        act(&mut windows);
+        while let Some(group) = windows.close() {
+            finished.push(group);
+            finished.extend(drain(&mut windows));
+        }
+        let expected = model(&rules, &triggers);
+        let spans = |group: &Vec<Plain>| (group[0].1, group.iter().map(|window| window.2).max().unwrap());
+        let found: Vec<_> = finished.iter().map(|group| (group.begin, group.to)).collect();
+        assert_eq!(found, expected.iter().map(spans).collect::<Vec<_>>(), "seed {seed}: {rules:?} {triggers:?}");
+        for (group, expected) in finished.iter().zip(&expected) {
+            for lambda in 0..lambdas {
+                let own: Vec<_> = expected.iter().filter(|window| window.0 == lambda).collect();
+                assert_eq!(group.windows(lambda), own.len() as u64, "seed {seed}");
+                for at in 0..now + 100 {
+                    let covered = own.iter().any(|(_, from, to)| (*from..=*to).contains(&at));
+                    assert_eq!(group.covers(lambda, at), covered, "seed {seed}, lambda {lambda} at {at}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_stop_ends_the_recording_of_its_label_and_the_clip_lasts_until_the_last() {
+    let mut windows = Windows::new(1_000_000);
+    windows.add(Rules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
+    windows.pass(100);
+    assert_eq!(windows.trigger(0, Start, "a", 100), Heard::Opened);
+    assert!(matches!(windows.step(), Some(Step::Begin(_))));
+    assert_eq!(windows.trigger(0, Start, "b", 110), Heard::Opened);
+    assert_eq!(windows.trigger(0, Start, "b", 111), Heard::Ignored);
+    assert_eq!(windows.trigger(0, Stop, "c", 112), Heard::Ignored);
+    assert_eq!(windows.trigger(0, Stop, "a", 120), Heard::Stopped);
+    assert!(windows.open().is_some_and(Group::waits_for_stop));
+    assert_eq!(windows.trigger(0, Stop, "b", 130), Heard::Stopped);
+    assert_eq!(windows.open().map(|group| (group.from, group.to)), Some((95, 135)));
+}
+
+#[test]
+fn a_lambda_that_starts_ever_new_recordings_is_heard_up_to_a_bound() {
+    let mut windows = Windows::new(1_000_000);
+    windows.add(Rules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
+    let heard = (0..STARTED_MAX + 1).map(|n| windows.trigger(0, Start, &n.to_string(), 100)).collect::<Vec<_>>();
+    assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
+    assert_eq!(heard.last(), Some(&Heard::Ignored));
+}

@@ -1,0 +1,128 @@
+//! The preroll, seen from clips: what did not fit is counted, in the clip whose window reaches over it.
+
+mod support;
+
+use std::fs;
+
+use gleaner_protocol::TriggerKind::Event;
+use gleaner_protocol::manifest::Store;
+use gleaner_protocol::{Clip, TriggerKind};
+use gleaner_recorder::{RecordError, Recorder};
+use support::*;
+
+const EVENT: &[TriggerKind] = &[Event];
+
+/// 100 bytes each ms on `/a` with a window of 1 s before 2000 ms, in a store of `bytes`.
+fn cut(store: Store, bytes: u64) -> (Scratch, Clip, u64) {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, bytes));
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (1000, 100, 0), &[a]));
+    for ms in 0..3000 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &[ms as u8; 100]).unwrap();
+        within_bound(&recorder);
+        if ms == 2000 {
+            recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
+        }
+    }
+    recorder.finish(T0 + S * 4).unwrap();
+    assert_eq!(recorder.clips().len(), 1);
+    let (clip, pushed_out) = (recorder.clips()[0].clone(), recorder.counts().pushed_out);
+    (scratch, clip, pushed_out)
+}
+
+fn within_bound(recorder: &Recorder) {
+    let counts = recorder.counts();
+    assert!(counts.preroll_bytes <= counts.preroll_highest && counts.preroll_highest <= counts.preroll_bound);
+}
+
+#[test]
+fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
+    for store in [Store::Ram, Store::Disk] {
+        let (scratch, clip, pushed_out) = cut(store, 50_000);
+        let topic = &clip.topics[0];
+        let overwritten = topic.overwritten.unwrap();
+        assert!(overwritten > 600, "50 kB hold some 290 samples of 100 bytes: {overwritten}");
+        assert_eq!((topic.received, topic.messages + overwritten), (Some(1101), 1101));
+        assert_eq!(scratch.contents(&clip).len() as u64, topic.messages);
+        assert_eq!(
+            clip.short,
+            [format!("the preroll was cut by preroll_size: {overwritten} samples of /a pushed out")]
+        );
+        assert!(pushed_out > overwritten);
+        let (_scratch, clip, pushed_out) = cut(store, 16 << 20);
+        assert_eq!((clip.topics[0].overwritten, pushed_out, clip.short), (Some(0), 0, vec![]));
+    }
+}
+
+#[test]
+fn what_nobody_can_count_is_said_to_be_unknown() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 10_000);
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (6000, 0, 0), &[a]));
+    drive(&mut recorder, &[a], (0, 6000, 1), &[(5999, lambda, EVENT)]);
+    recorder.finish(T0 + 6000 * MS).unwrap();
+    let clip = &recorder.clips()[0];
+    assert_eq!((clip.topics[0].overwritten, clip.topics[0].received, clip.topics[0].too_big), (None, None, Some(0)));
+    assert!(clip.short.iter().any(|short| short.ends_with("more than were counted")), "{:?}", clip.short);
+}
+
+#[test]
+fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
+    for store in [Store::Ram, Store::Disk] {
+        let scratch = Scratch::new();
+        let mut recorder = scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, 5_000));
+        let a = recorder.add_topic(topic("/a")).unwrap();
+        let lambda = recorder.add_lambda(member("hello", (1000, 1000, 0), &[a]));
+        recorder.sample(a, &meta(T0 - 1500 * MS, 1), &[0; 10]).unwrap();
+        for (ms, bytes) in [(0, 10), (100, 10_000), (200, 10)] {
+            recorder.sample(a, &meta(T0 + ms * MS, 2), &vec![1; bytes]).unwrap();
+        }
+        recorder.wake(lambda, &entry(T0 + 200 * MS, EVENT)).unwrap();
+        recorder.sample(a, &meta(T0 + 300 * MS, 3), &[2; 10_000]).unwrap();
+        // A second window over the same time counts nothing a second time.
+        recorder.wake(lambda, &entry(T0 + 400 * MS, EVENT)).unwrap();
+        recorder.finish(T0 + 3 * S).unwrap();
+        let clip = &recorder.clips()[0];
+        assert_eq!(stamps(&scratch, clip, "/a"), [0, 200, 300]);
+        assert_eq!((clip.topics[0].too_big, clip.topics[0].received), (Some(1), Some(4)));
+        assert_eq!(clip.short, ["1 sample of /a did not fit into the preroll: preroll_size"]);
+        assert_eq!(recorder.counts().too_big, 2);
+    }
+}
+
+#[test]
+fn wakes_that_were_pushed_out_are_missing_from_the_journal_and_said() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 3_000);
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (1000, 0, 0), &[a]));
+    for ms in 0..100 {
+        recorder.wake(lambda, &entry(T0 + ms * MS, if ms == 99 { EVENT } else { &[] })).unwrap();
+        within_bound(&recorder);
+    }
+    recorder.finish(T0 + 3 * S).unwrap();
+    let clip = &recorder.clips()[0];
+    let (header, wakes) = scratch.journal(clip, "hello");
+    assert_eq!((header.wakes_before + wakes.len() as u64, wakes.last()), (100, Some(&(T0 + 99 * MS))));
+    let said = format!("the journal of hello lacks {} wakes: pushed out of the preroll", header.wakes_before);
+    assert!(clip.short.contains(&said), "{:?}", clip.short);
+}
+
+#[test]
+fn a_preroll_on_disk_is_deleted_in_the_end_and_its_failure_is_named() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|settings| settings.store = Store::Disk);
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    recorder.sample(a, &meta(T0, 1), b"x").unwrap();
+    let folder = scratch.0.join("preroll");
+    assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+    drop(recorder);
+    assert!(!folder.exists());
+    let mut recorder = scratch.recorder(|settings| settings.store = Store::Disk);
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    fs::remove_dir_all(&folder).unwrap();
+    let error = recorder.sample(a, &meta(T0, 1), b"x").unwrap_err();
+    assert!(matches!(&error, RecordError::Preroll { path, .. } if path.starts_with(&folder)), "{error:?}");
+}

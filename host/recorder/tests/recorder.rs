@@ -1,0 +1,257 @@
+//! A recorder, clip by clip: what is in it, and what it says of itself.
+
+mod support;
+
+use std::time::Duration;
+
+use gleaner_protocol::TriggerKind::{Event, Start, Stop};
+use gleaner_recorder::{Folder, RecordError};
+use support::*;
+
+const EVENT: &[gleaner_protocol::TriggerKind] = &[Event];
+
+#[test]
+fn a_clip_holds_exactly_its_window_and_says_what_it_is() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let gone = recorder.add_missing_topic("/gone").unwrap();
+    let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[topics[0], gone]));
+    drive(&mut recorder, &topics, (0, 3000, 10), &[(100, lambda, &[]), (1136, lambda, EVENT), (1200, lambda, &[])]);
+    assert_eq!(recorder.clips().len(), 1, "the clip is complete once no window can touch it");
+    recorder.finish(T0 + 3000 * MS).unwrap();
+    let clip = &recorder.clips()[0];
+    assert_eq!(clip.file.to_str(), Some("clips/hello-20180802T083452.136Z.mcap"));
+    assert_eq!(stamps(&scratch, clip, "/a"), every(636, 1436, 10));
+    assert!(stamps(&scratch, clip, "/b").is_empty());
+    assert_eq!((clip.from_ns, clip.to_ns), (T0 + 636 * MS, T0 + 1436 * MS));
+    assert_eq!((clip.triggers, clip.moments.len(), clip.moments[0].label.as_str()), (1, 1, "here"));
+    assert_eq!((clip.lambdas.len(), clip.lambdas[0].windows, clip.lambdas[0].digest.as_str()), (1, 1, "d1e5"));
+    let [a, missing] = &clip.topics[..] else { panic!("{:?}", clip.topics) };
+    assert_eq!((a.messages, a.received, a.lost, a.overwritten, a.too_big), (80, Some(80), None, Some(0), Some(0)));
+    assert_eq!((missing.topic.as_str(), &missing.type_name, missing.received), ("/gone", &None, Some(0)));
+    assert_eq!(clip.short, Vec::<String>::new());
+    let (header, wakes) = scratch.journal(clip, "hello");
+    assert_eq!((header.wakes_before, wakes), (1, vec![T0 + 1136 * MS, T0 + 1200 * MS]));
+    let counts = recorder.counts();
+    assert_eq!((counts.clips, counts.windows, counts.refused, counts.out_of_order), (1, 1, 0, 0));
+}
+
+#[test]
+fn messages_are_written_byte_for_byte() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[a]));
+    let mut sample = meta(T0, 5);
+    (sample.endian, sample.options, sample.publish_ns) = (gleaner_transport::Endian::Big, [3, 4], -9);
+    recorder.sample(a, &sample, b"before").unwrap();
+    recorder.wake(lambda, &entry(T0, EVENT)).unwrap();
+    recorder.sample(a, &meta(T0, 6), b"after").unwrap();
+    recorder.finish(T0 + S).unwrap();
+    let data: Vec<_> =
+        scratch.messages(&recorder.clips()[0]).into_iter().map(|(_, _, seq, data)| (seq, data)).collect();
+    assert_eq!(data, [(5, b"\0\0\x03\x04before".to_vec()), (6, b"\0\x01\0\0after".to_vec())]);
+}
+
+#[test]
+fn lambdas_share_a_clip_each_with_its_own_topics() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let topics = ["/a", "/b", "/both"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let [a, b, both] = topics;
+    let first = recorder.add_lambda(member("first", (100, 100, 0), &[a, both]));
+    let second = recorder.add_lambda(member("second", (800, 50, 0), &[both, b]));
+    let wakes = [(1000, first, EVENT), (1150, second, EVENT), (950, second, &[] as &[_]), (300, second, &[])];
+    drive(&mut recorder, &topics, (0, 4000, 10), &wakes);
+    let [clip] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
+    assert_eq!((clip.from_ns, clip.to_ns), (T0 + 350 * MS, T0 + 1200 * MS));
+    assert_eq!(stamps(&scratch, clip, "/a"), every(900, 1100, 10));
+    assert_eq!(stamps(&scratch, clip, "/b"), every(350, 1200, 10));
+    assert_eq!(stamps(&scratch, clip, "/both"), every(350, 1200, 10));
+    assert_eq!(clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(), ["first", "second"]);
+    assert_eq!(scratch.journal(clip, "first").1, [T0 + 1000 * MS]);
+    let (header, wakes) = scratch.journal(clip, "second");
+    assert_eq!(
+        (header.wakes_before, wakes),
+        (1, vec![T0 + 950 * MS, T0 + 1150 * MS]),
+        "in order, though found backwards"
+    );
+}
+
+#[test]
+fn a_late_trigger_makes_the_clip_that_a_prompt_one_would_have_made() {
+    let made = |late_ms: i64| {
+        let scratch = Scratch::new();
+        let mut recorder = scratch.recorder(|_| {});
+        let a = recorder.add_topic(topic("/a")).unwrap();
+        let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[a]));
+        drive(&mut recorder, &[a], (0, 2000 + late_ms, 10), &[]);
+        recorder.wake(lambda, &entry(T0 + 2000 * MS, EVENT)).unwrap();
+        drive(&mut recorder, &[a], (2000 + late_ms, 6000, 10), &[]);
+        recorder.finish(T0 + 6000 * MS).unwrap();
+        assert_eq!(recorder.clips().len(), 1);
+        (scratch.contents(&recorder.clips()[0]), recorder.clips()[0].clone())
+    };
+    let (prompt, _) = made(1);
+    for late in [100, 299, 300, 301, 1400] {
+        let (contents, clip) = made(late);
+        assert_eq!((contents == prompt, clip.short), (true, vec![]), "{late} ms late");
+    }
+    let (contents, clip) = made(1700);
+    assert!(contents.len() < prompt.len());
+    assert_eq!(clip.short, ["a trigger came late: samples of /a had left the preroll"]);
+    assert_eq!(clip.topics[0].received, None, "nobody knows what was there");
+}
+
+#[test]
+fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|settings| settings.max_length = Duration::from_secs(1));
+    let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let [a, b] = topics;
+    let first = recorder.add_lambda(member("first", (2500, 0, 0), &[a]));
+    let second = recorder.add_lambda(member("second", (700, 100, 0), &[b]));
+    let wakes: [(_, _, &[_]); 3] = [(3000, first, &[Start]), (4400, second, EVENT), (6000, first, &[Stop])];
+    drive(&mut recorder, &topics, (0, 12_000, 10), &wakes);
+    let clips = recorder.clips();
+    let all: Vec<_> = clips.iter().flat_map(|clip| stamps(&scratch, clip, "/a")).collect();
+    assert_eq!(all, every(500, 6000, 10), "in order, nothing lost, nothing twice");
+    let mut all: Vec<_> = clips.iter().flat_map(|clip| stamps(&scratch, clip, "/b")).collect();
+    all.sort();
+    assert_eq!(all, every(3700, 4500, 10));
+    assert_eq!(clips.len(), 6);
+    for (index, clip) in clips.iter().enumerate() {
+        let (first, last) = (index == 0, index + 1 == clips.len());
+        assert_eq!(clip.short.contains(&"continues the clip before".to_owned()), !first, "{index}");
+        assert_eq!(clip.short.contains(&"continues in the next clip".to_owned()), !last, "{index}");
+        assert!(clip.to_ns - clip.from_ns <= S);
+        if !first {
+            assert_eq!(clip.from_ns, clips[index - 1].to_ns + 1);
+        }
+    }
+    let wakes: u64 = clips.iter().map(|clip| clip.triggers).sum();
+    assert_eq!(wakes, 3);
+}
+
+#[test]
+fn a_jump_in_time_makes_no_clips_of_nothing() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|settings| settings.max_length = Duration::from_secs(1));
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (100, 0, 0), &[a]));
+    drive(&mut recorder, &[a], (0, 500, 10), &[(400, lambda, &[Start])]);
+    let year = 365 * 24 * 3600 * S;
+    recorder.sample(a, &meta(T0 + year, 1), b"much later").unwrap();
+    recorder.sample(a, &meta(i64::MAX, 2), b"at the end of time").unwrap();
+    recorder.finish(T0).unwrap();
+    assert_eq!(recorder.clips().iter().map(|clip| clip.topics[0].messages).collect::<Vec<_>>(), [20, 1, 1]);
+}
+
+#[test]
+fn what_is_open_at_the_end_of_the_drive_says_so() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let event = recorder.add_lambda(member("event", (5000, 5000, 0), &[a]));
+    drive(&mut recorder, &[a], (0, 6000, 10), &[(3100, event, EVENT)]);
+    recorder.finish(T0 + 6000 * MS).unwrap();
+    let [clip] = recorder.clips() else { panic!() };
+    let expected =
+        ["the preroll begins 1.9 s late: nothing was recorded before", "the drive ended 2.1 s before the window did"];
+    assert_eq!((clip.short.as_slice(), clip.to_ns), (expected.map(str::to_owned).as_slice(), T0 + 8100 * MS));
+
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let start = recorder.add_lambda(member("start", (100, 0, 0), &[a]));
+    drive(&mut recorder, &[a], (0, 1000, 10), &[(500, start, &[Start])]);
+    recorder.finish(T0 + 1500 * MS).unwrap();
+    let [clip] = recorder.clips() else { panic!() };
+    assert_eq!(clip.short, ["the drive ended before the lambda said stop"]);
+    assert_eq!((clip.to_ns, clip.topics[0].messages), (T0 + 1500 * MS, 60));
+}
+
+#[test]
+fn what_is_before_1970_or_out_of_order_is_counted() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let missing = recorder.add_missing_topic("/gone").unwrap();
+    let lambda = recorder.add_lambda(member("hello", (100, 100, 0), &[a]));
+    recorder.sample(a, &meta(-1, 1), b"x").unwrap();
+    recorder.sample(missing, &meta(T0, 1), b"x").unwrap();
+    recorder.wake(lambda, &entry(-1, EVENT)).unwrap();
+    recorder.sample(a, &meta(T0 + 50 * MS, 2), b"x").unwrap();
+    recorder.sample(a, &meta(T0 + 40 * MS, 3), b"x").unwrap();
+    recorder.wake(lambda, &entry(T0 + 50 * MS, EVENT)).unwrap();
+    recorder.sample(a, &meta(T0 + 45 * MS, 4), b"x").unwrap();
+    recorder.finish(T0 + S).unwrap();
+    let counts = recorder.counts();
+    assert_eq!((counts.refused, counts.out_of_order), (3, 2));
+    assert_eq!(stamps(&scratch, &recorder.clips()[0], "/a"), [40, 45, 50]);
+}
+
+#[test]
+fn a_recorder_has_an_end_of_topics() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    for index in 0..256 {
+        recorder.add_topic(topic(&format!("/t{index}"))).unwrap();
+    }
+    assert!(recorder.add_topic(topic("/t7")).is_ok(), "one that it has");
+    let refused = recorder.add_topic(topic("/more")).unwrap_err();
+    assert!(matches!(refused, RecordError::TooManyTopics { most: 256 }));
+}
+
+#[test]
+fn the_picture_is_that_of_the_trigger() {
+    let image = |grey: u8| {
+        // Stamp, and an empty frame id of one byte.
+        let mut cdr = vec![0; 16];
+        cdr[8] = 1;
+        for number in [4_u32, 4, 6] {
+            cdr.extend(number.to_le_bytes());
+        }
+        cdr.extend(b"mono8\0\0\0");
+        for number in [4_u32, 16] {
+            cdr.extend(number.to_le_bytes());
+        }
+        cdr.extend([grey; 16]);
+        cdr
+    };
+    let picture = |anchor_ms: i64| {
+        let scratch = Scratch::new();
+        let mut recorder = scratch.recorder(|_| {});
+        let camera = recorder.add_topic(topic("/camera")).unwrap();
+        let lambda = recorder.add_lambda(member("hello", (500, 500, 0), &[camera]));
+        for ms in 0..500 {
+            if ms % 100 == 50 {
+                recorder.sample(camera, &meta(T0 + ms * MS, ms as u64), &image(ms as u8 / 2)).unwrap();
+            }
+            if ms == anchor_ms {
+                recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
+            }
+        }
+        recorder.finish(T0 + S).unwrap();
+        let clip = &recorder.clips()[0];
+        assert!(clip.thumbnail.is_some());
+        scratch.attachments(clip)["thumbnail.jpg"].clone()
+    };
+    assert_eq!(picture(60), picture(149), "the newest image before");
+    assert_ne!(picture(60), picture(150));
+    assert_eq!(picture(10), picture(60), "or the first one after");
+}
+
+#[test]
+fn a_recorder_that_dies_leaves_what_it_has_written() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (500, 500, 0), &[a]));
+    drive(&mut recorder, &[a], (0, 3000, 10), &[(2000, lambda, &[Start])]);
+    drop(recorder);
+    let (_folder, recovered) = Folder::open(&scratch.0).unwrap();
+    assert_eq!((recovered.len(), recovered[0].lambdas[0].name.as_str()), (1, "hello"));
+    assert!(recovered[0].recovered.is_some());
+}

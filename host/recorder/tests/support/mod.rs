@@ -1,0 +1,227 @@
+//! What the tests share: a folder, lambdas, a drive of samples and wakes, and a look into clips.
+// Each test program uses its own part.
+#![allow(dead_code)]
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use gleaner_protocol::journal::{Entry, Header, JournalInput, Reader, Said, Seen, Woken};
+use gleaner_protocol::manifest::{Kind, Manifest, Store};
+use gleaner_protocol::{Clip, Trigger, TriggerKind};
+use gleaner_recorder::{Folder, LambdaId, Member, Recorder, Settings, Topic, TopicId};
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+pub const MS: i64 = 1_000_000;
+pub const S: i64 = 1_000 * MS;
+/// 2018-08-02 08:34:51 UTC.
+pub const T0: i64 = 1_533_198_891 * S;
+
+/// A folder for one test, removed when the test ends.
+pub struct Scratch(pub PathBuf);
+
+impl Scratch {
+    pub fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("core-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+        fs::create_dir_all(&folder).unwrap();
+        Self(folder)
+    }
+
+    pub fn recorder(&self, settings: impl FnOnce(&mut Settings)) -> Recorder {
+        let mut given = Settings {
+            store: Store::Ram,
+            preroll_bytes: 16 << 20,
+            max_length: Duration::from_secs(600),
+            folder: self.0.clone(),
+            clock: "log time of the drive".to_owned(),
+            prefault: false,
+        };
+        settings(&mut given);
+        Recorder::new(Folder::open(&self.0).unwrap().0, given).unwrap()
+    }
+
+    /// The messages of a clip in the order of its file.
+    pub fn messages(&self, clip: &Clip) -> Vec<Message> {
+        let bytes = fs::read(self.0.join(&clip.file)).unwrap();
+        mcap::MessageStream::new(&bytes)
+            .unwrap()
+            .map(|message| {
+                let message = message.unwrap();
+                let data = message.data.into_owned();
+                (message.channel.topic.clone(), message.log_time as i64, message.sequence, data)
+            })
+            .collect()
+    }
+
+    /// Topic, stamp and number of the messages of a clip, sorted.
+    pub fn contents(&self, clip: &Clip) -> Vec<(String, i64, u32)> {
+        let mut contents: Vec<_> =
+            self.messages(clip).into_iter().map(|(topic, at, seq, _)| (topic, at, seq)).collect();
+        contents.sort();
+        contents
+    }
+
+    /// The attachments of a clip, by name.
+    pub fn attachments(&self, clip: &Clip) -> BTreeMap<String, Vec<u8>> {
+        let bytes = fs::read(self.0.join(&clip.file)).unwrap();
+        let records = mcap::read::LinearReader::new(&bytes).unwrap();
+        let mut found = BTreeMap::new();
+        for record in records {
+            if let mcap::records::Record::Attachment { header, data, .. } = record.unwrap() {
+                found.insert(header.name, data.into_owned());
+            }
+        }
+        found
+    }
+
+    /// The journal of a lambda in a clip: its header, and the stamps of its wakes.
+    pub fn journal(&self, clip: &Clip, lambda: &str) -> (Header, Vec<i64>) {
+        let bytes = &self.attachments(clip)[&format!("journal/{lambda}.journal")];
+        let mut reader = Reader::open(bytes.as_slice()).unwrap();
+        let header = reader.header().clone();
+        let mut stamps = Vec::new();
+        while let Some(entry) = reader.next().unwrap() {
+            stamps.push(entry.at_ns);
+        }
+        assert_eq!(reader.end().unwrap().wakes, stamps.len() as u64);
+        (header, stamps)
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Topic, stamp, number and bytes.
+pub type Message = (String, i64, u32, Vec<u8>);
+
+pub fn topic(name: &str) -> Topic {
+    let type_name = if name.starts_with("/camera") { "sensor_msgs/msg/Image" } else { "test_msgs/msg/Number" };
+    Topic {
+        name: name.to_owned(),
+        type_name: type_name.to_owned(),
+        definitions: Some("int64 value\n".into()),
+        offered_qos: None,
+    }
+}
+
+/// A lambda that records, with windows in ms.
+pub fn member(name: &str, rolls_ms: (i64, i64, i64), topics: &[TopicId]) -> Member {
+    let (preroll, postroll, cooldown) = rolls_ms;
+    let text = format!(
+        r#"
+[lambda]
+name = "{name}"
+version = "1.2.3"
+kind = "python"
+entry = "main.py"
+[schedule]
+event = "numbers"
+[[input]]
+name = "numbers"
+topic = "/a"
+type = "test_msgs/msg/Number"
+[record]
+topics = ["/a"]
+preroll = "{preroll}ms"
+postroll = "{postroll}ms"
+cooldown = "{cooldown}ms"
+"#
+    );
+    let rules = Manifest::parse(&text, "lambda.toml").unwrap().record.unwrap();
+    let input = JournalInput {
+        name: "numbers".to_owned(),
+        topic: "/a".to_owned(),
+        wire_topic: "/a".to_owned(),
+        type_name: "test_msgs/msg/Number".to_owned(),
+    };
+    let header = Header {
+        gleaner: "0.1.0".to_owned(),
+        engine: "Python".to_owned(),
+        machine: "x".to_owned(),
+        lambda: name.to_owned(),
+        version: "1.2.3".to_owned(),
+        kind: Kind::Python,
+        files: Vec::new(),
+        models: Vec::new(),
+        inputs: vec![input],
+        event_input: Some(0),
+        config: serde_json::Map::new(),
+        remaps: Vec::new(),
+        clock: "log time of the drive".to_owned(),
+        wakes_before: 0,
+    };
+    Member { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
+}
+
+pub fn meta(at_ns: i64, seq: u64) -> SampleMeta {
+    SampleMeta { at_ns, publish_ns: at_ns, writer: Guid([7; 16]), seq, endian: Endian::Little, options: [0; 2] }
+}
+
+pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> Entry {
+    let trigger = |kind: &TriggerKind| Trigger {
+        kind: *kind,
+        label: "here".to_owned(),
+        score: Some(0.5),
+        attributes: serde_json::Map::new(),
+    };
+    Entry {
+        at_ns,
+        cause: Woken::Tick { missed: 0 },
+        seen: vec![Seen::default()],
+        triggers: kinds.iter().map(trigger).collect(),
+        fault: None,
+        fuel: None,
+        log: Said::default(),
+    }
+}
+
+/// A sample every `every_ms` on each topic, from `T0 + from_ms` to before `T0 + to_ms`; numbered by its ms. Each of
+/// `wakes` wakes a lambda after the samples of its ms.
+pub fn drive(
+    recorder: &mut Recorder,
+    topics: &[TopicId],
+    (from_ms, to_ms, every_ms): (i64, i64, i64),
+    wakes: &[(i64, LambdaId, &[TriggerKind])],
+) {
+    for ms in from_ms..to_ms {
+        if ms % every_ms == 0 {
+            for topic in topics {
+                recorder.sample(*topic, &meta(T0 + ms * MS, ms as u64), &ms.to_le_bytes()).unwrap();
+            }
+        }
+        for (_, lambda, kinds) in wakes.iter().filter(|(at, _, _)| *at == ms) {
+            recorder.wake(*lambda, &entry(T0 + ms * MS, kinds)).unwrap();
+        }
+    }
+}
+
+/// The stamps of a topic's messages in a clip, in ms after [`T0`].
+pub fn stamps(scratch: &Scratch, clip: &Clip, topic: &str) -> Vec<i64> {
+    let contents = scratch.contents(clip);
+    contents.iter().filter(|(name, _, _)| name == topic).map(|(_, at, _)| (at - T0) / MS).collect()
+}
+
+/// Every `every`-th number from `from` to `to`, both included.
+pub fn every(from: i64, to: i64, every: i64) -> Vec<i64> {
+    (from..=to).filter(|ms| ms % every == 0).collect()
+}
+
+/// Numbers that look random and are the same in each run (SplitMix64).
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn below(&mut self, n: u64) -> i64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) % n) as i64
+    }
+}

@@ -1,0 +1,93 @@
+//! What a journal notes of one topic: which samples came since the wake before, and how far back the lambda looked.
+
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+
+use gleaner_buffers::Lease;
+use gleaner_protocol::journal::Seen;
+use gleaner_transport::SampleMeta;
+
+use super::data::Topic;
+
+/// No sample was looked at in this wake.
+const NONE: u64 = u64::MAX;
+
+/// What arrived at a ring, summed up by the thread that fills it.
+#[derive(Default)]
+pub struct Arrivals {
+    wanted: AtomicBool,
+    digest: AtomicU32,
+}
+
+impl Arrivals {
+    /// Adds a sample that entered the ring, if anybody wants to know.
+    pub fn add(&self, meta: &SampleMeta, cdr: &[u8]) {
+        if self.wanted.load(Ordering::Relaxed) {
+            // A sum, so that the order in which two topics are read does not matter.
+            self.digest.fetch_add(sample_digest(meta, cdr), Ordering::Relaxed);
+        }
+    }
+}
+
+/// CRC-32 of a sample with its stamps: finds every flipped byte.
+fn sample_digest(meta: &SampleMeta, cdr: &[u8]) -> u32 {
+    let mut stamps = [0; 16];
+    stamps[..8].copy_from_slice(&meta.at_ns.to_le_bytes());
+    stamps[8..].copy_from_slice(&meta.publish_ns.to_le_bytes());
+    let mut digest = crc32fast::Hasher::new();
+    digest.update(&stamps);
+    digest.update(cdr);
+    digest.finalize()
+}
+
+/// How far back the lambda has looked in this wake. Written by its thread alone.
+pub(super) struct Looked(AtomicU64);
+
+impl Default for Looked {
+    fn default() -> Self {
+        Self(AtomicU64::new(NONE))
+    }
+}
+
+impl Looked {
+    /// Notes the oldest of the samples that a call hands out.
+    pub(super) fn at(&self, oldest: Option<&Lease<SampleMeta>>) {
+        if let Some(position) = oldest.and_then(Lease::position)
+            && position < self.0.load(Ordering::Relaxed)
+        {
+            self.0.store(position, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Follows one topic from wake to wake.
+pub struct Trace {
+    head: u64,
+}
+
+impl Trace {
+    /// Begins with what is in the ring of `topic` now; from here on its samples are summed up.
+    pub fn of(topic: &Topic) -> Self {
+        topic.arrivals.wanted.store(true, Ordering::Relaxed);
+        Self { head: topic.reader().head() }
+    }
+
+    /// Before a wake: notes what came since the one before.
+    pub fn begin(&mut self, topic: &Topic, seen: &mut Seen) {
+        let head = topic.reader().head();
+        seen.new = head - self.head;
+        self.head = head;
+        if seen.new > 0 {
+            seen.digest = topic.arrivals.digest.swap(0, Ordering::Relaxed);
+            seen.newest = topic.reader().newest().map(|lease| (lease.meta().writer.0, lease.meta().seq));
+        } else {
+            seen.digest = 0;
+        }
+        topic.looked.0.store(NONE, Ordering::Relaxed);
+    }
+
+    /// After a wake that `woken_by` caused, if it is a sample of this topic: notes how far back the lambda looked.
+    pub fn end(&self, topic: &Topic, woken_by: Option<u64>, seen: &mut Seen) {
+        let oldest = topic.looked.0.load(Ordering::Relaxed).min(woken_by.unwrap_or(NONE));
+        seen.reach = self.head.saturating_sub(oldest);
+    }
+}

@@ -1,0 +1,152 @@
+//! Which lambda made a decision: its files with their digests, its config, and what it ran on.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::journal::{FileDigest, Header, JournalInput};
+use gleaner_protocol::manifest::{ConfigValue, Manifest, Schedule};
+use gleaner_protocol::{BuildDir, Explain};
+use serde_json::{Map, Value};
+use sha2::{Digest, Sha256};
+
+use crate::input::Remap;
+
+/// Python's, which the interpreter writes beside what it imports.
+const LEFT_BY_PYTHON: &str = "__pycache__";
+/// More files than a build has, by far.
+const FILES_MAX: usize = 10_000;
+
+/// A build cannot be identified.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot take the digest of `{}`", path.display())]
+pub struct IdentityError {
+    path: PathBuf,
+    source: io::Error,
+}
+
+impl Explain for IdentityError {}
+
+/// What makes a lambda what it is.
+pub struct Identity<'a> {
+    /// Its manifest.
+    pub manifest: &'a Manifest,
+    /// Its build.
+    pub build: &'a BuildDir,
+    /// All of `[config]`, as the lambda gets it.
+    pub config: &'a [(String, ConfigValue)],
+    /// Other names for topics of the manifest.
+    pub remaps: &'a [Remap],
+    /// What runs it, with its version.
+    pub engine: String,
+    /// What the times of the journal are.
+    pub clock: &'a str,
+}
+
+impl Identity<'_> {
+    /// The first block of a journal.
+    ///
+    /// # Errors
+    ///
+    /// [`IdentityError`] names the file that cannot be read.
+    pub fn header(self) -> Result<Header, IdentityError> {
+        let Self { manifest, build, config, remaps, engine, clock } = self;
+        let lambda = &manifest.lambda;
+        let event = match &manifest.schedule {
+            Schedule::Event { input, .. } => manifest.inputs.iter().position(|known| known.name == *input),
+            Schedule::Periodic { .. } => None,
+        };
+        Ok(Header {
+            gleaner: env!("CARGO_PKG_VERSION").to_owned(),
+            engine,
+            machine: std::env::consts::ARCH.to_owned(),
+            lambda: lambda.name.to_string(),
+            version: lambda.version.to_string(),
+            kind: lambda.kind,
+            files: build_digests(build)?,
+            models: manifest.models.iter().map(model).collect(),
+            inputs: manifest.inputs.iter().map(|input| journal_input(input, remaps)).collect(),
+            event_input: event,
+            config: config.iter().map(|(key, value)| (key.clone(), json(value))).collect::<Map<_, _>>(),
+            remaps: remaps.iter().map(|remap| (remap.from.clone(), remap.to.clone())).collect(),
+            clock: clock.to_owned(),
+            wakes_before: 0,
+        })
+    }
+}
+
+fn model(model: &gleaner_protocol::manifest::Model) -> FileDigest {
+    FileDigest { path: model.file.to_string(), bytes: 0, sha256: model.sha256.to_string() }
+}
+
+fn journal_input(input: &gleaner_protocol::manifest::Input, remaps: &[Remap]) -> JournalInput {
+    let topic = input.topic.as_str();
+    JournalInput {
+        name: input.name.to_string(),
+        topic: topic.to_owned(),
+        wire_topic: Remap::apply(remaps, topic).to_owned(),
+        type_name: input.type_name.to_string(),
+    }
+}
+
+fn json(value: &ConfigValue) -> Value {
+    match value {
+        ConfigValue::Bool(value) => Value::from(*value),
+        ConfigValue::Int(value) => Value::from(*value),
+        ConfigValue::Float(value) => Value::from(*value),
+        ConfigValue::Text(value) => Value::from(value.as_str()),
+    }
+}
+
+/// Every file of a build, by its path in it.
+fn build_digests(build: &BuildDir) -> Result<Vec<FileDigest>, IdentityError> {
+    let mut files = Vec::new();
+    collect(build.path(), &mut files)?;
+    files.sort();
+    files
+        .into_iter()
+        .map(|path| {
+            let name = path.strip_prefix(build.path()).unwrap_or(&path).to_string_lossy().into_owned();
+            digest_of_file(&path).map(|digest| FileDigest { path: name, ..digest })
+        })
+        .collect()
+}
+
+fn collect(folder: &Path, files: &mut Vec<PathBuf>) -> Result<(), IdentityError> {
+    let failed = |source| IdentityError { path: folder.to_owned(), source };
+    for entry in fs::read_dir(folder).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let kind = entry.file_type().map_err(failed)?;
+        if kind.is_dir() && entry.file_name() != LEFT_BY_PYTHON {
+            collect(&entry.path(), files)?;
+        } else if !kind.is_dir() {
+            files.push(entry.path());
+        }
+        if files.len() > FILES_MAX {
+            return Err(failed(io::Error::other(format!("it holds more than {FILES_MAX} files"))));
+        }
+    }
+    Ok(())
+}
+
+fn digest_of_file(path: &Path) -> Result<FileDigest, IdentityError> {
+    let failed = |source| IdentityError { path: path.to_owned(), source };
+    let mut file = File::open(path).map_err(failed)?;
+    let mut digest = Sha256::new();
+    let bytes = io::copy(&mut file, &mut digest).map_err(failed)?;
+    Ok(FileDigest { path: path.to_string_lossy().into_owned(), bytes, sha256: hex(digest) })
+}
+
+/// One digest for all files of a lambda: of their paths and digests, a line each, as `sha256sum` writes them.
+pub fn lambda_digest(files: &[FileDigest]) -> String {
+    let mut digest = Sha256::new();
+    for file in files {
+        // Hashing cannot fail.
+        let _ = writeln!(digest, "{}  {}", file.sha256, file.path);
+    }
+    hex(digest)
+}
+
+fn hex(digest: Sha256) -> String {
+    digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}

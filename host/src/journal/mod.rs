@@ -1,0 +1,82 @@
+//! What is written down of each wake, so that the decision can be made again and compared. The format is
+//! `gleaner_protocol::journal`; here it is filled in.
+
+mod identity;
+
+pub use identity::{Identity, IdentityError, lambda_digest};
+
+use std::sync::Arc;
+
+use gleaner_protocol::Decision;
+use gleaner_protocol::journal::{Entry, Said, Seen, Woken};
+
+use crate::api::data::{Topic, Wake};
+use crate::api::log::Line;
+use crate::api::trace::Trace;
+
+/// Follows a lambda from wake to wake. It reuses its memory, so that a wake costs no allocation.
+pub struct Scribe {
+    topics: Vec<(Arc<Topic>, Trace)>,
+    /// The topic, and the position in its ring, of the sample that caused the wake.
+    woken_by: Option<(usize, u64)>,
+    entry: Entry,
+}
+
+impl Scribe {
+    /// Begins with what is in the rings now.
+    pub fn new(inputs: &[Arc<Topic>]) -> Self {
+        let topics: Vec<_> = inputs.iter().map(|topic| (Arc::clone(topic), Trace::of(topic))).collect();
+        let entry = Entry {
+            at_ns: 0,
+            cause: Woken::Tick { missed: 0 },
+            seen: vec![Seen::default(); topics.len()],
+            triggers: Vec::new(),
+            fault: None,
+            fuel: None,
+            log: Said::default(),
+        };
+        Self { topics, woken_by: None, entry }
+    }
+
+    /// Before a wake.
+    pub fn begin(&mut self, wake: &Wake) {
+        self.entry.at_ns = wake.at_ns();
+        self.woken_by = None;
+        match wake {
+            Wake::Event(sample) => {
+                let meta = sample.meta();
+                self.entry.cause = Woken::Sample { writer: meta.writer.0, seq: meta.seq };
+                let input = self.topics.iter().position(|(topic, _)| Arc::ptr_eq(topic, sample.topic()));
+                self.woken_by = input.zip(sample.position());
+            }
+            Wake::Tick(tick) => self.entry.cause = Woken::Tick { missed: tick.missed },
+        }
+        for ((topic, trace), seen) in self.topics.iter_mut().zip(&mut self.entry.seen) {
+            trace.begin(topic, seen);
+        }
+    }
+
+    /// After a wake that led to `decision` and wrote `log`.
+    pub fn end(&mut self, decision: &Decision, log: &[Line]) -> &Entry {
+        for (index, ((topic, trace), seen)) in self.topics.iter().zip(&mut self.entry.seen).enumerate() {
+            let woken_by = self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
+            trace.end(topic, woken_by, seen);
+        }
+        self.entry.triggers.clone_from(&decision.triggers);
+        self.entry.fault.clone_from(&decision.fault);
+        self.entry.fuel = decision.fuel;
+        self.entry.log = said(log);
+        &self.entry
+    }
+}
+
+fn said(log: &[Line]) -> Said {
+    let mut digest = crc32fast::Hasher::new();
+    for line in log {
+        digest.update(&[line.level as u8]);
+        digest.update(&(line.message.len() as u64).to_le_bytes());
+        digest.update(line.message.as_bytes());
+    }
+    let lines = u32::try_from(log.len()).unwrap_or(u32::MAX);
+    Said { lines, digest: if log.is_empty() { 0 } else { digest.finalize() } }
+}

@@ -1,0 +1,149 @@
+//! What a journal claims: which lambda decided what, and where that is written.
+
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read};
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::journal::{Difference, Entry, Header, JournalError, Reader};
+use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
+use gleaner_protocol::{BuildDir, Exit, Failure};
+use gleaner_transport::replay::read_extras;
+use serde_json::Value;
+
+use super::options::Options;
+use super::stage::DriveError;
+use crate::input::Remap;
+use crate::journal::Identity;
+
+/// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at most.
+const EXTRAS_BYTES: u64 = 256 << 20;
+
+/// A journal, opened.
+pub(super) struct Claim {
+    path: PathBuf,
+    reader: Reader<Box<dyn Read + Send>>,
+    /// Whether it is the part in a clip, which begins in the middle.
+    pub(super) is_part: bool,
+}
+
+impl Claim {
+    /// The journal of a replay.
+    pub(super) fn journal(path: &Path) -> Result<Self, Failure> {
+        let file = File::open(path).map_err(|error| {
+            Failure::caused_by(Exit::Usage, format!("cannot open journal `{}`", path.display()), &error)
+        })?;
+        Self::open(path, Box::new(BufReader::new(file)), false)
+    }
+
+    /// The part of the journal of `lambda` that a clip holds.
+    pub(super) fn clip(path: &Path, lambda: &str) -> Result<Self, Failure> {
+        let extras = read_extras(path, EXTRAS_BYTES).map_err(|error| Failure::from(DriveError(error)))?;
+        if !extras.is_whole {
+            let message = format!("clip `{}` is cut off or was never finished", path.display());
+            return Err(Failure::new(Exit::Usage, message).with_help("copy it again; a clip of Gleaner has its end"));
+        }
+        let wanted = format!("journal/{lambda}.journal");
+        let mut journals = extras.attachments.into_iter().filter(|attachment| attachment.name.starts_with("journal/"));
+        let mut others = Vec::new();
+        let part = journals.find_map(|attachment| {
+            let found = attachment.name == wanted;
+            others.push(attachment.name);
+            found.then_some(attachment.data)
+        });
+        let Some(part) = part else {
+            let message = format!("clip `{}` holds no journal of lambda `{lambda}`", path.display());
+            let help = if others.is_empty() {
+                "it was recovered after its recorder had died, or is no clip of Gleaner".to_owned()
+            } else {
+                format!("it holds `{}`: name that lambda with --lambda", others.join("`, `"))
+            };
+            return Err(Failure::new(Exit::Usage, message).with_help(help));
+        };
+        Self::open(path, Box::new(Cursor::new(part)), true)
+    }
+
+    fn open(path: &Path, bytes: Box<dyn Read + Send>, is_part: bool) -> Result<Self, Failure> {
+        let reader = Reader::open(bytes).map_err(|error| unusable(path, &error))?;
+        Ok(Self { path: path.to_owned(), reader, is_part })
+    }
+
+    pub(super) fn header(&self) -> &Header {
+        self.reader.header()
+    }
+
+    /// The next wake; none at the end.
+    pub(super) fn next(&mut self) -> Result<Option<Entry>, Failure> {
+        self.reader.next().map_err(|error| unusable(&self.path, &error))
+    }
+
+    pub(super) fn reader(&self) -> &Reader<Box<dyn Read + Send>> {
+        &self.reader
+    }
+
+    /// What the journal was made with, unless `set` and `remaps` say otherwise, which then has to be the same.
+    pub(super) fn options(
+        &self,
+        lambda: PathBuf,
+        build: BuildDir,
+        manifest: &Manifest,
+        drives: Vec<PathBuf>,
+        set: Vec<(String, String)>,
+        remaps: Vec<Remap>,
+    ) -> Result<Options, Failure> {
+        let header = self.header();
+        let remaps = if remaps.is_empty() {
+            let journaled = header.remaps.iter();
+            journaled.map(|(from, to)| Remap { from: from.clone(), to: to.clone() }).collect()
+        } else {
+            remaps
+        };
+        let mut options = Options { lambda, build, drives, config: Vec::new(), remaps };
+        // The files first: in those of another lambda, the journal's config may not even exist.
+        let without_config = Header { config: serde_json::Map::new(), ..header.clone() };
+        compare(&without_config, &options, manifest)?;
+        let set = if set.is_empty() { assignments(header) } else { set };
+        options.config = ConfigSet::resolve(manifest, &set)?;
+        compare(header, &options, manifest)?;
+        Ok(options)
+    }
+}
+
+/// The config of a journal, as `--set` would give it.
+fn assignments(header: &Header) -> Vec<(String, String)> {
+    let text = |value: &Value| match value {
+        Value::String(text) => text.clone(),
+        // As the manifest writes a whole number that is a float.
+        Value::Number(number) if number.is_f64() => ConfigValue::Float(number.as_f64().unwrap_or(0.0)).to_string(),
+        other => other.to_string(),
+    };
+    header.config.iter().map(|(key, value)| (key.clone(), text(value))).collect()
+}
+
+fn compare(header: &Header, options: &Options, manifest: &Manifest) -> Result<(), Failure> {
+    let Options { build, config, remaps, .. } = options;
+    let (engine, clock) = (header.engine.clone(), header.clock.as_str());
+    let now = Identity { manifest, build, config, remaps, engine, clock }.header()?;
+    match header.differs_from(&now) {
+        None => Ok(()),
+        Some(difference) => Err(different("this is not the lambda that wrote the journal", &difference)
+            .with_help("verify with the build, the --set and the --remap of the journal, or write a new one")),
+    }
+}
+
+/// Two sides that should be equal.
+pub(super) fn different(message: impl Into<String>, difference: &Difference) -> Failure {
+    let Difference { what, journal, now } = difference;
+    let mut failure = Failure::new(Exit::Differs, message);
+    failure.causes = vec![format!("{what}\nin the journal: {journal}\nnow:            {now}")];
+    failure
+}
+
+fn unusable(path: &Path, error: &JournalError) -> Failure {
+    let failure = Failure::caused_by(Exit::Usage, format!("the journal in `{}` cannot be used", path.display()), error);
+    match error {
+        JournalError::Damaged { .. } => {
+            failure.with_help("it was changed after it was written: copy it again, or write a new one")
+        }
+        _ => failure,
+    }
+}

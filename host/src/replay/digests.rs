@@ -1,0 +1,56 @@
+//! The checksums of the drives: which files they were, byte for byte.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::thread::{self, JoinHandle};
+
+use gleaner_protocol::Explain;
+use gleaner_protocol::journal::DriveDigest;
+
+/// Read at once.
+const PIECE: usize = 256 << 10;
+
+/// A drive cannot be read a second time.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot take the checksum of drive `{}`", path.display())]
+pub(super) struct DigestError {
+    path: PathBuf,
+    source: io::Error,
+}
+
+impl Explain for DigestError {}
+
+/// Checksums that are taken on a thread of its own while the lambda runs, from the files that it is about to read anyway.
+pub(super) struct Digests(JoinHandle<Result<Vec<DriveDigest>, DigestError>>);
+
+impl Digests {
+    pub(super) fn start(drives: Vec<PathBuf>) -> Self {
+        Self(thread::spawn(move || drives.iter().map(|drive| digest(drive)).collect()))
+    }
+
+    /// Waits for them.
+    pub(super) fn take(self) -> Result<Vec<DriveDigest>, DigestError> {
+        self.0.join().expect("reading a file does not panic")
+    }
+}
+
+fn digest(path: &Path) -> Result<DriveDigest, DigestError> {
+    let failed = |source| DigestError { path: path.to_owned(), source };
+    let mut file = File::open(path).map_err(failed)?;
+    let (mut crc, mut bytes, mut piece) = (crc32fast::Hasher::new(), 0, vec![0; PIECE]);
+    loop {
+        match file.read(&mut piece) {
+            Ok(0) => break,
+            Ok(n) => {
+                crc.update(&piece[..n]);
+                bytes += n as u64;
+            }
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(failed(error)),
+        }
+    }
+    // Where a drive lay says nothing about it.
+    let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+    Ok(DriveDigest { name, bytes, crc32: crc.finalize() })
+}

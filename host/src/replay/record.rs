@@ -1,0 +1,177 @@
+//! Clips in a replay: the recorder sees the drive's samples beside the lambda, and every wake after it.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use gleaner_protocol::journal::{Entry, Header};
+use gleaner_protocol::manifest::{Manifest, Record};
+use gleaner_protocol::{Clip, Exit, Failure};
+use gleaner_recorder::{Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId};
+use gleaner_transport::replay::Replay;
+use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+
+use super::{CLOCK, Options};
+use crate::input::Remap;
+use crate::journal::lambda_digest;
+
+/// A recorder over one lambda's `[record]`.
+pub(super) struct Recording {
+    shared: Arc<Mutex<Shared>>,
+    /// One for each topic, with what the recorder calls it.
+    lanes: Vec<Arc<Lane>>,
+    rules: Record,
+    lambda: Option<LambdaId>,
+}
+
+struct Shared {
+    /// There from the moment when the lambda is ready: what could not start must not touch earlier results.
+    recorder: Option<Recorder>,
+    /// Why it stopped. A sink can only say that a sample was not taken.
+    failed: Option<RecordError>,
+}
+
+/// One recorded topic.
+struct Lane {
+    shared: Arc<Mutex<Shared>>,
+    topic: Topic,
+    /// Whether the drive has it.
+    is_there: bool,
+    id: Mutex<Option<TopicId>>,
+}
+
+impl Sink for Lane {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        let mut shared = lock(&self.shared);
+        let Shared { recorder: Some(recorder), failed: failed @ None } = &mut *shared else {
+            return Verdict::NoSlot;
+        };
+        let Some(id) = *lock(&self.id) else { return Verdict::NoSlot };
+        match recorder.sample(id, meta, cdr) {
+            Ok(()) => Verdict::Taken,
+            Err(error) => {
+                *failed = Some(error);
+                Verdict::NoSlot
+            }
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Recording {
+    /// Subscribes the topics of `[record]`; none if the manifest has no such table.
+    ///
+    /// A topic that the drive does not have is no error: a vehicle's sensors differ from drive to drive. Its clips say so.
+    pub(super) fn subscribe(
+        manifest: &Manifest,
+        options: &Options,
+        drive: &mut Replay,
+    ) -> Result<Option<Self>, Failure> {
+        let Some(rules) = &manifest.record else { return Ok(None) };
+        let shared = Arc::new(Mutex::new(Shared { recorder: None, failed: None }));
+        let known = drive.topics();
+        let mut lanes = Vec::new();
+        for wanted in &rules.topics {
+            let name = Remap::apply(&options.remaps, wanted.as_str());
+            let found = known.iter().find(|topic| topic.topic == name);
+            if found.is_none() {
+                tracing::warn!(topic = %name, "the drive does not have this topic of [record]: clips are made without it");
+            }
+            let lane = Arc::new(Lane {
+                shared: Arc::clone(&shared),
+                topic: topic(name, found),
+                is_there: found.is_some(),
+                id: Mutex::new(None),
+            });
+            if let Some(found) = found {
+                let spec = TopicSpec {
+                    topic: found.topic.clone(),
+                    type_name: found.type_name.clone(),
+                    queue: 1,
+                    max_bytes: usize::try_from(rules.preroll_size.bytes()).unwrap_or(usize::MAX),
+                };
+                drive.subscribe(&spec, lane.clone()).map_err(|error| {
+                    Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error)
+                        .with_help("remove the topic from [record], or replay without clips: --no-record")
+                })?;
+            }
+            lanes.push(lane);
+        }
+        Ok(Some(Self { shared, lanes, rules: rules.clone(), lambda: None }))
+    }
+
+    /// Makes the recorder, in `out`. What an earlier replay left there is replaced; what a killed one left is recovered,
+    /// kept until the next, and said.
+    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
+        let (mut folder, recovered) = Folder::open(out)?;
+        for clip in &recovered {
+            tracing::warn!(clip = %clip.file.display(), "recovered a clip of an earlier replay, which did not end well");
+        }
+        folder.replace(&recovered)?;
+        let settings = Settings {
+            store: self.rules.store,
+            preroll_bytes: self.rules.preroll_size.bytes(),
+            max_length: self.rules.max_length,
+            folder: out.to_owned(),
+            clock: CLOCK.to_owned(),
+            prefault: false,
+        };
+        let mut recorder = Recorder::new(folder, settings)?;
+        let mut topics = Vec::new();
+        for lane in &self.lanes {
+            let id = if lane.is_there {
+                recorder.add_topic(lane.topic.clone())?
+            } else {
+                recorder.add_missing_topic(&lane.topic.name)?
+            };
+            *lock(&lane.id) = Some(id);
+            topics.push(id);
+        }
+        let (header, digest) = (header.clone(), lambda_digest(&header.files));
+        self.lambda = Some(recorder.add_lambda(Member { header, rules: self.rules.clone(), digest, topics }));
+        lock(&self.shared).recorder = Some(recorder);
+        Ok(())
+    }
+
+    /// After a wake: what it triggered opens or closes windows.
+    pub(super) fn wake(&self, entry: &Entry) -> Result<(), Failure> {
+        self.with(|recorder| match self.lambda {
+            Some(lambda) => recorder.wake(lambda, entry),
+            None => Ok(()),
+        })
+    }
+
+    /// After a sample: whether it could be kept.
+    pub(super) fn check(&self) -> Result<(), Failure> {
+        match lock(&self.shared).failed.take() {
+            None => Ok(()),
+            Some(error) => Err(error.into()),
+        }
+    }
+
+    /// At the end of the drive: closes what is open. Returns all clips.
+    pub(super) fn finish(&self, end_ns: i64) -> Result<Vec<Clip>, Failure> {
+        self.with(|recorder| {
+            recorder.finish(end_ns)?;
+            Ok(recorder.clips().to_vec())
+        })
+    }
+
+    fn with<T: Default>(&self, act: impl FnOnce(&mut Recorder) -> Result<T, RecordError>) -> Result<T, Failure> {
+        match &mut lock(&self.shared).recorder {
+            Some(recorder) => Ok(act(recorder)?),
+            None => Ok(T::default()),
+        }
+    }
+}
+
+fn topic(name: &str, found: Option<&DiscoveredTopic>) -> Topic {
+    Topic {
+        name: name.to_owned(),
+        type_name: found.map(|topic| topic.type_name.clone()).unwrap_or_default(),
+        definitions: found.and_then(|topic| topic.definitions_text.clone()),
+        offered_qos: found.and_then(|topic| topic.offered_qos.clone()),
+    }
+}

@@ -1,0 +1,187 @@
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::manifest::Kind;
+use crate::{Trigger, TriggerKind};
+
+/// One clip that was written: one line of `clips.jsonl`.
+///
+/// The order of the fields is the order of the keys in the file. A number that nobody knows is `null`, never 0.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Clip {
+    /// The file, relative to the folder that holds `clips.jsonl`, for example
+    /// `clips/hello-20180802T083451.136Z.mcap`.
+    pub file: PathBuf,
+    /// A small JPEG of the moment, relative to the same folder; `None` if the clip has no image.
+    pub thumbnail: Option<PathBuf>,
+    /// Length of the file.
+    pub bytes: u64,
+    /// Begin of what was asked for: of the earliest of its windows, in ns since the epoch of the drive.
+    pub from_ns: i64,
+    /// End of what was asked for: of the latest of its windows, inclusive.
+    pub to_ns: i64,
+    /// Stamp of its first message; `None` if it has none.
+    pub first_ns: Option<i64>,
+    /// Stamp of its last message; `None` if it has none.
+    pub last_ns: Option<i64>,
+    /// The lambdas whose windows it holds.
+    pub lambdas: Vec<ClipLambda>,
+    /// Triggers of these lambdas within it.
+    pub triggers: u64,
+    /// The first [`MOMENTS_MAX`](Self::MOMENTS_MAX) of the triggers; the file itself has more of them.
+    pub moments: Vec<Moment>,
+    /// What was recorded, and what of it is missing.
+    pub topics: Vec<ClipTopic>,
+    /// Why it holds less than was asked for, in words; empty if it holds all.
+    pub short: Vec<String>,
+    /// How it was saved, if the recorder died while it wrote it.
+    pub recovered: Option<Recovered>,
+}
+
+impl Clip {
+    /// Most moments in one line, so that a lambda that triggers in every wake leaves a line that people can read.
+    pub const MOMENTS_MAX: usize = 100;
+}
+
+/// A lambda one or more of whose windows are in a clip.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClipLambda {
+    /// Its name.
+    pub name: String,
+    /// Its version.
+    pub version: String,
+    /// What kind of lambda it is.
+    pub kind: Kind,
+    /// SHA-256 over the digests of its files, in hexadecimal digits.
+    pub digest: String,
+    /// How many of its windows the clip holds.
+    pub windows: u64,
+}
+
+/// A trigger, as a clip lists it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Moment {
+    /// The lambda that triggered.
+    pub lambda: String,
+    /// What it asked for.
+    pub kind: TriggerKind,
+    /// Its word for what it saw.
+    pub label: String,
+    /// How sure or how strong; always finite.
+    pub score: Option<f64>,
+    /// Stamp of the wake, in ns since the epoch of the drive.
+    pub at_ns: i64,
+}
+
+impl Moment {
+    /// `trigger` of the lambda of this name, in a wake at `at_ns`.
+    pub fn of(lambda: &str, trigger: &Trigger, at_ns: i64) -> Moment {
+        Moment {
+            lambda: lambda.to_owned(),
+            kind: trigger.kind,
+            label: trigger.label.clone(),
+            score: trigger.score,
+            at_ns,
+        }
+    }
+}
+
+/// A topic of a clip. `None` means that nobody knows, for example after the recorder died.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClipTopic {
+    /// The topic.
+    pub topic: String,
+    /// Its message type; `None` if it was asked for and never appeared.
+    pub type_name: Option<String>,
+    /// Messages of it in the clip.
+    pub messages: u64,
+    /// Messages of it that reached the recorder within the windows of the clip.
+    pub received: Option<u64>,
+    /// Messages that were lost before they reached the recorder.
+    pub lost: Option<u64>,
+    /// Messages that the preroll had to give up before the clip was opened.
+    pub overwritten: Option<u64>,
+    /// Messages that were larger than the preroll.
+    pub too_big: Option<u64>,
+}
+
+/// How a clip was saved after the recorder died.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Recovered {
+    /// Bytes behind the last whole chunk, which were thrown away.
+    pub lost_bytes: u64,
+    /// What happened and what is missing, in words.
+    pub what: String,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn clip() -> Clip {
+        let trigger = Trigger {
+            kind: TriggerKind::Event,
+            label: "hard-brake".to_owned(),
+            score: Some(0.5),
+            attributes: serde_json::Map::new(),
+        };
+        Clip {
+            file: "clips/hello-20180802T083451.136Z.mcap".into(),
+            thumbnail: None,
+            bytes: 4096,
+            from_ns: 1_000,
+            to_ns: 11_000,
+            first_ns: Some(1_001),
+            last_ns: None,
+            lambdas: vec![ClipLambda {
+                name: "hello".to_owned(),
+                version: "0.1.0".to_owned(),
+                kind: Kind::Wasm,
+                digest: "00ff".to_owned(),
+                windows: 2,
+            }],
+            triggers: 3,
+            moments: vec![Moment::of("hello", &trigger, 6_000)],
+            topics: vec![ClipTopic {
+                topic: "/imu/data".to_owned(),
+                type_name: Some("sensor_msgs/msg/Imu".to_owned()),
+                messages: 7,
+                received: Some(8),
+                lost: None,
+                overwritten: Some(1),
+                too_big: Some(0),
+            }],
+            short: vec!["the drive ended 2.1 s before the window did".to_owned()],
+            recovered: Some(Recovered { lost_bytes: 5, what: "the recorder died".to_owned() }),
+        }
+    }
+
+    #[test]
+    fn a_clip_is_one_line_with_the_keys_in_the_order_of_its_fields() {
+        let line = serde_json::to_string(&clip()).unwrap();
+        assert_eq!(
+            line,
+            concat!(
+                r#"{"file":"clips/hello-20180802T083451.136Z.mcap","thumbnail":null,"bytes":4096,"from_ns":1000,"#,
+                r#""to_ns":11000,"first_ns":1001,"last_ns":null,"lambdas":[{"name":"hello","version":"0.1.0","#,
+                r#""kind":"wasm","digest":"00ff","windows":2}],"triggers":3,"moments":[{"lambda":"hello","#,
+                r#""kind":"event","label":"hard-brake","score":0.5,"at_ns":6000}],"topics":[{"topic":"/imu/data","#,
+                r#""type_name":"sensor_msgs/msg/Imu","messages":7,"received":8,"lost":null,"overwritten":1,"#,
+                r#""too_big":0}],"short":["the drive ended 2.1 s before the window did"],"#,
+                r#""recovered":{"lost_bytes":5,"what":"the recorder died"}}"#
+            )
+        );
+        assert_eq!(serde_json::from_str::<Clip>(&line).unwrap(), clip());
+    }
+
+    #[test]
+    fn a_number_that_nobody_knows_stays_unknown() {
+        let mut unknown = clip();
+        let topic = &mut unknown.topics[0];
+        (topic.received, topic.lost, topic.overwritten, topic.too_big) = (None, None, None, None);
+        let line = serde_json::to_string(&unknown).unwrap();
+        assert!(line.contains(r#""received":null,"lost":null,"overwritten":null,"too_big":null"#), "{line}");
+        assert_eq!(serde_json::from_str::<Clip>(&line).unwrap(), unknown);
+    }
+}

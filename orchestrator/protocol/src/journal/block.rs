@@ -1,0 +1,58 @@
+//! The blocks of a journal: a head that vouches for itself and its payload, then the payload.
+
+/// First bytes of a journal. Bytes that a transfer as text would change tell such a transfer from damage.
+pub(super) const MAGIC: [u8; 8] = *b"\x89GLJRN\r\n";
+
+/// Magic, version, and six bytes that are 0.
+pub(super) const PREAMBLE_LEN: usize = 16;
+
+/// Kind, length, checksum of the payload, checksum of the head.
+pub(super) const HEAD_LEN: usize = 13;
+
+/// Longest payload. It holds the header of a build with 10,000 files, and the largest wake that the host allows.
+pub(super) const PAYLOAD_MAX: usize = 2 << 20;
+
+/// What is in a block. Blocks of other kinds are stepped over: a newer writer may have more to say.
+pub(super) mod kind {
+    /// The header, as JSON: the first block and no other.
+    pub(crate) const HEADER: u8 = 1;
+    /// Wakes.
+    pub(crate) const WAKES: u8 = 2;
+    /// The end, as JSON: the last block.
+    pub(crate) const END: u8 = 3;
+}
+
+/// What stands before a payload.
+pub(super) struct Head {
+    pub(super) kind: u8,
+    pub(super) len: u32,
+    pub(super) payload_crc: u32,
+}
+
+impl Head {
+    /// The bytes of the head of block number `index`.
+    pub(super) fn to_bytes(&self, index: u64) -> [u8; HEAD_LEN] {
+        let mut bytes = [0; HEAD_LEN];
+        bytes[0] = self.kind;
+        bytes[1..5].copy_from_slice(&self.len.to_le_bytes());
+        bytes[5..9].copy_from_slice(&self.payload_crc.to_le_bytes());
+        let crc = head_crc(&bytes, index);
+        bytes[9..].copy_from_slice(&crc.to_le_bytes());
+        bytes
+    }
+
+    /// The head of block number `index`; `None` if its checksum is of another one.
+    pub(super) fn from_bytes(bytes: &[u8; HEAD_LEN], index: u64) -> Option<Head> {
+        let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+        (word(9) == head_crc(bytes, index)).then(|| Head { kind: bytes[0], len: word(1), payload_crc: word(5) })
+    }
+}
+
+/// The head has a checksum of its own, so that a flipped length is damage and does not look like a file that was cut off.
+/// The number of the block is in it, so that a block that is missing or stands elsewhere is found.
+fn head_crc(bytes: &[u8; HEAD_LEN], index: u64) -> u32 {
+    let mut crc = crc32fast::Hasher::new();
+    crc.update(&index.to_le_bytes());
+    crc.update(&bytes[..9]);
+    crc.finalize()
+}

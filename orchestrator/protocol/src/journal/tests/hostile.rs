@@ -1,0 +1,247 @@
+//! Journals that somebody changed: each change is found, none makes the reader panic or take memory.
+
+use super::*;
+
+/// What reading all of `bytes` ends with.
+fn outcome(bytes: &[u8]) -> Result<(Vec<Entry>, bool), JournalError> {
+    let mut reader = Reader::open(bytes)?;
+    match read_all(&mut reader) {
+        (entries, None) => Ok((entries, reader.cut_off())),
+        (_, Some(error)) => Err(error),
+    }
+}
+
+#[test]
+fn any_changed_byte_of_a_finished_journal_is_found() {
+    let mut random = Random(21);
+    let mut entries = usual_entries(2, 5);
+    entries.push(any_entry(&mut random, 2));
+    let bytes = journal(&header(2), &entries, 3);
+    assert!(outcome(&bytes).is_ok());
+    for at in 0..bytes.len() {
+        for change in (0..8).map(|bit| 1 << bit).chain([0xff, random.next() as u8 | 1]) {
+            let mut changed = bytes.clone();
+            changed[at] ^= change;
+            let error = outcome(&changed).expect_err("a changed byte");
+            match at {
+                0..8 => assert!(matches!(error, JournalError::NotAJournal), "{at}: {error:?}"),
+                8..10 => assert!(matches!(error, JournalError::Version { .. }), "{at}: {error:?}"),
+                _ => assert!(
+                    matches!(error, JournalError::Damaged { offset, .. } if offset <= at as u64),
+                    "{at}: {error:?}"
+                ),
+            }
+        }
+    }
+}
+
+#[test]
+fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
+    let entries = usual_entries(1, 9);
+    let mut bytes = journal(&header(1), &entries, 3);
+    let head = |bytes: &[u8], at: usize| u32::from_le_bytes(bytes[at + 1..][..4].try_into().unwrap()) as usize;
+    let mut at = PREAMBLE_LEN;
+    for _ in 0..2 {
+        at += HEAD_LEN + head(&bytes, at);
+    }
+    bytes[at + HEAD_LEN + 4] ^= 1;
+    let mut reader = Reader::open(bytes.as_slice()).unwrap();
+    let (read, error) = read_all(&mut reader);
+    assert_eq!(read, entries[..3]);
+    let error = error.unwrap();
+    assert_eq!(error.to_string(), format!("the journal is damaged in block 2, at byte {at}, after 3 whole wakes"));
+    assert_eq!(std::error::Error::source(&error).unwrap().to_string(), "the checksum of the block is wrong");
+    let help = "it was changed after it was written: copy it again, or write a new one";
+    assert_eq!((error.help().as_deref(), error.exit()), (Some(help), Exit::Usage));
+    // It stays damaged, and is not taken for one that is cut off.
+    assert!(matches!(reader.next(), Err(JournalError::Damaged { block: 2, wake: 3, .. })));
+    assert!(!reader.cut_off() && reader.end().is_none());
+}
+
+#[test]
+fn a_block_that_is_missing_doubled_or_elsewhere_is_found() {
+    let entries = usual_entries(1, 9);
+    let bytes = journal(&header(1), &entries, 3);
+    let mut cuts = vec![PREAMBLE_LEN];
+    while *cuts.last().unwrap() < bytes.len() {
+        let at = *cuts.last().unwrap();
+        let len = u32::from_le_bytes(bytes[at + 1..][..4].try_into().unwrap()) as usize;
+        cuts.push(at + HEAD_LEN + len);
+    }
+    let block = |n: usize| &bytes[cuts[n]..cuts[n + 1]];
+    let of = |blocks: &[usize]| {
+        let mut all = bytes[..PREAMBLE_LEN].to_vec();
+        blocks.iter().for_each(|n| all.extend_from_slice(block(*n)));
+        outcome(&all)
+    };
+    assert_eq!(of(&[0, 1, 2, 3, 4]).unwrap(), (entries, false));
+    for order in [&[0, 2, 3, 4][..], &[0, 1, 1, 2, 3, 4], &[0, 2, 1, 3, 4], &[0, 1, 3, 4], &[1, 2, 3, 4]] {
+        assert!(matches!(of(order), Err(JournalError::Damaged { why: Damage::Head, .. })), "{order:?}");
+    }
+    let why = |blocks| match of(blocks) {
+        Err(JournalError::Damaged { why, .. }) => why,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(why(&[0, 1, 2, 3, 4, 4]), Damage::AfterEnd);
+}
+
+#[test]
+fn blocks_that_no_writer_writes_are_refused_though_their_checksums_are_right() {
+    let header = header(1);
+    let first = header_block(&header);
+    let why = |blocks: &[(u8, Vec<u8>)]| match outcome(&journal_of(blocks)) {
+        Err(JournalError::Damaged { why, .. }) => why,
+        other => panic!("{other:?}"),
+    };
+    let end = (kind::END, serde_json::to_vec(&end(0)).unwrap());
+    assert_eq!(why(std::slice::from_ref(&end)), Damage::NotAHeader { kind: kind::END });
+    assert_eq!(why(&[first.clone(), first.clone()]), Damage::SecondHeader);
+    assert_eq!(why(&[first.clone(), end.clone(), end]), Damage::AfterEnd);
+    assert!(matches!(why(&[first.clone(), (kind::END, b"{}".to_vec())]), Damage::Json(_)));
+    assert!(matches!(why(&[(kind::HEADER, b"[".repeat(100_000))]), Damage::Json(_)));
+    let many = Header { inputs: vec![header.inputs[0].clone(); 257], ..header.clone() };
+    assert_eq!(why(&[header_block(&many)]), Damage::Inputs { found: 257 });
+    let nowhere = Header { event_input: Some(1), ..header };
+    assert_eq!(why(&[header_block(&nowhere)]), Damage::EventInput);
+    let wakes = |payload: &[u8]| why(&[first.clone(), (kind::WAKES, payload.to_vec())]);
+    assert_eq!(wakes(&[]), Damage::Wake(Malformed::Short));
+    assert_eq!(wakes(&[0, 0]), Damage::AfterWakes);
+    assert_eq!(wakes(&[1, 1, 0, 0, 0]), Damage::AfterWakes);
+    assert_eq!(wakes(&[2, 1, 0, 0]), Damage::Wake(Malformed::Short));
+    let claim = [&[0xff; 9][..], &[1], &[1, 0, 0]].concat();
+    assert_eq!(wakes(&claim), Damage::Wake(Malformed::Short));
+}
+
+#[test]
+fn a_block_of_an_unknown_kind_is_stepped_over_and_counted() {
+    let mut payload = vec![1];
+    let entry = usual_entries(1, 1).remove(0);
+    Encoder::new(1).encode(&entry, &mut payload);
+    let blocks = [header_block(&header(1)), (200, vec![1, 2, 3]), (kind::WAKES, payload), (0, Vec::new())];
+    let bytes = journal_of(&blocks);
+    let mut reader = Reader::open(bytes.as_slice()).unwrap();
+    assert_eq!(read_all(&mut reader).0, [entry]);
+    assert_eq!((reader.unknown_blocks(), reader.cut_off()), (2, true));
+}
+
+#[test]
+fn keys_of_a_newer_header_are_ignored() {
+    let mut json = serde_json::to_value(header(1)).unwrap();
+    json.as_object_mut().unwrap().insert("mood".to_owned(), json!({"x": [1]}));
+    let bytes = journal_of(&[(kind::HEADER, serde_json::to_vec(&json).unwrap())]);
+    assert_eq!(Reader::open(bytes.as_slice()).unwrap().header(), &header(1));
+}
+
+#[test]
+fn a_length_that_no_block_has_is_damage_and_takes_no_memory() {
+    let mut bytes = journal_of(&[header_block(&header(1))]);
+    let head = Head { kind: kind::WAKES, len: u32::MAX, payload_crc: 0 };
+    bytes.extend_from_slice(&head.to_bytes(1));
+    let why = Damage::TooLong { len: u32::MAX };
+    assert!(matches!(outcome(&bytes), Err(JournalError::Damaged { why: found, .. }) if found == why));
+}
+
+#[test]
+fn other_versions_and_other_files_are_refused_with_a_way_out() {
+    let mut newer = journal(&header(1), &[], 1);
+    newer[8] = 2;
+    let error = outcome(&newer).unwrap_err();
+    assert_eq!(error.to_string(), "the journal is of version 2; this is a reader of version 1");
+    assert_eq!((error.help().as_deref(), error.exit()), (Some("use the gleaner that wrote it"), Exit::Usage));
+    for other in [&b"\x89MCAP0\r\n and so on, for long enough"[..], b"{", b"\x89GLJRN\n\n"] {
+        assert!(matches!(outcome(other), Err(JournalError::NotAJournal)));
+    }
+    let error = outcome(b"").unwrap_err();
+    assert_eq!(error.to_string(), "the journal ends after 0 bytes, before its header is whole");
+}
+
+#[test]
+fn what_cannot_be_read_stays_unreadable() {
+    struct Broken(Vec<u8>, usize);
+    impl std::io::Read for Broken {
+        fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+            let rest = &self.0[self.1..];
+            if rest.is_empty() {
+                self.1 = 0;
+                return Err(std::io::Error::other("gone"));
+            }
+            let n = rest.len().min(buffer.len());
+            buffer[..n].copy_from_slice(&rest[..n]);
+            self.1 += n;
+            Ok(n)
+        }
+    }
+    let bytes = journal_of(&[header_block(&header(1))]);
+    let mut reader = Reader::open(Broken(bytes, 0)).unwrap();
+    for _ in 0..2 {
+        let error = reader.next().unwrap_err();
+        assert!(matches!(error, JournalError::Read { .. }));
+        assert_eq!(error.exit(), Exit::Internal);
+    }
+}
+
+#[test]
+fn no_change_of_a_wake_makes_the_decoder_panic() {
+    let mut random = Random(22);
+    for inputs in [0, 1, 3] {
+        let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
+        (0..40).for_each(|_| encoder.encode(&any_entry(&mut random, inputs), &mut bytes));
+        let mut payload = vec![40];
+        payload.extend_from_slice(&bytes);
+        for _ in 0..4000 {
+            let mut changed = payload.clone();
+            for _ in 0..=random.below(4) {
+                let at = random.below(changed.len() as u64) as usize;
+                match random.below(4) {
+                    0 => changed.truncate(at + 1),
+                    1 => changed.insert(at, random.next() as u8),
+                    2 => changed[at] = 0xff,
+                    _ => changed[at] = random.next() as u8,
+                }
+            }
+            // The checksums are right, so that only the decoder stands in the way.
+            let bytes = journal_of(&[header_block(&header(inputs)), (kind::WAKES, changed)]);
+            let _ = outcome(&bytes);
+        }
+        for _ in 0..4000 {
+            let noise: Vec<_> = (0..random.below(60)).map(|_| random.next() as u8).collect();
+            let mut rest = noise.as_slice();
+            let mut decoder = Decoder::new(inputs);
+            while decoder.decode(&mut rest).is_ok() && !rest.is_empty() {}
+        }
+    }
+}
+
+#[test]
+fn what_a_wake_claims_is_checked_before_memory_is_taken() {
+    let decode = |inputs: usize, bytes: &[u8]| Decoder::new(inputs).decode(&mut &*bytes).unwrap_err();
+    let (tick, triggers, fault, log) = (1_u8, 1 << 4, 1 << 5, 1 << 6);
+    assert_eq!(decode(1 << 40 >> 20, &[tick, 0, 0]), Malformed::Short);
+    assert_eq!(decode(0, &[]), Malformed::Short);
+    assert_eq!(decode(0, &[tick, 0x80]), Malformed::Short);
+    assert_eq!(decode(0, &[&[tick][..], &[0xff; 10]].concat()), Malformed::Number);
+    assert_eq!(decode(0, &[1 << 7, 0]), Malformed::Unknown { what: "flags", value: 0x80 });
+    assert_eq!(decode(0, &[tick | 2, 0]), Malformed::Unknown { what: "flags", value: 3 });
+    assert_eq!(decode(0, &[tick | triggers, 0, 65]), Malformed::Triggers { found: 65 });
+    assert_eq!(decode(0, &[tick | triggers, 0, 64]), Malformed::Short);
+    let kind = Malformed::Unknown { what: "kind of trigger", value: 3 };
+    assert_eq!(decode(0, &[tick | triggers, 0, 1, 3, 0, 0]), kind);
+    let long_label = [tick | triggers, 0, 1, 0, 0xff, 0xff, 0xff, 0xff, 0x7f];
+    assert_eq!(decode(0, &long_label), Malformed::Short);
+    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 1, 0xff, 0]), Malformed::Text);
+    let nan = [&[tick | triggers, 0, 1, 4, 0][..], &f64::NAN.to_le_bytes(), &[0]].concat();
+    assert_eq!(decode(0, &nan), Malformed::Score);
+    let found = ATTRIBUTES_MAX as u64 + 1;
+    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 0, 0x81, 0x80, 8]), Malformed::LongAttributes { found });
+    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 0, 2, b'[', b']']), Malformed::Attributes);
+    let mut deep = vec![tick | triggers, 0, 1, 0, 0, 0x80, 0x80, 4];
+    deep.extend(br#"{"a":"#.repeat(1 << 14));
+    assert_eq!(decode(0, &deep), Malformed::Attributes);
+    let kind = Malformed::Unknown { what: "kind of fault", value: 8 | 7 << 5 };
+    assert_eq!(decode(0, &[tick | fault, 0, 8 | 7 << 5, 0]), kind);
+    assert_eq!(decode(0, &[tick | log, 0, 0xff, 0xff, 0xff, 0xff, 0x7f, 0, 0, 0, 0]), Malformed::Number);
+    let form = Malformed::Unknown { what: "form of a newest sample", value: 1 };
+    assert_eq!(decode(1, &[tick, 0, 1 << 5, 1, 0]), form);
+    let overflow = [&[tick, 0, 31][..], &[0xff; 9], &[1]].concat();
+    assert_eq!(decode(1, &overflow), Malformed::Number);
+}

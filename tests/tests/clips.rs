@@ -1,0 +1,240 @@
+//! Clips hold exactly the messages of their windows, and the readers of others can read them.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+
+use gleaner_protocol::Clip;
+use gleaner_tests::{Copy, Folder, Run, replay_to, root, sample_drive, shared_drive};
+use libtest_mimic::{Arguments, Failed, Trial};
+
+const TOPICS: [&str; 3] = ["/camera/front/compressed", "/imu/data", "/vehicle/speed"];
+
+fn main() -> ExitCode {
+    let mut trials = vec![
+        Trial::test("two_triggers_4_s_apart_give_one_clip", || windows("10,14", &[(5.0, 19.0, 2)])),
+        Trial::test("two_triggers_8_s_apart_overlap_too", || windows("10,18", &[(5.0, 23.0, 2)])),
+        Trial::test("two_triggers_11_s_apart_give_two_clips", || windows("10,21", &[(5.0, 15.0, 1), (16.0, 26.0, 1)])),
+        Trial::test("a_start_lasts_until_its_stop", starts_and_stops),
+        Trial::test("a_window_that_outlasts_the_drive_is_short_and_says_so", at_the_end),
+        Trial::test("a_preroll_from_before_the_drive_is_short_and_says_so", at_the_begin),
+        Trial::test("a_long_recording_goes_on_in_a_next_clip_without_a_gap", rolls_over),
+        Trial::test("what_the_preroll_has_no_room_for_is_counted_and_said", pushed_out),
+        Trial::test("a_preroll_on_disk_gives_the_same_clips", on_disk),
+        Trial::test("a_topic_that_the_drive_does_not_have_is_listed_with_no_message", missing_topic),
+        Trial::test("a_second_replay_replaces_the_clips_of_the_first", replaced),
+        Trial::test("without_record_there_are_no_clips", no_record),
+    ];
+    let mut read = |name: &'static str, drive: Result<PathBuf, String>, args: &'static [&'static str]| {
+        trials.push(match drive.and_then(|drive| python().map(|python| (drive, python))) {
+            Ok((drive, python)) => Trial::test(name, move || reads(&python, &drive, args)),
+            Err(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
+        });
+    };
+    read(
+        "mcap_rosbags_and_mcap_ros2_read_the_clips_of_the_sample_drive",
+        Ok(sample_drive()),
+        &["--set", "event_s=4,8,20,38"],
+    );
+    read(
+        "mcap_rosbags_and_mcap_ros2_read_the_clips_of_rec_brake_dark",
+        shared_drive("rec_brake_dark.mcap"),
+        &["--set", "event_s=5,9,35"],
+    );
+    libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+}
+
+/// The Python that `cargo xtask test` sets up, if it has the readers.
+fn python() -> Result<PathBuf, String> {
+    let python = root().join(".venv/bin/python3");
+    let has = Command::new(&python).args(["-I", "-c", "import mcap, mcap_ros2, rosbags"]).output();
+    if has.is_ok_and(|output| output.status.success()) {
+        return Ok(python);
+    }
+    Err("no Python with mcap, mcap-ros2-support and rosbags in .venv; run: cargo xtask test".to_owned())
+}
+
+fn alarm() -> PathBuf {
+    root().join("tests/lambdas/alarm/rust")
+}
+
+fn record(lambda: &Path, drive: &Path, args: &[&str]) -> Result<(Folder, Run), Failed> {
+    let out = Folder::new();
+    let run = replay_to(out.path(), lambda, &[drive.to_owned()], args);
+    if run.exit == 0 { Ok((out, run)) } else { Err(format!("exit {}: {}", run.exit, run.stderr).into()) }
+}
+
+fn seconds(run: &Run, at_ns: i64) -> f64 {
+    let start_ns = run.summary.as_ref().map_or(0, |summary| summary.start_ns);
+    (at_ns - start_ns) as f64 / 1e9
+}
+
+fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), Failed> {
+    if found == expected { Ok(()) } else { Err(format!("found {found:?}, expected {expected:?}").into()) }
+}
+
+/// Events at `event_s` give clips from, to and of so many triggers.
+fn windows(event_s: &str, expected: &[(f64, f64, u64)]) -> Result<(), Failed> {
+    let (out, run) = record(&alarm(), &sample_drive(), &["--set", &format!("event_s={event_s}")])?;
+    let tenths = |clip: &Clip| {
+        let [from, to] = [clip.from_ns, clip.to_ns].map(|at_ns| (seconds(&run, at_ns) * 10.0).round() / 10.0);
+        (from, to, clip.triggers)
+    };
+    same(&run.clips.iter().map(tenths).collect(), &expected.to_vec())?;
+    run.clips.iter().try_for_each(|clip| whole(out.path(), clip, clip.from_ns, clip.to_ns))
+}
+
+/// The clip is there with its thumbnail, and holds as many messages of each topic as the drive has in its window.
+fn whole(out: &Path, clip: &Clip, from_ns: i64, to_ns: i64) -> Result<(), Failed> {
+    let thumbnail = clip.thumbnail.as_ref().ok_or("no thumbnail")?;
+    same(&std::fs::read(out.join(thumbnail))?.starts_with(&[0xff, 0xd8]), &true)?;
+    same(&std::fs::metadata(out.join(&clip.file))?.len(), &clip.bytes)?;
+    let (drive, found) = (messages(&sample_drive())?, messages(&out.join(&clip.file))?);
+    let wanted = drive.into_iter().filter(|message| (from_ns..=to_ns).contains(&message.1)).collect::<Vec<_>>();
+    same(&found.len(), &wanted.len())?;
+    if found != wanted {
+        return Err("the messages differ".into());
+    }
+    for topic in &clip.topics {
+        let n = found.iter().filter(|message| message.0 == topic.topic).count() as u64;
+        same(&(topic.messages, topic.received, topic.overwritten, topic.too_big), &(n, Some(n), Some(0), Some(0)))?;
+        same(&topic.lost, &None)?;
+    }
+    Ok(())
+}
+
+/// Topic, log time, publish time and bytes.
+type Message = (String, i64, u64, Vec<u8>);
+
+/// Every message, sorted.
+fn messages(path: &Path) -> Result<Vec<Message>, Failed> {
+    let bytes = std::fs::read(path)?;
+    let mut all = Vec::new();
+    for message in mcap::MessageStream::new(&bytes)? {
+        let message = message?;
+        all.push((message.channel.topic.clone(), message.log_time as i64, message.publish_time, message.data.to_vec()));
+    }
+    all.sort();
+    Ok(all)
+}
+
+fn starts_and_stops() -> Result<(), Failed> {
+    let (out, run) = record(&alarm(), &sample_drive(), &["--set", "start_s=12", "--set", "stop_s=20"])?;
+    same(&run.clips.len(), &1)?;
+    let clip = &run.clips[0];
+    same(&[clip.from_ns, clip.to_ns].map(|at_ns| seconds(&run, at_ns).round()), &[7.0, 25.0])?;
+    same(&clip.short, &Vec::new())?;
+    whole(out.path(), clip, clip.from_ns, clip.to_ns)
+}
+
+fn at_the_end() -> Result<(), Failed> {
+    let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=38", "--set", "start_s=20"])?;
+    same(&run.clips.len(), &1)?;
+    let clip = &run.clips[0];
+    same(&clip.short.iter().any(|why| why.contains("the drive ended")), &true)?;
+    whole(out.path(), clip, clip.from_ns, i64::MAX)
+}
+
+fn at_the_begin() -> Result<(), Failed> {
+    let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=2"])?;
+    same(&run.clips.len(), &1)?;
+    let clip = &run.clips[0];
+    same(&clip.short.iter().any(|why| why.contains("preroll")), &true)?;
+    whole(out.path(), clip, i64::MIN, clip.to_ns)
+}
+
+fn rolls_over() -> Result<(), Failed> {
+    let lambda =
+        Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("[record]", "[record]\nmax_length = \"7s\""));
+    let (out, run) = record(lambda.path(), &sample_drive(), &["--set", "start_s=10", "--set", "stop_s=30"])?;
+    same(&(run.clips.len() >= 4), &true)?;
+    let (first, last) = (&run.clips[0], &run.clips[run.clips.len() - 1]);
+    let mut found = Vec::new();
+    for clip in &run.clips {
+        same(&(seconds(&run, clip.to_ns) - seconds(&run, clip.from_ns) <= 7.01), &true)?;
+        found.extend(messages(&out.path().join(&clip.file))?);
+    }
+    found.sort();
+    let drive = messages(&sample_drive())?.into_iter();
+    let wanted = drive.filter(|message| (first.from_ns..=last.to_ns).contains(&message.1)).collect::<Vec<_>>();
+    same(&(found == wanted, found.len()), &(true, wanted.len()))?;
+    same(&first.short.iter().any(|why| why.contains("next clip")), &true)
+}
+
+fn pushed_out() -> Result<(), Failed> {
+    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+        manifest
+            .replace("[record]", "[record]\npreroll_size = \"1 MiB\"")
+            .replace("preroll = \"5s\"", "preroll = \"20s\"")
+    });
+    let (out, run) = record(lambda.path(), &sample_drive(), &["--set", "event_s=30"])?;
+    same(&run.clips.len(), &1)?;
+    let clip = &run.clips[0];
+    let drive = messages(&sample_drive())?;
+    for topic in &clip.topics {
+        let wanted = drive
+            .iter()
+            .filter(|(name, at_ns, ..)| *name == topic.topic && (clip.from_ns..=clip.to_ns).contains(at_ns));
+        let wanted = wanted.count() as u64;
+        same(&(topic.messages < wanted, topic.received), &(true, Some(wanted)))?;
+        same(&topic.overwritten, &Some(wanted - topic.messages))?;
+    }
+    same(
+        &messages(&out.path().join(&clip.file))?.len(),
+        &(clip.topics.iter().map(|topic| topic.messages).sum::<u64>() as usize),
+    )?;
+    same(&clip.short.iter().any(|why| why.contains("preroll_size")), &true)
+}
+
+fn on_disk() -> Result<(), Failed> {
+    let lambda =
+        Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("[record]", "[record]\nstore = \"disk\""));
+    let args = ["--set", "event_s=10,14,30"];
+    let (ram_out, ram) = record(&alarm(), &sample_drive(), &args)?;
+    let (disk_out, disk) = record(lambda.path(), &sample_drive(), &args)?;
+    same(&(ram.clips.len(), disk.clips.len()), &(2, 2))?;
+    for (ram, disk) in ram.clips.iter().zip(&disk.clips) {
+        same(&(&ram.topics, ram.from_ns, ram.to_ns), &(&disk.topics, disk.from_ns, disk.to_ns))?;
+        let found = messages(&disk_out.path().join(&disk.file))?;
+        same(&(found == messages(&ram_out.path().join(&ram.file))?), &true)?;
+    }
+    Ok(())
+}
+
+fn missing_topic() -> Result<(), Failed> {
+    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("/vehicle/speed", "/lidar/points"));
+    let (_out, run) = record(lambda.path(), &sample_drive(), &["--set", "event_s=10"])?;
+    let lidar = run.clips[0].topics.iter().find(|topic| topic.topic == "/lidar/points").ok_or("it is not listed")?;
+    same(&(lidar.messages, lidar.received, &lidar.type_name), &(0, Some(0), &None))?;
+    same(&run.stderr.contains("/lidar/points"), &true)
+}
+
+fn replaced() -> Result<(), Failed> {
+    let (out, first) = record(&alarm(), &sample_drive(), &["--set", "event_s=10"])?;
+    let second = replay_to(out.path(), &alarm(), &[sample_drive()], &["--set", "event_s=25"]);
+    same(&(first.clips.len(), second.clips.len()), &(1, 1))?;
+    same(&out.path().join(&first.clips[0].file).exists(), &false)?;
+    same(&out.path().join(&second.clips[0].file).exists(), &true)
+}
+
+fn no_record() -> Result<(), Failed> {
+    let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10", "--no-record"])?;
+    same(&(run.clips.len(), out.path().join("clips").exists()), &(0, false))
+}
+
+/// Three readers of others find exactly the messages of each clip's window, byte for byte as in the drive.
+fn reads(python: &Path, drive: &Path, args: &[&str]) -> Result<(), Failed> {
+    let (out, run) = record(&alarm(), drive, args)?;
+    same(&(run.clips.len() >= 2), &true)?;
+    for clip in &run.clips {
+        let mut reader = Command::new(python);
+        reader.arg("-I").arg(root().join("tests/readers/clip.py")).arg(drive).arg(out.path().join(&clip.file));
+        reader.args([clip.from_ns, clip.to_ns].map(|at_ns| at_ns.to_string())).args(TOPICS.map(OsStr::new));
+        let output = reader.output()?;
+        if !output.status.success() {
+            return Err(String::from_utf8_lossy(&output.stderr).into_owned().into());
+        }
+        same(&String::from_utf8_lossy(&output.stdout).lines().count(), &3)?;
+    }
+    Ok(())
+}

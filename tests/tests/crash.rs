@@ -1,0 +1,228 @@
+//! Whatever ends the recorder, a clip that is listed is whole, and nothing under a final name is broken.
+//!
+//! `GLEANER_KILLS` says how often the process is killed; 25 times if it does not.
+
+use std::collections::BTreeSet;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode, Stdio};
+use std::sync::Arc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::Clip;
+use gleaner_recorder::Folder as Clips;
+use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive};
+use gleaner_transport::replay::Replay;
+use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use libtest_mimic::{Arguments, Failed, Trial};
+
+/// Events all along the drive, so that clips begin and end at many moments.
+const EVENTS: &str = "event_s=2,8,14,20,26,32,38";
+
+fn main() -> ExitCode {
+    let mut trials = vec![
+        Trial::test("a_recorder_killed_at_any_moment_leaves_nothing_broken", || killed("ram")),
+        Trial::test("a_recorder_with_its_preroll_on_disk_killed_at_any_moment_leaves_nothing_broken", || {
+            killed("disk")
+        }),
+    ];
+    let name = "a_full_disk_is_an_error_with_a_name_and_leaves_nothing_broken";
+    trials.push(if can_mount() {
+        Trial::test(name, full_disk)
+    } else {
+        Trial::test(format!("{name} [no file system can be mounted here]"), || Ok(())).with_ignored_flag(true)
+    });
+    libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+}
+
+/// `alarm`, with short windows, so that there are several clips.
+fn alarm(store: &str) -> Copy {
+    Copy::of("tests/lambdas/alarm/rust", |manifest| {
+        let manifest =
+            manifest.replace("preroll = \"5s\"", "preroll = \"2s\"").replace("postroll = \"5s\"", "postroll = \"2s\"");
+        manifest.replace("[record]", &format!("[record]\nstore = \"{store}\""))
+    })
+}
+
+fn replay(lambda: &Path, out: &Path) -> Command {
+    let mut replay = runtime();
+    replay.arg("replay").arg(lambda).arg(sample_drive()).args(["--set", EVENTS, "--out"]).arg(out);
+    replay.stdout(Stdio::null()).stderr(Stdio::null());
+    replay
+}
+
+fn killed(store: &str) -> Result<(), Failed> {
+    let lambda = alarm(store);
+    let out = Folder::new();
+    // The first compiles the lambda.
+    replay(lambda.path(), out.path()).status()?;
+    let started = Instant::now();
+    replay(lambda.path(), out.path()).status()?;
+    let whole = started.elapsed();
+    let kills = std::env::var("GLEANER_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(25);
+    let mut seen = [0_u32; 3];
+    let mut random = 0x9e37_79b9_7f4a_7c15_u64;
+    for kill in 0..kills {
+        // xorshift64: the moments differ, and a run can be repeated as far as a machine repeats itself.
+        random ^= random << 13;
+        random ^= random >> 7;
+        random ^= random << 17;
+        let out = Folder::new();
+        let mut child = replay(lambda.path(), out.path()).spawn()?;
+        thread::sleep(Duration::from_nanos((whole.as_nanos() as u64).saturating_mul(random % 1000) / 1000));
+        child.kill()?;
+        child.wait()?;
+        let found = inspect(out.path()).map_err(|why| format!("kill {kill}: {}", why.message().unwrap_or_default()))?;
+        seen[0] += u32::from(found.listed > 0);
+        seen[1] += u32::from(found.recovered > 0);
+        seen[2] += found.recovered as u32;
+    }
+    println!(
+        "{store}: of {kills} kills, {} left listed clips, {} left something to recover, {} clips recovered",
+        seen[0], seen[1], seen[2]
+    );
+    // Else the kills met nothing, and the test shows nothing.
+    if kills >= 25 && (seen[0] == 0 || seen[1] == 0) {
+        return Err(format!("no kill met a recorder at work: {seen:?}").into());
+    }
+    Ok(())
+}
+
+struct Found {
+    listed: usize,
+    recovered: usize,
+}
+
+/// Looks at what a process left: listed clips at once, the others after the next start.
+fn inspect(out: &Path) -> Result<Found, Failed> {
+    let listed = listed(out)?;
+    for clip in &listed {
+        whole(&out.join(&clip.file))?;
+    }
+    if !out.join("clips").exists() {
+        return Ok(Found { listed: 0, recovered: 0 });
+    }
+    let (_folder, recovered) = Clips::open(out)?;
+    let names = listed_names(out)?;
+    for entry in std::fs::read_dir(out.join("clips"))? {
+        let path = entry?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        match path.extension().and_then(OsStr::to_str) {
+            Some("mcap") => {
+                whole(&path)?;
+                if !names.contains(&name) {
+                    return Err(format!("`{name}` is not listed").into());
+                }
+            }
+            Some("jpg") => {
+                if !std::fs::read(&path)?.ends_with(&[0xff, 0xd9]) {
+                    return Err(format!("`{name}` is cut off").into());
+                }
+            }
+            _ if name.starts_with('.') => {}
+            _ => return Err(format!("`{name}` was left behind").into()),
+        }
+    }
+    Ok(Found { listed: listed.len(), recovered: recovered.len() })
+}
+
+/// The whole lines of `clips.jsonl`.
+fn listed(out: &Path) -> Result<Vec<Clip>, Failed> {
+    let text = std::fs::read_to_string(out.join("clips.jsonl")).unwrap_or_default();
+    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+    whole.lines().map(|line| Ok(serde_json::from_str(line)?)).collect()
+}
+
+fn listed_names(out: &Path) -> Result<BTreeSet<String>, Failed> {
+    let names =
+        listed(out)?.into_iter().map(|clip| clip.file.file_name().unwrap_or_default().to_string_lossy().into_owned());
+    Ok(names.collect())
+}
+
+/// Reads a clip to its end, all checksums included.
+fn whole(path: &PathBuf) -> Result<(), Failed> {
+    struct Nowhere;
+    impl Sink for Nowhere {
+        fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
+            Verdict::Taken
+        }
+    }
+    let failed = |error: &dyn std::error::Error| Failed::from(format!("{}: {error}", path.display()));
+    let mut clip = Replay::open(std::slice::from_ref(path)).map_err(|error| failed(&error))?;
+    for topic in clip.topics() {
+        let spec = TopicSpec { topic: topic.topic, type_name: topic.type_name, queue: 1, max_bytes: usize::MAX };
+        clip.subscribe(&spec, Arc::new(Nowhere)).map_err(|error| failed(&error))?;
+    }
+    while clip.step().map_err(|error| failed(&error))?.is_some() {}
+    Ok(())
+}
+
+/// In a mount namespace of its own: the disk is a small tmpfs, what is left on it is copied out.
+const ON_A_SMALL_DISK: &str = r#"
+set -e
+mount -t tmpfs -o size="$1" tmpfs "$2"
+shift
+disk=$1 copy=$2
+shift 2
+code=0
+"$@" > /dev/null 2> "$copy/stderr" || code=$?
+cp -a "$disk/." "$copy/left"
+echo "$code"
+"#;
+
+fn in_namespace(script: &str, args: &[&OsStr]) -> Command {
+    let mut unshare = Command::new("unshare");
+    unshare.args(["--user", "--map-root-user", "--mount", "sh", "-c", script, "sh"]).args(args);
+    unshare
+}
+
+fn can_mount() -> bool {
+    let folder = Folder::new();
+    let mount = in_namespace("mount -t tmpfs -o size=16k tmpfs \"$1\"", &[folder.path().as_ref()]).output();
+    mount.is_ok_and(|output| output.status.success())
+}
+
+fn full_disk() -> Result<(), Failed> {
+    for store in ["ram", "disk"] {
+        let lambda = alarm(store);
+        // The first compiles the lambda.
+        replay(lambda.path(), Folder::new().path()).status()?;
+        let (mut full, mut fits) = (0, 0);
+        let mut kib = 4;
+        while kib < 16_384 {
+            let (disk, copy) = (Folder::new(), Folder::new());
+            std::fs::create_dir(copy.path().join("left"))?;
+            let size = format!("{kib}k");
+            let (program, drive) = (program("gleaner-runtime"), sample_drive());
+            let mut args: Vec<&OsStr> = vec![size.as_ref(), disk.path().as_ref(), copy.path().as_ref()];
+            args.extend([program.as_os_str(), "replay".as_ref(), lambda.path().as_ref(), drive.as_ref()]);
+            args.extend(["--set".as_ref(), EVENTS.as_ref(), "--out".as_ref(), disk.path().as_os_str()]);
+            let mut replay = in_namespace(ON_A_SMALL_DISK, &args);
+            let output = replay.env("XDG_CACHE_HOME", root().join("target/test-cache")).output()?;
+            let said = std::fs::read_to_string(copy.path().join("stderr"))?;
+            let here = |why: &str| Failed::from(format!("{store}, {kib} KiB: {why}\n{said}"));
+            match String::from_utf8_lossy(&output.stdout).trim() {
+                "0" => fits += 1,
+                "1" => {
+                    full += 1;
+                    if said.contains("panicked") || !said.contains("error: cannot") || !said.contains("No space left") {
+                        return Err(here("the error does not say what happened"));
+                    }
+                    if !said.contains("make room") || !said.contains(&*disk.path().to_string_lossy()) {
+                        return Err(here("the error names neither the file nor the way out"));
+                    }
+                }
+                other => return Err(here(&format!("ended with {other}: {}", String::from_utf8_lossy(&output.stderr)))),
+            }
+            inspect(&copy.path().join("left")).map_err(|why| here(why.message().unwrap_or_default()))?;
+            // Closer together where more of the small writes happen.
+            kib += if kib < 256 { 12 } else { kib / 8 };
+        }
+        println!("{store}: {full} disks were too small, {fits} large enough");
+        if full < 20 || fits == 0 {
+            return Err(format!("{store}: {full} disks were too small, {fits} large enough").into());
+        }
+    }
+    Ok(())
+}

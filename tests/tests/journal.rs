@@ -1,0 +1,227 @@
+//! A journal makes every decision again, and whatever was changed since is found and named.
+
+use std::collections::BTreeMap;
+use std::ffi::OsStr;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use gleaner_tests::{Copy, Folder, Run, Verification, replay_to, root, sample_drive, verify};
+
+const HELLO: &str = "examples/hello/rust";
+const BRAKING: [&str; 2] = ["--set", "brake_mps2=-1.4"];
+
+struct Journaled {
+    out: Folder,
+    journal: PathBuf,
+    run: Run,
+}
+
+fn journaled(lambda: &Path, drive: &Path, args: &[&str]) -> Journaled {
+    let out = Folder::new();
+    let journal = out.path().join("wakes.journal");
+    let args = [args, &["--journal", journal.to_str().unwrap()]].concat();
+    let run = replay_to(out.path(), lambda, &[drive.to_owned()], &args);
+    Journaled { out, journal, run }
+}
+
+fn verify_drive(lambda: &Path, drive: &Path, journal: &Path, args: &[&str]) -> Verification {
+    let mut line: Vec<&OsStr> = vec!["replay".as_ref(), lambda.as_ref(), drive.as_ref(), "--verify".as_ref()];
+    line.push(journal.as_ref());
+    line.extend(args.iter().map(OsStr::new));
+    verify(&line)
+}
+
+fn verify_clip(lambda: &Path, clip: &Path) -> Verification {
+    verify(&["verify".as_ref(), clip.as_ref(), "--lambda".as_ref(), lambda.as_ref()])
+}
+
+#[track_caller]
+fn differs(verification: &Verification, exit: u8, words: &[&str]) {
+    assert_eq!(verification.exit, i32::from(exit), "{}", verification.stderr);
+    for word in words {
+        assert!(verification.stderr.contains(word), "no `{word}` in:\n{}", verification.stderr);
+    }
+    assert!(verification.verified.is_none());
+}
+
+/// The sample drive with a byte of its `n`th IMU message changed, in a file whose checksums are right.
+fn forged(folder: &Folder, n: usize) -> PathBuf {
+    let bytes = std::fs::read(sample_drive()).unwrap();
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = mcap::WriteOptions::new().profile("ros2").create(&mut file).unwrap();
+    let (mut channels, mut imu) = (BTreeMap::new(), 0);
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let mut message = message.unwrap();
+        let schema = message.channel.schema.as_ref().unwrap();
+        let channel = *channels.entry(message.channel.topic.clone()).or_insert_with(|| {
+            let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data).unwrap();
+            writer.add_channel(schema, &message.channel.topic, "cdr", &BTreeMap::new()).unwrap()
+        });
+        if message.channel.topic == "/imu/data" {
+            if imu == n {
+                let data = message.data.to_mut();
+                let last = data.len() - 1;
+                data[last] ^= 1;
+            }
+            imu += 1;
+        }
+        let mcap::Message { sequence, log_time, publish_time, .. } = message;
+        let header = mcap::records::MessageHeader { channel_id: channel, sequence, log_time, publish_time };
+        writer.write_to_known_channel(&header, &message.data).unwrap();
+    }
+    writer.finish().unwrap();
+    drop(writer);
+    folder.write(&format!("forged-{n}.mcap"), file.into_inner())
+}
+
+#[test]
+fn every_decision_of_every_lambda_is_made_again_faults_included() {
+    for lambda in ["examples/hello", "examples/brake-dark", "tests/lambdas/misbehave", "tests/lambdas/probe"] {
+        for kind in ["rust", "python"] {
+            let lambda = root().join(lambda).join(kind);
+            let args = if lambda.starts_with(root().join("examples")) { &BRAKING[..] } else { &[] };
+            let journaled = journaled(&lambda, &sample_drive(), args);
+            assert!([0, 6].contains(&journaled.run.exit), "{}", journaled.run.stderr);
+            let summary = journaled.run.summary.unwrap();
+            let again = verify_drive(&lambda, &sample_drive(), &journaled.journal, &[]);
+            let verified = again.verified.unwrap_or_else(|| panic!("{}: {}", lambda.display(), again.stderr));
+            assert_eq!((verified.wakes, verified.uncovered, verified.cut_off), (summary.wakes, 0, false));
+            assert_eq!(verified.notes, Vec::<String>::new());
+        }
+    }
+}
+
+#[test]
+fn a_changed_sample_is_found_with_its_input_and_its_wake() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let folder = Folder::new();
+    for n in [0, 1000, 4169] {
+        let again = verify_drive(&root().join(HELLO), &forged(&folder, n), &journaled.journal, &[]);
+        let wake = format!("wake {} of lambda `hello`", n + 1);
+        differs(&again, 4, &[&wake, "input `imu`", "in the journal:", "now:"]);
+    }
+}
+
+#[test]
+fn a_flipped_byte_anywhere_in_the_drive_is_found() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let (folder, whole) = (Folder::new(), std::fs::read(sample_drive()).unwrap());
+    for part in 0..24 {
+        let at = whole.len() / 24 * part + part * 131;
+        let mut bytes = whole.clone();
+        bytes[at] ^= 0x10;
+        let drive = folder.write("flipped.mcap", &bytes);
+        let again = verify_drive(&root().join(HELLO), &drive, &journaled.journal, &[]);
+        assert!([2, 4, 7].contains(&again.exit), "flip at {at}: exit {} {}", again.exit, again.stderr);
+        assert!(again.stderr.contains("flipped.mcap"), "flip at {at}: {}", again.stderr);
+    }
+}
+
+#[test]
+fn another_build_is_named_by_the_file_that_changed() {
+    for (lambda, file) in [(HELLO, "hello.wasm"), ("examples/hello/python", "main.py"), (HELLO, "lambda.toml")] {
+        let copy = Copy::of(lambda, |manifest| manifest);
+        let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
+        assert_eq!(journaled.run.exit, 0, "{}", journaled.run.stderr);
+        let path = copy.path().join("build").join(file);
+        let mut bytes = std::fs::read(&path).unwrap();
+        // In a comment, a name or a custom section: the lambda would run as before.
+        let last = bytes.len() - 1;
+        bytes[last] = if file.ends_with("wasm") { bytes[last] ^ 1 } else { b' ' };
+        copy.replace(file, &bytes);
+        let again = verify_drive(copy.path(), &sample_drive(), &journaled.journal, &[]);
+        differs(&again, 4, &["not the lambda that wrote the journal", file, "in the journal:"]);
+    }
+}
+
+#[test]
+fn another_config_is_named_by_its_key_and_the_same_one_need_not_be_given() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let again = |args: &[&str]| verify_drive(&root().join(HELLO), &sample_drive(), &journaled.journal, args);
+    assert_eq!(again(&BRAKING).exit, 0);
+    differs(&again(&["--set", "brake_mps2=-1.5"]), 4, &["config `brake_mps2`", "-1.4", "-1.5"]);
+}
+
+#[test]
+fn a_flipped_byte_in_the_journal_is_found() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let whole = std::fs::read(&journaled.journal).unwrap();
+    for part in 0..16 {
+        let at = whole.len() / 16 * part + part;
+        let mut bytes = whole.clone();
+        bytes[at] ^= 0x04;
+        let changed = journaled.out.write("changed.journal", &bytes);
+        let again = verify_drive(&root().join(HELLO), &sample_drive(), &changed, &[]);
+        differs(&again, 2, &["changed.journal"]);
+    }
+}
+
+#[test]
+fn a_journal_whose_writer_died_proves_what_it_holds() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let whole = std::fs::read(&journaled.journal).unwrap();
+    let cut = journaled.out.write("cut.journal", &whole[..whole.len() * 9 / 10]);
+    let again = verify_drive(&root().join(HELLO), &sample_drive(), &cut, &[]);
+    let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
+    assert!(verified.cut_off && verified.wakes > 100 && verified.wakes < 4170, "{verified:?}");
+}
+
+#[test]
+fn a_journal_is_not_written_over_a_drive() {
+    let folder = Folder::new();
+    let drive = folder.write("drive.mcap", std::fs::read(sample_drive()).unwrap());
+    let run = replay_to(folder.path(), &root().join(HELLO), &[sample_drive()], &["--journal", drive.to_str().unwrap()]);
+    run.must_exit(2);
+    assert!(run.stderr.contains("is no journal"), "{}", run.stderr);
+    assert_eq!(std::fs::read(drive).unwrap(), std::fs::read(sample_drive()).unwrap());
+}
+
+#[test]
+fn a_clip_proves_its_decisions_alone_and_says_which_it_cannot() {
+    for kind in ["rust", "python"] {
+        for example in ["hello", "brake-dark"] {
+            let lambda = root().join("examples").join(example).join(kind);
+            let journaled = journaled(&lambda, &sample_drive(), &BRAKING);
+            assert!(!journaled.run.clips.is_empty());
+            for clip in &journaled.run.clips {
+                let again = verify_clip(&lambda, &journaled.out.path().join(&clip.file));
+                let verified = again.verified.unwrap_or_else(|| panic!("{example} in {kind}: {}", again.stderr));
+                assert!(verified.wakes > 50 && verified.uncovered < verified.wakes / 2, "{verified:?}");
+                // Half a second of the first wakes reaches back before a clip that does not begin with the drive.
+                let from_the_start = clip.first_ns == journaled.run.summary.as_ref().map(|summary| summary.start_ns);
+                assert_eq!(verified.uncovered == 0, from_the_start, "{verified:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_clip_without_a_topic_that_the_lambda_reads_cannot_be_proved_alone() {
+    let lambda = Copy::of("examples/brake-dark/rust", |manifest| manifest.replace("\"/imu/data\", ", ""));
+    let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
+    let clip = journaled.out.path().join(&journaled.run.clips[0].file);
+    differs(&verify_clip(lambda.path(), &clip), 2, &["/imu/data", "[record]", "--verify"]);
+}
+
+#[test]
+fn a_changed_clip_is_found() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let whole = std::fs::read(journaled.out.path().join(&journaled.run.clips[0].file)).unwrap();
+    for part in 0..16 {
+        let at = whole.len() / 16 * part + part;
+        let mut bytes = whole.clone();
+        bytes[at] ^= 0x20;
+        let changed = journaled.out.write("changed.mcap", &bytes);
+        let again = verify_clip(&root().join(HELLO), &changed);
+        assert!([2, 4, 7].contains(&again.exit), "flip at {at}: exit {} {}", again.exit, again.stderr);
+    }
+}
+
+#[test]
+fn another_lambda_finds_no_journal_of_its_own_in_a_clip() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let clip = journaled.out.path().join(&journaled.run.clips[0].file);
+    let again = verify_clip(&root().join("examples/brake-dark/rust"), &clip);
+    differs(&again, 2, &["no journal of lambda `brake-dark`", "hello"]);
+    differs(&verify_clip(&root().join(HELLO), &sample_drive()), 2, &["no journal of lambda `hello`"]);
+}
