@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 use gleaner_protocol::Clip;
+use gleaner_tests::drive::corrupted;
 use gleaner_tests::{Copy, Folder, Run, replay_to, root, sample_drive, shared_drive};
 use libtest_mimic::{Arguments, Failed, Trial};
 
@@ -24,6 +25,9 @@ fn main() -> ExitCode {
         Trial::test("a_topic_that_the_drive_does_not_have_is_listed_with_no_message", missing_topic),
         Trial::test("a_second_replay_replaces_the_clips_of_the_first", replaced),
         Trial::test("without_record_there_are_no_clips", no_record),
+        Trial::test("two_topics_that_are_one_of_the_drive_are_recorded_once", one_of_two),
+        Trial::test("where_a_drive_is_damaged_its_clip_ends_short", damaged),
+        Trial::test("a_second_replay_at_once_does_not_touch_the_results_of_the_first", busy),
     ];
     let mut read = |name: &'static str, drive: Result<PathBuf, String>, args: &'static [&'static str]| {
         trials.push(match drive.and_then(|drive| python().map(|python| (drive, python))) {
@@ -220,6 +224,35 @@ fn replaced() -> Result<(), Failed> {
 fn no_record() -> Result<(), Failed> {
     let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10", "--no-record"])?;
     same(&(run.clips.len(), out.path().join("clips").exists()), &(0, false))
+}
+
+fn one_of_two() -> Result<(), Failed> {
+    let lambda =
+        Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("topics = [", "topics = [\"/imu/other\", "));
+    let args = ["--set", "event_s=10", "--remap", "/imu/other:=/imu/data"];
+    let (out, run) = record(lambda.path(), &sample_drive(), &args)?;
+    whole(out.path(), &run.clips[0], run.clips[0].from_ns, run.clips[0].to_ns)
+}
+
+fn damaged() -> Result<(), Failed> {
+    let (out, folder) = (Folder::new(), Folder::new());
+    let run = replay_to(out.path(), &alarm(), &[corrupted(&folder)], &["--set", "event_s=10", "--set", "start_s=12"]);
+    same(&(run.exit, run.clips.len()), &(7, 1))?;
+    let clip = &run.clips[0];
+    same(&clip.short.iter().any(|why| why.contains("the drive ended")), &true)?;
+    same(&(Some(clip.to_ns) >= clip.last_ns, messages(&out.path().join(&clip.file))?.len() > 1000), &(true, true))
+}
+
+fn busy() -> Result<(), Failed> {
+    let (out, _run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10"])?;
+    let (first, recovered) = gleaner_recorder::Folder::open(out.path())?;
+    same(&recovered.len(), &0)?;
+    let before = std::fs::read_to_string(out.path().join("decisions.jsonl"))?;
+    let second = replay_to(out.path(), &alarm(), &[sample_drive()], &["--set", "event_s=20"]);
+    same(&(second.exit, second.stderr.contains(&*out.path().to_string_lossy())), &(1, true))?;
+    same(&std::fs::read_to_string(out.path().join("decisions.jsonl"))?, &before)?;
+    drop(first);
+    Ok(())
 }
 
 /// Three readers of others find exactly the messages of each clip's window, byte for byte as in the drive.

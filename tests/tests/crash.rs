@@ -62,24 +62,35 @@ fn killed(store: &str) -> Result<(), Failed> {
     let whole = started.elapsed();
     let kills = std::env::var("GLEANER_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(25);
     let mut seen = [0_u32; 3];
+    let mut out = Folder::new();
     let mut random = 0x9e37_79b9_7f4a_7c15_u64;
     for kill in 0..kills {
         // xorshift64: the moments differ, and a run can be repeated as far as a machine repeats itself.
         random ^= random << 13;
         random ^= random >> 7;
         random ^= random << 17;
-        let out = Folder::new();
+        // Every third one meets what the two before it left, so that recovery is killed, too.
+        if kill % 3 == 0 {
+            out = Folder::new();
+        }
         let mut child = replay(lambda.path(), out.path()).spawn()?;
         thread::sleep(Duration::from_nanos((whole.as_nanos() as u64).saturating_mul(random % 1000) / 1000));
         child.kill()?;
         child.wait()?;
-        let found = inspect(out.path()).map_err(|why| format!("kill {kill}: {}", why.message().unwrap_or_default()))?;
+        let here = |why: Failed| Failed::from(format!("kill {kill}: {}", why.message().unwrap_or_default()));
+        for clip in listed(out.path())? {
+            whole(&out.path().join(&clip.file)).map_err(here)?;
+        }
+        if kill % 3 < 2 {
+            continue;
+        }
+        let found = inspect(out.path()).map_err(here)?;
         seen[0] += u32::from(found.listed > 0);
         seen[1] += u32::from(found.recovered > 0);
         seen[2] += found.recovered as u32;
     }
     println!(
-        "{store}: of {kills} kills, {} left listed clips, {} left something to recover, {} clips recovered",
+        "{store}: {kills} kills, three in each folder: {} folders had listed clips, {} something to recover, {} clips",
         seen[0], seen[1], seen[2]
     );
     // Else the kills met nothing, and the test shows nothing.

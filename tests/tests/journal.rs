@@ -74,19 +74,42 @@ fn forged(folder: &Folder, n: usize) -> PathBuf {
     folder.write(&format!("forged-{n}.mcap"), file.into_inner())
 }
 
+/// Replays with a journal and makes every decision again; gives the number of faults.
+fn proved(lambda: &Path, args: &[&str]) -> u64 {
+    let journaled = journaled(lambda, &sample_drive(), args);
+    assert!([0, 6].contains(&journaled.run.exit), "{}", journaled.run.stderr);
+    let summary = journaled.run.summary.unwrap();
+    let again = verify_drive(lambda, &sample_drive(), &journaled.journal, &[]);
+    let verified = again.verified.unwrap_or_else(|| panic!("{} {args:?}: {}", lambda.display(), again.stderr));
+    assert_eq!((verified.wakes, verified.triggers), (summary.wakes, summary.triggers));
+    assert_eq!((verified.uncovered, verified.cut_off, verified.notes), (0, false, Vec::new()));
+    summary.faults
+}
+
 #[test]
-fn every_decision_of_every_lambda_is_made_again_faults_included() {
-    for lambda in ["examples/hello", "examples/brake-dark", "tests/lambdas/misbehave", "tests/lambdas/probe"] {
+fn every_decision_of_every_lambda_is_made_again() {
+    for lambda in ["examples/hello", "examples/brake-dark", "tests/lambdas/probe", "tests/lambdas/ticker"] {
         for kind in ["rust", "python"] {
             let lambda = root().join(lambda).join(kind);
             let args = if lambda.starts_with(root().join("examples")) { &BRAKING[..] } else { &[] };
-            let journaled = journaled(&lambda, &sample_drive(), args);
-            assert!([0, 6].contains(&journaled.run.exit), "{}", journaled.run.stderr);
-            let summary = journaled.run.summary.unwrap();
-            let again = verify_drive(&lambda, &sample_drive(), &journaled.journal, &[]);
-            let verified = again.verified.unwrap_or_else(|| panic!("{}: {}", lambda.display(), again.stderr));
-            assert_eq!((verified.wakes, verified.uncovered, verified.cut_off), (summary.wakes, 0, false));
-            assert_eq!(verified.notes, Vec::<String>::new());
+            assert_eq!(proved(&lambda, args), 0);
+        }
+    }
+}
+
+#[test]
+fn every_fault_happens_again() {
+    let faults =
+        ["error", "panic", "event_then_error", "event_then_panic", "huge_label", "too_many_triggers", "nan_score"];
+    let wasm_faults = ["endless", "memory", "recurse"];
+    for (kind, behaviours) in [("rust", [&faults[..], &wasm_faults].concat()), ("python", faults.to_vec())] {
+        for behaviour in behaviours {
+            let lambda = root().join("tests/lambdas/misbehave").join(kind);
+            let faults = proved(&lambda, &["--set", &format!("behaviour={behaviour}")]);
+            assert!(faults > 4000, "{behaviour} in {kind} faulted {faults} times");
+        }
+        for behaviour in ["hold", "log_flood", "print"] {
+            proved(&root().join("tests/lambdas/misbehave").join(kind), &["--set", &format!("behaviour={behaviour}")]);
         }
     }
 }
@@ -201,6 +224,30 @@ fn a_clip_without_a_topic_that_the_lambda_reads_cannot_be_proved_alone() {
     let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
     differs(&verify_clip(lambda.path(), &clip), 2, &["/imu/data", "[record]", "--verify"]);
+}
+
+#[test]
+fn a_clip_that_shows_no_trigger_to_the_lambda_proves_nothing_and_says_so() {
+    // Half a second is what hello looks back.
+    let lambda = Copy::of(HELLO, |manifest| manifest.replace("preroll = \"5s\"", "preroll = \"100ms\""));
+    let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
+    let clip = journaled.out.path().join(&journaled.run.clips[2].file);
+    differs(&verify_clip(lambda.path(), &clip), 2, &["proves no trigger", "preroll", "--verify"]);
+}
+
+#[test]
+fn a_clip_proves_a_lambda_that_logs_more_than_the_rate_limit_lets_pass() {
+    let lambda = Copy::of("tests/lambdas/misbehave/rust", |manifest| {
+        let record = "[record]\ntopics = [\"/imu/data\"]\npreroll = \"2s\"\npostroll = \"0s\"\ncooldown = \"30s\"\n";
+        format!("{manifest}\n{record}")
+    });
+    // It triggers and then faults in every wake, so that each is a fresh lambda.
+    let journaled = journaled(lambda.path(), &sample_drive(), &["--set", "behaviour=event_then_error"]);
+    assert!(journaled.run.clips.len() >= 2);
+    let clip = journaled.out.path().join(&journaled.run.clips[1].file);
+    let again = verify_clip(lambda.path(), &clip);
+    let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
+    assert!(verified.triggers > verified.uncovered_triggers, "{verified:?}");
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         agree &= difference.is_none();
         let settings: String = example.set.iter().map(|set| format!(" --set {set}")).collect();
         verdicts.push(match difference {
-            None => format!("{} with{settings}: the Rust and the Python lambda decide the same", example.name),
+            None => format!("{} with{settings}: the Rust and the Python lambda decide and keep the same", example.name),
             Some(what) => format!("{} with{settings}: the Rust and the Python lambda DIFFER: {what}", example.name),
         });
     }
@@ -38,7 +38,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     for verdict in verdicts {
         println!("{verdict}");
     }
-    println!("\nclips of the Rust lambdas (the Python ones make the same):");
+    println!("\nclips of the Rust lambdas:");
     for line in clips {
         println!("{line}");
     }

@@ -99,6 +99,12 @@ pub(crate) fn difference([a, b]: &[Replayed; 2]) -> Option<String> {
     if a.summary.wakes != b.summary.wakes {
         return Some(format!("the number of wakes is {} and {}", a.summary.wakes, b.summary.wakes));
     }
+    let held = |twin: &Replayed| {
+        twin.clips.iter().map(|clip| (clip.from_ns, clip.to_ns, clip.topics.clone())).collect::<Vec<_>>()
+    };
+    if held(a) != held(b) {
+        return Some("the clips do not hold the same".to_owned());
+    }
     let (a, b) = (&a.decisions, &b.decisions);
     let differ = |(index, (a, b))| twins_differ(a, b).map(|what| format!("decision {}: {what}", index + 1));
     a.iter()

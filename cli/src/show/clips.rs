@@ -34,18 +34,11 @@ pub(super) fn write(text: &mut String, clips: &[Clip], summary: &Summary, paint:
     more(text, (clips.len() as u64).saturating_sub(SHOWN as u64))
 }
 
+/// What never came; what the recorder had to give up stands in `short`.
 fn losses(clip: &Clip) -> Vec<String> {
-    let of_topic = |topic: &gleaner_protocol::ClipTopic| {
-        let causes = [
-            (topic.lost, "before they reached the recorder"),
-            (topic.overwritten, "pushed out of the preroll"),
-            (topic.too_big, "larger than the preroll"),
-        ];
-        let name = visible(&topic.topic);
-        causes.map(|(count, why)| {
-            (count.unwrap_or(0), format!("{} of {name}, {why}", counted(count.unwrap_or(0), "message")))
-        })
-    };
-    let all = clip.topics.iter().flat_map(of_topic);
-    all.filter(|(count, _)| *count > 0).map(|(_, loss)| loss).collect()
+    let lost = clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));
+    let lines = lost.map(|(topic, lost)| {
+        format!("{} of {}, before they reached the recorder", counted(lost, "message"), visible(&topic.topic))
+    });
+    lines.collect()
 }

@@ -141,12 +141,15 @@ pub(crate) fn verified(verified: &Verified, paint: Paint) -> String {
 
 fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::Result {
     let name = visible(&verified.lambda);
-    let compared = counted(verified.wakes - verified.uncovered.min(verified.wakes), "decision");
-    writeln!(text, "{}: {}", paint.bold(&name), paint.green(&format!("{compared} made again, all the same")))?;
+    let compared = counted(verified.wakes.saturating_sub(verified.uncovered), "decision");
+    let triggers = counted(verified.triggers.saturating_sub(verified.uncovered_triggers), "trigger");
+    let same = format!("{compared} with {triggers} made again, all the same");
+    writeln!(text, "{}: {}", paint.bold(&name), paint.green(&same))?;
     if verified.uncovered > 0 {
         let wakes = counted(verified.uncovered, "wake");
+        let triggers = counted(verified.uncovered_triggers, "trigger");
         let why = "not compared: the lambda looked at samples from before the clip";
-        writeln!(text, "  {}", paint.yellow(&format!("{wakes} {why}")))?;
+        writeln!(text, "  {}", paint.yellow(&format!("{wakes} with {triggers} {why}")))?;
     }
     if verified.cut_off {
         let why = "the journal has no end: its writer died, or the drive was damaged; what it holds was compared";

@@ -196,7 +196,7 @@ fn clip() -> Clip {
     let line = format!(
         r#"{{"file":"clips/x.mcap","thumbnail":"clips/x.jpg","bytes":1048576,"from_ns":{},"to_ns":{},"first_ns":{},
         "last_ns":{},"lambdas":[],"triggers":1,"moments":[],"topics":[{{"topic":"/imu/data","type_name":null,"messages":1646,
-        "received":1650,"lost":null,"overwritten":3,"too_big":1}}],"short":["the drive ended 6.8 s before the window did"],
+        "received":1650,"lost":2,"overwritten":3,"too_big":1}}],"short":["the drive ended 6.8 s before the window did"],
         "recovered":null}}"#,
         at(5.8),
         at(15.8),
@@ -213,8 +213,7 @@ fn a_clip_is_shown_with_its_length_topics_thumbnail_and_what_is_missing() {
                     5.801 to 9.000 s  clips/x.mcap\n              \
                     3.2 s, 1.0 MiB: /imu/data 1,646; clips/x.jpg\n              \
                     short: the drive ended 6.8 s before the window did\n              \
-                    lost: 3 messages of /imu/data, pushed out of the preroll\n              \
-                    lost: 1 message of /imu/data, larger than the preroll\n";
+                    lost: 2 messages of /imu/data, before they reached the recorder\n";
     assert!(text.contains(shown), "{text}");
     assert!(text.ends_with("out/demo: decisions.jsonl, log.jsonl, summary.json, clips.jsonl, clips/\n"), "{text}");
 }
@@ -231,16 +230,24 @@ fn a_verified_journal_says_how_many_decisions_are_the_same_and_what_was_not_comp
     let mut proved = Verified {
         lambda: "hello".to_owned(),
         wakes: 4170,
+        triggers: 3,
         uncovered: 0,
+        uncovered_triggers: 0,
         cut_off: false,
         wall_s: 0.25,
         notes: Vec::new(),
     };
-    assert_eq!(verified(&proved, PLAIN), "hello: 4,170 decisions made again, all the same\n  0.250 s\n");
-    proved.uncovered = 50;
+    assert_eq!(
+        verified(&proved, PLAIN),
+        "hello: 4,170 decisions with 3 triggers made again, all the same\n  0.250 s\n"
+    );
+    (proved.uncovered, proved.uncovered_triggers) = (50, 1);
     proved.cut_off = true;
     proved.notes = vec!["machine: aarch64 in the journal, x86_64 now".to_owned()];
     let text = verified(&proved, PLAIN);
-    assert!(text.starts_with("hello: 4,120 decisions made again, all the same\n  50 wakes not compared"), "{text}");
+    assert!(
+        text.starts_with("hello: 4,120 decisions with 2 triggers made again, all the same\n  50 wakes with 1"),
+        "{text}"
+    );
     assert!(text.contains("the journal has no end") && text.contains("machine: aarch64"), "{text}");
 }

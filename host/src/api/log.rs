@@ -1,5 +1,6 @@
 //! Lines for people: cut, rate-limited, and every dropped one counted.
 
+use gleaner_protocol::journal::Said;
 use serde::Serialize;
 
 use super::Session;
@@ -39,6 +40,8 @@ pub(super) struct Log {
     dropped: u64,
     /// Second of the lambda's time, and the lines written in it.
     window: (i64, u32),
+    /// Lines since the last call of `said`, those included that were dropped, and the CRC-32 over them.
+    said: (u32, crc32fast::Hasher),
 }
 
 impl Log {
@@ -50,7 +53,19 @@ impl Log {
         self.dropped
     }
 
+    /// What was written since the last call, whether or not the rate limit let it pass: how much that is depends on wakes before.
+    pub(super) fn said(&mut self) -> Said {
+        let (lines, digest) = std::mem::take(&mut self.said);
+        Said { lines, digest: if lines == 0 { 0 } else { digest.finalize() } }
+    }
+
     fn write(&mut self, at_ns: i64, level: Level, message: &str) {
+        let message = cut(message, LINE_BYTES);
+        let (lines, digest) = &mut self.said;
+        *lines = lines.saturating_add(1);
+        digest.update(&[level as u8]);
+        digest.update(&(message.len() as u64).to_le_bytes());
+        digest.update(message.as_bytes());
         let second = at_ns.div_euclid(1_000_000_000);
         if self.window.0 != second {
             self.window = (second, 0);
@@ -60,7 +75,7 @@ impl Log {
             return;
         }
         self.window.1 += 1;
-        self.lines.push(Line { at_ns, level, message: cut(message, LINE_BYTES).to_owned() });
+        self.lines.push(Line { at_ns, level, message: message.to_owned() });
     }
 }
 

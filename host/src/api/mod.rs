@@ -15,6 +15,7 @@ mod values;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_protocol::Trigger;
+use gleaner_protocol::journal::Said;
 use gleaner_protocol::manifest::ConfigValue;
 
 use data::{DataError, Topic};
@@ -63,6 +64,11 @@ impl Session {
     /// Takes the log lines written since the last call.
     pub fn take_log(&self) -> Vec<Line> {
         self.lock().log.take()
+    }
+
+    /// What was written to the log since the last call, as a journal notes it.
+    pub fn take_said(&self) -> Said {
+        self.lock().log.said()
     }
 
     /// Log lines dropped by the rate limit, since the start.

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 
-use gleaner_buffers::Lease;
+use gleaner_buffers::{Lease, RingCounts};
 use gleaner_protocol::journal::Seen;
 use gleaner_transport::SampleMeta;
 
@@ -22,7 +22,6 @@ impl Arrivals {
     /// Adds a sample that entered the ring, if anybody wants to know.
     pub fn add(&self, meta: &SampleMeta, cdr: &[u8]) {
         if self.wanted.load(Ordering::Relaxed) {
-            // A sum, so that the order in which two topics are read does not matter.
             self.digest.fetch_add(sample_digest(meta, cdr), Ordering::Relaxed);
         }
     }
@@ -39,6 +38,12 @@ fn sample_digest(meta: &SampleMeta, cdr: &[u8]) -> u32 {
     digest.finalize()
 }
 
+/// Samples of `topic` so far, those included that found no room in its ring.
+pub fn offered(topic: &Topic) -> u64 {
+    let RingCounts { received, no_slot, too_big, .. } = topic.reader().counts();
+    received + no_slot + too_big
+}
+
 /// How far back the lambda has looked in this wake. Written by its thread alone.
 pub(super) struct Looked(AtomicU64);
 
@@ -49,6 +54,11 @@ impl Default for Looked {
 }
 
 impl Looked {
+    /// Notes a look at what became of all samples so far.
+    pub(super) fn at_all(&self) {
+        self.0.store(0, Ordering::Relaxed);
+    }
+
     /// Notes the oldest of the samples that a call hands out.
     pub(super) fn at(&self, oldest: Option<&Lease<SampleMeta>>) {
         if let Some(position) = oldest.and_then(Lease::position)
@@ -60,7 +70,11 @@ impl Looked {
 }
 
 /// Follows one topic from wake to wake.
+///
+/// What it reads here belongs together only while no sample arrives meanwhile, as in a replay. Where topics have threads of their
+/// own, the ring has to be read as of one instant, and the lambda must see no more than that.
 pub struct Trace {
+    offered: u64,
     head: u64,
 }
 
@@ -68,15 +82,18 @@ impl Trace {
     /// Begins with what is in the ring of `topic` now; from here on its samples are summed up.
     pub fn of(topic: &Topic) -> Self {
         topic.arrivals.wanted.store(true, Ordering::Relaxed);
-        Self { head: topic.reader().head() }
+        Self { offered: offered(topic), head: topic.reader().head() }
     }
 
     /// Before a wake: notes what came since the one before.
     pub fn begin(&mut self, topic: &Topic, seen: &mut Seen) {
+        let offered = offered(topic);
+        seen.new = offered - self.offered;
+        self.offered = offered;
         let head = topic.reader().head();
-        seen.new = head - self.head;
+        let arrived = head > self.head;
         self.head = head;
-        if seen.new > 0 {
+        if arrived {
             seen.digest = topic.arrivals.digest.swap(0, Ordering::Relaxed);
             seen.newest = topic.reader().newest().map(|lease| (lease.meta().writer.0, lease.meta().seq));
         } else {

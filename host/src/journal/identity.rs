@@ -12,8 +12,6 @@ use sha2::{Digest, Sha256};
 
 use crate::input::Remap;
 
-/// Python's, which the interpreter writes beside what it imports.
-const LEFT_BY_PYTHON: &str = "__pycache__";
 /// More files than a build has, by far.
 const FILES_MAX: usize = 10_000;
 
@@ -117,9 +115,9 @@ fn collect(folder: &Path, files: &mut Vec<PathBuf>) -> Result<(), IdentityError>
     for entry in fs::read_dir(folder).map_err(failed)? {
         let entry = entry.map_err(failed)?;
         let kind = entry.file_type().map_err(failed)?;
-        if kind.is_dir() && entry.file_name() != LEFT_BY_PYTHON {
+        if kind.is_dir() {
             collect(&entry.path(), files)?;
-        } else if !kind.is_dir() {
+        } else {
             files.push(entry.path());
         }
         if files.len() > FILES_MAX {

@@ -11,7 +11,6 @@ use gleaner_protocol::Decision;
 use gleaner_protocol::journal::{Entry, Said, Seen, Woken};
 
 use crate::api::data::{Topic, Wake};
-use crate::api::log::Line;
 use crate::api::trace::Trace;
 
 /// Follows a lambda from wake to wake. It reuses its memory, so that a wake costs no allocation.
@@ -56,8 +55,8 @@ impl Scribe {
         }
     }
 
-    /// After a wake that led to `decision` and wrote `log`.
-    pub fn end(&mut self, decision: &Decision, log: &[Line]) -> &Entry {
+    /// After a wake that led to `decision` and said `log`.
+    pub fn end(&mut self, decision: &Decision, log: Said) -> &Entry {
         for (index, ((topic, trace), seen)) in self.topics.iter().zip(&mut self.entry.seen).enumerate() {
             let woken_by = self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
             trace.end(topic, woken_by, seen);
@@ -65,18 +64,7 @@ impl Scribe {
         self.entry.triggers.clone_from(&decision.triggers);
         self.entry.fault.clone_from(&decision.fault);
         self.entry.fuel = decision.fuel;
-        self.entry.log = said(log);
+        self.entry.log = log;
         &self.entry
     }
-}
-
-fn said(log: &[Line]) -> Said {
-    let mut digest = crc32fast::Hasher::new();
-    for line in log {
-        digest.update(&[line.level as u8]);
-        digest.update(&(line.message.len() as u64).to_le_bytes());
-        digest.update(line.message.as_bytes());
-    }
-    let lines = u32::try_from(log.len()).unwrap_or(u32::MAX);
-    Said { lines, digest: if log.is_empty() { 0 } else { digest.finalize() } }
 }

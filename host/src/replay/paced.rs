@@ -25,41 +25,55 @@ pub(super) enum PaceError {
 /// A drive with a lane for each subscription.
 pub(super) struct Paced {
     drive: Replay,
-    lanes: Vec<Lane>,
+    lanes: Vec<Arc<Gate>>,
     waiting_bytes: Arc<AtomicUsize>,
     ended: bool,
 }
 
-struct Lane {
+/// One lane's way from the drive to its sink. The drive fills it and the comparison empties it, on one thread.
+struct Gate {
     /// Where samples go when it is their turn.
     sink: Arc<dyn Sink>,
-    waiting: Arc<Waiting>,
+    state: Mutex<State>,
+    /// Bytes that wait, of all lanes.
+    waiting_bytes: Arc<AtomicUsize>,
 }
 
-/// Samples of one lane that were read and not delivered.
 #[derive(Default)]
-struct Waiting {
-    samples: Mutex<VecDeque<(SampleMeta, Vec<u8>)>>,
-    /// Of all lanes.
-    bytes: Arc<AtomicUsize>,
+struct State {
+    /// How many samples may pass.
+    owed: u64,
+    /// Samples that came before their turn.
+    waiting: VecDeque<(SampleMeta, Vec<u8>)>,
 }
 
-impl Waiting {
-    fn lock(&self) -> MutexGuard<'_, VecDeque<(SampleMeta, Vec<u8>)>> {
-        self.samples.lock().unwrap_or_else(PoisonError::into_inner)
+impl Gate {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn pop(&self) -> Option<(SampleMeta, Vec<u8>)> {
-        let (meta, cdr) = self.lock().pop_front()?;
-        self.bytes.fetch_sub(cdr.len(), Ordering::Relaxed);
-        Some((meta, cdr))
+    /// Lets `n` more samples pass: those that wait at once.
+    fn owe(&self, n: u64) {
+        let mut state = self.lock();
+        state.owed = state.owed.saturating_add(n);
+        while state.owed > 0 {
+            let Some((meta, cdr)) = state.waiting.pop_front() else { break };
+            state.owed -= 1;
+            self.waiting_bytes.fetch_sub(cdr.len(), Ordering::Relaxed);
+            self.sink.deliver(&meta, &cdr);
+        }
     }
 }
 
-impl Sink for Waiting {
+impl Sink for Gate {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        self.bytes.fetch_add(cdr.len(), Ordering::Relaxed);
-        self.lock().push_back((*meta, cdr.to_vec()));
+        let mut state = self.lock();
+        if state.owed > 0 {
+            state.owed -= 1;
+            return self.sink.deliver(meta, cdr);
+        }
+        self.waiting_bytes.fetch_add(cdr.len(), Ordering::Relaxed);
+        state.waiting.push_back((*meta, cdr.to_vec()));
         Verdict::Taken
     }
 }
@@ -69,13 +83,12 @@ impl Paced {
         Self { drive, lanes: Vec::new(), waiting_bytes: Arc::default(), ended: false }
     }
 
-    /// Delivers the next sample of `lane`; none at the end of the drive.
-    pub(super) fn deliver(&mut self, lane: usize) -> Result<Option<Verdict>, PaceError> {
-        if !self.reach(lane, 1)? {
-            return Ok(None);
-        }
-        let Lane { sink, waiting } = &self.lanes[lane];
-        Ok(waiting.pop().map(|(meta, cdr)| sink.deliver(&meta, &cdr)))
+    /// Delivers the next so many samples of each lane. Fewer pass where the drive ends before.
+    pub(super) fn deliver(&mut self, owed: impl Iterator<Item = u64>) -> Result<(), PaceError> {
+        self.lanes.iter().zip(owed).for_each(|(lane, n)| lane.owe(n));
+        while self.lanes.iter().any(|lane| lane.lock().owed > 0) && self.step()? {}
+        self.lanes.iter().for_each(|lane| lane.lock().owed = 0);
+        Ok(())
     }
 
     /// How many samples of `lane` come up to and with the one that `is_wanted`; none if there is none up to `until_ns`.
@@ -84,41 +97,31 @@ impl Paced {
         lane: usize,
         until_ns: i64,
         is_wanted: impl Fn(&SampleMeta) -> bool,
-    ) -> Result<Option<usize>, PaceError> {
+    ) -> Result<Option<u64>, PaceError> {
         let mut n = 0;
-        while self.reach(lane, n + 1)? {
-            let meta = self.lanes[lane].waiting.lock()[n].0;
-            if is_wanted(&meta) {
-                return Ok(Some(n + 1));
+        loop {
+            let next = self.lanes[lane].lock().waiting.get(n).map(|(meta, _)| *meta);
+            match next {
+                Some(meta) if is_wanted(&meta) => return Ok(Some(n as u64 + 1)),
+                Some(meta) if meta.at_ns > until_ns => return Ok(None),
+                Some(_) => n += 1,
+                None if self.step()? => {}
+                None => return Ok(None),
             }
-            if meta.at_ns > until_ns {
-                break;
-            }
-            n += 1;
         }
-        Ok(None)
     }
 
-    /// Reads on until `n` samples of `lane` wait; false if the drive ends before.
-    fn reach(&mut self, lane: usize, n: usize) -> Result<bool, PaceError> {
-        let waits = |lane: &Lane| lane.waiting.lock().len();
-        while waits(&self.lanes[lane]) < n {
-            if self.ended {
-                return Ok(false);
-            }
-            match self.drive.step() {
-                Ok(Some(_)) => {}
-                Ok(None) => self.ended = true,
-                Err(error) => {
-                    self.ended = true;
-                    return Err(error.into());
-                }
-            }
-            if self.waiting_bytes.load(Ordering::Relaxed) > WAITING_BYTES {
-                return Err(PaceError::TooFarAhead);
-            }
+    /// Reads one sample; false at the end.
+    fn step(&mut self) -> Result<bool, PaceError> {
+        if self.ended {
+            return Ok(false);
         }
-        Ok(true)
+        let step = self.drive.step();
+        self.ended = !matches!(step, Ok(Some(_)));
+        if step?.is_some() && self.waiting_bytes.load(Ordering::Relaxed) > WAITING_BYTES {
+            return Err(PaceError::TooFarAhead);
+        }
+        Ok(!self.ended)
     }
 
     pub(super) fn start_ns(&self) -> i64 {
@@ -132,9 +135,9 @@ impl Transport for Paced {
     }
 
     fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
-        let waiting = Arc::new(Waiting { samples: Mutex::default(), bytes: self.waiting_bytes.clone() });
-        let subscription = self.drive.subscribe(spec, waiting.clone())?;
-        self.lanes.push(Lane { sink, waiting });
+        let gate = Arc::new(Gate { sink, state: Mutex::default(), waiting_bytes: self.waiting_bytes.clone() });
+        let subscription = self.drive.subscribe(spec, gate.clone())?;
+        self.lanes.push(gate);
         Ok(subscription)
     }
 

@@ -20,6 +20,8 @@ pub(super) struct Recording {
     /// One for each topic, with what the recorder calls it.
     lanes: Vec<Arc<Lane>>,
     rules: Record,
+    /// Where clips go, and what was recovered there; until the recorder has it.
+    folder: Option<(Folder, Vec<Clip>)>,
     lambda: Option<LambdaId>,
 }
 
@@ -64,10 +66,13 @@ impl Recording {
     /// Subscribes the topics of `[record]`; none if the manifest has no such table.
     ///
     /// A topic that the drive does not have is no error: a vehicle's sensors differ from drive to drive. Its clips say so.
+    /// Takes hold of `out`, so that two replays do not write over each other; what a killed one left there is recovered, kept
+    /// until the next, and said.
     pub(super) fn subscribe(
         manifest: &Manifest,
         options: &Options,
         drive: &mut Replay,
+        out: &Path,
     ) -> Result<Option<Self>, Failure> {
         let Some(rules) = &manifest.record else { return Ok(None) };
         let shared = Arc::new(Mutex::new(Shared { recorder: None, failed: None }));
@@ -75,6 +80,10 @@ impl Recording {
         let mut lanes = Vec::new();
         for wanted in &rules.topics {
             let name = Remap::apply(&options.remaps, wanted.as_str());
+            // Two topics of the manifest may be one of the drive.
+            if lanes.iter().any(|lane: &Arc<Lane>| lane.topic.name == name) {
+                continue;
+            }
             let found = known.iter().find(|topic| topic.topic == name);
             if found.is_none() {
                 tracing::warn!(topic = %name, "the drive does not have this topic of [record]: clips are made without it");
@@ -99,16 +108,16 @@ impl Recording {
             }
             lanes.push(lane);
         }
-        Ok(Some(Self { shared, lanes, rules: rules.clone(), lambda: None }))
-    }
-
-    /// Makes the recorder, in `out`. What an earlier replay left there is replaced; what a killed one left is recovered,
-    /// kept until the next, and said.
-    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
-        let (mut folder, recovered) = Folder::open(out)?;
+        let (folder, recovered) = Folder::open(out)?;
         for clip in &recovered {
             tracing::warn!(clip = %clip.file.display(), "recovered a clip of an earlier replay, which did not end well");
         }
+        Ok(Some(Self { shared, lanes, rules: rules.clone(), folder: Some((folder, recovered)), lambda: None }))
+    }
+
+    /// Makes the recorder. The clips of an earlier replay are replaced, but not those that were recovered.
+    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
+        let Some((mut folder, recovered)) = self.folder.take() else { return Ok(()) };
         folder.replace(&recovered)?;
         let settings = Settings {
             store: self.rules.store,

@@ -19,6 +19,7 @@ use super::{CLOCK, Load, Options, report as send};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
 use crate::api::log::Line;
+use crate::api::trace::offered;
 use crate::journal::{Identity, Scribe};
 use crate::judge::Judge;
 use crate::schedule::Schedule;
@@ -55,7 +56,7 @@ impl Pass<'_> {
         self.output.decision(&decision)?;
         let log = self.session.take_log();
         if let Some(scribe) = &mut self.scribe {
-            let entry = scribe.end(&decision, &log);
+            let entry = scribe.end(&decision, self.session.take_said());
             if let Some(journal) = &mut self.journal {
                 journal.wake(entry)?;
             }
@@ -96,11 +97,14 @@ pub(super) fn replay(
     let name = manifest.lambda.name.as_str();
     let drive = Replay::open(&options.drives).map_err(|error| Failure::from(DriveError(error)))?;
     let Stage { mut drive, inputs, session, mut guest } = Stage::set(drive, options, manifest, load)?;
-    let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
+    let mut recording =
+        if results.record { Recording::subscribe(manifest, options, &mut drive, &results.out)? } else { None };
     // Only now does it cost the results of an earlier replay: what could not start must not touch them.
     let mut output = Output::create(&results.out, results.all)?;
     let initialised = guest.init();
     let said = session.take_log();
+    // What `init` says is no part of a wake.
+    session.take_said();
     if let Err(fault) = initialised {
         // What it said on the way may be why.
         output.log(&said)?;
@@ -109,6 +113,7 @@ pub(super) fn replay(
         failure.causes = vec![fault.message];
         return Err(failure);
     }
+    let started = Instant::now();
     let mut journal = None;
     let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.clone()));
     if results.journal.is_some() || recording.is_some() {
@@ -134,17 +139,19 @@ pub(super) fn replay(
     };
     pass.keep(&said)?;
 
-    let started = Instant::now();
-    let broken = drain(&mut drive, &mut pass, reports)?.map(DriveError);
+    let (read_to_ns, broken) = drain(&mut drive, &mut pass, reports)?;
+    let broken = broken.map(DriveError);
     let end_ns = drive.end_ns().unwrap_or(0);
-    let clips = pass.recording.as_ref().map_or(Ok(Vec::new()), |recording| recording.finish(end_ns))?;
-    let wall_s = started.elapsed().as_secs_f64();
+    // Of a damaged drive nobody knows what came after the last sample.
+    let recorded_to_ns = if broken.is_some() { read_to_ns } else { end_ns };
+    let clips = pass.recording.as_ref().map_or(Ok(Vec::new()), |recording| recording.finish(recorded_to_ns))?;
     if let (Some(journal), Some(digests)) = (pass.journal.take(), digests) {
-        let samples = inputs.iter().map(|topic| topic.counts().received).collect();
+        let samples = inputs.iter().map(|topic| offered(topic)).collect();
         // A journal of a damaged drive has no end: it cannot say what comes there.
         let end = End { wakes: pass.wakes, samples, drives: digests.take()? };
         journal.finish(broken.is_none().then_some(&end))?;
     }
+    let wall_s = started.elapsed().as_secs_f64();
     let summary = Summary {
         lambda: name.to_owned(),
         version: manifest.lambda.version.to_string(),
@@ -176,8 +183,13 @@ pub(super) fn replay(
     Ok((summary, broken.map(|error| error.exit())))
 }
 
-/// Delivers every sample of the drive and runs what it wakes. Ends with the damage, if there is one.
-fn drain(drive: &mut Replay, pass: &mut Pass<'_>, reports: &mut dyn Write) -> Result<Option<ReplayError>, Failure> {
+/// Delivers every sample of the drive and runs what it wakes. Returns the stamp of the last, and the damage that ended it, if
+/// there is one.
+fn drain(
+    drive: &mut Replay,
+    pass: &mut Pass<'_>,
+    reports: &mut dyn Write,
+) -> Result<(i64, Option<ReplayError>), Failure> {
     let mut at_ns = 0;
     let mut looked = Instant::now();
     let mut samples = 0_u64;
@@ -210,7 +222,7 @@ fn drain(drive: &mut Replay, pass: &mut Pass<'_>, reports: &mut dyn Write) -> Re
         // A tick of the very last instant is still due.
         pass.ticks(at_ns.saturating_add(1))?;
     }
-    Ok(damaged)
+    Ok((at_ns, damaged))
 }
 
 pub(super) fn report(n: u32, summary: &Summary) -> Round {

@@ -6,11 +6,11 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use gleaner_protocol::journal::{Difference, DriveDigest, End, Entry, Woken};
+use gleaner_protocol::journal::{Difference, DriveDigest, End, Entry, Header, Woken};
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure, Verified};
 use gleaner_transport::replay::Replay;
-use gleaner_transport::{Transport, Verdict};
+use gleaner_transport::{SampleMeta, Transport};
 
 use super::claim::{Claim, different};
 use super::digests::Digests;
@@ -18,6 +18,7 @@ use super::paced::{PaceError, Paced};
 use super::stage::{DriveError, Stage};
 use super::{Load, Options};
 use crate::api::data::{Tick, Topic, Wake};
+use crate::api::trace::offered;
 use crate::journal::Scribe;
 use crate::judge::Judge;
 
@@ -32,15 +33,18 @@ pub(super) fn run(
 ) -> Result<Verified, Failure> {
     let started = Instant::now();
     let name = manifest.lambda.name.as_str();
-    let digests = Digests::start(if claim.is_part { Vec::new() } else { options.drives.clone() });
+    let (header, is_part) = (claim.header().clone(), claim.is_part);
+    let digests = Digests::start(if is_part { Vec::new() } else { options.drives.clone() });
     let drive = Replay::open(&options.drives).map_err(|error| Failure::from(DriveError(error)))?;
-    if claim.is_part {
-        holds_all_inputs(&drive, claim)?;
+    if is_part {
+        holds_all_inputs(&drive, &header)?;
     }
     let Stage { drive, inputs, session, mut guest } = Stage::set(Paced::new(drive), options, manifest, load)?;
     let engine = guest.engine();
     let initialised = guest.init();
     let mut remake = Remake {
+        header: &header,
+        is_part,
         start_ns: drive.start_ns(),
         drive,
         scribe: Scribe::new(&inputs),
@@ -48,7 +52,9 @@ pub(super) fn run(
         session,
         inputs,
         wakes: 0,
+        triggers: 0,
         uncovered: 0,
+        uncovered_triggers: 0,
     };
     if let Err(fault) = initialised {
         let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{name}`"));
@@ -57,22 +63,35 @@ pub(super) fn run(
     }
     // What `init` says is no part of a wake.
     remake.session.take_log();
+    remake.session.take_said();
     while let Some(entry) = claim.next()? {
-        remake.wake(&entry, claim)?;
+        remake.wake(&entry)?;
     }
     let reader = claim.reader();
-    if let Some(end) = reader.end().filter(|_| !claim.is_part) {
-        remake.end(end, claim)?;
+    if let Some(end) = reader.end().filter(|_| !is_part) {
+        remake.end(end)?;
         same_drives(end, digests)?;
     }
-    let header = claim.header();
+    let Remake { wakes, triggers, uncovered, uncovered_triggers, .. } = remake;
+    if is_part && (uncovered == wakes || triggers > 0 && uncovered_triggers == triggers) {
+        let message = format!("the clip alone proves no trigger of lambda `{name}`");
+        let mut failure = Failure::new(Exit::Usage, message);
+        let what = "in each wake that could show one, it had looked at samples from before the clip";
+        failure.causes = vec![format!("{what} ({uncovered} of {wakes} wakes)")];
+        return Err(failure.with_help(
+            "make `preroll` longer than the lambda looks back; this clip can be verified against its drive: \
+             gleaner replay DIR DRIVE --verify JOURNAL",
+        ));
+    }
     let noted = |what: &str, journal: &str, now: &str| {
         (journal != now).then(|| format!("{what}: {journal} in the journal, {now} now"))
     };
     Ok(Verified {
         lambda: name.to_owned(),
-        wakes: remake.wakes,
-        uncovered: remake.uncovered,
+        wakes,
+        triggers,
+        uncovered,
+        uncovered_triggers,
         cut_off: reader.cut_off(),
         wall_s: started.elapsed().as_secs_f64(),
         notes: [
@@ -87,10 +106,9 @@ pub(super) fn run(
 }
 
 /// A clip cannot prove a decision over a topic that it does not hold.
-fn holds_all_inputs(clip: &Replay, claim: &Claim) -> Result<(), Failure> {
+fn holds_all_inputs(clip: &Replay, header: &Header) -> Result<(), Failure> {
     let topics = clip.topics();
-    let missing =
-        claim.header().inputs.iter().find(|input| !topics.iter().any(|topic| topic.topic == input.wire_topic));
+    let missing = header.inputs.iter().find(|input| !topics.iter().any(|topic| topic.topic == input.wire_topic));
     let Some(input) = missing else { return Ok(()) };
     let message = format!("the clip holds no `{}`, which input `{}` of the lambda reads", input.wire_topic, input.name);
     let help = "add the topic to [record] for further clips; this one can be verified against its drive only: \
@@ -99,7 +117,9 @@ fn holds_all_inputs(clip: &Replay, claim: &Claim) -> Result<(), Failure> {
 }
 
 /// A lambda that runs again.
-struct Remake {
+struct Remake<'a> {
+    header: &'a Header,
+    is_part: bool,
     drive: Paced,
     start_ns: i64,
     inputs: Vec<Arc<Topic>>,
@@ -107,96 +127,101 @@ struct Remake {
     scribe: Scribe,
     judge: Judge,
     wakes: u64,
-    /// Wakes in which the lambda had looked at samples from before the clip.
+    triggers: u64,
+    /// Wakes in which the lambda had looked at samples from before the clip, and their triggers.
     uncovered: u64,
+    uncovered_triggers: u64,
 }
 
-impl Remake {
-    fn wake(&mut self, entry: &Entry, claim: &Claim) -> Result<(), Failure> {
+impl Remake<'_> {
+    fn wake(&mut self, entry: &Entry) -> Result<(), Failure> {
         // Of a clip's first wake nobody knows how many of the samples before it are in the clip.
-        let joins = claim.is_part && self.wakes == 0;
-        for input in 0..self.inputs.len() {
-            if joins { self.join(input, entry)? } else { self.feed(input, entry, claim)? }
+        let joins = self.is_part && self.wakes == 0;
+        if joins {
+            self.join(entry)?
+        } else {
+            self.feed(entry)?
         }
-        let wake = self.cause(entry, claim)?;
+        let wake = self.cause(entry)?;
         self.scribe.begin(&wake);
         let decision = self.judge.judge(wake);
-        let log = self.session.take_log();
-        let mut now = self.scribe.end(&decision, &log).clone();
-        self.wakes += 1;
+        self.session.take_log();
+        let said = self.session.take_said();
+        let mut now = self.scribe.end(&decision, said).clone();
         if joins {
             for (now, journal) in now.seen.iter_mut().zip(&entry.seen) {
                 (now.new, now.digest) = (journal.new, journal.digest);
                 now.newest = now.newest.or(journal.newest);
             }
         }
-        if claim.is_part && claim.header().wakes_before > 0 {
+        let is_covered = self.covers(entry);
+        if !is_covered {
+            let (theirs, seen) = (entry.clone(), std::mem::take(&mut now.seen));
+            now = Entry { seen, ..theirs };
+        }
+        if !is_covered || self.is_part && self.header.wakes_before > 0 {
             // What the lambda keeps in its own variables since before the clip may cost it another step, or another look.
             now.fuel = entry.fuel;
             for (now, journal) in now.seen.iter_mut().zip(&entry.seen) {
                 now.reach = journal.reach;
             }
         }
-        if !self.covers(entry) {
-            self.uncovered += 1;
-            let (theirs, seen) = (entry.clone(), std::mem::take(&mut now.seen));
-            now = Entry { seen, ..theirs };
+        if let Some(difference) = entry.differs_from(&now, &self.header.inputs, !self.is_part) {
+            return Err(self.differs(entry, &difference));
         }
-        match entry.differs_from(&now, &claim.header().inputs, !claim.is_part) {
-            None => Ok(()),
-            Some(difference) => Err(self.differs(entry, claim, &difference)),
-        }
+        let triggers = entry.triggers.len() as u64;
+        self.wakes += 1;
+        self.triggers += triggers;
+        self.uncovered += u64::from(!is_covered);
+        self.uncovered_triggers += if is_covered { 0 } else { triggers };
+        Ok(())
     }
 
     /// Delivers the samples that came since the wake before.
-    fn feed(&mut self, input: usize, entry: &Entry, claim: &Claim) -> Result<(), Failure> {
-        let topic = Arc::clone(&self.inputs[input]);
-        let before = topic.reader().head();
-        let wanted = before.saturating_add(entry.seen[input].new);
-        while topic.reader().head() < wanted {
-            if self.deliver(input)?.is_none() {
+    fn feed(&mut self, entry: &Entry) -> Result<(), Failure> {
+        let before: Vec<_> = self.inputs.iter().map(|topic| offered(topic)).collect();
+        self.drive.deliver(entry.seen.iter().map(|seen| seen.new)).map_err(unreadable)?;
+        for ((topic, before), seen) in self.inputs.iter().zip(before).zip(&entry.seen) {
+            let came = offered(topic) - before;
+            if came < seen.new {
                 let difference = Difference {
                     what: format!("samples of input `{}` ({}) before this wake", topic.name(), topic.ros_topic()),
-                    journal: entry.seen[input].new.to_string(),
-                    now: format!("{}, then the drive ends", topic.reader().head() - before),
+                    journal: seen.new.to_string(),
+                    now: format!("{came}, then the drive ends"),
                 };
-                return Err(self.differs(entry, claim, &difference));
+                return Err(self.differs(entry, &difference));
             }
         }
         Ok(())
     }
 
-    /// Delivers what a clip holds up to the sample that was newest in its first wake.
-    fn join(&mut self, input: usize, entry: &Entry) -> Result<(), Failure> {
-        let Some((writer, seq)) = entry.seen[input].newest else { return Ok(()) };
+    /// Delivers what a clip holds up to the samples that were newest in its first wake.
+    fn join(&mut self, entry: &Entry) -> Result<(), Failure> {
         let until_ns = entry.at_ns.saturating_add(SLACK_NS);
-        // A clip keeps the lower 32 bits of a sequence number.
-        let is_newest = |meta: &gleaner_transport::SampleMeta| meta.writer.0 == writer && meta.seq as u32 == seq as u32;
-        let n = self.drive.ahead(input, until_ns, is_newest).map_err(unreadable)?;
-        for _ in 0..n.unwrap_or(0) {
-            self.deliver(input)?;
+        let mut owed = Vec::new();
+        for (lane, seen) in entry.seen.iter().enumerate() {
+            let is_newest = |meta: &SampleMeta| seen.newest.is_some_and(|newest| is_sample(meta, newest));
+            let ahead = match seen.newest {
+                Some(_) => self.drive.ahead(lane, until_ns, is_newest).map_err(unreadable)?,
+                None => None,
+            };
+            owed.push(ahead.unwrap_or(0));
         }
-        Ok(())
+        self.drive.deliver(owed.into_iter()).map_err(unreadable)
     }
 
-    fn deliver(&mut self, input: usize) -> Result<Option<Verdict>, Failure> {
-        self.drive.deliver(input).map_err(unreadable)
-    }
-
-    fn cause(&self, entry: &Entry, claim: &Claim) -> Result<Wake, Failure> {
+    fn cause(&self, entry: &Entry) -> Result<Wake, Failure> {
         let (writer, seq) = match entry.cause {
             Woken::Tick { missed } => return Ok(Wake::Tick(Tick { at_ns: entry.at_ns, missed })),
             Woken::Sample { writer, seq } => (writer, seq),
         };
-        let topic = claim.header().event_input.and_then(|input| self.inputs.get(input));
+        let topic = self.header.event_input.and_then(|input| self.inputs.get(input));
         let found = topic.and_then(|topic| {
             let reader = topic.reader();
             let head = reader.head();
             let oldest = head.saturating_sub(reader.depth() as u64);
             let mut leases = (oldest..head).rev().filter_map(|position| reader.get(position));
-            let lease =
-                leases.find(|lease| lease.meta().seq as u32 == seq as u32 && lease.meta().writer.0 == writer)?;
-            Some(Wake::Event(topic.sample(lease)))
+            Some(Wake::Event(topic.sample(leases.find(|lease| is_sample(lease.meta(), (writer, seq)))?)))
         });
         found.ok_or_else(|| {
             let difference = Difference {
@@ -204,7 +229,7 @@ impl Remake {
                 journal: format!("number {seq}, at {:.6} s", self.seconds(entry)),
                 now: "it is not there".to_owned(),
             };
-            self.differs(entry, claim, &difference)
+            self.differs(entry, &difference)
         })
     }
 
@@ -214,33 +239,32 @@ impl Remake {
     }
 
     /// The drive must end as the journal does.
-    fn end(&mut self, end: &End, claim: &Claim) -> Result<(), Failure> {
-        let mut counts = vec![("wakes".to_owned(), end.wakes, self.wakes)];
-        for input in 0..self.inputs.len() {
-            while self.deliver(input)?.is_some() {}
-            let (topic, journal) = (&self.inputs[input], end.samples.get(input).copied().unwrap_or(0));
-            counts.push((format!("samples of input `{}` in all", topic.name()), journal, topic.reader().head()));
-        }
-        match counts.into_iter().find(|(_, journal, now)| journal != now) {
+    fn end(&mut self, end: &End) -> Result<(), Failure> {
+        self.drive.deliver(std::iter::repeat(u64::MAX)).map_err(unreadable)?;
+        let samples = self.inputs.iter().enumerate().map(|(input, topic)| {
+            let journal = end.samples.get(input).copied().unwrap_or(0);
+            (format!("samples of input `{}` in all", topic.name()), journal, offered(topic))
+        });
+        let mut counts = std::iter::once(("wakes".to_owned(), end.wakes, self.wakes)).chain(samples);
+        match counts.find(|(_, journal, now)| journal != now) {
             None => Ok(()),
             Some((what, journal, now)) => {
                 let difference = Difference { what, journal: journal.to_string(), now: now.to_string() };
-                let name = &claim.header().lambda;
+                let name = &self.header.lambda;
                 Err(different(format!("the drive of lambda `{name}` does not end as in the journal"), &difference))
             }
         }
     }
 
-    fn differs(&self, entry: &Entry, claim: &Claim, difference: &Difference) -> Failure {
-        let header = claim.header();
-        let number = header.wakes_before.saturating_add(self.wakes.max(1));
-        let message = format!("wake {number} of lambda `{}`, at {:.6} s, differs", header.lambda, self.seconds(entry));
+    fn differs(&self, entry: &Entry, difference: &Difference) -> Failure {
+        let Header { wakes_before, lambda, .. } = self.header;
+        let number = wakes_before.saturating_add(self.wakes).saturating_add(1);
+        let message = format!("wake {number} of lambda `{lambda}`, at {:.6} s, differs", self.seconds(entry));
         let failure = different(message, difference);
-        if claim.is_part && header.wakes_before > 0 {
+        if self.is_part && *wakes_before > 0 {
             return failure.with_help(format!(
-                "the lambda had run {} times before this clip begins; what it kept in its own variables since then is not in \
-                 the clip: gleaner replay DIR DRIVE --verify JOURNAL tells",
-                header.wakes_before
+                "the lambda had run {wakes_before} times before this clip begins; what it kept in its own variables since then \
+                 is not in the clip: gleaner replay DIR DRIVE --verify JOURNAL tells"
             ));
         }
         failure
@@ -249,6 +273,11 @@ impl Remake {
     fn seconds(&self, entry: &Entry) -> f64 {
         entry.at_ns.saturating_sub(self.start_ns) as f64 / 1e9
     }
+}
+
+/// Whether `meta` is of the sample of this writer and number. A clip keeps the lower 32 bits of a number.
+fn is_sample(meta: &SampleMeta, (writer, seq): ([u8; 16], u64)) -> bool {
+    meta.writer.0 == writer && meta.seq as u32 == seq as u32
 }
 
 fn unreadable(error: PaceError) -> Failure {

@@ -1,6 +1,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 
 use crate::manifest::Kind;
 use crate::{Trigger, TriggerKind};
@@ -70,11 +71,17 @@ pub struct Moment {
     pub label: String,
     /// How sure or how strong; always finite.
     pub score: Option<f64>,
+    /// What else the lambda said of it; `None` where that takes more than [`Moment::ATTRIBUTE_BYTES`], and only the journal has
+    /// it.
+    pub attributes: Option<Map<String, Value>>,
     /// Stamp of the wake, in ns since the epoch of the drive.
     pub at_ns: i64,
 }
 
 impl Moment {
+    /// Most bytes of attributes, as JSON: thousands of moments may wait for their clip.
+    pub const ATTRIBUTE_BYTES: usize = 2048;
+
     /// `trigger` of the lambda of this name, in a wake at `at_ns`.
     pub fn of(lambda: &str, trigger: &Trigger, at_ns: i64) -> Moment {
         Moment {
@@ -82,9 +89,14 @@ impl Moment {
             kind: trigger.kind,
             label: trigger.label.clone(),
             score: trigger.score,
+            attributes: fits(&trigger.attributes).then(|| trigger.attributes.clone()),
             at_ns,
         }
     }
+}
+
+fn fits(attributes: &Map<String, Value>) -> bool {
+    serde_json::to_string(attributes).is_ok_and(|text| text.len() <= Moment::ATTRIBUTE_BYTES)
 }
 
 /// A topic of a clip. `None` means that nobody knows, for example after the recorder died.
@@ -166,13 +178,25 @@ mod tests {
                 r#"{"file":"clips/hello-20180802T083451.136Z.mcap","thumbnail":null,"bytes":4096,"from_ns":1000,"#,
                 r#""to_ns":11000,"first_ns":1001,"last_ns":null,"lambdas":[{"name":"hello","version":"0.1.0","#,
                 r#""kind":"wasm","digest":"00ff","windows":2}],"triggers":3,"moments":[{"lambda":"hello","#,
-                r#""kind":"event","label":"hard-brake","score":0.5,"at_ns":6000}],"topics":[{"topic":"/imu/data","#,
+                r#""kind":"event","label":"hard-brake","score":0.5,"attributes":{},"at_ns":6000}],"topics":[{"topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","messages":7,"received":8,"lost":null,"overwritten":1,"#,
                 r#""too_big":0}],"short":["the drive ended 2.1 s before the window did"],"#,
                 r#""recovered":{"lost_bytes":5,"what":"the recorder died"}}"#
             )
         );
         assert_eq!(serde_json::from_str::<Clip>(&line).unwrap(), clip());
+    }
+
+    #[test]
+    fn attributes_that_would_fill_the_memory_are_left_to_the_journal() {
+        let trigger = |bytes: usize| Trigger {
+            kind: TriggerKind::Event,
+            label: "x".to_owned(),
+            score: None,
+            attributes: serde_json::Map::from_iter([("text".to_owned(), "y".repeat(bytes).into())]),
+        };
+        assert_eq!(Moment::of("l", &trigger(100), 1).attributes, Some(trigger(100).attributes));
+        assert_eq!(Moment::of("l", &trigger(Moment::ATTRIBUTE_BYTES), 1).attributes, None);
     }
 
     #[test]

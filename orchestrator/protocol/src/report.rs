@@ -34,8 +34,12 @@ pub struct Verified {
     pub lambda: String,
     /// Wakes in the journal.
     pub wakes: u64,
-    /// Those of them that were not compared: the lambda had looked at samples from before the clip.
+    /// Triggers in them.
+    pub triggers: u64,
+    /// Those of the wakes that were not compared: the lambda had looked at samples from before the clip.
     pub uncovered: u64,
+    /// Triggers in these.
+    pub uncovered_triggers: u64,
     /// The journal has no end: its writer died, or its drive was damaged. What it holds was compared.
     pub cut_off: bool,
     /// Duration, in s.

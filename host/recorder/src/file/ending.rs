@@ -214,6 +214,7 @@ fn decision(moment: &Moment) -> Record {
     if let Some(score) = moment.score {
         metadata.insert("score".to_owned(), score.to_string());
     }
+    metadata.insert("attributes".to_owned(), moment.attributes.as_ref().map_or(UNKNOWN.to_owned(), json));
     ("gleaner.decision".to_owned(), metadata)
 }
 

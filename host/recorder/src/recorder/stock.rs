@@ -210,6 +210,7 @@ impl Stock {
             kind: gleaner_protocol::TriggerKind::Event,
             label: String::new(),
             score: None,
+            attributes: None,
             at_ns,
         })
     }

@@ -46,9 +46,9 @@ pub enum Woken {
 /// What a lambda could see of one input in a wake, and what of it it looked at.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Seen {
-    /// Samples that arrived since the wake before.
+    /// Samples that arrived since the wake before, those included that found no room in the ring.
     pub new: u64,
-    /// Wrapping sum of the CRC-32 of each of them, so that their order does not matter; 0 if there are none.
+    /// Wrapping sum of the CRC-32 of each of them that entered the ring; 0 if there are none.
     pub digest: u32,
     /// Writer and number of the newest sample in the ring.
     pub newest: Option<([u8; 16], u64)>,

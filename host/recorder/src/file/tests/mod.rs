@@ -66,7 +66,14 @@ fn lambda() -> ClipLambda {
 
 fn moment(at_ns: i64) -> Moment {
     let (lambda, label) = ("hello".to_owned(), "hard-brake".to_owned());
-    Moment { lambda, kind: TriggerKind::Event, label, score: Some(0.5), at_ns }
+    Moment {
+        lambda,
+        kind: TriggerKind::Event,
+        label,
+        score: Some(0.5),
+        attributes: Some(serde_json::Map::new()),
+        at_ns,
+    }
 }
 
 fn about() -> About {
