@@ -175,6 +175,7 @@ fn header() -> Header {
         kind: gleaner_protocol::manifest::Kind::Wasm,
         files: Vec::new(),
         models: Vec::new(),
+        manifest: String::new(),
         inputs: Vec::new(),
         event_input: None,
         config: serde_json::Map::new(),

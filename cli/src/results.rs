@@ -111,12 +111,20 @@ pub fn score(trigger: &Trigger) -> String {
     trigger.score.map_or("-".to_owned(), three_digits)
 }
 
-/// What is in a clip: `9.1 s, 0.3 MiB: /imu/data 950, /vehicle/speed 757`.
+/// `bytes` as people read it: `205 KiB`, `1.3 MiB`.
+pub fn size(bytes: u64) -> String {
+    match bytes {
+        0..1024 => format!("{bytes} B"),
+        1024..1_048_576 => format!("{} KiB", bytes.div_ceil(1024)),
+        _ => format!("{:.1} MiB", bytes as f64 / (1024.0 * 1024.0)),
+    }
+}
+
+/// What is in a clip: `9.1 s, 205 KiB: messages /imu/data 950, /vehicle/speed 757`.
 pub fn clip_contents(clip: &Clip) -> String {
     let [from, to] = clip_span(clip);
     let topics = clip.topics.iter().map(|topic| format!("{} {}", visible(&topic.topic), grouped(topic.messages)));
-    let mib = clip.bytes as f64 / (1024.0 * 1024.0);
-    format!("{:.1} s, {mib:.1} MiB: {}", seconds(to, from), topics.collect::<Vec<_>>().join(", "))
+    format!("{:.1} s, {}: messages {}", seconds(to, from), size(clip.bytes), topics.collect::<Vec<_>>().join(", "))
 }
 
 /// Log times of a clip's first and last message; of what was asked for, if it has none.
@@ -198,6 +206,12 @@ mod tests {
         ] {
             assert_eq!(three_digits(value), text, "of {value:?}");
         }
+    }
+
+    #[test]
+    fn a_size_has_the_unit_that_suits_it() {
+        let sizes = [0, 1023, 1024, 1025, 205_089, 1_048_576, 10_000_000].map(size);
+        assert_eq!(sizes, ["0 B", "1023 B", "1 KiB", "2 KiB", "201 KiB", "1.0 MiB", "9.5 MiB"]);
     }
 
     #[test]

@@ -59,7 +59,7 @@ fn killed(store: &str) -> Result<(), Failed> {
     replay(lambda.path(), out.path()).status()?;
     let started = Instant::now();
     replay(lambda.path(), out.path()).status()?;
-    let whole = started.elapsed();
+    let duration = started.elapsed();
     let kills = std::env::var("GLEANER_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(25);
     let mut seen = [0_u32; 3];
     let mut out = Folder::new();
@@ -74,7 +74,7 @@ fn killed(store: &str) -> Result<(), Failed> {
             out = Folder::new();
         }
         let mut child = replay(lambda.path(), out.path()).spawn()?;
-        thread::sleep(Duration::from_nanos((whole.as_nanos() as u64).saturating_mul(random % 1000) / 1000));
+        thread::sleep(Duration::from_nanos((duration.as_nanos() as u64).saturating_mul(random % 1000) / 1000));
         child.kill()?;
         child.wait()?;
         let here = |why: Failed| Failed::from(format!("kill {kill}: {}", why.message().unwrap_or_default()));

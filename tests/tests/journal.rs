@@ -142,7 +142,7 @@ fn a_flipped_byte_anywhere_in_the_drive_is_found() {
 
 #[test]
 fn another_build_is_named_by_the_file_that_changed() {
-    for (lambda, file) in [(HELLO, "hello.wasm"), ("examples/hello/python", "main.py"), (HELLO, "lambda.toml")] {
+    for (lambda, file) in [(HELLO, "hello.wasm"), ("examples/hello/python", "main.py")] {
         let copy = Copy::of(lambda, |manifest| manifest);
         let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
         assert_eq!(journaled.run.exit, 0, "{}", journaled.run.stderr);
@@ -155,6 +155,21 @@ fn another_build_is_named_by_the_file_that_changed() {
         let again = verify_drive(copy.path(), &sample_drive(), &journaled.journal, &[]);
         differs(&again, 4, &["not the lambda that wrote the journal", file, "in the journal:"]);
     }
+}
+
+#[test]
+fn another_manifest_is_found_and_another_record_table_is_none() {
+    let copy = Copy::of(HELLO, |manifest| manifest);
+    let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
+    let manifest = std::fs::read_to_string(copy.path().join("build/lambda.toml")).unwrap();
+    copy.replace(
+        "lambda.toml",
+        manifest.replace("preroll = \"5s\"", "preroll = \"7s\"").replace("hard braking", "dip"),
+    );
+    assert_eq!(verify_drive(copy.path(), &sample_drive(), &journaled.journal, &[]).exit, 0);
+    copy.replace("lambda.toml", manifest.replace("fuel = 10_000_000", "fuel = 9_000_000"));
+    let again = verify_drive(copy.path(), &sample_drive(), &journaled.journal, &[]);
+    differs(&again, 4, &["not the lambda that wrote the journal", "manifest lambda.toml"]);
 }
 
 #[test]
@@ -187,6 +202,38 @@ fn a_journal_whose_writer_died_proves_what_it_holds() {
     let again = verify_drive(&root().join(HELLO), &sample_drive(), &cut, &[]);
     let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
     assert!(verified.cut_off && verified.wakes > 100 && verified.wakes < 4170, "{verified:?}");
+}
+
+#[test]
+fn a_journal_without_a_whole_wake_proves_nothing() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let whole = std::fs::read(&journaled.journal).unwrap();
+    let cut = journaled.out.write("cut.journal", &whole[..2000]);
+    let again = verify_drive(&root().join(HELLO), &sample_drive(), &cut, &[]);
+    differs(&again, 2, &["cut.journal", "no whole wake"]);
+}
+
+#[test]
+fn the_wrong_drive_and_a_clip_in_the_place_of_a_journal_are_named() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let folder = Folder::new();
+    let again = verify_drive(&root().join(HELLO), &forged(&folder, 9), &journaled.journal, &[]);
+    differs(&again, 4, &["wake 10 of", "drive `forged-9.mcap`", "CRC-32"]);
+    let clip = journaled.out.path().join(&journaled.run.clips[0].file);
+    let again = verify_drive(&root().join(HELLO), &sample_drive(), &clip, &[]);
+    differs(&again, 2, &["gleaner verify CLIP --lambda DIR"]);
+}
+
+#[test]
+fn a_journal_is_not_written_into_a_file_of_the_results() {
+    let folder = Folder::new();
+    for name in ["clips.jsonl", "decisions.jsonl", "summary.json"] {
+        let journal = folder.path().join(name);
+        let args = ["--journal", journal.to_str().unwrap()];
+        let run = replay_to(folder.path(), &root().join(HELLO), &[sample_drive()], &args);
+        run.must_exit(2);
+        assert!(run.stderr.contains("is a file of the results"), "{}", run.stderr);
+    }
 }
 
 #[test]

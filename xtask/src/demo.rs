@@ -75,13 +75,16 @@ fn prove(checkout: &Checkout, name: &str, twin: &Replayed) -> Result<String, Fai
     let whole = twin.verify(checkout)?;
     let parts = twin.clips.iter().map(|clip| twin.verify_clip(checkout, clip)).collect::<Result<Vec<_>, _>>()?;
     let (wakes, uncovered) = parts.iter().fold((0, 0), |sum, part| (sum.0 + part.wakes, sum.1 + part.uncovered));
+    let clips = if parts.len() == 1 { "one clip".to_owned() } else { format!("{} clips", parts.len()) };
+    let further = match uncovered {
+        0 => String::new(),
+        _ => format!(" (in {} the lambda had looked at samples from before)", grouped(uncovered)),
+    };
     Ok(format!(
-        "  {name}, {}: all {} from the journal and the drive; {} of {} from {} alone",
+        "  {name}, {}: all {} from the journal and the drive; {} from {clips} alone{further}",
         twin.summary.kind.as_str(),
         grouped(whole.wakes),
-        grouped(wakes - uncovered),
-        grouped(wakes),
-        if parts.len() == 1 { "one clip".to_owned() } else { format!("{} clips", parts.len()) },
+        grouped(wakes.saturating_sub(uncovered)),
     ))
 }
 

@@ -18,6 +18,7 @@ use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, Sources};
 use error::BuildError;
 use folder::{Built, Partial};
 
+use crate::results::size;
 use crate::say::say;
 
 /// Builds the lambda in `dir` and says so.
@@ -28,9 +29,9 @@ pub(crate) fn run(dir: &Path) -> Result<Exit, Failure> {
     let built = build(dir, &manifest, started).map_err(|error| {
         Failure::because(format!("cannot build lambda `{}` in `{}`", manifest.lambda.name, dir.display()), &error)
     })?;
-    let (path, files, kb) = (BuildDir::of(dir), built.files, built.bytes.div_ceil(1000));
+    let (path, files) = (BuildDir::of(dir), built.files);
     let files = if files == 1 { "1 file".to_owned() } else { format!("{files} files") };
-    say(&format!("built {} ({files}, {kb} kB)\n", path.path().display()))?;
+    say(&format!("built {} ({files}, {})\n{}", path.path().display(), size(built.bytes), note(&manifest)))?;
     Ok(Exit::Ok)
 }
 
@@ -55,6 +56,17 @@ fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, 
         Ok(_) => Ok(built),
         Err(LayoutError::Older { source_file, .. }) => Err(BuildError::Changed { source_file }),
         Err(error) => Err(BuildError::Layout(error)),
+    }
+}
+
+/// What a clip of this lambda will not be able to prove, if there is anything.
+fn note(manifest: &Manifest) -> String {
+    let Some(record) = &manifest.record else { return String::new() };
+    let unrecorded = manifest.inputs.iter().map(|input| &input.topic).filter(|topic| !record.topics.contains(topic));
+    let topics = unrecorded.map(|topic| format!("`{topic}`")).collect::<Vec<_>>().join(", ");
+    match topics.is_empty() {
+        true => String::new(),
+        false => format!("note: [record] leaves out {topics}, which the lambda reads: its clips cannot be verified alone\n"),
     }
 }
 

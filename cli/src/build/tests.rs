@@ -175,3 +175,14 @@ fn messages_may_be_absent_but_a_model_that_is_named_may_not() {
     lambda.build().unwrap();
     assert_eq!(lambda.files("build"), ["lambda.toml", "main.py", "models/m.onnx"]);
 }
+
+#[test]
+fn a_lambda_whose_clips_will_lack_an_input_is_told_so() {
+    let manifest = |recorded: &str| {
+        let inputs = "[[input]]\nname = 'imu'\ntopic = '/imu/data'\ntype = 'sensor_msgs/msg/Imu'\n";
+        let text = format!("{PYTHON}{inputs}[record]\ntopics = ['{recorded}']\n");
+        Manifest::parse(&text, "lambda.toml").unwrap()
+    };
+    assert_eq!(note(&manifest("/imu/data")), "");
+    assert!(note(&manifest("/camera")).starts_with("note: [record] leaves out `/imu/data`"));
+}

@@ -2,7 +2,9 @@
 
 use std::fmt::{self, Write};
 
-use gleaner_protocol::{Clip, Decision, Fault, FaultKind, Summary, TopicReport, Trigger, Verified, visible};
+use gleaner_protocol::{
+    Clip, Decision, Fault, FaultKind, Summary, TopicReport, Trigger, TriggerKind, Verified, visible,
+};
 
 use crate::results::{ResultsError, grouped, seconds, three_digits};
 
@@ -67,7 +69,10 @@ impl Digest {
             self.other_triggers += 1;
             return;
         }
-        let label = visible(&trigger.label);
+        let label = match trigger.kind {
+            TriggerKind::Event => visible(&trigger.label),
+            kind => format!("{}, {}", visible(&trigger.label), kind.as_str()),
+        };
         let full = self.triggers.len() == SHOWN;
         match self.triggers.last_mut() {
             Some(burst) if burst.label == label && seconds - burst.last_seconds < BURST_GAP_S => {
@@ -187,6 +192,14 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
         more(text, digest.other_faults)?;
     }
     clips::write(text, clips, summary, paint)?;
+    let quiet = [
+        (summary.in_cooldown, "no window", "trigger", ", within the cooldown"),
+        (summary.ignored, "no window", "start or stop", ", of a recording that ran already or did not run"),
+        (summary.clips_replaced, "replaced", "clip", " of an earlier replay"),
+    ];
+    for (count, what, thing, why) in quiet.into_iter().filter(|(count, ..)| *count > 0) {
+        writeln!(text, "  {}", paint.dim(&format!("{what}: {}{why}", counted(count, thing))))?;
+    }
     for loss in losses(summary) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {loss}")))?;
     }

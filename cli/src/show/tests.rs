@@ -39,6 +39,9 @@ fn replay() -> Summary {
             too_big: 0,
         }],
         clips: 0,
+        clips_replaced: 0,
+        in_cooldown: 0,
+        ignored: 0,
         damaged: None,
     }
 }
@@ -211,11 +214,29 @@ fn a_clip_is_shown_with_its_length_topics_thumbnail_and_what_is_missing() {
     let text = summary(&Summary { clips: 1, ..replay() }, &digest(Vec::new()), &[clip()], PLAIN);
     let shown = "  1 clip\n     \
                     5.801 to 9.000 s  clips/x.mcap\n              \
-                    3.2 s, 1.0 MiB: /imu/data 1,646; clips/x.jpg\n              \
+                    3.2 s, 1.0 MiB: messages /imu/data 1,646; clips/x.jpg\n              \
                     short: the drive ended 6.8 s before the window did\n              \
                     lost: 2 messages of /imu/data, before they reached the recorder\n";
     assert!(text.contains(shown), "{text}");
     assert!(text.ends_with("out/demo: decisions.jsonl, log.jsonl, summary.json, clips.jsonl, clips/\n"), "{text}");
+}
+
+#[test]
+fn starts_and_stops_are_told_from_events_and_what_made_no_clip_is_counted() {
+    let mut decisions = vec![decision(1000, Some("turn"), None), decision(1100, Some("turn"), None)];
+    decisions[0].triggers[0].kind = TriggerKind::Start;
+    decisions[1].triggers[0].kind = TriggerKind::Stop;
+    let quiet = Summary { in_cooldown: 2, ignored: 1, clips_replaced: 5, ..replay() };
+    let text = summary(&quiet, &digest(decisions), &[], PLAIN);
+    for line in [
+        "  turn, start  1.46\n",
+        "  turn, stop  1.46\n",
+        "  no window: 2 triggers, within the cooldown\n",
+        "  no window: 1 start or stop, of a recording that ran already or did not run\n",
+        "  replaced: 5 clips of an earlier replay\n",
+    ] {
+        assert!(text.contains(line), "no `{line}` in {text}");
+    }
 }
 
 #[test]

@@ -123,6 +123,30 @@ pub enum RecordError {
         /// What the system said.
         source: io::Error,
     },
+    /// A topic says more of itself than a clip has room for.
+    #[error("the {what} of topic `{topic}` has {bytes} bytes; a clip has room for {most}")]
+    LongTopic {
+        /// Its name, or the begin of it.
+        topic: String,
+        /// What is long.
+        what: &'static str,
+        /// How long it is.
+        bytes: usize,
+        /// How long it may be.
+        most: usize,
+    },
+    /// Something is larger than a clip can hold.
+    #[error("{what} of {bytes} bytes is larger than clip `{}` can hold: {most} bytes", path.display())]
+    TooLarge {
+        /// The clip.
+        path: PathBuf,
+        /// What it is.
+        what: &'static str,
+        /// How large it is.
+        bytes: usize,
+        /// How large it may be.
+        most: usize,
+    },
     /// More topics than a recorder holds.
     #[error("a recorder holds at most {most} topics")]
     TooManyTopics {
@@ -150,6 +174,7 @@ impl Explain for RecordError {
         let help = match (self, self.system()) {
             (Self::Busy { .. }, _) => "wait until it ends, or choose another folder: --out DIR",
             (Self::TooManyTopics { .. }, _) => "record fewer topics: [record] topics in lambda.toml",
+            (Self::LongTopic { .. }, _) => "remove the topic from [record]",
             (_, Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)) => {
                 "make room on the disk, or choose another folder: --out DIR"
             }
@@ -163,7 +188,7 @@ impl Explain for RecordError {
 
     fn exit(&self) -> Exit {
         match self {
-            Self::TooManyTopics { .. } => Exit::Usage,
+            Self::TooManyTopics { .. } | Self::LongTopic { .. } => Exit::Usage,
             _ => Exit::Internal,
         }
     }

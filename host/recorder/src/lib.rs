@@ -9,14 +9,20 @@
 //! Synchronous and without threads: what is recorded depends on the stamps of samples and wakes only. What never happens
 //! here: running a lambda, subscribing a topic, deciding what is worth keeping.
 
+// The tests within the crate share support with those outside of it.
+#[cfg(test)]
+extern crate self as gleaner_recorder;
+
 mod error;
 mod file;
 mod preroll;
 mod recorder;
+#[cfg(test)]
+#[path = "../tests/support/mod.rs"]
+mod support;
 mod thumbnail;
 mod window;
 
 pub use error::RecordError;
-pub use file::{About, Ending, Folder, Topic, TopicCounts, Unfinished};
+pub use file::{Folder, Topic};
 pub use recorder::{Counts, LambdaId, Member, Recorder, Settings, TopicId};
-pub use thumbnail::thumbnail;

@@ -204,22 +204,24 @@ fn a_recorder_has_an_end_of_topics() {
     assert!(matches!(refused, RecordError::TooManyTopics { most: 256 }));
 }
 
+/// A grey image of 4x4 pixels.
+fn image(grey: u8) -> Vec<u8> {
+    // Stamp, and an empty frame id of one byte.
+    let mut cdr = vec![0; 16];
+    cdr[8] = 1;
+    for number in [4_u32, 4, 6] {
+        cdr.extend(number.to_le_bytes());
+    }
+    cdr.extend(b"mono8\0\0\0");
+    for number in [4_u32, 16] {
+        cdr.extend(number.to_le_bytes());
+    }
+    cdr.extend([grey; 16]);
+    cdr
+}
+
 #[test]
 fn the_picture_is_that_of_the_trigger() {
-    let image = |grey: u8| {
-        // Stamp, and an empty frame id of one byte.
-        let mut cdr = vec![0; 16];
-        cdr[8] = 1;
-        for number in [4_u32, 4, 6] {
-            cdr.extend(number.to_le_bytes());
-        }
-        cdr.extend(b"mono8\0\0\0");
-        for number in [4_u32, 16] {
-            cdr.extend(number.to_le_bytes());
-        }
-        cdr.extend([grey; 16]);
-        cdr
-    };
     let picture = |anchor_ms: i64| {
         let scratch = Scratch::new();
         let mut recorder = scratch.recorder(|_| {});
@@ -241,6 +243,35 @@ fn the_picture_is_that_of_the_trigger() {
     assert_eq!(picture(60), picture(149), "the newest image before");
     assert_ne!(picture(60), picture(150));
     assert_eq!(picture(10), picture(60), "or the first one after");
+}
+
+#[test]
+fn the_picture_is_in_the_clip() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let topics = ["/a", "/camera"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let lambda = recorder.add_lambda(member("hello", (100, 100, 0), &topics));
+    recorder.sample(topics[1], &meta(T0 + 10 * MS, 1), &image(10)).unwrap();
+    drive(&mut recorder, &topics[..1], (20, 500, 10), &[(300, lambda, EVENT)]);
+    recorder.finish(T0 + S).unwrap();
+    let clip = &recorder.clips()[0];
+    assert_eq!((clip.thumbnail.as_ref(), clip.topics[1].messages), (None, 0), "the one image was long before");
+}
+
+#[test]
+fn a_topic_that_was_silent_has_a_channel_and_a_missing_one_has_none() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let topics = ["/a", "/silent", "/other"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let gone = recorder.add_missing_topic("/gone").unwrap();
+    let lambda = recorder.add_lambda(member("hello", (100, 100, 0), &[topics[0], topics[1], gone]));
+    let empty = recorder.add_lambda(member("empty", (0, 0, 0), &[topics[1]]));
+    drive(&mut recorder, &topics[..1], (0, 1000, 10), &[(300, lambda, EVENT), (800, empty, EVENT)]);
+    recorder.finish(T0 + S).unwrap();
+    let [clip, without] = recorder.clips() else { panic!() };
+    assert_eq!(scratch.channels(clip), ["/a", "/silent"]);
+    assert_eq!(clip.topics.iter().map(|topic| topic.messages).collect::<Vec<_>>(), [21, 0, 0]);
+    assert_eq!((scratch.channels(without), without.first_ns), (vec!["/silent".to_owned()], None));
 }
 
 #[test]

@@ -54,11 +54,6 @@ impl Default for Looked {
 }
 
 impl Looked {
-    /// Notes a look at what became of all samples so far.
-    pub(super) fn at_all(&self) {
-        self.0.store(0, Ordering::Relaxed);
-    }
-
     /// Notes the oldest of the samples that a call hands out.
     pub(super) fn at(&self, oldest: Option<&Lease<SampleMeta>>) {
         if let Some(position) = oldest.and_then(Lease::position)

@@ -12,8 +12,8 @@ use sha2::{Digest, Sha256};
 
 use crate::input::Remap;
 
-/// More files than a build has, by far.
-const FILES_MAX: usize = 10_000;
+/// More files than a build has, by far; with names of 255 bytes they fit into the header of a journal.
+const FILES_MAX: usize = 4_000;
 
 /// A build cannot be identified.
 #[derive(Debug, thiserror::Error)]
@@ -63,6 +63,7 @@ impl Identity<'_> {
             kind: lambda.kind,
             files: build_digests(build)?,
             models: manifest.models.iter().map(model).collect(),
+            manifest: manifest_digest(manifest),
             inputs: manifest.inputs.iter().map(|input| journal_input(input, remaps)).collect(),
             event_input: event,
             config: config.iter().map(|(key, value)| (key.clone(), json(value))).collect::<Map<_, _>>(),
@@ -70,6 +71,27 @@ impl Identity<'_> {
             clock: clock.to_owned(),
             wakes_before: 0,
         })
+    }
+}
+
+/// Of what a decision can depend on.
+fn manifest_digest(manifest: &Manifest) -> String {
+    let mut json = manifest.to_json();
+    if let Some(table) = json.as_object_mut() {
+        table.remove("record");
+    }
+    without_descriptions(&mut json);
+    hex(Sha256::new_with_prefix(json.to_string()))
+}
+
+fn without_descriptions(json: &mut Value) {
+    match json {
+        Value::Object(table) => {
+            table.remove("description");
+            table.values_mut().for_each(without_descriptions);
+        }
+        Value::Array(items) => items.iter_mut().for_each(without_descriptions),
+        _ => {}
     }
 }
 

@@ -55,6 +55,13 @@ impl Scribe {
         }
     }
 
+    /// Forgets what came since the wake before.
+    pub fn skip(&mut self) {
+        for ((topic, trace), seen) in self.topics.iter_mut().zip(&mut self.entry.seen) {
+            trace.begin(topic, seen);
+        }
+    }
+
     /// After a wake that led to `decision` and said `log`.
     pub fn end(&mut self, decision: &Decision, log: Said) -> &Entry {
         for (index, ((topic, trace), seen)) in self.topics.iter().zip(&mut self.entry.seen).enumerate() {

@@ -3,11 +3,10 @@
 //! Time is the drive's. A sample is delivered, the lambda runs if its schedule says so, then the next: nothing is skipped,
 //! and nothing depends on how fast the machine is.
 
-mod claim;
+mod course;
 mod digests;
 mod options;
 mod output;
-mod paced;
 mod record;
 mod round;
 mod stage;

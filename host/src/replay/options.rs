@@ -1,12 +1,13 @@
 //! What to do: the arguments as typed, and what they mean once checked against the build.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
 use gleaner_protocol::{BuildDir, Exit, Failure};
 
-use super::claim::Claim;
+use super::output::RESULTS;
+use super::verify::Claim;
 use crate::input::Remap;
 
 /// Arguments of `replay`.
@@ -126,13 +127,19 @@ impl Job {
         }
         let config = ConfigSet::resolve(&manifest, &args.set)?;
         known_topics(&args.remap, &manifest)?;
-        let results = Results {
-            out: args.out.unwrap_or_else(|| args.lambda.join("out")),
-            all: args.all,
-            record: !args.no_record,
-            journal: args.journal,
-            repeat: args.repeat,
-        };
+        let out = args.out.unwrap_or_else(|| args.lambda.join("out"));
+        if let Some(journal) = args.journal.as_deref().filter(|journal| is_result(journal, &out)) {
+            let message = format!("`{}` is a file of the results", journal.display());
+            return Err(
+                Failure::new(Exit::Usage, message).with_help("give the journal a name of its own: --journal FILE")
+            );
+        }
+        if let Some(journal) = args.journal.as_deref().filter(|journal| journal.starts_with(build.path())) {
+            let message = format!("`{}` lies in the build, and would change the lambda", journal.display());
+            return Err(Failure::new(Exit::Usage, message).with_help("write the journal elsewhere: --journal FILE"));
+        }
+        let results =
+            Results { out, all: args.all, record: !args.no_record, journal: args.journal, repeat: args.repeat };
         let options = Options { lambda: args.lambda, build, drives: args.drives, config, remaps: args.remap };
         Ok(Self { options, manifest, task: Task::Replay(results) })
     }
@@ -168,6 +175,19 @@ fn known_topics(remaps: &[Remap], manifest: &Manifest) -> Result<(), Failure> {
             Err(failure.with_help(format!("the manifest has `{}`", known.join("`, `"))))
         }
     }
+}
+
+/// Whether `path` is one of the files that a replay writes into `out` anyway.
+fn is_result(path: &Path, out: &Path) -> bool {
+    if path.starts_with(out.join("clips")) {
+        return true;
+    }
+    let is_name = path.file_name().is_some_and(|name| RESULTS.iter().any(|result| name == *result));
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let same = |a: &Path, b: &Path| {
+        a == b || std::fs::canonicalize(a).ok().is_some_and(|a| std::fs::canonicalize(b).ok() == Some(a))
+    };
+    is_name && same(folder, out)
 }
 
 /// A file that is the same as an earlier one, under whatever name.

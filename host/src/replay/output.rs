@@ -12,6 +12,9 @@ use crate::api::log::Line;
 
 const SUMMARY: &str = "summary.json";
 
+/// The files of a replay beside its clips.
+pub(super) const RESULTS: [&str; 4] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", SUMMARY];
+
 /// Why results could not be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write `{}`", path.display())]
@@ -126,10 +129,12 @@ impl JournalFile {
     /// Begins the journal `path` anew. A file there that is no journal is left alone: it may be a drive, named by mistake.
     pub fn create(path: &Path, header: &Header) -> Result<Self, Failure> {
         let failed = |source| OutputError { path: path.to_owned(), source };
-        match File::open(path) {
-            Ok(mut file) => {
-                let is_empty = file.metadata().map_err(failed)?.len() == 0;
-                if !is_empty && Reader::open(&mut file).is_err() {
+        match fs::metadata(path) {
+            Ok(metadata) => {
+                // A pipe would never end, and a device is no file to verify later.
+                let is_file = metadata.is_file();
+                let is_journal = || File::open(path).is_ok_and(|file| Reader::open(file).is_ok());
+                if !is_file || metadata.len() > 0 && !is_journal() {
                     let message = format!("`{}` is there and is no journal of this version", path.display());
                     return Err(Failure::new(Exit::Usage, message).with_help("choose another name: --journal FILE"));
                 }

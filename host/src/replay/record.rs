@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
-use gleaner_recorder::{Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId};
+use gleaner_recorder::{Counts, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId};
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
@@ -23,6 +23,14 @@ pub(super) struct Recording {
     /// Where clips go, and what was recovered there; until the recorder has it.
     folder: Option<(Folder, Vec<Clip>)>,
     lambda: Option<LambdaId>,
+}
+
+/// What a recording did, beside its clips.
+#[derive(Default)]
+pub(super) struct Recorded {
+    pub(super) clips: u64,
+    pub(super) in_cooldown: u64,
+    pub(super) ignored: u64,
 }
 
 struct Shared {
@@ -60,6 +68,15 @@ impl Sink for Lane {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// What an earlier replay left in `out`, if it left clips: this one makes none, and results of two would lie side by side.
+pub(super) fn remove_clips(out: &Path) -> Result<u64, Failure> {
+    if !out.join("clips.jsonl").exists() {
+        return Ok(0);
+    }
+    let (mut folder, recovered) = Folder::open(out)?;
+    Ok(folder.replace(&recovered)?)
 }
 
 impl Recording {
@@ -108,6 +125,17 @@ impl Recording {
             }
             lanes.push(lane);
         }
+        if !lanes.iter().any(|lane| lane.is_there) {
+            let mut failure = Failure::new(Exit::Usage, "the drive has none of the topics of [record]");
+            let list = |names: Vec<&str>| names.join("`, `");
+            failure.causes =
+                vec![format!("[record] has `{}`", list(lanes.iter().map(|lane| lane.topic.name.as_str()).collect()))];
+            let help = format!(
+                "the drive has `{}`; pass --remap FROM:=TO, or replay without clips: --no-record",
+                list(known.iter().map(|topic| topic.topic.as_str()).collect())
+            );
+            return Err(failure.with_help(help));
+        }
         let (folder, recovered) = Folder::open(out)?;
         for clip in &recovered {
             tracing::warn!(clip = %clip.file.display(), "recovered a clip of an earlier replay, which did not end well");
@@ -115,10 +143,10 @@ impl Recording {
         Ok(Some(Self { shared, lanes, rules: rules.clone(), folder: Some((folder, recovered)), lambda: None }))
     }
 
-    /// Makes the recorder. The clips of an earlier replay are replaced, but not those that were recovered.
-    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
-        let Some((mut folder, recovered)) = self.folder.take() else { return Ok(()) };
-        folder.replace(&recovered)?;
+    /// Makes the recorder. The clips of an earlier replay are replaced, but not those that were recovered; returns how many.
+    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<u64, Failure> {
+        let Some((mut folder, recovered)) = self.folder.take() else { return Ok(0) };
+        let replaced = folder.replace(&recovered)?;
         let settings = Settings {
             store: self.rules.store,
             preroll_bytes: self.rules.preroll_size.bytes(),
@@ -141,7 +169,7 @@ impl Recording {
         let (header, digest) = (header.clone(), lambda_digest(&header.files));
         self.lambda = Some(recorder.add_lambda(Member { header, rules: self.rules.clone(), digest, topics }));
         lock(&self.shared).recorder = Some(recorder);
-        Ok(())
+        Ok(replaced)
     }
 
     /// After a wake: what it triggered opens or closes windows.
@@ -160,11 +188,12 @@ impl Recording {
         }
     }
 
-    /// At the end of the drive: closes what is open. Returns all clips.
-    pub(super) fn finish(&self, end_ns: i64) -> Result<Vec<Clip>, Failure> {
+    /// At the end of the drive: closes what is open.
+    pub(super) fn finish(&self, end_ns: i64) -> Result<Recorded, Failure> {
         self.with(|recorder| {
             recorder.finish(end_ns)?;
-            Ok(recorder.clips().to_vec())
+            let Counts { clips, in_cooldown, ignored, .. } = recorder.counts();
+            Ok(Recorded { clips, in_cooldown, ignored })
         })
     }
 

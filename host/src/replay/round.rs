@@ -8,12 +8,13 @@ use std::time::{Duration, Instant};
 use gleaner_protocol::journal::End;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Explain, Failure, Report, Round, Summary, TopicReport};
-use gleaner_transport::replay::{Replay, ReplayError};
+use gleaner_transport::replay::{Replay, Step};
 
+use super::course::{self, Course, Reached};
 use super::digests::Digests;
 use super::options::Results;
 use super::output::{JournalFile, Output};
-use super::record::Recording;
+use super::record::{Recorded, Recording, remove_clips};
 use super::stage::{DriveError, Stage};
 use super::{CLOCK, Load, Options, report as send};
 use crate::api::Session;
@@ -34,6 +35,7 @@ struct Pass<'a> {
     schedule: Schedule,
     session: Session,
     output: &'a mut Output,
+    reports: &'a mut dyn Write,
     /// Fills in what the journal and the clips say of a wake; none where there is neither.
     scribe: Option<Scribe>,
     journal: Option<JournalFile>,
@@ -42,10 +44,16 @@ struct Pass<'a> {
     triggers: u64,
     faults: u64,
     log_lines: u64,
+    samples: u64,
+    looked: Instant,
 }
 
-impl Pass<'_> {
-    fn wake(&mut self, wake: Wake) -> Result<(), Failure> {
+impl Course for Pass<'_> {
+    fn schedule(&mut self) -> &mut Schedule {
+        &mut self.schedule
+    }
+
+    fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
         if let Some(scribe) = &mut self.scribe {
             scribe.begin(&wake);
         }
@@ -55,6 +63,7 @@ impl Pass<'_> {
         self.faults += u64::from(decision.fault.is_some());
         self.output.decision(&decision)?;
         let log = self.session.take_log();
+        self.keep(&log)?;
         if let Some(scribe) = &mut self.scribe {
             let entry = scribe.end(&decision, self.session.take_said());
             if let Some(journal) = &mut self.journal {
@@ -64,9 +73,26 @@ impl Pass<'_> {
                 recording.wake(entry)?;
             }
         }
-        self.keep(&log)
+        Ok(true)
     }
 
+    fn sample(&mut self, drive: &Replay, step: &Step) -> Result<(), Failure> {
+        if let Some(recording) = &self.recording {
+            recording.check()?;
+        }
+        self.samples += 1;
+        if self.samples.is_multiple_of(SAMPLES_PER_LOOK) && self.looked.elapsed() >= PROGRESS {
+            self.looked = Instant::now();
+            self.flush()?;
+            let progress = drive.progress();
+            let report = Report::Progress { done: progress.done, total: Some(progress.total), at_ns: step.at_ns };
+            send(self.reports, &report);
+        }
+        Ok(())
+    }
+}
+
+impl Pass<'_> {
     fn keep(&mut self, log: &[Line]) -> Result<(), Failure> {
         self.log_lines += log.len() as u64;
         Ok(self.output.log(log)?)
@@ -78,12 +104,13 @@ impl Pass<'_> {
         Ok(self.journal.as_mut().map_or(Ok(()), JournalFile::flush)?)
     }
 
-    /// Runs the ticks that are due before a sample of `at_ns`.
-    fn ticks(&mut self, at_ns: i64) -> Result<(), Failure> {
-        while let Some(tick) = self.schedule.next_tick(at_ns) {
-            self.wake(tick)?;
-        }
-        Ok(())
+    /// Goes through the drive, and closes what is recorded.
+    fn run(&mut self, drive: &mut Replay) -> Result<(Reached, Recorded), Failure> {
+        let reached = course::take(drive, self)?;
+        // Of a damaged drive nobody knows what came after the last sample.
+        let end_ns = if reached.broken.is_some() { reached.at_ns } else { drive.end_ns().unwrap_or(0) };
+        let recorded = self.recording.as_ref().map_or(Ok(Recorded::default()), |recording| recording.finish(end_ns))?;
+        Ok((reached, recorded))
     }
 }
 
@@ -99,8 +126,21 @@ pub(super) fn replay(
     let Stage { mut drive, inputs, session, mut guest } = Stage::set(drive, options, manifest, load)?;
     let mut recording =
         if results.record { Recording::subscribe(manifest, options, &mut drive, &results.out)? } else { None };
+    let started = Instant::now();
+    let mut header = None;
+    if results.journal.is_some() || recording.is_some() {
+        let Options { build, config, remaps, .. } = options;
+        header = Some(Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK }.header()?);
+    }
+    let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.clone()));
+    let journal = results.journal.as_deref().zip(header.as_ref());
+    let journal = journal.map(|(path, header)| JournalFile::create(path, header)).transpose()?;
     // Only now does it cost the results of an earlier replay: what could not start must not touch them.
     let mut output = Output::create(&results.out, results.all)?;
+    let clips_replaced = match (&mut recording, &header) {
+        (Some(recording), Some(header)) => recording.start(&results.out, header)?,
+        _ => remove_clips(&results.out)?,
+    };
     let initialised = guest.init();
     let said = session.take_log();
     // What `init` says is no part of a wake.
@@ -113,38 +153,30 @@ pub(super) fn replay(
         failure.causes = vec![fault.message];
         return Err(failure);
     }
-    let started = Instant::now();
-    let mut journal = None;
-    let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.clone()));
-    if results.journal.is_some() || recording.is_some() {
-        let Options { build, config, remaps, .. } = options;
-        let header = Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK }.header()?;
-        journal = results.journal.as_deref().map(|path| JournalFile::create(path, &header)).transpose()?;
-        if let Some(recording) = &mut recording {
-            recording.start(&results.out, &header)?;
-        }
-    }
     let mut pass = Pass {
         schedule: Schedule::new(manifest, &inputs),
         judge: Judge::new(session.clone(), guest),
         session,
         output: &mut output,
-        scribe: (journal.is_some() || recording.is_some()).then(|| Scribe::new(&inputs)),
+        reports,
+        scribe: header.is_some().then(|| Scribe::new(&inputs)),
         journal,
         recording,
         wakes: 0,
         triggers: 0,
         faults: 0,
         log_lines: 0,
+        samples: 0,
+        looked: Instant::now(),
     };
     pass.keep(&said)?;
 
-    let (read_to_ns, broken) = drain(&mut drive, &mut pass, reports)?;
-    let broken = broken.map(DriveError);
-    let end_ns = drive.end_ns().unwrap_or(0);
-    // Of a damaged drive nobody knows what came after the last sample.
-    let recorded_to_ns = if broken.is_some() { read_to_ns } else { end_ns };
-    let clips = pass.recording.as_ref().map_or(Ok(Vec::new()), |recording| recording.finish(recorded_to_ns))?;
+    let ran = pass.run(&mut drive);
+    // Whatever ended it, what was decided until then is kept.
+    let flushed = pass.flush();
+    let (reached, recorded) = ran?;
+    flushed?;
+    let broken = reached.broken.map(DriveError);
     if let (Some(journal), Some(digests)) = (pass.journal.take(), digests) {
         let samples = inputs.iter().map(|topic| offered(topic)).collect();
         // A journal of a damaged drive has no end: it cannot say what comes there.
@@ -167,62 +199,23 @@ pub(super) fn replay(
         log_lines: pass.log_lines,
         log_dropped: pass.session.log_dropped(),
         start_ns: drive.start_ns().unwrap_or(0),
-        end_ns,
+        end_ns: drive.end_ns().unwrap_or(0),
         wall_s,
         run_s: pass.judge.run().as_secs_f64(),
         decode_s: inputs.iter().map(|topic| topic.decode_ns()).sum::<u64>() as f64 / 1e9,
         wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
         peak_rss_bytes: memory("VmHWM:"),
         topics: inputs.iter().map(topic_report).collect(),
-        clips: clips.len() as u64,
+        clips: recorded.clips,
+        clips_replaced,
+        in_cooldown: recorded.in_cooldown,
+        ignored: recorded.ignored,
         damaged: broken
             .as_ref()
             .map(|error| Failure::because("the drive could not be read to its end", error).to_string()),
     };
     output.finish(&summary)?;
     Ok((summary, broken.map(|error| error.exit())))
-}
-
-/// Delivers every sample of the drive and runs what it wakes. Returns the stamp of the last, and the damage that ended it, if
-/// there is one.
-fn drain(
-    drive: &mut Replay,
-    pass: &mut Pass<'_>,
-    reports: &mut dyn Write,
-) -> Result<(i64, Option<ReplayError>), Failure> {
-    let mut at_ns = 0;
-    let mut looked = Instant::now();
-    let mut samples = 0_u64;
-    let damaged = loop {
-        match drive.peek_at_ns() {
-            Ok(Some(next_ns)) => pass.ticks(next_ns)?,
-            Ok(None) => break None,
-            Err(error) => break Some(error),
-        }
-        match drive.step() {
-            Ok(Some(step)) => at_ns = step.at_ns,
-            Ok(None) => break None,
-            Err(error) => break Some(error),
-        }
-        if let Some(recording) = &pass.recording {
-            recording.check()?;
-        }
-        while let Some(wake) = pass.schedule.next_event() {
-            pass.wake(wake)?;
-        }
-        samples += 1;
-        if samples.is_multiple_of(SAMPLES_PER_LOOK) && looked.elapsed() >= PROGRESS {
-            looked = Instant::now();
-            pass.flush()?;
-            let progress = drive.progress();
-            send(reports, &Report::Progress { done: progress.done, total: Some(progress.total), at_ns });
-        }
-    };
-    if samples > 0 {
-        // A tick of the very last instant is still due.
-        pass.ticks(at_ns.saturating_add(1))?;
-    }
-    Ok((at_ns, damaged))
 }
 
 pub(super) fn report(n: u32, summary: &Summary) -> Round {

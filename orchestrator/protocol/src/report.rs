@@ -110,8 +110,14 @@ pub struct Summary {
     pub peak_rss_bytes: u64,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<TopicReport>,
-    /// Clips made; `clips.jsonl` has a line for each.
+    /// Clips made; `clips.jsonl` has a line for each, and for those that were recovered.
     pub clips: u64,
+    /// Clips of an earlier replay that were deleted from the same folder.
+    pub clips_replaced: u64,
+    /// Triggers that opened no window, as they came within the cooldown of another.
+    pub in_cooldown: u64,
+    /// Starts of a recording that was running, and stops of none.
+    pub ignored: u64,
     /// What is wrong with the drive, if it is damaged; the results end there.
     pub damaged: Option<String>,
 }
@@ -193,6 +199,9 @@ mod tests {
             peak_rss_bytes: 1 << 20,
             topics: vec![topic],
             clips: 2,
+            clips_replaced: 1,
+            in_cooldown: 3,
+            ignored: 0,
             damaged: None,
         };
         reads_back(
@@ -203,7 +212,7 @@ mod tests {
                 r#""log_dropped":0,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
                 r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,
-                r#""clips":2,"damaged":null}"#
+                r#""clips":2,"clips_replaced":1,"in_cooldown":3,"ignored":0,"damaged":null}"#
             ),
         );
     }

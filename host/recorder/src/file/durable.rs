@@ -8,37 +8,100 @@ use crate::error::RecordError;
 
 /// Makes the names in `folder` durable: a rename is on the disk only when its folder is.
 pub(super) fn sync_folder(folder: &Path) -> Result<(), RecordError> {
-    File::open(folder)
-        .and_then(|folder| folder.sync_all())
-        .map_err(|source| RecordError::Sync { path: folder.to_owned(), source })
+    sync_file(folder)
 }
 
 /// Makes the content of `path` durable.
 pub(super) fn sync_file(path: &Path) -> Result<(), RecordError> {
-    File::open(path)
-        .and_then(|file| file.sync_all())
+    step("sync", path)
+        .and_then(|()| File::open(path)?.sync_all())
         .map_err(|source| RecordError::Sync { path: path.to_owned(), source })
 }
 
 /// Gives the file `from`, whose content is durable, the name `to`.
 pub(super) fn rename(from: &Path, to: &Path, folder: &Path) -> Result<(), RecordError> {
-    fs::rename(from, to).map_err(|source| RecordError::Rename { from: from.to_owned(), to: to.to_owned(), source })?;
+    step("rename", to).and_then(|()| fs::rename(from, to)).map_err(|source| RecordError::Rename {
+        from: from.to_owned(),
+        to: to.to_owned(),
+        source,
+    })?;
     sync_folder(folder)
 }
 
 /// Writes `to` by way of `part`, so that it is whole or not there.
 pub(super) fn write(part: &Path, to: &Path, folder: &Path, content: &[u8]) -> Result<(), RecordError> {
+    write_with(part, to, folder, |file| file.write_all(content))
+}
+
+/// As [`write`], with what `fill` writes.
+pub(super) fn write_with(
+    part: &Path,
+    to: &Path,
+    folder: &Path,
+    fill: impl FnOnce(&mut File) -> io::Result<()>,
+) -> Result<(), RecordError> {
     let mut file = File::create(part).map_err(|source| RecordError::Create { path: part.to_owned(), source })?;
-    file.write_all(content).map_err(|source| RecordError::Write { path: part.to_owned(), source })?;
+    fill(&mut file).map_err(|source| RecordError::Write { path: part.to_owned(), source })?;
     file.sync_all().map_err(|source| RecordError::Sync { path: part.to_owned(), source })?;
     rename(part, to, folder)
 }
 
+/// Copies the content of `from` into the file `to`, which must not exist yet, and makes it durable there. What was read
+/// is what is on the disk then, even if an earlier attempt to make it durable where it was had failed.
+pub(super) fn copy(from: &Path, to: &Path) -> Result<(), RecordError> {
+    let cannot_write = |source| RecordError::Write { path: to.to_owned(), source };
+    let mut source = File::open(from).map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
+    let copy = step("copy", to).and_then(|()| File::create_new(to));
+    let mut copy = copy.map_err(|source| RecordError::Create { path: to.to_owned(), source })?;
+    io::copy(&mut source, &mut copy).map_err(cannot_write)?;
+    sync_file(to)
+}
+
 /// Removes a file, and says whether it was there.
 pub(super) fn remove(path: &Path) -> Result<bool, RecordError> {
-    match fs::remove_file(path) {
+    match step("remove", path).and_then(|()| fs::remove_file(path)) {
         Ok(()) => Ok(true),
         Err(source) if source.kind() == io::ErrorKind::NotFound => Ok(false),
         Err(source) => Err(RecordError::Remove { path: path.to_owned(), source }),
+    }
+}
+
+/// Comes before each step: a test sees their order, and may let the process die at any of them.
+#[cfg(not(test))]
+pub(super) fn step(_: &str, _: &Path) -> io::Result<()> {
+    Ok(())
+}
+
+#[cfg(test)]
+pub(super) use steps::step;
+
+#[cfg(test)]
+pub(super) mod steps {
+    use std::cell::RefCell;
+
+    use super::*;
+
+    thread_local! {
+        static STEPS: RefCell<(Vec<String>, usize)> = const { RefCell::new((Vec::new(), usize::MAX)) };
+    }
+
+    /// Counts from here on; whatever comes after `last` steps fails, as if the process had died.
+    pub fn restart(last: usize) {
+        STEPS.set((Vec::new(), last));
+    }
+
+    /// The steps so far.
+    pub fn taken() -> Vec<String> {
+        STEPS.with_borrow(|(taken, _)| taken.clone())
+    }
+
+    pub fn step(what: &str, path: &Path) -> io::Result<()> {
+        STEPS.with_borrow_mut(|(taken, last)| {
+            if taken.len() == *last {
+                return Err(io::Error::other("dead"));
+            }
+            taken.push(format!("{what} {}", path.file_name().unwrap_or_default().display()));
+            Ok(())
+        })
     }
 }

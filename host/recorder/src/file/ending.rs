@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::fmt::Display;
 use std::path::PathBuf;
 
+use gleaner_protocol::journal::{FileDigest, Header};
 use gleaner_protocol::{Clip, ClipLambda, ClipTopic, Moment};
 
 use super::{About, Ending};
@@ -145,14 +146,11 @@ pub(super) fn records<'a>(
     clock: &str,
     recovered_from: Option<&str>,
 ) -> impl Iterator<Item = Record> + 'a {
-    let brought = |lambda: &ClipLambda| {
-        ending.metadata.iter().any(|(name, of)| name == "gleaner.lambda" && of.get("name") == Some(&lambda.name))
-    };
-    let lambdas = clip.lambdas.iter().filter(move |lambda| !brought(lambda)).map(lambda);
+    let header = |lambda: &ClipLambda| ending.headers.iter().find(|header| header.lambda == lambda.name);
+    let lambdas = clip.lambdas.iter().map(move |of| lambda(of, header(of)));
     std::iter::once(about_clip(clip, clock, recovered_from))
         .chain(clip.topics.iter().map(topic))
         .chain(lambdas)
-        .chain(ending.metadata.iter().cloned())
         .chain(ending.moments.iter().map(decision))
 }
 
@@ -192,10 +190,15 @@ fn topic(topic: &ClipTopic) -> Record {
     ("gleaner.topic".to_owned(), metadata)
 }
 
-fn lambda(lambda: &ClipLambda) -> Record {
+fn lambda(lambda: &ClipLambda, header: Option<&Header>) -> Record {
+    let model = |model: &FileDigest| format!("{}={}", model.path, model.sha256);
     let metadata = pairs([
+        ("config", known(header.map(|header| json(&header.config)))),
         ("digest", lambda.digest.clone()),
+        ("engine", known(header.map(|header| &header.engine))),
+        ("gleaner", known(header.map(|header| &header.gleaner))),
         ("kind", lambda.kind.as_str().to_owned()),
+        ("models", known(header.map(|header| header.models.iter().map(model).collect::<Vec<_>>().join(", ")))),
         ("name", lambda.name.clone()),
         ("version", lambda.version.clone()),
         ("windows", lambda.windows.to_string()),

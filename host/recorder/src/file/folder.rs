@@ -52,7 +52,8 @@ impl Folder {
     }
 
     /// Starts anew with the clips in `keep`: deletes the others that are listed, with their thumbnails, and says how
-    /// many clips these were.
+    /// many clips these were. Lines of the list that name no clip
+    /// of ours stay.
     ///
     /// Only plain files in the folder of clips are deleted, whatever the list names.
     ///
@@ -85,7 +86,7 @@ impl Folder {
     /// # Errors
     ///
     /// [`RecordError`] if its file cannot be made or written.
-    pub fn begin(&mut self, stem: &str, about: &About) -> Result<Unfinished, RecordError> {
+    pub(crate) fn begin(&mut self, stem: &str, about: &About) -> Result<Unfinished, RecordError> {
         let name = self.place.free_name(stem);
         Unfinished::create(Arc::clone(&self.place), name, PART, Some(about))
     }

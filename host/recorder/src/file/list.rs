@@ -1,7 +1,7 @@
 //! `clips.jsonl`: a line for each whole clip.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Component, Path, PathBuf};
 
 use gleaner_protocol::Clip;
@@ -12,8 +12,9 @@ use super::durable;
 use super::place::{CLIP, CLIPS, JPG};
 use crate::error::RecordError;
 
-/// Our lines have some 30 KB at most: 100 moments and 256 topics.
-const LINE_MAX: u64 = 4 << 20;
+/// Longer lines are not ours. One of ours has some KB; at most 8 MB: 256 topics, whose names of 1 KiB may stand in it twice
+/// and in four texts of `short`, six bytes for each if they are control characters, and 100 moments of some 3 KB.
+const LINE_MAX: u64 = 16 << 20;
 
 /// The list of clips.
 pub(super) struct List {
@@ -48,7 +49,7 @@ impl List {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             Err(error) => return Err(failed(error)),
         };
-        let (listed, whole, len) = read_lines(&file).map_err(failed)?;
+        let (listed, whole, len) = read_lines(&file, |_| Ok(())).map_err(failed)?;
         if whole < len {
             warn!(path = %self.path.display(), bytes = len - whole, "last line of the list was torn, cut off");
             file.set_len(whole).and_then(|()| file.sync_all()).map_err(failed)?;
@@ -62,6 +63,7 @@ impl List {
         let is_new = !self.path.exists();
         let mut file = OpenOptions::new().append(true).create(true).open(&self.path).map_err(failed)?;
         let before = file.metadata().map_err(failed)?.len();
+        durable::step("append", &self.path).map_err(failed)?;
         if let Err(error) = file.write_all(&line(clip)).and_then(|()| file.sync_all()) {
             // A torn line would swallow the next one. If this fails as well, the next start cuts it off.
             let _ = file.set_len(before);
@@ -70,10 +72,20 @@ impl List {
         if is_new { durable::sync_folder(&self.folder) } else { Ok(()) }
     }
 
-    /// Starts anew with these clips.
+    /// Starts anew with these clips, behind the lines that are not ours.
     pub(super) fn replace(&self, clips: &[Clip]) -> Result<(), RecordError> {
-        let content = clips.iter().flat_map(line).collect::<Vec<u8>>();
-        durable::write(&self.folder.join("clips.jsonl.part"), &self.path, &self.folder, &content)
+        durable::write_with(&self.folder.join("clips.jsonl.part"), &self.path, &self.folder, |file| {
+            let mut new = BufWriter::new(file);
+            match File::open(&self.path) {
+                Ok(old) => {
+                    read_lines(&old, |foreign| new.write_all(foreign))?;
+                }
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => return Err(error),
+            }
+            clips.iter().try_for_each(|clip| new.write_all(&line(clip)))?;
+            new.flush()
+        })
     }
 }
 
@@ -83,8 +95,9 @@ fn line(clip: &Clip) -> Vec<u8> {
     line
 }
 
-/// The clips in `file`, how many of its bytes are whole lines, and how many there are.
-fn read_lines(file: &File) -> io::Result<(Vec<Listed>, u64, u64)> {
+/// The clips in `file`, how many of its bytes are whole lines, and how many there are. The lines that are not ours are given
+/// to `foreign`, each in one piece or, if it is longer than any of ours, in several.
+fn read_lines(file: &File, mut foreign: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<(Vec<Listed>, u64, u64)> {
     let mut reader = BufReader::new(file);
     let mut listed = Vec::new();
     let (mut at, mut whole, mut malformed) = (0, 0, 0_u64);
@@ -97,13 +110,19 @@ fn read_lines(file: &File) -> io::Result<(Vec<Listed>, u64, u64)> {
         }
         at += read;
         if !line.ends_with(b"\n") {
+            if read == LINE_MAX || too_long {
+                foreign(&line)?;
+            }
             too_long = true;
             continue;
         }
         whole = at;
         match serde_json::from_slice::<Line>(&line).ok().filter(|_| !too_long).and_then(names) {
             Some(names) => listed.push(names),
-            None => malformed += 1,
+            None => {
+                malformed += 1;
+                foreign(&line)?;
+            }
         }
         too_long = false;
     }

@@ -30,17 +30,24 @@ mod sink;
 mod tests;
 mod unfinished;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use gleaner_protocol::journal::Header;
 use gleaner_protocol::{ClipLambda, Moment};
 
 pub use folder::Folder;
-pub use unfinished::Unfinished;
+pub(crate) use unfinished::{MESSAGE_MAX, Unfinished};
+
+use crate::error::RecordError;
+
+/// Most bytes of a topic's name, and of its type's; ROS 2 allows 255. Both stand in a line of the list.
+const NAME_MAX: usize = 1 << 10;
+/// Most bytes of a topic's definitions and quality of service together: whoever reads a clip has to hold them.
+const DEFINITIONS_MAX: usize = 8 << 20;
 
 /// What is known when a clip begins. It stands in front of the messages, so that a recovered clip still says what it is.
 #[derive(Clone, Debug, PartialEq)]
-pub struct About {
+pub(crate) struct About {
     /// What the stamps are, for example "log time of the drive".
     pub clock: String,
     /// Begin of the window that opened the clip, in ns.
@@ -64,15 +71,38 @@ pub struct Topic {
     pub offered_qos: Option<String>,
 }
 
+impl Topic {
+    /// Whether a clip has room for what a topic says of itself. The fields of the file are larger; but what a file says of
+    /// its topics is held by all who read it.
+    pub(crate) fn check(&self) -> Result<(), RecordError> {
+        let definitions = self.definitions.as_deref().map_or(0, str::len);
+        let about = definitions + self.offered_qos.as_deref().map_or(0, str::len);
+        let parts = [
+            ("name", self.name.len(), NAME_MAX),
+            ("type name", self.type_name.len(), NAME_MAX),
+            ("definitions and quality of service", about, DEFINITIONS_MAX),
+        ];
+        match parts.into_iter().find(|(_, bytes, most)| bytes > most) {
+            None => Ok(()),
+            Some((what, bytes, most)) => {
+                let topic = self.name.chars().take(100).collect();
+                Err(RecordError::LongTopic { topic, what, bytes, most })
+            }
+        }
+    }
+}
+
 /// What is known when a clip ends.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Ending {
+pub(crate) struct Ending {
     /// Begin of what was asked for, in ns.
     pub from_ns: i64,
     /// End of what was asked for, inclusive, in ns.
     pub to_ns: i64,
     /// The lambdas whose windows it holds.
     pub lambdas: Vec<ClipLambda>,
+    /// What the journals of these lambdas say of them, as far as anybody knows.
+    pub headers: Vec<Header>,
     /// Triggers within it.
     pub triggers: u64,
     /// These triggers, or as many of them as were kept.
@@ -85,14 +115,11 @@ pub struct Ending {
     pub thumbnail: Option<Vec<u8>>,
     /// For each lambda its part of the journal.
     pub journals: Vec<(String, Vec<u8>)>,
-    /// Further metadata records. One named `gleaner.lambda` with a `name` takes the place of the one that
-    /// would be made from [`Ending::lambdas`].
-    pub metadata: Vec<(String, BTreeMap<String, String>)>,
 }
 
 /// What is known of a topic besides its messages in the clip; `None` is unknown.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct TopicCounts {
+pub(crate) struct TopicCounts {
     /// Absolute topic name.
     pub topic: String,
     /// Message type; `None` if it never appeared.

@@ -3,7 +3,8 @@
 //! Every step may be the last one of this process, too. So each leaves the folder in a state that the next attempt
 //! reads as it was meant: the unfinished file goes last, and a clip that was saved says from which file.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -37,7 +38,12 @@ pub(super) fn list(place: &Place, name: &str) -> Result<Option<Clip>, RecordErro
         }
     }
     match read::whole(&path) {
-        Ok(Some(clip)) => add(place, name, clip).map(Some),
+        Ok(Some(clip)) => {
+            // Whoever gave it its name may have died, or its disk lost its power, before the name was on the disk.
+            durable::sync_file(&path)?;
+            durable::sync_folder(place.folder())?;
+            add(place, name, clip).map(Some)
+        }
         Ok(None) => {
             warn!(path = %path.display(), "clip is damaged and not listed, left alone");
             Ok(None)
@@ -60,7 +66,10 @@ fn attempt(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, 
     }
     // What an earlier attempt wrote, and did not complete.
     durable::remove(&place.path(name, AGAIN))?;
-    if was_saved(place, name) {
+    if was_saved(place, name, part)? {
+        // It is listed, or will be, by its own name, which may not be on the disk yet.
+        durable::sync_folder(place.folder())?;
+        durable::remove(&place.path(name, JPG_PART))?;
         durable::remove(part)?;
         return Ok(None);
     }
@@ -71,13 +80,40 @@ fn attempt(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, 
     }
 }
 
-/// Whether an earlier attempt got as far as a whole clip.
-fn was_saved(place: &Place, name: &str) -> bool {
-    let part = format!("{name}{PART}");
-    let existing = names(name).take_while(|name| place.exists(name, CLIP));
-    existing
-        .map(|name| read::recovered_from(&place.path(&name, CLIP)))
-        .any(|from| from.is_some_and(|from| from == part))
+/// Whether an earlier attempt got as far as a whole clip: one that says so, or a copy of the unfinished file.
+fn was_saved(place: &Place, name: &str, part: &Path) -> Result<bool, RecordError> {
+    let from = format!("{name}{PART}");
+    for path in names(name).map(|name| place.path(&name, CLIP)).take_while(|path| path.symlink_metadata().is_ok()) {
+        let is_copy = || is_same(&path, part).map_err(|source| RecordError::Read { path: path.clone(), source });
+        if read::recovered_from(&path).is_some_and(|named| named == from) || is_copy()? {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
+/// Whether two files have the same content.
+fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
+    if !fs::symlink_metadata(one)?.is_file() {
+        return Ok(false);
+    }
+    let (one, other) = (File::open(one)?, File::open(other)?);
+    if one.metadata()?.len() != other.metadata()?.len() {
+        return Ok(false);
+    }
+    let (mut one, mut other) = (BufReader::new(one), BufReader::new(other));
+    loop {
+        let (left, right) = (one.fill_buf()?, other.fill_buf()?);
+        let both = left.len().min(right.len());
+        if left[..both] != right[..both] {
+            return Ok(false);
+        }
+        if both == 0 {
+            return Ok(left.len() == right.len());
+        }
+        one.consume(both);
+        other.consume(both);
+    }
 }
 
 /// The name for the clip of the unfinished file `name`: its own, as it was free when the file was begun, unless
@@ -87,11 +123,27 @@ fn name_for(place: &Place, name: &str) -> String {
     names(name).find(is_free).expect("numbers do not end before the files do")
 }
 
+/// Makes a clip of an unfinished file that is whole.
+///
+/// Its recorder may have died because the file could not be synced. The system then believes that its pages are on the
+/// disk, and to sync it again would prove nothing: only bytes that are written anew are known to arrive.
 fn adopt(place: &Place, name: &str, part: &Path, clip: Clip) -> Result<Clip, RecordError> {
     let free = name_for(place, name);
-    durable::sync_file(part)?;
-    durable::rename(part, &place.path(&free, CLIP), place.folder())?;
-    add(place, &free, clip)
+    let again = place.path(name, AGAIN);
+    if let Err(error) = durable::copy(part, &again) {
+        // On a full disk, its room is wanted.
+        durable::remove(&again)?;
+        return Err(error);
+    }
+    if free != name {
+        // It belongs to no clip now.
+        durable::remove(&place.path(name, JPG))?;
+    }
+    durable::rename(&again, &place.path(&free, CLIP), place.folder())?;
+    let clip = add(place, &free, clip)?;
+    durable::remove(&place.path(name, JPG_PART))?;
+    durable::remove(part)?;
+    Ok(clip)
 }
 
 /// Lists a whole clip whose line is that of its own record.

@@ -28,8 +28,14 @@ pub(super) const CHUNK_SPAN_NS: i64 = 1_000_000_000;
 /// Most channels of a clip. Writers beyond share the channel of their topic that names no writer.
 pub(super) const CHANNELS_MAX: usize = 16 << 10;
 
+/// Most bytes of a message. The fields of the file have room for more, but whoever reads a clip holds a chunk of it in
+/// memory, and our reader no more than 1 GiB: a message with what else may be in its chunk.
+pub(crate) const MESSAGE_MAX: usize = 960 << 20;
+/// Most bytes of a metadata record; ours have some KB, and with it the config of a lambda.
+pub(super) const METADATA_MAX: usize = 64 << 20;
+
 /// A clip that is being written. Unless it is finished, its file stays unfinished, for [`super::Folder::open`] to recover.
-pub struct Unfinished {
+pub(crate) struct Unfinished {
     place: Arc<Place>,
     name: String,
     path: PathBuf,
@@ -63,6 +69,15 @@ struct TopicChannels {
     /// Index in [`Written::topics`].
     index: usize,
     by_writer: HashMap<Option<Guid>, u16>,
+}
+
+/// Where messages of a topic go.
+struct Channel {
+    /// Index in [`Written::topics`].
+    index: usize,
+    id: u16,
+    /// What it took to describe it, if it is new, about.
+    new_bytes: u64,
 }
 
 /// How a clip came back after its recorder died.
@@ -118,13 +133,14 @@ impl Unfinished {
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if it cannot be written. The clip must not be used further then: what it has is recovered when
+    /// [`RecordError::TooLarge`] above [`MESSAGE_MAX`]: nothing was written then. [`RecordError`] if it cannot be written. The clip must not be used further then: what it has is recovered when
     /// the folder is opened again.
     pub fn message(&mut self, topic: &Topic, meta: &SampleMeta, cdr: &[u8]) -> Result<(), RecordError> {
+        self.check("a message", cdr.len(), MESSAGE_MAX)?;
         if self.chunk.is_some_and(|chunk| chunk.is_closed_by(meta.at_ns)) {
             self.flush()?;
         }
-        let (index, channel_id) = self.channel(topic, meta.writer)?;
+        let Channel { index, id: channel_id, new_bytes } = self.channel(topic, Some(meta.writer))?;
         let endian = match meta.endian {
             Endian::Big => 0,
             Endian::Little => 1,
@@ -141,7 +157,7 @@ impl Unfinished {
             publish_time: stamp(meta.publish_ns),
         };
         let written = self.with_writer(|writer| writer.write_to_known_channel(&header, &frame));
-        let bytes = frame.len() as u64;
+        let bytes = frame.len() as u64 + new_bytes;
         self.frame = frame;
         written?;
         self.written.count(index, meta.at_ns);
@@ -152,9 +168,18 @@ impl Unfinished {
         if chunk.bytes >= CHUNK_BYTES { self.flush() } else { Ok(()) }
     }
 
-    /// Bytes of the file so far, with those that wait uncompressed for the end of their chunk.
-    pub fn bytes(&self) -> u64 {
-        self.closed_bytes.load(Ordering::Relaxed) + self.chunk.map_or(0, |chunk| chunk.bytes)
+    /// Gives `topic` a channel if it has none: it was recorded, and no message of it came.
+    ///
+    /// # Errors
+    ///
+    /// As [`Unfinished::message`].
+    pub fn declare(&mut self, topic: &Topic) -> Result<(), RecordError> {
+        if self.channels.by_topic.contains_key(&topic.name) {
+            return Ok(());
+        }
+        let channel = self.channel(topic, None)?;
+        // Many topics with large definitions are not to be in one chunk.
+        if channel.new_bytes > CHUNK_BYTES / 16 { self.flush() } else { Ok(()) }
     }
 
     /// Closes the open chunk: what was added until now survives the death of this process. Called by itself at least
@@ -178,9 +203,6 @@ impl Unfinished {
         let name = self.name.clone();
         self.close(ending, &name, None)
     }
-
-    /// Gives up: what was written is recovered when the folder is opened again. Dropping does the same.
-    pub fn abandon(self) {}
 
     /// As [`Unfinished::finish`], under the name `name`.
     pub(super) fn close(mut self, ending: Ending, name: &str, saved: Option<Saved>) -> Result<Clip, RecordError> {
@@ -224,6 +246,8 @@ impl Unfinished {
     }
 
     fn metadata(&mut self, name: String, metadata: BTreeMap<String, String>) -> Result<(), RecordError> {
+        let bytes = metadata.iter().map(|(key, value)| key.len() + value.len()).sum();
+        self.check("a metadata record", bytes, METADATA_MAX)?;
         let record = Metadata { name, metadata };
         self.with_writer(|writer| writer.write_metadata(&record))
     }
@@ -235,18 +259,24 @@ impl Unfinished {
         self.with_writer(|writer| writer.attach(&attachment))
     }
 
-    /// Index of the topic, and the channel for messages of it by `writer`.
-    fn channel(&mut self, topic: &Topic, writer: Guid) -> Result<(usize, u16), RecordError> {
+    /// Whether a clip has room for `bytes` of something.
+    fn check(&self, what: &'static str, bytes: usize, most: usize) -> Result<(), RecordError> {
+        if bytes <= most { Ok(()) } else { Err(RecordError::TooLarge { path: self.path.clone(), what, bytes, most }) }
+    }
+
+    /// The channel for messages of the topic by this writer, or by none that is named.
+    fn channel(&mut self, topic: &Topic, writer: Option<Guid>) -> Result<Channel, RecordError> {
         let is_full = self.channels.count >= CHANNELS_MAX;
-        let mut key = Some(writer);
+        let mut key = writer;
         if let Some(known) = self.channels.by_topic.get(&topic.name) {
-            if let Some(id) = known.by_writer.get(&key) {
-                return Ok((known.index, *id));
+            let of = |key| known.by_writer.get(&key).map(|id| Channel { index: known.index, id: *id, new_bytes: 0 });
+            if let Some(found) = of(key) {
+                return Ok(found);
             }
             if is_full {
                 key = None;
-                if let Some(id) = known.by_writer.get(&key) {
-                    return Ok((known.index, *id));
+                if let Some(found) = of(key) {
+                    return Ok(found);
                 }
             }
         }
@@ -258,6 +288,7 @@ impl Unfinished {
             metadata.insert("gleaner.writer".to_owned(), writer.to_string());
         }
         let definitions = topic.definitions.as_deref().unwrap_or_default();
+        let new_bytes = definitions.len() + topic.offered_qos.as_deref().map_or(0, str::len) + topic.name.len();
         let id = self.with_writer(|writer| {
             // Without definitions the type still has a name.
             let schema = writer.add_schema(&topic.type_name, "ros2msg", definitions.as_bytes())?;
@@ -270,7 +301,7 @@ impl Unfinished {
         });
         known.by_writer.insert(key, id);
         self.channels.count += 1;
-        Ok((known.index, id))
+        Ok(Channel { index: known.index, id, new_bytes: new_bytes as u64 })
     }
 
     fn with_writer<T>(

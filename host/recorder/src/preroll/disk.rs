@@ -205,9 +205,9 @@ impl Disk {
         Ok(&self.buffer)
     }
 
-    pub(super) fn mark(&mut self, place: Place, chain: u64) {
+    pub(super) fn mark(&mut self, place: Place, group: u64) {
         let index = (place.0 - self.first) as usize;
-        self.index[index].held.chain = chain;
+        self.index[index].held.group = group;
     }
 
     pub(super) fn bytes_held(&self) -> u64 {

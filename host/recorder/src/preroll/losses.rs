@@ -24,25 +24,25 @@ pub struct Gone {
 }
 
 impl Gone {
-    /// Something of stamp `at` went; it is in the clips of group `chain`, 0 for none.
-    pub fn add(&mut self, at: i64, chain: u64) {
+    /// Something of stamp `at` went; it is in the clips of group `group`, 0 for none.
+    pub fn add(&mut self, at: i64, group: u64) {
         if self.stamps.len() == REMEMBERED
-            && let Some((at, chain)) = self.stamps.pop_front()
+            && let Some((at, group)) = self.stamps.pop_front()
         {
-            self.forgotten.add(at, chain);
+            self.forgotten.add(at, group);
         }
-        self.stamps.push_back((at, chain));
+        self.stamps.push_back((at, group));
     }
 
-    /// How many of those that `covered` wants are missing from the clips of group `chain`. They are counted once.
-    pub fn count(&mut self, chain: u64, covered: impl Fn(i64) -> bool) -> u64 {
-        let missing = self.stamps.iter_mut().filter(|(at, in_clip)| *in_clip != chain && covered(*at));
-        missing.map(|(_, in_clip)| *in_clip = chain).count() as u64
+    /// How many of those that `covered` wants are missing from the clips of group `group`. They are counted once.
+    pub fn count(&mut self, group: u64, covered: impl Fn(i64) -> bool) -> u64 {
+        let missing = self.stamps.iter_mut().filter(|(at, in_clip)| *in_clip != group && covered(*at));
+        missing.map(|(_, in_clip)| *in_clip = group).count() as u64
     }
 
     /// Whether more may have gone, from `from` on, than is remembered.
-    pub fn is_unknown(&self, from: i64, chain: u64) -> bool {
-        self.forgotten.hides(from, chain)
+    pub fn is_unknown(&self, from: i64, group: u64) -> bool {
+        self.forgotten.hides(from, group)
     }
 }
 
@@ -62,22 +62,22 @@ impl Default for Horizon {
 }
 
 impl Horizon {
-    /// Something of stamp `at` is gone; it is in the clips of group `chain`, 0 for none.
-    pub fn add(&mut self, at: i64, chain: u64) {
-        if chain == 0 {
+    /// Something of stamp `at` is gone; it is in the clips of group `group`, 0 for none.
+    pub fn add(&mut self, at: i64, group: u64) {
+        if group == 0 {
             self.unwritten = self.unwritten.max(at);
-        } else if chain == self.written.0 {
+        } else if group == self.written.0 {
             self.written.1 = self.written.1.max(at);
         } else {
             // For any later group, what is in the clips of an earlier one is missing as well.
             self.unwritten = self.unwritten.max(self.written.1);
-            self.written = (chain, at);
+            self.written = (group, at);
         }
     }
 
-    /// Whether a window of group `chain` that begins at `from` reaches over something that is in none of its clips.
-    pub fn hides(&self, from: i64, chain: u64) -> bool {
-        from <= self.unwritten || (chain != self.written.0 && from <= self.written.1)
+    /// Whether a window of group `group` that begins at `from` reaches over something that is in none of its clips.
+    pub fn hides(&self, from: i64, group: u64) -> bool {
+        from <= self.unwritten || (group != self.written.0 && from <= self.written.1)
     }
 }
 

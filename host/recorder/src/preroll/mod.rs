@@ -65,7 +65,7 @@ pub struct Held {
     /// Sequence number, or the number of the wake.
     pub seq: u64,
     /// The group of windows in whose clips it is, 0 for none.
-    pub chain: u64,
+    pub group: u64,
     /// Who wrote it; for a wake zeros.
     pub writer: [u8; 16],
     /// Options of the encapsulation.
@@ -76,14 +76,14 @@ pub struct Held {
 
 impl Held {
     /// A sample of a topic.
-    pub fn sample(topic: usize, meta: &SampleMeta, chain: u64) -> Held {
+    pub fn sample(topic: usize, meta: &SampleMeta, group: u64) -> Held {
         Held {
             source: Source::topic(topic),
             len: 0,
             at_ns: meta.at_ns,
             publish_ns: meta.publish_ns,
             seq: meta.seq,
-            chain,
+            group,
             writer: meta.writer.0,
             options: meta.options,
             is_big_endian: meta.endian == Endian::Big,
@@ -91,14 +91,14 @@ impl Held {
     }
 
     /// A wake of a lambda, the `number`-th from 0.
-    pub fn wake(lambda: usize, number: u64, at_ns: i64, chain: u64) -> Held {
+    pub fn wake(lambda: usize, number: u64, at_ns: i64, group: u64) -> Held {
         Held {
             source: Source::wakes(lambda),
             len: 0,
             at_ns,
             publish_ns: 0,
             seq: number,
-            chain,
+            group,
             writer: [0; 16],
             options: [0; 2],
             is_big_endian: false,
@@ -122,10 +122,27 @@ impl Held {
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Place(u64);
 
+/// An entry that a walk from the oldest on has come to. Unlike a [`Place`] it may be kept while the store changes.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Walked {
+    place: Place,
+    /// How many entries ever came before it.
+    number: u64,
+}
+
+impl Walked {
+    /// Where it is, until the store changes.
+    pub fn place(self) -> Place {
+        self.place
+    }
+}
+
 /// The store.
 pub struct Preroll {
     kind: Kind,
     highest: u64,
+    /// Entries that have gone: the number of the oldest one that is held.
+    gone: u64,
 }
 
 enum Kind {
@@ -145,7 +162,7 @@ impl Preroll {
             Store::Ram => Kind::Ram(Ram::new(usize::try_from(bytes).unwrap_or(usize::MAX), prefault)),
             Store::Disk => Kind::Disk(Disk::open(folder, bytes)?),
         };
-        Ok(Preroll { kind, highest: 0 })
+        Ok(Preroll { kind, highest: 0, gone: 0 })
     }
 
     /// Adds an entry; the oldest go to make room for it, and are told to `gone`. `false` if it is larger than the store.
@@ -156,9 +173,14 @@ impl Preroll {
     pub fn push(&mut self, held: Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
         let Ok(len) = u32::try_from(bytes.len()) else { return Ok(false) };
         let held = Held { len, ..held };
+        let count = &mut self.gone;
+        let mut gone = |held: &Held| {
+            *count += 1;
+            gone(held);
+        };
         let taken = match &mut self.kind {
-            Kind::Ram(ram) => ram.push(&held, bytes, gone),
-            Kind::Disk(disk) => disk.push(&held, bytes, gone)?,
+            Kind::Ram(ram) => ram.push(&held, bytes, &mut gone),
+            Kind::Disk(disk) => disk.push(&held, bytes, &mut gone)?,
         };
         self.highest = self.highest.max(self.bytes_held());
         Ok(taken)
@@ -170,17 +192,32 @@ impl Preroll {
     ///
     /// [`RecordError::Preroll`] if the disk fails.
     pub fn trim(&mut self, before: i64, aged: &mut dyn FnMut(&Held)) -> Result<(), RecordError> {
+        let count = &mut self.gone;
+        let mut aged = |held: &Held| {
+            *count += 1;
+            aged(held);
+        };
         match &mut self.kind {
             Kind::Ram(ram) => {
-                ram.trim(before, aged);
+                ram.trim(before, &mut aged);
                 Ok(())
             }
-            Kind::Disk(disk) => disk.trim(before, aged),
+            Kind::Disk(disk) => disk.trim(before, &mut aged),
+        }
+    }
+
+    /// The entry that came after `last`, or the oldest if `last` has gone or is none.
+    pub fn next(&self, last: Option<Walked>) -> Option<Walked> {
+        match last {
+            Some(Walked { place, number }) if number >= self.gone => {
+                self.after(place).map(|place| Walked { place, number: number + 1 })
+            }
+            _ => self.oldest().map(|place| Walked { place, number: self.gone }),
         }
     }
 
     /// The oldest entry.
-    pub fn oldest(&self) -> Option<Place> {
+    fn oldest(&self) -> Option<Place> {
         match &self.kind {
             Kind::Ram(ram) => ram.oldest(),
             Kind::Disk(disk) => disk.oldest(),
@@ -188,7 +225,7 @@ impl Preroll {
     }
 
     /// The entry that came after this one.
-    pub fn after(&self, place: Place) -> Option<Place> {
+    fn after(&self, place: Place) -> Option<Place> {
         match &self.kind {
             Kind::Ram(ram) => ram.after(place),
             Kind::Disk(disk) => disk.after(place),
@@ -216,10 +253,10 @@ impl Preroll {
     }
 
     /// Remembers that an entry is in the clips of a group of windows.
-    pub fn mark(&mut self, place: Place, chain: u64) {
+    pub fn mark(&mut self, place: Place, group: u64) {
         match &mut self.kind {
-            Kind::Ram(ram) => ram.mark(place, chain),
-            Kind::Disk(disk) => disk.mark(place, chain),
+            Kind::Ram(ram) => ram.mark(place, group),
+            Kind::Disk(disk) => disk.mark(place, group),
         }
     }
 

@@ -112,8 +112,8 @@ impl Ram {
         &self.arena[at + OVERHEAD..][..u32_at(&self.arena, at + LEN) as usize]
     }
 
-    pub(super) fn mark(&mut self, place: Place, chain: u64) {
-        self.arena[place.0 as usize + CHAIN..][..8].copy_from_slice(&chain.to_le_bytes());
+    pub(super) fn mark(&mut self, place: Place, group: u64) {
+        self.arena[place.0 as usize + GROUP..][..8].copy_from_slice(&group.to_le_bytes());
     }
 
     pub(super) fn bytes_held(&self) -> u64 {
@@ -134,7 +134,7 @@ fn size(len: usize) -> usize {
 const AT: usize = 0;
 const PUBLISH: usize = 8;
 const SEQ: usize = 16;
-const CHAIN: usize = 24;
+const GROUP: usize = 24;
 const WRITER: usize = 32;
 const SOURCE: usize = 48;
 const LEN: usize = 52;
@@ -145,7 +145,7 @@ fn write_head(head: &mut [u8], held: &Held) {
     head[AT..][..8].copy_from_slice(&held.at_ns.to_le_bytes());
     head[PUBLISH..][..8].copy_from_slice(&held.publish_ns.to_le_bytes());
     head[SEQ..][..8].copy_from_slice(&held.seq.to_le_bytes());
-    head[CHAIN..][..8].copy_from_slice(&held.chain.to_le_bytes());
+    head[GROUP..][..8].copy_from_slice(&held.group.to_le_bytes());
     head[WRITER..][..16].copy_from_slice(&held.writer);
     head[SOURCE..][..4].copy_from_slice(&held.source.0.to_le_bytes());
     head[LEN..][..4].copy_from_slice(&held.len.to_le_bytes());
@@ -158,7 +158,7 @@ fn read_head(head: &[u8]) -> Held {
         at_ns: i64::from_le_bytes(bytes_at(head, AT)),
         publish_ns: i64::from_le_bytes(bytes_at(head, PUBLISH)),
         seq: u64::from_le_bytes(bytes_at(head, SEQ)),
-        chain: u64::from_le_bytes(bytes_at(head, CHAIN)),
+        group: u64::from_le_bytes(bytes_at(head, GROUP)),
         writer: bytes_at(head, WRITER),
         source: Source(u32_at(head, SOURCE)),
         len: u32_at(head, LEN),

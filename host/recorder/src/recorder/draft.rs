@@ -1,20 +1,16 @@
 //! A clip that is being written.
 
-use std::collections::BTreeMap;
-
 use gleaner_protocol::{Clip, Moment};
 use gleaner_transport::SampleMeta;
 
+use super::limits::Limits;
 use super::part::Part;
 use super::picture::Picture;
 use super::stem::stem;
-use super::stock::{Desk, Member};
+use super::stock::{Desk, Member, Settled};
 use crate::RecordError;
 use crate::file::{About, Ending, TopicCounts, Unfinished};
 use crate::window::Group;
-
-/// Most triggers that a clip lists; it counts all.
-const MOMENTS_MAX: usize = 10_000;
 
 /// What one topic has in a clip, and what it has not.
 #[derive(Clone, Debug)]
@@ -23,13 +19,15 @@ pub(super) struct Tally {
     /// `None` if nobody knows.
     pub(super) overwritten: Option<u64>,
     pub(super) too_big: Option<u64>,
+    /// Of those that are too big, the ones that no clip can hold.
+    pub(super) huge: u64,
     /// Whether a window reaches further back than anything is held.
     pub(super) is_aged: bool,
 }
 
 impl Default for Tally {
     fn default() -> Tally {
-        Tally { messages: 0, overwritten: Some(0), too_big: Some(0), is_aged: false }
+        Tally { messages: 0, overwritten: Some(0), too_big: Some(0), huge: 0, is_aged: false }
     }
 }
 
@@ -47,12 +45,17 @@ pub(super) enum Close {
 /// A clip that is being written.
 pub(super) struct Draft {
     /// The group of windows that it belongs to. What is in one of its clips bears this number.
-    pub(super) chain: u64,
+    pub(super) group: u64,
     /// Whether it goes on where another clip was full.
     pub(super) continues: bool,
     pub(super) begins_late_ns: i64,
     pub(super) triggers: u64,
     pub(super) picture: Picture,
+    /// What of the preroll need not be looked through again.
+    pub(super) settled: Option<Settled>,
+    /// Lambdas with more triggers than were counted.
+    pub(super) uncertain: Vec<usize>,
+    limits: Limits,
     /// The trigger that names it.
     opening: Moment,
     from: i64,
@@ -68,13 +71,16 @@ pub(super) struct Draft {
 
 impl Draft {
     /// An empty clip of `group`.
-    pub(super) fn new(chain: u64, opening: Moment, group: &Group) -> Draft {
+    pub(super) fn new(number: u64, opening: Moment, group: &Group, limits: Limits) -> Draft {
         Draft {
-            chain,
+            group: number,
             continues: false,
             begins_late_ns: 0,
             triggers: 0,
             picture: Picture::default(),
+            settled: None,
+            uncertain: Vec::new(),
+            limits,
             opening,
             from: group.from,
             file: None,
@@ -88,7 +94,7 @@ impl Draft {
 
     /// The clip that goes on after this one.
     pub(super) fn next(&self, group: &Group) -> Draft {
-        Draft { continues: true, ..Draft::new(self.chain, self.opening.clone(), group) }
+        Draft { continues: true, ..Draft::new(self.group, self.opening.clone(), group, self.limits) }
     }
 
     /// Whether no message is in it.
@@ -98,6 +104,13 @@ impl Draft {
 
     pub(super) fn tally(&mut self, topic: usize) -> &mut Tally {
         at(&mut self.tallies, topic)
+    }
+
+    /// Counts a message that no clip can hold, and that would be in this one.
+    pub(super) fn refuse(&mut self, topic: usize) {
+        let tally = self.tally(topic);
+        tally.too_big = tally.too_big.map(|count| count + 1);
+        tally.huge += 1;
     }
 
     /// Writes a message.
@@ -135,7 +148,7 @@ impl Draft {
 
     /// Keeps a wake for the lambda's journal.
     pub(super) fn wake(&mut self, lambda: usize, number: u64, encoded: &[u8]) {
-        at(&mut self.parts, lambda).push(number, encoded);
+        at(&mut self.parts, lambda).push(number, encoded, self.limits.part_bytes);
     }
 
     /// Counts wakes that the preroll does not have any more.
@@ -146,14 +159,18 @@ impl Draft {
     /// Keeps a trigger.
     pub(super) fn moment(&mut self, moment: Moment) {
         self.triggers += 1;
-        if self.moments.len() < MOMENTS_MAX {
+        if self.moments.len() < self.limits.moments {
             self.moments.push(moment);
         }
     }
 
     /// Completes the file.
     pub(super) fn finish(mut self, desk: &mut Desk, group: &Group, close: Close) -> Result<Clip, RecordError> {
-        self.open(desk, group)?;
+        let topics = self.topics(desk, group);
+        let file = self.open(desk, group)?;
+        for lane in topics.iter().map(|topic| &desk.lanes[*topic]).filter(|lane| !lane.is_missing) {
+            file.declare(&lane.topic)?;
+        }
         let mut ending = Ending {
             from_ns: self.from.min(group.from),
             to_ns: match close {
@@ -167,12 +184,18 @@ impl Draft {
             ..Ending::default()
         };
         self.say_ends(group, close, &mut ending.short);
-        for topic in self.topics(desk, group) {
+        for lambda in &self.uncertain {
+            let name = &desk.crews[*lambda].member.header.lambda;
+            ending
+                .short
+                .push(format!("there are more triggers of {name} than are counted: too many waited for their clip"));
+        }
+        for topic in topics {
             ending.topics.push(self.counts(desk, topic, &mut ending.short));
         }
         for lambda in &group.lambdas {
             let member = &desk.crews[*lambda].member;
-            ending.metadata.push(("gleaner.lambda".to_owned(), about(member, group.windows(*lambda))));
+            ending.headers.push(member.header.clone());
             if let Some(journal) = self.journal(*lambda, member, &mut ending.short) {
                 ending.journals.push((member.header.lambda.clone(), journal));
             }
@@ -218,7 +241,7 @@ impl Draft {
     }
 
     fn counts(&mut self, desk: &Desk, topic: usize, short: &mut Vec<String>) -> TopicCounts {
-        let Tally { messages, overwritten, too_big, is_aged } = self.tally(topic).clone();
+        let Tally { messages, overwritten, too_big, huge, is_aged } = self.tally(topic).clone();
         let lane = &desk.lanes[topic];
         let name = &lane.topic.name;
         match overwritten {
@@ -231,7 +254,11 @@ impl Draft {
                 "the preroll was cut by preroll_size: samples of {name} pushed out, more than were counted"
             )),
         }
-        match too_big {
+        if huge > 0 {
+            let most = self.limits.message_bytes >> 20;
+            short.push(format!("{} of {name} larger than {most} MiB: no clip holds such", plural(huge, "sample")));
+        }
+        match too_big.map(|count| count.saturating_sub(huge)) {
             Some(0) => {}
             Some(count) => {
                 short.push(format!("{} of {name} did not fit into the preroll: preroll_size", plural(count, "sample")));
@@ -264,7 +291,9 @@ impl Draft {
             short.push(format!("the journal of {name} lacks {}: pushed out of the preroll", plural(lost, "wake")));
         }
         if part.cut() > 0 {
-            short.push(format!("the journal of {name} lacks {}: longer than 64 MiB", plural(part.cut(), "wake")));
+            let most = self.limits.part_bytes >> 20;
+            let last = plural(part.cut(), "wake");
+            short.push(format!("the journal of {name} lacks the last {last}: longer than {most} MiB"));
         }
         match part.write(&member.header)? {
             Ok(journal) => Some(journal),
@@ -275,25 +304,6 @@ impl Draft {
             }
         }
     }
-}
-
-/// What a clip says of a lambda.
-fn about(member: &Member, windows: u64) -> BTreeMap<String, String> {
-    let Member { header, digest, .. } = member;
-    let models: Vec<_> = header.models.iter().map(|model| format!("{}={}", model.path, model.sha256)).collect();
-    let config = serde_json::Value::Object(header.config.clone()).to_string();
-    let entries = [
-        ("name", header.lambda.clone()),
-        ("version", header.version.clone()),
-        ("kind", header.kind.as_str().to_owned()),
-        ("digest", digest.clone()),
-        ("windows", windows.to_string()),
-        ("engine", header.engine.clone()),
-        ("gleaner", header.gleaner.clone()),
-        ("config", config),
-        ("models", models.join(", ")),
-    ];
-    entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
 /// The item at `index` of a list that grows as far as it is asked for. Topics and lambdas are numbered from 0.

@@ -1,10 +1,13 @@
 //! The recorder: samples and wakes go in, clips come out.
 
 mod draft;
+mod limits;
 mod part;
 mod picture;
 mod stem;
 mod stock;
+#[cfg(test)]
+mod tests;
 mod waiting;
 
 use std::path::PathBuf;
@@ -20,6 +23,7 @@ use crate::file::{Folder, Topic};
 use crate::preroll::{Held, Losses, Preroll};
 use crate::window::{Group, Heard, Rules, Step, Window, Windows, nanoseconds};
 use draft::{Close, Draft};
+use limits::Limits;
 use stock::{Crew, Desk, Lane, Stock};
 use waiting::Waiting;
 
@@ -66,7 +70,8 @@ pub struct Counts {
     pub ignored: u64,
     /// Samples that left the preroll for want of bytes before they were too old for any window.
     pub pushed_out: u64,
-    /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless.
+    /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless, unless they are larger
+    /// than any message of a clip, which is somewhat below 1 GiB.
     pub too_big: u64,
     /// Samples and wakes with a stamp before 1970, and samples of missing topics: they are not recorded.
     pub refused: u64,
@@ -88,7 +93,7 @@ pub struct Recorder {
     stock: Stock,
     draft: Option<Draft>,
     /// Groups of windows so far; each has its number.
-    chains: u64,
+    groups: u64,
     now: Option<i64>,
     max_length_ns: i64,
     clips: Vec<Clip>,
@@ -114,11 +119,11 @@ impl Recorder {
                 losses: Vec::new(),
                 wake_losses: Vec::new(),
                 waiting: Waiting::default(),
-                desk: Desk { folder, clock, lanes: Vec::new(), crews: Vec::new() },
+                desk: Desk { folder, clock, limits: Limits::default(), lanes: Vec::new(), crews: Vec::new() },
                 began_at: 0,
             },
             draft: None,
-            chains: 0,
+            groups: 0,
             now: None,
             max_length_ns,
             clips: Vec::new(),
@@ -131,7 +136,7 @@ impl Recorder {
     ///
     /// # Errors
     ///
-    /// [`RecordError::TooManyTopics`] beyond 256.
+    /// [`RecordError::TooManyTopics`] beyond 256; [`RecordError::LongTopic`] if a clip has no room for what it says of itself.
     pub fn add_topic(&mut self, topic: Topic) -> Result<TopicId, RecordError> {
         self.add_lane(topic, false)
     }
@@ -140,7 +145,7 @@ impl Recorder {
     ///
     /// # Errors
     ///
-    /// [`RecordError::TooManyTopics`] beyond 256.
+    /// As [`Recorder::add_topic`].
     pub fn add_missing_topic(&mut self, name: &str) -> Result<TopicId, RecordError> {
         let topic = Topic { name: name.to_owned(), type_name: String::new(), definitions: None, offered_qos: None };
         self.add_lane(topic, true)
@@ -154,6 +159,7 @@ impl Recorder {
         if lanes.len() == TOPICS_MAX {
             return Err(RecordError::TooManyTopics { most: TOPICS_MAX });
         }
+        topic.check()?;
         lanes.push(Lane { topic, is_missing, lambdas: Vec::new() });
         self.stock.losses.push(Losses::default());
         Ok(TopicId(lanes.len() - 1))
@@ -192,15 +198,19 @@ impl Recorder {
         self.pass(meta.at_ns)?;
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
-        let mut chain = 0;
+        let mut in_group = 0;
         if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open())
             && self.stock.desk.covers(group, topic.0, meta.at_ns)
         {
-            draft.message(&mut self.stock.desk, group, topic.0, &meta, cdr)?;
-            chain = draft.chain;
+            if cdr.len() <= self.stock.desk.limits.message_bytes {
+                draft.message(&mut self.stock.desk, group, topic.0, &meta, cdr)?;
+            } else {
+                draft.refuse(topic.0);
+            }
+            in_group = draft.group;
         }
         let Counts { pushed_out, too_big, .. } = &mut self.counts;
-        self.stock.keep(Held::sample(topic.0, &meta, chain), cdr, pushed_out, too_big)
+        self.stock.keep(Held::sample(topic.0, &meta, in_group), cdr, pushed_out, too_big)
     }
 
     /// A lambda was woken: keeps the wake for its journal, and does what its triggers ask for.
@@ -220,18 +230,19 @@ impl Recorder {
         crew.encoder.reset();
         crew.encoder.encode(entry, &mut self.encoded);
         self.pass(entry.at_ns)?;
-        let mut chain = 0;
+        let mut in_group = 0;
         if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open())
             && (group.begin..=group.to).contains(&entry.at_ns)
         {
             draft.wake(lambda.0, number, &self.encoded);
-            chain = draft.chain;
+            in_group = draft.group;
         }
         let Counts { pushed_out, too_big, .. } = &mut self.counts;
-        self.stock.keep(Held::wake(lambda.0, number, entry.at_ns, chain), &self.encoded, pushed_out, too_big)?;
+        self.stock.keep(Held::wake(lambda.0, number, entry.at_ns, in_group), &self.encoded, pushed_out, too_big)?;
         if entry.triggers.is_empty() {
             return Ok(());
         }
+        let most = self.stock.desk.limits.waiting;
         for trigger in &entry.triggers {
             match self.windows.trigger(lambda.0, trigger.kind, &trigger.label, entry.at_ns) {
                 Heard::Opened => self.counts.windows += 1,
@@ -240,7 +251,7 @@ impl Recorder {
                 Heard::Stopped => {}
             }
             let name = &self.stock.desk.crews[lambda.0].member.header.lambda;
-            self.stock.waiting.push(lambda.0, Moment::of(name, trigger, entry.at_ns), self.windows.horizon());
+            self.stock.waiting.push(lambda.0, Moment::of(name, trigger, entry.at_ns), &self.windows, most);
         }
         self.run()?;
         if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) {
@@ -300,7 +311,7 @@ impl Recorder {
         while let Some(step) = self.windows.step() {
             match step {
                 Step::Begin(windows) => self.begin(&windows)?,
-                Step::Join { windows, reaches_back: true } => self.settle(&windows)?,
+                Step::Join { windows, fresh_from: Some(from) } => self.settle(&windows, from)?,
                 // It covers nothing new so far, and its trigger is gathered by whoever brought it.
                 Step::Join { .. } => {}
                 Step::Roll { boundary, before } => self.roll(boundary, &before)?,
@@ -313,15 +324,16 @@ impl Recorder {
 
     fn begin(&mut self, windows: &[Window]) -> Result<(), RecordError> {
         if let Some(group) = self.windows.open() {
-            self.chains += 1;
-            self.draft = Some(Draft::new(self.chains, self.stock.opening(group), group));
+            self.groups += 1;
+            let limits = self.stock.desk.limits;
+            self.draft = Some(Draft::new(self.groups, self.stock.opening(group), group, limits));
         }
-        self.settle(windows)
+        self.settle(windows, i64::MIN)
     }
 
-    fn settle(&mut self, windows: &[Window]) -> Result<(), RecordError> {
+    fn settle(&mut self, windows: &[Window], fresh_from: i64) -> Result<(), RecordError> {
         match (&mut self.draft, self.windows.open()) {
-            (Some(draft), Some(group)) => self.stock.settle(draft, group, windows, self.windows.limit()),
+            (Some(draft), Some(group)) => self.stock.settle(draft, group, windows, self.windows.limit(), fresh_from),
             _ => Ok(()),
         }
     }
@@ -332,7 +344,7 @@ impl Recorder {
         if !draft.is_empty() {
             let next = draft.next(group);
             let full = std::mem::replace(draft, next);
-            self.clips.push(full.finish(&mut self.stock.desk, before, Close::Full(boundary))?);
+            self.clips.push(self.stock.finish(full, before, Close::Full(boundary))?);
             self.counts.clips += 1;
         }
         // Where nothing came for longer than a clip may be, no clips are made of it.
@@ -340,12 +352,12 @@ impl Recorder {
         if until > self.windows.limit() {
             self.windows.slide(until);
         }
-        self.settle(&[])
+        self.settle(&[], i64::MIN)
     }
 
     fn complete(&mut self, group: &Group, close: Close) -> Result<(), RecordError> {
         if let Some(draft) = self.draft.take() {
-            self.clips.push(draft.finish(&mut self.stock.desk, group, close)?);
+            self.clips.push(self.stock.finish(draft, group, close)?);
             self.counts.clips += 1;
         }
         Ok(())
@@ -353,13 +365,13 @@ impl Recorder {
 
     /// Makes a clip of windows that lie before the one that is open. All of it is in the past.
     fn stray(&mut self, windows: &[Window], mut group: Group) -> Result<(), RecordError> {
-        self.chains += 1;
-        let mut draft = Draft::new(self.chains, self.stock.opening(&group), &group);
-        self.stock.settle(&mut draft, &group, windows, group.from.saturating_add(self.max_length_ns))?;
+        self.groups += 1;
+        let mut draft = Draft::new(self.groups, self.stock.opening(&group), &group, self.stock.desk.limits);
+        self.stock.settle(&mut draft, &group, windows, group.from.saturating_add(self.max_length_ns), i64::MIN)?;
         loop {
             let boundary = group.from.saturating_add(self.max_length_ns);
             if group.to <= boundary {
-                self.clips.push(draft.finish(&mut self.stock.desk, &group, Close::Complete)?);
+                self.clips.push(self.stock.finish(draft, &group, Close::Complete)?);
                 self.counts.clips += 1;
                 return Ok(());
             }
@@ -368,10 +380,10 @@ impl Recorder {
             if !draft.is_empty() {
                 let next = draft.next(&group);
                 let full = std::mem::replace(&mut draft, next);
-                self.clips.push(full.finish(&mut self.stock.desk, &before, Close::Full(boundary))?);
+                self.clips.push(self.stock.finish(full, &before, Close::Full(boundary))?);
                 self.counts.clips += 1;
             }
-            self.stock.settle(&mut draft, &group, &[], group.from.saturating_add(self.max_length_ns))?;
+            self.stock.settle(&mut draft, &group, &[], group.from.saturating_add(self.max_length_ns), i64::MIN)?;
         }
     }
 }

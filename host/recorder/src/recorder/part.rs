@@ -1,33 +1,42 @@
 //! The part of a lambda's journal that belongs to a clip.
 
+use std::collections::BTreeMap;
 use std::io;
 
 use gleaner_protocol::journal::{Decoder, End, Header, Writer};
 
-/// Most memory for one lambda's part. A wake takes some 60 bytes here, so that this is over a million of them.
-const PART_BYTES: usize = 64 << 20;
+/// What a wake takes beside its bytes, about.
+const OVERHEAD: usize = 64;
 
-/// Wakes of one lambda, each encoded by itself, in any order.
+/// Wakes of one lambda, each encoded by itself; they come in any order.
+///
+/// If there is no room for all, the last ones go: what a journal holds follows each other, so that it can be made again
+/// wake by wake.
 #[derive(Debug, Default)]
 pub(super) struct Part {
-    bytes: Vec<u8>,
-    /// Number of the wake, and where its bytes begin and end.
-    wakes: Vec<(u64, u32, u32)>,
+    /// By their numbers.
+    wakes: BTreeMap<u64, Box<[u8]>>,
+    bytes: usize,
+    /// The first wake that found no room.
+    end: Option<u64>,
     cut: u64,
 }
 
 impl Part {
-    /// Adds a wake, if there is room for it.
-    pub(super) fn push(&mut self, number: u64, encoded: &[u8]) {
-        let begin = self.bytes.len();
-        let taken = begin + encoded.len() + (self.wakes.len() + 1) * size_of::<(u64, u32, u32)>();
-        let ends = (u32::try_from(begin), u32::try_from(begin + encoded.len()));
-        match ends {
-            (Ok(begin), Ok(end)) if taken <= PART_BYTES => {
-                self.bytes.extend_from_slice(encoded);
-                self.wakes.push((number, begin, end));
-            }
-            _ => self.cut += 1,
+    /// Adds a wake, of which there is none with this number, if all of them take at most `most` bytes.
+    pub(super) fn push(&mut self, number: u64, encoded: &[u8], most: usize) {
+        if self.end.is_some_and(|end| number >= end) {
+            self.cut += 1;
+            return;
+        }
+        self.bytes += encoded.len() + OVERHEAD;
+        self.wakes.insert(number, encoded.into());
+        while self.bytes > most
+            && let Some((last, encoded)) = self.wakes.pop_last()
+        {
+            self.bytes -= encoded.len() + OVERHEAD;
+            self.end = Some(last);
+            self.cut += 1;
         }
     }
 
@@ -37,21 +46,49 @@ impl Part {
     }
 
     /// A journal of these wakes; `None` if there are none.
-    pub(super) fn write(mut self, header: &Header) -> Option<io::Result<Vec<u8>>> {
-        self.wakes.sort_unstable();
-        let first = self.wakes.first()?.0;
-        let header = Header { wakes_before: first, ..header.clone() };
+    pub(super) fn write(self, header: &Header) -> Option<io::Result<Vec<u8>>> {
+        let (first, _) = self.wakes.first_key_value()?;
+        let header = Header { wakes_before: *first, ..header.clone() };
         Some(self.journal(&header))
     }
 
     fn journal(&self, header: &Header) -> io::Result<Vec<u8>> {
         let mut decoder = Decoder::new(header.inputs.len());
         let mut writer = Writer::begin(Vec::new(), header)?;
-        for (_, begin, end) in &self.wakes {
+        for encoded in self.wakes.values() {
             decoder.reset();
-            let mut encoded = &self.bytes[*begin as usize..*end as usize];
-            writer.wake(&decoder.decode(&mut encoded).map_err(io::Error::other)?)?;
+            writer.wake(&decoder.decode(&mut &encoded[..]).map_err(io::Error::other)?)?;
         }
         writer.finish(&End { wakes: self.wakes.len() as u64, samples: Vec::new(), drives: Vec::new() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The numbers that a part of at most `most` bytes keeps of wakes of 36 bytes, and how many it cuts off.
+    fn kept(numbers: impl IntoIterator<Item = u64>, most: usize) -> (Vec<u64>, u64) {
+        let mut part = Part::default();
+        for number in numbers {
+            // One is longer than the room that is left, while those after it would fit again.
+            let len = if number == 7 { 400 } else { 36 };
+            part.push(number, &vec![number as u8; len], most);
+        }
+        assert!(part.bytes <= most);
+        (part.wakes.into_keys().collect(), part.cut)
+    }
+
+    #[test]
+    fn what_comes_after_the_first_wake_without_room_is_cut_off_too() {
+        assert_eq!(kept(0..5, 1000), ((0..5).collect(), 0));
+        assert_eq!(kept(0..12, 1000), ((0..7).collect(), 5), "without a hole at 7");
+        assert_eq!(kept([3], 99), (vec![], 1));
+    }
+
+    #[test]
+    fn earlier_wakes_that_come_later_push_out_the_last_ones() {
+        assert_eq!(kept((20..30).chain(8..13), 1000), ((8..13).chain(20..25).collect(), 5));
+        assert_eq!(kept([10, 11, 12, 0, 13, 1, 12], 300), (vec![0, 1, 10], 4));
     }
 }

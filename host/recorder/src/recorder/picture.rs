@@ -4,7 +4,7 @@ use gleaner_transport::SampleMeta;
 
 use super::stock::Desk;
 use crate::RecordError;
-use crate::preroll::{Preroll, Source};
+use crate::preroll::{Preroll, Source, Walked};
 use crate::thumbnail::thumbnail;
 use crate::window::Group;
 
@@ -21,13 +21,15 @@ pub(super) struct Picture {
 }
 
 impl Picture {
-    /// Makes the picture from the newest image that is held and not later than the trigger, when the clip first has a topic
-    /// with images. A clip that `continues` another takes its own first image.
+    /// Makes the picture when the clip first has a topic with images: from the newest image that is held, belongs into the
+    /// clip, which ends at `limit` at the latest, and is not later than the trigger. A clip that `continues` another takes
+    /// its own first image.
     pub(super) fn look(
         &mut self,
         desk: &Desk,
         preroll: &mut Preroll,
         group: &Group,
+        limit: i64,
         continues: bool,
     ) -> Result<(), RecordError> {
         if self.topic.is_some() {
@@ -35,15 +37,17 @@ impl Picture {
         }
         self.topic = desk.topics_of(group).into_iter().find(|topic| desk.lanes[*topic].is_image());
         let Some(topic) = self.topic.filter(|_| !continues) else { return Ok(()) };
+        let until = group.first.1.min(limit);
         let mut newest = None;
-        let mut next = preroll.oldest();
-        while let Some(place) = next {
+        let mut next = preroll.next(None);
+        while let Some(place) = next.map(Walked::place) {
             let held = preroll.held(place);
             let is_newer = newest.is_none_or(|(at, _)| at <= held.at_ns);
-            if held.source == Source::topic(topic) && held.at_ns <= group.first.1 && is_newer {
+            let is_ours = held.source == Source::topic(topic) && desk.covers(group, topic, held.at_ns);
+            if is_ours && held.at_ns <= until && is_newer {
                 newest = Some((held.at_ns, place));
             }
-            next = preroll.after(place);
+            next = preroll.next(next);
         }
         if let Some((_, place)) = newest {
             let meta = preroll.held(place).meta();

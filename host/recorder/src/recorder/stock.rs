@@ -2,13 +2,14 @@
 
 use gleaner_protocol::journal::{Encoder, Header};
 use gleaner_protocol::manifest::Record;
-use gleaner_protocol::{ClipLambda, Moment};
+use gleaner_protocol::{Clip, ClipLambda, Moment};
 
-use super::draft::Draft;
+use super::draft::{Close, Draft};
+use super::limits::Limits;
 use super::waiting::Waiting;
 use crate::RecordError;
 use crate::file::{Folder, Topic};
-use crate::preroll::{Held, Losses, Preroll};
+use crate::preroll::{Held, Losses, Preroll, Walked};
 use crate::window::{Group, Window};
 
 /// A lambda that records.
@@ -53,6 +54,7 @@ pub(super) struct Crew {
 pub(super) struct Desk {
     pub(super) folder: Folder,
     pub(super) clock: String,
+    pub(super) limits: Limits,
     pub(super) lanes: Vec<Lane>,
     pub(super) crews: Vec<Crew>,
 }
@@ -90,6 +92,14 @@ impl Desk {
     }
 }
 
+/// How far a clip has been settled: what came up to an entry will not be wanted by windows that cover nothing new before
+/// its newest stamp. So a lambda that triggers in every wake does not have the whole preroll looked through each time.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Settled {
+    pub(super) last: Walked,
+    pub(super) newest: i64,
+}
+
 /// Everything that clips are made from.
 pub(super) struct Stock {
     pub(super) preroll: Preroll,
@@ -112,19 +122,22 @@ impl Stock {
         pushed_out: &mut u64,
         too_big: &mut u64,
     ) -> Result<(), RecordError> {
-        let Stock { preroll, losses, wake_losses, .. } = self;
+        let is_sample = held.source.as_topic().is_some();
+        let Stock { preroll, losses, wake_losses, desk, .. } = self;
         let mut gone = |gone: &Held| {
             *pushed_out += u64::from(gone.source.as_topic().is_some());
             if let Some(losses) = losses_of(losses, wake_losses, gone) {
-                losses.overwritten.add(gone.at_ns, gone.chain);
+                losses.overwritten.add(gone.at_ns, gone.group);
             }
         };
-        if preroll.push(held, bytes, &mut gone)? {
+        // What no clip can hold need not wait for one.
+        let fits = !is_sample || bytes.len() <= desk.limits.message_bytes;
+        if fits && preroll.push(held, bytes, &mut gone)? {
             return Ok(());
         }
-        *too_big += u64::from(held.source.as_topic().is_some());
+        *too_big += u64::from(is_sample);
         if let Some(losses) = losses_of(losses, wake_losses, &held) {
-            losses.too_big.add(held.at_ns, held.chain);
+            losses.too_big.add(held.at_ns, held.group);
         }
         Ok(())
     }
@@ -134,25 +147,30 @@ impl Stock {
         let Stock { preroll, losses, wake_losses, .. } = self;
         preroll.trim(before, &mut |held| {
             if let Some(losses) = losses_of(losses, wake_losses, held) {
-                losses.aged.add(held.at_ns, held.chain);
+                losses.aged.add(held.at_ns, held.group);
             }
         })
     }
 
     /// Brings a clip up to what its group covers and what is held, not after `limit`. `windows` are those that have just
-    /// joined the group.
+    /// joined the group; what is before `fresh_from` it has covered already.
     pub(super) fn settle(
         &mut self,
         draft: &mut Draft,
         group: &Group,
         windows: &[Window],
         limit: i64,
+        fresh_from: i64,
     ) -> Result<(), RecordError> {
         windows.iter().for_each(|window| self.reach_back(draft, window));
         self.count_losses(draft, group, limit);
-        draft.picture.look(&self.desk, &mut self.preroll, group, draft.continues)?;
-        let mut next = self.preroll.oldest();
-        while let Some(place) = next {
+        draft.picture.look(&self.desk, &mut self.preroll, group, limit, draft.continues)?;
+        let settled = windows.iter().map(|window| window.to.unwrap_or(i64::MAX)).max().unwrap_or(group.to).min(limit);
+        draft.settled = draft.settled.filter(|settled| settled.newest < fresh_from);
+        let mut last = draft.settled.map(|settled| settled.last);
+        let mut is_settled = true;
+        while let Some(walked) = self.preroll.next(last) {
+            let place = walked.place();
             let held = self.preroll.held(place);
             if self.wants(draft, group, &held, limit) {
                 let bytes = self.preroll.bytes(place)?;
@@ -163,9 +181,14 @@ impl Stock {
                         draft.message(&mut self.desk, group, topic, &held.meta(), bytes)?;
                     }
                 }
-                self.preroll.mark(place, draft.chain);
+                self.preroll.mark(place, draft.group);
             }
-            next = self.preroll.after(place);
+            is_settled &= held.at_ns <= settled;
+            if is_settled {
+                let newest = draft.settled.map_or(held.at_ns, |settled| settled.newest.max(held.at_ns));
+                draft.settled = Some(Settled { last: walked, newest });
+            }
+            last = Some(walked);
         }
         self.gather(draft, group, limit);
         Ok(())
@@ -173,7 +196,7 @@ impl Stock {
 
     /// Whether an entry belongs into a clip that ends at `limit` at the latest, and is not in it.
     fn wants(&self, draft: &Draft, group: &Group, held: &Held, limit: i64) -> bool {
-        if held.chain == draft.chain || held.at_ns > limit {
+        if held.group == draft.group || held.at_ns > limit {
             return false;
         }
         match held.source.as_topic() {
@@ -185,13 +208,13 @@ impl Stock {
     /// The stamp of the earliest sample that is covered, but in none of the clips of the group.
     pub(super) fn earliest(&self, draft: &Draft, group: &Group) -> Option<i64> {
         let mut earliest = None;
-        let mut next = self.preroll.oldest();
-        while let Some(place) = next {
+        let mut next = self.preroll.next(None);
+        while let Some(place) = next.map(Walked::place) {
             let held = self.preroll.held(place);
             if held.source.as_topic().is_some() && self.wants(draft, group, &held, i64::MAX) {
                 earliest = Some(earliest.map_or(held.at_ns, |at: i64| at.min(held.at_ns)));
             }
-            next = self.preroll.after(place);
+            next = self.preroll.next(next);
         }
         earliest
     }
@@ -200,6 +223,13 @@ impl Stock {
     pub(super) fn gather(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
         let untold = self.waiting.take(group, limit, |moment| draft.moment(moment));
         draft.triggers += untold;
+    }
+
+    /// Completes a clip.
+    pub(super) fn finish(&mut self, mut draft: Draft, group: &Group, close: Close) -> Result<Clip, RecordError> {
+        let limit = if let Close::Full(boundary) = close { boundary } else { i64::MAX };
+        draft.uncertain = self.waiting.uncertain(group, limit);
+        draft.finish(&mut self.desk, group, close)
     }
 
     /// The trigger that names a clip.
@@ -218,28 +248,28 @@ impl Stock {
     /// What a window asks for and nobody can give.
     fn reach_back(&mut self, draft: &mut Draft, window: &Window) {
         draft.begins_late_ns = draft.begins_late_ns.max(self.began_at.saturating_sub(window.from));
-        let chain = draft.chain;
+        let number = draft.group;
         for topic in &self.desk.crews[window.lambda].member.topics {
             let losses = &self.losses[topic.0];
             let tally = draft.tally(topic.0);
-            tally.is_aged |= losses.aged.hides(window.from, chain);
-            if losses.overwritten.is_unknown(window.from, chain) {
+            tally.is_aged |= losses.aged.hides(window.from, number);
+            if losses.overwritten.is_unknown(window.from, number) {
                 tally.overwritten = None;
             }
-            if losses.too_big.is_unknown(window.from, chain) {
+            if losses.too_big.is_unknown(window.from, number) {
                 tally.too_big = None;
             }
         }
     }
 
     fn count_losses(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
-        let chain = draft.chain;
+        let number = draft.group;
         for topic in self.desk.topics_of(group) {
             let desk = &self.desk;
             let covered = |at: i64| at <= limit && desk.covers(group, topic, at);
             let losses = &mut self.losses[topic];
             let (overwritten, too_big) =
-                (losses.overwritten.count(chain, covered), losses.too_big.count(chain, covered));
+                (losses.overwritten.count(number, covered), losses.too_big.count(number, covered));
             let tally = draft.tally(topic);
             tally.overwritten = tally.overwritten.map(|count| count + overwritten);
             tally.too_big = tally.too_big.map(|count| count + too_big);
@@ -247,7 +277,7 @@ impl Stock {
         let inside = group.begin..=group.to.min(limit);
         for (lambda, losses) in self.wake_losses.iter_mut().enumerate() {
             let covered = |at: i64| inside.contains(&at);
-            let lost = losses.overwritten.count(chain, covered) + losses.too_big.count(chain, covered);
+            let lost = losses.overwritten.count(number, covered) + losses.too_big.count(number, covered);
             draft.lose_wakes(lambda, lost);
         }
     }

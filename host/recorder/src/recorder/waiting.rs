@@ -1,33 +1,51 @@
 //! Triggers that are in no clip yet: the window that they opened waits, or they came in a cooldown.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::RangeInclusive;
 
 use gleaner_protocol::Moment;
 
-use crate::window::Group;
-
-/// Most triggers that wait. A lambda can trigger often, and windows wait for minutes.
-const WAITING_MAX: usize = 10_000;
+use crate::window::{Group, Windows};
 
 /// Triggers in order of their wakes.
 #[derive(Debug, Default)]
 pub(super) struct Waiting {
     moments: VecDeque<(usize, Moment)>,
-    /// Those beyond [`WAITING_MAX`]: the next clip counts them.
-    untold: u64,
+    /// By lambda: those that there was no room for. Of them, only this is known.
+    untold: BTreeMap<usize, Untold>,
+}
+
+/// Triggers of one lambda that are only counted.
+#[derive(Copy, Clone, Debug)]
+struct Untold {
+    from: i64,
+    to: i64,
+    count: u64,
 }
 
 impl Waiting {
-    /// A trigger came. Nobody will ask for those before `horizon`.
-    pub(super) fn push(&mut self, lambda: usize, moment: Moment, horizon: i64) {
+    /// A trigger came. At most `most` wait: of more, the oldest that no window wants yet goes, or else the new one.
+    pub(super) fn push(&mut self, lambda: usize, moment: Moment, windows: &Windows, most: usize) {
+        let horizon = windows.horizon();
         while self.moments.front().is_some_and(|(_, moment)| moment.at_ns < horizon) {
             self.moments.pop_front();
         }
-        if self.moments.len() < WAITING_MAX {
+        self.untold.retain(|_, untold| untold.to >= horizon);
+        if self.moments.len() < most {
             self.moments.push_back((lambda, moment));
-        } else {
-            self.untold += 1;
+            return;
         }
+        let (whose, at) = match self.moments.iter().position(|(whose, moment)| !windows.covers(*whose, moment.at_ns)) {
+            Some(index) => {
+                let gone =
+                    self.moments.remove(index).map_or((lambda, moment.at_ns), |(whose, gone)| (whose, gone.at_ns));
+                self.moments.push_back((lambda, moment));
+                gone
+            }
+            None => (lambda, moment.at_ns),
+        };
+        let untold = self.untold.entry(whose).or_insert(Untold { from: at, to: at, count: 0 });
+        *untold = Untold { from: untold.from.min(at), to: untold.to.max(at), count: untold.count + 1 };
     }
 
     /// The trigger of `lambda` at `at_ns`, if it waits.
@@ -37,7 +55,7 @@ impl Waiting {
 
     /// Takes those out that are within `group` and not after `limit`, and how many more there were.
     pub(super) fn take(&mut self, group: &Group, limit: i64, mut each: impl FnMut(Moment)) -> u64 {
-        let inside = group.begin..=group.to.min(limit);
+        let inside = inside(group, limit);
         for _ in 0..self.moments.len() {
             let Some((lambda, moment)) = self.moments.pop_front() else { break };
             if inside.contains(&moment.at_ns) && group.lambdas.contains(&lambda) {
@@ -46,6 +64,28 @@ impl Waiting {
                 self.moments.push_back((lambda, moment));
             }
         }
-        std::mem::take(&mut self.untold)
+        let mut count = 0;
+        self.untold.retain(|lambda, untold| {
+            // Not those of the clip before, if this one continues it.
+            let is_inside = group.from <= untold.from && untold.to <= *inside.end();
+            let is_taken = is_inside && group.lambdas.contains(lambda);
+            count += if is_taken { untold.count } else { 0 };
+            !is_taken
+        });
+        count
     }
+
+    /// The lambdas of which more triggers may be within `group` and not after `limit` than were taken: they were only
+    /// counted, and some of them lie outside.
+    pub(super) fn uncertain(&self, group: &Group, limit: i64) -> Vec<usize> {
+        let inside = inside(group, limit);
+        let overlaps = |untold: &Untold| untold.from <= *inside.end() && *inside.start() <= untold.to;
+        let uncertain =
+            self.untold.iter().filter(|(lambda, untold)| group.lambdas.contains(lambda) && overlaps(untold));
+        uncertain.map(|(lambda, _)| *lambda).collect()
+    }
+}
+
+fn inside(group: &Group, limit: i64) -> RangeInclusive<i64> {
+    group.begin..=group.to.min(limit)
 }

@@ -103,11 +103,16 @@ impl Group {
         self.shares.get(lambda).is_some_and(|share| share.covers(at))
     }
 
-    /// Whether windows of `lambda` contain all of `from..=to`.
-    pub(super) fn covers_all(&self, lambda: usize, from: i64, to: i64) -> bool {
-        self.shares.get(lambda).is_some_and(|share| {
-            share.started.is_some_and(|started| started <= from) || share.ended.contains_all(from, to)
-        })
+    /// The first instant of `from..=to` that no window of `lambda` contains.
+    pub(super) fn first_uncovered(&self, lambda: usize, from: i64, to: i64) -> Option<i64> {
+        if from > to {
+            return None;
+        }
+        match self.shares.get(lambda) {
+            Some(share) if share.started.is_some_and(|started| started <= from) => None,
+            Some(share) => share.ended.first_outside(from, to),
+            None => Some(from),
+        }
     }
 
     /// How many windows of `lambda` the present clip has. In a clip that continues another, windows that overlap count

@@ -25,10 +25,12 @@ impl Intervals {
         self.0.get(self.0.partition_point(|(_, end)| *end < at)).is_some_and(|(begin, _)| *begin <= at)
     }
 
-    /// Whether every instant of `from..=to` is one of them.
-    pub fn contains_all(&self, from: i64, to: i64) -> bool {
-        let found = self.0.get(self.0.partition_point(|(_, end)| *end < from));
-        found.is_some_and(|(begin, end)| *begin <= from && to <= *end)
+    /// The first instant of `from..=to` that is none of them.
+    pub fn first_outside(&self, from: i64, to: i64) -> Option<i64> {
+        match self.0.get(self.0.partition_point(|(_, end)| *end < from)) {
+            Some((begin, end)) if *begin <= from => (*end < to).then(|| end.saturating_add(1)),
+            _ => Some(from),
+        }
     }
 
     /// The latest instant.
@@ -67,7 +69,8 @@ mod tests {
         intervals.insert(30, 30, 0);
         let inside: Vec<_> = (8..32).filter(|at| intervals.contains(*at)).collect();
         assert_eq!(inside, (10..=20).chain([30]).collect::<Vec<_>>());
-        assert!(intervals.contains_all(10, 20) && !intervals.contains_all(10, 21) && !intervals.contains_all(20, 30));
+        let outside = [(10, 20), (10, 21), (20, 30), (9, 9), (30, 40)].map(|(a, b)| intervals.first_outside(a, b));
+        assert_eq!(outside, [None, Some(21), Some(21), Some(9), Some(31)]);
         assert_eq!((intervals.end(), intervals.beyond(20), intervals.beyond(30)), (Some(30), 1, 0));
     }
 

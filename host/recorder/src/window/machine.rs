@@ -24,12 +24,13 @@ pub enum Heard {
 pub enum Step {
     /// A clip begins, with these windows; [`Windows::open`] has their group.
     Begin(Vec<Window>),
-    /// These windows have joined the open clip. If `reaches_back`, they cover instants up to now that it did not.
+    /// These windows have joined the open clip.
     Join {
         /// The windows.
         windows: Vec<Window>,
-        /// Whether samples that came before now have to be looked through.
-        reaches_back: bool,
+        /// The first instant up to now that they cover and the clip did not: only what is held from there on has to be
+        /// looked through.
+        fresh_from: Option<i64>,
     },
     /// The clip is full: it ends at `boundary`, and a next one goes on after it. The open group is already that of the next;
     /// `before` is the one that ends.
@@ -113,6 +114,13 @@ impl Windows {
         self.open.as_ref()
     }
 
+    /// Whether a window of `lambda`, open or waiting, contains `at`.
+    pub fn covers(&self, lambda: usize, at: i64) -> bool {
+        let waits =
+            |window: &Window| window.lambda == lambda && window.from <= at && window.to.is_none_or(|to| at <= to);
+        self.open.as_ref().is_some_and(|open| open.covers(lambda, at)) || self.pending.iter().any(waits)
+    }
+
     /// Last instant that fits into the open clip.
     pub fn limit(&self) -> i64 {
         self.open.as_ref().map_or(i64::MAX, |open| open.from.saturating_add(self.max_length_ns))
@@ -193,17 +201,18 @@ impl Windows {
             return Some(Step::Begin(windows));
         };
         if !self.pending.is_empty() {
-            let mut reaches_back = false;
+            let mut fresh_from = None;
             let mut joined = Vec::new();
             while let Some(index) = self.pending.iter().position(|window| open.touches(window)) {
                 let window = self.pending.swap_remove(index);
                 let to = window.to.unwrap_or(i64::MAX).min(self.now);
-                reaches_back |= window.from <= self.now && !open.covers_all(window.lambda, window.from, to);
+                let fresh = open.first_uncovered(window.lambda, window.from, to);
+                fresh_from = fresh.map(|fresh| fresh_from.map_or(fresh, |from: i64| from.min(fresh))).or(fresh_from);
                 open.add(&window, horizon);
                 joined.push(window);
             }
             if !joined.is_empty() {
-                return Some(Step::Join { windows: joined, reaches_back });
+                return Some(Step::Join { windows: joined, fresh_from });
             }
             if let Some(index) =
                 self.pending.iter().position(|window| window.to.is_some_and(|to| to < open.begin && to < self.now))

@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
@@ -26,7 +26,8 @@ impl Scratch {
     pub fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name = format!("core-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+        // Tests within the crate have no folder of their own.
+        let folder = option_env!("CARGO_TARGET_TMPDIR").map_or_else(std::env::temp_dir, PathBuf::from).join(name);
         fs::create_dir_all(&folder).unwrap();
         Self(folder)
     }
@@ -76,6 +77,26 @@ impl Scratch {
             }
         }
         found
+    }
+
+    /// The metadata records of a clip.
+    pub fn metadata(&self, clip: &Clip) -> Vec<(String, BTreeMap<String, String>)> {
+        let bytes = fs::read(self.0.join(&clip.file)).unwrap();
+        let records = mcap::read::LinearReader::new(&bytes).unwrap().map(Result::unwrap);
+        let metadata = records.filter_map(|record| match record {
+            mcap::records::Record::Metadata(metadata) => Some((metadata.name, metadata.metadata)),
+            _ => None,
+        });
+        metadata.collect()
+    }
+
+    /// The channels of a clip: topics, each as often as it has one, sorted.
+    pub fn channels(&self, clip: &Clip) -> Vec<String> {
+        let bytes = fs::read(self.0.join(&clip.file)).unwrap();
+        let channels = mcap::Summary::read(&bytes).unwrap().unwrap().channels;
+        let mut topics: Vec<_> = channels.values().map(|channel| channel.topic.clone()).collect();
+        topics.sort();
+        topics
     }
 
     /// The journal of a lambda in a clip: its header, and the stamps of its wakes.
@@ -150,6 +171,7 @@ cooldown = "{cooldown}ms"
         kind: Kind::Python,
         files: Vec::new(),
         models: Vec::new(),
+        manifest: String::new(),
         inputs: vec![input],
         event_input: Some(0),
         config: serde_json::Map::new(),

@@ -27,6 +27,9 @@ pub struct Header {
     pub files: Vec<FileDigest>,
     /// Its models.
     pub models: Vec<FileDigest>,
+    /// SHA-256 of what its manifest says that a decision can depend on, in hexadecimal digits: not of `[record]`, nor of
+    /// descriptions. So a clip stays provable when its preroll is tuned.
+    pub manifest: String,
     /// Its inputs, in the order of the manifest.
     pub inputs: Vec<JournalInput>,
     /// Which of `inputs` wakes it; `None` if the clock does.
@@ -117,6 +120,7 @@ impl Header {
             .or_else(|| Difference::of("version of the lambda", &self.version, &now.version))
             .or_else(|| Difference::of("kind of the lambda", self.kind.as_str(), now.kind.as_str()))
             .or_else(|| files_differ("build file", &self.files, &now.files))
+            .or_else(|| Difference::of("manifest lambda.toml, less [record]", &self.manifest, &now.manifest))
             .or_else(|| files_differ("model", &self.models, &now.models))
             .or_else(|| config_differs(&self.config, &now.config))
             .or_else(|| inputs_differ(&self.inputs, &now.inputs))
@@ -148,7 +152,8 @@ fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Optio
         files.iter().map(|file| (file.path.clone(), file.sha256.clone())).collect()
     };
     let (journal, now) = (by_path(journal), by_path(now));
-    let mut paths: Vec<_> = journal.keys().chain(now.keys()).collect();
+    // What counts of the manifest has a digest of its own.
+    let mut paths: Vec<_> = journal.keys().chain(now.keys()).filter(|path| *path != "lambda.toml").collect();
     paths.sort();
     paths.into_iter().find_map(|path| {
         let (journal, now) = (journal.get(path), now.get(path));

@@ -111,6 +111,60 @@ fn replacing_keeps_what_is_to_be_kept() {
 }
 
 #[test]
+fn lines_that_are_not_ours_stay_whatever_is_replaced() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let [a, _] = ["a", "b"].map(|stem| record(&mut folder, stem));
+    let list = scratch.path("clips.jsonl");
+    let ours = fs::read_to_string(&list).unwrap();
+    let (first, second) = ours.trim_end().split_once('\n').unwrap();
+    // One line is longer than any of ours.
+    let foreign = ["# notes", r#"{"file":"../x.mcap","thumbnail":null}"#, "", "\u{fffd}", &"[".repeat(17 << 20)];
+    let [notes, other, empty, odd, long] = foreign;
+    fs::write(&list, [notes, first, other, empty, long, second, odd, ""].join("\n")).unwrap();
+    let kept = [notes, other, empty, long, odd];
+    let lines = || fs::read_to_string(&list).unwrap().lines().map(str::to_owned).collect::<Vec<_>>();
+    for _ in 0..2 {
+        folder.replace(std::slice::from_ref(&a)).unwrap();
+        let found = lines();
+        assert!(found[..5] == kept && found.len() == 6, "{} lines", found.len());
+        assert_eq!(serde_json::from_str::<Clip>(&found[5]).unwrap(), a);
+    }
+    folder.replace(&[]).unwrap();
+    assert!(lines() == kept);
+    drop(folder);
+    assert!(scratch.open().1.is_empty());
+}
+
+#[test]
+fn the_longest_line_of_ours_is_read_again() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    // No character takes more room in JSON than a control character.
+    let name = |n: u64| format!("{}{n:04}", "\u{1}".repeat(1020));
+    let topic = |n: u64| Topic { name: name(n), type_name: name(n), definitions: None, offered_qos: None };
+    assert!(topic(1).check().is_ok());
+    let counts = |n| TopicCounts { topic: name(n), type_name: Some(name(n)), ..TopicCounts::default() };
+    let attributes = || Some(serde_json::Map::from_iter([("text".to_owned(), "y".repeat(2000).into())]));
+    let long = Ending {
+        topics: (0..256).map(counts).collect(),
+        short: (0..4 * 256).map(|n| format!("there is less of {}: for a reason of many words", name(n))).collect(),
+        moments: (0..200)
+            .map(|n| Moment { label: "\u{1}".repeat(128), attributes: attributes(), ..moment(n) })
+            .collect(),
+        ..ending()
+    };
+    let clip = folder.begin("a", &about()).unwrap().finish(long).unwrap();
+    let len = fs::metadata(scratch.path("clips.jsonl")).unwrap().len();
+    assert!((5 << 20..12 << 20).contains(&len), "{len} bytes");
+    assert_eq!(scratch.listed(), std::slice::from_ref(&clip));
+    drop(folder);
+    let (mut folder, found) = scratch.open();
+    assert!(found.is_empty(), "it is listed already");
+    assert_eq!(folder.replace(&[]).unwrap(), 1);
+}
+
+#[test]
 fn a_hostile_list_deletes_nothing_outside() {
     let scratch = Scratch::new();
     let (mut folder, _) = scratch.open();

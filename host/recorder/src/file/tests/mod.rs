@@ -4,7 +4,6 @@ mod folder;
 mod recover;
 mod write;
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -126,7 +125,7 @@ fn ending() -> Ending {
         short: vec!["the drive ended 2.1 s before the window did".to_owned()],
         thumbnail: Some(b"a picture".to_vec()),
         journals: vec![("hello".to_owned(), b"a journal".to_vec())],
-        metadata: vec![("extra".to_owned(), BTreeMap::from([("key".to_owned(), "value".to_owned())]))],
+        headers: Vec::new(),
     }
 }
 

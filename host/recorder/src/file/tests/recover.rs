@@ -2,6 +2,7 @@ use std::fs;
 use std::path::Path;
 
 use super::super::Unfinished;
+use super::super::durable::steps;
 use super::super::place::{AGAIN, CLIP, PART};
 use super::*;
 
@@ -11,7 +12,7 @@ fn part(messages: u64) -> Vec<u8> {
     let (mut folder, _) = scratch.open();
     let mut clip = folder.begin("a", &about()).unwrap();
     add(&mut clip, 0, messages);
-    clip.abandon();
+    drop(clip);
     fs::read(scratch.path("clips/a.mcap.part")).unwrap()
 }
 
@@ -137,6 +138,77 @@ fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
             more => panic!("{} clips", more.len()),
         }
     }
+}
+
+/// A folder in which a recorder died that had finished a clip and not renamed it, the clip, and its bytes.
+fn died_before_the_name() -> (Scratch, Clip, Vec<u8>) {
+    let source = Scratch::new();
+    let (mut folder, _) = source.open();
+    let mut clip = folder.begin("a", &about()).unwrap();
+    add(&mut clip, 0, 6);
+    let finished = clip.finish(ending()).unwrap();
+    let whole = fs::read(source.path("clips/a.mcap")).unwrap();
+    let scratch = died(&whole);
+    fs::write(scratch.path("clips/a.jpg"), b"a picture").unwrap();
+    fs::write(scratch.path("clips/a.jpg.part"), b"a pic").unwrap();
+    (scratch, finished, whole)
+}
+
+/// Of the whole file, it is not known whether its bytes are on the disk; of a copy it is.
+#[test]
+fn a_finished_file_is_written_anew_before_it_gets_its_name() {
+    let (scratch, _, _) = died_before_the_name();
+    let nothing = ["remove a.mcap.part2"];
+    let expected = [
+        "copy a.mcap.part2",
+        "sync a.mcap.part2",
+        "rename a.mcap",
+        "sync clips",
+        "append clips.jsonl",
+        "sync gleaner",
+        "remove a.jpg.part",
+        "remove a.mcap.part",
+    ];
+    steps::restart(usize::MAX);
+    scratch.open();
+    let taken =
+        steps::taken().into_iter().map(|step| if step.contains("gleaner-") { "sync gleaner".into() } else { step });
+    assert_eq!(taken.collect::<Vec<_>>(), [&nothing[..], &expected[..]].concat());
+}
+
+#[test]
+fn a_finished_file_is_recovered_once_though_its_recovery_dies_at_every_step() {
+    let mut deaths = 0;
+    for last in 0.. {
+        let (scratch, finished, whole) = died_before_the_name();
+        // A second death at the same step of the second attempt, and then none.
+        let mut is_done = false;
+        for _ in 0..2 {
+            steps::restart(last);
+            is_done = Folder::open(&scratch.0).is_ok();
+        }
+        steps::restart(usize::MAX);
+        scratch.open();
+        assert_eq!(scratch.listed(), std::slice::from_ref(&finished), "after {last} steps");
+        assert_eq!(scratch.files(), ["a.jpg", "a.mcap"], "after {last} steps");
+        assert_eq!(fs::read(scratch.path("clips/a.mcap")).unwrap(), whole, "after {last} steps");
+        assert!(scratch.open().1.is_empty());
+        deaths += u64::from(!is_done);
+        if is_done && last > 12 {
+            break;
+        }
+    }
+    assert!(deaths >= 3, "{deaths}");
+}
+
+#[test]
+fn a_whole_clip_that_is_not_listed_is_on_the_disk_before_it_is() {
+    let (scratch, finished, whole) = died_before_the_name();
+    fs::remove_file(scratch.path("clips/a.mcap.part")).unwrap();
+    fs::write(scratch.path("clips/a.mcap"), whole).unwrap();
+    steps::restart(usize::MAX);
+    assert_eq!(scratch.open().1, [finished]);
+    assert_eq!(steps::taken()[..3], ["sync a.mcap", "sync clips", "append clips.jsonl"]);
 }
 
 /// The folder as it is after each step of a recovery that dies there.

@@ -49,6 +49,7 @@ fn header(inputs: usize) -> Header {
         kind: Kind::Wasm,
         files: vec![file("brake_dark.wasm"), file("lambda.toml")],
         models: vec![file("models/d.onnx")],
+        manifest: String::new(),
         inputs: (0..inputs)
             .map(|n| JournalInput {
                 name: format!("in{n}"),

@@ -13,6 +13,9 @@ use gleaner_transport::{
 /// Most bytes that wait until their input's turn. Inputs take turns as they did in the drive, so that few wait.
 const WAITING_BYTES: usize = 256 << 20;
 
+/// What a sample that waits takes beside its bytes: a clip may hold millions of empty ones.
+const WAITING_COST: usize = 128;
+
 /// Why the next sample of an input cannot be had.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum PaceError {
@@ -59,7 +62,7 @@ impl Gate {
         while state.owed > 0 {
             let Some((meta, cdr)) = state.waiting.pop_front() else { break };
             state.owed -= 1;
-            self.waiting_bytes.fetch_sub(cdr.len(), Ordering::Relaxed);
+            self.waiting_bytes.fetch_sub(WAITING_COST + cdr.len(), Ordering::Relaxed);
             self.sink.deliver(&meta, &cdr);
         }
     }
@@ -72,7 +75,7 @@ impl Sink for Gate {
             state.owed -= 1;
             return self.sink.deliver(meta, cdr);
         }
-        self.waiting_bytes.fetch_add(cdr.len(), Ordering::Relaxed);
+        self.waiting_bytes.fetch_add(WAITING_COST + cdr.len(), Ordering::Relaxed);
         state.waiting.push_back((*meta, cdr.to_vec()));
         Verdict::Taken
     }

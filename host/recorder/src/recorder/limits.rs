@@ -1,0 +1,22 @@
+//! How much of each kind there may be, in memory and in a file.
+
+use crate::file::MESSAGE_MAX;
+
+/// Bounds that only tests change.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Limits {
+    /// The longest message.
+    pub(super) message_bytes: usize,
+    /// Most triggers that a clip lists; it counts all.
+    pub(super) moments: usize,
+    /// Most memory for one lambda's part of a journal.
+    pub(super) part_bytes: usize,
+    /// Most triggers that wait for their clip. A lambda can trigger often, and windows wait for minutes.
+    pub(super) waiting: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits { message_bytes: MESSAGE_MAX, moments: 10_000, part_bytes: 64 << 20, waiting: 10_000 }
+    }
+}
