@@ -227,7 +227,7 @@ fn unusable(path: &Path, error: &JournalError) -> Failure {
         JournalError::Damaged { .. } => {
             failure.with_help("it was changed after it was written: copy it again, or write a new one")
         }
-        JournalError::NotAJournal { .. } if begins_as_mcap(path) => {
+        JournalError::NotAJournal if begins_as_mcap(path) => {
             failure.with_help("it is an MCAP file; to verify a clip: gleaner verify CLIP --lambda DIR")
         }
         _ => failure.with_help("name a file that `gleaner replay --journal FILE` wrote"),
