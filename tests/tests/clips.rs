@@ -24,6 +24,7 @@ fn main() -> ExitCode {
         Trial::test("a_preroll_on_disk_gives_the_same_clips", on_disk),
         Trial::test("a_topic_that_the_drive_does_not_have_is_listed_with_no_message", missing_topic),
         Trial::test("a_second_replay_replaces_the_clips_of_the_first", replaced),
+        Trial::test("a_clip_that_somebody_copied_there_is_left_alone", copied),
         Trial::test("without_record_there_are_no_clips", no_record),
         Trial::test("two_topics_that_are_one_of_the_drive_are_recorded_once", one_of_two),
         Trial::test("where_a_drive_is_damaged_its_clip_ends_short", damaged),
@@ -221,9 +222,25 @@ fn replaced() -> Result<(), Failed> {
     same(&out.path().join(&second.clips[0].file).exists(), &true)
 }
 
+fn copied() -> Result<(), Failed> {
+    let (out, first) = record(&alarm(), &sample_drive(), &["--set", "event_s=10"])?;
+    let copy = out.path().join("clips/favourite.mcap");
+    std::fs::copy(out.path().join(&first.clips[0].file), &copy)?;
+    for event in ["event_s=25", "event_s=26"] {
+        let again = replay_to(out.path(), &alarm(), &[sample_drive()], &["--set", event]);
+        same(&(again.exit, again.clips.len(), copy.exists()), &(0, 1, true))?;
+        same(&again.summary.map(|summary| summary.clips_replaced), &Some(1))?;
+    }
+    Ok(())
+}
+
 fn no_record() -> Result<(), Failed> {
     let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10", "--no-record"])?;
-    same(&(run.clips.len(), out.path().join("clips").exists()), &(0, false))
+    same(&(run.clips.len(), out.path().join("clips").exists()), &(0, false))?;
+    // Clips of an earlier replay do not stay beside results that made none.
+    let (out, _run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10"])?;
+    let again = replay_to(out.path(), &alarm(), &[sample_drive()], &["--no-record"]);
+    same(&(again.clips.len(), again.summary.map(|summary| summary.clips_replaced)), &(0, Some(1)))
 }
 
 fn one_of_two() -> Result<(), Failed> {

@@ -66,7 +66,9 @@ fn note(manifest: &Manifest) -> String {
     let topics = unrecorded.map(|topic| format!("`{topic}`")).collect::<Vec<_>>().join(", ");
     match topics.is_empty() {
         true => String::new(),
-        false => format!("note: [record] leaves out {topics}, which the lambda reads: its clips cannot be verified alone\n"),
+        false => {
+            format!("note: [record] leaves out {topics}, which the lambda reads: its clips cannot be verified alone\n")
+        }
     }
 }
 

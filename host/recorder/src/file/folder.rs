@@ -59,7 +59,7 @@ impl Folder {
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if the list cannot be written, and nothing is deleted then, or if a file cannot be.
+    /// [`RecordError`] if the list cannot be written, and nothing is deleted then.
     pub fn replace(&mut self, keep: &[Clip]) -> Result<u64, RecordError> {
         let place = &self.place;
         let listed = place.list().read()?;
@@ -71,10 +71,15 @@ impl Folder {
         let mut deleted = 0;
         for Listed { file, thumbnail } in listed.iter().filter(|listed| !is_kept(&listed.file)) {
             // The thumbnail first: one without its clip would belong to nobody.
-            if let Some(thumbnail) = thumbnail {
-                durable::remove(&place.folder().join(thumbnail))?;
+            let thumbnail =
+                thumbnail.as_ref().map_or(Ok(false), |thumbnail| durable::remove(&place.folder().join(thumbnail)));
+            match thumbnail.and_then(|_| durable::remove(&place.folder().join(file))) {
+                Ok(was_there) => deleted += u64::from(was_there),
+                // The list is written: what stays, such as a folder of this name, is no clip of it any more.
+                Err(error) => {
+                    warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, left alone")
+                }
             }
-            deleted += u64::from(durable::remove(&place.folder().join(file))?);
         }
         durable::sync_folder(place.folder())?;
         place.take_only(listed.into_iter().map(|listed| listed.file).filter(|file| is_kept(file)).collect());

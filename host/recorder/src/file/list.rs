@@ -145,7 +145,9 @@ fn plain_name(path: &Path, ending: &str) -> Option<String> {
     let (Component::Normal(folder), Component::Normal(name), None) = (folder, name, components.next()) else {
         return None;
     };
-    let name = name.to_str().filter(|name| name.ends_with(ending) && name.len() > ending.len())?;
+    let fits =
+        |name: &&str| name.ends_with(ending) && name.len() > ending.len() && name.len() <= 255 && !name.contains('\0');
+    let name = name.to_str().filter(fits)?;
     (folder == CLIPS && path.to_str()? == format!("{CLIPS}/{name}")).then(|| name.to_owned())
 }
 
@@ -158,6 +160,8 @@ mod tests {
         assert_eq!(plain_name(Path::new("clips/a.mcap"), CLIP).as_deref(), Some("a.mcap"));
         let hostile = [
             "a.mcap",
+            "clips/a\0.mcap",
+            &format!("clips/{}.mcap", "a".repeat(251)),
             "../x.mcap",
             "clips/../x.mcap",
             "/clips/a.mcap",

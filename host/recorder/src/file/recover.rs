@@ -38,6 +38,8 @@ pub(super) fn list(place: &Place, name: &str) -> Result<Option<Clip>, RecordErro
         }
     }
     match read::whole(&path) {
+        // A clip that somebody copied here, under a name of theirs, is theirs.
+        Ok(Some(clip)) if !is_own_name(name, &clip) => Ok(None),
         Ok(Some(clip)) => {
             // Whoever gave it its name may have died, or its disk lost its power, before the name was on the disk.
             durable::sync_file(&path)?;
@@ -53,6 +55,13 @@ pub(super) fn list(place: &Place, name: &str) -> Result<Option<Clip>, RecordErro
             Ok(None)
         }
     }
+}
+
+/// Whether a clip that is called `name` was called so by its recorder, or by a recovery that found its name taken.
+fn is_own_name(name: &str, clip: &Clip) -> bool {
+    let own = clip.file.file_stem().map(|own| own.to_string_lossy().into_owned()).unwrap_or_default();
+    let number = name.strip_prefix(&own).and_then(|rest| rest.strip_prefix('-'));
+    name == own || number.is_some_and(|number| number.bytes().all(|digit| digit.is_ascii_digit()))
 }
 
 fn attempt(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, RecordError> {

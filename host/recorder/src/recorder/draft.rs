@@ -228,7 +228,7 @@ impl Draft {
             short.push(format!("the preroll begins {late} late: nothing was recorded before"));
         }
         match close {
-            Close::Full(_) => short.push("continues in the next clip".to_owned()),
+            Close::Full(_) => short.push("continues in the next clip, if anything more came".to_owned()),
             Close::EndOfDrive(_) if group.waits_for_stop() => {
                 short.push("the drive ended before the lambda said stop".to_owned());
             }

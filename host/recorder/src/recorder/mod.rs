@@ -1,6 +1,7 @@
 //! The recorder: samples and wakes go in, clips come out.
 
 mod draft;
+mod finished;
 mod limits;
 mod part;
 mod picture;
@@ -23,6 +24,7 @@ use crate::file::{Folder, Topic};
 use crate::preroll::{Held, Losses, Preroll};
 use crate::window::{Group, Heard, Rules, Step, Window, Windows, nanoseconds};
 use draft::{Close, Draft};
+use finished::Finished;
 use limits::Limits;
 use stock::{Crew, Desk, Lane, Stock};
 use waiting::Waiting;
@@ -96,7 +98,7 @@ pub struct Recorder {
     groups: u64,
     now: Option<i64>,
     max_length_ns: i64,
-    clips: Vec<Clip>,
+    finished: Finished,
     counts: Counts,
     /// Where a wake is encoded.
     encoded: Vec<u8>,
@@ -126,7 +128,7 @@ impl Recorder {
             groups: 0,
             now: None,
             max_length_ns,
-            clips: Vec::new(),
+            finished: Finished::default(),
             counts: Counts { preroll_bound: preroll_bytes, ..Counts::default() },
             encoded: Vec::new(),
         })
@@ -284,15 +286,16 @@ impl Recorder {
         Ok(())
     }
 
-    /// The clips that are finished, in the order in which they were.
+    /// The newest of the clips that are finished, in the order in which they were; `clips.jsonl` has all.
     pub fn clips(&self) -> &[Clip] {
-        &self.clips
+        self.finished.newest()
     }
 
     /// What was done so far.
     pub fn counts(&self) -> Counts {
         let preroll = &self.stock.preroll;
-        Counts { preroll_bytes: preroll.bytes_held(), preroll_highest: preroll.bytes_highest(), ..self.counts }
+        let (preroll_bytes, preroll_highest) = (preroll.bytes_held(), preroll.bytes_highest());
+        Counts { clips: self.finished.count, preroll_bytes, preroll_highest, ..self.counts }
     }
 
     /// Lets time pass. What is due is done before anything is given up for its age: it may need it.
@@ -344,8 +347,7 @@ impl Recorder {
         if !draft.is_empty() {
             let next = draft.next(group);
             let full = std::mem::replace(draft, next);
-            self.clips.push(self.stock.finish(full, before, Close::Full(boundary))?);
-            self.counts.clips += 1;
+            self.finished.add(self.stock.finish(full, before, Close::Full(boundary))?);
         }
         // Where nothing came for longer than a clip may be, no clips are made of it.
         let until = self.stock.earliest(draft, group).or(self.now).unwrap_or(boundary);
@@ -357,8 +359,11 @@ impl Recorder {
 
     fn complete(&mut self, group: &Group, close: Close) -> Result<(), RecordError> {
         if let Some(draft) = self.draft.take() {
-            self.clips.push(self.stock.finish(draft, group, close)?);
-            self.counts.clips += 1;
+            // The clip before promised that more would come; where nothing did, there is no clip of nothing.
+            if draft.continues && draft.is_empty() && draft.triggers == 0 {
+                return Ok(());
+            }
+            self.finished.add(self.stock.finish(draft, group, close)?);
         }
         Ok(())
     }
@@ -371,8 +376,7 @@ impl Recorder {
         loop {
             let boundary = group.from.saturating_add(self.max_length_ns);
             if group.to <= boundary {
-                self.clips.push(self.stock.finish(draft, &group, Close::Complete)?);
-                self.counts.clips += 1;
+                self.finished.add(self.stock.finish(draft, &group, Close::Complete)?);
                 return Ok(());
             }
             let before = group.clone();
@@ -380,8 +384,7 @@ impl Recorder {
             if !draft.is_empty() {
                 let next = draft.next(&group);
                 let full = std::mem::replace(&mut draft, next);
-                self.clips.push(self.stock.finish(full, &before, Close::Full(boundary))?);
-                self.counts.clips += 1;
+                self.finished.add(self.stock.finish(full, &before, Close::Full(boundary))?);
             }
             self.stock.settle(&mut draft, &group, &[], group.from.saturating_add(self.max_length_ns), i64::MIN)?;
         }
