@@ -54,11 +54,18 @@ fn main() -> ExitCode {
     let arrays = (0..rounds.min(5)).flat_map(|_| setting.array_ns()).collect::<Vec<_>>();
     figures.push(Figure::at_most("slot to ndarray, 1920x1080 bgr8 (6.2 MB)", "ns", 1000.0, &arrays));
 
-    let without = [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
-    let replays = alternate(rounds, without, |what| setting.hello_rounds(what));
-    let slower = |with: &[f64]| replays[0].1.iter().zip(with).map(|(a, b)| 100.0 * (a / b - 1.0)).collect::<Vec<_>>();
-    figures.push(Figure::at_most("replay slower by a journal, IMU only, wasm", "%", 5.0, &slower(&replays[1].1)));
-    figures.push(Figure::told("replay slower by recording, IMU only, wasm", "%", &slower(&replays[2].1)));
+    let what = || [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
+    let [imu, sample] = [
+        alternate(rounds, what(), |what| setting.imu_rounds(what)),
+        alternate(rounds, what(), |what| setting.sample_rounds(what)),
+    ];
+    let slower = |replays: &[(&str, Vec<f64>); 3], with: usize| {
+        let pairs = replays[0].1.iter().zip(&replays[with].1);
+        pairs.map(|(a, b)| 100.0 * (a / b - 1.0)).collect::<Vec<_>>()
+    };
+    figures.push(Figure::at_most("replay slower by a journal, 200 s of IMU, wasm", "%", 5.0, &slower(&imu, 1)));
+    figures.push(Figure::told("replay slower by a journal, sample drive with camera, wasm", "%", &slower(&sample, 1)));
+    figures.push(Figure::told("replay slower by clips, sample drive with camera, wasm", "%", &slower(&sample, 2)));
     let sizes = [("hello", 14.0), ("brake-dark", 20.0)];
     for (example, goal) in sizes {
         let name = format!("journal of {example}");
@@ -73,8 +80,11 @@ fn main() -> ExitCode {
         tell("arrived", "MB/s", load.megabytes_per_s);
         tell("part of the time in clips", "%", load.recorded_percent);
         tell("share of a core", "%", load.cpu_percent);
-        tell("memory", "MiB", load.memory_mib);
         tell("longest time to take a sample", "ms", load.longest_ms);
+        // Beyond the preroll, a chunk and its compression.
+        let bound = if store == Store::Ram { 64.0 + 16.0 } else { 16.0 };
+        let memory = format!("recorder at 20 MB/s, preroll in {name}: memory");
+        figures.push(Figure::at_most(&memory, "MiB", bound, &[load.memory_mib]));
         let name = format!("recorder at 20 MB/s, preroll in {name}: preroll against its bound");
         figures.push(Figure::at_most(&name, "%", 100.0, &[load.preroll_percent]));
     }

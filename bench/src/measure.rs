@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_protocol::{Report, Round, Summary};
-use gleaner_tests::drive::{IMAGE, image, one_topic};
+use gleaner_tests::drive::{IMAGE, image, imu_only, one_topic};
 use gleaner_tests::{Folder, program, replay, root, sample_drive};
 
 /// Which of two twins.
@@ -47,7 +47,8 @@ pub fn stay_on_one_core() -> std::io::Result<()> {
 pub struct Setting {
     sample: PathBuf,
     frames: PathBuf,
-    _folder: Folder,
+    imu: PathBuf,
+    _folders: [Folder; 2],
 }
 
 impl Setting {
@@ -56,7 +57,9 @@ impl Setting {
         let pixels = vec![99; 1920 * 1080 * 3];
         let frames = (0..4).map(|i| (i * 100_000_000, image(1920, 1080, "bgr8", 5760, &pixels))).collect::<Vec<_>>();
         let frames = one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &frames);
-        Self { sample: sample_drive(), frames, _folder: folder }
+        let imu_folder = Folder::new();
+        let imu = imu_only(&imu_folder, 5);
+        Self { sample: sample_drive(), frames, imu, _folders: [folder, imu_folder] }
     }
 
     /// `hello` over the sample drive: a wake for each of 4,170 IMU samples.
@@ -75,13 +78,14 @@ impl Setting {
 
     /// By how many per cent memory after the 10th replay of `example` in one process exceeds that after the 2nd.
     pub fn growth_from_2nd_to_10th(&self, example: &str, kind: Kind) -> f64 {
-        let rounds = self.rounds(&kind.folder(example), &["--set", "brake_mps2=-1.4", "--repeat", "10"]);
+        let args = ["--set", "brake_mps2=-1.4", "--repeat", "10"];
+        let rounds = self.rounds(&kind.folder(example), &self.sample, &args);
         100.0 * (rounds[9].rss_bytes as f64 / rounds[1].rss_bytes as f64 - 1.0)
     }
 
-    /// Wakes per second of `hello` in wasm that judges alone, or writes a `journal`, or makes `clips`: the median of so many
-    /// passes in one process that a pass of 20 ms is no matter of luck.
-    pub fn hello_rounds(&self, what: &str) -> f64 {
+    /// Wakes per second of `hello` in wasm over `drive` that judges alone, or writes a `journal`, or makes `clips`: the median of
+    /// so many passes in one process that a pass of 20 ms is no matter of luck.
+    fn hello_rounds(&self, drive: &Path, what: &str) -> f64 {
         let folder = Folder::new();
         let journal = folder.path().join("wakes.journal");
         let mut args = vec!["--set", "brake_mps2=-1.4", "--repeat", "20"];
@@ -90,10 +94,20 @@ impl Setting {
             "clips" => {}
             _ => args.push("--no-record"),
         }
-        let rounds = self.rounds(&Kind::Rust.folder("hello"), &args);
+        let rounds = self.rounds(&Kind::Rust.folder("hello"), drive, &args);
         let mut rates = rounds.iter().map(|round| round.wakes_per_s).collect::<Vec<_>>();
         rates.sort_by(f64::total_cmp);
         rates[rates.len() / 2]
+    }
+
+    /// As [`Setting::hello_rounds`] over the sample drive, most of which is pictures that the lambda does not read.
+    pub fn sample_rounds(&self, what: &str) -> f64 {
+        self.hello_rounds(&self.sample, what)
+    }
+
+    /// As [`Setting::hello_rounds`] over 200 s of IMU alone.
+    pub fn imu_rounds(&self, what: &str) -> f64 {
+        self.hello_rounds(&self.imu, what)
     }
 
     /// Bytes of the journal of `example` in wasm, for each wake.
@@ -105,12 +119,12 @@ impl Setting {
         std::fs::metadata(&journal).expect("a journal").len() as f64 / summary.wakes as f64
     }
 
-    fn rounds(&self, lambda: &Path, args: &[&str]) -> Vec<Round> {
+    fn rounds(&self, lambda: &Path, drive: &Path, args: &[&str]) -> Vec<Round> {
         let out = Folder::new();
         let output = Command::new(program("gleaner-runtime"))
             .arg("replay")
             .arg(lambda)
-            .arg(&self.sample)
+            .arg(drive)
             .args(args)
             .arg("--out")
             .arg(out.path())

@@ -29,7 +29,7 @@ pub struct Load {
     pub cpu_percent: f64,
     /// Memory of the process beyond what it had before, in MiB, at most.
     pub memory_mib: f64,
-    /// The most that the preroll took, in % of its bound: files on disk, or all memory that came with the recorder.
+    /// The most that the preroll took, in % of its bound.
     pub preroll_percent: f64,
     /// Longest time in which a sample was taken, in ms: a recorder of one thread writes within it.
     pub longest_ms: f64,
@@ -119,9 +119,10 @@ pub fn record(seconds: u64, store: Store) -> Load {
         }
         let mut recorder = recorder.lock().expect("one thread");
         recorder.wake(lambda, &wake(n, at_ns + 30_000_000)).expect("the disk has room");
+        // In memory it is one block of that size; on disk the system tells.
+        let held = recorder.counts().preroll_highest as f64;
         drop(recorder);
-        // What the system says it takes: memory beyond that of an empty recorder, or files.
-        let taken = if store == Store::Disk { files(&out.path().join("preroll")) } else { resident() - before };
+        let taken = if store == Store::Disk { files(&out.path().join("preroll")) } else { held };
         preroll = preroll.max(100.0 * taken / settings_bytes as f64);
         peak = peak.max(resident());
     }

@@ -58,7 +58,7 @@ pub struct ReplayArgs {
     /// Write every decision, not only those with a trigger or a fault
     #[arg(long)]
     pub all: bool,
-    /// Leave out the clips that [record] of the manifest asks for
+    /// Leave out the clips that the table `record` of the manifest asks for
     #[arg(long)]
     pub no_record: bool,
     /// Write a journal: of every wake, what the lambda saw and decided

@@ -40,6 +40,19 @@ pub fn one_topic(folder: &Folder, topic: &str, type_name: &str, schema: &str, me
     folder.write("made.mcap", file.into_inner())
 }
 
+/// The IMU of the sample drive alone, so many times in a row, 40 s each.
+pub fn imu_only(folder: &Folder, times: u64) -> PathBuf {
+    let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
+    let messages = mcap::MessageStream::new(&bytes).expect("a drive").map(|message| message.expect("a whole drive"));
+    let imu = messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
+    let schema = imu[0].channel.schema.clone().expect("a schema");
+    let schema = String::from_utf8_lossy(&schema.data).into_owned();
+    let rounds = (0..times).flat_map(|round| {
+        imu.iter().map(move |message| (message.log_time + round * 40_100_000_000, message.data[4..].to_vec()))
+    });
+    one_topic(folder, "/imu/data", "sensor_msgs/msg/Imu", &schema, &rounds.collect::<Vec<_>>())
+}
+
 /// Little-endian CDR, field by field.
 #[derive(Default)]
 pub struct Cdr(Vec<u8>);

@@ -227,12 +227,12 @@ fn a_guest_that_keeps_every_sample_makes_the_ring_refuse_and_count() {
 fn what_a_lambda_prints_becomes_log_lines_and_a_flood_is_counted() {
     let mut room = Room::of("print");
     assert!(room.wake().result.is_ok());
-    assert_eq!(room.session.take_log()[0].message, "hello from 1");
+    assert_eq!(room.session.take_log().0[0].message, "hello from 1");
     let mut room = Room::of("print_in_pieces");
     assert!(room.wake().result.is_ok());
-    let lines = room.session.take_log().into_iter().map(|line| line.message).collect::<Vec<_>>();
+    let lines = room.session.take_log().0.into_iter().map(|line| line.message).collect::<Vec<_>>();
     assert_eq!(lines, ["wake 1 of print_in_pieces"]);
     let mut room = Room::of("log_flood");
     assert!(room.wake().result.is_ok());
-    assert_eq!((room.session.take_log().len(), room.session.log_dropped()), (100, 900));
+    assert_eq!((room.session.take_log().0.len(), room.session.log_dropped()), (100, 900));
 }

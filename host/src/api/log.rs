@@ -40,32 +40,27 @@ pub(super) struct Log {
     dropped: u64,
     /// Second of the lambda's time, and the lines written in it.
     window: (i64, u32),
-    /// Lines since the last call of `said`, those included that were dropped, and the CRC-32 over them.
-    said: (u32, crc32fast::Hasher),
+    /// Lines since the last call of `take`, those included that were dropped, and the CRC-32 over them: how many the rate limit
+    /// lets pass depends on wakes before.
+    said: Said,
 }
 
 impl Log {
-    pub(super) fn take(&mut self) -> Vec<Line> {
-        std::mem::take(&mut self.lines)
+    pub(super) fn take(&mut self) -> (Vec<Line>, Said) {
+        (std::mem::take(&mut self.lines), std::mem::take(&mut self.said))
     }
 
     pub(super) fn dropped(&self) -> u64 {
         self.dropped
     }
 
-    /// What was written since the last call, whether or not the rate limit let it pass: how much that is depends on wakes before.
-    pub(super) fn said(&mut self) -> Said {
-        let (lines, digest) = std::mem::take(&mut self.said);
-        Said { lines, digest: if lines == 0 { 0 } else { digest.finalize() } }
-    }
-
     fn write(&mut self, at_ns: i64, level: Level, message: &str) {
         let message = cut(message, LINE_BYTES);
-        let (lines, digest) = &mut self.said;
-        *lines = lines.saturating_add(1);
+        let mut digest = crc32fast::Hasher::new_with_initial(self.said.digest);
         digest.update(&[level as u8]);
         digest.update(&(message.len() as u64).to_le_bytes());
         digest.update(message.as_bytes());
+        self.said = Said { lines: self.said.lines.saturating_add(1), digest: digest.finalize() };
         let second = at_ns.div_euclid(1_000_000_000);
         if self.window.0 != second {
             self.window = (second, 0);
@@ -105,7 +100,7 @@ mod tests {
         }
         log.write(1_000_000_000, Level::Info, "y");
         assert_eq!(log.dropped(), 150);
-        assert_eq!(log.take().len(), 101);
+        assert_eq!(log.take().0.len(), 101);
     }
 
     #[test]

@@ -61,14 +61,9 @@ impl Session {
         result
     }
 
-    /// Takes the log lines written since the last call.
-    pub fn take_log(&self) -> Vec<Line> {
+    /// Takes the log lines written since the last call, and what a journal notes of them.
+    pub fn take_log(&self) -> (Vec<Line>, Said) {
         self.lock().log.take()
-    }
-
-    /// What was written to the log since the last call, as a journal notes it.
-    pub fn take_said(&self) -> Said {
-        self.lock().log.said()
     }
 
     /// Log lines dropped by the rate limit, since the start.

@@ -27,15 +27,12 @@ impl Arrivals {
     }
 }
 
-/// CRC-32 of a sample with its stamps: finds every flipped byte.
+/// CRC-32 of a sample, plus its stamps: any flipped byte changes it. The stamps are not worth a CRC of their own, which would
+/// cost as much as that of a small sample.
 fn sample_digest(meta: &SampleMeta, cdr: &[u8]) -> u32 {
-    let mut stamps = [0; 16];
-    stamps[..8].copy_from_slice(&meta.at_ns.to_le_bytes());
-    stamps[8..].copy_from_slice(&meta.publish_ns.to_le_bytes());
-    let mut digest = crc32fast::Hasher::new();
-    digest.update(&stamps);
-    digest.update(cdr);
-    digest.finalize()
+    let fold = |stamp: i64| stamp as u32 ^ (stamp >> 32) as u32;
+    let stamps = fold(meta.at_ns).wrapping_mul(3).wrapping_add(fold(meta.publish_ns).wrapping_mul(5));
+    crc32fast::hash(cdr).wrapping_add(stamps)
 }
 
 /// Samples of `topic` so far, those included that found no room in its ring.
@@ -80,8 +77,9 @@ impl Trace {
         Self { offered: offered(topic), head: topic.reader().head() }
     }
 
-    /// Before a wake: notes what came since the one before.
-    pub fn begin(&mut self, topic: &Topic, seen: &mut Seen) {
+    /// Before a wake: notes what came since the one before. If a sample of this topic wakes the lambda, `woken_by` is its place
+    /// in the ring, and itself: most often it is the newest, and need not be looked for.
+    pub fn begin(&mut self, topic: &Topic, woken_by: Option<(u64, &SampleMeta)>, seen: &mut Seen) {
         let offered = offered(topic);
         seen.new = offered - self.offered;
         self.offered = offered;
@@ -90,7 +88,11 @@ impl Trace {
         self.head = head;
         if arrived {
             seen.digest = topic.arrivals.digest.swap(0, Ordering::Relaxed);
-            seen.newest = topic.reader().newest().map(|lease| (lease.meta().writer.0, lease.meta().seq));
+            let identity = |meta: &SampleMeta| (meta.writer.0, meta.seq);
+            seen.newest = match woken_by {
+                Some((position, meta)) if position + 1 == head => Some(identity(meta)),
+                _ => topic.reader().newest().map(|lease| identity(lease.meta())),
+            };
         } else {
             seen.digest = 0;
         }

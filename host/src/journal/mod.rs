@@ -50,15 +50,17 @@ impl Scribe {
             }
             Wake::Tick(tick) => self.entry.cause = Woken::Tick { missed: tick.missed },
         }
-        for ((topic, trace), seen) in self.topics.iter_mut().zip(&mut self.entry.seen) {
-            trace.begin(topic, seen);
+        for (index, ((topic, trace), seen)) in self.topics.iter_mut().zip(&mut self.entry.seen).enumerate() {
+            let woken_by = self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
+            let sample = if let Wake::Event(sample) = wake { Some(sample.meta()) } else { None };
+            trace.begin(topic, woken_by.zip(sample), seen);
         }
     }
 
     /// Forgets what came since the wake before.
     pub fn skip(&mut self) {
         for ((topic, trace), seen) in self.topics.iter_mut().zip(&mut self.entry.seen) {
-            trace.begin(topic, seen);
+            trace.begin(topic, None, seen);
         }
     }
 

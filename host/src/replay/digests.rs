@@ -9,7 +9,7 @@ use gleaner_protocol::Explain;
 use gleaner_protocol::journal::DriveDigest;
 
 /// Read at once.
-const PIECE: usize = 256 << 10;
+const PIECE: usize = 64 << 10;
 
 /// A drive cannot be read a second time.
 #[derive(Debug, thiserror::Error)]

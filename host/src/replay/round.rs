@@ -62,10 +62,10 @@ impl Course for Pass<'_> {
         self.triggers += decision.triggers.len() as u64;
         self.faults += u64::from(decision.fault.is_some());
         self.output.decision(&decision)?;
-        let log = self.session.take_log();
+        let (log, said) = self.session.take_log();
         self.keep(&log)?;
         if let Some(scribe) = &mut self.scribe {
-            let entry = scribe.end(&decision, self.session.take_said());
+            let entry = scribe.end(&decision, said);
             if let Some(journal) = &mut self.journal {
                 journal.wake(entry)?;
             }
@@ -142,9 +142,8 @@ pub(super) fn replay(
         _ => remove_clips(&results.out)?,
     };
     let initialised = guest.init();
-    let said = session.take_log();
     // What `init` says is no part of a wake.
-    session.take_said();
+    let (said, _) = session.take_log();
     if let Err(fault) = initialised {
         // What it said on the way may be why.
         output.log(&said)?;

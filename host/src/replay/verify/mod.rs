@@ -95,7 +95,6 @@ impl Remake {
         }
         // What `init` says is no part of a wake.
         session.take_log();
-        session.take_said();
         let judge = Judge::new(session.clone(), guest);
         Ok((Self { lambda, session, scribe: Scribe::new(&inputs), judge, engine }, drive, inputs))
     }
@@ -104,8 +103,8 @@ impl Remake {
     fn wake(&mut self, wake: Wake) -> &Entry {
         self.scribe.begin(&wake);
         let decision = self.judge.judge(wake);
-        self.session.take_log();
-        self.scribe.end(&decision, self.session.take_said())
+        let (_, said) = self.session.take_log();
+        self.scribe.end(&decision, said)
     }
 }
 

@@ -48,7 +48,7 @@ pub enum Woken {
 pub struct Seen {
     /// Samples that arrived since the wake before, those included that found no room in the ring.
     pub new: u64,
-    /// Wrapping sum of the CRC-32 of each of them that entered the ring; 0 if there are none.
+    /// Wrapping sum of the digests of those that entered the ring, see `docs/journal.md`; 0 if there are none.
     pub digest: u32,
     /// Writer and number of the newest sample in the ring.
     pub newest: Option<([u8; 16], u64)>,
