@@ -83,13 +83,11 @@ impl Recording {
     /// Subscribes the topics of `[record]`; none if the manifest has no such table.
     ///
     /// A topic that the drive does not have is no error: a vehicle's sensors differ from drive to drive. Its clips say so.
-    /// Takes hold of `out`, so that two replays do not write over each other; what a killed one left there is recovered, kept
-    /// until the next, and said.
+    /// Subscribed before the lambda's inputs, the recorder has the sample that a trigger is about.
     pub(super) fn subscribe(
         manifest: &Manifest,
         options: &Options,
         drive: &mut Replay,
-        out: &Path,
     ) -> Result<Option<Self>, Failure> {
         let Some(rules) = &manifest.record else { return Ok(None) };
         let shared = Arc::new(Mutex::new(Shared { recorder: None, failed: None }));
@@ -136,11 +134,18 @@ impl Recording {
             );
             return Err(failure.with_help(help));
         }
+        Ok(Some(Self { shared, lanes, rules: rules.clone(), folder: None, lambda: None }))
+    }
+
+    /// Takes hold of `out`, so that two replays do not write over each other. What a killed one left there is recovered, kept
+    /// until the next, and said.
+    pub(super) fn take_hold(&mut self, out: &Path) -> Result<(), Failure> {
         let (folder, recovered) = Folder::open(out)?;
         for clip in &recovered {
             tracing::warn!(clip = %clip.file.display(), "recovered a clip of an earlier replay, which did not end well");
         }
-        Ok(Some(Self { shared, lanes, rules: rules.clone(), folder: Some((folder, recovered)), lambda: None }))
+        self.folder = Some((folder, recovered));
+        Ok(())
     }
 
     /// Makes the recorder. The clips of an earlier replay are replaced, but not those that were recovered; returns how many.

@@ -122,10 +122,12 @@ pub(super) fn replay(
     reports: &mut dyn Write,
 ) -> Result<(Summary, Option<Exit>), Failure> {
     let name = manifest.lambda.name.as_str();
-    let drive = Replay::open(&options.drives).map_err(|error| Failure::from(DriveError(error)))?;
+    let mut drive = Replay::open(&options.drives).map_err(|error| Failure::from(DriveError(error)))?;
+    let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { mut drive, inputs, session, mut guest } = Stage::set(drive, options, manifest, load)?;
-    let mut recording =
-        if results.record { Recording::subscribe(manifest, options, &mut drive, &results.out)? } else { None };
+    if let Some(recording) = &mut recording {
+        recording.take_hold(&results.out)?;
+    }
     let started = Instant::now();
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {
