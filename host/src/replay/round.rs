@@ -15,7 +15,7 @@ use super::digests::Digests;
 use super::options::Results;
 use super::output::{JournalFile, Output};
 use super::record::{Recorded, Recording, remove_clips};
-use super::stage::{DriveError, Stage};
+use super::stage::{DriveError, Stage, not_started, open_drives};
 use super::{CLOCK, Load, Options, report as send};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
@@ -122,7 +122,7 @@ pub(super) fn replay(
     reports: &mut dyn Write,
 ) -> Result<(Summary, Option<Exit>), Failure> {
     let name = manifest.lambda.name.as_str();
-    let mut drive = Replay::open(&options.drives).map_err(|error| Failure::from(DriveError(error)))?;
+    let mut drive = open_drives(options)?;
     let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { mut drive, inputs, session, mut guest } = Stage::set(drive, options, manifest, load)?;
     if let Some(recording) = &mut recording {
@@ -150,9 +150,7 @@ pub(super) fn replay(
         // What it said on the way may be why.
         output.log(&said)?;
         output.flush()?;
-        let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{name}`"));
-        failure.causes = vec![fault.message];
-        return Err(failure);
+        return Err(not_started(name, fault));
     }
     let mut pass = Pass {
         schedule: Schedule::new(manifest, &inputs),

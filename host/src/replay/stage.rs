@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Explain, Failure};
-use gleaner_transport::replay::ReplayError;
+use gleaner_protocol::{Exit, Explain, Failure, Fault};
+use gleaner_transport::replay::{Replay, ReplayError};
 use gleaner_transport::{Transport, TransportError};
 
 use super::{Load, Options};
@@ -29,6 +29,18 @@ impl<T: Transport> Stage<T> {
         let guest = load(options, manifest, session.clone())?;
         Ok(Self { drive, inputs, session, guest })
     }
+}
+
+/// Opens the drives, merged by time.
+pub(super) fn open_drives(options: &Options) -> Result<Replay, Failure> {
+    Replay::open(&options.drives).map_err(|error| DriveError(error).into())
+}
+
+/// What a lambda's fault in `init` means for a run.
+pub(super) fn not_started(lambda: &str, fault: Fault) -> Failure {
+    let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{lambda}`"));
+    failure.causes = vec![fault.message];
+    failure
 }
 
 /// A drive that cannot be read.

@@ -1,16 +1,16 @@
 //! What a journal claims: which lambda decided what, and where that is written.
 
-use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::journal::{Difference, Entry, Header, JournalError, Reader};
 use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
-use gleaner_protocol::{BuildDir, Exit, Failure, visible};
-use gleaner_transport::replay::read_extras;
+use gleaner_protocol::{BuildDir, Exit, Failure};
+use gleaner_transport::replay::{ReplayError, read_extras};
 use serde_json::Value;
 
+use super::told::Told;
 use crate::input::Remap;
 use crate::journal::Identity;
 use crate::replay::Options;
@@ -29,79 +29,6 @@ pub(in crate::replay) struct Claim {
     pub(super) told: Told,
 }
 
-/// What a clip tells people of itself, in its metadata.
-#[derive(Default)]
-pub(super) struct Told {
-    /// Messages of each topic.
-    pub(super) messages: Vec<(String, u64)>,
-    /// What is missing of each topic, in words.
-    losses: Vec<String>,
-    /// Triggers of the lambda.
-    pub(super) triggers: u64,
-    /// The first of them, in words.
-    moments: Vec<String>,
-}
-
-/// As many moments as a clip keeps.
-const MOMENTS_MAX: usize = 10_000;
-
-impl Told {
-    fn of(metadata: &[(String, BTreeMap<String, String>)], lambda: &str) -> Self {
-        let mut told = Self::default();
-        for (name, values) in metadata {
-            let value = |key: &str| values.get(key).map_or("", String::as_str);
-            match name.as_str() {
-                "gleaner.topic" => {
-                    told.messages.push((value("topic").to_owned(), value("messages").parse().unwrap_or(0)));
-                    for (key, what) in [("overwritten", "pushed out"), ("too_big", "too big")] {
-                        if value(key) != "0" {
-                            told.losses.push(format!("{}: {} {what}", value("topic"), value(key)));
-                        }
-                    }
-                }
-                "gleaner.decision" if value("lambda") == lambda => {
-                    let score = values.get("score").map_or("none", String::as_str);
-                    told.moments.push(moment(value("at_ns"), value("kind"), value("label"), score));
-                }
-                _ => {}
-            }
-        }
-        told
-    }
-
-    /// Adds what the journal says.
-    pub(super) fn add(&mut self, entry: &Entry) {
-        for trigger in &entry.triggers {
-            self.triggers += 1;
-            if self.moments.len() < MOMENTS_MAX {
-                let score = trigger.score.map_or("none".to_owned(), |score| score.to_string());
-                self.moments.push(moment(&entry.at_ns.to_string(), trigger.kind.as_str(), &trigger.label, &score));
-            }
-        }
-    }
-
-    /// The first trigger that the journal and the clip do not tell alike.
-    pub(super) fn moments_differ(&self, clip: &Told) -> Option<Difference> {
-        // The clip's limit is for all its lambdas.
-        let all = clip.moments.len().max(self.moments.len().min(MOMENTS_MAX / 100));
-        (0..all).find_map(|index| {
-            let side = |told: &Told| told.moments.get(index).cloned().unwrap_or_else(|| "none".to_owned());
-            let (journal, now) = (side(self), side(clip));
-            let what = format!("trigger {} of the clip", index + 1);
-            (journal != now).then_some(Difference { what, journal, now })
-        })
-    }
-
-    /// What is missing in the clip, in words; none if nothing is.
-    pub(super) fn losses(&self) -> Option<String> {
-        (!self.losses.is_empty()).then(|| visible(&self.losses.join(", ")))
-    }
-}
-
-fn moment(at_ns: &str, kind: &str, label: &str, score: &str) -> String {
-    visible(&format!("{kind} `{label}` at {at_ns} ns, score {score}"))
-}
-
 impl Claim {
     /// The journal of a replay.
     pub(in crate::replay) fn journal(path: &Path) -> Result<Self, Failure> {
@@ -113,7 +40,7 @@ impl Claim {
 
     /// The part of the journal of `lambda` that a clip holds.
     pub(in crate::replay) fn clip(path: &Path, lambda: &str) -> Result<Self, Failure> {
-        let extras = read_extras(path, EXTRAS_BYTES).map_err(|error| Failure::from(DriveError(error)))?;
+        let extras = read_extras(path, EXTRAS_BYTES).map_err(unreadable_clip)?;
         if !extras.is_whole {
             let message = format!("clip `{}` is cut off or was never finished", path.display());
             return Err(Failure::new(Exit::Usage, message).with_help("copy it again; a clip of Gleaner has its end"));
@@ -232,6 +159,11 @@ fn unusable(path: &Path, error: &JournalError) -> Failure {
         }
         _ => failure.with_help("name a file that `gleaner replay --journal FILE` wrote"),
     }
+}
+
+/// A clip that cannot be read, or is damaged.
+pub(super) fn unreadable_clip(error: ReplayError) -> Failure {
+    Failure::from(DriveError(error)).with_help("copy the clip again if you can")
 }
 
 fn begins_as_mcap(path: &Path) -> bool {

@@ -8,12 +8,12 @@ use gleaner_protocol::{Exit, Failure};
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Transport};
 
-use super::claim::Told;
+use super::claim::unreadable_clip;
 use super::paced::{PaceError, Paced};
+use super::told::Told;
 use super::{Claim, Proved, Remake, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
 use crate::api::trace::offered;
-use crate::replay::stage::DriveError;
 use crate::replay::{Load, Options};
 
 /// A sample may be newer than the one that caused a wake by so much, where each topic has a thread of its own.
@@ -263,8 +263,4 @@ fn unreadable(error: PaceError) -> Failure {
             Failure::caused_by(Exit::Differs, "this clip does not have its samples in the order of the journal", &error)
         }
     }
-}
-
-fn unreadable_clip(error: gleaner_transport::replay::ReplayError) -> Failure {
-    Failure::from(DriveError(error)).with_help("copy the clip again if you can")
 }

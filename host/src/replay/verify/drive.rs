@@ -12,7 +12,7 @@ use crate::api::data::{Topic, Wake};
 use crate::api::trace::offered;
 use crate::replay::course::{self, Course};
 use crate::replay::digests::Digests;
-use crate::replay::stage::DriveError;
+use crate::replay::stage::{DriveError, open_drives};
 use crate::replay::{Load, Options};
 use crate::schedule::Schedule;
 
@@ -23,7 +23,7 @@ pub(super) fn prove(
     load: Load<'_>,
 ) -> Result<Proved, Failure> {
     let digests = Digests::start(options.drives.clone());
-    let drive = Replay::open(&options.drives).map_err(|error| Failure::from(DriveError(error)))?;
+    let drive = open_drives(options)?;
     let start_ns = drive.start_ns().unwrap_or(0);
     let (remake, mut drive, inputs) = Remake::start(drive, options, manifest, load)?;
     let schedule = Schedule::new(manifest, &inputs);

@@ -8,6 +8,7 @@ mod claim;
 mod clip;
 mod drive;
 mod paced;
+mod told;
 
 pub(super) use claim::Claim;
 
@@ -16,11 +17,11 @@ use std::time::Instant;
 
 use gleaner_protocol::journal::{Difference, Entry};
 use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Failure, Verified};
+use gleaner_protocol::{Failure, Verified};
 use gleaner_transport::Transport;
 
 use self::claim::different;
-use super::stage::Stage;
+use super::stage::{Stage, not_started};
 use super::{Load, Options};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
@@ -89,9 +90,7 @@ impl Remake {
         let lambda = manifest.lambda.name.to_string();
         let engine = guest.engine();
         if let Err(fault) = guest.init() {
-            let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{lambda}`"));
-            failure.causes = vec![fault.message];
-            return Err(failure);
+            return Err(not_started(&lambda, fault));
         }
         // What `init` says is no part of a wake.
         session.take_log();
