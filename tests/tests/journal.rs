@@ -237,6 +237,20 @@ fn a_journal_is_not_written_into_a_file_of_the_results() {
 }
 
 #[test]
+fn a_journal_of_another_version_or_that_is_cut_off_is_replaced() {
+    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    let whole = std::fs::read(&journaled.journal).unwrap();
+    let mut newer = whole.clone();
+    newer[8] = 99;
+    for found in [&newer[..], &whole[..20], &whole[..whole.len() - 1], b""] {
+        let journal = journaled.out.write("again.journal", found);
+        let args = [&BRAKING[..], &["--journal", journal.to_str().unwrap()]].concat();
+        replay_to(journaled.out.path(), &root().join(HELLO), &[sample_drive()], &args).must_exit(0);
+        assert_eq!(std::fs::read(journal).unwrap(), whole);
+    }
+}
+
+#[test]
 fn a_journal_is_not_written_over_a_drive() {
     let folder = Folder::new();
     let drive = folder.write("drive.mcap", std::fs::read(sample_drive()).unwrap());

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::journal::{self, End, Entry, Header, Reader};
+use gleaner_protocol::journal::{self, End, Entry, Header, JournalError, Reader};
 use gleaner_protocol::{Decision, Exit, Explain, Failure, Summary};
 use serde::Serialize;
 
@@ -119,6 +119,12 @@ impl Lines {
     }
 }
 
+/// Whether a file begins as a journal does, be it of another version, damaged or cut off: such a one may be replaced.
+fn is_journal(path: &Path) -> bool {
+    let opened = File::open(path).map(Reader::open);
+    opened.is_ok_and(|opened| !matches!(opened, Err(JournalError::NotAJournal | JournalError::Read { .. })))
+}
+
 /// The journal of a replay.
 pub struct JournalFile {
     path: PathBuf,
@@ -133,9 +139,8 @@ impl JournalFile {
             Ok(metadata) => {
                 // A pipe would never end, and a device is no file to verify later.
                 let is_file = metadata.is_file();
-                let is_journal = || File::open(path).is_ok_and(|file| Reader::open(file).is_ok());
-                if !is_file || metadata.len() > 0 && !is_journal() {
-                    let message = format!("`{}` is there and is no journal of this version", path.display());
+                if !is_file || metadata.len() > 0 && !is_journal(path) {
+                    let message = format!("`{}` is there and is no journal", path.display());
                     return Err(Failure::new(Exit::Usage, message).with_help("choose another name: --journal FILE"));
                 }
             }
