@@ -161,7 +161,13 @@ fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &st
     loopback.add_topic(name, type_name, "");
     let topic = Topic { name: name.to_owned(), type_name: type_name.to_owned(), definitions: None, offered_qos: None };
     let topic = recorder.lock().expect("one thread").add_topic(topic).expect("few topics");
-    let spec = TopicSpec { topic: name.to_owned(), type_name: type_name.to_owned(), queue: 1, max_bytes: 1 << 20 };
+    let spec = TopicSpec {
+        topic: name.to_owned(),
+        type_name: type_name.to_owned(),
+        queue: 1,
+        max_bytes: 1 << 20,
+        qos: Default::default(),
+    };
     loopback.subscribe(&spec, Arc::new(Lane { recorder: recorder.clone(), topic })).expect("the topic is there");
     topic
 }

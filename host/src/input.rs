@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_buffers::{Pool, PoolError, Refusal, RingWriter, ring};
-use gleaner_protocol::manifest::{Input, Manifest};
-use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, TransportError, Verdict};
+use gleaner_protocol::manifest::{self, Durability, Input, Manifest, Reliability};
+use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, TransportError, Verdict};
 
 use tracing::warn;
 
@@ -75,6 +75,7 @@ fn open_input(
         type_name: input.type_name.to_string(),
         queue: input.depth,
         max_bytes: input.max_size.as_usize(),
+        qos: qos(input.qos),
     };
 
     let samples = pool(input, input.slots(), spec.max_bytes)?;
@@ -94,6 +95,17 @@ fn open_input(
     transport.subscribe(&spec, ingest).map_err(subscribe)?;
     let definitions = transport.definitions(&spec.topic).map_err(subscribe)?;
     Ok(Topic::new(input.name.as_str(), topic, &spec.type_name, reader, arrivals, definitions, images))
+}
+
+fn qos(qos: manifest::Qos) -> Qos {
+    match qos {
+        manifest::Qos::Auto => Qos::Auto,
+        manifest::Qos::Fixed { reliability, durability, depth } => Qos::Fixed {
+            reliable: reliability == Reliability::Reliable,
+            transient_local: durability == Durability::TransientLocal,
+            depth,
+        },
+    }
 }
 
 fn pool<M: Copy + Send + Sync + 'static>(

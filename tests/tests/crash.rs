@@ -162,7 +162,13 @@ fn whole(path: &PathBuf) -> Result<(), Failed> {
     let failed = |error: &dyn std::error::Error| Failed::from(format!("{}: {error}", path.display()));
     let mut clip = Replay::open(std::slice::from_ref(path)).map_err(|error| failed(&error))?;
     for topic in clip.topics() {
-        let spec = TopicSpec { topic: topic.topic, type_name: topic.type_name, queue: 1, max_bytes: usize::MAX };
+        let spec = TopicSpec {
+            topic: topic.topic,
+            type_name: topic.type_name,
+            queue: 1,
+            max_bytes: usize::MAX,
+            qos: Default::default(),
+        };
         clip.subscribe(&spec, Arc::new(Nowhere)).map_err(|error| failed(&error))?;
     }
     while clip.step().map_err(|error| failed(&error))?.is_some() {}

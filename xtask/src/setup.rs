@@ -45,7 +45,7 @@ fn target(checkout: &Checkout) -> Result<(), Failure> {
 /// heavy compiles twice.
 fn programs(checkout: &Checkout) -> Result<(), Failure> {
     let mut build = checkout.cargo();
-    build.args(["build", "--release", "--workspace"]);
+    build.args(["build", "--release"]);
     steps::run(&mut build, "if a linker or a C compiler is missing, install one (`cc`); else see the first error above")
 }
 

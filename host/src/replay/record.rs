@@ -8,7 +8,7 @@ use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{Counts, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId};
 use gleaner_transport::replay::Replay;
-use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::{CLOCK, Options};
 use crate::input::Remap;
@@ -115,6 +115,7 @@ impl Recording {
                     type_name: found.type_name.clone(),
                     queue: 1,
                     max_bytes: usize::try_from(rules.preroll_size.bytes()).unwrap_or(usize::MAX),
+                    qos: Qos::Auto,
                 };
                 drive.subscribe(&spec, lane.clone()).map_err(|error| {
                     Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error)

@@ -19,6 +19,40 @@ pub struct TopicSpec {
     /// The largest sample, in bytes of CDR, that the sink will take. A live transport sizes its
     /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`].
     pub max_bytes: usize,
+    /// How a live transport asks for it.
+    pub qos: Qos,
+}
+
+/// The quality of service that a subscription asks for. A replay delivers what it has.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub enum Qos {
+    /// What the writers offer.
+    #[default]
+    Auto,
+    /// Exactly this.
+    Fixed {
+        /// Whether lost samples are sent again.
+        reliable: bool,
+        /// Whether samples from before the subscription are wanted, as far as writers keep them.
+        transient_local: bool,
+        /// Samples that DDS keeps until we take them.
+        depth: usize,
+    },
+}
+
+/// How a subscription is doing.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Status {
+    /// Writers that are connected now; `None` where there are none, as in a replay.
+    pub writers: Option<usize>,
+    /// Samples that were lost on their way to us, as far as gaps in their numbers tell; `None` if nothing tells.
+    pub lost: Option<u64>,
+    /// Samples that could not be read at all.
+    pub malformed: u64,
+    /// What is asked for now, in words: `reliable, volatile`.
+    pub qos: Option<String>,
+    /// What keeps writers from being heard, in whole sentences, at most 16.
+    pub trouble: Vec<String>,
 }
 
 /// The identity of whoever wrote a sample: 16 bytes, equal for all samples of one writer.
@@ -127,6 +161,11 @@ pub trait Transport {
     ///
     /// [`TransportError`] if there is no such topic, or its definitions are missing or malformed.
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError>;
+
+    /// How a subscription is doing.
+    fn status(&self, _subscription: Subscription) -> Status {
+        Status::default()
+    }
 }
 
 /// Why a topic cannot be had.

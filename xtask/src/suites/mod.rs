@@ -57,7 +57,7 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
     let suite = |name: &str, command, speech| Suite { name: name.to_owned(), how: How::Run(command, speech) };
 
     let mut tests = checkout.cargo();
-    tests.args(["test", "--release", "--workspace", "--no-fail-fast"]);
+    tests.args(["test", "--release", "--no-fail-fast"]);
 
     // In target folders of their own: their flags would have everything else compiled anew.
     let mut loom = checkout.cargo();

@@ -33,7 +33,13 @@ pub(super) fn each_message(
     let held = Arc::new(Held::default());
     let mut topics = Vec::new();
     for found in replay.topics() {
-        let spec = TopicSpec { topic: found.topic, type_name: found.type_name, queue: 1, max_bytes: usize::MAX };
+        let spec = TopicSpec {
+            topic: found.topic,
+            type_name: found.type_name,
+            queue: 1,
+            max_bytes: usize::MAX,
+            qos: Default::default(),
+        };
         replay
             .subscribe(&spec, Arc::clone(&held) as Arc<dyn gleaner_transport::Sink>)
             .map_err(|source| RecordError::Topic { path: path.to_owned(), source: Box::new(source) })?;

@@ -27,7 +27,7 @@ fn the_sample_drive_holds_what_its_description_says() {
     let memories = SAMPLE.map(|(topic, type_name, _)| {
         let memory = Arc::new(Memory::default());
         let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
-        let spec = TopicSpec { topic, type_name, queue: 0, max_bytes: 0 };
+        let spec = TopicSpec { topic, type_name, queue: 0, max_bytes: 0, qos: Default::default() };
         replay.subscribe(&spec, memory.clone()).unwrap();
         memory
     });

@@ -174,7 +174,7 @@ impl Memory {
 
 pub fn spec(topic: &str) -> TopicSpec {
     let (topic, type_name) = (topic.to_owned(), TYPE.to_owned());
-    TopicSpec { topic, type_name, queue: 1, max_bytes: 1 << 20 }
+    TopicSpec { topic, type_name, queue: 1, max_bytes: 1 << 20, qos: Default::default() }
 }
 
 /// Subscribes one memory to `topics`, in that order.

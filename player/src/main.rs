@@ -1,0 +1,2 @@
+//! Plays drives as live topics of ROS 2.
+fn main() {}
