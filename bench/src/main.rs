@@ -2,6 +2,7 @@
 //!
 //! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the spread of its runs.
 
+mod live;
 mod measure;
 mod record;
 
@@ -17,10 +18,24 @@ struct Args {
     /// Fewer rounds: shows that the benches run, not what they say.
     #[arg(long)]
     quick: bool,
+    /// Live topics instead of drives, in a private network; needs gleaner-player.
+    #[arg(long)]
+    live: bool,
 }
 
 fn main() -> ExitCode {
-    let Args { quick } = Args::parse();
+    let Args { quick, live } = Args::parse();
+    if live {
+        return match live::elsewhere() {
+            Some(Ok(true)) => ExitCode::SUCCESS,
+            Some(Ok(false)) => ExitCode::FAILURE,
+            Some(Err(why)) => {
+                println!("skipped: {why}");
+                ExitCode::SUCCESS
+            }
+            None => tell(&live::figures(quick), quick),
+        };
+    }
     let rounds = if quick { 2 } else { 9 };
     if let Err(error) = measure::stay_on_one_core() {
         eprintln!("cannot stay on one core, figures are of all: {error}");
@@ -80,7 +95,6 @@ fn main() -> ExitCode {
         tell("arrived", "MB/s", load.megabytes_per_s);
         tell("part of the time in clips", "%", load.recorded_percent);
         tell("share of a core", "%", load.cpu_percent);
-        tell("longest time to take a sample", "ms", load.longest_ms);
         // Beyond the preroll, a chunk and its compression.
         let bound = if store == Store::Ram { 64.0 + 16.0 } else { 16.0 };
         let memory = format!("recorder at 20 MB/s, preroll in {name}: memory");
@@ -89,8 +103,27 @@ fn main() -> ExitCode {
         figures.push(Figure::at_most(&name, "%", 100.0, &[load.preroll_percent]));
     }
 
+    let live = record::record_live(if quick { 4 } else { 60 });
+    let at =
+        |values: &[f64], share: f64| values.get((values.len() as f64 * share) as usize).copied().unwrap_or(f64::NAN);
+    let opened = |share| at(&live.opened_ms, share);
+    figures.push(Figure::told("trigger to window open, at 20 MB/s: median", "ms", &[opened(0.5)]));
+    figures.push(Figure::at_most("trigger to window open, at 20 MB/s: 99 %", "ms", 1.0, &[opened(0.99)]));
+    figures.push(Figure::told(
+        "trigger to window open, at 20 MB/s: longest",
+        "ms",
+        &live.opened_ms[live.opened_ms.len().max(1) - 1..],
+    ));
+    figures.push(Figure::told("live recorder at 20 MB/s: longest time to take a sample", "ms", &[live.longest_ms]));
+    figures.push(Figure::told("live recorder: time to tell it of a wake", "us", &[at(&live.told_us, 0.5)]));
+    figures.push(Figure::at_most("live recorder at 20 MB/s: samples lost", "samples", 0.0, &[live.lost as f64]));
+
+    tell(&figures, quick)
+}
+
+fn tell(figures: &[Figure], quick: bool) -> ExitCode {
     println!("| promise | goal | median | spread | runs | |\n|---|---|---|---|---|---|");
-    for figure in &figures {
+    for figure in figures {
         println!("{figure}");
     }
     // Two rounds on a busy machine say nothing about a promise.

@@ -1,5 +1,7 @@
 //! The command line, checked as far as it can be without looking at a file.
 
+use std::ffi::OsString;
+use std::net::IpAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
@@ -27,6 +29,107 @@ pub enum Command {
     ///
     /// Ends with 0 if all are the same, and with 4 at the first that is not.
     Verify(VerifyArgs),
+    /// Run a built lambda on the live topics of this vehicle, until ctrl-C
+    ///
+    /// Records the clips that the manifest asks for, and writes OUT/decisions.jsonl, OUT/log.jsonl and OUT/summary.json.
+    Run(RunArgs),
+    /// Show the live topics that are there
+    Topics(TopicsArgs),
+    /// Play recorded drives as live topics; see `gleaner play --help`
+    #[command(disable_help_flag = true)]
+    Play {
+        /// Handed to gleaner-player as they are
+        #[arg(value_name = "ARGUMENTS", trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<OsString>,
+    },
+    /// Look for what would keep lambdas from running well on this machine
+    Doctor(DoctorArgs),
+}
+
+/// Which network to join.
+#[derive(Args, Debug, Clone, Default)]
+pub struct NetworkArgs {
+    /// The domain of DDS [default: ROS_DOMAIN_ID, else 0]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
+    pub domain: Option<u16>,
+    /// The address of an interface to use; may be repeated [default: all]
+    #[arg(long, value_name = "ADDRESS")]
+    pub interface: Vec<IpAddr>,
+}
+
+/// Arguments of `gleaner run`.
+#[derive(Args, Debug)]
+pub struct RunArgs {
+    /// The lambda's folder, built by `gleaner build DIR`
+    #[arg(value_name = "DIR")]
+    pub lambda: PathBuf,
+    /// Another value for a key of the config table, as in brake_mps2=-1.4
+    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
+    pub set: Vec<String>,
+    /// Another name for a topic of the manifest, as in /imu/data:=/car/imu
+    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
+    pub remap: Vec<String>,
+    /// Where the results go [default: DIR/live]
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// Write every decision, not only those with a trigger or a fault
+    #[arg(long)]
+    pub all: bool,
+    /// Leave out the clips that the table `record` of the manifest asks for
+    #[arg(long)]
+    pub no_record: bool,
+    /// Show how the lambda and its topics are doing, every second
+    #[arg(long)]
+    pub stats: bool,
+    /// Stop after so many seconds
+    #[arg(long = "for", value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..))]
+    pub last: Option<u32>,
+    /// Answer each wake on this topic with the stamps of input and decision, as sensor_msgs/msg/TimeReference
+    #[arg(long, value_name = "TOPIC")]
+    pub rtt: Option<String>,
+    /// Publish decisions with a trigger or a fault on this topic, as std_msgs/msg/String with JSON
+    #[arg(long, value_name = "TOPIC")]
+    pub decisions: Option<String>,
+    /// Take commands to record from this topic, as std_msgs/msg/String with JSON; see docs/clips.md
+    #[arg(long, value_name = "TOPIC")]
+    pub commands: Option<String>,
+    /// Bytes of the disk that stay free: below, no clip is begun [default: 1 GiB]
+    #[arg(long, value_name = "BYTES")]
+    pub disk_floor: Option<u64>,
+    /// Most clips that are kept; of more, the oldest that nobody fetched are deleted, and counted
+    #[arg(long, value_name = "N")]
+    pub clips_max: Option<u64>,
+    /// Most bytes of clips that are kept, likewise
+    #[arg(long, value_name = "BYTES")]
+    pub bytes_max: Option<u64>,
+    /// Print what is reported as JSON, an object a line
+    #[arg(long, conflicts_with = "stats")]
+    pub json: bool,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub network: NetworkArgs,
+}
+
+/// Arguments of `gleaner topics`.
+#[derive(Args, Debug)]
+pub struct TopicsArgs {
+    /// How long to listen, in seconds [default: 2]
+    #[arg(long, value_name = "SECONDS")]
+    pub wait: Option<f64>,
+    /// Print the topics as one JSON object
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub network: NetworkArgs,
+}
+
+/// Arguments of `gleaner doctor`.
+#[derive(Args, Debug)]
+pub struct DoctorArgs {
+    /// Print the findings as JSON, an object a line
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Arguments of `gleaner build`.

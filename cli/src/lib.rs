@@ -1,17 +1,21 @@
 //! The command `gleaner`: `build` makes a lambda's build folder, `runtime` starts `gleaner-runtime` for `replay` and
-//! `verify`, `results` reads back what a replay left, and `show` is what people see of it.
+//! `verify`, `run` keeps it and the recorder going live,
+//! `results` reads back what a replay left, and `show` is what people see of it.
 //!
 //! It is thin. No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts its
 //! sibling programs and speaks to them through `gleaner-protocol`.
 
 pub mod args;
 mod build;
+mod doctor;
 mod listen;
 mod replay;
 pub mod results;
+mod run;
 mod runtime;
 mod say;
 mod show;
+mod sibling;
 
 use gleaner_protocol::{Exit, Failure};
 
@@ -27,5 +31,9 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         Command::Build(args) => build::run(&args.lambda),
         Command::Replay(args) => replay::run(&args),
         Command::Verify(args) => replay::verify(&args),
+        Command::Run(args) => run::run(&args),
+        Command::Topics(args) => sibling::topics(&args),
+        Command::Play { arguments } => sibling::play(&arguments),
+        Command::Doctor(args) => doctor::run(&args),
     }
 }

@@ -25,17 +25,13 @@ pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
 fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> Result<Exit, Failure> {
     let text = match heard {
         None => return Ok(exit),
-        Some(Heard::Summary(summary)) if json => to_json(&summary),
-        Some(Heard::Verified(verified)) if json => to_json(&verified),
+        Some(Heard::Summary(summary)) if json => show::json_line(&summary),
+        Some(Heard::Verified(verified)) if json => show::json_line(&verified),
         Some(Heard::Summary(summary)) => summary_text(&summary)?,
         Some(Heard::Verified(verified)) => show::verified(&verified, paint()),
     };
     say(&text)?;
     Ok(exit)
-}
-
-fn to_json(result: &impl serde::Serialize) -> String {
-    serde_json::to_string(result).expect("a report has only text keys and finite numbers") + "\n"
 }
 
 fn summary_text(summary: &Summary) -> Result<String, Failure> {

@@ -111,9 +111,10 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
                 }
                 bar.set_position(done);
             }
-            Ok(Report::Round(_)) => {}
             Ok(Report::Summary(summary)) => return Ok(Some(Heard::Summary(summary))),
             Ok(Report::Verified(verified)) => return Ok(Some(Heard::Verified(verified))),
+            // Of a replay that makes several passes; and what is only reported live.
+            Ok(_) => {}
             Err(source) => {
                 let line = visible(&line.chars().take(200).collect::<String>());
                 return Err(RuntimeError::Report { line, source });
@@ -125,7 +126,7 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
 
 /// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed. A line is cut into
 /// pieces rather than held whole, however long it is.
-fn pass_on(says: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
+pub(crate) fn pass_on(says: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
     const PIECE: u64 = 8192;
     let mut says = BufReader::new(says);
     let mut line = Vec::new();

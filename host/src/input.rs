@@ -3,10 +3,11 @@
 //! All memory is taken and touched here, before the first sample. Delivering copies a sample once and never waits for a lambda.
 
 use std::io;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::Thread;
+use std::time::{Duration, Instant};
 
-use gleaner_buffers::{Pool, PoolError, Refusal, RingWriter, ring};
+use gleaner_buffers::{Draft, Pool, PoolError, Refusal, RingWriter, ring};
 use gleaner_protocol::manifest::{self, Durability, Input, Manifest, Reliability};
 use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, TransportError, Verdict};
 
@@ -45,6 +46,32 @@ impl Remap {
     }
 }
 
+/// Wakes the thread that waits for samples of one input.
+#[derive(Clone, Debug)]
+pub struct Bell {
+    /// The input.
+    pub input: String,
+    /// Who waits.
+    pub thread: Thread,
+}
+
+/// What differs where samples arrive while the lambda runs.
+#[derive(Clone, Debug)]
+pub struct Live {
+    /// Whom samples of the input that wakes the lambda wake, if one does.
+    pub bell: Option<Bell>,
+}
+
+/// Samples up to this size are small: a ring has room for as many again as it shows.
+const SMALL_BYTES: u64 = 64 << 10;
+/// As many large samples may arrive during a wake without one leaving that it may see.
+const SPARE_LARGE: usize = 2;
+
+/// How much deeper a ring is than the lambda sees, so that what it may see does not leave while it runs.
+fn spare(input: &Input) -> usize {
+    if input.max_size.bytes() <= SMALL_BYTES { input.depth } else { input.depth.min(SPARE_LARGE) }
+}
+
 /// Subscribes every input of `manifest` and returns its topics, in the manifest's order.
 ///
 /// # Errors
@@ -54,15 +81,17 @@ pub fn open_inputs(
     manifest: &Manifest,
     remaps: &[Remap],
     transport: &mut dyn Transport,
+    live: Option<&Live>,
 ) -> Result<Vec<Arc<Topic>>, InputError> {
     let made = Budget::new(manifest.limits.memory.as_usize());
-    manifest.inputs.iter().map(|input| open_input(input, remaps, transport, &made)).collect()
+    manifest.inputs.iter().map(|input| open_input(input, remaps, transport, live, &made)).collect()
 }
 
 fn open_input(
     input: &Input,
     remaps: &[Remap],
     transport: &mut dyn Transport,
+    live: Option<&Live>,
     made: &Budget,
 ) -> Result<Arc<Topic>, InputError> {
     let layout = |source| InputError::Layout { input: input.name.to_string(), source };
@@ -78,23 +107,33 @@ fn open_input(
         qos: qos(input.qos),
     };
 
-    let samples = pool(input, input.slots(), spec.max_bytes)?;
-    let (writer, reader) = ring(samples, input.depth).map_err(layout)?;
+    // Live, one more is for the newest of those that a wake sees, which is held while it runs.
+    let (spare, pinned) = live.map_or((0, 0), |_| (spare(input), 1));
+    let samples = pool(input, input.slots() + spare + pinned, spec.max_bytes)?;
+    let (writer, reader) = ring(samples, input.depth + spare).map_err(layout)?;
     let decoded = match input.decoded_size {
         Some(bytes) => Some(pool(input, input.decoded_slots(), bytes.as_usize())?),
         None => None,
     };
     let images = Images::new(decoded, made.clone());
-    let arrivals = Arc::<Arrivals>::default();
+    let arrivals = Arc::new(Arrivals::new(input.depth + spare));
     let ingest = Arc::new(Ingest {
-        ring: Mutex::new(writer),
+        end: Mutex::new(End { ring: writer, copied: None }),
         arrivals: arrivals.clone(),
         input: input.name.to_string(),
-        said: Default::default(),
+        refused: Default::default(),
+        bell: live.and_then(|live| live.bell.clone()).filter(|bell| bell.input == input.name.as_str()),
     });
     transport.subscribe(&spec, ingest).map_err(subscribe)?;
-    let definitions = transport.definitions(&spec.topic).map_err(subscribe)?;
-    Ok(Topic::new(input.name.as_str(), topic, &spec.type_name, reader, arrivals, definitions, images))
+    let definitions = match transport.definitions(&spec.topic) {
+        Ok(definitions) => Some(definitions),
+        Err(TransportError::NoDefinitions { type_name, .. }) => {
+            warn!(input = %input.name, r#type = %type_name, "no message definitions: fields of this input cannot be read");
+            None
+        }
+        Err(error) => return Err(subscribe(error)),
+    };
+    Ok(Topic::new(input.name.as_str(), topic, &spec.type_name, (reader, input.depth), arrivals, definitions, images))
 }
 
 fn qos(qos: manifest::Qos) -> Qos {
@@ -121,46 +160,169 @@ fn pool<M: Copy + Send + Sync + 'static>(
     Pool::new(region, slots, slot_bytes).map_err(layout)
 }
 
+/// How often a refusal is said again, with how many there were: what a lambda can cause in a loop must not fill a log.
+const SAY_EVERY: Duration = Duration::from_secs(10);
+
 /// The transport's end of a ring. The lock is only ever taken by the transport's own thread.
 struct Ingest {
-    ring: Mutex<RingWriter<SampleMeta>>,
+    end: Mutex<End>,
     arrivals: Arc<Arrivals>,
     input: String,
-    /// Each loss is counted; each kind is said once, and what counts then is in the status.
-    said: [AtomicBool; 2],
+    /// By kind. Each loss is counted in the ring's status, too.
+    refused: [Mutex<Refused>; 2],
+    bell: Option<Bell>,
+}
+
+struct End {
+    ring: RingWriter<SampleMeta>,
+    /// What was copied last, until it is known whose sample it is.
+    copied: Option<Result<Draft<SampleMeta>, Refusal>>,
+}
+
+#[derive(Default)]
+struct Refused {
+    unsaid: u64,
+    said: Option<Instant>,
 }
 
 impl Sink for Ingest {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        let mut writer = self.ring.lock().unwrap_or_else(PoisonError::into_inner);
-        match writer.draft(cdr.len()) {
-            Ok(mut draft) => {
-                draft.copy_from_slice(cdr);
-                self.arrivals.add(meta, cdr);
-                match writer.publish(draft, *meta) {
-                    Ok(_) => Verdict::Taken,
-                    Err(_) => unreachable!("the draft is this ring's own"),
+        let verdict = self.fill(cdr);
+        self.accept(meta);
+        verdict
+    }
+
+    fn copy(&self, cdr: &[u8]) -> Option<Verdict> {
+        Some(self.fill(cdr))
+    }
+
+    fn accept(&self, meta: &SampleMeta) {
+        let mut end = self.end();
+        match end.copied.take() {
+            Some(Ok(draft)) => {
+                self.arrivals.add(meta, &draft);
+                let published = end.ring.publish(draft, *meta);
+                drop(end);
+                published.map(drop).expect("the draft is this ring's own");
+                if let Some(bell) = &self.bell {
+                    bell.thread.unpark();
                 }
             }
-            Err(refusal) => self.refuse(refusal),
+            Some(Err(refusal)) => {
+                drop(end);
+                self.arrivals.refuse();
+                self.say(refusal);
+            }
+            None => {}
         }
     }
 }
 
 impl Ingest {
-    fn refuse(&self, refusal: Refusal) -> Verdict {
-        let (verdict, said) = match refusal {
-            Refusal::NoSlot => (Verdict::NoSlot, &self.said[0]),
-            Refusal::TooBig { .. } => (Verdict::TooBig, &self.said[1]),
+    fn end(&self) -> MutexGuard<'_, End> {
+        self.end.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The one copy.
+    fn fill(&self, cdr: &[u8]) -> Verdict {
+        let mut end = self.end();
+        // First, so that the slot of one that was never accepted is free again.
+        end.copied = None;
+        let drafted = end.ring.draft(cdr.len()).map(|mut draft| {
+            draft.copy_from_slice(cdr);
+            draft
+        });
+        let verdict = match drafted {
+            Ok(_) => Verdict::Taken,
+            Err(Refusal::NoSlot) => Verdict::NoSlot,
+            Err(Refusal::TooBig { .. }) => Verdict::TooBig,
         };
-        if !said.swap(true, Ordering::Relaxed) {
-            match refusal {
-                Refusal::NoSlot => warn!(input = %self.input, "sample dropped: the lambda holds all slots"),
-                Refusal::TooBig { len, max } => {
-                    warn!(input = %self.input, bytes = len, max_size = max, "sample dropped: larger than max_size");
-                }
+        end.copied = Some(drafted);
+        verdict
+    }
+
+    fn say(&self, refusal: Refusal) {
+        let refused = match refusal {
+            Refusal::NoSlot => &self.refused[0],
+            Refusal::TooBig { .. } => &self.refused[1],
+        };
+        let Some(samples) = refused.lock().unwrap_or_else(PoisonError::into_inner).due() else { return };
+        match refusal {
+            Refusal::NoSlot => {
+                warn!(input = %self.input, samples, "samples dropped: the lambda holds all slots");
+            }
+            Refusal::TooBig { len, max } => {
+                warn!(input = %self.input, samples, bytes = len, max_size = max, "samples dropped: larger than max_size");
             }
         }
-        verdict
+    }
+}
+
+impl Refused {
+    /// One more; how many are to be said now, if it is time.
+    fn due(&mut self) -> Option<u64> {
+        self.unsaid += 1;
+        if self.said.is_some_and(|said| said.elapsed() < SAY_EVERY) {
+            return None;
+        }
+        self.said = Some(Instant::now());
+        Some(std::mem::take(&mut self.unsaid))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_buffers::{HeapRegion, RingReader};
+    use gleaner_transport::{Endian, Guid};
+
+    use super::*;
+
+    fn ingest() -> (Ingest, RingReader<SampleMeta>) {
+        let (slots, slot_bytes) = (3, 8);
+        let region = HeapRegion::zeroed(Pool::<SampleMeta>::bytes_needed(slots, slot_bytes).unwrap()).unwrap();
+        let (ring, reader) = ring(Pool::new(region, slots, slot_bytes).unwrap(), 2).unwrap();
+        let (end, arrivals) = (Mutex::new(End { ring, copied: None }), Arc::new(Arrivals::new(2)));
+        (Ingest { end, arrivals, input: "camera".to_owned(), refused: Default::default(), bell: None }, reader)
+    }
+
+    fn meta(seq: u64) -> SampleMeta {
+        let (at_ns, writer) = (seq as i64, Guid::default());
+        SampleMeta { at_ns, publish_ns: 0, writer, seq, endian: Endian::Little, options: [0; 2] }
+    }
+
+    #[test]
+    fn what_is_copied_is_seen_once_it_is_accepted() {
+        let (ingest, reader) = ingest();
+        assert_eq!(ingest.copy(b"first"), Some(Verdict::Taken));
+        assert!(reader.newest().is_none());
+        ingest.accept(&meta(1));
+        let newest = reader.newest().unwrap();
+        assert_eq!((&*newest, newest.meta().seq), (b"first".as_slice(), 1));
+        ingest.accept(&meta(2));
+        assert_eq!(reader.counts().received, 1, "there was nothing to accept");
+    }
+
+    #[test]
+    fn copies_that_are_never_accepted_leave_nothing_behind() {
+        let (ingest, reader) = ingest();
+        for _ in 0..10 {
+            assert_eq!(ingest.copy(b"nobody's"), Some(Verdict::Taken));
+        }
+        assert_eq!(ingest.copy(b"mine"), Some(Verdict::Taken));
+        ingest.accept(&meta(1));
+        assert_eq!(&*reader.newest().unwrap(), b"mine");
+        let counts = reader.counts();
+        assert_eq!((counts.received, counts.overwritten, counts.no_slot, counts.too_big), (1, 0, 0, 0));
+    }
+
+    #[test]
+    fn a_copy_that_is_refused_is_counted_and_not_taken_for_the_one_before() {
+        let (ingest, reader) = ingest();
+        assert_eq!(ingest.copy(b"old"), Some(Verdict::Taken));
+        assert_eq!(ingest.copy(b"too large"), Some(Verdict::TooBig));
+        ingest.accept(&meta(1));
+        assert!(reader.newest().is_none());
+        assert_eq!(ingest.deliver(&meta(2), b"new"), Verdict::Taken);
+        assert_eq!((reader.counts().too_big, reader.newest().unwrap().meta().seq), (1, 2));
     }
 }

@@ -2,10 +2,12 @@
 
 use std::ffi::OsString;
 use std::fmt;
+use std::fs::File;
 use std::io;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure};
 
 use tracing::{Event, Level, Subscriber};
@@ -13,7 +15,12 @@ use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::registry::LookupSpan;
 
-use crate::replay::{Job, Load, ReplayArgs, VerifyArgs};
+#[cfg(feature = "dds")]
+use crate::live;
+use crate::replay::{self, ReplayArgs, VerifyArgs};
+use crate::stage::{Asked, Load};
+#[cfg(feature = "dds")]
+use crate::topics::TopicsArgs;
 
 /// Hosts one lambda. Writes reports, a JSON object a line, to standard output.
 #[derive(Parser)]
@@ -29,21 +36,57 @@ enum Command {
     Replay(ReplayArgs),
     /// Makes the decisions in a clip again and compares.
     Verify(VerifyArgs),
+    /// Runs a built lambda on live topics, until SIGTERM.
+    #[cfg(feature = "dds")]
+    Run(live::RunArgs),
+    /// Reports the topics that are there.
+    #[cfg(feature = "dds")]
+    Topics(TopicsArgs),
+}
+
+/// What there is to do with a lambda.
+enum Job {
+    Replay(replay::Job),
+    #[cfg(feature = "dds")]
+    Live(live::Job),
+}
+
+impl Job {
+    fn lambda(&self) -> (&Asked, &Manifest) {
+        match self {
+            Self::Replay(job) => (&job.options.asked, &job.manifest),
+            #[cfg(feature = "dds")]
+            Self::Live(job) => (&job.asked, &job.manifest),
+        }
+    }
+
+    fn run(self, load: Load<'_>, mut reports: File) -> Result<Exit, Failure> {
+        match self {
+            Self::Replay(job) => job.run(load, &mut reports),
+            #[cfg(feature = "dds")]
+            Self::Live(job) => job.run(load, reports),
+        }
+    }
 }
 
 impl Command {
-    fn job(self) -> Result<Job, Failure> {
-        match self {
-            Self::Replay(args) => Job::replay(args),
-            Self::Verify(args) => Job::verify(args),
-        }
+    /// The job, or how it ended where no lambda is needed for it.
+    fn job(self) -> Result<Result<Job, Exit>, Failure> {
+        Ok(match self {
+            Self::Replay(args) => Ok(Job::Replay(replay::Job::replay(args)?)),
+            Self::Verify(args) => Ok(Job::Replay(replay::Job::verify(args)?)),
+            #[cfg(feature = "dds")]
+            Self::Run(args) => Ok(Job::Live(live::Job::new(args)?)),
+            #[cfg(feature = "dds")]
+            Self::Topics(args) => Err(crate::topics::run(args, &mut reports()?)?),
+        })
     }
 }
 
 /// `main` of `gleaner-runtime`.
 pub fn main() -> ExitCode {
     prepare();
-    end(Cli::parse().command.job().and_then(run_any))
+    end(Cli::parse().command.job().and_then(|job| job.map_or_else(Ok, run_any)))
 }
 
 /// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: their job, with the guest
@@ -57,18 +100,20 @@ pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
             return Exit::Usage.code();
         }
     };
-    code(command.job().and_then(|job| run(job, load)))
+    code(command.job().and_then(|job| job.map_or_else(Ok, |job| run(job, load))))
 }
 
 fn run_any(job: Job) -> Result<Exit, Failure> {
-    match job.manifest.lambda.kind {
+    #[allow(unused_variables, reason = "who cannot host Python does not look into the folder")]
+    let (asked, manifest) = job.lambda();
+    match manifest.lambda.kind {
         #[cfg(feature = "wasm")]
         gleaner_protocol::manifest::Kind::Wasm => run(job, &mut wasm::load),
         #[cfg(feature = "python")]
         gleaner_protocol::manifest::Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(&job.options.lambda, &args);
-            Err(Failure::because(format!("cannot start lambda `{}`", job.manifest.lambda.name), &error))
+            let error = crate::guest::python::become_interpreter(&asked.lambda, &args);
+            Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]
         kind => Err(Failure::new(
@@ -78,15 +123,18 @@ fn run_any(job: Job) -> Result<Exit, Failure> {
     }
 }
 
-/// Does the job with reports on what was standard output. What a library writes there by itself goes to standard error; what a
-/// lambda prints is in its log.
 fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
+    job.run(load, reports()?)
+}
+
+/// What was standard output. What a library writes there by itself goes to standard error; what a lambda prints is in its log.
+fn reports() -> Result<File, Failure> {
     let internal = |error: io::Error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error);
     let reports = io::stdout();
     // Not for processes that a lambda starts: whoever reads the reports waits for their end.
     let reports = rustix::io::fcntl_dupfd_cloexec(&reports, 3).map_err(io::Error::from).map_err(internal)?;
     rustix::stdio::dup2_stdout(io::stderr()).map_err(io::Error::from).map_err(internal)?;
-    job.run(load, &mut std::fs::File::from(reports))
+    Ok(File::from(reports))
 }
 
 #[cfg(feature = "wasm")]
@@ -96,18 +144,26 @@ mod wasm {
 
     use crate::api::Session;
     use crate::guest::Guest;
-    use crate::guest::wasm::{Allowance, Loaded, WasmError, WasmGuest};
-    use crate::replay::Options;
+    use crate::guest::wasm::{Allowance, Deadline, Loaded, WasmError, WasmGuest};
+    use crate::stage::{Asked, Bounds};
 
-    pub(super) fn load(options: &Options, manifest: &Manifest, session: Session) -> Result<Box<dyn Guest>, Failure> {
+    pub(super) fn load(
+        asked: &Asked,
+        manifest: &Manifest,
+        session: Session,
+        bounds: Bounds,
+    ) -> Result<Box<dyn Guest>, Failure> {
         let cannot =
             |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
         let cache = gleaner_protocol::parts::cache_dir().map_err(|error| cannot(&error.into()))?;
-        let loaded = Loaded::open(&options.build.entry_path(manifest), &cache).map_err(|error| cannot(&error))?;
+        let loaded = Loaded::open(&asked.build.entry_path(manifest), &cache).map_err(|error| cannot(&error))?;
         let allowance = Allowance { fuel: manifest.limits.fuel, memory_bytes: manifest.limits.memory.bytes() };
-        // In replay only fuel and memory bound a lambda: a deadline would make decisions depend on the machine.
-        let guest = WasmGuest::new(loaded, session, allowance, None);
-        let guest = guest.map_err(|error| Failure::caused_by(Exit::Internal, "cannot make a guest", &error))?;
+        let failed = |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot make a guest", &error);
+        let deadline = match bounds {
+            Bounds::Replay => None,
+            Bounds::Live(allowed) => Some(Deadline::new(loaded.engine(), allowed).map_err(failed)?),
+        };
+        let guest = WasmGuest::new(loaded, session, allowance, deadline).map_err(failed)?;
         Ok(Box::new(guest))
     }
 }
@@ -124,8 +180,22 @@ fn prepare() {
         .with_ansi(false)
         .event_format(Plain)
         .with_env_filter(filter)
-        .with_writer(io::stderr)
+        .with_writer(|| Says(io::stderr()))
         .try_init();
+}
+
+/// Standard error, which nobody may read any more: the library would panic about that.
+struct Says(io::Stderr);
+
+impl io::Write for Says {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let _ = self.0.write_all(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 /// One line for people, as errors are: `warning: ring full input=imu`.

@@ -29,9 +29,11 @@ pub struct Event {
     next: u64,
 }
 
-/// Wakes on a period, counted from the first sample of the drive.
+/// Wakes on a period, counted from the first sample of the drive, or live from the start.
 pub struct Periodic {
     period_ns: i64,
+    /// Live, a tick whose successor is due as well is missed: nobody waits for what is late.
+    live: bool,
     due_ns: Option<i64>,
     missed: u64,
     missed_total: u64,
@@ -44,9 +46,27 @@ impl Schedule {
             Declared::Event { input, backlog } => {
                 let topic =
                     inputs.iter().find(|topic| topic.name() == input.as_str()).expect("the manifest was checked");
-                Self::Event(Event { topic: Arc::clone(topic), backlog: *backlog, next: topic.reader().head() })
+                Self::Event(Event { topic: Arc::clone(topic), backlog: *backlog, next: 0 })
             }
             Declared::Periodic { period } => Self::Periodic(Periodic::new(*period)),
+        }
+    }
+
+    /// The same where time does not wait: it is `now_ns`, and the first tick comes a period later.
+    pub fn live(manifest: &Manifest, inputs: &[Arc<Topic>], now_ns: i64) -> Self {
+        let mut schedule = Self::new(manifest, inputs);
+        if let Self::Periodic(periodic) = &mut schedule {
+            periodic.live = true;
+            periodic.due_ns = Some(now_ns.saturating_add(periodic.period_ns));
+        }
+        schedule
+    }
+
+    /// When the next tick is due, if time causes any.
+    pub fn next_due(&self) -> Option<i64> {
+        match self {
+            Self::Event(_) => None,
+            Self::Periodic(periodic) => periodic.due_ns,
         }
     }
 
@@ -63,6 +83,15 @@ impl Schedule {
         match self {
             Self::Event(_) => None,
             Self::Periodic(periodic) => periodic.next(now_ns).map(Wake::Tick),
+        }
+    }
+
+    /// At the end: what has arrived and woken nobody was skipped.
+    pub fn finish(&mut self) {
+        if let Self::Event(event) = self {
+            let head = event.topic.reader().head();
+            event.topic.add_skipped(head - event.next.min(head));
+            event.next = head;
         }
     }
 
@@ -85,7 +114,7 @@ impl Event {
         let lease = match self.backlog {
             Backlog::Each => {
                 // What left the ring before this schedule came to it cannot wake any more.
-                let oldest = head.saturating_sub(reader.depth() as u64).max(self.next);
+                let oldest = head.saturating_sub(self.topic.depth() as u64).max(self.next);
                 (oldest..head).find_map(|position| reader.get(position))
             }
             Backlog::Latest => reader.newest(),
@@ -106,10 +135,13 @@ impl Event {
 impl Periodic {
     fn new(period: Duration) -> Self {
         let period_ns = i64::try_from(period.as_nanos()).unwrap_or(i64::MAX).max(1);
-        Self { period_ns, due_ns: None, missed: 0, missed_total: 0 }
+        Self { period_ns, live: false, due_ns: None, missed: 0, missed_total: 0 }
     }
 
     fn next(&mut self, now_ns: i64) -> Option<Tick> {
+        if let (true, Some(due_ns)) = (self.live, self.due_ns) {
+            return self.newest_due(due_ns, now_ns);
+        }
         let Some(due_ns) = self.due_ns else {
             self.due_ns = Some(now_ns.saturating_add(self.period_ns));
             return None;
@@ -129,6 +161,19 @@ impl Periodic {
         }
         self.due_ns = Some(due_ns.saturating_add(self.period_ns));
         Some(Tick { at_ns: due_ns, missed: std::mem::take(&mut self.missed) })
+    }
+
+    /// The newest of the ticks that are due by now.
+    fn newest_due(&mut self, due_ns: i64, now_ns: i64) -> Option<Tick> {
+        if due_ns > now_ns {
+            return None;
+        }
+        let missed = now_ns.abs_diff(due_ns) / self.period_ns as u64;
+        self.missed_total += missed;
+        let passed = i64::try_from(missed).unwrap_or(i64::MAX).saturating_mul(self.period_ns);
+        let at_ns = due_ns.saturating_add(passed);
+        self.due_ns = Some(at_ns.saturating_add(self.period_ns));
+        Some(Tick { at_ns, missed })
     }
 }
 
@@ -166,6 +211,17 @@ mod tests {
         // Due at 1100, 1200, ..., 20,001,100.
         assert!(ticks(&mut periodic, 20_001_150).is_empty());
         assert_eq!(periodic.missed_total, 200_001);
+    }
+
+    #[test]
+    fn live_only_the_newest_due_tick_runs_and_the_others_are_missed() {
+        let mut periodic = Periodic { live: true, due_ns: Some(1100), ..Periodic::new(Duration::from_nanos(100)) };
+        assert_eq!(periodic.next(1099), None);
+        assert_eq!(periodic.next(1100), Some(Tick { at_ns: 1100, missed: 0 }));
+        assert_eq!(periodic.next(1510), Some(Tick { at_ns: 1500, missed: 3 }));
+        assert_eq!(periodic.next(1511), None);
+        assert_eq!(periodic.next(1600), Some(Tick { at_ns: 1600, missed: 0 }));
+        assert_eq!(periodic.missed_total, 3);
     }
 
     #[test]

@@ -1,6 +1,9 @@
 //! What the suites share: where things are, running a replay, and drives made by a test.
 
 pub mod drive;
+pub mod live;
+pub mod namespace;
+pub mod peers;
 pub mod rooms;
 pub mod tree;
 

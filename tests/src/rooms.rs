@@ -15,6 +15,7 @@ pub const UNSAFE_FILES: &[&str] = &[
     "host/python/src/array.rs",
     "host/src/guest/wasm/load.rs",
     "host/src/memory.rs",
+    "player/src/cyclone.rs",
 ];
 
 /// The crates of ours that a crate may depend on. A crate that is not listed may depend on what it likes: tests, benches
@@ -35,6 +36,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         ],
     ),
     ("gleaner-image", &[]),
+    ("gleaner-player", &["gleaner-image", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-protocol", &[]),
     ("gleaner-python", &["gleaner-host", "gleaner-image", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-recorder", &["gleaner-image", "gleaner-protocol", "gleaner-transport"]),
@@ -44,18 +46,22 @@ pub const CRATES: &[(&str, &[&str])] = &[
 
 /// Crates that a program must not contain, whatever the features: a program, and what it does without.
 pub const WITHOUT: &[(&str, &[&str])] =
-    &[("gleaner-cli", &["wasmtime", "pyo3"]), ("gleaner-host", &["pyo3"]), ("gleaner-transport", &["pyo3"])];
+    &[("gleaner-cli", &["wasmtime", "pyo3", "rustdds"]), ("gleaner-host", &["pyo3"]), ("gleaner-transport", &["pyo3"])];
 
 /// Inside of `host/src`: a room, and the rooms that it must not name.
 pub const ROOMS: &[(&str, &[&str])] = &[
-    ("memory", &["api", "guest", "input", "judge", "program", "replay", "schedule"]),
-    ("api", &["guest", "input", "judge", "program", "replay", "schedule"]),
-    ("input", &["guest", "judge", "program", "replay", "schedule"]),
-    ("journal", &["guest", "judge", "program", "replay", "schedule"]),
-    ("schedule", &["guest", "judge", "program", "replay"]),
-    ("judge", &["program", "replay", "schedule"]),
-    ("guest", &["input", "judge", "program", "replay", "schedule"]),
-    ("replay", &["program"]),
+    ("memory", &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
+    ("api", &["guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
+    ("input", &["guest", "judge", "live", "program", "replay", "schedule", "stage"]),
+    ("journal", &["guest", "judge", "live", "program", "replay", "schedule", "stage"]),
+    ("schedule", &["guest", "judge", "live", "program", "replay", "stage"]),
+    ("judge", &["live", "program", "replay", "schedule", "stage"]),
+    ("guest", &["input", "judge", "live", "program", "replay", "schedule", "stage"]),
+    ("stage", &["judge", "live", "program", "replay", "schedule"]),
+    ("replay", &["live", "program"]),
+    ("live", &["program", "replay"]),
+    ("network", &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
+    ("topics", &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
 ];
 
 /// Whether `file` declares that it holds unsafe code.

@@ -339,6 +339,6 @@ fn a_sample_larger_than_max_size_is_counted_and_said() {
     for run in pixels_over(&[drive]) {
         let summary = run.must_exit(0).summary.as_ref().expect("a summary");
         assert_eq!((summary.wakes, summary.topics[0].too_big, summary.topics[0].received), (0, 1, 0));
-        says(&run, &["sample dropped: larger than max_size", "camera", "1048576"]);
+        says(&run, &["samples dropped: larger than max_size", "camera", "1048576"]);
     }
 }

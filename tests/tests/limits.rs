@@ -84,7 +84,7 @@ impl Room {
 fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic>) {
     let (mut transport, input) = (Loopback::new(), &manifest.inputs[0]);
     transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
-    let topic = open_inputs(manifest, &[], &mut transport).unwrap().remove(0);
+    let topic = open_inputs(manifest, &[], &mut transport, None).unwrap().remove(0);
     (transport, topic)
 }
 

@@ -104,7 +104,7 @@ impl Feed {
         let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
         let mut transport = Loopback::new();
         transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", IMU);
-        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
+        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
         Self { transport, topic: Arc::clone(&inputs[0]), schedule: Schedule::new(&manifest, &inputs), sent: 0 }
     }
 

@@ -7,6 +7,9 @@ mod bless;
 mod checkout;
 mod demo;
 mod examples;
+mod fuzz;
+mod peers;
+mod player;
 mod setup;
 mod steps;
 mod suites;
@@ -26,6 +29,9 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   test   run all tests; the last line is `N passed, M failed, K skipped`
   bless  write what the examples decide on the sample drive to examples/*/expected.txt
   bench  measure what is promised; what follows goes to gleaner-bench
+  peers  build programs on other DDS for the tests of live topics; --install fetches their packages first
+  player build gleaner-player, which plays drives with Cyclone DDS, and fetch what that takes
+  fuzz   feed what reads foreign bytes with made-up ones; [TARGET] [--seconds N]
   build  only set up: wasm target, Python environment, programs, lambdas";
 
 fn main() -> ExitCode {
@@ -43,7 +49,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    if !rest.is_empty() && command != "bench" {
+    if !rest.is_empty() && !["bench", "fuzz", "peers"].contains(&command) {
         return Err(Failure::new(Exit::Usage, format!("`cargo xtask {command}` takes no arguments")).with_help(USAGE));
     }
     let checkout = Checkout::find()?;
@@ -52,6 +58,9 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "bench" => bench(&checkout, rest),
+        "fuzz" => fuzz::run(&checkout, rest),
+        "peers" => peers::build(&checkout, rest),
+        "player" => player::run(&checkout),
         "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS), &FAMILIES).map(|()| Exit::Ok),
         _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
     }

@@ -15,23 +15,28 @@ pub(super) fn write(text: &mut String, clips: &[Clip], summary: &Summary, paint:
     writeln!(text, "  {}", paint.bold(&counted(clips.len() as u64, "clip")))?;
     for clip in clips.iter().take(SHOWN) {
         let [from, to] = clip_span(clip).map(|at_ns| seconds(at_ns, summary.start_ns));
-        let file = visible(&clip.file.to_string_lossy());
-        writeln!(text, "{}  {file}", paint.green(&format!("{from:>10.3} to {to:.3} s")))?;
-        let thumbnail = clip.thumbnail.as_ref().map(|path| format!("; {}", visible(&path.to_string_lossy())));
-        writeln!(text, "{:>14}{}{}", "", clip_contents(clip), thumbnail.unwrap_or_default())?;
-        for why in &clip.short {
-            writeln!(text, "{:>14}{}", "", paint.yellow(&format!("short: {}", visible(why))))?;
-        }
-        for loss in losses(clip) {
-            writeln!(text, "{:>14}{}", "", paint.yellow(&format!("lost: {loss}")))?;
-        }
-        if let Some(recovered) = &clip.recovered {
-            let what =
-                format!("recovered: {} ({} lost)", visible(&recovered.what), counted(recovered.lost_bytes, "byte"));
-            writeln!(text, "{:>14}{}", "", paint.yellow(&what))?;
-        }
+        one(text, clip, &format!("{from:>10.3} to {to:.3} s"), paint)?;
     }
     more(text, (clips.len() as u64).saturating_sub(SHOWN as u64))
+}
+
+/// A clip, and when it is in words.
+pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> fmt::Result {
+    let file = visible(&clip.file.to_string_lossy());
+    writeln!(text, "{}  {file}", paint.green(when))?;
+    let thumbnail = clip.thumbnail.as_ref().map(|path| format!("; {}", visible(&path.to_string_lossy())));
+    writeln!(text, "{:>14}{}{}", "", clip_contents(clip), thumbnail.unwrap_or_default())?;
+    for why in &clip.short {
+        writeln!(text, "{:>14}{}", "", paint.yellow(&format!("short: {}", visible(why))))?;
+    }
+    for loss in losses(clip) {
+        writeln!(text, "{:>14}{}", "", paint.yellow(&format!("lost: {loss}")))?;
+    }
+    if let Some(recovered) = &clip.recovered {
+        let what = format!("recovered: {} ({} lost)", visible(&recovered.what), counted(recovered.lost_bytes, "byte"));
+        writeln!(text, "{:>14}{}", "", paint.yellow(&what))?;
+    }
+    Ok(())
 }
 
 /// What never came; what the recorder had to give up stands in `short`.

@@ -9,6 +9,14 @@ use gleaner_protocol::{
 use crate::results::{ResultsError, grouped, seconds, three_digits};
 
 mod clips;
+mod live;
+
+pub(crate) use live::{clip_line, decision, live, recorder, topics};
+
+/// A report for programs: JSON, in one line.
+pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {
+    serde_json::to_string(result).expect("a report has only text keys and finite numbers") + "\n"
+}
 
 /// As many bursts of triggers, and as many causes of faults, are shown; the rest is counted.
 const SHOWN: usize = 20;

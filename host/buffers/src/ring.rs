@@ -241,11 +241,16 @@ impl<M> RingReader<M> {
     /// was published during the call, and at most `depth` looks lie between two, so the call ends unless the writer
     /// is forever as fast as the few instructions of one look.
     pub fn newest(&self) -> Option<Lease<M>> {
-        self.newest_at().map(|(lease, _)| lease)
+        self.newest_before(u64::MAX)
     }
 
-    fn newest_at(&self) -> Option<(Lease<M>, u64)> {
-        let mut head = self.head();
+    /// As [`RingReader::newest`], of the samples at positions below `end`.
+    pub fn newest_before(&self, end: u64) -> Option<Lease<M>> {
+        self.newest_at(end).map(|(lease, _)| lease)
+    }
+
+    fn newest_at(&self, end: u64) -> Option<(Lease<M>, u64)> {
+        let mut head = self.head().min(end);
         let mut back = 1;
         while back <= head.min(self.0.depth()) {
             let position = head - back;
@@ -255,7 +260,7 @@ impl<M> RingReader<M> {
             // Place or count told us, by an Acquire load, that the sample is gone. What the writer did before it took
             // the sample away is therefore visible: a publication that replaced it, or went before its eviction, had
             // raised `head`, and this load sees it.
-            let now = self.head();
+            let now = self.head().min(end);
             back = if now == head { back + 1 } else { 1 };
             head = now;
         }
@@ -269,15 +274,25 @@ impl<M> RingReader<M> {
         self.newest_while(n, |_| true, out);
     }
 
+    /// As [`RingReader::last`], of the samples at positions below `end`.
+    pub fn last_before(&self, end: u64, n: usize, out: &mut Vec<Lease<M>>) {
+        self.newest_while_before(end, n, |_| true, out);
+    }
+
     /// Fills `out` with the newest samples, at most `max`, back to the first one that `keep` refuses; oldest first.
     ///
     /// Positions that were evicted are passed over. `keep` is asked newest first.
-    pub fn newest_while(&self, max: usize, mut keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
+    pub fn newest_while(&self, max: usize, keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
+        self.newest_while_before(u64::MAX, max, keep, out);
+    }
+
+    /// As [`RingReader::newest_while`], of the samples at positions below `end`.
+    pub fn newest_while_before(&self, end: u64, max: usize, mut keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
         out.clear();
         if max == 0 {
             return;
         }
-        let Some((newest, position)) = self.newest_at() else {
+        let Some((newest, position)) = self.newest_at(end) else {
             return;
         };
         let oldest = (position + 1).saturating_sub(self.0.depth());

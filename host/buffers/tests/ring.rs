@@ -226,3 +226,22 @@ fn a_depth_of_zero_or_beyond_the_pool_is_refused() {
         assert_eq!(refused, PoolError::Depth { depth, slots: 2 });
     }
 }
+
+#[test]
+fn a_reader_can_be_kept_from_what_came_after_a_position() {
+    let (mut writer, reader) = ring_of(6, 4);
+    for sample in 0..5 {
+        publish(&mut writer, sample);
+    }
+    let before = |end: u64, n: usize| {
+        let mut out = Vec::new();
+        reader.last_before(end, n, &mut out);
+        out.iter().map(value).collect::<Vec<_>>()
+    };
+    assert_eq!(before(4, 9), [1, 2, 3]);
+    assert_eq!(before(4, 2), [2, 3]);
+    assert_eq!(before(9, 2), [3, 4]);
+    assert_eq!(reader.newest_before(4).as_ref().map(value), Some(3));
+    // What has left the ring does not come back.
+    assert!(before(1, 9).is_empty() && reader.newest_before(1).is_none() && reader.newest_before(0).is_none());
+}

@@ -27,9 +27,9 @@ const WAKES_PER_TIDY: u64 = 10;
 pub(crate) fn main(py: Python<'_>, args: Vec<OsString>, host: Py<PyAny>) -> u8 {
     // Attached only for the length of a call into the lambda, so that its own threads run between two wakes.
     py.detach(|| {
-        program::run_in_python(args, &mut |options, manifest, session| {
+        program::run_in_python(args, &mut |asked, manifest, session, _bounds| {
             let host = Python::attach(|py| host.clone_ref(py));
-            let entry = options.build.entry_path(manifest);
+            let entry = asked.build.entry_path(manifest);
             Ok(Box::new(PythonGuest::new(host, entry, handler(manifest), session)))
         })
     })

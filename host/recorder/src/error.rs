@@ -147,9 +147,21 @@ pub enum RecordError {
         /// How large it may be.
         most: usize,
     },
+    /// The thread that writes clips cannot be started, or is not there any more.
+    #[error("cannot write clips beside the recording")]
+    Thread {
+        /// Why.
+        source: io::Error,
+    },
     /// More topics than a recorder holds.
     #[error("a recorder holds at most {most} topics")]
     TooManyTopics {
+        /// How many it holds.
+        most: usize,
+    },
+    /// More lambdas than a recorder holds; one that was started again counts again.
+    #[error("a recorder holds at most {most} lambdas, counted with each start")]
+    TooManyLambdas {
         /// How many it holds.
         most: usize,
     },

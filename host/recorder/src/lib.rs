@@ -5,9 +5,11 @@
 //! - `recorder`: the two together, sample by sample and wake by wake.
 //! - `file`: clips as MCAP files that are whole or not there, the list of them, and what a death leaves.
 //! - `thumbnail`: a small picture of a moment.
+//! - `program`: the process that does it live, for all lambdas of a vehicle; with the feature of that name.
 //!
-//! Synchronous and without threads: what is recorded depends on the stamps of samples and wakes only. What never happens
-//! here: running a lambda, subscribing a topic, deciding what is worth keeping.
+//! A recorder of a replay is synchronous and without threads: what is recorded depends on the stamps of samples and wakes only.
+//! One that is fed live is the same, but for a thread that writes the files. What never happens here: running a lambda, deciding
+//! what is worth keeping.
 
 // The tests within the crate share support with those outside of it.
 #[cfg(test)]
@@ -16,6 +18,8 @@ extern crate self as gleaner_recorder;
 mod error;
 mod file;
 mod preroll;
+#[cfg(feature = "program")]
+pub mod program;
 mod recorder;
 #[cfg(test)]
 #[path = "../tests/support/mod.rs"]
@@ -25,4 +29,4 @@ mod window;
 
 pub use error::RecordError;
 pub use file::{Folder, Topic};
-pub use recorder::{Counts, LambdaId, Member, Recorder, Settings, TopicId};
+pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TopicId, Work};

@@ -7,11 +7,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_buffers::{Lease, RingCounts, RingReader};
 use gleaner_transport::SampleMeta;
-use gleaner_transport::message::{CdrError, Definitions, Endian, FieldPath, HeaderStamp, Value, header_stamp};
+use gleaner_transport::message::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
 
 pub use super::error::DataError;
-use super::frame::{Frame, Images, Picture};
+use super::frame::Images;
 use super::log::cut;
+pub use super::sample::Sample;
 use super::trace::{Arrivals, Looked};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
@@ -28,16 +29,28 @@ pub const PATH_BYTES: usize = 1024;
 /// Longest list of strings in one field.
 pub const TEXTS_PER_FIELD: usize = 4096;
 
+/// A count that nobody knows.
+const UNKNOWN: u64 = u64::MAX;
+
 /// The ring of one input, as its lambda sees it.
 pub struct Topic {
     input: String,
-    topic: String,
-    type_name: String,
+    pub(super) topic: String,
+    pub(super) type_name: String,
     reader: RingReader<SampleMeta>,
-    definitions: Arc<Definitions>,
-    header: Option<HeaderStamp>,
+    /// How many samples the lambda sees; the ring may be deeper.
+    depth: usize,
+    /// None if nobody has any: the lambda then reads bytes, but no fields.
+    definitions: Option<Arc<Definitions>>,
+    pub(super) header: Option<HeaderStamp>,
     pub(super) images: Images,
     skipped: AtomicU64,
+    /// Samples at this position in the ring and beyond came after the wake began: the lambda does not see them.
+    until: AtomicU64,
+    /// The newest that it sees, held while it runs: however many arrive meanwhile, this one stays.
+    newest: Mutex<Option<Lease<SampleMeta>>>,
+    /// Lost before they reached this process, and whether anybody knows.
+    lost: AtomicU64,
     pub(super) arrivals: Arc<Arrivals>,
     pub(super) looked: Looked,
     /// Reused between column reads, so that they allocate nothing but their result.
@@ -47,14 +60,7 @@ pub struct Topic {
 /// A compiled path into the messages of one topic.
 pub struct Field {
     topic: Arc<Topic>,
-    path: FieldPath,
-}
-
-/// One message; holds its cell of the ring until dropped.
-#[derive(Clone)]
-pub struct Sample {
-    topic: Arc<Topic>,
-    lease: Lease<SampleMeta>,
+    pub(super) path: FieldPath,
 }
 
 impl Topic {
@@ -63,20 +69,24 @@ impl Topic {
         input: &str,
         topic: &str,
         type_name: &str,
-        reader: RingReader<SampleMeta>,
+        (reader, depth): (RingReader<SampleMeta>, usize),
         arrivals: Arc<Arrivals>,
-        definitions: Arc<Definitions>,
+        definitions: Option<Arc<Definitions>>,
         images: Images,
     ) -> Arc<Self> {
         Arc::new(Self {
             input: input.to_owned(),
             topic: topic.to_owned(),
             type_name: type_name.to_owned(),
-            header: header_stamp(&definitions),
+            header: definitions.as_deref().and_then(header_stamp),
             reader,
+            depth,
+            newest: Mutex::default(),
             definitions,
             images,
             skipped: AtomicU64::new(0),
+            until: AtomicU64::new(u64::MAX),
+            lost: AtomicU64::new(UNKNOWN),
             arrivals,
             looked: Looked::default(),
             scratch: Mutex::default(),
@@ -100,7 +110,7 @@ impl Topic {
 
     /// Newest sample; none before the first.
     pub fn newest(self: &Arc<Self>) -> Option<Sample> {
-        let newest = self.reader.newest();
+        let newest = self.reader.newest_before(self.until()).or_else(|| self.pinned());
         self.looked.at(newest.as_ref());
         newest.map(|lease| self.sample(lease))
     }
@@ -108,7 +118,7 @@ impl Topic {
     /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`].
     pub fn last(self: &Arc<Self>, n: usize) -> Vec<Sample> {
         let mut leases = Vec::new();
-        self.reader.last(n.min(SAMPLES_PER_CALL), &mut leases);
+        self.reader.last_before(self.until(), n.min(SAMPLES_PER_CALL).min(self.depth), &mut leases);
         self.looked.at(leases.first());
         leases.into_iter().map(|lease| self.sample(lease)).collect()
     }
@@ -116,7 +126,13 @@ impl Topic {
     /// Samples received later than `since_ns`, oldest first; the newest [`SAMPLES_PER_CALL`] at most.
     pub fn since(self: &Arc<Self>, since_ns: i64) -> Vec<Sample> {
         let mut leases = Vec::new();
-        self.reader.newest_while(SAMPLES_PER_CALL, |meta| meta.at_ns > since_ns, &mut leases);
+        let until = self.until();
+        self.reader.newest_while_before(
+            until,
+            SAMPLES_PER_CALL.min(self.depth),
+            |meta| meta.at_ns > since_ns,
+            &mut leases,
+        );
         self.looked.at(leases.first());
         leases.into_iter().map(|lease| self.sample(lease)).collect()
     }
@@ -125,7 +141,8 @@ impl Topic {
     pub fn counts(&self) -> Counts {
         let RingCounts { received, overwritten, no_slot, too_big } = self.reader.counts();
         let skipped = self.skipped.load(Ordering::Relaxed);
-        Counts { received, lost: None, overwritten, no_slot, too_big, skipped }
+        let lost = Some(self.lost.load(Ordering::Relaxed)).filter(|lost| *lost != UNKNOWN);
+        Counts { received, lost, overwritten, no_slot, too_big, skipped }
     }
 
     /// Compiles a path once, such as `linear_acceleration.x` or `cov[3]`.
@@ -138,7 +155,11 @@ impl Topic {
             let why = format!("has {} bytes; a path has {PATH_BYTES} at most", path.len());
             return Err(DataError::WrongField { path: cut(path, 64).to_owned(), why });
         }
-        let path = FieldPath::compile(&self.definitions, path).map_err(DataError::NoSuchField)?;
+        let Some(definitions) = &self.definitions else {
+            let why = format!("cannot be found: nobody here has message definitions of `{}`", self.type_name);
+            return Err(DataError::WrongField { path: path.to_owned(), why });
+        };
+        let path = FieldPath::compile(definitions, path).map_err(DataError::NoSuchField)?;
         Ok(Field { topic: Arc::clone(self), path })
     }
 
@@ -148,7 +169,8 @@ impl Topic {
     ///
     /// [`DataError::WrongField`] if the field is no number or belongs to another topic; [`DataError::Malformed`].
     pub fn column(self: &Arc<Self>, field: &Field, n: usize) -> Result<Column, DataError> {
-        self.read_column(field, |reader, out| reader.last(n.min(COLUMN_LEN), out))
+        let until = self.until();
+        self.read_column(field, |reader, out| reader.last_before(until, n.min(COLUMN_LEN).min(self.depth), out))
     }
 
     /// `field` of all samples received later than `since_ns`; at most [`COLUMN_LEN`].
@@ -157,7 +179,11 @@ impl Topic {
     ///
     /// As [`Topic::column`].
     pub fn column_since(self: &Arc<Self>, field: &Field, since_ns: i64) -> Result<Column, DataError> {
-        self.read_column(field, |reader, out| reader.newest_while(COLUMN_LEN, |meta| meta.at_ns > since_ns, out))
+        let until = self.until();
+        let is_since = |meta: &SampleMeta| meta.at_ns > since_ns;
+        self.read_column(field, |reader, out| {
+            reader.newest_while_before(until, COLUMN_LEN.min(self.depth), is_since, out)
+        })
     }
 
     fn read_column(
@@ -179,11 +205,11 @@ impl Topic {
         column
     }
 
-    fn number(&self, path: &FieldPath, lease: &Lease<SampleMeta>) -> Result<f64, DataError> {
+    pub(super) fn number(&self, path: &FieldPath, lease: &Lease<SampleMeta>) -> Result<f64, DataError> {
         path.number(lease, lease.meta().endian).map_err(|error| self.unreadable(path, error))
     }
 
-    fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {
+    pub(super) fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {
         match error {
             CdrError::NotANumber => DataError::WrongField {
                 path: path.path().to_owned(),
@@ -196,9 +222,23 @@ impl Topic {
     /// Bytes that a column of `field` over `n` samples may touch, judged by the newest sample; the ring holds no more than
     /// its depth.
     pub fn column_work(&self, field: &Field, n: usize) -> usize {
-        let held = usize::try_from(self.reader.head()).unwrap_or(usize::MAX).min(self.reader.depth());
-        let message_bytes = self.reader.newest().map_or(0, |lease| lease.len());
+        let held = usize::try_from(self.reader.head()).unwrap_or(usize::MAX).min(self.depth);
+        let message_bytes = self.reader.newest_before(self.until()).map_or(0, |lease| lease.len());
         n.min(held).saturating_mul(field.work(message_bytes))
+    }
+
+    /// The end of what the lambda sees, as a position in the ring.
+    pub(crate) fn until(&self) -> u64 {
+        self.until.load(Ordering::Relaxed)
+    }
+
+    fn pinned(&self) -> Option<Lease<SampleMeta>> {
+        self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// How many samples the lambda sees at most.
+    pub(crate) fn depth(&self) -> usize {
+        self.depth
     }
 
     pub(crate) fn reader(&self) -> &RingReader<SampleMeta> {
@@ -206,7 +246,7 @@ impl Topic {
     }
 
     pub(crate) fn sample(self: &Arc<Self>, lease: Lease<SampleMeta>) -> Sample {
-        Sample { topic: Arc::clone(self), lease }
+        Sample::new(Arc::clone(self), lease)
     }
 
     pub(crate) fn add_skipped(&self, samples: u64) {
@@ -216,6 +256,35 @@ impl Topic {
     /// Nanoseconds spent in decoding JPEG and PNG for this topic.
     pub fn decode_ns(&self) -> u64 {
         self.images.decode_ns()
+    }
+}
+
+/// What only matters while time passes.
+#[cfg(feature = "dds")]
+impl Topic {
+    /// From now on the lambda sees the samples received until `at_ns`, and `woken_by` at most: what arrives while it runs belongs to
+    /// the next wake, as in a replay.
+    pub(crate) fn see_until(&self, at_ns: i64, woken_by: Option<u64>) {
+        let until = woken_by.map_or_else(|| self.received_until(at_ns), |position| position + 1);
+        self.until.store(until, Ordering::Relaxed);
+        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = self.reader.newest_before(until);
+    }
+
+    fn received_until(&self, at_ns: i64) -> u64 {
+        let head = self.reader.head();
+        let oldest = head.saturating_sub(self.reader.depth() as u64);
+        let is_later = |position: &u64| self.reader.get(*position).is_none_or(|lease| lease.meta().at_ns > at_ns);
+        head - (oldest..head).rev().take_while(is_later).count() as u64
+    }
+
+    /// Receive stamp of the newest sample.
+    pub(crate) fn newest_at(&self) -> Option<i64> {
+        self.reader.newest().map(|lease| lease.meta().at_ns)
+    }
+
+    /// Notes how many samples were lost before they reached this process.
+    pub(crate) fn set_lost(&self, lost: u64) {
+        self.lost.store(lost, Ordering::Relaxed);
     }
 }
 
@@ -235,130 +304,13 @@ impl Field {
         self.path.path()
     }
 
-    fn must_belong_to(&self, topic: &Arc<Topic>) -> Result<(), DataError> {
+    pub(super) fn must_belong_to(&self, topic: &Arc<Topic>) -> Result<(), DataError> {
         if Arc::ptr_eq(&self.topic, topic) {
             return Ok(());
         }
         let why = format!("belongs to input `{}`, not to `{}`", self.topic.input, topic.input);
         Err(DataError::WrongField { path: self.path().to_owned(), why })
     }
-}
-
-impl Sample {
-    /// What makes it different from every other sample.
-    pub fn identity(&self) -> Identity {
-        let meta = self.lease.meta();
-        Identity { topic: self.topic.topic.clone(), writer: meta.writer, seq: meta.seq }
-    }
-
-    /// When it came to be.
-    pub fn stamps(&self) -> Stamps {
-        let meta = self.lease.meta();
-        let header_ns = self.topic.header.as_ref().and_then(|header| header.read(&self.lease, meta.endian).ok());
-        Stamps { at_ns: meta.at_ns, publish_ns: meta.publish_ns, header_ns }
-    }
-
-    /// Any field.
-    ///
-    /// # Errors
-    ///
-    /// [`DataError::WrongField`] if the field belongs to another topic or is longer than one call hands out;
-    /// [`DataError::Malformed`].
-    pub fn get(&self, field: &Field) -> Result<Value<'_>, DataError> {
-        field.must_belong_to(&self.topic)?;
-        let value = field
-            .path
-            .read(&self.lease, self.lease.meta().endian)
-            .map_err(|error| self.topic.unreadable(&field.path, error))?;
-        let (len, max) = match &value {
-            Value::Text(text) => (text.len(), BYTES_PER_CALL),
-            Value::Bytes(bytes) => (bytes.len(), BYTES_PER_CALL),
-            Value::Numbers(numbers) => (numbers.len(), COLUMN_LEN),
-            Value::Texts(texts) => (texts.len(), TEXTS_PER_FIELD),
-            Value::Bool(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => (0, 0),
-        };
-        if len > max {
-            let why = format!("has {len} items, one call hands out {max}; read it with `cdr`");
-            return Err(DataError::WrongField { path: field.path().to_owned(), why });
-        }
-        Ok(value)
-    }
-
-    /// A numeric or boolean field.
-    ///
-    /// # Errors
-    ///
-    /// As [`Topic::column`].
-    pub fn number(&self, field: &Field) -> Result<f64, DataError> {
-        field.must_belong_to(&self.topic)?;
-        self.topic.number(&field.path, &self.lease)
-    }
-
-    /// The whole message as CDR, without the encapsulation header.
-    pub fn bytes(&self) -> &[u8] {
-        &self.lease
-    }
-
-    /// Whether the message is big-endian.
-    pub fn big_endian(&self) -> bool {
-        self.lease.meta().endian == Endian::Big
-    }
-
-    /// Bytes from `offset`, `len` at most, clamped to the message and to [`BYTES_PER_CALL`].
-    pub fn cdr(&self, offset: u64, len: u32) -> &[u8] {
-        piece(&self.lease, offset, len)
-    }
-
-    /// Bytes that [`Sample::as_frame`] would have to decode: by the header, and none if that is done already.
-    pub fn undecoded_bytes(&self) -> usize {
-        match self.picture() {
-            Ok(Picture::Compressed(compressed)) => {
-                self.topic.images.undecoded_bytes(self.lease.position(), compressed.data)
-            }
-            Ok(Picture::Raw(_)) | Err(_) => 0,
-        }
-    }
-
-    /// The message as an image; JPEG and PNG are decoded now, once for each sample.
-    ///
-    /// # Errors
-    ///
-    /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`], [`DataError::NoSlot`].
-    pub fn as_frame(&self) -> Result<Frame, DataError> {
-        Frame::of(self)
-    }
-
-    pub(super) fn picture(&self) -> Result<Picture<'_>, DataError> {
-        let Topic { topic, type_name, .. } = &*self.topic;
-        Picture::of(type_name, &self.lease, self.lease.meta().endian)
-            .map_err(|source| DataError::Malformed { topic: topic.clone(), type_name: type_name.clone(), source })?
-            .ok_or_else(|| DataError::NoImageType { topic: topic.clone(), type_name: type_name.clone() })
-    }
-
-    /// Where it stands in its ring.
-    pub(crate) fn position(&self) -> Option<u64> {
-        self.lease.position()
-    }
-
-    pub(crate) fn meta(&self) -> &SampleMeta {
-        self.lease.meta()
-    }
-
-    pub(super) fn lease(&self) -> &Lease<SampleMeta> {
-        &self.lease
-    }
-
-    /// The topic it arrived on.
-    pub fn topic(&self) -> &Arc<Topic> {
-        &self.topic
-    }
-}
-
-/// `len` bytes from `offset`, clamped to `bytes` and to [`BYTES_PER_CALL`].
-pub(super) fn piece(bytes: &[u8], offset: u64, len: u32) -> &[u8] {
-    let start = usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
-    let len = (len as usize).min(BYTES_PER_CALL).min(bytes.len() - start);
-    &bytes[start..start + len]
 }
 
 /// Why a lambda runs.

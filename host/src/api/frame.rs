@@ -8,7 +8,8 @@ use gleaner_buffers::{Lease, Pool, Refusal};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
 
-use super::data::{DataError, Identity, Sample, Stamps, piece};
+use super::data::{DataError, Identity, Sample, Stamps};
+use super::sample::piece;
 use gleaner_image::{self as image, Encoding, ImageError, Roi, View, ops};
 
 /// Shape of a frame.

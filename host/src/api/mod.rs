@@ -8,6 +8,7 @@ mod error;
 pub mod frame;
 pub mod inference;
 pub mod log;
+mod sample;
 pub mod trace;
 pub mod trigger;
 mod values;

@@ -11,19 +11,75 @@ use super::data::Topic;
 /// No sample was looked at in this wake.
 const NONE: u64 = u64::MAX;
 
-/// What arrived at a ring, summed up by the thread that fills it.
-#[derive(Default)]
+/// What arrived at a ring, summed up by the thread that fills it: as of each sample, so that a wake can be told what it saw while
+/// further samples arrive.
 pub struct Arrivals {
     wanted: AtomicBool,
+    /// Changed by the filling thread only, as are those below.
+    next: AtomicU64,
     digest: AtomicU32,
+    refused: AtomicU64,
+    marks: Box<[Mark]>,
+}
+
+/// What had arrived with a sample.
+#[derive(Default)]
+struct Mark {
+    /// The lower half of its position in the ring, and the sum of digests.
+    digest: AtomicU64,
+    /// Samples that found no room before it.
+    refused: AtomicU64,
+}
+
+/// Sums as of one sample.
+#[derive(Copy, Clone)]
+struct Sums {
+    digest: u32,
+    refused: u64,
 }
 
 impl Arrivals {
-    /// Adds a sample that entered the ring, if anybody wants to know.
-    pub fn add(&self, meta: &SampleMeta, cdr: &[u8]) {
-        if self.wanted.load(Ordering::Relaxed) {
-            self.digest.fetch_add(sample_digest(meta, cdr), Ordering::Relaxed);
+    /// For a ring of `depth`, which is still empty.
+    pub fn new(depth: usize) -> Self {
+        Self {
+            wanted: AtomicBool::new(false),
+            next: AtomicU64::new(0),
+            digest: AtomicU32::new(0),
+            refused: AtomicU64::new(0),
+            // Twice the samples that a ring shows: a mark that is asked for was among them a moment ago.
+            marks: (0..2 * (depth + 1)).map(|_| Mark::default()).collect(),
         }
+    }
+
+    /// Adds a sample that is about to enter the ring.
+    pub fn add(&self, meta: &SampleMeta, cdr: &[u8]) {
+        let position = self.next.load(Ordering::Relaxed);
+        self.next.store(position + 1, Ordering::Relaxed);
+        if self.wanted.load(Ordering::Relaxed) {
+            let digest = self.digest.load(Ordering::Relaxed).wrapping_add(sample_digest(meta, cdr));
+            self.digest.store(digest, Ordering::Relaxed);
+            let mark = &self.marks[(position % self.marks.len() as u64) as usize];
+            mark.refused.store(self.refused.load(Ordering::Relaxed), Ordering::Relaxed);
+            // The ring publishes the sample after this: who sees it there sees its mark.
+            mark.digest.store(position << 32 | u64::from(digest), Ordering::Release);
+        }
+    }
+
+    /// Adds a sample that found no room.
+    pub fn refuse(&self) {
+        self.refused.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// The sums as of the sample at `position`; `None` if so many came since that they are gone.
+    fn at(&self, position: u64) -> Option<Sums> {
+        let mark = &self.marks[(position % self.marks.len() as u64) as usize];
+        let digest = mark.digest.load(Ordering::Acquire);
+        let refused = mark.refused.load(Ordering::Relaxed);
+        (digest >> 32 == position & 0xffff_ffff).then_some(Sums { digest: digest as u32, refused })
+    }
+
+    fn now(&self) -> Sums {
+        Sums { digest: self.digest.load(Ordering::Relaxed), refused: self.refused.load(Ordering::Relaxed) }
     }
 }
 
@@ -61,40 +117,43 @@ impl Looked {
     }
 }
 
-/// Follows one topic from wake to wake.
-///
-/// What it reads here belongs together only while no sample arrives meanwhile, as in a replay. Where topics have threads of their
-/// own, the ring has to be read as of one instant, and the lambda must see no more than that.
+/// Follows one topic from wake to wake, by what the lambda may see of it.
 pub struct Trace {
     offered: u64,
-    head: u64,
+    until: u64,
+    digest: u32,
 }
 
 impl Trace {
     /// Begins with what is in the ring of `topic` now; from here on its samples are summed up.
     pub fn of(topic: &Topic) -> Self {
         topic.arrivals.wanted.store(true, Ordering::Relaxed);
-        Self { offered: offered(topic), head: topic.reader().head() }
+        Self { offered: offered(topic), until: topic.reader().head(), digest: 0 }
     }
 
     /// Before a wake: notes what came since the one before. If a sample of this topic wakes the lambda, `woken_by` is its place
     /// in the ring, and itself: most often it is the newest, and need not be looked for.
     pub fn begin(&mut self, topic: &Topic, woken_by: Option<(u64, &SampleMeta)>, seen: &mut Seen) {
-        let offered = offered(topic);
+        let head = topic.reader().head();
+        let until = topic.until().min(head);
+        // Where samples arrive meanwhile, only the mark of the last one that is seen tells what had come with it.
+        let is_still = topic.until() == u64::MAX;
+        let sums = if is_still { None } else { until.checked_sub(1).and_then(|last| topic.arrivals.at(last)) };
+        let Sums { digest, refused } = sums.unwrap_or_else(|| topic.arrivals.now());
+        let offered = (until + refused).max(self.offered);
         seen.new = offered - self.offered;
         self.offered = offered;
-        let head = topic.reader().head();
-        let arrived = head > self.head;
-        self.head = head;
+        let arrived = until > self.until;
+        self.until = self.until.max(until);
+        seen.digest = 0;
         if arrived {
-            seen.digest = topic.arrivals.digest.swap(0, Ordering::Relaxed);
+            seen.digest = digest.wrapping_sub(self.digest);
+            self.digest = digest;
             let identity = |meta: &SampleMeta| (meta.writer.0, meta.seq);
             seen.newest = match woken_by {
-                Some((position, meta)) if position + 1 == head => Some(identity(meta)),
-                _ => topic.reader().newest().map(|lease| identity(lease.meta())),
+                Some((position, meta)) if position + 1 == until => Some(identity(meta)),
+                _ => topic.reader().newest_before(until).map(|lease| identity(lease.meta())),
             };
-        } else {
-            seen.digest = 0;
         }
         topic.looked.0.store(NONE, Ordering::Relaxed);
     }
@@ -102,6 +161,6 @@ impl Trace {
     /// After a wake that `woken_by` caused, if it is a sample of this topic: notes how far back the lambda looked.
     pub fn end(&self, topic: &Topic, woken_by: Option<u64>, seen: &mut Seen) {
         let oldest = topic.looked.0.load(Ordering::Relaxed).min(woken_by.unwrap_or(NONE));
-        seen.reach = self.head.saturating_sub(oldest);
+        seen.reach = self.until.saturating_sub(oldest);
     }
 }

@@ -13,6 +13,11 @@ use gleaner_protocol::journal::{Entry, Said, Seen, Woken};
 use crate::api::data::{Topic, Wake};
 use crate::api::trace::Trace;
 
+/// What the times of a replay's journal are.
+pub const CLOCK_OF_DRIVE: &str = "log time of the drive";
+/// What the times of a live journal are.
+pub const CLOCK_OF_VEHICLE: &str = "CLOCK_MONOTONIC of the vehicle, set to the time of day once";
+
 /// Follows a lambda from wake to wake. It reuses its memory, so that a wake costs no allocation.
 pub struct Scribe {
     topics: Vec<(Arc<Topic>, Trace)>,

@@ -5,11 +5,11 @@
 
 mod course;
 mod digests;
+mod journal_file;
+mod open;
 mod options;
-mod output;
 mod record;
 mod round;
-mod stage;
 mod verify;
 
 pub use options::{Job, Options, ReplayArgs, VerifyArgs};
@@ -20,14 +20,10 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure, Report};
 
 use self::options::{Results, Task};
-use crate::api::Session;
-use crate::guest::Guest;
+use crate::stage::Load;
 
 /// What the times of a replay are.
-const CLOCK: &str = "log time of the drive";
-
-/// Makes the guest of a lambda whose kind the caller can host.
-pub type Load<'a> = &'a mut dyn FnMut(&Options, &Manifest, Session) -> Result<Box<dyn Guest>, Failure>;
+const CLOCK: &str = crate::journal::CLOCK_OF_DRIVE;
 
 impl Job {
     /// Does it, and writes reports to `reports`.

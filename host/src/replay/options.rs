@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
+use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, Exit, Failure};
 
-use super::output::RESULTS;
 use super::verify::Claim;
 use crate::input::Remap;
+use crate::stage::{Asked, RESULTS, assignment, remap};
 
 /// Arguments of `replay`.
 #[derive(Args, Clone, Debug)]
@@ -54,28 +54,12 @@ pub struct VerifyArgs {
     pub lambda: PathBuf,
 }
 
-fn assignment(text: &str) -> Result<(String, String), String> {
-    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, as in brake_mps2=-1.4")?;
-    Ok((key.trim().to_owned(), value.trim().to_owned()))
-}
-
-fn remap(text: &str) -> Result<Remap, String> {
-    let (from, to) = text.split_once(":=").ok_or("write FROM:=TO, as in /imu/data:=/car/imu")?;
-    Ok(Remap { from: from.trim().to_owned(), to: to.trim().to_owned() })
-}
-
 /// Which lambda judges which drives.
 pub struct Options {
-    /// The lambda's folder.
-    pub lambda: PathBuf,
-    /// Its build, not older than its sources.
-    pub build: BuildDir,
+    /// The lambda.
+    pub asked: Asked,
     /// The drives, merged by time.
     pub drives: Vec<PathBuf>,
-    /// All of `[config]`, with the overrides laid over the defaults.
-    pub config: Vec<(String, ConfigValue)>,
-    /// Other names for topics of the manifest.
-    pub remaps: Vec<Remap>,
 }
 
 /// What a replay leaves.
@@ -125,9 +109,9 @@ impl Job {
             let options = claim.options(args.lambda, build, &manifest, args.drives, args.set, args.remap)?;
             return Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) });
         }
-        let config = ConfigSet::resolve(&manifest, &args.set)?;
-        known_topics(&args.remap, &manifest)?;
-        let out = args.out.unwrap_or_else(|| args.lambda.join("out"));
+        let asked = Asked::new(args.lambda, build, &manifest, &args.set, args.remap)?;
+        let (lambda, build) = (&asked.lambda, &asked.build);
+        let out = args.out.unwrap_or_else(|| lambda.join("out"));
         if let Some(journal) = args.journal.as_deref().filter(|journal| is_result(journal, &out)) {
             let message = format!("`{}` is a file of the results", journal.display());
             return Err(
@@ -140,7 +124,7 @@ impl Job {
         }
         let results =
             Results { out, all: args.all, record: !args.no_record, journal: args.journal, repeat: args.repeat };
-        let options = Options { lambda: args.lambda, build, drives: args.drives, config, remaps: args.remap };
+        let options = Options { asked, drives: args.drives };
         Ok(Self { options, manifest, task: Task::Replay(results) })
     }
 
@@ -155,25 +139,6 @@ impl Job {
         let claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
         let options = claim.options(args.lambda, build, &manifest, vec![args.clip], Vec::new(), Vec::new())?;
         Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
-    }
-}
-
-/// Refuses a remap of a topic that the manifest does not have.
-fn known_topics(remaps: &[Remap], manifest: &Manifest) -> Result<(), Failure> {
-    let inputs = manifest.inputs.iter().map(|input| input.topic.as_str());
-    let recorded = manifest.record.iter().flat_map(|record| &record.topics).map(|topic| topic.as_str());
-    let mut known: Vec<&str> = Vec::new();
-    for topic in inputs.chain(recorded) {
-        if !known.contains(&topic) {
-            known.push(topic);
-        }
-    }
-    match remaps.iter().find(|remap| !known.contains(&remap.from.as_str())) {
-        None => Ok(()),
-        Some(remap) => {
-            let failure = Failure::new(Exit::Usage, format!("no input has the topic `{}` of --remap", remap.from));
-            Err(failure.with_help(format!("the manifest has `{}`", known.join("`, `"))))
-        }
     }
 }
 

@@ -94,7 +94,7 @@ impl Recording {
         let known = drive.topics();
         let mut lanes = Vec::new();
         for wanted in &rules.topics {
-            let name = Remap::apply(&options.remaps, wanted.as_str());
+            let name = Remap::apply(&options.asked.remaps, wanted.as_str());
             // Two topics of the manifest may be one of the drive.
             if lanes.iter().any(|lane: &Arc<Lane>| lane.topic.name == name) {
                 continue;

@@ -12,18 +12,20 @@ use gleaner_transport::replay::{Replay, Step};
 
 use super::course::{self, Course, Reached};
 use super::digests::Digests;
+use super::journal_file::JournalFile;
+use super::open::{DriveError, open_drives};
 use super::options::Results;
-use super::output::{JournalFile, Output};
 use super::record::{Recorded, Recording, remove_clips};
-use super::stage::{DriveError, Stage, not_started, open_drives};
-use super::{CLOCK, Load, Options, report as send};
+use super::{CLOCK, Options, report as send};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
 use crate::api::log::Line;
 use crate::api::trace::offered;
 use crate::journal::{Identity, Scribe};
 use crate::judge::Judge;
+use crate::memory::{most_resident, resident};
 use crate::schedule::Schedule;
+use crate::stage::{Asked, Bounds, Load, Output, Stage, not_started};
 
 /// How often progress is reported; a person sees no more.
 const PROGRESS: Duration = Duration::from_millis(100);
@@ -124,14 +126,15 @@ pub(super) fn replay(
     let name = manifest.lambda.name.as_str();
     let mut drive = open_drives(options)?;
     let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
-    let Stage { mut drive, inputs, session, mut guest } = Stage::set(drive, options, manifest, load)?;
+    let Stage { inputs, session, mut guest } =
+        Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
     if let Some(recording) = &mut recording {
         recording.take_hold(&results.out)?;
     }
     let started = Instant::now();
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {
-        let Options { build, config, remaps, .. } = options;
+        let Asked { build, config, remaps, .. } = &options.asked;
         header = Some(Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK }.header()?);
     }
     let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.clone()));
@@ -203,7 +206,7 @@ pub(super) fn replay(
         run_s: pass.judge.run().as_secs_f64(),
         decode_s: inputs.iter().map(|topic| topic.decode_ns()).sum::<u64>() as f64 / 1e9,
         wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
-        peak_rss_bytes: memory("VmHWM:"),
+        peak_rss_bytes: most_resident(),
         topics: inputs.iter().map(topic_report).collect(),
         clips: recorded.clips,
         clips_replaced,
@@ -224,7 +227,7 @@ pub(super) fn report(n: u32, summary: &Summary) -> Round {
         faults: summary.faults,
         wall_s: summary.wall_s,
         wakes_per_s: summary.wakes_per_s,
-        rss_bytes: memory("VmRSS:"),
+        rss_bytes: resident(),
     }
 }
 
@@ -245,12 +248,4 @@ fn topic_report(topic: &Arc<Topic>) -> TopicReport {
 /// A path as JSON can hold it: what is no UTF-8 is replaced.
 fn shown(path: &Path) -> PathBuf {
     PathBuf::from(path.to_string_lossy().into_owned())
-}
-
-/// A line of `/proc/self/status`, in bytes; 0 where there is none.
-fn memory(name: &str) -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix(name));
-    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<u64>().ok());
-    kib.unwrap_or(0) * 1024
 }

@@ -1,29 +1,234 @@
 //! Losses that sequence numbers tell of.
 
+use std::collections::VecDeque;
+
 use crate::transport::Guid;
 
+/// Writers that are followed at a time. When one more comes, the one that was silent for longest is forgotten.
+const WRITERS: usize = 256;
+/// Gaps of a writer that a late sample may still fill. The oldest gaps are final when there are more.
+const OPEN: usize = 64;
+
 /// Counts the samples that are missing between those that came, writer by writer.
+///
+/// A writer's first sample says where its numbers begin: what it sent before is no loss. A sample that comes late, as
+/// networks may cause without any fault, takes its loss back. A writer that starts again has another [`Guid`].
 #[derive(Debug, Default)]
 pub struct Gaps {
-    writers: Vec<(Guid, u64)>,
+    writers: Vec<Writer>,
+    /// Samples noted, by which it is known who was silent for longest.
+    noted: u64,
     lost: u64,
+}
+
+#[derive(Debug)]
+struct Writer {
+    guid: Guid,
+    /// The number that comes next; `None` when there is none after the last.
+    next: Option<u64>,
+    /// First and last number of each gap that is not filled, oldest first.
+    open: VecDeque<(u64, u64)>,
+    heard: u64,
 }
 
 impl Gaps {
     /// A sample came. Returns how many are missing just before it.
     pub fn note(&mut self, writer: Guid, seq: u64) -> u64 {
-        let Some((_, next)) = self.writers.iter_mut().find(|(known, _)| *known == writer) else {
-            self.writers.push((writer, seq.saturating_add(1)));
+        self.noted += 1;
+        let Some(found) = self.writers.iter_mut().find(|known| known.guid == writer) else {
+            self.follow(writer, seq);
             return 0;
         };
-        let missing = seq.saturating_sub(*next);
-        *next = (*next).max(seq.saturating_add(1));
-        self.lost += missing;
+        found.heard = self.noted;
+        let Some(next) = found.next.filter(|next| *next <= seq) else {
+            self.lost = self.lost.saturating_sub(u64::from(found.fill(seq)));
+            return 0;
+        };
+        found.next = seq.checked_add(1);
+        let missing = seq - next;
+        if missing > 0 {
+            found.open.push_back((next, seq - 1));
+            if found.open.len() > OPEN {
+                found.open.pop_front();
+            }
+            self.lost = self.lost.saturating_add(missing);
+        }
         missing
     }
 
     /// How many are missing in all.
     pub fn lost(&self) -> u64 {
         self.lost
+    }
+
+    /// The highest number that came from each writer.
+    #[cfg(feature = "dds")]
+    pub(crate) fn newest(&self) -> impl Iterator<Item = (Guid, u64)> {
+        self.writers.iter().map(|writer| (writer.guid, writer.next.map_or(u64::MAX, |next| next.saturating_sub(1))))
+    }
+
+    fn follow(&mut self, guid: Guid, seq: u64) {
+        if self.writers.len() >= WRITERS
+            && let Some(silent) = (0..self.writers.len()).min_by_key(|index| self.writers[*index].heard)
+        {
+            self.writers.swap_remove(silent);
+        }
+        self.writers.push(Writer { guid, next: seq.checked_add(1), open: VecDeque::new(), heard: self.noted });
+    }
+}
+
+impl Writer {
+    /// Whether `seq` was missing until now.
+    fn fill(&mut self, seq: u64) -> bool {
+        let Some(index) = self.open.iter().position(|(first, last)| (*first..=*last).contains(&seq)) else {
+            return false;
+        };
+        let (first, last) = self.open[index];
+        match (first == seq, last == seq) {
+            (true, true) => drop(self.open.remove(index)),
+            (true, false) => self.open[index].0 = seq + 1,
+            (false, true) => self.open[index].1 = seq - 1,
+            (false, false) => {
+                self.open[index].1 = seq - 1;
+                self.open.insert(index + 1, (seq + 1, last));
+                // The bound holds for gaps that are split, too.
+                if self.open.len() > OPEN {
+                    self.open.pop_front();
+                }
+            }
+        }
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    fn guid(n: u16) -> Guid {
+        let mut bytes = [0; 16];
+        bytes[..2].copy_from_slice(&n.to_be_bytes());
+        Guid(bytes)
+    }
+
+    fn lost_after(numbers: &[u64]) -> u64 {
+        let mut gaps = Gaps::default();
+        for seq in numbers {
+            gaps.note(guid(1), *seq);
+        }
+        gaps.lost()
+    }
+
+    #[test]
+    fn what_was_sent_before_the_first_sample_is_no_loss() {
+        assert_eq!(lost_after(&[1000, 1001]), 0);
+        assert_eq!(lost_after(&[1000, 1002]), 1);
+    }
+
+    #[test]
+    fn a_late_sample_takes_its_loss_back_once() {
+        assert_eq!(lost_after(&[1, 5]), 3);
+        assert_eq!(lost_after(&[1, 5, 3]), 2);
+        assert_eq!(lost_after(&[1, 5, 3, 3]), 2);
+        assert_eq!(lost_after(&[1, 5, 3, 2, 4]), 0);
+    }
+
+    #[test]
+    fn a_sample_that_comes_twice_or_from_before_the_first_changes_nothing() {
+        assert_eq!(lost_after(&[5, 7, 7, 5, 1]), 1);
+    }
+
+    #[test]
+    fn writers_are_counted_apart_and_a_new_one_starts_anew() {
+        let mut gaps = Gaps::default();
+        for (writer, seq, missing) in [(1, 1, 0), (2, 100, 0), (1, 3, 1), (2, 101, 0), (3, 1, 0), (2, 104, 2)] {
+            assert_eq!(gaps.note(guid(writer), seq), missing);
+        }
+        assert_eq!(gaps.lost(), 3);
+    }
+
+    #[test]
+    fn numbers_without_end_saturate() {
+        let mut gaps = Gaps::default();
+        for writer in 0..3 {
+            gaps.note(guid(writer), 0);
+            assert_eq!(gaps.note(guid(writer), u64::MAX), u64::MAX - 1);
+            assert_eq!(gaps.note(guid(writer), u64::MAX), 0);
+        }
+        assert_eq!(gaps.lost(), u64::MAX);
+    }
+
+    #[test]
+    fn the_writer_that_was_silent_for_longest_is_forgotten_first() {
+        let mut gaps = Gaps::default();
+        for writer in 0..WRITERS as u16 {
+            gaps.note(guid(writer), 1);
+        }
+        gaps.note(guid(0), 2);
+        gaps.note(guid(9999), 1);
+        assert_eq!(gaps.note(guid(0), 4), 1, "it spoke last but one");
+        assert_eq!(gaps.note(guid(1), 4), 0, "it is new again");
+        assert_eq!(gaps.writers.len(), WRITERS);
+    }
+
+    #[test]
+    fn gaps_that_are_too_many_become_final_and_memory_stays_bounded() {
+        let mut gaps = Gaps::default();
+        for n in 0..10_000 {
+            gaps.note(guid(1), 1 + 2 * n);
+        }
+        assert_eq!(gaps.lost(), 9_999);
+        gaps.note(guid(1), 2);
+        assert_eq!(gaps.lost(), 9_999, "the oldest gap is final");
+        gaps.note(guid(1), 19_998);
+        assert_eq!(gaps.lost(), 9_998, "the newest is not");
+        for n in 0..10_000 {
+            gaps.note(guid(2), 1 + 1_000 * (n % 3) + n);
+        }
+        assert!(gaps.writers.iter().all(|writer| writer.open.len() <= OPEN));
+    }
+
+    /// What a writer's numbers mean if one may remember all of them.
+    #[derive(Default)]
+    struct Naive {
+        first: Option<u64>,
+        came: BTreeSet<u64>,
+    }
+
+    impl Naive {
+        fn note(&mut self, seq: u64) {
+            let first = *self.first.get_or_insert(seq);
+            if seq >= first {
+                self.came.insert(seq);
+            }
+        }
+
+        fn lost(&self) -> u64 {
+            match (self.first, self.came.last()) {
+                (Some(first), Some(last)) => last - first + 1 - self.came.len() as u64,
+                _ => 0,
+            }
+        }
+    }
+
+    #[test]
+    fn random_orders_are_counted_as_by_a_model_that_remembers_everything() {
+        let mut state = 0x9e37_79b9_7f4a_7c15_u64;
+        let mut random = move |below: u64| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) % below
+        };
+        for _ in 0..300 {
+            let (mut gaps, mut naive) = (Gaps::default(), [Naive::default(), Naive::default()]);
+            // Numbers within a window that moves on: few enough gaps to be remembered all.
+            for step in 0..500 {
+                let (writer, seq) = (random(2) as usize, 1 + step / 4 + random(40));
+                gaps.note(guid(writer as u16), seq);
+                naive[writer].note(seq);
+                assert_eq!(gaps.lost(), naive.iter().map(Naive::lost).sum::<u64>(), "step {step}");
+            }
+        }
     }
 }

@@ -43,7 +43,8 @@ pub enum Qos {
 /// How a subscription is doing.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Status {
-    /// Writers that are connected now; `None` where there are none, as in a replay.
+    /// Writers that are connected now; `None` where there are none, as in a replay. One that was killed counts until the
+    /// time is over for which it said that it would be heard from, with ROS 2 often 10 to 20 s.
     pub writers: Option<usize>,
     /// Samples that were lost on their way to us, as far as gaps in their numbers tell; `None` if nothing tells.
     pub lost: Option<u64>,
@@ -119,6 +120,18 @@ pub trait Sink: Send + Sync {
     ///
     /// Runs on the transport's thread: one copy, no lock that a lambda can hold, never blocks.
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict;
+
+    /// Copies one sample, where a transport shows its bytes before it knows whose they are. `None`, as here: the sink
+    /// wants both at once, so the transport makes a copy of its own for [`deliver`](Self::deliver).
+    ///
+    /// It may run under a lock of the transport: memory is copied, and nothing else is done.
+    fn copy(&self, _cdr: &[u8]) -> Option<Verdict> {
+        None
+    }
+
+    /// What the last [`copy`](Self::copy) took or refused was this sample. One that is copied and never accepted was
+    /// none: the next copy takes its place.
+    fn accept(&self, _meta: &SampleMeta) {}
 }
 
 /// A topic that a transport knows of.

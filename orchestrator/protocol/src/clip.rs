@@ -28,7 +28,7 @@ pub struct Clip {
     pub last_ns: Option<i64>,
     /// The lambdas whose windows it holds.
     pub lambdas: Vec<ClipLambda>,
-    /// Triggers of these lambdas within it.
+    /// Triggers of these lambdas, and commands in their name, within it.
     pub triggers: u64,
     /// The first [`MOMENTS_MAX`](Self::MOMENTS_MAX) of the triggers; the file itself has more of them.
     pub moments: Vec<Moment>,
@@ -60,10 +60,10 @@ pub struct ClipLambda {
     pub windows: u64,
 }
 
-/// A trigger, as a clip lists it.
+/// A trigger or a command, as a clip lists it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Moment {
-    /// The lambda that triggered.
+    /// The lambda that triggered, or whose `[record]` a command used.
     pub lambda: String,
     /// What it asked for.
     pub kind: TriggerKind,
@@ -76,6 +76,9 @@ pub struct Moment {
     pub attributes: Option<Map<String, Value>>,
     /// Stamp of the wake, in ns since the epoch of the drive.
     pub at_ns: i64,
+    /// Where it came from, in words, if not from the lambda itself: then no journal has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub source: Option<String>,
 }
 
 impl Moment {
@@ -91,6 +94,7 @@ impl Moment {
             score: trigger.score,
             attributes: fits(&trigger.attributes).then(|| trigger.attributes.clone()),
             at_ns,
+            source: None,
         }
     }
 }
@@ -185,6 +189,16 @@ mod tests {
             )
         );
         assert_eq!(serde_json::from_str::<Clip>(&line).unwrap(), clip());
+    }
+
+    #[test]
+    fn a_moment_that_no_lambda_caused_says_whence_it_came() {
+        let trigger =
+            Trigger { kind: TriggerKind::Stop, label: "x".to_owned(), score: None, attributes: serde_json::Map::new() };
+        let moment = Moment { source: Some("command on /c".to_owned()), ..Moment::of("l", &trigger, 1) };
+        let line = serde_json::to_string(&moment).unwrap();
+        assert!(line.ends_with(r#""at_ns":1,"source":"command on /c"}"#), "{line}");
+        assert_eq!(serde_json::from_str::<Moment>(&line).unwrap(), moment);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What Gleaner's programs share, and the only thing they share: the manifest, decisions, journals, clips, reports,
 //! exit codes, how an error looks to a user, and where the parts of an installation are found.
 //!
-//! Nothing here runs a lambda, opens a socket, or needs more than a few small dependencies, so that the smallest
+//! Nothing here runs a lambda, listens on a socket, or needs more than a few small dependencies, so that the smallest
 //! program can afford it. Programs talk to each other through these types; they never link each other.
 
 mod clip;
@@ -10,6 +10,8 @@ mod exit;
 mod failure;
 pub mod journal;
 pub mod layout;
+pub mod link;
+mod live;
 pub mod manifest;
 pub mod parts;
 mod report;
@@ -23,8 +25,9 @@ pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, 
 pub use exit::Exit;
 pub use failure::{Explain, Failure};
 pub use layout::{BuildDir, LayoutError};
+pub use live::{Live, LiveTopic, Network, Spread, ToRecorder};
 pub use manifest::{Manifest, ManifestError};
 pub use parts::{Parts, PartsError};
-pub use report::{Report, Round, Summary, TopicReport, Verified};
+pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
 pub use sources::Sources;
 pub use words::visible;

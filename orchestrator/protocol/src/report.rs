@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::manifest::Kind;
+use crate::{Decision, Live};
 
 /// One line of JSON that `gleaner-runtime` writes on its standard output for the program that started it.
 ///
@@ -23,8 +24,36 @@ pub enum Report {
     Round(Round),
     /// Sent once, last.
     Summary(Box<Summary>),
+    /// Live: the lambda is ready for its first wake.
+    Ready,
+    /// Live: a wake with a trigger or a fault. Where nobody reads fast enough, some are left out here; all are in the file.
+    Decision(Box<Decision>),
+    /// Live: sent once a second.
+    Live(Box<Live>),
+    /// Live: sent once, last.
+    Ended(Box<Live>),
+    /// Sent once, last: the topics that are there.
+    Topics {
+        /// By name.
+        topics: Vec<TopicSeen>,
+    },
     /// Sent once, last, instead of a summary: a journal was compared, and every decision was the same.
     Verified(Verified),
+}
+
+/// A topic of the network.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TopicSeen {
+    /// Its absolute name.
+    pub topic: String,
+    /// Its type, for example `sensor_msgs/msg/Imu`.
+    pub type_name: String,
+    /// How many write it.
+    pub writers: usize,
+    /// How many read it.
+    pub readers: usize,
+    /// What the writers offer, in words, each once.
+    pub qos: Vec<String>,
 }
 
 /// How far a journal was proved.

@@ -14,6 +14,7 @@ use std::time::Instant;
 use gleaner_protocol::{Exit, Failure};
 
 use crate::checkout::{Checkout, FAMILIES};
+use crate::player;
 use crate::setup;
 use crate::steps::{Steps, succeeds};
 use tally::{Speech, Tally};
@@ -31,7 +32,8 @@ enum How {
 
 /// Sets up and runs all tests. The last line says `N passed, M failed, K skipped`.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
-    let suites = suites(checkout);
+    let mut suites = suites(checkout);
+    suites.extend(player_suites(checkout)?);
     let mut steps = Steps::of(setup::STEPS + suites.len());
     setup::run(checkout, &mut steps, &FAMILIES)?;
     let mut total = Tally::new(Speech::None);
@@ -86,6 +88,22 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         suite(&format!("mypy: {}", file.display()), mypy, Speech::None)
     }));
     suites
+}
+
+/// What has to hold of the player, where it was built: it is no default member.
+fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
+    let suite = |name: &str, how| Suite { name: name.to_owned(), how };
+    if !checkout.program("gleaner-player").is_file() {
+        return Ok(vec![suite("cargo test: player", How::Skip("no gleaner-player; run: cargo xtask player"))]);
+    }
+    let mut lints = player::cargo(checkout)?;
+    lints.args(["clippy", "--release", "-p", "gleaner-player", "--all-targets", "--", "-D", "warnings"]);
+    let mut tests = player::cargo(checkout)?;
+    tests.args(["test", "--release", "-p", "gleaner-player"]);
+    Ok(vec![
+        suite("lints: player", How::Run(lints, Speech::None)),
+        suite("cargo test: player", How::Run(tests, Speech::Libtest)),
+    ])
 }
 
 /// What mypy checks, relative to the checkout: the SDK, and each lambda by itself, as all are called `main`.

@@ -217,6 +217,9 @@ fn decision(moment: &Moment) -> Record {
     if let Some(score) = moment.score {
         metadata.insert("score".to_owned(), score.to_string());
     }
+    if let Some(source) = &moment.source {
+        metadata.insert("source".to_owned(), source.clone());
+    }
     metadata.insert("attributes".to_owned(), moment.attributes.as_ref().map_or(UNKNOWN.to_owned(), json));
     ("gleaner.decision".to_owned(), metadata)
 }

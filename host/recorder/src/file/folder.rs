@@ -6,11 +6,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use gleaner_protocol::Clip;
+use gleaner_protocol::link::Loss;
 use tracing::warn;
 
 use super::list::{List, Listed};
 use super::part::{Origin, origin};
 use super::place::{AGAIN, CLIP, CLIPS, PART, Place};
+use super::shelf::Shelf;
 use super::unfinished::Unfinished;
 use super::{About, durable, recover};
 use crate::error::RecordError;
@@ -18,6 +20,7 @@ use crate::error::RecordError;
 /// A folder of clips with their list, held by one process at a time.
 pub struct Folder {
     pub(super) place: Arc<Place>,
+    shelf: Option<Shelf>,
 }
 
 impl Folder {
@@ -48,7 +51,7 @@ impl Folder {
                 found.extend(recover::list(&place, &name)?);
             }
         }
-        Ok((Self { place }, found))
+        Ok((Self { place, shelf: None }, found))
     }
 
     /// Starts anew with the clips in `keep`: deletes the others that are listed, with their thumbnails, and says how
@@ -84,6 +87,22 @@ impl Folder {
         durable::sync_folder(place.folder())?;
         place.take_only(listed.into_iter().map(|listed| listed.file).filter(|file| is_kept(file)).collect());
         Ok(deleted)
+    }
+
+    /// From now on there are at most so many clips, or so many bytes of them: of more, the oldest that nobody fetched are deleted,
+    /// the present ones included. Each is named in `losses.jsonl` before; those that go at once are returned.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the list cannot be read, or a file not be removed.
+    pub fn keep_at_most(&mut self, clips: Option<u64>, bytes: Option<u64>) -> Result<Vec<Loss>, RecordError> {
+        let shelf = Shelf::new(&self.place, self.place.list().read()?, clips, bytes);
+        self.shelf.insert(shelf).make_room(&self.place)
+    }
+
+    /// A clip was finished: makes room, if there is a bound.
+    pub(crate) fn added(&mut self, clip: &Clip) -> Result<Vec<Loss>, RecordError> {
+        self.shelf.as_mut().map_or(Ok(Vec::new()), |shelf| shelf.add(&self.place, clip))
     }
 
     /// Begins a clip named `stem`, or `stem-2`, `stem-3` and so on if there is one.

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! OUT/clips.jsonl                 a line for each whole clip
+//! OUT/losses.jsonl                a line for each clip that was deleted to make room
 //! OUT/clips/.lock                 held by the process that records
 //! OUT/clips/NAME.mcap             a whole clip
 //! OUT/clips/NAME.jpg              its thumbnail
@@ -15,7 +16,7 @@
 //! that was, and a death in the middle of that changes nothing.
 //!
 //! Never: a file touched that this program did not write; a clip that was acknowledged deleted other than by
-//! [`Folder::replace`].
+//! [`Folder::replace`], or that nobody fetched other than by [`Folder::keep_at_most`].
 
 mod durable;
 mod ending;
@@ -25,6 +26,7 @@ mod part;
 mod place;
 mod read;
 mod recover;
+mod shelf;
 mod sink;
 #[cfg(test)]
 mod tests;

@@ -82,10 +82,10 @@ impl Disk {
     }
 
     pub(super) fn push(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
-        let len = bytes.len() as u64;
-        if len + INDEXED > self.bound {
+        if !self.fits(bytes.len()) {
             return Ok(false);
         }
+        let len = bytes.len() as u64;
         while self.bytes + len + INDEXED > self.bound || self.index.len() >= INDEX_MAX {
             self.drop_oldest(gone)?;
         }
@@ -166,6 +166,23 @@ impl Disk {
             self.drop_oldest(&mut |_| {})?;
         }
         Ok(())
+    }
+
+    pub(super) fn grow(&mut self, bound: u64) {
+        self.bound = bound;
+        self.chunk_bytes = (bound / 16).clamp(CHUNK_MIN, CHUNK_MAX);
+    }
+
+    pub(super) fn fits(&self, len: usize) -> bool {
+        len as u64 + INDEXED <= self.bound
+    }
+
+    pub(super) fn entries(&self) -> u64 {
+        self.index.len() as u64
+    }
+
+    pub(super) fn newest(&self) -> Option<Place> {
+        self.entries().checked_sub(1).map(|last| Place(self.first + last))
     }
 
     pub(super) fn oldest(&self) -> Option<Place> {

@@ -14,30 +14,50 @@ pub struct Losses {
     pub too_big: Gone,
     /// Older than any window reaches, unless its trigger comes late.
     pub aged: Horizon,
+    /// Lost before it came here, at the stamps of what came next.
+    pub lost: Gone,
 }
 
 /// Stamps of what went for one cause.
 #[derive(Debug, Default)]
 pub struct Gone {
-    stamps: VecDeque<(i64, u64)>,
+    /// Stamp, the group in whose clips it is, and how many went at once.
+    stamps: VecDeque<(i64, u64, u64)>,
     forgotten: Horizon,
 }
 
 impl Gone {
     /// Something of stamp `at` went; it is in the clips of group `group`, 0 for none.
     pub fn add(&mut self, at: i64, group: u64) {
+        self.add_some(at, group, 1);
+    }
+
+    /// As [`add`](Self::add), for so many at once.
+    pub fn add_some(&mut self, at: i64, group: u64, count: u64) {
         if self.stamps.len() == REMEMBERED
-            && let Some((at, group)) = self.stamps.pop_front()
+            && let Some((at, group, _)) = self.stamps.pop_front()
         {
             self.forgotten.add(at, group);
         }
-        self.stamps.push_back((at, group));
+        self.stamps.push_back((at, group, count));
+    }
+
+    /// One of those that went last and are in no clip's count has come after all.
+    pub fn take_back(&mut self) {
+        if let Some((_, _, count)) = self.stamps.iter_mut().rev().find(|(_, group, count)| *group == 0 && *count > 0) {
+            *count -= 1;
+        }
     }
 
     /// How many of those that `covered` wants are missing from the clips of group `group`. They are counted once.
     pub fn count(&mut self, group: u64, covered: impl Fn(i64) -> bool) -> u64 {
-        let missing = self.stamps.iter_mut().filter(|(at, in_clip)| *in_clip != group && covered(*at));
-        missing.map(|(_, in_clip)| *in_clip = group).count() as u64
+        let missing = self.stamps.iter_mut().filter(|(at, in_clip, _)| *in_clip != group && covered(*at));
+        missing
+            .map(|(_, in_clip, count)| {
+                *in_clip = group;
+                *count
+            })
+            .fold(0, u64::saturating_add)
     }
 
     /// Whether more may have gone, from `from` on, than is remembered.

@@ -165,6 +165,28 @@ impl Preroll {
         Ok(Preroll { kind, highest: 0, gone: 0 })
     }
 
+    /// Lets it hold `bytes`, on disk if `store` is that. What it holds stays, but may lie elsewhere: `true` says that no
+    /// [`Walked`] is of use any more.
+    ///
+    /// # Errors
+    ///
+    /// As for [`Preroll::open`] and [`Preroll::push`].
+    pub fn grow(&mut self, store: Store, bytes: u64, folder: PathBuf, prefault: bool) -> Result<bool, RecordError> {
+        if let Kind::Disk(disk) = &mut self.kind {
+            disk.grow(bytes);
+            return Ok(false);
+        }
+        let mut new = Preroll::open(store, bytes, folder, prefault)?;
+        let mut next = self.next(None);
+        while let Some(walked) = next {
+            let held = self.held(walked.place());
+            new.push(held, self.bytes(walked.place())?, &mut |_| {})?;
+            next = self.next(next);
+        }
+        self.kind = new.kind;
+        Ok(true)
+    }
+
     /// Adds an entry; the oldest go to make room for it, and are told to `gone`. `false` if it is larger than the store.
     ///
     /// # Errors
@@ -213,6 +235,28 @@ impl Preroll {
                 self.after(place).map(|place| Walked { place, number: number + 1 })
             }
             _ => self.oldest().map(|place| Walked { place, number: self.gone }),
+        }
+    }
+
+    /// The entry that came last.
+    pub fn newest(&self) -> Option<Walked> {
+        let (place, entries) = match &self.kind {
+            Kind::Ram(ram) => (ram.newest()?, ram.entries()),
+            Kind::Disk(disk) => (disk.newest()?, disk.entries()),
+        };
+        Some(Walked { place, number: (self.gone + entries).saturating_sub(1) })
+    }
+
+    /// Where an entry is, unless it has gone.
+    pub fn find(&self, walked: Walked) -> Option<Place> {
+        (walked.number >= self.gone).then_some(walked.place)
+    }
+
+    /// Whether an entry of `len` bytes has room here, once others have gone for it.
+    pub fn fits(&self, len: usize) -> bool {
+        match &self.kind {
+            Kind::Ram(ram) => ram.fits(len),
+            Kind::Disk(disk) => disk.fits(len),
         }
     }
 

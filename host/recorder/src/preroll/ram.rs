@@ -16,6 +16,8 @@ pub(super) struct Ram {
     head: usize,
     /// Where the next one will.
     tail: usize,
+    /// Where the newest one begins, if there is one.
+    newest: usize,
     /// Where the entries before the end of the block end, if those after them are at its beginning.
     wrapped: Option<usize>,
     entries: usize,
@@ -29,14 +31,14 @@ impl Ram {
         if prefault {
             arena.iter_mut().step_by(PAGE).for_each(|byte| *black_box(byte) = 0);
         }
-        Ram { arena, head: 0, tail: 0, wrapped: None, entries: 0, bytes: 0 }
+        Ram { arena, head: 0, tail: 0, newest: 0, wrapped: None, entries: 0, bytes: 0 }
     }
 
     pub(super) fn push(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> bool {
-        let need = size(bytes.len());
-        if need > self.arena.len() {
+        if !self.fits(bytes.len()) {
             return false;
         }
+        let need = size(bytes.len());
         let at = loop {
             if let Some(at) = self.room(need) {
                 break at;
@@ -46,6 +48,7 @@ impl Ram {
         let (head, rest) = self.arena[at..at + need].split_at_mut(OVERHEAD);
         write_head(head, held);
         rest[..bytes.len()].copy_from_slice(bytes);
+        self.newest = at;
         self.tail = at + need;
         self.entries += 1;
         self.bytes += need as u64;
@@ -88,6 +91,18 @@ impl Ram {
         while self.entries > 0 && self.at_ns(self.head) < before {
             aged(&self.pop());
         }
+    }
+
+    pub(super) fn fits(&self, len: usize) -> bool {
+        size(len) <= self.arena.len()
+    }
+
+    pub(super) fn entries(&self) -> u64 {
+        self.entries as u64
+    }
+
+    pub(super) fn newest(&self) -> Option<Place> {
+        (self.entries > 0).then_some(Place(self.newest as u64))
     }
 
     pub(super) fn oldest(&self) -> Option<Place> {

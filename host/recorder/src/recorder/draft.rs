@@ -1,15 +1,18 @@
-//! A clip that is being written.
+//! A clip that is being written: what is counted of it, and what it says of itself in the end.
 
+use std::sync::Arc;
+
+use gleaner_protocol::journal::Header;
 use gleaner_protocol::{Clip, Moment};
 use gleaner_transport::SampleMeta;
 
 use super::limits::Limits;
-use super::part::Part;
-use super::picture::Picture;
+use super::pen::Last;
+use super::pen::part::Part;
 use super::stem::stem;
-use super::stock::{Desk, Member, Settled};
+use super::stock::{Desk, Settled};
 use crate::RecordError;
-use crate::file::{About, Ending, TopicCounts, Unfinished};
+use crate::file::{About, Ending, TopicCounts};
 use crate::window::Group;
 
 /// What one topic has in a clip, and what it has not.
@@ -19,6 +22,8 @@ pub(super) struct Tally {
     /// `None` if nobody knows.
     pub(super) overwritten: Option<u64>,
     pub(super) too_big: Option<u64>,
+    /// Before they came here.
+    pub(super) lost: Option<u64>,
     /// Of those that are too big, the ones that no clip can hold.
     pub(super) huge: u64,
     /// Whether a window reaches further back than anything is held.
@@ -27,12 +32,12 @@ pub(super) struct Tally {
 
 impl Default for Tally {
     fn default() -> Tally {
-        Tally { messages: 0, overwritten: Some(0), too_big: Some(0), huge: 0, is_aged: false }
+        Tally { messages: 0, overwritten: Some(0), too_big: Some(0), lost: None, huge: 0, is_aged: false }
     }
 }
 
 /// How a clip comes to its end.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Close {
     /// No window is open any more.
     Complete,
@@ -40,61 +45,80 @@ pub(super) enum Close {
     Full(i64),
     /// The drive ends, at this instant.
     EndOfDrive(i64),
+    /// Somebody ends it at this instant, and says why.
+    Early(i64, Arc<str>),
 }
 
 /// A clip that is being written.
 pub(super) struct Draft {
     /// The group of windows that it belongs to. What is in one of its clips bears this number.
     pub(super) group: u64,
+    /// Its own number.
+    pub(super) clip: u64,
     /// Whether it goes on where another clip was full.
     pub(super) continues: bool,
     pub(super) begins_late_ns: i64,
     pub(super) triggers: u64,
-    pub(super) picture: Picture,
+    /// Whether it has a topic that its picture is made from.
+    pub(super) has_images: bool,
     /// What of the preroll need not be looked through again.
     pub(super) settled: Option<Settled>,
     /// Lambdas with more triggers than were counted.
     pub(super) uncertain: Vec<usize>,
+    /// Lambdas that ended while they recorded.
+    pub(super) ended: Vec<usize>,
     limits: Limits,
     /// The trigger that names it.
     opening: Moment,
     from: i64,
-    file: Option<Unfinished>,
+    /// Whether it has a file.
+    is_begun: bool,
     messages: u64,
     /// By topic.
     tallies: Vec<Tally>,
     moments: Vec<Moment>,
     /// By lambda; those without windows in the clip are thrown away at its end.
     parts: Vec<Part>,
+    /// Pushed out of the preroll.
     wakes_lost: Vec<u64>,
+    /// Lost on their way to the recorder.
+    wakes_unheard: Vec<u64>,
 }
 
 impl Draft {
     /// An empty clip of `group`.
-    pub(super) fn new(number: u64, opening: Moment, group: &Group, limits: Limits) -> Draft {
+    pub(super) fn new(number: u64, opening: Moment, group: &Group, desk: &mut Desk) -> Draft {
         Draft {
             group: number,
+            clip: desk.next_clip(),
             continues: false,
             begins_late_ns: 0,
             triggers: 0,
-            picture: Picture::default(),
+            has_images: false,
             settled: None,
             uncertain: Vec::new(),
-            limits,
+            ended: Vec::new(),
+            limits: desk.limits,
             opening,
             from: group.from,
-            file: None,
+            is_begun: false,
             messages: 0,
             tallies: Vec::new(),
             moments: Vec::new(),
             parts: Vec::new(),
             wakes_lost: Vec::new(),
+            wakes_unheard: Vec::new(),
         }
     }
 
     /// The clip that goes on after this one.
-    pub(super) fn next(&self, group: &Group) -> Draft {
-        Draft { continues: true, ..Draft::new(self.group, self.opening.clone(), group, self.limits) }
+    pub(super) fn next(&self, group: &Group, desk: &mut Desk) -> Draft {
+        Draft { continues: true, ..Draft::new(self.group, self.opening.clone(), group, desk) }
+    }
+
+    /// Where it begins.
+    pub(super) fn from(&self, group: &Group) -> i64 {
+        self.from.min(group.from)
     }
 
     /// Whether no message is in it.
@@ -122,28 +146,28 @@ impl Draft {
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
-        self.picture.offer(desk, topic, meta, cdr);
-        self.open(desk, group)?.message(&desk.lanes[topic].topic, meta, cdr)?;
+        if let Some((stem, about)) = self.begin(desk, group) {
+            desk.pen.begin(self.clip, stem, about)?;
+        }
+        desk.pen.message(self.clip, topic, &desk.lanes[topic].topic, meta, cdr)?;
         self.messages += 1;
         self.tally(topic).messages += 1;
         Ok(())
     }
 
-    /// The file, which is made when it is first needed.
-    fn open(&mut self, desk: &mut Desk, group: &Group) -> Result<&mut Unfinished, RecordError> {
-        let file = match self.file.take() {
-            Some(file) => file,
-            None => {
-                let about = About {
-                    clock: desk.clock.clone(),
-                    from_ns: self.from.min(group.from),
-                    lambdas: desk.lambdas_of(group),
-                    moment: self.opening.clone(),
-                };
-                desk.folder.begin(&stem(&self.opening.lambda, self.opening.at_ns), &about)?
-            }
+    /// What its file begins with, which is made when it is first needed.
+    fn begin(&mut self, desk: &Desk, group: &Group) -> Option<(String, About)> {
+        if self.is_begun {
+            return None;
+        }
+        self.is_begun = true;
+        let about = About {
+            clock: desk.clock.clone(),
+            from_ns: self.from(group),
+            lambdas: desk.lambdas_of(group),
+            moment: self.opening.clone(),
         };
-        Ok(self.file.insert(file))
+        Some((stem(&self.opening.lambda, self.opening.at_ns), about))
     }
 
     /// Keeps a wake for the lambda's journal.
@@ -156,6 +180,11 @@ impl Draft {
         *at(&mut self.wakes_lost, lambda) += count;
     }
 
+    /// Counts wakes that were lost before they came here.
+    pub(super) fn wakes_unheard(&mut self, lambda: usize, count: u64) {
+        *at(&mut self.wakes_unheard, lambda) += count;
+    }
+
     /// Keeps a trigger.
     pub(super) fn moment(&mut self, moment: Moment) {
         self.triggers += 1;
@@ -164,46 +193,45 @@ impl Draft {
         }
     }
 
-    /// Completes the file.
-    pub(super) fn finish(mut self, desk: &mut Desk, group: &Group, close: Close) -> Result<Clip, RecordError> {
+    /// Completes the file; returns the clip if that is done already.
+    pub(super) fn finish(mut self, desk: &mut Desk, group: &Group, close: &Close) -> Result<Option<Clip>, RecordError> {
         let topics = self.topics(desk, group);
-        let file = self.open(desk, group)?;
-        for lane in topics.iter().map(|topic| &desk.lanes[*topic]).filter(|lane| !lane.is_missing) {
-            file.declare(&lane.topic)?;
-        }
+        let begin = self.begin(desk, group);
+        let there = topics.iter().map(|topic| &desk.lanes[*topic]).filter(|lane| !lane.is_missing);
+        let declared = there.map(|lane| Arc::clone(&lane.topic)).collect();
         let mut ending = Ending {
-            from_ns: self.from.min(group.from),
+            from_ns: self.from(group),
             to_ns: match close {
-                Close::Complete => group.to,
-                Close::Full(boundary) => boundary,
-                Close::EndOfDrive(end) if group.waits_for_stop() => end.max(group.from),
-                Close::EndOfDrive(_) => group.to,
+                Close::Full(boundary) => *boundary,
+                Close::EndOfDrive(end) | Close::Early(end, _) if group.waits_for_stop() => (*end).max(group.from),
+                Close::Complete | Close::EndOfDrive(_) | Close::Early(..) => group.to,
             },
             lambdas: desk.lambdas_of(group),
             triggers: self.triggers,
             ..Ending::default()
         };
         self.say_ends(group, close, &mut ending.short);
-        for lambda in &self.uncertain {
-            let name = &desk.crews[*lambda].member.header.lambda;
-            ending
-                .short
-                .push(format!("there are more triggers of {name} than are counted: too many waited for their clip"));
-        }
+        let name = |lambda: &usize| &desk.crews[*lambda].header.lambda;
+        ending.short.extend(self.ended.iter().map(|lambda| format!("{} ended before it said stop", name(lambda))));
+        ending.short.extend(self.uncertain.iter().map(|lambda| {
+            let name = name(lambda);
+            format!("there are more triggers of {name} than are counted: too many waited for their clip")
+        }));
         for topic in topics {
-            ending.topics.push(self.counts(desk, topic, &mut ending.short));
+            ending.topics.push(self.counts(desk, topic, group, &mut ending.short));
         }
+        let mut journals: Vec<(String, _, _)> = Vec::new();
         for lambda in &group.lambdas {
-            let member = &desk.crews[*lambda].member;
-            ending.headers.push(member.header.clone());
-            if let Some(journal) = self.journal(*lambda, member, &mut ending.short) {
-                ending.journals.push((member.header.lambda.clone(), journal));
-            }
+            let header = &desk.crews[*lambda].header;
+            ending.headers.push(Header::clone(header));
+            let part = self.part(*lambda, &header.lambda, &mut ending.short);
+            // A lambda that was started again is another one of the same name.
+            let mut names = names(&header.lambda);
+            let name = names.find(|name| !journals.iter().any(|(taken, ..)| taken == name));
+            journals.push((name.unwrap_or_default(), Arc::clone(header), part));
         }
         ending.moments = self.moments;
-        ending.thumbnail = self.picture.into_jpeg();
-        let file = self.file.expect("the file was opened above");
-        file.finish(ending)
+        desk.pen.finish(Last { clip: self.clip, begin, ending, topics: declared, journals })
     }
 
     /// The topics of its lambdas; and those of which it holds late messages, for a lambda whose windows ended before it.
@@ -219,7 +247,7 @@ impl Draft {
     }
 
     /// Why the clip does not begin and end where its windows do.
-    fn say_ends(&self, group: &Group, close: Close, short: &mut Vec<String>) {
+    fn say_ends(&self, group: &Group, close: &Close, short: &mut Vec<String>) {
         if self.continues {
             short.push("continues the clip before".to_owned());
         }
@@ -232,16 +260,17 @@ impl Draft {
             Close::EndOfDrive(_) if group.waits_for_stop() => {
                 short.push("the drive ended before the lambda said stop".to_owned());
             }
-            Close::EndOfDrive(end) if end < group.to => {
-                let early = seconds(group.to.saturating_sub(end));
+            Close::EndOfDrive(end) if *end < group.to => {
+                let early = seconds(group.to.saturating_sub(*end));
                 short.push(format!("the drive ended {early} before the window did"));
             }
-            Close::EndOfDrive(_) | Close::Complete => {}
+            Close::Early(end, why) if *end < group.to => short.push(why.to_string()),
+            Close::EndOfDrive(_) | Close::Early(..) | Close::Complete => {}
         }
     }
 
-    fn counts(&mut self, desk: &Desk, topic: usize, short: &mut Vec<String>) -> TopicCounts {
-        let Tally { messages, overwritten, too_big, huge, is_aged } = self.tally(topic).clone();
+    fn counts(&mut self, desk: &Desk, topic: usize, group: &Group, short: &mut Vec<String>) -> TopicCounts {
+        let Tally { messages, overwritten, too_big, lost, huge, is_aged } = self.tally(topic).clone();
         let lane = &desk.lanes[topic];
         let name = &lane.topic.name;
         match overwritten {
@@ -272,20 +301,36 @@ impl Draft {
         if is_aged {
             short.push(format!("a trigger came late: samples of {name} had left the preroll"));
         }
+        if let Some(late) = lane.found_at.map(|at| at.saturating_sub(self.from(group))).filter(|late| *late > 0) {
+            short.push(format!("{name} was found {} after the clip begins", seconds(late)));
+        }
+        if let Some(count) = lost.filter(|count| *count > 0) {
+            short.push(format!("{} of {name} did not reach the recorder", plural(count, "sample")));
+        }
         let received = || Some(messages + overwritten? + too_big?);
         TopicCounts {
             topic: name.clone(),
             type_name: (!lane.is_missing).then(|| lane.topic.type_name.clone()),
             received: if is_aged { None } else { received() },
-            lost: None,
+            lost,
             overwritten,
             too_big,
         }
     }
 
-    fn journal(&mut self, lambda: usize, member: &Member, short: &mut Vec<String>) -> Option<Vec<u8>> {
-        let name = &member.header.lambda;
-        let part = std::mem::take(at(&mut self.parts, lambda));
+    /// The wakes of a lambda, and what is missing of them.
+    fn part(&mut self, lambda: usize, name: &str, short: &mut Vec<String>) -> Part {
+        let mut part = std::mem::take(at(&mut self.parts, lambda));
+        let unheard = *at(&mut self.wakes_unheard, lambda);
+        if unheard > 0 {
+            let wakes = plural(unheard, "wake");
+            short.push(format!("the journal of {name} lacks {wakes}: lost on the way to the recorder"));
+            let apart = part.keep_run();
+            if apart > 0 {
+                let wakes = plural(apart, "more wake");
+                short.push(format!("the journal of {name} lacks {wakes}: some between were lost"));
+            }
+        }
         let lost = *at(&mut self.wakes_lost, lambda);
         if lost > 0 {
             short.push(format!("the journal of {name} lacks {}: pushed out of the preroll", plural(lost, "wake")));
@@ -295,15 +340,13 @@ impl Draft {
             let last = plural(part.cut(), "wake");
             short.push(format!("the journal of {name} lacks the last {last}: longer than {most} MiB"));
         }
-        match part.write(&member.header)? {
-            Ok(journal) => Some(journal),
-            Err(error) => {
-                tracing::error!(lambda = %name, %error, "the journal of a clip cannot be written");
-                short.push(format!("the journal of {name} could not be written: {error}"));
-                None
-            }
-        }
+        part
     }
+}
+
+/// `name`, `name-2`, `name-3` and so on.
+fn names(name: &str) -> impl Iterator<Item = String> + '_ {
+    (1_u64..).map(move |n| if n == 1 { name.to_owned() } else { format!("{name}-{n}") })
 }
 
 /// The item at `index` of a list that grows as far as it is asked for. Topics and lambdas are numbered from 0.

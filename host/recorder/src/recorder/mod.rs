@@ -3,97 +3,63 @@
 mod draft;
 mod finished;
 mod limits;
-mod part;
-mod picture;
+mod live;
+mod pen;
+mod settings;
 mod stem;
+mod steps;
 mod stock;
 #[cfg(test)]
 mod tests;
 mod waiting;
+mod walk;
 
-use std::path::PathBuf;
-use std::time::Duration;
+use std::sync::Arc;
 
 use gleaner_protocol::journal::{Encoder, Entry};
-use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Clip, Moment};
-use gleaner_transport::SampleMeta;
+use gleaner_protocol::{Clip, Moment, TriggerKind};
+use gleaner_transport::{Gaps, SampleMeta};
 
 use crate::RecordError;
 use crate::file::{Folder, Topic};
-use crate::preroll::{Held, Losses, Preroll};
-use crate::window::{Group, Heard, Rules, Step, Window, Windows, nanoseconds};
-use draft::{Close, Draft};
+use crate::preroll::{Held, Losses, Preroll, Walked};
+use crate::window::{Heard, Rules, Windows, nanoseconds};
+use draft::Draft;
 use finished::Finished;
 use limits::Limits;
+use pen::Pen;
+use steps::Stray;
 use stock::{Crew, Desk, Lane, Stock};
 use waiting::Waiting;
+use walk::Walk;
 
+pub use settings::{Commanded, Counts, LambdaId, Settings, TopicId, Work};
 pub use stock::Member;
 
 /// Most topics of one recorder.
 const TOPICS_MAX: usize = 256;
 
-/// How a recorder works.
-#[derive(Clone, Debug)]
-pub struct Settings {
-    /// Where the preroll waits.
-    pub store: Store,
-    /// Most bytes of the preroll, with 64 bytes or a little more for each sample.
-    pub preroll_bytes: u64,
-    /// The longest clip; what is longer goes on in a next one.
-    pub max_length: Duration,
-    /// The folder that clips go to. A preroll on disk is in `preroll` there.
-    pub folder: PathBuf,
-    /// What stamps are, for example "log time of the drive".
-    pub clock: String,
-    /// Whether memory for the preroll is taken from the system at once.
-    pub prefault: bool,
-}
+/// Most lambdas of one recorder, counted with each start: of each a header is kept.
+const LAMBDAS_MAX: usize = 1024;
 
-/// A topic of a recorder.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct TopicId(usize);
-
-/// A lambda of a recorder.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct LambdaId(usize);
-
-/// What a recorder has done so far.
-#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
-pub struct Counts {
-    /// Clips that are finished.
-    pub clips: u64,
-    /// Windows that triggers opened.
-    pub windows: u64,
-    /// Triggers that opened none, because they came within the cooldown of another.
-    pub in_cooldown: u64,
-    /// Starts while one was open, and stops while none was.
-    pub ignored: u64,
-    /// Samples that left the preroll for want of bytes before they were too old for any window.
-    pub pushed_out: u64,
-    /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless, unless they are larger
-    /// than any message of a clip, which is somewhat below 1 GiB.
-    pub too_big: u64,
-    /// Samples and wakes with a stamp before 1970, and samples of missing topics: they are not recorded.
-    pub refused: u64,
-    /// Samples older than one that came before them. They are recorded where windows cover them.
-    pub out_of_order: u64,
-    /// Bytes that the preroll holds.
-    pub preroll_bytes: u64,
-    /// The most that it held so far.
-    pub preroll_highest: u64,
-    /// The most that it may hold.
-    pub preroll_bound: u64,
-}
-
-/// Cuts clips out of what passes by. Synchronous; time is what stamps and [`Recorder::advance`] say, and never goes back.
+/// Cuts clips out of what passes by. Time is what stamps and [`Recorder::advance`] say, and never goes back.
+///
+/// One made by [`new`](Self::new) does everything within each call; what it records depends on stamps only. One made by
+/// [`live`](Self::live) leaves what takes long to a thread, and to [`work`](Self::work), which is to be called in between.
 ///
 /// After an error a recorder is of no use: drop it. What it has written is recovered by the next [`Folder::open`].
 pub struct Recorder {
     windows: Windows,
     stock: Stock,
     draft: Option<Draft>,
+    /// A clip of windows before those of `draft`.
+    stray: Option<Stray>,
+    /// What brings `stray`, or else `draft`, up to what is held. Nothing is decided while it is under way.
+    walk: Option<Walk>,
+    /// Messages after this one came while they could not be written to `draft`.
+    behind: Option<Option<Walked>>,
+    /// Why nothing is to be recorded for now.
+    held: Option<Arc<str>>,
     /// Groups of windows so far; each has its number.
     groups: u64,
     now: Option<i64>,
@@ -102,18 +68,23 @@ pub struct Recorder {
     counts: Counts,
     /// Where a wake is encoded.
     encoded: Vec<u8>,
+    settings: Settings,
 }
 
 impl Recorder {
-    /// A recorder without topics and lambdas.
+    /// A recorder without topics and lambdas, for a drive that waits.
     ///
     /// # Errors
     ///
     /// [`RecordError::Preroll`] if the preroll is on disk and has no place there.
     pub fn new(folder: Folder, settings: Settings) -> Result<Recorder, RecordError> {
-        let Settings { store, preroll_bytes, max_length, folder: out, clock, prefault } = settings;
-        let preroll = Preroll::open(store, preroll_bytes, out.join("preroll"), prefault)?;
-        let max_length_ns = nanoseconds(max_length).max(1);
+        Recorder::with(Pen::here(folder), settings, false)
+    }
+
+    fn with(pen: Pen, settings: Settings, is_live: bool) -> Result<Recorder, RecordError> {
+        let Settings { store, preroll_bytes, prefault, .. } = settings;
+        let preroll = Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
+        let max_length_ns = nanoseconds(settings.max_length).max(1);
         Ok(Recorder {
             windows: Windows::new(max_length_ns),
             stock: Stock {
@@ -121,16 +92,29 @@ impl Recorder {
                 losses: Vec::new(),
                 wake_losses: Vec::new(),
                 waiting: Waiting::default(),
-                desk: Desk { folder, clock, limits: Limits::default(), lanes: Vec::new(), crews: Vec::new() },
+                desk: Desk {
+                    pen,
+                    clips: 0,
+                    clock: settings.clock.clone(),
+                    limits: Limits::default(),
+                    is_live,
+                    lanes: Vec::new(),
+                    crews: Vec::new(),
+                },
                 began_at: 0,
             },
             draft: None,
+            stray: None,
+            walk: None,
+            behind: None,
+            held: None,
             groups: 0,
             now: None,
             max_length_ns,
             finished: Finished::default(),
             counts: Counts { preroll_bound: preroll_bytes, ..Counts::default() },
             encoded: Vec::new(),
+            settings,
         })
     }
 
@@ -162,13 +146,30 @@ impl Recorder {
             return Err(RecordError::TooManyTopics { most: TOPICS_MAX });
         }
         topic.check()?;
-        lanes.push(Lane { topic, is_missing, lambdas: Vec::new() });
+        let (topic, lambdas, gaps) = (Arc::new(topic), Vec::new(), Gaps::default());
+        lanes.push(Lane { topic, is_missing, found_at: None, lambdas, gaps });
         self.stock.losses.push(Losses::default());
         Ok(TopicId(lanes.len() - 1))
     }
 
     /// Adds a lambda that records, before its first wake.
+    ///
+    /// # Panics
+    ///
+    /// Beyond 1024 lambdas, which a replay never has; [`Recorder::try_add_lambda`] says so instead.
     pub fn add_lambda(&mut self, member: Member) -> LambdaId {
+        self.try_add_lambda(member).expect("few lambdas are added without asking")
+    }
+
+    /// As [`Recorder::add_lambda`].
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::TooManyLambdas`] beyond 1024.
+    pub fn try_add_lambda(&mut self, member: Member) -> Result<LambdaId, RecordError> {
+        if self.stock.desk.crews.len() == LAMBDAS_MAX {
+            return Err(RecordError::TooManyLambdas { most: LAMBDAS_MAX });
+        }
         let lambda = self.windows.add(Rules {
             preroll_ns: nanoseconds(member.rules.preroll),
             postroll_ns: nanoseconds(member.rules.postroll),
@@ -180,10 +181,10 @@ impl Recorder {
                 lambdas.push(lambda);
             }
         }
-        let encoder = Encoder::new(member.header.inputs.len());
-        self.stock.desk.crews.push(Crew { member, encoder, wakes: 0 });
+        let (encoder, header) = (Encoder::new(member.header.inputs.len()), Arc::new(member.header.clone()));
+        self.stock.desk.crews.push(Crew { member, header, encoder, wakes: 0 });
         self.stock.wake_losses.push(Losses::default());
-        LambdaId(lambda)
+        Ok(LambdaId(lambda))
     }
 
     /// A sample came.
@@ -197,25 +198,42 @@ impl Recorder {
             return Ok(());
         }
         self.counts.out_of_order += u64::from(self.now.is_some_and(|now| meta.at_ns < now));
+        if self.stock.desk.is_live {
+            self.stock.note_gap(topic.0, meta);
+        }
         self.pass(meta.at_ns)?;
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
-        let mut in_group = 0;
-        if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open())
-            && self.stock.desk.covers(group, topic.0, meta.at_ns)
-        {
-            if cdr.len() <= self.stock.desk.limits.message_bytes {
-                draft.message(&mut self.stock.desk, group, topic.0, &meta, cdr)?;
-            } else {
-                draft.refuse(topic.0);
-            }
-            in_group = draft.group;
-        }
+        let in_group = self.write(topic.0, &meta, cdr)?;
         let Counts { pushed_out, too_big, .. } = &mut self.counts;
         self.stock.keep(Held::sample(topic.0, &meta, in_group), cdr, pushed_out, too_big)
     }
 
+    /// Writes a sample to the open clip, if it belongs there. Returns the group in whose clip it is then.
+    fn write(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) -> Result<u64, RecordError> {
+        let is_prompt = self.is_prompt(meta.at_ns);
+        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else { return Ok(0) };
+        let Stock { preroll, desk, .. } = &mut self.stock;
+        if !desk.covers(group, topic, meta.at_ns) {
+            return Ok(0);
+        }
+        if cdr.len() > desk.limits.message_bytes {
+            draft.refuse(topic);
+        } else if is_prompt || !preroll.fits(cdr.len()) && desk.pen.has_room() {
+            draft.message(desk, group, topic, meta, cdr)?;
+        } else {
+            // It is counted as too big if it cannot be kept; else a walk comes by.
+            if self.walk.is_none() || self.stray.is_some() {
+                self.behind.get_or_insert_with(|| preroll.newest());
+            }
+            return Ok(0);
+        }
+        Ok(draft.group)
+    }
+
     /// A lambda was woken: keeps the wake for its journal, and does what its triggers ask for.
+    ///
+    /// Live, its stamp lets no time pass: samples from before it may still be on their way, and it may itself be up to 200 ms late.
     ///
     /// # Errors
     ///
@@ -231,10 +249,12 @@ impl Recorder {
         self.encoded.clear();
         crew.encoder.reset();
         crew.encoder.encode(entry, &mut self.encoded);
-        self.pass(entry.at_ns)?;
+        if !self.stock.desk.is_live {
+            self.pass(entry.at_ns)?;
+        }
         let mut in_group = 0;
         if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open())
-            && (group.begin..=group.to).contains(&entry.at_ns)
+            && (group.begin..=group.to.min(self.windows.limit())).contains(&entry.at_ns)
         {
             draft.wake(lambda.0, number, &self.encoded);
             in_group = draft.group;
@@ -244,7 +264,11 @@ impl Recorder {
         if entry.triggers.is_empty() {
             return Ok(());
         }
-        let most = self.stock.desk.limits.waiting;
+        if self.held.is_some() {
+            self.counts.held_back +=
+                entry.triggers.iter().filter(|trigger| trigger.kind != TriggerKind::Stop).count() as u64;
+            return Ok(());
+        }
         for trigger in &entry.triggers {
             match self.windows.trigger(lambda.0, trigger.kind, &trigger.label, entry.at_ns) {
                 Heard::Opened => self.counts.windows += 1,
@@ -252,9 +276,23 @@ impl Recorder {
                 Heard::Ignored => self.counts.ignored += 1,
                 Heard::Stopped => {}
             }
-            let name = &self.stock.desk.crews[lambda.0].member.header.lambda;
-            self.stock.waiting.push(lambda.0, Moment::of(name, trigger, entry.at_ns), &self.windows, most);
+            self.await_clip(lambda, Moment::of(self.name_of(lambda), trigger, entry.at_ns));
         }
+        self.act()
+    }
+
+    fn name_of(&self, lambda: LambdaId) -> &str {
+        &self.stock.desk.crews[lambda.0].member.header.lambda
+    }
+
+    /// A moment waits for the clip that it belongs to.
+    fn await_clip(&mut self, lambda: LambdaId, moment: Moment) {
+        let most = self.stock.desk.limits.waiting;
+        self.stock.waiting.push(lambda.0, moment, &self.windows, most);
+    }
+
+    /// Does what triggers ask for.
+    fn act(&mut self) -> Result<(), RecordError> {
         self.run()?;
         if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) {
             self.stock.gather(draft, group, self.windows.limit());
@@ -271,21 +309,6 @@ impl Recorder {
         self.pass(now_ns.max(0))
     }
 
-    /// The drive ends: completes what is open. A clip whose window had not ended says so.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
-    pub fn finish(&mut self, end_ns: i64) -> Result<(), RecordError> {
-        self.pass(end_ns.max(0))?;
-        let end = self.now.unwrap_or(end_ns);
-        while let Some(group) = self.windows.close() {
-            self.complete(&group, Close::EndOfDrive(end))?;
-            self.run()?;
-        }
-        Ok(())
-    }
-
     /// The newest of the clips that are finished, in the order in which they were; `clips.jsonl` has all.
     pub fn clips(&self) -> &[Clip] {
         self.finished.newest()
@@ -294,99 +317,12 @@ impl Recorder {
     /// What was done so far.
     pub fn counts(&self) -> Counts {
         let preroll = &self.stock.preroll;
-        let (preroll_bytes, preroll_highest) = (preroll.bytes_held(), preroll.bytes_highest());
-        Counts { clips: self.finished.count, preroll_bytes, preroll_highest, ..self.counts }
-    }
-
-    /// Lets time pass. What is due is done before anything is given up for its age: it may need it.
-    fn pass(&mut self, now: i64) -> Result<(), RecordError> {
-        if self.now.is_none() {
-            self.stock.began_at = now;
-        }
-        self.now = self.now.max(Some(now));
-        self.windows.pass(now);
-        self.run()?;
-        self.stock.trim(self.windows.horizon())
-    }
-
-    /// Does all that is to be done.
-    fn run(&mut self) -> Result<(), RecordError> {
-        while let Some(step) = self.windows.step() {
-            match step {
-                Step::Begin(windows) => self.begin(&windows)?,
-                Step::Join { windows, fresh_from: Some(from) } => self.settle(&windows, from)?,
-                // It covers nothing new so far, and its trigger is gathered by whoever brought it.
-                Step::Join { .. } => {}
-                Step::Roll { boundary, before } => self.roll(boundary, &before)?,
-                Step::Finish(group) => self.complete(&group, Close::Complete)?,
-                Step::Stray(windows, group) => self.stray(&windows, *group)?,
-            }
-        }
-        Ok(())
-    }
-
-    fn begin(&mut self, windows: &[Window]) -> Result<(), RecordError> {
-        if let Some(group) = self.windows.open() {
-            self.groups += 1;
-            let limits = self.stock.desk.limits;
-            self.draft = Some(Draft::new(self.groups, self.stock.opening(group), group, limits));
-        }
-        self.settle(windows, i64::MIN)
-    }
-
-    fn settle(&mut self, windows: &[Window], fresh_from: i64) -> Result<(), RecordError> {
-        match (&mut self.draft, self.windows.open()) {
-            (Some(draft), Some(group)) => self.stock.settle(draft, group, windows, self.windows.limit(), fresh_from),
-            _ => Ok(()),
-        }
-    }
-
-    /// Goes on in a next clip.
-    fn roll(&mut self, boundary: i64, before: &Group) -> Result<(), RecordError> {
-        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else { return Ok(()) };
-        if !draft.is_empty() {
-            let next = draft.next(group);
-            let full = std::mem::replace(draft, next);
-            self.finished.add(self.stock.finish(full, before, Close::Full(boundary))?);
-        }
-        // Where nothing came for longer than a clip may be, no clips are made of it.
-        let until = self.stock.earliest(draft, group).or(self.now).unwrap_or(boundary);
-        if until > self.windows.limit() {
-            self.windows.slide(until);
-        }
-        self.settle(&[], i64::MIN)
-    }
-
-    fn complete(&mut self, group: &Group, close: Close) -> Result<(), RecordError> {
-        if let Some(draft) = self.draft.take() {
-            // The clip before promised that more would come; where nothing did, there is no clip of nothing.
-            if draft.continues && draft.is_empty() && draft.triggers == 0 {
-                return Ok(());
-            }
-            self.finished.add(self.stock.finish(draft, group, close)?);
-        }
-        Ok(())
-    }
-
-    /// Makes a clip of windows that lie before the one that is open. All of it is in the past.
-    fn stray(&mut self, windows: &[Window], mut group: Group) -> Result<(), RecordError> {
-        self.groups += 1;
-        let mut draft = Draft::new(self.groups, self.stock.opening(&group), &group, self.stock.desk.limits);
-        self.stock.settle(&mut draft, &group, windows, group.from.saturating_add(self.max_length_ns), i64::MIN)?;
-        loop {
-            let boundary = group.from.saturating_add(self.max_length_ns);
-            if group.to <= boundary {
-                self.finished.add(self.stock.finish(draft, &group, Close::Complete)?);
-                return Ok(());
-            }
-            let before = group.clone();
-            group.roll(boundary);
-            if !draft.is_empty() {
-                let next = draft.next(&group);
-                let full = std::mem::replace(&mut draft, next);
-                self.finished.add(self.stock.finish(full, &before, Close::Full(boundary))?);
-            }
-            self.stock.settle(&mut draft, &group, &[], group.from.saturating_add(self.max_length_ns), i64::MIN)?;
+        Counts {
+            clips: self.finished.count,
+            preroll_bytes: preroll.bytes_held(),
+            preroll_highest: preroll.bytes_highest(),
+            in_flight: self.stock.desk.pen.in_flight() as u64,
+            ..self.counts
         }
     }
 }

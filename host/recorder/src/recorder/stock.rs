@@ -1,14 +1,19 @@
 //! What is held and known while no clip is written: the preroll and its losses, topics, lambdas, triggers that wait.
 
+use std::sync::Arc;
+
 use gleaner_protocol::journal::{Encoder, Header};
 use gleaner_protocol::manifest::Record;
 use gleaner_protocol::{Clip, ClipLambda, Moment};
 
+use gleaner_transport::{Gaps, SampleMeta};
+
 use super::draft::{Close, Draft};
 use super::limits::Limits;
+use super::pen::Pen;
 use super::waiting::Waiting;
 use crate::RecordError;
-use crate::file::{Folder, Topic};
+use crate::file::Topic;
 use crate::preroll::{Held, Losses, Preroll, Walked};
 use crate::window::{Group, Window};
 
@@ -28,9 +33,13 @@ pub struct Member {
 /// A topic, and who records it.
 #[derive(Debug)]
 pub(super) struct Lane {
-    pub(super) topic: Topic,
+    pub(super) topic: Arc<Topic>,
     pub(super) is_missing: bool,
+    /// When it was found, if that was later than it was wanted.
+    pub(super) found_at: Option<i64>,
     pub(super) lambdas: Vec<usize>,
+    /// What numbers tell of losses.
+    pub(super) gaps: Gaps,
 }
 
 impl Lane {
@@ -46,20 +55,32 @@ impl Lane {
 /// One lambda, its windows aside.
 pub(super) struct Crew {
     pub(super) member: Member,
+    /// As in `member`; clips are written with it elsewhere.
+    pub(super) header: Arc<Header>,
     pub(super) encoder: Encoder,
     pub(super) wakes: u64,
 }
 
 /// What every clip is written with.
 pub(super) struct Desk {
-    pub(super) folder: Folder,
+    pub(super) pen: Pen,
+    /// Clips so far; each has its number.
+    pub(super) clips: u64,
     pub(super) clock: String,
     pub(super) limits: Limits,
+    /// Whether samples come as they are made, so that gaps in their numbers are losses.
+    pub(super) is_live: bool,
     pub(super) lanes: Vec<Lane>,
     pub(super) crews: Vec<Crew>,
 }
 
 impl Desk {
+    /// The number of a new clip.
+    pub(super) fn next_clip(&mut self) -> u64 {
+        self.clips += 1;
+        self.clips
+    }
+
     /// Whether a window of a lambda that records this topic contains `at`.
     pub(super) fn covers(&self, group: &Group, topic: usize, at: i64) -> bool {
         self.lanes[topic].lambdas.iter().any(|lambda| group.covers(*lambda, at))
@@ -142,6 +163,19 @@ impl Stock {
         Ok(())
     }
 
+    /// Counts what the number of a sample tells of samples before it.
+    pub(super) fn note_gap(&mut self, topic: usize, meta: &SampleMeta) {
+        let gaps = &mut self.desk.lanes[topic].gaps;
+        let before = gaps.lost();
+        let missing = gaps.note(meta.writer, meta.seq);
+        let lost = &mut self.losses[topic].lost;
+        if missing > 0 {
+            lost.add_some(meta.at_ns, 0, missing);
+        } else if gaps.lost() < before {
+            lost.take_back();
+        }
+    }
+
     /// Gives up what is older than `before`.
     pub(super) fn trim(&mut self, before: i64) -> Result<(), RecordError> {
         let Stock { preroll, losses, wake_losses, .. } = self;
@@ -152,50 +186,8 @@ impl Stock {
         })
     }
 
-    /// Brings a clip up to what its group covers and what is held, not after `limit`. `windows` are those that have just
-    /// joined the group; what is before `fresh_from` it has covered already.
-    pub(super) fn settle(
-        &mut self,
-        draft: &mut Draft,
-        group: &Group,
-        windows: &[Window],
-        limit: i64,
-        fresh_from: i64,
-    ) -> Result<(), RecordError> {
-        windows.iter().for_each(|window| self.reach_back(draft, window));
-        self.count_losses(draft, group, limit);
-        draft.picture.look(&self.desk, &mut self.preroll, group, limit, draft.continues)?;
-        let settled = windows.iter().map(|window| window.to.unwrap_or(i64::MAX)).max().unwrap_or(group.to).min(limit);
-        draft.settled = draft.settled.filter(|settled| settled.newest < fresh_from);
-        let mut last = draft.settled.map(|settled| settled.last);
-        let mut is_settled = true;
-        while let Some(walked) = self.preroll.next(last) {
-            let place = walked.place();
-            let held = self.preroll.held(place);
-            if self.wants(draft, group, &held, limit) {
-                let bytes = self.preroll.bytes(place)?;
-                match held.source.lambda() {
-                    Some(lambda) => draft.wake(lambda, held.seq, bytes),
-                    None => {
-                        let topic = held.source.as_topic().unwrap_or_default();
-                        draft.message(&mut self.desk, group, topic, &held.meta(), bytes)?;
-                    }
-                }
-                self.preroll.mark(place, draft.group);
-            }
-            is_settled &= held.at_ns <= settled;
-            if is_settled {
-                let newest = draft.settled.map_or(held.at_ns, |settled| settled.newest.max(held.at_ns));
-                draft.settled = Some(Settled { last: walked, newest });
-            }
-            last = Some(walked);
-        }
-        self.gather(draft, group, limit);
-        Ok(())
-    }
-
     /// Whether an entry belongs into a clip that ends at `limit` at the latest, and is not in it.
-    fn wants(&self, draft: &Draft, group: &Group, held: &Held, limit: i64) -> bool {
+    pub(super) fn wants(&self, draft: &Draft, group: &Group, held: &Held, limit: i64) -> bool {
         if held.group == draft.group || held.at_ns > limit {
             return false;
         }
@@ -225,11 +217,36 @@ impl Stock {
         draft.triggers += untold;
     }
 
-    /// Completes a clip.
-    pub(super) fn finish(&mut self, mut draft: Draft, group: &Group, close: Close) -> Result<Clip, RecordError> {
+    /// Completes a clip, which is returned if it is written already.
+    pub(super) fn finish(
+        &mut self,
+        mut draft: Draft,
+        group: &Group,
+        close: Close,
+    ) -> Result<Option<Clip>, RecordError> {
         let limit = if let Close::Full(boundary) = close { boundary } else { i64::MAX };
         draft.uncertain = self.waiting.uncertain(group, limit);
-        draft.finish(&mut self.desk, group, close)
+        if self.desk.is_live {
+            self.count_lost(&mut draft, group, limit);
+        }
+        draft.finish(&mut self.desk, group, &close)
+    }
+
+    /// What did not even come here.
+    fn count_lost(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
+        let (number, from) = (draft.group, draft.from(group));
+        for topic in self.desk.topics_of(group) {
+            let desk = &self.desk;
+            let lost = &mut self.losses[topic].lost;
+            let is_known = !lost.is_unknown(from, number) && desk.lanes[topic].found_at.is_none_or(|at| at <= from);
+            let count = lost.count(number, |at| at <= limit && desk.covers(group, topic, at));
+            draft.tally(topic).lost = is_known.then_some(count);
+        }
+        let inside = group.begin..=group.to.min(limit);
+        for lambda in &group.lambdas {
+            let count = self.wake_losses[*lambda].lost.count(number, |at| inside.contains(&at));
+            draft.wakes_unheard(*lambda, count);
+        }
     }
 
     /// The trigger that names a clip.
@@ -242,11 +259,12 @@ impl Stock {
             score: None,
             attributes: None,
             at_ns,
+            source: None,
         })
     }
 
     /// What a window asks for and nobody can give.
-    fn reach_back(&mut self, draft: &mut Draft, window: &Window) {
+    pub(super) fn reach_back(&mut self, draft: &mut Draft, window: &Window) {
         draft.begins_late_ns = draft.begins_late_ns.max(self.began_at.saturating_sub(window.from));
         let number = draft.group;
         for topic in &self.desk.crews[window.lambda].member.topics {
@@ -262,7 +280,7 @@ impl Stock {
         }
     }
 
-    fn count_losses(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
+    pub(super) fn count_losses(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
         let number = draft.group;
         for topic in self.desk.topics_of(group) {
             let desk = &self.desk;

@@ -15,8 +15,17 @@ pub enum Heard {
     Stopped,
     /// It came too soon after the last one that opened a window.
     InCooldown,
-    /// A start while one of its label is open, or [`STARTED_MAX`] are; or a stop while none of its label is.
+    /// A start while one of its label is open, or [`STARTED_MAX`] are; a stop while none of its label is; or too many windows
+    /// wait.
     Ignored,
+}
+
+/// Who triggers in the name of a lambda.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum By {
+    Lambda,
+    /// Somebody outside, who has nothing to do with what the lambda started, nor with its cooldown.
+    Command,
 }
 
 /// What is to be done next.
@@ -52,6 +61,8 @@ pub struct Windows {
     lambdas: Vec<Lambda>,
     longest_preroll_ns: i64,
     max_length_ns: i64,
+    /// How long nothing is ended for good, as wakes may come late.
+    grace_ns: i64,
     pub(super) now: i64,
     open: Option<Group>,
     /// Windows that touch nothing that is open. They wait at most for the longest preroll, unless they came late.
@@ -63,12 +74,16 @@ struct Lambda {
     rules: Rules,
     /// Anchor of the last trigger that opened a window.
     opened_at: Option<i64>,
-    /// Labels of the recordings that were started and not stopped. Together they are one window: it lasts until the last stop.
-    started: BTreeSet<String>,
+    /// Recordings that were started and not stopped, by their labels. Together they are one window: it lasts until the last stop.
+    started: BTreeSet<(By, String)>,
 }
 
-/// Recordings of one lambda that may run at once, by their labels.
+/// Recordings of one lambda that may run at once, by their labels; and as many that commands started.
 pub const STARTED_MAX: usize = 64;
+
+/// Windows that may wait for an open clip to end. A lambda with windows that do not touch could fill the memory otherwise, while
+/// a disk is slow.
+const WAITING_MAX: usize = 4096;
 
 /// What a late trigger may lag behind the samples even if no window has a preroll.
 const LATE_NS: i64 = 1_000_000_000;
@@ -80,6 +95,7 @@ impl Windows {
             lambdas: Vec::new(),
             longest_preroll_ns: 0,
             max_length_ns,
+            grace_ns: 0,
             now: i64::MIN,
             open: None,
             pending: Vec::new(),
@@ -97,11 +113,11 @@ impl Windows {
     ///
     /// Let P be the longest preroll. A trigger whose anchor is now covers nothing before `now - P`. A window that waits,
     /// because it lies behind the end `to` of the open clip, begins after `to`; and it waits no longer than until
-    /// `now > to + P`, when that clip is finished: till then its begin is after `now - P`. (A step that does both at once
-    /// is made before samples are given up, see `Recorder::pass`.) So P is enough for triggers that come at once. Twice that
-    /// and a second lets a trigger be late by a preroll and a second.
+    /// `now > to + P + grace`, when that clip is finished: till then its begin is after `now - P - grace`. (A step that does both
+    /// at once is made before samples are given up, see `Recorder::pass`.) So P and the grace are enough for triggers that come at
+    /// once. Another P and a second let a trigger be late by as much.
     pub fn retention_ns(&self) -> i64 {
-        self.longest_preroll_ns.saturating_mul(2).saturating_add(LATE_NS)
+        self.longest_preroll_ns.saturating_mul(2).saturating_add(LATE_NS).saturating_add(self.grace_ns)
     }
 
     /// Nobody will ask for instants before this one.
@@ -133,28 +149,40 @@ impl Windows {
 
     /// Lambda `lambda` triggered in a wake at `anchor`. A stop ends the recording that was started with the same label.
     pub fn trigger(&mut self, lambda: usize, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
+        self.hear(lambda, By::Lambda, kind, label, anchor)
+    }
+
+    /// Somebody commands at `anchor` what `lambda` could trigger. A stop ends only what a command started.
+    pub fn command(&mut self, lambda: usize, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
+        self.hear(lambda, By::Command, kind, label, anchor)
+    }
+
+    fn hear(&mut self, lambda: usize, by: By, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
         let Some(state) = self.lambdas.get_mut(lambda) else { return Heard::Ignored };
-        let rules = state.rules;
+        let (rules, label) = (state.rules, (by, label.to_owned()));
         match kind {
-            TriggerKind::Start if state.started.contains(label) || state.started.len() >= STARTED_MAX => {
+            TriggerKind::Start if state.started.contains(&label) || state.started_by(by) >= STARTED_MAX => {
                 return Heard::Ignored;
             }
-            TriggerKind::Stop if !state.started.remove(label) => return Heard::Ignored,
+            TriggerKind::Stop if !state.started.remove(&label) => return Heard::Ignored,
             TriggerKind::Stop => {
                 if state.started.is_empty() {
                     self.stop(lambda, anchor.saturating_add(rules.postroll_ns));
                 }
                 return Heard::Stopped;
             }
+            TriggerKind::Event | TriggerKind::Start if self.pending.len() >= WAITING_MAX => return Heard::Ignored,
             TriggerKind::Event | TriggerKind::Start => {}
         }
-        if state.opened_at.is_some_and(|last| last.abs_diff(anchor) < rules.cooldown_ns.unsigned_abs()) {
-            return Heard::InCooldown;
+        if by == By::Lambda {
+            if state.opened_at.is_some_and(|last| last.abs_diff(anchor) < rules.cooldown_ns.unsigned_abs()) {
+                return Heard::InCooldown;
+            }
+            state.opened_at = Some(anchor);
         }
-        state.opened_at = Some(anchor);
         if kind == TriggerKind::Start {
             let is_covered = !state.started.is_empty();
-            state.started.insert(label.to_owned());
+            state.started.insert(label);
             if is_covered {
                 return Heard::Opened;
             }
@@ -193,7 +221,7 @@ impl Windows {
 
     /// What is to be done next; `None` until time passes or a trigger comes.
     pub fn step(&mut self) -> Option<Step> {
-        let horizon = self.horizon();
+        let (horizon, due) = (self.horizon(), self.now.saturating_sub(self.grace_ns));
         let Some(open) = &mut self.open else {
             let first = (0..self.pending.len()).min_by_key(|index| self.pending[*index].from)?;
             let windows = take_group(&mut self.pending, first);
@@ -215,7 +243,7 @@ impl Windows {
                 return Some(Step::Join { windows: joined, fresh_from });
             }
             if let Some(index) =
-                self.pending.iter().position(|window| window.to.is_some_and(|to| to < open.begin && to < self.now))
+                self.pending.iter().position(|window| window.to.is_some_and(|to| to < open.begin && to < due))
             {
                 let windows = take_group(&mut self.pending, index);
                 let group = Group::new(&windows, horizon)?;
@@ -223,12 +251,12 @@ impl Windows {
             }
         }
         let limit = open.from.saturating_add(self.max_length_ns);
-        if limit < self.now && limit < open.to {
+        if limit < due && limit < open.to {
             let before = Box::new(open.clone());
             open.roll(limit);
             return Some(Step::Roll { boundary: limit, before });
         }
-        if self.now > open.to.saturating_add(self.longest_preroll_ns) {
+        if due > open.to.saturating_add(self.longest_preroll_ns) {
             return self.open.take().map(|group| Step::Finish(Box::new(group)));
         }
         None
@@ -242,10 +270,44 @@ impl Windows {
         }
     }
 
+    /// A lambda has ended, at `at`: so does what it started, but not what commands did. `false` if that was nothing.
+    pub fn end(&mut self, lambda: usize, at: i64) -> bool {
+        let Some(state) = self.lambdas.get_mut(lambda).filter(|state| state.started_by(By::Lambda) > 0) else {
+            return false;
+        };
+        state.started.retain(|(by, _)| *by != By::Lambda);
+        if state.started.is_empty() {
+            let to = at.saturating_add(state.rules.postroll_ns);
+            self.stop(lambda, to);
+        }
+        true
+    }
+
+    /// From now on clips end so much later than time says, for what comes late.
+    pub fn set_grace(&mut self, grace_ns: i64) {
+        self.grace_ns = grace_ns;
+    }
+
+    /// Clips may be as long from now on.
+    pub fn grow_length(&mut self, max_length_ns: i64) {
+        self.max_length_ns = max_length_ns;
+    }
+
+    /// Gives up the windows that wait, and says how many they were.
+    pub fn forget_waiting(&mut self) -> u64 {
+        self.pending.drain(..).map(|window| window.windows).sum()
+    }
+
     /// At the end: closes the open group, whatever may come. Starts are over.
     pub fn close(&mut self) -> Option<Group> {
         self.lambdas.iter_mut().for_each(|lambda| lambda.started.clear());
         self.open.take()
+    }
+}
+
+impl Lambda {
+    fn started_by(&self, by: By) -> usize {
+        self.started.iter().filter(|(whose, _)| *whose == by).count()
     }
 }
 

@@ -303,3 +303,66 @@ fn a_lambda_that_starts_ever_new_recordings_is_heard_up_to_a_bound() {
     assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
     assert_eq!(heard.last(), Some(&Heard::Ignored));
 }
+
+#[test]
+fn what_comes_late_is_waited_for_before_anything_is_ended() {
+    let mut windows = machine(100, &[rules(10, 20, 0), rules(0, 0, 0)]);
+    windows.set_grace(30);
+    windows.pass(1000);
+    windows.trigger(0, Event, "x", 1000);
+    // An end and a preroll later it would be finished.
+    windows.pass(1030 + 30);
+    assert!(drain(&mut windows).is_empty());
+    // One that lies behind it waits as long.
+    windows.trigger(1, Event, "x", 1060);
+    windows.pass(1031 + 30);
+    assert_eq!(drain(&mut windows).len(), 1);
+    windows.pass(2000);
+    assert_eq!(drain(&mut windows).len(), 1);
+    windows.trigger(0, Start, "x", 2000);
+    windows.pass(2090 + 30);
+    assert!(matches!(windows.step(), Some(Step::Begin(_))) && windows.step().is_none(), "it is full, and waits");
+    windows.pass(2091 + 30);
+    assert!(matches!(windows.step(), Some(Step::Roll { boundary: 2090, .. })));
+    // A stray is one that nothing can join any more.
+    windows.trigger(1, Event, "x", 2091 - 102);
+    assert!(windows.step().is_some_and(|step| matches!(step, Step::Stray(..))));
+    windows.set_grace(i64::MAX / 2);
+    windows.trigger(1, Event, "x", 2091 - 102);
+    assert_eq!(windows.step(), None);
+}
+
+#[test]
+fn commands_and_triggers_end_only_what_is_their_own() {
+    let mut windows = machine(1_000_000, &[rules(10, 10, 1000)]);
+    windows.pass(100);
+    assert_eq!(windows.trigger(0, Event, "x", 100), Heard::Opened);
+    let heard = [0, 1, 2].map(|at| windows.command(0, Event, "x", 100 + at));
+    assert_eq!(heard, [Heard::Opened; 3], "a cooldown is the lambda's");
+    assert_eq!(windows.trigger(0, Event, "x", 103), Heard::InCooldown);
+    assert_eq!(windows.command(0, Start, "a", 105), Heard::Opened);
+    assert_eq!(windows.command(0, Start, "a", 106), Heard::Ignored);
+    assert_eq!(windows.trigger(0, Stop, "a", 107), Heard::Ignored);
+    assert_eq!(windows.trigger(0, Start, "a", 1200), Heard::Opened);
+    assert_eq!(windows.command(0, Stop, "a", 1300), Heard::Stopped);
+    assert_eq!(windows.command(0, Stop, "a", 1301), Heard::Ignored);
+    drain(&mut windows);
+    assert!(windows.open().unwrap().waits_for_stop(), "the lambda's goes on");
+    assert_eq!(windows.command(0, Start, "b", 1310), Heard::Opened);
+    assert!(windows.end(0, 1400));
+    assert!(windows.open().unwrap().waits_for_stop(), "a command's outlives the lambda");
+    assert!(!windows.end(0, 1401));
+    assert_eq!(windows.command(0, Stop, "b", 1500), Heard::Stopped);
+    windows.pass(LONG);
+    assert_eq!(drain(&mut windows).iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(90, 1510)]);
+}
+
+#[test]
+fn a_lambda_that_starts_too_much_keeps_no_command_from_starting() {
+    let mut windows = machine(1_000_000, &[rules(10, 10, 0)]);
+    for n in 0..2 * STARTED_MAX {
+        windows.trigger(0, Start, &n.to_string(), 100);
+    }
+    let heard = (0..STARTED_MAX + 1).map(|n| windows.command(0, Start, &n.to_string(), 100)).collect::<Vec<_>>();
+    assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
+}

@@ -1,25 +1,43 @@
-//! Wall-clock deadlines: a thread advances the engine's epoch while a call runs, and the guest traps when its time is over.
+//! Wall-clock deadlines: a thread looks whether a call is over its time, and advances the engine's epoch then, upon which the guest
+//! traps.
 
-use std::sync::mpsc::{self, RecvTimeoutError, Sender};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use wasmtime::{Engine, Store};
+use wasmtime::{Engine, Store, Trap, UpdateDeadline};
 
-/// The epoch's period; a deadline is kept to about this.
-const EPOCH: Duration = Duration::from_millis(1);
+use super::Hosted;
+
+/// How long nothing must have run for the ticker to sleep until something does. A lambda at 1 Hz wakes it with each call, one at
+/// 100 Hz never: waking a thread costs a call more than all else that hosting does.
+const IDLE: Duration = Duration::from_millis(500);
+
+/// No call runs.
+const NONE: u64 = 0;
 
 /// How long each call into a guest may take.
 pub struct Deadline {
     allowed: Duration,
-    control: Option<Sender<bool>>,
+    shared: Arc<Shared>,
     ticker: Option<JoinHandle<()>>,
 }
 
-/// A running call; its end stops the ticker.
+struct Shared {
+    base: Instant,
+    /// When the call that runs has to end, in ns since `base`.
+    due: AtomicU64,
+    /// The ticker sleeps until it is woken.
+    sleeps: AtomicBool,
+    stop: AtomicBool,
+}
+
+/// A running call.
 pub(super) struct Armed<'a> {
     deadline: &'a Deadline,
     started: Instant,
+    allowed: Duration,
 }
 
 impl Deadline {
@@ -29,45 +47,82 @@ impl Deadline {
     ///
     /// If the thread cannot be started.
     pub fn new(engine: &Engine, allowed: Duration) -> std::io::Result<Self> {
-        let engine = engine.clone();
-        let (control, commands) = mpsc::channel();
-        let ticker = thread::Builder::new().name("gleaner-epoch".to_owned()).spawn(move || {
-            let mut armed = false;
-            loop {
-                let command = if armed {
-                    commands.recv_timeout(EPOCH)
-                } else {
-                    commands.recv().map_err(|_| RecvTimeoutError::Disconnected)
-                };
-                match command {
-                    Ok(arm) => armed = arm,
-                    Err(RecvTimeoutError::Timeout) => engine.increment_epoch(),
-                    Err(RecvTimeoutError::Disconnected) => return,
-                }
-            }
-        })?;
-        Ok(Self { allowed, control: Some(control), ticker: Some(ticker) })
+        let shared = Arc::new(Shared {
+            base: Instant::now(),
+            due: AtomicU64::new(NONE),
+            sleeps: AtomicBool::new(false),
+            stop: AtomicBool::new(false),
+        });
+        let (engine, seen) = (engine.clone(), Arc::clone(&shared));
+        let ticker = thread::Builder::new().name("gleaner-epoch".to_owned());
+        let ticker = ticker.spawn(move || seen.tick(&engine, allowed))?;
+        Ok(Self { allowed, shared, ticker: Some(ticker) })
     }
 
-    pub(super) fn arm<T>(&self, store: &mut Store<T>) -> Armed<'_> {
-        // One more, since the first epoch may end at once.
-        let epochs = self.allowed.as_nanos().div_ceil(EPOCH.as_nanos()) as u64 + 1;
-        store.set_epoch_deadline(epochs);
-        self.tell(true);
-        Armed { deadline: self, started: Instant::now() }
+    /// Begins a call that may take `times` the deadline.
+    pub(super) fn arm(&self, store: &mut Store<Hosted>, times: u32) -> Armed<'_> {
+        let started = Instant::now();
+        let allowed = self.allowed.saturating_mul(times);
+        store.data_mut().due = Some(started + allowed);
+        store.set_epoch_deadline(1);
+        let due = started.duration_since(self.shared.base) + allowed;
+        self.shared.due.store((due.as_nanos() as u64).max(NONE + 1), Ordering::SeqCst);
+        // Either the ticker sees the call before it sleeps, or we see that it sleeps.
+        if self.shared.sleeps.load(Ordering::SeqCst) {
+            self.wake();
+        }
+        Armed { deadline: self, started, allowed }
     }
 
-    fn tell(&self, armed: bool) {
-        if let Some(control) = &self.control {
-            // The ticker ends only with this sender.
-            let _ = control.send(armed);
+    fn wake(&self) {
+        if let Some(ticker) = &self.ticker {
+            ticker.thread().unpark();
         }
     }
 }
 
+impl Shared {
+    fn tick(&self, engine: &Engine, allowed: Duration) {
+        // A look at least every half of the allowed time finds each call before it is due, and sleeps exactly until then.
+        let step = (allowed / 2).max(Duration::from_micros(500));
+        let mut quiet = Instant::now();
+        while !self.stop.load(Ordering::SeqCst) {
+            let now = Instant::now();
+            let due = self.due.load(Ordering::SeqCst);
+            if due != NONE {
+                quiet = now;
+                let left = Duration::from_nanos(due).saturating_sub(now.duration_since(self.base));
+                if left.is_zero() {
+                    engine.increment_epoch();
+                }
+                // A call in the host, which ends by itself, is asked again when it is back in the guest.
+                thread::park_timeout(left.clamp(Duration::from_micros(500), step));
+            } else if now.duration_since(quiet) < IDLE {
+                thread::park_timeout(step);
+            } else {
+                self.sleeps.store(true, Ordering::SeqCst);
+                if self.due.load(Ordering::SeqCst) == NONE && !self.stop.load(Ordering::SeqCst) {
+                    thread::park();
+                }
+                self.sleeps.store(false, Ordering::SeqCst);
+                quiet = Instant::now();
+            }
+        }
+    }
+}
+
+/// What a guest does when the epoch advances: the ticker may have meant the call before.
+pub(super) fn ask_at_each_epoch(store: &mut Store<Hosted>) {
+    store.epoch_deadline_callback(|context| match context.data().due {
+        Some(due) if Instant::now() < due => Ok(UpdateDeadline::Continue(1)),
+        _ => Err(Trap::Interrupt.into()),
+    });
+}
+
 impl Drop for Deadline {
     fn drop(&mut self) {
-        self.control = None;
+        self.shared.stop.store(true, Ordering::SeqCst);
+        self.wake();
         if let Some(ticker) = self.ticker.take() {
             let _ = ticker.join();
         }
@@ -77,12 +132,12 @@ impl Drop for Deadline {
 impl Armed<'_> {
     /// Nanoseconds since the call began, and those it was allowed.
     pub(super) fn elapsed_and_allowed(&self) -> (u64, u64) {
-        (self.started.elapsed().as_nanos() as u64, self.deadline.allowed.as_nanos() as u64)
+        (self.started.elapsed().as_nanos() as u64, self.allowed.as_nanos() as u64)
     }
 }
 
 impl Drop for Armed<'_> {
     fn drop(&mut self) {
-        self.deadline.tell(false);
+        self.deadline.shared.due.store(NONE, Ordering::SeqCst);
     }
 }

@@ -17,6 +17,8 @@ mod wasi;
 pub use deadline::Deadline;
 pub use load::{Loaded, WasmError};
 
+use std::time::Instant;
+
 use gleaner_protocol::manifest::ConfigValue;
 use gleaner_protocol::{Fault, FaultKind};
 use tokio::runtime::{self, Runtime};
@@ -34,6 +36,9 @@ use crate::api::data::Wake;
 
 /// `init` may use so many times the fuel of a wake: it builds tables once.
 pub const INIT_FUEL_FACTOR: u64 = 20;
+
+/// And so many times the time.
+pub const INIT_TIME_FACTOR: u32 = 20;
 
 /// Handles that a guest may hold at a time, of all kinds.
 pub const HANDLES: usize = 4096;
@@ -74,6 +79,8 @@ struct Hosted {
     printed: Printed,
     limits: Limits,
     meter: Meter,
+    /// When the call that runs has to end, where there is a deadline.
+    due: Option<Instant>,
 }
 
 impl WasiView for Hosted {
@@ -100,7 +107,11 @@ impl WasmGuest {
 
     fn start(&mut self) -> Result<Live, Fault> {
         let mut store = self.new_store();
-        let mut call = Call::begin(&mut store, self.init_fuel(), self.deadline.as_ref());
+        let mut call = Call::begin(
+            &mut store,
+            self.init_fuel(),
+            self.deadline.as_ref().map(|deadline| (deadline, INIT_TIME_FACTOR)),
+        );
         let lambda = self.loaded.instantiate(call.store());
         let result = lambda.and_then(|lambda| {
             let config = self.session.config().into_iter().map(config_entry).collect::<Vec<_>>();
@@ -120,9 +131,11 @@ impl WasmGuest {
             printed,
             limits: Limits::new(self.allowance.memory_bytes),
             meter: Meter::default(),
+            due: None,
         };
         let mut store = Store::new(self.loaded.engine(), hosted);
         store.limiter(|hosted| &mut hosted.limits);
+        deadline::ask_at_each_epoch(&mut store);
         store.set_hostcall_fuel(HOST_CALL_BYTES);
         // Our table refuses first, by name: a call lends some handles beside those that are held.
         store.set_max_component_handles(2 * HANDLES);
@@ -150,7 +163,8 @@ impl Guest for WasmGuest {
             Ok(live) => live,
             Err(fault) => return Outcome { result: Err(fault), fuel: None },
         };
-        let mut call = Call::begin(&mut live.store, self.allowance.fuel, self.deadline.as_ref());
+        let mut call =
+            Call::begin(&mut live.store, self.allowance.fuel, self.deadline.as_ref().map(|deadline| (deadline, 1)));
         let result = call.hand_over(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
         let (fuel, result) = call.end(result);
         let result = result.and_then(|answer| answer.map_err(exception));
@@ -179,13 +193,13 @@ struct Call<'a> {
 }
 
 impl<'a> Call<'a> {
-    fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<&'a Deadline>) -> Self {
+    fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<(&'a Deadline, u32)>) -> Self {
         store.set_fuel(fuel).expect("the engine counts fuel");
         let hosted = store.data_mut();
         hosted.meter = Meter::new(fuel);
         hosted.limits.forget_refusal();
         hosted.printed.begin();
-        let armed = deadline.map(|deadline| deadline.arm(store));
+        let armed = deadline.map(|(deadline, times)| deadline.arm(store, times));
         if armed.is_none() {
             store.set_epoch_deadline(u64::MAX / 2);
         }

@@ -12,9 +12,10 @@ use serde_json::Value;
 
 use super::told::Told;
 use crate::input::Remap;
-use crate::journal::Identity;
+use crate::journal::{CLOCK_OF_VEHICLE, Identity};
 use crate::replay::Options;
-use crate::replay::stage::DriveError;
+use crate::replay::open::DriveError;
+use crate::stage::Asked;
 
 /// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at most.
 const EXTRAS_BYTES: u64 = 256 << 20;
@@ -68,6 +69,15 @@ impl Claim {
 
     fn open(path: &Path, bytes: Box<dyn Read + Send>, is_part: bool, told: Told) -> Result<Self, Failure> {
         let reader = Reader::open(bytes).map_err(|error| unusable(path, &error))?;
+        if reader.header().clock == CLOCK_OF_VEHICLE {
+            let message = format!("`{}` was recorded live, and cannot be verified yet", path.display());
+            let mut failure = Failure::new(Exit::Usage, message);
+            failure.causes = vec![
+                "lambda and recorder each received the samples by themselves, and the clip has the recorder's stamps"
+                    .to_owned(),
+            ];
+            return Err(failure.with_help("replay the lambda over the clip: gleaner replay DIR CLIP"));
+        }
         Ok(Self { path: path.to_owned(), reader, is_part, told })
     }
 
@@ -107,14 +117,14 @@ impl Claim {
         } else {
             remaps
         };
-        let mut options = Options { lambda, build, drives, config: Vec::new(), remaps };
+        let mut asked = Asked { lambda, build, config: Vec::new(), remaps };
         // The files first: in those of another lambda, the journal's config may not even exist.
         let without_config = Header { config: serde_json::Map::new(), ..header.clone() };
-        compare(&without_config, &options, manifest)?;
+        compare(&without_config, &asked, manifest)?;
         let set = if set.is_empty() { assignments(header) } else { set };
-        options.config = ConfigSet::resolve(manifest, &set)?;
-        compare(header, &options, manifest)?;
-        Ok(options)
+        asked.config = ConfigSet::resolve(manifest, &set)?;
+        compare(header, &asked, manifest)?;
+        Ok(Options { asked, drives })
     }
 }
 
@@ -129,8 +139,8 @@ fn assignments(header: &Header) -> Vec<(String, String)> {
     header.config.iter().map(|(key, value)| (key.clone(), text(value))).collect()
 }
 
-fn compare(header: &Header, options: &Options, manifest: &Manifest) -> Result<(), Failure> {
-    let Options { build, config, remaps, .. } = options;
+fn compare(header: &Header, asked: &Asked, manifest: &Manifest) -> Result<(), Failure> {
+    let Asked { build, config, remaps, .. } = asked;
     let (engine, clock) = (header.engine.clone(), header.clock.as_str());
     let now = Identity { manifest, build, config, remaps, engine, clock }.header()?;
     match header.differs_from(&now) {

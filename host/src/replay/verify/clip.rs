@@ -14,7 +14,8 @@ use super::told::Told;
 use super::{Claim, Proved, Remake, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
 use crate::api::trace::offered;
-use crate::replay::{Load, Options};
+use crate::replay::Options;
+use crate::stage::Load;
 
 /// A sample may be newer than the one that caused a wake by so much, where each topic has a thread of its own.
 const SLACK_NS: i64 = 1_000_000_000;

@@ -10,11 +10,12 @@ use gleaner_transport::replay::{Replay, Step};
 use super::{Claim, Proved, Remake, counts_differ, different, seconds};
 use crate::api::data::{Topic, Wake};
 use crate::api::trace::offered;
+use crate::replay::Options;
 use crate::replay::course::{self, Course};
 use crate::replay::digests::Digests;
-use crate::replay::stage::{DriveError, open_drives};
-use crate::replay::{Load, Options};
+use crate::replay::open::{DriveError, open_drives};
 use crate::schedule::Schedule;
+use crate::stage::Load;
 
 pub(super) fn prove(
     options: &Options,

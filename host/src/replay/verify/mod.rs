@@ -21,12 +21,12 @@ use gleaner_protocol::{Failure, Verified};
 use gleaner_transport::Transport;
 
 use self::claim::different;
-use super::stage::{Stage, not_started};
-use super::{Load, Options};
+use super::Options;
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
 use crate::journal::Scribe;
 use crate::judge::Judge;
+use crate::stage::{Bounds, Load, Stage, not_started};
 
 pub(super) fn run(
     options: &Options,
@@ -81,12 +81,13 @@ struct Remake {
 impl Remake {
     /// The lambda after its `init`, with the drive that fills its inputs.
     fn start<T: Transport>(
-        drive: T,
+        mut drive: T,
         options: &Options,
         manifest: &Manifest,
         load: Load<'_>,
     ) -> Result<(Self, T, Vec<Arc<Topic>>), Failure> {
-        let Stage { drive, inputs, session, mut guest } = Stage::set(drive, options, manifest, load)?;
+        let Stage { inputs, session, mut guest } =
+            Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
         let lambda = manifest.lambda.name.to_string();
         let engine = guest.engine();
         if let Err(fault) = guest.init() {

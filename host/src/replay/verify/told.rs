@@ -35,7 +35,8 @@ impl Told {
                         }
                     }
                 }
-                "gleaner.decision" if value("lambda") == lambda => {
+                // A command is no trigger of the lambda: its journal does not have it.
+                "gleaner.decision" if value("lambda") == lambda && !values.contains_key("source") => {
                     let score = values.get("score").map_or("none", String::as_str);
                     told.moments.push(moment(value("at_ns"), value("kind"), value("label"), score));
                 }

@@ -1,9 +1,17 @@
 //! How a domain is joined.
 
-use std::net::IpAddr;
+use std::error::Error;
+use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
 use super::Clock;
+
+/// The highest domain whose ports exist.
+const LAST_DOMAIN: u16 = 232;
+const DOMAIN: &str = "ROS_DOMAIN_ID";
+const DOMAINS: &str = "it may be a number from 0 to 232";
+/// The environment is not longer where it means well.
+const PREFIXES: usize = 256;
 
 /// A distribution of ROS 2, as far as nodes of others have to know it of us.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -25,10 +33,12 @@ pub struct Options {
     pub node: String,
     /// The distribution of the others; `None`: found out from what they say.
     pub distro: Option<Distro>,
-    /// Bytes of the largest sample, by which socket buffers are sized.
+    /// Bytes of the largest sample, by which socket buffers are sized; 0 if no samples are to be received.
     pub largest: usize,
     /// Folders with message definitions, looked through first.
     pub messages: Vec<PathBuf>,
+    /// Where ROS 2 is installed, looked through last; `AMENT_PREFIX_PATH`.
+    pub prefixes: Vec<PathBuf>,
     /// The clock of receive stamps.
     pub clock: Clock,
 }
@@ -42,6 +52,151 @@ pub enum DdsError {
         /// The domain.
         domain: u16,
         /// What the library says.
-        source: Box<dyn std::error::Error + Send + Sync>,
+        source: Box<dyn Error + Send + Sync>,
     },
+    /// An environment variable has a value that means nothing.
+    #[error("{variable} is `{value}`; {wanted}")]
+    Setting {
+        /// The variable.
+        variable: &'static str,
+        /// Its value, made fit to be shown.
+        value: String,
+        /// What it may be.
+        wanted: &'static str,
+    },
+    /// What should be a name is none in ROS 2.
+    #[error("`{name}` is not {what}")]
+    Name {
+        /// The name, made fit to be shown.
+        name: String,
+        /// What it should be.
+        what: &'static str,
+    },
+    /// No writer.
+    #[error("cannot write topic `{topic}`")]
+    Advertise {
+        /// The topic.
+        topic: String,
+        /// What the library says.
+        source: Box<dyn Error + Send + Sync>,
+    },
+    /// A message was not sent.
+    #[error("a message of topic `{topic}` was not sent: {why}")]
+    Write {
+        /// The topic.
+        topic: String,
+        /// Why.
+        why: String,
+    },
+}
+
+impl Options {
+    /// Domain 0 on all interfaces as `node`, for samples of up to 8 MiB, with the time of day as clock.
+    pub fn new(node: impl Into<String>) -> Self {
+        Self {
+            domain: 0,
+            interfaces: Vec::new(),
+            node: node.into(),
+            distro: None,
+            largest: 8 << 20,
+            messages: Vec::new(),
+            prefixes: Vec::new(),
+            clock: Clock::of_today(),
+        }
+    }
+
+    /// As the environment of ROS 2 says: `ROS_DOMAIN_ID`, `ROS_LOCALHOST_ONLY`, `ROS_AUTOMATIC_DISCOVERY_RANGE`,
+    /// `ROS_DISTRO` and `AMENT_PREFIX_PATH`; otherwise as [`Options::new`].
+    ///
+    /// # Errors
+    ///
+    /// [`DdsError::Setting`] if a variable has a value that means nothing.
+    pub fn from_env(node: impl Into<String>) -> Result<Self, DdsError> {
+        Self::read(node.into(), |variable| std::env::var_os(variable).map(|value| value.to_string_lossy().into_owned()))
+    }
+
+    /// Namespace and name of the node, if all is as it must be.
+    pub(super) fn checked(&self) -> Result<(String, String), DdsError> {
+        if self.domain > LAST_DOMAIN {
+            return Err(setting(DOMAIN, &self.domain.to_string(), DOMAINS));
+        }
+        let what = "a node's namespace and name";
+        super::names::node(&self.node).ok_or_else(|| DdsError::Name { name: super::names::visible(&self.node), what })
+    }
+
+    fn read(node: String, variable: impl Fn(&str) -> Option<String>) -> Result<Self, DdsError> {
+        let variable = |name| variable(name).filter(|value| !value.is_empty());
+        let mut options = Self::new(node);
+        if let Some(value) = variable(DOMAIN) {
+            let domain = value.parse().ok().filter(|domain| *domain <= LAST_DOMAIN);
+            options.domain = domain.ok_or_else(|| setting(DOMAIN, &value, DOMAINS))?;
+        }
+        let range = variable("ROS_AUTOMATIC_DISCOVERY_RANGE");
+        let here = match range.as_deref().map(str::to_ascii_uppercase).as_deref() {
+            None | Some("SUBNET" | "SYSTEM_DEFAULT") => variable("ROS_LOCALHOST_ONLY").as_deref() == Some("1"),
+            Some("LOCALHOST") => true,
+            Some(_) => {
+                let wanted = "Gleaner knows SUBNET, LOCALHOST and SYSTEM_DEFAULT";
+                return Err(setting("ROS_AUTOMATIC_DISCOVERY_RANGE", &range.unwrap_or_default(), wanted));
+            }
+        };
+        if here {
+            options.interfaces = vec![IpAddr::V4(Ipv4Addr::LOCALHOST)];
+        }
+        options.distro = match variable("ROS_DISTRO").as_deref() {
+            Some("foxy" | "galactic" | "humble") => Some(Distro::Humble),
+            Some("iron" | "jazzy" | "kilted" | "lyrical" | "rolling") => Some(Distro::Newer),
+            // One that is not known yet is found out as if nothing were said.
+            _ => None,
+        };
+        if let Some(value) = variable("AMENT_PREFIX_PATH") {
+            let prefixes = value.split(':').filter(|prefix| !prefix.is_empty());
+            options.prefixes = prefixes.take(PREFIXES).map(PathBuf::from).collect();
+        }
+        Ok(options)
+    }
+}
+
+fn setting(variable: &'static str, value: &str, wanted: &'static str) -> DdsError {
+    DdsError::Setting { variable, value: super::names::visible(value), wanted }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(variables: &[(&str, &str)]) -> Result<Options, DdsError> {
+        Options::read("/n".to_owned(), |name| {
+            variables.iter().find(|(known, _)| *known == name).map(|(_, value)| (*value).to_owned())
+        })
+    }
+
+    #[test]
+    fn an_empty_environment_means_domain_0_on_all_interfaces() {
+        let options = read(&[("ROS_DOMAIN_ID", ""), ("ROS_DISTRO", "")]).unwrap();
+        assert_eq!((options.domain, options.interfaces.len(), options.distro), (0, 0, None));
+    }
+
+    #[test]
+    fn the_environment_of_ros_is_understood() {
+        let all = [("ROS_DOMAIN_ID", "232"), ("ROS_DISTRO", "humble"), ("AMENT_PREFIX_PATH", "/opt/a::/opt/b")];
+        let options = read(&all).unwrap();
+        assert_eq!((options.domain, options.distro), (232, Some(Distro::Humble)));
+        assert_eq!(options.prefixes, [PathBuf::from("/opt/a"), PathBuf::from("/opt/b")]);
+        assert_eq!(read(&[("ROS_DISTRO", "jazzy")]).unwrap().distro, Some(Distro::Newer));
+        assert_eq!(read(&[("ROS_DISTRO", "unheard-of")]).unwrap().distro, None);
+        for here in [("ROS_LOCALHOST_ONLY", "1"), ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")] {
+            assert_eq!(read(&[here]).unwrap().interfaces, [IpAddr::V4(Ipv4Addr::LOCALHOST)]);
+        }
+        assert_eq!(read(&[("ROS_LOCALHOST_ONLY", "0")]).unwrap().interfaces, [] as [IpAddr; 0]);
+    }
+
+    #[test]
+    fn values_that_mean_nothing_are_refused_by_name() {
+        for domain in ["233", "-1", "one", "1 ", "99999999999"] {
+            let error = read(&[("ROS_DOMAIN_ID", domain)]).unwrap_err().to_string();
+            assert_eq!(error, format!("ROS_DOMAIN_ID is `{domain}`; it may be a number from 0 to 232"));
+        }
+        assert!(read(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")]).unwrap_err().to_string().contains("`OFF`"));
+    }
 }

@@ -4,6 +4,7 @@
 //! an MCAP schema or a folder of `.msg` files carries. [`FieldPath`] is one field of it, compiled
 //! once into a short skip program; reading it from CDR bytes walks that program and borrows from
 //! the bytes. [`ImageView`] and [`CompressedView`] are the two types that image work needs whole.
+//! [`Sources`] finds the text where no recording brings it: in folders, bundled, or installed.
 //!
 //! What never happens here: a panic, or an allocation larger than the message, whatever the bytes
 //! claim; knowledge of a particular message type, apart from the two views and the header stamp;
@@ -11,17 +12,21 @@
 
 mod cdr;
 mod definitions;
+mod encode;
 mod layout;
 mod parse;
 mod path;
 mod program;
+mod sources;
 mod stamp;
 mod value;
 mod views;
 
 pub use cdr::{CdrError, Endian};
 pub use definitions::{Definitions, MessageError};
+pub use encode::CdrWriter;
 pub use path::{FieldPath, PathError};
+pub use sources::{Sources, SourcesError};
 pub use stamp::{HeaderStamp, header_stamp};
 pub use value::{Kind, Value};
 pub use views::{CompressedView, ImageView};

@@ -2,7 +2,7 @@
 
 use super::cdr::{CdrError, Cursor, Endian};
 use super::definitions::{Definitions, Struct};
-use super::parse::{Count, Element};
+use super::parse::{Count, Element, Field, Primitive};
 
 /// Reads `header.stamp`, or a leading `stamp`, of one message type.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -44,9 +44,16 @@ fn first<'d>(definitions: &'d Definitions, owner: &'d Struct) -> Option<(&'d str
     }
 }
 
+/// A drive may define the name otherwise: then what stands there is no stamp.
 fn is_time(found: &Struct) -> bool {
-    let fields = found.fields.iter().map(|field| field.name.as_str());
-    found.name == "builtin_interfaces/Time" && fields.eq(["sec", "nanosec"])
+    let is = |field: &Field<usize>, name: &str, primitive| {
+        field.name == name
+            && field.count == Count::One
+            && matches!(&field.element, Element::Primitive(p) if *p == primitive)
+    };
+    found.name == "builtin_interfaces/Time"
+        && matches!(&found.fields[..], [sec, nanosec]
+            if is(sec, "sec", Primitive::I32) && is(nanosec, "nanosec", Primitive::U32))
 }
 
 #[cfg(test)]
@@ -55,6 +62,15 @@ mod tests {
 
     fn stamp_of(text: &str) -> Option<HeaderStamp> {
         header_stamp(&Definitions::parse("p/T", text).unwrap())
+    }
+
+    #[test]
+    fn what_only_has_the_names_of_a_stamp_is_none() {
+        let text = "builtin_interfaces/Time stamp\n===\nMSG: builtin_interfaces/Time\n";
+        assert!(stamp_of(&format!("{text}int32 sec\nuint32 nanosec\n")).is_some());
+        for other in ["int64 sec\nuint32 nanosec\n", "int32 sec\nint32 nanosec\n", "int32[1] sec\nuint32 nanosec\n"] {
+            assert_eq!(stamp_of(&format!("{text}{other}")), None, "{other}");
+        }
     }
 
     const HEADER: &str = "===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n";

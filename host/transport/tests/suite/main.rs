@@ -1,4 +1,4 @@
-//! The crate through its public interface: messages, replay, channels, damage, extras, loopback.
+//! The crate through its public interface: messages, replay, channels, damage, extras, loopback, sources.
 
 mod channels;
 mod damage;
@@ -6,4 +6,5 @@ mod extras;
 mod loopback;
 mod messages;
 mod replay;
+mod sources;
 mod support;

@@ -50,7 +50,9 @@ impl Parts {
     ///
     /// [`PartsError::Missing`] with every place that was looked at.
     pub fn program(&self, name: &str) -> Result<PathBuf, PartsError> {
-        self.places.first(name, "cargo build --release", |folder| {
+        // It is not built with the rest: see its docs.
+        let how = if name == "gleaner-player" { "cargo xtask player" } else { "cargo build --release" };
+        self.places.first(name, how, |folder| {
             let program = folder.join(name);
             is_program(&program).then_some(program)
         })

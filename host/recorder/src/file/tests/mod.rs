@@ -72,6 +72,7 @@ fn moment(at_ns: i64) -> Moment {
         score: Some(0.5),
         attributes: Some(serde_json::Map::new()),
         at_ns,
+        source: None,
     }
 }
 

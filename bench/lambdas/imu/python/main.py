@@ -1,0 +1,7 @@
+"""Does nothing: what is left is what hosting costs."""
+
+import gleaner
+
+
+def on_event(ctx: gleaner.Context, sample: gleaner.Sample) -> None:
+    pass

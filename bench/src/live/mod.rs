@@ -1,0 +1,162 @@
+//! Live topics: what arrives, how fast it is answered, and what that costs. In a private network, with our player on Cyclone DDS.
+
+mod bare;
+mod rounds;
+
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::{Live, Report};
+use gleaner_tests::live::{Line, Started, no_player, play, run};
+use gleaner_tests::{Folder, namespace, root};
+
+use crate::measure::{Figure, Kind};
+
+/// Set in the process that is alone in its network.
+const ALONE: &str = "GLEANER_BENCH_ALONE";
+
+/// Where the system says how large a socket's buffer may be. It counts for all networks, and can be changed in the first only.
+const BUFFER_LIMIT: &str = "/proc/sys/net/core/rmem_max";
+const BUFFER_BYTES: u64 = 64 << 20;
+
+/// Runs this program again in a network of its own; `None` in the process that is there already.
+///
+/// The limit of socket buffers is raised meanwhile, where that is allowed.
+pub fn elsewhere() -> Option<Result<bool, String>> {
+    if std::env::var_os(ALONE).is_some() {
+        return None;
+    }
+    Some(again())
+}
+
+fn again() -> Result<bool, String> {
+    if let Some(why) = namespace::unavailable().or(no_player()) {
+        return Err(why.to_owned());
+    }
+    let before = std::fs::read_to_string(BUFFER_LIMIT).unwrap_or_default();
+    let is_small = before.trim().parse::<u64>().is_ok_and(|bytes| bytes < BUFFER_BYTES);
+    let raised = is_small && std::fs::write(BUFFER_LIMIT, BUFFER_BYTES.to_string()).is_ok();
+    let exe = std::env::current_exe().map_err(|error| error.to_string())?;
+    let status = namespace::command(&exe).args(std::env::args_os().skip(1)).env(ALONE, "1").status();
+    if raised {
+        // As it was: others on this machine did not ask for it.
+        let _ = std::fs::write(BUFFER_LIMIT, before.trim());
+    }
+    status.map(|status| status.success()).map_err(|error| error.to_string())
+}
+
+/// All figures.
+pub fn figures(quick: bool) -> Vec<Figure> {
+    let seconds = |long: u32| if quick { 4 } else { long };
+    let mut figures = Vec::new();
+    for (name, camera, imu, long) in [
+        ("1080p bgr8 at 30 Hz", Some("1920x1080@30"), None, 60),
+        ("3848x2168 bgr8 at 10 Hz", Some("3848x2168@10"), None, 30),
+        ("IMU at 1 kHz", None, Some("1000"), 60),
+        ("1080p at 30 Hz and an IMU at 1 kHz", Some("1920x1080@30"), Some("1000"), 60),
+    ] {
+        receive(name, camera, imu, seconds(long), &mut figures);
+    }
+    rounds::figures(seconds(60), &mut figures);
+    many(16, seconds(20), &mut figures);
+    figures
+}
+
+fn lambda(name: &str, kind: Kind) -> PathBuf {
+    let folder = if matches!(kind, Kind::Rust) { "rust" } else { "python" };
+    root().join("bench/lambdas").join(name).join(folder)
+}
+
+fn start(lambda: &Path, args: &[&str]) -> (Started, Folder) {
+    let out = Folder::new();
+    let started = run(lambda, out.path(), args);
+    started.until_ready();
+    (started, out)
+}
+
+/// Plays to the end, and then asks how the lambdas were. The statuses of the first one meanwhile go to `seen`.
+fn to_the_end(started: Vec<(Started, Folder)>, player: &[&str], seen: &mut Vec<Live>) -> Vec<Live> {
+    let played = play(player);
+    let mut is_over = false;
+    while !is_over {
+        let live = started[0].0.until("a status", |line| match line {
+            Line::Lambda(Report::Live(live)) => Some(*live),
+            _ => None,
+        });
+        is_over = live.topics[0].received > 0 && live.topics[0].writers == Some(0);
+        seen.push(live);
+    }
+    let played = played.finish();
+    assert!(played.status.success(), "{}", played.said);
+    started.iter().for_each(|(started, _)| started.signal("INT"));
+    started.into_iter().map(|(started, _out)| started.finish().ended()).collect()
+}
+
+fn receive(name: &str, camera: Option<&str>, imu: Option<&str>, seconds: u32, figures: &mut Vec<Figure>) {
+    let mut started = Vec::new();
+    let duration = seconds.to_string();
+    let mut player = vec!["--wait", "1", "--duration", &duration];
+    for (topic, flag, what) in [("camera", "--synthetic", camera), ("imu", "--imu", imu)] {
+        if let Some(what) = what {
+            started.push(start(&lambda(topic, Kind::Rust), &["--no-record"]));
+            player.extend([flag, what]);
+        }
+    }
+    let mut seen = Vec::new();
+    let ended = to_the_end(started, &player, &mut seen);
+    for live in &ended {
+        let topic = &live.topics[0];
+        let of = if ended.len() > 1 { format!("{name}: {}", topic.name) } else { name.to_owned() };
+        let refused = topic.no_slot + topic.too_big + topic.malformed;
+        let granted = live.network.buffer_granted >= live.network.buffer_asked;
+        let buffer = live.network.buffer_granted as f64 / f64::from(1 << 20);
+        figures.push(Figure::told(&format!("{of}: received in {seconds} s"), "samples", &[topic.received as f64]));
+        let lost = format!(
+            "{of}: lost, with a socket buffer of {buffer:.0} MiB{}",
+            if granted { "" } else { " (not granted)" }
+        );
+        let count = topic.lost.unwrap_or(u64::MAX) + refused;
+        figures.push(if granted {
+            Figure::at_most(&lost, "samples", 0.0, &[count as f64])
+        } else {
+            Figure::told(&lost, "samples", &[count as f64])
+        });
+        let cpu = 100.0 * live.cpu_s / live.up_s;
+        figures.push(Figure::told(&format!("{of}: share of a core"), "%", &[cpu]));
+        if let Some(wake_up) = live.wake_up {
+            let times = [wake_up.p50_ns, wake_up.p99_ns].map(|ns| ns as f64 / 1e3);
+            figures.push(Figure::told(&format!("{of}: wake-up, median and 99 %"), "us", &times));
+        }
+    }
+    // Once everything is warm, until the end.
+    let rss = |live: &Live| live.rss_bytes as f64 / f64::from(1 << 20);
+    if let (Some(warm), Some(last)) = (seen.get(seen.len() / 4), seen.last()) {
+        let growth = 100.0 * (rss(last) / rss(warm) - 1.0);
+        figures.push(Figure::told(&format!("{name}: resident memory"), "MiB", &[rss(last)]));
+        figures.push(Figure::at_most(&format!("{name}: its growth after a quarter of the time"), "%", 2.0, &[growth]));
+    }
+}
+
+/// So many runtimes on one machine: whether all find the one publisher, and what they take.
+fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
+    let started: Vec<_> = (0..count).map(|_| start(&lambda("imu", Kind::Rust), &["--no-record"])).collect();
+    let (count, duration) = (count.to_string(), seconds.to_string());
+    let ended = to_the_end(started, &["--imu", "100", "--wait", &count, "--duration", &duration], &mut Vec::new());
+    let heard = ended.iter().filter(|live| live.topics[0].received > 0).count();
+    let whole = ended.iter().filter(|live| live.topics[0].lost == Some(0)).count();
+    figures.push(Figure::at_least(
+        &format!("{count} runtimes: found the publisher"),
+        "runtimes",
+        ended.len() as f64,
+        &[heard as f64],
+    ));
+    figures.push(Figure::at_least(
+        &format!("{count} runtimes: lost nothing"),
+        "runtimes",
+        ended.len() as f64,
+        &[whole as f64],
+    ));
+    let pss: Vec<f64> = ended.iter().map(|live| live.rss_bytes as f64 / f64::from(1 << 20)).collect();
+    figures.push(Figure::told(&format!("{count} runtimes: resident memory of each"), "MiB", &pss));
+    let cpu: Vec<f64> = ended.iter().map(|live| 100.0 * live.cpu_s / live.up_s).collect();
+    figures.push(Figure::told(&format!("{count} runtimes: share of a core of each"), "%", &cpu));
+}

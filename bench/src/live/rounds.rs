@@ -1,0 +1,105 @@
+//! The way from a sample to its answer: an empty lambda of each kind, and a reader that does nothing but that, in one run.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use gleaner_transport::dds::{Dds, Options};
+use gleaner_transport::message::{Definitions, FieldPath, Sources};
+use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+
+use super::bare::Bare;
+use super::{lambda, start, to_the_end};
+use crate::measure::{Figure, Kind};
+
+const ANSWER: &str = "sensor_msgs/msg/TimeReference";
+/// Goal: how many times as long as the bare reader a lambda may take.
+const RATIO: f64 = 1.5;
+
+/// Collects answers, in ns from input to decision.
+struct Answers {
+    paths: [FieldPath; 4],
+    ns: Mutex<Vec<f64>>,
+}
+
+impl Answers {
+    fn new() -> Arc<Self> {
+        let sources = Sources::new(&[], &[]);
+        let text = sources.find(ANSWER).expect("bundled definitions are sound").expect("a type of common_interfaces");
+        let definitions = Definitions::parse(ANSWER, &text).expect("bundled definitions are sound");
+        let path = |path: &str| FieldPath::compile(&definitions, path).expect("a field of the type");
+        let paths = ["header.stamp.sec", "header.stamp.nanosec", "time_ref.sec", "time_ref.nanosec"].map(path);
+        Arc::new(Self { paths, ns: Mutex::default() })
+    }
+
+    fn take(&self) -> Vec<f64> {
+        std::mem::take(&mut self.ns.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+impl Sink for Answers {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        let [a, b, c, d] = [0, 1, 2, 3].map(|n| self.paths[n].number(cdr, meta.endian).unwrap_or(f64::NAN));
+        self.ns.lock().unwrap_or_else(PoisonError::into_inner).push((c - a) * 1e9 + (d - b));
+        Verdict::Taken
+    }
+}
+
+pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
+    let mut dds = Dds::open(Options::new("/gleaner_bench/answers")).expect("a private network can be joined");
+    let mut collect = |topic: &str| {
+        let answers = Answers::new();
+        let spec = TopicSpec {
+            topic: topic.to_owned(),
+            type_name: ANSWER.to_owned(),
+            queue: 1024,
+            max_bytes: 4096,
+            qos: Qos::Auto,
+        };
+        dds.subscribe(&spec, answers.clone()).expect("a topic of ours");
+        answers
+    };
+    let kinds = [Kind::Rust, Kind::Python].map(|kind| (kind, collect(&format!("/rtt/{kind}"))));
+    let bare = Bare::start("/imu/synthetic", "/rtt/bare");
+    let started =
+        kinds.iter().map(|(kind, _)| start(&lambda("imu", *kind), &["--no-record", "--rtt", &format!("/rtt/{kind}")]));
+    let started = started.collect();
+    let duration = seconds.to_string();
+    let player = ["--imu", "100", "--stamp", "monotonic", "--wait", "3", "--duration", &duration];
+    let ended = to_the_end(started, &player, &mut Vec::new());
+    // The last answers may be on their way.
+    std::thread::sleep(Duration::from_millis(200));
+    let base = bare.stop();
+    told("bare reader", &base, figures);
+    let base = median(&base);
+    for (((kind, answers), live), goals) in kinds.iter().zip(&ended).zip([[20.0, 100.0], [30.0, 150.0]]) {
+        let ns = answers.take();
+        told(&format!("empty lambda, {kind}"), &ns, figures);
+        figures.push(Figure::at_most(
+            &format!("IMU round trip at 100 Hz, empty lambda, {kind}, against the bare reader"),
+            "times",
+            RATIO,
+            &[median(&ns) / base],
+        ));
+        let spreads =
+            [("sample received to lambda entered", live.wake_up), ("lambda left to decision out", live.hand_out)];
+        for (what, spread) in spreads.iter().filter_map(|(what, spread)| Some((what, (*spread)?))) {
+            let us = |ns: u64| ns as f64 / 1e3;
+            figures.push(Figure::at_most(&format!("{what}, {kind}, median"), "us", goals[0], &[us(spread.p50_ns)]));
+            figures.push(Figure::at_most(&format!("{what}, {kind}, 99 %"), "us", goals[1], &[us(spread.p99_ns)]));
+        }
+    }
+}
+
+fn told(who: &str, ns: &[f64], figures: &mut Vec<Figure>) {
+    let mut sorted = ns.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let at = |share: f64| sorted.get((share * sorted.len() as f64) as usize).copied().unwrap_or(f64::NAN) / 1e3;
+    let name = format!("IMU round trip at 100 Hz, {who}: median, 99 %");
+    figures.push(Figure::told(&name, "us", &[at(0.5), at(0.99)]));
+}
+
+fn median(ns: &[f64]) -> f64 {
+    let mut sorted = ns.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
+}

@@ -1,0 +1,99 @@
+//! The recorder under load: 20 MB/s on ten topics, from the loopback transport, at the pace of a vehicle.
+//!
+//! - `inline`: as a replay has it, in one thread.
+//! - `process`: as a vehicle has it: the whole program, but for the network and a process of its own.
+
+mod inline;
+mod process;
+
+use gleaner_protocol::journal::{Entry, Header, Said, Seen, Woken};
+use gleaner_protocol::{Trigger, TriggerKind};
+use gleaner_transport::{Endian, Guid, SampleMeta};
+
+pub use inline::record;
+pub use process::record_live;
+
+const TYPE: &str = "std_msgs/msg/ByteMultiArray";
+/// Of the camera: with it, all topics together make 20 MB/s.
+const FRAME_BYTES: usize = 652_000;
+const FRAMES_PER_S: u64 = 30;
+const IMU_BYTES: usize = 324;
+const IMU_PER_FRAME: u64 = 10;
+const STATUS_BYTES: usize = 1000;
+const STATUS_TOPICS: usize = 8;
+
+/// What comes: a camera, an IMU, and eight topics of little.
+struct Traffic {
+    names: Vec<String>,
+    frame: Vec<u8>,
+    status: Vec<u8>,
+}
+
+impl Traffic {
+    fn new() -> Traffic {
+        let status = (0..STATUS_TOPICS).map(|n| format!("/status_{n}"));
+        let names = ["/camera".to_owned(), "/imu".to_owned()].into_iter().chain(status).collect();
+        // Like a JPEG, it cannot be made smaller.
+        let mut noise = 0x2545_f491_4f6c_dd1d_u64;
+        let noise = std::iter::repeat_with(|| {
+            noise ^= noise << 13;
+            noise ^= noise >> 7;
+            noise ^= noise << 17;
+            noise as u8
+        });
+        Traffic { names, frame: noise.take(FRAME_BYTES).collect(), status: vec![7; STATUS_BYTES] }
+    }
+
+    fn topics(&self) -> &[String] {
+        &self.names
+    }
+
+    /// What comes with frame `n`, at `at_ns` and until the next one.
+    fn frame(&self, n: u64, at_ns: i64, mut publish: impl FnMut(&str, &SampleMeta, &[u8])) {
+        let mut publish = |name: &str, at_ns: i64, seq: u64, cdr: &[u8]| {
+            let (writer, endian) = (Guid::default(), Endian::Little);
+            publish(name, &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian, options: [0; 2] }, cdr);
+        };
+        publish("/camera", at_ns, n + 1, &self.frame);
+        for i in 0..IMU_PER_FRAME {
+            publish("/imu", at_ns + i as i64 * 3_000_000, n * IMU_PER_FRAME + i + 1, &self.frame[..IMU_BYTES]);
+        }
+        for name in &self.names[2..] {
+            publish(name, at_ns + 30_000_000, n + 1, &self.status);
+        }
+    }
+}
+
+fn header() -> Header {
+    Header {
+        gleaner: env!("CARGO_PKG_VERSION").to_owned(),
+        engine: "none".to_owned(),
+        machine: std::env::consts::ARCH.to_owned(),
+        lambda: "load".to_owned(),
+        version: "0.1.0".to_owned(),
+        kind: gleaner_protocol::manifest::Kind::Wasm,
+        files: Vec::new(),
+        models: Vec::new(),
+        manifest: String::new(),
+        inputs: Vec::new(),
+        event_input: None,
+        config: serde_json::Map::new(),
+        remaps: Vec::new(),
+        clock: "monotonic".to_owned(),
+        wakes_before: 0,
+    }
+}
+
+fn wake(at_ns: i64, triggers: bool) -> Entry {
+    let trigger =
+        Trigger { kind: TriggerKind::Event, label: "load".to_owned(), score: None, attributes: serde_json::Map::new() };
+    Entry {
+        at_ns,
+        cause: Woken::Tick { missed: 0 },
+        seen: Vec::<Seen>::new(),
+        triggers: if triggers { vec![trigger] } else { Vec::new() },
+        fault: None,
+        fuel: Some(1000),
+        log: Said::default(),
+    }
+}

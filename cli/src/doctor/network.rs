@@ -1,0 +1,174 @@
+//! The network of this machine, as far as DDS depends on it.
+
+use std::fs;
+use std::net::Ipv4Addr;
+
+use nix::ifaddrs::getifaddrs;
+use nix::net::if_::InterfaceFlags;
+
+use super::Finding;
+
+const UP: InterfaceFlags = InterfaceFlags::IFF_UP;
+const MULTICAST: InterfaceFlags = InterfaceFlags::IFF_MULTICAST;
+
+/// Largest socket buffer that a runtime asks for.
+const BUFFER_BYTES: u64 = 64 << 20;
+/// What a socket filter of ours takes, and some more: see `docs/dds-limits.md`.
+const FILTER_BYTES: u64 = 128 << 10;
+/// Participants on one host that find each other without multicast: RustDDS announces itself to the first twelve by address.
+const WITHOUT_MULTICAST: usize = 12;
+
+/// An interface of this machine.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Interface {
+    name: String,
+    flags: InterfaceFlags,
+}
+
+pub(super) fn findings() -> Vec<Finding> {
+    let buffer = fs::read_to_string("/proc/sys/net/core/rmem_max");
+    let filters = fs::read_to_string("/proc/sys/net/core/optmem_max");
+    let routes = fs::read_to_string("/proc/net/route").unwrap_or_default();
+    let localhost_only = std::env::var("ROS_LOCALHOST_ONLY").is_ok_and(|value| value == "1")
+        || std::env::var("ROS_AUTOMATIC_DISCOVERY_RANGE").is_ok_and(|range| range.eq_ignore_ascii_case("localhost"));
+    vec![
+        socket_buffer(buffer.ok().and_then(|text| text.trim().parse().ok())),
+        socket_filter(filters.ok().and_then(|text| text.trim().parse().ok())),
+        discovery(&interfaces(), &routes, localhost_only),
+        domain(std::env::var("ROS_DOMAIN_ID").ok().as_deref()),
+    ]
+}
+
+fn socket_buffer(most: Option<u64>) -> Finding {
+    const ABOUT: &str = "socket buffer";
+    let help = format!("for images: `sysctl -w net.core.rmem_max={BUFFER_BYTES}`, and the same in /etc/sysctl.d");
+    match most {
+        None => Finding::warning(ABOUT, "the system does not tell its limit", help),
+        Some(most) if most >= BUFFER_BYTES => Finding::fine(ABOUT, format!("up to {} MiB", most >> 20)),
+        Some(most) => {
+            let kib = most >> 10;
+            Finding::warning(ABOUT, format!("{kib} KiB at most: bursts of large messages will be lost"), help)
+        }
+    }
+}
+
+fn socket_filter(most: Option<u64>) -> Finding {
+    const ABOUT: &str = "socket filter";
+    let help = format!("`sysctl -w net.core.optmem_max={FILTER_BYTES}`, and the same in /etc/sysctl.d");
+    match most {
+        Some(most) if most >= FILTER_BYTES => Finding::fine(ABOUT, format!("up to {} KiB", most >> 10)),
+        _ => {
+            let found = "no room for the one that keeps hostile fragments from taking all memory";
+            Finding::warning(ABOUT, found, help)
+        }
+    }
+}
+
+fn discovery(interfaces: &[Interface], routes: &str, localhost_only: bool) -> Finding {
+    const ABOUT: &str = "discovery";
+    let usable = |interface: &&Interface| {
+        interface.flags.contains(UP | MULTICAST)
+            && (!localhost_only || interface.name == "lo")
+            && has_multicast_route(routes, &interface.name)
+    };
+    let by: Vec<&str> = interfaces.iter().filter(usable).map(|interface| interface.name.as_str()).collect();
+    if !by.is_empty() {
+        return Finding::fine(ABOUT, format!("multicast by {}", by.join(", ")));
+    }
+    let found = format!(
+        "no interface carries multicast: participants of this machine find each other only up to {WITHOUT_MULTICAST}, and other machines not at all"
+    );
+    let help = format!(
+        "more than {WITHOUT_MULTICAST} lambdas need it: `ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo`"
+    );
+    Finding::warning(ABOUT, found, help)
+}
+
+/// Whether multicast leaves by this interface: it has a route of its own for it, or the default one.
+fn has_multicast_route(routes: &str, interface: &str) -> bool {
+    // Interface, destination, gateway, flags, references, use, metric, mask; addresses as the CPU holds them.
+    routes.lines().skip(1).any(|line| {
+        let mut words = line.split_whitespace();
+        let (Some(name), Some(destination)) = (words.next(), words.next()) else { return false };
+        let mask = words.nth(5);
+        let address = |word: Option<&str>| {
+            let bits = u32::from_str_radix(word?, 16).ok()?;
+            Some(Ipv4Addr::from(bits.to_ne_bytes()))
+        };
+        let (Some(destination), Some(mask)) = (address(Some(destination)), address(mask)) else { return false };
+        // The group that every participant joins.
+        let group = Ipv4Addr::new(239, 255, 0, 1);
+        name == interface && u32::from(group) & u32::from(mask) == u32::from(destination)
+    })
+}
+
+fn domain(id: Option<&str>) -> Finding {
+    const ABOUT: &str = "ROS_DOMAIN_ID";
+    match id {
+        None => Finding::fine(ABOUT, "not set: domain 0"),
+        Some(id) => match id.trim().parse::<u16>() {
+            Ok(domain) if domain <= 232 => Finding::fine(ABOUT, format!("domain {domain}")),
+            _ => Finding::warning(ABOUT, format!("`{}` is no domain", gleaner_protocol::visible(id)), "use 0 to 232"),
+        },
+    }
+}
+
+/// Those of the network that this process is in, each once.
+fn interfaces() -> Vec<Interface> {
+    let mut interfaces: Vec<Interface> = Vec::new();
+    for address in getifaddrs().into_iter().flatten() {
+        if !interfaces.iter().any(|known| known.name == address.interface_name) {
+            interfaces.push(Interface { name: address.interface_name, flags: address.flags });
+        }
+    }
+    interfaces
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::State;
+    use super::*;
+
+    const HEAD: &str = "Iface\tDestination\tGateway\tFlags\tRefCnt\tUse\tMetric\tMask\tMTU\tWindow\tIRTT\n";
+
+    fn interface(name: &str, flags: InterfaceFlags) -> Interface {
+        Interface { name: name.to_owned(), flags }
+    }
+
+    #[cfg(target_endian = "little")]
+    #[test]
+    fn more_than_twelve_runtimes_need_multicast_and_a_route_for_it() {
+        let lo = [interface("lo", UP | MULTICAST)];
+        let route = format!("{HEAD}lo\t000000E0\t00000000\t0001\t0\t0\t0\t000000F0\t0\t0\t0\n");
+        assert_eq!(discovery(&lo, &route, true).state, State::Fine);
+        assert_eq!(discovery(&lo, HEAD, true).state, State::Warning);
+        assert_eq!(discovery(&[interface("lo", UP)], &route, true).state, State::Warning);
+        assert!(discovery(&lo, HEAD, true).help.unwrap().contains("more than 12 lambdas"));
+    }
+
+    #[cfg(target_endian = "little")]
+    #[test]
+    fn the_default_route_carries_multicast_unless_only_this_machine_is_meant() {
+        let interfaces = [interface("eth0", UP | MULTICAST), interface("lo", UP)];
+        let route = format!("{HEAD}eth0\t00000000\t0100000A\t0003\t0\t0\t0\t00000000\t0\t0\t0\n");
+        assert_eq!(discovery(&interfaces, &route, false).found, "multicast by eth0");
+        assert_eq!(discovery(&interfaces, &route, true).state, State::Warning);
+        let down = [interface("eth0", MULTICAST)];
+        assert_eq!(discovery(&down, &route, false).state, State::Warning);
+    }
+
+    #[test]
+    fn a_small_socket_buffer_is_named_with_the_way_out() {
+        assert_eq!(socket_buffer(Some(64 << 20)).state, State::Fine);
+        let small = socket_buffer(Some(212_992));
+        assert_eq!(small.found, "208 KiB at most: bursts of large messages will be lost");
+        assert!(small.help.unwrap().contains("net.core.rmem_max=67108864"));
+    }
+
+    #[test]
+    fn a_domain_that_is_none_is_said() {
+        assert_eq!(domain(Some("42")).found, "domain 42");
+        assert_eq!(domain(Some("233")).state, State::Warning);
+        assert_eq!(domain(Some("x\n")).found, "`x\\n` is no domain");
+    }
+}

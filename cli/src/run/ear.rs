@@ -1,0 +1,123 @@
+//! What the processes of a run report, and what is shown of it.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::Report;
+use gleaner_protocol::link::{Loss, RecorderReport};
+
+use super::screen::Screen;
+
+/// What is heard of a process.
+pub(super) enum Heard {
+    /// The lambda's process reports.
+    Runtime(Report),
+    /// The recorder reports.
+    Recorder(RecorderReport),
+    /// A report that cannot be understood.
+    Garbled(String),
+    /// Something for people.
+    Said(Vec<u8>),
+}
+
+/// Hears all of them.
+pub(super) struct Ear {
+    heard: Receiver<Heard>,
+    /// The lambda has had its `init`.
+    pub(super) is_ready: bool,
+    /// It has faulted.
+    pub(super) has_faulted: bool,
+    /// Its last report has come.
+    pub(super) has_ended: bool,
+}
+
+impl Ear {
+    pub(super) fn new(heard: Receiver<Heard>) -> Self {
+        Self { heard, is_ready: false, has_faulted: false, has_ended: false }
+    }
+
+    /// Shows what is heard for so long, or until all streams are closed.
+    pub(super) fn listen(&mut self, screen: &mut Screen, patience: Duration) {
+        let until = Instant::now() + patience;
+        while let Ok(heard) = self.heard.recv_timeout(until.saturating_duration_since(Instant::now())) {
+            self.show(heard, screen);
+        }
+    }
+
+    /// Shows what is heard, until nothing is there; but not longer than this, or a flood would keep us from all else.
+    pub(super) fn look(&mut self, screen: &mut Screen, patience: Duration) {
+        let until = Instant::now() + patience;
+        let mut wait = patience;
+        loop {
+            match self.heard.recv_timeout(wait) {
+                Ok(heard) => self.show(heard, screen),
+                Err(RecvTimeoutError::Timeout) => return,
+                // Whoever asks again and again shall not be busy.
+                Err(RecvTimeoutError::Disconnected) => return thread::sleep(Duration::from_millis(10)),
+            }
+            if Instant::now() >= until {
+                return;
+            }
+            wait = Duration::ZERO;
+        }
+    }
+
+    fn show(&mut self, heard: Heard, screen: &mut Screen) {
+        match heard {
+            Heard::Said(piece) => screen.err(&piece),
+            Heard::Garbled(line) => screen.warn(&format!("a report that nobody understands: {line}")),
+            Heard::Runtime(report) => {
+                screen.report(&report);
+                self.show_runtime(report, screen);
+            }
+            Heard::Recorder(report) => {
+                screen.report(&report);
+                show_recorder(report, screen);
+            }
+        }
+    }
+
+    fn show_runtime(&mut self, report: Report, screen: &mut Screen) {
+        match report {
+            Report::Ready => {
+                self.is_ready = true;
+                screen.say("running; ctrl-C ends it\n");
+            }
+            Report::Decision(decision) => {
+                self.has_faulted |= decision.fault.is_some();
+                screen.decision(&decision);
+            }
+            Report::Live(live) => {
+                self.has_faulted |= live.faults > 0;
+                screen.live(&live);
+            }
+            Report::Ended(live) => {
+                self.has_ended = true;
+                self.has_faulted |= live.faults > 0;
+                screen.ended(&live);
+            }
+            _ => {}
+        }
+    }
+}
+
+fn show_recorder(report: RecorderReport, screen: &mut Screen) {
+    match report {
+        RecorderReport::Clip(clip) => screen.clip(&clip),
+        RecorderReport::Recovered(clip) => {
+            screen.warn("recovered a clip of an earlier recorder, which did not end well");
+            screen.clip(&clip);
+        }
+        RecorderReport::Loss(Loss::Deleted { file, why, .. }) => {
+            screen.warn(&format!("deleted `{}`, which nobody had fetched: {why}", file.display()));
+        }
+        RecorderReport::Loss(Loss::Failed { why, .. }) => screen.warn(&format!("a clip could not be written: {why}")),
+        RecorderReport::Loss(Loss::HeldBack { triggers, why, .. }) => {
+            screen.warn(&format!("{triggers} triggers opened no window: {why}"));
+        }
+        RecorderReport::Status(status) => screen.recorder(&status),
+        RecorderReport::Ended(status) => screen.recorder_ended(&status),
+        RecorderReport::Ready => {}
+    }
+}

@@ -1,0 +1,97 @@
+//! `gleaner run DIR`: keeps a lambda and its recorder going until ctrl-C, and shows what they report.
+//!
+//! A process that breaks is started again, a little later each time; one that could not even start is not.
+
+mod arguments;
+mod ear;
+mod party;
+mod process;
+mod screen;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::{BuildDir, Exit, Failure, Manifest};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+
+use self::party::{Ended, Party};
+use self::screen::Screen;
+use crate::args::RunArgs;
+
+/// The first pause before a new start; each further one is twice as long.
+const PAUSE: Duration = Duration::from_secs(1);
+/// The longest pause: a broken deployment must not occupy a core with restarts.
+const PAUSE_MAX: Duration = Duration::from_secs(30);
+/// What ran for so long is taken for sound: its end counts as the first.
+const SOUND: Duration = Duration::from_secs(60);
+/// How often somebody looks whether it is time to stop.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// Runs until it is told to stop, or until the time is over.
+pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
+    let build = BuildDir::check_fresh(&args.lambda)?;
+    let manifest = Manifest::load(build.path())?;
+    // Recorded topics need not be inputs; what is known of the largest message is what the inputs say.
+    let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes());
+    let largest = (manifest.record.is_some() && !args.no_record).then(|| sizes.max().unwrap_or(0));
+    let stop = stop_flag()?;
+    let mut screen = Screen::new(args.stats, args.json);
+    let offset_ns = clock_offset();
+    let started = Instant::now();
+    let mut pause = PAUSE;
+    let mut restarts = 0;
+    // A fault stays one, though the process that had it was replaced.
+    let mut worst = Exit::Ok;
+    loop {
+        let left = args.last.map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
+        let begun = Instant::now();
+        let mut party = Party::start(args, largest, offset_ns, left, restarts)?;
+        let (why, faulted) = match party.attend(&mut screen, &stop)? {
+            Ended::Well(exit) => return Ok(if exit == Exit::Ok { worst } else { exit }),
+            // It has said why. What ran before may run again: a network may be down for a while.
+            Ended::Never(exit) if restarts == 0 => return Ok(exit),
+            Ended::Never(_) => ("it could not start".to_owned(), false),
+            Ended::Broken { why, faulted } => (why, faulted),
+        };
+        if faulted {
+            worst = Exit::LambdaFaulted;
+        }
+        let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
+        if stop.load(Ordering::Relaxed) || is_over() {
+            return Err(Failure::new(Exit::Internal, why));
+        }
+        restarts += 1;
+        pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
+        screen.warn(&format!("{why}; starting again in {} s (restart {restarts})", pause.as_secs()));
+        let until = Instant::now() + pause;
+        while Instant::now() < until && !stop.load(Ordering::Relaxed) && !is_over() {
+            thread::sleep(LOOK);
+        }
+        if stop.load(Ordering::Relaxed) || is_over() {
+            return Ok(worst);
+        }
+        pause = (pause * 2).min(PAUSE_MAX);
+    }
+}
+
+/// Raised by ctrl-C, SIGTERM, and the end of the terminal.
+fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register(signal, Arc::clone(&stop))
+            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for signals", &error))?;
+    }
+    Ok(stop)
+}
+
+/// How far the vehicle's clock is ahead of CLOCK_MONOTONIC, in ns: it shows the time of day now, and never jumps afterwards.
+fn clock_offset() -> i64 {
+    use rustix::time::{ClockId, clock_gettime};
+    let ns = |clock| {
+        let now = clock_gettime(clock);
+        now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec)
+    };
+    ns(ClockId::Realtime).saturating_sub(ns(ClockId::Monotonic))
+}

@@ -1,0 +1,119 @@
+//! The processes of one run, from their start to their end.
+
+use std::process::ExitStatus;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+use std::time::Duration;
+
+use gleaner_protocol::link::{Add, Control};
+use gleaner_protocol::{Exit, Failure, Parts};
+
+use super::ear::{Ear, Heard};
+use super::process::Process;
+use super::screen::Screen;
+use super::{LOOK, arguments};
+use crate::args::RunArgs;
+
+/// How long after the end of all processes their streams may still bring something: what they left running may hold them open.
+const REST: Duration = Duration::from_millis(300);
+
+/// How a run ended.
+pub(super) enum Ended {
+    /// It was told to, or its time was over.
+    Well(Exit),
+    /// It could not start, and has said why.
+    Never(Exit),
+    /// It broke after it had started.
+    Broken {
+        /// What broke.
+        why: String,
+        /// Whether the lambda had faulted before.
+        faulted: bool,
+    },
+}
+
+/// A lambda's process, and its recorder's.
+pub(super) struct Party {
+    runtime: Process,
+    recorder: Option<(Process, Control)>,
+    ear: Ear,
+}
+
+impl Party {
+    /// Starts them. `largest` is the largest sample that is recorded, in bytes; none if nothing is.
+    pub(super) fn start(
+        args: &RunArgs,
+        largest: Option<u64>,
+        offset_ns: i64,
+        left: Option<Duration>,
+        restarts: u32,
+    ) -> Result<Self, Failure> {
+        let parts = Parts::find()?;
+        let (say, heard) = mpsc::channel();
+        let failed = |error: &dyn std::error::Error| {
+            Failure::caused_by(Exit::Internal, "cannot connect lambda and recorder", error)
+        };
+        let mut recorder = None;
+        let mut socket = None;
+        if let Some(largest) = largest {
+            let (mut control, stdin) = Control::pair().map_err(|error| failed(&error))?;
+            let line = arguments::recorder(args, largest, offset_ns);
+            let process = Process::start(&parts, "gleaner-recorder", line, Some(stdin), Heard::Recorder, &say)?;
+            let add = Add { lambda: args.lambda.clone(), remaps: arguments::remaps(args) };
+            socket = Some(control.add(&add).map_err(|error| failed(&error))?);
+            recorder = Some((process, control));
+        }
+        let line = arguments::runtime(args, socket.is_some(), offset_ns, left, restarts);
+        let runtime = Process::start(&parts, "gleaner-runtime", line, socket, Heard::Runtime, &say)?;
+        Ok(Self { runtime, recorder, ear: Ear::new(heard) })
+    }
+
+    /// Shows what they report until they end, which they do when `stop` is raised.
+    pub(super) fn attend(&mut self, screen: &mut Screen, stop: &AtomicBool) -> Result<Ended, Failure> {
+        let Self { runtime, recorder, ear } = self;
+        let status = loop {
+            ear.look(screen, LOOK);
+            if stop.load(Ordering::Relaxed) {
+                break runtime.end(ear, screen)?;
+            }
+            if let Some(status) = runtime.status()? {
+                break status;
+            }
+            if let Some((recorder, _)) = recorder
+                && let Some(status) = recorder.status()?
+            {
+                runtime.end(ear, screen)?;
+                ear.listen(screen, REST);
+                return Ok(match status.code().and_then(Exit::from_code) {
+                    // It has said why.
+                    Some(exit) if !ear.is_ready && exit != Exit::Ok => Ended::Never(exit),
+                    _ => Ended::Broken { why: in_words("the recorder", status), faulted: ear.has_faulted },
+                });
+            }
+        };
+        if let Some((recorder, control)) = recorder {
+            // One that has gone meanwhile has nothing left to complete.
+            let _ = control.stop();
+            let status = recorder.wait(ear, screen)?;
+            if !status.success() {
+                screen.warn(&format!(
+                    "{}: clips may be unfinished, and are recovered by the next run",
+                    in_words("the recorder", status)
+                ));
+            }
+        }
+        ear.listen(screen, REST);
+        // Told to end before it could listen for that.
+        let is_early = stop.load(Ordering::Relaxed) && !ear.is_ready;
+        Ok(match status.code().and_then(Exit::from_code) {
+            None if is_early => Ended::Well(Exit::Ok),
+            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if ear.has_ended => Ended::Well(exit),
+            Some(exit) if !ear.is_ready && exit != Exit::Ok => Ended::Never(exit),
+            _ => Ended::Broken { why: in_words("the lambda's process", status), faulted: ear.has_faulted },
+        })
+    }
+}
+
+fn in_words(who: &str, status: ExitStatus) -> String {
+    format!("{who} ended by itself ({status})")
+}

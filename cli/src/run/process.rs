@@ -1,0 +1,133 @@
+//! One process of a run.
+
+use std::ffi::OsString;
+use std::io::{BufRead, BufReader, Read};
+use std::os::fd::OwnedFd;
+use std::os::unix::process::CommandExt;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::Sender;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::{Exit, Failure, Parts, visible};
+use rustix::process::{Pid, Signal, kill_process, kill_process_group};
+use serde::de::DeserializeOwned;
+
+use super::LOOK;
+use super::ear::{Ear, Heard};
+use super::screen::Screen;
+
+/// How long a process may take for its end: a wake that runs, clips that are completed.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Longest report, as of one trigger with all its attributes or a clip with all that it lists, with much room.
+const REPORT_BYTES: u64 = 16 << 20;
+
+/// A program of ours that reports.
+pub(super) struct Process {
+    name: &'static str,
+    child: Child,
+}
+
+impl Process {
+    /// Starts it; its reports are `T`, and are heard as `heard` says.
+    pub(super) fn start<T: DeserializeOwned + 'static>(
+        parts: &Parts,
+        name: &'static str,
+        line: Vec<OsString>,
+        stdin: Option<OwnedFd>,
+        heard: fn(T) -> Heard,
+        say: &Sender<Heard>,
+    ) -> Result<Self, Failure> {
+        let program = parts.program(name)?;
+        let mut child = Command::new(&program)
+            .args(line)
+            // Ctrl-C is for us: we end them in order.
+            .process_group(0)
+            .stdin(stdin.map_or_else(Stdio::null, Stdio::from))
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(|error| {
+                Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error)
+            })?;
+        if let Some(reports) = child.stdout.take() {
+            let say = say.clone();
+            thread::spawn(move || follow(reports, heard, &say));
+        }
+        if let Some(says) = child.stderr.take() {
+            let say = say.clone();
+            let pass_on = move |piece: &[u8]| drop(say.send(Heard::Said(piece.to_vec())));
+            thread::spawn(move || crate::runtime::pass_on(says, &AtomicBool::new(false), pass_on));
+        }
+        Ok(Self { name, child })
+    }
+
+    /// How it ended, if it has.
+    pub(super) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
+        let failed = |error| Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error);
+        self.child.try_wait().map_err(failed)
+    }
+
+    /// Asks it to end, and waits for that.
+    pub(super) fn end(&mut self, ear: &mut Ear, screen: &mut Screen) -> Result<ExitStatus, Failure> {
+        self.tell(Signal::TERM);
+        self.wait(ear, screen)
+    }
+
+    /// Waits for its end, and forces it in the end.
+    pub(super) fn wait(&mut self, ear: &mut Ear, screen: &mut Screen) -> Result<ExitStatus, Failure> {
+        let mut asked = Instant::now();
+        loop {
+            ear.look(screen, LOOK);
+            if let Some(status) = self.status()? {
+                self.end_group();
+                return Ok(status);
+            }
+            if asked.elapsed() > PATIENCE {
+                screen.warn(&format!("{} did not end when it was asked to, and is killed", self.name));
+                self.tell(Signal::KILL);
+                asked = Instant::now();
+            }
+        }
+    }
+
+    /// Ends what it left running, as the workers of a Python lambda.
+    fn end_group(&self) {
+        if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
+            // Mostly there is nobody.
+            let _ = kill_process_group(pid, Signal::KILL);
+        }
+    }
+
+    fn tell(&self, signal: Signal) {
+        // One that has just ended is not there to be told, which is as good.
+        if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
+            let _ = kill_process(pid, signal);
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // Only where an error kept us from waiting for it.
+        if let Ok(None) = self.child.try_wait() {
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
+        self.end_group();
+    }
+}
+
+fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &Sender<Heard>) {
+    let mut reports = BufReader::new(reports);
+    let mut line = Vec::new();
+    while matches!((&mut reports).take(REPORT_BYTES).read_until(b'\n', &mut line), Ok(1..)) {
+        let garbled =
+            |_| Heard::Garbled(visible(&String::from_utf8_lossy(&line).chars().take(200).collect::<String>()));
+        if say.send(serde_json::from_slice(&line).map_or_else(garbled, heard)).is_err() {
+            return;
+        }
+        line.clear();
+    }
+}

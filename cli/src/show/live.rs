@@ -1,0 +1,252 @@
+//! What a person sees of a lambda that runs live.
+
+use std::fmt::{self, Write};
+
+use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
+use gleaner_protocol::{Clip, Live, LiveTopic, Spread, TopicSeen, TriggerKind, visible};
+
+use super::{Paint, counted, grouped, mib, word};
+use crate::results::{clip_span, three_digits};
+
+/// How it is doing, in some lines.
+pub(crate) fn live(live: &Live, paint: Paint) -> String {
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write_live(&mut text, live, paint);
+    text
+}
+
+/// How the recorder is doing, in some lines.
+pub(crate) fn recorder(status: &RecorderStatus, paint: Paint) -> String {
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write_recorder(&mut text, status, paint);
+    text
+}
+
+/// The topics that are there, as a table.
+pub(crate) fn topics(topics: &[TopicSeen]) -> String {
+    if topics.is_empty() {
+        return "no topics\n".to_owned();
+    }
+    let rows = topics.iter().map(|topic| {
+        [
+            visible(&topic.topic),
+            visible(&topic.type_name),
+            topic.writers.to_string(),
+            topic.readers.to_string(),
+            topic.qos.join("; "),
+        ]
+    });
+    let head = ["topic", "type", "writers", "readers", "quality of service"].map(str::to_owned);
+    table(std::iter::once(head).chain(rows).collect(), &[2, 3])
+}
+
+/// A clip that was just completed.
+pub(crate) fn clip_line(clip: &Clip, paint: Paint) -> String {
+    let [from, to] = clip_span(clip).map(time_of_day);
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = super::clips::one(&mut text, clip, &format!("{from} to {to}  clip"), paint);
+    text
+}
+
+/// A wake with a trigger or a fault, in a line for each.
+pub(crate) fn decision(decision: &gleaner_protocol::Decision, paint: Paint) -> String {
+    let time = time_of_day(decision.at_ns);
+    let mut text = String::new();
+    for trigger in &decision.triggers {
+        let kind = if trigger.kind == TriggerKind::Event { "" } else { trigger.kind.as_str() };
+        let score = trigger.score.map(three_digits).unwrap_or_default();
+        let line = format!("{time}  {}  {kind}{score}", visible(&trigger.label));
+        text += &format!("{}\n", paint.green(line.trim_end()));
+    }
+    if let Some(fault) = &decision.fault {
+        let line = format!("{time}  {}: {}", word(fault.kind), visible(super::gist(&fault.message)));
+        text += &format!("{}\n", paint.red(&line));
+    }
+    text
+}
+
+fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
+    writeln!(
+        text,
+        "{} ({}), domain {}, {:.0} s: {}, {}, {}",
+        paint.bold(&format!("{} {}", visible(&live.lambda), visible(&live.version))),
+        live.kind.as_str(),
+        live.network.domain,
+        live.up_s,
+        counted(live.wakes, "wake"),
+        counted(live.triggers, "trigger"),
+        if live.faults > 0 { paint.red(&counted(live.faults, "fault")) } else { counted(live.faults, "fault") },
+    )?;
+    let spreads = [("wake-up", live.wake_up), ("in the lambda", live.run), ("handed out", live.hand_out)];
+    let told: Vec<String> =
+        spreads.iter().filter_map(|(what, spread)| spread.map(|spread| format!("{what} {}", in_ms(&spread)))).collect();
+    if !told.is_empty() {
+        writeln!(text, "  {} ms (median / 99 % / longest)", told.join(", "))?;
+    }
+    let head = [
+        "input",
+        "topic",
+        "writers",
+        "Hz",
+        "received",
+        "lost",
+        "no slot",
+        "too big",
+        "malformed",
+        "overwritten",
+        "skipped",
+        "newest",
+    ];
+    let rows = std::iter::once(head.map(str::to_owned)).chain(live.topics.iter().map(row)).collect();
+    for line in table(rows, &[2, 3, 4, 5, 6, 7, 8, 9, 10, 11]).lines() {
+        writeln!(text, "  {line}")?;
+    }
+    for topic in &live.topics {
+        for trouble in &topic.trouble {
+            writeln!(text, "  {}", paint.yellow(&visible(trouble)))?;
+        }
+    }
+    let losses = [
+        (live.missed_ticks, "tick", "missed"),
+        (live.log_dropped, "log line", "over the rate limit"),
+        (live.unwritten, "decision or log line", "not written"),
+        (live.recorder.map_or(0, |recorder| recorder.wakes_dropped), "wake", "not told to the recorder"),
+        (live.recorder.map_or(0, |recorder| recorder.triggers_lost), "trigger", "not told to the recorder"),
+        (live.network.socket_drops, "datagram", "dropped by the system: a socket buffer was full"),
+        (live.network.filtered, "datagram", "dropped: fragments that claim too much, or of nobody known"),
+    ];
+    for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
+        writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
+    }
+    let network = &live.network;
+    let line = format!(
+        "{}, socket buffer {:.1} of {:.1} MiB, {:.1} MiB resident, {:.1} s of CPU time",
+        counted(network.participants as u64, "participant"),
+        mib(network.buffer_granted as u64),
+        mib(network.buffer_asked as u64),
+        mib(live.rss_bytes),
+        live.cpu_s,
+    );
+    writeln!(text, "  {}", paint.dim(&line))
+}
+
+fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> fmt::Result {
+    let opened = status.trigger_to_open.map(|spread| format!("; trigger to window {} ms", in_ms(&spread)));
+    writeln!(
+        text,
+        "{}: {}, {}{}; preroll {:.1} of {:.1} MiB{}",
+        paint.bold("recorder"),
+        counted(status.clips, "clip"),
+        counted(status.windows, "window"),
+        if status.recording { ", recording" } else { "" },
+        mib(status.preroll_bytes),
+        mib(status.preroll_bound),
+        opened.unwrap_or_default(),
+    )?;
+    let head = ["topic", "writers", "received", "lost", "no slot", "too big", "malformed"].map(str::to_owned);
+    let rows = std::iter::once(head).chain(status.topics.iter().map(recorded)).collect();
+    for line in table(rows, &[1, 2, 3, 4, 5, 6]).lines() {
+        writeln!(text, "  {line}")?;
+    }
+    if let Some(commands) = &status.commands {
+        let line = format!(
+            "commands on {}: {} accepted, {} refused",
+            visible(&commands.topic),
+            grouped(commands.accepted),
+            grouped(commands.refused)
+        );
+        writeln!(text, "  {}", if commands.refused > 0 { paint.yellow(&line) } else { line })?;
+    }
+    for trouble in status.topics.iter().flat_map(|topic| &topic.trouble) {
+        writeln!(text, "  {}", paint.yellow(&visible(trouble)))?;
+    }
+    let losses = [
+        (status.failed, "clip", "could not be written"),
+        (status.deleted, "clip", "deleted before anybody fetched it"),
+        (status.held_back, "trigger", "opened no window: the disk is too full"),
+        (status.wakes_lost, "wake", "not in any journal"),
+        (status.pushed_out, "sample", "pushed out of the preroll too early: preroll_size"),
+    ];
+    for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
+        writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
+    }
+    Ok(())
+}
+
+fn recorded(topic: &RecordedTopic) -> [String; 7] {
+    let unknown = || "?".to_owned();
+    [
+        visible(&topic.topic),
+        topic.writers.map_or_else(unknown, |writers| writers.to_string()),
+        grouped(topic.received),
+        topic.lost.map_or_else(unknown, grouped),
+        grouped(topic.no_slot),
+        grouped(topic.too_big),
+        grouped(topic.malformed),
+    ]
+}
+
+fn row(topic: &LiveTopic) -> [String; 12] {
+    let unknown = || "?".to_owned();
+    [
+        visible(&topic.name),
+        visible(&topic.topic),
+        topic.writers.map_or_else(unknown, |writers| writers.to_string()),
+        format!("{:.1}", topic.rate_hz),
+        grouped(topic.received),
+        topic.lost.map_or_else(unknown, grouped),
+        grouped(topic.no_slot),
+        grouped(topic.too_big),
+        grouped(topic.malformed),
+        grouped(topic.overwritten),
+        grouped(topic.skipped),
+        topic.age_ns.map_or_else(|| "never".to_owned(), |age| format!("{:.3} s ago", age as f64 / 1e9)),
+    ]
+}
+
+fn in_ms(spread: &Spread) -> String {
+    let ms = |ns: u64| format!("{:.3}", ns as f64 / 1e6);
+    format!("{} / {} / {}", ms(spread.p50_ns), ms(spread.p99_ns), ms(spread.max_ns))
+}
+
+/// Columns as wide as their widest cell; those of `numbers` end on the right.
+fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..N).map(width).collect();
+    let mut text = String::new();
+    for row in &rows {
+        let cells = row.iter().enumerate().map(|(column, cell)| {
+            let width = widths[column];
+            if numbers.contains(&column) { format!("{cell:>width$}") } else { format!("{cell:<width$}") }
+        });
+        text += cells.collect::<Vec<_>>().join("  ").trim_end();
+        text.push('\n');
+    }
+    text
+}
+
+/// Time of day in UTC: the vehicle's clock shows it.
+fn time_of_day(at_ns: i64) -> String {
+    let ms = at_ns.div_euclid(1_000_000).rem_euclid(86_400_000);
+    let (hours, minutes, seconds) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
+    format!("{hours:02}:{minutes:02}:{seconds:02}.{:03}", ms % 1000)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_are_as_wide_as_their_widest_cell() {
+        let rows = vec![["a", "1"].map(str::to_owned), ["topic", "23"].map(str::to_owned)];
+        assert_eq!(table(rows, &[1]), "a       1\ntopic  23\n");
+    }
+
+    #[test]
+    fn a_time_of_day_is_that_of_utc() {
+        assert_eq!(time_of_day(1_533_199_491_136_999_999), "08:44:51.136");
+    }
+}

@@ -1,0 +1,138 @@
+//! Journals: as files, and as the wakes in them.
+//!
+//! An input is a byte for the mode, and what that says. Checksums would keep a fuzzer from all that lies behind them, so that in
+//! one mode they are made right.
+
+use gleaner_protocol::journal::{ATTRIBUTES_MAX, Decoder, Encoder, End, Entry, Reader, TRIGGERS_MAX, VERSION, Writer};
+
+use crate::budget;
+use crate::input::Input;
+
+/// Modes of an input.
+pub mod mode {
+    /// A file follows.
+    pub const FILE: u8 = 0;
+    /// Blocks follow: kind, length in two bytes, payload. They get the right checksums.
+    pub const BLOCKS: u8 = 1;
+    /// The number of inputs follows, and wakes as a block has them.
+    pub const WAKES: u8 = 2;
+}
+
+/// A journal holds one block at a time, and JSON takes many times its text.
+const MEMORY: usize = 8 << 20;
+
+/// Reads it, writes what was read, and reads that. Whether it has wakes, and is not damaged.
+pub fn check(data: &[u8]) -> bool {
+    let mut input = Input(data);
+    match input.u8() {
+        mode::WAKES => {
+            let inputs = usize::from(input.u8());
+            wakes(inputs, input.0)
+        }
+        mode::BLOCKS => file(&sealed(input)),
+        _ => file(input.0),
+    }
+}
+
+/// A file of the blocks that `input` names; `docs/journal.md` says what it consists of.
+pub(crate) fn sealed(mut input: Input) -> Vec<u8> {
+    let mut file = b"\x89GLJRN\r\n".to_vec();
+    file.extend(VERSION.to_le_bytes());
+    file.resize(16, 0);
+    let mut index = 0_u64;
+    while !input.0.is_empty() {
+        let (kind, len) = (input.u8(), input.u16());
+        let payload = input.bytes(len.into());
+        let mut head = vec![kind];
+        head.extend((payload.len() as u32).to_le_bytes());
+        head.extend(crc32fast::hash(payload).to_le_bytes());
+        let crc = crc32fast::hash(&[&index.to_le_bytes()[..], &head].concat());
+        file.extend(head);
+        file.extend(crc.to_le_bytes());
+        file.extend(payload);
+        index += 1;
+    }
+    file
+}
+
+fn file(bytes: &[u8]) -> bool {
+    let Ok(mut reader) = budget::within(MEMORY, || Reader::open(bytes)) else { return false };
+    let header = reader.header().clone();
+    let mut entries = Vec::new();
+    let failed = loop {
+        match budget::within(MEMORY, || reader.next()) {
+            Ok(Some(entry)) => entries.push(entry),
+            Ok(None) => break None,
+            Err(error) => break Some(error.to_string()),
+        }
+        assert!(entries.len() <= bytes.len(), "more wakes than bytes");
+    };
+    match &failed {
+        None => assert!(reader.next().is_ok_and(|entry| entry.is_none()), "a wake behind the end"),
+        Some(first) => {
+            let again = reader.next().expect_err("what is damaged stays damaged").to_string();
+            assert_eq!(*first, again);
+        }
+    }
+    assert!(failed.is_none() || !reader.cut_off() && reader.end().is_none());
+    assert!(failed.is_some() || reader.cut_off() != reader.end().is_some());
+    assert!(reader.torn_bytes() <= bytes.len() as u64);
+    let end = reader.end().cloned().unwrap_or(End { wakes: entries.len() as u64, ..End::default() });
+    let mut writer = Writer::begin(Vec::new(), &header).expect("the header was read");
+    entries.retain(fits);
+    entries.iter().for_each(|entry| writer.wake(entry).expect("the wake was read"));
+    let written = writer.finish(&end).expect("the end was read");
+    let mut reader = Reader::open(written.as_slice()).expect("it was written");
+    assert_eq!(*reader.header(), header);
+    for entry in &entries {
+        assert_eq!(reader.next().expect("it was written").as_ref(), Some(entry));
+    }
+    assert!(reader.next().expect("it was written").is_none());
+    assert_eq!(reader.end(), Some(&end));
+    failed.is_none() && !entries.is_empty()
+}
+
+/// Numbers in attributes may be longer when they are written again: `1e15` is 1000000000000000.0 then.
+fn fits(entry: &Entry) -> bool {
+    let long = |attributes| serde_json::to_string(attributes).is_ok_and(|json| json.len() > ATTRIBUTES_MAX);
+    !entry.triggers.iter().any(|trigger| long(&trigger.attributes))
+}
+
+/// What is decoded, encoded again, and decoded again is the same, to the last bit.
+fn wakes(inputs: usize, bytes: &[u8]) -> bool {
+    let mut decoder = Decoder::new(inputs);
+    let mut rest = bytes;
+    let (mut entries, mut sound) = (Vec::new(), true);
+    while !rest.is_empty() {
+        let before = rest.len();
+        let Ok(entry) = budget::within(MEMORY, || decoder.decode(&mut rest)) else {
+            sound = false;
+            break;
+        };
+        assert!(rest.len() < before, "a wake of no bytes");
+        assert_eq!(entry.seen.len(), inputs);
+        assert!(entry.triggers.len() <= TRIGGERS_MAX);
+        entries.push(entry);
+    }
+    entries.retain(fits);
+    again(inputs, &entries);
+    sound && !entries.is_empty()
+}
+
+/// Encodes `entries`, decodes that, and compares.
+pub(crate) fn again(inputs: usize, entries: &[Entry]) {
+    let encode = |entries: &[Entry]| {
+        let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
+        entries.iter().for_each(|entry| encoder.encode(entry, &mut bytes));
+        bytes
+    };
+    let bytes = encode(entries);
+    let (mut decoder, mut rest, mut read) = (Decoder::new(inputs), bytes.as_slice(), Vec::new());
+    for entry in entries {
+        let now = decoder.decode(&mut rest).expect("it was encoded");
+        assert_eq!(entry.differs_from(&now, &[], true), None);
+        read.push(now);
+    }
+    assert!(rest.is_empty(), "bytes behind the last wake");
+    assert!(encode(&read) == bytes, "the same wakes as other bytes");
+}

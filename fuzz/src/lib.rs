@@ -1,0 +1,39 @@
+//! What reads foreign bytes, fed with bytes that a fuzzer makes up. `docs/fuzzing.md` says how.
+//!
+//! Each module is a target: its `check` reads bytes in every way that we offer, panics if what comes out contradicts
+//! what is promised, and returns whether the input was sound, so that there was something to check. Most promises are such that two readings must agree. `budget` bounds the memory of a reading,
+//! `seeds` are the sound inputs that a fuzzer begins with. In `targets/` is a program for each.
+//!
+//! What never happens here: a promise that only holds for what our own writers write.
+
+pub mod budget;
+pub mod drive;
+pub mod image;
+mod input;
+pub mod journal;
+pub mod link;
+pub mod manifest;
+pub mod message;
+pub mod seeds;
+
+/// A target: its name, what it does with an input, and the inputs and words to begin with.
+pub struct Target {
+    /// Its name; its program is `fuzz-<name>`.
+    pub name: &'static str,
+    /// Panics if a promise is broken. Returns whether the input was sound, as seeds are.
+    pub check: fn(&[u8]) -> bool,
+    /// Sound inputs.
+    pub seeds: fn() -> Vec<Vec<u8>>,
+    /// What a fuzzer is unlikely to find by itself.
+    pub words: &'static [&'static str],
+}
+
+/// All targets.
+pub const TARGETS: [Target; 6] = [
+    Target { name: "message", check: message::check, seeds: seeds::message::all, words: seeds::message::WORDS },
+    Target { name: "drive", check: drive::check, seeds: seeds::drive::all, words: seeds::drive::WORDS },
+    Target { name: "image", check: image::check, seeds: seeds::image::all, words: seeds::image::WORDS },
+    Target { name: "journal", check: journal::check, seeds: seeds::journal::all, words: seeds::journal::WORDS },
+    Target { name: "link", check: link::check, seeds: seeds::link::all, words: seeds::journal::WORDS },
+    Target { name: "manifest", check: manifest::check, seeds: seeds::manifest::all, words: seeds::manifest::WORDS },
+];

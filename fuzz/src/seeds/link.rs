@@ -1,0 +1,42 @@
+//! Conversations with the recorder, frame by frame.
+
+use gleaner_protocol::journal::Encoder;
+
+use super::journal::{entries, header};
+use crate::link::mode;
+
+/// All seeds. The numbers of the tags stand in `gleaner_protocol::link`, for nobody else to use.
+pub fn all() -> Vec<Vec<u8>> {
+    let hello = serde_json::to_vec(&header()).expect("a header is JSON");
+    let wakes = entries().into_iter().map(|entry| {
+        let mut payload = [&1_000_i64.to_le_bytes()[..], &2_u32.to_le_bytes()].concat();
+        Encoder::new(2).encode(&entry, &mut payload);
+        (17, payload)
+    });
+    let lambda = [(16, hello)].into_iter().chain(wakes).chain([(18, Vec::new())]).collect();
+    let add = br#"{"lambda":"/lambdas/brake","remaps":[["/imu","/car/imu"]]}"#.to_vec();
+    let starter = vec![(1, add), (2, Vec::new())];
+    let recorder = vec![(32, Vec::new()), (34, 5_u64.to_le_bytes().to_vec()), (33, b"not today".to_vec())];
+    let all = [(mode::LAMBDA, lambda), (mode::STARTER, starter), (mode::RECORDER, recorder)];
+    all.into_iter().flat_map(|(who, frames)| [as_frames(who, &frames), as_bytes(who, &frames)]).collect()
+}
+
+fn as_frames(who: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {
+    let mut seed = vec![who | mode::FRAMES];
+    for (tag, payload) in frames {
+        seed.push(*tag);
+        seed.extend((payload.len() as u16).to_le_bytes());
+        seed.extend(payload);
+    }
+    seed
+}
+
+fn as_bytes(who: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {
+    let mut seed = vec![who];
+    for (tag, payload) in frames {
+        seed.extend((payload.len() as u32).to_le_bytes());
+        seed.push(*tag);
+        seed.extend(payload);
+    }
+    seed
+}

@@ -1,0 +1,7 @@
+//! `gleaner-recorder`: the process that records for all lambdas of a vehicle. `gleaner` starts it; see `gleaner-recorder --help`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    gleaner_recorder::program::main()
+}

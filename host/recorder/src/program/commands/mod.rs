@@ -1,0 +1,236 @@
+//! Commands of people and other programs, over a topic of ROS 2: whoever writes it can have something recorded.
+//!
+//! A command asks for what a lambda could trigger, in the lambda's name. Who writes the topic is not known here, so nothing of a
+//! message is looked at before it is known to be short and not one of too many. What a command can cost others: the disk, within
+//! what the recorder may take, and the commands of others, which come too often with it.
+//!
+//! - `order`: what one message says.
+
+mod order;
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::Thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::link::CommandStatus;
+use gleaner_protocol::{TriggerKind, visible};
+use gleaner_transport::{SampleMeta, Sink, Status, Verdict};
+use tracing::warn;
+
+use super::allowance::Allowance;
+use crate::{Commanded, LambdaId, RecordError, Recorder};
+pub(super) use order::MESSAGE_MAX;
+use order::{CommandError, Order};
+
+/// The type of the topic.
+pub(super) const TYPE: &str = "std_msgs/msg/String";
+/// Messages per second that are read, and at once.
+const ALLOWED: Allowance = Allowance::of(1.0, 5.0);
+/// Messages that wait for the loop: more than may come at once.
+const WAITING: usize = 8;
+/// Messages that the network keeps until they are taken.
+pub(super) const QUEUE: usize = 16;
+/// How often it is said how many were not read.
+const AGAIN: Duration = Duration::from_secs(10);
+/// Characters of what is said of a refusal: a message may say what it likes, but not as much.
+const WHY_MAX: usize = 200;
+
+/// A message that is to be read.
+struct Message {
+    meta: SampleMeta,
+    cdr: Vec<u8>,
+}
+
+/// Messages that nobody reads.
+#[derive(Debug, Default)]
+struct Unread {
+    too_many: AtomicU64,
+    too_long: AtomicU64,
+}
+
+impl Unread {
+    fn counts(&self) -> (u64, u64) {
+        (self.too_many.load(Ordering::Relaxed), self.too_long.load(Ordering::Relaxed))
+    }
+}
+
+/// Takes the messages of the topic.
+struct Ear {
+    allowed: Mutex<Allowance>,
+    messages: SyncSender<Message>,
+    unread: Arc<Unread>,
+    reader: Thread,
+}
+
+impl Sink for Ear {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        if cdr.len() > MESSAGE_MAX {
+            self.unread.too_long.fetch_add(1, Ordering::Relaxed);
+            return Verdict::TooBig;
+        }
+        // Only the transport's thread is here.
+        let may = self.allowed.lock().unwrap_or_else(PoisonError::into_inner).take(1.0, Instant::now());
+        if !may || self.messages.try_send(Message { meta: *meta, cdr: cdr.to_vec() }).is_err() {
+            self.unread.too_many.fetch_add(1, Ordering::Relaxed);
+            return Verdict::NoSlot;
+        }
+        self.reader.unpark();
+        Verdict::Taken
+    }
+}
+
+/// Obeys commands.
+pub(super) struct Commands {
+    topic: String,
+    messages: Receiver<Message>,
+    unread: Arc<Unread>,
+    /// The newest of each name, also after its end: an operator need not wait for a lambda that is being started again.
+    lambdas: BTreeMap<String, LambdaId>,
+    /// What runs, by lambda and label: with the lambda that it was started with, which may have ended since.
+    running: BTreeMap<(String, String), LambdaId>,
+    accepted: u64,
+    refused: u64,
+    /// What was said of messages that nobody read, and when.
+    said: ((u64, u64), Option<Instant>),
+}
+
+impl Commands {
+    /// Commands over `topic`, and who hears them there.
+    pub(super) fn new(topic: String, reader: Thread) -> (Commands, Arc<dyn Sink>) {
+        let (sender, messages) = sync_channel(WAITING);
+        let unread = Arc::<Unread>::default();
+        let ear = Ear { allowed: Mutex::new(ALLOWED), messages: sender, unread: Arc::clone(&unread), reader };
+        let commands = Commands {
+            topic,
+            messages,
+            unread,
+            lambdas: BTreeMap::new(),
+            running: BTreeMap::new(),
+            accepted: 0,
+            refused: 0,
+            said: ((0, 0), None),
+        };
+        (commands, Arc::new(ear))
+    }
+
+    /// A lambda is there.
+    pub(super) fn add(&mut self, name: &str, lambda: LambdaId) {
+        self.lambdas.insert(name.to_owned(), lambda);
+    }
+
+    /// All that ran was ended.
+    pub(super) fn forget_running(&mut self) {
+        self.running.clear();
+    }
+
+    /// Obeys those that came; `true` if there were any.
+    pub(super) fn obey(&mut self, recorder: &mut Recorder) -> Result<bool, RecordError> {
+        let mut heard = false;
+        // Those that come meanwhile are for the next time.
+        for _ in 0..WAITING {
+            let Ok(Message { meta, cdr }) = self.messages.try_recv() else { break };
+            heard = true;
+            let source = format!("command on {} by {}", self.topic, meta.writer);
+            let refused = match Order::read(&cdr, meta.endian) {
+                Ok(order) => self.carry_out(order, meta.at_ns, source.clone(), recorder)?,
+                Err(why) => Some(why),
+            };
+            match refused {
+                None => self.accepted += 1,
+                Some(why) => {
+                    self.refused += 1;
+                    // There are no more of them than messages are read.
+                    warn!(%source, why = in_words(&why), "a command is refused");
+                }
+            }
+        }
+        self.say_unread();
+        Ok(heard)
+    }
+
+    /// Why not, if it is refused.
+    fn carry_out(
+        &mut self,
+        Order { lambda, trigger }: Order,
+        at_ns: i64,
+        source: String,
+        recorder: &mut Recorder,
+    ) -> Result<Option<CommandError>, RecordError> {
+        let (name, mut id) = match self.whose(lambda) {
+            Ok(found) => found,
+            Err(why) => return Ok(Some(why)),
+        };
+        let label = trigger.label.clone();
+        let key = (name, label.clone());
+        match (trigger.kind, self.running.get(&key)) {
+            (TriggerKind::Stop, Some(started)) => id = *started,
+            (TriggerKind::Stop, None) => return Ok(Some(CommandError::NotRunning { label })),
+            (TriggerKind::Start, Some(_)) => return Ok(Some(CommandError::Running { label })),
+            (TriggerKind::Start, None) | (TriggerKind::Event, _) => {}
+        }
+        Ok(match recorder.command(id, &trigger, at_ns, source)? {
+            Commanded::Opened => {
+                if trigger.kind == TriggerKind::Start {
+                    self.running.insert(key, id);
+                }
+                None
+            }
+            Commanded::Stopped => {
+                self.running.remove(&key);
+                None
+            }
+            Commanded::Ignored => Some(match trigger.kind {
+                TriggerKind::Event => CommandError::TooMuch,
+                TriggerKind::Start => CommandError::Running { label },
+                TriggerKind::Stop => {
+                    self.running.remove(&key);
+                    CommandError::NotRunning { label }
+                }
+            }),
+            Commanded::HeldBack => Some(CommandError::HeldBack),
+        })
+    }
+
+    fn whose(&self, lambda: Option<String>) -> Result<(String, LambdaId), CommandError> {
+        let known = self.lambdas.len();
+        match lambda {
+            Some(name) => match self.lambdas.get(&name) {
+                Some(id) => Ok((name, *id)),
+                None => Err(CommandError::NoSuchLambda { name }),
+            },
+            None if known > 1 => Err(CommandError::WhichLambda { known }),
+            None => self.lambdas.first_key_value().map(|(name, id)| (name.clone(), *id)).ok_or(CommandError::NoLambdas),
+        }
+    }
+
+    fn say_unread(&mut self) {
+        let (unread, said) = (self.unread.counts(), self.said);
+        if unread == said.0 || said.1.is_some_and(|at| at.elapsed() < AGAIN) {
+            return;
+        }
+        self.said = (unread, Some(Instant::now()));
+        let (too_many, too_long) = (unread.0 - said.0.0, unread.1 - said.0.1);
+        warn!(topic = %self.topic, too_many, too_long, "commands are refused unread");
+    }
+
+    /// What came of them.
+    pub(super) fn status(&self, network: Option<&Status>) -> CommandStatus {
+        let (too_many, too_long) = self.unread.counts();
+        CommandStatus {
+            topic: self.topic.clone(),
+            accepted: self.accepted,
+            refused: self.refused + too_many + too_long,
+            writers: network.and_then(|status| status.writers),
+            trouble: network.map(|status| status.trouble.clone()).unwrap_or_default(),
+        }
+    }
+}
+
+/// An error with its cause, fit for a log.
+fn in_words(error: &CommandError) -> String {
+    let cause = std::error::Error::source(error).map(|cause| format!(": {cause}")).unwrap_or_default();
+    visible(&format!("{error}{cause}")).chars().take(WHY_MAX).collect()
+}

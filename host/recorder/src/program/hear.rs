@@ -1,0 +1,196 @@
+//! What the starter and the lambdas say, on its way to the loop. A thread each: their frames may come in pieces, or not at all.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::{Builder, Thread};
+
+use gleaner_protocol::journal::{Entry, FileDigest, Header};
+use gleaner_protocol::link::{Add, Answers, Controlled, Heard, LambdaLink, LinkError, Order};
+use gleaner_protocol::manifest::bounds::MANIFEST_MAX;
+use gleaner_protocol::{BuildDir, Failure, Manifest, ManifestError};
+use sha2::{Digest, Sha256};
+use tracing::warn;
+
+use super::watch::Seen;
+
+/// What one lambda said waits for the loop, up to this; then its socket waits, and then the lambda's own queue.
+const SPOKEN: usize = 64;
+
+/// What the loop hears beside samples and lambdas.
+pub(super) enum Event {
+    /// A lambda will come.
+    Announced(Box<Announced>),
+    /// It is to end: the starter said so, or has ended, or speaks nonsense.
+    Stop,
+    /// From the watch.
+    Seen(Seen),
+}
+
+/// A lambda that will come, and how it is heard.
+pub(super) struct Announced {
+    pub(super) manifest: Manifest,
+    pub(super) remaps: Vec<(String, String)>,
+    pub(super) spoken: Receiver<Spoken>,
+    pub(super) answers: Answers,
+}
+
+/// What a lambda said.
+pub(super) enum Spoken {
+    /// What it is: what was announced.
+    Hello(Box<Header>),
+    /// It is something else.
+    Another(String),
+    Wake {
+        entry: Box<Entry>,
+        decided_ns: i64,
+        missing: u32,
+        bytes: usize,
+    },
+    /// Nothing more comes.
+    Gone(Option<LinkError>),
+}
+
+/// Hears the starter until it ends.
+pub(super) fn starter(control: OwnedFd, events: SyncSender<Event>, reader: Thread) -> io::Result<()> {
+    Builder::new().name("starter".to_owned()).spawn(move || {
+        let mut control = Controlled::new(control);
+        loop {
+            let event = match control.order() {
+                Ok(Some(Order::Add(add, socket))) => match announced(add, socket, &reader) {
+                    Some(announced) => Event::Announced(Box::new(announced)),
+                    None => continue,
+                },
+                Ok(Some(Order::Stop) | None) => Event::Stop,
+                Err(error) => {
+                    warn!(error = &error as &dyn std::error::Error, "the starter cannot be understood");
+                    Event::Stop
+                }
+            };
+            let is_last = matches!(event, Event::Stop);
+            if events.send(event).is_err() || is_last {
+                return reader.unpark();
+            }
+            reader.unpark();
+        }
+    })?;
+    Ok(())
+}
+
+fn announced(add: Add, socket: OwnedFd, reader: &Thread) -> Option<Announced> {
+    let lambda = add.lambda.display().to_string();
+    let (link, mut answers) = match LambdaLink::new(socket) {
+        Ok(both) => both,
+        Err(error) => {
+            warn!(%lambda, %error, "a lambda's socket cannot be used");
+            return None;
+        }
+    };
+    let (manifest, digest) = match load(&add.lambda) {
+        Ok(loaded) => loaded,
+        Err(failure) => {
+            warn!(%lambda, %failure, "a lambda cannot be recorded for");
+            answers.refused(&failure.message);
+            return None;
+        }
+    };
+    let expected = Expected { manifest: manifest.clone(), digest, remaps: add.remaps.clone() };
+    let (sender, spoken) = sync_channel(SPOKEN);
+    let reader = reader.clone();
+    let name = format!("hear {}", manifest.lambda.name);
+    let heard = Builder::new().name(name).spawn(move || hear(link, &expected, &sender, &reader));
+    if let Err(error) = heard {
+        warn!(%lambda, %error, "a lambda cannot be heard");
+        answers.refused("the recorder has no thread for it");
+        return None;
+    }
+    Some(Announced { manifest, remaps: add.remaps, spoken, answers })
+}
+
+fn hear(mut link: LambdaLink, expected: &Expected, spoken: &SyncSender<Spoken>, reader: &Thread) {
+    loop {
+        let said = match link.hear() {
+            Ok(Some(Heard::Hello(header))) => match expected.differs(&header) {
+                None => Spoken::Hello(header),
+                Some(why) => Spoken::Another(why),
+            },
+            Ok(Some(Heard::Wake { entry, decided_ns, missing, bytes })) => {
+                Spoken::Wake { entry, decided_ns, missing, bytes }
+            }
+            Ok(Some(Heard::Bye) | None) => Spoken::Gone(None),
+            Err(error) => Spoken::Gone(Some(error)),
+        };
+        let is_last = matches!(said, Spoken::Gone(_) | Spoken::Another(_));
+        if spoken.send(said).is_err() || is_last {
+            return reader.unpark();
+        }
+        reader.unpark();
+    }
+}
+
+/// What the starter said that a lambda is.
+struct Expected {
+    manifest: Manifest,
+    /// Of its `lambda.toml`, in hexadecimal digits.
+    digest: String,
+    remaps: Vec<(String, String)>,
+}
+
+impl Expected {
+    /// In which way `header` is of another lambda.
+    fn differs(&self, header: &Header) -> Option<String> {
+        let lambda = &self.manifest.lambda;
+        let text = |what: &str, wanted: &str, found: &str| {
+            (wanted != found).then(|| format!("its {what} is `{found}`; the recorder was told of `{wanted}`"))
+        };
+        let manifest = header.files.iter().find(|file| file.path == "lambda.toml");
+        text("name", lambda.name.as_str(), &header.lambda)
+            .or_else(|| text("version", lambda.version.as_ref(), &header.version))
+            .or_else(|| text("kind", lambda.kind.as_str(), header.kind.as_str()))
+            .or_else(|| {
+                let found = manifest.map_or("missing", |file| &file.sha256);
+                text("lambda.toml, by its digest,", &self.digest, found)
+            })
+            .or_else(|| {
+                let is_other = header.remaps != self.remaps;
+                is_other.then(|| "its topics are remapped in another way than the recorder was told".to_owned())
+            })
+    }
+}
+
+/// The manifest of a build, and its digest: of the same bytes.
+fn load(lambda: &Path) -> Result<(Manifest, String), Failure> {
+    let path = BuildDir::of(lambda).manifest_path();
+    let mut bytes = Vec::new();
+    File::open(&path)
+        .and_then(|file| file.take(MANIFEST_MAX.bytes() + 1).read_to_end(&mut bytes))
+        .map_err(|source| ManifestError::Read { path: path.clone(), source })?;
+    if bytes.len() as u64 > MANIFEST_MAX.bytes() {
+        return Err(ManifestError::TooLong { path, limit: MANIFEST_MAX }.into());
+    }
+    let text = std::str::from_utf8(&bytes).map_err(|error| ManifestError::Read {
+        path: path.clone(),
+        source: io::Error::new(io::ErrorKind::InvalidData, error),
+    })?;
+    let manifest = Manifest::parse(text, &path)?;
+    if manifest.record.is_none() {
+        let message = format!("lambda `{}` has no [record]", manifest.lambda.name);
+        return Err(Failure::new(gleaner_protocol::Exit::Usage, message));
+    }
+    Ok((manifest, hex(&Sha256::digest(&bytes))))
+}
+
+/// One digest for all files of a lambda, as a replay takes it: of their paths and digests, a line each.
+pub(super) fn lambda_digest(files: &[FileDigest]) -> String {
+    let mut digest = Sha256::new();
+    for file in files {
+        digest.update(format!("{}  {}\n", file.sha256, file.path));
+    }
+    hex(&digest.finalize())
+}
+
+fn hex(digest: &[u8]) -> String {
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}

@@ -1,0 +1,150 @@
+//! Who is heard, and how much each may ask for.
+
+use std::sync::mpsc::{Receiver, TryRecvError};
+use std::time::Instant;
+
+use gleaner_protocol::journal::Entry;
+use gleaner_protocol::link::Answers;
+use gleaner_protocol::manifest::Record;
+use tracing::warn;
+
+use super::allowance::Allowance;
+use super::hear::{Spoken, lambda_digest};
+use super::spread::Spreads;
+use crate::{LambdaId, Member, RecordError, Recorder, TopicId};
+
+/// What of one lambda is heard before it is the next one's turn.
+const TURN: usize = 16;
+
+/// Triggers per second that a lambda may cause, and at once.
+const TRIGGERS: Allowance = Allowance::of(200.0, 1000.0);
+/// Bytes of wakes per second that a lambda may fill the preroll with, and at once.
+const BYTES: Allowance = Allowance::of(1048576.0, 4194304.0);
+
+/// How far a wake's stamp may lie behind the clock, and ahead of it: it is the stamp of a sample or of a tick.
+const BEHIND_NS: i64 = 60_000_000_000;
+const AHEAD_NS: i64 = 1_000_000_000;
+
+/// A lambda that is heard, or will be.
+pub(super) struct Lambda {
+    pub(super) name: String,
+    rules: Record,
+    topics: Vec<TopicId>,
+    spoken: Receiver<Spoken>,
+    answers: Answers,
+    /// Once it has said what it is.
+    id: Option<LambdaId>,
+    triggers: Allowance,
+    bytes: Allowance,
+    /// What was refused is said once.
+    is_warned: bool,
+}
+
+/// What came of listening.
+#[derive(Copy, Clone, Debug, Default)]
+pub(super) struct Listened {
+    pub(super) heard: bool,
+    /// It has said what it is.
+    pub(super) is_new: Option<LambdaId>,
+    pub(super) is_gone: bool,
+    /// Wakes that are not recorded, and triggers of such.
+    pub(super) wakes_lost: u64,
+    pub(super) triggers_refused: u64,
+}
+
+impl Lambda {
+    pub(super) fn new(
+        name: String,
+        rules: Record,
+        topics: Vec<TopicId>,
+        spoken: Receiver<Spoken>,
+        answers: Answers,
+    ) -> Lambda {
+        Lambda { name, rules, topics, spoken, answers, id: None, triggers: TRIGGERS, bytes: BYTES, is_warned: false }
+    }
+
+    /// Hears what it has said, up to its turn.
+    pub(super) fn listen(
+        &mut self,
+        recorder: &mut Recorder,
+        now_ns: i64,
+        monotonic_ns: impl Fn() -> i64,
+        spreads: &mut Spreads,
+    ) -> Result<Listened, RecordError> {
+        let mut listened = Listened::default();
+        for _ in 0..TURN {
+            let said = match self.spoken.try_recv() {
+                Ok(said) => said,
+                Err(TryRecvError::Empty) => break,
+                Err(TryRecvError::Disconnected) => Spoken::Gone(None),
+            };
+            listened.heard = true;
+            match said {
+                Spoken::Hello(header) => {
+                    let digest = lambda_digest(&header.files);
+                    let (rules, topics) = (self.rules.clone(), self.topics.clone());
+                    match recorder.try_add_lambda(Member { header: *header, rules, digest, topics }) {
+                        Ok(id) => {
+                            self.id = Some(id);
+                            listened.is_new = Some(id);
+                            self.answers.ready();
+                        }
+                        Err(error) => self.answers.refused(&error.to_string()),
+                    }
+                }
+                Spoken::Another(why) => {
+                    warn!(lambda = %self.name, %why, "a lambda is not what the starter said");
+                    self.answers.refused(&why);
+                    listened.is_gone = true;
+                }
+                Spoken::Wake { entry, decided_ns, missing, bytes } => {
+                    let Some(id) = self.id else { continue };
+                    if missing > 0 {
+                        recorder.lost_wakes(id, entry.at_ns, missing.into());
+                        listened.wakes_lost += u64::from(missing);
+                    }
+                    if !self.may(&entry, bytes, now_ns) {
+                        recorder.lost_wakes(id, entry.at_ns.clamp(0, now_ns.max(0)), 1);
+                        listened.wakes_lost += 1;
+                        listened.triggers_refused += entry.triggers.len() as u64;
+                        continue;
+                    }
+                    recorder.wake(id, &entry)?;
+                    if !entry.triggers.is_empty() {
+                        let wait_ns = u64::try_from(monotonic_ns().saturating_sub(decided_ns)).unwrap_or(0);
+                        spreads.add(wait_ns);
+                        self.answers.opened(wait_ns);
+                    }
+                }
+                Spoken::Gone(why) => {
+                    if let Some(why) = why {
+                        let error = &why as &dyn std::error::Error;
+                        warn!(lambda = %self.name, error, "a lambda is not heard any more");
+                    }
+                    listened.is_gone = true;
+                }
+            }
+            if listened.is_gone {
+                self.answers.close();
+                if let Some(id) = self.id {
+                    recorder.end_lambda(id, now_ns)?;
+                }
+                break;
+            }
+        }
+        Ok(listened)
+    }
+
+    /// Whether a wake is one that an honest host may send: a lambda cannot fill what all share.
+    fn may(&mut self, entry: &Entry, bytes: usize, now_ns: i64) -> bool {
+        let now = Instant::now();
+        let is_now = (now_ns.saturating_sub(BEHIND_NS)..=now_ns.saturating_add(AHEAD_NS)).contains(&entry.at_ns);
+        let triggers = entry.triggers.len() as f64;
+        let may = is_now && self.bytes.take(bytes as f64, now) && self.triggers.take(triggers, now);
+        if !may && !self.is_warned {
+            self.is_warned = true;
+            warn!(lambda = %self.name, is_now, "wakes of a lambda are not recorded: too many, or of another time");
+        }
+        may
+    }
+}

@@ -1,0 +1,256 @@
+//! Finds the topics that are wanted and subscribes them; looks after the network and the disk once a second.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError};
+use std::thread::Thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::{Network, visible};
+use gleaner_transport::dds::Dds;
+use gleaner_transport::message::Definitions;
+use gleaner_transport::{DiscoveredTopic, Qos, Sink, Status, Subscription, TopicSpec, Transport, TransportError};
+use tracing::{error, warn};
+
+use super::commands;
+use super::hear::Event;
+use crate::{Topic, TopicId};
+
+/// How often topics are looked for.
+const LOOK: Duration = Duration::from_millis(100);
+/// How often network and disk are looked after.
+const PULSE: Duration = Duration::from_secs(1);
+/// Looks until a topic that could not be subscribed is tried again.
+const AGAIN: u32 = 100;
+
+/// Where samples come from.
+pub trait Feed: Transport + Send {
+    /// How the network is.
+    fn pulse(&mut self) -> Pulse;
+}
+
+/// How a network is.
+#[derive(Clone, Debug, Default)]
+pub struct Pulse {
+    /// What is known of it; `None` where there is none.
+    pub network: Option<Network>,
+    /// Why nothing comes any more.
+    pub dead: Option<String>,
+}
+
+/// ROS 2.
+pub(super) struct Live {
+    pub(super) dds: Dds,
+    pub(super) domain: u16,
+}
+
+impl Feed for Live {
+    fn pulse(&mut self) -> Pulse {
+        let health = self.dds.health();
+        let network = Network {
+            domain: self.domain,
+            participants: health.participants,
+            buffer_asked: health.buffer_asked,
+            buffer_granted: health.buffer_granted,
+            socket_drops: health.socket_drops,
+            filtered: health.filtered,
+        };
+        Pulse { network: Some(network), dead: health.dead }
+    }
+}
+
+impl Transport for Live {
+    fn topics(&self) -> Vec<DiscoveredTopic> {
+        self.dds.topics()
+    }
+
+    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+        self.dds.subscribe(spec, sink)
+    }
+
+    fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
+        self.dds.definitions(topic)
+    }
+
+    fn status(&self, subscription: Subscription) -> Status {
+        self.dds.status(subscription)
+    }
+}
+
+/// A topic that is to be heard.
+pub(super) struct Want {
+    pub(super) what: Wanted,
+    pub(super) name: String,
+    pub(super) sink: Arc<dyn Sink>,
+}
+
+/// What a topic is wanted for.
+#[derive(Copy, Clone, Debug)]
+pub(super) enum Wanted {
+    /// To be recorded, once it is there and its type known.
+    Recorded {
+        topic: TopicId,
+        /// Of the largest sample, if a manifest says so.
+        max_bytes: Option<usize>,
+    },
+    /// Commands come over it. It is heard before anybody writes, where the network can do that: a command is written once.
+    Commands,
+}
+
+/// What was seen.
+pub(super) enum Seen {
+    /// A topic is there, and will be heard.
+    Found { topic: TopicId, of: Topic },
+    /// Once a second.
+    Pulse(Box<Beat>),
+}
+
+/// How everything outside is.
+#[derive(Default)]
+pub(super) struct Beat {
+    pub(super) pulse: Pulse,
+    pub(super) topics: Vec<(TopicId, Status)>,
+    pub(super) commands: Option<Status>,
+    pub(super) disk_free: Option<u64>,
+    pub(super) rss_bytes: u64,
+    pub(super) cpu_s: f64,
+}
+
+/// The thread's own.
+pub(super) struct Watch {
+    pub(super) feed: Box<dyn Feed>,
+    pub(super) wants: Receiver<Want>,
+    pub(super) events: SyncSender<Event>,
+    pub(super) reader: Thread,
+    pub(super) out: PathBuf,
+}
+
+impl Watch {
+    /// Until nobody wants anything more.
+    pub(super) fn run(mut self) {
+        let mut wanted: Vec<(Want, u32)> = Vec::new();
+        let (mut subscribed, mut commands) = (Vec::new(), None);
+        let mut beat_at = Instant::now();
+        loop {
+            match self.wants.recv_timeout(LOOK) {
+                Ok(want) => wanted.push((want, 0)),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return,
+            }
+            if !wanted.is_empty() {
+                let topics = self.feed.topics();
+                wanted.retain_mut(|(want, wait)| {
+                    *wait = wait.saturating_sub(1);
+                    let found = topics.iter().find(|topic| topic.topic == want.name);
+                    match (want.what, found) {
+                        _ if *wait > 0 => return true,
+                        (Wanted::Recorded { topic, max_bytes }, Some(found)) => {
+                            match self.record(want, topic, max_bytes, found) {
+                                Some(subscription) => subscribed.push((topic, subscription)),
+                                None => *wait = AGAIN,
+                            }
+                        }
+                        (Wanted::Recorded { .. }, None) => return true,
+                        (Wanted::Commands, _) => match self.hear_commands(want) {
+                            Ok(subscription) => commands = Some(subscription),
+                            Err(again) => *wait = again,
+                        },
+                    }
+                    *wait > 0
+                });
+            }
+            if beat_at.elapsed() >= PULSE {
+                beat_at = Instant::now();
+                let topics = subscribed.iter().map(|(topic, of)| (*topic, self.feed.status(*of))).collect();
+                let (rss_bytes, cpu_s) = used();
+                let disk_free = free(&self.out);
+                let commands = commands.map(|of| self.feed.status(of));
+                let beat = Beat { pulse: self.feed.pulse(), topics, commands, disk_free, rss_bytes, cpu_s };
+                match self.events.try_send(Event::Seen(Seen::Pulse(Box::new(beat)))) {
+                    Ok(()) => self.reader.unpark(),
+                    // The next one comes soon.
+                    Err(TrySendError::Full(_)) => {}
+                    Err(TrySendError::Disconnected(_)) => return,
+                }
+            }
+        }
+    }
+
+    fn record(
+        &mut self,
+        want: &Want,
+        topic: TopicId,
+        max_bytes: Option<usize>,
+        found: &DiscoveredTopic,
+    ) -> Option<Subscription> {
+        if found.definitions_text.is_none() {
+            let (topic, type_name) = (visible(&want.name), visible(&found.type_name));
+            warn!(%topic, %type_name, "no definitions of this type: its messages are recorded without");
+        }
+        let of = Topic {
+            name: want.name.clone(),
+            type_name: found.type_name.clone(),
+            definitions: found.definitions_text.clone(),
+            offered_qos: found.offered_qos.clone(),
+        };
+        let max_bytes = max_bytes.unwrap_or_else(|| usual_bytes(&found.type_name));
+        let spec = TopicSpec {
+            topic: want.name.clone(),
+            type_name: found.type_name.clone(),
+            queue: ((64 << 20) / max_bytes.max(1)).clamp(4, 1024),
+            max_bytes,
+            qos: Qos::Auto,
+        };
+        // Before its first sample.
+        self.events.send(Event::Seen(Seen::Found { topic, of })).ok()?;
+        match self.feed.subscribe(&spec, Arc::clone(&want.sink)) {
+            Ok(subscription) => Some(subscription),
+            Err(why) => {
+                error!(topic = %visible(&want.name), error = &why as &dyn std::error::Error, "cannot record a topic");
+                None
+            }
+        }
+    }
+
+    /// Or after how many looks to try again.
+    fn hear_commands(&mut self, want: &Want) -> Result<Subscription, u32> {
+        let spec = TopicSpec {
+            topic: want.name.clone(),
+            type_name: commands::TYPE.to_owned(),
+            queue: commands::QUEUE,
+            max_bytes: commands::MESSAGE_MAX,
+            // Not those from before: they are obeyed already, or nobody wants them any more.
+            qos: Qos::Fixed { reliable: true, transient_local: false, depth: commands::QUEUE },
+        };
+        self.feed.subscribe(&spec, Arc::clone(&want.sink)).map_err(|why| match why {
+            TransportError::NoSuchTopic { .. } => 1,
+            why => {
+                error!(topic = %visible(&want.name), error = &why as &dyn std::error::Error, "cannot hear commands");
+                AGAIN
+            }
+        })
+    }
+}
+
+/// Bytes of the largest sample of a topic of which no manifest says more. What is larger may be dropped before anybody can count
+/// it, so this is generous; the staging area, which counts what it has no room for, is not.
+fn usual_bytes(type_name: &str) -> usize {
+    match type_name.rsplit('/').next() {
+        Some("Image" | "PointCloud2") => 32 << 20,
+        _ => 8 << 20,
+    }
+}
+
+/// Bytes that are free on the disk of `folder`.
+fn free(folder: &Path) -> Option<u64> {
+    rustix::fs::statvfs(folder).ok().map(|disk| disk.f_bavail.saturating_mul(disk.f_frsize))
+}
+
+/// Resident memory in bytes, and CPU time in s.
+fn used() -> (u64, f64) {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<u64>().ok());
+    let times = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    (kib.unwrap_or(0) * 1024, times.tv_sec as f64 + times.tv_nsec as f64 / 1e9)
+}

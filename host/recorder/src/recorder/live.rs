@@ -1,0 +1,235 @@
+//! A recorder that is fed live: nothing that it is told waits for a disk.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_protocol::link::Loss;
+use gleaner_protocol::manifest::Store;
+use gleaner_protocol::{Moment, Trigger};
+use gleaner_transport::SampleMeta;
+
+use super::finished::KEPT;
+use super::pen::{Outcome, Pen};
+use super::walk::Budget;
+use super::{Commanded, LambdaId, Recorder, Settings, TopicId, Work};
+use crate::RecordError;
+use crate::file::{Folder, Topic};
+use crate::window::{Heard, nanoseconds};
+
+/// How much later than its stamp a wake may come: a lambda's process sends them together, see
+/// [`gleaner_protocol::link::RecorderLink::wake`]. Clips wait for them.
+const GRACE: Duration = Duration::from_millis(200);
+
+impl Recorder {
+    /// A recorder without topics and lambdas, that is fed while it happens. A thread writes its clips; at most 16 MiB and
+    /// one message are on their way to it, and the preroll holds what has to wait. Gaps in the numbers of samples are losses.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Preroll`] as for [`Recorder::new`], and [`RecordError::Thread`].
+    pub fn live(folder: Folder, settings: Settings) -> Result<Recorder, RecordError> {
+        let mut recorder = Recorder::with(Pen::there(folder)?, settings, true)?;
+        recorder.windows.set_grace(nanoseconds(GRACE));
+        Ok(recorder)
+    }
+
+    /// Does a piece of what is to be done, which takes a tenth of a millisecond or two unless a single message takes longer.
+    /// To be called after every few samples and wakes, and again while it says so.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the preroll is on disk and that fails, or the thread that writes is gone. That a clip could not be
+    /// written is no such error: see [`Recorder::take_failures`].
+    pub fn work(&mut self) -> Result<Work, RecordError> {
+        let mut outcomes = Vec::new();
+        self.stock.desk.pen.poll(&mut outcomes)?;
+        self.note(outcomes);
+        self.run_within(Budget::STEP)?;
+        if self.is_settled() {
+            return Ok(Work::Done);
+        }
+        Ok(if self.stock.desk.pen.has_room() { Work::More } else { Work::Wait })
+    }
+
+    /// Why clips could not be written since this was asked last; the first of them, 16 at most.
+    pub fn take_failures(&mut self) -> Vec<RecordError> {
+        std::mem::take(&mut self.finished.failures)
+    }
+
+    /// Clips that had to go for others since this was asked last; the first of them.
+    pub fn take_deleted(&mut self) -> Vec<Loss> {
+        std::mem::take(&mut self.finished.deleted)
+    }
+
+    /// Whether a clip is open.
+    pub fn is_recording(&self) -> bool {
+        self.draft.is_some()
+    }
+
+    /// A topic that was missing is there.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::LongTopic`] if a clip has no room for what it says of itself: it stays missing.
+    pub fn found_topic(&mut self, id: TopicId, topic: Topic) -> Result<(), RecordError> {
+        topic.check()?;
+        let now = self.now;
+        let lane = &mut self.stock.desk.lanes[id.0];
+        if lane.is_missing {
+            // Messages and windows know it by the name under which it was wanted.
+            lane.topic = Arc::new(Topic { name: lane.topic.name.clone(), ..topic });
+            (lane.is_missing, lane.found_at) = (false, now);
+        }
+        Ok(())
+    }
+
+    /// So many wakes of a lambda were lost before they came here; the next one to come is of this stamp.
+    pub fn lost_wakes(&mut self, lambda: LambdaId, at_ns: i64, count: u64) {
+        self.stock.desk.crews[lambda.0].wakes += count;
+        self.stock.wake_losses[lambda.0].lost.add_some(at_ns, 0, count);
+    }
+
+    /// A sample came as far as here, and there was no room for it.
+    pub fn lost_sample(&mut self, topic: TopicId, meta: &SampleMeta) {
+        self.stock.note_gap(topic.0, meta);
+        self.stock.losses[topic.0].lost.add(meta.at_ns, 0);
+    }
+
+    /// Somebody commands what `lambda` could trigger; `source` says who, in words. It is no wake: no journal has it, and it has
+    /// no part in the lambda's cooldown. A stop ends what a command started with this label.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the disk fails.
+    pub fn command(
+        &mut self,
+        lambda: LambdaId,
+        trigger: &Trigger,
+        at_ns: i64,
+        source: String,
+    ) -> Result<Commanded, RecordError> {
+        if self.held.is_some() {
+            self.counts.held_back += 1;
+            return Ok(Commanded::HeldBack);
+        }
+        let commanded = match self.windows.command(lambda.0, trigger.kind, &trigger.label, at_ns) {
+            Heard::Opened => {
+                self.counts.windows += 1;
+                Commanded::Opened
+            }
+            Heard::Stopped => Commanded::Stopped,
+            Heard::InCooldown | Heard::Ignored => return Ok(Commanded::Ignored),
+        };
+        let moment = Moment { source: Some(source), ..Moment::of(self.name_of(lambda), trigger, at_ns) };
+        self.await_clip(lambda, moment);
+        self.act()?;
+        Ok(commanded)
+    }
+
+    /// A lambda has ended: what it started and did not stop ends now.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the disk fails.
+    pub fn end_lambda(&mut self, lambda: LambdaId, at_ns: i64) -> Result<(), RecordError> {
+        if self.windows.end(lambda.0, at_ns)
+            && let Some(draft) = &mut self.draft
+            && !draft.ended.contains(&lambda.0)
+        {
+            draft.ended.push(lambda.0);
+        }
+        self.run()
+    }
+
+    /// From now on no clip is begun, and the one that is open ends: `why` says it. `None`: goes on.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the disk fails.
+    pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
+        self.held = why.map(Arc::from);
+        // What is open ends at once.
+        self.windows.set_grace(if why.is_some() { 0 } else { nanoseconds(GRACE) });
+        self.run()
+    }
+
+    /// Whether nothing is to be recorded for now.
+    pub fn is_held(&self) -> bool {
+        self.held.is_some()
+    }
+
+    /// The preroll may take more from now on: `bytes`, and a disk if it was in memory. It is never made smaller.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Preroll`] if it has no place on the disk.
+    pub fn grow_preroll(&mut self, store: Store, bytes: u64) -> Result<(), RecordError> {
+        let Settings { folder, prefault, .. } = &self.settings;
+        if bytes <= self.counts.preroll_bound && store != Store::Disk {
+            return Ok(());
+        }
+        let bytes = bytes.max(self.counts.preroll_bound);
+        if self.stock.preroll.grow(store, bytes, folder.join("preroll"), *prefault)? {
+            if let Some(walk) = &mut self.walk {
+                walk.restart();
+            }
+            if let Some(behind) = &mut self.behind {
+                *behind = None;
+            }
+            if let Some(draft) = &mut self.draft {
+                draft.settled = None;
+            }
+        }
+        self.counts.preroll_bound = bytes;
+        Ok(())
+    }
+
+    /// The longest clip is as long from now on, if that is longer than before.
+    pub fn grow_length(&mut self, most: Duration) {
+        self.max_length_ns = self.max_length_ns.max(nanoseconds(most));
+        self.windows.grow_length(self.max_length_ns);
+    }
+
+    /// Does everything that can be decided, however long it takes.
+    pub(super) fn settle_all(&mut self) -> Result<(), RecordError> {
+        loop {
+            self.run_within(Budget::ALL)?;
+            if self.is_settled() {
+                return Ok(());
+            }
+            self.wait()?;
+        }
+    }
+
+    /// Waits until everything is written.
+    pub(super) fn drain(&mut self) -> Result<(), RecordError> {
+        while !self.stock.desk.pen.is_idle() {
+            self.wait()?;
+        }
+        Ok(())
+    }
+
+    fn wait(&mut self) -> Result<(), RecordError> {
+        let mut outcomes = Vec::new();
+        self.stock.desk.pen.wait(&mut outcomes)?;
+        self.note(outcomes);
+        Ok(())
+    }
+
+    fn note(&mut self, outcomes: Vec<Outcome>) {
+        for outcome in outcomes {
+            match outcome {
+                Outcome::Finished(clip, deleted) => {
+                    self.counts.deleted += deleted.len() as u64;
+                    self.finished.add(Some(*clip));
+                    self.finished.deleted.extend(deleted);
+                    self.finished.deleted.truncate(KEPT);
+                }
+                Outcome::Failed(error) => {
+                    self.counts.failed += 1;
+                    self.finished.fail(error);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,183 @@
+//! Commands over a topic: what they record, and what is refused.
+#![cfg(feature = "program")]
+
+mod running;
+mod support;
+
+use std::time::Instant;
+
+use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_protocol::link::{CommandStatus, RecorderLink};
+use gleaner_protocol::{Clip, TriggerKind};
+use gleaner_transport::Verdict;
+use running::*;
+use support::*;
+
+const TOPIC: &str = "/gleaner/commands";
+/// The writer that `meta` names, in hexadecimal digits.
+const SOURCE: &str = "command on /gleaner/commands by 07070707070707070707070707070707";
+
+/// A process that hears commands, with a sensor on `/a`.
+struct Commanded {
+    running: Running,
+    network: Network,
+    _sensor: Sensor,
+}
+
+impl Commanded {
+    fn start(scratch: &Scratch) -> Commanded {
+        let network = Network::default();
+        network.add("/a");
+        network.add_texts(TOPIC);
+        let running = Running::start(scratch, &network, |options| options.commands = Some(TOPIC.to_owned()));
+        let sensor = Sensor::start(&network, running.clock);
+        Commanded { running, network, _sensor: sensor }
+    }
+
+    fn join(&mut self, scratch: &Scratch, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
+        let (folder, header) = lambda(scratch, name, rolls_ms);
+        let mut link = RecorderLink::new(self.running.control.add(&add(&folder)).unwrap());
+        link.hello(&header, PATIENCE).unwrap();
+        link
+    }
+
+    /// Says something; once somebody listens.
+    fn say(&self, text: impl AsRef<[u8]>) -> (i64, Verdict) {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let at = self.running.clock.now();
+            match self.network.publish_text(TOPIC, at, text.as_ref()) {
+                Some(verdict) => return (at, verdict),
+                None => assert!(Instant::now() < deadline, "nobody listens"),
+            }
+            std::thread::yield_now();
+        }
+    }
+
+    fn told(&mut self, wanted: impl Fn(&CommandStatus) -> bool) -> CommandStatus {
+        let status = self.running.status(|status| status.commands.as_ref().is_some_and(&wanted));
+        status.commands.unwrap()
+    }
+
+    fn accepted_and_refused(&mut self, accepted: u64, refused: u64) {
+        let told = self.told(|told| told.accepted + told.refused >= accepted + refused);
+        assert_eq!((told.accepted, told.refused), (accepted, refused));
+    }
+
+    fn end(mut self) {
+        self.running.control.stop().unwrap();
+        assert_eq!(self.running.ended().1, Ok(()));
+    }
+}
+
+fn moments(clip: &Clip) -> Vec<(&str, TriggerKind, &str, Option<&str>)> {
+    let moment = |moment: &gleaner_protocol::Moment| moment.source.is_some();
+    assert!(clip.moments.iter().any(moment));
+    let told = clip.moments.iter();
+    told.map(|m| (m.lambda.as_str(), m.kind, m.label.as_str(), m.source.as_deref())).collect()
+}
+
+#[test]
+fn an_event_by_command_records_as_the_lambda_would_and_stands_in_no_journal() {
+    let scratch = Scratch::new();
+    let mut commanded = Commanded::start(&scratch);
+    let mut link = commanded.join(&scratch, "first", (5000, 100));
+    received(&mut commanded.running, 300);
+    // The only lambda needs no name. The stamp of this wake lies in the window.
+    let at_wake = commanded.running.clock.now();
+    link.wake(&entry(at_wake, &[]), 0).unwrap();
+    link.poll().unwrap();
+    let (at, _) = commanded.say(r#"{"command": "event", "label": "odd noise", "score": 0.25}"#);
+    let clip = commanded.running.clip();
+    assert_eq!((clip.from_ns, clip.to_ns, clip.triggers), (at - 5 * S, at + 100 * MS, 1));
+    assert_eq!(moments(&clip), [("first", Event, "odd noise", Some(SOURCE))]);
+    assert_eq!((clip.moments[0].score, clip.moments[0].at_ns), (Some(0.25), at));
+    assert_eq!(clip.lambdas[0].windows, 1);
+    let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
+    assert!(numbers.len() > 50 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "{numbers:?}");
+    assert_eq!(scratch.journal(&clip, "first").1, [at_wake], "wakes, and nothing else");
+    let told = scratch.metadata(&clip);
+    let decisions: Vec<_> = told.iter().filter(|(name, _)| name == "gleaner.decision").collect();
+    assert_eq!(decisions.len(), 1);
+    assert_eq!(decisions[0].1["source"], SOURCE);
+    commanded.accepted_and_refused(1, 0);
+    commanded.end();
+}
+
+#[test]
+fn a_stop_ends_what_a_command_started_and_nothing_else() {
+    let scratch = Scratch::new();
+    let mut commanded = Commanded::start(&scratch);
+    let mut first = commanded.join(&scratch, "first", (0, 0));
+    let second = commanded.join(&scratch, "second", (0, 0));
+    received(&mut commanded.running, 50);
+    first.wake(&entry(commanded.running.clock.now(), &[Start]), 0).unwrap();
+    commanded.running.status(|status| status.windows == 1);
+    // The lambda's own is not ended, whoever asks.
+    commanded.say(r#"{"command": "stop", "label": "here", "lambda": "first"}"#);
+    commanded.accepted_and_refused(0, 1);
+    commanded.say(r#"{"command": "start", "label": "here", "lambda": "second"}"#);
+    commanded.accepted_and_refused(1, 1);
+    // Nor does the lambda's end end what was commanded in its name.
+    second.bye(PATIENCE);
+    first.bye(PATIENCE);
+    let status = commanded.running.status(|status| status.lambdas == 0);
+    assert!(status.recording);
+    commanded.say(r#"{"command": "stop", "label": "here"}"#);
+    commanded.accepted_and_refused(1, 2);
+    let (stopped, _) = commanded.say(r#"{"command": "stop", "label": "here", "lambda": "second"}"#);
+    let clip = commanded.running.clip();
+    assert!(clip.to_ns >= stopped, "{clip:?}");
+    let source = Some(SOURCE);
+    assert_eq!(
+        moments(&clip),
+        [
+            ("first", Start, "here", None),
+            ("second", Start, "here", source),
+            ("second", TriggerKind::Stop, "here", source)
+        ]
+    );
+    assert_eq!(clip.short, ["first ended before it said stop"]);
+    commanded.accepted_and_refused(2, 2);
+    commanded.end();
+}
+
+#[test]
+fn too_many_too_long_and_senseless_commands_are_counted_and_do_nothing() {
+    let scratch = Scratch::new();
+    let mut commanded = Commanded::start(&scratch);
+    let long = format!(r#"{{"command": "event", "label": "x"}}{}"#, " ".repeat(4096));
+    assert_eq!(commanded.say(&long).1, Verdict::TooBig);
+    for text in ["", "{\"command\": \"event\", \"label\": \"\u{1b}[2J\", \"lambda\": \"\u{7}\"}", "{\"command\":\"x\"}"]
+    {
+        assert_eq!(commanded.say(text).1, Verdict::Taken);
+    }
+    commanded.say([0xff; 100]);
+    commanded.accepted_and_refused(0, 5);
+    let verdicts: Vec<_> = (0..10_000).map(|_| commanded.say(r#"{"command":"event","label":"x"}"#).1).collect();
+    let taken = verdicts.iter().filter(|verdict| **verdict == Verdict::Taken).count();
+    assert!(taken < 100, "at most five at once, and one each second: {taken}");
+    commanded.accepted_and_refused(0, 5 + 10_000);
+    let last = {
+        commanded.running.control.stop().unwrap();
+        commanded.running.ended().0
+    };
+    assert_eq!((last.windows, last.clips, last.ignored), (0, 0, 0));
+}
+
+#[test]
+fn nobody_commands_where_nobody_asked_for_it() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add("/a");
+    network.add_texts(TOPIC);
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let _sensor = Sensor::start(&network, running.clock);
+    let (folder, header) = lambda(&scratch, "first", (0, 0));
+    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    link.hello(&header, PATIENCE).unwrap();
+    received(&mut running, 50);
+    let text = br#"{"command": "event", "label": "x"}"#;
+    assert_eq!(network.publish_text(TOPIC, running.clock.now(), text), None);
+    assert_eq!(running.status(|_| true).commands, None);
+}

@@ -1,0 +1,388 @@
+//! A recorder that is fed live makes the clips that one makes which is told the same of a drive.
+
+mod support;
+
+use std::time::Duration;
+
+use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
+use gleaner_protocol::manifest::Store;
+use gleaner_recorder::{Folder, Recorder, Settings, Work};
+use gleaner_transport::{Guid, SampleMeta};
+use support::*;
+
+const EVENT: &[TriggerKind] = &[Event];
+
+fn live(scratch: &Scratch, change: impl FnOnce(&mut Settings)) -> Recorder {
+    let mut settings = Settings {
+        store: Store::Ram,
+        preroll_bytes: 16 << 20,
+        max_length: Duration::from_secs(600),
+        folder: scratch.0.clone(),
+        clock: "monotonic".to_owned(),
+        prefault: true,
+    };
+    change(&mut settings);
+    Recorder::live(Folder::open(&scratch.0).unwrap().0, settings).unwrap()
+}
+
+/// What the clips of a random drive hold, each by itself. Triggers come at once; `work` is done as often as chance has it.
+fn random_drive(seed: u64, is_live: bool) -> Vec<Vec<(String, i64, u32)>> {
+    let (mut random, mut pace) = (Random(seed), Random(seed + 1000));
+    let scratch = Scratch::new();
+    let store =
+        |settings: &mut Settings| settings.store = if seed.is_multiple_of(2) { Store::Ram } else { Store::Disk };
+    let mut recorder = if is_live { live(&scratch, store) } else { scratch.recorder(store) };
+    let topics = ["/a", "/b", "/camera"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let rolls = [(random.below(80), random.below(60)), (random.below(500), random.below(20))];
+    let lambdas = [
+        recorder.add_lambda(member("l0", (rolls[0].0, rolls[0].1, 0), &[topics[0], topics[2]])),
+        recorder.add_lambda(member("l1", (rolls[1].0, rolls[1].1, random.below(40)), &[topics[1], topics[0]])),
+    ];
+    for ms in 1000..3000 {
+        let at = ms - random.below(3) * random.below(5);
+        recorder.sample(topics[0], &meta(T0 + at * MS, ms as u64), &vec![7; random.below(300) as usize]).unwrap();
+        if ms % 3 == 0 {
+            recorder.sample(topics[1], &meta(T0 + at * MS, ms as u64), &[8; 3000]).unwrap();
+        }
+        recorder.advance(T0 + ms * MS).unwrap();
+        for lambda in lambdas {
+            let kinds: &[TriggerKind] = match random.below(300) {
+                0 => &[Start],
+                1..6 => &[Stop],
+                6 | 7 => EVENT,
+                _ => continue,
+            };
+            recorder.wake(lambda, &entry(T0 + ms * MS, kinds)).unwrap();
+        }
+        let steps = pace.below(40) - 30;
+        for _ in 0..if is_live { steps.max(0) } else { 0 } {
+            recorder.work().unwrap();
+        }
+    }
+    recorder.finish(T0 + 3000 * MS).unwrap();
+    recorder.clips().iter().map(|clip| scratch.contents(clip)).collect()
+}
+
+#[test]
+fn clips_are_those_of_a_drive_whenever_the_work_is_done() {
+    let mut clips = 0;
+    for seed in 0..60 {
+        let expected = random_drive(seed, false);
+        clips += expected.len();
+        assert_eq!(random_drive(seed, true), expected, "seed {seed}");
+    }
+    assert!(clips > 120, "{clips}");
+}
+
+#[test]
+fn clips_that_go_on_hold_everything_once_whenever_the_work_is_done() {
+    for every in [1, 7, 60] {
+        let scratch = Scratch::new();
+        let mut recorder = live(&scratch, |settings| settings.max_length = Duration::from_millis(100));
+        let a = recorder.add_topic(topic("/a")).unwrap();
+        let lambda = recorder.add_lambda(member("hello", (250, 0, 0), &[a]));
+        for ms in 0..2000 {
+            recorder.sample(a, &meta(T0 + ms * MS, ms as u64), b"x").unwrap();
+            match ms {
+                1000 => recorder.wake(lambda, &entry(T0 + ms * MS, &[Start])).unwrap(),
+                1600 => recorder.wake(lambda, &entry(T0 + ms * MS, &[Stop])).unwrap(),
+                _ => {}
+            }
+            if ms % every == 0 {
+                recorder.work().unwrap();
+            }
+        }
+        recorder.finish(T0 + 2000 * MS).unwrap();
+        let clips = recorder.clips();
+        let all: Vec<_> = clips.iter().flat_map(|clip| stamps(&scratch, clip, "/a")).collect();
+        assert_eq!(all, (750..=1600).collect::<Vec<_>>(), "work is done every {every} ms");
+        assert_eq!(clips.len(), 9);
+    }
+}
+
+#[test]
+fn little_is_on_its_way_to_the_disk_however_fast_samples_come() {
+    let scratch = Scratch::new();
+    let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 256 << 20);
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (1000, 1000, 0), &[a]));
+    let mut noise = Random(1);
+    let bytes: Vec<u8> = (0..1 << 20).map(|_| noise.below(256) as u8).collect();
+    let mut highest = 0;
+    for ms in 0..200 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &bytes).unwrap();
+        if ms == 50 {
+            recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
+        }
+        recorder.work().unwrap();
+        highest = highest.max(recorder.counts().in_flight);
+    }
+    while recorder.work().unwrap() != Work::Done {
+        highest = highest.max(recorder.counts().in_flight);
+    }
+    recorder.finish(T0 + 200 * MS).unwrap();
+    assert!(highest <= (16 << 20) + (2 << 20), "{highest}");
+    let clip = &recorder.clips()[0];
+    assert_eq!(stamps(&scratch, clip, "/a"), (0..200).collect::<Vec<_>>());
+    assert_eq!(
+        clip.short,
+        [
+            "the preroll begins 0.9 s late: nothing was recorded before",
+            "the recording was stopped before the window ended"
+        ]
+    );
+}
+
+#[test]
+fn what_has_to_go_before_it_is_written_is_counted() {
+    let scratch = Scratch::new();
+    let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 50_000);
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (100, 1000, 0), &[a]));
+    for ms in 0..2000 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &[1; 100]).unwrap();
+        if ms == 500 {
+            // Nobody finds the time to work.
+            recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
+        }
+    }
+    recorder.finish(T0 + 2000 * MS).unwrap();
+    let clip = &recorder.clips()[0];
+    let topic = &clip.topics[0];
+    assert!(topic.overwritten.unwrap() > 500, "{topic:?}");
+    assert_eq!((topic.received, topic.lost), (Some(1101), Some(0)));
+    assert_eq!(topic.messages + topic.overwritten.unwrap(), 1101);
+}
+
+#[test]
+fn gaps_in_numbers_are_losses_of_the_clip_that_they_are_in() {
+    let scratch = Scratch::new();
+    let mut recorder = live(&scratch, |_| {});
+    let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let late = recorder.add_missing_topic("/late").unwrap();
+    let wanted = [topics[0], topics[1], late];
+    let lambda = recorder.add_lambda(member("hello", (100, 100, 0), &wanted));
+    let other = SampleMeta { writer: Guid([8; 16]), ..meta(0, 0) };
+    for ms in 0..1000_u64 {
+        let at = T0 + ms as i64 * MS;
+        // Three are lost before the clip, five in its preroll, two in its postroll, four after it.
+        let seq = ms
+            + [(100, 3), (450, 5), (550, 2), (800, 4)]
+                .iter()
+                .filter(|(from, _)| ms >= *from)
+                .map(|(_, lost)| lost)
+                .sum::<u64>();
+        recorder.sample(topics[0], &meta(at, seq), b"x").unwrap();
+        if ms % 2 == 0 {
+            // One comes late, and is no loss; another had no room here.
+            let swapped = match ms {
+                540 => 542,
+                542 => 540,
+                ms => ms,
+            };
+            let meta = SampleMeta { at_ns: at, seq: swapped / 2 + 1, ..other };
+            match ms {
+                520 => recorder.lost_sample(topics[1], &meta),
+                _ => recorder.sample(topics[1], &meta, b"y").unwrap(),
+            }
+        }
+        match ms {
+            480 => recorder.found_topic(late, topic("/late")).unwrap(),
+            500 => {
+                recorder.lost_wakes(lambda, at, 3);
+                recorder.wake(lambda, &entry(at, EVENT)).unwrap();
+            }
+            510.. => recorder.sample(late, &meta(at, ms), b"z").unwrap(),
+            _ => {}
+        }
+        recorder.work().unwrap();
+    }
+    recorder.finish(T0 + S).unwrap();
+    let [clip] = recorder.clips() else { panic!() };
+    let told: Vec<_> = clip.topics.iter().map(|topic| (topic.messages, topic.lost)).collect();
+    assert_eq!(told, [(201, Some(7)), (100, Some(1)), (91, None)]);
+    assert_eq!(clip.topics[2].type_name.as_deref(), Some("test_msgs/msg/Number"));
+    let expected = [
+        "7 samples of /a did not reach the recorder",
+        "1 sample of /b did not reach the recorder",
+        "/late was found 0.1 s after the clip begins",
+        "the journal of hello lacks 3 wakes: lost on the way to the recorder",
+    ];
+    assert_eq!(clip.short, expected);
+    assert_eq!(scratch.journal(clip, "hello").0.wakes_before, 3);
+}
+
+#[test]
+fn while_nothing_may_be_recorded_triggers_are_counted_and_the_open_clip_ends() {
+    let scratch = Scratch::new();
+    let mut recorder = live(&scratch, |_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (50, 500, 0), &[a]));
+    for ms in 0..2000 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), b"x").unwrap();
+        match ms {
+            100 | 400 | 1000 => recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap(),
+            300 => recorder.hold(Some("the disk is full")).unwrap(),
+            600 => recorder.hold(None).unwrap(),
+            _ => {}
+        }
+        while recorder.work().unwrap() == Work::More {}
+    }
+    recorder.finish(T0 + 2 * S).unwrap();
+    let [early, whole] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
+    assert_eq!(
+        (stamps(&scratch, early, "/a"), early.short.as_slice()),
+        (every(50, 300, 1), &["the disk is full".to_owned()][..])
+    );
+    assert_eq!((stamps(&scratch, whole, "/a"), whole.short.len()), (every(950, 1500, 1), 0));
+    assert_eq!(recorder.counts().held_back, 1);
+}
+
+#[test]
+fn a_lambda_that_ends_stops_what_it_started() {
+    let scratch = Scratch::new();
+    let mut recorder = live(&scratch, |_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (0, 50, 0), &[a]));
+    for ms in 0..1000 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), b"x").unwrap();
+        match ms {
+            100 => recorder.wake(lambda, &entry(T0 + ms * MS, &[Start])).unwrap(),
+            300 => recorder.end_lambda(lambda, T0 + ms * MS).unwrap(),
+            _ => {}
+        }
+        recorder.work().unwrap();
+    }
+    recorder.finish(T0 + S).unwrap();
+    let clip = &recorder.clips()[0];
+    assert_eq!(stamps(&scratch, clip, "/a"), every(100, 350, 1));
+    assert_eq!(clip.short, ["hello ended before it said stop"]);
+}
+
+#[test]
+fn a_clip_that_cannot_be_written_is_told_and_the_next_one_can() {
+    let scratch = Scratch::new();
+    let mut recorder = live(&scratch, |_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (0, 50, 0), &[a]));
+    let clips = scratch.0.join("clips");
+    for ms in 0..2000 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), b"x").unwrap();
+        match ms {
+            90 => std::fs::rename(&clips, scratch.0.join("away")).unwrap(),
+            100 | 1000 => recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap(),
+            500 => {
+                while recorder.counts().failed == 0 {
+                    recorder.work().unwrap();
+                }
+                assert_eq!(recorder.take_failures().len(), 1);
+                std::fs::rename(scratch.0.join("away"), &clips).unwrap();
+            }
+            _ => {}
+        }
+        recorder.work().unwrap();
+    }
+    recorder.finish(T0 + 2 * S).unwrap();
+    let [clip] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
+    assert_eq!(stamps(&scratch, clip, "/a"), every(1000, 1050, 1));
+    assert_eq!(recorder.counts().failed, 1);
+}
+
+#[test]
+fn a_preroll_that_grows_keeps_what_it_holds() {
+    for store in [Store::Ram, Store::Disk] {
+        let scratch = Scratch::new();
+        let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 30_000);
+        let a = recorder.add_topic(topic("/a")).unwrap();
+        let lambda = recorder.add_lambda(member("hello", (1000, 300, 0), &[a]));
+        for ms in 0..2000 {
+            recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &[1; 8]).unwrap();
+            match ms {
+                300 => recorder.grow_preroll(store, 64 << 20).unwrap(),
+                1000 => recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap(),
+                // In the middle of the way through it.
+                1003 => recorder.grow_preroll(store, 65 << 20).unwrap(),
+                _ => {}
+            }
+            if ms % 5 == 0 {
+                recorder.work().unwrap();
+            }
+        }
+        recorder.finish(T0 + 2 * S).unwrap();
+        assert_eq!(stamps(&scratch, &recorder.clips()[0], "/a"), every(0, 1300, 1));
+    }
+}
+
+#[test]
+fn the_oldest_clips_make_room_and_each_is_named() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = Folder::open(&scratch.0).unwrap();
+    assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
+    let settings = Settings {
+        store: Store::Ram,
+        preroll_bytes: 1 << 20,
+        max_length: Duration::from_secs(600),
+        folder: scratch.0.clone(),
+        clock: "x".to_owned(),
+        prefault: false,
+    };
+    let mut recorder = Recorder::live(folder, settings).unwrap();
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (0, 50, 0), &[a]));
+    for ms in 0..1000 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), b"x").unwrap();
+        if ms % 200 == 100 {
+            recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
+        }
+        recorder.work().unwrap();
+    }
+    recorder.finish(T0 + S).unwrap();
+    let is_there: Vec<_> = recorder.clips().iter().map(|clip| scratch.0.join(&clip.file).exists()).collect();
+    assert_eq!(is_there, [false, false, false, true, true]);
+    let losses = std::fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap();
+    assert_eq!(losses.lines().count(), 3);
+    for (line, clip) in losses.lines().zip(recorder.clips().to_vec()) {
+        assert!(line.contains(&format!(r#""file":"{}""#, clip.file.display())), "{line}");
+    }
+    assert_eq!((recorder.counts().deleted, recorder.take_deleted().len()), (3, 3));
+}
+
+#[test]
+fn a_clip_that_was_fetched_leaves_its_room_to_others() {
+    let scratch = Scratch::new();
+    let (folder, _) = Folder::open(&scratch.0).unwrap();
+    let settings = Settings {
+        store: Store::Ram,
+        preroll_bytes: 1 << 20,
+        max_length: Duration::from_secs(600),
+        folder: scratch.0.clone(),
+        clock: "x".to_owned(),
+        prefault: false,
+    };
+    let mut recorder = Recorder::live(folder, settings.clone()).unwrap();
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (0, 50, 0), &[a]));
+    for ms in 0..600 {
+        recorder.sample(a, &meta(T0 + ms * MS, ms as u64), b"x").unwrap();
+        if ms % 200 == 100 {
+            recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
+        }
+    }
+    recorder.finish(T0 + S).unwrap();
+    let files: Vec<_> = recorder.clips().iter().map(|clip| scratch.0.join(&clip.file)).collect();
+    drop(recorder);
+    let [oldest, second, third] = &files[..] else { panic!("{files:?}") };
+    std::fs::remove_file(second).unwrap();
+    // Two are left, and two there may be.
+    let (mut folder, _) = Folder::open(&scratch.0).unwrap();
+    assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
+    std::fs::remove_file(third).unwrap();
+    let mut recorder = Recorder::live(folder, settings).unwrap();
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (0, 50, 0), &[a]));
+    let at = T0 + 10 * S;
+    recorder.sample(a, &meta(at, 1), b"x").unwrap();
+    recorder.wake(lambda, &entry(at, EVENT)).unwrap();
+    recorder.finish(at + S).unwrap();
+    assert!(oldest.exists() && recorder.clips().len() == 1 && recorder.counts().deleted == 0);
+}

@@ -1,0 +1,174 @@
+//! The process, fed by the loopback transport: from sockets and samples to clips and reports.
+#![cfg(feature = "program")]
+
+mod running;
+mod support;
+
+use std::fs;
+use std::os::fd::AsFd;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use gleaner_protocol::Exit;
+use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, Said};
+use running::*;
+use support::*;
+
+#[test]
+fn two_lambdas_record_and_neither_speaks_for_the_other() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add("/a");
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let clock = running.clock;
+    let (first, first_header) = lambda(&scratch, "first", (200, 100));
+    let (second, second_header) = lambda(&scratch, "second", (50, 300));
+    let sockets = [running.control.add(&add(&first)).unwrap(), running.control.add(&add(&second)).unwrap()];
+    let [mut one, mut two] = sockets.map(RecorderLink::new);
+    // Each is only what its own socket was made for.
+    let refused = RecorderLink::new(running.control.add(&add(&first)).unwrap()).hello(&second_header, PATIENCE);
+    assert!(matches!(&refused, Err(LinkError::Refused { why }) if why.contains("`second`")), "{refused:?}");
+    one.hello(&first_header, PATIENCE).unwrap();
+    two.hello(&second_header, PATIENCE).unwrap();
+    let sensor = Sensor::start(&network, clock);
+    received(&mut running, 300);
+    let anchor = clock.now();
+    one.wake(&entry(anchor, &[Event]), monotonic(clock)).unwrap();
+    two.wake(&entry(anchor, &[]), monotonic(clock)).unwrap();
+    let deadline = Instant::now() + PATIENCE;
+    let mut opened = Vec::new();
+    while opened.is_empty() && Instant::now() < deadline {
+        opened = one.poll().unwrap();
+    }
+    assert!(matches!(opened[..], [Said::Opened { .. }]), "{opened:?}");
+    let clip = running.clip();
+    assert_eq!(clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(), ["first"]);
+    assert_eq!((clip.from_ns, clip.to_ns, clip.triggers), (anchor - 200 * MS, anchor + 100 * MS, 1));
+    // Every number from the first to the last, once.
+    let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
+    assert!(numbers.len() > 50 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "{numbers:?}");
+    let told: Vec<_> =
+        clip.topics.iter().map(|topic| (topic.topic.as_str(), topic.lost, topic.type_name.is_some())).collect();
+    assert_eq!((told[0].0, told[0].1, told[0].2), ("/a", Some(0), true));
+    assert_eq!((told[1].0, told[1].2), ("/b", false), "one that is not there");
+    assert_eq!(scratch.journal(&clip, "first").1, [anchor]);
+    assert_eq!(two.bye(PATIENCE), one.bye(PATIENCE));
+    running.status(|status| status.lambdas == 0);
+    running.control.stop().unwrap();
+    let (last, ended) = running.ended();
+    assert_eq!(ended, Ok(()));
+    assert_eq!((last.clips, last.windows, last.trigger_to_open.unwrap().n), (1, 1, 1));
+    drop(sensor);
+}
+
+#[test]
+fn a_recording_that_is_stopped_keeps_what_it_has() {
+    for how in ["stop", "the starter's end", "SIGTERM"] {
+        let scratch = Scratch::new();
+        let network = Network::default();
+        let mut running = Running::start(&scratch, &network, |_| {});
+        let (folder, header) = lambda(&scratch, "first", (100, 60_000));
+        let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+        link.hello(&header, PATIENCE).unwrap();
+        // A topic that comes later is found.
+        network.add("/a");
+        let _sensor = Sensor::start(&network, running.clock);
+        received(&mut running, 10);
+        link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+        running.status(|status| status.recording);
+        match how {
+            "stop" => running.control.stop().unwrap(),
+            "SIGTERM" => running.stop.store(true, Ordering::Relaxed),
+            _ => running.control = Control::pair().unwrap().0,
+        }
+        let clip = running.clip();
+        assert!(
+            clip.short.contains(&"the recording was stopped before the window ended".to_owned()),
+            "{:?}",
+            clip.short
+        );
+        assert!(!scratch.messages(&clip).is_empty());
+        assert_eq!(running.ended().1, Ok(()), "{how}");
+    }
+}
+
+#[test]
+fn what_a_hostile_lambda_says_costs_nobody_else() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add("/a");
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let clock = running.clock;
+    let (honest, honest_header) = lambda(&scratch, "honest", (100, 50));
+    let (hostile, hostile_header) = lambda(&scratch, "hostile", (0, 0));
+    let mut honest = RecorderLink::new(running.control.add(&add(&honest)).unwrap());
+    honest.hello(&honest_header, PATIENCE).unwrap();
+    let mut noisy = RecorderLink::new(running.control.add(&add(&hostile)).unwrap());
+    noisy.hello(&hostile_header, PATIENCE).unwrap();
+    let nonsense = running.control.add(&add(&scratch.0.join("hostile"))).unwrap();
+    rustix::net::send(nonsense.as_fd(), &[255; 4096], rustix::net::SendFlags::NOSIGNAL).unwrap();
+    let _sensor = Sensor::start(&network, clock);
+    received(&mut running, 200);
+    // Of other times, and far too often.
+    for at in [i64::MAX, i64::MIN + 1, 0, clock.now() + 3600 * S] {
+        noisy.wake(&entry(at, &[Start, Event]), 0).unwrap();
+    }
+    for _ in 0..20_000 {
+        noisy.wake(&entry(clock.now(), &[Event]), monotonic(clock)).unwrap();
+    }
+    noisy.bye(PATIENCE);
+    running.status(|status| status.wakes_lost > 4 && status.ignored > 10_000);
+    let anchor = clock.now();
+    honest.wake(&entry(anchor, &[Event]), monotonic(clock)).unwrap();
+    let clip = running.until(|report| match report {
+        RecorderReport::Clip(clip) if clip.lambdas.iter().any(|lambda| lambda.name == "honest") => Some(*clip),
+        _ => None,
+    });
+    assert_eq!(clip.topics[0].lost, Some(0));
+    assert_eq!(clip.topics[0].overwritten, Some(0));
+    running.control.stop().unwrap();
+    assert_eq!(running.ended().1, Ok(()));
+}
+
+#[test]
+fn a_full_disk_is_said_and_no_clip_is_begun() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add("/a");
+    let mut running = Running::start(&scratch, &network, |options| options.disk_floor = u64::MAX);
+    let (folder, header) = lambda(&scratch, "first", (10, 10));
+    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    link.hello(&header, PATIENCE).unwrap();
+    let _sensor = Sensor::start(&network, running.clock);
+    running.status(|status| status.disk_free.is_some());
+    link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+    let triggers = running.until(|report| match report {
+        RecorderReport::Loss(Loss::HeldBack { triggers, .. }) => Some(triggers),
+        _ => None,
+    });
+    assert_eq!(triggers, 1);
+    running.control.stop().unwrap();
+    let (last, ended) = running.ended();
+    assert_eq!((last.held_back, last.clips, ended), (1, 0, Ok(())));
+    assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains(r#""loss":"held_back""#));
+}
+
+#[test]
+fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add("/a");
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let (folder, header) = lambda(&scratch, "first", (100, 60_000));
+    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    link.hello(&header, PATIENCE).unwrap();
+    let _sensor = Sensor::start(&network, running.clock);
+    received(&mut running, 10);
+    link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+    running.status(|status| status.recording);
+    network.dead.store(true, Ordering::Relaxed);
+    running.clip();
+    let failure = running.ended().1.unwrap_err();
+    assert_eq!((failure.exit, failure.causes), (Exit::Internal, vec!["its thread is gone".to_owned()]));
+}

@@ -1,0 +1,205 @@
+//! The process within a test: a network that the test feeds, lambdas, and what is reported.
+// Each test program uses its own part.
+#![allow(dead_code)]
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, PipeReader};
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use gleaner_protocol::journal::{FileDigest, Header};
+use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
+use gleaner_protocol::{Clip, Failure};
+use gleaner_recorder::program::{Feed, Options, Pulse, run};
+use gleaner_transport::dds::Clock;
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::message::Definitions;
+use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict};
+use sha2::{Digest, Sha256};
+
+use crate::support::{Scratch, member, meta};
+
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A loopback that the test feeds while the process listens.
+#[derive(Clone, Default)]
+pub struct Network {
+    loopback: Arc<Mutex<Loopback>>,
+    pub dead: Arc<AtomicBool>,
+}
+
+impl Network {
+    pub fn add(&self, topic: &str) {
+        self.loopback.lock().unwrap().add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
+    }
+
+    pub fn add_texts(&self, topic: &str) {
+        self.loopback.lock().unwrap().add_topic(topic, "std_msgs/msg/String", "string data\n");
+    }
+
+    /// Whether anybody takes what is published.
+    pub fn publish_text(&self, topic: &str, at_ns: i64, text: &[u8]) -> Option<Verdict> {
+        self.loopback.lock().unwrap().publish(topic, &meta(at_ns, 1), &cdr(text)).unwrap()
+    }
+
+    pub fn publish(&self, topic: &str, at_ns: i64, seq: u64, cdr: &[u8]) {
+        self.loopback.lock().unwrap().publish(topic, &meta(at_ns, seq), cdr).unwrap();
+    }
+}
+
+impl Transport for Network {
+    fn topics(&self) -> Vec<DiscoveredTopic> {
+        self.loopback.lock().unwrap().topics()
+    }
+
+    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+        self.loopback.lock().unwrap().subscribe(spec, sink)
+    }
+
+    fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
+        self.loopback.lock().unwrap().definitions(topic)
+    }
+}
+
+impl Feed for Network {
+    fn pulse(&mut self) -> Pulse {
+        let dead = self.dead.load(Ordering::Relaxed).then(|| "its thread is gone".to_owned());
+        Pulse { network: None, dead }
+    }
+}
+
+/// A process, but for the process.
+pub struct Running {
+    pub control: Control,
+    reports: BufReader<PipeReader>,
+    thread: JoinHandle<Result<(), Failure>>,
+    pub stop: Arc<AtomicBool>,
+    pub clock: Clock,
+}
+
+pub fn options(out: &Path, clock: Clock) -> Options {
+    Options {
+        out: out.to_owned(),
+        clock,
+        preroll_bytes: None,
+        disk_floor: 0,
+        clips_max: None,
+        bytes_max: None,
+        commands: None,
+    }
+}
+
+impl Running {
+    pub fn start(scratch: &Scratch, network: &Network, change: impl FnOnce(&mut Options)) -> Running {
+        let clock = Clock::of_today();
+        let mut options = options(&scratch.0, clock);
+        change(&mut options);
+        let (control, stdin) = Control::pair().unwrap();
+        let (reader, writer) = std::io::pipe().unwrap();
+        let (stop, network) = (Arc::<AtomicBool>::default(), network.clone());
+        let for_thread = Arc::clone(&stop);
+        let thread = thread::spawn(move || {
+            let reports = File::from(OwnedFd::from(writer));
+            run(options, || Ok(Box::new(network) as Box<dyn Feed>), stdin, reports, for_thread)
+        });
+        let mut running = Running { control, reports: BufReader::new(reader), thread, stop, clock };
+        running.until(|report| matches!(report, RecorderReport::Ready).then_some(()));
+        running
+    }
+
+    /// Reads reports until one is what is looked for.
+    pub fn until<T>(&mut self, mut looked_for: impl FnMut(RecorderReport) -> Option<T>) -> T {
+        loop {
+            let mut line = String::new();
+            assert!(self.reports.read_line(&mut line).unwrap() > 0, "the reports end");
+            if let Some(found) = looked_for(serde_json::from_str(&line).unwrap()) {
+                return found;
+            }
+        }
+    }
+
+    pub fn clip(&mut self) -> Clip {
+        self.until(|report| if let RecorderReport::Clip(clip) = report { Some(*clip) } else { None })
+    }
+
+    pub fn status(&mut self, wanted: impl Fn(&RecorderStatus) -> bool) -> RecorderStatus {
+        self.until(|report| match report {
+            RecorderReport::Status(status) if wanted(&status) => Some(*status),
+            _ => None,
+        })
+    }
+
+    pub fn ended(mut self) -> (RecorderStatus, Result<(), Failure>) {
+        let last = self.until(|report| if let RecorderReport::Ended(last) = report { Some(*last) } else { None });
+        (last, self.thread.join().unwrap())
+    }
+}
+
+/// A built lambda that records `/a`, and the header of its journal.
+pub fn lambda(scratch: &Scratch, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, Header) {
+    let text = format!(
+        "[lambda]\nname = \"{name}\"\nversion = \"1.2.3\"\nkind = \"python\"\nentry = \"main.py\"\n[schedule]\nevent = \"numbers\"\n\
+         [[input]]\nname = \"numbers\"\ntopic = \"/a\"\ntype = \"test_msgs/msg/Number\"\n\
+         [record]\ntopics = [\"/a\", \"/b\"]\npreroll = \"{}ms\"\npostroll = \"{}ms\"\npreroll_size = \"2 MiB\"\n",
+        rolls_ms.0, rolls_ms.1
+    );
+    let folder = scratch.0.join(name);
+    fs::create_dir_all(folder.join("build")).unwrap();
+    fs::write(folder.join("build/lambda.toml"), &text).unwrap();
+    let sha256 = Sha256::digest(&text).iter().map(|byte| format!("{byte:02x}")).collect();
+    let manifest = FileDigest { path: "lambda.toml".to_owned(), bytes: text.len() as u64, sha256 };
+    let header = Header { files: vec![manifest], ..member(name, (0, 0, 0), &[]).header };
+    (folder, header)
+}
+
+/// A `std_msgs/msg/String`.
+pub fn cdr(text: &[u8]) -> Vec<u8> {
+    [&(text.len() as u32 + 1).to_le_bytes()[..], text, &[0]].concat()
+}
+
+pub fn add(folder: &Path) -> Add {
+    Add { lambda: folder.to_owned(), remaps: Vec::new() }
+}
+
+pub fn monotonic(clock: Clock) -> i64 {
+    clock.monotonic(clock.now())
+}
+
+/// A number each ms on `/a`, as long as it lives.
+pub struct Sensor {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<u64>>,
+}
+
+impl Sensor {
+    pub fn start(network: &Network, clock: Clock) -> Sensor {
+        let (stop, network) = (Arc::<AtomicBool>::default(), network.clone());
+        let stopped = Arc::clone(&stop);
+        let thread = thread::spawn(move || {
+            let mut seq = 0_u64;
+            while !stopped.load(Ordering::Relaxed) {
+                seq += 1;
+                network.publish("/a", clock.now(), seq, &seq.to_le_bytes());
+                thread::sleep(Duration::from_millis(1));
+            }
+            seq
+        });
+        Sensor { stop, thread: Some(thread) }
+    }
+}
+
+impl Drop for Sensor {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+/// Waits for samples of `/a`.
+pub fn received(running: &mut Running, least: u64) {
+    running.status(|status| status.topics.iter().any(|topic| topic.topic == "/a" && topic.received >= least));
+}

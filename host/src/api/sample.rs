@@ -1,0 +1,140 @@
+//! One message, as a lambda reads it: fields, bytes, stamps, and its picture if it is one.
+
+use std::sync::Arc;
+
+use gleaner_buffers::Lease;
+use gleaner_transport::SampleMeta;
+use gleaner_transport::message::{Endian, Value};
+
+use super::data::{BYTES_PER_CALL, COLUMN_LEN, DataError, Field, TEXTS_PER_FIELD, Topic};
+use super::frame::{Frame, Picture};
+use super::values::{Identity, Stamps};
+
+/// One message; holds its cell of the ring until dropped.
+#[derive(Clone)]
+pub struct Sample {
+    topic: Arc<Topic>,
+    lease: Lease<SampleMeta>,
+}
+
+impl Sample {
+    /// The message of `topic` in this cell of its ring.
+    pub(super) fn new(topic: Arc<Topic>, lease: Lease<SampleMeta>) -> Self {
+        Self { topic, lease }
+    }
+
+    /// What makes it different from every other sample.
+    pub fn identity(&self) -> Identity {
+        let meta = self.lease.meta();
+        Identity { topic: self.topic.topic.clone(), writer: meta.writer, seq: meta.seq }
+    }
+
+    /// When it came to be.
+    pub fn stamps(&self) -> Stamps {
+        let meta = self.lease.meta();
+        let header_ns = self.topic.header.as_ref().and_then(|header| header.read(&self.lease, meta.endian).ok());
+        Stamps { at_ns: meta.at_ns, publish_ns: meta.publish_ns, header_ns }
+    }
+
+    /// Any field.
+    ///
+    /// # Errors
+    ///
+    /// [`DataError::WrongField`] if the field belongs to another topic or is longer than one call hands out;
+    /// [`DataError::Malformed`].
+    pub fn get(&self, field: &Field) -> Result<Value<'_>, DataError> {
+        field.must_belong_to(&self.topic)?;
+        let value = field
+            .path
+            .read(&self.lease, self.lease.meta().endian)
+            .map_err(|error| self.topic.unreadable(&field.path, error))?;
+        let (len, max) = match &value {
+            Value::Text(text) => (text.len(), BYTES_PER_CALL),
+            Value::Bytes(bytes) => (bytes.len(), BYTES_PER_CALL),
+            Value::Numbers(numbers) => (numbers.len(), COLUMN_LEN),
+            Value::Texts(texts) => (texts.len(), TEXTS_PER_FIELD),
+            Value::Bool(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => (0, 0),
+        };
+        if len > max {
+            let why = format!("has {len} items, one call hands out {max}; read it with `cdr`");
+            return Err(DataError::WrongField { path: field.path().to_owned(), why });
+        }
+        Ok(value)
+    }
+
+    /// A numeric or boolean field.
+    ///
+    /// # Errors
+    ///
+    /// As [`Topic::column`].
+    pub fn number(&self, field: &Field) -> Result<f64, DataError> {
+        field.must_belong_to(&self.topic)?;
+        self.topic.number(&field.path, &self.lease)
+    }
+
+    /// The whole message as CDR, without the encapsulation header.
+    pub fn bytes(&self) -> &[u8] {
+        &self.lease
+    }
+
+    /// Whether the message is big-endian.
+    pub fn big_endian(&self) -> bool {
+        self.lease.meta().endian == Endian::Big
+    }
+
+    /// Bytes from `offset`, `len` at most, clamped to the message and to [`BYTES_PER_CALL`].
+    pub fn cdr(&self, offset: u64, len: u32) -> &[u8] {
+        piece(&self.lease, offset, len)
+    }
+
+    /// Bytes that [`Sample::as_frame`] would have to decode: by the header, and none if that is done already.
+    pub fn undecoded_bytes(&self) -> usize {
+        match self.picture() {
+            Ok(Picture::Compressed(compressed)) => {
+                self.topic.images.undecoded_bytes(self.lease.position(), compressed.data)
+            }
+            Ok(Picture::Raw(_)) | Err(_) => 0,
+        }
+    }
+
+    /// The message as an image; JPEG and PNG are decoded now, once for each sample.
+    ///
+    /// # Errors
+    ///
+    /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`], [`DataError::NoSlot`].
+    pub fn as_frame(&self) -> Result<Frame, DataError> {
+        Frame::of(self)
+    }
+
+    pub(super) fn picture(&self) -> Result<Picture<'_>, DataError> {
+        let Topic { topic, type_name, .. } = &*self.topic;
+        Picture::of(type_name, &self.lease, self.lease.meta().endian)
+            .map_err(|source| DataError::Malformed { topic: topic.clone(), type_name: type_name.clone(), source })?
+            .ok_or_else(|| DataError::NoImageType { topic: topic.clone(), type_name: type_name.clone() })
+    }
+
+    /// Where it stands in its ring.
+    pub(crate) fn position(&self) -> Option<u64> {
+        self.lease.position()
+    }
+
+    pub(crate) fn meta(&self) -> &SampleMeta {
+        self.lease.meta()
+    }
+
+    pub(super) fn lease(&self) -> &Lease<SampleMeta> {
+        &self.lease
+    }
+
+    /// The topic it arrived on.
+    pub fn topic(&self) -> &Arc<Topic> {
+        &self.topic
+    }
+}
+
+/// `len` bytes from `offset`, clamped to `bytes` and to [`BYTES_PER_CALL`].
+pub(super) fn piece(bytes: &[u8], offset: u64, len: u32) -> &[u8] {
+    let start = usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
+    let len = (len as usize).min(BYTES_PER_CALL).min(bytes.len() - start);
+    &bytes[start..start + len]
+}

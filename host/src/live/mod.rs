@@ -1,0 +1,130 @@
+//! A lambda live: on the topics of a vehicle, in its time, with a deadline, until it is told to stop.
+//!
+//! One thread owns the lambda and waits here; the transport's thread fills the rings and rings a bell. What is written, to files
+//! and to whoever started us, is written by a thread of its own. Nothing here knows which kind of lambda runs.
+
+mod announce;
+mod course;
+mod ledger;
+mod options;
+mod recorder;
+mod round_trip;
+mod spread;
+mod status;
+
+pub use options::{Job, RunArgs};
+
+use std::io::Write;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use gleaner_protocol::manifest::Schedule as Declared;
+use gleaner_protocol::{Exit, Failure, Report};
+use gleaner_transport::dds::Dds;
+
+use self::announce::Announcer;
+use self::course::Course;
+use self::ledger::Ledger;
+use self::options::take_stdin;
+use self::recorder::ToRecorder;
+use self::round_trip::RoundTrip;
+use self::status::Watch;
+use crate::input::{Bell, Live};
+use crate::journal::{CLOCK_OF_VEHICLE, Identity};
+use crate::judge::Judge;
+use crate::network::NetworkError;
+use crate::schedule::Schedule;
+use crate::stage::{Bounds, Load, Output, Stage, not_started};
+
+impl Job {
+    /// Runs the lambda until SIGTERM, or for as long as was asked, and writes reports to `reports`.
+    ///
+    /// The exit is [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
+    ///
+    /// # Errors
+    ///
+    /// A failure if it cannot start, if the network or the recorder fails, or if results could not be written.
+    pub fn run(self, load: Load<'_>, reports: impl Write + Send + 'static) -> Result<Exit, Failure> {
+        let Self { asked, manifest, wanted } = self;
+        let stop = stop_flag()?;
+        end_with_starter()?;
+        let clock = wanted.dds.clock;
+        let domain = wanted.dds.domain;
+        let mut dds = Dds::open(wanted.dds).map_err(NetworkError::failure)?;
+        let bell = match &manifest.schedule {
+            Declared::Event { input, .. } => Some(Bell { input: input.to_string(), thread: std::thread::current() }),
+            Declared::Periodic { .. } => None,
+        };
+        let bounds = Bounds::Live(manifest.limits.deadline);
+        let Stage { inputs, session, mut guest } =
+            Stage::set(&mut dds, &asked, &manifest, bounds, Some(&Live { bell }), load)?;
+        let recorder = match wanted.recorder.then(take_stdin).transpose()? {
+            Some(socket) => {
+                let (build, config, remaps) = (&asked.build, &asked.config, &asked.remaps);
+                let engine = guest.engine();
+                let identity = Identity { manifest: &manifest, build, config, remaps, engine, clock: CLOCK_OF_VEHICLE };
+                Some(ToRecorder::join(socket, &identity.header()?, &inputs)?)
+            }
+            None => None,
+        };
+        let round_trip = wanted
+            .round_trip
+            .as_deref()
+            .map(|topic| RoundTrip::open(&dds, topic, clock, manifest.lambda.name.as_str()))
+            .transpose()?;
+        let announcer = wanted.announce.as_deref();
+        let announcer =
+            announcer.map(|topic| Announcer::open(&dds, topic, manifest.lambda.name.as_str())).transpose()?;
+        let mut ledger = Ledger::start(Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?, reports)?;
+        let initialised = guest.init();
+        let (said, _) = session.take_log();
+        ledger.log(said);
+        if let Err(fault) = initialised {
+            // What it said on the way may be why.
+            ledger.finish(None)?;
+            return Err(not_started(manifest.lambda.name.as_str(), fault));
+        }
+        ledger.report(Report::Ready);
+        let schedule = Schedule::live(&manifest, &inputs, clock.now());
+        let watch = Watch::new(&manifest, &asked.remaps, wanted.out, wanted.restarts, domain, clock);
+        let mut course = Course {
+            judge: Judge::new(session.clone(), guest),
+            schedule,
+            session,
+            inputs,
+            ledger,
+            recorder,
+            round_trip,
+            announcer,
+            watch,
+            dds,
+            clock,
+            last: wanted.last,
+        };
+        let ended = course.run(&stop);
+        let faults = course.watch.faults();
+        course.schedule.finish();
+        let Course { ledger, watch, inputs, schedule, session, recorder, dds, .. } = course;
+        let dropped = recorder.map(ToRecorder::leave);
+        let last = watch.ended(&dds, &inputs, &schedule, &session, ledger.unwritten(), dropped);
+        ledger.finish(Some(last))?;
+        ended?;
+        Ok(if faults > 0 { Exit::LambdaFaulted } else { Exit::Ok })
+    }
+}
+
+/// Has the system send SIGTERM when whoever started us dies: nobody else would end us.
+fn end_with_starter() -> Result<(), Failure> {
+    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM)).map_err(|error| {
+        let error = std::io::Error::from(error);
+        Failure::caused_by(Exit::Internal, "cannot be told of the starter's death", &error)
+    })
+}
+
+/// Raised by SIGTERM. SIGINT is for whoever started us, who then sends the other.
+fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
+    let stop = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGTERM, Arc::clone(&stop))
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error))?;
+    Ok(stop)
+}

@@ -1,0 +1,125 @@
+//! What to run live: the arguments as typed, and what they mean once checked against the build.
+
+use std::io;
+use std::net::IpAddr;
+use std::os::fd::OwnedFd;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use gleaner_protocol::manifest::Manifest;
+use gleaner_protocol::{BuildDir, Exit, Failure};
+use gleaner_transport::dds::{self, Clock};
+
+use crate::input::Remap;
+use crate::network::NetworkError;
+use crate::stage::{Asked, assignment, remap};
+
+/// Arguments of `run`.
+#[derive(Args, Clone, Debug)]
+pub struct RunArgs {
+    /// The lambda's folder, built by `gleaner build`.
+    pub lambda: PathBuf,
+    /// A value of the table `config` of the manifest.
+    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
+    pub set: Vec<(String, String)>,
+    /// Another name for a topic of the manifest.
+    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
+    pub remap: Vec<Remap>,
+    /// Where the results go; `DIR/live` if not given.
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Write every decision, not only those with a trigger or a fault.
+    #[arg(long)]
+    pub all: bool,
+    /// Standard input is the socket to the recorder.
+    #[arg(long)]
+    pub recorder: bool,
+    /// The domain of DDS.
+    #[arg(long)]
+    pub domain: Option<u16>,
+    /// The address of an interface to use, instead of all.
+    #[arg(long, value_name = "ADDRESS")]
+    pub interface: Vec<IpAddr>,
+    /// How far the vehicle's clock is ahead of CLOCK_MONOTONIC, in ns.
+    #[arg(long, value_name = "NS", allow_hyphen_values = true)]
+    pub clock_offset: Option<i64>,
+    /// Answer each wake on this topic, as sensor_msgs/msg/TimeReference.
+    #[arg(long, value_name = "TOPIC")]
+    pub rtt: Option<String>,
+    /// Publish decisions with a trigger or a fault on this topic, as std_msgs/msg/String.
+    #[arg(long, value_name = "TOPIC")]
+    pub decisions: Option<String>,
+    /// How often this lambda's process was started before: results are then added to those that are there.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub restarts: u32,
+    /// Stop after so many seconds.
+    #[arg(long, value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..))]
+    pub last: Option<u32>,
+}
+
+/// How to run.
+pub(super) struct Wanted {
+    pub(super) out: PathBuf,
+    pub(super) all: bool,
+    pub(super) recorder: bool,
+    pub(super) dds: dds::Options,
+    pub(super) restarts: u32,
+    pub(super) round_trip: Option<String>,
+    pub(super) announce: Option<String>,
+    pub(super) last: Option<Duration>,
+}
+
+/// A lambda to run live.
+pub struct Job {
+    /// Which lambda.
+    pub asked: Asked,
+    /// Its manifest.
+    pub manifest: Manifest,
+    pub(super) wanted: Wanted,
+}
+
+impl Job {
+    /// Checks the arguments against the build and its manifest.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the manifest's line, the key or the topic, and the way out.
+    pub fn new(args: RunArgs) -> Result<Self, Failure> {
+        let build = BuildDir::check_fresh(&args.lambda)?;
+        let manifest = Manifest::load(build.path())?;
+        let messages = vec![build.path().join("msg")];
+        let asked = Asked::new(args.lambda, build, &manifest, &args.set, args.remap)?;
+        let name: String =
+            manifest.lambda.name.as_str().chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
+        let mut dds = dds::Options::from_env(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
+        dds.domain = args.domain.unwrap_or(dds.domain);
+        if !args.interface.is_empty() {
+            dds.interfaces = args.interface;
+        }
+        dds.clock = args.clock_offset.map_or_else(Clock::of_today, Clock::new);
+        dds.largest = manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
+        dds.messages = messages;
+        let wanted = Wanted {
+            out: args.out.unwrap_or_else(|| asked.lambda.join("live")),
+            all: args.all,
+            recorder: args.recorder,
+            dds,
+            restarts: args.restarts,
+            round_trip: args.rtt,
+            announce: args.decisions,
+            last: args.last.map(|seconds| Duration::from_secs(seconds.into())),
+        };
+        Ok(Self { asked, manifest, wanted })
+    }
+}
+
+/// Takes the socket that standard input is, and leaves nothing there: a lambda may read its standard input.
+pub(super) fn take_stdin() -> Result<OwnedFd, Failure> {
+    let failed =
+        |error: io::Error| Failure::caused_by(Exit::Internal, "cannot take the socket to the recorder", &error);
+    let socket = rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;
+    let nothing = std::fs::File::open("/dev/null").map_err(failed)?;
+    rustix::stdio::dup2_stdin(&nothing).map_err(io::Error::from).map_err(failed)?;
+    Ok(socket)
+}

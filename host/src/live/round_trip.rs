@@ -1,0 +1,61 @@
+//! On request each wake is answered on a topic, so that a bench can measure the way from a sensor to a decision.
+//!
+//! `sensor_msgs/msg/TimeReference`, a type that every ROS 2 has: `header.stamp` is that of the waking message (its receive stamp
+//! where it has none; for a tick, when it was due), `time_ref` is when the decision was out, `source` is
+//! `LAMBDA:WAKE:TRIGGERS` with the labels of the triggers in between commas. Both stamps are of CLOCK_MONOTONIC if the
+//! message's is, as with `gleaner play --stamp monotonic`.
+
+use gleaner_protocol::{Decision, Failure};
+use gleaner_transport::dds::{Clock, Dds, Writer};
+use gleaner_transport::message::CdrWriter;
+
+use crate::api::data::Wake;
+use crate::network::NetworkError;
+
+const TYPE: &str = "sensor_msgs/msg/TimeReference";
+/// A bench that is a second behind has lost.
+const DEPTH: usize = 1024;
+
+pub(super) struct RoundTrip {
+    writer: Writer,
+    clock: Clock,
+    lambda: String,
+    wakes: u64,
+    unsent: u64,
+    message: CdrWriter,
+}
+
+impl RoundTrip {
+    /// Answers of `lambda` on `topic`.
+    pub(super) fn open(dds: &Dds, topic: &str, clock: Clock, lambda: &str) -> Result<Self, Failure> {
+        let writer = dds.writer(topic, TYPE, DEPTH).map_err(NetworkError::failure)?;
+        Ok(Self { writer, clock, lambda: lambda.to_owned(), wakes: 0, unsent: 0, message: CdrWriter::new() })
+    }
+
+    /// The stamp of what woke the lambda, in ns.
+    pub(super) fn cause(wake: &Wake, clock: Clock) -> i64 {
+        match wake {
+            Wake::Event(sample) => {
+                let stamps = sample.stamps();
+                stamps.header_ns.unwrap_or_else(|| clock.monotonic(stamps.at_ns))
+            }
+            Wake::Tick(tick) => clock.monotonic(tick.at_ns),
+        }
+    }
+
+    /// Sends the answer to one wake. Those that cannot be sent are counted, and said now and then.
+    pub(super) fn answer(&mut self, cause_ns: i64, decision: &Decision) {
+        let labels: Vec<&str> = decision.triggers.iter().map(|trigger| trigger.label.as_str()).collect();
+        let source = format!("{}:{}:{}", self.lambda, self.wakes, labels.join(","));
+        self.wakes += 1;
+        let now = self.clock.monotonic(self.clock.now());
+        self.message.clear();
+        self.message.time(cause_ns).string("").time(now).string(&source);
+        if let Err(error) = self.writer.write(self.message.bytes()) {
+            if self.unsent.is_power_of_two() || self.unsent == 0 {
+                tracing::warn!(%error, unsent = self.unsent + 1, "a wake was not answered");
+            }
+            self.unsent += 1;
+        }
+    }
+}

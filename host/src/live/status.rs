@@ -1,0 +1,214 @@
+//! How the lambda is doing: counted at each wake, told once a second.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use gleaner_protocol::manifest::Manifest;
+use gleaner_protocol::{Decision, Live, LiveTopic, Network, Spread, ToRecorder};
+use gleaner_transport::dds::{Clock, Dds};
+use gleaner_transport::{Subscription, Transport};
+
+use super::spread::Spreads;
+use crate::api::Session;
+use crate::api::data::Topic;
+use crate::input::Remap;
+use crate::schedule::Schedule;
+
+/// Time between two reports.
+const EVERY_NS: i64 = 1_000_000_000;
+
+/// When what happened in a wake, in ns of the vehicle's clock.
+pub(super) struct Times {
+    /// Sample received, or tick due.
+    pub(super) at: i64,
+    /// Lambda entered.
+    pub(super) entered: i64,
+    /// Lambda left.
+    pub(super) left: i64,
+    /// Decision out.
+    pub(super) out: i64,
+}
+
+/// Counts and spreads of one lambda.
+pub(super) struct Watch {
+    base: Live,
+    clock: Clock,
+    started: i64,
+    reported: i64,
+    wake_up: Spreads,
+    run: Spreads,
+    hand_out: Spreads,
+    /// Samples that each input had received at the report before.
+    before: Vec<u64>,
+    /// Topics after remapping.
+    wire: Vec<String>,
+}
+
+impl Watch {
+    pub(super) fn new(
+        manifest: &Manifest,
+        remaps: &[Remap],
+        out: PathBuf,
+        restarts: u32,
+        domain: u16,
+        clock: Clock,
+    ) -> Self {
+        let now = clock.now();
+        let base = Live {
+            lambda: manifest.lambda.name.to_string(),
+            version: manifest.lambda.version.to_string(),
+            kind: manifest.lambda.kind,
+            out: out.to_string_lossy().into_owned().into(),
+            restarts,
+            up_s: 0.0,
+            wakes: 0,
+            triggers: 0,
+            faults: 0,
+            skipped: 0,
+            missed_ticks: 0,
+            log_lines: 0,
+            log_dropped: 0,
+            unwritten: 0,
+            wake_up: None,
+            run: None,
+            hand_out: None,
+            topics: Vec::new(),
+            network: Network { domain, ..Network::default() },
+            recorder: None,
+            rss_bytes: 0,
+            cpu_s: 0.0,
+        };
+        let wire = manifest.inputs.iter().map(|input| Remap::apply(remaps, input.topic.as_str()).to_owned());
+        Self {
+            base,
+            clock,
+            started: now,
+            reported: now,
+            wake_up: Spreads::new(),
+            run: Spreads::new(),
+            hand_out: Spreads::new(),
+            before: vec![0; manifest.inputs.len()],
+            wire: wire.collect(),
+        }
+    }
+
+    /// A wake is over.
+    pub(super) fn woke(&mut self, decision: &Decision, log_lines: usize, times: Times) {
+        self.base.wakes += 1;
+        self.base.triggers += decision.triggers.len() as u64;
+        self.base.faults += u64::from(decision.fault.is_some());
+        self.base.log_lines += log_lines as u64;
+        self.wake_up.add(times.entered.saturating_sub(times.at));
+        self.run.add(times.left.saturating_sub(times.entered));
+        self.hand_out.add(times.out.saturating_sub(times.left));
+    }
+
+    /// Wakes that ended in a fault.
+    pub(super) fn faults(&self) -> u64 {
+        self.base.faults
+    }
+
+    /// Whether it is time for a report.
+    pub(super) fn is_due(&self, now: i64) -> bool {
+        now.saturating_sub(self.reported) >= EVERY_NS
+    }
+
+    /// How it is now.
+    pub(super) fn report(
+        &mut self,
+        dds: &Dds,
+        inputs: &[Arc<Topic>],
+        schedule: &Schedule,
+        session: &Session,
+        unwritten: u64,
+        recorder: Option<ToRecorder>,
+    ) -> Live {
+        let spreads = [self.wake_up.take(), self.run.take(), self.hand_out.take()];
+        let live = self.as_of_now(dds, inputs, schedule, session, spreads);
+        Live { unwritten, recorder, ..live }
+    }
+
+    /// How it was.
+    pub(super) fn ended(
+        mut self,
+        dds: &Dds,
+        inputs: &[Arc<Topic>],
+        schedule: &Schedule,
+        session: &Session,
+        unwritten: u64,
+        recorder: Option<ToRecorder>,
+    ) -> Live {
+        self.reported = self.started;
+        self.before.fill(0);
+        let spreads = [self.wake_up.all(), self.run.all(), self.hand_out.all()];
+        let live = self.as_of_now(dds, inputs, schedule, session, spreads);
+        Live { unwritten, recorder, ..live }
+    }
+
+    fn as_of_now(
+        &mut self,
+        dds: &Dds,
+        inputs: &[Arc<Topic>],
+        schedule: &Schedule,
+        session: &Session,
+        [wake_up, run, hand_out]: [Option<Spread>; 3],
+    ) -> Live {
+        let now = self.clock.now();
+        let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
+        self.reported = now;
+        let mut topics = Vec::with_capacity(inputs.len());
+        for (index, topic) in inputs.iter().enumerate() {
+            // The inputs were the first subscriptions of this transport, in their order.
+            let status = dds.status(Subscription(index));
+            if let Some(lost) = status.lost {
+                topic.set_lost(lost);
+            }
+            let counts = topic.counts();
+            let came = counts.received.saturating_sub(std::mem::replace(&mut self.before[index], counts.received));
+            topics.push(LiveTopic {
+                name: topic.name().to_owned(),
+                topic: self.wire[index].clone(),
+                type_name: topic.type_name().to_owned(),
+                writers: status.writers,
+                rate_hz: if seconds > 0.0 { came as f64 / seconds } else { 0.0 },
+                received: counts.received,
+                lost: status.lost,
+                malformed: status.malformed,
+                overwritten: counts.overwritten,
+                no_slot: counts.no_slot,
+                too_big: counts.too_big,
+                skipped: counts.skipped,
+                age_ns: topic.newest_at().map(|at| now.saturating_sub(at)),
+                qos: status.qos,
+                trouble: status.trouble,
+            });
+        }
+        let health = dds.health();
+        Live {
+            up_s: now.saturating_sub(self.started) as f64 / 1e9,
+            skipped: topics.iter().map(|topic| topic.skipped).sum(),
+            missed_ticks: schedule.missed(),
+            log_dropped: session.log_dropped(),
+            wake_up,
+            run,
+            hand_out,
+            topics,
+            network: Network {
+                participants: health.participants,
+                buffer_asked: health.buffer_asked,
+                buffer_granted: health.buffer_granted,
+                socket_drops: health.socket_drops,
+                filtered: health.filtered,
+                ..self.base.network
+            },
+            rss_bytes: crate::memory::resident(),
+            cpu_s: cpu_seconds(),
+            ..self.base.clone()
+        }
+    }
+}
+
+fn cpu_seconds() -> f64 {
+    let used = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    used.tv_sec as f64 + used.tv_nsec as f64 / 1e9
+}

@@ -1,0 +1,32 @@
+//! What it means for a user that the network cannot be had.
+
+use gleaner_protocol::{Exit, Explain, Failure};
+use gleaner_transport::dds::DdsError;
+
+/// Why DDS does not do what it was asked for.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+pub(crate) struct NetworkError(DdsError);
+
+impl NetworkError {
+    /// For `map_err`.
+    pub(crate) fn failure(error: DdsError) -> Failure {
+        Self(error).into()
+    }
+}
+
+impl Explain for NetworkError {
+    fn help(&self) -> Option<String> {
+        match &self.0 {
+            DdsError::Join { .. } => Some("`gleaner doctor` looks at the network of this machine".to_owned()),
+            _ => None,
+        }
+    }
+
+    fn exit(&self) -> Exit {
+        match &self.0 {
+            DdsError::Join { .. } => Exit::Unreachable,
+            _ => Exit::Usage,
+        }
+    }
+}

@@ -1,0 +1,78 @@
+//! Which lambda is to run, with which settings.
+
+use std::path::PathBuf;
+
+use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
+use gleaner_protocol::{BuildDir, Exit, Failure};
+
+use crate::input::Remap;
+
+/// A lambda as it was asked for.
+pub struct Asked {
+    /// Its folder.
+    pub lambda: PathBuf,
+    /// Its build, not older than its sources.
+    pub build: BuildDir,
+    /// All of `[config]`, with the overrides laid over the defaults.
+    pub config: Vec<(String, ConfigValue)>,
+    /// Other names for topics of the manifest.
+    pub remaps: Vec<Remap>,
+}
+
+impl Asked {
+    /// Checks the overrides against the manifest.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the key or the topic, and the way out.
+    pub fn new(
+        lambda: PathBuf,
+        build: BuildDir,
+        manifest: &Manifest,
+        set: &[(String, String)],
+        remaps: Vec<Remap>,
+    ) -> Result<Self, Failure> {
+        let config = ConfigSet::resolve(manifest, set)?;
+        known_topics(&remaps, manifest)?;
+        Ok(Self { lambda, build, config, remaps })
+    }
+}
+
+/// Takes `KEY=VALUE` apart, an argument.
+///
+/// # Errors
+///
+/// What to write instead.
+pub fn assignment(text: &str) -> Result<(String, String), String> {
+    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, as in brake_mps2=-1.4")?;
+    Ok((key.trim().to_owned(), value.trim().to_owned()))
+}
+
+/// Takes `FROM:=TO` apart, an argument.
+///
+/// # Errors
+///
+/// What to write instead.
+pub fn remap(text: &str) -> Result<Remap, String> {
+    let (from, to) = text.split_once(":=").ok_or("write FROM:=TO, as in /imu/data:=/car/imu")?;
+    Ok(Remap { from: from.trim().to_owned(), to: to.trim().to_owned() })
+}
+
+/// Refuses a remap of a topic that the manifest does not have.
+fn known_topics(remaps: &[Remap], manifest: &Manifest) -> Result<(), Failure> {
+    let inputs = manifest.inputs.iter().map(|input| input.topic.as_str());
+    let recorded = manifest.record.iter().flat_map(|record| &record.topics).map(|topic| topic.as_str());
+    let mut known: Vec<&str> = Vec::new();
+    for topic in inputs.chain(recorded) {
+        if !known.contains(&topic) {
+            known.push(topic);
+        }
+    }
+    match remaps.iter().find(|remap| !known.contains(&remap.from.as_str())) {
+        None => Ok(()),
+        Some(remap) => {
+            let failure = Failure::new(Exit::Usage, format!("no input has the topic `{}` of --remap", remap.from));
+            Err(failure.with_help(format!("the manifest has `{}`", known.join("`, `"))))
+        }
+    }
+}

@@ -1,0 +1,174 @@
+//! The files of a run: `decisions.jsonl`, `log.jsonl`, `summary.json`.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::{Decision, Exit, Explain};
+use serde::Serialize;
+
+use crate::api::log::Line;
+
+const SUMMARY: &str = "summary.json";
+
+/// The files of a run beside its clips.
+pub const RESULTS: [&str; 4] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", SUMMARY];
+
+/// Why results could not be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write `{}`", path.display())]
+pub struct OutputError {
+    /// The file.
+    pub path: PathBuf,
+    /// Why not.
+    pub source: io::Error,
+}
+
+impl Explain for OutputError {
+    fn help(&self) -> Option<String> {
+        Some("make room or choose another folder: --out DIR".to_owned())
+    }
+
+    fn exit(&self) -> Exit {
+        Exit::Internal
+    }
+}
+
+/// Open result files.
+pub struct Output {
+    folder: PathBuf,
+    decisions: Lines,
+    log: Lines,
+    all: bool,
+}
+
+impl Output {
+    /// Makes `folder` and starts its files anew. With `all`, decisions without trigger and fault are written too.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`] names the file.
+    pub fn create(folder: &Path, all: bool) -> Result<Self, OutputError> {
+        Self::begin(folder, all, false)
+    }
+
+    /// As [`Output::create`]; with `again`, lines are added to the files that are there.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`] names the file.
+    pub fn begin(folder: &Path, all: bool, again: bool) -> Result<Self, OutputError> {
+        fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
+        // A summary says that the files beside it are whole.
+        let summary = folder.join(SUMMARY);
+        match fs::remove_file(&summary) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => {
+                return Err(OutputError { path: summary, source });
+            }
+            _ => {}
+        }
+        let decisions = Lines::begin(folder.join("decisions.jsonl"), again)?;
+        let log = Lines::begin(folder.join("log.jsonl"), again)?;
+        Ok(Self { folder: folder.to_owned(), decisions, log, all })
+    }
+
+    /// Writes a decision, if it is one to keep.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`]
+    pub fn decision(&mut self, decision: &Decision) -> Result<(), OutputError> {
+        if self.all || !decision.triggers.is_empty() || decision.fault.is_some() {
+            self.decisions.write(decision)?;
+        }
+        Ok(())
+    }
+
+    /// Writes what the lambda said.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`]
+    pub fn log(&mut self, lines: &[Line]) -> Result<(), OutputError> {
+        lines.iter().try_for_each(|line| self.log.write(line))
+    }
+
+    /// Writes what waits, so that a reader sees how far the run is.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`]
+    pub fn flush(&mut self) -> Result<(), OutputError> {
+        self.decisions.flush()?;
+        self.log.flush()
+    }
+
+    /// Lines that were taken, and could not be written.
+    pub fn lost(&self) -> u64 {
+        self.decisions.lost + self.log.lost
+    }
+
+    /// Completes the files and adds the summary.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`]
+    pub fn finish(mut self, summary: &impl Serialize) -> Result<(), OutputError> {
+        self.flush()?;
+        let path = self.folder.join(SUMMARY);
+        let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
+        text.push(b'\n');
+        fs::write(&path, text).map_err(|source| OutputError { path, source })
+    }
+}
+
+/// A file of lines. It grows by whole lines only, so that it can be read whenever this process ends.
+struct Lines {
+    path: PathBuf,
+    file: File,
+    pending: Vec<u8>,
+    /// Lines in `pending`.
+    waiting: u64,
+    /// Lines that were taken, and could not be written.
+    lost: u64,
+}
+
+/// Bytes that wait for the next write.
+const PENDING_BYTES: usize = 64 << 10;
+
+impl Lines {
+    fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
+        let opened = File::options().create(true).append(true).open(&path);
+        let opened = opened.and_then(|file| if again { Ok(file) } else { file.set_len(0).map(|()| file) });
+        match opened {
+            Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0 }),
+            Err(source) => Err(OutputError { path, source }),
+        }
+    }
+
+    fn write(&mut self, line: &impl Serialize) -> Result<(), OutputError> {
+        let failed = |source| OutputError { path: self.path.clone(), source };
+        serde_json::to_writer(&mut self.pending, line).map_err(io::Error::from).map_err(failed)?;
+        self.pending.push(b'\n');
+        self.waiting += 1;
+        if self.pending.len() < PENDING_BYTES { Ok(()) } else { self.flush() }
+    }
+
+    fn flush(&mut self) -> Result<(), OutputError> {
+        if self.waiting == 0 {
+            return Ok(());
+        }
+        let before = self.file.metadata().map(|metadata| metadata.len());
+        let written = self.file.write_all(&self.pending);
+        let waited = std::mem::take(&mut self.waiting);
+        self.pending.clear();
+        written.map_err(|source| {
+            self.lost += waited;
+            // A part of a line would keep all that comes later from being read.
+            if let Ok(before) = before {
+                let _ = self.file.set_len(before);
+            }
+            OutputError { path: self.path.clone(), source }
+        })
+    }
+}

@@ -1,0 +1,59 @@
+//! `gleaner-runtime topics`: what is there to subscribe.
+
+use std::io::Write;
+use std::net::IpAddr;
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use gleaner_protocol::{Exit, Failure, Report, TopicSeen};
+use gleaner_transport::dds::{Dds, Options};
+
+use crate::network::NetworkError;
+
+/// How long to listen if nothing else is said: announcements of participants come every few seconds, and those who are there
+/// answer a new one at once.
+const WAIT_S: f64 = 2.0;
+const WAIT_MAX: Duration = Duration::from_secs(3600);
+
+/// Arguments of `topics`.
+#[derive(Args, Clone, Debug)]
+pub struct TopicsArgs {
+    /// The domain of DDS.
+    #[arg(long)]
+    domain: Option<u16>,
+    /// The address of an interface to use, instead of all.
+    #[arg(long, value_name = "ADDRESS")]
+    interface: Vec<IpAddr>,
+    /// How long to listen, in seconds.
+    #[arg(long, value_name = "SECONDS", default_value_t = WAIT_S)]
+    wait: f64,
+}
+
+/// Listens for a while, and reports what there was.
+pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Failure> {
+    let wait = Duration::try_from_secs_f64(args.wait).ok().filter(|wait| *wait <= WAIT_MAX);
+    let wait = wait.ok_or_else(|| Failure::new(Exit::Usage, format!("--wait {}: use 0 to 3600 s", args.wait)))?;
+    let mut options = Options::from_env("/gleaner/topics").map_err(NetworkError::failure)?;
+    options.largest = 0;
+    options.domain = args.domain.unwrap_or(options.domain);
+    if !args.interface.is_empty() {
+        options.interfaces = args.interface;
+    }
+    let dds = Dds::open(options).map_err(NetworkError::failure)?;
+    let until = Instant::now() + wait;
+    while let Some(left) = until.checked_duration_since(Instant::now()) {
+        std::thread::sleep(left);
+    }
+    let seen = dds.discovered().into_iter().map(|topic| TopicSeen {
+        topic: topic.topic,
+        type_name: topic.type_name,
+        writers: topic.writers,
+        readers: topic.readers,
+        qos: topic.qos,
+    });
+    let report = Report::Topics { topics: seen.collect() };
+    // Whoever asked may have gone.
+    let _ = serde_json::to_writer(&mut *reports, &report);
+    let _ = reports.write_all(b"\n");
+    Ok(Exit::Ok)
+}

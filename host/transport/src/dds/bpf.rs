@@ -1,0 +1,166 @@
+//! Instructions of classic BPF, and jumps between them.
+//!
+//! A conditional jump passes over at most 255 instructions, and none goes back. So the exits that many places share are
+//! built again and again, as islands between them.
+//!
+//! Source: the kernel's `Documentation/networking/filter.rst` and `include/uapi/linux/bpf_common.h`.
+
+/// Instructions that the kernel takes.
+pub(super) const MOST: usize = 4096;
+/// Instructions that a conditional jump may pass over.
+pub(super) const FAR: usize = 255;
+
+pub(super) const LD_IMM: u16 = 0x00;
+pub(super) const LDX_IMM: u16 = 0x01;
+pub(super) const ST: u16 = 0x02;
+pub(super) const ADD: u16 = 0x04;
+pub(super) const JA: u16 = 0x05;
+pub(super) const RET: u16 = 0x06;
+pub(super) const TAX: u16 = 0x07;
+pub(super) const ADD_X: u16 = 0x0c;
+pub(super) const JEQ: u16 = 0x15;
+pub(super) const RET_A: u16 = 0x16;
+pub(super) const JEQ_X: u16 = 0x1d;
+pub(super) const LD_WORD_AT: u16 = 0x20;
+pub(super) const MUL: u16 = 0x24;
+pub(super) const JGT: u16 = 0x25;
+pub(super) const LD_BYTE_AT: u16 = 0x30;
+pub(super) const LD_WORD: u16 = 0x40;
+pub(super) const JSET: u16 = 0x45;
+pub(super) const LD_HALF: u16 = 0x48;
+pub(super) const LD_BYTE: u16 = 0x50;
+pub(super) const AND: u16 = 0x54;
+pub(super) const LD_MEM: u16 = 0x60;
+pub(super) const LSH: u16 = 0x64;
+pub(super) const RSH: u16 = 0x74;
+pub(super) const LD_LEN: u16 = 0x80;
+pub(super) const TXA: u16 = 0x87;
+pub(super) const MOD: u16 = 0x94;
+
+/// In memory: how many bytes of the packet pass.
+pub(super) const PASS: u32 = 1;
+
+/// Kinds of submessages that may be empty.
+const PAD: u32 = 0x01;
+const INFO_TS: u32 = 0x09;
+
+/// Instructions of an island, at most.
+pub(super) const ISLAND: usize = 17;
+
+/// Operation, instructions that are passed over if its condition holds and if not, and its number.
+pub(super) type Instruction = (u16, u8, u8, u32);
+
+/// Where a conditional jump goes.
+#[derive(Copy, Clone, PartialEq, Eq)]
+pub(super) enum To {
+    /// Over so many instructions.
+    Over(u8),
+    /// The packet is dropped.
+    Drop,
+    /// The submessage has no length.
+    Endless,
+    /// The packet is cut off here.
+    Cut,
+    /// The packet ends here.
+    End,
+}
+
+pub(super) const NEXT: To = To::Over(0);
+
+/// A program, as far as it is written. X is where the walk through a packet is.
+#[derive(Default)]
+pub(super) struct Program {
+    code: Vec<Instruction>,
+    /// Jumps to a place of the next island: by instruction, and whether it jumps if the condition holds.
+    exits: Vec<(usize, bool, To)>,
+    /// Jumps to where the program ends.
+    ends: Vec<usize>,
+}
+
+impl Program {
+    pub(super) fn len(&self) -> usize {
+        self.code.len()
+    }
+
+    pub(super) fn code(self) -> Vec<Instruction> {
+        self.code
+    }
+
+    /// Writes an instruction, and answers which it is.
+    pub(super) fn put(&mut self, code: u16, k: u32) -> usize {
+        self.code.push((code, 0, 0, k));
+        self.code.len() - 1
+    }
+
+    pub(super) fn jump(&mut self, code: u16, k: u32, yes: To, no: To) {
+        let at = self.put(code, k);
+        for (holds, to) in [(true, yes), (false, no)] {
+            match to {
+                To::Over(over) if holds => self.code[at].1 = over,
+                To::Over(over) => self.code[at].2 = over,
+                exit => self.exits.push((at, holds, exit)),
+            }
+        }
+    }
+
+    /// Lets the unconditional jump `from` go to what is written next.
+    pub(super) fn land(&mut self, from: usize) {
+        self.code[from].3 = u32::try_from(self.code.len() - from - 1).expect("a program has 4096 instructions");
+    }
+
+    /// Sees to it that all exits reach an island that is written after `instructions` more.
+    pub(super) fn reach(&mut self, instructions: usize) {
+        if self.exits.first().is_some_and(|(at, ..)| self.code.len() + instructions + ISLAND - at > FAR) {
+            self.island();
+        }
+    }
+
+    /// Cuts the packet off.
+    pub(super) fn cut(&mut self) {
+        self.island();
+        self.put(TXA, 0);
+        self.put(ST, PASS);
+        let end = self.put(JA, 0);
+        self.ends.push(end);
+    }
+
+    /// What is written next is where all ends go.
+    pub(super) fn end(&mut self) {
+        for end in std::mem::take(&mut self.ends) {
+            self.land(end);
+        }
+    }
+
+    /// Where the exits before it go. Whoever comes from before it passes over it.
+    fn island(&mut self) {
+        let over = self.put(JA, 0);
+        let drop = self.put(RET, 0);
+        // Without a length, paddings and time stamps are empty, and everything else is the packet's last.
+        let endless = self.put(LD_BYTE, 0);
+        self.jump(JEQ, PAD, To::Over(4), NEXT);
+        self.jump(JEQ, INFO_TS, To::Over(3), To::Over(2));
+        let cut = self.put(TXA, 0);
+        self.put(ST, PASS);
+        let end = self.put(JA, 0);
+        // The walk goes on behind the island, whichever step it came from: steps are alike.
+        self.put(TXA, 0);
+        self.put(ADD, 4);
+        self.put(TAX, 0);
+        self.put(LD_LEN, 0);
+        self.jump(JEQ_X, 0, NEXT, To::Over(1));
+        let empty = self.put(JA, 0);
+        self.ends.extend([end, empty]);
+        self.land(over);
+        for (at, holds, exit) in std::mem::take(&mut self.exits) {
+            let place = match exit {
+                To::Drop => drop,
+                To::Endless => endless,
+                To::Cut => cut,
+                To::End => end,
+                To::Over(_) => continue,
+            };
+            let far = u8::try_from(place - at - 1).expect("there is an island before it is too far");
+            if holds { self.code[at].1 = far } else { self.code[at].2 = far }
+        }
+    }
+}

@@ -1,0 +1,217 @@
+//! What the kernel knows of our sockets and threads, read from `/proc`.
+
+use std::collections::{HashMap, HashSet};
+use std::fs;
+use std::io;
+use std::net::UdpSocket;
+use std::os::fd::OwnedFd;
+
+use rustix::net::sockopt;
+use rustix::process::{PidfdFlags, PidfdGetfdFlags, getpid, pidfd_getfd, pidfd_open};
+
+/// How all threads of RustDDS begin their names.
+const LIBRARY: &str = "RustDDS ";
+
+/// The sockets at which a participant listens.
+#[derive(Debug, Default)]
+pub(super) struct Sockets {
+    /// Descriptors, by inode.
+    open: HashMap<u64, i32>,
+    /// Datagrams for which sockets of this network had had no room before these were opened.
+    full_before: Option<u64>,
+}
+
+/// How the sockets are.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Queues {
+    /// Bytes that wait to be read.
+    pub(super) waiting: u64,
+    /// Datagrams for which there was no room.
+    pub(super) drops: u64,
+    /// Datagrams that the filter did not let pass.
+    pub(super) filtered: u64,
+}
+
+impl Sockets {
+    /// The sockets of this process at the ports of a participant.
+    pub(super) fn of(domain: u16, participant: u16) -> Self {
+        // RTPS, "Default Port Numbers": multicast for discovery and for data, and two ports of the participant's own.
+        let first = 7400 + 250 * u32::from(domain);
+        let own = first + 10 + 2 * u32::from(participant);
+        let ports = [first, first + 1, own, own + 1];
+        let mut mine = inodes();
+        let rows = rows().into_iter().filter(|row| ports.contains(&row.port));
+        let open = rows.filter_map(|row| mine.remove_entry(&row.inode)).collect();
+        Self { open, full_before: full() }
+    }
+
+    pub(super) fn queues(&self) -> Queues {
+        let (mut waiting, mut drops) = (0_u64, 0_u64);
+        for row in rows().iter().filter(|row| self.open.contains_key(&row.inode)) {
+            waiting = waiting.saturating_add(row.waiting);
+            drops = drops.saturating_add(row.drops);
+        }
+        let full = self.full_before.zip(full()).map_or(u64::MAX, |(before, now)| now.saturating_sub(before)).min(drops);
+        Queues { waiting, drops: full, filtered: drops - full }
+    }
+
+    /// The sockets once more, for what RustDDS has no way to set.
+    pub(super) fn duplicates(&self) -> io::Result<Vec<OwnedFd>> {
+        let this = pidfd_open(getpid(), PidfdFlags::empty())?;
+        let duplicate = |descriptor: &i32| Ok(pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty())?);
+        self.open.values().map(duplicate).collect()
+    }
+}
+
+/// Datagrams for which sockets of this network had no room. What one socket dropped is told as one number only, whether its
+/// buffer was full or its filter said so.
+fn full() -> Option<u64> {
+    let table = fs::read_to_string("/proc/self/net/snmp").ok()?;
+    let mut lines = table.lines().filter_map(|line| line.strip_prefix("Udp:"));
+    let (names, numbers) = (lines.next()?, lines.next()?);
+    let mut columns = names.split_ascii_whitespace().zip(numbers.split_ascii_whitespace());
+    columns.find(|(name, _)| *name == "RcvbufErrors")?.1.parse().ok()
+}
+
+struct Row {
+    port: u32,
+    waiting: u64,
+    inode: u64,
+    drops: u64,
+}
+
+/// The UDP sockets of the network that we are in. RustDDS listens with IPv4 only.
+fn rows() -> Vec<Row> {
+    let table = fs::read_to_string("/proc/self/net/udp").unwrap_or_default();
+    table.lines().skip(1).filter_map(row).collect()
+}
+
+fn row(line: &str) -> Option<Row> {
+    let fields: Vec<&str> = line.split_ascii_whitespace().collect();
+    let hex = |field: &str, after: char| u64::from_str_radix(field.rsplit_once(after)?.1, 16).ok();
+    Some(Row {
+        port: u32::try_from(hex(fields.get(1)?, ':')?).ok()?,
+        waiting: hex(fields.get(4)?, ':')?,
+        inode: fields.get(9)?.parse().ok()?,
+        drops: fields.get(12)?.parse().ok()?,
+    })
+}
+
+/// The sockets that this process has open: descriptors, by inode.
+fn inodes() -> HashMap<u64, i32> {
+    let Ok(open) = fs::read_dir("/proc/self/fd") else { return HashMap::new() };
+    let inode = |entry: fs::DirEntry| {
+        let target = fs::read_link(entry.path()).ok()?;
+        let inode = target.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?.parse().ok()?;
+        Some((inode, entry.file_name().to_str()?.parse().ok()?))
+    };
+    open.flatten().filter_map(inode).collect()
+}
+
+/// Bytes of receive buffer that a socket gets which asks for `asked`.
+///
+/// All sockets of a process get the same for the same, so one of our own tells what the participant's have. Linux
+/// reports twice what it grants.
+pub(super) fn granted(asked: usize) -> Option<usize> {
+    let socket = UdpSocket::bind(("127.0.0.1", 0)).ok()?;
+    sockopt::set_socket_recv_buffer_size(&socket, asked).ok()?;
+    sockopt::socket_recv_buffer_size(&socket).ok().map(|doubled| doubled / 2)
+}
+
+/// The threads of RustDDS in this process.
+pub(super) fn library_threads() -> HashSet<u32> {
+    let Ok(tasks) = fs::read_dir("/proc/self/task") else { return HashSet::new() };
+    let id = |entry: fs::DirEntry| entry.file_name().to_str()?.parse().ok();
+    tasks.flatten().filter_map(id).filter(|id| is_library(*id)).collect()
+}
+
+/// The one of `threads` that is gone, if one is.
+pub(super) fn gone(threads: &HashSet<u32>) -> Option<u32> {
+    threads.iter().copied().find(|id| !is_library(*id))
+}
+
+fn is_library(thread: u32) -> bool {
+    fs::read_to_string(format!("/proc/self/task/{thread}/comm")).is_ok_and(|name| name.starts_with(LIBRARY))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+    use std::thread;
+
+    use socket2::{SockFilter, SockRef};
+
+    use super::*;
+
+    fn sockets_of(socket: &UdpSocket) -> Sockets {
+        let port = u32::from(socket.local_addr().unwrap().port());
+        let mut mine = inodes();
+        let open = rows().into_iter().filter(|row| row.port == port).find_map(|row| mine.remove_entry(&row.inode));
+        Sockets { open: HashMap::from([open.unwrap()]), full_before: full() }
+    }
+
+    #[test]
+    fn a_line_of_the_table_is_understood() {
+        let line = " 3431: 00000000:1CE8 00000000:0000 07 00000000:00001A00 00:00000000 00000000  1000        0 98765 2 \
+                    0000000000000000 42";
+        let row = row(line).unwrap();
+        assert_eq!((row.port, row.waiting, row.inode, row.drops), (7400, 0x1a00, 98765, 42));
+        assert!(super::row("sl local_address").is_none());
+        assert!(super::row("").is_none());
+    }
+
+    #[test]
+    fn what_waits_in_a_socket_and_what_was_dropped_there_is_seen() {
+        let socket = UdpSocket::bind(("127.0.0.1", 0)).unwrap();
+        sockopt::set_socket_recv_buffer_size(&socket, 1).unwrap();
+        let sockets = sockets_of(&socket);
+        assert_eq!(sockets.queues(), Queues::default());
+        for _ in 0..100 {
+            socket.send_to(&[0; 1000], socket.local_addr().unwrap()).unwrap();
+        }
+        let queues = sockets.queues();
+        assert!(queues.waiting > 0 && queues.drops > 0, "{queues:?}");
+    }
+
+    #[test]
+    fn what_a_filter_drops_at_a_duplicate_is_no_full_buffer() {
+        let socket = UdpSocket::bind(("127.0.0.1", 0)).unwrap();
+        let sockets = sockets_of(&socket);
+        let [duplicate] = sockets.duplicates().unwrap().try_into().unwrap();
+        // RET 0: nothing passes.
+        SockRef::from(&duplicate).attach_filter(&[SockFilter::new(6, 0, 0, 0)]).unwrap();
+        for _ in 0..7 {
+            socket.send_to(&[0; 1000], socket.local_addr().unwrap()).unwrap();
+        }
+        let queues = sockets.queues();
+        // Buffers of others may have been full meanwhile.
+        assert_eq!((queues.waiting, queues.drops + queues.filtered), (0, 7));
+    }
+
+    #[test]
+    fn a_small_buffer_is_granted_and_a_huge_one_is_not() {
+        assert_eq!(granted(64 << 10), Some(64 << 10));
+        assert!(granted(1 << 30).unwrap() < 1 << 30);
+    }
+
+    #[test]
+    fn a_thread_of_the_library_is_known_by_its_name_and_missed_when_it_ends() {
+        let (end, ended) = mpsc::channel::<()>();
+        let (begun, begins) = mpsc::channel();
+        let name = format!("{LIBRARY}test");
+        let body = move || {
+            begun.send(rustix::thread::gettid().as_raw_nonzero().get() as u32).unwrap();
+            let _ = ended.recv();
+        };
+        let thread = thread::Builder::new().name(name).spawn(body).unwrap();
+        let id = begins.recv().unwrap();
+        assert!(library_threads().contains(&id));
+        assert_eq!(gone(&HashSet::from([id])), None);
+        drop(end);
+        thread.join().unwrap();
+        // The kernel takes the thread away a moment after it was joined.
+        while gone(&HashSet::from([id])).is_none() {
+            thread::yield_now();
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! Topics that this process writes.
+
+use bytes::Bytes;
+use rustdds::dds::{CreateError, WriteError};
+use rustdds::{DomainParticipant, Duration, GUID, QosPolicyBuilder, RTPSEntity, TopicKind, policy};
+
+use std::sync::Arc;
+
+use super::DdsError;
+use super::names::{dds_topic, dds_type, visible};
+use super::raw::RawWriter;
+use super::receive::{Command, Line};
+use super::state::State;
+
+/// How long a write waits for room, as in ROS 2.
+const PATIENCE: Duration = Duration::from_millis(100);
+/// Samples that are kept for readers that ask again.
+const DEPTH: std::ops::RangeInclusive<usize> = 1..=65_536;
+
+/// A topic that this process writes.
+pub struct Writer {
+    topic: String,
+    writer: RawWriter,
+    state: Arc<State>,
+    line: Line,
+}
+
+impl Writer {
+    pub(super) fn new(
+        participant: &DomainParticipant,
+        state: &Arc<State>,
+        line: &Line,
+        topic: &str,
+        type_name: &str,
+        depth: usize,
+    ) -> Result<Self, DdsError> {
+        let name = |name: &str, what| DdsError::Name { name: visible(name), what };
+        let dds_topic = dds_topic(topic).ok_or_else(|| name(topic, "the absolute name of a topic"))?;
+        let dds_type =
+            dds_type(type_name).ok_or_else(|| name(type_name, "a message type, such as `std_msgs/msg/Empty`"))?;
+        let depth = i32::try_from(depth.clamp(*DEPTH.start(), *DEPTH.end())).unwrap_or(i32::MAX);
+        let policies = QosPolicyBuilder::new()
+            .reliability(policy::Reliability::Reliable { max_blocking_time: PATIENCE })
+            .durability(policy::Durability::Volatile)
+            .history(policy::History::KeepLast { depth })
+            .build();
+        // Held, so that nobody can be connected before it is followed who.
+        let mut peers = state.peers();
+        let made = (|| {
+            let topic = participant.create_topic(dds_topic, dds_type, &policies, TopicKind::NoKey)?;
+            participant.create_publisher(&policies)?.create_datawriter_no_key(&topic, Some(policies.clone()))
+        })();
+        let writer: RawWriter =
+            made.map_err(|error: CreateError| DdsError::Advertise { topic: topic.to_owned(), source: error.into() })?;
+        peers.follow(writer.guid());
+        drop(peers);
+        line.send(Command::Writer(writer.guid()));
+        Ok(Self { topic: topic.to_owned(), writer, state: state.clone(), line: line.clone() })
+    }
+
+    /// Sends a message: little-endian CDR without its four bytes of encapsulation.
+    ///
+    /// Waits, at most 100 ms, while readers have not yet confirmed what was sent before.
+    ///
+    /// # Errors
+    ///
+    /// [`DdsError`] if DDS refuses it.
+    pub fn write(&self, cdr: &[u8]) -> Result<(), DdsError> {
+        let why = |error: WriteError<Bytes>| match error {
+            WriteError::WouldBlock { .. } => "readers do not keep up".to_owned(),
+            error => visible(&error.to_string()),
+        };
+        let sent = self.writer.write(Bytes::copy_from_slice(cdr), None);
+        sent.map_err(|error| DdsError::Write { topic: self.topic.clone(), why: why(error) })
+    }
+
+    /// Readers that are connected now.
+    pub fn readers(&self) -> usize {
+        self.state.peers().connected(self.guid())
+    }
+
+    fn guid(&self) -> GUID {
+        self.writer.guid()
+    }
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        self.state.peers().forget(self.guid());
+        self.line.send(Command::WriterGone(self.guid()));
+    }
+}

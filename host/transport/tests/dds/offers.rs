@@ -1,0 +1,120 @@
+//! What writers offer, and what is asked of them.
+
+use gleaner_transport::{Qos, Transport};
+
+use super::Test;
+use super::peer::{Kept, Peer, connected, domain, matched, open, policies, spec, until, write};
+
+pub const TESTS: &[Test] = &[
+    ("auto_asks_for_what_the_first_writer_offers_and_again_when_another_offers_less", auto_adapts),
+    ("auto_gets_what_a_writer_kept_for_late_readers", auto_transient_local),
+    ("auto_asks_for_more_again_when_all_writers_have_gone", auto_recovers),
+    ("a_fixed_request_that_a_writer_does_not_satisfy_is_trouble_with_names", fixed_does_not_fit),
+    ("a_writer_of_another_type_is_trouble_with_both_types", another_type),
+];
+
+fn auto_adapts() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/mixed", Qos::Auto), sink.clone()).unwrap();
+    assert_eq!(dds.status(subscription).qos, None, "nobody writes yet");
+    let peer = Peer::join(domain);
+    let reliable = peer.writer("/mixed", true, false);
+    assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("reliable, volatile"));
+    matched(&reliable);
+    for n in 0..10 {
+        write(&reliable, &[n; 4]);
+    }
+    sink.wait(10);
+
+    let other = Peer::join(domain);
+    let best_effort = other.writer("/mixed", false, false);
+    let status = connected(&dds, subscription, 2);
+    assert_eq!(status.qos.as_deref(), Some("best effort, volatile"));
+    sink.mark(&best_effort, b"from the second.");
+    sink.mark(&reliable, b"from the first..");
+    let samples = sink.bytes(12);
+    for n in 0..10 {
+        assert_eq!(samples.iter().filter(|bytes| **bytes == [n; 4]).count(), 1, "no sample comes a second time");
+    }
+    let trouble = dds.status(subscription).trouble;
+    assert!(
+        trouble.iter().any(|line| line.contains("differ") && line.contains("best effort, volatile")),
+        "{trouble:?}"
+    );
+    assert!(trouble.iter().any(|line| line.contains("asked for again")), "{trouble:?}");
+}
+
+fn auto_transient_local() {
+    let domain = domain();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/map", true, true);
+    for n in 0..5 {
+        write(&writer, &[n; 4]);
+    }
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/map", Qos::Auto), sink.clone()).unwrap();
+    assert_eq!(sink.bytes(5), (0..5).map(|n| vec![n; 4]).collect::<Vec<_>>());
+    assert_eq!(dds.status(subscription).qos.as_deref(), Some("reliable, transient local"));
+    // The same once more for a subscription that comes when RustDDS has these samples already.
+    let late = Kept::new();
+    dds.subscribe(&spec("/map", Qos::Auto), late.clone()).unwrap();
+    assert_eq!(late.bytes(5), (0..5).map(|n| vec![n; 4]).collect::<Vec<_>>());
+}
+
+fn auto_recovers() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/driver", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let weak = peer.writer("/driver", false, false);
+    assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("best effort, volatile"));
+    let strong = peer.writer("/driver", true, false);
+    // One that offers more is no reason to lose samples.
+    assert_eq!(connected(&dds, subscription, 2).qos.as_deref(), Some("best effort, volatile"));
+    drop((weak, strong));
+    connected(&dds, subscription, 0);
+    // Not before it was seen that all have gone, which nobody tells.
+    let mut strong = None;
+    until("asking for more", || {
+        drop(strong.take());
+        connected(&dds, subscription, 0);
+        strong = Some(peer.writer("/driver", true, false));
+        connected(&dds, subscription, 1).qos.as_deref() == Some("reliable, volatile")
+    });
+    let strong = strong.unwrap();
+    sink.mark(&strong, b"is heard");
+}
+
+fn fixed_does_not_fit() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let qos = Qos::Fixed { reliable: true, transient_local: false, depth: 5 };
+    let subscription = dds.subscribe(&spec("/strict", qos), Kept::new()).unwrap();
+    let peer = Peer::join(domain);
+    let _writer = peer.writer("/strict", false, false);
+    until("trouble", || !dds.status(subscription).trouble.is_empty());
+    let status = dds.status(subscription);
+    let [line] = status.trouble.as_slice() else { panic!("{:?}", status.trouble) };
+    assert!(
+        line.contains("`/strict` offers best effort, volatile, asked for is reliable, volatile: Reliability"),
+        "{line}"
+    );
+    assert_eq!((status.writers, status.qos.as_deref()), (Some(0), Some("reliable, volatile")));
+}
+
+fn another_type() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let subscription = dds.subscribe(&spec("/typed", Qos::Auto), Kept::new()).unwrap();
+    let peer = Peer::join(domain);
+    let policies = policies(true, false);
+    let topic = peer.topic("rt/typed", "sensor_msgs::msg::dds_::Imu_", &policies);
+    let _writer = peer.writer_of::<super::peer::Little>(&topic, &policies);
+    until("trouble", || !dds.status(subscription).trouble.is_empty());
+    let trouble = dds.status(subscription).trouble;
+    assert!(trouble[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"), "{trouble:?}");
+}

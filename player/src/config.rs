@@ -1,0 +1,43 @@
+//! How Cyclone DDS is set up, unless the user did.
+
+use std::net::IpAddr;
+
+/// The configuration of Cyclone DDS as its own XML.
+///
+/// With its defaults a frame of 25 MB is 18,600 fragments of 1344 bytes, of which a reader with an ordinary socket buffer
+/// loses many; with these, 400. A writer waits when more than `WhcHigh` was not acknowledged: ten frames of 25 MB are
+/// below it. A sample that is larger than `MaxQueuedRexmitBytes` could never be repaired, and one that is larger than
+/// `MaxRexmit` is repaired in several rounds, each as long as the reader waits before it asks.
+pub(crate) fn xml(interface: Option<IpAddr>) -> String {
+    let interfaces = match interface {
+        Some(address) => format!("<Interfaces><NetworkInterface address=\"{address}\"/></Interfaces>"),
+        None => String::new(),
+    };
+    format!(
+        "<CycloneDDS><Domain id=\"any\"><General>{interfaces}\
+           <MaxMessageSize>65500B</MaxMessageSize>\
+           <MaxRexmitMessageSize>65500B</MaxRexmitMessageSize>\
+           <FragmentSize>63000B</FragmentSize>\
+         </General><Internal>\
+           <SocketSendBufferSize max=\"8MiB\"/>\
+           <BurstSize><MaxRexmit>32MiB</MaxRexmit></BurstSize>\
+           <MaxQueuedRexmitBytes>64MiB</MaxQueuedRexmitBytes>\
+           <Watermarks>\
+             <WhcAdaptive>false</WhcAdaptive>\
+             <WhcHigh>256MiB</WhcHigh><WhcHighInit>256MiB</WhcHighInit><WhcLow>64MiB</WhcLow>\
+           </Watermarks>\
+         </Internal></Domain></CycloneDDS>"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_interface_is_named_only_if_asked_for() {
+        assert!(!xml(None).contains("Interface"));
+        assert!(xml(Some("127.0.0.1".parse().unwrap())).contains("<NetworkInterface address=\"127.0.0.1\"/>"));
+        assert!(xml(Some("fe80::1".parse().unwrap())).contains("\"fe80::1\""));
+    }
+}

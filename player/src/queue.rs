@@ -1,0 +1,194 @@
+//! What was read ahead: messages in the order of the drive, sorted into lanes, within one bound of bytes for all.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use gleaner_transport::Endian;
+
+use crate::buffer::Buffer;
+
+/// A message that waits for its time.
+#[derive(Debug)]
+pub(crate) struct Message {
+    /// Index of its topic.
+    pub(crate) topic: usize,
+    /// When it is due, in ns of the drive since the begin, all rounds counted.
+    pub(crate) at_ns: i64,
+    /// How much of that are the rounds before, in ns.
+    pub(crate) rounds_ns: i64,
+    pub(crate) endian: Endian,
+    /// Encapsulation, CDR, and zeros up to a multiple of four.
+    pub(crate) bytes: Buffer,
+}
+
+/// What a message takes besides its bytes, so that small ones are bounded too.
+const OVERHEAD: usize = 256;
+
+impl Message {
+    fn cost(&self) -> usize {
+        self.bytes.len() + OVERHEAD
+    }
+}
+
+/// One reader in front, one thread for each lane behind.
+pub(crate) struct Queue<'s> {
+    inner: Mutex<Inner>,
+    changed: Condvar,
+    budget: usize,
+    stop: &'s AtomicBool,
+}
+
+struct Inner {
+    lanes: Vec<VecDeque<Message>>,
+    /// The cost of all messages that wait or are being sent.
+    held: usize,
+    is_closed: bool,
+}
+
+/// How long a thread sleeps before it looks whether the player is to stop.
+const LOOK: Duration = Duration::from_millis(100);
+
+impl<'s> Queue<'s> {
+    /// A queue of `lanes` lanes, which holds `budget` bytes, or one message if that is larger.
+    pub(crate) fn new(lanes: usize, budget: usize, stop: &'s AtomicBool) -> Queue<'s> {
+        let lanes = std::iter::repeat_with(VecDeque::new).take(lanes).collect();
+        let inner = Mutex::new(Inner { lanes, held: 0, is_closed: false });
+        Queue { inner, changed: Condvar::new(), budget, stop }
+    }
+
+    /// How many lanes there are.
+    pub(crate) fn lanes(&self) -> usize {
+        self.lock().lanes.len()
+    }
+
+    /// Puts a message behind the others of its lane, as soon as there is room. False if the player is to stop.
+    pub(crate) fn push(&self, lane: usize, message: Message) -> bool {
+        let mut inner = self.lock();
+        while inner.held > 0 && inner.held + message.cost() > self.budget {
+            if self.is_stopping() {
+                return false;
+            }
+            inner = self.sleep(inner);
+        }
+        inner.held += message.cost();
+        inner.lanes[lane].push_back(message);
+        self.changed.notify_all();
+        !self.is_stopping()
+    }
+
+    /// The next message of a lane; `None` if there will be none, or if the player is to stop. It counts until
+    /// [`Self::sent`] is told its length.
+    pub(crate) fn pop(&self, lane: usize) -> Option<Message> {
+        let mut inner = self.lock();
+        loop {
+            if self.is_stopping() {
+                return None;
+            }
+            match inner.lanes[lane].pop_front() {
+                Some(message) => return Some(message),
+                None if inner.is_closed => return None,
+                None => inner = self.sleep(inner),
+            }
+        }
+    }
+
+    /// A message of so many bytes left the player: there is room again.
+    pub(crate) fn sent(&self, bytes: usize) {
+        let mut inner = self.lock();
+        inner.held = inner.held.saturating_sub(bytes + OVERHEAD);
+        self.changed.notify_all();
+    }
+
+    /// No more messages come.
+    pub(crate) fn close(&self) {
+        self.lock().is_closed = true;
+        self.changed.notify_all();
+    }
+
+    /// Waits until so much was read ahead that playing can begin: half of the budget, everything, or what came within a
+    /// second after the first message.
+    pub(crate) fn wait_until_filled(&self) {
+        let mut inner = self.lock();
+        let mut looks = 0;
+        while !inner.is_closed && inner.held <= self.budget / 2 && looks < 10 && !self.is_stopping() {
+            looks += u32::from(inner.held > 0);
+            let is_filling = |inner: &mut Inner| !inner.is_closed && inner.held <= self.budget / 2;
+            inner = self.changed.wait_timeout_while(inner, LOOK, is_filling).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    fn is_stopping(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn sleep<'g>(&self, inner: MutexGuard<'g, Inner>) -> MutexGuard<'g, Inner> {
+        self.changed.wait_timeout(inner, LOOK).unwrap_or_else(PoisonError::into_inner).0
+    }
+
+    /// Each change of what is inside is a single step, so it is whole even if a thread died holding it.
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message(topic: usize, len: usize) -> Message {
+        Message { topic, at_ns: 0, rounds_ns: 0, endian: Endian::Little, bytes: vec![0; len].into() }
+    }
+
+    #[test]
+    fn lanes_keep_their_order_and_end_when_the_queue_is_closed() {
+        let stop = AtomicBool::new(false);
+        let queue = Queue::new(2, 10_000, &stop);
+        for (lane, topic) in [(0, 1), (1, 2), (0, 3)] {
+            assert!(queue.push(lane, message(topic, 10)));
+        }
+        queue.close();
+        let topics = |lane| std::iter::from_fn(|| queue.pop(lane)).map(|message| message.topic).collect::<Vec<_>>();
+        assert_eq!((topics(0), topics(1)), (vec![1, 3], vec![2]));
+    }
+
+    #[test]
+    fn a_full_queue_makes_its_reader_wait_until_a_message_was_sent() {
+        let stop = AtomicBool::new(false);
+        let queue = Queue::new(1, 1000, &stop);
+        std::thread::scope(|scope| {
+            let reader = scope.spawn(|| (0..100).all(|topic| queue.push(0, message(topic, 500))));
+            for topic in 0..100 {
+                let message = queue.pop(0).unwrap();
+                assert_eq!(message.topic, topic);
+                assert!(queue.lock().held <= 1000);
+                queue.sent(message.bytes.len());
+            }
+            assert!(reader.join().unwrap());
+        });
+        assert_eq!(queue.lock().held, 0);
+    }
+
+    #[test]
+    fn a_message_larger_than_the_budget_passes_alone() {
+        let stop = AtomicBool::new(false);
+        let queue = Queue::new(1, 10, &stop);
+        assert!(queue.push(0, message(0, 5000)));
+        assert_eq!(queue.pop(0).unwrap().bytes.len(), 5000);
+    }
+
+    #[test]
+    fn a_stop_ends_both_who_waits_for_room_and_who_waits_for_a_message() {
+        let stop = AtomicBool::new(false);
+        let queue = Queue::new(2, 10, &stop);
+        assert!(queue.push(0, message(0, 10)));
+        std::thread::scope(|scope| {
+            let reader = scope.spawn(|| queue.push(0, message(1, 10)));
+            let lane = scope.spawn(|| queue.pop(1).is_none());
+            stop.store(true, Ordering::Relaxed);
+            assert!(!reader.join().unwrap());
+            assert!(lane.join().unwrap());
+        });
+    }
+}

@@ -1,0 +1,339 @@
+//! A drive: its topics as they are to be played, and its messages, round after round.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use gleaner_protocol::{Exit, Explain, Failure};
+use gleaner_transport::replay::{Replay, ReplayError};
+use gleaner_transport::{DiscoveredTopic, Endian, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+
+use super::images::Decoder;
+use super::{Source, Topic};
+use crate::args::Args;
+use crate::buffer::{Buffer, Pool};
+use crate::offer::{Offer, is_large};
+use crate::queue::Message;
+use crate::say::warn;
+use crate::{cdr, names, stamp};
+
+/// Between the last message of a round and the first of the next.
+const GAP_NS: i64 = 10_000_000;
+
+/// From which size on a message is put into memory that was used before.
+const LARGE: usize = 256 << 10;
+
+/// A drive that cannot be read.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+struct DriveError(ReplayError);
+
+impl Explain for DriveError {
+    fn help(&self) -> Option<String> {
+        matches!(self.0, ReplayError::Damaged { .. })
+            .then(|| "it was played up to the damage; copy the file again if you can".to_owned())
+    }
+
+    fn exit(&self) -> Exit {
+        match self.0 {
+            ReplayError::Damaged { .. } => Exit::DriveDamaged,
+            ReplayError::Read { .. } => Exit::Internal,
+            _ => Exit::Usage,
+        }
+    }
+}
+
+/// The files of a drive, being read.
+pub(crate) struct Drive {
+    paths: Vec<PathBuf>,
+    topics: Vec<Topic>,
+    /// How each topic is named and typed in the drive, and whether its images are decoded.
+    recorded: Vec<(TopicSpec, bool)>,
+    replay: Replay,
+    inbox: Arc<Inbox>,
+    decoder: Decoder,
+    undecodable: Vec<u64>,
+    /// Log times: from the first on, up to the second, without it.
+    window: (i64, i64),
+    /// How long a round takes, if there is more than one.
+    round_ns: Option<i64>,
+    rounds: i64,
+    /// Whether the current round had a message.
+    is_alive: bool,
+}
+
+/// Takes what the replay delivers, one message at a time.
+struct Inbox {
+    from_ns: i64,
+    pool: Pool,
+    taken: Mutex<Option<(Endian, Buffer)>>,
+}
+
+impl Sink for Inbox {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        // Not even copied: `--start` reads through what is before it.
+        if meta.at_ns < self.from_ns {
+            return Verdict::Taken;
+        }
+        let len = cdr.len() + cdr::ENCAPSULATION;
+        let mut bytes = if len < LARGE { Buffer::from(Vec::with_capacity(len + 3)) } else { self.pool.take(len + 3) };
+        bytes.clear();
+        bytes.extend_from_slice(&cdr::encapsulation(meta.endian, meta.options));
+        bytes.extend_from_slice(cdr);
+        cdr::pad(&mut bytes);
+        *self.taken.lock().unwrap_or_else(PoisonError::into_inner) = Some((meta.endian, bytes));
+        Verdict::Taken
+    }
+}
+
+impl Drive {
+    pub(crate) fn open(args: &Args) -> Result<Drive, Failure> {
+        let mut replay = Replay::open(&args.drives).map_err(DriveError)?;
+        let (start_ns, end_ns) = (replay.start_ns().unwrap_or(0), replay.end_ns().unwrap_or(0));
+        let from_ns = start_ns.saturating_add(args.start);
+        let to_ns = args.duration.map_or(i64::MAX, |duration| from_ns.saturating_add(duration));
+        if from_ns > end_ns {
+            let seconds = end_ns.saturating_sub(start_ns) as f64 / 1e9;
+            let what = format!("the drive is only {seconds:.1} s long");
+            return Err(Failure::new(Exit::Usage, what).with_help("give a smaller --start"));
+        }
+        let round_ns =
+            if to_ns <= end_ns { to_ns - from_ns } else { end_ns.saturating_sub(from_ns).saturating_add(GAP_NS) };
+        let inbox = Arc::new(Inbox { from_ns, pool: Pool::default(), taken: Mutex::new(None) });
+        let mut renamed: BTreeMap<&str, &str> =
+            args.remap.iter().map(|(from, to)| (from.as_str(), to.as_str())).collect();
+        let (mut topics, mut recorded) = (Vec::<Topic>::new(), Vec::new());
+        for found in wanted(&replay, &args.topics)? {
+            let decoded = args.raw_images && names::dds_type(&found.type_name).as_deref() == Some(COMPRESSED);
+            let to = renamed.remove(found.topic.as_str());
+            let topic = play_as(&replay, &found, decoded, to);
+            let spec = TopicSpec {
+                topic: found.topic.clone(),
+                type_name: found.type_name.clone(),
+                queue: 1,
+                max_bytes: usize::MAX,
+                qos: Qos::Auto,
+            };
+            let subscribed = topic.and_then(|topic| {
+                let sink: Arc<dyn Sink> = inbox.clone();
+                replay.subscribe(&spec, sink).map(|_| topic).map_err(|error| error.to_string())
+            });
+            match subscribed {
+                Ok(topic) if topics.iter().any(|other| other.topic == topic.topic) => {
+                    let what = format!("two topics of the drive would be played as `{}`", topic.topic);
+                    return Err(Failure::new(Exit::Usage, what).with_help("give one of them another name with --remap"));
+                }
+                Ok(topic) => {
+                    topics.push(topic);
+                    recorded.push((spec, decoded));
+                }
+                // A topic that was asked for by its name is not left out.
+                Err(why) if args.topics.contains(&found.topic) => return Err(Failure::new(Exit::Usage, why)),
+                Err(why) => warn(&format!("{why}; it is not played")),
+            }
+        }
+        if let Some(name) = renamed.keys().next() {
+            let what = format!("--remap names `{name}`, which is not played");
+            return Err(Failure::new(Exit::Usage, what).with_help("FROM is the name of a topic in the drive"));
+        }
+        if topics.is_empty() {
+            return Err(Failure::new(Exit::Usage, "the drive has no topic that can be played"));
+        }
+        Ok(Drive {
+            paths: args.drives.clone(),
+            undecodable: vec![0; topics.len()],
+            topics,
+            recorded,
+            replay,
+            inbox,
+            decoder: Decoder::new(args.size),
+            window: (from_ns, to_ns),
+            round_ns: args.looped.then_some(round_ns),
+            rounds: 0,
+            is_alive: false,
+        })
+    }
+
+    /// Begins the next round; false if there is none.
+    fn begin_again(&mut self) -> Result<bool, Failure> {
+        if self.round_ns.is_none() || !self.is_alive {
+            return Ok(false);
+        }
+        self.replay = Replay::open(&self.paths).map_err(DriveError)?;
+        for (spec, _) in &self.recorded {
+            let sink: Arc<dyn Sink> = self.inbox.clone();
+            self.replay
+                .subscribe(spec, sink)
+                .map_err(|error| Failure::caused_by(Exit::Usage, "the drive changed while it was played", &error))?;
+        }
+        self.is_alive = false;
+        self.rounds += 1;
+        Ok(true)
+    }
+}
+
+/// The type of compressed images, as DDS calls it.
+const COMPRESSED: &str = "sensor_msgs::msg::dds_::CompressedImage_";
+
+/// The topics of `replay` that are asked for, or all.
+fn wanted(replay: &Replay, names: &[String]) -> Result<Vec<DiscoveredTopic>, Failure> {
+    let topics = replay.topics();
+    if let Some(unknown) = names.iter().find(|name| topics.iter().all(|topic| topic.topic != **name)) {
+        // Its error says which topics there are.
+        let error = replay.definitions(unknown).err().map(|error| error.to_string());
+        return Err(Failure::new(Exit::Usage, error.unwrap_or_else(|| format!("no topic `{unknown}`"))));
+    }
+    Ok(topics.into_iter().filter(|topic| names.is_empty() || names.contains(&topic.topic)).collect())
+}
+
+/// How a topic is played, under the name `to` if it is given; or why it cannot be.
+fn play_as(replay: &Replay, found: &DiscoveredTopic, decoded: bool, to: Option<&str>) -> Result<Topic, String> {
+    let topic = match to {
+        Some(to) => to.to_owned(),
+        None if decoded => names::image_raw(&found.topic),
+        None => found.topic.clone(),
+    };
+    if names::dds_topic(&topic).is_none() {
+        return Err(format!("ROS 2 takes no topic of the name `{topic}`"));
+    }
+    let type_name = if decoded { "sensor_msgs/msg/Image" } else { &found.type_name };
+    if names::dds_type(type_name).is_none() {
+        return Err(format!("topic `{}` has type `{type_name}`, which is none of ROS 2", found.topic));
+    }
+    let is_stamped =
+        decoded || replay.definitions(&found.topic).is_ok_and(|definitions| stamp::has_stamp(&definitions));
+    let offer = Offer::recorded(found.offered_qos.as_deref()).of_large(is_large(type_name));
+    Ok(Topic { topic, type_name: type_name.to_owned(), offer, is_stamped })
+}
+
+impl Source for Drive {
+    fn topics(&self) -> &[Topic] {
+        &self.topics
+    }
+
+    fn next(&mut self) -> Result<Option<Message>, Failure> {
+        loop {
+            let step = match self.replay.step().map_err(DriveError)? {
+                Some(step) if step.at_ns < self.window.1 => step,
+                _ if self.begin_again()? => continue,
+                _ => return Ok(None),
+            };
+            let taken = self.inbox.taken.lock().unwrap_or_else(PoisonError::into_inner).take();
+            let Some((mut endian, mut bytes)) = taken else { continue };
+            // Subscribed in the order of the topics.
+            let topic = step.subscription.0;
+            if self.recorded[topic].1 {
+                match self.decoder.convert(&bytes[cdr::ENCAPSULATION..], endian) {
+                    Ok(image) => (endian, bytes) = (Endian::Little, image),
+                    Err(error) => {
+                        if self.undecodable[topic] == 0 {
+                            let topic = &self.recorded[topic].0.topic;
+                            warn(&format!("an image of `{topic}` is left out: {error}; the summary counts them"));
+                        }
+                        self.undecodable[topic] += 1;
+                        continue;
+                    }
+                }
+            }
+            self.is_alive = true;
+            let rounds_ns = self.round_ns.unwrap_or(0).saturating_mul(self.rounds);
+            let at_ns = step.at_ns.saturating_sub(self.window.0).saturating_add(rounds_ns);
+            return Ok(Some(Message { topic, at_ns, rounds_ns, endian, bytes }));
+        }
+    }
+
+    fn read_ahead(&self) -> usize {
+        256 << 20
+    }
+
+    fn undecodable(&self, topic: usize) -> u64 {
+        self.undecodable[topic]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use gleaner_transport::message::ImageView;
+
+    use super::*;
+
+    /// 40 s of a camera at 10 Hz, an IMU at 100 Hz, and a speed.
+    const SAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/highway_drive.mcap");
+
+    fn open(arguments: &[&str]) -> Result<Drive, Failure> {
+        let line = ["gleaner-player", SAMPLE].into_iter().chain(arguments.iter().copied());
+        Drive::open(&Args::try_parse_from(line).unwrap())
+    }
+
+    fn names(drive: &Drive) -> Vec<&str> {
+        drive.topics().iter().map(|topic| topic.topic.as_str()).collect()
+    }
+
+    fn refused(arguments: &[&str]) -> Failure {
+        open(arguments).err().expect("it is refused")
+    }
+
+    #[test]
+    fn a_drive_is_played_whole_and_in_order_from_time_0() {
+        let mut drive = open(&[]).unwrap();
+        assert_eq!(names(&drive), ["/camera/front/compressed", "/imu/data", "/vehicle/speed"]);
+        assert!(drive.topics().iter().all(|topic| topic.is_stamped));
+        let messages: Vec<_> = std::iter::from_fn(|| drive.next().unwrap()).collect();
+        assert_eq!(messages.len(), 400 + 4170 + 3316);
+        assert_eq!(messages[0].at_ns, 0);
+        assert!(messages.is_sorted_by_key(|message| message.at_ns));
+        assert!(messages.iter().all(|message| message.bytes.len() % 4 == 0 && message.bytes[..4] == [0, 1, 0, 0]));
+    }
+
+    #[test]
+    fn a_part_of_a_drive_begins_at_time_0_and_ends_before_its_end() {
+        let mut drive = open(&["--topics", "/imu/data", "--start", "10", "--duration", "2"]).unwrap();
+        assert_eq!(names(&drive), ["/imu/data"]);
+        let times: Vec<_> = std::iter::from_fn(|| drive.next().unwrap()).map(|message| message.at_ns).collect();
+        assert!((190..220).contains(&times.len()), "{}", times.len());
+        assert!(times[0] < 20_000_000 && times.iter().all(|at_ns| (0..2_000_000_000).contains(at_ns)));
+    }
+
+    #[test]
+    fn rounds_follow_each_other_without_an_end_and_without_a_step_back() {
+        let mut drive = open(&["--topics", "/imu/data", "--start", "39", "--loop"]).unwrap();
+        let messages: Vec<_> = std::iter::from_fn(|| drive.next().unwrap()).take(1000).collect();
+        assert_eq!(messages.len(), 1000);
+        assert!(messages.is_sorted_by(|a, b| a.at_ns < b.at_ns));
+        let rounds: std::collections::BTreeSet<_> = messages.iter().map(|message| message.rounds_ns).collect();
+        let rounds: Vec<_> = rounds.into_iter().collect();
+        assert!(rounds.len() > 5 && rounds[0] == 0);
+        assert!(rounds.windows(2).all(|pair| pair[1] - pair[0] == rounds[1]));
+    }
+
+    #[test]
+    fn compressed_images_become_raw_ones_under_another_name() {
+        let arguments = ["--topics", "/camera/front/compressed", "--raw-images", "--size", "64x36"];
+        let mut drive = open(&arguments).unwrap();
+        assert_eq!(names(&drive), ["/camera/front/image_raw"]);
+        assert_eq!(drive.topics()[0].type_name, "sensor_msgs/msg/Image");
+        let message = drive.next().unwrap().unwrap();
+        let image = ImageView::read(&message.bytes[4..], message.endian).unwrap();
+        assert_eq!((image.width, image.height, image.encoding, image.data.len()), (64, 36, "bgr8", 64 * 36 * 3));
+        assert_eq!(drive.undecodable(0), 0);
+    }
+
+    #[test]
+    fn topics_are_renamed_and_nonsense_is_refused_with_a_way_out() {
+        assert!(names(&open(&["--remap", "/imu/data:=/car/imu"]).unwrap()).contains(&"/car/imu"));
+        let renamed = ["--raw-images", "--remap", "/camera/front/compressed:=/front"];
+        assert!(names(&open(&renamed).unwrap()).contains(&"/front"));
+        for (arguments, said) in [
+            (&["--topics", "/imu/dat"][..], "/imu/data"),
+            (&["--remap", "/nothing:=/x"], "which is not played"),
+            (&["--remap", "/imu/data:=/vehicle/speed"], "two topics"),
+            (&["--topics", "/imu/data", "--remap", "/imu/data:=no name"], "takes no topic"),
+            (&["--start", "41"], "40.0 s long"),
+        ] {
+            let failure = refused(arguments);
+            assert_eq!(failure.exit, Exit::Usage);
+            assert!(failure.message.contains(said), "{failure}");
+        }
+    }
+}

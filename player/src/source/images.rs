@@ -1,0 +1,141 @@
+//! Compressed images become raw ones, in another size if asked for.
+
+use gleaner_image::{ImageError, decode_rgb8, probe};
+use gleaner_transport::Endian;
+use gleaner_transport::message::{CdrError, CompressedView, Definitions, FieldPath, HeaderStamp, Value, header_stamp};
+
+use crate::args::Size;
+use crate::buffer::{Buffer, Pool};
+use crate::cdr;
+
+/// Why an image cannot be sent.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ConvertError {
+    /// The message is no `CompressedImage`.
+    #[error("it is no sensor_msgs/msg/CompressedImage")]
+    Message(#[from] CdrError),
+    /// What it holds is no picture.
+    #[error("its picture cannot be decoded: {0}")]
+    Picture(#[from] ImageError),
+}
+
+/// Bytes that an image may have as rgb8: 21 million pixels.
+const MAX_BYTES: usize = 64 << 20;
+
+/// Decodes the images of one drive.
+pub(crate) struct Decoder {
+    size: Option<Size>,
+    stamp: HeaderStamp,
+    frame_id: FieldPath,
+    rgb: Vec<u8>,
+    pool: Pool,
+}
+
+/// `sensor_msgs/msg/CompressedImage` as ROS 2 defines it. A drive need not say it.
+const DEFINITION: &str = "std_msgs/Header header\nstring format\nuint8[] data\n\
+    ===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n";
+
+impl Decoder {
+    /// Makes images of `size`, or as large as they are.
+    pub(crate) fn new(size: Option<Size>) -> Decoder {
+        let definitions =
+            Definitions::parse("sensor_msgs/msg/CompressedImage", DEFINITION).expect("a sound definition");
+        let stamp = header_stamp(&definitions).expect("it begins with a header");
+        let frame_id = FieldPath::compile(&definitions, "header.frame_id").expect("a header has it");
+        Decoder { size, stamp, frame_id, rgb: Vec::new(), pool: Pool::default() }
+    }
+
+    /// The `sensor_msgs/msg/Image` in bgr8, little-endian, of a `CompressedImage`.
+    pub(crate) fn convert(&mut self, cdr: &[u8], endian: Endian) -> Result<Buffer, ConvertError> {
+        let view = CompressedView::read(cdr, endian)?;
+        let stamp_ns = self.stamp.read(cdr, endian)?;
+        let frame_id = match self.frame_id.read(cdr, endian)? {
+            Value::Text(text) => text,
+            _ => "",
+        };
+        let header = probe(view.data)?;
+        // Too large is refused below, before any memory is taken.
+        let len = header.rgb8_len().filter(|len| *len <= MAX_BYTES).unwrap_or(0);
+        self.rgb.resize(len, 0);
+        decode_rgb8(view.data, &header, MAX_BYTES, &mut self.rgb)?;
+        let from = Size { width: header.width, height: header.height };
+        let to = self.size.unwrap_or(from);
+        let head = cdr::image_head(stamp_ns, frame_id, to.width, to.height);
+        let len = (head.len() + to.bytes()).next_multiple_of(4);
+        let mut image = self.pool.take(len);
+        image.resize(len, 0);
+        image[..head.len()].copy_from_slice(&head);
+        scale_to_bgr(&self.rgb, from, &mut image[head.len()..head.len() + to.bytes()], to);
+        Ok(image)
+    }
+}
+
+/// Takes for each pixel the nearest one of `rgb`, and turns red, green, blue around.
+fn scale_to_bgr(rgb: &[u8], from: Size, bgr: &mut [u8], to: Size) {
+    let nearest = |at: u32, to: u32, from: u32| (u64::from(at) * u64::from(from) / u64::from(to)) as usize;
+    let columns: Vec<usize> = (0..to.width).map(|x| nearest(x, to.width, from.width)).collect();
+    let rows = rgb.chunks_exact(3 * from.width as usize).collect::<Vec<_>>();
+    for (y, out) in (0..).zip(bgr.chunks_exact_mut(3 * to.width as usize)) {
+        let (row, _) = rows[nearest(y, to.height, from.height)].as_chunks::<3>();
+        let (out, _) = out.as_chunks_mut::<3>();
+        for (out, column) in out.iter_mut().zip(&columns) {
+            let [red, green, blue] = row[*column];
+            *out = [blue, green, red];
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_transport::message::ImageView;
+    use jpeg_encoder::{ColorType, Encoder};
+
+    use super::*;
+    use crate::cdr::Cdr;
+
+    /// A picture whose left half is red and whose right half is blue.
+    fn message() -> Vec<u8> {
+        let pixels = [[255, 0, 0], [0, 0, 255]].map(|pixel| pixel.repeat(16)).concat().repeat(16);
+        let mut jpeg = Vec::new();
+        Encoder::new(&mut jpeg, 100).encode(&pixels, 32, 16, ColorType::Rgb).unwrap();
+        let mut cdr = Cdr::with_header(1_500_000_000, "front");
+        cdr.text("jpeg");
+        cdr.u32(jpeg.len() as u32);
+        jpeg.iter().for_each(|byte| cdr.u8(*byte));
+        cdr.done()[4..].to_vec()
+    }
+
+    #[test]
+    fn a_picture_becomes_bgr8_with_its_stamp_and_frame() {
+        for (size, side) in [(None, (32, 16)), (Some("64x48"), (64, 48)), (Some("7x5"), (7, 5))] {
+            let mut decoder = Decoder::new(size.map(|text| text.parse().unwrap()));
+            let image = decoder.convert(&message(), Endian::Little).unwrap();
+            assert_eq!(image.len() % 4, 0);
+            let head = Cdr::with_header(1_500_000_000, "front").done();
+            assert_eq!(image[..head.len()], head);
+            let view = ImageView::read(&image[4..], Endian::Little).unwrap();
+            assert_eq!((view.width, view.height), side);
+            let (pixels, _) = view.data.as_chunks::<3>();
+            assert_eq!(pixels.len() as u32, view.width * view.height);
+            let (first, last) = (pixels[0], pixels[pixels.len() - 1]);
+            assert!(first[2] > 240 && first[0] < 15, "red comes last: {first:?}");
+            assert!(last[0] > 240 && last[2] < 15, "blue comes first: {last:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_picture_is_refused_and_the_next_one_decoded() {
+        let mut decoder = Decoder::new(None);
+        assert!(matches!(decoder.convert(&[0; 3], Endian::Little), Err(ConvertError::Message(_))));
+        let mut broken = message();
+        let at = broken.len() / 2;
+        broken.truncate(at);
+        assert!(decoder.convert(&broken, Endian::Little).is_err());
+        let mut no_picture = Cdr::with_header(0, "");
+        no_picture.text("jpeg");
+        no_picture.u32(0);
+        let cdr = no_picture.done();
+        assert!(matches!(decoder.convert(&cdr[4..], Endian::Little), Err(ConvertError::Picture(_))));
+        assert!(decoder.convert(&message(), Endian::Little).is_ok());
+    }
+}

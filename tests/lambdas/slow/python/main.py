@@ -1,0 +1,29 @@
+"""A lambda that is slower than its camera, or keeps what it sees. The host must neither fall behind nor lose anything uncounted."""
+
+import time
+
+import gleaner
+
+
+class Lambda:
+    def __init__(self, ctx: gleaner.Context) -> None:
+        self.behaviour = ctx.config["behaviour"]
+        self.seconds = float(ctx.config["seconds"])
+        self.camera = ctx.input("camera")
+        self.kept: list[gleaner.Sample] = []
+        # Samples received less the number of the newest, when it first ran.
+        self.ahead: int | None = None
+
+    def on_event(self, ctx: gleaner.Context, sample: gleaner.Sample) -> None:
+        ahead = self.camera.counts().received - sample.identity.seq
+        if self.ahead is None:
+            self.ahead = ahead
+        # One may arrive between being chosen and being looked at.
+        if ahead - self.ahead > 1:
+            ctx.event("stale", float(ahead))
+        if self.behaviour == "sleep":
+            time.sleep(self.seconds)
+        elif self.behaviour == "keep":
+            self.kept.append(sample)
+        else:
+            raise ValueError(f"unknown behaviour `{self.behaviour}`")

@@ -1,0 +1,45 @@
+//! A lambda that is slower than its camera, or keeps what it sees. The host must neither fall behind nor lose anything uncounted.
+
+use gleaner_sdk::{Config, Error, Lambda, Result, Sample, Topic, event, input};
+
+struct Slow {
+    behaviour: String,
+    rounds: i64,
+    camera: Topic,
+    kept: Vec<Sample>,
+    /// Samples received less the number of the newest, when it first ran.
+    ahead: Option<u64>,
+}
+
+impl Lambda for Slow {
+    fn init(config: &Config) -> Result<Self> {
+        let behaviour = config.text("behaviour")?.to_owned();
+        Ok(Self {
+            behaviour,
+            rounds: config.integer("rounds")?,
+            camera: input("camera")?,
+            kept: Vec::new(),
+            ahead: None,
+        })
+    }
+
+    fn on_event(&mut self, sample: Sample) -> Result<()> {
+        let ahead = self.camera.counts().received.wrapping_sub(sample.identity().seq);
+        // One may arrive between being chosen and being looked at.
+        if ahead.wrapping_sub(*self.ahead.get_or_insert(ahead)) > 1 {
+            event("stale", ahead as f64).send()?;
+        }
+        match self.behaviour.as_str() {
+            "sleep" => {
+                for round in 0..self.rounds {
+                    std::hint::black_box(round);
+                }
+            }
+            "keep" => self.kept.push(sample),
+            other => return Err(Error::new(format!("unknown behaviour `{other}`"))),
+        }
+        Ok(())
+    }
+}
+
+gleaner_sdk::lambda!(Slow);

@@ -1,0 +1,85 @@
+//! Live topics with programs on other people's DDS: what they write arrives whole, what we write arrives there, and neither
+//! restarts, losses nor hostile packets keep it from doing so.
+//!
+//! Each case is this program once more, in a network of its own (`gleaner_tests::namespace`). `GLEANER_RESTARTS` says how often a
+//! publisher is killed; 10 times if it does not.
+
+mod faults;
+mod from_peers;
+mod graph;
+mod ours;
+mod rtps;
+mod to_peers;
+
+use std::process::{ExitCode, Stdio};
+
+use gleaner_tests::namespace;
+use gleaner_tests::peers::Kind;
+use libtest_mimic::{Arguments, Failed, Trial};
+
+/// What a case needs besides a network of its own.
+#[derive(Copy, Clone)]
+enum Need {
+    Peer(Kind),
+    /// Rules that drop packets.
+    Nft,
+}
+
+type Run = fn() -> Result<(), Failed>;
+
+struct Case {
+    name: &'static str,
+    needs: &'static [Need],
+    run: Run,
+}
+
+/// Tells this program which case it is.
+const CASE: &str = "GLEANER_DDS_CASE";
+
+fn main() -> ExitCode {
+    let cases = || [from_peers::CASES, to_peers::CASES, graph::CASES, faults::CASES].into_iter().flatten();
+    if let Ok(name) = std::env::var(CASE) {
+        let case = cases().find(|case| case.name == name).expect("this program gives itself the names of its cases");
+        return match (case.run)() {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(failed) => {
+                eprintln!("{}", failed.message().unwrap_or("failed"));
+                ExitCode::FAILURE
+            }
+        };
+    }
+    let mut arguments = Arguments::from_args();
+    // Two that move images at the same time would show how small this machine is.
+    arguments.test_threads.get_or_insert(1);
+    let trials = cases().map(|case| match unavailable(case) {
+        None => Trial::test(case.name, || in_private(case.name)),
+        Some(why) => Trial::test(format!("{} [{why}]", case.name), || in_private(case.name)).with_ignored_flag(true),
+    });
+    libtest_mimic::run(&arguments, trials.collect()).exit_code()
+}
+
+fn unavailable(case: &Case) -> Option<&'static str> {
+    let missing = |need: &Need| match need {
+        Need::Peer(kind) => kind.unavailable(),
+        Need::Nft => (!can_filter()).then_some("no packets can be dropped here: nft is needed"),
+    };
+    namespace::unavailable().or_else(|| case.needs.iter().find_map(missing))
+}
+
+fn can_filter() -> bool {
+    let mut probe = namespace::command("nft".as_ref());
+    let probe = probe.args(["add", "table", "inet", "probe"]).stdin(Stdio::null()).stderr(Stdio::null());
+    probe.status().is_ok_and(|status| status.success())
+}
+
+/// Runs a case in a network of its own.
+fn in_private(name: &str) -> Result<(), Failed> {
+    let mut run = namespace::command(&std::env::current_exe()?);
+    let output = run.env(CASE, name).stdin(Stdio::null()).output()?;
+    print!("{}", String::from_utf8_lossy(&output.stdout));
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = String::from_utf8_lossy(&output.stderr);
+    Err(format!("{}; it said:\n{said}", output.status).into())
+}

@@ -1,0 +1,122 @@
+//! Our side: a participant, and a sink that keeps what it is given.
+
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::time::{Duration, Instant};
+
+use gleaner_tests::peers::PATIENCE;
+use gleaner_tests::peers::message::Type;
+use gleaner_transport::dds::{Dds, Distro, Options};
+use gleaner_transport::{Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
+use libtest_mimic::Failed;
+
+/// The largest message here: an image of 1080p.
+const LARGEST: usize = 7 << 20;
+
+/// Joins the domain.
+pub fn join(distro: Option<Distro>) -> Result<Dds, Failed> {
+    let mut options = Options::new("/gleaner/tests");
+    options.largest = LARGEST;
+    options.distro = distro;
+    Ok(Dds::open(options)?)
+}
+
+/// A sample that was heard.
+pub struct Sample {
+    pub meta: SampleMeta,
+    pub cdr: Vec<u8>,
+}
+
+#[derive(Default)]
+struct Memory {
+    samples: Mutex<Vec<Sample>>,
+    arrived: Condvar,
+}
+
+impl Sink for Memory {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        self.samples.lock().unwrap().push(Sample { meta: *meta, cdr: cdr.to_vec() });
+        self.arrived.notify_all();
+        Verdict::Taken
+    }
+}
+
+/// One topic that we listen to.
+pub struct Heard {
+    pub subscription: Subscription,
+    ty: Type,
+    memory: Arc<Memory>,
+}
+
+impl Heard {
+    /// Subscribes.
+    pub fn on(dds: &mut Dds, ty: Type, topic: &str, qos: Qos) -> Result<Self, Failed> {
+        let memory = Arc::new(Memory::default());
+        let (topic, type_name) = (topic.to_owned(), ty.name());
+        let spec = TopicSpec { topic, type_name, queue: 100, max_bytes: LARGEST, qos };
+        Ok(Self { subscription: dds.subscribe(&spec, memory.clone())?, ty, memory })
+    }
+
+    /// Waits until what was heard is `enough`, and returns it.
+    pub fn wait(
+        &self,
+        what: &str,
+        mut enough: impl FnMut(&[Sample]) -> bool,
+    ) -> Result<MutexGuard<'_, Vec<Sample>>, Failed> {
+        let mut samples = self.memory.samples.lock().unwrap();
+        let deadline = Instant::now() + PATIENCE;
+        while !enough(&samples) {
+            if Instant::now() > deadline {
+                return Err(format!("waited for {what}; {} samples were heard", samples.len()).into());
+            }
+            // Asked again now and then: that something was lost comes without a sample.
+            samples = self.memory.arrived.wait_timeout(samples, Duration::from_millis(100)).unwrap().0;
+        }
+        Ok(samples)
+    }
+
+    /// How many were heard by now.
+    pub fn count(&self) -> usize {
+        self.memory.samples.lock().unwrap().len()
+    }
+
+    /// Waits for messages 1 to `count` of one writer: each once, in order, every byte as it should be, none counted as lost.
+    pub fn all(&self, dds: &Dds, count: u32) -> Result<(), Failed> {
+        let samples = self.wait("all messages", |samples| samples.len() >= count as usize)?;
+        if samples.len() > count as usize {
+            return Err(format!("{} samples for {count} messages", samples.len()).into());
+        }
+        self.in_order(samples.iter(), 1)?;
+        // A comparison that finds nothing because it is blind shows nothing.
+        if self.in_order(samples.iter().take(1), 2).is_ok() {
+            return Err("message 1 passes for message 2".into());
+        }
+        drop(samples);
+        let status = dds.status(self.subscription);
+        let Status { lost, malformed, trouble, .. } = &status;
+        if *lost != Some(0) || *malformed != 0 || !trouble.is_empty() {
+            return Err(format!("all messages arrived, but the status is {status:?}").into());
+        }
+        Ok(())
+    }
+
+    /// Checks that `samples` are messages from `first` on, of one writer, without a gap.
+    pub fn in_order<'s>(&self, samples: impl IntoIterator<Item = &'s Sample>, first: u32) -> Result<(), Failed> {
+        let mut before: Option<(Guid, u64)> = None;
+        for (n, Sample { meta, cdr }) in (first..).zip(samples) {
+            if let Some(how) = self.ty.message(n).differs(cdr, meta.endian) {
+                return Err(format!("message {n}: {how}").into());
+            }
+            if before.is_some_and(|(writer, seq)| writer != meta.writer || seq + 1 != meta.seq) {
+                return Err(format!("message {n} is not the next of {before:?}: {meta:?}").into());
+            }
+            before = Some((meta.writer, meta.seq));
+        }
+        Ok(())
+    }
+}
+
+/// The number of a message, from its stamp.
+pub fn number(sample: &Sample) -> u32 {
+    let sec = sample.cdr.first_chunk().map_or(0, |sec| i32::from_le_bytes(*sec));
+    u32::try_from(sec - 1000).unwrap_or(0)
+}

@@ -1,0 +1,258 @@
+//! Lambdas on live topics: `gleaner run`, with the recorder and the player, each in a private network.
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::link::RecorderReport;
+use gleaner_protocol::{Clip, Decision, Report};
+use gleaner_tests::live::{self, Line, Started, children, decisions, no_player, play, run, signal};
+use gleaner_tests::{Folder, namespace, replay_to, root, sample_drive};
+use libtest_mimic::{Arguments, Failed, Trial};
+
+/// Names the case that this process is to run in the network that it was started in.
+const CASE: &str = "GLEANER_LIVE_CASE";
+
+type Case = (&'static str, fn());
+
+const CASES: &[Case] = &[
+    ("a_drive_played_live_is_decided_as_in_its_replay", as_in_replay),
+    ("a_lambda_slower_than_its_camera_sees_the_newest_frame_and_skips_are_counted", || slow("sleep")),
+    ("a_lambda_that_keeps_every_frame_does_not_stop_the_reception_and_refusals_are_counted", || slow("keep")),
+    ("ctrl_c_ends_in_order_and_clips_that_are_open_are_closed", ctrl_c),
+    ("a_lambda_whose_process_is_killed_is_started_again_and_loses_no_decision", || killed("start.py")),
+    ("a_recorder_that_is_killed_is_started_again_and_its_clip_recovered", || killed("gleaner-recorder")),
+    ("a_topic_that_nobody_writes_is_said", nobody_writes),
+    ("a_lambda_does_not_outlive_the_command_that_started_it", outlives),
+];
+
+fn main() -> ExitCode {
+    if let Ok(name) = std::env::var(CASE) {
+        let (_, case) = CASES.iter().find(|(known, _)| *known == name).expect("a case of this suite");
+        case();
+        return ExitCode::SUCCESS;
+    }
+    let missing = namespace::unavailable().or(no_player());
+    let trial = |(name, _): &Case| match missing {
+        Some(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
+        None => Trial::test(*name, || alone(name)),
+    };
+    let mut arguments = Arguments::from_args();
+    // They measure nothing, but starving each other would make samples skip.
+    arguments.test_threads = Some(1);
+    libtest_mimic::run(&arguments, CASES.iter().map(trial).collect()).exit_code()
+}
+
+/// Runs a case in a process of its own, in a network of its own.
+fn alone(name: &str) -> Result<(), Failed> {
+    let mut command = namespace::command(&std::env::current_exe()?);
+    let output = command.env(CASE, name).output()?;
+    if output.status.success() {
+        return Ok(());
+    }
+    Err(String::from_utf8_lossy(&output.stderr).into_owned().into())
+}
+
+fn lambda(name: &str, language: &str) -> std::path::PathBuf {
+    root().join(name).join(language)
+}
+
+/// What a decision is about: the label, and which of the camera's or IMU's samples.
+type About = (String, Option<u64>);
+
+/// What decisions are about.
+fn about(decisions: &[Decision]) -> Vec<About> {
+    let of = |decision: &Decision| {
+        let seq = decision.seq;
+        decision.triggers.iter().map(move |trigger| (trigger.label.clone(), seq)).collect::<Vec<_>>()
+    };
+    decisions.iter().flat_map(of).collect()
+}
+
+/// The same labels for the same samples of the camera, and for nearly the same of the IMU.
+///
+/// Both lambdas look at half a second of the IMU by receive stamps. Live, these jitter by a millisecond and more, so that a sample
+/// at the edge is in or out; a threshold may then be passed some samples earlier or later. A frame of the camera is 10 of them.
+fn alike(live: &[About], replay: &[About]) -> bool {
+    let is_camera = replay.iter().all(|(label, _)| label == "brake-dark");
+    let slack = if is_camera { 0 } else { 10 };
+    let same = |((a, n), (b, m)): (&About, &About)| a == b && n.zip(*m).is_some_and(|(n, m)| n.abs_diff(m) <= slack);
+    live.len() == replay.len() && live.iter().zip(replay).all(same)
+}
+
+fn as_in_replay() {
+    const SET: [&str; 2] = ["--set", "brake_mps2=-1.4"];
+    let args = [SET[0], SET[1], "--no-record"];
+    let rounds = std::env::var("GLEANER_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(1);
+    let lambdas = ["examples/hello", "examples/brake-dark"];
+    let all = || lambdas.iter().flat_map(|name| ["rust", "python"].map(|language| lambda(name, language)));
+    let drive = sample_drive();
+    let expected: Vec<_> = all()
+        .map(|lambda| {
+            let out = Folder::new();
+            let replayed = replay_to(out.path(), &lambda, std::slice::from_ref(&drive), &SET);
+            about(&replayed.decisions)
+        })
+        .collect();
+    assert!(expected.iter().all(|expected| !expected.is_empty()));
+    for round in 1..=rounds {
+        let outs: Vec<Folder> = all().map(|_| Folder::new()).collect();
+        let runs: Vec<Started> = all().zip(&outs).map(|(lambda, out)| run(&lambda, out.path(), &args)).collect();
+        runs.iter().for_each(Started::until_ready);
+        let path = drive.to_str().expect("the checkout has a plain path");
+        let played = play(&[path, "--wait", "2", "--topics", "/imu/data,/camera/front/compressed"]).finish();
+        assert!(played.status.success(), "{}", played.said);
+        // The last sample may still be on its way, and windows are open for some seconds after it.
+        for started in &runs {
+            started.until_live("the end of the drive", |live| {
+                let is_over = live.topics.iter().all(|topic| topic.writers == Some(0) && topic.received > 0);
+                // Each event sample has been considered: one of the topics causes the wakes.
+                is_over && live.topics.iter().any(|topic| live.wakes + topic.skipped == topic.received)
+            });
+            started.signal("INT");
+        }
+        let mut compared = 0;
+        for (((started, out), expected), lambda) in runs.into_iter().zip(&outs).zip(&expected).zip(all()) {
+            let finished = started.finish();
+            let lambda = lambda.display();
+            let ended = finished.ended();
+            // On a machine that is busy with others, a wake may exceed its deadline.
+            assert!(finished.status.success() || ended.faults > 0, "{lambda}: {}, {}", finished.status, finished.said);
+            let lost: u64 =
+                ended.topics.iter().map(|topic| topic.lost.expect("DDS tells") + topic.no_slot + topic.malformed).sum();
+            let (wakes, skipped, faults) = (ended.wakes, ended.skipped, ended.faults);
+            println!("round {round}: {lambda}: {wakes} wakes, {skipped} skipped, {lost} lost, {faults} faults");
+            if skipped == 0 && lost == 0 && faults == 0 {
+                let live = about(&decisions(out.path()));
+                assert!(alike(&live, expected), "{lambda}, round {round}: {live:?}, but in the replay {expected:?}");
+                compared += 1;
+            }
+        }
+        assert!(compared > 0, "this machine skipped samples in every run: nothing could be compared");
+    }
+}
+
+fn slow(behaviour: &str) {
+    let outs = [Folder::new(), Folder::new()];
+    let set = format!("behaviour={behaviour}");
+    let start = |(language, out): (&str, &Folder)| {
+        run(&lambda("tests/lambdas/slow", language), out.path(), &["--all", "--set", &set])
+    };
+    let runs: Vec<Started> = ["rust", "python"].into_iter().zip(&outs).map(start).collect();
+    runs.iter().for_each(Started::until_ready);
+    let player = play(&["--synthetic", "640x480@30", "--wait", "2", "--duration", "6"]).finish();
+    assert!(player.status.success(), "{}", player.said);
+    for (started, out) in runs.into_iter().zip(&outs) {
+        started.until_live("the end of the pictures", |live| live.topics[0].writers == Some(0));
+        started.signal("INT");
+        let finished = started.finish();
+        let ended = finished.ended();
+        let topic = &ended.topics[0];
+        let stale = decisions(out.path()).iter().filter(|decision| !decision.triggers.is_empty()).count();
+        assert_eq!(stale, 0, "a wake was not for the newest frame");
+        assert_eq!(ended.faults, 0, "{}", finished.said);
+        // Each sample that was sent is accounted for, once.
+        let arrived = topic.received + topic.no_slot + topic.too_big;
+        assert_eq!(arrived + topic.lost.unwrap_or(0), 180, "{topic:?}");
+        assert_eq!(ended.wakes + topic.skipped, topic.received, "{topic:?}");
+        if behaviour == "sleep" {
+            assert!(topic.skipped > 0 && topic.no_slot == 0, "{topic:?}");
+        } else {
+            assert!(topic.no_slot > 0, "{topic:?}");
+            assert!(finished.said.contains("the lambda holds all slots"), "{}", finished.said);
+        }
+    }
+}
+
+fn ctrl_c() {
+    let out = Folder::new();
+    let set = ["--set", "brake_mps2=-1.4"];
+    let started = run(&lambda("examples/brake-dark", "rust"), out.path(), &set);
+    started.until_ready();
+    let drive = sample_drive();
+    let path = drive.to_str().expect("the checkout has a plain path");
+    // The night brake is at 10.8 s.
+    let player = play(&[path, "--wait", "1", "--start", "8"]);
+    started.until("a window", |line| match line {
+        Line::Recorder(RecorderReport::Status(status)) if status.recording => Some(()),
+        _ => None,
+    });
+    started.signal("INT");
+    let finished = started.finish();
+    drop(player);
+    assert!(finished.status.success(), "{}", finished.said);
+    let clips = clips(out.path());
+    assert_eq!(clips.len(), 1);
+    assert!(clips[0].short.iter().any(|why| why.contains("stopped")), "{:?}", clips[0].short);
+    assert!(clips[0].topics.iter().all(|topic| topic.messages > 0), "{:?}", clips[0].topics);
+    assert!(out.path().join("summary.json").is_file());
+}
+
+fn killed(name: &str) {
+    let out = Folder::new();
+    let set = ["--set", "brake_mps2=-1.4"];
+    let started = run(&lambda("examples/brake-dark", "python"), out.path(), &set);
+    started.until_ready();
+    let drive = sample_drive();
+    let path = drive.to_str().expect("the checkout has a plain path");
+    let player = play(&[path, "--wait", "1", "--start", "8"]);
+    let mut told = Vec::new();
+    started.until("a window", |line| match line {
+        Line::Lambda(Report::Decision(decision)) => {
+            told.extend(about(std::slice::from_ref(&decision)));
+            None
+        }
+        Line::Recorder(RecorderReport::Status(status)) if status.recording => Some(()),
+        _ => None,
+    });
+    let victims = children(started.pid(), name);
+    assert_eq!(victims.len(), 1, "{victims:?}");
+    signal(victims[0], "KILL");
+    started.until_ready();
+    started.until_live("samples after the restart", |live| live.restarts == 1 && live.topics[0].received > 0);
+    started.signal("INT");
+    let finished = started.finish();
+    drop(player);
+    assert!(finished.said.contains("starting again in 1 s (restart 1)"), "{}", finished.said);
+    // What was told before the death is in the file.
+    assert!(!told.is_empty() && about(&decisions(out.path())).starts_with(&told), "{told:?}");
+    let clips = clips(out.path());
+    // The lambda's process may die while the recorder lives: then the clip has all that it should.
+    assert_eq!(clips.len(), 1, "{clips:?}");
+    assert_eq!(clips[0].recovered.is_some(), name == "gleaner-recorder", "{clips:?}");
+    assert!(clips[0].topics.iter().any(|topic| topic.messages > 0), "{clips:?}");
+}
+
+fn outlives() {
+    let out = Folder::new();
+    let started = run(&lambda("examples/hello", "python"), out.path(), &["--no-record"]);
+    started.until_ready();
+    let left = children(started.pid(), "start.py");
+    assert_eq!(left.len(), 1);
+    started.signal("KILL");
+    // A process that has ended has no command line, even where nobody asks how it ended.
+    let line = format!("/proc/{}/cmdline", left[0]);
+    wait_for("the end of the lambda's process", || std::fs::read(&line).unwrap_or_default().is_empty());
+}
+
+fn nobody_writes() {
+    let out = Folder::new();
+    let started = run(&lambda("examples/hello", "rust"), out.path(), &["--for", "5"]);
+    let finished = started.finish();
+    assert!(finished.status.success(), "{}", finished.said);
+    assert!(finished.said.contains("nobody writes `/imu/data` (sensor_msgs/msg/Imu) yet"), "{}", finished.said);
+    assert_eq!(finished.ended().topics[0].received, 0);
+}
+
+fn clips(out: &Path) -> Vec<Clip> {
+    let text = std::fs::read_to_string(out.join("clips.jsonl")).unwrap_or_default();
+    text.lines().map(|line| serde_json::from_str(line).expect("a line is a clip")).collect()
+}
+
+fn wait_for(what: &str, mut is_so: impl FnMut() -> bool) {
+    let deadline = Instant::now() + live::PATIENCE;
+    while !is_so() {
+        assert!(Instant::now() < deadline, "waited for {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}

@@ -1,0 +1,165 @@
+//! `cargo xtask peers`: programs on other people's DDS, which the suite `dds` lets us talk to. Those whose packages are there are
+//! built into `peers/` of the target folder; for the others it is said how to get them.
+
+use std::ffi::OsString;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::{Exit, Failure, Parts};
+
+use crate::checkout::Checkout;
+use crate::steps::{Steps, run, succeeds};
+
+/// Debian's and Ubuntu's packages: of the two DDS, and of what private networks for tests are made with.
+const CYCLONE: [&str; 2] = ["cyclonedds-dev", "cyclonedds-tools"];
+const FAST: [&str; 4] = ["libfastrtps-dev", "libfastcdr-dev", "fastddsgen", "default-jre-headless"];
+const NETWORK: [&str; 2] = ["iproute2", "nftables"];
+
+/// A Gid has 24 bytes up to ROS 2 Humble and 16 since Iron.
+const GID_SIZES: [u32; 2] = [24, 16];
+
+const COMPILER: &str = "see the first error above; a C and a C++ compiler are needed";
+
+/// Builds the peers; `--install` fetches what is missing first.
+pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let install = match arguments {
+        [] => false,
+        [one] if one == "--install" => true,
+        _ => return Err(Failure::new(Exit::Usage, "`cargo xtask peers` takes `--install` or nothing")),
+    };
+    let peers = Peers { checkout, folder: checkout.target().join("peers") };
+    let mut steps = Steps::of(4);
+    steps.begin("packages");
+    let missing = peers.missing();
+    if install && !missing.is_empty() {
+        peers.install(&missing)?;
+    }
+    steps.begin("Cyclone DDS in C");
+    let cyclone = peers.has_cyclone();
+    if cyclone {
+        peers.cyclone()?;
+    } else {
+        println!("left out: {} are missing", CYCLONE.join(" and "));
+    }
+    steps.begin("Fast DDS in C++");
+    let fast = peers.has_fast();
+    if fast {
+        peers.fast()?;
+    } else {
+        println!("left out: {} are missing", FAST.join(", "));
+    }
+    steps.begin("Cyclone DDS in Python");
+    peers.python()?;
+    println!("peers are in {}", peers.folder.display());
+    let missing = peers.missing();
+    if missing.is_empty() {
+        return Ok(Exit::Ok);
+    }
+    let help = format!("as root: cargo xtask peers --install, or: apt-get install {}", missing.join(" "));
+    Err(Failure::new(Exit::Internal, "packages are missing").with_help(help))
+}
+
+struct Peers<'c> {
+    checkout: &'c Checkout,
+    folder: PathBuf,
+}
+
+impl Peers<'_> {
+    fn has(&self, program: &str, argument: &str) -> bool {
+        succeeds(self.checkout.command(program).arg(argument))
+    }
+
+    /// Whether a compiler finds a header.
+    fn has_header(&self, compiler: &str, language: &str, header: &str) -> bool {
+        let mut compile = self.checkout.command(compiler);
+        succeeds(compile.args(["-fsyntax-only", "-x", language, "-include", header, "/dev/null"]))
+    }
+
+    fn has_cyclone(&self) -> bool {
+        self.has("idlc", "-h") && self.has_header("cc", "c", "dds/dds.h")
+    }
+
+    fn has_fast(&self) -> bool {
+        self.has("fastddsgen", "-version")
+            && self.has_header("c++", "c++", "fastdds/dds/domain/DomainParticipant.hpp")
+            && self.has_header("c++", "c++", "fastcdr/Cdr.h")
+    }
+
+    fn missing(&self) -> Vec<&'static str> {
+        let network = self.has("ip", "-V") && self.has("nft", "-v");
+        let groups = [(self.has_cyclone(), &CYCLONE[..]), (self.has_fast(), &FAST[..]), (network, &NETWORK[..])];
+        groups.into_iter().filter(|(there, _)| !there).flat_map(|(_, packages)| packages).copied().collect()
+    }
+
+    fn install(&self, packages: &[&str]) -> Result<(), Failure> {
+        let help = "packages of Debian and Ubuntu are installed by root, after `apt-get update`; elsewhere, install what they stand for";
+        let mut install = self.checkout.command("apt-get");
+        install.args(["install", "-y", "--no-install-recommends"]).args(packages);
+        run(install.env("DEBIAN_FRONTEND", "noninteractive"), help)
+    }
+
+    /// A folder below `peers/` for what a tool generates.
+    fn generated(&self, name: &str) -> Result<PathBuf, Failure> {
+        let folder = self.folder.join(name);
+        fs::create_dir_all(&folder).map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot make folder `{}`", folder.display()), &error)
+        })?;
+        Ok(folder)
+    }
+
+    fn source(&self, name: &str) -> PathBuf {
+        self.checkout.path("tests/peers").join(name)
+    }
+
+    fn cyclone(&self) -> Result<(), Failure> {
+        let messages = self.generated("cyclone")?;
+        self.idlc(&["-o".as_ref(), messages.as_ref(), self.source("messages.idl").as_ref()])?;
+        let sources = [self.source("cyclone/peer.c"), self.source("cyclone/content.c"), messages.join("messages.c")];
+        self.compile_c(&messages, &sources, "cyclone-peer")?;
+        for size in GID_SIZES {
+            let graph = self.generated(&format!("graph-{size}"))?;
+            let define = format!("-DGID_SIZE={size}");
+            self.idlc(&[define.as_ref(), "-o".as_ref(), graph.as_ref(), self.source("graph.idl").as_ref()])?;
+            let sources = [self.source("cyclone/graph.c"), graph.join("graph.c")];
+            self.compile_c(&graph, &sources, &format!("cyclone-graph-{size}"))?;
+        }
+        Ok(())
+    }
+
+    fn idlc(&self, arguments: &[&Path]) -> Result<(), Failure> {
+        let mut idlc = self.checkout.command("idlc");
+        run(idlc.args(arguments), "see the error above")
+    }
+
+    fn compile_c(&self, generated: &Path, sources: &[PathBuf], name: &str) -> Result<(), Failure> {
+        let mut cc = self.checkout.command("cc");
+        cc.args(["-O2", "-Wall", "-Wextra", "-I"]).arg(generated).arg("-I").arg(self.source(""));
+        run(cc.args(sources).arg("-lddsc").arg("-o").arg(self.folder.join(name)), COMPILER)
+    }
+
+    fn fast(&self) -> Result<(), Failure> {
+        let generated = self.generated("fast")?;
+        let mut generate = self.checkout.command("fastddsgen");
+        generate.args(["-replace", "-d"]).arg(&generated).arg(self.source("messages.idl"));
+        run(&mut generate, "see the error above")?;
+        let mut cc = self.checkout.command("c++");
+        cc.args(["-O2", "-std=c++17", "-I"]).arg(&generated).arg("-I").arg(self.source(""));
+        cc.arg(self.source("fast/peer.cpp"));
+        cc.args(["messages.cxx", "messagesPubSubTypes.cxx"].map(|file| generated.join(file)));
+        run(cc.args(["-lfastrtps", "-lfastcdr", "-o"]).arg(self.folder.join("fast-peer")), COMPILER)
+    }
+
+    fn python(&self) -> Result<(), Failure> {
+        let venv = self.folder.join("venv");
+        let python = venv.join("bin/python3");
+        if succeeds(self.checkout.command(&python).args(["-I", "-c", "import cyclonedds.pub"])) {
+            return Ok(());
+        }
+        let mut make = self.checkout.command(Parts::find()?.python(None)?);
+        make.args(["-m", "venv", "--clear"]).arg(&venv);
+        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
+        let mut install = self.checkout.command(&python);
+        install.args(["-m", "pip", "install", "--disable-pip-version-check", "-q", "cyclonedds"]);
+        run(&mut install, "pip fetches cyclonedds: see that the network is there, or configure pip for a mirror")
+    }
+}

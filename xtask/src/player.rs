@@ -1,0 +1,99 @@
+//! `cargo xtask player`: builds `gleaner-player`. It holds Cyclone DDS, which is C: that takes cmake, and libclang to read its
+//! headers. What the system lacks of them is put into `.venv`, which needs no root.
+
+use std::env;
+use std::ffi::OsString;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::{Exit, Failure};
+
+use crate::checkout::Checkout;
+use crate::steps::{self, Steps};
+use crate::venv;
+
+/// Finds or fetches the tools, and builds.
+pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
+    let mut steps = Steps::of(2);
+    steps.begin("cmake and libclang");
+    let mut build = cargo(checkout)?;
+    steps.begin("gleaner-player with Cyclone DDS (the first time this takes minutes)");
+    build.args(["build", "--release", "-p", "gleaner-player"]);
+    let help = "if a C compiler is missing, install one (`cc`); else see the first error above";
+    steps::run(&mut build, help)?;
+    println!("built {}", checkout.program("gleaner-player").display());
+    Ok(Exit::Ok)
+}
+
+/// Cargo that can build the player: with the tools that it takes, which are fetched if the system lacks them.
+pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
+    let lacks_cmake = !steps::succeeds(checkout.command("cmake").arg("--version"));
+    let lacks_libclang = env::var_os("LIBCLANG_PATH").is_none() && !has_libclang();
+    if lacks_cmake || lacks_libclang {
+        fetch(checkout)?;
+    }
+    let mut cargo = checkout.cargo();
+    if lacks_cmake {
+        cargo.env("PATH", path_with(checkout.path(".venv/bin"))?);
+    }
+    if lacks_libclang {
+        cargo.env("LIBCLANG_PATH", fetched_libclang(checkout)?);
+    }
+    // libclang alone has no stddef.h and the like, and finds those of the C compiler only if told where.
+    if env::var_os("BINDGEN_EXTRA_CLANG_ARGS").is_none() {
+        cargo.env("BINDGEN_EXTRA_CLANG_ARGS", format!("-I{}", headers(checkout)?));
+    }
+    Ok(cargo)
+}
+
+/// Whether libclang lies where the crate `clang-sys` looks for it.
+fn has_libclang() -> bool {
+    let folders = ["/usr/lib", "/usr/lib64", "/usr/local/lib", "/usr/local/lib64"].map(PathBuf::from);
+    // Below each, distributions have one for their architecture, and one for each version of LLVM.
+    let deeper = folders.iter().flat_map(|folder| entries(folder)).flat_map(|path| [path.join("lib"), path]);
+    deeper.chain(folders.iter().cloned()).any(|folder| entries(&folder).iter().any(|path| is_libclang(path)))
+}
+
+fn is_libclang(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    // Another library has the begin of its name: libclang-cpp.
+    let has_version = name.strip_prefix("libclang-").is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()));
+    name.starts_with("libclang.so") || has_version && name.contains(".so")
+}
+
+fn entries(folder: &Path) -> Vec<PathBuf> {
+    fs::read_dir(folder).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path())).collect()
+}
+
+/// Puts both into `.venv`; pip does nothing where they are there.
+fn fetch(checkout: &Checkout) -> Result<(), Failure> {
+    venv::set_up(checkout)?;
+    let mut install = checkout.command(checkout.python());
+    install.args(["-m", "pip", "install", "--disable-pip-version-check", "-q", "cmake", "libclang"]);
+    steps::run(
+        &mut install,
+        "pip fetches cmake and libclang: see that the network is there, or install both with the system",
+    )
+}
+
+fn path_with(folder: PathBuf) -> Result<OsString, Failure> {
+    let path = env::var_os("PATH").unwrap_or_default();
+    env::join_paths(env::split_paths(&path).chain([folder]))
+        .map_err(|error| Failure::caused_by(Exit::Internal, "the checkout's path cannot stand in PATH", &error))
+}
+
+fn fetched_libclang(checkout: &Checkout) -> Result<PathBuf, Failure> {
+    let mut python = checkout.command(checkout.python());
+    let code = "import clang, os; print(os.path.join(list(clang.__path__)[0], 'native'))";
+    python.args(["-I", "-c", code]);
+    let folder = steps::output(&mut python, "remove .venv, and run this again")?;
+    Ok(PathBuf::from(folder.trim()))
+}
+
+fn headers(checkout: &Checkout) -> Result<String, Failure> {
+    let mut compiler = checkout.command(env::var_os("CC").unwrap_or_else(|| "cc".into()));
+    compiler.arg("-print-file-name=include");
+    let folder = steps::output(&mut compiler, "install a C compiler (`cc`)")?;
+    Ok(folder.trim().to_owned())
+}
