@@ -150,6 +150,13 @@ impl Setting {
     }
 }
 
+/// The value that a share of `values` is below; no number if there are none.
+pub fn quantile(values: &[f64], share: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get((share * sorted.len() as f64) as usize).copied().unwrap_or(f64::NAN)
+}
+
 /// One row of the table.
 pub struct Figure {
     name: String,

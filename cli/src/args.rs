@@ -46,6 +46,31 @@ pub enum Command {
     Doctor(DoctorArgs),
 }
 
+/// Which lambda, with which settings.
+#[derive(Args, Debug, Clone)]
+pub struct AskedArgs {
+    /// The lambda's folder, built by `gleaner build DIR`
+    #[arg(value_name = "DIR")]
+    pub lambda: PathBuf,
+    /// Another value for a key of the config table, as in brake_mps2=-1.4
+    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
+    pub set: Vec<String>,
+    /// Another name for a topic of the manifest, as in /imu/data:=/car/imu
+    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
+    pub remap: Vec<String>,
+}
+
+impl AskedArgs {
+    /// The settings, as our programs take them.
+    pub(crate) fn settings(&self) -> Vec<OsString> {
+        let settings = [("--set", &self.set), ("--remap", &self.remap)];
+        settings
+            .iter()
+            .flat_map(|(flag, values)| values.iter().flat_map(move |value| [OsString::from(*flag), value.into()]))
+            .collect()
+    }
+}
+
 /// Which network to join.
 #[derive(Args, Debug, Clone, Default)]
 pub struct NetworkArgs {
@@ -60,15 +85,9 @@ pub struct NetworkArgs {
 /// Arguments of `gleaner run`.
 #[derive(Args, Debug)]
 pub struct RunArgs {
-    /// The lambda's folder, built by `gleaner build DIR`
-    #[arg(value_name = "DIR")]
-    pub lambda: PathBuf,
-    /// Another value for a key of the config table, as in brake_mps2=-1.4
-    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
-    pub set: Vec<String>,
-    /// Another name for a topic of the manifest, as in /imu/data:=/car/imu
-    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
-    pub remap: Vec<String>,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub asked: AskedArgs,
     /// Where the results go [default: DIR/live]
     #[arg(long)]
     pub out: Option<PathBuf>,
@@ -143,18 +162,12 @@ pub struct BuildArgs {
 /// Arguments of `gleaner replay`.
 #[derive(Args, Debug)]
 pub struct ReplayArgs {
-    /// The lambda's folder, built by `gleaner build DIR`
-    #[arg(value_name = "DIR")]
-    pub lambda: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub asked: AskedArgs,
     /// MCAP files; several are merged by time
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
-    /// Another value for a key of the config table, as in brake_mps2=-1.4
-    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
-    pub set: Vec<String>,
-    /// Another name for a topic of the manifest, as in /imu/data:=/car/imu
-    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
-    pub remap: Vec<String>,
     /// Where the results go [default: DIR/out]
     #[arg(long)]
     pub out: Option<PathBuf>,
@@ -225,7 +238,7 @@ mod tests {
     #[test]
     fn a_value_may_begin_with_a_minus_and_hold_an_equals_sign() {
         let args = replay(&["dir", "a.mcap", "--set", "brake_mps2=-1.4", "--set", "word=a=b", "b.mcap"]).unwrap();
-        assert_eq!(args.set, ["brake_mps2=-1.4", "word=a=b"]);
+        assert_eq!(args.asked.set, ["brake_mps2=-1.4", "word=a=b"]);
         assert_eq!(args.drives, [PathBuf::from("a.mcap"), PathBuf::from("b.mcap")]);
     }
 

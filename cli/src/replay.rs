@@ -47,12 +47,7 @@ fn paint() -> Paint {
 /// The runtime's arguments: ours, less what only concerns showing.
 fn arguments(args: &ReplayArgs) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["replay".into()];
-    for set in &args.set {
-        line.extend(["--set".into(), set.into()]);
-    }
-    for remap in &args.remap {
-        line.extend(["--remap".into(), remap.into()]);
-    }
+    line.extend(args.asked.settings());
     for (flag, file) in [("--out", &args.out), ("--journal", &args.journal), ("--verify", &args.verify)] {
         if let Some(file) = file {
             line.extend([flag.into(), file.into()]);
@@ -64,7 +59,7 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
         }
     }
     line.push("--".into());
-    line.push(args.lambda.clone().into());
+    line.push(args.asked.lambda.clone().into());
     line.extend(args.drives.iter().map(|drive| drive.clone().into()));
     line
 }
@@ -72,14 +67,13 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::args::AskedArgs;
 
     #[test]
     fn the_runtime_gets_our_arguments_with_the_files_last() {
         let args = ReplayArgs {
-            lambda: "-dir".into(),
+            asked: AskedArgs { lambda: "-dir".into(), set: vec!["x=-1".to_owned()], remap: vec!["/a:=/b".to_owned()] },
             drives: vec!["a.mcap".into(), "b".into()],
-            set: vec!["x=-1".to_owned()],
-            remap: vec!["/a:=/b".to_owned()],
             out: Some("out".into()),
             all: true,
             no_record: true,

@@ -24,24 +24,6 @@ pub fn give_large_blocks_back() {
     }
 }
 
-/// Resident memory of this process, in bytes; 0 where the system does not tell.
-pub fn resident() -> u64 {
-    told("VmRSS:")
-}
-
-/// The most that it was so far.
-pub fn most_resident() -> u64 {
-    told("VmHWM:")
-}
-
-/// A line of `/proc/self/status`, in bytes.
-fn told(name: &str) -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix(name));
-    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<u64>().ok());
-    kib.unwrap_or(0) * 1024
-}
-
 /// Zeroed memory of this process alone.
 pub struct Mapping {
     base: NonNull<u8>,

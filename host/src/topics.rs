@@ -1,14 +1,13 @@
 //! `gleaner-runtime topics`: what is there to subscribe.
 
 use std::io::Write;
-use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
 use clap::Args;
 use gleaner_protocol::{Exit, Failure, Report, TopicSeen};
-use gleaner_transport::dds::{Dds, Options};
+use gleaner_transport::dds::Dds;
 
-use crate::network::NetworkError;
+use crate::network::{NetworkArgs, NetworkError};
 
 /// How long to listen if nothing else is said: announcements of participants come every few seconds, and those who are there
 /// answer a new one at once.
@@ -18,12 +17,8 @@ const WAIT_MAX: Duration = Duration::from_secs(3600);
 /// Arguments of `topics`.
 #[derive(Args, Clone, Debug)]
 pub struct TopicsArgs {
-    /// The domain of DDS.
-    #[arg(long)]
-    domain: Option<u16>,
-    /// The address of an interface to use, instead of all.
-    #[arg(long, value_name = "ADDRESS")]
-    interface: Vec<IpAddr>,
+    #[command(flatten)]
+    network: NetworkArgs,
     /// How long to listen, in seconds.
     #[arg(long, value_name = "SECONDS", default_value_t = WAIT_S)]
     wait: f64,
@@ -33,12 +28,9 @@ pub struct TopicsArgs {
 pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Failure> {
     let wait = Duration::try_from_secs_f64(args.wait).ok().filter(|wait| *wait <= WAIT_MAX);
     let wait = wait.ok_or_else(|| Failure::new(Exit::Usage, format!("--wait {}: use 0 to 3600 s", args.wait)))?;
-    let mut options = Options::from_env("/gleaner/topics").map_err(NetworkError::failure)?;
+    let mut options = args.network.options("/gleaner/topics")?;
+    // No samples are received.
     options.largest = 0;
-    options.domain = args.domain.unwrap_or(options.domain);
-    if !args.interface.is_empty() {
-        options.interfaces = args.interface;
-    }
     let dds = Dds::open(options).map_err(NetworkError::failure)?;
     let until = Instant::now() + wait;
     while let Some(left) = until.checked_duration_since(Instant::now()) {

@@ -1,6 +1,7 @@
 //! Messages as they go over the wire: four bytes of encapsulation, then CDR, then zeros up to a multiple of four.
 
 use gleaner_transport::Endian;
+use gleaner_transport::message::CdrWriter;
 
 /// Bytes in front of the CDR, from which its alignment does not count.
 pub(crate) const ENCAPSULATION: usize = 4;
@@ -16,65 +17,26 @@ pub(crate) fn pad(bytes: &mut Vec<u8>) {
     bytes.resize(bytes.len().next_multiple_of(4), 0);
 }
 
-/// A little-endian message, written field by field.
-pub(crate) struct Cdr(Vec<u8>);
+/// The begin of a little-endian message: a `std_msgs/msg/Header`.
+pub(crate) fn with_header(stamp_ns: i64, frame_id: &str) -> CdrWriter {
+    let mut cdr = CdrWriter::new();
+    cdr.time(stamp_ns).string(frame_id);
+    cdr
+}
 
-impl Cdr {
-    /// A message that begins with a `std_msgs/msg/Header`.
-    pub(crate) fn with_header(stamp_ns: i64, frame_id: &str) -> Cdr {
-        let mut cdr = Cdr(encapsulation(Endian::Little, [0, 0]).to_vec());
-        let (sec, nanosec) = crate::stamp::split(stamp_ns);
-        cdr.align(4);
-        cdr.0.extend(sec.to_le_bytes());
-        cdr.u32(nanosec);
-        cdr.text(frame_id);
-        cdr
-    }
-
-    pub(crate) fn u8(&mut self, value: u8) {
-        self.0.push(value);
-    }
-
-    pub(crate) fn u32(&mut self, value: u32) {
-        self.align(4);
-        self.0.extend(value.to_le_bytes());
-    }
-
-    pub(crate) fn f64s(&mut self, values: &[f64]) {
-        self.align(8);
-        values.iter().for_each(|value| self.0.extend(value.to_le_bytes()));
-    }
-
-    pub(crate) fn text(&mut self, text: &str) {
-        // A text comes out of a message of less than 4 GiB.
-        self.u32(text.len() as u32 + 1);
-        self.0.extend(text.as_bytes());
-        self.0.push(0);
-    }
-
-    /// The message, with its padding.
-    pub(crate) fn done(mut self) -> Vec<u8> {
-        pad(&mut self.0);
-        self.0
-    }
-
-    fn align(&mut self, to: usize) {
-        let end = (self.0.len() - ENCAPSULATION).next_multiple_of(to) + ENCAPSULATION;
-        self.0.resize(end, 0);
-    }
+/// A little-endian message as it goes over the wire.
+pub(crate) fn sealed(cdr: &CdrWriter) -> Vec<u8> {
+    let mut message = [&encapsulation(Endian::Little, [0, 0]), cdr.bytes()].concat();
+    pad(&mut message);
+    message
 }
 
 /// All of a `sensor_msgs/msg/Image` in bgr8 that comes before its pixels, of which there are `3 * width * height`.
 pub(crate) fn image_head(stamp_ns: i64, frame_id: &str, width: u32, height: u32) -> Vec<u8> {
-    let mut cdr = Cdr::with_header(stamp_ns, frame_id);
-    cdr.u32(height);
-    cdr.u32(width);
-    cdr.text("bgr8");
-    cdr.u8(0);
-    cdr.u32(3 * width);
-    cdr.u32(3 * width * height);
+    let mut cdr = with_header(stamp_ns, frame_id);
+    cdr.u32(height).u32(width).string("bgr8").u8(0).u32(3 * width).u32(3 * width * height);
     // The length was aligned to four, and so is what ends with it.
-    cdr.done()
+    sealed(&cdr)
 }
 
 #[cfg(test)]
@@ -100,9 +62,9 @@ mod tests {
 
     #[test]
     fn doubles_are_aligned_to_eight_from_the_end_of_the_encapsulation() {
-        let mut cdr = Cdr::with_header(0, "abc");
+        let mut cdr = with_header(0, "abc");
         cdr.f64s(&[1.0]);
-        let message = cdr.done();
+        let message = sealed(&cdr);
         assert_eq!(message.len(), 4 + 16 + 8, "a header of 16 bytes, then no gap");
         assert_eq!(message[20..28], 1f64.to_le_bytes());
     }

@@ -101,6 +101,14 @@ mod tests {
     #[test]
     fn a_wait_for_a_message_in_the_far_future_ends_when_the_player_stops() {
         let pace = Pace { rate: Rate::Times(1.0), begin_ns: now(ClockId::Monotonic) };
-        assert_eq!(pace.wait(i64::MAX, &AtomicBool::new(true)), None);
+        let stop = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| pace.wait(i64::MAX, &stop));
+            // It is to find the flag raised only after it has begun to wait.
+            std::thread::sleep(std::time::Duration::from_millis(20));
+            assert!(!waiting.is_finished());
+            stop.store(true, Ordering::Relaxed);
+            assert_eq!(waiting.join().unwrap(), None);
+        });
     }
 }

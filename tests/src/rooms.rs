@@ -33,15 +33,17 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-protocol",
             "gleaner-recorder",
             "gleaner-transport",
+            "gleaner-vitals",
         ],
     ),
     ("gleaner-image", &[]),
     ("gleaner-player", &["gleaner-image", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-protocol", &[]),
     ("gleaner-python", &["gleaner-host", "gleaner-image", "gleaner-protocol", "gleaner-transport"]),
-    ("gleaner-recorder", &["gleaner-image", "gleaner-protocol", "gleaner-transport"]),
+    ("gleaner-recorder", &["gleaner-image", "gleaner-protocol", "gleaner-transport", "gleaner-vitals"]),
     ("gleaner-sdk", &[]),
     ("gleaner-transport", &[]),
+    ("gleaner-vitals", &["gleaner-protocol"]),
 ];
 
 /// Crates that a program must not contain, whatever the features: a program, and what it does without.

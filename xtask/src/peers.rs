@@ -9,6 +9,7 @@ use gleaner_protocol::{Exit, Failure, Parts};
 
 use crate::checkout::Checkout;
 use crate::steps::{Steps, run, succeeds};
+use crate::venv;
 
 /// Debian's and Ubuntu's packages: of the two DDS, and of what private networks for tests are made with.
 const CYCLONE: [&str; 2] = ["cyclonedds-dev", "cyclonedds-tools"];
@@ -32,7 +33,7 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     steps.begin("packages");
     let missing = peers.missing();
     if install && !missing.is_empty() {
-        peers.install(&missing)?;
+        peers.install(&missing).map_err(unreachable)?;
     }
     steps.begin("Cyclone DDS in C");
     let cyclone = peers.has_cyclone();
@@ -56,7 +57,12 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
         return Ok(Exit::Ok);
     }
     let help = format!("as root: cargo xtask peers --install, or: apt-get install {}", missing.join(" "));
-    Err(Failure::new(Exit::Internal, "packages are missing").with_help(help))
+    Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help))
+}
+
+/// What could not be fetched.
+fn unreachable(failure: Failure) -> Failure {
+    Failure { exit: Exit::Unreachable, ..failure }
 }
 
 struct Peers<'c> {
@@ -158,8 +164,7 @@ impl Peers<'_> {
         let mut make = self.checkout.command(Parts::find()?.python(None)?);
         make.args(["-m", "venv", "--clear"]).arg(&venv);
         run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
-        let mut install = self.checkout.command(&python);
-        install.args(["-m", "pip", "install", "--disable-pip-version-check", "-q", "cyclonedds"]);
-        run(&mut install, "pip fetches cyclonedds: see that the network is there, or configure pip for a mirror")
+        let help = "see that the network is there, or configure pip for a mirror";
+        venv::pip(self.checkout.command(&python), &["cyclonedds"], help).map_err(unreachable)
     }
 }

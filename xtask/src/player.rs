@@ -31,7 +31,8 @@ pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
     let lacks_cmake = !steps::succeeds(checkout.command("cmake").arg("--version"));
     let lacks_libclang = env::var_os("LIBCLANG_PATH").is_none() && !has_libclang();
     if lacks_cmake || lacks_libclang {
-        fetch(checkout)?;
+        // Who cannot fetch them may do without a player; what does not compile is another matter.
+        fetch(checkout).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
     }
     let mut cargo = checkout.cargo();
     if lacks_cmake {
@@ -69,12 +70,8 @@ fn entries(folder: &Path) -> Vec<PathBuf> {
 /// Puts both into `.venv`; pip does nothing where they are there.
 fn fetch(checkout: &Checkout) -> Result<(), Failure> {
     venv::set_up(checkout)?;
-    let mut install = checkout.command(checkout.python());
-    install.args(["-m", "pip", "install", "--disable-pip-version-check", "-q", "cmake", "libclang"]);
-    steps::run(
-        &mut install,
-        "pip fetches cmake and libclang: see that the network is there, or install both with the system",
-    )
+    let help = "see that the network is there, or install both with the system";
+    venv::pip(checkout.command(checkout.python()), &["cmake", "libclang"], help)
 }
 
 fn path_with(folder: PathBuf) -> Result<OsString, Failure> {

@@ -3,6 +3,7 @@
 //! is tested.
 
 use std::fs;
+use std::process::Command;
 
 use gleaner_protocol::{Exit, Failure, Parts};
 
@@ -43,12 +44,12 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
         make.args(["-m", "venv"]).arg(folder);
         run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
     }
-    let mut install = checkout.command(checkout.python());
-    install
-        .args(["-m", "pip", "install", "--disable-pip-version-check", "-q"])
-        .args(PACKAGES.map(|(package, _)| package));
-    run(
-        &mut install,
-        "pip fetches numpy, mypy and readers of MCAP: see that the network is there, or configure pip for a mirror",
-    )
+    let packages = PACKAGES.map(|(package, _)| package);
+    pip(checkout.command(checkout.python()), &packages, "see that the network is there, or configure pip for a mirror")
+}
+
+/// Has the pip of a `python` fetch packages. `help` is what else can be done.
+pub(crate) fn pip(mut python: Command, packages: &[&str], help: &str) -> Result<(), Failure> {
+    python.args(["-m", "pip", "install", "--disable-pip-version-check", "-q"]).args(packages);
+    run(&mut python, &format!("pip fetches {}: {help}", packages.join(", ")))
 }

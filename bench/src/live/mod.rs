@@ -114,7 +114,7 @@ fn receive(name: &str, camera: Option<&str>, imu: Option<&str>, seconds: u32, fi
             "{of}: lost, with a socket buffer of {buffer:.0} MiB{}",
             if granted { "" } else { " (not granted)" }
         );
-        let count = topic.lost.unwrap_or(u64::MAX) + refused;
+        let count = topic.lost.unwrap_or(u64::MAX).saturating_add(refused);
         figures.push(if granted {
             Figure::at_most(&lost, "samples", 0.0, &[count as f64])
         } else {
@@ -123,8 +123,9 @@ fn receive(name: &str, camera: Option<&str>, imu: Option<&str>, seconds: u32, fi
         let cpu = 100.0 * live.cpu_s / live.up_s;
         figures.push(Figure::told(&format!("{of}: share of a core"), "%", &[cpu]));
         if let Some(wake_up) = live.wake_up {
-            let times = [wake_up.p50_ns, wake_up.p99_ns].map(|ns| ns as f64 / 1e3);
-            figures.push(Figure::told(&format!("{of}: wake-up, median and 99 %"), "us", &times));
+            for (what, ns) in [("median", wake_up.p50_ns), ("99 %", wake_up.p99_ns)] {
+                figures.push(Figure::told(&format!("{of}: wake-up, {what}"), "us", &[ns as f64 / 1e3]));
+            }
         }
     }
     // Once everything is warm, until the end.

@@ -9,7 +9,7 @@ use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::bare::Bare;
 use super::{lambda, start, to_the_end};
-use crate::measure::{Figure, Kind};
+use crate::measure::{Figure, Kind, quantile};
 
 const ANSWER: &str = "sensor_msgs/msg/TimeReference";
 /// Goal: how many times as long as the bare reader a lambda may take.
@@ -70,7 +70,7 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
     std::thread::sleep(Duration::from_millis(200));
     let base = bare.stop();
     told("bare reader", &base, figures);
-    let base = median(&base);
+    let base = quantile(&base, 0.5);
     for (((kind, answers), live), goals) in kinds.iter().zip(&ended).zip([[20.0, 100.0], [30.0, 150.0]]) {
         let ns = answers.take();
         told(&format!("empty lambda, {kind}"), &ns, figures);
@@ -78,7 +78,7 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
             &format!("IMU round trip at 100 Hz, empty lambda, {kind}, against the bare reader"),
             "times",
             RATIO,
-            &[median(&ns) / base],
+            &[quantile(&ns, 0.5) / base],
         ));
         let spreads =
             [("sample received to lambda entered", live.wake_up), ("lambda left to decision out", live.hand_out)];
@@ -91,15 +91,8 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
 }
 
 fn told(who: &str, ns: &[f64], figures: &mut Vec<Figure>) {
-    let mut sorted = ns.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let at = |share: f64| sorted.get((share * sorted.len() as f64) as usize).copied().unwrap_or(f64::NAN) / 1e3;
-    let name = format!("IMU round trip at 100 Hz, {who}: median, 99 %");
-    figures.push(Figure::told(&name, "us", &[at(0.5), at(0.99)]));
-}
-
-fn median(ns: &[f64]) -> f64 {
-    let mut sorted = ns.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
+    for (what, share) in [("median", 0.5), ("99 %", 0.99)] {
+        let name = format!("IMU round trip at 100 Hz, {who}: {what}");
+        figures.push(Figure::told(&name, "us", &[quantile(ns, share) / 1e3]));
+    }
 }

@@ -10,6 +10,7 @@ use gleaner_recorder::{Folder as Clips, Member, Recorder, Settings, Topic, Topic
 use gleaner_tests::Folder;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_vitals::usage;
 
 use super::{FRAMES_PER_S, TYPE, Traffic, header};
 
@@ -44,7 +45,7 @@ impl Sink for Lane {
 /// Records for `seconds`, with a trigger every 15 s and windows of 5 s and 5 s.
 pub fn record(seconds: u64, store: Store) -> Load {
     let out = Folder::new();
-    let before = resident();
+    let before = usage::resident() as f64;
     let (folder, _) = Clips::open(out.path()).expect("an empty folder");
     let settings = Settings {
         store,
@@ -66,7 +67,7 @@ pub fn record(seconds: u64, store: Store) -> Load {
         recorder.add_lambda(Member { header, rules, digest: "0".repeat(64), topics })
     };
 
-    let (started, cpu) = (Instant::now(), cpu());
+    let (started, cpu) = (Instant::now(), usage::cpu_seconds());
     let (mut bytes, mut peak, mut preroll) = (0, before, 0.0_f64);
     for n in 0..seconds * FRAMES_PER_S {
         let at_ns = (n * 1_000_000_000 / FRAMES_PER_S) as i64;
@@ -85,10 +86,10 @@ pub fn record(seconds: u64, store: Store) -> Load {
         drop(recorder);
         let taken = if store == Store::Disk { files(&out.path().join("preroll")) } else { held };
         preroll = preroll.max(100.0 * taken / settings_bytes as f64);
-        peak = peak.max(resident());
+        peak = peak.max(usage::resident() as f64);
     }
     let passed = started.elapsed().as_secs_f64();
-    let cpu_s = self::cpu() - cpu;
+    let cpu_s = self::usage::cpu_seconds() - cpu;
     let mut recorder = recorder.lock().expect("one thread");
     recorder.finish((seconds * 1_000_000_000) as i64).expect("the disk has room");
     let recorded: i64 =
@@ -141,16 +142,4 @@ fn wake(n: u64, at_ns: i64) -> Entry {
 fn files(folder: &std::path::Path) -> f64 {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries.filter_map(|entry| entry.metadata().ok()).map(|metadata| metadata.len() as f64).sum()
-}
-
-fn cpu() -> f64 {
-    let times = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-    times.tv_sec as f64 + times.tv_nsec as f64 / 1e9
-}
-
-fn resident() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
-    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<f64>().ok());
-    kib.unwrap_or(0.0) * 1024.0
 }

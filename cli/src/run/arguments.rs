@@ -1,6 +1,7 @@
 //! What the processes of a run are told.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::args::RunArgs;
@@ -15,24 +16,11 @@ pub(super) fn runtime(
     restarts: u32,
 ) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["run".into(), format!("--clock-offset={offset_ns}").into()];
-    // A value may begin with a minus, so that name and value are one word.
-    let word = |flag: &str, value: &std::ffi::OsStr| {
-        let mut word = OsString::from(format!("{flag}="));
-        word.push(value);
-        word
-    };
-    for set in &args.set {
-        line.extend(["--set".into(), set.into()]);
-    }
-    for remap in &args.remap {
-        line.extend(["--remap".into(), remap.into()]);
-    }
-    if let Some(out) = &args.out {
-        line.push(word("--out", out.as_os_str()));
-    }
+    line.extend(args.asked.settings());
+    line.push(word("--out", out(args)));
     for (flag, topic) in [("--rtt", &args.rtt), ("--decisions", &args.decisions)] {
         if let Some(topic) = topic {
-            line.push(word(flag, topic.as_ref()));
+            line.push(word(flag, topic));
         }
     }
     if let Some(left) = left {
@@ -47,22 +35,16 @@ pub(super) fn runtime(
         }
     }
     line.extend(network(&args.network));
-    line.extend(["--".into(), args.lambda.clone().into()]);
+    line.extend(["--".into(), args.asked.lambda.clone().into()]);
     line
 }
 
 /// The recorder's arguments. `largest` is the largest sample that it will see, in bytes.
 pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsString> {
-    let out = args.out.clone().unwrap_or_else(|| args.lambda.join("live"));
-    let mut first = OsString::from("--out=");
-    first.push(out);
-    let mut line: Vec<OsString> = vec![first];
+    let mut line = vec![word("--out", out(args)), word("--messages", args.asked.lambda.join("build/msg"))];
     line.push(format!("--clock-offset={offset_ns}").into());
     line.push(format!("--largest={largest}").into());
-    line.extend(["--messages".into(), args.lambda.join("build/msg").into()]);
-    if let Some(topic) = &args.commands {
-        line.extend(["--commands".into(), topic.into()]);
-    }
+    line.extend(args.commands.as_ref().map(|topic| word("--commands", topic)));
     let bounds = [("disk-floor", args.disk_floor), ("clips-max", args.clips_max), ("bytes-max", args.bytes_max)];
     for (flag, bound) in bounds {
         if let Some(bound) = bound {
@@ -73,8 +55,20 @@ pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsSt
     line
 }
 
+/// Where the results go.
+fn out(args: &RunArgs) -> PathBuf {
+    args.out.clone().unwrap_or_else(|| args.asked.lambda.join("live"))
+}
+
+/// An argument in one word: its value may begin with a minus.
+fn word(flag: &str, value: impl AsRef<OsStr>) -> OsString {
+    let mut word = OsString::from(format!("{flag}="));
+    word.push(value);
+    word
+}
+
 /// Other names for topics, as the recorder is told of them. They were checked when they were typed.
 pub(super) fn remaps(args: &RunArgs) -> Vec<(String, String)> {
-    let pairs = args.remap.iter().filter_map(|remap| remap.split_once(":="));
+    let pairs = args.asked.remap.iter().filter_map(|remap| remap.split_once(":="));
     pairs.map(|(from, to)| (from.trim().to_owned(), to.trim().to_owned())).collect()
 }

@@ -31,7 +31,7 @@ const LOOK: Duration = Duration::from_millis(100);
 
 /// Runs until it is told to stop, or until the time is over.
 pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
-    let build = BuildDir::check_fresh(&args.lambda)?;
+    let build = BuildDir::check_fresh(&args.asked.lambda)?;
     let manifest = Manifest::load(build.path())?;
     // Recorded topics need not be inputs; what is known of the largest message is what the inputs say.
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes());

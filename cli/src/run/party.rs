@@ -59,7 +59,7 @@ impl Party {
             let (mut control, stdin) = Control::pair().map_err(|error| failed(&error))?;
             let line = arguments::recorder(args, largest, offset_ns);
             let process = Process::start(&parts, "gleaner-recorder", line, Some(stdin), Heard::Recorder, &say)?;
-            let add = Add { lambda: args.lambda.clone(), remaps: arguments::remaps(args) };
+            let add = Add { lambda: args.asked.lambda.clone(), remaps: arguments::remaps(args) };
             socket = Some(control.add(&add).map_err(|error| failed(&error))?);
             recorder = Some((process, control));
         }

@@ -12,7 +12,7 @@ use super::announce::Announcer;
 use super::ledger::Ledger;
 use super::recorder::ToRecorder;
 use super::round_trip::RoundTrip;
-use super::status::{Times, Watch};
+use super::status::{Around, Times, Watch};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
 use crate::judge::Judge;
@@ -104,14 +104,20 @@ impl Course {
             return Ok(());
         }
         let health = self.dds.health();
-        if let Some(why) = health.dead {
+        if let Some(why) = &health.dead {
             let mut failure = Failure::new(Exit::Unreachable, "nothing of the network is handled any more");
-            failure.causes = vec![why];
+            failure.causes = vec![why.clone()];
             return Err(failure.with_help("start again; where it happens often, report it with these words"));
         }
-        let sent = self.recorder.as_ref().map(ToRecorder::dropped);
-        let unwritten = self.ledger.unwritten();
-        let live = self.watch.report(&self.dds, &self.inputs, &self.schedule, &self.session, unwritten, sent);
+        let live = self.watch.report(&Around {
+            dds: &self.dds,
+            health: &health,
+            inputs: &self.inputs,
+            schedule: &self.schedule,
+            session: &self.session,
+            unwritten: self.ledger.unwritten(),
+            recorder: self.recorder.as_ref().map(ToRecorder::dropped),
+        });
         self.ledger.report(Report::Live(Box::new(live)));
         Ok(())
     }

@@ -9,7 +9,7 @@ mod ledger;
 mod options;
 mod recorder;
 mod round_trip;
-mod spread;
+mod speaker;
 mod status;
 
 pub use options::{Job, RunArgs};
@@ -28,7 +28,7 @@ use self::ledger::Ledger;
 use self::options::take_stdin;
 use self::recorder::ToRecorder;
 use self::round_trip::RoundTrip;
-use self::status::Watch;
+use self::status::{Around, Watch};
 use crate::input::{Bell, Live};
 use crate::journal::{CLOCK_OF_VEHICLE, Identity};
 use crate::judge::Judge;
@@ -67,14 +67,9 @@ impl Job {
             }
             None => None,
         };
-        let round_trip = wanted
-            .round_trip
-            .as_deref()
-            .map(|topic| RoundTrip::open(&dds, topic, clock, manifest.lambda.name.as_str()))
-            .transpose()?;
-        let announcer = wanted.announce.as_deref();
-        let announcer =
-            announcer.map(|topic| Announcer::open(&dds, topic, manifest.lambda.name.as_str())).transpose()?;
+        let name = manifest.lambda.name.as_str();
+        let round_trip = wanted.round_trip.map(|topic| RoundTrip::open(&dds, &topic, clock, name)).transpose()?;
+        let announcer = wanted.announce.map(|topic| Announcer::open(&dds, &topic, name)).transpose()?;
         let mut ledger = Ledger::start(Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?, reports)?;
         let initialised = guest.init();
         let (said, _) = session.take_log();
@@ -82,7 +77,7 @@ impl Job {
         if let Err(fault) = initialised {
             // What it said on the way may be why.
             ledger.finish(None)?;
-            return Err(not_started(manifest.lambda.name.as_str(), fault));
+            return Err(not_started(name, fault));
         }
         ledger.report(Report::Ready);
         let schedule = Schedule::live(&manifest, &inputs, clock.now());
@@ -106,7 +101,15 @@ impl Job {
         course.schedule.finish();
         let Course { ledger, watch, inputs, schedule, session, recorder, dds, .. } = course;
         let dropped = recorder.map(ToRecorder::leave);
-        let last = watch.ended(&dds, &inputs, &schedule, &session, ledger.unwritten(), dropped);
+        let last = watch.ended(&Around {
+            dds: &dds,
+            health: &dds.health(),
+            inputs: &inputs,
+            schedule: &schedule,
+            session: &session,
+            unwritten: ledger.unwritten(),
+            recorder: dropped,
+        });
         ledger.finish(Some(last))?;
         ended?;
         Ok(if faults > 0 { Exit::LambdaFaulted } else { Exit::Ok })

@@ -1,7 +1,6 @@
 //! What to run live: the arguments as typed, and what they mean once checked against the build.
 
 use std::io;
-use std::net::IpAddr;
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,36 +10,27 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, Exit, Failure};
 use gleaner_transport::dds::{self, Clock};
 
-use crate::input::Remap;
-use crate::network::NetworkError;
-use crate::stage::{Asked, assignment, remap};
+use crate::network::NetworkArgs;
+use crate::stage::{Asked, AskedArgs};
 
 /// Arguments of `run`.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
-    /// The lambda's folder, built by `gleaner build`.
-    pub lambda: PathBuf,
-    /// A value of the table `config` of the manifest.
-    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
-    pub set: Vec<(String, String)>,
-    /// Another name for a topic of the manifest.
-    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
-    pub remap: Vec<Remap>,
-    /// Where the results go; `DIR/live` if not given.
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub asked: AskedArgs,
+    /// Where the results go.
     #[arg(long, value_name = "DIR")]
-    pub out: Option<PathBuf>,
+    pub out: PathBuf,
     /// Write every decision, not only those with a trigger or a fault.
     #[arg(long)]
     pub all: bool,
     /// Standard input is the socket to the recorder.
     #[arg(long)]
     pub recorder: bool,
-    /// The domain of DDS.
-    #[arg(long)]
-    pub domain: Option<u16>,
-    /// The address of an interface to use, instead of all.
-    #[arg(long, value_name = "ADDRESS")]
-    pub interface: Vec<IpAddr>,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub network: NetworkArgs,
     /// How far the vehicle's clock is ahead of CLOCK_MONOTONIC, in ns.
     #[arg(long, value_name = "NS", allow_hyphen_values = true)]
     pub clock_offset: Option<i64>,
@@ -86,22 +76,18 @@ impl Job {
     ///
     /// A failure that names the manifest's line, the key or the topic, and the way out.
     pub fn new(args: RunArgs) -> Result<Self, Failure> {
-        let build = BuildDir::check_fresh(&args.lambda)?;
+        let build = BuildDir::check_fresh(&args.asked.lambda)?;
         let manifest = Manifest::load(build.path())?;
         let messages = vec![build.path().join("msg")];
-        let asked = Asked::new(args.lambda, build, &manifest, &args.set, args.remap)?;
+        let asked = Asked::new(args.asked, build, &manifest)?;
         let name: String =
             manifest.lambda.name.as_str().chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
-        let mut dds = dds::Options::from_env(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
-        dds.domain = args.domain.unwrap_or(dds.domain);
-        if !args.interface.is_empty() {
-            dds.interfaces = args.interface;
-        }
+        let mut dds = args.network.options(&format!("/gleaner/{name}"))?;
         dds.clock = args.clock_offset.map_or_else(Clock::of_today, Clock::new);
         dds.largest = manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
         dds.messages = messages;
         let wanted = Wanted {
-            out: args.out.unwrap_or_else(|| asked.lambda.join("live")),
+            out: args.out,
             all: args.all,
             recorder: args.recorder,
             dds,

@@ -6,30 +6,26 @@
 //! message's is, as with `gleaner play --stamp monotonic`.
 
 use gleaner_protocol::{Decision, Failure};
-use gleaner_transport::dds::{Clock, Dds, Writer};
-use gleaner_transport::message::CdrWriter;
+use gleaner_transport::dds::{Clock, Dds};
 
+use super::speaker::Speaker;
 use crate::api::data::Wake;
-use crate::network::NetworkError;
 
 const TYPE: &str = "sensor_msgs/msg/TimeReference";
 /// A bench that is a second behind has lost.
 const DEPTH: usize = 1024;
 
 pub(super) struct RoundTrip {
-    writer: Writer,
+    speaker: Speaker,
     clock: Clock,
     lambda: String,
     wakes: u64,
-    unsent: u64,
-    message: CdrWriter,
 }
 
 impl RoundTrip {
     /// Answers of `lambda` on `topic`.
     pub(super) fn open(dds: &Dds, topic: &str, clock: Clock, lambda: &str) -> Result<Self, Failure> {
-        let writer = dds.writer(topic, TYPE, DEPTH).map_err(NetworkError::failure)?;
-        Ok(Self { writer, clock, lambda: lambda.to_owned(), wakes: 0, unsent: 0, message: CdrWriter::new() })
+        Ok(Self { speaker: Speaker::open(dds, topic, TYPE, DEPTH)?, clock, lambda: lambda.to_owned(), wakes: 0 })
     }
 
     /// The stamp of what woke the lambda, in ns.
@@ -43,19 +39,12 @@ impl RoundTrip {
         }
     }
 
-    /// Sends the answer to one wake. Those that cannot be sent are counted, and said now and then.
+    /// Sends the answer to one wake.
     pub(super) fn answer(&mut self, cause_ns: i64, decision: &Decision) {
         let labels: Vec<&str> = decision.triggers.iter().map(|trigger| trigger.label.as_str()).collect();
         let source = format!("{}:{}:{}", self.lambda, self.wakes, labels.join(","));
         self.wakes += 1;
         let now = self.clock.monotonic(self.clock.now());
-        self.message.clear();
-        self.message.time(cause_ns).string("").time(now).string(&source);
-        if let Err(error) = self.writer.write(self.message.bytes()) {
-            if self.unsent.is_power_of_two() || self.unsent == 0 {
-                tracing::warn!(%error, unsent = self.unsent + 1, "a wake was not answered");
-            }
-            self.unsent += 1;
-        }
+        self.speaker.say(|message| message.time(cause_ns).string("").time(now).string(&source));
     }
 }

@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Decision, Live, LiveTopic, Network, Spread, ToRecorder};
-use gleaner_transport::dds::{Clock, Dds};
+use gleaner_transport::dds::{Clock, Dds, Health};
 use gleaner_transport::{Subscription, Transport};
+use gleaner_vitals::{Spreads, usage};
 
-use super::spread::Spreads;
 use crate::api::Session;
 use crate::api::data::Topic;
 use crate::input::Remap;
@@ -27,6 +27,19 @@ pub(super) struct Times {
     pub(super) left: i64,
     /// Decision out.
     pub(super) out: i64,
+}
+
+/// What else a report tells of.
+pub(super) struct Around<'a> {
+    pub(super) dds: &'a Dds,
+    pub(super) health: &'a Health,
+    pub(super) inputs: &'a [Arc<Topic>],
+    pub(super) schedule: &'a Schedule,
+    pub(super) session: &'a Session,
+    /// Decisions and lines that could not be written.
+    pub(super) unwritten: u64,
+    /// Where there is a recorder, what it could not be told.
+    pub(super) recorder: Option<ToRecorder>,
 }
 
 /// Counts and spreads of one lambda.
@@ -114,45 +127,21 @@ impl Watch {
     }
 
     /// How it is now.
-    pub(super) fn report(
-        &mut self,
-        dds: &Dds,
-        inputs: &[Arc<Topic>],
-        schedule: &Schedule,
-        session: &Session,
-        unwritten: u64,
-        recorder: Option<ToRecorder>,
-    ) -> Live {
+    pub(super) fn report(&mut self, around: &Around) -> Live {
         let spreads = [self.wake_up.take(), self.run.take(), self.hand_out.take()];
-        let live = self.as_of_now(dds, inputs, schedule, session, spreads);
-        Live { unwritten, recorder, ..live }
+        self.as_of_now(around, spreads)
     }
 
     /// How it was.
-    pub(super) fn ended(
-        mut self,
-        dds: &Dds,
-        inputs: &[Arc<Topic>],
-        schedule: &Schedule,
-        session: &Session,
-        unwritten: u64,
-        recorder: Option<ToRecorder>,
-    ) -> Live {
+    pub(super) fn ended(mut self, around: &Around) -> Live {
         self.reported = self.started;
         self.before.fill(0);
         let spreads = [self.wake_up.all(), self.run.all(), self.hand_out.all()];
-        let live = self.as_of_now(dds, inputs, schedule, session, spreads);
-        Live { unwritten, recorder, ..live }
+        self.as_of_now(around, spreads)
     }
 
-    fn as_of_now(
-        &mut self,
-        dds: &Dds,
-        inputs: &[Arc<Topic>],
-        schedule: &Schedule,
-        session: &Session,
-        [wake_up, run, hand_out]: [Option<Spread>; 3],
-    ) -> Live {
+    fn as_of_now(&mut self, around: &Around, [wake_up, run, hand_out]: [Option<Spread>; 3]) -> Live {
+        let Around { dds, health, inputs, schedule, session, unwritten, recorder } = *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
         self.reported = now;
@@ -183,12 +172,13 @@ impl Watch {
                 trouble: status.trouble,
             });
         }
-        let health = dds.health();
         Live {
             up_s: now.saturating_sub(self.started) as f64 / 1e9,
             skipped: topics.iter().map(|topic| topic.skipped).sum(),
             missed_ticks: schedule.missed(),
             log_dropped: session.log_dropped(),
+            unwritten,
+            recorder,
             wake_up,
             run,
             hand_out,
@@ -201,14 +191,9 @@ impl Watch {
                 filtered: health.filtered,
                 ..self.base.network
             },
-            rss_bytes: crate::memory::resident(),
-            cpu_s: cpu_seconds(),
+            rss_bytes: usage::resident(),
+            cpu_s: usage::cpu_seconds(),
             ..self.base.clone()
         }
     }
-}
-
-fn cpu_seconds() -> f64 {
-    let used = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-    used.tv_sec as f64 + used.tv_nsec as f64 / 1e9
 }

@@ -7,23 +7,17 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, Exit, Failure};
 
 use super::verify::Claim;
-use crate::input::Remap;
-use crate::stage::{Asked, RESULTS, assignment, remap};
+use crate::stage::{Asked, AskedArgs, RESULTS};
 
 /// Arguments of `replay`.
 #[derive(Args, Clone, Debug)]
 pub struct ReplayArgs {
-    /// The lambda's folder, built by `gleaner build`.
-    pub lambda: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub asked: AskedArgs,
     /// MCAP files; several are merged by time.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
-    /// A value of the table `config` of the manifest.
-    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
-    pub set: Vec<(String, String)>,
-    /// Another name for a topic of the manifest.
-    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
-    pub remap: Vec<Remap>,
     /// Where the results go; `DIR/out` if not given.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
@@ -98,7 +92,7 @@ impl Job {
     ///
     /// A failure that names the manifest's line, the key, the topic or what differs from the journal, and the way out.
     pub fn replay(args: ReplayArgs) -> Result<Self, Failure> {
-        let build = BuildDir::check_fresh(&args.lambda)?;
+        let build = BuildDir::check_fresh(&args.asked.lambda)?;
         let manifest = Manifest::load(build.path())?;
         if let Some(twice) = given_twice(&args.drives) {
             let failure = Failure::new(Exit::Usage, format!("drive `{}` is given twice", twice.display()));
@@ -106,10 +100,10 @@ impl Job {
         }
         if let Some(journal) = args.verify {
             let claim = Claim::journal(&journal)?;
-            let options = claim.options(args.lambda, build, &manifest, args.drives, args.set, args.remap)?;
+            let options = claim.options(args.asked, build, &manifest, args.drives)?;
             return Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) });
         }
-        let asked = Asked::new(args.lambda, build, &manifest, &args.set, args.remap)?;
+        let asked = Asked::new(args.asked, build, &manifest)?;
         let (lambda, build) = (&asked.lambda, &asked.build);
         let out = args.out.unwrap_or_else(|| lambda.join("out"));
         if let Some(journal) = args.journal.as_deref().filter(|journal| is_result(journal, &out)) {
@@ -137,7 +131,8 @@ impl Job {
         let build = BuildDir::check_fresh(&args.lambda)?;
         let manifest = Manifest::load(build.path())?;
         let claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
-        let options = claim.options(args.lambda, build, &manifest, vec![args.clip], Vec::new(), Vec::new())?;
+        let asked = AskedArgs { lambda: args.lambda, set: Vec::new(), remap: Vec::new() };
+        let options = claim.options(asked, build, &manifest, vec![args.clip])?;
         Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
     }
 }

@@ -9,6 +9,7 @@ use gleaner_protocol::journal::End;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Explain, Failure, Report, Round, Summary, TopicReport};
 use gleaner_transport::replay::{Replay, Step};
+use gleaner_vitals::usage;
 
 use super::course::{self, Course, Reached};
 use super::digests::Digests;
@@ -23,7 +24,6 @@ use crate::api::log::Line;
 use crate::api::trace::offered;
 use crate::journal::{Identity, Scribe};
 use crate::judge::Judge;
-use crate::memory::{most_resident, resident};
 use crate::schedule::Schedule;
 use crate::stage::{Asked, Bounds, Load, Output, Stage, not_started};
 
@@ -206,7 +206,7 @@ pub(super) fn replay(
         run_s: pass.judge.run().as_secs_f64(),
         decode_s: inputs.iter().map(|topic| topic.decode_ns()).sum::<u64>() as f64 / 1e9,
         wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
-        peak_rss_bytes: most_resident(),
+        peak_rss_bytes: usage::most_resident(),
         topics: inputs.iter().map(topic_report).collect(),
         clips: recorded.clips,
         clips_replaced,
@@ -227,7 +227,7 @@ pub(super) fn report(n: u32, summary: &Summary) -> Round {
         faults: summary.faults,
         wall_s: summary.wall_s,
         wakes_per_s: summary.wakes_per_s,
-        rss_bytes: resident(),
+        rss_bytes: usage::resident(),
     }
 }
 

@@ -2,10 +2,24 @@
 
 use std::path::PathBuf;
 
+use clap::Args;
 use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
 use gleaner_protocol::{BuildDir, Exit, Failure};
 
 use crate::input::Remap;
+
+/// Arguments that say which lambda is to run, with which settings.
+#[derive(Args, Clone, Debug)]
+pub struct AskedArgs {
+    /// The lambda's folder, built by `gleaner build`.
+    pub lambda: PathBuf,
+    /// A value of the table `config` of the manifest.
+    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
+    pub set: Vec<(String, String)>,
+    /// Another name for a topic of the manifest.
+    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
+    pub remap: Vec<Remap>,
+}
 
 /// A lambda as it was asked for.
 pub struct Asked {
@@ -25,35 +39,20 @@ impl Asked {
     /// # Errors
     ///
     /// A failure that names the key or the topic, and the way out.
-    pub fn new(
-        lambda: PathBuf,
-        build: BuildDir,
-        manifest: &Manifest,
-        set: &[(String, String)],
-        remaps: Vec<Remap>,
-    ) -> Result<Self, Failure> {
-        let config = ConfigSet::resolve(manifest, set)?;
+    pub fn new(args: AskedArgs, build: BuildDir, manifest: &Manifest) -> Result<Self, Failure> {
+        let AskedArgs { lambda, set, remap: remaps } = args;
+        let config = ConfigSet::resolve(manifest, &set)?;
         known_topics(&remaps, manifest)?;
         Ok(Self { lambda, build, config, remaps })
     }
 }
 
-/// Takes `KEY=VALUE` apart, an argument.
-///
-/// # Errors
-///
-/// What to write instead.
-pub fn assignment(text: &str) -> Result<(String, String), String> {
+fn assignment(text: &str) -> Result<(String, String), String> {
     let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, as in brake_mps2=-1.4")?;
     Ok((key.trim().to_owned(), value.trim().to_owned()))
 }
 
-/// Takes `FROM:=TO` apart, an argument.
-///
-/// # Errors
-///
-/// What to write instead.
-pub fn remap(text: &str) -> Result<Remap, String> {
+fn remap(text: &str) -> Result<Remap, String> {
     let (from, to) = text.split_once(":=").ok_or("write FROM:=TO, as in /imu/data:=/car/imu")?;
     Ok(Remap { from: from.trim().to_owned(), to: to.trim().to_owned() })
 }

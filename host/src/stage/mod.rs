@@ -11,7 +11,7 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Explain, Failure, Fault};
 use gleaner_transport::{Transport, TransportError};
 
-pub use asked::{Asked, assignment, remap};
+pub use asked::{Asked, AskedArgs};
 pub use output::{Output, OutputError, RESULTS};
 
 use crate::api::Session;

@@ -2,7 +2,9 @@
 
 use gleaner_image::{ImageError, decode_rgb8, probe};
 use gleaner_transport::Endian;
-use gleaner_transport::message::{CdrError, CompressedView, Definitions, FieldPath, HeaderStamp, Value, header_stamp};
+use gleaner_transport::message::{
+    CdrError, CompressedView, Definitions, FieldPath, HeaderStamp, Sources, Value, header_stamp,
+};
 
 use crate::args::Size;
 use crate::buffer::{Buffer, Pool};
@@ -31,15 +33,14 @@ pub(crate) struct Decoder {
     pool: Pool,
 }
 
-/// `sensor_msgs/msg/CompressedImage` as ROS 2 defines it. A drive need not say it.
-const DEFINITION: &str = "std_msgs/Header header\nstring format\nuint8[] data\n\
-    ===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n";
+/// A drive need not define it.
+const TYPE: &str = "sensor_msgs/msg/CompressedImage";
 
 impl Decoder {
     /// Makes images of `size`, or as large as they are.
     pub(crate) fn new(size: Option<Size>) -> Decoder {
-        let definitions =
-            Definitions::parse("sensor_msgs/msg/CompressedImage", DEFINITION).expect("a sound definition");
+        let text = Sources::default().find(TYPE).expect("bundled definitions are sound").expect("it is bundled");
+        let definitions = Definitions::parse(TYPE, &text).expect("bundled definitions are sound");
         let stamp = header_stamp(&definitions).expect("it begins with a header");
         let frame_id = FieldPath::compile(&definitions, "header.frame_id").expect("a header has it");
         Decoder { size, stamp, frame_id, rgb: Vec::new(), pool: Pool::default() }
@@ -91,18 +92,19 @@ mod tests {
     use jpeg_encoder::{ColorType, Encoder};
 
     use super::*;
-    use crate::cdr::Cdr;
+    use crate::cdr::{sealed, with_header};
 
     /// A picture whose left half is red and whose right half is blue.
     fn message() -> Vec<u8> {
         let pixels = [[255, 0, 0], [0, 0, 255]].map(|pixel| pixel.repeat(16)).concat().repeat(16);
         let mut jpeg = Vec::new();
         Encoder::new(&mut jpeg, 100).encode(&pixels, 32, 16, ColorType::Rgb).unwrap();
-        let mut cdr = Cdr::with_header(1_500_000_000, "front");
-        cdr.text("jpeg");
-        cdr.u32(jpeg.len() as u32);
-        jpeg.iter().for_each(|byte| cdr.u8(*byte));
-        cdr.done()[4..].to_vec()
+        let mut cdr = with_header(1_500_000_000, "front");
+        cdr.string("jpeg").u32(jpeg.len() as u32);
+        for byte in &jpeg {
+            cdr.u8(*byte);
+        }
+        sealed(&cdr)[4..].to_vec()
     }
 
     #[test]
@@ -111,7 +113,7 @@ mod tests {
             let mut decoder = Decoder::new(size.map(|text| text.parse().unwrap()));
             let image = decoder.convert(&message(), Endian::Little).unwrap();
             assert_eq!(image.len() % 4, 0);
-            let head = Cdr::with_header(1_500_000_000, "front").done();
+            let head = sealed(&with_header(1_500_000_000, "front"));
             assert_eq!(image[..head.len()], head);
             let view = ImageView::read(&image[4..], Endian::Little).unwrap();
             assert_eq!((view.width, view.height), side);
@@ -131,10 +133,9 @@ mod tests {
         let at = broken.len() / 2;
         broken.truncate(at);
         assert!(decoder.convert(&broken, Endian::Little).is_err());
-        let mut no_picture = Cdr::with_header(0, "");
-        no_picture.text("jpeg");
-        no_picture.u32(0);
-        let cdr = no_picture.done();
+        let mut no_picture = with_header(0, "");
+        no_picture.string("jpeg").u32(0);
+        let cdr = sealed(&no_picture);
         assert!(matches!(decoder.convert(&cdr[4..], Endian::Little), Err(ConvertError::Picture(_))));
         assert!(decoder.convert(&message(), Endian::Little).is_ok());
     }

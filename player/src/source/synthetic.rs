@@ -9,7 +9,7 @@ use gleaner_transport::Endian;
 use super::{Source, Topic};
 use crate::args::{Camera, Size};
 use crate::buffer::{Buffer, Pool};
-use crate::cdr::{self, Cdr};
+use crate::cdr;
 use crate::offer::Offer;
 use crate::queue::Message;
 
@@ -123,29 +123,19 @@ fn noise(pixels: &mut [u8]) {
 
 /// A `sensor_msgs/msg/Imu` that lies still, with its z axis up.
 fn imu(number: u64) -> Vec<u8> {
-    let mut cdr = Cdr::with_header(0, &frame_id(number));
+    let mut imu = cdr::with_header(0, &frame_id(number));
     let diagonal = |variance: f64| [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance];
-    cdr.f64s(&[0.0, 0.0, 0.0, 1.0]);
-    cdr.f64s(&diagonal(1e-4));
-    cdr.f64s(&[0.0, 0.0, 0.0]);
-    cdr.f64s(&diagonal(1e-6));
-    cdr.f64s(&[0.0, 0.0, 9.806_65]);
-    cdr.f64s(&diagonal(1e-4));
-    cdr.done()
+    imu.f64s(&[0.0, 0.0, 0.0, 1.0]).f64s(&diagonal(1e-4));
+    imu.f64s(&[0.0, 0.0, 0.0]).f64s(&diagonal(1e-6));
+    imu.f64s(&[0.0, 0.0, 9.806_65]).f64s(&diagonal(1e-4));
+    cdr::sealed(&imu)
 }
 
 #[cfg(test)]
 mod tests {
-    use gleaner_transport::message::{Definitions, FieldPath, ImageView, Value};
+    use gleaner_transport::message::{Definitions, FieldPath, ImageView, Sources, Value};
 
     use super::*;
-
-    const IMU_TEXT: &str = "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n\
-        geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n\
-        geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n\
-        ===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-        ===\nMSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n\
-        ===\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n";
 
     fn camera(text: &str) -> Option<Camera> {
         Some(text.parse().unwrap())
@@ -157,7 +147,8 @@ mod tests {
 
     #[test]
     fn an_imu_is_read_back_by_its_field_paths() {
-        let definitions = Definitions::parse("sensor_msgs/msg/Imu", IMU_TEXT).unwrap();
+        let text = Sources::default().find("sensor_msgs/msg/Imu").unwrap().unwrap();
+        let definitions = Definitions::parse("sensor_msgs/msg/Imu", &text).unwrap();
         let messages = all(Synthetic::new(None, Some(100.0), Some(1_000_000_000)));
         assert_eq!(messages.len(), 100);
         let cdr = &messages[42].bytes[4..];

@@ -57,10 +57,7 @@ impl Args {
     pub(super) fn read(self) -> Result<(Options, Network), Failure> {
         let usage = |error: &dds::DdsError| Failure::caused_by(Exit::Usage, "cannot use the network", error);
         let mut network = dds::Options::from_env("/gleaner/recorder").map_err(|error| usage(&error))?;
-        network.domain = self.domain.unwrap_or(network.domain);
-        if !self.interface.is_empty() {
-            network.interfaces = self.interface;
-        }
+        network = network.narrowed(self.domain, self.interface);
         network.largest = self.largest.unwrap_or(network.largest);
         network.messages = self.messages;
         network.clock = self.clock_offset.map_or(network.clock, Clock::new);

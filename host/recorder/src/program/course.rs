@@ -14,6 +14,7 @@ use gleaner_protocol::link::RecorderReport;
 use gleaner_protocol::manifest::Store;
 use gleaner_protocol::{Exit, Failure};
 use gleaner_transport::dds::Clock;
+use gleaner_vitals::Spreads;
 use tracing::{error, warn};
 
 use super::Options;
@@ -21,7 +22,6 @@ use super::commands::Commands;
 use super::hear::{Announced, Event, starter};
 use super::lambdas::Lambda;
 use super::say::Say;
-use super::spread::Spreads;
 use super::staging::{Arrivals, Block, Lane, Staging};
 use super::telling::Said;
 use super::watch::{Beat, Feed, Seen, Want, Wanted, Watch};

@@ -6,11 +6,11 @@ use std::time::Instant;
 use gleaner_protocol::journal::Entry;
 use gleaner_protocol::link::Answers;
 use gleaner_protocol::manifest::Record;
+use gleaner_vitals::Spreads;
 use tracing::warn;
 
 use super::allowance::Allowance;
 use super::hear::{Spoken, lambda_digest};
-use super::spread::Spreads;
 use crate::{LambdaId, Member, RecordError, Recorder, TopicId};
 
 /// What of one lambda is heard before it is the next one's turn.
@@ -111,9 +111,9 @@ impl Lambda {
                     }
                     recorder.wake(id, &entry)?;
                     if !entry.triggers.is_empty() {
-                        let wait_ns = u64::try_from(monotonic_ns().saturating_sub(decided_ns)).unwrap_or(0);
+                        let wait_ns = monotonic_ns().saturating_sub(decided_ns);
                         spreads.add(wait_ns);
-                        self.answers.opened(wait_ns);
+                        self.answers.opened(u64::try_from(wait_ns).unwrap_or(0));
                     }
                 }
                 Spoken::Gone(why) => {

@@ -17,9 +17,7 @@ mod commands;
 mod course;
 mod hear;
 mod lambdas;
-mod log;
 mod say;
-mod spread;
 mod staging;
 mod telling;
 mod watch;
@@ -60,7 +58,7 @@ pub struct Options {
 
 /// `main` of `gleaner-recorder`.
 pub fn main() -> ExitCode {
-    log::prepare();
+    gleaner_vitals::log::prepare();
     match start(Args::parse()) {
         Ok(()) => Exit::Ok.into(),
         Err(failure) => {

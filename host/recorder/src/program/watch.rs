@@ -10,6 +10,7 @@ use gleaner_protocol::{Network, visible};
 use gleaner_transport::dds::Dds;
 use gleaner_transport::message::Definitions;
 use gleaner_transport::{DiscoveredTopic, Qos, Sink, Status, Subscription, TopicSpec, Transport, TransportError};
+use gleaner_vitals::usage;
 use tracing::{error, warn};
 
 use super::commands;
@@ -162,7 +163,7 @@ impl Watch {
             if beat_at.elapsed() >= PULSE {
                 beat_at = Instant::now();
                 let topics = subscribed.iter().map(|(topic, of)| (*topic, self.feed.status(*of))).collect();
-                let (rss_bytes, cpu_s) = used();
+                let (rss_bytes, cpu_s) = (usage::resident(), usage::cpu_seconds());
                 let disk_free = free(&self.out);
                 let commands = commands.map(|of| self.feed.status(of));
                 let beat = Beat { pulse: self.feed.pulse(), topics, commands, disk_free, rss_bytes, cpu_s };
@@ -244,13 +245,4 @@ fn usual_bytes(type_name: &str) -> usize {
 /// Bytes that are free on the disk of `folder`.
 fn free(folder: &Path) -> Option<u64> {
     rustix::fs::statvfs(folder).ok().map(|disk| disk.f_bavail.saturating_mul(disk.f_frsize))
-}
-
-/// Resident memory in bytes, and CPU time in s.
-fn used() -> (u64, f64) {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
-    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<u64>().ok());
-    let times = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-    (kib.unwrap_or(0) * 1024, times.tv_sec as f64 + times.tv_nsec as f64 / 1e9)
 }

@@ -15,7 +15,7 @@ use crate::input::Remap;
 use crate::journal::{CLOCK_OF_VEHICLE, Identity};
 use crate::replay::Options;
 use crate::replay::open::DriveError;
-use crate::stage::Asked;
+use crate::stage::{Asked, AskedArgs};
 
 /// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at most.
 const EXTRAS_BYTES: u64 = 256 << 20;
@@ -103,13 +103,12 @@ impl Claim {
     /// What the journal was made with, unless `set` and `remaps` say otherwise, which then has to be the same.
     pub(in crate::replay) fn options(
         &self,
-        lambda: PathBuf,
+        args: AskedArgs,
         build: BuildDir,
         manifest: &Manifest,
         drives: Vec<PathBuf>,
-        set: Vec<(String, String)>,
-        remaps: Vec<Remap>,
     ) -> Result<Options, Failure> {
+        let AskedArgs { lambda, set, remap: remaps } = args;
         let header = self.header();
         let remaps = if remaps.is_empty() {
             let journaled = header.remaps.iter();

@@ -105,6 +105,12 @@ impl Options {
         }
     }
 
+    /// With this domain instead, if one is given, and on these interfaces alone, if there are any.
+    pub fn narrowed(self, domain: Option<u16>, interfaces: Vec<IpAddr>) -> Self {
+        let interfaces = if interfaces.is_empty() { self.interfaces } else { interfaces };
+        Self { domain: domain.unwrap_or(self.domain), interfaces, ..self }
+    }
+
     /// As the environment of ROS 2 says: `ROS_DOMAIN_ID`, `ROS_LOCALHOST_ONLY`, `ROS_AUTOMATIC_DISCOVERY_RANGE`,
     /// `ROS_DISTRO` and `AMENT_PREFIX_PATH`; otherwise as [`Options::new`].
     ///

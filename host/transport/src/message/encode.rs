@@ -10,6 +10,11 @@ impl CdrWriter {
         Self::default()
     }
 
+    /// Adds a `uint8`.
+    pub fn u8(&mut self, value: u8) -> &mut Self {
+        self.aligned(&[value])
+    }
+
     /// Adds an `int32`.
     pub fn i32(&mut self, value: i32) -> &mut Self {
         self.aligned(&value.to_le_bytes())
@@ -18,6 +23,11 @@ impl CdrWriter {
     /// Adds a `uint32`.
     pub fn u32(&mut self, value: u32) -> &mut Self {
         self.aligned(&value.to_le_bytes())
+    }
+
+    /// Adds `float64`s, as of an array of fixed length.
+    pub fn f64s(&mut self, values: &[f64]) -> &mut Self {
+        values.iter().fold(self, |cdr, value| cdr.aligned(&value.to_le_bytes()))
     }
 
     /// Adds a `string`. What is longer than 4 GiB is cut.

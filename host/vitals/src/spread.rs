@@ -7,33 +7,40 @@ use hdrhistogram::Histogram;
 const MOST_NS: u64 = 60_000_000_000;
 
 /// Durations since the report before, and since the start.
-pub(super) struct Spreads {
+pub struct Spreads {
     now: Histogram<u64>,
     all: Histogram<u64>,
 }
 
+impl Default for Spreads {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl Spreads {
-    pub(super) fn new() -> Self {
+    /// None so far.
+    pub fn new() -> Self {
         let empty = || Histogram::new_with_max(MOST_NS, 2).expect("two digits up to a minute are no problem");
         Self { now: empty(), all: empty() }
     }
 
     /// Adds a duration; a negative one, as of clocks that disagree, counts as none.
-    pub(super) fn add(&mut self, ns: i64) {
+    pub fn add(&mut self, ns: i64) {
         let ns = u64::try_from(ns).unwrap_or(0);
         self.now.saturating_record(ns);
         self.all.saturating_record(ns);
     }
 
     /// Those since the last call.
-    pub(super) fn take(&mut self) -> Option<Spread> {
+    pub fn take(&mut self) -> Option<Spread> {
         let spread = spread(&self.now);
         self.now.reset();
         spread
     }
 
     /// All of them.
-    pub(super) fn all(&self) -> Option<Spread> {
+    pub fn all(&self) -> Option<Spread> {
         spread(&self.all)
     }
 }

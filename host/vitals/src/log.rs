@@ -1,4 +1,4 @@
-//! Log lines for people, as every program of ours writes them: `warning: ring full input=imu`.
+//! Log lines for people, as errors are: `warning: ring full input=imu`.
 
 use std::fmt;
 use std::io;
@@ -8,8 +8,8 @@ use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::registry::LookupSpan;
 
-/// Log lines go to standard error; `GLEANER_LOG` says which.
-pub(super) fn prepare() {
+/// Has log lines go to standard error from now on; `GLEANER_LOG` says which, and else it is warnings.
+pub fn prepare() {
     let wanted = std::env::var("GLEANER_LOG").unwrap_or_else(|_| "warn".to_owned());
     let filter = tracing_subscriber::EnvFilter::try_new(&wanted).unwrap_or_else(|error| {
         eprintln!("warning: GLEANER_LOG=`{wanted}` is no filter, `warn` is used: {error}");
@@ -20,10 +20,25 @@ pub(super) fn prepare() {
         .with_ansi(false)
         .event_format(Plain)
         .with_env_filter(filter)
-        .with_writer(io::stderr)
+        .with_writer(|| Says(io::stderr()))
         .try_init();
 }
 
+/// Standard error, which nobody may read any more: the library would panic about that.
+struct Says(io::Stderr);
+
+impl io::Write for Says {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let _ = self.0.write_all(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// One line for people, as errors are: `warning: ring full input=imu`.
 struct Plain;
 
 impl<S, N> FormatEvent<S, N> for Plain

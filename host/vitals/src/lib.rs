@@ -1,0 +1,13 @@
+//! How a process of ours is doing, and what it says of itself: the same for the runtime and for the recorder.
+//!
+//! - [`log`]: lines for people, on standard error.
+//! - [`Spreads`]: how long things take, in bounded memory.
+//! - [`usage`]: memory and CPU time.
+//!
+//! What never happens here: reports to whoever started us, which are `gleaner_protocol`'s.
+
+pub mod log;
+mod spread;
+pub mod usage;
+
+pub use spread::Spreads;
