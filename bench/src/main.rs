@@ -2,6 +2,7 @@
 //!
 //! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the spread of its runs.
 
+mod kernels;
 mod live;
 mod measure;
 mod record;
@@ -10,7 +11,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use gleaner_protocol::manifest::Store;
-use measure::{Figure, Kind, Setting};
+use measure::{Figure, Kind, Setting, quantile};
 
 /// Prints a table of promises with what was measured, in Markdown.
 #[derive(Parser)]
@@ -21,10 +22,13 @@ struct Args {
     /// Live topics instead of drives, in a private network; needs gleaner-player.
     #[arg(long)]
     live: bool,
+    /// Arithmetic in lambdas against the same natively, and calls between lambda and host, instead of drives.
+    #[arg(long, conflicts_with = "live")]
+    kernels: bool,
 }
 
 fn main() -> ExitCode {
-    let Args { quick, live } = Args::parse();
+    let Args { quick, live, kernels } = Args::parse();
     if live {
         return match live::elsewhere() {
             Some(Ok(true)) => ExitCode::SUCCESS,
@@ -39,6 +43,9 @@ fn main() -> ExitCode {
     let rounds = if quick { 2 } else { 9 };
     if let Err(error) = measure::stay_on_one_core() {
         eprintln!("cannot stay on one core, figures are of all: {error}");
+    }
+    if kernels {
+        return tell(&kernels::figures(quick), quick);
     }
     let setting = Setting::new();
     let mut figures = Vec::new();
@@ -104,9 +111,7 @@ fn main() -> ExitCode {
     }
 
     let live = record::record_live(if quick { 4 } else { 60 });
-    let at =
-        |values: &[f64], share: f64| values.get((values.len() as f64 * share) as usize).copied().unwrap_or(f64::NAN);
-    let opened = |share| at(&live.opened_ms, share);
+    let opened = |share| quantile(&live.opened_ms, share);
     figures.push(Figure::told("trigger to window open, at 20 MB/s: median", "ms", &[opened(0.5)]));
     figures.push(Figure::at_most("trigger to window open, at 20 MB/s: 99 %", "ms", 1.0, &[opened(0.99)]));
     figures.push(Figure::told(
@@ -115,7 +120,7 @@ fn main() -> ExitCode {
         &live.opened_ms[live.opened_ms.len().max(1) - 1..],
     ));
     figures.push(Figure::told("live recorder at 20 MB/s: longest time to take a sample", "ms", &[live.longest_ms]));
-    figures.push(Figure::told("live recorder: time to tell it of a wake", "us", &[at(&live.told_us, 0.5)]));
+    figures.push(Figure::told("live recorder: time to tell it of a wake", "us", &[quantile(&live.told_us, 0.5)]));
     figures.push(Figure::at_most("live recorder at 20 MB/s: samples lost", "samples", 0.0, &[live.lost as f64]));
 
     tell(&figures, quick)

@@ -58,15 +58,20 @@ pub struct AskedArgs {
     /// Another name for a topic of the manifest, as in /imu/data:=/car/imu
     #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
     pub remap: Vec<String>,
+    /// The configuration of the vehicle, whose limits hold where they are smaller than those of the manifest; see docs/limits.md
+    #[arg(long, value_name = "FILE")]
+    pub vehicle: Option<PathBuf>,
 }
 
 impl AskedArgs {
     /// The settings, as our programs take them.
     pub(crate) fn settings(&self) -> Vec<OsString> {
         let settings = [("--set", &self.set), ("--remap", &self.remap)];
+        let vehicle = self.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]);
         settings
             .iter()
             .flat_map(|(flag, values)| values.iter().flat_map(move |value| [OsString::from(*flag), value.into()]))
+            .chain(vehicle)
             .collect()
     }
 }
@@ -196,6 +201,9 @@ pub struct VerifyArgs {
     /// The lambda's folder, built by `gleaner build DIR`
     #[arg(long, value_name = "DIR")]
     pub lambda: PathBuf,
+    /// The configuration of the vehicle [default: the limits that the journal names]
+    #[arg(long, value_name = "FILE")]
+    pub vehicle: Option<PathBuf>,
     /// Print the result as one JSON object
     #[arg(long)]
     pub json: bool,

@@ -18,8 +18,10 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
 
 /// Makes the decisions in a clip again.
 pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
-    let line = ["verify".into(), "--lambda".into(), args.lambda.clone().into(), "--".into(), args.clip.clone().into()];
-    show_result(runtime::run(line.into())?, args.json)
+    let mut line = vec!["verify".into(), "--lambda".into(), args.lambda.clone().into()];
+    line.extend(args.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]));
+    line.extend(["--".into(), args.clip.clone().into()]);
+    show_result(runtime::run(line)?, args.json)
 }
 
 fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> Result<Exit, Failure> {
@@ -72,7 +74,12 @@ mod tests {
     #[test]
     fn the_runtime_gets_our_arguments_with_the_files_last() {
         let args = ReplayArgs {
-            asked: AskedArgs { lambda: "-dir".into(), set: vec!["x=-1".to_owned()], remap: vec!["/a:=/b".to_owned()] },
+            asked: AskedArgs {
+                lambda: "-dir".into(),
+                set: vec!["x=-1".to_owned()],
+                remap: vec!["/a:=/b".to_owned()],
+                vehicle: Some("v.toml".into()),
+            },
             drives: vec!["a.mcap".into(), "b".into()],
             out: Some("out".into()),
             all: true,
@@ -82,7 +89,7 @@ mod tests {
             json: true,
         };
         let line =
-            "replay --set x=-1 --remap /a:=/b --out out --journal j --all --no-record -- -dir a.mcap b".split(' ');
+            "replay --set x=-1 --remap /a:=/b --vehicle v.toml --out out --journal j --all --no-record -- -dir a.mcap b".split(' ');
         assert_eq!(arguments(&args), line.collect::<Vec<_>>());
     }
 }

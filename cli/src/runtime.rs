@@ -53,9 +53,11 @@ pub(crate) enum Heard {
 /// Runs the runtime with these arguments to its end. Gives its result and how it ended; no result if it has said why there
 /// is none.
 pub(crate) fn run(arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Failure> {
-    let program = Parts::find()?.program("gleaner-runtime")?;
+    let parts = Parts::find()?;
+    let runtime = parts.program("gleaner-runtime")?;
+    let shim = parts.program("gleaner-shim")?;
     let bar = progress_bar();
-    let mut child = start(program, arguments)?;
+    let mut child = start(shim, runtime, arguments)?;
     // Both streams are heard on threads of their own: a lambda may leave processes behind that hold them open for ever.
     let explained = Arc::new(AtomicBool::new(false));
     let says = child.stderr.take().map(|says| {
@@ -89,9 +91,11 @@ pub(crate) fn run(arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Fai
     }
 }
 
-/// The one place where `gleaner` starts the runtime.
-fn start(program: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
+/// Starts the runtime below its shim.
+fn start(program: PathBuf, runtime: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
     Command::new(&program)
+        .args(["--with-starter", "--"])
+        .arg(runtime)
         .args(arguments)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())

@@ -22,7 +22,9 @@ pub struct Target {
     pub name: &'static str,
     /// Panics if a promise is broken. Returns whether the input was sound, as seeds are.
     pub check: fn(&[u8]) -> bool,
-    /// Sound inputs.
+    /// Length up to which inputs make sense, in bytes: a longer one is cut off there.
+    pub longest: usize,
+    /// Sound inputs, none longer.
     pub seeds: fn() -> Vec<Vec<u8>>,
     /// What a fuzzer is unlikely to find by itself.
     pub words: &'static [&'static str],
@@ -30,10 +32,46 @@ pub struct Target {
 
 /// All targets.
 pub const TARGETS: [Target; 6] = [
-    Target { name: "message", check: message::check, seeds: seeds::message::all, words: seeds::message::WORDS },
-    Target { name: "drive", check: drive::check, seeds: seeds::drive::all, words: seeds::drive::WORDS },
-    Target { name: "image", check: image::check, seeds: seeds::image::all, words: seeds::image::WORDS },
-    Target { name: "journal", check: journal::check, seeds: seeds::journal::all, words: seeds::journal::WORDS },
-    Target { name: "link", check: link::check, seeds: seeds::link::all, words: seeds::journal::WORDS },
-    Target { name: "manifest", check: manifest::check, seeds: seeds::manifest::all, words: seeds::manifest::WORDS },
+    Target {
+        name: "message",
+        check: message::check,
+        longest: 4 << 10,
+        seeds: seeds::message::all,
+        words: seeds::message::WORDS,
+    },
+    Target {
+        name: "drive",
+        check: drive::check,
+        longest: 8 << 10,
+        seeds: seeds::drive::all,
+        words: seeds::drive::WORDS,
+    },
+    Target {
+        name: "image",
+        check: image::check,
+        longest: 4 << 10,
+        seeds: seeds::image::all,
+        words: seeds::image::WORDS,
+    },
+    Target {
+        name: "journal",
+        check: journal::check,
+        longest: 4 << 10,
+        seeds: seeds::journal::all,
+        words: seeds::journal::WORDS,
+    },
+    Target {
+        name: "link",
+        check: link::check,
+        longest: 4 << 10,
+        seeds: seeds::link::all,
+        words: seeds::journal::WORDS,
+    },
+    Target {
+        name: "manifest",
+        check: manifest::check,
+        longest: 4 << 10,
+        seeds: seeds::manifest::all,
+        words: seeds::manifest::WORDS,
+    },
 ];

@@ -39,7 +39,7 @@ from .data import (
     Topic,
     Value,
 )
-from .error import Error
+from .error import DeadlineExceeded, Error
 from .inference import Detection, DetectOptions, InferenceError, Model, Preprocess, Tensor
 from .log import Level
 from .trigger import AttributeValue, TriggerError
@@ -55,6 +55,7 @@ __all__ = [
     "DetectOptions",
     "Detection",
     "Encoding",
+    "DeadlineExceeded",
     "Error",
     "Field",
     "Frame",

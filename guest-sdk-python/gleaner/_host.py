@@ -11,10 +11,13 @@ import traceback
 from types import ModuleType, TracebackType
 from typing import Any, Callable, Dict, Optional, Tuple
 
+from . import _deadline
+from ._deadline import keep as keep_deadlines
 from ._printed import end_call, print_to
 from .context import Context
+from .error import DeadlineExceeded
 
-__all__ = ["attempt", "load", "print_to", "settle", "tidy"]
+__all__ = ["attempt", "keep_deadlines", "load", "print_to", "settle", "tidy"]
 
 Handler = Callable[..., object]
 
@@ -84,15 +87,27 @@ def _missing(owner: Any, entry: str, handler: str) -> str:
     return f"{where} has no `{wanted}`, which `{schedule}` in [schedule] asks for; found {found or 'no handler'}"
 
 
-def attempt(call: Callable[..., object], *arguments: object) -> Tuple[object, Optional[str]]:
-    """What ``call`` returns, or the text of what it raises: even of what asks to leave the process, and of a panic in the
-    host's own code, which comes as an exception, too."""
+def attempt(seconds: float, call: Callable[..., object], *arguments: object) -> Tuple[object, Optional[str], str]:
+    """What ``call`` returns, or the text of what it raises and of which kind that is: even of what asks to leave the process, and
+    of a panic in the host's own code, which comes as an exception, too. After so many seconds it raises DeadlineExceeded; 0 is
+    for ever."""
     try:
-        return call(*arguments), None
+        _deadline.arm(seconds)
+        result = call(*arguments)
+        if _deadline.disarm():
+            return None, "the lambda caught DeadlineExceeded, and went on", "deadline"
+        return result, None, ""
     except BaseException as error:
-        return None, explain(error)
+        _deadline.disarm()
+        return None, explain(error), _kind(error)
     finally:
         end_call()
+
+
+def _kind(error: BaseException) -> str:
+    if isinstance(error, DeadlineExceeded):
+        return "deadline"
+    return "memory" if isinstance(error, MemoryError) else "exception"
 
 
 def explain(error: BaseException) -> str:

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 
+class DeadlineExceeded(BaseException):
+    """The wake, or ``init``, has taken longer than ``[limits]`` allows, and is ended. No ``except Exception`` catches it; what
+    does should clean up and let it go on: the wake is a fault anyway, and a process that stays in it is killed."""
+
+
 class Error(ValueError):
     """A refused call. The text names the thing, the cause and the way out.
 

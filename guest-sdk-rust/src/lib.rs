@@ -33,6 +33,8 @@
 //! The functions of this crate reach the host only on the vehicle (and in replay); called natively they panic. So keep the
 //! judgement in plain functions over plain numbers: those are tested natively, as any Rust code.
 //!
+//! [`kernels`] are such functions, for pixels and signals.
+//!
 //! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same four names as the modules here.
 
 #[doc(hidden)]
@@ -41,6 +43,7 @@ mod config;
 pub mod data;
 mod error;
 pub mod inference;
+pub mod kernels;
 mod lambda;
 pub mod log;
 pub mod trigger;

@@ -13,7 +13,7 @@ use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, TransportEr
 
 use tracing::warn;
 
-use crate::api::data::Topic;
+use crate::api::data::{PerCall, Topic};
 use crate::api::frame::{Budget, Images};
 use crate::api::trace::Arrivals;
 use crate::memory::Mapping;
@@ -83,8 +83,16 @@ pub fn open_inputs(
     transport: &mut dyn Transport,
     live: Option<&Live>,
 ) -> Result<Vec<Arc<Topic>>, InputError> {
-    let made = Budget::new(manifest.limits.memory.as_usize());
-    manifest.inputs.iter().map(|input| open_input(input, remaps, transport, live, &made)).collect()
+    let limits = &manifest.limits;
+    let frames = usize::try_from(limits.frames).unwrap_or(usize::MAX);
+    let shared = Shared { made: Budget::new(frames, limits.memory.as_usize()), per_call: PerCall::new(limits) };
+    manifest.inputs.iter().map(|input| open_input(input, remaps, transport, live, &shared)).collect()
+}
+
+/// What all inputs of a lambda have together.
+struct Shared {
+    made: Budget,
+    per_call: PerCall,
 }
 
 fn open_input(
@@ -92,7 +100,7 @@ fn open_input(
     remaps: &[Remap],
     transport: &mut dyn Transport,
     live: Option<&Live>,
-    made: &Budget,
+    shared: &Shared,
 ) -> Result<Arc<Topic>, InputError> {
     let layout = |source| InputError::Layout { input: input.name.to_string(), source };
     let subscribe = |source| InputError::Subscribe { input: input.name.to_string(), source };
@@ -115,7 +123,7 @@ fn open_input(
         Some(bytes) => Some(pool(input, input.decoded_slots(), bytes.as_usize())?),
         None => None,
     };
-    let images = Images::new(decoded, made.clone());
+    let images = (Images::new(decoded, shared.made.clone()), shared.per_call.clone());
     let arrivals = Arc::new(Arrivals::new(input.depth + spare));
     let ingest = Arc::new(Ingest {
         end: Mutex::new(End { ring: writer, copied: None }),
@@ -125,7 +133,16 @@ fn open_input(
         bell: live.and_then(|live| live.bell.clone()).filter(|bell| bell.input == input.name.as_str()),
     });
     transport.subscribe(&spec, ingest).map_err(subscribe)?;
-    let definitions = match transport.definitions(&spec.topic) {
+    // Whoever writes a topic that is there already can say what it is, if nobody here can.
+    let found = loop {
+        match transport.definitions(&spec.topic) {
+            Err(TransportError::NoDefinitions { .. }) if transport.definitions_may_come(&spec.topic) => {
+                std::thread::sleep(ASK_EVERY);
+            }
+            found => break found,
+        }
+    };
+    let definitions = match found {
         Ok(definitions) => Some(definitions),
         Err(TransportError::NoDefinitions { type_name, .. }) => {
             warn!(input = %input.name, r#type = %type_name, "no message definitions: fields of this input cannot be read");
@@ -160,6 +177,8 @@ fn pool<M: Copy + Send + Sync + 'static>(
     Pool::new(region, slots, slot_bytes).map_err(layout)
 }
 
+/// How often it is looked whether definitions have come.
+const ASK_EVERY: Duration = Duration::from_millis(20);
 /// How often a refusal is said again, with how many there were: what a lambda can cause in a loop must not fill a log.
 const SAY_EVERY: Duration = Duration::from_secs(10);
 

@@ -8,17 +8,70 @@ use crate::api::Session;
 use crate::api::data::Wake;
 use crate::guest::Guest;
 
+/// Faults in a row that are taken for bad luck, or for one bad second of a sensor. From then on the lambda rests.
+pub const FAULTS_IN_A_ROW: u32 = 8;
+
+/// The first rest; each further fault doubles it. A hundredth of the time at most is then spent on a lambda that always takes all of
+/// a deadline of 100 ms.
+const SHORTEST_REST_NS: i64 = 100_000_000;
+
+/// The longest rest: so long it takes at most until a lambda runs again whose cause of faults is gone.
+const LONGEST_REST_NS: i64 = 10_000_000_000;
+
+/// What the log says when a wake finds a fresh lambda.
+pub const MADE_ANEW: &str = "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone \
+                             (in Python, all but the globals of its module)";
+
+/// What the log says when a lambda begins to rest.
+pub const RESTS: &str = "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and twice as \
+                         long after each further fault, 10 s at most, until a wake ends well";
+
 /// Runs one lambda and writes down what it decides.
 pub struct Judge {
     session: Session,
     guest: Box<dyn Guest>,
     run: Duration,
+    faults: Faults,
+}
+
+/// Faults without a good wake between them. Time is that of the lambda, so that a replay rests as the vehicle did.
+#[derive(Default)]
+struct Faults {
+    in_a_row: u32,
+    rest_ns: i64,
+    /// From the wake that faulted last until the first that may run, without the latter.
+    rest: Option<(i64, i64)>,
+}
+
+impl Faults {
+    fn add(&mut self, at_ns: i64) {
+        self.in_a_row = self.in_a_row.saturating_add(1);
+        if self.in_a_row < FAULTS_IN_A_ROW {
+            return;
+        }
+        self.rest_ns = (2 * self.rest_ns).clamp(SHORTEST_REST_NS, LONGEST_REST_NS);
+        self.rest = Some((at_ns, at_ns.saturating_add(self.rest_ns)));
+    }
+
+    /// A clock that went back is no reason to rest for long.
+    fn rests(&self, at_ns: i64) -> bool {
+        self.rest.is_some_and(|(from, until)| (from..until).contains(&at_ns))
+    }
 }
 
 impl Judge {
     /// A judge over a guest whose `init` has succeeded, and the session that the guest was given.
     pub fn new(session: Session, guest: Box<dyn Guest>) -> Self {
-        Self { session, guest, run: Duration::ZERO }
+        Self { session, guest, run: Duration::ZERO, faults: Faults::default() }
+    }
+
+    /// Whether the wake at that time does not happen, since the lambda has faulted again and again. It is counted then.
+    pub fn passes_over(&mut self, at_ns: i64) -> bool {
+        let rests = self.faults.rests(at_ns);
+        if rests {
+            self.session.pass_over();
+        }
+        rests
     }
 
     /// Runs the lambda once. A fault becomes part of the decision; what the lambda triggered before it still counts, since a
@@ -26,6 +79,9 @@ impl Judge {
     pub fn judge(&mut self, wake: Wake) -> Decision {
         let mut decision = cause(&wake);
         self.session.begin(decision.at_ns);
+        if self.faults.in_a_row > 0 {
+            self.session.note(MADE_ANEW);
+        }
         let started = Instant::now();
         let outcome = self.guest.wake(wake);
         let run = started.elapsed();
@@ -34,6 +90,14 @@ impl Judge {
         decision.fuel = outcome.fuel;
         decision.triggers = self.session.end();
         decision.fault = outcome.result.err();
+        if decision.fault.is_none() {
+            self.faults = Faults::default();
+        } else {
+            self.faults.add(decision.at_ns);
+            if self.faults.in_a_row == FAULTS_IN_A_ROW {
+                self.session.note(RESTS);
+            }
+        }
         decision
     }
 
@@ -65,4 +129,94 @@ fn cause(wake: &Wake) -> Decision {
         decision.seq = Some(meta.seq);
     }
     decision
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_protocol::manifest::Limits;
+    use gleaner_protocol::{Fault, FaultKind};
+
+    use super::*;
+    use crate::api::data::Tick;
+    use crate::guest::Outcome;
+
+    /// Faults in every wake before that time.
+    struct Faulty {
+        until_ns: i64,
+    }
+
+    impl Guest for Faulty {
+        fn init(&mut self) -> Result<(), Fault> {
+            Ok(())
+        }
+
+        fn wake(&mut self, wake: Wake) -> Outcome {
+            let fault = Fault { kind: FaultKind::Trap, message: String::new(), used: None, allowed: None };
+            let result = if wake.at_ns() < self.until_ns { Err(fault) } else { Ok(()) };
+            Outcome { result, fuel: None }
+        }
+
+        fn engine(&self) -> String {
+            String::new()
+        }
+    }
+
+    const MS: i64 = 1_000_000;
+
+    /// A judge over a lambda that faults until then, and its session.
+    fn room(until_ns: i64) -> (Judge, Session) {
+        let session = Session::new(Vec::new(), Vec::new(), &Limits::default());
+        (Judge::new(session.clone(), Box::new(Faulty { until_ns })), session)
+    }
+
+    /// The times at which a lambda runs that is due every 10 ms.
+    fn runs(judge: &mut Judge, from_ms: i64, to_ms: i64) -> Vec<i64> {
+        let due = (from_ms..to_ms).step_by(10);
+        due.filter(|ms| {
+            let at_ns = ms * MS;
+            let runs = !judge.passes_over(at_ns);
+            if runs {
+                judge.judge(Wake::Tick(Tick { at_ns, missed: 0 }));
+            }
+            runs
+        })
+        .collect()
+    }
+
+    #[test]
+    fn after_eight_faults_in_a_row_a_lambda_rests_twice_as_long_after_each_further_one() {
+        let (mut judge, session) = room(i64::MAX);
+        let first = runs(&mut judge, 0, 2000);
+        assert_eq!(first, [0, 10, 20, 30, 40, 50, 60, 70, 170, 370, 770, 1570]);
+        assert_eq!(session.passed_over(), 200 - 12);
+        // The longest rest is 10 s.
+        assert_eq!(runs(&mut judge, 2000, 60_000), [3170, 6370, 12_770, 22_770, 32_770, 42_770, 52_770]);
+    }
+
+    #[test]
+    fn a_good_wake_ends_the_rest_and_the_count() {
+        let (mut judge, session) = room(100 * MS);
+        assert_eq!(runs(&mut judge, 0, 250), [0, 10, 20, 30, 40, 50, 60, 70, 170, 180, 190, 200, 210, 220, 230, 240]);
+        assert_eq!(session.passed_over(), 9);
+    }
+
+    #[test]
+    fn a_clock_that_went_back_ends_a_rest() {
+        let (mut judge, _) = room(i64::MAX);
+        runs(&mut judge, 1000, 1080);
+        assert!(judge.passes_over(1100 * MS));
+        assert!(!judge.passes_over(900 * MS));
+    }
+
+    #[test]
+    fn that_a_lambda_was_made_anew_and_rests_is_in_its_log_and_nothing_that_it_said() {
+        let (mut judge, session) = room(i64::MAX);
+        runs(&mut judge, 0, 1000);
+        let (lines, said) = session.take_log();
+        assert_eq!(lines.iter().map(|line| line.message.as_str()).collect::<Vec<_>>(), [MADE_ANEW, RESTS]);
+        assert_eq!((lines[0].at_ns, lines[1].at_ns, said.lines), (10 * MS, 70 * MS, 0));
+        // Again in the next second: state was lost again.
+        runs(&mut judge, 1000, 2000);
+        assert_eq!(session.take_log().0.len(), 1);
+    }
 }

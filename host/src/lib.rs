@@ -8,6 +8,7 @@
 pub mod api;
 pub mod guest;
 pub mod input;
+pub mod isolation;
 pub mod journal;
 pub mod judge;
 #[cfg(feature = "dds")]

@@ -4,15 +4,19 @@ use std::ffi::OsString;
 use std::fs::File;
 use std::io;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
-use gleaner_protocol::manifest::Manifest;
+use gleaner_jail::alone::Grants;
+use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
 
+use crate::guest::watched::{Patience, Watched};
+use crate::isolation::{Inside, Isolation};
 #[cfg(feature = "dds")]
 use crate::live;
 use crate::replay::{self, ReplayArgs, VerifyArgs};
-use crate::stage::{Asked, Load};
+use crate::stage::{Asked, Bounds, Load};
 #[cfg(feature = "dds")]
 use crate::topics::TopicsArgs;
 
@@ -54,11 +58,40 @@ impl Job {
         }
     }
 
-    fn run(self, load: Load<'_>, mut reports: File) -> Result<Exit, Failure> {
-        match self {
-            Self::Replay(job) => job.run(load, &mut reports),
+    /// The files that a process needs from its start: with those that are only made there.
+    #[cfg(feature = "python")]
+    fn around(&self) -> gleaner_jail::Paths {
+        use crate::isolation::existing;
+        let results = match self {
+            Self::Replay(job) => job.results(),
             #[cfg(feature = "dds")]
-            Self::Live(job) => job.run(load, reports),
+            Self::Live(job) => job.results(),
+        };
+        let mut paths = self.inside().paths;
+        paths.write.extend(results.iter().map(|path| existing(path)));
+        paths
+    }
+
+    /// What is left to the process once the lambda is in it.
+    fn inside(&self) -> Inside {
+        let (paths, ours) = match self {
+            Self::Replay(job) => (job.paths(), job.own_memory()),
+            #[cfg(feature = "dds")]
+            Self::Live(job) => (job.paths(), job.own_memory()),
+        };
+        let manifest = self.lambda().1;
+        let memory = match manifest.lambda.kind {
+            Kind::Wasm => None,
+            Kind::Python => Some(manifest.limits.memory.bytes().saturating_add(ours)),
+        };
+        Inside { paths, grants: Grants::default(), memory }
+    }
+
+    fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {
+        match self {
+            Self::Replay(job) => job.run(load, isolation, &mut reports),
+            #[cfg(feature = "dds")]
+            Self::Live(job) => job.run(load, isolation, reports),
         }
     }
 }
@@ -102,11 +135,11 @@ fn run_any(job: Job) -> Result<Exit, Failure> {
     let (asked, manifest) = job.lambda();
     match manifest.lambda.kind {
         #[cfg(feature = "wasm")]
-        gleaner_protocol::manifest::Kind::Wasm => run(job, &mut wasm::load),
+        Kind::Wasm => run(job, &mut wasm::load),
         #[cfg(feature = "python")]
-        gleaner_protocol::manifest::Kind::Python => {
+        Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(&asked.lambda, &args);
+            let error = crate::guest::python::become_interpreter(&asked.lambda, &args, job.around());
             Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]
@@ -118,7 +151,17 @@ fn run_any(job: Job) -> Result<Exit, Failure> {
 }
 
 fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
-    job.run(load, reports()?)
+    let isolation = Arc::new(Isolation::of_this_process(job.inside())?);
+    let mut watched = |asked: &Asked, manifest: &Manifest, session, bounds| {
+        let limits = &manifest.limits;
+        let patience = match bounds {
+            Bounds::Replay => Patience::replay(limits.init_deadline, limits.deadline),
+            Bounds::Live(deadline) => Patience::live(limits.init_deadline, deadline),
+        };
+        let guest = load(asked, manifest, session, bounds)?;
+        Ok(Box::new(Watched::new(guest, Arc::clone(&isolation), patience)) as _)
+    };
+    job.run(&mut watched, &isolation, reports()?)
 }
 
 /// What was standard output. What a library writes there by itself goes to standard error; what a lambda prints is in its log.
@@ -138,7 +181,7 @@ mod wasm {
 
     use crate::api::Session;
     use crate::guest::Guest;
-    use crate::guest::wasm::{Allowance, Deadline, Loaded, WasmError, WasmGuest};
+    use crate::guest::wasm::{Deadline, Loaded, WasmError, WasmGuest};
     use crate::stage::{Asked, Bounds};
 
     pub(super) fn load(
@@ -150,14 +193,17 @@ mod wasm {
         let cannot =
             |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
         let cache = gleaner_protocol::parts::cache_dir().map_err(|error| cannot(&error.into()))?;
-        let loaded = Loaded::open(&asked.build.entry_path(manifest), &cache).map_err(|error| cannot(&error))?;
-        let allowance = Allowance { fuel: manifest.limits.fuel, memory_bytes: manifest.limits.memory.bytes() };
+        let limits = &manifest.limits;
+        let loaded = Loaded::open(&asked.build.entry_path(manifest), &cache, limits.stack.as_usize())
+            .map_err(|error| cannot(&error))?;
         let failed = |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot make a guest", &error);
         let deadline = match bounds {
             Bounds::Replay => None,
-            Bounds::Live(allowed) => Some(Deadline::new(loaded.engine(), allowed).map_err(failed)?),
+            Bounds::Live(allowed) => {
+                Some(Deadline::new(loaded.engine(), allowed.min(limits.init_deadline)).map_err(failed)?)
+            }
         };
-        let guest = WasmGuest::new(loaded, session, allowance, deadline).map_err(failed)?;
+        let guest = WasmGuest::new(loaded, session, limits, deadline).map_err(failed)?;
         Ok(Box::new(guest))
     }
 }

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::{ArgGroup, Parser};
+use gleaner_protocol::manifest::TopicName;
 use gleaner_protocol::{Exit, Failure};
 
 use crate::pace::Rate;
@@ -34,7 +35,7 @@ pub(crate) struct Args {
     /// Play only these topics of the drive
     #[arg(long, value_name = "TOPIC,TOPIC", value_delimiter = ',')]
     pub(crate) topics: Vec<String>,
-    /// Another name for a topic of the drive, as in /imu/data:=/car/imu
+    /// Another name for a topic that is played, as in /imu/data:=/car/imu
     #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
     pub(crate) remap: Vec<(String, String)>,
     /// Begin so many seconds into the drive
@@ -141,11 +142,13 @@ impl Args {
     }
 }
 
+/// A drive may call its topics as it likes; what they are played as, ROS 2 has to take.
 fn remap(text: &str) -> Result<(String, String), String> {
-    match text.split_once(":=") {
-        Some((from, to)) if !from.trim().is_empty() && !to.trim().is_empty() => {
-            Ok((from.trim().to_owned(), to.trim().to_owned()))
-        }
+    match text.split_once(":=").map(|(from, to)| (from.trim(), to.trim())) {
+        Some((from, to)) if !from.is_empty() && !to.is_empty() => match to.parse::<TopicName>() {
+            Ok(to) => Ok((from.to_owned(), to.to_string())),
+            Err(error) => Err(format!("{error}: {}", error.rule)),
+        },
         _ => Err("write FROM:=TO, as in /imu/data:=/car/imu".to_owned()),
     }
 }
@@ -206,6 +209,7 @@ mod tests {
             (["--rate", "inf"], "greater than 0"),
             (["--remap", "/a=/b"], "FROM:=TO"),
             (["--remap", ":=/b"], "FROM:=TO"),
+            (["--remap", "/a:=no name"], "`no name` is no topic name"),
             (["--domain", "233"], "233"),
             (["--interface", "eth0"], "eth0"),
             (["--start", "-1"], "seconds"),
@@ -229,6 +233,11 @@ mod tests {
         assert_eq!(of(&["a"], Some(" 42 ")), Ok(42));
         assert_eq!(of(&["a"], Some("")), Ok(0));
         assert_eq!(of(&["a"], None), Ok(0));
+        // The page by which all programs of ours are tested.
+        for line in include_str!("../../tests/domains.txt").lines().filter(|line| line.starts_with('|')) {
+            let (content, domain) = line[1..].split_once('|').unwrap();
+            assert_eq!(of(&["a"], Some(content)).ok(), domain.trim().parse().ok(), "{line}");
+        }
         for nonsense in ["233", "-1", "a", "4.0"] {
             assert_eq!(of(&["a"], Some(nonsense)).unwrap_err().exit, Exit::Usage);
         }

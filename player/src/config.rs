@@ -40,4 +40,11 @@ mod tests {
         assert!(xml(Some("127.0.0.1".parse().unwrap())).contains("<NetworkInterface address=\"127.0.0.1\"/>"));
         assert!(xml(Some("fe80::1".parse().unwrap())).contains("\"fe80::1\""));
     }
+
+    #[test]
+    fn people_who_configure_cyclone_dds_themselves_are_told_the_same() {
+        let page = include_str!("../../docs/play.md");
+        let told = page.split_once("```xml\n").and_then(|(_, rest)| rest.split_once("```")).unwrap().0;
+        assert_eq!(told.lines().map(str::trim).collect::<String>(), xml(None));
+    }
 }

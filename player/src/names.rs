@@ -1,10 +1,10 @@
 //! Names of ROS 2, and what DDS calls them.
 
+use gleaner_protocol::manifest::TopicName;
+
 /// The DDS name of a topic: `rt/imu/data` of `/imu/data`; `None` if ROS 2 takes no such name.
 pub(crate) fn dds_topic(topic: &str) -> Option<String> {
-    let parts = topic.strip_prefix('/')?;
-    let is_whole = parts.split('/').all(is_identifier) && topic.len() <= 247;
-    is_whole.then(|| format!("rt{topic}"))
+    topic.parse::<TopicName>().ok().map(|topic| format!("rt{topic}"))
 }
 
 /// The DDS name of a type: `sensor_msgs::msg::dds_::Imu_` of `sensor_msgs/msg/Imu`; `None` if it is no type of ROS 2.

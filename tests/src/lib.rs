@@ -1,6 +1,7 @@
 //! What the suites share: where things are, running a replay, and drives made by a test.
 
 pub mod drive;
+pub mod greedy;
 pub mod live;
 pub mod namespace;
 pub mod peers;
@@ -44,6 +45,17 @@ pub fn program(name: &str) -> PathBuf {
     let path = folder.join(name);
     assert!(path.is_file(), "{} is not built; run: cargo xtask test", path.display());
     path
+}
+
+/// How often a test is to do what it does: what the variable `name` says, else `usual`.
+///
+/// # Panics
+///
+/// If the variable is set to anything but a whole number above 0: a test that does nothing would pass.
+pub fn times(name: &str, usual: u32) -> u32 {
+    let Some(said) = std::env::var_os(name) else { return usual };
+    let times = said.to_str().and_then(|said| said.parse().ok()).filter(|times| *times > 0);
+    times.unwrap_or_else(|| panic!("{name} is {said:?}; set it to a whole number above 0, or not at all"))
 }
 
 /// A folder of this test's own, removed with it.

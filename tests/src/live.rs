@@ -190,15 +190,16 @@ pub fn signal(pid: u32, name: &str) {
     let _ = Command::new("kill").arg(format!("-{name}")).arg(pid.to_string()).stderr(Stdio::null()).status();
 }
 
-/// The children of a process whose program is called `name`.
-pub fn children(of: u32, name: &str) -> Vec<u32> {
+/// The processes below `of` whose command line contains `name`.
+pub fn below(of: u32, name: &str) -> Vec<u32> {
     let text = std::fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
-    let is_called = |pid: &u32| {
+    let is_called = |pid: u32| {
         let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         // Python, too, has our program's name in its arguments no more; it has `start.py`.
         String::from_utf8_lossy(&line).contains(name)
     };
-    text.split_whitespace().filter_map(|pid| pid.parse().ok()).filter(is_called).collect()
+    let children = text.split_whitespace().filter_map(|pid| pid.parse().ok());
+    children.flat_map(|pid| is_called(pid).then_some(pid).into_iter().chain(below(pid, name))).collect()
 }
 
 /// The decisions in a folder of results.

@@ -15,6 +15,7 @@ pub const UNSAFE_FILES: &[&str] = &[
     "host/python/src/array.rs",
     "host/src/guest/wasm/load.rs",
     "host/src/memory.rs",
+    "host/vitals/src/pulse.rs",
     "player/src/cyclone.rs",
 ];
 
@@ -30,6 +31,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-buffers",
             "gleaner-compile",
             "gleaner-image",
+            "gleaner-jail",
             "gleaner-protocol",
             "gleaner-recorder",
             "gleaner-transport",
@@ -37,11 +39,13 @@ pub const CRATES: &[(&str, &[&str])] = &[
         ],
     ),
     ("gleaner-image", &[]),
+    ("gleaner-jail", &["gleaner-protocol"]),
     ("gleaner-player", &["gleaner-image", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-protocol", &[]),
     ("gleaner-python", &["gleaner-host", "gleaner-image", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-recorder", &["gleaner-image", "gleaner-protocol", "gleaner-transport", "gleaner-vitals"]),
     ("gleaner-sdk", &[]),
+    ("gleaner-shim", &["gleaner-jail", "gleaner-protocol", "gleaner-vitals"]),
     ("gleaner-transport", &[]),
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];
@@ -55,6 +59,7 @@ pub const ROOMS: &[(&str, &[&str])] = &[
     ("memory", &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
     ("api", &["guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
     ("input", &["guest", "judge", "live", "program", "replay", "schedule", "stage"]),
+    ("isolation", &["api", "guest", "input", "journal", "judge", "live", "program", "replay", "schedule", "stage"]),
     ("journal", &["guest", "judge", "live", "program", "replay", "schedule", "stage"]),
     ("schedule", &["guest", "judge", "live", "program", "replay", "stage"]),
     ("judge", &["live", "program", "replay", "schedule", "stage"]),

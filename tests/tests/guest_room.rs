@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
-use gleaner_host::guest::wasm::{Allowance, Deadline, Loaded, WasmGuest};
+use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
 use gleaner_host::guest::{Guest, Outcome};
 use gleaner_host::input::open_inputs;
 use gleaner_protocol::FaultKind;
-use gleaner_protocol::manifest::{ConfigValue, Manifest};
+use gleaner_protocol::manifest::{ByteSize, ConfigValue, Limits, Manifest};
 use gleaner_tests::root;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Endian, Guid, SampleMeta};
@@ -40,12 +40,14 @@ impl Room {
         let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
         let topic = Arc::clone(&inputs[0]);
         let config = vec![("behaviour".to_owned(), ConfigValue::Text(behaviour.to_owned()))];
-        let session = Session::new(inputs, config);
+        let mut limits = Limits::default();
+        (limits.fuel, limits.memory) = (fuel, ByteSize::new(MEMORY));
+        limits.deadline = deadline.unwrap_or(limits.deadline);
+        let session = Session::new(inputs, config, &limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(&lambda.join("misbehave.wasm"), &cache).unwrap();
+        let loaded = Loaded::open(&lambda.join("misbehave.wasm"), &cache, limits.stack.as_usize()).unwrap();
         let deadline = deadline.map(|allowed| Deadline::new(loaded.engine(), allowed).unwrap());
-        let guest =
-            WasmGuest::new(loaded, session.clone(), Allowance { fuel, memory_bytes: MEMORY }, deadline).unwrap();
+        let guest = WasmGuest::new(loaded, session.clone(), &limits, deadline).unwrap();
         Self { guest, session, transport, topic, sent: 0 }
     }
 

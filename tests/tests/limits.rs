@@ -1,97 +1,20 @@
 //! What a lambda may have at most, limit by limit: a greedy guest is stopped with the cause, and the host stays small.
 
-use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_host::api::Session;
-use gleaner_host::api::data::{
-    BYTES_PER_CALL, COLUMN_LEN, DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD, Topic, Wake,
-};
-use gleaner_host::guest::wasm::{Allowance, HANDLES, INIT_FUEL_FACTOR, Loaded, WasmGuest};
-use gleaner_host::guest::{Guest, Outcome};
-use gleaner_host::input::open_inputs;
-use gleaner_protocol::manifest::{ConfigValue, Manifest};
-use gleaner_protocol::{Fault, FaultKind};
+use gleaner_host::api::data::{DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD, Topic};
+use gleaner_host::guest::Guest;
+use gleaner_protocol::FaultKind;
+use gleaner_protocol::manifest::Manifest;
+use gleaner_protocol::manifest::bounds::{CALL_BYTES, CALL_ITEMS, HANDLES};
 use gleaner_tests::drive::{Cdr, IMAGE, image};
-use gleaner_tests::{Folder, root};
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_tests::greedy::{FUEL, MEMORY, PICTURE, Room, component, publish, subscribed};
+use gleaner_vitals::usage;
 
-const FUEL: u64 = 5_000_000;
-const MEMORY: u64 = 16 << 20;
+/// What one call gives at most.
+const BYTES_PER_CALL: usize = CALL_BYTES.max.bytes() as usize;
+const COLUMN_LEN: usize = CALL_ITEMS.max as usize;
 const PAGE: u64 = 64 << 10;
-const CAMERA: &str = "/camera/front/image_raw";
-/// Bytes of the pixels of each picture that wakes a guest.
-const PICTURE: u32 = 300_000;
-
-/// A guest, and the transport that feeds it.
-struct Room {
-    guest: WasmGuest,
-    session: Session,
-    transport: Loopback,
-    topic: Arc<Topic>,
-    sent: u64,
-}
-
-impl Room {
-    /// `greedy`, with its configuration.
-    fn greedy(behaviour: &str, bytes: u32) -> Self {
-        let component = root().join("tests/lambdas/greedy/rust/build/greedy.wasm");
-        assert!(component.is_file(), "greedy is not built; run: cargo xtask test");
-        let behaviour = ("behaviour".to_owned(), ConfigValue::Text(behaviour.to_owned()));
-        Self::new(&component, vec![behaviour, ("bytes".to_owned(), ConfigValue::Int(bytes.into()))])
-    }
-
-    /// A component written by hand, for what no compiler makes.
-    fn written(text: &str) -> Self {
-        let folder = Folder::new();
-        let component = wat::parse_str(text).unwrap_or_else(|error| panic!("{error}"));
-        Self::new(&folder.write("written.wasm", component), Vec::new())
-    }
-
-    fn new(component: &Path, config: Vec<(String, ConfigValue)>) -> Self {
-        let manifest = Manifest::load(root().join("tests/lambdas/greedy/rust")).unwrap();
-        let (transport, topic) = subscribed(&manifest, IMAGE);
-        let session = Session::new(vec![Arc::clone(&topic)], config);
-        let loaded = Loaded::open(component, &root().join("target/test-cache/gleaner")).unwrap();
-        let allowance = Allowance { fuel: FUEL, memory_bytes: MEMORY };
-        let guest = WasmGuest::new(loaded, session.clone(), allowance, None).unwrap();
-        Self { guest, session, transport, topic, sent: 0 }
-    }
-
-    fn wake(&mut self) -> Outcome {
-        self.sent += 1;
-        let cdr = image(400, 250, "rgb8", 1200, &[9; PICTURE as usize]);
-        publish(&mut self.transport, CAMERA, self.sent, &cdr);
-        self.session.begin(self.sent as i64);
-        self.guest.wake(Wake::Event(self.topic.newest().unwrap()))
-    }
-
-    fn fault(&mut self) -> Fault {
-        self.wake().result.expect_err("a fault")
-    }
-
-    /// Fuel of a wake that follows a first one, in which the guest still grows.
-    fn fuel(&mut self) -> u64 {
-        self.wake().result.unwrap();
-        let outcome = self.wake();
-        outcome.result.unwrap();
-        outcome.fuel.unwrap()
-    }
-}
-
-/// The one input of `manifest`, whose type has this definition, and the transport that feeds it.
-fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic>) {
-    let (mut transport, input) = (Loopback::new(), &manifest.inputs[0]);
-    transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
-    let topic = open_inputs(manifest, &[], &mut transport, None).unwrap().remove(0);
-    (transport, topic)
-}
-
-fn publish(transport: &mut Loopback, topic: &str, seq: u64, cdr: &[u8]) {
-    let (at_ns, writer, endian, options) = (seq as i64, Guid::default(), Endian::Little, [0; 2]);
-    transport.publish(topic, &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian, options }, cdr).unwrap();
-}
 
 #[test]
 fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
@@ -101,7 +24,9 @@ fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
         let owners = Arc::strong_count(&room.topic);
         let first = room.fault();
         assert_eq!(first.kind, FaultKind::HostCall, "{behaviour}: {first:?}");
-        assert!(first.message.contains(&format!("{HANDLES} handles")), "{behaviour}: {}", first.message);
+        let allowed = HANDLES.default;
+        assert!(first.message.contains(&format!("{allowed} handles")), "{behaviour}: {}", first.message);
+        assert_eq!((first.used, first.allowed), (Some(allowed + 1), Some(allowed)), "{behaviour}");
         // What the guest held went with it, so the second one comes as far as the first.
         assert!(Arc::strong_count(&room.topic) < owners, "{behaviour}");
         assert_eq!(room.fault(), first, "{behaviour}");
@@ -109,9 +34,9 @@ fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
 }
 
 #[test]
-fn an_endless_init_ends_with_the_fuel_of_so_many_wakes() {
+fn an_endless_init_ends_with_its_fuel() {
     let fault = Room::greedy("endless_init", 0).guest.init().unwrap_err();
-    let allowed = FUEL * INIT_FUEL_FACTOR;
+    let allowed = 20 * FUEL;
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Fuel, Some(allowed)));
     assert_eq!(fault.message, format!("in init: used {allowed} of {allowed} units of fuel"));
 }
@@ -136,40 +61,6 @@ fn a_long_text_is_refused_by_its_length_and_paid_for() {
     assert_eq!(fault.kind, FaultKind::Exception);
     assert!(fault.message.contains("the label has 100000 bytes"), "{}", fault.message);
     assert!(outcome.fuel.unwrap() >= 100_000 / 8);
-}
-
-/// A component of this world, by hand. `parts` come before the module `lambda`, which has `body` and gets `with`.
-fn component(parts: &str, with: &str, body: &str) -> String {
-    format!(
-        r#"(component
-            (import "gleaner:lambda/data@0.1.0" (instance $data
-                (export "sample" (type $sample (sub resource)))
-                (type $a-tick (record (field "at-ns" s64) (field "missed" u64)))
-                (export "tick" (type $tick (eq $a-tick)))
-                (type $a-wake (variant (case "event" (own $sample)) (case "tick" $tick)))
-                (export "wake" (type (eq $a-wake)))))
-            (alias export $data "wake" (type $wake))
-            (type $a-value (variant (case "boolean" bool) (case "integer" s64) (case "real" f64) (case "text" string)))
-            (import "config-value" (type $value (eq $a-value)))
-            (type $an-entry (record (field "key" string) (field "value" $value)))
-            (import "config-entry" (type $entry (eq $an-entry)))
-            {parts}
-            (core module $lambda
-                {body}
-                (memory (export "memory") 1)
-                (func (export "realloc") (param i32 i32 i32 i32) (result i32) (i32.const 1024))
-                ;; An answer at 0 is one without an error, as long as nobody writes there.
-                (func (export "init") (param i32 i32) (result i32) (i32.const 0))
-                (func (export "on-wake") (param i32 i64 i64) (result i32) (call $wake) (i32.const 0)))
-            (core instance $lambda (instantiate $lambda {with}))
-            (alias core export $lambda "memory" (core memory $memory))
-            (alias core export $lambda "realloc" (core func $realloc))
-            (type $answer (result (error string)))
-            (func (export "init") (param "config" (list $entry)) (result $answer)
-                (canon lift (core func $lambda "init") (memory $memory) (realloc $realloc)))
-            (func (export "on-wake") (param "wake" $wake) (result $answer)
-                (canon lift (core func $lambda "on-wake") (memory $memory) (realloc $realloc))))"#
-    )
 }
 
 /// A component with two more memories or tables, each in a module of its own, that `$a` and `$b` grow.
@@ -283,11 +174,12 @@ fn four_gibibytes(first: &str) -> String {
 fn one_mebibyte_named_four_thousand_times_never_becomes_four_gibibytes() {
     let mut room = Room::written(&four_gibibytes(""));
     room.guest.init().unwrap();
-    let before = peak_rss_bytes();
+    // Of the whole process; other tests run in it too, and none has a gigabyte.
+    let before = usage::most_resident();
     let fault = room.fault();
     assert_eq!(fault.kind, FaultKind::HostCall);
     assert!(fault.message.contains("too much data"), "{}", fault.message);
-    assert!(peak_rss_bytes() - before < 1 << 30);
+    assert!(before > 0 && usage::most_resident() - before < 1 << 30);
     assert_eq!(room.fault(), fault);
 }
 
@@ -296,13 +188,6 @@ fn a_refusal_of_memory_that_a_guest_survives_is_not_the_cause_of_what_the_host_r
     let refused = format!("(memory.grow $heap (i32.const 1000)) {MUST_NOT}");
     let fault = Room::written(&four_gibibytes(&refused)).fault();
     assert_eq!(fault.kind, FaultKind::HostCall, "{}", fault.message);
-}
-
-/// Most memory that this process has had. Other tests run in it too, and none has a gigabyte.
-fn peak_rss_bytes() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
-    line.trim().strip_suffix(" kB").unwrap().trim().parse::<u64>().unwrap() * 1024
 }
 
 /// An input without a guest, and so many of the same message in its ring. Of a type its name and definition are needed.

@@ -1,4 +1,6 @@
 //! Lambdas on live topics: `gleaner run`, with the recorder and the player, each in a private network.
+//!
+//! `GLEANER_ROUNDS` says how often a drive is played and compared with its replay; once if it does not.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -6,9 +8,9 @@ use std::time::{Duration, Instant};
 
 use gleaner_protocol::link::RecorderReport;
 use gleaner_protocol::{Clip, Decision, Report};
-use gleaner_tests::live::{self, Line, Started, children, decisions, no_player, play, run, signal};
-use gleaner_tests::{Folder, namespace, replay_to, root, sample_drive};
-use libtest_mimic::{Arguments, Failed, Trial};
+use gleaner_tests::live::{self, Line, Started, below, decisions, no_player, play, run, signal};
+use gleaner_tests::{Folder, namespace, replay_to, root, sample_drive, times};
+use libtest_mimic::{Arguments, Trial};
 
 /// Names the case that this process is to run in the network that it was started in.
 const CASE: &str = "GLEANER_LIVE_CASE";
@@ -23,7 +25,8 @@ const CASES: &[Case] = &[
     ("a_lambda_whose_process_is_killed_is_started_again_and_loses_no_decision", || killed("start.py")),
     ("a_recorder_that_is_killed_is_started_again_and_its_clip_recovered", || killed("gleaner-recorder")),
     ("a_topic_that_nobody_writes_is_said", nobody_writes),
-    ("a_lambda_does_not_outlive_the_command_that_started_it", outlives),
+    ("a_lambda_does_not_outlive_the_command_that_started_it", || outlives(None)),
+    ("a_lambda_does_not_outlive_its_shim", || outlives(Some("gleaner-shim"))),
 ];
 
 fn main() -> ExitCode {
@@ -33,24 +36,17 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let missing = namespace::unavailable().or(no_player());
-    let trial = |(name, _): &Case| match missing {
-        Some(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
-        None => Trial::test(*name, || alone(name)),
+    let trial = |(name, _): &Case| {
+        let run = || namespace::case(CASE, name);
+        match missing {
+            Some(why) => Trial::test(format!("{name} [{why}]"), run).with_ignored_flag(true),
+            None => Trial::test(*name, run),
+        }
     };
     let mut arguments = Arguments::from_args();
     // They measure nothing, but starving each other would make samples skip.
     arguments.test_threads = Some(1);
     libtest_mimic::run(&arguments, CASES.iter().map(trial).collect()).exit_code()
-}
-
-/// Runs a case in a process of its own, in a network of its own.
-fn alone(name: &str) -> Result<(), Failed> {
-    let mut command = namespace::command(&std::env::current_exe()?);
-    let output = command.env(CASE, name).output()?;
-    if output.status.success() {
-        return Ok(());
-    }
-    Err(String::from_utf8_lossy(&output.stderr).into_owned().into())
 }
 
 fn lambda(name: &str, language: &str) -> std::path::PathBuf {
@@ -83,7 +79,7 @@ fn alike(live: &[About], replay: &[About]) -> bool {
 fn as_in_replay() {
     const SET: [&str; 2] = ["--set", "brake_mps2=-1.4"];
     let args = [SET[0], SET[1], "--no-record"];
-    let rounds = std::env::var("GLEANER_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(1);
+    let rounds = times("GLEANER_ROUNDS", 1);
     let lambdas = ["examples/hello", "examples/brake-dark"];
     let all = || lambdas.iter().flat_map(|name| ["rust", "python"].map(|language| lambda(name, language)));
     let drive = sample_drive();
@@ -205,7 +201,7 @@ fn killed(name: &str) {
         Line::Recorder(RecorderReport::Status(status)) if status.recording => Some(()),
         _ => None,
     });
-    let victims = children(started.pid(), name);
+    let victims = below(started.pid(), name);
     assert_eq!(victims.len(), 1, "{victims:?}");
     signal(victims[0], "KILL");
     started.until_ready();
@@ -223,13 +219,14 @@ fn killed(name: &str) {
     assert!(clips[0].topics.iter().any(|topic| topic.messages > 0), "{clips:?}");
 }
 
-fn outlives() {
+fn outlives(who: Option<&str>) {
     let out = Folder::new();
     let started = run(&lambda("examples/hello", "python"), out.path(), &["--no-record"]);
     started.until_ready();
-    let left = children(started.pid(), "start.py");
+    let left = below(started.pid(), "start.py");
     assert_eq!(left.len(), 1);
-    started.signal("KILL");
+    let starter = who.map_or(started.pid(), |name| below(started.pid(), name)[0]);
+    signal(starter, "KILL");
     // A process that has ended has no command line, even where nobody asks how it ended.
     let line = format!("/proc/{}/cmdline", left[0]);
     wait_for("the end of the lambda's process", || std::fs::read(&line).unwrap_or_default().is_empty());

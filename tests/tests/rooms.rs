@@ -85,6 +85,23 @@ fn programs_do_without_what_they_should_not_link() {
     none(problems);
 }
 
+/// Native code is loaded by the runtime and made by `gleaner-compile` alone: a runtime that is built by itself has no compiler in it.
+#[test]
+fn a_runtime_contains_no_compiler() {
+    let tree = |package: &str| {
+        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let mut cargo = std::process::Command::new(cargo);
+        cargo
+            .args(["tree", "--offline", "--edges", "normal", "--prefix", "none", "--package", package])
+            .current_dir(gleaner_tests::root());
+        let output = cargo.output().expect("cargo starts");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8_lossy(&output.stdout).contains("cranelift-codegen ")
+    };
+    assert!(tree("gleaner-compile"), "this test looks for the wrong name");
+    assert!(!tree("gleaner-host"));
+}
+
 #[test]
 fn rooms_of_the_host_name_only_those_they_may() {
     let mut problems = Vec::new();

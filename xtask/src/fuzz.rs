@@ -14,17 +14,16 @@ use gleaner_protocol::{Exit, Failure};
 use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
 
-/// The targets, each with the length up to which inputs make sense.
-const TARGETS: [(&str, usize); 6] =
-    [("message", 4096), ("drive", 8192), ("image", 4096), ("journal", 4096), ("link", 4096), ("manifest", 4096)];
+/// The targets. The rest about them is known to `gleaner-fuzz`, which would take too long to be built for this.
+const TARGETS: [&str; 6] = ["message", "drive", "image", "journal", "link", "manifest"];
 
 /// How the compiler counts which code was reached, and what was compared with what.
 const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
                      -Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
                      -Cllvm-args=-sanitizer-coverage-trace-compares -Cdebug-assertions -Coverflow-checks --cfg fuzzing";
 
-const USAGE: &str = "usage: cargo xtask fuzz [TARGET] [--seconds N] [--seed N]
-targets: message, drive, image, journal, link, manifest; without one, each in turn, for N seconds each (60).
+const USAGE: &str = "usage: cargo xtask fuzz [TARGET...] [--seconds N] [--seed N]
+targets: message, drive, image, journal, link, manifest; those named, or all, in turn, for N seconds each (60).
 With a seed, runs of the same programs from the same inputs go the same way.";
 
 /// Builds the targets and runs those asked for.
@@ -42,16 +41,17 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     let programs = fuzz.programs()?;
     steps.begin("inputs to begin with");
     fuzz.seeds()?;
-    steps.begin(&format!("{} s for each of: {}", asked.seconds, asked.names().join(", ")));
+    steps.begin(&format!("{} s for each of: {}", asked.seconds, asked.targets.join(", ")));
     let mut found = 0;
-    for (name, longest) in asked.targets {
-        found += usize::from(fuzz.target(&programs, name, longest)?);
+    for name in asked.targets {
+        found += usize::from(fuzz.target(&programs, name)?);
     }
     Ok(if found == 0 { Exit::Ok } else { Exit::Internal })
 }
 
 struct Asked {
-    targets: Vec<(&'static str, usize)>,
+    /// Each once.
+    targets: Vec<&'static str>,
     seconds: u64,
     seed: Option<u64>,
 }
@@ -59,7 +59,7 @@ struct Asked {
 impl Asked {
     fn of(arguments: &[OsString]) -> Result<Asked, Failure> {
         let refused = |what: String| Failure::new(Exit::Usage, what).with_help(USAGE);
-        let mut asked = Asked { targets: TARGETS.to_vec(), seconds: 60, seed: None };
+        let mut asked = Asked { targets: Vec::new(), seconds: 60, seed: None };
         let mut words = arguments.iter().map(|argument| argument.to_string_lossy());
         while let Some(word) = words.next() {
             if word == "--seconds" {
@@ -69,15 +69,17 @@ impl Asked {
                 let seed = words.next().and_then(|seed| seed.parse().ok()).filter(|seed| *seed > 0);
                 asked.seed = Some(seed.ok_or_else(|| refused("`--seed` takes a whole number above 0".to_owned()))?);
             } else {
-                let target = TARGETS.into_iter().find(|(name, _)| *name == word);
-                asked.targets = vec![target.ok_or_else(|| refused(format!("there is no target `{word}`")))?];
+                let target = TARGETS.into_iter().find(|name| *name == word);
+                let target = target.ok_or_else(|| refused(format!("there is no target `{word}`")))?;
+                if !asked.targets.contains(&target) {
+                    asked.targets.push(target);
+                }
             }
         }
+        if asked.targets.is_empty() {
+            asked.targets = TARGETS.to_vec();
+        }
         Ok(asked)
-    }
-
-    fn names(&self) -> Vec<&str> {
-        self.targets.iter().map(|(name, _)| *name).collect()
     }
 }
 
@@ -98,7 +100,7 @@ impl Fuzz<'_> {
         let mut build = self.checkout.cargo();
         // With a target named, flags are for it alone, and not for the programs that run while building.
         build.args(["build", "--release", "-p", "gleaner-fuzz", "--target", machine]);
-        for (name, _) in TARGETS {
+        for name in TARGETS {
             build.args(["--bin", &format!("fuzz-{name}")]);
         }
         build.env("CARGO_TARGET_DIR", &self.build).env("RUSTFLAGS", FLAGS).env_remove("CARGO_ENCODED_RUSTFLAGS");
@@ -115,10 +117,12 @@ impl Fuzz<'_> {
     }
 
     /// Runs one target and says how it went, in a line. Whether it found anything.
-    fn target(&self, programs: &Path, name: &str, longest: usize) -> Result<bool, Failure> {
+    fn target(&self, programs: &Path, name: &str) -> Result<bool, Failure> {
         let program = programs.join(format!("fuzz-{name}"));
         let findings = folder(self.findings.join(name))?;
         let log = findings.join("log");
+        let longest = self.build.join("seeds").join(format!("{name}.longest"));
+        let longest = fs::read_to_string(&longest).map_err(|error| cannot("read", &longest, &error))?;
         let output = File::create(&log).map_err(|error| cannot("write", &log, &error))?;
         let mut fuzzer = self.checkout.command(&program);
         // What was reached in earlier runs is kept, and is where the next one begins.
@@ -126,7 +130,7 @@ impl Fuzz<'_> {
         fuzzer.arg(option("dict", self.build.join("seeds").join(format!("{name}.dict")).display()));
         fuzzer.arg(option("artifact_prefix", format!("{}/", findings.display())));
         fuzzer.args(self.seed.map(|seed| option("seed", seed)));
-        fuzzer.arg(option("max_total_time", self.seconds)).arg(option("max_len", longest));
+        fuzzer.arg(option("max_total_time", self.seconds)).arg(option("max_len", longest.trim()));
         fuzzer.args(["-rss_limit_mb=2048", "-timeout=10", "-print_final_stats=1"]);
         fuzzer.stdin(Stdio::null()).stdout(Stdio::null()).stderr(output);
         let status = fuzzer.status().map_err(|error| cannot("start", &program, &error))?;
@@ -197,13 +201,16 @@ mod tests {
     }
 
     #[test]
-    fn a_target_and_a_time_can_be_asked_for() {
+    fn targets_a_time_and_a_seed_can_be_asked_for() {
         let asked = |words: &[&str]| Asked::of(&words.iter().map(OsString::from).collect::<Vec<_>>());
         let all = asked(&[]).unwrap_or_else(|failure| panic!("{failure}"));
         assert_eq!((all.targets.len(), all.seconds), (TARGETS.len(), 60));
-        let one = asked(&["drive", "--seconds", "5"]).unwrap_or_else(|failure| panic!("{failure}"));
-        assert_eq!((one.names(), one.seconds), (vec!["drive"], 5));
-        for wrong in [&["x"][..], &["--seconds"], &["--seconds", "0"]] {
+        assert_eq!(all.seed, None);
+        let some = ["drive", "--seconds", "5", "image", "--seed", "7", "drive"];
+        let some = asked(&some).unwrap_or_else(|failure| panic!("{failure}"));
+        assert_eq!((some.targets, some.seconds, some.seed), (vec!["drive", "image"], 5, Some(7)));
+        let nonsense = [["--seconds", "0"], ["--seconds", "-1"], ["--seed", "0"], ["--seed", "x"], ["drive", "x"]];
+        for wrong in nonsense.iter().map(|wrong| &wrong[..]).chain([&["x"][..], &["--seconds"], &["--seed"]]) {
             assert!(asked(wrong).is_err_and(|failure| failure.exit == Exit::Usage), "{wrong:?}");
         }
     }

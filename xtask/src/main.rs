@@ -31,7 +31,7 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   bench  measure what is promised; what follows goes to gleaner-bench
   peers  build programs on other DDS for the tests of live topics; --install fetches their packages first
   player build gleaner-player, which plays drives with Cyclone DDS, and fetch what that takes
-  fuzz   feed what reads foreign bytes with made-up ones; [TARGET] [--seconds N]
+  fuzz   feed what reads foreign bytes with made-up ones; [TARGET...] [--seconds N] [--seed N]
   build  only set up: wasm target, Python environment, programs, lambdas";
 
 fn main() -> ExitCode {

@@ -5,8 +5,8 @@ mod rounds;
 
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Live, Report};
-use gleaner_tests::live::{Line, Started, no_player, play, run};
+use gleaner_protocol::Live;
+use gleaner_tests::live::{Started, no_player, play, run};
 use gleaner_tests::{Folder, namespace, root};
 
 use crate::measure::{Figure, Kind};
@@ -17,6 +17,9 @@ const ALONE: &str = "GLEANER_BENCH_ALONE";
 /// Where the system says how large a socket's buffer may be. It counts for all networks, and can be changed in the first only.
 const BUFFER_LIMIT: &str = "/proc/sys/net/core/rmem_max";
 const BUFFER_BYTES: u64 = 64 << 20;
+
+/// The second camera of `bench/lambdas/rig`.
+const REAR: &str = "/camera/synthetic/image_raw:=/camera/rear/image_raw";
 
 /// Runs this program again in a network of its own; `None` in the process that is there already.
 ///
@@ -35,8 +38,7 @@ fn again() -> Result<bool, String> {
     let before = std::fs::read_to_string(BUFFER_LIMIT).unwrap_or_default();
     let is_small = before.trim().parse::<u64>().is_ok_and(|bytes| bytes < BUFFER_BYTES);
     let raised = is_small && std::fs::write(BUFFER_LIMIT, BUFFER_BYTES.to_string()).is_ok();
-    let exe = std::env::current_exe().map_err(|error| error.to_string())?;
-    let status = namespace::command(&exe).args(std::env::args_os().skip(1)).env(ALONE, "1").status();
+    let status = namespace::again(ALONE, "1").args(std::env::args_os().skip(1)).status();
     if raised {
         // As it was: others on this machine did not ask for it.
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());
@@ -48,13 +50,21 @@ fn again() -> Result<bool, String> {
 pub fn figures(quick: bool) -> Vec<Figure> {
     let seconds = |long: u32| if quick { 4 } else { long };
     let mut figures = Vec::new();
-    for (name, camera, imu, long) in [
-        ("1080p bgr8 at 30 Hz", Some("1920x1080@30"), None, 60),
-        ("3848x2168 bgr8 at 10 Hz", Some("3848x2168@10"), None, 30),
-        ("IMU at 1 kHz", None, Some("1000"), 60),
-        ("1080p at 30 Hz and an IMU at 1 kHz", Some("1920x1080@30"), Some("1000"), 60),
+    const FULL_HD: &str = "1920x1080@30";
+    for (name, lambdas, players, long) in [
+        ("1080p bgr8 at 30 Hz", &["camera"][..], &[&["--synthetic", FULL_HD][..]][..], 60),
+        ("3848x2168 bgr8 at 10 Hz", &["camera"], &[&["--synthetic", "3848x2168@10"]], 30),
+        ("IMU at 1 kHz", &["imu"], &[&["--imu", "1000"]], 60),
+        ("1080p at 30 Hz and an IMU at 1 kHz", &["camera", "imu"], &[&["--synthetic", FULL_HD, "--imu", "1000"]], 60),
+        // One lambda with three inputs. A player has one camera, so the second one has a player of its own.
+        (
+            "two cameras of 1080p at 30 Hz and an IMU at 1 kHz at once",
+            &["rig"],
+            &[&["--synthetic", FULL_HD, "--imu", "1000"], &["--synthetic", FULL_HD, "--remap", REAR]],
+            60,
+        ),
     ] {
-        receive(name, camera, imu, seconds(long), &mut figures);
+        receive(name, lambdas, players, seconds(long), &mut figures);
     }
     rounds::figures(seconds(60), &mut figures);
     many(16, seconds(20), &mut figures);
@@ -73,53 +83,56 @@ fn start(lambda: &Path, args: &[&str]) -> (Started, Folder) {
     (started, out)
 }
 
-/// Plays to the end, and then asks how the lambdas were. The statuses of the first one meanwhile go to `seen`.
-fn to_the_end(started: Vec<(Started, Folder)>, player: &[&str], seen: &mut Vec<Live>) -> Vec<Live> {
-    let played = play(player);
+/// Plays to the end, with a player for each of `players`, and then asks how the lambdas were. The statuses of the first one
+/// meanwhile go to `seen`.
+fn to_the_end(started: Vec<(Started, Folder)>, players: &[Vec<&str>], seen: &mut Vec<Live>) -> Vec<Live> {
+    let playing: Vec<_> = players.iter().map(|player| play(player)).collect();
     let mut is_over = false;
     while !is_over {
-        let live = started[0].0.until("a status", |line| match line {
-            Line::Lambda(Report::Live(live)) => Some(*live),
-            _ => None,
-        });
-        is_over = live.topics[0].received > 0 && live.topics[0].writers == Some(0);
+        let live = started[0].0.until_live("a status", |_| true);
+        is_over = live.topics.iter().all(|topic| topic.received > 0 && topic.writers == Some(0));
         seen.push(live);
     }
-    let played = played.finish();
-    assert!(played.status.success(), "{}", played.said);
+    for played in playing {
+        let played = played.finish();
+        assert!(played.status.success(), "{}", played.said);
+    }
     started.iter().for_each(|(started, _)| started.signal("INT"));
     started.into_iter().map(|(started, _out)| started.finish().ended()).collect()
 }
 
-fn receive(name: &str, camera: Option<&str>, imu: Option<&str>, seconds: u32, figures: &mut Vec<Figure>) {
-    let mut started = Vec::new();
+/// What the empty `lambdas` receive, each in a process of its own, and what that takes.
+fn receive(name: &str, lambdas: &[&str], players: &[&[&str]], seconds: u32, figures: &mut Vec<Figure>) {
+    let started = lambdas.iter().map(|lambda| start(&self::lambda(lambda, Kind::Rust), &["--no-record"])).collect();
     let duration = seconds.to_string();
-    let mut player = vec!["--wait", "1", "--duration", &duration];
-    for (topic, flag, what) in [("camera", "--synthetic", camera), ("imu", "--imu", imu)] {
-        if let Some(what) = what {
-            started.push(start(&lambda(topic, Kind::Rust), &["--no-record"]));
-            player.extend([flag, what]);
-        }
-    }
+    let players: Vec<_> =
+        players.iter().map(|player| [player, &["--wait", "1", "--duration", &duration][..]].concat()).collect();
     let mut seen = Vec::new();
-    let ended = to_the_end(started, &player, &mut seen);
+    let ended = to_the_end(started, &players, &mut seen);
+    let topics: usize = ended.iter().map(|live| live.topics.len()).sum();
     for live in &ended {
-        let topic = &live.topics[0];
-        let of = if ended.len() > 1 { format!("{name}: {}", topic.name) } else { name.to_owned() };
-        let refused = topic.no_slot + topic.too_big + topic.malformed;
         let granted = live.network.buffer_granted >= live.network.buffer_asked;
         let buffer = live.network.buffer_granted as f64 / f64::from(1 << 20);
-        figures.push(Figure::told(&format!("{of}: received in {seconds} s"), "samples", &[topic.received as f64]));
-        let lost = format!(
-            "{of}: lost, with a socket buffer of {buffer:.0} MiB{}",
-            if granted { "" } else { " (not granted)" }
-        );
-        let count = topic.lost.unwrap_or(u64::MAX).saturating_add(refused);
-        figures.push(if granted {
-            Figure::at_most(&lost, "samples", 0.0, &[count as f64])
-        } else {
-            Figure::told(&lost, "samples", &[count as f64])
-        });
+        for topic in &live.topics {
+            let of = if topics > 1 { format!("{name}: {}", topic.name) } else { name.to_owned() };
+            let refused = topic.no_slot + topic.too_big + topic.malformed;
+            figures.push(Figure::told(&format!("{of}: received in {seconds} s"), "samples", &[topic.received as f64]));
+            let lost = format!(
+                "{of}: lost, with a socket buffer of {buffer:.0} MiB{}",
+                if granted { "" } else { " (not granted)" }
+            );
+            let count = topic.lost.unwrap_or(u64::MAX).saturating_add(refused);
+            figures.push(if granted {
+                Figure::at_most(&lost, "samples", 0.0, &[count as f64])
+            } else {
+                Figure::told(&lost, "samples", &[count as f64])
+            });
+        }
+        // What a process takes is said once, however many topics it has.
+        let of = match &live.topics[..] {
+            [topic] if topics > 1 => format!("{name}: {}", topic.name),
+            _ => name.to_owned(),
+        };
         let cpu = 100.0 * live.cpu_s / live.up_s;
         figures.push(Figure::told(&format!("{of}: share of a core"), "%", &[cpu]));
         if let Some(wake_up) = live.wake_up {
@@ -141,7 +154,8 @@ fn receive(name: &str, camera: Option<&str>, imu: Option<&str>, seconds: u32, fi
 fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
     let started: Vec<_> = (0..count).map(|_| start(&lambda("imu", Kind::Rust), &["--no-record"])).collect();
     let (count, duration) = (count.to_string(), seconds.to_string());
-    let ended = to_the_end(started, &["--imu", "100", "--wait", &count, "--duration", &duration], &mut Vec::new());
+    let player = vec!["--imu", "100", "--wait", &count, "--duration", &duration];
+    let ended = to_the_end(started, &[player], &mut Vec::new());
     let heard = ended.iter().filter(|live| live.topics[0].received > 0).count();
     let whole = ended.iter().filter(|live| live.topics[0].lost == Some(0)).count();
     figures.push(Figure::at_least(

@@ -64,8 +64,8 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
         kinds.iter().map(|(kind, _)| start(&lambda("imu", *kind), &["--no-record", "--rtt", &format!("/rtt/{kind}")]));
     let started = started.collect();
     let duration = seconds.to_string();
-    let player = ["--imu", "100", "--stamp", "monotonic", "--wait", "3", "--duration", &duration];
-    let ended = to_the_end(started, &player, &mut Vec::new());
+    let player = vec!["--imu", "100", "--stamp", "monotonic", "--wait", "3", "--duration", &duration];
+    let ended = to_the_end(started, &[player], &mut Vec::new());
     // The last answers may be on their way.
     std::thread::sleep(Duration::from_millis(200));
     let base = bare.stop();

@@ -81,6 +81,7 @@ fn header() -> Header {
         remaps: Vec::new(),
         clock: "monotonic".to_owned(),
         wakes_before: 0,
+        limits: Default::default(),
     }
 }
 

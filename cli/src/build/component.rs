@@ -1,6 +1,7 @@
 //! Rust: cargo compiles the package in the lambda's folder, and says which file came out.
 
 use std::env;
+use std::ffi::OsString;
 use std::fs;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -12,6 +13,10 @@ use super::error::{BuildError, TARGET};
 
 /// Cargo's own variable for what is left out of a component.
 const STRIP: &str = "CARGO_PROFILE_RELEASE_STRIP";
+
+/// Instructions on 128 bits at a time, which every host runs: kernels of the SDK take several times as long without. Not
+/// `relaxed-simd`, whose results depend on the CPU.
+const SIMD: &str = "-Ctarget-feature=+simd128";
 
 /// Compiles the package in `dir`. The result is the component, in cargo's target folder.
 pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
@@ -30,8 +35,8 @@ pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
         // The standard library's line tables are most of a component: 2.6 MB with them, a tenth without. Names stay.
         build.env(STRIP, "debuginfo");
     }
-    let mut child = build
-        .args(["build", "--release", "--target", TARGET, "--message-format=json-render-diagnostics", "--manifest-path"])
+    let mut child = with_simd(build.arg("build"), |variable| env::var_os(variable))
+        .args(["--release", "--target", TARGET, "--message-format=json-render-diagnostics", "--manifest-path"])
         .arg(&package)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -49,6 +54,20 @@ pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
         return Err(if target_is_missing() { BuildError::NoTarget } else { BuildError::Compile { status } });
     }
     component.ok_or(BuildError::NoComponent { package })
+}
+
+/// Adds [`SIMD`] to the flags that the compiler gets. Cargo takes those of one place only, and of a variable first; so they are
+/// added where the user has some.
+fn with_simd(cargo: &mut Command, variable: impl Fn(&str) -> Option<OsString>) -> &mut Command {
+    for (name, between) in [("CARGO_ENCODED_RUSTFLAGS", "\x1f"), ("RUSTFLAGS", " ")] {
+        if let Some(mut flags) = variable(name).filter(|flags| !flags.is_empty()) {
+            flags.push(between);
+            flags.push(SIMD);
+            return cargo.env(name, flags);
+        }
+    }
+    // Joined with those of the user's files of configuration for this target.
+    cargo.arg("--config").arg(format!("target.{TARGET}.rustflags=['{SIMD}']"))
 }
 
 /// The component that this message of cargo announces, if it does and `package` made it.
@@ -93,6 +112,26 @@ mod tests {
     fn the_component_is_the_wasm_file_of_the_packages_cdylib() {
         let found = component_in(MESSAGE, Path::new("/l/Cargo.toml"));
         assert_eq!(found, Some("/t/wasm32-wasip2/release/hello.wasm".into()));
+    }
+
+    #[test]
+    fn flags_of_the_user_stay_and_vectors_come_to_them() {
+        let build = |set: &'static str, flags: &'static str| {
+            let mut cargo = Command::new("cargo");
+            with_simd(&mut cargo, |name| (name == set).then(|| flags.into()));
+            let told = cargo.get_envs().filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
+            let arguments = cargo.get_args().map(ToOwned::to_owned).collect::<Vec<_>>();
+            (told.collect::<Vec<_>>(), arguments)
+        };
+        let config = "target.wasm32-wasip2.rustflags=['-Ctarget-feature=+simd128']";
+        assert_eq!(build("", ""), (vec![], vec!["--config".into(), config.into()]));
+        assert_eq!(build("RUSTFLAGS", "").1.len(), 2);
+        let flags = |name: &str, flags: &str| (vec![(name.into(), flags.into())], vec![]);
+        assert_eq!(build("RUSTFLAGS", "-Dwarnings"), flags("RUSTFLAGS", "-Dwarnings -Ctarget-feature=+simd128"));
+        assert_eq!(
+            build("CARGO_ENCODED_RUSTFLAGS", "-C\x1flto"),
+            flags("CARGO_ENCODED_RUSTFLAGS", "-C\x1flto\x1f-Ctarget-feature=+simd128")
+        );
     }
 
     #[test]

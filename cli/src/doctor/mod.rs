@@ -2,6 +2,7 @@
 //!
 //! It only looks: nothing is changed, started or sent.
 
+mod isolation;
 mod network;
 
 use gleaner_protocol::{Exit, Failure, Parts};
@@ -49,8 +50,10 @@ impl Finding {
 pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     let parts = Parts::find()?;
     let mut findings = vec![program(&parts, "gleaner-runtime"), program(&parts, "gleaner-recorder")];
+    findings.push(program(&parts, "gleaner-shim"));
     findings.push(optional(&parts, "gleaner-player", "`gleaner play` needs it"));
     findings.push(python(&parts));
+    findings.extend(isolation::findings(&parts));
     findings.extend(network::findings());
     let text = findings.iter().map(if args.json { json_line::<Finding> } else { text });
     say(&text.collect::<String>())?;

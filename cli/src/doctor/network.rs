@@ -104,9 +104,9 @@ fn has_multicast_route(routes: &str, interface: &str) -> bool {
 
 fn domain(id: Option<&str>) -> Finding {
     const ABOUT: &str = "ROS_DOMAIN_ID";
-    match id {
-        None => Finding::fine(ABOUT, "not set: domain 0"),
-        Some(id) => match id.trim().parse::<u16>() {
+    match id.map(str::trim) {
+        None | Some("") => Finding::fine(ABOUT, "not set: domain 0"),
+        Some(id) => match id.parse::<u16>() {
             Ok(domain) if domain <= 232 => Finding::fine(ABOUT, format!("domain {domain}")),
             _ => Finding::warning(ABOUT, format!("`{}` is no domain", gleaner_protocol::visible(id)), "use 0 to 232"),
         },
@@ -166,9 +166,20 @@ mod tests {
     }
 
     #[test]
+    fn the_domain_is_that_which_all_programs_of_ours_read() {
+        let page = include_str!("../../../tests/domains.txt");
+        for line in page.lines().filter(|line| line.starts_with('|')) {
+            let (content, wanted) = line[1..].split_once('|').unwrap();
+            let found = domain(Some(content));
+            assert_eq!(found.state == State::Fine, wanted.trim() != "none", "{line}");
+            assert!(found.state != State::Fine || found.found.ends_with(&format!("domain{wanted}")), "{line}");
+        }
+    }
+
+    #[test]
     fn a_domain_that_is_none_is_said() {
         assert_eq!(domain(Some("42")).found, "domain 42");
         assert_eq!(domain(Some("233")).state, State::Warning);
-        assert_eq!(domain(Some("x\n")).found, "`x\\n` is no domain");
+        assert_eq!(domain(Some("x\ny")).found, "`x\\ny` is no domain");
     }
 }

@@ -56,7 +56,7 @@ pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsSt
 }
 
 /// Where the results go.
-fn out(args: &RunArgs) -> PathBuf {
+pub(super) fn out(args: &RunArgs) -> PathBuf {
     args.out.clone().unwrap_or_else(|| args.asked.lambda.join("live"))
 }
 

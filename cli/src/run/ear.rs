@@ -4,10 +4,11 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::Report;
 use gleaner_protocol::link::{Loss, RecorderReport};
+use gleaner_protocol::{Live, Report};
 
 use super::screen::Screen;
+use crate::show;
 
 /// What is heard of a process.
 pub(super) enum Heard {
@@ -30,11 +31,13 @@ pub(super) struct Ear {
     pub(super) has_faulted: bool,
     /// Its last report has come.
     pub(super) has_ended: bool,
+    /// What it counted, as it said last.
+    pub(super) last: Option<Live>,
 }
 
 impl Ear {
     pub(super) fn new(heard: Receiver<Heard>) -> Self {
-        Self { heard, is_ready: false, has_faulted: false, has_ended: false }
+        Self { heard, is_ready: false, has_faulted: false, has_ended: false, last: None }
     }
 
     /// Shows what is heard for so long, or until all streams are closed.
@@ -80,6 +83,7 @@ impl Ear {
 
     fn show_runtime(&mut self, report: Report, screen: &mut Screen) {
         match report {
+            Report::Isolation { layers } => screen.say(&show::isolation(&layers)),
             Report::Ready => {
                 self.is_ready = true;
                 screen.say("running; ctrl-C ends it\n");
@@ -91,11 +95,13 @@ impl Ear {
             Report::Live(live) => {
                 self.has_faulted |= live.faults > 0;
                 screen.live(&live);
+                self.last = Some(*live);
             }
             Report::Ended(live) => {
                 self.has_ended = true;
                 self.has_faulted |= live.faults > 0;
                 screen.ended(&live);
+                self.last = Some(*live);
             }
             _ => {}
         }
@@ -111,6 +117,9 @@ fn show_recorder(report: RecorderReport, screen: &mut Screen) {
         }
         RecorderReport::Loss(Loss::Deleted { file, why, .. }) => {
             screen.warn(&format!("deleted `{}`, which nobody had fetched: {why}", file.display()));
+        }
+        RecorderReport::Loss(Loss::NotDeleted { file, why, .. }) => {
+            screen.warn(&format!("cannot delete `{}` to make room: {why}", file.display()));
         }
         RecorderReport::Loss(Loss::Failed { why, .. }) => screen.warn(&format!("a clip could not be written: {why}")),
         RecorderReport::Loss(Loss::HeldBack { triggers, why, .. }) => {

@@ -7,6 +7,7 @@ mod ear;
 mod party;
 mod process;
 mod screen;
+mod summary;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,6 +19,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::party::{Ended, Party};
 use self::screen::Screen;
+use self::summary::Earlier;
 use crate::args::RunArgs;
 
 /// The first pause before a new start; each further one is twice as long.
@@ -44,12 +46,16 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let mut restarts = 0;
     // A fault stays one, though the process that had it was replaced.
     let mut worst = Exit::Ok;
+    let mut earlier = Earlier::default();
     loop {
         let left = args.last.map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let begun = Instant::now();
         let mut party = Party::start(args, largest, offset_ns, left, restarts)?;
         let (why, faulted) = match party.attend(&mut screen, &stop)? {
-            Ended::Well(exit) => return Ok(if exit == Exit::Ok { worst } else { exit }),
+            Ended::Well(exit) => {
+                earlier.complete(party.last())?;
+                return Ok(if exit == Exit::Ok { worst } else { exit });
+            }
             // It has said why. What ran before may run again: a network may be down for a while.
             Ended::Never(exit) if restarts == 0 => return Ok(exit),
             Ended::Never(_) => ("it could not start".to_owned(), false),
@@ -62,6 +68,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         if stop.load(Ordering::Relaxed) || is_over() {
             return Err(Failure::new(Exit::Internal, why));
         }
+        earlier.add(party.last());
         restarts += 1;
         pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
         screen.warn(&format!("{why}; starting again in {} s (restart {restarts})", pause.as_secs()));

@@ -1,12 +1,13 @@
 //! The processes of one run, from their start to their end.
 
+use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::time::Duration;
 
 use gleaner_protocol::link::{Add, Control};
-use gleaner_protocol::{Exit, Failure, Parts};
+use gleaner_protocol::{Exit, ExitRecord, Failure, Live, Parts};
 
 use super::ear::{Ear, Heard};
 use super::process::Process;
@@ -35,6 +36,7 @@ pub(super) enum Ended {
 /// A lambda's process, and its recorder's.
 pub(super) struct Party {
     runtime: Process,
+    exit_record: PathBuf,
     recorder: Option<(Process, Control)>,
     ear: Ear,
 }
@@ -58,19 +60,26 @@ impl Party {
         if let Some(largest) = largest {
             let (mut control, stdin) = Control::pair().map_err(|error| failed(&error))?;
             let line = arguments::recorder(args, largest, offset_ns);
-            let process = Process::start(&parts, "gleaner-recorder", line, Some(stdin), Heard::Recorder, &say)?;
+            let process = Process::start(&parts, "gleaner-recorder", line, Some(stdin), None, Heard::Recorder, &say)?;
             let add = Add { lambda: args.asked.lambda.clone(), remaps: arguments::remaps(args) };
             socket = Some(control.add(&add).map_err(|error| failed(&error))?);
             recorder = Some((process, control));
         }
         let line = arguments::runtime(args, socket.is_some(), offset_ns, left, restarts);
-        let runtime = Process::start(&parts, "gleaner-runtime", line, socket, Heard::Runtime, &say)?;
-        Ok(Self { runtime, recorder, ear: Ear::new(heard) })
+        let exit_record = arguments::out(args).join(ExitRecord::FILE);
+        let runtime =
+            Process::start(&parts, "gleaner-runtime", line, socket, Some(&exit_record), Heard::Runtime, &say)?;
+        Ok(Self { runtime, exit_record, recorder, ear: Ear::new(heard) })
+    }
+
+    /// What the lambda's process counted, as it said last.
+    pub(super) fn last(&mut self) -> Option<Live> {
+        self.ear.last.take()
     }
 
     /// Shows what they report until they end, which they do when `stop` is raised.
     pub(super) fn attend(&mut self, screen: &mut Screen, stop: &AtomicBool) -> Result<Ended, Failure> {
-        let Self { runtime, recorder, ear } = self;
+        let Self { runtime, exit_record, recorder, ear } = self;
         let status = loop {
             ear.look(screen, LOOK);
             if stop.load(Ordering::Relaxed) {
@@ -109,7 +118,18 @@ impl Party {
             None if is_early => Ended::Well(Exit::Ok),
             Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if ear.has_ended => Ended::Well(exit),
             Some(exit) if !ear.is_ready && exit != Exit::Ok => Ended::Never(exit),
-            _ => Ended::Broken { why: in_words("the lambda's process", status), faulted: ear.has_faulted },
+            _ => {
+                let record = ExitRecord::read(exit_record).ok();
+                let why = record.as_ref().and_then(ExitRecord::sentence);
+                let killed = record.is_some_and(|record| record.killed.is_some());
+                Ended::Broken {
+                    why: why.map_or_else(
+                        || in_words("the lambda's process", status),
+                        |why| format!("the lambda's process {why}"),
+                    ),
+                    faulted: ear.has_faulted || killed,
+                }
+            }
         })
     }
 }

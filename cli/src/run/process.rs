@@ -4,6 +4,7 @@ use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::Sender;
@@ -30,16 +31,17 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts it; its reports are `T`, and are heard as `heard` says.
+    /// Starts it; its reports are `T`, and are heard as `heard` says. With `exit_record` it is a runtime, which has a shim.
     pub(super) fn start<T: DeserializeOwned + 'static>(
         parts: &Parts,
         name: &'static str,
         line: Vec<OsString>,
         stdin: Option<OwnedFd>,
+        exit_record: Option<&Path>,
         heard: fn(T) -> Heard,
         say: &Sender<Heard>,
     ) -> Result<Self, Failure> {
-        let program = parts.program(name)?;
+        let (program, line) = watched(parts, name, line, exit_record)?;
         let mut child = Command::new(&program)
             .args(line)
             // Ctrl-C is for us: we end them in order.
@@ -117,6 +119,21 @@ impl Drop for Process {
         }
         self.end_group();
     }
+}
+
+/// The program to start and its arguments: `name` itself, or the shim that writes `exit_record` and starts it.
+fn watched(
+    parts: &Parts,
+    name: &str,
+    line: Vec<OsString>,
+    exit_record: Option<&Path>,
+) -> Result<(PathBuf, Vec<OsString>), Failure> {
+    let program = parts.program(name)?;
+    let Some(path) = exit_record else { return Ok((program, line)) };
+    let mut record = OsString::from("--exit-record=");
+    record.push(path);
+    let shim = [record, "--with-starter".into(), "--".into(), program.into()];
+    Ok((parts.program("gleaner-shim")?, shim.into_iter().chain(line).collect()))
 }
 
 fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &Sender<Heard>) {

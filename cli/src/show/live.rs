@@ -112,6 +112,8 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
     let losses = [
         (live.missed_ticks, "tick", "missed"),
         (live.log_dropped, "log line", "over the rate limit"),
+        (live.triggers_refused, "trigger", "refused: over `events_per_minute`"),
+        (live.passed_over, "wake", "passed over after repeated faults"),
         (live.unwritten, "decision or log line", "not written"),
         (live.recorder.map_or(0, |recorder| recorder.wakes_dropped), "wake", "not told to the recorder"),
         (live.recorder.map_or(0, |recorder| recorder.triggers_lost), "trigger", "not told to the recorder"),
@@ -122,6 +124,9 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
     }
     let network = &live.network;
+    if let Some(why) = &network.unfiltered {
+        writeln!(text, "  {}", paint.yellow(&visible(why)))?;
+    }
     let line = format!(
         "{}, socket buffer {:.1} of {:.1} MiB, {:.1} MiB resident, {:.1} s of CPU time",
         counted(network.participants as u64, "participant"),
@@ -166,12 +171,23 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
     let losses = [
         (status.failed, "clip", "could not be written"),
         (status.deleted, "clip", "deleted before anybody fetched it"),
+        (status.lambdas_refused, "lambda", "not recorded for: the recorder has said why"),
         (status.held_back, "trigger", "opened no window: the disk is too full"),
         (status.wakes_lost, "wake", "not in any journal"),
         (status.pushed_out, "sample", "pushed out of the preroll too early: preroll_size"),
+        (status.too_big, "sample", "larger than the preroll: preroll_size"),
+        (status.refused, "sample", "stamped before 1970, or of a topic not yet known"),
     ];
     for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
+    }
+    if status.not_deleted > 0 {
+        let clips = counted(status.not_deleted, "clip");
+        writeln!(
+            text,
+            "  {}",
+            paint.yellow(&format!("{clips} could not be deleted to make room: losses.jsonl says why"))
+        )?;
     }
     Ok(())
 }

@@ -9,8 +9,10 @@ use gleaner_protocol::{
 use crate::results::{ResultsError, grouped, seconds, three_digits};
 
 mod clips;
+mod isolation;
 mod live;
 
+pub(crate) use isolation::isolation;
 pub(crate) use live::{clip_line, decision, live, recorder, topics};
 
 /// A report for programs: JSON, in one line.
@@ -262,6 +264,11 @@ fn losses(summary: &Summary) -> Vec<String> {
         (summary.skipped, format!("{}, skipped", counted(summary.skipped, "event sample"))),
         (summary.missed_ticks, format!("{}, missed", counted(summary.missed_ticks, "tick"))),
         (summary.log_dropped, format!("{}, over the rate limit", counted(summary.log_dropped, "log line"))),
+        (
+            summary.triggers_refused,
+            format!("{}, refused: over `events_per_minute`", counted(summary.triggers_refused, "trigger")),
+        ),
+        (summary.passed_over, format!("{}, passed over after repeated faults", counted(summary.passed_over, "wake"))),
     ];
     let all = summary.topics.iter().flat_map(of_topic).chain(overall);
     all.filter(|(count, _)| *count > 0).map(|(_, loss)| loss).collect()

@@ -21,6 +21,8 @@ fn replay() -> Summary {
         out_of_order: 0,
         log_lines: 0,
         log_dropped: 0,
+        triggers_refused: 0,
+        passed_over: 0,
         start_ns: START_NS,
         end_ns: START_NS + 40_000_000_000,
         wall_s: 0.5,
@@ -153,7 +155,7 @@ fn faults_with_ever_new_messages_take_no_more_room() {
 #[test]
 fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
     assert!(losses(&replay()).is_empty());
-    let mut lossy = Summary { skipped: 1, log_dropped: 3000, ..replay() };
+    let mut lossy = Summary { skipped: 1, log_dropped: 3000, triggers_refused: 1, passed_over: 2, ..replay() };
     lossy.topics[0].lost = Some(2);
     lossy.topics[0].too_big = 4;
     assert_eq!(
@@ -163,6 +165,8 @@ fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
             "4 samples of /imu/data, larger than `max_size`",
             "1 event sample, skipped",
             "3,000 log lines, over the rate limit",
+            "1 trigger, refused: over `events_per_minute`",
+            "2 wakes, passed over after repeated faults",
         ]
     );
 }

@@ -98,6 +98,7 @@ pub(super) fn header() -> Header {
         remaps: vec![("/imu".to_owned(), "/car/imu".to_owned())],
         clock: "x".to_owned(),
         wakes_before: 0,
+        limits: Default::default(),
     }
 }
 

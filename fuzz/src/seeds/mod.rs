@@ -13,7 +13,8 @@ use std::path::Path;
 
 use crate::TARGETS;
 
-/// Writes the seeds of each target to files in a folder of its name, and its words to `<name>.dict`, as libFuzzer reads them.
+/// Writes the seeds of each target to files in a folder of its name, its words to `<name>.dict`, as libFuzzer reads them, and the
+/// longest input to `<name>.longest`, in bytes.
 ///
 /// # Errors
 ///
@@ -27,6 +28,7 @@ pub fn write(folder: &Path) -> io::Result<()> {
         }
         let words = target.words.iter().map(|word| format!("\"{}\"\n", escaped(word)));
         fs::write(folder.join(format!("{}.dict", target.name)), words.collect::<String>())?;
+        fs::write(folder.join(format!("{}.longest", target.name)), target.longest.to_string())?;
     }
     Ok(())
 }

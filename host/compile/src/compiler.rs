@@ -5,7 +5,9 @@ use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use super::{CODE_BYTES, CompileError, cache_entry, check_folder, engine, make_cache, read_component};
+use super::{
+    CODE_BYTES, CompileError, GUEST_STACK_BYTES, cache_entry, check_folder, engine, make_cache, read_component,
+};
 
 /// Compiles the component at `path` into `cache` and returns the entry; an entry that exists is left as it is.
 ///
@@ -20,7 +22,7 @@ pub fn compile(path: &Path, cache: &Path) -> Result<PathBuf, CompileError> {
     if entry.exists() {
         return Ok(entry);
     }
-    let code = engine()?
+    let code = engine(GUEST_STACK_BYTES)?
         .precompile_component(&component)
         .map_err(|source| CompileError::Compile { path: path.to_owned(), source: source.into() })?;
     if code.len() > CODE_BYTES {

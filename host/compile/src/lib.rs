@@ -27,7 +27,7 @@ pub const COMPILE_MEMORY_BYTES: u64 = 2 << 30;
 /// Seconds of CPU time that compiling may take; an ordinary lambda takes one.
 pub const COMPILE_CPU_SECONDS: u64 = 120;
 
-/// Stack of a guest, in bytes. The thread that runs it needs some more.
+/// Most stack of a guest, in bytes. The thread that runs it needs some more.
 pub const GUEST_STACK_BYTES: usize = 512 << 10;
 
 /// Wasmtime's version and the settings of [`engine`]; a change of either makes new entries.
@@ -77,12 +77,20 @@ impl Explain for CompileError {
     }
 }
 
-/// The engine for which all lambdas are compiled and on which they run.
+/// The engine for which all lambdas are compiled and on which they run, with a stack of so many bytes, at most
+/// [`GUEST_STACK_BYTES`]. Native code does not depend on that.
 ///
 /// # Errors
 ///
 /// [`CompileError::Engine`] if this machine does not support it.
-pub fn engine() -> Result<Engine, CompileError> {
+pub fn engine(stack_bytes: usize) -> Result<Engine, CompileError> {
+    let mut settings = settings();
+    settings.max_wasm_stack(stack_bytes.min(GUEST_STACK_BYTES));
+    Engine::new(&settings).map_err(|source| CompileError::Engine { source: source.into() })
+}
+
+/// What [`engine`] is set to, named by [`SETTINGS`]; benches change a part of it to tell its price.
+pub fn settings() -> Config {
     let mut config = Config::new();
     config
         // Instructions are counted and the clock can interrupt, always: the same code serves replay and vehicle.
@@ -95,7 +103,7 @@ pub fn engine() -> Result<Engine, CompileError> {
         .max_wasm_stack(GUEST_STACK_BYTES);
     #[cfg(feature = "compiler")]
     config.cranelift_opt_level(wasmtime::OptLevel::Speed);
-    Engine::new(&config).map_err(|source| CompileError::Engine { source: source.into() })
+    config
 }
 
 /// Reads a component that is small enough to be compiled.

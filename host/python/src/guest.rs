@@ -2,13 +2,15 @@
 
 use std::ffi::OsString;
 use std::path::{self, PathBuf};
+use std::time::{Duration, Instant};
 
 use gleaner_host::api::Session;
 use gleaner_host::api::data::Wake;
 use gleaner_host::api::log::LINE_BYTES;
 use gleaner_host::guest::{Guest, Outcome};
 use gleaner_host::program;
-use gleaner_protocol::manifest::{Manifest, Schedule};
+use gleaner_host::stage::Bounds;
+use gleaner_protocol::manifest::{Limits, Manifest, Schedule};
 use gleaner_protocol::{Fault, FaultKind};
 use pyo3::call::PyCallArgs;
 use pyo3::intern;
@@ -27,10 +29,11 @@ const WAKES_PER_TIDY: u64 = 10;
 pub(crate) fn main(py: Python<'_>, args: Vec<OsString>, host: Py<PyAny>) -> u8 {
     // Attached only for the length of a call into the lambda, so that its own threads run between two wakes.
     py.detach(|| {
-        program::run_in_python(args, &mut |asked, manifest, session, _bounds| {
+        program::run_in_python(args, &mut |asked, manifest, session, bounds| {
             let host = Python::attach(|py| host.clone_ref(py));
             let entry = asked.build.entry_path(manifest);
-            Ok(Box::new(PythonGuest::new(host, entry, handler(manifest), session)))
+            let allowed = Allowed::new(&manifest.limits, bounds);
+            Ok(Box::new(PythonGuest::new(host, entry, handler(manifest), session, allowed)))
         })
     })
 }
@@ -42,12 +45,34 @@ fn handler(manifest: &Manifest) -> &'static str {
     }
 }
 
+/// What a call into the lambda may use.
+#[derive(Copy, Clone)]
+struct Allowed {
+    /// Time of `init`, the import before it included; 0 is for ever.
+    init: Duration,
+    /// Time of a wake.
+    wake: Duration,
+    /// Memory, in bytes.
+    memory: u64,
+}
+
+impl Allowed {
+    fn new(limits: &Limits, bounds: Bounds) -> Self {
+        let memory = limits.memory.bytes();
+        match bounds {
+            Bounds::Replay => Self { init: Duration::ZERO, wake: Duration::ZERO, memory },
+            Bounds::Live(wake) => Self { init: limits.init_deadline, wake, memory },
+        }
+    }
+}
+
 /// A lambda in a Python file. After a fault it is made anew; the globals of its module stay as they are.
 struct PythonGuest {
     host: Py<PyAny>,
     entry: PathBuf,
     handler: &'static str,
     session: Session,
+    allowed: Allowed,
     /// Makes a lambda and gives its handler; there once the file was imported.
     make: Option<Py<PyAny>>,
     live: Option<Live>,
@@ -61,8 +86,8 @@ struct Live {
 }
 
 impl PythonGuest {
-    fn new(host: Py<PyAny>, entry: PathBuf, handler: &'static str, session: Session) -> Self {
-        Self { host, entry, handler, session, make: None, live: None, wakes: 0 }
+    fn new(host: Py<PyAny>, entry: PathBuf, handler: &'static str, session: Session, allowed: Allowed) -> Self {
+        Self { host, entry, handler, session, allowed, make: None, live: None, wakes: 0 }
     }
 
     /// From now on what the lambda prints is its log, what it prints while it is imported included.
@@ -83,13 +108,15 @@ impl PythonGuest {
     fn import(&self, py: Python<'_>) -> Result<Py<PyAny>, Raised> {
         self.listen(py)?;
         let entry = path::absolute(&self.entry).map_err(PyErr::from)?;
-        let make = self.attempt(py, (self.host.getattr(py, "load")?, entry, self.handler))?;
+        let (init, load) = (self.allowed.init, self.host.getattr(py, "load")?);
+        let make = self.attempt(py, init, (init.as_secs_f64(), load, entry, self.handler))?;
         Ok(make.unbind())
     }
 
     fn make_live(&self, py: Python<'_>, make: &Py<PyAny>) -> Result<Live, Raised> {
         let context = Py::new(py, Context::new(py, self.session.clone())?)?;
-        let handler = self.attempt(py, (make, &context))?.unbind();
+        let init = self.allowed.init;
+        let handler = self.attempt(py, init, (init.as_secs_f64(), make, &context))?.unbind();
         Ok(Live { context, handler })
     }
 
@@ -108,28 +135,44 @@ impl PythonGuest {
 
     fn call(&self, py: Python<'_>, live: &Live, wake: Wake) -> Result<(), Raised> {
         let Live { context, handler } = live;
+        let (wake_time, seconds) = (self.allowed.wake, self.allowed.wake.as_secs_f64());
         match wake {
             Wake::Event(sample) => {
                 let event = context.get().sample(py, sample)?;
-                self.attempt(py, (handler, context, event))?;
+                self.attempt(py, wake_time, (seconds, handler, context, event))?;
             }
             Wake::Tick(tick) => {
                 context.get().set_missed(tick.missed);
-                self.attempt(py, (handler, context))?;
+                self.attempt(py, wake_time, (seconds, handler, context))?;
             }
         }
         Ok(())
     }
 
-    /// Calls the first of `call` with the others, all of it code of the lambda.
+    /// Calls the second of `call` with those behind it, all of it code of the lambda; the first is `allowed` in seconds.
     ///
     /// `gleaner._host` catches what it raises, since a panic of ours below it must not come back here as an exception: where
     /// an exception enters Rust, one that was made of a panic becomes a panic again, and would end the process.
-    fn attempt<'py>(&self, py: Python<'py>, call: impl PyCallArgs<'py>) -> Result<Bound<'py, PyAny>, Raised> {
+    fn attempt<'py>(
+        &self,
+        py: Python<'py>,
+        allowed: Duration,
+        call: impl PyCallArgs<'py>,
+    ) -> Result<Bound<'py, PyAny>, Raised> {
+        let started = Instant::now();
         let ended = self.host.bind(py).call_method1(intern!(py, "attempt"), call)?;
-        match ended.extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>)>()? {
-            (result, None) => Ok(result),
-            (_, Some(told)) => Err(Raised(told.to_string_lossy().into_owned())),
+        match ended.extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>, Bound<'py, PyString>)>()? {
+            (result, None, _) => Ok(result),
+            (_, Some(told), kind) => {
+                let told = told.to_string_lossy().into_owned();
+                Err(match &*kind.to_string_lossy() {
+                    "deadline" => Raised::late(&told, started.elapsed(), allowed),
+                    "memory" => {
+                        Raised { kind: FaultKind::Memory, told, used: None, allowed: Some(self.allowed.memory) }
+                    }
+                    _ => Raised { kind: FaultKind::Exception, told, used: None, allowed: None },
+                })
+            }
         }
     }
 
@@ -145,19 +188,33 @@ impl PythonGuest {
 
 /// What ended a call into the lambda, told. Nothing else is kept of it: a traceback holds the frames of a call, and these
 /// the sample.
-struct Raised(String);
+struct Raised {
+    kind: FaultKind,
+    told: String,
+    used: Option<u64>,
+    allowed: Option<u64>,
+}
 
 impl Raised {
     fn fault(&self, when: &str) -> Fault {
-        let message = format!("{when}{}", ending(&self.0, LINE_BYTES - when.len()));
-        Fault { kind: FaultKind::Exception, message, used: None, allowed: None }
+        let Self { kind, told, used, allowed } = self;
+        let message = format!("{when}{}", ending(told, LINE_BYTES - when.len()));
+        Fault { kind: *kind, message, used: *used, allowed: *allowed }
+    }
+
+    /// `told` says where it was.
+    fn late(told: &str, ran: Duration, allowed: Duration) -> Self {
+        let ms = |time: Duration| time.as_secs_f64() * 1e3;
+        let told = format!("{told}\nran {:.1} ms; the deadline is {:.1} ms", ms(ran), ms(allowed));
+        let ns = |time: Duration| u64::try_from(time.as_nanos()).ok();
+        Self { kind: FaultKind::Deadline, told, used: ns(ran), allowed: ns(allowed) }
     }
 }
 
 /// An exception in what surrounds the call, such as a lack of memory.
 impl From<PyErr> for Raised {
     fn from(error: PyErr) -> Self {
-        Self(error.to_string())
+        Self { kind: FaultKind::Exception, told: error.to_string(), used: None, allowed: None }
     }
 }
 
@@ -165,6 +222,8 @@ impl Guest for PythonGuest {
     fn init(&mut self) -> Result<(), Fault> {
         Python::attach(|py| {
             self.live = None;
+            let kept = self.host.call_method0(py, "keep_deadlines");
+            kept.map_err(|error| Raised::from(error).fault("in init: "))?;
             self.live = Some(self.start(py)?);
             let settled = self.host.call_method0(py, "settle");
             settled.map(drop).map_err(|error| Raised::from(error).fault("in init: "))

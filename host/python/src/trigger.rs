@@ -11,7 +11,7 @@ static TRIGGER_ERROR: SdkClass = SdkClass::new("gleaner.trigger", "TriggerError"
 
 pub(crate) fn refused(py: Python<'_>, error: &TriggerError) -> PyErr {
     let kind = match error {
-        TriggerError::TooMany => "too-many",
+        TriggerError::TooMany | TriggerError::TooOften { .. } => "too-many",
         _ => "invalid",
     };
     TRIGGER_ERROR.error(py, error.to_string(), kind)

@@ -1,5 +1,6 @@
 //! Why something cannot be recorded, in the words that a user sees.
 
+use std::collections::TryReserveError;
 use std::error::Error;
 use std::io;
 use std::path::PathBuf;
@@ -123,6 +124,14 @@ pub enum RecordError {
         /// What the system said.
         source: io::Error,
     },
+    /// There is no memory for the preroll.
+    #[error("there is no memory for a preroll of {} MiB", bytes.div_ceil(1 << 20))]
+    PrerollMemory {
+        /// What was asked for.
+        bytes: u64,
+        /// What the system said.
+        source: TryReserveError,
+    },
     /// A topic says more of itself than a clip has room for.
     #[error("the {what} of topic `{topic}` has {bytes} bytes; a clip has room for {most}")]
     LongTopic {
@@ -186,6 +195,7 @@ impl Explain for RecordError {
         let help = match (self, self.system()) {
             (Self::Busy { .. }, _) => "wait until it ends, or choose another folder: --out DIR",
             (Self::TooManyTopics { .. }, _) => "record fewer topics: [record] topics in lambda.toml",
+            (Self::PrerollMemory { .. }, _) => "keep less: preroll_size in lambda.toml, or --preroll-memory BYTES",
             (Self::LongTopic { .. }, _) => "remove the topic from [record]",
             (_, Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)) => {
                 "make room on the disk, or choose another folder: --out DIR"
@@ -200,7 +210,7 @@ impl Explain for RecordError {
 
     fn exit(&self) -> Exit {
         match self {
-            Self::TooManyTopics { .. } | Self::LongTopic { .. } => Exit::Usage,
+            Self::TooManyTopics { .. } | Self::LongTopic { .. } | Self::PrerollMemory { .. } => Exit::Usage,
             _ => Exit::Internal,
         }
     }

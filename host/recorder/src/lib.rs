@@ -15,6 +15,7 @@
 #[cfg(test)]
 extern crate self as gleaner_recorder;
 
+mod digest;
 mod error;
 mod file;
 mod preroll;
@@ -27,6 +28,7 @@ mod support;
 mod thumbnail;
 mod window;
 
+pub use digest::lambda_digest;
 pub use error::RecordError;
-pub use file::{Folder, Topic};
+pub use file::{Folder, LossList, Topic};
 pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TopicId, Work};

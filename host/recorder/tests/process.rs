@@ -4,14 +4,17 @@
 mod running;
 mod support;
 
-use std::fs;
-use std::os::fd::AsFd;
+use std::fs::{self, File};
+use std::os::fd::{AsFd, OwnedFd};
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use gleaner_protocol::Exit;
 use gleaner_protocol::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, Said};
+use gleaner_protocol::{Exit, Failure};
+use gleaner_recorder::program::{Feed, Options, run};
+use gleaner_transport::dds::Clock;
 use running::*;
 use support::*;
 
@@ -54,7 +57,9 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     assert_eq!((told[1].0, told[1].2), ("/b", false), "one that is not there");
     assert_eq!(scratch.journal(&clip, "first").1, [anchor]);
     assert_eq!(two.bye(PATIENCE), one.bye(PATIENCE));
-    running.status(|status| status.lambdas == 0);
+    // One that was never built.
+    let _unbuilt = running.control.add(&add(&scratch.0.join("third"))).unwrap();
+    running.status(|status| status.lambdas == 0 && status.lambdas_refused == 2);
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!(ended, Ok(()));
@@ -171,4 +176,63 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     running.clip();
     let failure = running.ended().1.unwrap_err();
     assert_eq!((failure.exit, failure.causes), (Exit::Internal, vec!["its thread is gone".to_owned()]));
+}
+
+#[test]
+fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_expects() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let mut links = Vec::new();
+    for (name, max_size) in [("first", "64 KiB"), ("second", "3 MiB"), ("third", "1 MiB")] {
+        let (folder, header) = lambda(&scratch, name, (10, 10));
+        let path = folder.join("build/lambda.toml");
+        let text = fs::read_to_string(&path).unwrap();
+        let (before, record) = text.split_once("[record]").unwrap();
+        let text = format!("{before}max_size = \"{max_size}\"\n[record]{record}");
+        fs::write(&path, &text).unwrap();
+        let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+        link.hello(&with_manifest(header, &text), PATIENCE).unwrap();
+        links.push(link);
+    }
+    // All have said what they want before it is there.
+    network.add("/a");
+    let _sensor = Sensor::start(&network, running.clock);
+    received(&mut running, 1);
+    let specs = network.specs.lock().unwrap();
+    assert_eq!(specs.iter().map(|spec| (spec.topic.as_str(), spec.max_bytes)).collect::<Vec<_>>(), [("/a", 3 << 20)]);
+}
+
+#[test]
+fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    let mut running = Running::start(&scratch, &network, |options| options.preroll_bytes = Some(1 << 20));
+    let (folder, header) = lambda(&scratch, "one", (10, 10));
+    let sockets: Vec<_> = (0..256).map(|_| running.control.add(&add(&folder)).unwrap()).collect();
+    let mut last = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let refused = last.hello(&header, PATIENCE).unwrap_err();
+    assert_eq!(refused.to_string(), "the recorder refuses the lambda: it hears at most 256 lambdas at a time");
+    running.status(|status| (status.lambdas, status.lambdas_refused) == (256, 1));
+    let mut links = sockets.into_iter().map(RecorderLink::new);
+    links.next_back().unwrap().hello(&header, PATIENCE).unwrap();
+    // Where one goes, there is room for another.
+    drop(links.next());
+    running.status(|status| status.lambdas < 256);
+    RecorderLink::new(running.control.add(&add(&folder)).unwrap()).hello(&header, PATIENCE).unwrap();
+}
+
+#[test]
+fn a_preroll_that_no_memory_holds_is_an_error_in_words() {
+    for bytes in [u64::MAX, 1 << 60] {
+        let scratch = Scratch::new();
+        let options = Options { preroll_bytes: Some(bytes), ..options(&scratch.0, Clock::of_today()) };
+        let (_control, stdin) = Control::pair().unwrap();
+        let (_reader, writer) = std::io::pipe().unwrap();
+        let never = || -> Result<Box<dyn Feed>, Failure> { panic!("the network is joined later") };
+        let failure = run(options, never, stdin, File::from(OwnedFd::from(writer)), Arc::default()).unwrap_err();
+        assert_eq!(failure.exit, Exit::Usage);
+        let said = failure.to_string();
+        assert!(said.contains("there is no memory for a preroll of") && said.contains("--preroll-memory"), "{said}");
+    }
 }

@@ -290,3 +290,25 @@ fn a_recorder_that_dies_leaves_what_it_has_written() {
     assert_eq!((recovered.len(), recovered[0].lambdas[0].name.as_str()), (1, "hello"));
     assert!(recovered[0].recovered.is_some());
 }
+
+#[test]
+fn a_lambda_that_was_started_again_within_a_clip_is_told_from_itself() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambdas = [1, 2].map(|limit| {
+        let mut member = member("hello", (100, 50, 0), &[a]);
+        member.header.config.insert("limit".to_owned(), limit.into());
+        recorder.add_lambda(member)
+    });
+    let wakes: [(_, _, &[_]); 2] = [(200, lambdas[0], &[Event]), (230, lambdas[1], &[Event])];
+    drive(&mut recorder, &[a], (0, 500, 10), &wakes);
+    recorder.finish(T0 + 500 * MS).unwrap();
+    let [clip] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
+    let records = scratch.metadata(clip);
+    let configs = records.iter().filter(|(name, _)| name == "gleaner.lambda").map(|(_, of)| of["config"].as_str());
+    assert_eq!(configs.collect::<Vec<_>>(), [r#"{"limit":1}"#, r#"{"limit":2}"#]);
+    for (journal, limit) in [("hello", 1), ("hello-2", 2)] {
+        assert_eq!(scratch.journal(clip, journal).0.config["limit"], limit);
+    }
+}

@@ -9,6 +9,7 @@ use gleaner_buffers::{Lease, RingCounts, RingReader};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
 
+pub use super::call::{Due, PerCall, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
 pub use super::error::DataError;
 use super::frame::Images;
 use super::log::cut;
@@ -16,18 +17,13 @@ pub use super::sample::Sample;
 use super::trace::{Arrivals, Looked};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
-/// Most samples that one call hands out.
-pub const SAMPLES_PER_CALL: usize = 256;
-/// Most values in one column.
-pub const COLUMN_LEN: usize = 65_536;
-/// Most bytes that one call copies out.
-pub const BYTES_PER_CALL: usize = 1 << 20;
 /// What reading a field at a fixed place costs, in bytes: the walk to it, and its value.
 pub const FIELD_BYTES: usize = 64;
 /// Longest path of a field, in bytes.
 pub const PATH_BYTES: usize = 1024;
-/// Longest list of strings in one field.
-pub const TEXTS_PER_FIELD: usize = 4096;
+/// Samples of a column between two looks at the time, and bytes of those that are walked over.
+const SAMPLES_PER_LOOK: usize = 1024;
+const BYTES_PER_LOOK: usize = 1 << 20;
 
 /// A count that nobody knows.
 const UNKNOWN: u64 = u64::MAX;
@@ -44,6 +40,7 @@ pub struct Topic {
     definitions: Option<Arc<Definitions>>,
     pub(super) header: Option<HeaderStamp>,
     pub(super) images: Images,
+    pub(super) per_call: PerCall,
     skipped: AtomicU64,
     /// Samples at this position in the ring and beyond came after the wake began: the lambda does not see them.
     until: AtomicU64,
@@ -72,7 +69,7 @@ impl Topic {
         (reader, depth): (RingReader<SampleMeta>, usize),
         arrivals: Arc<Arrivals>,
         definitions: Option<Arc<Definitions>>,
-        images: Images,
+        (images, per_call): (Images, PerCall),
     ) -> Arc<Self> {
         Arc::new(Self {
             input: input.to_owned(),
@@ -84,6 +81,7 @@ impl Topic {
             newest: Mutex::default(),
             definitions,
             images,
+            per_call,
             skipped: AtomicU64::new(0),
             until: AtomicU64::new(u64::MAX),
             lost: AtomicU64::new(UNKNOWN),
@@ -115,21 +113,21 @@ impl Topic {
         newest.map(|lease| self.sample(lease))
     }
 
-    /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`].
+    /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and what `[limits]` allows.
     pub fn last(self: &Arc<Self>, n: usize) -> Vec<Sample> {
         let mut leases = Vec::new();
-        self.reader.last_before(self.until(), n.min(SAMPLES_PER_CALL).min(self.depth), &mut leases);
+        self.reader.last_before(self.until(), n.min(self.per_call.samples()).min(self.depth), &mut leases);
         self.looked.at(leases.first());
         leases.into_iter().map(|lease| self.sample(lease)).collect()
     }
 
-    /// Samples received later than `since_ns`, oldest first; the newest [`SAMPLES_PER_CALL`] at most.
+    /// Samples received later than `since_ns`, oldest first; as many of the newest as [`Topic::last`] gives at most.
     pub fn since(self: &Arc<Self>, since_ns: i64) -> Vec<Sample> {
         let mut leases = Vec::new();
         let until = self.until();
         self.reader.newest_while_before(
             until,
-            SAMPLES_PER_CALL.min(self.depth),
+            self.per_call.samples().min(self.depth),
             |meta| meta.at_ns > since_ns,
             &mut leases,
         );
@@ -163,17 +161,20 @@ impl Topic {
         Ok(Field { topic: Arc::clone(self), path })
     }
 
-    /// `field` of the `n` newest samples; at most [`COLUMN_LEN`].
+    /// `field` of the `n` newest samples; at most `call_items` of `[limits]`.
     ///
     /// # Errors
     ///
-    /// [`DataError::WrongField`] if the field is no number or belongs to another topic; [`DataError::Malformed`].
+    /// [`DataError::WrongField`] if the field is no number or belongs to another topic; [`DataError::Malformed`];
+    /// [`DataError::OutOfTime`].
     pub fn column(self: &Arc<Self>, field: &Field, n: usize) -> Result<Column, DataError> {
         let until = self.until();
-        self.read_column(field, |reader, out| reader.last_before(until, n.min(COLUMN_LEN).min(self.depth), out))
+        self.read_column(field, |reader, out| {
+            reader.last_before(until, n.min(self.per_call.items).min(self.depth), out)
+        })
     }
 
-    /// `field` of all samples received later than `since_ns`; at most [`COLUMN_LEN`].
+    /// `field` of all samples received later than `since_ns`; at most `call_items` of `[limits]`.
     ///
     /// # Errors
     ///
@@ -182,7 +183,7 @@ impl Topic {
         let until = self.until();
         let is_since = |meta: &SampleMeta| meta.at_ns > since_ns;
         self.read_column(field, |reader, out| {
-            reader.newest_while_before(until, COLUMN_LEN.min(self.depth), is_since, out)
+            reader.newest_while_before(until, self.per_call.items.min(self.depth), is_since, out)
         })
     }
 
@@ -195,7 +196,13 @@ impl Topic {
         let mut leases = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
         select(&self.reader, &mut leases);
         self.looked.at(leases.first());
+        let mut unlooked = 0;
         let column = leases.iter().try_fold(Column::with_capacity(leases.len()), |mut column, lease| {
+            unlooked += field.work(lease.len()).max(BYTES_PER_LOOK / SAMPLES_PER_LOOK);
+            if unlooked >= BYTES_PER_LOOK {
+                unlooked = 0;
+                self.per_call.due.check()?;
+            }
             column.values.push(self.number(&field.path, lease)?);
             column.at_ns.push(lease.meta().at_ns);
             Ok(column)
@@ -224,7 +231,7 @@ impl Topic {
     pub fn column_work(&self, field: &Field, n: usize) -> usize {
         let held = usize::try_from(self.reader.head()).unwrap_or(usize::MAX).min(self.depth);
         let message_bytes = self.reader.newest_before(self.until()).map_or(0, |lease| lease.len());
-        n.min(held).saturating_mul(field.work(message_bytes))
+        n.min(held).min(self.per_call.items).saturating_mul(field.work(message_bytes))
     }
 
     /// The end of what the lambda sees, as a position in the ring.
@@ -234,6 +241,11 @@ impl Topic {
 
     fn pinned(&self) -> Option<Lease<SampleMeta>> {
         self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// When a call has to end, for all inputs of the lambda.
+    pub(super) fn due(&self) -> Due {
+        self.per_call.due.clone()
     }
 
     /// How many samples the lambda sees at most.

@@ -30,8 +30,12 @@ pub enum DataError {
         "{asked} bytes for a new frame, {left} are left; drop frames that are not needed, or raise `memory` in [limits]"
     )]
     NoMemory { asked: usize, left: usize },
+    #[error("the lambda holds {allowed} frames; drop frames that are not needed, or raise `frames` in [limits]")]
+    TooManyFrames { allowed: usize },
     #[error("{0}")]
     OutOfRange(ImageError),
+    #[error("the deadline is over")]
+    OutOfTime,
 }
 
 fn list(names: &[String]) -> String {

@@ -8,9 +8,17 @@ use gleaner_buffers::{Lease, Pool, Refusal};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
 
-use super::data::{DataError, Identity, Sample, Stamps};
+use super::data::{DataError, Due, Identity, Sample, Stamps};
 use super::sample::piece;
 use gleaner_image::{self as image, Encoding, ImageError, Roi, View, ops};
+
+/// Bytes of a frame between two looks at the time.
+const STRIP_BYTES: usize = 1 << 20;
+/// Bytes that the fastest machine goes through in a microsecond: summing up pixels, making a frame of another size, and of what JPEG
+/// or PNG become. The first and the last are four times what was measured (41 and 0.5 GB/s on an x86-64 server), the other is a guess.
+const FASTEST_SUM: u64 = 160_000;
+const FASTEST_RESIZE: u64 = 8_000;
+const FASTEST_DECODE: u64 = 2_000;
 
 /// Shape of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,32 +89,47 @@ impl Images {
     }
 }
 
-/// Bytes that the frames made by `resize` and `to_gray` may take together.
+/// Frames that a lambda may hold at a time, and the bytes that those made by `resize` and `to_gray` may take together.
 #[derive(Clone)]
-pub struct Budget(Arc<AtomicUsize>);
+pub struct Budget(Arc<Left>);
 
+struct Left {
+    frames: AtomicUsize,
+    frames_allowed: usize,
+    bytes: AtomicUsize,
+}
+
+/// A frame that is held, and what it takes; given back when it is dropped.
 struct Taken {
     budget: Budget,
     bytes: usize,
 }
 
 impl Budget {
-    /// A budget of that many bytes.
-    pub fn new(bytes: usize) -> Self {
-        Self(Arc::new(AtomicUsize::new(bytes)))
+    /// A budget of that many frames and bytes.
+    pub fn new(frames: usize, bytes: usize) -> Self {
+        let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
+        Self(Arc::new(Left { frames: left, frames_allowed: frames, bytes }))
     }
 
     fn take(&self, bytes: usize) -> Result<Taken, DataError> {
-        self.0
-            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes))
-            .map(|_| Taken { budget: self.clone(), bytes })
-            .map_err(|left| DataError::NoMemory { asked: bytes, left })
+        let take = |from: &AtomicUsize, n: usize| {
+            from.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(n))
+        };
+        let allowed = self.0.frames_allowed;
+        take(&self.0.frames, 1).map_err(|_| DataError::TooManyFrames { allowed })?;
+        // From here on the frame is given back, whatever comes.
+        let mut taken = Taken { budget: self.clone(), bytes: 0 };
+        take(&self.0.bytes, bytes).map_err(|left| DataError::NoMemory { asked: bytes, left })?;
+        taken.bytes = bytes;
+        Ok(taken)
     }
 }
 
 impl Drop for Taken {
     fn drop(&mut self) {
-        self.budget.0.fetch_add(self.bytes, Ordering::Relaxed);
+        self.budget.0.bytes.fetch_add(self.bytes, Ordering::Relaxed);
+        self.budget.0.frames.fetch_add(1, Ordering::Relaxed);
     }
 }
 
@@ -115,6 +138,7 @@ pub struct Frame {
     source: Source,
     info: Info,
     pixels: Pixels,
+    _taken: Taken,
 }
 
 /// What a frame remembers of its sample without holding it.
@@ -133,22 +157,21 @@ enum Pixels {
         len: usize,
     },
     Decoded(Lease<Info>),
-    Made {
-        bytes: Box<[u8]>,
-        _taken: Taken,
-    },
+    Made(Box<[u8]>),
 }
 
 impl Frame {
     pub(super) fn of(sample: &Sample) -> Result<Self, DataError> {
         let source = Source { topic: Arc::clone(sample.topic()), identity: sample.identity(), stamps: sample.stamps() };
-        match sample.picture()? {
-            Picture::Raw(raw) => Self::raw(source, sample, &raw),
-            Picture::Compressed(compressed) => Self::decoded(source, sample, compressed.data),
+        let picture = sample.picture()?;
+        let taken = source.topic.images.made.take(0)?;
+        match picture {
+            Picture::Raw(raw) => Self::raw(source, sample, &raw, taken),
+            Picture::Compressed(compressed) => Self::decoded(source, sample, compressed.data, taken),
         }
     }
 
-    fn raw(source: Source, sample: &Sample, raw: &ImageView<'_>) -> Result<Self, DataError> {
+    fn raw(source: Source, sample: &Sample, raw: &ImageView<'_>, taken: Taken) -> Result<Self, DataError> {
         let encoding = Encoding::from_ros(raw.encoding).map_err(|error| source.not_a_frame(error))?;
         let info =
             Info { width: raw.width, height: raw.height, encoding, step: raw.step, big_endian: raw.is_bigendian };
@@ -156,10 +179,11 @@ impl Frame {
         let len = view.step() * (view.height() as usize - 1) + view.width() as usize * encoding.bytes_per_pixel();
         // The pixels were borrowed from the message, so they lie within it.
         let start = raw.data.as_ptr().addr() - sample.bytes().as_ptr().addr();
-        Ok(Self { source, info, pixels: Pixels::Raw { lease: sample.lease().clone(), start, len } })
+        let pixels = Pixels::Raw { lease: sample.lease().clone(), start, len };
+        Ok(Self { source, info, pixels, _taken: taken })
     }
 
-    fn decoded(source: Source, sample: &Sample, data: &[u8]) -> Result<Self, DataError> {
+    fn decoded(source: Source, sample: &Sample, data: &[u8], taken: Taken) -> Result<Self, DataError> {
         let owner = Arc::clone(&source.topic);
         let images = &owner.images;
         let Some(pool) = &images.decoded else {
@@ -169,19 +193,22 @@ impl Frame {
         let mut newest = images.newest.lock().unwrap_or_else(PoisonError::into_inner);
         let position = sample.lease().position();
         if let Some((_, lease)) = newest.as_ref().filter(|(at, _)| Some(*at) == position) {
-            return Ok(Self::of_decoded(source, lease.clone()));
+            return Ok(Self::of_decoded(source, lease.clone(), taken));
         }
         // The older image's slot may be the one that is needed now.
         *newest = None;
         let started = Instant::now();
+        let bytes =
+            image::probe(data).ok().and_then(|header| header.rgb8_len()).map_or(0, |len| len.min(pool.slot_bytes()));
+        owner.per_call.due.allows(bytes, FASTEST_DECODE)?;
         let lease = decode(&source, pool, data)?;
         images.decode_ns.fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
         *newest = position.map(|position| (position, lease.clone()));
-        Ok(Self::of_decoded(source, lease))
+        Ok(Self::of_decoded(source, lease, taken))
     }
 
-    fn of_decoded(source: Source, lease: Lease<Info>) -> Self {
-        Self { source, info: *lease.meta(), pixels: Pixels::Decoded(lease) }
+    fn of_decoded(source: Source, lease: Lease<Info>, taken: Taken) -> Self {
+        Self { source, info: *lease.meta(), pixels: Pixels::Decoded(lease), _taken: taken }
     }
 
     /// The shape.
@@ -215,21 +242,23 @@ impl Frame {
         match &self.pixels {
             Pixels::Raw { lease, start, len } => &lease[*start..*start + *len],
             Pixels::Decoded(lease) => lease,
-            Pixels::Made { bytes, .. } => bytes,
+            Pixels::Made(bytes) => bytes,
         }
     }
 
-    /// Bytes from `offset`, `len` at most, clamped to the frame and to [`super::data::BYTES_PER_CALL`].
+    /// Bytes from `offset`, `len` at most, clamped to the frame and to `call_bytes` of `[limits]`.
     pub fn read(&self, offset: u64, len: u32) -> &[u8] {
-        piece(self.bytes(), offset, len)
+        piece(self.bytes(), offset, len, self.source.topic.per_call.bytes)
     }
 
     /// Mean BT.601 luma, 0 to 255, computed in integers.
     ///
     /// # Errors
     ///
-    /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer encodings.
+    /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer encodings;
+    /// [`DataError::OutOfTime`].
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
+        self.due().allows(self.work(roi, None) as usize, FASTEST_SUM)?;
         ops::mean_luma(&self.view()?, roi).map_err(|error| self.source.refused(error))
     }
 
@@ -239,7 +268,27 @@ impl Frame {
     ///
     /// As [`Frame::mean_luma`].
     pub fn histogram(&self, roi: Option<Roi>) -> Result<[u32; 256], DataError> {
-        ops::histogram(&self.view()?, roi).map_err(|error| self.source.refused(error))
+        let view = self.view()?;
+        let Roi { x, y, width, height } = view.clip(roi).map_err(|error| self.source.refused(error))?;
+        let mut counts = [0; 256];
+        for (top, rows) in self.strips(y, height) {
+            self.due().check()?;
+            let strip = Roi { x, y: top, width, height: rows };
+            let levels = ops::histogram(&view, Some(strip)).map_err(|error| self.source.refused(error))?;
+            counts.iter_mut().zip(levels).for_each(|(sum, level)| *sum += level);
+        }
+        Ok(counts)
+    }
+
+    fn due(&self) -> &Due {
+        &self.source.topic.per_call.due
+    }
+
+    /// `height` rows from `y` in strips of some [`STRIP_BYTES`]: the first row and the number of rows of each.
+    fn strips(&self, y: u32, height: u32) -> impl Iterator<Item = (u32, u32)> {
+        let rows = (STRIP_BYTES / self.info.step.max(1) as usize).max(1) as u32;
+        let end = y + height;
+        (y..end).step_by(rows as usize).map(move |top| (top, rows.min(end - top)))
     }
 
     /// A new frame of that size: rgb8, or mono8 for grey encodings.
@@ -250,7 +299,10 @@ impl Frame {
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
         let (encoding, _) = ops::resized(&self.view()?, width, height).map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
-        self.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
+        self.due().allows(self.work(None, Some((width, height))) as usize, FASTEST_RESIZE)?;
+        self.make(info, |out| {
+            ops::resize(&self.view()?, width, height, out).map(drop).map_err(|error| self.source.refused(error))
+        })
     }
 
     /// A new mono8 frame of the same size.
@@ -260,19 +312,27 @@ impl Frame {
     /// [`DataError::NoMemory`]; as [`Frame::mean_luma`].
     pub fn to_gray(&self) -> Result<Self, DataError> {
         let info = Info::tight(self.info.width, self.info.height, Encoding::Mono8);
-        self.make(info, ops::to_gray)
+        self.make(info, |out| {
+            let (view, mut rest) = (self.view()?, out);
+            for (top, rows) in self.strips(0, view.height()) {
+                self.due().check()?;
+                let (strip, below) = rest.split_at_mut(rows as usize * info.step as usize);
+                rest = below;
+                let part = Info { height: rows, ..self.info };
+                let pixels = &self.bytes()[top as usize * self.info.step as usize..];
+                let part = part.view(pixels).map_err(|error| self.source.not_a_frame(error))?;
+                ops::to_gray(&part, strip).map_err(|error| self.source.refused(error))?;
+            }
+            Ok(())
+        })
     }
 
-    fn make(
-        &self,
-        info: Info,
-        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), ImageError>,
-    ) -> Result<Self, DataError> {
+    fn make(&self, info: Info, fill: impl FnOnce(&mut [u8]) -> Result<(), DataError>) -> Result<Self, DataError> {
         let len = info.step as usize * info.height as usize;
         let taken = self.source.topic.images.made.take(len)?;
         let mut bytes = vec![0; len].into_boxed_slice();
-        fill(&self.view()?, &mut bytes).map_err(|error| self.source.refused(error))?;
-        Ok(Self { source: self.source.clone(), info, pixels: Pixels::Made { bytes, _taken: taken } })
+        fill(&mut bytes)?;
+        Ok(Self { source: self.source.clone(), info, pixels: Pixels::Made(bytes), _taken: taken })
     }
 
     fn view(&self) -> Result<View<'_>, DataError> {

@@ -1,12 +1,10 @@
 //! Lines for people: cut, rate-limited, and every dropped one counted.
 
 use gleaner_protocol::journal::Said;
+use gleaner_protocol::manifest::Limits;
 use serde::Serialize;
 
 use super::Session;
-
-/// Lines that a lambda may write in one second of its own time.
-pub const LINES_PER_SECOND: u32 = 100;
 
 /// Longest line in bytes; the rest is cut at a character boundary.
 pub const LINE_BYTES: usize = 4096;
@@ -34,18 +32,41 @@ pub struct Line {
     pub message: String,
 }
 
-#[derive(Default)]
 pub(super) struct Log {
     lines: Vec<Line>,
     dropped: u64,
-    /// Second of the lambda's time, and the lines written in it.
-    window: (i64, u32),
+    /// What may be written in one second of the lambda's time.
+    lines_per_second: u64,
+    bytes_per_second: u64,
+    window: Window,
+    /// What the host noted in this second.
+    notes: (i64, Vec<&'static str>),
     /// Lines since the last call of `take`, those included that were dropped, and the CRC-32 over them: how many the rate limit
     /// lets pass depends on wakes before.
     said: Said,
 }
 
+/// What was written in a second.
+#[derive(Default)]
+struct Window {
+    second: i64,
+    lines: u64,
+    bytes: u64,
+}
+
 impl Log {
+    pub(super) fn new(limits: &Limits) -> Self {
+        Self {
+            lines: Vec::new(),
+            dropped: 0,
+            lines_per_second: limits.log_lines,
+            bytes_per_second: limits.log_bytes.bytes(),
+            window: Window::default(),
+            notes: (0, Vec::new()),
+            said: Said::default(),
+        }
+    }
+
     pub(super) fn take(&mut self) -> (Vec<Line>, Said) {
         (std::mem::take(&mut self.lines), std::mem::take(&mut self.said))
     }
@@ -61,17 +82,35 @@ impl Log {
         digest.update(&(message.len() as u64).to_le_bytes());
         digest.update(message.as_bytes());
         self.said = Said { lines: self.said.lines.saturating_add(1), digest: digest.finalize() };
-        let second = at_ns.div_euclid(1_000_000_000);
-        if self.window.0 != second {
-            self.window = (second, 0);
+        let second = second(at_ns);
+        if self.window.second != second {
+            self.window = Window { second, ..Window::default() };
         }
-        if self.window.1 >= LINES_PER_SECOND {
+        let Window { lines, bytes, .. } = &mut self.window;
+        let with_it = bytes.saturating_add(message.len() as u64);
+        if *lines >= self.lines_per_second || with_it > self.bytes_per_second {
             self.dropped += 1;
             return;
         }
-        self.window.1 += 1;
+        (*lines, *bytes) = (*lines + 1, with_it);
         self.lines.push(Line { at_ns, level, message: message.to_owned() });
     }
+
+    /// Each text once in a second, beside what the lambda may write, and no part of what it said.
+    fn note(&mut self, at_ns: i64, text: &'static str) {
+        let second = second(at_ns);
+        if self.notes.0 != second {
+            self.notes = (second, Vec::new());
+        }
+        if !self.notes.1.contains(&text) {
+            self.notes.1.push(text);
+            self.lines.push(Line { at_ns, level: Level::Warn, message: text.to_owned() });
+        }
+    }
+}
+
+fn second(at_ns: i64) -> i64 {
+    at_ns.div_euclid(1_000_000_000)
 }
 
 impl Session {
@@ -80,6 +119,13 @@ impl Session {
         let mut state = self.lock();
         let at_ns = state.now_ns;
         state.log.write(at_ns, level, message);
+    }
+
+    /// The host says something about the lambda, as a warning at the time of this wake; the same thing once in a second.
+    pub fn note(&self, text: &'static str) {
+        let mut state = self.lock();
+        let at_ns = state.now_ns;
+        state.log.note(at_ns, text);
     }
 }
 
@@ -94,13 +140,37 @@ mod tests {
 
     #[test]
     fn a_flood_is_dropped_and_counted_until_the_next_second() {
-        let mut log = Log::default();
+        let mut log = Log::new(&Limits::default());
         for _ in 0..250 {
             log.write(10, Level::Info, "x");
         }
         log.write(1_000_000_000, Level::Info, "y");
         assert_eq!(log.dropped(), 150);
         assert_eq!(log.take().0.len(), 101);
+    }
+
+    #[test]
+    fn bytes_are_limited_beside_lines() {
+        let mut limits = Limits::default();
+        limits.log_bytes = gleaner_protocol::manifest::ByteSize::kib(4);
+        let mut log = Log::new(&limits);
+        for _ in 0..5 {
+            log.write(10, Level::Info, &"x".repeat(1000));
+        }
+        // A short one still has room.
+        log.write(10, Level::Info, "y");
+        assert_eq!((log.dropped(), log.take().0.len()), (1, 5));
+    }
+
+    #[test]
+    fn what_the_host_notes_comes_once_in_a_second_and_is_nothing_that_the_lambda_said() {
+        let mut log = Log::new(&Limits::default());
+        for at_ns in [0, 1, 2_000_000_000] {
+            log.note(at_ns, "made anew");
+            log.note(at_ns, "paused");
+        }
+        let (lines, said) = log.take();
+        assert_eq!((lines.len(), said), (4, Said::default()));
     }
 
     #[test]

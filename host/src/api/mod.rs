@@ -3,6 +3,7 @@
 //! The four files beside this one carry the names of the four WIT interfaces. WebAssembly (`guest::wasm`) and Python
 //! (`host/python`) are thin skins over them: they convert arguments and errors, and decide nothing. What is here knows neither.
 
+mod call;
 pub mod data;
 mod error;
 pub mod frame;
@@ -17,11 +18,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_protocol::Trigger;
 use gleaner_protocol::journal::Said;
-use gleaner_protocol::manifest::ConfigValue;
+use gleaner_protocol::manifest::{ConfigValue, Limits};
 
-use data::{DataError, Topic};
+use data::{DataError, Due, Topic};
 use log::{Line, Log};
-use trigger::Triggers;
+use trigger::{Rate, Triggers};
 
 /// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call, by one thread.
 #[derive(Clone)]
@@ -33,13 +34,20 @@ struct State {
     now_ns: i64,
     /// What the wake has caused; none outside of a wake, where nothing can be caused.
     triggers: Option<Triggers>,
+    rate: Rate,
     log: Log,
+    due: Option<Due>,
+    passed_over: u64,
 }
 
 impl Session {
-    /// A session over these inputs, in the manifest's order, and this configuration.
-    pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>) -> Self {
-        Self(Arc::new(Mutex::new(State { inputs, config, now_ns: 0, triggers: None, log: Log::default() })))
+    /// A session over these inputs, in the manifest's order, and this configuration, within these limits.
+    pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>, limits: &Limits) -> Self {
+        // All inputs of a lambda have the same.
+        let due = inputs.first().map(|topic| topic.due());
+        let (rate, log) = (Rate::new(limits), Log::new(limits));
+        let state = State { inputs, config, now_ns: 0, triggers: None, rate, log, due, passed_over: 0 };
+        Self(Arc::new(Mutex::new(state)))
     }
 
     /// Begins a wake at `now_ns`: what an earlier wake left behind is dropped.
@@ -70,6 +78,26 @@ impl Session {
     /// Log lines dropped by the rate limit, since the start.
     pub fn log_dropped(&self) -> u64 {
         self.lock().log.dropped()
+    }
+
+    /// Triggers refused by the rate limit, since the start.
+    pub fn triggers_refused(&self) -> u64 {
+        self.lock().rate.refused()
+    }
+
+    /// Counts a wake that did not happen, because the lambda had faulted again and again.
+    pub fn pass_over(&self) {
+        self.lock().passed_over += 1;
+    }
+
+    /// Wakes passed over, since the start.
+    pub fn passed_over(&self) -> u64 {
+        self.lock().passed_over
+    }
+
+    /// When calls of the lambda have to end; none without inputs, where no call takes long.
+    pub fn due(&self) -> Option<Due> {
+        self.lock().due.clone()
     }
 
     /// Time of this wake, in nanoseconds.

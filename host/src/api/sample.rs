@@ -6,7 +6,7 @@ use gleaner_buffers::Lease;
 use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{Endian, Value};
 
-use super::data::{BYTES_PER_CALL, COLUMN_LEN, DataError, Field, TEXTS_PER_FIELD, Topic};
+use super::data::{DataError, Field, Topic};
 use super::frame::{Frame, Picture};
 use super::values::{Identity, Stamps};
 
@@ -48,11 +48,12 @@ impl Sample {
             .path
             .read(&self.lease, self.lease.meta().endian)
             .map_err(|error| self.topic.unreadable(&field.path, error))?;
+        let per_call = &self.topic.per_call;
         let (len, max) = match &value {
-            Value::Text(text) => (text.len(), BYTES_PER_CALL),
-            Value::Bytes(bytes) => (bytes.len(), BYTES_PER_CALL),
-            Value::Numbers(numbers) => (numbers.len(), COLUMN_LEN),
-            Value::Texts(texts) => (texts.len(), TEXTS_PER_FIELD),
+            Value::Text(text) => (text.len(), per_call.bytes),
+            Value::Bytes(bytes) => (bytes.len(), per_call.bytes),
+            Value::Numbers(numbers) => (numbers.len(), per_call.items),
+            Value::Texts(texts) => (texts.len(), per_call.texts()),
             Value::Bool(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => (0, 0),
         };
         if len > max {
@@ -82,9 +83,9 @@ impl Sample {
         self.lease.meta().endian == Endian::Big
     }
 
-    /// Bytes from `offset`, `len` at most, clamped to the message and to [`BYTES_PER_CALL`].
+    /// Bytes from `offset`, `len` at most, clamped to the message and to `call_bytes` of `[limits]`.
     pub fn cdr(&self, offset: u64, len: u32) -> &[u8] {
-        piece(&self.lease, offset, len)
+        piece(&self.lease, offset, len, self.topic.per_call.bytes)
     }
 
     /// Bytes that [`Sample::as_frame`] would have to decode: by the header, and none if that is done already.
@@ -101,7 +102,8 @@ impl Sample {
     ///
     /// # Errors
     ///
-    /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`], [`DataError::NoSlot`].
+    /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`], [`DataError::NoSlot`],
+    /// [`DataError::TooManyFrames`].
     pub fn as_frame(&self) -> Result<Frame, DataError> {
         Frame::of(self)
     }
@@ -132,9 +134,9 @@ impl Sample {
     }
 }
 
-/// `len` bytes from `offset`, clamped to `bytes` and to [`BYTES_PER_CALL`].
-pub(super) fn piece(bytes: &[u8], offset: u64, len: u32) -> &[u8] {
+/// `len` bytes from `offset`, clamped to `bytes` and to `most`.
+pub(super) fn piece(bytes: &[u8], offset: u64, len: u32, most: usize) -> &[u8] {
     let start = usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
-    let len = (len as usize).min(BYTES_PER_CALL).min(bytes.len() - start);
+    let len = (len as usize).min(most).min(bytes.len() - start);
     &bytes[start..start + len]
 }

@@ -1,5 +1,6 @@
 //! What a lambda causes: events, and the start and stop of recordings.
 
+use gleaner_protocol::manifest::Limits;
 use gleaner_protocol::{Trigger, TriggerKind};
 use serde_json::{Map, Value};
 
@@ -55,6 +56,43 @@ pub enum TriggerError {
     NoWake,
     #[error("this wake has caused {PER_WAKE} triggers already; further ones are refused")]
     TooMany,
+    #[error(
+        "the lambda has caused {allowed} triggers in this minute already, `events_per_minute` in [limits]; further ones are refused"
+    )]
+    TooOften { allowed: u64 },
+}
+
+const MINUTE_NS: i64 = 60_000_000_000;
+
+/// Triggers in this minute of the lambda's time.
+pub(super) struct Rate {
+    allowed: u64,
+    minute: i64,
+    caused: u64,
+    refused: u64,
+}
+
+impl Rate {
+    pub(super) fn new(limits: &Limits) -> Self {
+        Self { allowed: limits.events_per_minute, minute: 0, caused: 0, refused: 0 }
+    }
+
+    pub(super) fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// Whether one more may be caused.
+    fn check(&mut self, at_ns: i64) -> Result<(), TriggerError> {
+        let minute = at_ns.div_euclid(MINUTE_NS);
+        if self.minute != minute {
+            (self.minute, self.caused) = (minute, 0);
+        }
+        if self.caused < self.allowed {
+            return Ok(());
+        }
+        self.refused += 1;
+        Err(TriggerError::TooOften { allowed: self.allowed })
+    }
 }
 
 #[derive(Default)]
@@ -157,7 +195,12 @@ impl Session {
         score: Option<f64>,
         attributes: Vec<Attribute>,
     ) -> Result<(), TriggerError> {
-        self.lock().triggers.as_mut().ok_or(TriggerError::NoWake)?.add(kind, label, score, attributes)
+        let state = &mut *self.lock();
+        let triggers = state.triggers.as_mut().ok_or(TriggerError::NoWake)?;
+        state.rate.check(state.now_ns)?;
+        triggers.add(kind, label, score, attributes)?;
+        state.rate.caused += 1;
+        Ok(())
     }
 }
 
@@ -167,7 +210,7 @@ mod tests {
 
     /// A session in the middle of a wake.
     fn session() -> Session {
-        let session = Session::new(Vec::new(), Vec::new());
+        let session = Session::new(Vec::new(), Vec::new(), &Limits::default());
         session.begin(0);
         session
     }
@@ -196,6 +239,25 @@ mod tests {
         assert_eq!(session.event("x", 1.0, Vec::new()), Err(TriggerError::TooMany));
         session.begin(1);
         assert_eq!(session.event("x", 1.0, Vec::new()), Ok(()));
+    }
+
+    #[test]
+    fn triggers_beyond_those_of_a_minute_are_refused_by_name_and_counted() {
+        let mut limits = Limits::default();
+        limits.events_per_minute = 2;
+        let session = Session::new(Vec::new(), Vec::new(), &limits);
+        let event = |at_ns| {
+            session.begin(at_ns);
+            session.event("x", 1.0, Vec::new())
+        };
+        assert_eq!([event(0), event(1)], [Ok(()), Ok(())]);
+        // What is refused for another reason does not count.
+        assert_eq!(session.event("", 1.0, Vec::new()), Err(TriggerError::TooOften { allowed: 2 }));
+        assert_eq!(event(MINUTE_NS - 1), Err(TriggerError::TooOften { allowed: 2 }));
+        assert_eq!(session.triggers_refused(), 2);
+        session.begin(MINUTE_NS);
+        assert_eq!(session.event("", 1.0, Vec::new()), Err(TriggerError::NoLabel));
+        assert_eq!([event(MINUTE_NS), event(MINUTE_NS), event(0)], [Ok(()), Ok(()), Ok(())]);
     }
 
     #[test]

@@ -8,6 +8,8 @@ pub mod wasm;
 #[cfg(feature = "python")]
 pub mod python;
 
+pub mod watched;
+
 use gleaner_protocol::Fault;
 
 use crate::api::data::Wake;

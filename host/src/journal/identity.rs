@@ -1,7 +1,7 @@
 //! Which lambda made a decision: its files with their digests, its config, and what it ran on.
 
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::journal::{FileDigest, Header, JournalInput};
@@ -64,6 +64,7 @@ impl Identity<'_> {
             files: build_digests(build)?,
             models: manifest.models.iter().map(model).collect(),
             manifest: manifest_digest(manifest),
+            limits: manifest.limits,
             inputs: manifest.inputs.iter().map(|input| journal_input(input, remaps)).collect(),
             event_input: event,
             config: config.iter().map(|(key, value)| (key.clone(), json(value))).collect::<Map<_, _>>(),
@@ -74,11 +75,12 @@ impl Identity<'_> {
     }
 }
 
-/// Of what a decision can depend on.
+/// Of what a decision can depend on; limits stand in the header themselves.
 fn manifest_digest(manifest: &Manifest) -> String {
     let mut json = manifest.to_json();
     if let Some(table) = json.as_object_mut() {
         table.remove("record");
+        table.remove("limits");
     }
     without_descriptions(&mut json);
     hex(Sha256::new_with_prefix(json.to_string()))
@@ -155,16 +157,6 @@ fn digest_of_file(path: &Path) -> Result<FileDigest, IdentityError> {
     let mut digest = Sha256::new();
     let bytes = io::copy(&mut file, &mut digest).map_err(failed)?;
     Ok(FileDigest { path: path.to_string_lossy().into_owned(), bytes, sha256: hex(digest) })
-}
-
-/// One digest for all files of a lambda: of their paths and digests, a line each, as `sha256sum` writes them.
-pub fn lambda_digest(files: &[FileDigest]) -> String {
-    let mut digest = Sha256::new();
-    for file in files {
-        // Hashing cannot fail.
-        let _ = writeln!(digest, "{}  {}", file.sha256, file.path);
-    }
-    hex(digest)
 }
 
 fn hex(digest: Sha256) -> String {

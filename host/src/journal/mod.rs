@@ -3,7 +3,7 @@
 
 mod identity;
 
-pub use identity::{Identity, IdentityError, lambda_digest};
+pub use identity::{Identity, IdentityError};
 
 use std::sync::Arc;
 

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use gleaner_protocol::{Exit, Failure, Report};
 use gleaner_transport::dds::{Clock, Dds};
+use gleaner_vitals::Pulse;
 
 use super::announce::Announcer;
 use super::ledger::Ledger;
@@ -20,6 +21,8 @@ use crate::schedule::Schedule;
 
 /// How long nobody looks at signals, the recorder and the time for a report. A wake does not wait for it.
 const ROUND: Duration = Duration::from_millis(50);
+/// How long it may take until we are back here, all that stands still on the way included.
+const ALIVE: Duration = Duration::from_secs(30);
 
 /// A lambda and all that it takes to run it live.
 pub(super) struct Course {
@@ -34,6 +37,7 @@ pub(super) struct Course {
     pub(super) watch: Watch,
     pub(super) dds: Dds,
     pub(super) clock: Clock,
+    pub(super) pulse: Pulse,
     /// How long to run, if not until the end.
     pub(super) last: Option<Duration>,
 }
@@ -51,6 +55,7 @@ impl Course {
                 if stop.load(Ordering::Relaxed) || end.is_some_and(|end| now >= end) {
                     return Ok(());
                 }
+                self.pulse.alive(ALIVE);
                 self.look_after(now)?;
             }
             if let Some(wake) = self.schedule.next_tick(now).or_else(|| self.schedule.next_event()) {
@@ -65,6 +70,9 @@ impl Course {
 
     fn wake(&mut self, wake: Wake) -> Result<(), Failure> {
         let at_ns = wake.at_ns();
+        if self.judge.passes_over(at_ns) {
+            return Ok(());
+        }
         let sample = if let Wake::Event(sample) = &wake { Some(sample) } else { None };
         for topic in &self.inputs {
             let woken_by = sample.filter(|sample| Arc::ptr_eq(sample.topic(), topic)).and_then(|it| it.position());

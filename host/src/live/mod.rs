@@ -4,6 +4,7 @@
 //! and to whoever started us, is written by a thread of its own. Nothing here knows which kind of lambda runs.
 
 mod announce;
+mod before;
 mod course;
 mod ledger;
 mod options;
@@ -30,6 +31,7 @@ use self::recorder::ToRecorder;
 use self::round_trip::RoundTrip;
 use self::status::{Around, Watch};
 use crate::input::{Bell, Live};
+use crate::isolation::Isolation;
 use crate::journal::{CLOCK_OF_VEHICLE, Identity};
 use crate::judge::Judge;
 use crate::network::NetworkError;
@@ -44,10 +46,14 @@ impl Job {
     /// # Errors
     ///
     /// A failure if it cannot start, if the network or the recorder fails, or if results could not be written.
-    pub fn run(self, load: Load<'_>, reports: impl Write + Send + 'static) -> Result<Exit, Failure> {
+    pub fn run(
+        self,
+        load: Load<'_>,
+        isolation: &Isolation,
+        reports: impl Write + Send + 'static,
+    ) -> Result<Exit, Failure> {
         let Self { asked, manifest, wanted } = self;
         let stop = stop_flag()?;
-        end_with_starter()?;
         let clock = wanted.dds.clock;
         let domain = wanted.dds.domain;
         let mut dds = Dds::open(wanted.dds).map_err(NetworkError::failure)?;
@@ -71,6 +77,7 @@ impl Job {
         let round_trip = wanted.round_trip.map(|topic| RoundTrip::open(&dds, &topic, clock, name)).transpose()?;
         let announcer = wanted.announce.map(|topic| Announcer::open(&dds, &topic, name)).transpose()?;
         let mut ledger = Ledger::start(Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?, reports)?;
+        ledger.report(Report::Isolation { layers: isolation.close().to_vec() });
         let initialised = guest.init();
         let (said, _) = session.take_log();
         ledger.log(said);
@@ -81,7 +88,12 @@ impl Job {
         }
         ledger.report(Report::Ready);
         let schedule = Schedule::live(&manifest, &inputs, clock.now());
-        let watch = Watch::new(&manifest, &asked.remaps, wanted.out, wanted.restarts, domain, clock);
+        let undecided = (wanted.restarts > 0).then(|| before::undecided(&manifest, &wanted.out)).flatten();
+        let mut watch = Watch::new(&manifest, &asked.remaps, wanted.out, wanted.restarts, domain, clock);
+        if let Some(decision) = undecided {
+            watch.lost_wake();
+            ledger.decision(decision);
+        }
         let mut course = Course {
             judge: Judge::new(session.clone(), guest),
             schedule,
@@ -94,6 +106,7 @@ impl Job {
             watch,
             dds,
             clock,
+            pulse: isolation.pulse().clone(),
             last: wanted.last,
         };
         let ended = course.run(&stop);
@@ -114,14 +127,6 @@ impl Job {
         ended?;
         Ok(if faults > 0 { Exit::LambdaFaulted } else { Exit::Ok })
     }
-}
-
-/// Has the system send SIGTERM when whoever started us dies: nobody else would end us.
-fn end_with_starter() -> Result<(), Failure> {
-    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM)).map_err(|error| {
-        let error = std::io::Error::from(error);
-        Failure::caused_by(Exit::Internal, "cannot be told of the starter's death", &error)
-    })
 }
 
 /// Raised by SIGTERM. SIGINT is for whoever started us, who then sends the other.

@@ -6,10 +6,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use gleaner_jail::Paths;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, Exit, Failure};
 use gleaner_transport::dds::{self, Clock};
 
+use crate::isolation::definitions;
 use crate::network::NetworkArgs;
 use crate::stage::{Asked, AskedArgs};
 
@@ -70,6 +72,29 @@ pub struct Job {
 }
 
 impl Job {
+    /// What may be opened while the lambda runs. Its results are open by then.
+    pub fn paths(&self) -> Paths {
+        let mut read = definitions();
+        read.push(self.asked.lambda.clone());
+        read.extend(self.asked.vehicle.clone());
+        Paths { read, write: Vec::new() }
+    }
+
+    /// Memory that our own threads may still take, in bytes: decisions that wait to be written, and messages that the network puts
+    /// together, beside those in the rings.
+    pub fn own_memory(&self) -> u64 {
+        const LINES: u64 = 48 << 20;
+        // So many unfinished messages does RustDDS keep of a writer, and where memory is refused to it, it ends the process.
+        const MESSAGES: u64 = 130;
+        let sizes = self.manifest.inputs.iter().map(|input| input.max_size.bytes().saturating_mul(MESSAGES));
+        sizes.fold(LINES, u64::saturating_add)
+    }
+
+    /// The results.
+    pub fn results(&self) -> Vec<PathBuf> {
+        vec![self.wanted.out.clone()]
+    }
+
     /// Checks the arguments against the build and its manifest.
     ///
     /// # Errors
@@ -77,9 +102,9 @@ impl Job {
     /// A failure that names the manifest's line, the key or the topic, and the way out.
     pub fn new(args: RunArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.asked.lambda)?;
-        let manifest = Manifest::load(build.path())?;
+        let mut manifest = Manifest::load(build.path())?;
         let messages = vec![build.path().join("msg")];
-        let asked = Asked::new(args.asked, build, &manifest)?;
+        let asked = Asked::new(args.asked, build, &mut manifest)?;
         let name: String =
             manifest.lambda.name.as_str().chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
         let mut dds = args.network.options(&format!("/gleaner/{name}"))?;

@@ -81,6 +81,8 @@ impl Watch {
             missed_ticks: 0,
             log_lines: 0,
             log_dropped: 0,
+            triggers_refused: 0,
+            passed_over: 0,
             unwritten: 0,
             wake_up: None,
             run: None,
@@ -114,6 +116,11 @@ impl Watch {
         self.wake_up.add(times.entered.saturating_sub(times.at));
         self.run.add(times.left.saturating_sub(times.entered));
         self.hand_out.add(times.out.saturating_sub(times.left));
+    }
+
+    /// A wake of the process before this one ended with it.
+    pub(super) fn lost_wake(&mut self) {
+        self.base.faults += 1;
     }
 
     /// Wakes that ended in a fault.
@@ -177,6 +184,8 @@ impl Watch {
             skipped: topics.iter().map(|topic| topic.skipped).sum(),
             missed_ticks: schedule.missed(),
             log_dropped: session.log_dropped(),
+            triggers_refused: session.triggers_refused(),
+            passed_over: session.passed_over(),
             unwritten,
             recorder,
             wake_up,
@@ -189,6 +198,7 @@ impl Watch {
                 buffer_granted: health.buffer_granted,
                 socket_drops: health.socket_drops,
                 filtered: health.filtered,
+                unfiltered: health.unfiltered.clone(),
                 ..self.base.network
             },
             rss_bytes: usage::resident(),

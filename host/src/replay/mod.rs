@@ -20,6 +20,7 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure, Report};
 
 use self::options::{Results, Task};
+use crate::isolation::Isolation;
 use crate::stage::Load;
 
 /// What the times of a replay are.
@@ -34,10 +35,10 @@ impl Job {
     /// # Errors
     ///
     /// A failure if it cannot start, or results cannot be written; of a comparison, the first difference.
-    pub fn run(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
+    pub fn run(self, load: Load<'_>, isolation: &Isolation, reports: &mut dyn Write) -> Result<Exit, Failure> {
         let Self { options, manifest, task } = self;
         match task {
-            Task::Replay(results) => replay(&options, &results, &manifest, load, reports),
+            Task::Replay(results) => replay(&options, &results, &manifest, load, isolation, reports),
             Task::Verify(mut claim) => {
                 let verified = verify::run(&options, &manifest, &mut claim, load)?;
                 report(reports, &Report::Verified(verified));
@@ -52,11 +53,15 @@ fn replay(
     results: &Results,
     manifest: &Manifest,
     load: Load<'_>,
+    isolation: &Isolation,
     reports: &mut dyn Write,
 ) -> Result<Exit, Failure> {
     let mut n = 1;
     let (summary, broken) = loop {
         let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports)?;
+        if n == 1 {
+            report(reports, &Report::Isolation { layers: isolation.close().to_vec() });
+        }
         if results.repeat > 1 {
             report(reports, &Report::Round(round::report(n, &summary)));
         }

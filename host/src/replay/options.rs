@@ -3,10 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use gleaner_jail::Paths;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, Exit, Failure};
 
 use super::verify::Claim;
+use crate::isolation::definitions;
 use crate::stage::{Asked, AskedArgs, RESULTS};
 
 /// Arguments of `replay`.
@@ -46,6 +48,9 @@ pub struct VerifyArgs {
     /// The lambda's folder, built by `gleaner build`.
     #[arg(long, value_name = "DIR")]
     pub lambda: PathBuf,
+    /// The configuration of the vehicle; by default, the limits are those of the journal.
+    #[arg(long, value_name = "FILE")]
+    pub vehicle: Option<PathBuf>,
 }
 
 /// Which lambda judges which drives.
@@ -86,6 +91,33 @@ pub struct Job {
 }
 
 impl Job {
+    /// What a replay may open while the lambda runs: drives again in a further pass, the results, the code that was compiled.
+    pub fn paths(&self) -> Paths {
+        let Options { asked, drives } = &self.options;
+        let mut read = definitions();
+        read.push(asked.lambda.clone());
+        read.extend(asked.vehicle.clone());
+        read.extend(drives.iter().cloned());
+        if let Task::Verify(claim) = &self.task {
+            read.push(claim.path().to_owned());
+        }
+        read.extend(gleaner_protocol::parts::cache_dir().ok());
+        Paths { read, write: self.results() }
+    }
+
+    /// Memory that our own part of the process may still take, in bytes: chunks of drives, unpacked, and of clips.
+    pub fn own_memory(&self) -> u64 {
+        512 << 20
+    }
+
+    /// The results.
+    pub fn results(&self) -> Vec<PathBuf> {
+        match &self.task {
+            Task::Replay(results) => std::iter::once(&results.out).chain(&results.journal).cloned().collect(),
+            Task::Verify(_) => Vec::new(),
+        }
+    }
+
     /// A replay, or with `--verify` a comparison with an earlier one, checked against the build and its manifest.
     ///
     /// # Errors
@@ -93,17 +125,17 @@ impl Job {
     /// A failure that names the manifest's line, the key, the topic or what differs from the journal, and the way out.
     pub fn replay(args: ReplayArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.asked.lambda)?;
-        let manifest = Manifest::load(build.path())?;
+        let mut manifest = Manifest::load(build.path())?;
         if let Some(twice) = given_twice(&args.drives) {
             let failure = Failure::new(Exit::Usage, format!("drive `{}` is given twice", twice.display()));
             return Err(failure.with_help("its samples would count twice; give each file once"));
         }
         if let Some(journal) = args.verify {
             let claim = Claim::journal(&journal)?;
-            let options = claim.options(args.asked, build, &manifest, args.drives)?;
+            let options = claim.options(args.asked, build, &mut manifest, args.drives)?;
             return Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) });
         }
-        let asked = Asked::new(args.asked, build, &manifest)?;
+        let asked = Asked::new(args.asked, build, &mut manifest)?;
         let (lambda, build) = (&asked.lambda, &asked.build);
         let out = args.out.unwrap_or_else(|| lambda.join("out"));
         if let Some(journal) = args.journal.as_deref().filter(|journal| is_result(journal, &out)) {
@@ -129,10 +161,10 @@ impl Job {
     /// As [`Job::replay`].
     pub fn verify(args: VerifyArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.lambda)?;
-        let manifest = Manifest::load(build.path())?;
+        let mut manifest = Manifest::load(build.path())?;
         let claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
-        let asked = AskedArgs { lambda: args.lambda, set: Vec::new(), remap: Vec::new() };
-        let options = claim.options(asked, build, &manifest, vec![args.clip])?;
+        let asked = AskedArgs { lambda: args.lambda, set: Vec::new(), remap: Vec::new(), vehicle: args.vehicle };
+        let options = claim.options(asked, build, &mut manifest, vec![args.clip])?;
         Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
     }
 }

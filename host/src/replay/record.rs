@@ -6,13 +6,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
-use gleaner_recorder::{Counts, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId};
+use gleaner_recorder::{
+    Counts, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, lambda_digest,
+};
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::{CLOCK, Options};
 use crate::input::Remap;
-use crate::journal::lambda_digest;
 
 /// A recorder over one lambda's `[record]`.
 pub(super) struct Recording {

@@ -56,6 +56,9 @@ impl Course for Pass<'_> {
     }
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
+        if self.judge.passes_over(wake.at_ns()) {
+            return Ok(true);
+        }
         if let Some(scribe) = &mut self.scribe {
             scribe.begin(&wake);
         }
@@ -200,6 +203,8 @@ pub(super) fn replay(
         out_of_order: drive.out_of_order(),
         log_lines: pass.log_lines,
         log_dropped: pass.session.log_dropped(),
+        triggers_refused: pass.session.triggers_refused(),
+        passed_over: pass.session.passed_over(),
         start_ns: drive.start_ns().unwrap_or(0),
         end_ns: drive.end_ns().unwrap_or(0),
         wall_s,

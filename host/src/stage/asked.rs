@@ -1,10 +1,10 @@
 //! Which lambda is to run, with which settings.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
-use gleaner_protocol::{BuildDir, Exit, Failure};
+use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
+use gleaner_protocol::{BuildDir, Exit, Failure, Vehicle};
 
 use crate::input::Remap;
 
@@ -19,6 +19,9 @@ pub struct AskedArgs {
     /// Another name for a topic of the manifest.
     #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
     pub remap: Vec<Remap>,
+    /// The configuration of the vehicle, whose limits make those of the manifest smaller.
+    #[arg(long, value_name = "FILE")]
+    pub vehicle: Option<PathBuf>,
 }
 
 /// A lambda as it was asked for.
@@ -31,20 +34,40 @@ pub struct Asked {
     pub config: Vec<(String, ConfigValue)>,
     /// Other names for topics of the manifest.
     pub remaps: Vec<Remap>,
+    /// The configuration of the vehicle, which an interpreter reads once more.
+    pub vehicle: Option<PathBuf>,
 }
 
 impl Asked {
-    /// Checks the overrides against the manifest.
+    /// Checks the overrides against the manifest, and has the vehicle tighten its limits: from here on they are what holds.
     ///
     /// # Errors
     ///
     /// A failure that names the key or the topic, and the way out.
-    pub fn new(args: AskedArgs, build: BuildDir, manifest: &Manifest) -> Result<Self, Failure> {
-        let AskedArgs { lambda, set, remap: remaps } = args;
+    pub fn new(args: AskedArgs, build: BuildDir, manifest: &mut Manifest) -> Result<Self, Failure> {
+        let AskedArgs { lambda, set, remap: remaps, vehicle } = args;
+        if let Some(vehicle) = &vehicle {
+            tighten(manifest, vehicle)?;
+        }
         let config = ConfigSet::resolve(manifest, &set)?;
         known_topics(&remaps, manifest)?;
-        Ok(Self { lambda, build, config, remaps })
+        Ok(Self { lambda, build, config, remaps, vehicle })
     }
+}
+
+/// Makes the limits of `manifest` those of the vehicle described in `file`, where these are smaller.
+///
+/// # Errors
+///
+/// A failure that names the file, the line and the key.
+pub fn tighten(manifest: &mut Manifest, file: &Path) -> Result<(), Failure> {
+    let (limits, tightened) = manifest.limits.tightened_by(&Vehicle::load(file)?.limits);
+    manifest.limits = limits;
+    if !tightened.is_empty() {
+        let limits = tightened.iter().map(Tightened::to_string).collect::<Vec<_>>().join(", ");
+        tracing::warn!(lambda = %manifest.lambda.name, by = %file.display(), %limits, "the vehicle allows less than the lambda asks for");
+    }
+    Ok(())
 }
 
 fn assignment(text: &str) -> Result<(String, String), String> {

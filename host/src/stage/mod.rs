@@ -11,7 +11,7 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Explain, Failure, Fault};
 use gleaner_transport::{Transport, TransportError};
 
-pub use asked::{Asked, AskedArgs};
+pub use asked::{Asked, AskedArgs, tighten};
 pub use output::{Output, OutputError, RESULTS};
 
 use crate::api::Session;
@@ -57,7 +57,7 @@ impl Stage {
     ) -> Result<Self, Failure> {
         let inputs = open_inputs(manifest, &asked.remaps, transport, live)
             .map_err(|error| Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))?;
-        let session = Session::new(inputs.clone(), asked.config.clone());
+        let session = Session::new(inputs.clone(), asked.config.clone(), &manifest.limits);
         let guest = load(asked, manifest, session.clone(), bounds)?;
         Ok(Self { inputs, session, guest })
     }

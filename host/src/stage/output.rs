@@ -116,9 +116,12 @@ impl Output {
     pub fn finish(mut self, summary: &impl Serialize) -> Result<(), OutputError> {
         self.flush()?;
         let path = self.folder.join(SUMMARY);
+        // So that it is whole, or not there.
+        let part = self.folder.join(format!("{SUMMARY}.part"));
         let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
         text.push(b'\n');
-        fs::write(&path, text).map_err(|source| OutputError { path, source })
+        let written = fs::write(&part, text).and_then(|()| fs::rename(&part, &path));
+        written.map_err(|source| OutputError { path, source })
     }
 }
 

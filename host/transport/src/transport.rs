@@ -175,6 +175,12 @@ pub trait Transport {
     /// [`TransportError`] if there is no such topic, or its definitions are missing or malformed.
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError>;
 
+    /// Whether it is worth while to ask soon once more for the definitions of a topic that has none. A live transport asks
+    /// whoever writes the topic, which takes at most some seconds; this sets it going.
+    fn definitions_may_come(&self, _topic: &str) -> bool {
+        false
+    }
+
     /// How a subscription is doing.
     fn status(&self, _subscription: Subscription) -> Status {
         Status::default()

@@ -1,13 +1,16 @@
 //! How a process of ours is doing, and what it says of itself: the same for the runtime and for the recorder.
 //!
 //! - [`log`]: lines for people, on standard error.
+//! - [`Pulse`]: what it does, and since when, for the shim that ends it if it does not come back.
 //! - [`Spreads`]: how long things take, in bounded memory.
 //! - [`usage`]: memory and CPU time.
 //!
 //! What never happens here: reports to whoever started us, which are `gleaner_protocol`'s.
 
 pub mod log;
+mod pulse;
 mod spread;
 pub mod usage;
 
+pub use pulse::{Busy, PULSE_ENV, Pulse};
 pub use spread::Spreads;

@@ -7,7 +7,9 @@
 mod clip;
 mod decision;
 mod exit;
+mod exit_record;
 mod failure;
+mod isolation;
 pub mod journal;
 pub mod layout;
 pub mod link;
@@ -18,16 +20,20 @@ mod report;
 #[cfg(test)]
 mod scratch;
 mod sources;
+mod vehicle;
 mod words;
 
 pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
 pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ};
 pub use exit::Exit;
+pub use exit_record::{Doing, ExitRecord, Killed};
 pub use failure::{Explain, Failure};
+pub use isolation::{Holds, LAYERS_ENV, Layer};
 pub use layout::{BuildDir, LayoutError};
 pub use live::{Live, LiveTopic, Network, Spread, ToRecorder};
 pub use manifest::{Manifest, ManifestError};
 pub use parts::{Parts, PartsError};
 pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
 pub use sources::Sources;
+pub use vehicle::Vehicle;
 pub use words::visible;

@@ -34,6 +34,10 @@ pub struct Live {
     pub log_lines: u64,
     /// Log lines over the rate limit, thrown away.
     pub log_dropped: u64,
+    /// Triggers over `events_per_minute` of `[limits]`, refused.
+    pub triggers_refused: u64,
+    /// Wakes that did not happen, since the lambda had faulted again and again.
+    pub passed_over: u64,
     /// Decisions and log lines that could not be written: the disk failed, or was too slow.
     pub unwritten: u64,
     /// Sample received, or tick due, until the lambda is entered. `None` without wakes.
@@ -52,6 +56,52 @@ pub struct Live {
     pub rss_bytes: u64,
     /// CPU time of the process, in s.
     pub cpu_s: f64,
+}
+
+impl Live {
+    /// With what was counted of `before`, an earlier process of the same lambda. Spreads, rates, and what is true of an instant
+    /// stay those of this one.
+    #[must_use]
+    pub fn after(mut self, before: &Live) -> Live {
+        self.up_s += before.up_s;
+        self.cpu_s += before.cpu_s;
+        let counts = [
+            (&mut self.wakes, before.wakes),
+            (&mut self.triggers, before.triggers),
+            (&mut self.faults, before.faults),
+            (&mut self.skipped, before.skipped),
+            (&mut self.missed_ticks, before.missed_ticks),
+            (&mut self.log_lines, before.log_lines),
+            (&mut self.log_dropped, before.log_dropped),
+            (&mut self.triggers_refused, before.triggers_refused),
+            (&mut self.passed_over, before.passed_over),
+            (&mut self.unwritten, before.unwritten),
+            (&mut self.network.socket_drops, before.network.socket_drops),
+            (&mut self.network.filtered, before.network.filtered),
+        ];
+        add(counts);
+        for topic in &mut self.topics {
+            let Some(before) = before.topics.iter().find(|before| before.name == topic.name) else { continue };
+            // Unknown in one of them is unknown in both.
+            topic.lost = topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
+            add([
+                (&mut topic.received, before.received),
+                (&mut topic.malformed, before.malformed),
+                (&mut topic.overwritten, before.overwritten),
+                (&mut topic.no_slot, before.no_slot),
+                (&mut topic.too_big, before.too_big),
+                (&mut topic.skipped, before.skipped),
+            ]);
+        }
+        if let (Some(now), Some(before)) = (&mut self.recorder, &before.recorder) {
+            add([(&mut now.wakes_dropped, before.wakes_dropped), (&mut now.triggers_lost, before.triggers_lost)]);
+        }
+        self
+    }
+}
+
+fn add<const N: usize>(counts: [(&mut u64, u64); N]) {
+    counts.into_iter().for_each(|(count, before)| *count = count.saturating_add(before));
 }
 
 /// How long something took.
@@ -118,6 +168,9 @@ pub struct Network {
     /// Datagrams with fragments that nobody should send, dropped before they could do harm: see `docs/dds-limits.md`.
     #[serde(default)]
     pub filtered: u64,
+    /// Why such datagrams are let pass, if they are.
+    #[serde(default)]
+    pub unfiltered: Option<String>,
 }
 
 /// What became of wakes on their way to the recorder.
@@ -127,4 +180,67 @@ pub struct ToRecorder {
     pub wakes_dropped: u64,
     /// Triggers that could not be handed over.
     pub triggers_lost: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn live(count: u64, lost: Option<u64>) -> Live {
+        let topic = LiveTopic {
+            name: "imu".to_owned(),
+            topic: "/imu".to_owned(),
+            type_name: "sensor_msgs/msg/Imu".to_owned(),
+            writers: Some(1),
+            rate_hz: count as f64,
+            received: count,
+            lost,
+            malformed: count,
+            overwritten: count,
+            no_slot: count,
+            too_big: count,
+            skipped: count,
+            age_ns: Some(5),
+            qos: None,
+            trouble: Vec::new(),
+        };
+        Live {
+            lambda: "hello".to_owned(),
+            version: "0.1.0".to_owned(),
+            kind: Kind::Wasm,
+            out: PathBuf::from("out"),
+            restarts: count as u32,
+            up_s: count as f64,
+            wakes: count,
+            triggers: count,
+            faults: count,
+            skipped: count,
+            missed_ticks: count,
+            log_lines: count,
+            log_dropped: count,
+            triggers_refused: count,
+            passed_over: count,
+            unwritten: count,
+            wake_up: Some(Spread { n: count, p50_ns: count, p99_ns: count, max_ns: count }),
+            run: None,
+            hand_out: None,
+            topics: vec![topic],
+            network: Network { socket_drops: count, filtered: count, participants: 3, ..Network::default() },
+            recorder: Some(ToRecorder { wakes_dropped: count, triggers_lost: count }),
+            rss_bytes: count,
+            cpu_s: count as f64,
+        }
+    }
+
+    #[test]
+    fn counts_are_those_of_both_processes_and_all_else_is_of_the_later_one() {
+        let both = live(2, Some(3)).after(&live(40, Some(50)));
+        let mut expected = live(42, Some(53));
+        (expected.restarts, expected.rss_bytes, expected.topics[0].rate_hz) = (2, 2, 2.0);
+        expected.wake_up = live(2, None).wake_up;
+        assert_eq!(both, expected);
+        assert_eq!(live(2, Some(3)).after(&live(40, None)).topics[0].lost, None, "unknown is never 0");
+        let long = live(u64::MAX, None).after(&live(1, None));
+        assert_eq!(long.wakes, u64::MAX);
+    }
 }

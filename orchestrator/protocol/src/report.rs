@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::manifest::Kind;
-use crate::{Decision, Live};
+use crate::{Decision, Layer, Live};
 
 /// One line of JSON that `gleaner-runtime` writes on its standard output for the program that started it.
 ///
@@ -24,6 +24,11 @@ pub enum Report {
     Round(Round),
     /// Sent once, last.
     Summary(Box<Summary>),
+    /// Sent once, before the lambda is entered for the first time.
+    Isolation {
+        /// The layers around its process, and whether they hold here.
+        layers: Vec<Layer>,
+    },
     /// Live: the lambda is ready for its first wake.
     Ready,
     /// Live: a wake with a trigger or a fault. Where nobody reads fast enough, some are left out here; all are in the file.
@@ -123,6 +128,10 @@ pub struct Summary {
     pub log_lines: u64,
     /// Log lines over the rate limit, thrown away.
     pub log_dropped: u64,
+    /// Triggers over `events_per_minute` of `[limits]`, refused.
+    pub triggers_refused: u64,
+    /// Wakes that did not happen, since the lambda had faulted again and again.
+    pub passed_over: u64,
     /// Log time of the drive's first message, in ns since the epoch.
     pub start_ns: i64,
     /// Log time of the drive's last message, in ns since the epoch.
@@ -219,6 +228,8 @@ mod tests {
             out_of_order: 4,
             log_lines: 3,
             log_dropped: 0,
+            triggers_refused: 5,
+            passed_over: 6,
             start_ns: 1,
             end_ns: 2,
             wall_s: 0.25,
@@ -238,7 +249,7 @@ mod tests {
             concat!(
                 r#"{"report":"summary","lambda":"brake-dark","version":"0.1.0","kind":"wasm","drive":["a.mcap","b"],"#,
                 r#""out":"out","wakes":50,"triggers":2,"faults":0,"skipped":0,"missed_ticks":0,"out_of_order":4,"log_lines":3,"#,
-                r#""log_dropped":0,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
+                r#""log_dropped":0,"triggers_refused":5,"passed_over":6,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
                 r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,
                 r#""clips":2,"clips_replaced":1,"in_cooldown":3,"ignored":0,"damaged":null}"#

@@ -1,6 +1,5 @@
 //! A drive: its topics as they are to be played, and its messages, round after round.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -9,7 +8,7 @@ use gleaner_transport::replay::{Replay, ReplayError};
 use gleaner_transport::{DiscoveredTopic, Endian, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::images::Decoder;
-use super::{Source, Topic};
+use super::{Renamed, Source, Topic};
 use crate::args::Args;
 use crate::buffer::{Buffer, Pool};
 use crate::offer::{Offer, is_large};
@@ -100,12 +99,11 @@ impl Drive {
         let round_ns =
             if to_ns <= end_ns { to_ns - from_ns } else { end_ns.saturating_sub(from_ns).saturating_add(GAP_NS) };
         let inbox = Arc::new(Inbox { from_ns, pool: Pool::default(), taken: Mutex::new(None) });
-        let mut renamed: BTreeMap<&str, &str> =
-            args.remap.iter().map(|(from, to)| (from.as_str(), to.as_str())).collect();
+        let mut renamed = Renamed::by(args);
         let (mut topics, mut recorded) = (Vec::<Topic>::new(), Vec::new());
         for found in wanted(&replay, &args.topics)? {
             let decoded = args.raw_images && names::dds_type(&found.type_name).as_deref() == Some(COMPRESSED);
-            let to = renamed.remove(found.topic.as_str());
+            let to = renamed.take(&found.topic);
             let topic = play_as(&replay, &found, decoded, to);
             let spec = TopicSpec {
                 topic: found.topic.clone(),
@@ -119,10 +117,6 @@ impl Drive {
                 replay.subscribe(&spec, sink).map(|_| topic).map_err(|error| error.to_string())
             });
             match subscribed {
-                Ok(topic) if topics.iter().any(|other| other.topic == topic.topic) => {
-                    let what = format!("two topics of the drive would be played as `{}`", topic.topic);
-                    return Err(Failure::new(Exit::Usage, what).with_help("give one of them another name with --remap"));
-                }
                 Ok(topic) => {
                     topics.push(topic);
                     recorded.push((spec, decoded));
@@ -132,10 +126,7 @@ impl Drive {
                 Err(why) => warn(&format!("{why}; it is not played")),
             }
         }
-        if let Some(name) = renamed.keys().next() {
-            let what = format!("--remap names `{name}`, which is not played");
-            return Err(Failure::new(Exit::Usage, what).with_help("FROM is the name of a topic in the drive"));
-        }
+        renamed.check(&topics)?;
         if topics.is_empty() {
             return Err(Failure::new(Exit::Usage, "the drive has no topic that can be played"));
         }
@@ -328,7 +319,6 @@ mod tests {
             (&["--topics", "/imu/dat"][..], "/imu/data"),
             (&["--remap", "/nothing:=/x"], "which is not played"),
             (&["--remap", "/imu/data:=/vehicle/speed"], "two topics"),
-            (&["--topics", "/imu/data", "--remap", "/imu/data:=no name"], "takes no topic"),
             (&["--start", "41"], "40.0 s long"),
         ] {
             let failure = refused(arguments);

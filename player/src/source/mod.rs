@@ -4,7 +4,9 @@ mod drive;
 mod images;
 mod synthetic;
 
-use gleaner_protocol::Failure;
+use std::collections::{BTreeMap, BTreeSet};
+
+use gleaner_protocol::{Exit, Failure};
 
 use crate::args::Args;
 use crate::offer::Offer;
@@ -39,7 +41,35 @@ pub(crate) trait Source: Send {
 /// The source that the arguments ask for.
 pub(crate) fn open(args: &Args) -> Result<Box<dyn Source>, Failure> {
     if args.drives.is_empty() {
-        return Ok(Box::new(synthetic::Synthetic::new(args.synthetic, args.imu, args.duration)));
+        return Ok(Box::new(synthetic::Synthetic::open(args)?));
     }
     Ok(Box::new(drive::Drive::open(args)?))
+}
+
+/// Other names for topics, by `--remap`.
+struct Renamed<'a>(BTreeMap<&'a str, &'a str>);
+
+impl<'a> Renamed<'a> {
+    fn by(args: &'a Args) -> Renamed<'a> {
+        Renamed(args.remap.iter().map(|(from, to)| (from.as_str(), to.as_str())).collect())
+    }
+
+    /// The other name of `topic`, if it is given one.
+    fn take(&mut self, topic: &str) -> Option<&'a str> {
+        self.0.remove(topic)
+    }
+
+    /// Refuses names that nobody took, and two topics of one name.
+    fn check(&self, topics: &[Topic]) -> Result<(), Failure> {
+        if let Some(name) = self.0.keys().next() {
+            let what = format!("--remap names `{name}`, which is not played");
+            return Err(Failure::new(Exit::Usage, what).with_help("FROM is the name of a topic without --remap"));
+        }
+        let mut names = BTreeSet::new();
+        if let Some(twice) = topics.iter().find(|topic| !names.insert(&topic.topic)) {
+            let what = format!("two topics would be played as `{}`", twice.topic);
+            return Err(Failure::new(Exit::Usage, what).with_help("give one of them another name with --remap"));
+        }
+        Ok(())
+    }
 }

@@ -6,8 +6,8 @@
 use gleaner_protocol::Failure;
 use gleaner_transport::Endian;
 
-use super::{Source, Topic};
-use crate::args::{Camera, Size};
+use super::{Renamed, Source, Topic};
+use crate::args::{Args, Camera, Size};
 use crate::buffer::{Buffer, Pool};
 use crate::cdr;
 use crate::offer::Offer;
@@ -43,23 +43,25 @@ impl Stream {
 }
 
 impl Synthetic {
-    pub(crate) fn new(camera: Option<Camera>, imu_hertz: Option<f64>, duration_ns: Option<i64>) -> Synthetic {
-        let topic = |topic: &str, type_name: &str| Topic {
-            topic: topic.to_owned(),
+    pub(crate) fn open(args: &Args) -> Result<Synthetic, Failure> {
+        let mut renamed = Renamed::by(args);
+        let mut topic = |topic: &'static str, type_name: &str| Topic {
+            topic: renamed.take(topic).unwrap_or(topic).to_owned(),
             type_name: type_name.to_owned(),
             offer: Offer::default(),
             is_stamped: true,
         };
         let (mut topics, mut streams) = (Vec::new(), Vec::new());
-        if let Some(Camera { size, hertz }) = camera {
+        if let Some(Camera { size, hertz }) = args.synthetic {
             topics.push(topic(IMAGES, "sensor_msgs/msg/Image"));
             streams.push(Stream { size: Some(size), hertz, next: 0 });
         }
-        if let Some(hertz) = imu_hertz {
+        if let Some(hertz) = args.imu {
             topics.push(topic(IMU, "sensor_msgs/msg/Imu"));
             streams.push(Stream { size: None, hertz, next: 0 });
         }
-        Synthetic { topics, streams, until_ns: duration_ns, pool: Pool::default() }
+        renamed.check(&topics)?;
+        Ok(Synthetic { topics, streams, until_ns: args.duration, pool: Pool::default() })
     }
 
     fn frame(&self, number: u64, size: Size) -> Buffer {
@@ -133,12 +135,14 @@ fn imu(number: u64) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+    use gleaner_protocol::Exit;
     use gleaner_transport::message::{Definitions, FieldPath, ImageView, Sources, Value};
 
     use super::*;
 
-    fn camera(text: &str) -> Option<Camera> {
-        Some(text.parse().unwrap())
+    fn open(arguments: &[&str]) -> Result<Synthetic, Failure> {
+        Synthetic::open(&Args::try_parse_from(["gleaner-player"].iter().chain(arguments)).unwrap())
     }
 
     fn all(mut source: Synthetic) -> Vec<Message> {
@@ -149,7 +153,7 @@ mod tests {
     fn an_imu_is_read_back_by_its_field_paths() {
         let text = Sources::default().find("sensor_msgs/msg/Imu").unwrap().unwrap();
         let definitions = Definitions::parse("sensor_msgs/msg/Imu", &text).unwrap();
-        let messages = all(Synthetic::new(None, Some(100.0), Some(1_000_000_000)));
+        let messages = all(open(&["--imu", "100", "--duration", "1"]).unwrap());
         assert_eq!(messages.len(), 100);
         let cdr = &messages[42].bytes[4..];
         let number = |path: &str| FieldPath::compile(&definitions, path).unwrap().number(cdr, Endian::Little).unwrap();
@@ -163,7 +167,7 @@ mod tests {
 
     #[test]
     fn frames_are_images_with_equal_noise_and_a_number_each_even_in_memory_that_is_used_again() {
-        let mut source = Synthetic::new(camera("33x7@30"), None, None);
+        let mut source = open(&["--synthetic", "33x7@30"]).unwrap();
         let mut first = None;
         for number in 0..20 {
             // Dropped at once, so that the next frame is made in its memory.
@@ -180,9 +184,26 @@ mod tests {
 
     #[test]
     fn sensors_are_merged_by_time() {
-        let messages = all(Synthetic::new(camera("4x4@10"), Some(40.0), Some(300_000_000)));
+        let messages = all(open(&["--synthetic", "4x4@10", "--imu", "40", "--duration", "0.3"]).unwrap());
         let topics: Vec<_> = messages.iter().map(|message| message.topic).collect();
         assert_eq!(topics, [0, 1, 1, 1, 1, 0, 1, 1, 1, 1, 0, 1, 1, 1, 1]);
         assert!(messages.is_sorted_by_key(|message| message.at_ns));
+    }
+
+    #[test]
+    fn sensors_can_have_other_names_and_a_name_that_no_sensor_has_is_refused() {
+        let both = ["--imu", "1", "--synthetic", "4x4@10", "--remap"];
+        let remapped = |remap| open(&[&both[..], &[remap]].concat());
+        let source = remapped("/camera/synthetic/image_raw:=/camera/rear/image_raw").unwrap();
+        let names: Vec<_> = source.topics().iter().map(|topic| topic.topic.as_str()).collect();
+        assert_eq!(names, ["/camera/rear/image_raw", "/imu/synthetic"]);
+        for (remap, said) in [
+            ("/imu:=/car/imu", "`/imu`, which is not played"),
+            ("/imu/synthetic:=/camera/synthetic/image_raw", "two topics"),
+        ] {
+            let failure = remapped(remap).err().expect("it is refused");
+            assert_eq!(failure.exit, Exit::Usage);
+            assert!(failure.message.contains(said), "{failure}");
+        }
     }
 }

@@ -157,22 +157,11 @@ impl Peer {
     /// # Errors
     ///
     /// In words, if it ends or is silent for too long.
-    pub fn wait<T>(&mut self, what: &str, mut wanted: impl FnMut(Said) -> Option<T>) -> Result<T, String> {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            let left = deadline.saturating_duration_since(Instant::now());
-            match self.said.recv_timeout(left) {
-                Ok(said) => {
-                    if let Some(found) = wanted(said) {
-                        return Ok(found);
-                    }
-                }
-                Err(_) => {
-                    let state = self.child.try_wait().map(|ended| ended.map(|status| status.to_string()));
-                    return Err(format!("waiting for {what}: peer is silent; ended: {state:?}"));
-                }
-            }
-        }
+    pub fn wait<T>(&mut self, what: &str, wanted: impl FnMut(Said) -> Option<T>) -> Result<T, String> {
+        self.wait_for(PATIENCE, wanted).ok_or_else(|| {
+            let state = self.child.try_wait().map(|ended| ended.map(|status| status.to_string()));
+            format!("waiting for {what}: peer is silent; ended: {state:?}")
+        })
     }
 
     /// What `wanted` makes of the next lines; `None` if none of them comes in time.

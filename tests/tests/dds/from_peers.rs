@@ -85,7 +85,7 @@ fn mixed() -> Result<(), Failed> {
 }
 
 fn restarts() -> Result<(), Failed> {
-    let times = std::env::var("GLEANER_RESTARTS").ok().and_then(|times| times.parse().ok()).unwrap_or(10);
+    let times = gleaner_tests::times("GLEANER_RESTARTS", 10);
     let mut dds = join(None)?;
     let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
     let mut known = BTreeSet::new();

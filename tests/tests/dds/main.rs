@@ -51,9 +51,12 @@ fn main() -> ExitCode {
     let mut arguments = Arguments::from_args();
     // Two that move images at the same time would show how small this machine is.
     arguments.test_threads.get_or_insert(1);
-    let trials = cases().map(|case| match unavailable(case) {
-        None => Trial::test(case.name, || in_private(case.name)),
-        Some(why) => Trial::test(format!("{} [{why}]", case.name), || in_private(case.name)).with_ignored_flag(true),
+    let trials = cases().map(|case| {
+        let run = || namespace::case(CASE, case.name);
+        match unavailable(case) {
+            None => Trial::test(case.name, run),
+            Some(why) => Trial::test(format!("{} [{why}]", case.name), run).with_ignored_flag(true),
+        }
     });
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
 }
@@ -70,16 +73,4 @@ fn can_filter() -> bool {
     let mut probe = namespace::command("nft".as_ref());
     let probe = probe.args(["add", "table", "inet", "probe"]).stdin(Stdio::null()).stderr(Stdio::null());
     probe.status().is_ok_and(|status| status.success())
-}
-
-/// Runs a case in a network of its own.
-fn in_private(name: &str) -> Result<(), Failed> {
-    let mut run = namespace::command(&std::env::current_exe()?);
-    let output = run.env(CASE, name).stdin(Stdio::null()).output()?;
-    print!("{}", String::from_utf8_lossy(&output.stdout));
-    if output.status.success() {
-        return Ok(());
-    }
-    let said = String::from_utf8_lossy(&output.stderr);
-    Err(format!("{}; it said:\n{said}", output.status).into())
 }

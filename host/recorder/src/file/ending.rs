@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::collections::HashMap;
 use std::fmt::Display;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use gleaner_protocol::journal::{FileDigest, Header};
 use gleaner_protocol::{Clip, ClipLambda, ClipTopic, Moment};
@@ -146,8 +147,8 @@ pub(super) fn records<'a>(
     clock: &str,
     recovered_from: Option<&str>,
 ) -> impl Iterator<Item = Record> + 'a {
-    let header = |lambda: &ClipLambda| ending.headers.iter().find(|header| header.lambda == lambda.name);
-    let lambdas = clip.lambdas.iter().map(move |of| lambda(of, header(of)));
+    let header = |index: usize| ending.headers.get(index).map(Arc::as_ref);
+    let lambdas = clip.lambdas.iter().enumerate().map(move |(index, of)| lambda(of, header(index)));
     std::iter::once(about_clip(clip, clock, recovered_from))
         .chain(clip.topics.iter().map(topic))
         .chain(lambdas)

@@ -10,6 +10,7 @@ use gleaner_protocol::link::Loss;
 use tracing::warn;
 
 use super::list::{List, Listed};
+use super::losses::LossList;
 use super::part::{Origin, origin};
 use super::place::{AGAIN, CLIP, CLIPS, PART, Place};
 use super::shelf::Shelf;
@@ -21,6 +22,7 @@ use crate::error::RecordError;
 pub struct Folder {
     pub(super) place: Arc<Place>,
     shelf: Option<Shelf>,
+    losses: Arc<LossList>,
 }
 
 impl Folder {
@@ -51,7 +53,7 @@ impl Folder {
                 found.extend(recover::list(&place, &name)?);
             }
         }
-        Ok((Self { place, shelf: None }, found))
+        Ok((Self { place, shelf: None, losses: Arc::new(LossList::of(out)) }, found))
     }
 
     /// Starts anew with the clips in `keep`: deletes the others that are listed, with their thumbnails, and says how
@@ -90,19 +92,25 @@ impl Folder {
     }
 
     /// From now on there are at most so many clips, or so many bytes of them: of more, the oldest that nobody fetched are deleted,
-    /// the present ones included. Each is named in `losses.jsonl` before; those that go at once are returned.
+    /// the present ones included. Each is named in `losses.jsonl` before; those that go at once are returned, and with them
+    /// those that should and cannot be deleted.
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if the list cannot be read, or a file not be removed.
+    /// [`RecordError`] if the list of clips cannot be read.
     pub fn keep_at_most(&mut self, clips: Option<u64>, bytes: Option<u64>) -> Result<Vec<Loss>, RecordError> {
-        let shelf = Shelf::new(&self.place, self.place.list().read()?, clips, bytes);
-        self.shelf.insert(shelf).make_room(&self.place)
+        let shelf = Shelf::new(&self.place, self.losses(), self.place.list().read()?, clips, bytes);
+        Ok(self.shelf.insert(shelf).make_room(&self.place))
     }
 
-    /// A clip was finished: makes room, if there is a bound.
-    pub(crate) fn added(&mut self, clip: &Clip) -> Result<Vec<Loss>, RecordError> {
-        self.shelf.as_mut().map_or(Ok(Vec::new()), |shelf| shelf.add(&self.place, clip))
+    /// `losses.jsonl`.
+    pub fn losses(&self) -> Arc<LossList> {
+        Arc::clone(&self.losses)
+    }
+
+    /// A clip was finished: makes room, if there is a bound. What went for it, and what should have and could not.
+    pub(crate) fn added(&mut self, clip: &Clip) -> Vec<Loss> {
+        self.shelf.as_mut().map_or(Vec::new(), |shelf| shelf.add(&self.place, clip))
     }
 
     /// Begins a clip named `stem`, or `stem-2`, `stem-3` and so on if there is one.

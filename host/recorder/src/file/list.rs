@@ -41,11 +41,6 @@ impl List {
         Self { path: folder.join("clips.jsonl"), folder: folder.to_owned() }
     }
 
-    /// Where it lies.
-    pub(super) fn folder(&self) -> &Path {
-        &self.folder
-    }
-
     /// What the list names. A line that was torn when its writer died is cut off.
     pub(super) fn read(&self) -> Result<Vec<Listed>, RecordError> {
         let failed = |source| RecordError::List { path: self.path.clone(), source };

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! OUT/clips.jsonl                 a line for each whole clip
-//! OUT/losses.jsonl                a line for each clip that was deleted to make room
+//! OUT/losses.jsonl                a line for each thing that was wanted and is not there
 //! OUT/clips/.lock                 held by the process that records
 //! OUT/clips/NAME.mcap             a whole clip
 //! OUT/clips/NAME.jpg              its thumbnail
@@ -22,6 +22,7 @@ mod durable;
 mod ending;
 mod folder;
 mod list;
+mod losses;
 mod part;
 mod place;
 mod read;
@@ -38,6 +39,7 @@ use gleaner_protocol::journal::Header;
 use gleaner_protocol::{ClipLambda, Moment};
 
 pub use folder::Folder;
+pub use losses::LossList;
 pub(crate) use unfinished::{MESSAGE_MAX, Unfinished};
 
 use crate::error::RecordError;
@@ -103,8 +105,9 @@ pub(crate) struct Ending {
     pub to_ns: i64,
     /// The lambdas whose windows it holds.
     pub lambdas: Vec<ClipLambda>,
-    /// What the journals of these lambdas say of them, as far as anybody knows.
-    pub headers: Vec<Header>,
+    /// What the journals of these lambdas say of them, in the same order; empty where nobody knows. Two of them may have one
+    /// name: a lambda that was started again.
+    pub headers: Vec<Arc<Header>>,
     /// Triggers within it.
     pub triggers: u64,
     /// These triggers, or as many of them as were kept.

@@ -1,17 +1,17 @@
 //! How much room clips may take. Beyond it the oldest go, and what goes is named.
 
 use std::collections::VecDeque;
-use std::fs::OpenOptions;
-use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use gleaner_protocol::Clip;
 use gleaner_protocol::link::Loss;
-use tracing::warn;
+use gleaner_protocol::{Clip, Failure};
+use tracing::{error, warn};
 
 use super::durable;
 use super::list::Listed;
+use super::losses::LossList;
 use super::place::{CLIPS, Place};
 use crate::error::RecordError;
 
@@ -21,23 +21,32 @@ pub(super) struct Shelf {
     bytes_max: u64,
     clips: VecDeque<Kept>,
     bytes: u64,
+    losses: Arc<LossList>,
 }
 
 struct Kept {
     file: String,
     thumbnail: Option<String>,
     bytes: u64,
+    /// It could not be deleted, and that was told.
+    is_stuck: bool,
 }
 
 impl Shelf {
     /// Over the clips that are listed. One that is not there was fetched.
-    pub(super) fn new(place: &Place, listed: Vec<Listed>, clips_max: Option<u64>, bytes_max: Option<u64>) -> Shelf {
+    pub(super) fn new(
+        place: &Place,
+        losses: Arc<LossList>,
+        listed: Vec<Listed>,
+        clips_max: Option<u64>,
+        bytes_max: Option<u64>,
+    ) -> Shelf {
         let (clips_max, bytes_max) = (clips_max.unwrap_or(u64::MAX), bytes_max.unwrap_or(u64::MAX));
-        let mut shelf = Shelf { clips_max, bytes_max, clips: VecDeque::new(), bytes: 0 };
+        let mut shelf = Shelf { clips_max, bytes_max, clips: VecDeque::new(), bytes: 0, losses };
         for Listed { file, thumbnail } in listed {
             let bytes = place.folder().join(&file).symlink_metadata().ok().filter(|metadata| metadata.is_file());
             if let Some(bytes) = bytes.map(|metadata| metadata.len()) {
-                shelf.push(Kept { file, thumbnail, bytes });
+                shelf.push(Kept { file, thumbnail, bytes, is_stuck: false });
             }
         }
         shelf
@@ -49,53 +58,77 @@ impl Shelf {
     }
 
     /// Adds a clip that is whole now; deletes the oldest until the others have room. The newest stays in any case.
-    pub(super) fn add(&mut self, place: &Place, clip: &Clip) -> Result<Vec<Loss>, RecordError> {
+    pub(super) fn add(&mut self, place: &Place, clip: &Clip) -> Vec<Loss> {
         let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         let (file, thumbnail) = (name(&clip.file), clip.thumbnail.as_deref().and_then(name));
         if let Some(file) = file {
-            self.push(Kept { file, thumbnail, bytes: clip.bytes });
+            self.push(Kept { file, thumbnail, bytes: clip.bytes, is_stuck: false });
         }
         self.make_room(place)
     }
 
-    /// Deletes the oldest until the others have room.
-    pub(super) fn make_room(&mut self, place: &Place) -> Result<Vec<Loss>, RecordError> {
+    /// Deletes the oldest until the others have room. What cannot be deleted is passed over, and tried again the next time.
+    pub(super) fn make_room(&mut self, place: &Place) -> Vec<Loss> {
         // Those that somebody has fetched take no room any more.
         self.clips.retain(|kept| place.folder().join(&kept.file).symlink_metadata().is_ok());
         self.bytes = self.clips.iter().map(|kept| kept.bytes).sum();
-        let mut losses = Vec::new();
-        while self.clips.len() > 1 && (self.clips.len() as u64 > self.clips_max || self.bytes > self.bytes_max) {
-            let Some(gone) = self.clips.front() else { break };
-            let path = place.folder().join(&gone.file);
+        let mut told = Vec::new();
+        let mut passed_over = 0;
+        while self.clips.len() > passed_over + 1
+            && (self.clips.len() as u64 > self.clips_max || self.bytes > self.bytes_max)
+        {
             let why = match self.clips.len() as u64 > self.clips_max {
                 true => format!("there may be {} clips", self.clips_max),
                 false => format!("clips may take {} MiB", self.bytes_max >> 20),
             };
-            warn!(clip = %gone.file, %why, "oldest clip deleted, nobody had fetched it");
-            let loss =
-                Loss::Deleted { at_ns: now(), file: PathBuf::from(CLIPS).join(&gone.file), bytes: gone.bytes, why };
-            // What is lost is told before it is.
-            note(place, &loss)?;
-            if let Some(thumbnail) = &gone.thumbnail {
-                durable::remove(&place.folder().join(thumbnail))?;
+            let kept = &mut self.clips[passed_over];
+            match kept.delete(place, &self.losses, why) {
+                Ok(deleted) => {
+                    told.push(deleted);
+                    self.bytes -= kept.bytes;
+                    self.clips.remove(passed_over);
+                }
+                Err(error) => {
+                    passed_over += 1;
+                    told.extend(kept.stuck(&self.losses, error));
+                }
             }
-            durable::remove(&path)?;
-            self.bytes -= gone.bytes;
-            self.clips.pop_front();
-            losses.push(loss);
         }
-        Ok(losses)
+        told
     }
 }
 
-/// Adds a line to `losses.jsonl`.
-fn note(place: &Place, loss: &Loss) -> Result<(), RecordError> {
-    let path = place.list().folder().join("losses.jsonl");
-    let failed = |source| RecordError::List { path: path.clone(), source };
-    let mut line = serde_json::to_vec(loss).expect("a loss is plain data");
-    line.push(b'\n');
-    let mut file = OpenOptions::new().append(true).create(true).open(&path).map_err(failed)?;
-    file.write_all(&line).and_then(|()| file.sync_data()).map_err(failed)
+impl Kept {
+    fn path(&self) -> PathBuf {
+        PathBuf::from(CLIPS).join(&self.file)
+    }
+
+    /// Deletes it, because of `why`. What is lost is told before it is.
+    fn delete(&self, place: &Place, losses: &LossList, why: String) -> Result<Loss, RecordError> {
+        warn!(clip = %self.file, %why, "oldest clip is deleted, nobody has fetched it");
+        let deleted = Loss::Deleted { at_ns: now(), file: self.path(), bytes: self.bytes, why };
+        losses.note(&deleted)?;
+        if let Some(thumbnail) = &self.thumbnail {
+            durable::remove(&place.folder().join(thumbnail))?;
+        }
+        durable::remove(&place.folder().join(&self.file))?;
+        Ok(deleted)
+    }
+
+    /// It could not be deleted: that is told once.
+    fn stuck(&mut self, losses: &LossList, error: RecordError) -> Option<Loss> {
+        if std::mem::replace(&mut self.is_stuck, true) {
+            return None;
+        }
+        let failure = Failure::from(error);
+        error!(clip = %self.file, %failure, "a clip cannot be deleted to make room, and stays");
+        let why = std::iter::once(failure.message).chain(failure.causes).collect::<Vec<_>>().join(": ");
+        let loss = Loss::NotDeleted { at_ns: now(), file: self.path(), bytes: self.bytes, why };
+        if let Err(error) = losses.note(&loss) {
+            error!(error = &error as &dyn std::error::Error, "cannot note a loss");
+        }
+        Some(loss)
+    }
 }
 
 fn now() -> i64 {

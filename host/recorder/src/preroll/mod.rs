@@ -156,10 +156,14 @@ impl Preroll {
     ///
     /// # Errors
     ///
-    /// [`RecordError::Preroll`] if the folder cannot be made or emptied.
+    /// [`RecordError::Preroll`] if the folder cannot be made or emptied, [`RecordError::PrerollMemory`] if the system does not
+    /// have as much memory.
     pub fn open(store: Store, bytes: u64, folder: PathBuf, prefault: bool) -> Result<Preroll, RecordError> {
         let kind = match store {
-            Store::Ram => Kind::Ram(Ram::new(usize::try_from(bytes).unwrap_or(usize::MAX), prefault)),
+            Store::Ram => {
+                let ram = Ram::new(usize::try_from(bytes).unwrap_or(usize::MAX), prefault);
+                Kind::Ram(ram.map_err(|source| RecordError::PrerollMemory { bytes, source })?)
+            }
             Store::Disk => Kind::Disk(Disk::open(folder, bytes)?),
         };
         Ok(Preroll { kind, highest: 0, gone: 0 })

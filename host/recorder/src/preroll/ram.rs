@@ -1,5 +1,6 @@
 //! A preroll in memory: one block, in which entries follow each other, each behind a head of [`OVERHEAD`] bytes.
 
+use std::collections::TryReserveError;
 use std::hint::black_box;
 
 use super::{Held, OVERHEAD, Place, Source};
@@ -25,13 +26,18 @@ pub(super) struct Ram {
 }
 
 impl Ram {
-    pub(super) fn new(bytes: usize, prefault: bool) -> Ram {
+    /// # Errors
+    ///
+    /// If the system does not have as much memory.
+    pub(super) fn new(bytes: usize, prefault: bool) -> Result<Ram, TryReserveError> {
+        // Asked for first: what follows would end the process.
+        Vec::<u8>::new().try_reserve_exact(bytes)?;
         // Zeroed memory comes from the system untouched, so that a large block costs nothing before it is filled.
         let mut arena = vec![0; bytes];
         if prefault {
             arena.iter_mut().step_by(PAGE).for_each(|byte| *black_box(byte) = 0);
         }
-        Ram { arena, head: 0, tail: 0, newest: 0, wrapped: None, entries: 0, bytes: 0 }
+        Ok(Ram { arena, head: 0, tail: 0, newest: 0, wrapped: None, entries: 0, bytes: 0 })
     }
 
     pub(super) fn push(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> bool {

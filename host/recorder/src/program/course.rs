@@ -19,16 +19,15 @@ use tracing::{error, warn};
 
 use super::Options;
 use super::commands::Commands;
-use super::hear::{Announced, Event, starter};
+use super::hear::{Event, starter};
 use super::lambdas::Lambda;
 use super::say::Say;
-use super::staging::{Arrivals, Block, Lane, Staging};
+use super::staging::{Block, Lane, Staging};
 use super::telling::Said;
 use super::watch::{Beat, Feed, Seen, Want, Wanted, Watch};
-use crate::{Folder, RecordError, Recorder, Settings, TopicId, Work};
+use crate::recorder::counted;
+use crate::{Folder, Recorder, Settings, TopicId, Work};
 
-/// Lambdas that are heard at a time. Each has a thread.
-const LAMBDAS: usize = 256;
 /// Events that wait for the loop.
 const EVENTS: usize = 256;
 /// Samples and bytes that are taken before triggers are looked for again.
@@ -40,13 +39,11 @@ const LOOK: Duration = Duration::from_millis(5);
 const BEHIND: Duration = Duration::from_millis(1);
 /// A sample is stamped before it is staged: time passes for the recorder only when all up to then must have come.
 const MARGIN_NS: i64 = 100_000_000;
-/// How long the last words of lambdas may take.
+/// How long the last words of lambdas may take, and the last sample.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 const LAST_LOOK: Duration = Duration::from_millis(2);
-/// Bytes of the largest sample of a topic of which no manifest says more, as far as room for it goes.
-const USUAL_BYTES: usize = 8 << 20;
 /// Room for staged samples: twice as much is taken.
-const STAGING: std::ops::RangeInclusive<usize> = 8 << 20..=256 << 20;
+pub(super) const STAGING: std::ops::RangeInclusive<usize> = 8 << 20..=256 << 20;
 /// Room on the disk above the floor from which on clips are begun again.
 const SLACK: u64 = 64 << 20;
 
@@ -60,7 +57,7 @@ pub(super) fn run(
 ) -> Result<(), Failure> {
     let internal = |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
     let (mut folder, recovered) = Folder::open(&options.out)?;
-    let mut say = Say::start(reports, options.out.join("losses.jsonl")).map_err(internal)?;
+    let mut say = Say::start(reports, folder.losses()).map_err(internal)?;
     for clip in recovered {
         warn!(clip = %clip.file.display(), "recovered a clip of an earlier recorder, which did not end well");
         say.say(RecorderReport::Recovered(Box::new(clip)));
@@ -113,9 +110,10 @@ pub(super) fn run(
         said: Said::default(),
         beat: Beat::default(),
         spreads: Spreads::new(),
+        lambdas_refused: 0,
         wakes_lost: 0,
         triggers_refused: 0,
-        deleted_before: deleted.len() as u64,
+        deleted_before: counted(&deleted),
         is_ending: false,
         options,
         stop,
@@ -132,37 +130,51 @@ pub(super) fn run(
     ended
 }
 
+/// What came of samples.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Came {
+    /// There may be more.
+    More,
+    /// Nothing.
+    Nothing,
+    /// One is just being copied: nobody knows what came before that is accepted.
+    Copying,
+}
+
 /// A topic that is recorded.
 pub(super) struct Recorded {
     pub(super) name: String,
     pub(super) type_name: Option<String>,
-    pub(super) arrivals: Arc<Arrivals>,
+    pub(super) lane: Arc<Lane>,
 }
 
 pub(super) struct Course {
     pub(super) recorder: Recorder,
     pub(super) clock: Clock,
-    staging: Arc<Staging>,
+    pub(super) staging: Arc<Staging>,
     /// Samples that are being taken, and up to which they are.
     block: Block,
     at: usize,
     /// How much room there is to be.
-    room: usize,
+    pub(super) room: usize,
     inbox: Receiver<Event>,
-    wants: SyncSender<Want>,
+    pub(super) wants: SyncSender<Want>,
     pub(super) commands: Option<Commands>,
     pub(super) lambdas: Vec<Lambda>,
     pub(super) topics: BTreeMap<TopicId, Recorded>,
     /// By lambda: what it asks of the preroll, and bytes that it expects in a second.
-    asked: BTreeMap<String, (Store, u64, usize)>,
+    pub(super) asked: BTreeMap<String, (Store, u64, usize)>,
     pub(super) said: Said,
     pub(super) beat: Beat,
     pub(super) spreads: Spreads,
+    /// Lambdas that are not recorded for.
+    pub(super) lambdas_refused: u64,
     pub(super) wakes_lost: u64,
     pub(super) triggers_refused: u64,
-    pub(super) deleted_before: u64,
+    /// Clips that were deleted before anything was recorded, and that could not be.
+    pub(super) deleted_before: (u64, u64),
     is_ending: bool,
-    options: Options,
+    pub(super) options: Options,
     stop: Arc<AtomicBool>,
     pub(super) say: Say,
 }
@@ -175,7 +187,7 @@ impl Course {
             if let Some(commands) = &mut self.commands {
                 is_busy |= commands.obey(&mut self.recorder)?;
             }
-            is_busy |= self.samples(SAMPLES_TURN)?;
+            is_busy |= self.samples(SAMPLES_TURN)? == Came::More;
             let work = self.recorder.work()?;
             self.tell(false)?;
             if let Some(why) = self.beat.pulse.dead.take() {
@@ -198,6 +210,7 @@ impl Course {
             heard = true;
             match event {
                 Event::Announced(announced) => self.announce(*announced)?,
+                Event::Refused => self.lambdas_refused += 1,
                 Event::Stop => self.is_ending = true,
                 Event::Seen(Seen::Found { topic, of }) => {
                     let type_name = of.type_name.clone();
@@ -216,69 +229,6 @@ impl Course {
             }
         }
         Ok(heard)
-    }
-
-    /// A lambda will come: its topics are wanted from now on, so that there is a preroll when it does.
-    fn announce(&mut self, announced: Announced) -> Result<(), Failure> {
-        let Announced { manifest, remaps, spoken, mut answers } = announced;
-        let Some(rules) = manifest.record.clone() else { return Ok(()) };
-        let name = manifest.lambda.name.to_string();
-        if self.lambdas.len() == LAMBDAS {
-            warn!(lambda = %name, most = LAMBDAS, "too many lambdas at a time: not recorded for");
-            answers.refused(&format!("it hears at most {LAMBDAS} lambdas at a time"));
-            return Ok(());
-        }
-        let mut topics = Vec::new();
-        let mut largest = 0;
-        for wanted in &rules.topics {
-            let remapped = remaps.iter().find(|(from, _)| from == wanted.as_str()).map(|(_, to)| to.as_str());
-            let input = manifest.inputs.iter().find(|input| input.topic == *wanted);
-            let max_bytes = input.map(|input| input.max_size.as_usize());
-            largest = largest.max(max_bytes.unwrap_or(USUAL_BYTES));
-            match self.want(remapped.unwrap_or(wanted.as_str()), max_bytes) {
-                Ok(topic) if !topics.contains(&topic) => topics.push(topic),
-                Ok(_) => {}
-                Err(error) => {
-                    let why = error.to_string();
-                    warn!(lambda = %name, topic = %wanted, %why, "a lambda cannot be recorded for");
-                    answers.refused(&why);
-                    return Ok(());
-                }
-            }
-        }
-        let seconds = rules.preroll.as_secs_f64().max(1.0);
-        let per_s = (rules.preroll_size.bytes() as f64 / seconds) as usize;
-        self.asked.insert(name.clone(), (rules.store, rules.preroll_size.bytes(), per_s));
-        let per_s: usize = self.asked.values().map(|(_, _, per_s)| *per_s).fold(0, usize::saturating_add);
-        let wanted = largest.saturating_add(per_s).clamp(*STAGING.start(), *STAGING.end());
-        self.room = self.room.max(wanted);
-        let store = if self.asked.values().any(|asked| asked.0 == Store::Disk) { Store::Disk } else { Store::Ram };
-        let bytes = self.asked.values().map(|asked| asked.1).fold(0, u64::saturating_add);
-        match self.options.preroll_bytes {
-            // What is given is memory.
-            Some(given) if store == Store::Ram => {
-                if given < bytes {
-                    warn!(asked = bytes, given, "lambdas ask for more preroll than the recorder was given");
-                }
-            }
-            _ => self.recorder.grow_preroll(store, bytes)?,
-        }
-        self.recorder.grow_length(rules.max_length);
-        self.lambdas.push(Lambda::new(name, rules, topics, spoken, answers));
-        Ok(())
-    }
-
-    fn want(&mut self, name: &str, max_bytes: Option<usize>) -> Result<TopicId, RecordError> {
-        let topic = self.recorder.add_missing_topic(name)?;
-        if !self.topics.contains_key(&topic) {
-            let arrivals = Arc::<Arrivals>::default();
-            let lane = Lane { topic, staging: Arc::clone(&self.staging), arrivals: Arc::clone(&arrivals) };
-            // The watch takes them as they come; there are at most 256.
-            let what = Wanted::Recorded { topic, max_bytes };
-            let _ = self.wants.send(Want { what, name: name.to_owned(), sink: Arc::new(lane) });
-            self.topics.insert(topic, Recorded { name: name.to_owned(), type_name: None, arrivals });
-        }
-        Ok(topic)
     }
 
     /// Below the floor no clip is begun, and the open one ends.
@@ -307,6 +257,7 @@ impl Course {
             let monotonic = || clock.monotonic(clock.now());
             let listened = self.lambdas[index].listen(&mut self.recorder, now, monotonic, &mut self.spreads)?;
             heard |= listened.heard;
+            self.lambdas_refused += u64::from(listened.is_refused);
             self.wakes_lost += listened.wakes_lost;
             self.triggers_refused += listened.triggers_refused;
             if let (Some(commands), Some(id)) = (&mut self.commands, listened.is_new) {
@@ -321,12 +272,12 @@ impl Course {
         Ok(heard)
     }
 
-    /// Takes some of the samples that came; `true` if there may be more.
-    fn samples(&mut self, most: usize) -> Result<bool, Failure> {
+    /// Takes some of the samples that came.
+    fn samples(&mut self, most: usize) -> Result<Came, Failure> {
         let (mut samples, mut bytes) = (0, 0);
         while let Some((staged, cdr)) = self.block.get(self.at) {
             if samples == most || bytes >= BYTES_TURN {
-                return Ok(true);
+                return Ok(Came::More);
             }
             match staged.bytes {
                 Some(_) => self.recorder.sample(staged.topic, &staged.meta, cdr)?,
@@ -340,14 +291,22 @@ impl Course {
             empty = Block::new(self.room);
         }
         empty.clear();
-        (self.block, self.at) = (self.staging.exchange(empty), 0);
+        self.at = 0;
+        match self.staging.exchange(empty) {
+            Ok(block) => self.block = block,
+            Err(empty) => {
+                // Time passes only once it is known what came.
+                self.block = empty;
+                return Ok(Came::Copying);
+            }
+        }
         if self.block.get(0).is_none() {
             self.recorder.advance(now.saturating_sub(MARGIN_NS))?;
-            return Ok(false);
+            return Ok(Came::Nothing);
         }
         // A topic is told before its first sample.
         self.events()?;
-        Ok(true)
+        Ok(Came::More)
     }
 
     /// Takes what has come, and completes what is open.
@@ -360,10 +319,16 @@ impl Course {
             }
         }
         let end = self.clock.now();
+        let until = Instant::now() + LAST_WORDS;
         // Three blocks at most: what comes in another is later than the end.
         let mut blocks = 0;
-        while blocks < 4 && self.samples(usize::MAX)? {
-            blocks += u32::from(self.at == 0);
+        while blocks < 4 {
+            match self.samples(usize::MAX)? {
+                Came::More => blocks += u32::from(self.at == 0),
+                // No sample takes as long to copy.
+                Came::Copying if Instant::now() < until => thread::park_timeout(LAST_LOOK),
+                Came::Copying | Came::Nothing => break,
+            }
         }
         self.recorder.finish(end)?;
         self.tell(true)

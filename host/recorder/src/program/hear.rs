@@ -1,20 +1,19 @@
 //! What the starter and the lambdas say, on its way to the loop. A thread each: their frames may come in pieces, or not at all.
 
-use std::fs::File;
-use std::io::{self, Read};
+use std::io;
 use std::os::fd::OwnedFd;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{Builder, Thread};
 
-use gleaner_protocol::journal::{Entry, FileDigest, Header};
+use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::link::{Add, Answers, Controlled, Heard, LambdaLink, LinkError, Order};
-use gleaner_protocol::manifest::bounds::MANIFEST_MAX;
-use gleaner_protocol::{BuildDir, Failure, Manifest, ManifestError};
+use gleaner_protocol::{BuildDir, Exit, Failure, Manifest};
 use sha2::{Digest, Sha256};
 use tracing::warn;
 
 use super::watch::Seen;
+use crate::digest::hex;
 
 /// What one lambda said waits for the loop, up to this; then its socket waits, and then the lambda's own queue.
 const SPOKEN: usize = 64;
@@ -23,6 +22,8 @@ const SPOKEN: usize = 64;
 pub(super) enum Event {
     /// A lambda will come.
     Announced(Box<Announced>),
+    /// One was announced, and refused; it was said why.
+    Refused,
     /// It is to end: the starter said so, or has ended, or speaks nonsense.
     Stop,
     /// From the watch.
@@ -59,10 +60,8 @@ pub(super) fn starter(control: OwnedFd, events: SyncSender<Event>, reader: Threa
         let mut control = Controlled::new(control);
         loop {
             let event = match control.order() {
-                Ok(Some(Order::Add(add, socket))) => match announced(add, socket, &reader) {
-                    Some(announced) => Event::Announced(Box::new(announced)),
-                    None => continue,
-                },
+                Ok(Some(Order::Add(add, socket))) => announced(add, socket, &reader)
+                    .map_or(Event::Refused, |announced| Event::Announced(Box::new(announced))),
                 Ok(Some(Order::Stop) | None) => Event::Stop,
                 Err(error) => {
                     warn!(error = &error as &dyn std::error::Error, "the starter cannot be understood");
@@ -162,35 +161,12 @@ impl Expected {
 
 /// The manifest of a build, and its digest: of the same bytes.
 fn load(lambda: &Path) -> Result<(Manifest, String), Failure> {
-    let path = BuildDir::of(lambda).manifest_path();
-    let mut bytes = Vec::new();
-    File::open(&path)
-        .and_then(|file| file.take(MANIFEST_MAX.bytes() + 1).read_to_end(&mut bytes))
-        .map_err(|source| ManifestError::Read { path: path.clone(), source })?;
-    if bytes.len() as u64 > MANIFEST_MAX.bytes() {
-        return Err(ManifestError::TooLong { path, limit: MANIFEST_MAX }.into());
-    }
-    let text = std::str::from_utf8(&bytes).map_err(|error| ManifestError::Read {
-        path: path.clone(),
-        source: io::Error::new(io::ErrorKind::InvalidData, error),
-    })?;
-    let manifest = Manifest::parse(text, &path)?;
+    let build = BuildDir::of(lambda);
+    let text = Manifest::read(build.path())?;
+    let manifest = Manifest::parse(&text, build.manifest_path())?;
     if manifest.record.is_none() {
         let message = format!("lambda `{}` has no [record]", manifest.lambda.name);
-        return Err(Failure::new(gleaner_protocol::Exit::Usage, message));
+        return Err(Failure::new(Exit::Usage, message));
     }
-    Ok((manifest, hex(&Sha256::digest(&bytes))))
-}
-
-/// One digest for all files of a lambda, as a replay takes it: of their paths and digests, a line each.
-pub(super) fn lambda_digest(files: &[FileDigest]) -> String {
-    let mut digest = Sha256::new();
-    for file in files {
-        digest.update(format!("{}  {}\n", file.sha256, file.path));
-    }
-    hex(&digest.finalize())
-}
-
-fn hex(digest: &[u8]) -> String {
-    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+    Ok((manifest, hex(&Sha256::digest(text))))
 }

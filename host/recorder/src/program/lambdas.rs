@@ -10,8 +10,8 @@ use gleaner_vitals::Spreads;
 use tracing::warn;
 
 use super::allowance::Allowance;
-use super::hear::{Spoken, lambda_digest};
-use crate::{LambdaId, Member, RecordError, Recorder, TopicId};
+use super::hear::Spoken;
+use crate::{LambdaId, Member, RecordError, Recorder, TopicId, lambda_digest};
 
 /// What of one lambda is heard before it is the next one's turn.
 const TURN: usize = 16;
@@ -46,6 +46,9 @@ pub(super) struct Listened {
     pub(super) heard: bool,
     /// It has said what it is.
     pub(super) is_new: Option<LambdaId>,
+    /// It is not recorded for: that was said, to it and in the log.
+    pub(super) is_refused: bool,
+    /// Nothing more is heard of it.
     pub(super) is_gone: bool,
     /// Wakes that are not recorded, and triggers of such.
     pub(super) wakes_lost: u64,
@@ -89,13 +92,18 @@ impl Lambda {
                             listened.is_new = Some(id);
                             self.answers.ready();
                         }
-                        Err(error) => self.answers.refused(&error.to_string()),
+                        Err(why) => {
+                            let error = &why as &dyn std::error::Error;
+                            warn!(lambda = %self.name, error, "a lambda cannot be recorded for");
+                            self.answers.refused(&why.to_string());
+                            (listened.is_refused, listened.is_gone) = (true, true);
+                        }
                     }
                 }
                 Spoken::Another(why) => {
                     warn!(lambda = %self.name, %why, "a lambda is not what the starter said");
                     self.answers.refused(&why);
-                    listened.is_gone = true;
+                    (listened.is_refused, listened.is_gone) = (true, true);
                 }
                 Spoken::Wake { entry, decided_ns, missing, bytes } => {
                     let Some(id) = self.id else { continue };

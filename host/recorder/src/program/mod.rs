@@ -4,6 +4,7 @@
 //! - `hear`: a thread for the starter, and one for each lambda: what they say, on its way to the loop.
 //! - `staging`: samples on their way from the transport's thread to the loop; all memory of it is there before they come.
 //! - `watch`: a thread that finds topics, subscribes them, and looks after the network and the disk.
+//! - `announce`: a lambda will come: what it records is wanted, and room for it made.
 //! - `lambdas`: who is heard, and how much each may ask for: `allowance`.
 //! - `commands`: what somebody outside may ask for, over a topic.
 //! - `course`: the loop: it owns the recorder, and nothing in it waits for a disk, a lambda or the network.
@@ -12,6 +13,7 @@
 //! What never happens here: a lambda's code; a lambda that speaks for another; a sample that is kept waiting for a file.
 
 mod allowance;
+mod announce;
 mod args;
 mod commands;
 mod course;

@@ -1,41 +1,59 @@
-//! Reports to the starter, and losses to their file, by a thread of their own: the starter may be slow to read.
+//! Reports to the starter, and losses to their list, by a thread each: a starter that is slow to read keeps no loss from being
+//! noted, and a slow disk no report from being said.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::Write;
-use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::thread::Builder;
 use std::time::Duration;
 
 use gleaner_protocol::link::{Loss, RecorderReport};
 use tracing::{error, warn};
 
-/// Reports that wait. Those of clips are few; of status, one more or less does not matter.
+use crate::LossList;
+
+/// Reports that wait, and losses. Those of clips are few; of status, one more or less does not matter.
 const WAITING: usize = 1024;
 
-/// How long a starter is waited for that does not read.
+/// How long a starter is waited for that does not read, and a disk that does not write.
 const PATIENCE: Duration = Duration::from_secs(2);
 
 /// Says things without waiting.
 pub(super) struct Say {
     reports: SyncSender<RecorderReport>,
-    /// Nothing comes over it; it closes when the thread has ended.
+    losses: SyncSender<Loss>,
+    /// Nothing comes over it; it closes when both threads have ended.
     ended: Receiver<()>,
-    /// Reports for which there was no room. Clips and losses stand in their files all the same.
+    /// Reports for which there was no room. Clips and losses stand in their lists all the same.
     left_out: u64,
 }
 
 impl Say {
-    pub(super) fn start(to: File, losses: PathBuf) -> std::io::Result<Say> {
-        let (reports, inbox) = sync_channel(WAITING);
+    pub(super) fn start(to: File, list: Arc<LossList>) -> std::io::Result<Say> {
+        let (reports, said) = sync_channel(WAITING);
+        let (losses, lost) = sync_channel(WAITING);
         let (ends, ended) = sync_channel::<()>(1);
-        std::thread::Builder::new().name("reports".to_owned()).spawn(move || {
-            write(to, &losses, &inbox);
+        let notes_end = ends.clone();
+        Builder::new().name("reports".to_owned()).spawn(move || {
+            write(to, &said);
             drop(ends);
         })?;
-        Ok(Say { reports, ended, left_out: 0 })
+        Builder::new().name("losses".to_owned()).spawn(move || {
+            note(&list, &lost);
+            drop(notes_end);
+        })?;
+        Ok(Say { reports, losses, ended, left_out: 0 })
     }
 
     pub(super) fn say(&mut self, report: RecorderReport) {
+        if let RecorderReport::Loss(loss) = &report
+            // Noted already, by whoever deletes: before.
+            && !matches!(loss, Loss::Deleted { .. } | Loss::NotDeleted { .. })
+            && self.losses.try_send(loss.clone()).is_err()
+        {
+            error!(?loss, "the disk is too slow to note a loss");
+        }
         match self.reports.try_send(report) {
             Ok(()) | Err(TrySendError::Disconnected(_)) => {}
             Err(TrySendError::Full(_)) => {
@@ -47,36 +65,69 @@ impl Say {
         }
     }
 
-    /// Says the last thing, and waits until all is said; not for a starter that does not read.
+    /// Says the last thing, and waits until all is said and noted; not for a starter that does not read.
     pub(super) fn end(mut self, report: RecorderReport) {
         self.say(report);
-        drop(self.reports);
-        let _ = self.ended.recv_timeout(PATIENCE);
+        let Say { reports, losses, ended, left_out } = self;
+        drop((reports, losses));
+        let _ = ended.recv_timeout(PATIENCE);
+        if left_out > 0 {
+            warn!(left_out, "reports were left out, as the starter did not read them");
+        }
     }
 }
 
-fn write(mut to: File, losses: &PathBuf, reports: &Receiver<RecorderReport>) {
-    let mut is_read = true;
+fn write(mut to: File, reports: &Receiver<RecorderReport>) {
     for report in reports {
-        if let RecorderReport::Loss(loss) = &report {
-            note(losses, loss);
-        }
         let mut line = serde_json::to_vec(&report).expect("a report is plain data");
         line.push(b'\n');
-        // Losses are noted even if nobody reads.
-        is_read = is_read && to.write_all(&line).is_ok();
+        if to.write_all(&line).is_err() {
+            // Nobody reads any more.
+            return;
+        }
     }
 }
 
-/// A clip that was deleted is noted by whoever deletes it, before.
-fn note(path: &PathBuf, loss: &Loss) {
-    if matches!(loss, Loss::Deleted { .. }) {
-        return;
+fn note(list: &LossList, losses: &Receiver<Loss>) {
+    for loss in losses {
+        if let Err(error) = list.note(&loss) {
+            error!(?loss, error = &error as &dyn std::error::Error, "cannot note a loss");
+        }
     }
-    let mut line = serde_json::to_vec(loss).expect("a loss is plain data");
-    line.push(b'\n');
-    let file = OpenOptions::new().append(true).create(true).open(path);
-    if let Err(why) = file.and_then(|mut file| file.write_all(&line)) {
-        error!(path = %path.display(), error = %why, "cannot note a loss");
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{BufRead, BufReader};
+    use std::os::fd::OwnedFd;
+    use std::time::Instant;
+
+    use super::*;
+    use crate::Folder;
+    use crate::support::Scratch;
+
+    #[test]
+    fn a_loss_is_noted_though_the_starter_reads_nothing() {
+        let scratch = Scratch::new();
+        let (folder, _) = Folder::open(&scratch.0).unwrap();
+        let (reader, writer) = std::io::pipe().unwrap();
+        let mut say = Say::start(File::from(OwnedFd::from(writer)), folder.losses()).unwrap();
+        // The pipe holds 64 KiB; the queue is full some time after it is.
+        while say.left_out == 0 {
+            say.say(RecorderReport::Status(Box::default()));
+        }
+        say.say(RecorderReport::Loss(Loss::Failed { at_ns: 7, why: "x".to_owned() }));
+        let noted = || std::fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap_or_default();
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while !noted().ends_with('\n') {
+            assert!(Instant::now() < deadline, "{}", noted());
+            std::thread::yield_now();
+        }
+        assert_eq!(noted(), "{\"loss\":\"failed\",\"at_ns\":7,\"why\":\"x\"}\n");
+        assert_eq!(say.left_out, 2);
+        // A starter that reads again has every report that waited.
+        let reading = std::thread::spawn(move || BufReader::new(reader).lines().map_while(Result::ok).count());
+        drop(say);
+        assert!(reading.join().unwrap() >= WAITING);
     }
 }

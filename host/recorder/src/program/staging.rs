@@ -1,8 +1,11 @@
 //! Samples on their way from the transport to the loop.
 //!
 //! Two blocks of memory: into one the transport's thread writes, the other is read by the loop, and they change places when
-//! that one is empty. So a sample is copied once, nothing is allocated while samples come, and the lock is held for no longer
-//! than it takes to copy one sample.
+//! that one is empty. Nothing is allocated while samples come. A sample is copied here once, from the transport's own memory,
+//! before it is known whose it is: it counts when that is accepted.
+//!
+//! Neither side waits for the other's copying: while the transport's thread copies, it has the block, and the loop comes back
+//! later.
 
 use std::hint::black_box;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -60,24 +63,100 @@ impl Block {
     }
 }
 
-/// Where the sinks of all topics put samples.
+/// Where the sinks of all topics put samples. They are all called by one thread, the transport's.
 pub(super) struct Staging {
-    filling: Mutex<Block>,
+    filling: Mutex<Filling>,
     /// The loop, which looks by itself every few ms; it is woken only when half of the room is taken.
     reader: Thread,
 }
 
+struct Filling {
+    /// `None` while a sample is being copied into it.
+    block: Option<Block>,
+    /// What was copied last, until it is known whose sample it is.
+    copied: Option<Copied>,
+}
+
+/// A sample whose bytes are the last ones of the block, or that was refused.
+struct Copied {
+    topic: TopicId,
+    verdict: Verdict,
+    /// Where its bytes begin; they go to the end of the block.
+    at: usize,
+    /// Whether the loop has come for the block once since.
+    is_awaited: bool,
+}
+
 impl Staging {
     pub(super) fn new(bytes: usize, reader: Thread) -> Arc<Staging> {
-        Arc::new(Staging { filling: Mutex::new(Block::new(bytes)), reader })
+        let filling = Filling { block: Some(Block::new(bytes)), copied: None };
+        Arc::new(Staging { filling: Mutex::new(filling), reader })
     }
 
-    /// Takes what came, for `empty`.
-    pub(super) fn exchange(&self, empty: Block) -> Block {
-        std::mem::replace(&mut *self.filling(), empty)
+    /// Takes what came, for `empty`, which has as much room as the one before at least. `empty` comes back if a sample is
+    /// just being copied or about to be accepted: whoever asks is to come again.
+    pub(super) fn exchange(&self, mut empty: Block) -> Result<Block, Block> {
+        let mut filling = self.filling();
+        let Filling { block: Some(block), copied } = &mut *filling else { return Err(empty) };
+        if let Some(copied) = copied.as_mut().filter(|copied| copied.verdict == Verdict::Taken) {
+            if !copied.is_awaited {
+                copied.is_awaited = true;
+                return Err(empty);
+            }
+            // It may be nobody's, and never be accepted; or its thread was interrupted. What came before is not kept waiting
+            // for it: it goes along to the next block.
+            empty.bytes.extend_from_slice(&block.bytes[copied.at..]);
+            block.bytes.truncate(copied.at);
+            copied.at = 0;
+        }
+        Ok(std::mem::replace(block, empty))
     }
 
-    fn filling(&self) -> MutexGuard<'_, Block> {
+    /// The one copy.
+    fn fill(&self, topic: TopicId, cdr: &[u8]) -> Verdict {
+        let mut filling = self.filling();
+        let unaccepted = filling.copied.take();
+        // All samples come from one thread, so nobody else is copying.
+        let Some(mut block) = filling.block.take() else { return Verdict::NoSlot };
+        drop(filling);
+        // One that was never accepted was nobody's.
+        if let Some(copied) = unaccepted {
+            block.bytes.truncate(copied.at);
+        }
+        let (at, room) = (block.bytes.len(), block.bytes.capacity());
+        let verdict = match () {
+            () if cdr.len() > room => Verdict::TooBig,
+            () if cdr.len() > room - at || block.samples.len() == SAMPLES => Verdict::NoSlot,
+            () => Verdict::Taken,
+        };
+        if verdict == Verdict::Taken {
+            block.bytes.extend_from_slice(cdr);
+        }
+        let mut filling = self.filling();
+        filling.block = Some(block);
+        filling.copied = Some(Copied { topic, verdict, at, is_awaited: false });
+        verdict
+    }
+
+    /// What was copied last is this sample of `topic`; what became of it.
+    fn accept(&self, topic: TopicId, meta: &SampleMeta) -> Option<Verdict> {
+        let mut filling = self.filling();
+        let copied = filling.copied.take_if(|copied| copied.topic == topic)?;
+        let block = filling.block.as_mut()?;
+        // A sample without room is still known to have been there. If there is no room even for that, its number will be missing.
+        if block.samples.len() < SAMPLES {
+            let bytes = (copied.verdict == Verdict::Taken).then(|| (copied.at, block.bytes.len() - copied.at));
+            block.samples.push(Staged { topic, meta: *meta, bytes });
+        }
+        let is_late = block.bytes.len() > block.room() / 2 || block.samples.len() > SAMPLES / 2;
+        drop(filling);
+        if is_late {
+            self.reader.unpark();
+        }
+        Some(copied.verdict)
+    }
+
+    fn filling(&self) -> MutexGuard<'_, Filling> {
         self.filling.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -99,33 +178,110 @@ pub(super) struct Lane {
 
 impl Sink for Lane {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        let mut block = self.staging.filling();
-        let (at, room) = (block.bytes.len(), block.bytes.capacity());
-        let verdict = match () {
-            () if cdr.len() > room => Verdict::TooBig,
-            () if cdr.len() > room - at || block.samples.len() == SAMPLES => Verdict::NoSlot,
-            () => Verdict::Taken,
-        };
-        let taken = verdict == Verdict::Taken;
-        if taken {
-            block.bytes.extend_from_slice(cdr);
-        }
-        // A sample without room is still known to have been there. If there is no room even for that, its number will be missing.
-        if block.samples.len() < SAMPLES {
-            let bytes = taken.then_some((at, cdr.len()));
-            block.samples.push(Staged { topic: self.topic, meta: *meta, bytes });
-        }
-        let is_late = block.bytes.len() > room / 2 || block.samples.len() > SAMPLES / 2;
-        drop(block);
-        match verdict {
-            Verdict::Taken => &self.arrivals.received,
-            Verdict::NoSlot => &self.arrivals.no_slot,
-            Verdict::TooBig => &self.arrivals.too_big,
-        }
-        .fetch_add(1, Ordering::Relaxed);
-        if is_late {
-            self.staging.reader.unpark();
-        }
+        let verdict = self.staging.fill(self.topic, cdr);
+        self.accept(meta);
         verdict
+    }
+
+    fn copy(&self, cdr: &[u8]) -> Option<Verdict> {
+        Some(self.staging.fill(self.topic, cdr))
+    }
+
+    fn accept(&self, meta: &SampleMeta) {
+        let arrivals = match self.staging.accept(self.topic, meta) {
+            Some(Verdict::Taken) => &self.arrivals.received,
+            Some(Verdict::NoSlot) => &self.arrivals.no_slot,
+            Some(Verdict::TooBig) => &self.arrivals.too_big,
+            None => return,
+        };
+        arrivals.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::support::{Scratch, meta, topic};
+
+    /// Room for 100 bytes, and the sinks of two topics.
+    fn lanes() -> (Arc<Staging>, [Lane; 2]) {
+        let scratch = Scratch::new();
+        let mut recorder = scratch.recorder(|_| {});
+        let staging = Staging::new(100, std::thread::current());
+        let lanes = ["/a", "/b"].map(|name| Lane {
+            topic: recorder.add_topic(topic(name)).unwrap(),
+            staging: Arc::clone(&staging),
+            arrivals: Arc::default(),
+        });
+        (staging, lanes)
+    }
+
+    /// Topic, number and bytes of what waits; `None` for what found no room.
+    type Came = (TopicId, u64, Option<Vec<u8>>);
+
+    fn came(block: &Block) -> Vec<Came> {
+        let came = |(staged, cdr): (Staged, &[u8])| (staged.topic, staged.meta.seq, staged.bytes.map(|_| cdr.to_vec()));
+        (0..).map_while(|index| block.get(index).map(came)).collect()
+    }
+
+    fn take(staging: &Staging) -> Vec<Came> {
+        came(&staging.exchange(Block::new(100)).ok().expect("nothing is being copied"))
+    }
+
+    #[test]
+    fn what_is_copied_comes_once_it_is_accepted() {
+        let (staging, [a, b]) = lanes();
+        assert_eq!(a.copy(b"first"), Some(Verdict::Taken));
+        a.accept(&meta(1, 1));
+        assert_eq!(b.deliver(&meta(2, 2), b"second"), Verdict::Taken);
+        a.accept(&meta(3, 3));
+        b.accept(&meta(3, 3));
+        let expected = [(a.topic, 1, Some(b"first".to_vec())), (b.topic, 2, Some(b"second".to_vec()))];
+        assert_eq!(take(&staging), expected, "there was nothing else to accept");
+        assert_eq!(a.arrivals.received.load(Ordering::Relaxed), 1);
+    }
+
+    #[test]
+    fn copies_that_are_never_accepted_leave_nothing_behind_and_keep_nobody_waiting() {
+        let (staging, [a, b]) = lanes();
+        b.deliver(&meta(1, 1), b"before");
+        for _ in 0..10 {
+            assert_eq!(a.copy(&[7; 60]), Some(Verdict::Taken));
+        }
+        let empty = staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
+        let block = staging.exchange(empty).ok().expect("or never");
+        assert_eq!(came(&block), [(b.topic, 1, Some(b"before".to_vec()))]);
+        assert_eq!(b.deliver(&meta(2, 2), &[8; 100]), Verdict::Taken, "its room is free again");
+        a.accept(&meta(3, 3));
+        assert_eq!(take(&staging), [(b.topic, 2, Some(vec![8; 100]))]);
+    }
+
+    #[test]
+    fn a_copy_that_is_accepted_late_comes_with_the_next_block() {
+        let (staging, [a, b]) = lanes();
+        b.deliver(&meta(1, 1), b"before");
+        a.copy(b"late");
+        let empty = staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
+        assert!(staging.exchange(empty).is_ok());
+        a.accept(&meta(2, 2));
+        b.deliver(&meta(3, 3), b"after");
+        assert_eq!(take(&staging), [(a.topic, 2, Some(b"late".to_vec())), (b.topic, 3, Some(b"after".to_vec()))]);
+    }
+
+    #[test]
+    fn what_finds_no_room_is_counted_and_known_to_have_been_there() {
+        let (staging, [a, b]) = lanes();
+        assert_eq!(a.copy(&[0; 101]), Some(Verdict::TooBig));
+        a.accept(&meta(1, 1));
+        assert_eq!(a.copy(&[1; 60]), Some(Verdict::Taken));
+        a.accept(&meta(2, 2));
+        assert_eq!(b.copy(&[2; 60]), Some(Verdict::NoSlot));
+        b.accept(&meta(3, 3));
+        assert_eq!(take(&staging), [(a.topic, 1, None), (a.topic, 2, Some(vec![1; 60])), (b.topic, 3, None)]);
+        let counts = |lane: &Lane| {
+            let Arrivals { received, no_slot, too_big } = &*lane.arrivals;
+            [received, no_slot, too_big].map(|count| count.load(Ordering::Relaxed))
+        };
+        assert_eq!((counts(&a), counts(&b)), ([1, 0, 1], [0, 1, 0]));
     }
 }

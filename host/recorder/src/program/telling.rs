@@ -58,14 +58,15 @@ impl Course {
         let topic = |(id, of): (&TopicId, &Recorded)| {
             let known = self.beat.topics.iter().find(|(known, _)| known == id);
             let status = known.map(|(_, status)| status.clone()).unwrap_or_default();
+            let arrivals = &of.lane.arrivals;
             RecordedTopic {
                 topic: of.name.clone(),
                 type_name: of.type_name.clone(),
                 writers: status.writers,
-                received: of.arrivals.received.load(Ordering::Relaxed),
+                received: arrivals.received.load(Ordering::Relaxed),
                 lost: status.lost,
-                no_slot: of.arrivals.no_slot.load(Ordering::Relaxed),
-                too_big: of.arrivals.too_big.load(Ordering::Relaxed),
+                no_slot: arrivals.no_slot.load(Ordering::Relaxed),
+                too_big: arrivals.too_big.load(Ordering::Relaxed),
                 malformed: status.malformed,
                 qos: status.qos,
                 trouble: status.trouble,
@@ -73,9 +74,11 @@ impl Course {
         };
         RecorderStatus {
             lambdas: self.lambdas.len(),
+            lambdas_refused: self.lambdas_refused,
             clips: counts.clips,
             failed: counts.failed,
-            deleted: counts.deleted + self.deleted_before,
+            deleted: counts.deleted + self.deleted_before.0,
+            not_deleted: counts.not_deleted + self.deleted_before.1,
             windows: counts.windows,
             recording: self.recorder.is_recording(),
             in_cooldown: counts.in_cooldown,
@@ -85,6 +88,8 @@ impl Course {
             preroll_bytes: counts.preroll_bytes,
             preroll_bound: counts.preroll_bound,
             pushed_out: counts.pushed_out,
+            too_big: counts.too_big,
+            refused: counts.refused,
             in_flight: counts.in_flight,
             trigger_to_open: None,
             commands: self.commands.as_ref().map(|commands| commands.status(self.beat.commands.as_ref())),

@@ -55,6 +55,7 @@ impl Feed for Live {
             buffer_granted: health.buffer_granted,
             socket_drops: health.socket_drops,
             filtered: health.filtered,
+            unfiltered: health.unfiltered,
         };
         Pulse { network: Some(network), dead: health.dead }
     }
@@ -71,6 +72,10 @@ impl Transport for Live {
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
         self.dds.definitions(topic)
+    }
+
+    fn definitions_may_come(&self, topic: &str) -> bool {
+        self.dds.definitions_may_come(topic)
     }
 
     fn status(&self, subscription: Subscription) -> Status {
@@ -91,11 +96,36 @@ pub(super) enum Wanted {
     /// To be recorded, once it is there and its type known.
     Recorded {
         topic: TopicId,
-        /// Of the largest sample, if a manifest says so.
-        max_bytes: Option<usize>,
+        /// How large its samples are. Of several wants of a topic, the largest counts.
+        largest: Largest,
     },
     /// Commands come over it. It is heard before anybody writes, where the network can do that: a command is written once.
     Commands,
+}
+
+/// How large the samples of a topic may be, as far as manifests say.
+#[derive(Copy, Clone, Debug, Default)]
+pub(super) struct Largest {
+    /// The most that a manifest says, in bytes.
+    said: usize,
+    /// Whether somebody wants it whose manifest does not say: the usual size of its type counts as well.
+    is_usual: bool,
+}
+
+impl Largest {
+    /// What one manifest says.
+    pub(super) fn of(max_bytes: Option<usize>) -> Largest {
+        Largest { said: max_bytes.unwrap_or(0), is_usual: max_bytes.is_none() }
+    }
+
+    /// What two of them say.
+    fn and(self, other: Largest) -> Largest {
+        Largest { said: self.said.max(other.said), is_usual: self.is_usual || other.is_usual }
+    }
+
+    fn bytes(self, type_name: &str) -> usize {
+        self.said.max(if self.is_usual { usual_bytes(type_name) } else { 0 })
+    }
 }
 
 /// What was seen.
@@ -117,6 +147,35 @@ pub(super) struct Beat {
     pub(super) cpu_s: f64,
 }
 
+/// A topic that is heard.
+struct Heard {
+    topic: TopicId,
+    subscription: Subscription,
+    type_name: String,
+    /// What it was subscribed for.
+    max_bytes: usize,
+}
+
+/// Adds a want; several for one topic are one.
+fn add(wanted: &mut Vec<(Want, u32)>, heard: &[Heard], want: Want) {
+    let Wanted::Recorded { topic, largest } = want.what else { return wanted.push((want, 0)) };
+    if let Some(of) = heard.iter().find(|of| of.topic == topic) {
+        let (max_bytes, wanted) = (of.max_bytes, largest.bytes(&of.type_name));
+        if wanted > max_bytes {
+            let topic = visible(&want.name);
+            warn!(%topic, wanted, max_bytes, "a topic is heard already, with room for smaller samples: more of them may be lost");
+        }
+        return;
+    }
+    for (known, _) in wanted.iter_mut() {
+        match &mut known.what {
+            Wanted::Recorded { topic: of, largest: known } if *of == topic => return *known = known.and(largest),
+            _ => {}
+        }
+    }
+    wanted.push((want, 0));
+}
+
 /// The thread's own.
 pub(super) struct Watch {
     pub(super) feed: Box<dyn Feed>,
@@ -130,11 +189,14 @@ impl Watch {
     /// Until nobody wants anything more.
     pub(super) fn run(mut self) {
         let mut wanted: Vec<(Want, u32)> = Vec::new();
-        let (mut subscribed, mut commands) = (Vec::new(), None);
+        let (mut heard, mut commands) = (Vec::<Heard>::new(), None);
         let mut beat_at = Instant::now();
         loop {
             match self.wants.recv_timeout(LOOK) {
-                Ok(want) => wanted.push((want, 0)),
+                // All that wait at once: to look for topics takes longer.
+                Ok(want) => std::iter::once(want)
+                    .chain(std::iter::from_fn(|| self.wants.try_recv().ok()))
+                    .for_each(|want| add(&mut wanted, &heard, want)),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return,
             }
@@ -145,9 +207,15 @@ impl Watch {
                     let found = topics.iter().find(|topic| topic.topic == want.name);
                     match (want.what, found) {
                         _ if *wait > 0 => return true,
-                        (Wanted::Recorded { topic, max_bytes }, Some(found)) => {
-                            match self.record(want, topic, max_bytes, found) {
-                                Some(subscription) => subscribed.push((topic, subscription)),
+                        // Whoever writes it is asked what it is, which takes some seconds at most.
+                        (Wanted::Recorded { .. }, Some(found))
+                            if found.definitions_text.is_none() && self.feed.definitions_may_come(&want.name) =>
+                        {
+                            return true;
+                        }
+                        (Wanted::Recorded { topic, largest }, Some(found)) => {
+                            match self.record(want, topic, largest, found) {
+                                Some(of) => heard.push(of),
                                 None => *wait = AGAIN,
                             }
                         }
@@ -162,7 +230,7 @@ impl Watch {
             }
             if beat_at.elapsed() >= PULSE {
                 beat_at = Instant::now();
-                let topics = subscribed.iter().map(|(topic, of)| (*topic, self.feed.status(*of))).collect();
+                let topics = heard.iter().map(|of| (of.topic, self.feed.status(of.subscription))).collect();
                 let (rss_bytes, cpu_s) = (usage::resident(), usage::cpu_seconds());
                 let disk_free = free(&self.out);
                 let commands = commands.map(|of| self.feed.status(of));
@@ -177,13 +245,7 @@ impl Watch {
         }
     }
 
-    fn record(
-        &mut self,
-        want: &Want,
-        topic: TopicId,
-        max_bytes: Option<usize>,
-        found: &DiscoveredTopic,
-    ) -> Option<Subscription> {
+    fn record(&mut self, want: &Want, topic: TopicId, largest: Largest, found: &DiscoveredTopic) -> Option<Heard> {
         if found.definitions_text.is_none() {
             let (topic, type_name) = (visible(&want.name), visible(&found.type_name));
             warn!(%topic, %type_name, "no definitions of this type: its messages are recorded without");
@@ -194,7 +256,7 @@ impl Watch {
             definitions: found.definitions_text.clone(),
             offered_qos: found.offered_qos.clone(),
         };
-        let max_bytes = max_bytes.unwrap_or_else(|| usual_bytes(&found.type_name));
+        let max_bytes = largest.bytes(&found.type_name);
         let spec = TopicSpec {
             topic: want.name.clone(),
             type_name: found.type_name.clone(),
@@ -205,7 +267,7 @@ impl Watch {
         // Before its first sample.
         self.events.send(Event::Seen(Seen::Found { topic, of })).ok()?;
         match self.feed.subscribe(&spec, Arc::clone(&want.sink)) {
-            Ok(subscription) => Some(subscription),
+            Ok(subscription) => Some(Heard { topic, subscription, type_name: spec.type_name, max_bytes }),
             Err(why) => {
                 error!(topic = %visible(&want.name), error = &why as &dyn std::error::Error, "cannot record a topic");
                 None
@@ -245,4 +307,18 @@ fn usual_bytes(type_name: &str) -> usize {
 /// Bytes that are free on the disk of `folder`.
 fn free(folder: &Path) -> Option<u64> {
     rustix::fs::statvfs(folder).ok().map(|disk| disk.f_bavail.saturating_mul(disk.f_frsize))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_several_who_want_a_topic_the_largest_sample_counts() {
+        let image = "sensor_msgs/msg/Image";
+        let said = |bytes| Largest::of(Some(bytes));
+        assert_eq!(said(100).and(said(300)).and(said(200)).bytes(image), 300);
+        assert_eq!(said(100).and(Largest::of(None)).bytes(image), 32 << 20, "somebody does not know");
+        assert_eq!(Largest::of(None).and(said(64 << 20)).bytes(image), 64 << 20);
+    }
 }

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use gleaner_protocol::journal::Header;
 use gleaner_protocol::{Clip, Moment};
 use gleaner_transport::SampleMeta;
 
@@ -79,6 +78,10 @@ pub(super) struct Draft {
     moments: Vec<Moment>,
     /// By lambda; those without windows in the clip are thrown away at its end.
     parts: Vec<Part>,
+    /// What they take together, about.
+    parts_bytes: usize,
+    /// Lambdas whose part is short because there was no room for all together.
+    crowded: Vec<usize>,
     /// Pushed out of the preroll.
     wakes_lost: Vec<u64>,
     /// Lost on their way to the recorder.
@@ -106,6 +109,8 @@ impl Draft {
             tallies: Vec::new(),
             moments: Vec::new(),
             parts: Vec::new(),
+            parts_bytes: 0,
+            crowded: Vec::new(),
             wakes_lost: Vec::new(),
             wakes_unheard: Vec::new(),
         }
@@ -172,7 +177,21 @@ impl Draft {
 
     /// Keeps a wake for the lambda's journal.
     pub(super) fn wake(&mut self, lambda: usize, number: u64, encoded: &[u8]) {
-        at(&mut self.parts, lambda).push(number, encoded, self.limits.part_bytes);
+        let part = at(&mut self.parts, lambda);
+        let (before, cut) = (part.bytes(), part.cut());
+        let others = self.parts_bytes - before;
+        let left = self.limits.parts_bytes.saturating_sub(others);
+        part.push(number, encoded, self.limits.part_bytes.min(left));
+        self.parts_bytes = others + part.bytes();
+        if left < self.limits.part_bytes && part.cut() > cut && !self.crowded.contains(&lambda) {
+            self.crowded.push(lambda);
+        }
+    }
+
+    /// What it keeps of journals in memory, about.
+    #[cfg(test)]
+    pub(super) fn journal_bytes(&self) -> usize {
+        self.parts.iter().map(Part::bytes).sum()
     }
 
     /// Counts wakes that the preroll does not have any more.
@@ -223,7 +242,7 @@ impl Draft {
         let mut journals: Vec<(String, _, _)> = Vec::new();
         for lambda in &group.lambdas {
             let header = &desk.crews[*lambda].header;
-            ending.headers.push(Header::clone(header));
+            ending.headers.push(Arc::clone(header));
             let part = self.part(*lambda, &header.lambda, &mut ending.short);
             // A lambda that was started again is another one of the same name.
             let mut names = names(&header.lambda);
@@ -336,9 +355,12 @@ impl Draft {
             short.push(format!("the journal of {name} lacks {}: pushed out of the preroll", plural(lost, "wake")));
         }
         if part.cut() > 0 {
-            let most = self.limits.part_bytes >> 20;
             let last = plural(part.cut(), "wake");
-            short.push(format!("the journal of {name} lacks the last {last}: longer than {most} MiB"));
+            let why = match self.crowded.contains(&lambda) {
+                false => format!("longer than {} MiB", self.limits.part_bytes >> 20),
+                true => format!("the journals of all are longer than {} MiB", self.limits.parts_bytes >> 20),
+            };
+            short.push(format!("the journal of {name} lacks the last {last}: {why}"));
         }
         part
     }

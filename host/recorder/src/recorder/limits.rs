@@ -11,12 +11,20 @@ pub(super) struct Limits {
     pub(super) moments: usize,
     /// Most memory for one lambda's part of a journal.
     pub(super) part_bytes: usize,
+    /// Most memory for the parts of all lambdas in one clip.
+    pub(super) parts_bytes: usize,
     /// Most triggers that wait for their clip. A lambda can trigger often, and windows wait for minutes.
     pub(super) waiting: usize,
 }
 
 impl Default for Limits {
     fn default() -> Limits {
-        Limits { message_bytes: MESSAGE_MAX, moments: 10_000, part_bytes: 64 << 20, waiting: 10_000 }
+        Limits {
+            message_bytes: MESSAGE_MAX,
+            moments: 10_000,
+            part_bytes: 64 << 20,
+            parts_bytes: 256 << 20,
+            waiting: 10_000,
+        }
     }
 }

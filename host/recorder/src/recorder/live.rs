@@ -20,6 +20,12 @@ use crate::window::{Heard, nanoseconds};
 /// [`gleaner_protocol::link::RecorderLink::wake`]. Clips wait for them.
 const GRACE: Duration = Duration::from_millis(200);
 
+/// How many clips were deleted to make room, and how many could not be.
+pub(crate) fn counted(losses: &[Loss]) -> (u64, u64) {
+    let count = |is_it: fn(&Loss) -> bool| losses.iter().filter(|loss| is_it(loss)).count() as u64;
+    (count(|loss| matches!(loss, Loss::Deleted { .. })), count(|loss| matches!(loss, Loss::NotDeleted { .. })))
+}
+
 impl Recorder {
     /// A recorder without topics and lambdas, that is fed while it happens. A thread writes its clips; at most 16 MiB and
     /// one message are on their way to it, and the preroll holds what has to wait. Gaps in the numbers of samples are losses.
@@ -56,7 +62,7 @@ impl Recorder {
         std::mem::take(&mut self.finished.failures)
     }
 
-    /// Clips that had to go for others since this was asked last; the first of them.
+    /// Clips that had to go for others, or could not be deleted, since this was asked last; the first of them.
     pub fn take_deleted(&mut self) -> Vec<Loss> {
         std::mem::take(&mut self.finished.deleted)
     }
@@ -220,7 +226,9 @@ impl Recorder {
         for outcome in outcomes {
             match outcome {
                 Outcome::Finished(clip, deleted) => {
-                    self.counts.deleted += deleted.len() as u64;
+                    let (gone, stuck) = counted(&deleted);
+                    self.counts.deleted += gone;
+                    self.counts.not_deleted += stuck;
                     self.finished.add(Some(*clip));
                     self.finished.deleted.extend(deleted);
                     self.finished.deleted.truncate(KEPT);

@@ -33,6 +33,8 @@ use stock::{Crew, Desk, Lane, Stock};
 use waiting::Waiting;
 use walk::Walk;
 
+#[cfg(feature = "program")]
+pub(crate) use live::counted;
 pub use settings::{Commanded, Counts, LambdaId, Settings, TopicId, Work};
 pub use stock::Member;
 
@@ -181,8 +183,9 @@ impl Recorder {
                 lambdas.push(lambda);
             }
         }
-        let (encoder, header) = (Encoder::new(member.header.inputs.len()), Arc::new(member.header.clone()));
-        self.stock.desk.crews.push(Crew { member, header, encoder, wakes: 0 });
+        let Member { header, digest, topics, .. } = member;
+        let encoder = Encoder::new(header.inputs.len());
+        self.stock.desk.crews.push(Crew { header: Arc::new(header), digest, topics, encoder, wakes: 0 });
         self.stock.wake_losses.push(Losses::default());
         Ok(LambdaId(lambda))
     }
@@ -282,7 +285,7 @@ impl Recorder {
     }
 
     fn name_of(&self, lambda: LambdaId) -> &str {
-        &self.stock.desk.crews[lambda.0].member.header.lambda
+        &self.stock.desk.crews[lambda.0].header.lambda
     }
 
     /// A moment waits for the clip that it belongs to.

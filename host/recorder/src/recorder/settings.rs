@@ -39,13 +39,17 @@ pub struct Counts {
     pub failed: u64,
     /// Clips that were deleted to make room, and that nobody had fetched.
     pub deleted: u64,
+    /// Clips that should have been deleted to make room, and could not be.
+    pub not_deleted: u64,
     /// Windows that triggers and commands opened.
     pub windows: u64,
     /// Triggers that opened none, because they came within the cooldown of another.
     pub in_cooldown: u64,
-    /// Starts while one was open, and stops while none was.
+    /// Starts while one of the same label was open or 64 of the lambda were, stops while none was, and what came while too many
+    /// windows waited for their clip.
     pub ignored: u64,
-    /// Triggers that came while nothing was recorded: [`Recorder::hold`](super::Recorder::hold).
+    /// Triggers but for stops, and commands, that came while nothing was recorded, and windows that waited for their clip then:
+    /// [`Recorder::hold`](super::Recorder::hold).
     pub held_back: u64,
     /// Samples that left the preroll for want of bytes before they were too old for any window.
     pub pushed_out: u64,

@@ -54,9 +54,11 @@ impl Lane {
 
 /// One lambda, its windows aside.
 pub(super) struct Crew {
-    pub(super) member: Member,
-    /// As in `member`; clips are written with it elsewhere.
+    /// Clips share it.
     pub(super) header: Arc<Header>,
+    /// As in [`Member`].
+    pub(super) digest: String,
+    pub(super) topics: Vec<super::TopicId>,
     pub(super) encoder: Encoder,
     pub(super) wakes: u64,
 }
@@ -89,7 +91,7 @@ impl Desk {
     /// The topics of the lambdas of a clip, each once, in their order.
     pub(super) fn topics_of(&self, group: &Group) -> Vec<usize> {
         let mut topics = Vec::new();
-        for topic in group.lambdas.iter().flat_map(|lambda| &self.crews[*lambda].member.topics) {
+        for topic in group.lambdas.iter().flat_map(|lambda| &self.crews[*lambda].topics) {
             if !topics.contains(&topic.0) {
                 topics.push(topic.0);
             }
@@ -100,7 +102,7 @@ impl Desk {
     /// The lambdas of a clip.
     pub(super) fn lambdas_of(&self, group: &Group) -> Vec<ClipLambda> {
         let lambda = |lambda: &usize| {
-            let Member { header, digest, .. } = &self.crews[*lambda].member;
+            let Crew { header, digest, .. } = &self.crews[*lambda];
             ClipLambda {
                 name: header.lambda.clone(),
                 version: header.version.clone(),
@@ -253,7 +255,7 @@ impl Stock {
     pub(super) fn opening(&self, group: &Group) -> Moment {
         let (lambda, at_ns) = group.first;
         self.waiting.find(lambda, at_ns).cloned().unwrap_or_else(|| Moment {
-            lambda: self.desk.crews[lambda].member.header.lambda.clone(),
+            lambda: self.desk.crews[lambda].header.lambda.clone(),
             kind: gleaner_protocol::TriggerKind::Event,
             label: String::new(),
             score: None,
@@ -267,7 +269,7 @@ impl Stock {
     pub(super) fn reach_back(&mut self, draft: &mut Draft, window: &Window) {
         draft.begins_late_ns = draft.begins_late_ns.max(self.began_at.saturating_sub(window.from));
         let number = draft.group;
-        for topic in &self.desk.crews[window.lambda].member.topics {
+        for topic in &self.desk.crews[window.lambda].topics {
             let losses = &self.losses[topic.0];
             let tally = draft.tally(topic.0);
             tally.is_aged |= losses.aged.hides(window.from, number);

@@ -37,6 +37,34 @@ fn a_journal_that_is_too_long_has_no_hole_and_says_what_is_missing() {
 }
 
 #[test]
+fn the_journals_of_a_clip_are_bounded_together_and_each_says_what_it_lacks() {
+    let scratch = Scratch::new();
+    let limits = Limits { part_bytes: 2 << 10, parts_bytes: 3 << 10, ..Limits::default() };
+    let (mut recorder, a, first) = recorder(&scratch, (100, 50, 0), limits);
+    let second = recorder.add_lambda(member("second", (100, 50, 0), &[a]));
+    drive(&mut recorder, &[a], (0, 100, 10), &[]);
+    (100..140).for_each(|ms| [first, second].into_iter().for_each(|lambda| wake(&mut recorder, lambda, ms)));
+    let draft = recorder.draft.as_ref().unwrap();
+    assert!(draft.journal_bytes() <= 3 << 10);
+    recorder.finish(T0 + S).unwrap();
+    let clip = &recorder.clips()[0];
+    let mut lacking = 0;
+    for name in ["hello", "second"] {
+        let wakes = scratch.journal(clip, name).1;
+        let kept = wakes.len() as i64;
+        assert!((5..20).contains(&kept), "{kept}");
+        assert_eq!(wakes, (0..kept).map(|n| T0 + (100 + n) * MS).collect::<Vec<_>>());
+        lacking += 40 - kept;
+        let short = format!(
+            "the journal of {name} lacks the last {} wakes: the journals of all are longer than 0 MiB",
+            40 - kept
+        );
+        assert!(clip.short.contains(&short), "{:?}", clip.short);
+    }
+    assert!(lacking > 40);
+}
+
+#[test]
 fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
     let scratch = Scratch::new();
     let (mut recorder, a, lambda) = recorder(&scratch, (100, 50, 0), Limits { moments: 150, ..Limits::default() });

@@ -30,6 +30,8 @@ pub const PATIENCE: Duration = Duration::from_secs(60);
 pub struct Network {
     loopback: Arc<Mutex<Loopback>>,
     pub dead: Arc<AtomicBool>,
+    /// What was subscribed.
+    pub specs: Arc<Mutex<Vec<TopicSpec>>>,
 }
 
 impl Network {
@@ -57,6 +59,7 @@ impl Transport for Network {
     }
 
     fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+        self.specs.lock().unwrap().push(spec.clone());
         self.loopback.lock().unwrap().subscribe(spec, sink)
     }
 
@@ -150,10 +153,15 @@ pub fn lambda(scratch: &Scratch, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, 
     let folder = scratch.0.join(name);
     fs::create_dir_all(folder.join("build")).unwrap();
     fs::write(folder.join("build/lambda.toml"), &text).unwrap();
-    let sha256 = Sha256::digest(&text).iter().map(|byte| format!("{byte:02x}")).collect();
-    let manifest = FileDigest { path: "lambda.toml".to_owned(), bytes: text.len() as u64, sha256 };
-    let header = Header { files: vec![manifest], ..member(name, (0, 0, 0), &[]).header };
+    let header = with_manifest(member(name, (0, 0, 0), &[]).header, &text);
     (folder, header)
+}
+
+/// The header of a lambda with this manifest.
+pub fn with_manifest(header: Header, text: &str) -> Header {
+    let sha256 = Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect();
+    let manifest = FileDigest { path: "lambda.toml".to_owned(), bytes: text.len() as u64, sha256 };
+    Header { files: vec![manifest], ..header }
 }
 
 /// A `std_msgs/msg/String`.

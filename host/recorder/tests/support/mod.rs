@@ -178,6 +178,7 @@ cooldown = "{cooldown}ms"
         remaps: Vec::new(),
         clock: "log time of the drive".to_owned(),
         wakes_before: 0,
+        limits: Default::default(),
     };
     Member { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
 }

@@ -79,7 +79,7 @@ impl HostTopic for Hosted {
     fn column(&mut self, topic: Resource<Topic>, field: Resource<Field>, n: u32) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
         self.meter.charge(topic.column_work(field, n as usize))?;
-        Ok(column_out(topic.column(field, n as usize)))
+        answer(topic.column(field, n as usize).map(column_out))
     }
 
     fn column_since(&mut self, topic: Resource<Topic>, field: Resource<Field>, since_ns: i64) -> Answer<Column> {
@@ -95,7 +95,7 @@ impl HostTopic for Hosted {
             self.meter.charge(read)?;
             column
         };
-        Ok(column_out(column))
+        answer(column.map(column_out))
     }
 
     fn drop(&mut self, topic: Resource<Topic>) -> wasmtime::Result<()> {
@@ -130,13 +130,13 @@ impl HostSample for Hosted {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
         // A path may walk over the whole message, and the value may be most of it.
         self.meter.charge(sample.bytes().len())?;
-        Ok(sample.get(field).map(value).map_err(refused))
+        answer(sample.get(field).map(value))
     }
 
     fn number(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<f64> {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
         self.meter.charge(field.work(sample.bytes().len()))?;
-        Ok(sample.number(field).map_err(refused))
+        answer(sample.number(field))
     }
 
     fn size(&mut self, sample: Resource<Sample>) -> wasmtime::Result<u64> {
@@ -190,13 +190,13 @@ impl HostFrame for Hosted {
     fn mean_luma(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<f64> {
         let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
         self.meter.charge(frame.work(roi, None) as usize)?;
-        Ok(frame.mean_luma(roi).map_err(refused))
+        answer(frame.mean_luma(roi))
     }
 
     fn histogram(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<Vec<u32>> {
         let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
         self.meter.charge(frame.work(roi, None) as usize)?;
-        Ok(frame.histogram(roi).map(Vec::from).map_err(refused))
+        answer(frame.histogram(roi).map(Vec::from))
     }
 
     fn resize(&mut self, frame: Resource<Frame>, width: u32, height: u32) -> Answer<Resource<Frame>> {
@@ -227,9 +227,9 @@ impl HostFrame for Hosted {
 
 impl Hosted {
     fn hand_out<T: Send + 'static>(&mut self, made: Result<T, data::DataError>) -> Answer<Resource<T>> {
-        Ok(match made {
+        Ok(match answer(made)? {
             Ok(value) => Ok(self.handles.push(value)?),
-            Err(error) => Err(refused(error)),
+            Err(refused) => Err(refused),
         })
     }
 
@@ -244,8 +244,17 @@ impl Hosted {
     }
 }
 
-fn column_out(column: Result<data::Column, data::DataError>) -> Result<Column, DataError> {
-    column.map(|data::Column { at_ns, values }| Column { at_ns, values }).map_err(refused)
+/// What a guest is answered; what could not end in time ends it.
+fn answer<T>(made: Result<T, data::DataError>) -> Answer<T> {
+    match made {
+        Ok(value) => Ok(Ok(value)),
+        Err(error @ data::DataError::OutOfTime) => Err(error.into()),
+        Err(error) => Ok(Err(refused(error))),
+    }
+}
+
+fn column_out(data::Column { at_ns, values }: data::Column) -> Column {
+    Column { at_ns, values }
 }
 
 fn identity(data::Identity { topic, writer, seq }: &data::Identity) -> Identity {
@@ -284,9 +293,11 @@ fn refused(error: data::DataError) -> DataError {
         data::DataError::WrongField { .. } => DataError::WrongField(message),
         data::DataError::Malformed { .. } => DataError::Malformed(message),
         data::DataError::NoImageType { .. } | data::DataError::NotAFrame { .. } => DataError::NotAFrame(message),
-        data::DataError::TooLarge { .. } | data::DataError::NoSlot { .. } | data::DataError::NoMemory { .. } => {
-            DataError::NoRoom(message)
-        }
+        data::DataError::TooLarge { .. }
+        | data::DataError::NoSlot { .. }
+        | data::DataError::NoMemory { .. }
+        | data::DataError::TooManyFrames { .. }
+        | data::DataError::OutOfTime => DataError::NoRoom(message),
         data::DataError::OutOfRange(_) => DataError::OutOfRange(message),
     }
 }

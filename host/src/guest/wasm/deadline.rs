@@ -17,9 +17,8 @@ const IDLE: Duration = Duration::from_millis(500);
 /// No call runs.
 const NONE: u64 = 0;
 
-/// How long each call into a guest may take.
+/// Ends each call into a guest that takes longer than it may.
 pub struct Deadline {
-    allowed: Duration,
     shared: Arc<Shared>,
     ticker: Option<JoinHandle<()>>,
 }
@@ -41,12 +40,13 @@ pub(super) struct Armed<'a> {
 }
 
 impl Deadline {
-    /// A deadline of `allowed` for the guests of `engine`. Starts the ticker, which sleeps until a call runs.
+    /// A deadline for the guests of `engine`, whose calls may take `shortest` or longer. Starts the ticker, which sleeps until a
+    /// call runs.
     ///
     /// # Errors
     ///
     /// If the thread cannot be started.
-    pub fn new(engine: &Engine, allowed: Duration) -> std::io::Result<Self> {
+    pub fn new(engine: &Engine, shortest: Duration) -> std::io::Result<Self> {
         let shared = Arc::new(Shared {
             base: Instant::now(),
             due: AtomicU64::new(NONE),
@@ -55,14 +55,13 @@ impl Deadline {
         });
         let (engine, seen) = (engine.clone(), Arc::clone(&shared));
         let ticker = thread::Builder::new().name("gleaner-epoch".to_owned());
-        let ticker = ticker.spawn(move || seen.tick(&engine, allowed))?;
-        Ok(Self { allowed, shared, ticker: Some(ticker) })
+        let ticker = ticker.spawn(move || seen.tick(&engine, shortest))?;
+        Ok(Self { shared, ticker: Some(ticker) })
     }
 
-    /// Begins a call that may take `times` the deadline.
-    pub(super) fn arm(&self, store: &mut Store<Hosted>, times: u32) -> Armed<'_> {
+    /// Begins a call that may take `allowed`.
+    pub(super) fn arm(&self, store: &mut Store<Hosted>, allowed: Duration) -> Armed<'_> {
         let started = Instant::now();
-        let allowed = self.allowed.saturating_mul(times);
         store.data_mut().due = Some(started + allowed);
         store.set_epoch_deadline(1);
         let due = started.duration_since(self.shared.base) + allowed;
@@ -82,9 +81,9 @@ impl Deadline {
 }
 
 impl Shared {
-    fn tick(&self, engine: &Engine, allowed: Duration) {
-        // A look at least every half of the allowed time finds each call before it is due, and sleeps exactly until then.
-        let step = (allowed / 2).max(Duration::from_micros(500));
+    fn tick(&self, engine: &Engine, shortest: Duration) {
+        // A look at least every half of the shortest time finds each call before it is due, and sleeps exactly until then.
+        let step = (shortest / 2).max(Duration::from_micros(500));
         let mut quiet = Instant::now();
         while !self.stop.load(Ordering::SeqCst) {
             let now = Instant::now();

@@ -5,9 +5,13 @@ use wasmtime::component::ResourceTableError;
 use wasmtime::{Trap, WasmBacktrace};
 use wasmtime_wasi::I32Exit;
 
-use super::limits::OutOfFuel;
+use super::Hosted;
+use super::limits::{OutOfFuel, Refused};
 use super::wasi::Asleep;
-use super::{HANDLES, Hosted};
+use crate::api::data::DataError;
+
+/// How wasmtime begins to say that a lambda passed more than `call_bytes`.
+const TOO_MUCH_DATA: &str = "too much data is being copied between the host and the guest";
 
 pub(super) fn fuel(used: u64, allowed: u64) -> Fault {
     let message = format!("used {used} of {allowed} units of fuel");
@@ -31,8 +35,14 @@ pub(super) fn from_error(
         let message = format!("ran {:.1} ms; the deadline is {:.1} ms", ms(used), ms(allowed));
         return Fault { kind: FaultKind::Deadline, message, used, allowed };
     }
+    if let Some(DataError::OutOfTime) = error.downcast_ref() {
+        let (used, allowed) = time.unzip();
+        let message = "a call into the host takes longer than is left until the deadline".to_owned();
+        return Fault { kind: FaultKind::Deadline, message, used, allowed };
+    }
     if trap == Some(&Trap::StackOverflow) {
-        let allowed = Some(gleaner_compile::GUEST_STACK_BYTES as u64);
+        // How much it was that one call more would have taken nobody knows.
+        let allowed = Some(hosted.allowed.stack.bytes());
         return Fault { kind: FaultKind::Stack, message: "the call stack is full".to_owned(), used: None, allowed };
     }
     let plain = |kind, message| Fault { kind, message, used: None, allowed: None };
@@ -43,9 +53,15 @@ pub(super) fn from_error(
         return plain(FaultKind::Trap, "the lambda called exit".to_owned());
     }
     if let Some(ResourceTableError::Full) = error.downcast_ref() {
+        let allowed = hosted.allowed.handles;
         let message =
-            format!("the lambda holds {HANDLES} handles; drop samples, frames, fields and topics that are not needed");
-        return plain(FaultKind::HostCall, message);
+            format!("the lambda holds {allowed} handles; drop samples, frames, fields and topics that are not needed");
+        return Fault { kind: FaultKind::HostCall, message, used: Some(allowed + 1), allowed: Some(allowed) };
+    }
+    if error.root_cause().to_string().starts_with(TOO_MUCH_DATA) {
+        let allowed = hosted.allowed.call_bytes;
+        let message = format!("{TOO_MUCH_DATA}: at most {allowed} in one call");
+        return Fault { kind: FaultKind::HostCall, message, used: None, allowed: Some(allowed.bytes()) };
     }
     let said = hosted.printed.reason();
     // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is the cause. But a guest may
@@ -54,9 +70,9 @@ pub(super) fn from_error(
     let starting = trap.is_none() && error.downcast_ref::<WasmBacktrace>().is_none();
     let aborted = starting || trap == Some(&Trap::UnreachableCodeReached);
     let for_memory = said.as_ref().is_none_or(|said| said.contains("memory allocation of"));
-    if let Some((used, allowed)) = hosted.limits.refused().filter(|_| aborted && for_memory) {
-        let message = format!("asked for {used} bytes of memory; {allowed} are allowed");
-        return Fault { kind: FaultKind::Memory, message, used: Some(used), allowed: Some(allowed) };
+    if let Some(Refused { what, asked, allowed }) = hosted.caps.refused().filter(|_| aborted && for_memory) {
+        let message = format!("asked for {asked} {what}; {allowed} are allowed");
+        return Fault { kind: FaultKind::Memory, message, used: Some(asked), allowed: Some(allowed) };
     }
     match trap {
         // A panic says why on standard error, and the trap only says that it happened.

@@ -1,46 +1,56 @@
 //! What a store refuses: memory beyond the cap, and host work beyond the fuel.
 
+use gleaner_protocol::manifest::Limits;
 use wasmtime::ResourceLimiter;
-
-/// Elements of all tables together; a lambda built from Rust has one of some hundred.
-const TABLE_ELEMENTS: usize = 20_000;
 
 /// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in the same time.
 const BYTES_PER_FUEL: u64 = 8;
 /// Fuel for the call itself.
 const FUEL_PER_CALL: u64 = 20;
 
-/// Caps memory and remembers what it refused, since a guest only traps afterwards.
-pub(super) struct Limits {
-    allowed_bytes: usize,
+/// Caps memory and tables, and remembers what it refused, since a guest only traps afterwards.
+pub(super) struct Caps {
+    memory_allowed: usize,
+    tables_allowed: usize,
     /// Of all linear memories together: a component may have several.
     memory_bytes: usize,
     /// Of all tables together.
     table_elements: usize,
-    refused: Option<usize>,
+    refused: Option<Refused>,
 }
 
-impl Limits {
-    pub(super) fn new(memory_bytes: u64) -> Self {
-        let allowed_bytes = usize::try_from(memory_bytes).unwrap_or(usize::MAX);
-        Self { allowed_bytes, memory_bytes: 0, table_elements: 0, refused: None }
+/// What was asked for beyond a cap.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Refused {
+    /// `bytes of memory` or `elements of tables`.
+    pub(super) what: &'static str,
+    pub(super) asked: u64,
+    pub(super) allowed: u64,
+}
+
+impl Caps {
+    pub(super) fn new(limits: &Limits) -> Self {
+        let tables_allowed = usize::try_from(limits.tables).unwrap_or(usize::MAX);
+        let memory_allowed = limits.memory.as_usize();
+        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None }
     }
 
     pub(super) fn forget_refusal(&mut self) {
         self.refused = None;
     }
 
-    /// Bytes asked for beyond the cap, and the cap.
-    pub(super) fn refused(&self) -> Option<(u64, u64)> {
-        self.refused.map(|asked| (asked as u64, self.allowed_bytes as u64))
+    /// What was refused last.
+    pub(super) fn refused(&self) -> Option<Refused> {
+        self.refused
     }
 }
 
-impl ResourceLimiter for Limits {
+impl ResourceLimiter for Caps {
     fn memory_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
         let total = self.memory_bytes.saturating_add(desired.saturating_sub(now));
-        if total > self.allowed_bytes {
-            self.refused = Some(total);
+        if total > self.memory_allowed {
+            let (asked, allowed) = (total as u64, self.memory_allowed as u64);
+            self.refused = Some(Refused { what: "bytes of memory", asked, allowed });
             return Ok(false);
         }
         // Beyond its own maximum it does not grow, and must not be counted as if it had.
@@ -53,7 +63,12 @@ impl ResourceLimiter for Limits {
 
     fn table_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
         let total = self.table_elements.saturating_add(desired.saturating_sub(now));
-        let grows = total <= TABLE_ELEMENTS && max.is_none_or(|max| desired <= max);
+        if total > self.tables_allowed {
+            let (asked, allowed) = (total as u64, self.tables_allowed as u64);
+            self.refused = Some(Refused { what: "elements of tables", asked, allowed });
+            return Ok(false);
+        }
+        let grows = max.is_none_or(|max| desired <= max);
         if grows {
             self.table_elements = total;
         }
@@ -115,20 +130,33 @@ mod tests {
 
     #[test]
     fn a_refused_growth_is_remembered() {
-        let mut limits = Limits::new(100);
-        assert!(limits.memory_growing(0, 100, None).unwrap());
-        assert_eq!(limits.refused(), None);
-        assert!(!limits.memory_growing(100, 101, None).unwrap());
-        assert_eq!(limits.refused(), Some((101, 100)));
+        let mut caps = caps();
+        assert!(caps.memory_growing(0, MIB, None).unwrap());
+        assert_eq!(caps.refused(), None);
+        assert!(!caps.memory_growing(MIB, MIB + 1, None).unwrap());
+        let asked = MIB as u64 + 1;
+        assert_eq!(caps.refused(), Some(Refused { what: "bytes of memory", asked, allowed: asked - 1 }));
+        caps.forget_refusal();
+        assert!(!caps.table_growing(0, 101, None).unwrap());
+        assert_eq!(caps.refused(), Some(Refused { what: "elements of tables", asked: 101, allowed: 100 }));
+    }
+
+    const MIB: usize = 1 << 20;
+
+    /// Of a mebibyte and 100 elements.
+    fn caps() -> Caps {
+        let mut limits = Limits::default();
+        (limits.memory, limits.tables) = (gleaner_protocol::manifest::ByteSize::mib(1), 100);
+        Caps::new(&limits)
     }
 
     #[test]
     fn several_memories_and_tables_count_together() {
-        let mut limits = Limits::new(100);
-        assert!(limits.memory_growing(0, 60, None).unwrap());
-        assert!(!limits.memory_growing(0, 60, None).unwrap());
-        assert!(limits.memory_growing(60, 100, None).unwrap());
-        assert!(limits.table_growing(0, TABLE_ELEMENTS, None).unwrap());
-        assert!(!limits.table_growing(0, 1, None).unwrap());
+        let mut caps = caps();
+        assert!(caps.memory_growing(0, MIB / 2 + 1, None).unwrap());
+        assert!(!caps.memory_growing(0, MIB / 2, None).unwrap());
+        assert!(caps.memory_growing(MIB / 2 + 1, MIB, None).unwrap());
+        assert!(caps.table_growing(0, 100, None).unwrap());
+        assert!(!caps.table_growing(0, 1, None).unwrap());
     }
 }

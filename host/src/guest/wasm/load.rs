@@ -75,14 +75,14 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// Loads the component at `path`, compiling it into `cache` first if it is not there.
+    /// Loads the component at `path`, compiling it into `cache` first if it is not there. It gets a stack of that many bytes.
     ///
     /// # Errors
     ///
     /// [`WasmError`] names the component and what does not fit.
-    pub fn open(path: &Path, cache: &Path) -> Result<Self, WasmError> {
+    pub fn open(path: &Path, cache: &Path, stack_bytes: usize) -> Result<Self, WasmError> {
         let component = read_component(path)?;
-        let engine = gleaner_compile::engine()?;
+        let engine = gleaner_compile::engine(stack_bytes)?;
         let entry = cache_entry(cache, &component);
         if !entry.exists() {
             compile(path, cache)?;

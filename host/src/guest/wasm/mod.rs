@@ -17,9 +17,9 @@ mod wasi;
 pub use deadline::Deadline;
 pub use load::{Loaded, WasmError};
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use gleaner_protocol::manifest::ConfigValue;
+use gleaner_protocol::manifest::{ConfigValue, Limits};
 use gleaner_protocol::{Fault, FaultKind};
 use tokio::runtime::{self, Runtime};
 use wasmtime::Store;
@@ -28,38 +28,17 @@ use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
 
 use self::bindings::gleaner::lambda::data as wit;
 use self::bindings::{ConfigEntry, ConfigValue as WitConfigValue, Lambda};
-use self::limits::{Limits, Meter};
+use self::limits::{Caps, Meter};
 use self::wasi::Printed;
 use super::{Guest, Outcome};
 use crate::api::Session;
 use crate::api::data::Wake;
 
-/// `init` may use so many times the fuel of a wake: it builds tables once.
-pub const INIT_FUEL_FACTOR: u64 = 20;
-
-/// And so many times the time.
-pub const INIT_TIME_FACTOR: u32 = 20;
-
-/// Handles that a guest may hold at a time, of all kinds.
-pub const HANDLES: usize = 4096;
-
-/// Bytes that a guest may pass to the host in one call.
-const HOST_CALL_BYTES: usize = 1 << 20;
-
-/// What a guest is allowed, from `[limits]`.
-#[derive(Clone, Copy, Debug)]
-pub struct Allowance {
-    /// Fuel for each wake.
-    pub fuel: u64,
-    /// Linear memory, in bytes.
-    pub memory_bytes: u64,
-}
-
 /// A component and the session that it works on.
 pub struct WasmGuest {
     loaded: Loaded,
     session: Session,
-    allowance: Allowance,
+    limits: Limits,
     deadline: Option<Deadline>,
     /// For the few calls of WASI that wait. Without one, the first print would start a thread for each core.
     waiting: Runtime,
@@ -77,7 +56,8 @@ struct Hosted {
     handles: ResourceTable,
     wasi: WasiCtx,
     printed: Printed,
-    limits: Limits,
+    allowed: Limits,
+    caps: Caps,
     meter: Meter,
     /// When the call that runs has to end, where there is a deadline.
     due: Option<Instant>,
@@ -90,28 +70,21 @@ impl WasiView for Hosted {
 }
 
 impl WasmGuest {
-    /// A guest without an instance yet. With `deadline`, each call must end in time; in replay there is none.
+    /// A guest without an instance yet, within `limits`. With `deadline`, each call must end in time; in replay there is none. The
+    /// stack is that of the engine that `loaded` runs on.
     ///
     /// # Errors
     ///
     /// If the system has no more descriptors or memory.
-    pub fn new(
-        loaded: Loaded,
-        session: Session,
-        allowance: Allowance,
-        deadline: Option<Deadline>,
-    ) -> std::io::Result<Self> {
+    pub fn new(loaded: Loaded, session: Session, limits: &Limits, deadline: Option<Deadline>) -> std::io::Result<Self> {
         let waiting = runtime::Builder::new_current_thread().build()?;
-        Ok(Self { loaded, session, allowance, deadline, waiting, live: None })
+        Ok(Self { loaded, session, limits: *limits, deadline, waiting, live: None })
     }
 
     fn start(&mut self) -> Result<Live, Fault> {
         let mut store = self.new_store();
-        let mut call = Call::begin(
-            &mut store,
-            self.init_fuel(),
-            self.deadline.as_ref().map(|deadline| (deadline, INIT_TIME_FACTOR)),
-        );
+        let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.init_deadline));
+        let mut call = Call::begin(&mut store, self.limits.init_fuel, deadline);
         let lambda = self.loaded.instantiate(call.store());
         let result = lambda.and_then(|lambda| {
             let config = self.session.config().into_iter().map(config_entry).collect::<Vec<_>>();
@@ -126,24 +99,21 @@ impl WasmGuest {
         let printed = Printed::new(&self.session);
         let hosted = Hosted {
             session: self.session.clone(),
-            handles: handle_table(),
+            handles: handle_table(&self.limits),
             wasi: wasi::context(&self.session, &printed, self.loaded.seed()),
             printed,
-            limits: Limits::new(self.allowance.memory_bytes),
+            allowed: self.limits,
+            caps: Caps::new(&self.limits),
             meter: Meter::default(),
             due: None,
         };
         let mut store = Store::new(self.loaded.engine(), hosted);
-        store.limiter(|hosted| &mut hosted.limits);
+        store.limiter(|hosted| &mut hosted.caps);
         deadline::ask_at_each_epoch(&mut store);
-        store.set_hostcall_fuel(HOST_CALL_BYTES);
+        store.set_hostcall_fuel(self.limits.call_bytes.as_usize());
         // Our table refuses first, by name: a call lends some handles beside those that are held.
-        store.set_max_component_handles(2 * HANDLES);
+        store.set_max_component_handles(2 * handles(&self.limits));
         store
-    }
-
-    fn init_fuel(&self) -> u64 {
-        self.allowance.fuel.saturating_mul(INIT_FUEL_FACTOR)
     }
 }
 
@@ -163,8 +133,8 @@ impl Guest for WasmGuest {
             Ok(live) => live,
             Err(fault) => return Outcome { result: Err(fault), fuel: None },
         };
-        let mut call =
-            Call::begin(&mut live.store, self.allowance.fuel, self.deadline.as_ref().map(|deadline| (deadline, 1)));
+        let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));
+        let mut call = Call::begin(&mut live.store, self.limits.fuel, deadline);
         let result = call.hand_over(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
         let (fuel, result) = call.end(result);
         let result = result.and_then(|answer| answer.map_err(exception));
@@ -179,9 +149,13 @@ impl Guest for WasmGuest {
     }
 }
 
-fn handle_table() -> ResourceTable {
+fn handles(limits: &Limits) -> usize {
+    usize::try_from(limits.handles).unwrap_or(usize::MAX)
+}
+
+fn handle_table(limits: &Limits) -> ResourceTable {
     let mut table = ResourceTable::new();
-    table.set_max_capacity(HANDLES);
+    table.set_max_capacity(handles(limits));
     table
 }
 
@@ -193,15 +167,19 @@ struct Call<'a> {
 }
 
 impl<'a> Call<'a> {
-    fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<(&'a Deadline, u32)>) -> Self {
+    fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<(&'a Deadline, Duration)>) -> Self {
         store.set_fuel(fuel).expect("the engine counts fuel");
         let hosted = store.data_mut();
         hosted.meter = Meter::new(fuel);
-        hosted.limits.forget_refusal();
+        hosted.caps.forget_refusal();
         hosted.printed.begin();
-        let armed = deadline.map(|(deadline, times)| deadline.arm(store, times));
+        let armed = deadline.map(|(deadline, allowed)| deadline.arm(store, allowed));
         if armed.is_none() {
             store.set_epoch_deadline(u64::MAX / 2);
+        }
+        let hosted = store.data();
+        if let Some(due) = hosted.session.due() {
+            due.set(hosted.due);
         }
         Self { store, fuel, armed }
     }

@@ -46,7 +46,9 @@ fn attribute(Attribute { key, value }: Attribute) -> trigger::Attribute {
 
 fn refused(error: trigger::TriggerError) -> TriggerError {
     match error {
-        trigger::TriggerError::TooMany => TriggerError::TooMany(error.to_string()),
+        trigger::TriggerError::TooMany | trigger::TriggerError::TooOften { .. } => {
+            TriggerError::TooMany(error.to_string())
+        }
         error => TriggerError::Invalid(error.to_string()),
     }
 }

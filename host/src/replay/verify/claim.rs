@@ -15,7 +15,7 @@ use crate::input::Remap;
 use crate::journal::{CLOCK_OF_VEHICLE, Identity};
 use crate::replay::Options;
 use crate::replay::open::DriveError;
-use crate::stage::{Asked, AskedArgs};
+use crate::stage::{Asked, AskedArgs, tighten};
 
 /// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at most.
 const EXTRAS_BYTES: u64 = 256 << 20;
@@ -37,6 +37,11 @@ impl Claim {
             Failure::caused_by(Exit::Usage, format!("cannot open journal `{}`", path.display()), &error)
         })?;
         Self::open(path, Box::new(BufReader::new(file)), false, Told::default())
+    }
+
+    /// The file that it is in.
+    pub(in crate::replay) fn path(&self) -> &Path {
+        &self.path
     }
 
     /// The part of the journal of `lambda` that a clip holds.
@@ -100,23 +105,28 @@ impl Claim {
         &self.reader
     }
 
-    /// What the journal was made with, unless `set` and `remaps` say otherwise, which then has to be the same.
+    /// What the journal was made with, unless `set`, `remaps` and the vehicle say otherwise, which then has to be the same. Limits
+    /// of the journal count as those of a vehicle: they cannot be wider than those of the manifest.
     pub(in crate::replay) fn options(
         &self,
         args: AskedArgs,
         build: BuildDir,
-        manifest: &Manifest,
+        manifest: &mut Manifest,
         drives: Vec<PathBuf>,
     ) -> Result<Options, Failure> {
-        let AskedArgs { lambda, set, remap: remaps } = args;
+        let AskedArgs { lambda, set, remap: remaps, vehicle } = args;
         let header = self.header();
+        match &vehicle {
+            Some(file) => tighten(manifest, file)?,
+            None => manifest.limits = manifest.limits.tightened_by(&header.limits).0,
+        }
         let remaps = if remaps.is_empty() {
             let journaled = header.remaps.iter();
             journaled.map(|(from, to)| Remap { from: from.clone(), to: to.clone() }).collect()
         } else {
             remaps
         };
-        let mut asked = Asked { lambda, build, config: Vec::new(), remaps };
+        let mut asked = Asked { lambda, build, config: Vec::new(), remaps, vehicle };
         // The files first: in those of another lambda, the journal's config may not even exist.
         let without_config = Header { config: serde_json::Map::new(), ..header.clone() };
         compare(&without_config, &asked, manifest)?;
@@ -144,8 +154,9 @@ fn compare(header: &Header, asked: &Asked, manifest: &Manifest) -> Result<(), Fa
     let now = Identity { manifest, build, config, remaps, engine, clock }.header()?;
     match header.differs_from(&now) {
         None => Ok(()),
-        Some(difference) => Err(different("this is not the lambda that wrote the journal", &difference)
-            .with_help("name the folder of the lambda that wrote it, with the build, --set and --remap of then")),
+        Some(difference) => Err(different("this is not the lambda that wrote the journal", &difference).with_help(
+            "name the folder of the lambda that wrote it, with the build, --set, --remap and --vehicle of then",
+        )),
     }
 }
 

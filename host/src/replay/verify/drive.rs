@@ -66,6 +66,9 @@ impl Course for Proof<'_> {
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
         let at_ns = wake.at_ns();
+        if self.remake.judge.passes_over(at_ns) {
+            return Ok(true);
+        }
         let Some(entry) = self.claim.next()? else {
             // Its writer died: what it holds is proved.
             if self.claim.reader().end().is_none() {

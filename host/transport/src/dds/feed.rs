@@ -145,7 +145,7 @@ impl Feed {
                 }
                 Err(ReadError::Deserialization { reason }) => {
                     self.told.malformed.fetch_add(1, Relaxed);
-                    if self.once.first("malformed") {
+                    if self.once.first("malformed", "") {
                         warn!(topic = %self.spec.topic, reason = visible(&reason), "malformed sample");
                     }
                 }
@@ -166,7 +166,7 @@ impl Feed {
     fn deliver(&mut self, around: &Around<'_>, writer: Guid, seq: u64, publish_ns: i64, raw: Raw) {
         let Some(sink) = &self.sink else { return };
         let missing = self.gaps.note(writer, seq);
-        if missing > 0 && self.once.first("lost") {
+        if missing > 0 && self.once.first("lost", "") {
             warn!(topic = %self.spec.topic, %writer, missing, "samples were lost on their way; said once, counted further");
         }
         let meta = SampleMeta { at_ns: raw.at_ns, publish_ns, writer, seq, endian: raw.endian, options: [0; 2] };
@@ -210,35 +210,36 @@ impl Feed {
         }
         self.alone = ours.is_empty();
         let trouble = self.trouble(&ours, &others);
-        for sentence in &trouble {
-            if self.once.first(sentence) {
+        for (cause, sentence) in &trouble {
+            if self.once.first(cause, sentence) {
                 warn!(topic = %self.spec.topic, "{sentence}");
             }
         }
         let mut words = lock(&self.told.words);
         words.reader = self.guid();
         words.qos = self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
-        words.trouble = trouble;
+        words.trouble = trouble.into_iter().map(|(_, sentence)| sentence).collect();
         words.trouble.extend_from_slice(&self.asked_again);
     }
 
-    /// Why writers are not heard, or not as they could be.
-    fn trouble(&self, ours: &[&Offer], others: &[&Offer]) -> Vec<String> {
+    /// Why writers are not heard, or not as they could be: causes, and sentences.
+    fn trouble(&self, ours: &[&Offer], others: &[&Offer]) -> Vec<(&'static str, String)> {
         let topic = &self.spec.topic;
         let of_another_type = others.iter().map(|offer| {
             let (found, wanted) = (visible(&ros_type(&offer.type_name)), ros_type(&self.type_name));
-            format!("writer {} of `{topic}` sends `{found}`, not `{wanted}`", offer.guid)
+            ("another type", format!("writer {} of `{topic}` sends `{found}`, not `{wanted}`", offer.guid))
         });
-        let mut trouble: Vec<String> = of_another_type.take(TROUBLE / 2).collect();
+        let mut trouble: Vec<_> = of_another_type.take(TROUBLE / 2).collect();
         let Some(request) = self.request else { return trouble };
         let policies = request.policies(1);
         for offer in ours {
             if let Some(policy) = offer.qos.compliance_failure_wrt(&policies) {
                 let offered = in_words(&offer.qos);
-                trouble.push(format!(
+                let sentence = format!(
                     "writer {} of `{topic}` offers {offered}, asked for is {request}: {policy:?} does not fit",
                     offer.guid
-                ));
+                );
+                trouble.push(("offers less", sentence));
             }
         }
         let most = Request::of_all(ours.first().copied());
@@ -247,9 +248,10 @@ impl Feed {
         {
             let (a, b) = (in_words(&ours[0].qos), in_words(&other.qos));
             let (first, second) = (ours[0].guid, other.guid);
-            trouble.push(format!(
+            let sentence = format!(
                 "writers of `{topic}` differ, {first} offers {a} and {second} {b}: all are asked for {request}"
-            ));
+            );
+            trouble.push(("differ", sentence));
         }
         trouble.truncate(TROUBLE);
         trouble
@@ -276,7 +278,7 @@ impl Feed {
             Ok(reader) => reader,
             // Tried again at the next look.
             Err(error) => {
-                if self.once.first("reader") {
+                if self.once.first("reader", "") {
                     warn!(topic = %self.spec.topic, error, "no reader; trying again");
                 }
                 return;

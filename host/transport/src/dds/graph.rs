@@ -26,6 +26,14 @@ pub(super) struct Entry {
     pub(super) writers: Vec<[u8; 16]>,
 }
 
+/// A node of somebody else, as it says itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Node {
+    /// Namespace and name: `/sensors/camera`.
+    pub(super) name: String,
+    pub(super) writers: Vec<[u8; 16]>,
+}
+
 /// Whether we are in the graph.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Part {
@@ -123,10 +131,15 @@ fn count(cdr: &mut Vec<u8>, n: usize) {
 
 /// Whether `cdr` is such a message of a node of `distro`, down to its last byte.
 fn plausible(cdr: &[u8], endian: Endian, distro: Distro) -> bool {
+    nodes(cdr, endian, distro).is_some()
+}
+
+/// The nodes of a participant out of such a message; `None` if it is none, or names no node.
+pub(super) fn nodes(cdr: &[u8], endian: Endian, distro: Distro) -> Option<Vec<Node>> {
     let mut rest = Rest { cdr, at: 0, endian };
-    let whole = rest.nodes(gid_size(distro));
+    let nodes = rest.nodes(gid_size(distro))?;
     // Some writers fill up to a multiple of four.
-    whole.is_some() && cdr.len() - rest.at < 4
+    (cdr.len() - rest.at < 4).then_some(nodes)
 }
 
 struct Rest<'a> {
@@ -136,29 +149,41 @@ struct Rest<'a> {
 }
 
 impl<'a> Rest<'a> {
-    fn nodes(&mut self, gid: usize) -> Option<()> {
+    fn nodes(&mut self, gid: usize) -> Option<Vec<Node>> {
         self.take(gid)?;
-        let nodes = self.count()?;
+        let count = self.count()?;
         // Without a node there is too little to tell the sizes apart by.
-        if nodes == 0 {
+        if count == 0 {
             return None;
         }
-        for _ in 0..nodes {
-            for text in 0..2 {
-                let length = self.count()?;
-                let [bytes @ .., 0] = self.take(length)? else { return None };
-                let printable = bytes.iter().all(|byte| byte.is_ascii_graphic());
-                let begins = text == 1 || bytes.starts_with(b"/");
-                if !printable || !begins || bytes.is_empty() || bytes.len() > LONGEST {
-                    return None;
-                }
+        let mut nodes = Vec::new();
+        for _ in 0..count {
+            let (namespace, name) = (self.name()?, self.name()?);
+            if !namespace.starts_with('/') {
+                return None;
             }
-            for _ in 0..2 {
-                let gids = self.count()?.checked_mul(gid)?;
-                self.take(gids)?;
-            }
+            self.gids(gid)?;
+            let writers = self.gids(gid)?;
+            nodes.push(Node { name: format!("{}/{name}", namespace.trim_end_matches('/')), writers });
         }
-        Some(())
+        Some(nodes)
+    }
+
+    fn name(&mut self) -> Option<&'a str> {
+        let length = self.count()?;
+        let [bytes @ .., 0] = self.take(length)? else { return None };
+        let printable = bytes.iter().all(|byte| byte.is_ascii_graphic());
+        if !printable || bytes.is_empty() || bytes.len() > LONGEST {
+            return None;
+        }
+        str::from_utf8(bytes).ok()
+    }
+
+    /// A list of names of endpoints, of each the 16 bytes that mean something.
+    fn gids(&mut self, gid: usize) -> Option<Vec<[u8; 16]>> {
+        let bytes = self.count()?.checked_mul(gid)?;
+        let gids = self.take(bytes)?.chunks_exact(gid);
+        gids.map(|gid| gid.first_chunk().copied()).collect()
     }
 
     fn count(&mut self) -> Option<usize> {
@@ -210,6 +235,17 @@ mod tests {
                     assert_eq!(plausible(&cdr, Endian::Little, Distro::Humble), humble, "{name} {readers} {writers}");
                     assert_eq!(plausible(&cdr, Endian::Little, Distro::Newer), !humble, "{name} {readers} {writers}");
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn nodes_are_read_with_what_they_write() {
+        for distro in [Distro::Humble, Distro::Newer] {
+            for (namespace, full) in [("/", "/camera"), ("/front/left", "/front/left/camera")] {
+                let entry = Entry { namespace: namespace.to_owned(), ..entry("camera", 3, 2) };
+                let found = nodes(&encode(&entry, distro), Endian::Little, distro).unwrap();
+                assert_eq!(found, [Node { name: full.to_owned(), writers: vec![[2; 16]; 2] }]);
             }
         }
     }

@@ -9,20 +9,23 @@
 //! `docs/dds-limits.md`.
 //!
 //! What never happens here: a sink that does more than to copy under a lock of RustDDS; a message being understood, apart from those of
-//! ROS 2's graph; a packet sent elsewhere than RustDDS sends it.
+//! ROS 2's graph and the answers of nodes that are asked for definitions; a packet sent elsewhere than RustDDS sends it.
 //!
 //! What RustDDS does not tell: bytes 2 and 3 of a sample's encapsulation, given as zeros, and samples that are so broken
 //! that it drops them itself, which show as lost.
 //!
 //! [`Qos::Auto`]: crate::Qos::Auto
 
+mod ask;
 mod bpf;
 mod clock;
 mod feed;
 mod filter;
 mod graph;
 mod guard;
+mod known;
 mod names;
+mod nodes;
 mod offers;
 mod options;
 mod peers;
@@ -35,7 +38,7 @@ mod watch;
 mod wire;
 mod writer;
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -53,6 +56,7 @@ use crate::nearest::nearest;
 use crate::transport::{DiscoveredTopic, Sink, Status, Subscription, TopicSpec, Transport, TransportError};
 use feed::Feed;
 use guard::Guard;
+use known::Known;
 use receive::{Command, Line};
 use sockets::Sockets;
 use state::{State, Told, lock};
@@ -82,9 +86,7 @@ pub struct Dds {
     buffer: (usize, usize),
     /// Topic, type and status of each subscription.
     subscriptions: Vec<(TopicSpec, Arc<Told>)>,
-    sources: Sources,
-    /// By type.
-    definitions: Mutex<HashMap<String, Arc<Definitions>>>,
+    known: Mutex<Known>,
 }
 
 /// Whether a participant is alive, and what it was granted.
@@ -145,8 +147,7 @@ impl Dds {
             watch: Mutex::new(Watch::new(sockets, threads)),
             buffer: (asked, granted(asked, needed)),
             subscriptions: Vec::new(),
-            sources: Sources::new(&options.messages, &options.prefixes),
-            definitions: Mutex::default(),
+            known: Mutex::new(Known::new(Sources::new(&options.messages, &options.prefixes))),
         })
     }
 
@@ -195,14 +196,6 @@ impl Dds {
         let nearest = nearest(topic, known.iter().map(String::as_str)).map(str::to_owned);
         Err(TransportError::NoSuchTopic { topic: topic.to_owned(), known, nearest })
     }
-
-    /// The text of a type's definitions, if there is one.
-    fn text(&self, type_name: &str) -> Option<Arc<str>> {
-        self.sources.find(type_name).unwrap_or_else(|error| {
-            warn!(type_name, error = &error as &dyn std::error::Error, "definitions that cannot be used");
-            None
-        })
-    }
 }
 
 /// What of `asked` the kernel grants; says so if that is less than `needed`.
@@ -219,7 +212,7 @@ impl Transport for Dds {
     fn topics(&self) -> Vec<DiscoveredTopic> {
         let topics = wire::topics(&self.participant, self.state.graph().1);
         let discovered = |(found, offered_qos): (TopicOnWire, Option<String>)| DiscoveredTopic {
-            definitions_text: self.text(&found.type_name),
+            definitions_text: lock(&self.known).text(&found.type_name),
             topic: found.topic,
             type_name: found.type_name,
             messages: None,
@@ -248,17 +241,15 @@ impl Transport for Dds {
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
         let type_name = self.type_of(topic)?;
-        if let Some(known) = lock(&self.definitions).get(&type_name) {
-            return Ok(known.clone());
-        }
-        let Some(text) = self.text(&type_name) else {
-            return Err(TransportError::NoDefinitions { topic: topic.to_owned(), type_name });
-        };
-        let parsed = Definitions::parse(&type_name, &text)
-            .map_err(|source| TransportError::BadDefinitions { topic: topic.to_owned(), source })?;
-        let parsed = Arc::new(parsed);
-        // What is here was asked for by us, so there are not many.
-        Ok(lock(&self.definitions).entry(type_name).or_insert(parsed).clone())
+        let bad = |source| TransportError::BadDefinitions { topic: topic.to_owned(), source };
+        let known = lock(&self.known).parsed(&type_name).map_err(bad)?;
+        known.ok_or_else(|| TransportError::NoDefinitions { topic: topic.to_owned(), type_name })
+    }
+
+    /// Asks the node that writes the topic, as far as one question at a time and three for a type allow.
+    fn definitions_may_come(&self, topic: &str) -> bool {
+        let type_name = self.type_of(topic);
+        type_name.is_ok_and(|type_name| lock(&self.known).may_come(&type_name, &self.line, &self.state))
     }
 
     fn status(&self, subscription: Subscription) -> Status {

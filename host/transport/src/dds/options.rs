@@ -133,10 +133,7 @@ impl Options {
     fn read(node: String, variable: impl Fn(&str) -> Option<String>) -> Result<Self, DdsError> {
         let variable = |name| variable(name).filter(|value| !value.is_empty());
         let mut options = Self::new(node);
-        if let Some(value) = variable(DOMAIN) {
-            let domain = value.parse().ok().filter(|domain| *domain <= LAST_DOMAIN);
-            options.domain = domain.ok_or_else(|| setting(DOMAIN, &value, DOMAINS))?;
-        }
+        options.domain = domain_of(variable(DOMAIN).as_deref()).map_err(|value| setting(DOMAIN, value, DOMAINS))?;
         let range = variable("ROS_AUTOMATIC_DISCOVERY_RANGE");
         let here = match range.as_deref().map(str::to_ascii_uppercase).as_deref() {
             None | Some("SUBNET" | "SYSTEM_DEFAULT") => variable("ROS_LOCALHOST_ONLY").as_deref() == Some("1"),
@@ -160,6 +157,18 @@ impl Options {
             options.prefixes = prefixes.take(PREFIXES).map(PathBuf::from).collect();
         }
         Ok(options)
+    }
+}
+
+/// The domain that the content of `ROS_DOMAIN_ID` means; 0 if there is none. White space around it means nothing.
+///
+/// # Errors
+///
+/// The content, without that space, if it means no domain.
+fn domain_of(content: Option<&str>) -> Result<u16, &str> {
+    match content.map(str::trim) {
+        None | Some("") => Ok(0),
+        Some(text) => text.parse().ok().filter(|domain| *domain <= LAST_DOMAIN).ok_or(text),
     }
 }
 
@@ -198,8 +207,19 @@ mod tests {
     }
 
     #[test]
+    fn the_domain_is_that_which_all_programs_of_ours_read() {
+        // The same page is the test of `gleaner doctor` and of the player: they cannot share this code.
+        let page = include_str!("../../../../tests/domains.txt");
+        for line in page.lines().filter(|line| line.starts_with('|')) {
+            let (content, domain) = line[1..].split_once('|').unwrap();
+            let read = read(&[("ROS_DOMAIN_ID", content)]).map(|options| options.domain);
+            assert_eq!(read.ok(), domain.trim().parse().ok(), "{line}");
+        }
+    }
+
+    #[test]
     fn values_that_mean_nothing_are_refused_by_name() {
-        for domain in ["233", "-1", "one", "1 ", "99999999999"] {
+        for domain in ["233", "-1", "one", "1 2", "99999999999"] {
             let error = read(&[("ROS_DOMAIN_ID", domain)]).unwrap_err().to_string();
             assert_eq!(error, format!("ROS_DOMAIN_ID is `{domain}`; it may be a number from 0 to 232"));
         }

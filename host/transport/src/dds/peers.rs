@@ -18,7 +18,8 @@ pub(super) fn prefix(guid: &GUID) -> Prefix {
 /// Other participants, and connections of our endpoints to theirs.
 #[derive(Debug, Default)]
 pub(super) struct Peers {
-    participants: HashSet<GUID>,
+    /// Of each, whose DDS it is on: the vendor's number.
+    participants: HashMap<GUID, [u8; 2]>,
     /// By endpoint of ours.
     matched: HashMap<GUID, HashSet<GUID>>,
 }
@@ -29,12 +30,12 @@ impl Peers {
         match event {
             Event::ParticipantDiscovered { dpd } => {
                 if self.participants.len() < MOST {
-                    self.participants.insert(dpd.guid);
+                    self.participants.insert(dpd.guid, dpd.vendor_id.vendor_id);
                 }
             }
             Event::ParticipantLost { id, .. } => {
                 let theirs = id.range();
-                self.participants.retain(|participant| !theirs.contains(participant));
+                self.participants.retain(|participant, _| !theirs.contains(participant));
                 self.matched.values_mut().for_each(|matched| matched.retain(|guid| !theirs.contains(guid)));
             }
             Event::WriterLost { guid, .. } | Event::ReaderLost { guid, .. } => {
@@ -74,9 +75,14 @@ impl Peers {
         self.participants.len()
     }
 
+    /// Whose DDS the participant is on whose endpoints' names begin so: the vendor's number, if it is known.
+    pub(super) fn vendor(&self, theirs: Prefix) -> Option<[u8; 2]> {
+        self.participants.iter().find(|(guid, _)| prefix(guid) == theirs).map(|(_, vendor)| *vendor)
+    }
+
     /// How the names of all endpoints of each participant begin, sorted.
     pub(super) fn prefixes(&self) -> Vec<Prefix> {
-        let mut prefixes: Vec<Prefix> = self.participants.iter().map(prefix).collect();
+        let mut prefixes: Vec<Prefix> = self.participants.keys().map(prefix).collect();
         prefixes.sort_unstable();
         prefixes
     }

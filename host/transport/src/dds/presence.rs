@@ -8,7 +8,9 @@ use tracing::{info, warn};
 
 use super::feed::Around;
 use super::graph::{Entry, Hearing, Part, TOPIC, TYPE, encode};
+use super::nodes::Nodes;
 use super::offers::Request;
+use super::peers::prefix;
 use super::raw::{CopyInto, RawReader, RawWriter};
 use super::state::State;
 use super::{DdsError, Distro, Options};
@@ -23,6 +25,7 @@ pub(super) struct Presence {
     node: String,
     entry: Entry,
     hearing: Hearing,
+    nodes: Nodes,
     part: Part,
     reader: RawReader,
     /// Made when there is something to say.
@@ -51,6 +54,7 @@ impl Presence {
             node: options.node.clone(),
             entry,
             hearing: Hearing::new(options.distro),
+            nodes: Nodes::default(),
             part: Part::Silent,
             reader,
             writer: None,
@@ -66,13 +70,20 @@ impl Presence {
                 Ok(None) => break,
                 Ok(Some(change)) => {
                     if change.writer_guid.prefix != self.reader.guid().prefix {
-                        self.hearing.hear(&around.memory.borrow(), change.sample.endian);
+                        let said = around.memory.borrow();
+                        self.hearing.hear(&said, change.sample.endian);
+                        self.nodes.hear(prefix(&change.writer_guid), &said, change.sample.endian);
                     }
                 }
                 // Whatever it was, it says nothing.
                 Err(_) => {}
             }
         }
+    }
+
+    /// Which nodes others have said that they have.
+    pub(super) fn nodes(&mut self) -> &mut Nodes {
+        &mut self.nodes
     }
 
     /// Says what there is to say, if it is not what was said.

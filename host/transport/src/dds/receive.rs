@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use mio::{Events, Interest, Poll, Token, Waker};
 use rustdds::{DomainParticipant, DomainParticipantStatusListener, GUID, StatusEvented};
 
+use super::ask::{Ask, Asker};
 use super::feed::{self, Around, Feed};
 use super::guard::Guard;
 use super::offers::Offer;
@@ -22,6 +23,7 @@ use super::{Clock, DdsError, Options, wire};
 const WAKE: Token = Token(0);
 const STATUS: Token = Token(1);
 const GRAPH: Token = Token(2);
+const ANSWER: Token = Token(3);
 
 /// Samples of one topic before it is the next one's turn.
 const TURN: usize = 64;
@@ -36,6 +38,7 @@ pub(super) enum Command {
     Subscribe(Box<Feed>),
     Writer(GUID),
     WriterGone(GUID),
+    Ask(Ask),
     Stop,
 }
 
@@ -63,6 +66,7 @@ struct Receiver {
     feeds: Vec<Feed>,
     writers: Vec<GUID>,
     presence: Presence,
+    asker: Asker,
     guard: Guard,
     state: Arc<State>,
     memory: RefCell<Vec<u8>>,
@@ -97,6 +101,7 @@ pub(super) fn start(
         feeds: Vec::new(),
         writers: Vec::new(),
         presence,
+        asker: Asker::default(),
         guard,
         state: state.clone(),
         memory: RefCell::new(Vec::with_capacity(KEPT_BYTES)),
@@ -128,7 +133,7 @@ impl Receiver {
                 match event.token() {
                     WAKE => self.changed = true,
                     STATUS => self.note_events(),
-                    GRAPH => self.changed = true,
+                    GRAPH | ANSWER => self.changed = true,
                     token => {
                         if let Some(feed) = feed::index(token).and_then(|index| self.feeds.get_mut(index)) {
                             feed.ready = true;
@@ -173,6 +178,7 @@ impl Receiver {
                 }
                 Command::Writer(guid) => self.writers.push(guid),
                 Command::WriterGone(guid) => self.writers.retain(|writer| *writer != guid),
+                Command::Ask(ask) => self.asker.ask(ask),
                 Command::Stop => return false,
             }
             self.changed = true;
@@ -203,9 +209,11 @@ impl Receiver {
     fn look(&mut self) {
         self.changed = false;
         self.looked = Some(Instant::now());
-        let offers: Vec<Offer> = self.participant.discovered_writers().iter().map(wire::offer).collect();
+        let writers = self.participant.discovered_writers();
+        let offers: Vec<Offer> = writers.iter().map(wire::offer).collect();
         self.note_events();
-        let largest = self.feeds.iter().map(Feed::largest).max().unwrap_or(0).max(self.largest);
+        let largest = self.feeds.iter().map(Feed::largest).max().unwrap_or(0);
+        let largest = largest.max(self.largest).max(self.asker.largest());
         // Before there are readers: fragments of the first sample have to pass. Participants are told of once; a writer that is
         // known speaks for one that was missed.
         let mut others = self.state.peers().prefixes();
@@ -226,6 +234,10 @@ impl Receiver {
             feed.ready = true;
         }
         self.presence.listen(&around);
+        self.presence.nodes().keep(&others);
+        self.asker.look(&around, ANSWER, &writers, self.presence.nodes());
+        // What it waits for is looked at soon.
+        self.changed |= self.asker.is_asking();
         let readers = self.feeds.iter().filter_map(Feed::guid).collect();
         self.presence.speak(&around, readers, &self.writers);
         // One sample of a size that nobody expected shall not be remembered for ever.

@@ -1,12 +1,13 @@
 //! What the receive thread tells those who ask.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use rustdds::GUID;
 use tracing::error;
 
+use super::ask::Outcome;
 use super::peers::Peers;
 use super::{Distro, names};
 use crate::transport::Status;
@@ -18,6 +19,8 @@ pub(super) struct State {
     peers: Mutex<Peers>,
     graph: Mutex<(String, Option<Distro>)>,
     unfiltered: Mutex<Option<String>>,
+    /// What became of the question with this ticket.
+    answer: Mutex<Option<(u64, Outcome)>>,
     /// Samples and events that were handled.
     pub(super) handled: AtomicU64,
     /// Odd while a sink may have a sample.
@@ -78,6 +81,15 @@ impl State {
         lock(&self.unfiltered).clone()
     }
 
+    pub(super) fn answer(&self, ticket: u64, outcome: Outcome) {
+        *lock(&self.answer) = Some((ticket, outcome));
+    }
+
+    /// What became of a question, if it is known. Told once.
+    pub(super) fn answered(&self, ticket: u64) -> Option<Outcome> {
+        lock(&self.answer).take_if(|(of, _)| *of == ticket).map(|(_, outcome)| outcome)
+    }
+
     /// A sink gets a sample, or gives it back.
     pub(super) fn deliver(&self, to: usize) {
         self.to.store(to, Ordering::Relaxed);
@@ -104,18 +116,20 @@ impl Told {
     }
 }
 
-/// Says each thing once, and counts what it has no room to remember as said.
+/// Says each thing once. Of one cause only so many things: what others send must not use up what there is to say of other
+/// causes.
 #[derive(Debug, Default)]
 pub(super) struct Once {
-    said: HashSet<String>,
+    said: HashMap<&'static str, HashSet<String>>,
 }
 
 impl Once {
-    const MOST: usize = 256;
+    const MOST: usize = 64;
 
-    /// Whether `what` is new.
-    pub(super) fn first(&mut self, what: &str) -> bool {
-        self.said.len() < Self::MOST && self.said.insert(what.to_owned())
+    /// Whether `what` is new among what `cause` had to say, and there is room to remember it.
+    pub(super) fn first(&mut self, cause: &'static str, what: &str) -> bool {
+        let said = self.said.entry(cause).or_default();
+        said.len() < Self::MOST && said.insert(what.to_owned())
     }
 }
 
@@ -123,4 +137,19 @@ impl Once {
 pub(super) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
     let text = panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str));
     names::visible(text.unwrap_or("no text"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_thing_is_said_once_and_a_flood_of_one_cause_silences_no_other() {
+        let mut once = Once::default();
+        assert!(once.first("lost", ""));
+        assert!(!once.first("lost", ""));
+        let said = (0..10_000).filter(|n| once.first("another type", &format!("writer {n}"))).count();
+        assert_eq!(said, Once::MOST);
+        assert!(once.first("malformed", "") && once.first("offers less", "writer 1"));
+    }
 }

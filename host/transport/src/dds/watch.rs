@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-use super::sockets::{Queues, Sockets, gone};
+use super::sockets::{Queues, Sockets, busy, gone};
 use super::state::State;
 
 /// Looks in a row at which something stood still, until it is said to be dead.
@@ -20,7 +20,10 @@ pub(super) struct Watch {
     looked: Option<Instant>,
     queues: Queues,
     handled: u64,
-    /// Looks in a row at which datagrams waited and nothing was handled.
+    /// CPU time of the thread that reads the sockets.
+    busy: u64,
+    /// Looks in a row at which datagrams waited, nothing was handled, and nobody worked on it: datagrams that are none of our
+    /// business may keep a queue filled while nobody writes what we listen to.
     waiting: u32,
     delivery: Option<(u64, usize)>,
     /// Looks in a row at which the same delivery was going on.
@@ -35,6 +38,7 @@ impl Watch {
             looked: None,
             queues: Queues::default(),
             handled: 0,
+            busy: 0,
             waiting: 0,
             delivery: None,
             delivering: 0,
@@ -46,17 +50,17 @@ impl Watch {
         let queues = self.sockets.queues();
         if self.looked.is_none_or(|looked| looked.elapsed() >= SPACING) {
             self.looked = Some(Instant::now());
-            self.count(queues, state.handled.load(Relaxed), state.delivering());
+            self.count(queues, (state.handled.load(Relaxed), busy(&self.threads)), state.delivering());
         }
         self.queues = queues;
         let dead = state.dead().or_else(|| self.verdict(topics));
         (queues, dead)
     }
 
-    fn count(&mut self, queues: Queues, handled: u64, delivery: Option<(u64, usize)>) {
-        let still = queues.waiting > 0 && handled == self.handled;
+    fn count(&mut self, queues: Queues, (handled, busy): (u64, u64), delivery: Option<(u64, usize)>) {
+        let still = queues.waiting > 0 && handled == self.handled && busy == self.busy;
         self.waiting = if still { self.waiting + 1 } else { 0 };
-        self.handled = handled;
+        (self.handled, self.busy) = (handled, busy);
         let same = delivery.is_some() && delivery == self.delivery;
         self.delivering = if same { self.delivering + 1 } else { 0 };
         self.delivery = delivery;
@@ -85,7 +89,7 @@ mod tests {
 
     fn look(watch: &mut Watch, waiting: u64, handled: u64, delivery: Option<(u64, usize)>) -> Option<String> {
         watch.queues = Queues { waiting, ..Queues::default() };
-        watch.count(watch.queues, handled, delivery);
+        watch.count(watch.queues, (handled, 0), delivery);
         watch.verdict(&["/imu".to_owned()])
     }
 
@@ -106,6 +110,16 @@ mod tests {
         }
         for round in 0..100_u64 {
             assert_eq!(look(&mut watch, u64::from(round % 9 != 0), 0, None), None, "round {round}");
+        }
+    }
+
+    #[test]
+    fn a_thread_that_works_through_datagrams_of_others_is_alive() {
+        let mut watch = watch();
+        for busy in 0..100 {
+            watch.queues = Queues { waiting: 700, ..Queues::default() };
+            watch.count(watch.queues, (0, busy / 9), None);
+            assert_eq!(watch.verdict(&[]), None, "look {busy}");
         }
     }
 

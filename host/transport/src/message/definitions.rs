@@ -130,6 +130,16 @@ impl Definitions {
         self.root().fields.iter().map(|field| field.name.as_str())
     }
 
+    /// Whether both say the same of every message.
+    #[cfg(feature = "dds")]
+    pub(super) fn says_as(&self, other: &Self) -> bool {
+        let all = |definitions: &Self| -> Vec<(String, Vec<Field<usize>>)> {
+            definitions.structs.iter().map(|one| (one.name.clone(), one.fields.clone())).collect()
+        };
+        // Both list a type before those that contain it, in the order of the fields.
+        all(self) == all(other)
+    }
+
     pub(super) fn root(&self) -> &Struct {
         self.structs.last().expect("parse resolves the root or fails, and pushes it last")
     }

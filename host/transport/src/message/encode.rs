@@ -25,6 +25,11 @@ impl CdrWriter {
         self.aligned(&value.to_le_bytes())
     }
 
+    /// Adds a `uint64`.
+    pub fn u64(&mut self, value: u64) -> &mut Self {
+        self.aligned(&value.to_le_bytes())
+    }
+
     /// Adds `float64`s, as of an array of fixed length.
     pub fn f64s(&mut self, values: &[f64]) -> &mut Self {
         values.iter().fold(self, |cdr, value| cdr.aligned(&value.to_le_bytes()))

@@ -12,6 +12,8 @@
 
 mod cdr;
 mod definitions;
+#[cfg(feature = "dds")]
+mod described;
 mod encode;
 mod layout;
 mod parse;
@@ -32,3 +34,5 @@ pub use value::{Kind, Value};
 pub use views::{CompressedView, ImageView};
 
 pub(crate) use definitions::short_name;
+#[cfg(feature = "dds")]
+pub(crate) use described::{Described, Header, question};

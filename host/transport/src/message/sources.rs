@@ -111,14 +111,7 @@ impl Sources {
             let shown = type_name.chars().filter(|c| !c.is_control()).take(80).collect();
             return Err(SourcesError::Name { name: shown });
         }
-        let Some(text) = self.one(&root)? else {
-            return Ok(None);
-        };
-        let mut gathered = Gathered { sources: self, root: &root, known: HashSet::new(), text: String::new() };
-        gathered.add(&root, &text)?;
-        let unusable = |source| SourcesError::Unusable { type_name: root.clone(), source };
-        Definitions::parse(&root, &gathered.text).map_err(unusable)?;
-        Ok(Some(gathered.text.into()))
+        gather(&root, &|name| self.one(name))
     }
 
     /// The text of one type, without those it refers to. `name` is a name.
@@ -153,9 +146,24 @@ impl Sources {
     }
 }
 
+/// The text of `root`, which is a name, with all types it refers to. `one` has the text of one type, if there is one.
+pub(super) fn gather(root: &str, one: &One<'_>) -> Result<Option<Arc<str>>, SourcesError> {
+    let Some(text) = one(root)? else {
+        return Ok(None);
+    };
+    let mut gathered = Gathered { one, root, known: HashSet::new(), text: String::new() };
+    gathered.add(root, &text)?;
+    let unusable = |source| SourcesError::Unusable { type_name: root.to_owned(), source };
+    Definitions::parse(root, &gathered.text).map_err(unusable)?;
+    Ok(Some(gathered.text.into()))
+}
+
+/// The text of one type, without those it refers to.
+type One<'s> = dyn Fn(&str) -> Result<Option<String>, SourcesError> + 's;
+
 /// A type and what it refers to, as far as they are known; depth first, each type where it is first needed.
 struct Gathered<'s> {
-    sources: &'s Sources,
+    one: &'s One<'s>,
     root: &'s str,
     known: HashSet<String>,
     text: String,
@@ -200,7 +208,7 @@ impl Gathered<'_> {
             if self.known.contains(&candidate) {
                 return Ok(());
             }
-            if let Some(text) = self.sources.one(&candidate)? {
+            if let Some(text) = (self.one)(&candidate)? {
                 return self.add(&candidate, &text);
             }
         }
@@ -219,7 +227,7 @@ fn bundled() -> &'static HashMap<&'static str, &'static str> {
 }
 
 /// Whether `name` is `pkg/Type`, both of them letters, digits and `_`, and a letter first.
-fn is_name(name: &str) -> bool {
+pub(super) fn is_name(name: &str) -> bool {
     let is_word = |word: &str| {
         word.len() <= MAX_NAME
             && word.starts_with(|c: char| c.is_ascii_alphabetic())

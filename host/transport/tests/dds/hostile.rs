@@ -16,7 +16,7 @@ pub const TESTS: &[Test] = &[
 ];
 
 /// An RTPS packet of `writer` with one submessage.
-fn packet(writer: GUID, kind: u8, body: &[u8]) -> Vec<u8> {
+pub fn packet(writer: GUID, kind: u8, body: &[u8]) -> Vec<u8> {
     let mut packet = b"RTPS\x02\x04\x01\x10".to_vec();
     packet.extend_from_slice(&writer.to_bytes()[..12]);
     packet.extend_from_slice(&[kind, 5]);

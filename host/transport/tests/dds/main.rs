@@ -4,6 +4,7 @@
 //! else is heard. Where there may be none, every test is skipped and says so.
 
 mod apart;
+mod ask;
 mod graph;
 mod hostile;
 mod life;
@@ -28,7 +29,16 @@ fn main() -> ExitCode {
             Err(why) => Err(why),
         },
     };
-    let tests = [receive::TESTS, offers::TESTS, graph::TESTS, wire::TESTS, write::TESTS, hostile::TESTS, life::TESTS];
+    let tests = [
+        ask::TESTS,
+        receive::TESTS,
+        offers::TESTS,
+        graph::TESTS,
+        wire::TESTS,
+        write::TESTS,
+        hostile::TESTS,
+        life::TESTS,
+    ];
     let trial = |&(name, test): &Test| match &here {
         Ok(()) => Trial::test(name, move || -> Result<(), Failed> {
             test();

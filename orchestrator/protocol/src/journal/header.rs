@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::manifest::Kind;
+use crate::manifest::{Kind, Limits};
 use crate::words::{excerpt, visible};
 
 /// What made the decisions of a journal: its first block, as JSON.
@@ -28,8 +28,11 @@ pub struct Header {
     /// Its models.
     pub models: Vec<FileDigest>,
     /// SHA-256 of what its manifest says that a decision can depend on, in hexadecimal digits: not of `[record]`, nor of
-    /// descriptions. So a clip stays provable when its preroll is tuned.
+    /// descriptions, so that a clip stays provable when its preroll is tuned; and not of `[limits]`, which are here as they were.
     pub manifest: String,
+    /// What it was allowed: the limits of its manifest, as a vehicle may have tightened them.
+    #[serde(default)]
+    pub limits: Limits,
     /// Its inputs, in the order of the manifest.
     pub inputs: Vec<JournalInput>,
     /// Which of `inputs` wakes it; `None` if the clock does.
@@ -120,7 +123,10 @@ impl Header {
             .or_else(|| Difference::of("version of the lambda", &self.version, &now.version))
             .or_else(|| Difference::of("kind of the lambda", self.kind.as_str(), now.kind.as_str()))
             .or_else(|| files_differ("build file", &self.files, &now.files))
-            .or_else(|| Difference::of("manifest lambda.toml, less [record]", &self.manifest, &now.manifest))
+            .or_else(|| {
+                Difference::of("manifest lambda.toml, less [record] and [limits]", &self.manifest, &now.manifest)
+            })
+            .or_else(|| limits_differ(&self.limits, &now.limits))
             .or_else(|| files_differ("model", &self.models, &now.models))
             .or_else(|| config_differs(&self.config, &now.config))
             .or_else(|| inputs_differ(&self.inputs, &now.inputs))
@@ -172,6 +178,11 @@ fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Optio
         };
         Difference::of(format!("{what} `{}`", excerpt(path)), side(journal), side(now))
     })
+}
+
+fn limits_differ(journal: &Limits, now: &Limits) -> Option<Difference> {
+    let mut pairs = journal.in_words().into_iter().zip(now.in_words());
+    pairs.find_map(|((key, journal), (_, now))| Difference::of(format!("limit `{key}`"), journal, now))
 }
 
 /// Values are compared as they are written, so that `-0.0` is not `0.0`, and 1 is not 1.0.

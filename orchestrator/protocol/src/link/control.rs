@@ -7,6 +7,7 @@ use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 
+use rustix::io::Errno;
 use rustix::net::{
     RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage, SendFlags,
     recvmsg, send, sendmsg,
@@ -69,8 +70,8 @@ impl Control {
         let sent = loop {
             match sendmsg(&self.socket, &[IoSlice::new(&bytes)], &mut with, SendFlags::NOSIGNAL) {
                 Ok(sent) => break sent,
-                Err(rustix::io::Errno::INTR) => {}
-                Err(error) => return Err(cannot_send(error)),
+                Err(Errno::INTR) => {}
+                Err(error) => return Err(LinkError::of(RECORDER, error)),
             }
         };
         self.send(&bytes[sent..])?;
@@ -91,18 +92,11 @@ impl Control {
         while !bytes.is_empty() {
             match send(&self.socket, bytes, SendFlags::NOSIGNAL) {
                 Ok(sent) => bytes = &bytes[sent..],
-                Err(rustix::io::Errno::INTR) => {}
-                Err(error) => return Err(cannot_send(error)),
+                Err(Errno::INTR) => {}
+                Err(error) => return Err(LinkError::of(RECORDER, error)),
             }
         }
         Ok(())
-    }
-}
-
-fn cannot_send(error: rustix::io::Errno) -> LinkError {
-    match error {
-        rustix::io::Errno::PIPE | rustix::io::Errno::CONNRESET => LinkError::Gone { who: RECORDER },
-        error => LinkError::Socket { who: RECORDER, source: error.into() },
     }
 }
 

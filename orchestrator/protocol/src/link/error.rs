@@ -1,5 +1,7 @@
 use std::io;
 
+use rustix::io::Errno;
+
 use super::FRAME_MAX;
 use crate::journal::Malformed;
 use crate::{Exit, Explain};
@@ -82,6 +84,16 @@ pub enum LinkError {
         /// What the system said.
         source: io::Error,
     },
+}
+
+impl LinkError {
+    /// What the system says of a socket to `who`.
+    pub(super) fn of(who: &'static str, error: Errno) -> LinkError {
+        match error {
+            Errno::PIPE | Errno::CONNRESET => LinkError::Gone { who },
+            error => LinkError::Socket { who, source: error.into() },
+        }
+    }
 }
 
 impl Explain for LinkError {

@@ -30,7 +30,19 @@ pub enum RecorderReport {
 pub enum Loss {
     /// A clip was deleted that nobody had fetched.
     Deleted {
-        /// When, in ns on the clock of the clips.
+        /// When, in ns since 1970.
+        at_ns: i64,
+        /// The clip, as in `clips.jsonl`.
+        file: PathBuf,
+        /// Its length.
+        bytes: u64,
+        /// Why, in words.
+        why: String,
+    },
+    /// A clip that should have been deleted to make room, and could not be: it is still there, whole or without its thumbnail,
+    /// though a line before may say that it was deleted.
+    NotDeleted {
+        /// When, in ns since 1970.
         at_ns: i64,
         /// The clip, as in `clips.jsonl`.
         file: PathBuf,
@@ -63,12 +75,18 @@ pub enum Loss {
 pub struct RecorderStatus {
     /// Lambdas that it hears.
     pub lambdas: usize,
+    /// Lambdas that it was told of and does not record for; the log says why.
+    #[serde(default)]
+    pub lambdas_refused: u64,
     /// Clips that are finished.
     pub clips: u64,
     /// Clips that could not be written.
     pub failed: u64,
     /// Clips that were deleted to make room, and that nobody had fetched.
     pub deleted: u64,
+    /// Clips that should have been deleted to make room, and could not be.
+    #[serde(default)]
+    pub not_deleted: u64,
     /// Windows that triggers and commands opened.
     pub windows: u64,
     /// Whether a clip is open.
@@ -87,6 +105,12 @@ pub struct RecorderStatus {
     pub preroll_bound: u64,
     /// Samples that it gave up too early, for want of bytes.
     pub pushed_out: u64,
+    /// Samples that are larger than the preroll: they are in a clip only if it was open when they came.
+    #[serde(default)]
+    pub too_big: u64,
+    /// Samples and wakes that were not taken, as their stamps were before 1970, or their topic was not known yet.
+    #[serde(default)]
+    pub refused: u64,
     /// Bytes on their way to the disk.
     pub in_flight: u64,
     /// From a decision with triggers to the opening of its windows. `None` without such.

@@ -184,7 +184,7 @@ impl RecorderLink {
                 Ok(sent) => self.queue.sent(sent),
                 Err(Errno::AGAIN) => return Ok(()),
                 Err(Errno::INTR) => {}
-                Err(error) => return Err(cannot(error)),
+                Err(error) => return Err(LinkError::of(RECORDER, error)),
             }
         }
         Ok(())
@@ -200,7 +200,7 @@ impl RecorderLink {
             match send(&self.socket, bytes, SendFlags::NOSIGNAL) {
                 Ok(sent) => bytes = &bytes[sent..],
                 Err(Errno::INTR | Errno::AGAIN) => {}
-                Err(error) => return Err(cannot(error)),
+                Err(error) => return Err(LinkError::of(RECORDER, error)),
             }
         }
         Ok(())
@@ -216,7 +216,7 @@ impl RecorderLink {
                 Ok(())
             }
             Err(Errno::AGAIN | Errno::INTR) => Ok(()),
-            Err(error) => Err(cannot(error)),
+            Err(error) => Err(LinkError::of(RECORDER, error)),
         }
     }
 
@@ -225,7 +225,8 @@ impl RecorderLink {
         let Some(bytes) = self.heard.first_chunk::<HEAD>() else { return Ok(None) };
         let (tag, len) = frame::head(*bytes, RECORDER)?;
         if len > READ {
-            return Err(LinkError::TooLong { who: RECORDER, frame: frame::name(tag), bytes: len as u64 });
+            let why = format!("it has {len} bytes, above the maximum of {READ}");
+            return Err(LinkError::Malformed { who: RECORDER, frame: frame::name(tag), why });
         }
         let Some(payload) = self.heard.get(HEAD..HEAD + len) else { return Ok(None) };
         let said = match tag {
@@ -243,12 +244,5 @@ impl RecorderLink {
         };
         self.heard.drain(..HEAD + len);
         Ok(Some(said))
-    }
-}
-
-fn cannot(error: Errno) -> LinkError {
-    match error {
-        Errno::PIPE | Errno::CONNRESET => LinkError::Gone { who: RECORDER },
-        error => LinkError::Socket { who: RECORDER, source: error.into() },
     }
 }

@@ -37,6 +37,7 @@ fn header(lambda: &str) -> Header {
         remaps: Vec::new(),
         clock: "x".to_owned(),
         wakes_before: 0,
+        limits: Default::default(),
     }
 }
 
@@ -326,4 +327,38 @@ fn reports_are_lines_that_name_themselves() {
     assert!(line.starts_with(r#"{"recorder":"status","lambdas":0,"#), "{line}");
     assert_eq!(serde_json::from_str::<RecorderReport>(&line).unwrap(), status);
     assert_eq!(serde_json::to_string(&RecorderReport::Ready).unwrap(), r#"{"recorder":"ready"}"#);
+}
+
+#[test]
+fn a_recorder_that_talks_nonsense_is_refused_by_name() {
+    let said = |bytes: &[u8]| {
+        let (mut ours, theirs) = UnixStream::pair().unwrap();
+        ours.write_all(bytes).unwrap();
+        RecorderLink::new(theirs.into()).poll().unwrap_err().to_string()
+    };
+    assert_eq!(said(&frame::whole(99, &[])), "frame 99 from the recorder is not known here");
+    assert_eq!(said(&frame::whole(tag::WAKE, &[0; 20])), "frame 17 from the recorder is not known here");
+    let short = frame::whole(tag::OPENED, &[0; 7]);
+    assert_eq!(said(&short), "frame `opened` from the recorder cannot be read: it has 7 bytes instead of 8");
+    let claims = [&5000_u32.to_le_bytes()[..], &[tag::REFUSED]].concat();
+    assert_eq!(
+        said(&claims),
+        "frame `refused` from the recorder cannot be read: it has 5000 bytes, above the maximum of 4096"
+    );
+    let claims = [&u32::MAX.to_le_bytes()[..], &[tag::READY]].concat();
+    assert!(said(&claims).contains("has 4294967295 bytes, above the maximum of 2097152"));
+}
+
+#[test]
+fn an_order_that_no_frame_holds_is_not_sent() {
+    let (mut control, stdin) = Control::pair().unwrap();
+    let long = Add { lambda: "x".repeat(FRAME_MAX).into(), remaps: Vec::new() };
+    let refused = control.add(&long).unwrap_err();
+    assert!(
+        matches!(refused, LinkError::TooLong { who: "the starter", frame: "add", bytes } if bytes > FRAME_MAX as u64),
+        "{refused}"
+    );
+    // Nothing of it went over, so that what follows is understood.
+    control.stop().unwrap();
+    assert!(matches!(Controlled::new(stdin).order(), Ok(Some(Order::Stop))));
 }

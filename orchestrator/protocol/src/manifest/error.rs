@@ -220,8 +220,10 @@ impl Explain for ManifestError {
     fn help(&self) -> Option<String> {
         use ManifestError::*;
         Some(match self {
-            Read { source, .. } if source.kind() == io::ErrorKind::NotFound => {
-                "name a folder that has a lambda.toml".to_owned()
+            Read { path, source } if source.kind() == io::ErrorKind::NotFound => {
+                let is_manifest = path.ends_with("lambda.toml");
+                let wanted = if is_manifest { "a folder that has a lambda.toml" } else { "the configuration of a vehicle" };
+                format!("name {wanted}")
             }
             Read { source, .. } if source.kind() == io::ErrorKind::InvalidData => "save it as UTF-8".to_owned(),
             Read { .. } => return None,

@@ -7,9 +7,11 @@
 pub mod bounds;
 mod config;
 mod error;
+mod limits;
 mod names;
 mod read;
 mod read_config;
+mod read_limits;
 mod syntax;
 mod table;
 #[cfg(test)]
@@ -20,15 +22,17 @@ mod value;
 
 pub use config::{ConfigError, ConfigItem, ConfigSet, ConfigValue};
 pub use error::{InputMemory, ManifestError, Place};
+pub use limits::{Limits, Tightened};
 pub use names::{ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version};
-pub use types::{
-    Backlog, Durability, Input, Kind, Lambda, Limits, Manifest, Model, Qos, Record, Reliability, Schedule, Store,
-};
+pub use types::{Backlog, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store};
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};
 
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
+
+/// Name of the file.
+const FILE: &str = "lambda.toml";
 
 impl Manifest {
     /// The manifest that `text` holds. `file` is its name in messages, usually `lambda.toml`.
@@ -45,27 +49,40 @@ impl Manifest {
     ///
     /// # Errors
     ///
-    /// As [`parse`](Self::parse), and if `dir/lambda.toml` cannot be read, is longer than
-    /// [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no UTF-8.
+    /// As [`parse`](Self::parse) and [`read`](Self::read).
     pub fn load(dir: impl AsRef<Path>) -> Result<Manifest, ManifestError> {
-        let path = dir.as_ref().join("lambda.toml");
-        let limit = bounds::MANIFEST_MAX;
-        let read = || -> io::Result<Vec<u8>> {
-            let mut bytes = Vec::new();
-            // One byte more than allowed is enough to know.
-            File::open(&path)?.take(limit.bytes() + 1).read_to_end(&mut bytes)?;
-            Ok(bytes)
-        };
-        let bytes = read().map_err(|source| ManifestError::Read { path: path.clone(), source })?;
-        if bytes.len() > limit.as_usize() {
-            return Err(ManifestError::TooLong { path, limit });
-        }
-        match String::from_utf8(bytes) {
-            Ok(text) => Manifest::parse(&text, &path),
-            Err(error) => Err(ManifestError::Read {
-                path,
-                source: io::Error::new(io::ErrorKind::InvalidData, error.utf8_error()),
-            }),
-        }
+        let dir = dir.as_ref();
+        Manifest::parse(&Manifest::read(dir)?, dir.join(FILE))
     }
+
+    /// The text of the manifest in the folder `dir`, for whoever needs its bytes as well.
+    ///
+    /// # Errors
+    ///
+    /// If `dir/lambda.toml` cannot be read, is longer than [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no UTF-8.
+    pub fn read(dir: impl AsRef<Path>) -> Result<String, ManifestError> {
+        read_text(&dir.as_ref().join(FILE))
+    }
+}
+
+/// The limits that `text` has for a vehicle; those that it does not name are at their maximum.
+pub(crate) fn vehicle_limits(text: &str, file: &str) -> Result<Limits, ManifestError> {
+    read_limits::vehicle(&table::Document { text, file })
+}
+
+/// The text of a manifest, or of what is written alike.
+pub(crate) fn read_text(path: &Path) -> Result<String, ManifestError> {
+    let limit = bounds::MANIFEST_MAX;
+    let read = || -> io::Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        // One byte more than allowed is enough to know.
+        File::open(path)?.take(limit.bytes() + 1).read_to_end(&mut bytes)?;
+        Ok(bytes)
+    };
+    let failed = |source| ManifestError::Read { path: path.to_owned(), source };
+    let bytes = read().map_err(failed)?;
+    if bytes.len() > limit.as_usize() {
+        return Err(ManifestError::TooLong { path: path.to_owned(), limit });
+    }
+    String::from_utf8(bytes).map_err(|error| failed(io::Error::new(io::ErrorKind::InvalidData, error.utf8_error())))
 }

@@ -5,12 +5,13 @@ use toml::de::DeTable;
 use super::bounds;
 use super::error::{InputMemory, ManifestError};
 use super::read_config;
+use super::read_limits::{self, Missing};
 use super::syntax;
 use super::table::{Document, Table};
 use super::value::Value;
 use super::{
-    Backlog, ByteSize, Durability, Input, Kind, Lambda, Limits, Manifest, Model, Qos, Record, Reliability, Schedule,
-    Store, TopicName, TypeName,
+    Backlog, ByteSize, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store,
+    TopicName, TypeName,
 };
 use crate::words::{excerpt, nearest};
 
@@ -35,7 +36,7 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
         inputs,
         models: models(document, &root)?,
         record: root.get("record").map(|value| record(document, &value)).transpose()?,
-        limits: limits(root.get("limits").as_ref())?,
+        limits: read_limits::limits(root.get("limits").as_ref(), Missing::Default)?,
         config: root.get("config").map_or(Ok(Vec::new()), |value| read_config::items(&value))?,
     })
 }
@@ -219,22 +220,6 @@ fn record(document: &Document, value: &Value) -> Result<Record> {
         preroll_size: table.size("preroll_size", &preroll_size)?,
         cooldown: table.duration("cooldown", &bounds::COOLDOWN)?,
         max_length: table.duration("max_length", &bounds::MAX_LENGTH)?,
-    })
-}
-
-fn limits(value: Option<&Value>) -> Result<Limits> {
-    let Some(value) = value else {
-        return Ok(Limits {
-            fuel: bounds::FUEL.default,
-            deadline: bounds::DEADLINE.default,
-            memory: bounds::MEMORY.default,
-        });
-    };
-    let table = value.table("[limits]", &["fuel", "deadline", "memory"])?;
-    Ok(Limits {
-        fuel: table.integer("fuel", &bounds::FUEL)?,
-        deadline: table.duration("deadline", &bounds::DEADLINE)?,
-        memory: table.size("memory", &bounds::MEMORY)?,
     })
 }
 

@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize, Serializer};
 
-use super::{ByteSize, ConfigItem, ItemName, LambdaName, RelativePath, Sha256, TopicName, TypeName, Version};
+use super::{ByteSize, ConfigItem, ItemName, LambdaName, Limits, RelativePath, Sha256, TopicName, TypeName, Version};
 
 /// What `lambda.toml` says, checked. As JSON it has the file's keys; durations are `_ns`, sizes are in bytes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -20,7 +20,7 @@ pub struct Manifest {
     pub models: Vec<Model>,
     /// `[record]`: the clip that an event trigger opens; `None` if the lambda records nothing.
     pub record: Option<Record>,
-    /// `[limits]`: what one wake may use.
+    /// `[limits]`: what it may use.
     pub limits: Limits,
     /// `[config]`, in the order of the file.
     pub config: Vec<ConfigItem>,
@@ -222,19 +222,6 @@ pub enum Store {
     Ram,
     /// In rolling chunks on disk, with a cap on their bytes: for heavy topics.
     Disk,
-}
-
-/// `[limits]`: what one wake may use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[non_exhaustive]
-pub struct Limits {
-    /// Fuel units; without meaning for Python.
-    pub fuel: u64,
-    /// Time until the wake ends with a fault.
-    #[serde(rename = "deadline_ns", serialize_with = "nanoseconds")]
-    pub deadline: Duration,
-    /// Memory that the lambda itself may allocate.
-    pub memory: ByteSize,
 }
 
 impl Manifest {

@@ -4,7 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::{Exit, Explain};
 
@@ -31,7 +31,7 @@ impl Explain for UnitError {
 }
 
 /// A number of bytes, written `"2 MiB"`, `"512 KiB"`, `"100 B"` or as a plain integer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct ByteSize(u64);
 
 impl ByteSize {

@@ -1,6 +1,8 @@
 use std::fs::{self, OpenOptions};
 use std::io::Write;
 
+use gleaner_protocol::link::Loss;
+
 use super::super::Folder;
 use super::*;
 use crate::error::RecordError;
@@ -191,4 +193,50 @@ fn a_hostile_list_deletes_nothing_outside() {
     for victim in &victims {
         assert_eq!(fs::read(victim).unwrap(), b"precious", "{}", victim.display());
     }
+}
+
+#[test]
+fn a_clip_that_cannot_be_deleted_is_told_once_and_the_next_one_goes_for_it() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
+    let mut added = |stem: &str| {
+        let clip = record(&mut folder, stem);
+        folder.added(&clip)
+    };
+    assert!(added("a").is_empty() && added("b").is_empty());
+    // What no file is cannot be removed as one.
+    let (stuck, aside) = (scratch.path("clips/a.mcap"), scratch.path("aside"));
+    fs::rename(&stuck, &aside).unwrap();
+    fs::create_dir(&stuck).unwrap();
+    let told = added("c");
+    let [Loss::NotDeleted { file, why, .. }, Loss::Deleted { file: gone, .. }] = &told[..] else { panic!("{told:?}") };
+    assert_eq!((file.to_str(), gone.to_str()), (Some("clips/a.mcap"), Some("clips/b.mcap")));
+    assert!(why.contains("cannot remove") && why.contains("a.mcap"), "{why}");
+    assert!(scratch.files().contains(&"c.mcap".to_owned()) && !scratch.files().contains(&"b.mcap".to_owned()));
+    // Both stay known: the bound holds as far as it can.
+    let told = added("d");
+    assert!(matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/c.mcap")), "{told:?}");
+    fs::remove_dir(&stuck).unwrap();
+    fs::rename(&aside, &stuck).unwrap();
+    let told = added("e");
+    assert!(matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/a.mcap")), "{told:?}");
+    let noted = fs::read_to_string(scratch.path("losses.jsonl")).unwrap();
+    let noted: Vec<Loss> = noted.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let names = noted.iter().map(|loss| match loss {
+        Loss::Deleted { file, .. } => format!("deleted {}", file.display()),
+        Loss::NotDeleted { file, .. } => format!("not deleted {}", file.display()),
+        other => panic!("{other:?}"),
+    });
+    assert_eq!(
+        names.collect::<Vec<_>>(),
+        [
+            "deleted clips/a.mcap",
+            "not deleted clips/a.mcap",
+            "deleted clips/b.mcap",
+            "deleted clips/a.mcap",
+            "deleted clips/c.mcap",
+            "deleted clips/a.mcap"
+        ]
+    );
 }

@@ -140,7 +140,7 @@ fn a_clip_says_of_a_lambda_what_its_journal_says() {
     header.config.insert("limit".to_owned(), 3.into());
     let model = |path: &str| FileDigest { path: path.to_owned(), bytes: 5, sha256: "ff".to_owned() };
     header.models = vec![model("a.onnx"), model("b.onnx")];
-    folder.begin("a", &about()).unwrap().finish(Ending { headers: vec![header], ..ending() }).unwrap();
+    folder.begin("a", &about()).unwrap().finish(Ending { headers: vec![header.into()], ..ending() }).unwrap();
     folder.begin("b", &about()).unwrap().finish(ending()).unwrap();
     let of = |name: &str| {
         let records = metadata(&fs::read(scratch.path(name)).unwrap());
@@ -197,7 +197,7 @@ fn what_a_clip_cannot_hold_is_refused_and_harms_nothing() {
     let header = |bytes: usize| {
         let mut header = crate::support::member("hello", (1, 1, 1), &[]).header;
         header.config.insert("text".to_owned(), "x".repeat(bytes).into());
-        Ending { headers: vec![header], ..ending() }
+        Ending { headers: vec![header.into()], ..ending() }
     };
     folder.begin("b", &about()).unwrap().finish(header(1 << 20)).unwrap();
     let error = folder.begin("c", &about()).unwrap().finish(header(METADATA_MAX)).unwrap_err();

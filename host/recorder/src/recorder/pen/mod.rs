@@ -19,6 +19,9 @@ pub(super) use scribe::Last;
 use scribe::Scribe;
 use thread::Thread;
 
+/// Bytes on their way to the disk at most, but for one message that goes beyond.
+const IN_FLIGHT: usize = 16 << 20;
+
 /// Writes clips.
 pub(super) enum Pen {
     /// Each call returns when its work is done.
@@ -29,7 +32,7 @@ pub(super) enum Pen {
 
 /// What became of a clip.
 pub(super) enum Outcome {
-    /// It is whole, and listed; others had to go for it.
+    /// It is whole, and listed; others had to go for it, or could not.
     Finished(Box<Clip>, Vec<Loss>),
     /// It is not; what was written is recovered when the folder is opened again.
     Failed(RecordError),
@@ -122,10 +125,7 @@ impl Pen {
 
     /// Whether more may be handed over. Whoever does it all the same makes the queue longer than it may be.
     pub(super) fn has_room(&self) -> bool {
-        match self {
-            Pen::Here(_) => true,
-            Pen::There(thread) => thread.has_room(),
-        }
+        self.in_flight() < IN_FLIGHT
     }
 
     /// Hands over what was collected, if the thread has nothing else to do; and tells what became of clips.
@@ -146,10 +146,7 @@ impl Pen {
 
     /// Whether nothing is under way.
     pub(super) fn is_idle(&self) -> bool {
-        match self {
-            Pen::Here(_) => true,
-            Pen::There(thread) => thread.is_idle(),
-        }
+        self.in_flight() == 0
     }
 
     /// Bytes that were handed over and are not yet written.

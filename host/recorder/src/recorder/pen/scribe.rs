@@ -135,9 +135,6 @@ impl Scribe {
 
     /// Makes room for a clip that was finished, if there is a bound. What cannot be deleted stays, and is tried again with the next.
     pub(super) fn make_room(&mut self, clip: &Clip) -> Vec<Loss> {
-        self.folder.added(clip).unwrap_or_else(|error| {
-            tracing::error!(error = &error as &dyn std::error::Error, "cannot make room for clips");
-            Vec::new()
-        })
+        self.folder.added(clip)
     }
 }

@@ -12,8 +12,6 @@ use super::scribe::{Last, Scribe};
 use crate::RecordError;
 use crate::file::{About, Topic};
 
-/// Bytes on their way to the disk at most, but for one message that goes beyond.
-const IN_FLIGHT: usize = 16 << 20;
 /// Messages are handed over when they have so many bytes together.
 const BATCH: usize = 1 << 20;
 /// What a message costs on its way beside its bytes, about.
@@ -106,7 +104,7 @@ pub(in crate::recorder) struct Thread {
 
 impl Thread {
     pub(super) fn start(scribe: Scribe) -> Result<Thread, RecordError> {
-        // Neither queue has a bound of its own: what is in them is counted, and nothing is added beyond `IN_FLIGHT`.
+        // Neither queue has a bound of its own: what is in them is counted, and nothing is added beyond what a pen has room for.
         let ((jobs, inbox), (outbox, done)) = (channel(), channel());
         let handle = Builder::new()
             .name("clips".to_owned())
@@ -162,16 +160,8 @@ impl Thread {
         self.send(Job::Finish(Box::new(last)), cost)
     }
 
-    pub(super) fn has_room(&self) -> bool {
-        self.in_flight + self.batch.cost() < IN_FLIGHT
-    }
-
     pub(super) fn in_flight(&self) -> usize {
         self.in_flight + self.batch.cost()
-    }
-
-    pub(super) fn is_idle(&self) -> bool {
-        self.in_flight == 0 && self.batch.messages.is_empty()
     }
 
     pub(super) fn poll(&mut self, outcomes: &mut Vec<Outcome>) -> Result<(), RecordError> {

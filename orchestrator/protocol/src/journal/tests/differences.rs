@@ -29,7 +29,7 @@ fn what_a_decision_should_not_depend_on_is_no_difference_of_a_header() {
 #[test]
 fn the_most_telling_difference_of_a_header_comes_first() {
     type Case = (fn(&mut Header), [&'static str; 3]);
-    let changes: [Case; 9] = [
+    let changes: [Case; 10] = [
         (|now| now.clock = "system".to_owned(), ["clock", "log time of the drive", "system"]),
         (|now| now.remaps.clear(), ["remapped topics", "/in0 is /wire0", "none"]),
         (|now| now.event_input = None, ["what wakes the lambda", "samples of input `in0`", "the clock"]),
@@ -39,7 +39,8 @@ fn the_most_telling_difference_of_a_header_comes_first() {
         ),
         (|now| now.config["brake_mps2"] = json!(-3), ["config `brake_mps2`", "-3.0", "-3"]),
         (|now| now.models.clear(), ["model `models/d.onnx`", "sha256 0123456789abcdef…", "not there"]),
-        (|now| now.manifest = "0a".to_owned(), ["manifest lambda.toml, less [record]", "", "0a"]),
+        (|now| now.limits.deadline /= 2, ["limit `deadline`", "50ms", "25ms"]),
+        (|now| now.manifest = "0a".to_owned(), ["manifest lambda.toml, less [record] and [limits]", "", "0a"]),
         (
             |now| now.files[0].sha256 = "f".repeat(64),
             ["build file `brake_dark.wasm`", "sha256 0123456789abcdef…", "sha256 ffffffffffffffff…"],

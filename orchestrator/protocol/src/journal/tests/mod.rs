@@ -63,6 +63,7 @@ fn header(inputs: usize) -> Header {
         remaps: vec![("/in0".to_owned(), "/wire0".to_owned())],
         clock: "log time of the drive".to_owned(),
         wakes_before: 0,
+        limits: Default::default(),
     }
 }
 

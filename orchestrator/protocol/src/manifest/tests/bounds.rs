@@ -29,6 +29,31 @@ fn every_limit_has_a_minimum_and_a_maximum() {
 }
 
 #[test]
+fn every_further_limit_has_a_minimum_and_a_maximum() {
+    for (key, below, above, min, max) in [
+        ("init_fuel", "999", "1000000000001", "1000", "1000000000000"),
+        ("init_deadline", "\"999us\"", "\"301s\"", "1ms", "5min"),
+        ("tables", "0", "1000001", "1", "1000000"),
+        ("stack", "\"15 KiB\"", "\"513 KiB\"", "16 KiB", "512 KiB"),
+        ("handles", "15", "65537", "16", "65536"),
+        ("frames", "0", "4097", "1", "4096"),
+        ("call_bytes", "\"63 KiB\"", "\"1025 KiB\"", "64 KiB", "1 MiB"),
+        ("call_items", "15", "65537", "16", "65536"),
+        ("log_lines", "0", "10001", "1", "10000"),
+        ("log_bytes", "\"3 KiB\"", "\"17 MiB\"", "4 KiB", "16 MiB"),
+        ("events_per_minute", "0", "60001", "1", "60000"),
+    ] {
+        let help = format!("give a value from {min} to {max}");
+        for (value, side) in
+            [(below, format!("below the minimum of {min}")), (above, format!("above the maximum of {max}"))]
+        {
+            let problem = format!("`limits.{key}` is {}, {side}", value.trim_matches('"'));
+            out_of_bounds(&format!("[limits]\n{key} = {value}"), 9, &problem, &help);
+        }
+    }
+}
+
+#[test]
 fn recording_and_models_have_bounds() {
     let help = "give a value from 0s to 10min";
     for key in ["preroll", "postroll"] {

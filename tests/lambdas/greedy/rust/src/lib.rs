@@ -1,6 +1,6 @@
 //! A lambda that takes more than its share, as its configuration says. The host has to notice.
 
-use gleaner_sdk::{Config, Error, Field, Lambda, Result, Sample, Topic, event, input};
+use gleaner_sdk::{Config, Error, Field, Frame, Lambda, Result, Sample, Topic, event, input, log};
 
 struct Greedy {
     behaviour: String,
@@ -8,6 +8,7 @@ struct Greedy {
     camera: Topic,
     topics: Vec<Topic>,
     fields: Vec<Field>,
+    frames: Vec<Frame>,
 }
 
 impl Lambda for Greedy {
@@ -19,7 +20,14 @@ impl Lambda for Greedy {
             }
         }
         let bytes = config.integer("bytes")? as u32;
-        Ok(Self { behaviour, bytes, camera: input("camera")?, topics: Vec::new(), fields: Vec::new() })
+        Ok(Self {
+            behaviour,
+            bytes,
+            camera: input("camera")?,
+            topics: Vec::new(),
+            fields: Vec::new(),
+            frames: Vec::new(),
+        })
     }
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
@@ -34,6 +42,22 @@ impl Lambda for Greedy {
             "read_frame" => drop(sample.as_frame()?.read(0, self.bytes)),
             "mean_luma" => drop(sample.as_frame()?.mean_luma(None)?),
             "long_label" => event(&"x".repeat(self.bytes as usize), 0.0).send()?,
+            "frames" => loop {
+                self.frames.push(sample.as_frame()?);
+            },
+            "resized" => loop {
+                self.frames.push(sample.as_frame()?.resize(8, 8)?);
+            },
+            "huge" => drop(sample.as_frame()?.resize(16_384, 16_384)?),
+            "log" => (0..1000).for_each(|_| log::info(&"x".repeat(self.bytes as usize))),
+            "events" => (0..self.bytes).try_for_each(|_| event("x", 1.0).send())?,
+            "panic" => panic!("no, not today"),
+            "endless" => loop {
+                std::hint::black_box(self.bytes);
+            },
+            "memory" => loop {
+                std::mem::forget(std::hint::black_box(Vec::<u8>::with_capacity(1 << 20)));
+            },
             "ok" => {}
             other => return Err(Error::new(format!("unknown behaviour `{other}`"))),
         }

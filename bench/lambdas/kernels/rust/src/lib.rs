@@ -1,0 +1,162 @@
+//! Does one thing over and over, for as many rounds as its caller says. The bench calls [`Work`] natively, too.
+
+use std::hint::black_box;
+
+use gleaner_sdk::data::Encoding;
+use gleaner_sdk::kernels::fft::{Real, Spectrum};
+use gleaner_sdk::kernels::{Image, downscale, histogram, luma, mean};
+use gleaner_sdk::{Config, Error, Lambda, Result, Sample, Tick, now_ns};
+
+const WIDTH: u32 = 1920;
+const HEIGHT: u32 = 1080;
+
+/// One kernel with its input and the place for its output.
+pub enum Work {
+    /// Density of a signal of `f32`.
+    Single(Density<f32>),
+    /// Density of a signal of `f64`.
+    Double(Density<f64>),
+    /// Something over a picture of 1920x1080 bgr8.
+    Pixels {
+        /// Width * height * 3 bytes.
+        bgr: Vec<u8>,
+        /// A kernel; it may use the place for its result.
+        kernel: fn(&Image<'_>, &mut [u8]) -> Result<f64>,
+        /// As large as the largest result.
+        out: Vec<u8>,
+    },
+    /// Mean of 65,536 numbers.
+    Mean(Vec<f64>),
+}
+
+/// A plan, a signal and the place for its density.
+pub struct Density<T: Real> {
+    plan: Spectrum<T>,
+    signal: Vec<T>,
+    density: Vec<T>,
+}
+
+impl<T: Real + Into<f64>> Density<T> {
+    fn new(samples: usize) -> Result<Self> {
+        let plan = Spectrum::hann(samples, 1000.0)?;
+        let density = vec![T::zero(); plan.bins()];
+        Ok(Self { plan, signal: noise(samples).into_iter().filter_map(T::from_u8).collect(), density })
+    }
+
+    fn round(&mut self) -> Result<f64> {
+        self.plan.density(black_box(&self.signal), &mut self.density)?;
+        Ok(self.density[1].into())
+    }
+}
+
+impl Work {
+    /// What is called `name`.
+    ///
+    /// # Errors
+    ///
+    /// If nothing is.
+    pub fn new(name: &str) -> Result<Self> {
+        let pixels = |kernel| {
+            let bgr = noise((WIDTH * HEIGHT * 3) as usize);
+            Ok(Self::Pixels { bgr, kernel, out: vec![0; (WIDTH * HEIGHT) as usize] })
+        };
+        match name {
+            "spectrum-256-f32" => Ok(Self::Single(Density::new(256)?)),
+            "spectrum-1024-f32" => Ok(Self::Single(Density::new(1024)?)),
+            "spectrum-256-f64" => Ok(Self::Double(Density::new(256)?)),
+            "spectrum-1024-f64" => Ok(Self::Double(Density::new(1024)?)),
+            "luma" => pixels(|image, _| Ok(luma::mean_luma(image))),
+            "gray" => pixels(|image, out| {
+                luma::to_gray(image, out)?;
+                Ok(f64::from(out[out.len() / 2]))
+            }),
+            "histogram" => pixels(|image, _| Ok(f64::from(histogram::histogram(image)[99]))),
+            "downscale" => pixels(|image, out| {
+                let out = &mut out[..640 * 360 * 3];
+                downscale::downscale(image, 640, 360, out)?;
+                Ok(f64::from(out[out.len() / 2]))
+            }),
+            "mean" => Ok(Self::Mean(noise(1 << 16).into_iter().map(f64::from).collect())),
+            _ => Err(Error::new(format!("there is no work called `{name}`"))),
+        }
+    }
+
+    /// Does it once; the number depends on what came out.
+    ///
+    /// # Errors
+    ///
+    /// None, if the kernels are right.
+    pub fn round(&mut self) -> Result<f64> {
+        match self {
+            Self::Single(density) => density.round(),
+            Self::Double(density) => density.round(),
+            Self::Pixels { bgr, kernel, out } => {
+                let image = Image::new(WIDTH, HEIGHT, WIDTH * 3, Encoding::Bgr8, black_box(bgr))?;
+                kernel(&image, out)
+            }
+            Self::Mean(values) => Ok(mean::mean(black_box(values)).unwrap_or_default()),
+        }
+    }
+
+    /// Does it `rounds` times; what came out last.
+    ///
+    /// # Errors
+    ///
+    /// As [`round`](Self::round).
+    pub fn rounds(&mut self, rounds: u64) -> Result<f64> {
+        (0..rounds).try_fold(0.0, |_, _| self.round().map(black_box))
+    }
+}
+
+/// Bytes that look random and are the same in every run.
+fn noise(count: usize) -> Vec<u8> {
+    let mut state = 1_u32;
+    let next = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (state >> 24) as u8
+    };
+    std::iter::repeat_with(next).take(count).collect()
+}
+
+struct Kernels {
+    name: String,
+    rounds: i64,
+    /// None for what needs a host.
+    work: Option<Work>,
+    pixels: Vec<u8>,
+}
+
+impl Lambda for Kernels {
+    fn init(config: &Config) -> Result<Self> {
+        let name = config.text("work")?.to_owned();
+        let work = if ["copy", "call"].contains(&name.as_str()) { None } else { Some(Work::new(&name)?) };
+        Ok(Self { name, rounds: config.integer("rounds")?, work, pixels: Vec::new() })
+    }
+
+    /// Work with the host, which has a frame: all pixels copied in pieces, or the smallest call there is.
+    fn on_event(&mut self, sample: Sample) -> Result<()> {
+        if self.name == "call" {
+            for _ in 0..self.rounds {
+                black_box(now_ns());
+            }
+            return Ok(());
+        }
+        let frame = sample.as_frame()?;
+        self.pixels.resize(frame.info().size as usize, 0);
+        for _ in 0..self.rounds {
+            frame.copy_to(black_box(&mut self.pixels))?;
+        }
+        Ok(())
+    }
+
+    /// Work without a host: `missed` rounds. What came out is told as an error, the only words that a wake returns.
+    fn on_tick(&mut self, tick: Tick) -> Result<()> {
+        if tick.missed == 0 {
+            return Ok(());
+        }
+        let work = self.work.as_mut().ok_or_else(|| Error::new("this work needs a host"))?;
+        Err(Error::new(work.rounds(tick.missed)?.to_string()))
+    }
+}
+
+gleaner_sdk::lambda!(Kernels);

@@ -1,0 +1,124 @@
+//! The lambda of the bench on an engine of our own making, without the host around it.
+
+use gleaner_tests::root;
+use wasmtime::component::types::ComponentItem;
+use wasmtime::component::{Component, Func, Linker, ResourceTable, ResourceType, Val};
+use wasmtime::{Engine, Store};
+use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
+
+/// Fuel and epochs that never run out.
+const PLENTY: u64 = u64::MAX / 2;
+
+/// What code is made to do beside its work.
+#[derive(Clone, Copy)]
+pub struct Checks {
+    pub fuel: bool,
+    pub epochs: bool,
+    /// Whether every NaN is given the same bits.
+    pub nans: bool,
+}
+
+/// The component as an engine with such checks compiles it.
+pub struct Compiled {
+    component: Component,
+    checks: Checks,
+}
+
+/// Compiles the component.
+pub fn compiled(checks: Checks) -> Compiled {
+    let mut config = gleaner_compile::settings();
+    config.consume_fuel(checks.fuel).epoch_interruption(checks.epochs).cranelift_nan_canonicalization(checks.nans);
+    let engine = Engine::new(&config).expect("an engine");
+    let path = root().join("bench/lambdas/kernels/rust/build/bench_kernels.wasm");
+    let component = Component::from_file(&engine, path).expect("a component; run: cargo xtask bench");
+    Compiled { component, checks }
+}
+
+/// An instance that does one kind of work.
+pub struct Bare {
+    store: Store<Wasi>,
+    on_wake: Func,
+}
+
+struct Wasi {
+    ctx: WasiCtx,
+    table: ResourceTable,
+}
+
+impl WasiView for Wasi {
+    fn ctx(&mut self) -> WasiCtxView<'_> {
+        WasiCtxView { ctx: &mut self.ctx, table: &mut self.table }
+    }
+}
+
+/// Kernels call nobody, so what the host offers is there only by name.
+fn refuse_host_calls(linker: &mut Linker<Wasi>, component: &Component) -> wasmtime::Result<()> {
+    let engine = component.engine();
+    for (interface, item) in component.component_type().imports(engine) {
+        let ComponentItem::ComponentInstance(items) = item.ty else { continue };
+        if !interface.starts_with("gleaner:lambda/") {
+            continue;
+        }
+        let mut interface = linker.instance(interface)?;
+        for (name, item) in items.exports(engine) {
+            match item.ty {
+                ComponentItem::ComponentFunc(_) => {
+                    interface.func_new(name, |_, _, _, _| Err(wasmtime::Error::msg("there is no host here")))?;
+                }
+                ComponentItem::Resource(_) => {
+                    interface.resource(name, ResourceType::host::<()>(), |_, _| Ok(()))?;
+                }
+                _ => {}
+            }
+        }
+    }
+    Ok(())
+}
+
+impl Bare {
+    /// The lambda after `init`, told to do `work`.
+    pub fn new(compiled: &Compiled, work: &str) -> Self {
+        let Compiled { component, checks } = compiled;
+        let mut linker = Linker::new(component.engine());
+        wasmtime_wasi::p2::add_to_linker_sync(&mut linker).expect("WASI");
+        refuse_host_calls(&mut linker, component).expect("imports");
+        let mut store =
+            Store::new(component.engine(), Wasi { ctx: WasiCtx::builder().build(), table: ResourceTable::new() });
+        if checks.fuel {
+            store.set_fuel(PLENTY).expect("fuel is counted");
+        }
+        if checks.epochs {
+            store.set_epoch_deadline(PLENTY);
+        }
+        let instance = linker.instantiate(&mut store, component).expect("an instance");
+        let mut function = |name| instance.get_func(&mut store, name).expect("the world of lambdas");
+        let (init, on_wake) = (function("init"), function("on-wake"));
+        let entry = |key: &str, value: Val| {
+            Val::Record(vec![("key".to_owned(), Val::String(key.to_owned())), ("value".to_owned(), value)])
+        };
+        let variant = |case: &str, value| Val::Variant(case.to_owned(), Some(Box::new(value)));
+        let config = Val::List(vec![
+            entry("work", variant("text", Val::String(work.to_owned()))),
+            entry("rounds", variant("integer", Val::S64(0))),
+        ]);
+        let mut answer = [Val::Bool(false)];
+        init.call(&mut store, &[config], &mut answer).expect("init");
+        assert!(matches!(answer, [Val::Result(Ok(_))]), "{answer:?}");
+        Self { store, on_wake }
+    }
+
+    /// Does the work `rounds` times; what came out last.
+    pub fn rounds(&mut self, rounds: u64) -> f64 {
+        let tick = vec![("at-ns".to_owned(), Val::S64(0)), ("missed".to_owned(), Val::U64(rounds))];
+        let wake = Val::Variant("tick".to_owned(), Some(Box::new(Val::Record(tick))));
+        let mut answer = [Val::Bool(false)];
+        self.on_wake.call(&mut self.store, &[wake], &mut answer).expect("a wake");
+        match answer {
+            [Val::Result(Err(Some(said)))] => match *said {
+                Val::String(number) => number.parse().expect("a number"),
+                other => panic!("said {other:?}"),
+            },
+            other => panic!("said {other:?}"),
+        }
+    }
+}

@@ -1,0 +1,37 @@
+//! Which layers of isolation a lambda's process has here: `gleaner-shim` sets each up, and tries it.
+
+use std::process::Command;
+
+use gleaner_protocol::{Holds, Layer, Parts};
+
+use super::{Finding, State};
+
+/// A finding for each layer.
+pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
+    match layers(parts) {
+        Ok(layers) => layers.iter().map(finding).collect(),
+        Err(why) => vec![Finding::warning("isolation", why, "build it again: cargo build --release")],
+    }
+}
+
+fn layers(parts: &Parts) -> Result<Vec<Layer>, String> {
+    let shim = parts.program("gleaner-shim").map_err(|error| error.to_string())?;
+    let output = Command::new(&shim).arg("--layers").output().map_err(|error| error.to_string())?;
+    if !output.status.success() {
+        return Err(format!("gleaner-shim cannot tell: {}", String::from_utf8_lossy(&output.stderr).trim()));
+    }
+    serde_json::from_slice(&output.stdout).map_err(|error| format!("cannot understand gleaner-shim: {error}"))
+}
+
+fn finding(layer: &Layer) -> Finding {
+    let found = format!("{}: {}", layer.name, layer.note);
+    match layer.holds {
+        Holds::Yes => Finding::fine("isolation", found),
+        Holds::Partly | Holds::No => Finding {
+            about: "isolation",
+            state: State::Warning,
+            found,
+            help: Some("Python lambdas are held by fewer layers; see docs/security.md".to_owned()),
+        },
+    }
+}

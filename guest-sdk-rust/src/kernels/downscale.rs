@@ -1,0 +1,213 @@
+//! An image in fewer pixels.
+//!
+//! Each axis by itself: cut the axis of `from` pixels into `from * to` pieces, then an old pixel is `to` of them and a new one
+//! `from`, and the weight of an old pixel in a new one is the number of pieces that they share. So a result is an exact fraction,
+//! rounded once.
+
+use super::{Colours, Image, ImageError};
+
+/// Bytes of a row that are weighed in one turn.
+const TURN: usize = 64;
+
+/// Bytes that [`downscale`] of `image` to `width` x `height` writes: three for each pixel of a coloured image, one of a grey one.
+///
+/// # Errors
+///
+/// [`ImageError::ResizeTo`] if a side is 0 or longer than before.
+pub fn downscaled(image: &Image<'_>, width: u32, height: u32) -> Result<usize, ImageError> {
+    if !(1..=image.width()).contains(&width) || !(1..=image.height()).contains(&height) {
+        return Err(ImageError::ResizeTo { from: (image.width(), image.height()), to: (width, height) });
+    }
+    // No more than the image has.
+    Ok(width as usize * height as usize * image.pixel())
+}
+
+/// Writes the image in `width` x `height` pixels to `out`, without padding: rgb8 of a coloured image (also of bgr8), mono8 of a
+/// grey one. It is what [`Frame::resize`](crate::Frame::resize) makes, byte for byte, where no side grows.
+///
+/// A new pixel is the mean of the area that it covers, exact and rounded to nearest (a half goes up). Takes memory of 4 bytes for
+/// each byte in a row of the old image.
+///
+/// # Errors
+///
+/// As [`downscaled`], and [`ImageError::Output`] if `out` has another length.
+pub fn downscale(image: &Image<'_>, width: u32, height: u32, out: &mut [u8]) -> Result<(), ImageError> {
+    let needed = downscaled(image, width, height)?;
+    if out.len() != needed {
+        return Err(ImageError::Output { needed, found: out.len() });
+    }
+    let across = Axis::new(image.width(), width);
+    let down = Axis::new(image.height(), height);
+    let rounded = Rounded::to(u64::from(down.from) * u64::from(across.from));
+    let mut columns = vec![0_u32; image.width * image.pixel()];
+    for (y, line) in (0..height).zip(out.chunks_exact_mut(width as usize * image.pixel())) {
+        let taps = down.taps(y);
+        columns.fill(0);
+        for (source, row) in (taps.first..=taps.last).zip(image.rows_from(taps.first as usize)) {
+            add_weighted(row, down.weight(taps, source), &mut columns);
+        }
+        match image.colours {
+            Colours::Grey => blend(&columns, across, rounded, line, |[grey]| [grey]),
+            Colours::Rgb => blend(&columns, across, rounded, line, |rgb: [u8; 3]| rgb),
+            Colours::Bgr => blend(&columns, across, rounded, line, |[blue, green, red]| [red, green, blue]),
+        }
+    }
+    Ok(())
+}
+
+/// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no sum reaches 2^24; checked
+/// arithmetic would not become a vector's.
+fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
+    let add = |sum: &mut u32, byte: &u8| *sum = sum.wrapping_add(weight.wrapping_mul(u32::from(*byte)));
+    let (turns, rest) = row.as_chunks::<TURN>();
+    let (column_turns, column_rest) = columns.as_chunks_mut::<TURN>();
+    for (sums, bytes) in column_turns.iter_mut().zip(turns) {
+        for (sum, byte) in sums.iter_mut().zip(bytes) {
+            add(sum, byte);
+        }
+    }
+    for (sum, byte) in column_rest.iter_mut().zip(rest) {
+        add(sum, byte);
+    }
+}
+
+/// Writes a row of pixels of `N` bytes from `columns`, in the order that `arrange` gives them.
+fn blend<const N: usize>(
+    columns: &[u32],
+    across: Axis,
+    rounded: Rounded,
+    line: &mut [u8],
+    arrange: impl Fn([u8; N]) -> [u8; N],
+) {
+    let columns = columns.as_chunks::<N>().0;
+    for (x, pixel) in (0..).zip(line.as_chunks_mut::<N>().0) {
+        let taps = across.taps(x);
+        let mut sums = [0_u64; N];
+        for (source, values) in (taps.first..).zip(&columns[taps.first as usize..=taps.last as usize]) {
+            let weight = u64::from(across.weight(taps, source));
+            for (sum, value) in sums.iter_mut().zip(values) {
+                // Below 2^16 * 2^24.
+                *sum += weight * u64::from(*value);
+            }
+        }
+        *pixel = arrange(sums.map(|sum| rounded.divide(sum)));
+    }
+}
+
+/// An axis of an image and its new length, as a fraction in lowest terms.
+#[derive(Clone, Copy)]
+struct Axis {
+    from: u32,
+    to: u32,
+}
+
+/// Old pixels `first..=last` of a new one, and the weights of the two.
+#[derive(Clone, Copy)]
+struct Taps {
+    first: u32,
+    last: u32,
+    head: u32,
+    tail: u32,
+}
+
+impl Axis {
+    fn new(from: u32, to: u32) -> Self {
+        let (mut divisor, mut rest) = (from, to);
+        while rest > 0 {
+            (divisor, rest) = (rest, divisor % rest);
+        }
+        Self { from: from / divisor, to: to / divisor }
+    }
+
+    /// What new pixel `at` is made of; `from` is the sum of all weights. No product is larger than the square of
+    /// [`MAX_SIDE`](super::MAX_SIDE), which fits a `u32`.
+    fn taps(self, at: u32) -> Taps {
+        let Self { from, to } = self;
+        let (start, end) = (at * from, (at + 1) * from);
+        let (first, last) = (start / to, (end - 1) / to);
+        Taps { first, last, head: end.min((first + 1) * to) - start, tail: end - last * to }
+    }
+
+    fn weight(self, taps: Taps, source: u32) -> u32 {
+        if source == taps.first {
+            taps.head
+        } else if source == taps.last {
+            taps.tail
+        } else {
+            self.to
+        }
+    }
+}
+
+/// Division of a sum of weighted bytes by the sum of weights, rounded to nearest.
+#[derive(Clone, Copy)]
+struct Rounded {
+    total: u64,
+    /// 2^[`SHIFT`](Self::SHIFT) / `total`, rounded up, where a product with it is exact enough.
+    factor: Option<u64>,
+}
+
+impl Rounded {
+    const SHIFT: u32 = 55;
+
+    /// A sum and half of `total` are below 256 * total. The factor is too large by less than 1, which moves the quotient by
+    /// less than 256 * total / 2^55. Up to a total of 2^23 that is at most 1 / total, too little to reach the next whole number;
+    /// and no product exceeds 2^63 + 2^31.
+    fn to(total: u64) -> Self {
+        let factor = (total <= 1 << 23).then(|| (1_u64 << Self::SHIFT).div_ceil(total));
+        Self { total, factor }
+    }
+
+    fn divide(self, sum: u64) -> u8 {
+        let sum = sum + self.total / 2;
+        match self.factor {
+            Some(factor) => ((sum * factor) >> Self::SHIFT) as u8,
+            None => (sum / self.total) as u8,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::Encoding;
+
+    #[test]
+    fn a_product_divides_as_a_division_does() {
+        for total in [1, 2, 3, 7, 1000, 65_535, 2_073_600, (1 << 23) - 1, 1 << 23, (1 << 23) + 1, 4_294_836_225] {
+            let rounded = Rounded::to(total);
+            for level in 0..=255 {
+                // Around the places where the result changes.
+                let edge = level * total + total.div_ceil(2);
+                for sum in (edge.saturating_sub(2)..edge + 2).filter(|sum| *sum <= 255 * total) {
+                    assert_eq!(u64::from(rounded.divide(sum)), (sum + total / 2) / total, "{sum} / {total}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn half_the_size_is_the_mean_of_four_rounded_to_nearest() {
+        let image = Image::new(4, 2, 4, Encoding::Mono8, &[0, 1, 10, 20, 0, 1, 30, 41]).unwrap();
+        let mut out = [0; 2];
+        downscale(&image, 2, 1, &mut out).unwrap();
+        assert_eq!(out, [1, 25]); // 0.5 and 25.25
+    }
+
+    #[test]
+    fn blue_and_red_change_places() {
+        let image = Image::new(1, 1, 3, Encoding::Bgr8, &[1, 2, 3]).unwrap();
+        let mut out = [0; 3];
+        downscale(&image, 1, 1, &mut out).unwrap();
+        assert_eq!(out, [3, 2, 1]);
+    }
+
+    #[test]
+    fn growing_and_wrong_places_are_refused() {
+        let image = Image::new(2, 1, 2, Encoding::Mono8, &[1, 2]).unwrap();
+        let refused = |width, height, out| downscale(&image, width, height, &mut vec![0; out]).unwrap_err().to_string();
+        assert!(refused(3, 1, 3).starts_with("2x1 pixels cannot become 3x1"));
+        assert!(refused(0, 1, 0).starts_with("2x1 pixels cannot become 0x1"));
+        assert_eq!(refused(1, 1, 2), "the result takes 1 bytes; the place for it has 2");
+    }
+}

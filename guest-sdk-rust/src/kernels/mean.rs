@@ -1,0 +1,76 @@
+//! Means.
+
+use super::luma::sums;
+use super::{Colours, Image};
+
+/// Sums that are kept side by side.
+const LANES: usize = 16;
+
+/// Values that are added in a turn of the loop: to keep the sums while fuel and deadline are looked at takes as long as to add 16.
+const TURN: usize = 8 * LANES;
+
+/// Arithmetic mean of `values`, of any number type that fits an `f64`; none if there are none. In the unit of the values.
+///
+/// Sixteen sums are kept side by side and added up in a fixed order, so the result is equal on every machine; it may differ in
+/// its last bits from a sum from left to right, such as [`Column::mean`](crate::Column::mean), and is the more exact one.
+pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
+    let (turns, rest) = values.as_chunks::<TURN>();
+    let mut lanes = long_sums(turns);
+    for group in rest.chunks(LANES) {
+        for (lane, value) in lanes.iter_mut().zip(group) {
+            *lane += (*value).into();
+        }
+    }
+    (!values.is_empty()).then(|| lanes.iter().sum::<f64>() / values.len() as f64)
+}
+
+/// Sums of every sixteenth value. By itself, since together with what surrounds it the compiler finds no vectors in it.
+#[inline(never)]
+fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
+    let mut lanes = [0.0_f64; LANES];
+    for turn in turns {
+        for group in turn.as_chunks::<LANES>().0 {
+            for (lane, value) in lanes.iter_mut().zip(group) {
+                *lane += (*value).into();
+            }
+        }
+    }
+    lanes
+}
+
+/// Mean of red, green and blue, each 0 to 255; of a mono8 image, three times that of its grey. The sums are exact.
+pub fn mean_rgb(image: &Image<'_>) -> [f64; 3] {
+    let count = (image.width * image.height) as f64;
+    let [first, second, third] = sums(image).map(|sum| sum as f64 / count);
+    match image.colours {
+        Colours::Grey => [first; 3],
+        Colours::Rgb => [first, second, third],
+        Colours::Bgr => [third, second, first],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::Encoding;
+
+    #[test]
+    fn the_mean_is_that_of_all_values_whatever_their_number() {
+        for count in 1..300_i32 {
+            // 1 + 2 + ... + n = n (n + 1) / 2
+            let expected = Some(f64::from(count + 1) / 2.0);
+            assert_eq!(mean(&(1..=count).map(f64::from).collect::<Vec<_>>()), expected);
+            assert_eq!(mean(&(1..=count as u16).collect::<Vec<_>>()), expected);
+        }
+        assert_eq!(mean::<f32>(&[]), None);
+    }
+
+    #[test]
+    fn colours_are_told_apart() {
+        let pixels = [1, 2, 3, 5, 6, 7];
+        let image = |encoding| Image::new(2, 1, 6, encoding, &pixels).unwrap();
+        assert_eq!(mean_rgb(&image(Encoding::Rgb8)), [3.0, 4.0, 5.0]);
+        assert_eq!(mean_rgb(&image(Encoding::Bgr8)), [5.0, 4.0, 3.0]);
+        assert_eq!(mean_rgb(&image(Encoding::Mono8)), [1.5; 3]);
+    }
+}

@@ -1,0 +1,85 @@
+//! From a list of system calls to a filter in the kernel that refuses them.
+
+use std::collections::BTreeMap;
+
+use seccompiler::{
+    BpfProgram, SeccompAction, SeccompCmpArgLen, SeccompCmpOp, SeccompCondition, SeccompFilter, SeccompRule, TargetArch,
+};
+
+use crate::JailError;
+
+/// On x86-64 a call can also be made by the numbers of the x32 ABI, which have this bit.
+#[cfg(target_arch = "x86_64")]
+const X32: i64 = 0x4000_0000;
+/// Calls that have numbers of their own in the x32 ABI.
+#[cfg(target_arch = "x86_64")]
+const X32_OWN: std::ops::RangeInclusive<i64> = 512..=547;
+
+/// Calls to refuse.
+#[derive(Default)]
+pub(crate) struct Refused(BTreeMap<i64, Vec<SeccompRule>>);
+
+impl Refused {
+    /// Refuses `calls`, whatever their arguments.
+    pub(crate) fn calls(mut self, calls: &[i64]) -> Self {
+        for call in calls {
+            self.insert(*call, Vec::new());
+        }
+        self
+    }
+
+    /// Refuses `call` where its argument `index` is `value` in the bits of `mask`.
+    pub(crate) fn bits(self, call: i64, index: u8, mask: u64, value: u64) -> Self {
+        self.when(call, index, SeccompCmpOp::MaskedEq(mask), value)
+    }
+
+    /// Refuses `call` unless the lower half of its argument `index` is `value`.
+    pub(crate) fn unless(self, call: i64, index: u8, value: u64) -> Self {
+        self.when(call, index, SeccompCmpOp::Ne, value)
+    }
+
+    fn when(mut self, call: i64, index: u8, operator: SeccompCmpOp, value: u64) -> Self {
+        // Flags, process numbers and requests are `int`s: the kernel looks at the lower half only, and so must we.
+        let condition = SeccompCondition::new(index, SeccompCmpArgLen::Dword, operator, value);
+        let rule = condition.and_then(|condition| SeccompRule::new(vec![condition]));
+        self.insert(call, vec![rule.expect("an index below 6, and one condition")]);
+        self
+    }
+
+    fn insert(&mut self, call: i64, rules: Vec<SeccompRule>) {
+        self.0.entry(call).or_default().extend(rules);
+    }
+
+    /// The filter, which answers refused calls with `errno`.
+    pub(crate) fn filter(mut self, errno: i32) -> Result<BpfProgram, JailError> {
+        let machine = std::env::consts::ARCH;
+        let target: TargetArch = machine.try_into().map_err(|_| JailError::Machine(machine))?;
+        self.refuse_other_numbers();
+        let answer = SeccompAction::Errno(errno.unsigned_abs());
+        let filter = SeccompFilter::new(self.0, SeccompAction::Allow, answer, target).map_err(JailError::Build)?;
+        filter.try_into().map_err(JailError::Build)
+    }
+
+    /// The same calls by other numbers. Calls of another machine, such as 32-bit ones, end the process anyway.
+    #[cfg(target_arch = "x86_64")]
+    fn refuse_other_numbers(&mut self) {
+        let twins: Vec<_> = self.0.iter().map(|(call, rules)| (call | X32, rules.clone())).collect();
+        self.0.extend(twins);
+        for call in X32_OWN {
+            self.0.insert(call | X32, Vec::new());
+        }
+    }
+
+    #[cfg(not(target_arch = "x86_64"))]
+    fn refuse_other_numbers(&mut self) {}
+}
+
+/// Installs `filter` for this thread and all that it starts.
+pub(crate) fn install(filter: &BpfProgram) -> Result<(), JailError> {
+    seccompiler::apply_filter(filter).map_err(JailError::Install)
+}
+
+/// Installs `filter` for all threads of this process and all that they start.
+pub(crate) fn install_everywhere(filter: &BpfProgram) -> Result<(), JailError> {
+    seccompiler::apply_filter_all_threads(filter).map_err(JailError::Install)
+}

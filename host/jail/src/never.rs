@@ -1,0 +1,134 @@
+//! What no lambda's process ever needs: looking into other processes, changing the system, becoming somebody else.
+
+use gleaner_protocol::Layer;
+use rustix::process::{Resource, Rlimit, setrlimit};
+
+use crate::JailError;
+use crate::filter::{Refused, install};
+
+/// The name of this layer.
+pub const NAME: &str = "system calls";
+
+/// Flags of `clone` that make namespaces, in which a process would have new powers.
+const NAMESPACES: [i32; 7] = [
+    libc::CLONE_NEWNS,
+    libc::CLONE_NEWCGROUP,
+    libc::CLONE_NEWUTS,
+    libc::CLONE_NEWIPC,
+    libc::CLONE_NEWUSER,
+    libc::CLONE_NEWPID,
+    libc::CLONE_NEWNET,
+];
+
+const CALLS: &[i64] = &[
+    // Other processes' memory and files.
+    libc::SYS_ptrace,
+    libc::SYS_process_vm_readv,
+    libc::SYS_process_vm_writev,
+    libc::SYS_process_madvise,
+    libc::SYS_kcmp,
+    // The kernel, and parts of it with a history of holes.
+    libc::SYS_bpf,
+    libc::SYS_perf_event_open,
+    libc::SYS_userfaultfd,
+    libc::SYS_io_uring_setup,
+    libc::SYS_io_uring_enter,
+    libc::SYS_io_uring_register,
+    libc::SYS_add_key,
+    libc::SYS_request_key,
+    libc::SYS_keyctl,
+    libc::SYS_init_module,
+    libc::SYS_finit_module,
+    libc::SYS_delete_module,
+    libc::SYS_kexec_load,
+    libc::SYS_syslog,
+    libc::SYS_lookup_dcookie,
+    libc::SYS_personality,
+    // The system.
+    libc::SYS_mount,
+    libc::SYS_umount2,
+    libc::SYS_pivot_root,
+    libc::SYS_chroot,
+    libc::SYS_move_mount,
+    libc::SYS_open_tree,
+    libc::SYS_fsopen,
+    libc::SYS_fsconfig,
+    libc::SYS_fsmount,
+    libc::SYS_fspick,
+    libc::SYS_mount_setattr,
+    libc::SYS_unshare,
+    libc::SYS_setns,
+    libc::SYS_name_to_handle_at,
+    libc::SYS_open_by_handle_at,
+    libc::SYS_quotactl,
+    libc::SYS_acct,
+    libc::SYS_swapon,
+    libc::SYS_swapoff,
+    libc::SYS_reboot,
+    libc::SYS_sethostname,
+    libc::SYS_setdomainname,
+    libc::SYS_settimeofday,
+    libc::SYS_clock_settime,
+    libc::SYS_clock_adjtime,
+    libc::SYS_adjtimex,
+    libc::SYS_vhangup,
+    // Another user.
+    libc::SYS_setuid,
+    libc::SYS_setgid,
+    libc::SYS_setreuid,
+    libc::SYS_setregid,
+    libc::SYS_setresuid,
+    libc::SYS_setresgid,
+    libc::SYS_setfsuid,
+    libc::SYS_setfsgid,
+    libc::SYS_setgroups,
+    libc::SYS_capset,
+];
+
+#[cfg(target_arch = "x86_64")]
+const MACHINE_CALLS: &[i64] =
+    &[libc::SYS_iopl, libc::SYS_ioperm, libc::SYS_modify_ldt, libc::SYS_uselib, libc::SYS_kexec_file_load];
+#[cfg(not(target_arch = "x86_64"))]
+const MACHINE_CALLS: &[i64] = &[];
+
+/// Refuses all of that to this process, and to what it starts. Says what holds.
+pub fn forbid() -> Vec<Layer> {
+    vec![privileges(), core_dumps(), calls()]
+}
+
+fn privileges() -> Layer {
+    const NAME: &str = "new privileges";
+    match rustix::thread::set_no_new_privs(true) {
+        Ok(()) => Layer::yes(NAME, "no_new_privs: programs with the setuid bit give none"),
+        Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
+    }
+}
+
+/// What a lambda saw is not for whoever may read core files.
+fn core_dumps() -> Layer {
+    const NAME: &str = "core files";
+    match setrlimit(Resource::Core, Rlimit { current: Some(0), maximum: Some(0) }) {
+        Ok(()) => Layer::yes(NAME, "none are written"),
+        Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
+    }
+}
+
+fn calls() -> Layer {
+    match install_both() {
+        Ok(()) => Layer::yes(NAME, "seccomp: other processes' memory, namespaces, mounts, keys, modules, time, users"),
+        Err(error) => Layer::no(NAME, error.told()),
+    }
+}
+
+fn install_both() -> Result<(), JailError> {
+    let mut refused = Refused::default().calls(CALLS).calls(MACHINE_CALLS);
+    for flag in NAMESPACES {
+        let flag = u64::from(flag.unsigned_abs());
+        refused = refused.bits(libc::SYS_clone, 0, flag, flag);
+    }
+    // A filter cannot read the flags of `clone3`, which are in memory. Told that it does not exist, libraries take `clone`.
+    let newer = Refused::default().calls(&[libc::SYS_clone3]);
+    let (refused, newer) = (refused.filter(libc::EPERM)?, newer.filter(libc::ENOSYS)?);
+    install(&newer)?;
+    install(&refused)
+}

@@ -1,0 +1,45 @@
+//! `losses.jsonl`: a line for each thing that was wanted and is not there. Whoever notes one does it here, so that lines stay
+//! whole.
+
+use std::fs::OpenOptions;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+use gleaner_protocol::link::Loss;
+
+use crate::error::RecordError;
+
+/// The list of losses.
+#[derive(Debug)]
+pub struct LossList {
+    path: PathBuf,
+    /// One line at a time.
+    turn: Mutex<()>,
+}
+
+impl LossList {
+    /// The list in `folder`.
+    pub(super) fn of(folder: &Path) -> LossList {
+        LossList { path: folder.join("losses.jsonl"), turn: Mutex::default() }
+    }
+
+    /// Adds a line, which is on the disk then. After an error the list is as it was.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError::Write`]
+    pub fn note(&self, loss: &Loss) -> Result<(), RecordError> {
+        let failed = |source| RecordError::Write { path: self.path.clone(), source };
+        let mut line = serde_json::to_vec(loss).expect("a loss is plain data");
+        line.push(b'\n');
+        let _turn = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut file = OpenOptions::new().append(true).create(true).open(&self.path).map_err(failed)?;
+        let before = file.metadata().map_err(failed)?.len();
+        file.write_all(&line).and_then(|()| file.sync_data()).map_err(|error| {
+            // A torn line would swallow the next one.
+            let _ = file.set_len(before);
+            failed(error)
+        })
+    }
+}

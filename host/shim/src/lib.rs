@@ -1,0 +1,164 @@
+//! `gleaner-shim [OPTIONS] -- PROGRAM ARGUMENTS...`: the parent of every runtime, whoever wants it started.
+//!
+//! It takes from itself, and so from the runtime, what no lambda's process needs; hands on a small part of its environment;
+//! kills the runtime when it does not come back from a lambda in time; ends what the runtime left behind; and writes down how it
+//! ended. Its own exit is that of the runtime. It has one thread, allocates next to nothing, and looks ten times a second.
+//!
+//! It lives as long as its runtime, even if whoever started it goes away; with `--with-starter` it then asks the runtime to end.
+
+mod environment;
+mod left_behind;
+mod signals;
+mod watch;
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+use std::process::{Child, Command, ExitCode};
+
+use clap::Parser;
+use gleaner_jail::alone::Grants;
+use gleaner_jail::cgroup::{Bounds, Group};
+use gleaner_jail::{Paths, alone, cgroup, files, memory, never, tried};
+use gleaner_protocol::{Exit, ExitRecord, Failure, LAYERS_ENV, Layer};
+use gleaner_vitals::{PULSE_ENV, Pulse};
+
+use self::signals::Signals;
+use self::watch::Watched;
+
+/// Starts a runtime in its jail, and watches over it.
+#[derive(Parser)]
+#[command(name = "gleaner-shim", version)]
+struct Args {
+    /// Write down here how it ended.
+    #[arg(long, value_name = "FILE")]
+    exit_record: Option<PathBuf>,
+    /// Ask it to end when whoever started this shim dies.
+    #[arg(long)]
+    with_starter: bool,
+    /// Give it a control group of its own in this folder, which was delegated to this user.
+    #[arg(long, value_name = "DIR")]
+    cgroup: Option<PathBuf>,
+    /// Most memory of the control group, in bytes.
+    #[arg(long, value_name = "BYTES", default_value_t = 2 << 30)]
+    cgroup_memory: u64,
+    /// Most processes and threads of the control group.
+    #[arg(long, value_name = "N", default_value_t = 512)]
+    cgroup_tasks: u64,
+    /// Start nothing: set up every layer here, try each, and write what holds, as JSON.
+    #[arg(long, conflicts_with = "program")]
+    layers: bool,
+    /// The runtime and its arguments.
+    #[arg(last = true, required_unless_present = "layers")]
+    program: Vec<OsString>,
+}
+
+/// `main` of `gleaner-shim`.
+pub fn main() -> ExitCode {
+    let args = Args::parse();
+    let ended = if args.layers { show_layers(&args) } else { run(&args) };
+    match ended {
+        Ok(code) => code,
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit.code().into()
+        }
+    }
+}
+
+fn run(args: &Args) -> Result<ExitCode, Failure> {
+    let cannot = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
+    if args.with_starter {
+        use rustix::process::{Signal, set_parent_process_death_signal};
+        set_parent_process_death_signal(Some(Signal::TERM))
+            .map_err(|error| cannot("cannot be told of the starter's death", &std::io::Error::from(error)))?;
+    }
+    let signals = Signals::hear().map_err(|error| cannot("cannot listen for signals", &error))?;
+    left_behind::adopt().map_err(|error| cannot("cannot adopt what a runtime leaves behind", &error))?;
+    let (pulse, page) = Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
+    let number = Pulse::hand_on(&page).map_err(|error| cannot("cannot hand on the pulse", &error))?;
+    let mut layers = never::forbid();
+    layers.push(Layer::yes("hard deadline", "gleaner-shim kills what does not come back"));
+    let (group, layer) = own_group(args);
+    layers.push(layer);
+    let layers = serde_json::to_string(&layers).expect("layers are plain data");
+    let (program, arguments) = args.program.split_first().expect("clap asks for a program");
+    let mut command = Command::new(program);
+    command.args(arguments).env_clear().envs(environment::handed_on()).env(PULSE_ENV, number).env(LAYERS_ENV, layers);
+    let started_ns = signals::time_of_day_ns();
+    let child = command.spawn().map_err(|error| {
+        let program = program.to_string_lossy();
+        Failure::caused_by(Exit::Internal, format!("cannot start `{program}`"), &error)
+    })?;
+    drop(page);
+    if let Some(group) = &group
+        && let Err(error) = group.take(child.id())
+    {
+        // It runs without this layer, which it was told it had: rather not at all.
+        end_now(child);
+        return Err(cannot("cannot move the runtime into its control group", &error));
+    }
+    let watched = Watched { child, pulse, signals, group };
+    let ended = watched.until_its_end().map_err(|error| cannot("cannot watch over the runtime", &error))?;
+    let left_behind = left_behind::end();
+    if left_behind > 0 {
+        eprintln!("gleaner-shim: ended {left_behind} processes that the runtime had left behind");
+    }
+    let record = ended.record(started_ns, left_behind);
+    if let Some(path) = &args.exit_record
+        && let Err(error) = record.write(path)
+    {
+        // How it ended is more important than that this is not written.
+        eprintln!("gleaner-shim: cannot write `{}`: {error}", path.display());
+    }
+    Ok(end_alike(&record))
+}
+
+/// Ends this process as the runtime ended.
+fn end_alike(record: &ExitRecord) -> ExitCode {
+    if let Some(killed) = &record.killed {
+        let mut failure = Failure::new(Exit::LambdaFaulted, "the lambda was killed");
+        failure.causes = vec![format!("its process {}", killed.sentence())];
+        eprintln!("{}", failure.with_help("raise `deadline` in [limits], or do less in one wake"));
+        return failure_code();
+    }
+    if let Some(signal) = record.signal {
+        signals::end_by(signal);
+    }
+    u8::try_from(record.code.unwrap_or(1)).unwrap_or(1).into()
+}
+
+fn failure_code() -> ExitCode {
+    Exit::LambdaFaulted.code().into()
+}
+
+fn end_now(mut child: Child) {
+    let _ = child.kill();
+    let _ = child.wait();
+}
+
+/// The control group that was asked for, and what there is to say of it.
+fn own_group(args: &Args) -> (Option<Group>, Layer) {
+    let Some(tree) = &args.cgroup else {
+        return (None, Layer::no(cgroup::NAME, "none was delegated: --cgroup DIR"));
+    };
+    let bounds = Bounds { memory: args.cgroup_memory, tasks: args.cgroup_tasks };
+    match Group::make(tree, &format!("gleaner-{}", std::process::id()), bounds) {
+        Ok(group) => {
+            let layer = group.layer(bounds);
+            (Some(group), layer)
+        }
+        Err(why) => (None, Layer::no(cgroup::NAME, why)),
+    }
+}
+
+/// What holds on this machine: each layer is set up in this process, and tried.
+fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
+    let mut layers = never::forbid();
+    layers.push(own_group(args).1);
+    layers.push(files::confine(&Paths::default()));
+    layers.extend(alone::stay(Grants::default()));
+    layers.push(memory::limit(64 << 20));
+    let layers = tried::tried(layers);
+    println!("{}", serde_json::to_string(&layers).expect("layers are plain data"));
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,146 @@
+//! The shim as a program, around small programs that stand for a runtime.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::PathBuf;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::Duration;
+
+use gleaner_protocol::{Doing, ExitRecord, Holds, Layer};
+use gleaner_vitals::{PULSE_ENV, Pulse};
+use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+
+const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
+
+/// Where the record of one test goes; removed with it.
+struct Record(PathBuf);
+
+impl Record {
+    fn of(test: &str) -> Self {
+        Self(std::env::temp_dir().join(format!("gleaner-shim-{}-{test}.json", std::process::id())))
+    }
+
+    fn read(&self) -> ExitRecord {
+        ExitRecord::read(&self.0).unwrap()
+    }
+}
+
+impl Drop for Record {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+fn shim(record: &Record, program: &[&str]) -> Command {
+    let mut shim = Command::new(SHIM);
+    shim.arg("--exit-record").arg(&record.0).arg("--").args(program);
+    shim
+}
+
+fn run(record: &Record, script: &str) -> Output {
+    shim(record, &["sh", "-c", script]).output().unwrap()
+}
+
+/// Starts `script`, and waits for its first line.
+fn start(record: &Record, script: &str) -> (Child, String) {
+    let mut child = shim(record, &["sh", "-c", script]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    (child, line.trim().to_owned())
+}
+
+fn pid(number: impl TryInto<i32>) -> Pid {
+    number.try_into().ok().and_then(Pid::from_raw).unwrap()
+}
+
+#[test]
+fn the_exit_code_is_that_of_the_runtime_and_is_written_down() {
+    let record = Record::of("code");
+    assert_eq!(run(&record, "exit 7").status.code(), Some(7));
+    let written = record.read();
+    assert_eq!((written.code, written.signal, written.killed, written.left_behind), (Some(7), None, None, 0));
+    assert!(written.ended_ns > written.started_ns && written.max_rss_bytes > 0);
+}
+
+#[test]
+fn a_runtime_that_crashes_takes_its_shim_along_by_the_same_signal() {
+    use std::os::unix::process::ExitStatusExt;
+    let record = Record::of("crash");
+    assert_eq!(run(&record, "kill -ABRT $$").status.signal(), Some(6));
+    assert_eq!(record.read().signal, Some(6));
+}
+
+#[test]
+fn a_signal_to_the_shim_reaches_the_runtime() {
+    let record = Record::of("term");
+    let (mut shim, _) = start(&record, "trap 'exit 5' TERM; echo ready; while :; do sleep 0.01; done");
+    kill_process(pid(shim.id()), Signal::TERM).unwrap();
+    assert_eq!(shim.wait().unwrap().code(), Some(5));
+    assert_eq!(record.read().code, Some(5));
+}
+
+#[test]
+fn what_a_runtime_leaves_behind_is_ended_even_in_a_session_of_its_own() {
+    let record = Record::of("left");
+    let output = run(&record, "setsid sleep 1000 >/dev/null 2>&1 & echo $!");
+    let left: i32 = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
+    assert!(test_kill_process(pid(left)).is_err(), "process {left} still lives");
+    assert!(record.read().left_behind >= 1);
+}
+
+#[test]
+fn what_does_not_come_back_is_killed_and_the_record_says_what_it_did() {
+    let record = Record::of("late");
+    let me = std::env::current_exe().unwrap();
+    let hang = [me.to_str().unwrap(), "--exact", "a_runtime_that_hangs"];
+    let output = shim(&record, &hang).stdout(Stdio::null()).output().unwrap();
+    assert_eq!(output.status.code(), Some(6), "{}", String::from_utf8_lossy(&output.stderr));
+    let killed = record.read().killed.unwrap();
+    assert_eq!((killed.doing, killed.at_ns, killed.allowed_ns), (Doing::Wake, 42, 50_000_000));
+    assert!(killed.ran_ns >= killed.allowed_ns);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("its process was in one wake for 0."), "{said}");
+}
+
+/// What the test before starts, this program being the runtime. By itself it is over at once.
+#[test]
+fn a_runtime_that_hangs() {
+    if std::env::var_os(PULSE_ENV).is_none() {
+        return;
+    }
+    let pulse = Pulse::inherited().unwrap();
+    let _busy = pulse.busy(Doing::Wake, Duration::from_millis(50), 42);
+    loop {
+        std::thread::park();
+    }
+}
+
+#[test]
+fn secrets_of_the_starter_are_not_handed_on() {
+    let record = Record::of("secrets");
+    let output = shim(&record, &["sh", "-c", "env"]).env("CLOUD_TOKEN", "hush").env("GLEANER_X", "y").output().unwrap();
+    let environment = String::from_utf8(output.stdout).unwrap();
+    assert!(!environment.contains("hush") && environment.contains("GLEANER_X=y"), "{environment}");
+}
+
+#[test]
+fn a_program_that_is_not_there_is_named() {
+    let record = Record::of("nobody");
+    let output = shim(&record, &["/no/such/runtime"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8(output.stderr).unwrap().contains("cannot start `/no/such/runtime`"));
+}
+
+#[test]
+fn every_layer_says_whether_it_holds_here() {
+    let output = Command::new(SHIM).arg("--layers").output().unwrap();
+    let layers: Vec<Layer> = serde_json::from_slice(&output.stdout).unwrap();
+    let names: Vec<_> = layers.iter().map(|layer| layer.name.as_str()).collect();
+    for name in ["new privileges", "system calls", "files", "processes", "sockets", "memory", "control group"] {
+        assert!(names.contains(&name), "{name} is missing in {names:?}");
+    }
+    // Every Linux that Gleaner runs on has these; Landlock and control groups are told as they are.
+    for layer in layers.iter().filter(|layer| !["files", "control group"].contains(&layer.name.as_str())) {
+        assert_eq!(layer.holds, Holds::Yes, "{layer:?}");
+    }
+}

@@ -1,0 +1,72 @@
+//! A guest that is entered only once this process is shut, and whose shim knows by when it has to be back.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_protocol::{Doing, Fault};
+
+use super::{Guest, Outcome};
+use crate::api::data::Wake;
+use crate::isolation::Isolation;
+
+/// How long a guest may take before its process is killed. Longer than its deadline, upon which it is asked to end.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Patience {
+    /// For `init`.
+    pub init: Duration,
+    /// For a wake.
+    pub wake: Duration,
+}
+
+impl Patience {
+    /// Live: enough for a deadline that is met late, on a machine where much runs.
+    pub fn live(init: Duration, wake: Duration) -> Self {
+        const MORE: Duration = Duration::from_millis(250);
+        let hard = |deadline: Duration| deadline.saturating_mul(2).saturating_add(MORE);
+        Self { init: hard(init), wake: hard(wake) }
+    }
+
+    /// In a replay there is no deadline; only what never comes back is ended.
+    pub fn replay(init: Duration, wake: Duration) -> Self {
+        const LEAST: Duration = Duration::from_secs(60);
+        Self { init: init.saturating_mul(10).max(LEAST), wake: wake.saturating_mul(100).max(LEAST) }
+    }
+}
+
+/// The guest, and what is around it.
+pub struct Watched {
+    guest: Box<dyn Guest>,
+    isolation: Arc<Isolation>,
+    patience: Patience,
+    /// The next wake begins with an `init`.
+    is_new: bool,
+}
+
+impl Watched {
+    /// `guest`, which has not been entered yet.
+    pub fn new(guest: Box<dyn Guest>, isolation: Arc<Isolation>, patience: Patience) -> Self {
+        Self { guest, isolation, patience, is_new: false }
+    }
+}
+
+impl Guest for Watched {
+    fn init(&mut self) -> Result<(), Fault> {
+        self.isolation.close();
+        let _busy = self.isolation.pulse().busy(Doing::Init, self.patience.init, 0);
+        self.guest.init()
+    }
+
+    fn wake(&mut self, wake: Wake) -> Outcome {
+        let Patience { init, wake: patience } = self.patience;
+        let patience = if self.is_new { patience.saturating_add(init) } else { patience };
+        let busy = self.isolation.pulse().busy(Doing::Wake, patience, wake.at_ns());
+        let outcome = self.guest.wake(wake);
+        drop(busy);
+        self.is_new = outcome.result.is_err();
+        outcome
+    }
+
+    fn engine(&self) -> String {
+        self.guest.engine()
+    }
+}

@@ -1,0 +1,105 @@
+//! What this process may do once foreign code is in it, and what is told of that.
+//!
+//! `gleaner-shim` has set up the first layers and told us of them. A process that becomes a Python interpreter confines its files
+//! before; everything else is given up by [`Isolation::close`], when topics, drives and results are open and the lambda is not
+//! in yet. From there on no way leads back.
+
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use gleaner_jail::alone::Grants;
+use gleaner_jail::{Paths, alone, files, memory, tried};
+use gleaner_protocol::{Exit, Failure, LAYERS_ENV, Layer};
+use gleaner_vitals::{PULSE_ENV, Pulse};
+use rustix::process::{Signal, set_parent_process_death_signal};
+
+/// How far this process is shut.
+pub struct Isolation {
+    inside: Inside,
+    pulse: Pulse,
+    layers: OnceLock<Vec<Layer>>,
+}
+
+/// What is left to a lambda's process.
+#[derive(Clone, Debug, Default)]
+pub struct Inside {
+    /// Files that it may still open.
+    pub paths: Paths,
+    /// What its manifest grants.
+    pub grants: Grants,
+    /// Memory that this process may still take, in bytes; none if what runs the lambda counts the lambda's by itself.
+    pub memory: Option<u64>,
+}
+
+impl Isolation {
+    /// That of this process, which from now on does not outlive whoever started it: a shim takes it along, since nobody else would
+    /// end a lambda that hangs; anybody else has it end in order.
+    ///
+    /// # Errors
+    ///
+    /// If the page that the shim looks at cannot be used.
+    pub fn of_this_process(inside: Inside) -> Result<Self, Failure> {
+        let failed = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
+        let pulse = Pulse::inherited().map_err(|error| failed("cannot use the shim's page", &error))?;
+        let has_shim = std::env::var_os(PULSE_ENV).is_some();
+        let signal = if has_shim { Signal::KILL } else { Signal::TERM };
+        set_parent_process_death_signal(Some(signal))
+            .map_err(|error| failed("cannot be told of the starter's death", &std::io::Error::from(error)))?;
+        Ok(Self { inside, pulse, layers: OnceLock::new() })
+    }
+
+    /// The page that the shim looks at.
+    pub fn pulse(&self) -> &Pulse {
+        &self.pulse
+    }
+
+    /// Gives up what the lambda's process does not need any more; gives the layers that were seen to hold, and those that are
+    /// not there. Later calls change nothing.
+    pub fn close(&self) -> &[Layer] {
+        self.layers.get_or_init(|| {
+            let Inside { paths, grants, memory: allowed } = &self.inside;
+            let mut layers = told_by_starter();
+            if layers.iter().any(|layer| layer.name == files::NAME) {
+                // Reading is confined already, by who knew what the interpreter reads.
+                let writes = files::confine_writes(&paths.write);
+                if let Some(layer) = writes {
+                    layers.retain(|layer| layer.name != files::NAME);
+                    layers.push(layer);
+                }
+            } else {
+                layers.push(files::confine(paths));
+            }
+            let counted = || Layer::yes(memory::NAME, "the component's memories are counted as they grow");
+            layers.push(allowed.map_or_else(counted, memory::limit));
+            layers.extend(alone::stay(*grants));
+            tried::tried(layers)
+        })
+    }
+}
+
+/// The layers that `gleaner-shim`, or the process that became this interpreter, has set up.
+fn told_by_starter() -> Vec<Layer> {
+    let told = std::env::var(LAYERS_ENV).ok().and_then(|text| serde_json::from_str(&text).ok());
+    told.unwrap_or_else(|| vec![Layer::no("hard deadline", "started without gleaner-shim: nobody ends what hangs")])
+}
+
+/// Confines the files of this process, and of the interpreter `program` that it is about to become; gives the value of
+/// [`LAYERS_ENV`] for that.
+pub fn before_interpreter(mut paths: Paths, program: &Path) -> String {
+    paths.interpreter(program);
+    let mut layers = told_by_starter();
+    layers.push(files::confine(&paths));
+    serde_json::to_string(&layers).expect("layers are plain data")
+}
+
+/// Where definitions of messages are looked for: everybody may read them.
+pub fn definitions() -> Vec<PathBuf> {
+    let prefixes = std::env::var_os("AMENT_PREFIX_PATH").unwrap_or_default();
+    std::env::split_paths(&prefixes).filter(|path| path.is_absolute() && path.parent().is_some()).collect()
+}
+
+/// `path`, or what is there of the way to it.
+pub fn existing(path: &Path) -> PathBuf {
+    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    absolute.ancestors().find(|path| path.exists()).unwrap_or(&absolute).to_owned()
+}

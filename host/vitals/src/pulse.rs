@@ -1,0 +1,198 @@
+//! The page through which `gleaner-shim` sees, without a message, what its runtime does and since when.
+//!
+//! The shim makes it, and hands it on as a file that the runtime inherits; its number stands in [`PULSE_ENV`]. The runtime says
+//! by when it will be back, before it enters code that is not ours. A runtime without a shim has a page that nobody reads.
+#![allow(unsafe_code)]
+
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsFd, AsRawFd, FromRawFd, OwnedFd};
+use std::ptr::{self, NonNull};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64, Ordering};
+use std::time::Duration;
+
+use gleaner_protocol::{Doing, Killed};
+use rustix::fs::{MemfdFlags, memfd_create};
+use rustix::io::{FdFlags, fcntl_getfd, fcntl_setfd};
+use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
+use rustix::time::{ClockId, clock_gettime};
+
+/// The environment variable with the number of the page's file.
+pub const PULSE_ENV: &str = "GLEANER_PULSE";
+
+/// What the page holds. Times are ns of CLOCK_MONOTONIC.
+#[repr(C)]
+struct Page {
+    /// Since when the runtime does what it does.
+    since_ns: AtomicU64,
+    /// How long that may take; 0 if it may take as long as it likes. Written last.
+    allowed_ns: AtomicU64,
+    at_ns: AtomicI64,
+    doing: AtomicU32,
+}
+
+/// A view of the page. Clones see the same one.
+#[derive(Clone)]
+pub struct Pulse(Arc<Mapped>);
+
+struct Mapped {
+    page: NonNull<Page>,
+}
+
+// SAFETY: all fields of the page are atomics, so any thread may use them at any time; the mapping lives as long as this does.
+unsafe impl Send for Mapped {}
+// SAFETY: as above.
+unsafe impl Sync for Mapped {}
+
+/// For the runtime: what was begun goes on until this is dropped.
+#[must_use]
+pub struct Busy<'a> {
+    pulse: &'a Pulse,
+}
+
+impl Pulse {
+    /// A new page, and the file to hand on. The file is closed by `exec` unless [`Pulse::hand_on`] was called.
+    ///
+    /// # Errors
+    ///
+    /// Those of `memfd_create` and `mmap`.
+    pub fn make() -> io::Result<(Self, OwnedFd)> {
+        let file = File::from(memfd_create("gleaner-pulse", MemfdFlags::CLOEXEC)?);
+        file.set_len(size_of::<Page>() as u64)?;
+        let pulse = Self::over(file.as_fd())?;
+        Ok((pulse, file.into()))
+    }
+
+    /// Has `file` survive `exec`; gives the value for [`PULSE_ENV`].
+    ///
+    /// # Errors
+    ///
+    /// Those of `fcntl`.
+    pub fn hand_on(file: &OwnedFd) -> io::Result<String> {
+        fcntl_setfd(file, fcntl_getfd(file)? - FdFlags::CLOEXEC)?;
+        Ok(file.as_raw_fd().to_string())
+    }
+
+    /// The page of this process's shim, or one that nobody reads.
+    ///
+    /// # Errors
+    ///
+    /// If the variable is set and names no such page, or there is no memory.
+    pub fn inherited() -> io::Result<Self> {
+        let Some(number) = std::env::var_os(PULSE_ENV) else { return Ok(Self::make()?.0) };
+        let wrong = || io::Error::new(io::ErrorKind::InvalidInput, format!("{PULSE_ENV} names no page"));
+        let number: i32 = number.to_str().and_then(|text| text.parse().ok()).filter(|n| *n > 2).ok_or_else(wrong)?;
+        // SAFETY: `dup` of a number that is no open file fails and does nothing else, and what it gives is ours alone.
+        let copy = unsafe { libc::fcntl(number, libc::F_DUPFD_CLOEXEC, 3) };
+        if copy < 0 {
+            return Err(wrong());
+        }
+        // SAFETY: the number was made a line above and nobody else knows it.
+        let copy = unsafe { OwnedFd::from_raw_fd(copy) };
+        if rustix::fs::fstat(&copy)?.st_size != size_of::<Page>() as i64 {
+            return Err(wrong());
+        }
+        Self::over(copy.as_fd())
+    }
+
+    fn over(file: impl AsFd) -> io::Result<Self> {
+        // SAFETY: a new mapping at an address that the kernel chooses overlaps nothing of ours.
+        let page = unsafe {
+            mmap(ptr::null_mut(), size_of::<Page>(), ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, file, 0)
+        }?;
+        let page = NonNull::new(page.cast()).ok_or_else(|| io::Error::other("mapped at 0"))?;
+        Ok(Self(Arc::new(Mapped { page })))
+    }
+
+    fn page(&self) -> &Page {
+        // SAFETY: the mapping is page-aligned, at least as large as a `Page`, lives as long as `self.0`, and any bytes are
+        // valid values of its atomics. Should the file be cut by the other side, an access would be a SIGBUS: an end, as wanted.
+        unsafe { self.0.page.as_ref() }
+    }
+
+    /// From now on this process is busy with `doing`, and should be back within `allowed`. `at_ns` is the time of the wake.
+    pub fn busy(&self, doing: Doing, allowed: Duration, at_ns: i64) -> Busy<'_> {
+        self.set(doing, allowed, at_ns);
+        Busy { pulse: self }
+    }
+
+    /// This process is alive, and will say so again within `allowed`.
+    pub fn alive(&self, allowed: Duration) {
+        self.set(Doing::Rounds, allowed, 0);
+    }
+
+    fn set(&self, doing: Doing, allowed: Duration, at_ns: i64) {
+        let page = self.page();
+        // Whoever reads meanwhile must not take the old allowance with the new time, or the other way round.
+        page.allowed_ns.store(0, Ordering::Release);
+        page.since_ns.store(now_ns(), Ordering::Release);
+        page.doing.store(doing as u32, Ordering::Release);
+        page.at_ns.store(at_ns, Ordering::Release);
+        page.allowed_ns.store(u64::try_from(allowed.as_nanos()).unwrap_or(u64::MAX), Ordering::Release);
+    }
+
+    /// For the shim: what the runtime was to be done with by now, or how long it is before there is reason to look again.
+    pub fn overdue(&self) -> Result<Killed, Duration> {
+        /// A call that begins just after a look is seen this much later, at the most.
+        const LOOK: Duration = Duration::from_millis(100);
+        let read = || {
+            let page = self.page();
+            let allowed_ns = page.allowed_ns.load(Ordering::Acquire);
+            let since_ns = page.since_ns.load(Ordering::Acquire);
+            let doing = Doing::from_number(page.doing.load(Ordering::Acquire));
+            (allowed_ns, since_ns, doing, page.at_ns.load(Ordering::Acquire))
+        };
+        let seen = read();
+        let (allowed_ns, since_ns, doing, at_ns) = seen;
+        if allowed_ns == 0 || read() != seen {
+            return Err(LOOK);
+        }
+        let ran_ns = now_ns().saturating_sub(since_ns);
+        if ran_ns >= allowed_ns {
+            return Ok(Killed { doing, ran_ns, allowed_ns, at_ns });
+        }
+        Err(Duration::from_nanos(allowed_ns - ran_ns).min(LOOK))
+    }
+}
+
+impl Drop for Busy<'_> {
+    fn drop(&mut self) {
+        self.pulse.page().allowed_ns.store(0, Ordering::Release);
+    }
+}
+
+impl Drop for Mapped {
+    fn drop(&mut self) {
+        // SAFETY: the mapping was made with this size, and nothing refers to it any more: `page` lends it for less than our life.
+        let _ = unsafe { munmap(self.page.as_ptr().cast(), size_of::<Page>()) };
+    }
+}
+
+fn now_ns() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_who_does_not_come_back_is_overdue() {
+        let (pulse, file) = Pulse::make().unwrap();
+        let seen = Pulse::over(file.as_fd()).unwrap();
+        assert!(seen.overdue().is_err(), "nothing has begun");
+        let busy = pulse.busy(Doing::Wake, Duration::from_secs(3600), 7);
+        assert!(seen.overdue().is_err(), "there is time left");
+        drop(busy);
+        let busy = pulse.busy(Doing::Init, Duration::from_nanos(1), 9);
+        let killed = seen.overdue().unwrap();
+        assert_eq!((killed.doing, killed.allowed_ns, killed.at_ns), (Doing::Init, 1, 9));
+        assert!(killed.ran_ns >= 1);
+        drop(busy);
+        assert!(seen.overdue().is_err(), "it came back");
+        pulse.alive(Duration::from_nanos(1));
+        assert_eq!(seen.overdue().unwrap().doing, Doing::Rounds);
+    }
+}

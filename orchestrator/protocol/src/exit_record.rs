@@ -1,0 +1,174 @@
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+/// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if it was not there at that time.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ExitRecord {
+    /// Process id that it had.
+    pub pid: u32,
+    /// When it was started, in ns of CLOCK_REALTIME.
+    pub started_ns: i64,
+    /// When it ended, likewise.
+    pub ended_ns: i64,
+    /// Its exit code; `None` if a signal ended it.
+    pub code: Option<i32>,
+    /// The signal that ended it.
+    pub signal: Option<i32>,
+    /// Why `gleaner-shim` killed it, if it did.
+    pub killed: Option<Killed>,
+    /// The kernel killed some of it, because its control group had no memory left.
+    pub out_of_memory: bool,
+    /// The most memory that it had resident, in bytes.
+    pub max_rss_bytes: u64,
+    /// CPU time that it and what it started used, in ns.
+    pub cpu_ns: u64,
+    /// Processes that it left behind, which were killed.
+    pub left_behind: u32,
+}
+
+/// What a runtime was doing when it was killed for not coming back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Killed {
+    /// What it did.
+    pub doing: Doing,
+    /// How long it had been at it, in ns.
+    pub ran_ns: u64,
+    /// How long that may take before it is killed, in ns.
+    pub allowed_ns: u64,
+    /// Time of the wake, in ns of the lambda's clock; 0 if there was none.
+    pub at_ns: i64,
+}
+
+/// What a runtime is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u32)]
+pub enum Doing {
+    /// It looks after itself between two wakes.
+    Rounds = 0,
+    /// The lambda's `init` runs.
+    Init = 1,
+    /// The lambda is awake.
+    Wake = 2,
+}
+
+impl Doing {
+    /// From its number; what is unknown counts as `Rounds`.
+    pub fn from_number(number: u32) -> Self {
+        match number {
+            1 => Self::Init,
+            2 => Self::Wake,
+            _ => Self::Rounds,
+        }
+    }
+}
+
+impl Killed {
+    /// A sentence for people, without what was killed.
+    pub fn sentence(&self) -> String {
+        let seconds = |ns: u64| ns as f64 / 1e9;
+        let what = match self.doing {
+            Doing::Rounds => "gave no sign of life",
+            Doing::Init => "was in its init",
+            Doing::Wake => "was in one wake",
+        };
+        format!("{what} for {:.2} s; after {:.2} s it is killed", seconds(self.ran_ns), seconds(self.allowed_ns))
+    }
+}
+
+/// Longest record that is read. One has some 300 bytes.
+const RECORD_MAX: u64 = 16 << 10;
+
+impl ExitRecord {
+    /// Its name in the folder of a run's results.
+    pub const FILE: &'static str = "exit.json";
+
+    /// Why it did not end well, as the end of a sentence about the process; `None` if it did.
+    pub fn sentence(&self) -> Option<String> {
+        match (self.killed, self.out_of_memory, self.signal, self.code) {
+            (Some(killed), ..) => Some(killed.sentence()),
+            (None, true, ..) => Some("was killed by the kernel: its control group had no memory left".to_owned()),
+            (None, false, Some(signal), _) => Some(format!("was ended by signal {signal}")),
+            (None, false, None, Some(0)) => None,
+            (None, false, None, code) => Some(format!("ended by itself, with exit code {}", code.unwrap_or(-1))),
+        }
+    }
+
+    /// Writes it so that `path` holds the former record or this one, whole.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    pub fn write(&self, path: &Path) -> io::Result<()> {
+        let mut text = serde_json::to_vec_pretty(self).expect("a record is plain data");
+        text.push(b'\n');
+        let mut part = path.as_os_str().to_owned();
+        part.push(".part");
+        let mut file = File::create(&part)?;
+        file.write_all(&text)?;
+        file.sync_all()?;
+        fs::rename(&part, path)
+    }
+
+    /// Reads the record at `path`.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system; [`io::ErrorKind::InvalidData`] if it is no record.
+    pub fn read(path: &Path) -> io::Result<Self> {
+        let mut text = Vec::new();
+        File::open(path)?.take(RECORD_MAX).read_to_end(&mut text)?;
+        serde_json::from_slice(&text).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scratch::Scratch;
+
+    fn record() -> ExitRecord {
+        ExitRecord {
+            pid: 17,
+            started_ns: 1,
+            ended_ns: 2,
+            code: None,
+            signal: Some(9),
+            killed: Some(Killed { doing: Doing::Wake, ran_ns: 350_000_000, allowed_ns: 350_000_000, at_ns: 5 }),
+            out_of_memory: false,
+            max_rss_bytes: 1 << 20,
+            cpu_ns: 3,
+            left_behind: 0,
+        }
+    }
+
+    #[test]
+    fn what_was_written_is_read_again_and_replaces_what_was_there() {
+        let folder = Scratch::new();
+        let path = folder.path("exit.json");
+        record().write(&path).unwrap();
+        let second = ExitRecord { killed: None, code: Some(0), signal: None, ..record() };
+        second.write(&path).unwrap();
+        assert_eq!(ExitRecord::read(&path).unwrap(), second);
+        assert_eq!(fs::read_dir(folder.root()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_is_no_record_is_refused() {
+        let folder = Scratch::new();
+        let path = folder.path("exit.json");
+        fs::write(&path, "{\"pid\": -1}").unwrap();
+        assert_eq!(ExitRecord::read(&path).unwrap_err().kind(), io::ErrorKind::InvalidData);
+    }
+
+    #[test]
+    fn a_person_reads_why_it_was_killed() {
+        assert_eq!(record().sentence().unwrap(), "was in one wake for 0.35 s; after 0.35 s it is killed");
+        let crashed = ExitRecord { killed: None, signal: Some(11), ..record() };
+        assert_eq!(crashed.sentence().unwrap(), "was ended by signal 11");
+        assert_eq!(ExitRecord { code: Some(0), signal: None, ..crashed }.sentence(), None);
+    }
+}

@@ -1,0 +1,142 @@
+"""A lambda that attacks whatever is around it, once, in its third wake. It says with an event what came of that: `refused` with
+the error, or `escaped`."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import Callable, List
+
+from gleaner import Context
+
+KEPT: List[object] = []
+
+
+class Lambda:
+    def __init__(self, ctx: Context) -> None:
+        self.attack: str = ctx.config["attack"]
+        self.target: int = ctx.config["target"]
+        self.wakes = 0
+
+    def on_tick(self, ctx: Context) -> None:
+        self.wakes += 1
+        if self.wakes != 3 or self.attack == "none":
+            return
+        attack: Callable[[Context], object] = getattr(self, self.attack)
+        try:
+            result = attack(ctx)
+        except (OSError, ValueError) as error:
+            ctx.event("refused", 1.0, why=repr(error)[:200])
+        else:
+            ctx.event("escaped", 1.0, found=repr(result)[:200])
+
+    def endless(self, ctx: Context) -> None:
+        while True:
+            pass
+
+    def host_calls(self, ctx: Context) -> None:
+        while True:
+            ctx.now_ns
+
+    def recurse(self, ctx: Context) -> None:
+        self.recurse(ctx)
+
+    def memory(self, ctx: Context) -> None:
+        while True:
+            KEPT.append(bytearray(1 << 20))
+
+    def log_flood(self, ctx: Context) -> None:
+        for i in range(5000):
+            ctx.log("info", "x" * 100)
+
+    def event_flood(self, ctx: Context) -> None:
+        for i in range(5000):
+            ctx.event("flood", 1.0)
+
+    def handles(self, ctx: Context) -> None:
+        for _ in range(100_000):
+            KEPT.append(ctx.input("camera").field("format"))
+
+    def frames(self, ctx: Context) -> None:
+        frame = ctx.input("camera").newest().as_frame()
+        while True:
+            KEPT.append(frame.resize(640, 480))
+
+    def fork(self, ctx: Context) -> int:
+        if os.fork() == 0:
+            while True:
+                os.fork()
+        return 1
+
+    def program(self, ctx: Context) -> object:
+        return subprocess.run(["/bin/true"], check=True)
+
+    def read_passwd(self, ctx: Context) -> str:
+        with open("/etc/passwd") as file:
+            return file.read()
+
+    def read_memory(self, ctx: Context) -> bytes:
+        with open(f"/proc/{self.target}/mem", "rb") as file:
+            return file.read(1)
+
+    def socket(self, ctx: Context) -> object:
+        return socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+
+    def connect(self, ctx: Context) -> object:
+        return socket.create_connection(("127.0.0.1", 9))
+
+    def write_outside(self, ctx: Context) -> int:
+        with open("/tmp/gleaner-escaped", "w") as file:
+            return file.write("here I was")
+
+    def chmod(self, ctx: Context) -> None:
+        os.chmod("/tmp", 0o700)
+
+    def kill(self, ctx: Context) -> None:
+        os.kill(self.target, signal.SIGKILL)
+
+    def ptrace(self, ctx: Context) -> int:
+        libc = ctypes.CDLL(None, use_errno=True)
+        attach = 16
+        if libc.ptrace(attach, self.target, 0, 0) != 0:
+            raise OSError(ctypes.get_errno(), "ptrace")
+        return self.target
+
+    def priority(self, ctx: Context) -> None:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+
+    def sleep(self, ctx: Context) -> None:
+        time.sleep(3600)
+
+    def swallow(self, ctx: Context) -> None:
+        while True:
+            try:
+                while True:
+                    pass
+            except BaseException:
+                pass
+
+    def deaf(self, ctx: Context) -> None:
+        signal.signal(signal.SIGALRM, signal.SIG_IGN)
+        while True:
+            pass
+
+    def exit(self, ctx: Context) -> None:
+        sys.exit(3)
+
+    def exit_now(self, ctx: Context) -> None:
+        os._exit(0)
+
+    def abort(self, ctx: Context) -> None:
+        os.abort()
+
+    def write_frame(self, ctx: Context) -> None:
+        ctx.input("camera").newest().as_frame().as_array()[0] = 1
+
+    def corrupt(self, ctx: Context) -> None:
+        ctypes.memset(id(ctx), 0xFF, 1 << 16)

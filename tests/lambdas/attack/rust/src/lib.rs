@@ -1,0 +1,81 @@
+//! A lambda that attacks whatever is around it, once, in its third wake. It says with an event what came of that: `refused` with
+//! the error, or `escaped`.
+
+use std::time::Duration;
+
+use gleaner_sdk::{Config, Error, Field, Frame, Lambda, Result, Tick, event, input, log, now_ns};
+
+struct Attack {
+    attack: String,
+    wakes: u64,
+    fields: Vec<Field>,
+    frames: Vec<Frame>,
+    bytes: Vec<Vec<u8>>,
+}
+
+impl Lambda for Attack {
+    fn init(config: &Config) -> Result<Self> {
+        let attack = config.text("attack")?.to_owned();
+        Ok(Attack { attack, wakes: 0, fields: Vec::new(), frames: Vec::new(), bytes: Vec::new() })
+    }
+
+    fn on_tick(&mut self, _tick: Tick) -> Result<()> {
+        self.wakes += 1;
+        if self.wakes != 3 || self.attack == "none" {
+            return Ok(());
+        }
+        match self.attack() {
+            Ok(()) => event("escaped", 1.0).send(),
+            Err(error) => event("refused", 1.0).with("why", error.to_string().as_str()).send(),
+        }
+    }
+}
+
+impl Attack {
+    fn attack(&mut self) -> Result<()> {
+        match self.attack.as_str() {
+            "endless" => loop {
+                std::hint::black_box(self.wakes);
+            },
+            "host_calls" => loop {
+                std::hint::black_box(now_ns());
+            },
+            "recurse" => drop(deeper(self.wakes)),
+            "memory" => loop {
+                self.bytes.push(std::hint::black_box(Vec::with_capacity(1 << 20)));
+            },
+            "log_flood" => (0..5000).for_each(|_| log::info(&"x".repeat(100))),
+            "event_flood" => (0..5000).try_for_each(|_| event("flood", 1.0).send())?,
+            "handles" => loop {
+                self.fields.push(input("camera")?.field("format")?);
+            },
+            "frames" => {
+                let sample = input("camera")?.newest().ok_or(Error::new("there is no frame yet"))?;
+                let frame = sample.as_frame()?;
+                loop {
+                    self.frames.push(frame.resize(640, 480)?);
+                }
+            }
+            "fork" | "program" => drop(std::process::Command::new("/bin/true").status()?),
+            "read_passwd" => drop(std::fs::read("/etc/passwd")?),
+            "socket" => drop(std::net::UdpSocket::bind("127.0.0.1:0")?),
+            "connect" => drop(std::net::TcpStream::connect("127.0.0.1:9")?),
+            "write_outside" => std::fs::write("/tmp/gleaner-escaped", "here I was")?,
+            "sleep" => std::thread::sleep(Duration::from_secs(3600)),
+            "exit" => std::process::exit(3),
+            "abort" => std::process::abort(),
+            other => return Err(Error::new(format!("unknown attack `{other}`"))),
+        }
+        Ok(())
+    }
+}
+
+fn deeper(n: u64) -> [u64; 64] {
+    let mut stack = [n; 64];
+    if n < u64::MAX {
+        stack = deeper(std::hint::black_box(n + 1));
+    }
+    std::hint::black_box(stack)
+}
+
+gleaner_sdk::lambda!(Attack);

@@ -1,0 +1,186 @@
+//! Lambdas that attack whatever is around them, live, below `gleaner-shim`: what becomes of each attack is a row of the table in
+//! `docs/security.md`, and has to be as it says there.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Child, Command, ExitCode, Stdio};
+
+use gleaner_protocol::{Decision, FaultKind, Live, Report};
+use gleaner_tests::live::{Line, Started, decisions, run};
+use gleaner_tests::{Folder, namespace, root};
+use libtest_mimic::{Arguments, Trial};
+
+/// Names the case that this process is to run in the network that it was started in.
+const CASE: &str = "GLEANER_ATTACK_CASE";
+
+/// What becomes of an attack.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Fate {
+    /// The wake ends with this fault; the process goes on.
+    Fault(FaultKind),
+    /// The call is refused, with these words in the error, and the lambda may go on.
+    Refused(&'static str),
+    /// It may go on, and what is too much is thrown away and counted.
+    Cut,
+    /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault of kind `killed`.
+    Killed,
+}
+
+use Fate::{Cut, Fault, Killed, Refused};
+use FaultKind::{Deadline, Exception, Fuel, HostCall, Memory, Trap};
+
+/// An attack, and its fate in WebAssembly and in Python; none where the language has no words for it.
+const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
+    ("endless", Some(Fault(Fuel)), Some(Fault(Deadline))),
+    ("host_calls", Some(Fault(Fuel)), Some(Fault(Deadline))),
+    ("recurse", Some(Fault(Trap)), Some(Fault(Exception))),
+    ("memory", Some(Fault(Memory)), Some(Fault(Memory))),
+    ("log_flood", Some(Cut), Some(Cut)),
+    // Even the event that says so is refused then.
+    ("event_flood", Some(Fault(Exception)), Some(Fault(Exception))),
+    ("handles", Some(Fault(HostCall)), None),
+    ("fork", Some(Refused("not supported")), Some(Refused("Operation not permitted"))),
+    ("program", Some(Refused("not supported")), Some(Refused("Operation not permitted"))),
+    ("read_passwd", Some(Refused("")), Some(Refused("Permission denied"))),
+    ("read_memory", None, Some(Refused("Permission denied"))),
+    ("socket", Some(Refused("")), Some(Refused("Operation not permitted"))),
+    ("connect", Some(Refused("")), Some(Refused("Operation not permitted"))),
+    ("write_outside", Some(Refused("")), Some(Refused("Permission denied"))),
+    ("chmod", None, Some(Refused("Operation not permitted"))),
+    ("kill", None, Some(Refused("Operation not permitted"))),
+    ("ptrace", None, Some(Refused("PermissionError(1"))),
+    ("priority", None, Some(Refused("Operation not permitted"))),
+    ("sleep", Some(Fault(HostCall)), Some(Fault(Deadline))),
+    ("swallow", None, Some(Killed)),
+    ("deaf", None, Some(Killed)),
+    ("exit", Some(Fault(Trap)), Some(Fault(Exception))),
+    ("exit_now", None, Some(Killed)),
+    ("abort", Some(Fault(Trap)), Some(Killed)),
+    ("corrupt", None, Some(Killed)),
+];
+
+fn main() -> ExitCode {
+    if let Ok(case) = std::env::var(CASE) {
+        let (attack, language) = case.split_once('/').expect("a case of this suite");
+        let (_, wasm, python) = ATTACKS.iter().find(|(known, ..)| *known == attack).expect("a case of this suite");
+        let fate = if language == "rust" { wasm } else { python };
+        attacked(attack, language, fate.expect("a case of this suite"));
+        return ExitCode::SUCCESS;
+    }
+    let missing = namespace::unavailable();
+    let cases = ATTACKS.iter().flat_map(|(attack, wasm, python)| {
+        let languages = [("rust", wasm), ("python", python)];
+        languages
+            .into_iter()
+            .filter(|(_, fate)| fate.is_some())
+            .map(move |(language, _)| format!("{attack}/{language}"))
+    });
+    let trial = |case: String| {
+        let name = match missing {
+            Some(why) => format!("{case} [{why}]"),
+            None => case.clone(),
+        };
+        Trial::test(name, move || namespace::case(CASE, &case)).with_ignored_flag(missing.is_some())
+    };
+    let mut arguments = Arguments::from_args();
+    arguments.test_threads = arguments.test_threads.or(Some(2));
+    let trials = cases.map(trial).collect();
+    libtest_mimic::run(&arguments, trials).exit_code()
+}
+
+/// A process of somebody else, for attacks.
+struct Bystander(Child);
+
+impl Bystander {
+    fn new() -> Self {
+        let child = Command::new("sleep").arg("1000").stdin(Stdio::null()).spawn().expect("there is a `sleep`");
+        Self(child)
+    }
+
+    fn is_alive(&mut self) -> bool {
+        matches!(self.0.try_wait(), Ok(None))
+    }
+}
+
+impl Drop for Bystander {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn attacked(attack: &str, language: &str, fate: Fate) {
+    let mut bystander = Bystander::new();
+    let out = Folder::new();
+    let lambda = root().join("tests/lambdas/attack").join(language);
+    let (attack_set, target) = (format!("attack={attack}"), format!("target={}", bystander.0.id()));
+    let started = run(&lambda, out.path(), &["--set", &attack_set, "--set", &target]);
+    let decision = fallout(&started, fate);
+    // One that dies of it dies again after each start.
+    let live = (fate != Killed).then(|| until_it_goes_on(&started));
+    started.signal("INT");
+    let finished = started.finish();
+    println!("{attack}/{language}: {}", in_words(decision.as_ref()));
+    match fate {
+        Fault(kind) => {
+            let fault = decision.and_then(|decision| decision.fault).expect("a fault");
+            assert_eq!(fault.kind, kind, "{}", fault.message);
+            assert_eq!(finished.ended().restarts, 0, "the process lives on");
+        }
+        Refused(words) => {
+            let decision = decision.expect("an event");
+            let event =
+                decision.triggers.iter().find(|it| it.label != "flood").expect("the lambda says what came of it");
+            assert_eq!(event.label, "refused", "{event:?}");
+            let why = event.attributes["why"].as_str().expect("a text");
+            assert!(why.contains(words), "{why}");
+        }
+        Cut => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
+        Killed => {
+            let fault = decision.and_then(|decision| decision.fault).expect("a fault");
+            assert_eq!(fault.kind, FaultKind::Killed, "{}", fault.message);
+            let written = decisions(out.path());
+            let killed = |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed);
+            assert!(written.iter().any(killed), "{written:?}");
+        }
+    }
+    assert!(bystander.is_alive(), "the process of somebody else was hit");
+    assert!(!Path::new("/tmp/gleaner-escaped").exists(), "a file was written where nobody had allowed it");
+}
+
+/// The decision in which the attack shows; none where it is only counted.
+fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
+    let decision = |wanted: fn(&Decision) -> bool| {
+        started.until("the attack to show", |line| match line {
+            Line::Lambda(Report::Decision(decision)) if wanted(&decision) => Some(*decision),
+            _ => None,
+        })
+    };
+    match fate {
+        Fault(_) => Some(decision(|decision| decision.fault.is_some())),
+        Refused(_) => Some(decision(|decision| !decision.triggers.is_empty())),
+        Killed => Some(decision(|it| it.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed))),
+        Cut => None,
+    }
+}
+
+/// Waits until the lambda has run for some wakes after its attack.
+fn until_it_goes_on(started: &Started) -> Live {
+    let mut seen: BTreeMap<u32, u64> = BTreeMap::new();
+    started.until("the lambda to go on", |line| match line {
+        Line::Lambda(Report::Live(live)) => {
+            let first = *seen.entry(live.restarts).or_insert(live.wakes);
+            (live.wakes > first.max(5)).then_some(*live)
+        }
+        _ => None,
+    })
+}
+
+fn in_words(decision: Option<&Decision>) -> String {
+    let Some(decision) = decision else { return "counted".to_owned() };
+    match (&decision.fault, decision.triggers.first()) {
+        (Some(fault), _) => format!("{:?}: {}", fault.kind, fault.message.lines().last().unwrap_or_default()),
+        (None, Some(trigger)) => format!("{}: {:?}", trigger.label, trigger.attributes),
+        (None, None) => "nothing".to_owned(),
+    }
+}

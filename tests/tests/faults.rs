@@ -1,0 +1,76 @@
+//! A lambda that faults for ever leaves the host as it was. How often it does here is `GLEANER_FAULTS`.
+
+use std::sync::Arc;
+
+use gleaner_host::guest::Guest;
+use gleaner_protocol::FaultKind;
+use gleaner_protocol::manifest::{ByteSize, Limits};
+use gleaner_tests::greedy::{Room, component, limits};
+use gleaner_tests::times;
+use gleaner_vitals::usage;
+
+/// What the allocator and the kernel may keep, over any number of faults.
+const SLACK_BYTES: u64 = 4 << 20;
+
+fn small() -> Limits {
+    let mut limits = limits();
+    // Enough for a good wake, and soon used by a bad one.
+    (limits.fuel, limits.memory, limits.handles) = (100_000, ByteSize::mib(4), 256);
+    limits
+}
+
+/// A component that gives back a sample that it never had.
+fn misuse() -> Room {
+    let parts = r#"(alias export $data "sample" (type $a-sample)) (core func $drop (canon resource.drop $a-sample))
+        (core instance $host (export "drop" (func $drop)))"#;
+    let body = "(import \"host\" \"drop\" (func $drop (param i32))) (func $wake (call $drop (i32.const 99)))";
+    Room::written_within(&component(parts, "(with \"host\" (instance $host))", body), &small())
+}
+
+fn descriptors() -> usize {
+    std::fs::read_dir("/proc/self/fd").unwrap().count()
+}
+
+/// In one test, since memory is counted for the whole program.
+#[test]
+fn faults_in_a_row_leave_memory_slots_and_handles_where_they_were() {
+    let faults = times("GLEANER_FAULTS", 2000);
+    let greedy = |behaviour: &str| Room::within(behaviour, 0, &small());
+    let mut stacked = small();
+    stacked.stack = ByteSize::kib(16);
+    let endless = component("", "", "(func $wake (call $wake) (call $wake))");
+    let rooms = [
+        ("fuel", greedy("endless"), FaultKind::Fuel),
+        ("trap", greedy("panic"), FaultKind::Trap),
+        ("memory", greedy("memory"), FaultKind::Memory),
+        ("stack", Room::written_within(&endless, &stacked), FaultKind::Stack),
+        ("handles kept", greedy("topics"), FaultKind::HostCall),
+        ("a handle of nothing", misuse(), FaultKind::HostCall),
+        ("frames kept", greedy("frames"), FaultKind::HostCall),
+    ];
+    for (name, mut room, kind) in rooms {
+        room.guest.init().unwrap();
+        let mut go_on = |times: u32| {
+            for _ in 0..times {
+                let fault = room.fault();
+                assert_eq!(fault.kind, kind, "{name}: {}", fault.message);
+                room.session.end();
+                room.session.take_log();
+            }
+            (usage::resident(), Arc::strong_count(&room.topic), descriptors())
+        };
+        let (resident, owners, open) = go_on(500);
+        let (resident_now, owners_now, open_now) = go_on(faults);
+        let (before, now) = (resident / 1024, resident_now / 1024);
+        println!(
+            "{name}: {faults} faults, {before} KiB resident before, {now} KiB now, {owners_now} owners of the input"
+        );
+        assert!(resident_now < resident + SLACK_BYTES, "{name}: from {before} to {now} KiB");
+        assert_eq!((owners_now, open_now), (owners, open), "{name}");
+        let counts = room.topic.counts();
+        assert_eq!((counts.received, counts.no_slot), (u64::from(faults) + 500, 0), "{name}");
+        // What it held last went with it: all frames can be had again.
+        let frames: Vec<_> = (0..small().frames).map(|_| room.topic.newest().unwrap().as_frame().unwrap()).collect();
+        assert_eq!(frames.len() as u64, small().frames, "{name}");
+    }
+}

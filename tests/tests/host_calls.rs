@@ -1,0 +1,170 @@
+//! Calls through the WIT in every order, with whatever arguments, from the lambda `driver`: the host stays whole, gives back what it
+//! lent, and decides the same again. Programs are made up by a generator of numbers that always begins with the same one.
+//!
+//! `GLEANER_HOST_CALLS` says how many programs; 10,000 take half a minute, a million an hour.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use gleaner_host::api::Session;
+use gleaner_host::api::data::{Topic, Wake};
+use gleaner_host::guest::Guest;
+use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
+use gleaner_host::input::open_inputs;
+use gleaner_protocol::manifest::{Limits, Manifest};
+use gleaner_protocol::{Fault, Trigger};
+use gleaner_tests::drive::{COMPRESSED, Cdr, IMAGE, compressed, image};
+use gleaner_tests::{root, times};
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_vitals::usage;
+
+/// Most memory by which the process may grow over all programs. What it holds at a time is bounded by the limits of `driver`.
+const GROWTH_BYTES: u64 = 32 << 20;
+
+/// xorshift64: good enough to make up arguments, and the same everywhere.
+struct Numbers(u64);
+
+impl Numbers {
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    fn below(&mut self, n: u64) -> u64 {
+        self.next() % n
+    }
+
+    /// Bytes of which some are the kind that breaks things.
+    fn hostile(&mut self, n: u64) -> Vec<u8> {
+        let length = self.below(n + 1);
+        let edge = [0, 1, 2, 3, 16, 0x7f, 0x80, 0xff];
+        let byte = |numbers: &mut Self| match numbers.below(3) {
+            0 => edge[numbers.below(8) as usize],
+            1 => numbers.below(48) as u8,
+            _ => numbers.next() as u8,
+        };
+        (0..length).map(|_| byte(self)).collect()
+    }
+
+    /// A sound message, one with some bytes changed, or none at all.
+    fn message(&mut self, sound: &[u8]) -> Vec<u8> {
+        let mut message = sound.to_vec();
+        match self.below(4) {
+            0 => return self.hostile(200),
+            1 => {
+                for _ in 0..=self.below(4) {
+                    let at = self.below(message.len() as u64) as usize;
+                    message[at] = self.next() as u8;
+                }
+            }
+            2 if self.below(4) == 0 => message.truncate(self.below(message.len() as u64) as usize),
+            _ => {}
+        }
+        message
+    }
+}
+
+/// What of a wake must be the same again.
+type Outcome = (Result<(), Fault>, Option<u64>, Vec<Trigger>);
+
+/// The lambda `driver` and what it sees.
+struct Driver {
+    guest: WasmGuest,
+    session: Session,
+    transport: Loopback,
+    inputs: Vec<Arc<Topic>>,
+    sent: u64,
+}
+
+impl Driver {
+    fn new(timed: bool) -> Self {
+        let lambda = root().join("tests/lambdas/driver/rust/build");
+        let manifest = Manifest::load(&lambda).expect("driver is built; run: cargo xtask test");
+        let mut transport = Loopback::new();
+        for (input, definition) in manifest.inputs.iter().zip(["uint8[] data\n", IMAGE, COMPRESSED]) {
+            transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
+        }
+        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
+        let limits: &Limits = &manifest.limits;
+        let session = Session::new(inputs.clone(), Vec::new(), limits);
+        let cache = root().join("target/test-cache/gleaner");
+        let loaded = Loaded::open(&lambda.join("driver.wasm"), &cache, limits.stack.as_usize()).unwrap();
+        let deadline = timed.then(|| Deadline::new(loaded.engine(), limits.deadline).unwrap());
+        let mut guest = WasmGuest::new(loaded, session.clone(), limits, deadline).unwrap();
+        guest.init().unwrap();
+        Self { guest, session, transport, inputs, sent: 0 }
+    }
+
+    fn publish(&mut self, topic: &str, cdr: &[u8]) {
+        self.sent += 1;
+        let (at_ns, seq) = (self.sent as i64 * 1_000_000, self.sent);
+        let endian = if cdr.len() % 7 == 6 { Endian::Big } else { Endian::Little };
+        let meta = SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian, options: [0; 2] };
+        self.transport.publish(topic, &meta, cdr).unwrap();
+    }
+
+    /// Runs a program over these pictures.
+    fn run(&mut self, raw: &[u8], coded: &[u8], program: &[u8]) -> Outcome {
+        self.publish("/camera/raw", raw);
+        self.publish("/camera/coded", coded);
+        self.publish("/program", &Cdr::default().bytes(program).done());
+        self.session.begin(self.sent as i64 * 1_000_000);
+        // It keeps what it likes: then there may be no room for the program, and the one before runs again.
+        let Some(sample) = self.inputs[0].newest() else { return (Ok(()), None, Vec::new()) };
+        let outcome = self.guest.wake(Wake::Event(sample));
+        self.session.take_log();
+        (outcome.result, outcome.fuel, self.session.end())
+    }
+}
+
+fn pictures() -> Vec<(Vec<u8>, Vec<u8>)> {
+    let noise: Vec<u8> = (0..64 * 48 * 3_u32).map(|n| (n * 7 + n / 11) as u8).collect();
+    let mut jpeg = Vec::new();
+    jpeg_encoder::Encoder::new(&mut jpeg, 80).encode(&noise, 64, 48, jpeg_encoder::ColorType::Rgb).unwrap();
+    let raw = [("rgb8", 192), ("mono16", 128), ("yuv422", 128), ("bayer_rggb8", 64)];
+    raw.map(|(encoding, step)| (image(64, 48, encoding, step, &noise[..48 * step as usize]), compressed(&jpeg)))
+        .to_vec()
+}
+
+#[test]
+fn whatever_a_lambda_calls_the_host_stays_whole() {
+    let programs = times("GLEANER_HOST_CALLS", 10_000);
+    let pictures = pictures();
+    let mut numbers = Numbers(0x9e37_79b9_7f4a_7c15);
+    // The same calls twice, and once more with a deadline.
+    let (mut first, mut second, mut timed) = (Driver::new(false), Driver::new(false), Driver::new(true));
+    let (mut faults, mut triggers, mut longest) = ([0_u32; 9], 0, Duration::ZERO);
+    let mut resident = None;
+    for number in 0..programs {
+        let (raw, coded) = &pictures[numbers.below(pictures.len() as u64) as usize];
+        let (raw, coded) = (numbers.message(raw), numbers.message(coded));
+        let program = numbers.hostile(600);
+        let outcome = first.run(&raw, &coded, &program);
+        assert_eq!(outcome, second.run(&raw, &coded, &program), "program {number} decides otherwise: {program:?}");
+        let started = Instant::now();
+        let _ = timed.run(&raw, &coded, &program);
+        longest = longest.max(started.elapsed());
+        if let Err(fault) = &outcome.0 {
+            faults[fault.kind as usize] += 1;
+            assert!(!fault.message.is_empty(), "program {number}");
+        }
+        triggers += outcome.2.len();
+        if number == programs / 10 {
+            resident = Some(usage::resident());
+        }
+    }
+    let (before, now) = (resident.unwrap_or_default(), usage::resident());
+    println!("{programs} programs: faults by kind {faults:?}, {triggers} triggers, longest wake {longest:?}");
+    println!("{} KiB resident after a tenth, {} KiB at the end", before / 1024, now / 1024);
+    assert!(now < before + GROWTH_BYTES, "from {before} to {now} bytes");
+    assert!(faults.iter().sum::<u32>() > 0 && triggers > 0, "the programs do nothing");
+    // What the guests held goes with them, and nothing else holds the inputs.
+    for driver in [first, second, timed] {
+        let Driver { guest, session, transport, inputs, .. } = driver;
+        drop((guest, session, transport));
+        assert_eq!(inputs.iter().map(Arc::strong_count).collect::<Vec<_>>(), [1; 3]);
+    }
+}

@@ -1,0 +1,192 @@
+//! Every limit of `[limits]`, made small and then hit: the cause is named with what was used and what was allowed.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_host::api::data::{DataError, Topic};
+use gleaner_host::guest::Guest;
+use gleaner_protocol::manifest::bounds::{FUEL, STACK};
+use gleaner_protocol::manifest::{ByteSize, Limits, Manifest};
+use gleaner_protocol::{Fault, FaultKind};
+use gleaner_tests::drive::Cdr;
+use gleaner_tests::greedy::{Room, component, limits, publish, subscribed};
+
+/// The limits of the suite, with a change.
+fn with(change: impl FnOnce(&mut Limits)) -> Limits {
+    let mut limits = limits();
+    change(&mut limits);
+    limits
+}
+
+#[track_caller]
+fn is(fault: &Fault, kind: FaultKind, used: Option<u64>, allowed: u64) {
+    assert_eq!((fault.kind, fault.used, fault.allowed), (kind, used, Some(allowed)), "{}", fault.message);
+}
+
+#[test]
+fn fuel_of_a_wake_and_of_init_are_two_limits() {
+    let limits = with(|limits| (limits.fuel, limits.init_fuel) = (300_000, 200_000));
+    is(&Room::within("endless", 0, &limits).fault(), FaultKind::Fuel, Some(300_000), 300_000);
+    let fault = Room::within("endless_init", 0, &limits).guest.init().unwrap_err();
+    is(&fault, FaultKind::Fuel, Some(200_000), 200_000);
+}
+
+#[test]
+fn the_deadline_of_a_wake_and_of_init_are_two_limits() {
+    let ms = Duration::from_millis;
+    for [wake, init] in [[20, 90], [90, 20]] {
+        let limits = with(|limits| {
+            (limits.fuel, limits.init_fuel) = (FUEL.max, FUEL.max);
+            (limits.deadline, limits.init_deadline) = (ms(wake), ms(init));
+        });
+        for (behaviour, allowed) in [("endless", wake), ("endless_init", init)] {
+            let mut room = Room::timed(behaviour, 0, &limits);
+            let fault = if behaviour == "endless" { room.fault() } else { room.guest.init().unwrap_err() };
+            assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(allowed * 1_000_000)), "{fault:?}");
+            assert!(fault.used >= fault.allowed, "{fault:?}");
+        }
+    }
+}
+
+#[test]
+fn a_call_that_cannot_end_in_time_is_a_fault_and_not_begun() {
+    // 800 MB of pixels, for which no machine takes less than 100 ms.
+    let limits = with(|limits| (limits.fuel, limits.deadline) = (FUEL.max, Duration::from_millis(50)));
+    Room::timed("mean_luma", 0, &limits).wake().result.unwrap();
+    let fault = Room::timed("huge", 0, &limits).fault();
+    assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(50_000_000)), "{fault:?}");
+    assert!(fault.message.contains("a call into the host"), "{}", fault.message);
+}
+
+#[test]
+fn memory_beyond_the_limit_is_a_fault_with_both_numbers() {
+    let fault = Room::within("memory", 0, &with(|limits| limits.memory = ByteSize::mib(4))).fault();
+    assert_eq!((fault.kind, fault.allowed), (FaultKind::Memory, Some(4 << 20)), "{fault:?}");
+    assert!(fault.used > fault.allowed, "{fault:?}");
+}
+
+#[test]
+fn elements_of_tables_beyond_the_limit_are_a_fault_with_both_numbers() {
+    let body = |elements: u32| {
+        let grow = "(table.grow $t (ref.null func) (i32.const 100))";
+        let wake = format!("(if (i32.eq (i32.const -1) {grow}) (then (unreachable)))");
+        component("", "", &format!("(table $t {elements} funcref) (func $wake {wake})"))
+    };
+    let limits = with(|limits| limits.tables = 200);
+    Room::written_within(&body(100), &limits).wake().result.unwrap();
+    is(&Room::written_within(&body(101), &limits).fault(), FaultKind::Memory, Some(201), 200);
+    let fault = Room::written_within(&body(201), &limits).guest.init().unwrap_err();
+    is(&fault, FaultKind::Memory, Some(201), 200);
+    assert_eq!(fault.message, "in init: asked for 201 elements of tables; 200 are allowed");
+}
+
+#[test]
+fn a_smaller_stack_is_full_earlier() {
+    // Each call takes some stack and a little fuel, and nothing else.
+    let endless = component("", "", "(func $wake (call $wake) (call $wake))");
+    let deep = |stack: ByteSize| {
+        let mut room = Room::written_within(&endless, &with(|limits| limits.stack = stack));
+        let outcome = room.wake();
+        is(&outcome.result.unwrap_err(), FaultKind::Stack, None, stack.bytes());
+        outcome.fuel.unwrap()
+    };
+    let (least, most) = (deep(STACK.min), deep(STACK.max));
+    assert!((20..45).contains(&(most / least)), "{least} and {most}");
+}
+
+#[test]
+fn a_lambda_that_keeps_handles_is_told_how_many_it_may() {
+    let limits = with(|limits| limits.handles = 64);
+    is(&Room::within("fields", 0, &limits).fault(), FaultKind::HostCall, Some(65), 64);
+}
+
+#[test]
+fn a_lambda_that_keeps_frames_is_refused_the_next_one() {
+    let limits = with(|limits| limits.frames = 3);
+    for behaviour in ["frames", "resized"] {
+        let mut room = Room::within(behaviour, 0, &limits);
+        for _ in 0..3 {
+            // They went with the lambda that held them: the next one comes as far.
+            let fault = room.fault();
+            assert_eq!(fault.kind, FaultKind::Exception);
+            let said = "the lambda holds 3 frames; drop frames that are not needed, or raise `frames` in [limits]";
+            assert!(fault.message.contains(said), "{behaviour}: {}", fault.message);
+        }
+    }
+}
+
+#[test]
+fn what_one_call_takes_from_a_lambda_is_limited() {
+    let limits = with(|limits| limits.call_bytes = ByteSize::kib(64));
+    let fault = Room::within("long_label", 60_000, &limits).fault();
+    assert!(fault.message.contains("the label has 60000 bytes"), "{}", fault.message);
+    is(&Room::within("long_label", 70_000, &limits).fault(), FaultKind::HostCall, None, 64 << 10);
+}
+
+/// An input with so many messages of one type in its ring, for a lambda with these limits.
+fn topic(definition: &str, limits: &str, messages: u64, cdr: &[u8]) -> Arc<Topic> {
+    let manifest = format!(
+        "[lambda]\nname = \"many\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"many.wasm\"\n\
+         [schedule]\nevent = \"many\"\nbacklog = \"each\"\n\
+         [[input]]\nname = \"many\"\ntopic = \"/many\"\ntype = \"test_msgs/msg/Only\"\ndepth = 100\nmax_size = \"1 MiB\"\n\
+         [limits]\n{limits}"
+    );
+    let (mut transport, topic) = subscribed(&Manifest::parse(&manifest, "lambda.toml").unwrap(), definition);
+    (1..=messages).for_each(|seq| publish(&mut transport, "/many", seq, cdr));
+    topic
+}
+
+#[test]
+fn what_one_call_gives_is_limited() {
+    let bytes = vec![7; 100_000];
+    let topic = topic("uint8[] x\n", "call_bytes = \"64 KiB\"", 1, &Cdr::default().bytes(&bytes).done());
+    let sample = topic.newest().unwrap();
+    assert_eq!(sample.cdr(0, u32::MAX).len(), 64 << 10);
+    let error = sample.get(&topic.field("x").unwrap()).map(drop).unwrap_err();
+    assert!(error.to_string().contains("has 100000 items, one call hands out 65536"), "{error}");
+}
+
+#[test]
+fn how_many_items_one_call_gives_is_limited() {
+    let few = "call_items = 20";
+    let one = topic("uint8 x\n", few, 100, &[7]);
+    let field = one.field("x").unwrap();
+    let lists = [one.last(usize::MAX).len(), one.since(0).len()];
+    let columns = [one.column(&field, usize::MAX).unwrap(), one.column_since(&field, 0).unwrap()];
+    assert_eq!((lists, columns.map(|column| column.values.len())), ([20; 2], [20; 2]));
+    let texts = |n: usize| (0..n).fold(Cdr::default().u32(n as u32), |cdr, _| cdr.text("x")).done();
+    let numbers = |n: usize| [&(n as u32).to_le_bytes(), vec![0_u8; 2 * n].as_slice()].concat();
+    let get = |definition, cdr: &[u8]| {
+        let topic = topic(definition, few, 1, cdr);
+        topic.newest().unwrap().get(&topic.field("x").unwrap()).map(drop)
+    };
+    get("string[] x\n", &texts(20)).unwrap();
+    get("uint16[] x\n", &numbers(20)).unwrap();
+    for error in [get("string[] x\n", &texts(21)), get("uint16[] x\n", &numbers(21))] {
+        assert!(matches!(&error, Err(DataError::WrongField { why, .. }) if why.contains("hands out 20")), "{error:?}");
+    }
+}
+
+#[test]
+fn log_lines_and_their_bytes_are_two_limits() {
+    let said = |length: u32, change: fn(&mut Limits)| {
+        let mut room = Room::within("log", length, &with(change));
+        room.wake().result.unwrap();
+        (room.session.take_log().0.len(), room.session.log_dropped())
+    };
+    assert_eq!(said(1, |limits| limits.log_lines = 30), (30, 970));
+    assert_eq!(said(1000, |limits| limits.log_bytes = ByteSize::kib(8)), (8, 992));
+}
+
+#[test]
+fn triggers_beyond_those_of_a_minute_are_refused_and_counted() {
+    let mut room = Room::within("events", 3, &with(|limits| limits.events_per_minute = 5));
+    room.wake().result.unwrap();
+    assert_eq!(room.session.end().len(), 3);
+    let fault = room.fault();
+    assert!(fault.message.contains("the lambda has caused 5 triggers in this minute already"), "{}", fault.message);
+    // Those before it count, and in the next minute all is well again.
+    assert_eq!((room.session.end().len(), room.session.triggers_refused()), (2, 1));
+    room.wake_at(60_000_000_000).result.unwrap();
+    assert_eq!((room.session.end().len(), room.session.triggers_refused()), (3, 1));
+}

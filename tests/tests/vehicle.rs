@@ -1,0 +1,98 @@
+//! A vehicle makes the limits of a lambda smaller: in a replay, in what its journal says, and when that is made again.
+
+use std::path::Path;
+
+use gleaner_tests::{Copy, Folder, Run, Verification, replay_to, root, sample_drive, verify};
+
+const OK: u8 = 0;
+const USAGE: u8 = 2;
+const DIFFERS: i32 = 4;
+const FAULTED: u8 = 6;
+const BRAKING: [&str; 2] = ["--set", "brake_mps2=-1.4"];
+
+/// Replays a lambda on the vehicle that `vehicle` describes.
+fn on(folder: &Folder, lambda: &Path, vehicle: &str, args: &[&str]) -> Run {
+    let file = folder.write("vehicle.toml", vehicle);
+    let args = [args, &["--vehicle", file.to_str().unwrap()]].concat();
+    replay_to(&folder.path().join("out"), lambda, &[sample_drive()], &args)
+}
+
+/// Makes the journal again on that vehicle, if one is named.
+fn again(folder: &Folder, lambda: &Path, vehicle: Option<&str>) -> Verification {
+    let (drive, journal) = (sample_drive(), folder.path().join("journal"));
+    let mut args =
+        vec!["replay".as_ref(), lambda.as_os_str(), drive.as_os_str(), "--verify".as_ref(), journal.as_os_str()];
+    let file = vehicle.map(|text| folder.write("another.toml", text));
+    if let Some(file) = &file {
+        args.extend(["--vehicle".as_ref(), file.as_os_str()]);
+    }
+    verify(&args)
+}
+
+#[test]
+fn the_smaller_limit_holds_and_is_named() {
+    let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
+    let run = on(&folder, &lambda, "[limits]\nfuel = 1_000\nmemory = \"1 GiB\"\n", &[]);
+    let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
+    assert!(message.ends_with("of 1000 units of fuel"), "{message}");
+    assert!(run.stderr.contains("fuel 10000000 -> 1000") && !run.stderr.contains("memory"), "{}", run.stderr);
+    let run = on(&folder, &lambda, "[limits]\nfuel = 100_000_000\n", &BRAKING);
+    assert!(run.must_exit(OK).stderr.is_empty(), "{}", run.stderr);
+}
+
+#[test]
+fn a_mistake_in_the_file_of_a_vehicle_is_refused_with_its_line() {
+    let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
+    let run = on(&folder, &lambda, "[limits]\nfule = 1_000\n", &[]);
+    let said = &run.must_exit(USAGE).stderr;
+    assert!(said.contains("vehicle.toml, line 2: unknown key `fule`") && said.contains("`fuel`?"), "{said}");
+}
+
+#[test]
+fn a_journal_is_made_again_under_the_limits_that_it_names() {
+    let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
+    let journal = folder.path().join("journal");
+    let tight = "[limits]\nfuel = 100_000\n";
+    on(&folder, &lambda, tight, &[&BRAKING[..], &["--journal", journal.to_str().unwrap()]].concat()).must_exit(OK);
+    for vehicle in [None, Some(tight)] {
+        let again = again(&folder, &lambda, vehicle);
+        assert!(again.verified.is_some(), "{}", again.stderr);
+    }
+    let other = again(&folder, &lambda, Some("[limits]\nfuel = 200_000\n"));
+    assert_eq!(other.exit, DIFFERS, "{}", other.stderr);
+    for part in ["limit `fuel`", "in the journal: 100000", "now:            200000", "--vehicle"] {
+        assert!(other.stderr.contains(part), "{part}: {}", other.stderr);
+    }
+    // A journal cannot have more than the manifest gives.
+    let poor = Copy::of("examples/hello/rust", |manifest| manifest.replace("fuel = 10_000_000", "fuel = 50_000"));
+    let poor = again(&folder, poor.path(), None);
+    assert!(poor.exit == DIFFERS && poor.stderr.contains("now:            50000"), "{}", poor.stderr);
+}
+
+#[test]
+fn both_kinds_drop_log_lines_and_refuse_triggers_at_the_same_limits() {
+    for kind in ["rust", "python"] {
+        let (folder, lambda) = (Folder::new(), root().join("tests/lambdas/misbehave").join(kind));
+        let summary = |vehicle: &str, behaviour: &str| {
+            let behaviour = format!("behaviour={behaviour}");
+            on(&folder, &lambda, vehicle, &["--set", &behaviour]).summary.expect("a summary")
+        };
+        let all = summary("", "log_flood");
+        let few = summary("[limits]\nlog_lines = 10\n", "log_flood");
+        assert_eq!(
+            (few.log_lines * 10, few.log_dropped),
+            (all.log_lines, all.log_dropped + all.log_lines - few.log_lines)
+        );
+        let all = summary("", "event_then_error");
+        assert_eq!((all.triggers, all.triggers_refused), (all.wakes, 0), "{kind}");
+        assert!(
+            all.passed_over > 4000 && all.wakes < 30,
+            "{kind}: {} wakes, {} passed over",
+            all.wakes,
+            all.passed_over
+        );
+        let few = summary("[limits]\nevents_per_minute = 3\n", "event_then_error");
+        assert!((3..=6).contains(&few.triggers), "{kind}: {} triggers", few.triggers);
+        assert_eq!(few.triggers + few.triggers_refused, few.wakes, "{kind}");
+    }
+}
