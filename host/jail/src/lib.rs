@@ -2,7 +2,7 @@
 //!
 //! Nothing here can be taken back, and all of it holds for what the process starts. In the order in which a runtime comes by it:
 //!
-//! 1. [`never`], by `gleaner-shim`, before the runtime exists: no new privileges, no calls that no lambda's process ever needs.
+//! 1. [`never`](mod@never), by `gleaner-shim`, before the runtime exists: no new privileges, no calls that no lambda's process ever needs.
 //! 2. [`files`], before the first foreign code is loaded: only the files that were named can be opened; no TCP.
 //! 3. [`alone`], once sockets and files are open: no further ones, no new processes, no signals to others.
 //! 4. [`memory`], with it: so much more than there is now.
