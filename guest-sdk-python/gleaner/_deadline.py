@@ -16,16 +16,13 @@ _is_armed = False
 _was_late = False
 
 
-def keep() -> None:
-    """From now on `arm` works. To be called by the main thread, as Python wants it for signals."""
-    signal.signal(signal.SIGALRM, _late)
-
-
 def arm(seconds: float) -> None:
     """A call into the lambda begins, and should be over in so many seconds; 0 is for ever."""
     global _is_armed, _was_late
     _was_late = False
     if seconds:
+        # Each time: a lambda may have taken it in a wake before. By the main thread, as Python wants it.
+        signal.signal(signal.SIGALRM, _late)
         _is_armed = True
         signal.setitimer(signal.ITIMER_REAL, seconds, AGAIN)
 

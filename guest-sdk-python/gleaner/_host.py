@@ -12,12 +12,11 @@ from types import ModuleType, TracebackType
 from typing import Any, Callable, Dict, Optional, Tuple
 
 from . import _deadline
-from ._deadline import keep as keep_deadlines
 from ._printed import end_call, print_to
 from .context import Context
 from .error import DeadlineExceeded
 
-__all__ = ["attempt", "keep_deadlines", "load", "print_to", "settle", "tidy"]
+__all__ = ["attempt", "load", "print_to", "settle", "tidy"]
 
 Handler = Callable[..., object]
 
@@ -92,6 +91,17 @@ def attempt(seconds: float, call: Callable[..., object], *arguments: object) -> 
     of a panic in the host's own code, which comes as an exception, too. After so many seconds it raises DeadlineExceeded; 0 is
     for ever."""
     try:
+        return _attempt(seconds, call, *arguments)
+    except DeadlineExceeded as late:
+        # It came once more, on the way out.
+        _deadline.disarm()
+        return None, explain(late), "deadline"
+    finally:
+        end_call()
+
+
+def _attempt(seconds: float, call: Callable[..., object], *arguments: object) -> Tuple[object, Optional[str], str]:
+    try:
         _deadline.arm(seconds)
         result = call(*arguments)
         if _deadline.disarm():
@@ -100,8 +110,6 @@ def attempt(seconds: float, call: Callable[..., object], *arguments: object) -> 
     except BaseException as error:
         _deadline.disarm()
         return None, explain(error), _kind(error)
-    finally:
-        end_call()
 
 
 def _kind(error: BaseException) -> str:

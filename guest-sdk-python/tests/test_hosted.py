@@ -304,7 +304,7 @@ class Faults(Hosted):
         """
         told = self.fault(source, wake=1)
         self.assertIn("line 6, in on_event\n    event.as_frame().array()\npyo3_runtime.PanicException: ", told)
-        self.assertEqual(self.log(), [])
+        self.assertEqual([line for line in self.log() if not line[1].startswith("gleaner: ")], [])
 
     def test_a_thread_left_behind_does_not_keep_the_process(self) -> None:
         source = """

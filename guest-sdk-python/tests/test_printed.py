@@ -48,15 +48,16 @@ class Printing(Hosted):
         self.printed("sys.stdout.buffer.write(b'\\xff\\n'); sys.stdout.write('')", "\ufffd")
 
     def test_what_is_printed_is_no_report_and_not_said_twice(self) -> None:
-        source = "import os\ndef on_event(ctx, event): print('hello'); os.system('echo there')"
+        source = "import os\ndef on_event(ctx, event): print('hello'); os.write(1, b'there\\n')"
         ended = self.start(source, [GREY])
-        self.assertEqual([json.loads(line)["report"] for line in ended.stdout.splitlines()], ["summary"])
+        self.assertEqual([json.loads(line)["report"] for line in ended.stdout.splitlines()], ["isolation", "summary"])
         self.assertEqual((self.log(), ended.stderr), ([("info", "hello")], "there\n"))
 
     def test_a_fault_is_told_once_and_what_was_printed_before_it_is_kept(self) -> None:
         told = self.fault("def on_event(ctx, event): print('so far'); raise RuntimeError('no')")
         self.assertTrue(told.endswith("RuntimeError: no"), told)
-        self.assertEqual(self.log(), [("info", "so far")] * 2)
+        said = [line for line in self.log() if not line[1].startswith("gleaner: ")]
+        self.assertEqual(said, [("info", "so far")] * 2)
 
     def test_a_lambda_that_cannot_start_has_printed_too(self) -> None:
         ended = self.start("print('so far')\nraise RuntimeError('no')", [GREY])
@@ -87,23 +88,20 @@ class Printing(Hosted):
         self.assertEqual(sorted(of_threads), [("info", f"thread {n} " + "x" * 500) for n in range(8)])
         self.assertEqual(last, ("warn", "INFO:root:all of them"))
 
-    def test_what_another_process_prints_goes_to_standard_error(self) -> None:
+    def test_no_other_process_can_be_started(self) -> None:
         source = """
-            import faulthandler, os, subprocess, sys
-
-            faulthandler.enable()
+            import os, subprocess
 
             def on_event(ctx, event):
-                print("parent")
-                if os.fork() == 0:
-                    print("child")
-                    os._exit(0)
-                os.wait()
-                subprocess.run(["echo", "other"], stdout=sys.stdout, check=True)
+                for start in [os.fork, lambda: subprocess.run(["echo", "other"])]:
+                    try:
+                        start()
+                    except PermissionError:
+                        print("refused")
         """
         ended = self.start(source, [GREY])
-        self.assertEqual((ended.returncode, ended.stderr), (0, "child\nother\n"))
-        self.assertEqual(self.log(), [("info", "parent")])
+        self.assertEqual((ended.returncode, ended.stderr), (0, ""))
+        self.assertEqual(self.log(), [("info", "refused")] * 2)
 
     def test_a_farewell_after_the_last_wake_goes_to_standard_error(self) -> None:
         source = """

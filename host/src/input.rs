@@ -85,12 +85,18 @@ pub fn open_inputs(
 ) -> Result<Vec<Arc<Topic>>, InputError> {
     let limits = &manifest.limits;
     let frames = usize::try_from(limits.frames).unwrap_or(usize::MAX);
-    let shared = Shared { made: Budget::new(frames, limits.memory.as_usize()), per_call: PerCall::new(limits) };
+    let shared = Shared {
+        made: Budget::new(frames, limits.memory.as_usize()),
+        per_call: PerCall::new(limits),
+        ask_until: Instant::now() + ASK_ALL,
+    };
     manifest.inputs.iter().map(|input| open_input(input, remaps, transport, live, &shared)).collect()
 }
 
 /// What all inputs of a lambda have together.
 struct Shared {
+    /// Until when nodes are asked what is not known here.
+    ask_until: Instant,
     made: Budget,
     per_call: PerCall,
 }
@@ -136,7 +142,9 @@ fn open_input(
     // Whoever writes a topic that is there already can say what it is, if nobody here can.
     let found = loop {
         match transport.definitions(&spec.topic) {
-            Err(TransportError::NoDefinitions { .. }) if transport.definitions_may_come(&spec.topic) => {
+            Err(TransportError::NoDefinitions { .. })
+                if Instant::now() < shared.ask_until && transport.definitions_may_come(&spec.topic) =>
+            {
                 std::thread::sleep(ASK_EVERY);
             }
             found => break found,
@@ -177,6 +185,8 @@ fn pool<M: Copy + Send + Sync + 'static>(
     Pool::new(region, slots, slot_bytes).map_err(layout)
 }
 
+/// How long a start may wait for what others know, for all inputs together.
+const ASK_ALL: Duration = Duration::from_secs(6);
 /// How often it is looked whether definitions have come.
 const ASK_EVERY: Duration = Duration::from_millis(20);
 /// How often a refusal is said again, with how many there were: what a lambda can cause in a loop must not fill a log.

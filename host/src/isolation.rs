@@ -23,6 +23,8 @@ pub struct Isolation {
 /// What is left to a lambda's process.
 #[derive(Clone, Debug, Default)]
 pub struct Inside {
+    /// This process is a Python interpreter.
+    pub is_interpreter: bool,
     /// Files that it may still open.
     pub paths: Paths,
     /// What its manifest grants.
@@ -57,7 +59,7 @@ impl Isolation {
     /// not there. Later calls change nothing.
     pub fn close(&self) -> &[Layer] {
         self.layers.get_or_init(|| {
-            let Inside { paths, grants, memory: allowed } = &self.inside;
+            let Inside { paths, grants, memory: allowed, is_interpreter } = &self.inside;
             let mut layers = told_by_starter();
             if layers.iter().any(|layer| layer.name == files::NAME) {
                 // Reading is confined already, by who knew what the interpreter reads.
@@ -66,6 +68,9 @@ impl Isolation {
                     layers.retain(|layer| layer.name != files::NAME);
                     layers.push(layer);
                 }
+            } else if *is_interpreter {
+                // What it reads only whoever starts it can know.
+                layers.push(Layer::no(files::NAME, "this interpreter was not started by gleaner-runtime"));
             } else {
                 layers.push(files::confine(paths));
             }
@@ -89,6 +94,9 @@ pub fn before_interpreter(mut paths: Paths, program: &Path) -> String {
     paths.interpreter(program);
     let mut layers = told_by_starter();
     layers.push(files::confine(&paths));
+    if let Err(error) = alone::before_interpreter() {
+        layers.push(Layer::no("start of the interpreter", error.told()));
+    }
     serde_json::to_string(&layers).expect("layers are plain data")
 }
 
@@ -98,8 +106,24 @@ pub fn definitions() -> Vec<PathBuf> {
     std::env::split_paths(&prefixes).filter(|path| path.is_absolute() && path.parent().is_some()).collect()
 }
 
-/// `path`, or what is there of the way to it.
-pub fn existing(path: &Path) -> PathBuf {
-    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-    absolute.ancestors().find(|path| path.exists()).unwrap_or(&absolute).to_owned()
+/// Makes sure that results are where they seem to be: `folder` is made now, and is no way out of the lambda's folder.
+///
+/// # Errors
+///
+/// A failure that names the link, or why the folder cannot be made.
+pub fn place_of_results(folder: &Path, lambda: &Path) -> Result<PathBuf, Failure> {
+    let failed = |error: &dyn std::error::Error| {
+        Failure::caused_by(Exit::Internal, format!("cannot make `{}`", folder.display()), error)
+            .with_help("choose another folder: --out DIR")
+    };
+    if folder.starts_with(lambda) {
+        // Whoever made the lambda may have put a link there.
+        let within = folder.ancestors().take_while(|path| *path != lambda);
+        if let Some(link) = within.filter(|path| path.is_symlink()).last() {
+            let message = format!("`{}` is a link in the lambda's own folder", link.display());
+            return Err(Failure::new(Exit::Usage, message).with_help("remove it, or name the folder: --out DIR"));
+        }
+    }
+    std::fs::create_dir_all(folder).map_err(|error| failed(&error))?;
+    folder.canonicalize().map_err(|error| failed(&error))
 }

@@ -11,11 +11,12 @@ use crate::guest::Guest;
 /// Faults in a row that are taken for bad luck, or for one bad second of a sensor. From then on the lambda rests.
 pub const FAULTS_IN_A_ROW: u32 = 8;
 
-/// The first rest; each further fault doubles it. A hundredth of the time at most is then spent on a lambda that always takes all of
-/// a deadline of 100 ms.
+/// The first rest; each further fault doubles it. It counts from the time of the wake: one that runs for longer than its rest, as a
+/// long `init` does, has none.
 const SHORTEST_REST_NS: i64 = 100_000_000;
 
-/// The longest rest: so long it takes at most until a lambda runs again whose cause of faults is gone.
+/// The longest rest: so long it takes at most until a lambda runs again whose cause of faults is gone. A lambda that always takes all
+/// of a deadline of 100 ms then has a hundredth of the time.
 const LONGEST_REST_NS: i64 = 10_000_000_000;
 
 /// What the log says when a wake finds a fresh lambda.

@@ -7,12 +7,13 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
+use gleaner_jail::Paths;
 use gleaner_jail::alone::Grants;
 use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
 
 use crate::guest::watched::{Patience, Watched};
-use crate::isolation::{Inside, Isolation};
+use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
 use crate::live;
 use crate::replay::{self, ReplayArgs, VerifyArgs};
@@ -58,18 +59,21 @@ impl Job {
         }
     }
 
-    /// The files that a process needs from its start: with those that are only made there.
-    #[cfg(feature = "python")]
-    fn around(&self) -> gleaner_jail::Paths {
-        use crate::isolation::existing;
+    /// The files that a process needs from its start, its results among them, whose place is made.
+    fn around(&self) -> Result<Paths, Failure> {
         let results = match self {
             Self::Replay(job) => job.results(),
             #[cfg(feature = "dds")]
-            Self::Live(job) => job.results(),
+            Self::Live(job) => Some(job.results()),
         };
         let mut paths = self.inside().paths;
-        paths.write.extend(results.iter().map(|path| existing(path)));
-        paths
+        if let Some(folder) = results {
+            paths.write.push(place_of_results(folder, &self.lambda().0.lambda)?);
+        }
+        if let Self::Replay(job) = self {
+            job.make_journal()?;
+        }
+        Ok(paths)
     }
 
     /// What is left to the process once the lambda is in it.
@@ -84,7 +88,8 @@ impl Job {
             Kind::Wasm => None,
             Kind::Python => Some(manifest.limits.memory.bytes().saturating_add(ours)),
         };
-        Inside { paths, grants: Grants::default(), memory }
+        let grants = Grants { uncounted_memory_is_refused: memory.is_some(), ..Grants::default() };
+        Inside { is_interpreter: manifest.lambda.kind == Kind::Python, paths, grants, memory }
     }
 
     fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {
@@ -133,13 +138,15 @@ pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
 fn run_any(job: Job) -> Result<Exit, Failure> {
     #[allow(unused_variables, reason = "who cannot host Python does not look into the folder")]
     let (asked, manifest) = job.lambda();
+    #[allow(unused_variables, reason = "the same")]
+    let around = job.around()?;
     match manifest.lambda.kind {
         #[cfg(feature = "wasm")]
         Kind::Wasm => run(job, &mut wasm::load),
         #[cfg(feature = "python")]
         Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(&asked.lambda, &args, job.around());
+            let error = crate::guest::python::become_interpreter(&asked.lambda, &args, around);
             Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]

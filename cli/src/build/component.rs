@@ -60,8 +60,11 @@ pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
 /// added where the user has some.
 fn with_simd(cargo: &mut Command, variable: impl Fn(&str) -> Option<OsString>) -> &mut Command {
     for (name, between) in [("CARGO_ENCODED_RUSTFLAGS", "\x1f"), ("RUSTFLAGS", " ")] {
-        if let Some(mut flags) = variable(name).filter(|flags| !flags.is_empty()) {
-            flags.push(between);
+        // Set to nothing it still counts, and hides those of files.
+        if let Some(mut flags) = variable(name) {
+            if !flags.is_empty() {
+                flags.push(between);
+            }
             flags.push(SIMD);
             return cargo.env(name, flags);
         }
@@ -125,8 +128,8 @@ mod tests {
         };
         let config = "target.wasm32-wasip2.rustflags=['-Ctarget-feature=+simd128']";
         assert_eq!(build("", ""), (vec![], vec!["--config".into(), config.into()]));
-        assert_eq!(build("RUSTFLAGS", "").1.len(), 2);
         let flags = |name: &str, flags: &str| (vec![(name.into(), flags.into())], vec![]);
+        assert_eq!(build("RUSTFLAGS", ""), flags("RUSTFLAGS", "-Ctarget-feature=+simd128"));
         assert_eq!(build("RUSTFLAGS", "-Dwarnings"), flags("RUSTFLAGS", "-Dwarnings -Ctarget-feature=+simd128"));
         assert_eq!(
             build("CARGO_ENCODED_RUSTFLAGS", "-C\x1flto"),

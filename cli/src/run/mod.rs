@@ -53,7 +53,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         let mut party = Party::start(args, largest, offset_ns, left, restarts)?;
         let (why, faulted) = match party.attend(&mut screen, &stop)? {
             Ended::Well(exit) => {
-                earlier.complete(party.last())?;
+                earlier.complete(party.last(), &arguments::out(args))?;
                 return Ok(if exit == Exit::Ok { worst } else { exit });
             }
             // It has said why. What ran before may run again: a network may be down for a while.
@@ -65,10 +65,11 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             worst = Exit::LambdaFaulted;
         }
         let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
+        earlier.add(party.last());
         if stop.load(Ordering::Relaxed) || is_over() {
+            earlier.complete(None, &arguments::out(args))?;
             return Err(Failure::new(Exit::Internal, why));
         }
-        earlier.add(party.last());
         restarts += 1;
         pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
         screen.warn(&format!("{why}; starting again in {} s (restart {restarts})", pause.as_secs()));
@@ -77,6 +78,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             thread::sleep(LOOK);
         }
         if stop.load(Ordering::Relaxed) || is_over() {
+            earlier.complete(None, &arguments::out(args))?;
             return Ok(worst);
         }
         pause = (pause * 2).min(PAUSE_MAX);

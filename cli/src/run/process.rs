@@ -12,7 +12,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::{Exit, Failure, Parts, visible};
-use rustix::process::{Pid, Signal, kill_process, kill_process_group};
+use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
 
 use super::LOOK;
@@ -83,7 +83,6 @@ impl Process {
         loop {
             ear.look(screen, LOOK);
             if let Some(status) = self.status()? {
-                self.end_group();
                 return Ok(status);
             }
             if asked.elapsed() > PATIENCE {
@@ -91,14 +90,6 @@ impl Process {
                 self.tell(Signal::KILL);
                 asked = Instant::now();
             }
-        }
-    }
-
-    /// Ends what it left running, as the workers of a Python lambda.
-    fn end_group(&self) {
-        if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
-            // Mostly there is nobody.
-            let _ = kill_process_group(pid, Signal::KILL);
         }
     }
 
@@ -117,7 +108,6 @@ impl Drop for Process {
             let _ = self.child.kill();
             let _ = self.child.wait();
         }
-        self.end_group();
     }
 }
 

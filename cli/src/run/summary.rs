@@ -3,6 +3,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
+use std::path::Path;
 
 use gleaner_protocol::{Exit, Failure, Live};
 
@@ -19,19 +20,23 @@ impl Earlier {
         };
     }
 
-    /// The last one has ended well, and has written its own counts: writes those of all, if there were others.
+    /// There will be no further one. Writes the counts of all, if there were others than the last one, which has written its own:
+    /// `last`, if it ended well.
     ///
     /// # Errors
     ///
     /// A failure that names the file.
-    pub(super) fn complete(self, last: Option<Live>) -> Result<(), Failure> {
-        let (Some(before), Some(last)) = (self.0, last) else { return Ok(()) };
-        let path = last.out.join("summary.json");
-        let part = last.out.join("summary.json.part");
-        let mut text = serde_json::to_vec_pretty(&last.after(&before)).expect("counts are plain data");
+    pub(super) fn complete(self, last: Option<Live>, out: &Path) -> Result<(), Failure> {
+        let Some(before) = self.0 else { return Ok(()) };
+        let last = last.map_or_else(|| before.clone(), |last| last.after(&before));
+        // Not where the report says: it comes from the lambda's process.
+        let (path, part) = (out.join("summary.json"), out.join("summary.json.part"));
+        let mut text = serde_json::to_vec_pretty(&last).expect("counts are plain data");
         text.push(b'\n');
         let write = || -> io::Result<()> {
-            let mut file = File::create(&part)?;
+            // A new one: what is there may be a link to somewhere else.
+            let _ = fs::remove_file(&part);
+            let mut file = File::options().write(true).create_new(true).open(&part)?;
             file.write_all(&text)?;
             file.sync_all()?;
             fs::rename(&part, &path)

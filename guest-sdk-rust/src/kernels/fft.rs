@@ -30,7 +30,7 @@ impl Real for f64 {}
 ///
 /// for the bins `k` of 0 to `n / 2`, which lie at `k * rate_hz / n`; `c` is 1 for the first and the last bin and 2 for those between, which
 /// stand for negative frequencies as well. Its unit is that of the signal, squared, per Hz: (m/s²)²/Hz of an acceleration. The mean is
-/// not taken out: it is in the first bin and, by the window, a sixth as much in the second.
+/// not taken out: it is in the first bin and, by the window, half as much in the second.
 ///
 /// On one machine and in every component it gives the same bits again. A component and a native test agree to the last few bits
 /// only: sine and cosine come from other libraries.

@@ -6,13 +6,15 @@
 use gleaner_protocol::Layer;
 
 use crate::JailError;
-use crate::filter::{Refused, install_everywhere};
+use crate::filter::{Refused, install, install_everywhere};
 
-/// What a lambda's manifest grants of it.
+/// What of it is different for a process.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Grants {
     /// It may start processes, and end them.
     pub processes: bool,
+    /// Memory is bounded for the whole process, so what that bound does not count is refused.
+    pub uncounted_memory_is_refused: bool,
 }
 
 /// The name of the layer for processes.
@@ -22,7 +24,7 @@ pub const SOCKETS: &str = "sockets";
 /// The name of the layer for what a process shares with others.
 pub const SHARE: &str = "others' share";
 
-/// Sockets. A pair of connected ones, which reaches nobody else, can still be made.
+/// Sockets. A pair of connected streams, which reaches nobody else, can still be made.
 const NEW_SOCKETS: &[i64] = &[
     libc::SYS_socket,
     libc::SYS_bind,
@@ -62,8 +64,12 @@ const SHARED: &[i64] = &[
     libc::SYS_shmctl,
     libc::SYS_semget,
     libc::SYS_semctl,
+    libc::SYS_semop,
+    libc::SYS_semtimedop,
     libc::SYS_msgget,
     libc::SYS_msgctl,
+    libc::SYS_msgsnd,
+    libc::SYS_msgrcv,
     libc::SYS_mq_open,
     libc::SYS_mq_unlink,
     libc::SYS_fchmod,
@@ -77,6 +83,13 @@ const SHARED: &[i64] = &[
     libc::SYS_removexattr,
     libc::SYS_lremovexattr,
     libc::SYS_fremovexattr,
+    // Landlock has known it since Linux 6.2 only.
+    libc::SYS_truncate,
+    libc::SYS_setrlimit,
+    FCHMODAT2,
+    SETXATTRAT,
+    REMOVEXATTRAT,
+    FILE_SETATTR,
 ];
 #[cfg(target_arch = "x86_64")]
 const SHARED_HERE: &[i64] =
@@ -84,8 +97,21 @@ const SHARED_HERE: &[i64] =
 #[cfg(not(target_arch = "x86_64"))]
 const SHARED_HERE: &[i64] = &[];
 
-/// `fchmodat2` is younger than libc's list, and has the same number on every machine.
+// Younger than libc's lists, with the same numbers on every machine.
 const FCHMODAT2: i64 = 452;
+const SETXATTRAT: i64 = 463;
+const REMOVEXATTRAT: i64 = 466;
+const FILE_SETATTR: i64 = 469;
+
+/// Requests of `fcntl` that have the kernel send signals to others.
+const OWNERS: [u64; 3] = [8, 10, 15];
+/// Requests of `ioctl`: the same for sockets, and typing into somebody's terminal.
+const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
+
+/// All bits of an argument.
+const ALL: u64 = u32::MAX as u64;
+/// The bits of a socket's type that are not flags.
+const TYPE: u64 = 0xf;
 
 /// Leaves this process alone, in all of its threads. Gives the layers with what was refused; whether they hold is for
 /// [`tried`](crate::tried) to see.
@@ -115,20 +141,66 @@ fn install_for(grants: Grants) -> Result<(), JailError> {
         .calls(SHARED_HERE)
         // The transport needed it, to find its own sockets.
         .calls(&[libc::SYS_pidfd_getfd])
-        .calls(&[FCHMODAT2])
+        // Limits of others, and its own to larger ones.
+        .unless(libc::SYS_prlimit64, 0, 0)
+        .with_pointer(libc::SYS_prlimit64, 2)
         // Else it would outlive `gleaner-shim`, which watches it.
-        .bits(libc::SYS_prctl, 0, u64::from(u32::MAX), libc::PR_SET_PDEATHSIG as u64)
-        // Typing into somebody's terminal.
-        .bits(libc::SYS_ioctl, 1, u64::from(u32::MAX), libc::TIOCSTI);
-    if !grants.processes {
-        let thread = libc::CLONE_THREAD as u64;
+        .bits(libc::SYS_prctl, 0, ALL, libc::PR_SET_PDEATHSIG as u64);
+    refused = pairs_only(refused);
+    for request in OWNERS {
+        refused = refused.bits(libc::SYS_fcntl, 1, ALL, request);
+    }
+    for request in REQUESTS {
+        refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
+    }
+    if grants.uncounted_memory_is_refused {
+        // What RLIMIT_DATA does not count.
+        let shared = (libc::MAP_SHARED | libc::MAP_ANONYMOUS) as u64;
+        let down = libc::MAP_GROWSDOWN as u64;
         refused = refused
-            .calls(NEW_PROGRAMS)
-            .calls(NEW_PROCESSES)
-            .calls(SIGNALS)
-            .bits(libc::SYS_clone, 0, thread, 0)
-            .unless(libc::SYS_kill, 0, me)
-            .unless(libc::SYS_tgkill, 0, me);
+            .bits(libc::SYS_mmap, 3, shared, shared)
+            .bits(libc::SYS_mmap, 3, down, down)
+            .calls(&[libc::SYS_memfd_create, MEMFD_SECRET]);
+    }
+    if !grants.processes {
+        refused = no_processes(refused).calls(NEW_PROGRAMS).calls(SIGNALS).unless(libc::SYS_kill, 0, me).unless(
+            libc::SYS_tgkill,
+            0,
+            me,
+        );
     }
     install_everywhere(&refused.filter(libc::EPERM)?)
+}
+
+/// What a process that is about to become an interpreter does not need any more. From the first line on that runs code of the
+/// lambda's environment, which may leave nothing behind that is not shut later: no other process, and no socket but those of DDS.
+///
+/// # Errors
+///
+/// [`JailError`] if the filter cannot be installed.
+pub fn before_interpreter() -> Result<(), JailError> {
+    let mut refused = no_processes(pairs_only(Refused::default()));
+    for family in 0..FAMILIES {
+        if ![libc::AF_INET, libc::AF_INET6, libc::AF_NETLINK].contains(&family) {
+            refused = refused.bits(libc::SYS_socket, 0, ALL, u64::from(family.unsigned_abs()));
+        }
+    }
+    install(&refused.filter(libc::EPERM)?)
+}
+
+/// Families of sockets that Linux knows, with some to come.
+const FAMILIES: i32 = 64;
+/// See above.
+const MEMFD_SECRET: i64 = 447;
+
+fn no_processes(refused: Refused) -> Refused {
+    refused.calls(NEW_PROCESSES).bits(libc::SYS_clone, 0, libc::CLONE_THREAD as u64, 0)
+}
+
+/// Of pairs of sockets only streams: with others one can send to whoever has a name.
+fn pairs_only(refused: Refused) -> Refused {
+    refused
+        .unless(libc::SYS_socketpair, 0, libc::AF_UNIX as u64)
+        .bits(libc::SYS_socketpair, 1, TYPE, libc::SOCK_DGRAM as u64)
+        .bits(libc::SYS_socketpair, 1, TYPE, libc::SOCK_RAW as u64)
 }

@@ -47,22 +47,15 @@ pub struct Paths {
 }
 
 impl Paths {
-    /// Adds what an interpreter needs: its own folder, that of its virtual environment, and the one that this was made from.
+    /// Adds what the interpreter `program` needs: of its own folder, and of the one that it was made from, programs and libraries.
     pub fn interpreter(&mut self, program: &Path) {
-        let above = |path: &Path| path.parent().and_then(Path::parent).map(Path::to_owned);
-        let environment = above(program);
-        let base =
-            environment.as_ref().and_then(|folder| base_of(folder)).and_then(|bin| bin.parent().map(Path::to_owned));
-        let real = program.canonicalize().ok().and_then(|real| above(&real));
-        self.read.extend([environment, base, real].into_iter().flatten().filter(|folder| folder.parent().is_some()));
+        let real = program.canonicalize().ok();
+        for bin in [Some(program), real.as_deref()].into_iter().flatten().filter_map(Path::parent) {
+            let Some(prefix) = bin.parent() else { continue };
+            self.read.push(bin.to_owned());
+            self.read.extend(["lib", "lib64", "pyvenv.cfg"].map(|name| prefix.join(name)));
+        }
     }
-}
-
-/// `home` of a virtual environment: the folder with the program that it was made from.
-fn base_of(environment: &Path) -> Option<PathBuf> {
-    let text = std::fs::read_to_string(environment.join("pyvenv.cfg")).ok()?;
-    let homes = text.lines().filter_map(|line| line.split_once('=')).filter(|(key, _)| key.trim() == "home");
-    homes.map(|(_, home)| PathBuf::from(home.trim())).find(|home| home.is_absolute())
 }
 
 /// From now on this thread, and what it starts, can open only `paths` and the system's programs and libraries.

@@ -38,9 +38,18 @@ impl Refused {
         self.when(call, index, SeccompCmpOp::Ne, value)
     }
 
-    fn when(mut self, call: i64, index: u8, operator: SeccompCmpOp, value: u64) -> Self {
+    /// Refuses `call` if its argument `index`, a pointer, is there.
+    pub(crate) fn with_pointer(self, call: i64, index: u8) -> Self {
+        self.of_width(call, index, SeccompCmpArgLen::Qword, SeccompCmpOp::Ne, 0)
+    }
+
+    fn when(self, call: i64, index: u8, operator: SeccompCmpOp, value: u64) -> Self {
         // Flags, process numbers and requests are `int`s: the kernel looks at the lower half only, and so must we.
-        let condition = SeccompCondition::new(index, SeccompCmpArgLen::Dword, operator, value);
+        self.of_width(call, index, SeccompCmpArgLen::Dword, operator, value)
+    }
+
+    fn of_width(mut self, call: i64, index: u8, width: SeccompCmpArgLen, operator: SeccompCmpOp, value: u64) -> Self {
+        let condition = SeccompCondition::new(index, width, operator, value);
         let rule = condition.and_then(|condition| SeccompRule::new(vec![condition]));
         self.insert(call, vec![rule.expect("an index below 6, and one condition")]);
         self
@@ -66,6 +75,8 @@ impl Refused {
         let twins: Vec<_> = self.0.iter().map(|(call, rules)| (call | X32, rules.clone())).collect();
         self.0.extend(twins);
         for call in X32_OWN {
+            // Old kernels take them without the bit, too.
+            self.0.insert(call, Vec::new());
             self.0.insert(call | X32, Vec::new());
         }
     }

@@ -1,7 +1,7 @@
 //! What no lambda's process ever needs: looking into other processes, changing the system, becoming somebody else.
 
 use gleaner_protocol::Layer;
-use rustix::process::{Resource, Rlimit, setrlimit};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 use crate::JailError;
 use crate::filter::{Refused, install};
@@ -20,6 +20,11 @@ const NAMESPACES: [i32; 7] = [
     libc::CLONE_NEWNET,
 ];
 
+// Younger than libc's lists, with the same numbers on every machine.
+const QUOTACTL_FD: i64 = 443;
+const PROCESS_MRELEASE: i64 = 448;
+const OPEN_TREE_ATTR: i64 = 467;
+
 const CALLS: &[i64] = &[
     // Other processes' memory and files.
     libc::SYS_ptrace,
@@ -27,6 +32,9 @@ const CALLS: &[i64] = &[
     libc::SYS_process_vm_writev,
     libc::SYS_process_madvise,
     libc::SYS_kcmp,
+    libc::SYS_move_pages,
+    libc::SYS_migrate_pages,
+    PROCESS_MRELEASE,
     // The kernel, and parts of it with a history of holes.
     libc::SYS_bpf,
     libc::SYS_perf_event_open,
@@ -61,6 +69,8 @@ const CALLS: &[i64] = &[
     libc::SYS_name_to_handle_at,
     libc::SYS_open_by_handle_at,
     libc::SYS_quotactl,
+    QUOTACTL_FD,
+    OPEN_TREE_ATTR,
     libc::SYS_acct,
     libc::SYS_swapon,
     libc::SYS_swapoff,
@@ -93,7 +103,7 @@ const MACHINE_CALLS: &[i64] = &[];
 
 /// Refuses all of that to this process, and to what it starts. Says what holds.
 pub fn forbid() -> Vec<Layer> {
-    vec![privileges(), core_dumps(), calls()]
+    vec![privileges(), core_dumps(), open_files(), calls()]
 }
 
 fn privileges() -> Layer {
@@ -109,6 +119,19 @@ fn core_dumps() -> Layer {
     const NAME: &str = "core files";
     match setrlimit(Resource::Core, Rlimit { current: Some(0), maximum: Some(0) }) {
         Ok(()) => Layer::yes(NAME, "none are written"),
+        Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
+    }
+}
+
+/// Descriptors are memory of the kernel, which no other limit counts.
+fn open_files() -> Layer {
+    const NAME: &str = "open files";
+    const MOST: u64 = 4096;
+    let now = getrlimit(Resource::Nofile);
+    let most = now.maximum.map_or(MOST, |maximum| maximum.min(MOST));
+    let current = now.current.map_or(most, |current| current.min(most));
+    match setrlimit(Resource::Nofile, Rlimit { current: Some(current), maximum: Some(most) }) {
+        Ok(()) => Layer::yes(NAME, format!("{most} at most")),
         Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
     }
 }

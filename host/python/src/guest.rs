@@ -222,8 +222,6 @@ impl Guest for PythonGuest {
     fn init(&mut self) -> Result<(), Fault> {
         Python::attach(|py| {
             self.live = None;
-            let kept = self.host.call_method0(py, "keep_deadlines");
-            kept.map_err(|error| Raised::from(error).fault("in init: "))?;
             self.live = Some(self.start(py)?);
             let settled = self.host.call_method0(py, "settle");
             settled.map(drop).map_err(|error| Raised::from(error).fault("in init: "))

@@ -14,6 +14,7 @@ mod watch;
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::{Child, Command, ExitCode};
+use std::time::Duration;
 
 use clap::Parser;
 use gleaner_jail::alone::Grants;
@@ -24,6 +25,9 @@ use gleaner_vitals::{PULSE_ENV, Pulse};
 
 use self::signals::Signals;
 use self::watch::Watched;
+
+/// How long a runtime may take until it gives a sign of life; compiling alone may take minutes on a small machine.
+const START: Duration = Duration::from_secs(900);
 
 /// Starts a runtime in its jail, and watches over it.
 #[derive(Parser)]
@@ -75,6 +79,8 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let signals = Signals::hear().map_err(|error| cannot("cannot listen for signals", &error))?;
     left_behind::adopt().map_err(|error| cannot("cannot adopt what a runtime leaves behind", &error))?;
     let (pulse, page) = Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
+    // Finding an interpreter, compiling, discovery: until the first word of its own.
+    pulse.alive(START);
     let number = Pulse::hand_on(&page).map_err(|error| cannot("cannot hand on the pulse", &error))?;
     let mut layers = never::forbid();
     layers.push(Layer::yes("hard deadline", "gleaner-shim kills what does not come back"));
@@ -84,6 +90,12 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let (program, arguments) = args.program.split_first().expect("clap asks for a program");
     let mut command = Command::new(program);
     command.args(arguments).env_clear().envs(environment::handed_on()).env(PULSE_ENV, number).env(LAYERS_ENV, layers);
+    if let Some(path) = &args.exit_record {
+        // Nobody shall take the end of an earlier one for that of this one, which may want to read it. Mostly there is none.
+        let mut earlier = path.as_os_str().to_owned();
+        earlier.push(ExitRecord::EARLIER);
+        let _ = std::fs::rename(path, earlier);
+    }
     let started_ns = signals::time_of_day_ns();
     let child = command.spawn().map_err(|error| {
         let program = program.to_string_lossy();
@@ -156,8 +168,8 @@ fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
     let mut layers = never::forbid();
     layers.push(own_group(args).1);
     layers.push(files::confine(&Paths::default()));
-    layers.extend(alone::stay(Grants::default()));
     layers.push(memory::limit(64 << 20));
+    layers.extend(alone::stay(Grants::default()));
     let layers = tried::tried(layers);
     println!("{}", serde_json::to_string(&layers).expect("layers are plain data"));
     Ok(ExitCode::SUCCESS)

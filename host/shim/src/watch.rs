@@ -3,7 +3,7 @@
 use std::io;
 use std::os::unix::process::ExitStatusExt;
 use std::process::{Child, ExitStatus};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use gleaner_jail::cgroup::Group;
 use gleaner_protocol::{ExitRecord, Killed};
@@ -14,6 +14,14 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open};
 
 use crate::signals::{Signals, time_of_day_ns};
+
+/// What is found late twice, so far apart, is late. Where the whole machine stood still, or all of us were stopped, whoever was about
+/// to come back has so much time to do so.
+const AGAIN: Duration = Duration::from_millis(100);
+/// Looks that are further apart than this do not count as two: we stood still ourselves.
+const ASLEEP: Duration = Duration::from_secs(1);
+/// How long a runtime may take for its end once it was asked for it.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A runtime that has been started.
 pub(crate) struct Watched {
@@ -29,6 +37,8 @@ pub(crate) struct Ended {
     status: ExitStatus,
     killed: Option<Killed>,
     out_of_memory: bool,
+    /// Removed last: what was left behind is still in it.
+    _group: Option<Group>,
 }
 
 impl Watched {
@@ -37,16 +47,29 @@ impl Watched {
         let pid = Pid::from_child(&self.child);
         let process = pidfd_open(pid, PidfdFlags::empty())?;
         let mut killed = None;
+        let mut late_since: Option<Instant> = None;
+        let mut asked: Option<Instant> = None;
         loop {
             let patience = match self.pulse.overdue() {
-                Ok(late) if killed.is_none() => {
-                    killed = Some(late);
-                    kill_process(pid, Signal::KILL)?;
-                    Duration::from_secs(1)
+                Ok(late) => {
+                    let waited = late_since.map(|since| since.elapsed()).filter(|waited| *waited < ASLEEP);
+                    if waited.is_none() {
+                        late_since = Some(Instant::now());
+                    }
+                    if waited.is_some_and(|waited| waited >= AGAIN) {
+                        killed = killed.or(Some(late));
+                        kill_process(pid, Signal::KILL)?;
+                    }
+                    AGAIN
                 }
-                Ok(_) => Duration::from_secs(1),
-                Err(patience) => patience,
+                Err(patience) => {
+                    late_since = None;
+                    patience
+                }
             };
+            if asked.is_some_and(|asked| asked.elapsed() >= PATIENCE) {
+                kill_process(pid, Signal::KILL)?;
+            }
             let patience =
                 Timespec { tv_sec: patience.as_secs().cast_signed(), tv_nsec: i64::from(patience.subsec_nanos()) };
             let mut heard =
@@ -58,12 +81,14 @@ impl Watched {
             for signal in self.signals.take() {
                 // One that has just ended is not there to be told, which is as good.
                 let _ = kill_process(pid, signal);
+                asked = asked.or(Some(Instant::now()));
             }
             if let Some(status) = self.child.try_wait()? {
                 let out_of_memory = self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
                 // It may have come back, or ended by itself, just before it was killed.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
-                return Ok(Ended { pid: self.child.id(), status, killed, out_of_memory });
+                let pid = self.child.id();
+                return Ok(Ended { pid, status, killed, out_of_memory, _group: self.group });
             }
         }
     }

@@ -197,7 +197,10 @@ impl Session {
     ) -> Result<(), TriggerError> {
         let state = &mut *self.lock();
         let triggers = state.triggers.as_mut().ok_or(TriggerError::NoWake)?;
-        state.rate.check(state.now_ns)?;
+        // Who has used up the minute may still end what was begun.
+        if kind != TriggerKind::Stop {
+            state.rate.check(state.now_ns)?;
+        }
         triggers.add(kind, label, score, attributes)?;
         state.rate.caused += 1;
         Ok(())

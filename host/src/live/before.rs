@@ -2,12 +2,19 @@
 
 use std::path::Path;
 
+use crate::stage::SUMMARY;
 use gleaner_protocol::manifest::{Manifest, Schedule};
 use gleaner_protocol::{Cause, Decision, Doing, ExitRecord, Fault, FaultKind};
 
-/// The decision that the process before could not write, by the record of its end in `out`. None if nobody wrote down how.
+/// The decision that the process before could not write, by the record of its end in `out`. None if nobody wrote down how, or if it
+/// ended in order, or because something around the lambda failed. To be asked before results are begun.
 pub(super) fn undecided(manifest: &Manifest, out: &Path) -> Option<Decision> {
-    let record = ExitRecord::read(&out.join(ExitRecord::FILE)).ok()?;
+    if out.join(SUMMARY).exists() {
+        return None;
+    }
+    let record = ExitRecord::read(&out.join(format!("{}{}", ExitRecord::FILE, ExitRecord::EARLIER)))
+        .ok()
+        .filter(ExitRecord::is_the_lambdas)?;
     // Had it ended as it should, there would have been no need for this process.
     let why = record.sentence().unwrap_or_else(|| "ended by itself, as if it had been told to".to_owned());
     let wake = record.killed.filter(|killed| killed.doing == Doing::Wake);

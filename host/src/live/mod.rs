@@ -76,6 +76,7 @@ impl Job {
         let name = manifest.lambda.name.as_str();
         let round_trip = wanted.round_trip.map(|topic| RoundTrip::open(&dds, &topic, clock, name)).transpose()?;
         let announcer = wanted.announce.map(|topic| Announcer::open(&dds, &topic, name)).transpose()?;
+        let undecided = (wanted.restarts > 0).then(|| before::undecided(&manifest, &wanted.out)).flatten();
         let mut ledger = Ledger::start(Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?, reports)?;
         ledger.report(Report::Isolation { layers: isolation.close().to_vec() });
         let initialised = guest.init();
@@ -88,7 +89,6 @@ impl Job {
         }
         ledger.report(Report::Ready);
         let schedule = Schedule::live(&manifest, &inputs, clock.now());
-        let undecided = (wanted.restarts > 0).then(|| before::undecided(&manifest, &wanted.out)).flatten();
         let mut watch = Watch::new(&manifest, &asked.remaps, wanted.out, wanted.restarts, domain, clock);
         if let Some(decision) = undecided {
             watch.lost_wake();

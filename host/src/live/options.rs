@@ -2,7 +2,7 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
@@ -90,9 +90,9 @@ impl Job {
         sizes.fold(LINES, u64::saturating_add)
     }
 
-    /// The results.
-    pub fn results(&self) -> Vec<PathBuf> {
-        vec![self.wanted.out.clone()]
+    /// The folder of the results.
+    pub fn results(&self) -> &Path {
+        &self.wanted.out
     }
 
     /// Checks the arguments against the build and its manifest.

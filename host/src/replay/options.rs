@@ -1,5 +1,7 @@
 //! What to do: the arguments as typed, and what they mean once checked against the build.
 
+use std::fs::File;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -9,7 +11,7 @@ use gleaner_protocol::{BuildDir, Exit, Failure};
 
 use super::verify::Claim;
 use crate::isolation::definitions;
-use crate::stage::{Asked, AskedArgs, RESULTS};
+use crate::stage::{Asked, AskedArgs, OutputError, RESULTS};
 
 /// Arguments of `replay`.
 #[derive(Args, Clone, Debug)]
@@ -102,7 +104,8 @@ impl Job {
             read.push(claim.path().to_owned());
         }
         read.extend(gleaner_protocol::parts::cache_dir().ok());
-        Paths { read, write: self.results() }
+        let journal = if let Task::Replay(results) = &self.task { results.journal.clone() } else { None };
+        Paths { read, write: self.results().map(Path::to_owned).into_iter().chain(journal).collect() }
     }
 
     /// Memory that our own part of the process may still take, in bytes: chunks of drives, unpacked, and of clips.
@@ -110,11 +113,26 @@ impl Job {
         512 << 20
     }
 
-    /// The results.
-    pub fn results(&self) -> Vec<PathBuf> {
+    /// Makes an empty journal where none is: nothing but what exists can be granted.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names it.
+    pub fn make_journal(&self) -> Result<(), Failure> {
+        let Task::Replay(Results { journal: Some(path), .. }) = &self.task else { return Ok(()) };
+        match File::options().write(true).create_new(true).open(path) {
+            Err(source) if source.kind() != ErrorKind::AlreadyExists => {
+                Err(OutputError { path: path.clone(), source }.into())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The folder of the results, where there are some.
+    pub fn results(&self) -> Option<&Path> {
         match &self.task {
-            Task::Replay(results) => std::iter::once(&results.out).chain(&results.journal).cloned().collect(),
-            Task::Verify(_) => Vec::new(),
+            Task::Replay(results) => Some(&results.out),
+            Task::Verify(_) => None,
         }
     }
 

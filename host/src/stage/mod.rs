@@ -12,7 +12,7 @@ use gleaner_protocol::{Exit, Explain, Failure, Fault};
 use gleaner_transport::{Transport, TransportError};
 
 pub use asked::{Asked, AskedArgs, tighten};
-pub use output::{Output, OutputError, RESULTS};
+pub use output::{Output, OutputError, RESULTS, SUMMARY};
 
 use crate::api::Session;
 use crate::api::data::Topic;

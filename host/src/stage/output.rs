@@ -9,7 +9,8 @@ use serde::Serialize;
 
 use crate::api::log::Line;
 
-const SUMMARY: &str = "summary.json";
+/// What a run did, as a whole; there once it has ended.
+pub const SUMMARY: &str = "summary.json";
 
 /// The files of a run beside its clips.
 pub const RESULTS: [&str; 4] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", SUMMARY];

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64, Ordering};
 use std::time::Duration;
 
 use gleaner_protocol::{Doing, Killed};
-use rustix::fs::{MemfdFlags, memfd_create};
+use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
 use rustix::io::{FdFlags, fcntl_getfd, fcntl_setfd};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use rustix::time::{ClockId, clock_gettime};
@@ -45,6 +45,10 @@ unsafe impl Send for Mapped {}
 // SAFETY: as above.
 unsafe impl Sync for Mapped {}
 
+/// How long it may take from the end of one call into a lambda until there is a word again: writing results to a disk that stands
+/// still for a while, or reading on in a drive.
+const BETWEEN: Duration = Duration::from_secs(300);
+
 /// For the runtime: what was begun goes on until this is dropped.
 #[must_use]
 pub struct Busy<'a> {
@@ -58,8 +62,10 @@ impl Pulse {
     ///
     /// Those of `memfd_create` and `mmap`.
     pub fn make() -> io::Result<(Self, OwnedFd)> {
-        let file = File::from(memfd_create("gleaner-pulse", MemfdFlags::CLOEXEC)?);
+        let file = File::from(memfd_create("gleaner-pulse", MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING)?);
         file.set_len(size_of::<Page>() as u64)?;
+        // Else the other side could cut it, and our next look would be our end.
+        fcntl_add_seals(&file, SealFlags::SHRINK | SealFlags::GROW | SealFlags::SEAL)?;
         let pulse = Self::over(file.as_fd())?;
         Ok((pulse, file.into()))
     }
@@ -107,7 +113,7 @@ impl Pulse {
 
     fn page(&self) -> &Page {
         // SAFETY: the mapping is page-aligned, at least as large as a `Page`, lives as long as `self.0`, and any bytes are
-        // valid values of its atomics. Should the file be cut by the other side, an access would be a SIGBUS: an end, as wanted.
+        // valid values of its atomics. The file is sealed, so nobody can cut it under us.
         unsafe { self.0.page.as_ref() }
     }
 
@@ -158,7 +164,7 @@ impl Pulse {
 
 impl Drop for Busy<'_> {
     fn drop(&mut self) {
-        self.pulse.page().allowed_ns.store(0, Ordering::Release);
+        self.pulse.alive(BETWEEN);
     }
 }
 
@@ -191,7 +197,7 @@ mod tests {
         assert_eq!((killed.doing, killed.allowed_ns, killed.at_ns), (Doing::Init, 1, 9));
         assert!(killed.ran_ns >= 1);
         drop(busy);
-        assert!(seen.overdue().is_err(), "it came back");
+        assert!(seen.overdue().is_err(), "it came back, and has some time again");
         pulse.alive(Duration::from_nanos(1));
         assert_eq!(seen.overdue().unwrap().doing, Doing::Rounds);
     }

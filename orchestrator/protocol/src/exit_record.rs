@@ -4,6 +4,8 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
+use crate::Exit;
+
 /// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if it was not there at that time.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ExitRecord {
@@ -86,6 +88,15 @@ impl ExitRecord {
     /// Its name in the folder of a run's results.
     pub const FILE: &'static str = "exit.json";
 
+    /// What `gleaner-shim` adds to the name of the record of the process before, which it keeps beside that of its own.
+    pub const EARLIER: &'static str = ".before";
+
+    /// Whether the lambda ended the process, and not the programs around it: these tell how by their own exit codes.
+    pub fn is_the_lambdas(&self) -> bool {
+        let is_ours = |code| Exit::from_code(code).is_some_and(|exit| exit != Exit::Ok);
+        self.killed.is_some() || self.out_of_memory || !self.code.is_some_and(is_ours)
+    }
+
     /// Why it did not end well, as the end of a sentence about the process; `None` if it did.
     pub fn sentence(&self) -> Option<String> {
         match (self.killed, self.out_of_memory, self.signal, self.code) {
@@ -107,10 +118,14 @@ impl ExitRecord {
         text.push(b'\n');
         let mut part = path.as_os_str().to_owned();
         part.push(".part");
-        let mut file = File::create(&part)?;
+        // A new one: what is there may be a link to somewhere else.
+        let _ = fs::remove_file(&part);
+        let mut file = File::options().write(true).create_new(true).open(&part)?;
         file.write_all(&text)?;
         file.sync_all()?;
-        fs::rename(&part, path)
+        fs::rename(&part, path)?;
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
     }
 
     /// Reads the record at `path`.

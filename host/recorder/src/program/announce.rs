@@ -55,7 +55,15 @@ impl Course {
         let per_s: usize = self.asked.values().map(|(_, _, per_s)| *per_s).fold(0, usize::saturating_add);
         let wanted = largest.saturating_add(per_s).clamp(*STAGING.start(), *STAGING.end());
         self.room = self.room.max(wanted);
-        self.grow_preroll()?;
+        if let Err(error) = self.grow_preroll() {
+            // The others go on with what they have.
+            self.asked.remove(&name);
+            let why = Failure::from(error).to_string();
+            warn!(lambda = %name, %why, "a lambda cannot be recorded for");
+            answers.refused(&why);
+            self.lambdas_refused += 1;
+            return Ok(());
+        }
         self.recorder.grow_length(rules.max_length);
         self.lambdas.push(Lambda::new(name, rules, topics, spoken, answers));
         Ok(())

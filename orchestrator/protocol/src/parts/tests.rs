@@ -122,7 +122,8 @@ fn the_python_that_the_user_wants_comes_before_those_of_lambda_and_checkout() {
     let dir = checkout();
     let exe = dir.path("target/release/gleaner");
     let wanted = python(&dir, "wanted/python", "3 9");
-    let own = python(&dir, "lambda/.venv/bin/python3", "3 12");
+    let own = python(&dir, "elsewhere/bin/python3", "3 12");
+    environment(&dir, &own);
     let shared = python(&dir, ".venv/bin/python3", "4 0");
     let lambda = dir.path("lambda");
 
@@ -132,6 +133,38 @@ fn the_python_that_the_user_wants_comes_before_those_of_lambda_and_checkout() {
     assert_eq!(parts.python(Some(&lambda)).unwrap(), own);
     assert_eq!(parts.python(None).unwrap(), shared);
     assert_eq!(parts.python(Some(&dir.path("another"))).unwrap(), shared);
+}
+
+/// A virtual environment in the folder `lambda`, as `python3 -m venv` makes it of `program`.
+fn environment(dir: &Scratch, program: &std::path::Path) {
+    let home = program.parent().unwrap().display();
+    dir.write("lambda/.venv/pyvenv.cfg", &format!("home = {home}\n"));
+    let link = dir.path("lambda/.venv/bin/python3");
+    std::fs::create_dir_all(link.parent().unwrap()).unwrap();
+    let _ = std::fs::remove_file(&link);
+    std::os::unix::fs::symlink(program, link).unwrap();
+}
+
+#[test]
+fn nothing_that_came_with_a_lambda_is_run_to_find_its_python() {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let dir = checkout();
+    let lambda = dir.path("lambda");
+    let shared = python(&dir, ".venv/bin/python3", "3 12");
+    let parts = Parts::around(&dir.path("target/release/gleaner"), None, None);
+    let ran = dir.path("ran");
+    let script = format!("#!/bin/sh\ntouch '{}'\n", ran.display());
+    // A program of its own, and one behind a link within the folder.
+    let own = dir.write_program("lambda/.venv/bin/python3", &script);
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
+    std::fs::rename(own, dir.path("lambda/python3")).unwrap();
+    environment(&dir, &dir.path("lambda/python3"));
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
+    // A good program, with libraries of the lambda's choice.
+    environment(&dir, &python(&dir, "elsewhere/bin/python3", "3 12"));
+    dir.write("lambda/.venv/pyvenv.cfg", &format!("home = {}\n", lambda.display()));
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
+    assert!(!ran.exists());
 }
 
 #[test]
@@ -184,7 +217,7 @@ fn without_a_python_that_runs_each_candidate_is_named_with_its_fault() {
     let locked = dir.write("locked", "");
     let missing = dir.path("missing");
     let root = dir.root().display().to_string();
-    let error = python::first_that_runs(vec![old, silent, split, other, locked, missing]).unwrap_err();
+    let error = python::first_that_runs(vec![old, silent, split, other, locked, missing], None).unwrap_err();
     assert_eq!(
         error.to_string(),
         format!(

@@ -4,7 +4,10 @@ the error, or `escaped`."""
 from __future__ import annotations
 
 import ctypes
+import fcntl
+import mmap
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -58,15 +61,6 @@ class Lambda:
         for i in range(5000):
             ctx.event("flood", 1.0)
 
-    def handles(self, ctx: Context) -> None:
-        for _ in range(100_000):
-            KEPT.append(ctx.input("camera").field("format"))
-
-    def frames(self, ctx: Context) -> None:
-        frame = ctx.input("camera").newest().as_frame()
-        while True:
-            KEPT.append(frame.resize(640, 480))
-
     def fork(self, ctx: Context) -> int:
         if os.fork() == 0:
             while True:
@@ -95,7 +89,10 @@ class Lambda:
             return file.write("here I was")
 
     def chmod(self, ctx: Context) -> None:
-        os.chmod("/tmp", 0o700)
+        os.chmod(__file__, 0o600)
+
+    def truncate(self, ctx: Context) -> None:
+        os.truncate("/tmp/gleaner-no-such-file", 0)
 
     def kill(self, ctx: Context) -> None:
         os.kill(self.target, signal.SIGKILL)
@@ -107,8 +104,24 @@ class Lambda:
             raise OSError(ctypes.get_errno(), "ptrace")
         return self.target
 
-    def priority(self, ctx: Context) -> None:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+    def cores(self, ctx: Context) -> None:
+        os.sched_setaffinity(0, os.sched_getaffinity(0))
+
+    def limits_of_others(self, ctx: Context) -> object:
+        return resource.prlimit(self.target, resource.RLIMIT_CPU, (0, 0))
+
+    def owner(self, ctx: Context) -> object:
+        ours, _theirs = socket.socketpair()
+        return fcntl.fcntl(ours, fcntl.F_SETOWN, self.target)
+
+    def datagrams(self, ctx: Context) -> object:
+        return socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+    def uncounted(self, ctx: Context) -> object:
+        return mmap.mmap(-1, 1 << 30)
+
+    def replace(self, ctx: Context) -> None:
+        os.execv("/bin/true", ["true"])
 
     def sleep(self, ctx: Context) -> None:
         time.sleep(3600)
@@ -134,9 +147,6 @@ class Lambda:
 
     def abort(self, ctx: Context) -> None:
         os.abort()
-
-    def write_frame(self, ctx: Context) -> None:
-        ctx.input("camera").newest().as_frame().as_array()[0] = 1
 
     def corrupt(self, ctx: Context) -> None:
         ctypes.memset(id(ctx), 0xFF, 1 << 16)

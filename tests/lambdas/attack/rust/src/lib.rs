@@ -3,20 +3,19 @@
 
 use std::time::Duration;
 
-use gleaner_sdk::{Config, Error, Field, Frame, Lambda, Result, Tick, event, input, log, now_ns};
+use gleaner_sdk::{Config, Error, Field, Lambda, Result, Tick, event, input, log, now_ns};
 
 struct Attack {
     attack: String,
     wakes: u64,
     fields: Vec<Field>,
-    frames: Vec<Frame>,
     bytes: Vec<Vec<u8>>,
 }
 
 impl Lambda for Attack {
     fn init(config: &Config) -> Result<Self> {
         let attack = config.text("attack")?.to_owned();
-        Ok(Attack { attack, wakes: 0, fields: Vec::new(), frames: Vec::new(), bytes: Vec::new() })
+        Ok(Attack { attack, wakes: 0, fields: Vec::new(), bytes: Vec::new() })
     }
 
     fn on_tick(&mut self, _tick: Tick) -> Result<()> {
@@ -49,13 +48,6 @@ impl Attack {
             "handles" => loop {
                 self.fields.push(input("camera")?.field("format")?);
             },
-            "frames" => {
-                let sample = input("camera")?.newest().ok_or(Error::new("there is no frame yet"))?;
-                let frame = sample.as_frame()?;
-                loop {
-                    self.frames.push(frame.resize(640, 480)?);
-                }
-            }
             "fork" | "program" => drop(std::process::Command::new("/bin/true").status()?),
             "read_passwd" => drop(std::fs::read("/etc/passwd")?),
             "socket" => drop(std::net::UdpSocket::bind("127.0.0.1:0")?),
