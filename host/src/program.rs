@@ -62,16 +62,16 @@ impl Job {
     /// The files that a process needs from its start, its results among them, whose place is made.
     fn around(&self) -> Result<Paths, Failure> {
         let results = match self {
-            Self::Replay(job) => job.results(),
+            Self::Replay(job) => {
+                job.make_journal()?;
+                job.results()
+            }
             #[cfg(feature = "dds")]
             Self::Live(job) => Some(job.results()),
         };
         let mut paths = self.inside().paths;
         if let Some(folder) = results {
             paths.write.push(place_of_results(folder, &self.lambda().0.lambda)?);
-        }
-        if let Self::Replay(job) = self {
-            job.make_journal()?;
         }
         Ok(paths)
     }
