@@ -7,7 +7,6 @@
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use gleaner_jail::alone::Grants;
 use gleaner_jail::{Paths, alone, files, memory, tried};
 use gleaner_protocol::{Exit, Failure, LAYERS_ENV, Layer};
 use gleaner_vitals::{PULSE_ENV, Pulse};
@@ -23,13 +22,9 @@ pub struct Isolation {
 /// What is left to a lambda's process.
 #[derive(Clone, Debug, Default)]
 pub struct Inside {
-    /// This process is a Python interpreter.
-    pub is_interpreter: bool,
     /// Files that it may still open.
     pub paths: Paths,
-    /// What its manifest grants.
-    pub grants: Grants,
-    /// Memory that this process may still take, in bytes; none if what runs the lambda counts the lambda's by itself.
+    /// Memory that this process may still take, in bytes, if it is an interpreter; that of a component is counted as it grows.
     pub memory: Option<u64>,
 }
 
@@ -59,7 +54,7 @@ impl Isolation {
     /// not there. Later calls change nothing.
     pub fn close(&self) -> &[Layer] {
         self.layers.get_or_init(|| {
-            let Inside { paths, grants, memory: allowed, is_interpreter } = &self.inside;
+            let Inside { paths, memory: allowed } = &self.inside;
             let mut layers = told_by_starter();
             if layers.iter().any(|layer| layer.name == files::NAME) {
                 // Reading is confined already, by who knew what the interpreter reads.
@@ -68,7 +63,7 @@ impl Isolation {
                     layers.retain(|layer| layer.name != files::NAME);
                     layers.push(layer);
                 }
-            } else if *is_interpreter {
+            } else if allowed.is_some() {
                 // What it reads only whoever starts it can know.
                 layers.push(Layer::no(files::NAME, "this interpreter was not started by gleaner-runtime"));
             } else {
@@ -76,7 +71,7 @@ impl Isolation {
             }
             let counted = || Layer::yes(memory::NAME, "the component's memories are counted as they grow");
             layers.push(allowed.map_or_else(counted, memory::limit));
-            layers.extend(alone::stay(*grants));
+            layers.extend(alone::stay(allowed.is_some()));
             tried::tried(layers)
         })
     }

@@ -8,7 +8,6 @@ use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
 use gleaner_jail::Paths;
-use gleaner_jail::alone::Grants;
 use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
 
@@ -88,8 +87,7 @@ impl Job {
             Kind::Wasm => None,
             Kind::Python => Some(manifest.limits.memory.bytes().saturating_add(ours)),
         };
-        let grants = Grants { uncounted_memory_is_refused: memory.is_some(), ..Grants::default() };
-        Inside { is_interpreter: manifest.lambda.kind == Kind::Python, paths, grants, memory }
+        Inside { paths, memory }
     }
 
     fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {

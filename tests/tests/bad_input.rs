@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use gleaner_protocol::FaultKind;
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, corrupted, image, one_topic, truncated};
-use gleaner_tests::{Copy, Folder, Run, replay, root, sample_drive};
+use gleaner_tests::{Copy, Folder, Run, replay, root, runtime, sample_drive};
 
 const USAGE: u8 = 2;
 const FAULTED: u8 = 6;
@@ -348,5 +348,20 @@ fn a_sample_larger_than_max_size_is_counted_and_said() {
         let summary = run.must_exit(0).summary.as_ref().expect("a summary");
         assert_eq!((summary.wakes, summary.topics[0].too_big, summary.topics[0].received), (0, 1, 0));
         says(&run, &["samples dropped: larger than max_size", "camera", "1048576"]);
+    }
+}
+
+#[test]
+fn a_page_of_the_shim_that_is_none_is_refused() {
+    let folder = Folder::new();
+    // No number, none that can be a page, a file that is not open.
+    for number in ["", "seven", "-4", "1", "99999"] {
+        let mut replay = runtime();
+        replay.env("GLEANER_PULSE", number).arg("replay").arg(root().join("examples/hello/rust"));
+        let output =
+            replay.arg(sample_drive()).arg("--out").arg(folder.path()).output().expect("gleaner-runtime starts");
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{number}: {said}");
+        assert!(said.contains("cannot use the shim's page") && said.contains("GLEANER_PULSE names no page"), "{said}");
     }
 }

@@ -1,11 +1,9 @@
 //! `summary.json` of a run whose lambda was started again: its processes each count for themselves, and only who started them has
 //! seen them all.
 
-use std::fs::{self, File};
-use std::io::{self, Write};
 use std::path::Path;
 
-use gleaner_protocol::{Exit, Failure, Live};
+use gleaner_protocol::{Exit, Failure, Live, write_whole};
 
 /// What the processes of a lambda counted that have ended.
 #[derive(Default)]
@@ -30,18 +28,10 @@ impl Earlier {
         let Some(before) = self.0 else { return Ok(()) };
         let last = last.map_or_else(|| before.clone(), |last| last.after(&before));
         // Not where the report says: it comes from the lambda's process.
-        let (path, part) = (out.join("summary.json"), out.join("summary.json.part"));
+        let path = out.join("summary.json");
         let mut text = serde_json::to_vec_pretty(&last).expect("counts are plain data");
         text.push(b'\n');
-        let write = || -> io::Result<()> {
-            // A new one: what is there may be a link to somewhere else.
-            let _ = fs::remove_file(&part);
-            let mut file = File::options().write(true).create_new(true).open(&part)?;
-            file.write_all(&text)?;
-            file.sync_all()?;
-            fs::rename(&part, &path)
-        };
-        write()
+        write_whole(&path, &text)
             .map_err(|error| Failure::caused_by(Exit::Internal, format!("cannot write `{}`", path.display()), &error))
     }
 }

@@ -8,15 +8,6 @@ use gleaner_protocol::Layer;
 use crate::JailError;
 use crate::filter::{Refused, install, install_everywhere};
 
-/// What of it is different for a process.
-#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
-pub struct Grants {
-    /// It may start processes, and end them.
-    pub processes: bool,
-    /// Memory is bounded for the whole process, so what that bound does not count is refused.
-    pub uncounted_memory_is_refused: bool,
-}
-
 /// The name of the layer for processes.
 pub const PROCESSES: &str = "processes";
 /// The name of the layer for sockets.
@@ -98,6 +89,7 @@ const SHARED_HERE: &[i64] =
 const SHARED_HERE: &[i64] = &[];
 
 // Younger than libc's lists, with the same numbers on every machine.
+const MEMFD_SECRET: i64 = 447;
 const FCHMODAT2: i64 = 452;
 const SETXATTRAT: i64 = 463;
 const REMOVEXATTRAT: i64 = 466;
@@ -108,35 +100,36 @@ const OWNERS: [u64; 3] = [8, 10, 15];
 /// Requests of `ioctl`: the same for sockets, and typing into somebody's terminal.
 const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
 
+/// Families of sockets that Linux knows, with some to come.
+const FAMILIES: i32 = 64;
+
 /// All bits of an argument.
 const ALL: u64 = u32::MAX as u64;
 /// The bits of a socket's type that are not flags.
 const TYPE: u64 = 0xf;
 
-/// Leaves this process alone, in all of its threads. Gives the layers with what was refused; whether they hold is for
+/// Leaves this process alone, in all of its threads. With `only_counted_memory` it can take none that a
+/// [`memory::limit`](crate::memory::limit) does not count. Gives the layers with what was refused; whether they hold is for
 /// [`tried`](crate::tried) to see.
-pub fn stay(grants: Grants) -> Vec<Layer> {
-    match install_for(grants) {
-        Ok(()) => {
-            let processes = if grants.processes {
-                Layer::no(PROCESSES, "granted by the manifest")
-            } else {
-                Layer::yes(PROCESSES, "seccomp: no new ones, no programs, no signals to others")
-            };
-            vec![
-                processes,
-                Layer::yes(SOCKETS, "seccomp: no new ones, no connections"),
-                Layer::yes(SHARE, "seccomp: no priorities, no cores, no shared memory, no owners or dates of files"),
-            ]
-        }
+pub fn stay(only_counted_memory: bool) -> Vec<Layer> {
+    match install_all(only_counted_memory) {
+        Ok(()) => vec![
+            Layer::yes(PROCESSES, "seccomp: no new ones, no programs, no signals to others"),
+            Layer::yes(SOCKETS, "seccomp: no new ones, no connections"),
+            Layer::yes(SHARE, "seccomp: no priorities, no cores, no shared memory, no owners or dates of files"),
+        ],
         Err(error) => [PROCESSES, SOCKETS, SHARE].map(|name| Layer::no(name, error.told())).to_vec(),
     }
 }
 
-fn install_for(grants: Grants) -> Result<(), JailError> {
+fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
     let me = u64::from(std::process::id());
-    let mut refused = Refused::default()
+    let mut refused = no_processes(pairs_only(Refused::default()))
         .calls(NEW_SOCKETS)
+        .calls(NEW_PROGRAMS)
+        .calls(SIGNALS)
+        .unless(libc::SYS_kill, 0, me)
+        .unless(libc::SYS_tgkill, 0, me)
         .calls(SHARED)
         .calls(SHARED_HERE)
         // The transport needed it, to find its own sockets.
@@ -146,28 +139,19 @@ fn install_for(grants: Grants) -> Result<(), JailError> {
         .with_pointer(libc::SYS_prlimit64, 2)
         // Else it would outlive `gleaner-shim`, which watches it.
         .bits(libc::SYS_prctl, 0, ALL, libc::PR_SET_PDEATHSIG as u64);
-    refused = pairs_only(refused);
     for request in OWNERS {
         refused = refused.bits(libc::SYS_fcntl, 1, ALL, request);
     }
     for request in REQUESTS {
         refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
     }
-    if grants.uncounted_memory_is_refused {
-        // What RLIMIT_DATA does not count.
+    if only_counted_memory {
         let shared = (libc::MAP_SHARED | libc::MAP_ANONYMOUS) as u64;
         let down = libc::MAP_GROWSDOWN as u64;
         refused = refused
             .bits(libc::SYS_mmap, 3, shared, shared)
             .bits(libc::SYS_mmap, 3, down, down)
             .calls(&[libc::SYS_memfd_create, MEMFD_SECRET]);
-    }
-    if !grants.processes {
-        refused = no_processes(refused).calls(NEW_PROGRAMS).calls(SIGNALS).unless(libc::SYS_kill, 0, me).unless(
-            libc::SYS_tgkill,
-            0,
-            me,
-        );
     }
     install_everywhere(&refused.filter(libc::EPERM)?)
 }
@@ -187,11 +171,6 @@ pub fn before_interpreter() -> Result<(), JailError> {
     }
     install(&refused.filter(libc::EPERM)?)
 }
-
-/// Families of sockets that Linux knows, with some to come.
-const FAMILIES: i32 = 64;
-/// See above.
-const MEMFD_SECRET: i64 = 447;
 
 fn no_processes(refused: Refused) -> Refused {
     refused.calls(NEW_PROCESSES).bits(libc::SYS_clone, 0, libc::CLONE_THREAD as u64, 0)

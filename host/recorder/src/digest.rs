@@ -14,7 +14,7 @@ pub fn lambda_digest(files: &[FileDigest]) -> String {
 }
 
 /// In hexadecimal digits.
-pub(crate) fn hex(digest: &[u8]) -> String {
+pub fn hex(digest: &[u8]) -> String {
     digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 

@@ -17,7 +17,6 @@ use std::process::{Child, Command, ExitCode};
 use std::time::Duration;
 
 use clap::Parser;
-use gleaner_jail::alone::Grants;
 use gleaner_jail::cgroup::{Bounds, Group};
 use gleaner_jail::{Paths, alone, cgroup, files, memory, never, tried};
 use gleaner_protocol::{Exit, ExitRecord, Failure, LAYERS_ENV, Layer};
@@ -131,16 +130,12 @@ fn end_alike(record: &ExitRecord) -> ExitCode {
         let mut failure = Failure::new(Exit::LambdaFaulted, "the lambda was killed");
         failure.causes = vec![format!("its process {}", killed.sentence())];
         eprintln!("{}", failure.with_help("raise `deadline` in [limits], or do less in one wake"));
-        return failure_code();
+        return Exit::LambdaFaulted.code().into();
     }
     if let Some(signal) = record.signal {
         signals::end_by(signal);
     }
     u8::try_from(record.code.unwrap_or(1)).unwrap_or(1).into()
-}
-
-fn failure_code() -> ExitCode {
-    Exit::LambdaFaulted.code().into()
 }
 
 fn end_now(mut child: Child) {
@@ -169,7 +164,7 @@ fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
     layers.push(own_group(args).1);
     layers.push(files::confine(&Paths::default()));
     layers.push(memory::limit(64 << 20));
-    layers.extend(alone::stay(Grants::default()));
+    layers.extend(alone::stay(true));
     let layers = tried::tried(layers);
     println!("{}", serde_json::to_string(&layers).expect("layers are plain data"));
     Ok(ExitCode::SUCCESS)

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use gleaner_protocol::journal::{FileDigest, Header, JournalInput};
 use gleaner_protocol::manifest::{ConfigValue, Manifest, Schedule};
 use gleaner_protocol::{BuildDir, Explain};
+use gleaner_recorder::hex;
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
@@ -83,7 +84,7 @@ fn manifest_digest(manifest: &Manifest) -> String {
         table.remove("limits");
     }
     without_descriptions(&mut json);
-    hex(Sha256::new_with_prefix(json.to_string()))
+    hex(&Sha256::digest(json.to_string()))
 }
 
 fn without_descriptions(json: &mut Value) {
@@ -156,9 +157,5 @@ fn digest_of_file(path: &Path) -> Result<FileDigest, IdentityError> {
     let mut file = File::open(path).map_err(failed)?;
     let mut digest = Sha256::new();
     let bytes = io::copy(&mut file, &mut digest).map_err(failed)?;
-    Ok(FileDigest { path: path.to_string_lossy().into_owned(), bytes, sha256: hex(digest) })
-}
-
-fn hex(digest: Sha256) -> String {
-    digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    Ok(FileDigest { path: path.to_string_lossy().into_owned(), bytes, sha256: hex(&digest.finalize()) })
 }

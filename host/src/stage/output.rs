@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Decision, Exit, Explain};
+use gleaner_protocol::{Decision, Exit, Explain, write_whole};
 use serde::Serialize;
 
 use crate::api::log::Line;
@@ -117,12 +117,9 @@ impl Output {
     pub fn finish(mut self, summary: &impl Serialize) -> Result<(), OutputError> {
         self.flush()?;
         let path = self.folder.join(SUMMARY);
-        // So that it is whole, or not there.
-        let part = self.folder.join(format!("{SUMMARY}.part"));
         let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
         text.push(b'\n');
-        let written = fs::write(&part, text).and_then(|()| fs::rename(&part, &path));
-        written.map_err(|source| OutputError { path, source })
+        write_whole(&path, &text).map_err(|source| OutputError { path, source })
     }
 }
 

@@ -1,10 +1,10 @@
-use std::fs::{self, File};
-use std::io::{self, Read, Write};
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Exit;
+use crate::{Exit, write_whole};
 
 /// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if it was not there at that time.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -116,16 +116,7 @@ impl ExitRecord {
     pub fn write(&self, path: &Path) -> io::Result<()> {
         let mut text = serde_json::to_vec_pretty(self).expect("a record is plain data");
         text.push(b'\n');
-        let mut part = path.as_os_str().to_owned();
-        part.push(".part");
-        // A new one: what is there may be a link to somewhere else.
-        let _ = fs::remove_file(&part);
-        let mut file = File::options().write(true).create_new(true).open(&part)?;
-        file.write_all(&text)?;
-        file.sync_all()?;
-        fs::rename(&part, path)?;
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
-        File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
+        write_whole(path, &text)
     }
 
     /// Reads the record at `path`.
@@ -142,6 +133,8 @@ impl ExitRecord {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use crate::scratch::Scratch;
 

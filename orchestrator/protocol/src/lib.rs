@@ -21,6 +21,7 @@ mod report;
 mod scratch;
 mod sources;
 mod vehicle;
+mod whole;
 mod words;
 
 pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
@@ -36,4 +37,5 @@ pub use parts::{Parts, PartsError};
 pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
 pub use sources::Sources;
 pub use vehicle::Vehicle;
+pub use whole::write_whole;
 pub use words::visible;

@@ -47,8 +47,12 @@ pub(super) const STAGING: std::ops::RangeInclusive<usize> = 8 << 20..=256 << 20;
 /// Room on the disk above the floor from which on clips are begun again.
 const SLACK: u64 = 64 << 20;
 
-/// Records until it is to end.
-pub(super) fn run(
+/// Records until the starter says stop, or ends, or `stop` is set; then open clips are completed.
+///
+/// # Errors
+///
+/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead: whoever started this starts it again.
+pub fn run(
     options: Options,
     feed: impl FnOnce() -> Result<Box<dyn Feed>, Failure>,
     control: OwnedFd,

@@ -37,6 +37,7 @@ use gleaner_transport::dds::Clock;
 use rustix::process::{Signal, set_parent_process_death_signal};
 
 use args::Args;
+pub use course::run;
 pub use watch::{Feed, Pulse};
 
 /// How the process records.
@@ -86,21 +87,6 @@ fn start(args: Args) -> Result<(), Failure> {
     let reports = reports().map_err(internal("cannot set up the report stream"))?;
     let (options, network) = args.read()?;
     run(options, || network.open(), control, reports, stop)
-}
-
-/// Records until the starter says stop, or ends, or `stop` is set; then open clips are completed.
-///
-/// # Errors
-///
-/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead: whoever started this starts it again.
-pub fn run(
-    options: Options,
-    feed: impl FnOnce() -> Result<Box<dyn Feed>, Failure>,
-    control: OwnedFd,
-    reports: File,
-    stop: Arc<AtomicBool>,
-) -> Result<(), Failure> {
-    course::run(options, feed, control, reports, stop)
 }
 
 /// Standard input, which has to be the socket of the starter.

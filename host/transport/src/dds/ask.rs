@@ -96,7 +96,7 @@ struct Call {
     whom: Whom,
     writer: RawWriter,
     reader: RawReader,
-    sent: Option<SequenceNumber>,
+    sent: Option<(SequenceNumber, Option<Header>)>,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -162,7 +162,7 @@ impl Open {
             call.send(around, &self.ask)?;
         }
         self.lacks = (format!("node `{node}` did not answer within {} s", LIMIT.as_secs()), true);
-        call.take(around, &self.ask).map(|answer| match answer {
+        call.take(around).map(|answer| match answer {
             Ok((cdr, endian)) => Outcome::Answer { node, hash: call.whom.hash.clone(), cdr, endian },
             Err(why) => Outcome::Silence { why: format!("node `{node}`: {why}"), again: true },
         })
@@ -260,14 +260,14 @@ impl Call {
         // Fast DDS waits for this reader, then, before it answers. The number is that of the question, which it knows.
         let related = SampleIdentity { writer_guid: self.reader.guid(), sequence_number: SequenceNumber::UNKNOWN };
         let options = WriteOptionsBuilder::new().related_sample_identity_opt(header.is_none().then_some(related));
-        self.sent = self.writer.write_with_options(question, options.build()).ok().map(|sent| sent.sequence_number);
-        self.sent.map(|_| ())
+        let sent = self.writer.write_with_options(question, options.build()).ok()?;
+        self.sent = Some((sent.sequence_number, header));
+        Some(())
     }
 
     /// The answer, or why there is none; `None` while there is neither.
-    fn take(&mut self, around: &Around<'_>, ask: &Ask) -> Option<Result<(Vec<u8>, Endian), String>> {
-        let sent = self.sent?;
-        let header = self.header(around, ask);
+    fn take(&mut self, around: &Around<'_>) -> Option<Result<(Vec<u8>, Endian), String>> {
+        let (sent, header) = self.sent?;
         self.reader.drain_read_notifications();
         for _ in 0..KEPT {
             let memory = CopyInto { sink: None, memory: around.memory, clock: around.clock };

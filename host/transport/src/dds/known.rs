@@ -10,7 +10,7 @@ use super::ask::{Ask, Asked, Outcome};
 use super::names::visible;
 use super::receive::{Command, Line};
 use super::state::State;
-use crate::message::{Definitions, Described, MessageError, Sources, SourcesError};
+use crate::message::{Definitions, Described, MessageError, Sources, SourcesError, chain};
 
 /// How often a type is asked for, at most.
 const ASKED: usize = 3;
@@ -126,12 +126,6 @@ impl Known {
             }
         })
     }
-}
-
-/// An error with its causes, in one line.
-fn chain(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(Some(error), |error| error.source());
-    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
 }
 
 #[cfg(test)]

@@ -35,4 +35,4 @@ pub use views::{CompressedView, ImageView};
 
 pub(crate) use definitions::short_name;
 #[cfg(feature = "dds")]
-pub(crate) use described::{Described, Header, question};
+pub(crate) use described::{Described, Header, chain, question};
