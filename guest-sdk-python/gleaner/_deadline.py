@@ -3,7 +3,8 @@ in ``time.sleep``, in a long operation of numpy as soon as it is over. Who does 
 
 from __future__ import annotations
 
-import signal
+# What `signal` is made of. That turns numbers into enumerations and back, which costs 55 us in a wake whose code has left the caches.
+import _signal  # type: ignore[import-not-found]
 from types import FrameType
 from typing import Optional
 
@@ -22,9 +23,10 @@ def arm(seconds: float) -> None:
     _was_late = False
     if seconds:
         # Each time: a lambda may have taken it in a wake before. By the main thread, as Python wants it.
-        signal.signal(signal.SIGALRM, _late)
+        if _signal.getsignal(_signal.SIGALRM) is not _late:
+            _signal.signal(_signal.SIGALRM, _late)
         _is_armed = True
-        signal.setitimer(signal.ITIMER_REAL, seconds, AGAIN)
+        _signal.setitimer(_signal.ITIMER_REAL, seconds, AGAIN)
 
 
 def disarm() -> bool:
@@ -33,7 +35,7 @@ def disarm() -> bool:
     if _is_armed:
         # First this: a signal that is on its way must not become an exception any more.
         _is_armed = False
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        _signal.setitimer(_signal.ITIMER_REAL, 0)
     return _was_late
 
 
