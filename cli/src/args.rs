@@ -126,6 +126,9 @@ pub struct RunArgs {
     /// Most bytes of clips that are kept, likewise
     #[arg(long, value_name = "BYTES")]
     pub bytes_max: Option<u64>,
+    /// Give the lambda's process a control group of its own in this folder of cgroup v2, delegated to this user
+    #[arg(long, value_name = "DIR")]
+    pub cgroup: Option<PathBuf>,
     /// Print what is reported as JSON, an object a line
     #[arg(long, conflicts_with = "stats")]
     pub json: bool,

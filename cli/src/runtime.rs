@@ -94,7 +94,7 @@ pub(crate) fn run(arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Fai
 /// Starts the runtime below its shim.
 fn start(program: PathBuf, runtime: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
     Command::new(&program)
-        .args(["--with-starter", "--"])
+        .args([&format!("--starter={}", std::process::id()), "--"])
         .arg(runtime)
         .args(arguments)
         .stdin(Stdio::null())
@@ -140,10 +140,17 @@ pub(crate) fn pass_on(says: impl Read, explained: &AtomicBool, mut show: impl Fn
         if at_start && line.starts_with(b"error: ") {
             explained.store(true, Ordering::Relaxed);
         }
-        show(&line);
+        show(fit_to_print(&line).as_bytes());
         at_start = line.ends_with(b"\n");
         line.clear();
     }
+}
+
+/// With what a terminal would act on written out.
+fn fit_to_print(piece: &[u8]) -> String {
+    let text = String::from_utf8_lossy(piece);
+    let (words, end) = text.strip_suffix('\n').map_or((&*text, ""), |words| (words, "\n"));
+    words.split('\t').map(visible).collect::<Vec<_>>().join("\t") + end
 }
 
 fn progress_bar() -> ProgressBar {
@@ -176,6 +183,19 @@ mod tests {
         assert_eq!(shown[0], b"one\n");
         assert_eq!(shown.concat(), text.as_bytes());
         assert!(shown.iter().all(|piece| piece.len() <= 8192));
+    }
+
+    #[test]
+    fn nothing_that_is_passed_on_acts_on_a_terminal() {
+        for (said, shown) in [
+            ("plain\ttext, ä\n", "plain\ttext, ä\n"),
+            ("\u{1b}]0;owned\u{7}\n", "\\u{1b}]0;owned\\u{7}\n"),
+            ("back\rover", "back\\rover"),
+            ("\u{202e}turned", "\\u{202e}turned"),
+        ] {
+            assert_eq!(fit_to_print(said.as_bytes()), shown);
+        }
+        assert_eq!(fit_to_print(b"\xffbroken\n"), "\u{fffd}broken\n");
     }
 
     #[test]

@@ -24,7 +24,7 @@ pub const UNSAFE_FILES: &[&str] = &[
 pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-buffers", &[]),
     ("gleaner-cli", &["gleaner-protocol"]),
-    ("gleaner-compile", &["gleaner-protocol"]),
+    ("gleaner-compile", &["gleaner-jail", "gleaner-protocol"]),
     (
         "gleaner-host",
         &[

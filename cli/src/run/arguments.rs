@@ -1,7 +1,7 @@
 //! What the processes of a run are told.
 
 use std::ffi::{OsStr, OsString};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::args::RunArgs;
@@ -36,6 +36,13 @@ pub(super) fn runtime(
     }
     line.extend(network(&args.network));
     line.extend(["--".into(), args.asked.lambda.clone().into()]);
+    line
+}
+
+/// The arguments of the runtime's shim.
+pub(super) fn shim(args: &RunArgs, exit_record: &Path) -> Vec<OsString> {
+    let mut line = vec![word("--exit-record", exit_record), format!("--starter={}", std::process::id()).into()];
+    line.extend(args.cgroup.as_ref().map(|folder| word("--cgroup", folder)));
     line
 }
 

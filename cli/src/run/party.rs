@@ -18,6 +18,9 @@ use crate::args::RunArgs;
 /// How long after the end of all processes their streams may still bring something: what they left running may hold them open.
 const REST: Duration = Duration::from_millis(300);
 
+/// Reports that may wait to be shown. Beyond that they stay in their pipe, and whoever writes them counts what does not go in.
+const UNHEARD: usize = 16;
+
 /// How a run ended.
 pub(super) enum Ended {
     /// It was told to, or its time was over.
@@ -51,7 +54,7 @@ impl Party {
         restarts: u32,
     ) -> Result<Self, Failure> {
         let parts = Parts::find()?;
-        let (say, heard) = mpsc::channel();
+        let (say, heard) = mpsc::sync_channel(UNHEARD);
         let failed = |error: &dyn std::error::Error| {
             Failure::caused_by(Exit::Internal, "cannot connect lambda and recorder", error)
         };
@@ -67,8 +70,8 @@ impl Party {
         }
         let line = arguments::runtime(args, socket.is_some(), offset_ns, left, restarts);
         let exit_record = arguments::out(args).join(ExitRecord::FILE);
-        let runtime =
-            Process::start(&parts, "gleaner-runtime", line, socket, Some(&exit_record), Heard::Runtime, &say)?;
+        let shim = Some(arguments::shim(args, &exit_record));
+        let runtime = Process::start(&parts, "gleaner-runtime", line, socket, shim, Heard::Runtime, &say)?;
         Ok(Self { runtime, exit_record, recorder, ear: Ear::new(heard) })
     }
 

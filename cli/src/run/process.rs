@@ -4,10 +4,10 @@ use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::CommandExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::AtomicBool;
-use std::sync::mpsc::Sender;
+use std::sync::mpsc::SyncSender;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -31,17 +31,17 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts it; its reports are `T`, and are heard as `heard` says. With `exit_record` it is a runtime, which has a shim.
+    /// Starts it; its reports are `T`, and are heard as `heard` says. With `shim`, arguments of gleaner-shim, it is a runtime.
     pub(super) fn start<T: DeserializeOwned + 'static>(
         parts: &Parts,
         name: &'static str,
         line: Vec<OsString>,
         stdin: Option<OwnedFd>,
-        exit_record: Option<&Path>,
+        shim: Option<Vec<OsString>>,
         heard: fn(T) -> Heard,
-        say: &Sender<Heard>,
+        say: &SyncSender<Heard>,
     ) -> Result<Self, Failure> {
-        let (program, line) = watched(parts, name, line, exit_record)?;
+        let (program, line) = watched(parts, name, line, shim)?;
         let mut child = Command::new(&program)
             .args(line)
             // Ctrl-C is for us: we end them in order.
@@ -111,22 +111,20 @@ impl Drop for Process {
     }
 }
 
-/// The program to start and its arguments: `name` itself, or the shim that writes `exit_record` and starts it.
+/// The program to start and its arguments: `name` itself, or the shim that starts it.
 fn watched(
     parts: &Parts,
     name: &str,
     line: Vec<OsString>,
-    exit_record: Option<&Path>,
+    shim: Option<Vec<OsString>>,
 ) -> Result<(PathBuf, Vec<OsString>), Failure> {
     let program = parts.program(name)?;
-    let Some(path) = exit_record else { return Ok((program, line)) };
-    let mut record = OsString::from("--exit-record=");
-    record.push(path);
-    let shim = [record, "--with-starter".into(), "--".into(), program.into()];
-    Ok((parts.program("gleaner-shim")?, shim.into_iter().chain(line).collect()))
+    let Some(shim) = shim else { return Ok((program, line)) };
+    let below = ["--".into(), program.into()];
+    Ok((parts.program("gleaner-shim")?, shim.into_iter().chain(below).chain(line).collect()))
 }
 
-fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &Sender<Heard>) {
+fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &SyncSender<Heard>) {
     let mut reports = BufReader::new(reports);
     let mut line = Vec::new();
     while matches!((&mut reports).take(REPORT_BYTES).read_until(b'\n', &mut line), Ok(1..)) {

@@ -4,7 +4,8 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use gleaner_compile::{COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES};
+use gleaner_compile::{COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError};
+use gleaner_jail::{Paths, alone, files};
 use gleaner_protocol::{Exit, Failure};
 use rustix::process::{Resource, Rlimit, setrlimit};
 
@@ -22,7 +23,7 @@ struct Args {
 fn main() -> ExitCode {
     let args = Args::parse();
     bound_this_process();
-    match gleaner_compile::compile(&args.component, &args.cache) {
+    match confine_to(&args).and_then(|()| gleaner_compile::compile(&args.component, &args.cache)) {
         Ok(entry) => {
             println!("{}", entry.display());
             Exit::Ok.into()
@@ -33,6 +34,16 @@ fn main() -> ExitCode {
             failure.exit.into()
         }
     }
+}
+
+/// Whatever a component makes of the compiler: it can read that component and the system's libraries, and write into the cache.
+/// Where the kernel cannot do that, the bounds above are all there is; what is below this process is said by who runs it.
+fn confine_to(args: &Args) -> Result<(), CompileError> {
+    gleaner_compile::make_cache(&args.cache)?;
+    let paths = Paths { read: vec![args.component.clone()], write: vec![args.cache.clone()] };
+    files::confine(&paths);
+    alone::stay(false);
+    Ok(())
 }
 
 /// Past these limits an allocation fails, or the kernel ends this process; whoever started it says so.

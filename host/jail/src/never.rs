@@ -2,6 +2,9 @@
 
 use gleaner_protocol::Layer;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use rustix::thread::{
+    CapabilitySet, CapabilitySets, capabilities, remove_capability_from_bounding_set, set_capabilities,
+};
 
 use crate::JailError;
 use crate::filter::{Refused, install};
@@ -103,7 +106,36 @@ const MACHINE_CALLS: &[i64] = &[];
 
 /// Refuses all of that to this process, and to what it starts. Says what holds.
 pub fn forbid() -> Vec<Layer> {
-    vec![privileges(), core_dumps(), open_files(), calls()]
+    vec![privileges(), powers(), core_dumps(), open_files(), calls()]
+}
+
+/// What root has, or who was given a part of it. Files stay as they are: in a container root often writes into a folder of
+/// somebody else, and which files there are at all is for Landlock to say.
+fn powers() -> Layer {
+    const NAME: &str = "capabilities";
+    const KEPT: CapabilitySet = CapabilitySet::DAC_OVERRIDE.union(CapabilitySet::DAC_READ_SEARCH);
+    let given_up = || {
+        let had = capabilities(None)?;
+        if had.permitted.is_empty() {
+            return Ok(had.permitted);
+        }
+        for power in CapabilitySet::all().difference(KEPT).iter() {
+            // One that is not known here is not there either; without leave to do this, no_new_privs keeps them from coming back.
+            let _ = remove_capability_from_bounding_set(power);
+        }
+        let (effective, permitted) = (had.effective & KEPT, had.permitted & KEPT);
+        set_capabilities(None, CapabilitySets { effective, permitted, inheritable: CapabilitySet::empty() })?;
+        Ok(capabilities(None)?.permitted)
+    };
+    let given_up: rustix::io::Result<CapabilitySet> = given_up();
+    match given_up {
+        Ok(left) if left.is_empty() => Layer::yes(NAME, "none"),
+        Ok(left) if KEPT.contains(left) => {
+            Layer::yes(NAME, "given up, but for reading and writing files of other users")
+        }
+        Ok(_) => Layer::no(NAME, "could not be given up"),
+        Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
+    }
 }
 
 fn privileges() -> Layer {

@@ -4,7 +4,7 @@
 //! kills the runtime when it does not come back from a lambda in time; ends what the runtime left behind; and writes down how it
 //! ended. Its own exit is that of the runtime. It has one thread, allocates next to nothing, and looks ten times a second.
 //!
-//! It lives as long as its runtime, even if whoever started it goes away; with `--with-starter` it then asks the runtime to end.
+//! It lives as long as its runtime, even if whoever started it goes away; with `--starter` it then asks the runtime to end.
 
 mod environment;
 mod left_behind;
@@ -35,9 +35,9 @@ struct Args {
     /// Write down here how it ended.
     #[arg(long, value_name = "FILE")]
     exit_record: Option<PathBuf>,
-    /// Ask it to end when whoever started this shim dies.
-    #[arg(long)]
-    with_starter: bool,
+    /// Ask it to end when this process dies, which started this shim.
+    #[arg(long, value_name = "PID")]
+    starter: Option<u32>,
     /// Give it a control group of its own in this folder, which was delegated to this user.
     #[arg(long, value_name = "DIR")]
     cgroup: Option<PathBuf>,
@@ -70,12 +70,10 @@ pub fn main() -> ExitCode {
 
 fn run(args: &Args) -> Result<ExitCode, Failure> {
     let cannot = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
-    if args.with_starter {
-        use rustix::process::{Signal, set_parent_process_death_signal};
-        set_parent_process_death_signal(Some(Signal::TERM))
-            .map_err(|error| cannot("cannot be told of the starter's death", &std::io::Error::from(error)))?;
-    }
     let signals = Signals::hear().map_err(|error| cannot("cannot listen for signals", &error))?;
+    if let Some(starter) = args.starter {
+        end_with(starter)?;
+    }
     left_behind::adopt().map_err(|error| cannot("cannot adopt what a runtime leaves behind", &error))?;
     let (pulse, page) = Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
     // Finding an interpreter, compiling, discovery: until the first word of its own.
@@ -122,6 +120,20 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         eprintln!("gleaner-shim: cannot write `{}`: {error}", path.display());
     }
     Ok(end_alike(&record))
+}
+
+/// Has SIGTERM sent to this process when `starter` dies, which is not said twice: it may be gone already.
+fn end_with(starter: u32) -> Result<(), Failure> {
+    use rustix::process::{Signal, getppid, set_parent_process_death_signal};
+    let cannot = "cannot be told of the starter's death";
+    set_parent_process_death_signal(Some(Signal::TERM))
+        .map_err(|error| Failure::caused_by(Exit::Internal, cannot, &std::io::Error::from(error)))?;
+    let parent = getppid().map(|parent| parent.as_raw_nonzero().get().unsigned_abs());
+    if parent == Some(starter) {
+        return Ok(());
+    }
+    let help = "it has ended meanwhile; else give `--starter` the number of the process that starts gleaner-shim";
+    Err(Failure::new(Exit::Internal, format!("process {starter} is not who started this")).with_help(help))
 }
 
 /// Ends this process as the runtime ended.

@@ -136,11 +136,38 @@ fn every_layer_says_whether_it_holds_here() {
     let output = Command::new(SHIM).arg("--layers").output().unwrap();
     let layers: Vec<Layer> = serde_json::from_slice(&output.stdout).unwrap();
     let names: Vec<_> = layers.iter().map(|layer| layer.name.as_str()).collect();
-    for name in ["new privileges", "system calls", "files", "processes", "sockets", "memory", "control group"] {
+    for name in
+        ["new privileges", "capabilities", "system calls", "files", "processes", "sockets", "memory", "control group"]
+    {
         assert!(names.contains(&name), "{name} is missing in {names:?}");
     }
     // Every Linux that Gleaner runs on has these; Landlock and control groups are told as they are.
     for layer in layers.iter().filter(|layer| !["files", "control group"].contains(&layer.name.as_str())) {
         assert_eq!(layer.holds, Holds::Yes, "{layer:?}");
+    }
+}
+
+#[test]
+fn a_starter_that_is_not_there_any_more_gets_nothing_started() {
+    let folder = std::env::temp_dir().join(format!("gleaner-shim-starter-{}", std::process::id()));
+    let output = Command::new(SHIM).args(["--starter=1", "--", "/bin/mkdir"]).arg(&folder).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8(output.stderr).unwrap().contains("process 1 is not who started this"));
+    assert!(!folder.exists());
+    let starter = format!("--starter={}", std::process::id());
+    let status = Command::new(SHIM).args([&starter, "--", "/bin/mkdir"]).arg(&folder).status().unwrap();
+    assert!(status.success());
+    std::fs::remove_dir(folder).unwrap();
+}
+
+#[test]
+fn what_root_may_do_is_given_up_but_for_files() {
+    let output = Command::new(SHIM).args(["--", "/bin/cat", "/proc/self/status"]).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    // Of all: reading and writing files of others.
+    const FILES: u64 = 1 << 1 | 1 << 2;
+    for set in ["CapInh:", "CapPrm:", "CapEff:", "CapAmb:"] {
+        let bits = text.lines().find_map(|line| line.strip_prefix(set)).expect("a line of this set").trim();
+        assert_eq!(u64::from_str_radix(bits, 16).unwrap() & !FILES, 0, "{set} {bits}");
     }
 }
