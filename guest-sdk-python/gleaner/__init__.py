@@ -42,6 +42,7 @@ from .data import (
 from .error import DeadlineExceeded, Error
 from .inference import Detection, DetectOptions, InferenceError, Model, Preprocess, Tensor
 from .log import Level
+from .scratch import Entry, Scratch, ScratchError
 from .trigger import AttributeValue, TriggerError
 
 __version__ = "0.1.0"
@@ -56,6 +57,7 @@ __all__ = [
     "Detection",
     "Encoding",
     "DeadlineExceeded",
+    "Entry",
     "Error",
     "Field",
     "Frame",
@@ -68,6 +70,8 @@ __all__ = [
     "Preprocess",
     "Roi",
     "Sample",
+    "Scratch",
+    "ScratchError",
     "Stamps",
     "Tensor",
     "Topic",

@@ -6,6 +6,7 @@ from typing import Any, Mapping, Protocol
 
 from .data import Data
 from .log import Log
+from .scratch import Scratch
 from .trigger import Trigger
 
 
@@ -20,6 +21,10 @@ class Context(Data, Trigger, Log, Protocol):
     def config(self) -> Mapping[str, Any]:
         """``[config]`` by key: bool, int, float or str, as the manifest's default has it. The deployment's values lie over
         the manifest's."""
+
+    @property
+    def scratch(self) -> Scratch:
+        """What the host keeps for the lambda, by name, beyond its faults."""
 
     @property
     def missed(self) -> int:

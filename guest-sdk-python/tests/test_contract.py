@@ -1,7 +1,7 @@
 """The WIT package, the classes of `_gleaner` and those of the package `gleaner` have the same names.
 
 The rules: `-` becomes `_`, types are in CamelCase. The functions of the interfaces `data`, `trigger` and `log` are methods
-of `Context`; resources are classes, records are named tuples, an error's variant is the `kind` of an exception, an enum is a
+of `Context`, those of `scratch` of `ctx.scratch`; resources are classes, records are named tuples, an error's variant is the `kind` of an exception, an enum is a
 set of words. What never changes while a handle lives is a property; what asks the host is a method.
 """
 
@@ -16,13 +16,14 @@ import home
 import wit
 
 import gleaner
-from gleaner import data, inference, log, trigger
+from gleaner import data, inference, log, scratch, trigger
 
 INTERFACES = wit.read(home.CHECKOUT / "wit")
 OF_CONTEXT = ("data", "trigger", "log")
 
 PROPERTIES: Dict[str, Set[str]] = {
-    "Context": {"config", "missed"},
+    "Context": {"config", "missed", "scratch"},
+    "Scratch": set(),
     "Topic": {"name", "ros_topic", "type_name"},
     "Field": {"path"},
     "Sample": {"identity", "stamps", "size", "big_endian"},
@@ -33,7 +34,7 @@ PROPERTIES: Dict[str, Set[str]] = {
 
 # What Python has and the WIT has not: `config` comes with `init` there, and `missed` with the tick.
 ONLY_PYTHON: Dict[str, Set[str]] = {
-    "Context": {"config", "missed"},
+    "Context": {"config", "missed", "scratch"},
     "Frame": {"array", "__array__", "__dlpack__", "__dlpack_device__"},
 }
 
@@ -41,6 +42,7 @@ KINDS: Dict[str, Any] = {
     "data-error": data.DataErrorKind,
     "trigger-error": trigger.TriggerErrorKind,
     "inference-error": inference.InferenceErrorKind,
+    "scratch-error": scratch.ScratchErrorKind,
 }
 ENUMS: Dict[str, Any] = {"encoding": data.Encoding, "level": log.Level}
 
@@ -61,7 +63,7 @@ def camel(name: str) -> str:
 def wanted() -> Dict[str, Dict[str, wit.Function]]:
     """The functions of each class, by their names in Python."""
     functions = {name: function for of in OF_CONTEXT for name, function in INTERFACES[of].functions.items()}
-    classes = {"Context": functions}
+    classes = {"Context": functions, "Scratch": INTERFACES["scratch"].functions}
     for interface in INTERFACES.values():
         classes.update({camel(name): functions for name, functions in interface.resources.items()})
     return {cls: {snake(name): function for name, function in of.items()} for cls, of in classes.items()}

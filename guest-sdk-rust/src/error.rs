@@ -3,6 +3,7 @@
 use std::fmt;
 
 use crate::bindings::gleaner::lambda::inference::InferenceError;
+use crate::bindings::gleaner::lambda::scratch::ScratchError;
 use crate::bindings::gleaner::lambda::trigger::TriggerError;
 use crate::bindings::gleaner::lambda::types::DataError;
 
@@ -79,6 +80,16 @@ impl Refusal for TriggerError {
         match self {
             Self::Invalid(message) => ("invalid", message),
             Self::TooMany(message) => ("too-many", message),
+        }
+    }
+}
+
+impl Refusal for ScratchError {
+    fn said(self) -> (&'static str, String) {
+        match self {
+            Self::NoRoom(message) => ("no-room", message),
+            Self::NoSuchEntry(message) => ("no-such-entry", message),
+            Self::WrongName(message) => ("wrong-name", message),
         }
     }
 }

@@ -35,7 +35,7 @@
 //!
 //! [`kernels`] are such functions, for pixels and signals.
 //!
-//! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same four names as the modules here.
+//! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same five names as the modules here.
 
 #[doc(hidden)]
 pub mod bindings;
@@ -46,6 +46,7 @@ pub mod inference;
 pub mod kernels;
 mod lambda;
 pub mod log;
+pub mod scratch;
 pub mod trigger;
 
 pub use config::{Config, ConfigValue};

@@ -85,7 +85,11 @@ impl Job {
         let manifest = self.lambda().1;
         let memory = match manifest.lambda.kind {
             Kind::Wasm => None,
-            Kind::Python => Some(manifest.limits.memory.bytes().saturating_add(ours)),
+            Kind::Python => {
+                // What grows in place may be there twice for a moment.
+                let kept = 2 * manifest.limits.scratch.bytes();
+                Some(manifest.limits.memory.bytes().saturating_add(kept).saturating_add(ours))
+            }
         };
         Inside { paths, memory }
     }

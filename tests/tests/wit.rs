@@ -16,7 +16,7 @@ fn functions(wit: &str) -> Vec<String> {
 #[test]
 fn the_rust_sdk_calls_every_function_of_the_interface() {
     let mut found = 0;
-    for interface in ["data", "trigger", "inference", "log"] {
+    for interface in ["data", "trigger", "inference", "log", "scratch"] {
         let read = |path: String| std::fs::read_to_string(root().join(&path)).unwrap_or_else(|_| panic!("no {path}"));
         let sdk = read(format!("guest-sdk-rust/src/{interface}.rs"));
         for function in functions(&read(format!("wit/{interface}.wit"))) {

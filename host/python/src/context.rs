@@ -11,6 +11,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::data::{Sample, Topic, refused};
+use crate::scratch::Scratch;
 use crate::{log, trigger};
 
 /// The session of one lambda. A lambda that starts afresh after a fault gets a new one.
@@ -19,6 +20,7 @@ pub(crate) struct Context {
     session: Session,
     topics: Vec<Py<Topic>>,
     config: Py<PyDict>,
+    scratch: Py<Scratch>,
     missed: AtomicU64,
 }
 
@@ -35,7 +37,8 @@ impl Context {
                 ConfigValue::Text(value) => config.set_item(key, value)?,
             }
         }
-        Ok(Self { session, topics, config: config.unbind(), missed: AtomicU64::new(0) })
+        let scratch = Py::new(py, Scratch::new(session.clone()))?;
+        Ok(Self { session, topics, config: config.unbind(), scratch, missed: AtomicU64::new(0) })
     }
 
     /// What the lambda will see as `missed`.
@@ -63,6 +66,12 @@ impl Context {
     #[getter]
     fn config<'py>(&self, py: Python<'py>) -> &Bound<'py, PyDict> {
         self.config.bind(py)
+    }
+
+    /// What the host keeps for the lambda, by name.
+    #[getter]
+    fn scratch<'py>(&self, py: Python<'py>) -> &Bound<'py, Scratch> {
+        self.scratch.bind(py)
     }
 
     #[getter]

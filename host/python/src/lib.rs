@@ -1,6 +1,6 @@
 //! The extension module `_gleaner`: the runtime's library, hosted by a Python interpreter.
 //!
-//! `data`, `frame`, `trigger`, `inference` and `log` are thin skins over the files of the same names in `gleaner_host::api`:
+//! `data`, `frame`, `trigger`, `inference`, `log` and `scratch` are thin skins over the files of the same names in `gleaner_host::api`:
 //! they convert arguments and errors, and decide nothing. `guest` wakes the lambda. Plain values and exceptions are
 //! classes of the Python package `gleaner`, defined once, there; `sdk` finds them.
 //!
@@ -14,6 +14,7 @@ mod frame;
 mod guest;
 mod inference;
 mod log;
+mod scratch;
 mod sdk;
 mod trigger;
 
@@ -34,6 +35,8 @@ mod _gleaner {
     use super::guest::main;
     #[pymodule_export]
     use super::inference::{Model, Tensor};
+    #[pymodule_export]
+    use super::scratch::Scratch;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

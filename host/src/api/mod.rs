@@ -1,6 +1,6 @@
 //! What a lambda may do, written once, in plain Rust.
 //!
-//! The four files beside this one carry the names of the four WIT interfaces. WebAssembly (`guest::wasm`) and Python
+//! Five of the files beside this one carry the names of the five WIT interfaces. WebAssembly (`guest::wasm`) and Python
 //! (`host/python`) are thin skins over them: they convert arguments and errors, and decide nothing. What is here knows neither.
 
 mod call;
@@ -10,6 +10,7 @@ pub mod frame;
 pub mod inference;
 pub mod log;
 mod sample;
+pub mod scratch;
 pub mod trace;
 pub mod trigger;
 mod values;
@@ -22,6 +23,7 @@ use gleaner_protocol::manifest::{ConfigValue, Limits};
 
 use data::{DataError, Due, Topic};
 use log::{Line, Log};
+use scratch::Scratch;
 use trigger::{Rate, Triggers};
 
 /// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call, by one thread.
@@ -36,6 +38,7 @@ struct State {
     triggers: Option<Triggers>,
     rate: Rate,
     log: Log,
+    scratch: Scratch,
     due: Option<Due>,
     passed_over: u64,
 }
@@ -45,8 +48,8 @@ impl Session {
     pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>, limits: &Limits) -> Self {
         // All inputs of a lambda have the same.
         let due = inputs.first().map(|topic| topic.due());
-        let (rate, log) = (Rate::new(limits), Log::new(limits));
-        let state = State { inputs, config, now_ns: 0, triggers: None, rate, log, due, passed_over: 0 };
+        let (rate, log, scratch) = (Rate::new(limits), Log::new(limits), Scratch::new(limits));
+        let state = State { inputs, config, now_ns: 0, triggers: None, rate, log, scratch, due, passed_over: 0 };
         Self(Arc::new(Mutex::new(state)))
     }
 

@@ -1,6 +1,6 @@
 //! WebAssembly components: one store on one thread, fuel and a memory cap always on, a deadline where the clock is real.
 //!
-//! The four files named as the WIT interfaces are thin: they convert, charge fuel for the bytes that the host touches, and
+//! The five files named as the WIT interfaces are thin: they convert, charge fuel for the bytes that the host touches, and
 //! leave everything else to `api`. A trap ends the store; the next wake gets a new one. Nothing here compiles code.
 
 mod bindings;
@@ -11,6 +11,7 @@ mod inference;
 mod limits;
 mod load;
 mod log;
+mod scratch;
 mod trigger;
 mod wasi;
 

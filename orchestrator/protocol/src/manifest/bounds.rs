@@ -117,6 +117,10 @@ pub const CALL_BYTES: Bounds<ByteSize> =
 /// `limits.call_items`: samples, values or texts that one call gives. As many as the deepest ring has.
 pub const CALL_ITEMS: Bounds<u64> = Bounds { min: 16, default: 65_536, max: 65_536 };
 
+/// `limits.scratch`: what the host keeps for a lambda. It is memory, so nobody has some who does not ask for it.
+pub const SCRATCH: Bounds<ByteSize> =
+    Bounds { min: ByteSize::kib(0), default: ByteSize::kib(0), max: ByteSize::mib(256) };
+
 /// `limits.log_lines`: for each second of the lambda's time. Nobody reads more, and a disk should last.
 pub const LOG_LINES: Bounds<u64> = Bounds { min: 1, default: 100, max: 10_000 };
 

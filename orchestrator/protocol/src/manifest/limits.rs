@@ -39,6 +39,8 @@ pub struct Limits {
     pub call_bytes: ByteSize,
     /// Samples, values or texts that one call gives.
     pub call_items: u64,
+    /// Bytes that the host keeps for the lambda, by name.
+    pub scratch: ByteSize,
     /// Log lines for each second of the lambda's time.
     pub log_lines: u64,
     /// Bytes of log lines, likewise.
@@ -84,6 +86,7 @@ impl Limits {
             frames: self.frames.min(most.frames),
             call_bytes: self.call_bytes.min(most.call_bytes),
             call_items: self.call_items.min(most.call_items),
+            scratch: self.scratch.min(most.scratch),
             log_lines: self.log_lines.min(most.log_lines),
             log_bytes: self.log_bytes.min(most.log_bytes),
             events_per_minute: self.events_per_minute.min(most.events_per_minute),
@@ -94,7 +97,7 @@ impl Limits {
     }
 
     /// Each key with its value, as it would be written in the file.
-    pub fn in_words(&self) -> [(&'static str, String); 14] {
+    pub fn in_words(&self) -> [(&'static str, String); 15] {
         [
             ("fuel", self.fuel.to_string()),
             ("init_fuel", self.init_fuel.to_string()),
@@ -107,6 +110,7 @@ impl Limits {
             ("frames", self.frames.to_string()),
             ("call_bytes", self.call_bytes.to_string()),
             ("call_items", self.call_items.to_string()),
+            ("scratch", self.scratch.to_string()),
             ("log_lines", self.log_lines.to_string()),
             ("log_bytes", self.log_bytes.to_string()),
             ("events_per_minute", self.events_per_minute.to_string()),
@@ -165,7 +169,7 @@ mod tests {
             let mut vehicle = serde_json::to_value(Limits::most()).unwrap();
             vehicle[key] = least.clone();
             let vehicle: Limits = serde_json::from_value(vehicle).unwrap();
-            let (tight, tightened) = Limits::default().tightened_by(&vehicle);
+            let (tight, tightened) = Limits::most().tightened_by(&vehicle);
             assert_eq!(serde_json::to_value(tight).unwrap()[key], *least, "{key}");
             assert_eq!(tightened.len(), 1, "{key}");
         }

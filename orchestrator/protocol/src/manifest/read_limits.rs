@@ -15,7 +15,7 @@ use super::{ByteSize, Limits};
 type Result<T> = std::result::Result<T, ManifestError>;
 
 /// The keys, in their order.
-pub(super) const KEYS: &[&str; 14] = &[
+pub(super) const KEYS: &[&str; 15] = &[
     "fuel",
     "init_fuel",
     "deadline",
@@ -27,6 +27,7 @@ pub(super) const KEYS: &[&str; 14] = &[
     "frames",
     "call_bytes",
     "call_items",
+    "scratch",
     "log_lines",
     "log_bytes",
     "events_per_minute",
@@ -95,6 +96,7 @@ pub(super) fn all(table: Option<Table>, missing: Missing) -> Result<Limits> {
         frames: integer("frames", bounds::FRAMES)?,
         call_bytes: size("call_bytes", bounds::CALL_BYTES)?,
         call_items: integer("call_items", bounds::CALL_ITEMS)?,
+        scratch: size("scratch", bounds::SCRATCH)?,
         log_lines: integer("log_lines", bounds::LOG_LINES)?,
         log_bytes: size("log_bytes", bounds::LOG_BYTES)?,
         events_per_minute: integer("events_per_minute", bounds::EVENTS_PER_MINUTE)?,

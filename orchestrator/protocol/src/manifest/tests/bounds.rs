@@ -39,6 +39,7 @@ fn every_further_limit_has_a_minimum_and_a_maximum() {
         ("frames", "0", "4097", "1", "4096"),
         ("call_bytes", "\"63 KiB\"", "\"1025 KiB\"", "64 KiB", "1 MiB"),
         ("call_items", "15", "65537", "16", "65536"),
+        ("scratch", "-1", "\"257 MiB\"", "0 B", "256 MiB"),
         ("log_lines", "0", "10001", "1", "10000"),
         ("log_bytes", "\"3 KiB\"", "\"17 MiB\"", "4 KiB", "16 MiB"),
         ("events_per_minute", "0", "60001", "1", "60000"),

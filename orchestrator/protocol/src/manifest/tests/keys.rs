@@ -30,7 +30,7 @@ fn unknown_keys_are_refused_at_every_level() {
         "[limits]\nzz = 1\naa = 1",
         "lambda.toml, line 9: unknown key `zz` in [limits]",
         "the known keys are `fuel`, `init_fuel`, `deadline`, `init_deadline`, `memory`, `tables`, `stack`, `handles`, `frames`, \
-         `call_bytes`, `call_items`, `log_lines`, `log_bytes` and `events_per_minute`",
+         `call_bytes`, `call_items`, `scratch`, `log_lines`, `log_bytes` and `events_per_minute`",
     );
 }
 

@@ -199,7 +199,7 @@ fn as_json_a_manifest_has_the_keys_of_the_file_and_its_defaults() {
             r#""depth":64,"max_size":4096,"decoded_size":null,"hold":8,"qos":"auto"}],"model":[],"record":null,"#,
             r#""limits":{"fuel":50000000,"init_fuel":1000000000,"deadline_ns":50000000,"init_deadline_ns":10000000000,"#,
             r#""memory":67108864,"tables":20000,"stack":524288,"handles":4096,"frames":256,"call_bytes":1048576,"#,
-            r#""call_items":65536,"log_lines":100,"log_bytes":409600,"events_per_minute":12000},"#,
+            r#""call_items":65536,"scratch":0,"log_lines":100,"log_bytes":409600,"events_per_minute":12000},"#,
             r#""config":[{"name":"gain","default":2,"min":null,"max":null,"unit":null,"description":null}]}"#
         )
     );

@@ -7,7 +7,7 @@
 use gleaner_sdk::data::{Frame, Roi};
 use gleaner_sdk::inference::{Model, Preprocess, Tensor};
 use gleaner_sdk::log::{error, trace, warn};
-use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, inputs, now_ns, start, stop};
+use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, inputs, now_ns, scratch, start, stop};
 
 /// Steps of one wake: more would only use up its fuel.
 const STEPS: usize = 256;
@@ -47,7 +47,7 @@ impl Lambda for Driver {
 
 impl Kept {
     fn step(&mut self, bytes: &mut Bytes) {
-        match bytes.u8() % 48 {
+        match bytes.u8() % 54 {
             0 => self.topics.extend(input(["program", "raw", "coded"][usize::from(bytes.u8() % 3)])),
             1 => self.topics.extend(input(&bytes.text())),
             2 => drop(inputs()),
@@ -101,6 +101,12 @@ impl Kept {
             45 => drop((std::fs::read("/"), std::time::SystemTime::now(), std::time::Instant::now())),
             46 if bytes.u8() == 0xba => panic!("{}", bytes.text()),
             47 if bytes.u8() == 0xba => std::process::exit(i32::from(bytes.u8())),
+            48 => drop(scratch::put(bytes.name(), &vec![1; bytes.u32() as usize % TEXT])),
+            49 => drop(scratch::append(bytes.name(), &vec![2; usize::from(bytes.u16())])),
+            50 => drop(scratch::put(&bytes.text(), b"")),
+            51 => drop(scratch::get(bytes.name(), bytes.u64(), bytes.u32())),
+            52 => drop(scratch::remove(bytes.name())),
+            53 => drop((scratch::entries(), scratch::free(), scratch::get(bytes.name(), u64::from(bytes.u16()), 9))),
             _ => {}
         }
     }
@@ -172,6 +178,10 @@ impl Bytes<'_> {
             255 => "x".repeat(self.u32() as usize % TEXT),
             length => (0..length.min(40)).map(|_| char::from(self.u8())).collect(),
         }
+    }
+
+    fn name(&mut self) -> &'static str {
+        ["a", "b", "c", "", "not\nthere"][usize::from(self.u8() % 5)]
     }
 
     fn path(&mut self) -> &'static str {

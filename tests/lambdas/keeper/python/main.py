@@ -1,0 +1,40 @@
+"""Counts its wakes in scratch, fills that up, and faults in every third wake. Its twin must say the same."""
+
+from __future__ import annotations
+
+from typing import Dict, Union
+
+from gleaner import Context, ScratchError
+
+# What is added in each wake until there is no room.
+BULK = 100_000
+
+
+class Lambda:
+    def __init__(self, ctx: Context) -> None:
+        pass
+
+    def on_tick(self, ctx: Context) -> None:
+        try:
+            before = int.from_bytes(ctx.scratch.get("wakes"), "little")
+        except ScratchError as error:
+            if error.kind != "no-such-entry":
+                raise
+            before = 0
+        wakes = before + 1
+        ctx.scratch.put("wakes", wakes.to_bytes(8, "little"))
+        try:
+            # Not only `bytes` are taken.
+            ctx.scratch.append("bulk", bytearray([wakes % 256]) * BULK)
+        except ScratchError as error:
+            ctx.scratch.remove("bulk")
+            ctx.event("full", 1.0, why=str(error))
+        said: Dict[str, Union[int, str]] = {"free": ctx.scratch.free()}
+        said.update((entry.name, entry.bytes) for entry in ctx.scratch.entries())
+        try:
+            said["last"] = str(list(ctx.scratch.get("bulk", (wakes - 1) % 10 * BULK, 2)))
+        except ScratchError:
+            pass
+        ctx.event("kept", wakes, **said)
+        if wakes % 3 == 0:
+            raise ValueError("every third time")
