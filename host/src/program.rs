@@ -185,6 +185,7 @@ fn reports() -> Result<File, Failure> {
 
 #[cfg(feature = "wasm")]
 mod wasm {
+    use gleaner_compile::Nans;
     use gleaner_protocol::manifest::Manifest;
     use gleaner_protocol::{Exit, Failure};
 
@@ -203,7 +204,8 @@ mod wasm {
             |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
         let cache = gleaner_protocol::parts::cache_dir().map_err(|error| cannot(&error.into()))?;
         let limits = &manifest.limits;
-        let loaded = Loaded::open(&asked.build.entry_path(manifest), &cache, limits.stack.as_usize())
+        let nans = if manifest.lambda.deterministic { Nans::Canonical } else { Nans::AsMade };
+        let loaded = Loaded::open(&asked.build.entry_path(manifest), &cache, limits.stack.as_usize(), nans)
             .map_err(|error| cannot(&error))?;
         let failed = |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot make a guest", &error);
         let deadline = match bounds {

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
@@ -87,7 +88,8 @@ impl Room {
         let (transport, topic) = subscribed(&manifest, IMAGE);
         let session = Session::new(vec![Arc::clone(&topic)], config, limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(component, &cache, limits.stack.as_usize()).expect("a component of this world");
+        let loaded =
+            Loaded::open(component, &cache, limits.stack.as_usize(), Nans::AsMade).expect("a component of this world");
         let shortest = limits.deadline.min(limits.init_deadline);
         let deadline = timed.then(|| Deadline::new(loaded.engine(), shortest).expect("a thread can be started"));
         let guest = WasmGuest::new(loaded, session.clone(), limits, deadline).expect("a guest can be made");

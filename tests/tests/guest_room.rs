@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
@@ -45,7 +46,8 @@ impl Room {
         limits.deadline = deadline.unwrap_or(limits.deadline);
         let session = Session::new(inputs, config, &limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(&lambda.join("misbehave.wasm"), &cache, limits.stack.as_usize()).unwrap();
+        let loaded =
+            Loaded::open(&lambda.join("misbehave.wasm"), &cache, limits.stack.as_usize(), Nans::AsMade).unwrap();
         let deadline = deadline.map(|allowed| Deadline::new(loaded.engine(), allowed).unwrap());
         let guest = WasmGuest::new(loaded, session.clone(), &limits, deadline).unwrap();
         Self { guest, session, transport, topic, sent: 0 }

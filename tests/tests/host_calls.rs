@@ -6,6 +6,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::Guest;
@@ -91,7 +92,7 @@ impl Driver {
         let limits: &Limits = &manifest.limits;
         let session = Session::new(inputs.clone(), Vec::new(), limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(&lambda.join("driver.wasm"), &cache, limits.stack.as_usize()).unwrap();
+        let loaded = Loaded::open(&lambda.join("driver.wasm"), &cache, limits.stack.as_usize(), Nans::AsMade).unwrap();
         let deadline = timed.then(|| Deadline::new(loaded.engine(), limits.deadline).unwrap());
         let mut guest = WasmGuest::new(loaded, session.clone(), limits, deadline).unwrap();
         guest.init().unwrap();

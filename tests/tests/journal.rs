@@ -180,6 +180,25 @@ fn another_manifest_is_found_and_another_record_table_is_none() {
 }
 
 #[test]
+fn a_lambda_whose_nans_are_the_same_everywhere_says_so() {
+    let at = |toml: &str| toml.replace("kind = \"wasm\"", "kind = \"wasm\"\ndeterministic = true");
+    let copy = Copy::of(HELLO, |toml| at(&toml));
+    let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
+    assert_eq!(journaled.run.exit, 0, "{}", journaled.run.stderr);
+    // It is other native code, for which there is another entry; what it decides is what any other decides, as it looks at no NaN.
+    let plain = self::journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
+    assert_eq!(journaled.run.labels(), plain.run.labels());
+    let names = |journal: &Path| {
+        let bytes = std::fs::read(journal).unwrap();
+        bytes.windows(14).any(|bytes| bytes == b"canonical NaNs")
+    };
+    assert!(names(&journaled.journal) && !names(&plain.journal));
+    assert_eq!(verify_drive(copy.path(), &sample_drive(), &journaled.journal, &[]).exit, 0);
+    let again = verify_drive(&root().join(HELLO), &sample_drive(), &journaled.journal, &[]);
+    differs(&again, 4, &["not the lambda that wrote the journal", "manifest lambda.toml"]);
+}
+
+#[test]
 fn another_config_is_named_by_its_key_and_the_same_one_need_not_be_given() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
     let again = |args: &[&str]| verify_drive(&root().join(HELLO), &sample_drive(), &journaled.journal, args);

@@ -1,5 +1,6 @@
 //! The lambda of the bench on an engine of our own making, without the host around it.
 
+use gleaner_compile::Nans;
 use gleaner_tests::root;
 use wasmtime::component::types::ComponentItem;
 use wasmtime::component::{Component, Func, Linker, ResourceTable, ResourceType, Val};
@@ -26,7 +27,7 @@ pub struct Compiled {
 
 /// Compiles the component.
 pub fn compiled(checks: Checks) -> Compiled {
-    let mut config = gleaner_compile::settings();
+    let mut config = gleaner_compile::settings(Nans::AsMade);
     config.consume_fuel(checks.fuel).epoch_interruption(checks.epochs).cranelift_nan_canonicalization(checks.nans);
     let engine = Engine::new(&config).expect("an engine");
     let path = root().join("bench/lambdas/kernels/rust/build/bench_kernels.wasm");

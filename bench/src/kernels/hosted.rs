@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Tick, Topic, Wake};
 use gleaner_host::guest::Guest;
@@ -55,7 +56,7 @@ impl Hosted {
         limits.fuel = u64::MAX / 1000;
         let session = Session::new(inputs, config, &limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(&lambda.join("bench_kernels.wasm"), &cache, limits.stack.as_usize());
+        let loaded = Loaded::open(&lambda.join("bench_kernels.wasm"), &cache, limits.stack.as_usize(), Nans::AsMade);
         let loaded = loaded.expect("a component");
         let mut guest = WasmGuest::new(loaded, session.clone(), &limits, None).expect("a guest");
         guest.init().expect("init");

@@ -6,7 +6,7 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use super::{
-    CODE_BYTES, CompileError, GUEST_STACK_BYTES, cache_entry, check_folder, engine, make_cache, read_component,
+    CODE_BYTES, CompileError, GUEST_STACK_BYTES, Nans, cache_entry, check_folder, engine, make_cache, read_component,
 };
 
 /// Compiles the component at `path` into `cache` and returns the entry; an entry that exists is left as it is.
@@ -14,15 +14,15 @@ use super::{
 /// # Errors
 ///
 /// [`CompileError`] names the component and the cause.
-pub fn compile(path: &Path, cache: &Path) -> Result<PathBuf, CompileError> {
+pub fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<PathBuf, CompileError> {
     let component = read_component(path)?;
     make_cache(cache)?;
     check_folder(cache)?;
-    let entry = cache_entry(cache, &component);
+    let entry = cache_entry(cache, &component, nans);
     if entry.exists() {
         return Ok(entry);
     }
-    let code = engine(GUEST_STACK_BYTES)?
+    let code = engine(GUEST_STACK_BYTES, nans)?
         .precompile_component(&component)
         .map_err(|source| CompileError::Compile { path: path.to_owned(), source: source.into() })?;
     if code.len() > CODE_BYTES {

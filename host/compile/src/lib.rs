@@ -30,8 +30,25 @@ pub const COMPILE_CPU_SECONDS: u64 = 120;
 /// Most stack of a guest, in bytes. The thread that runs it needs some more.
 pub const GUEST_STACK_BYTES: usize = 512 << 10;
 
-/// Wasmtime's version and the settings of [`engine`]; a change of either makes new entries.
-pub const SETTINGS: &str = "wasmtime 48.0.8, fuel, epochs, speed, 1";
+/// Which bits a NaN has that a component computes.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub enum Nans {
+    /// Those that the CPU gives it, as WebAssembly allows. Only who looks at the bits can tell.
+    #[default]
+    AsMade,
+    /// The same on every CPU. On spectra this costs twice the time and more, see `bench/README.md`.
+    Canonical,
+}
+
+impl Nans {
+    /// Wasmtime's version and the settings of [`engine`]; a change of either makes new entries.
+    pub const fn settings(self) -> &'static str {
+        match self {
+            Self::AsMade => "wasmtime 48.0.8, fuel, epochs, speed, 1",
+            Self::Canonical => "wasmtime 48.0.8, fuel, epochs, speed, canonical NaNs, 1",
+        }
+    }
+}
 
 /// Why native code could not be made or found.
 #[derive(Debug, thiserror::Error)]
@@ -78,19 +95,19 @@ impl Explain for CompileError {
 }
 
 /// The engine for which all lambdas are compiled and on which they run, with a stack of so many bytes, at most
-/// [`GUEST_STACK_BYTES`]. Native code does not depend on that.
+/// [`GUEST_STACK_BYTES`]. Native code does not depend on that, but on `nans`.
 ///
 /// # Errors
 ///
 /// [`CompileError::Engine`] if this machine does not support it.
-pub fn engine(stack_bytes: usize) -> Result<Engine, CompileError> {
-    let mut settings = settings();
+pub fn engine(stack_bytes: usize, nans: Nans) -> Result<Engine, CompileError> {
+    let mut settings = settings(nans);
     settings.max_wasm_stack(stack_bytes.min(GUEST_STACK_BYTES));
     Engine::new(&settings).map_err(|source| CompileError::Engine { source: source.into() })
 }
 
-/// What [`engine`] is set to, named by [`SETTINGS`]; benches change a part of it to tell its price.
-pub fn settings() -> Config {
+/// What [`engine`] is set to, named by [`Nans::settings`]; benches change a part of it to tell its price.
+pub fn settings(nans: Nans) -> Config {
     let mut config = Config::new();
     config
         // Instructions are counted and the clock can interrupt, always: the same code serves replay and vehicle.
@@ -102,7 +119,9 @@ pub fn settings() -> Config {
         .wasm_relaxed_simd(false)
         .max_wasm_stack(GUEST_STACK_BYTES);
     #[cfg(feature = "compiler")]
-    config.cranelift_opt_level(wasmtime::OptLevel::Speed);
+    config.cranelift_opt_level(wasmtime::OptLevel::Speed).cranelift_nan_canonicalization(nans == Nans::Canonical);
+    #[cfg(not(feature = "compiler"))]
+    let _ = nans;
     config
 }
 
@@ -121,9 +140,9 @@ pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
 }
 
 /// Where the native code of `component` is kept on this machine: `<cache>/<key>.cwasm`.
-pub fn cache_entry(cache: &Path, component: &[u8]) -> PathBuf {
+pub fn cache_entry(cache: &Path, component: &[u8], nans: Nans) -> PathBuf {
     let mut key = Sha256::new();
-    for part in [SETTINGS.as_bytes(), std::env::consts::ARCH.as_bytes(), cpu_features().as_bytes(), component] {
+    for part in [nans.settings().as_bytes(), std::env::consts::ARCH.as_bytes(), cpu_features().as_bytes(), component] {
         key.update((part.len() as u64).to_le_bytes());
         key.update(part);
     }
@@ -226,16 +245,20 @@ mod tests {
 
     #[test]
     fn another_component_has_another_entry() {
-        let entry = |bytes: &[u8]| cache_entry(Path::new("/c"), bytes);
+        let entry = |bytes: &[u8]| cache_entry(Path::new("/c"), bytes, Nans::AsMade);
         assert_eq!(entry(b"a"), entry(b"a"));
         assert_ne!(entry(b"a"), entry(b"b"));
+        assert_ne!(entry(b"a"), cache_entry(Path::new("/c"), b"a", Nans::Canonical));
         assert_eq!(entry(b"a").file_name().unwrap().len(), 64 + ".cwasm".len());
     }
 
     #[test]
     fn the_settings_name_the_version_that_is_pinned() {
         let workspace = include_str!("../../../Cargo.toml");
-        assert!(SETTINGS.starts_with("wasmtime 48.0.8,") && workspace.contains("wasmtime = { version = \"=48.0.8\""));
+        for nans in [Nans::AsMade, Nans::Canonical] {
+            assert!(nans.settings().starts_with("wasmtime 48.0.8,"));
+        }
+        assert!(workspace.contains("wasmtime = { version = \"=48.0.8\""));
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use gleaner_compile::{COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError};
+use gleaner_compile::{COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans};
 use gleaner_jail::{Paths, alone, files};
 use gleaner_protocol::{Exit, Failure};
 use rustix::process::{Resource, Rlimit, setrlimit};
@@ -18,12 +18,16 @@ struct Args {
     /// Folder of the compiled code; made if it is missing.
     #[arg(long, value_name = "DIR")]
     cache: PathBuf,
+    /// Give every NaN the same bits on every CPU.
+    #[arg(long)]
+    deterministic: bool,
 }
 
 fn main() -> ExitCode {
     let args = Args::parse();
     bound_this_process();
-    match confine_to(&args).and_then(|()| gleaner_compile::compile(&args.component, &args.cache)) {
+    let nans = if args.deterministic { Nans::Canonical } else { Nans::AsMade };
+    match confine_to(&args).and_then(|()| gleaner_compile::compile(&args.component, &args.cache, nans)) {
         Ok(entry) => {
             println!("{}", entry.display());
             Exit::Ok.into()

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_compile::{
-    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, cache_entry, open_entry, read_component,
+    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans, cache_entry, open_entry, read_component,
 };
 use gleaner_protocol::{Exit, Explain, Parts, PartsError};
 use sha2::{Digest, Sha256};
@@ -72,20 +72,22 @@ pub struct Loaded {
     engine: Engine,
     lambda: LambdaPre<Hosted>,
     seed: [u8; 32],
+    nans: Nans,
 }
 
 impl Loaded {
-    /// Loads the component at `path`, compiling it into `cache` first if it is not there. It gets a stack of that many bytes.
+    /// Loads the component at `path`, compiling it into `cache` first if it is not there. It gets a stack of that many bytes, and NaNs of
+    /// this kind.
     ///
     /// # Errors
     ///
     /// [`WasmError`] names the component and what does not fit.
-    pub fn open(path: &Path, cache: &Path, stack_bytes: usize) -> Result<Self, WasmError> {
+    pub fn open(path: &Path, cache: &Path, stack_bytes: usize, nans: Nans) -> Result<Self, WasmError> {
         let component = read_component(path)?;
-        let engine = gleaner_compile::engine(stack_bytes)?;
-        let entry = cache_entry(cache, &component);
+        let engine = gleaner_compile::engine(stack_bytes, nans)?;
+        let entry = cache_entry(cache, &component, nans);
         if !entry.exists() {
-            compile(path, cache)?;
+            compile(path, cache, nans)?;
         }
         let file = open_entry(&entry)?;
         let opened = format!("/proc/self/fd/{}", file.as_raw_fd());
@@ -94,21 +96,26 @@ impl Loaded {
         // engine and the CPU.
         let code = unsafe { Component::deserialize_file(&engine, opened) }
             .map_err(|source| WasmError::Load { path: entry, source: source.into() })?;
-        Self::check(path, engine, &code, Sha256::digest(&component).into())
+        let lambda = Self::check(path, &engine, &code)?;
+        Ok(Self { engine, lambda, seed: Sha256::digest(&component).into(), nans })
     }
 
-    fn check(path: &Path, engine: Engine, code: &Component, seed: [u8; 32]) -> Result<Self, WasmError> {
+    fn check(path: &Path, engine: &Engine, code: &Component) -> Result<LambdaPre<Hosted>, WasmError> {
         let world = |source: wasmtime::Error| WasmError::World { path: path.to_owned(), source: source.into() };
-        let mut linker = Linker::new(&engine);
+        let mut linker = Linker::new(engine);
         wasi::add_to_linker(&mut linker).map_err(world)?;
         Lambda::add_to_linker::<_, wasmtime::component::HasSelf<_>>(&mut linker, |hosted| hosted).map_err(world)?;
-        let lambda = linker.instantiate_pre(code).and_then(LambdaPre::new).map_err(world)?;
-        Ok(Self { engine, lambda, seed })
+        linker.instantiate_pre(code).and_then(LambdaPre::new).map_err(world)
     }
 
     /// The engine it runs on.
     pub fn engine(&self) -> &Engine {
         &self.engine
+    }
+
+    /// Wasmtime's version, and what the code was compiled with.
+    pub(super) fn settings(&self) -> &'static str {
+        self.nans.settings()
     }
 
     pub(super) fn seed(&self) -> [u8; 32] {
@@ -120,12 +127,13 @@ impl Loaded {
     }
 }
 
-fn compile(path: &Path, cache: &Path) -> Result<(), WasmError> {
+fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
     let program = Parts::find()?.program("gleaner-compile")?;
     let output = Command::new(&program)
         .arg(path)
         .arg("--cache")
         .arg(cache)
+        .args((nans == Nans::Canonical).then_some("--deterministic"))
         .output()
         .map_err(|source| WasmError::Start { program, source })?;
     if output.status.success() {

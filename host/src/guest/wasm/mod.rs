@@ -146,7 +146,7 @@ impl Guest for WasmGuest {
     }
 
     fn engine(&self) -> String {
-        gleaner_compile::SETTINGS.to_owned()
+        self.loaded.settings().to_owned()
     }
 }
 

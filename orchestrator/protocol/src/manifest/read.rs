@@ -42,8 +42,8 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
 }
 
 fn lambda(value: &Value) -> Result<Lambda> {
-    let table = value.table("[lambda]", &["name", "version", "kind", "entry", "description"])?;
-    Ok(Lambda {
+    let table = value.table("[lambda]", &["name", "version", "kind", "entry", "description", "deterministic"])?;
+    let lambda = Lambda {
         name: table.need("name", "name = \"brake-dark\"")?.parse()?,
         version: table.need("version", "version = \"0.1.0\"")?.parse()?,
         kind: table
@@ -51,7 +51,15 @@ fn lambda(value: &Value) -> Result<Lambda> {
             .choice(&[("wasm", Kind::Wasm), ("python", Kind::Python)])?,
         entry: table.need("entry", "entry = \"brake_dark.wasm\", or entry = \"main.py\" for Python")?.parse()?,
         description: table.optional_text("description")?,
-    })
+        deterministic: table.flag("deterministic")?,
+    };
+    match table.get("deterministic") {
+        Some(value) if lambda.kind == Kind::Python => Err(value.misplaced(
+            "has no meaning with kind = \"python\"",
+            "remove it: Python's numbers are those of the machine",
+        )),
+        _ => Ok(lambda),
+    }
 }
 
 fn schedule(value: &Value, inputs: &[Input]) -> Result<Schedule> {

@@ -112,6 +112,11 @@ impl<'a> Table<'a> {
         self.get(key).map(|value| value.text().map(str::to_owned)).transpose()
     }
 
+    /// `true` or `false`; `false` if it is not there.
+    pub(super) fn flag(&self, key: &str) -> Result<bool> {
+        self.get(key).map_or(Ok(false), |value| value.boolean())
+    }
+
     pub(super) fn choice<T: Copy>(&self, key: &str, choices: &[(&'static str, T)], default: T) -> Result<T> {
         self.get(key).map_or(Ok(default), |value| value.choice(choices))
     }

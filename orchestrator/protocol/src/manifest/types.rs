@@ -40,6 +40,9 @@ pub struct Lambda {
     pub entry: RelativePath,
     /// One line for people.
     pub description: Option<String>,
+    /// Of a component: whether every NaN that it computes has the same bits on every CPU.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub deterministic: bool,
 }
 
 /// The kinds of lambda.

@@ -95,6 +95,13 @@ impl<'a> Value<'a> {
         self.value.as_str().ok_or_else(|| self.wrong_type("a text in quotes"))
     }
 
+    pub(super) fn boolean(&self) -> Result<bool> {
+        match self.value {
+            DeValue::Boolean(truth) => Ok(*truth),
+            _ => Err(self.wrong_type("true or false")),
+        }
+    }
+
     /// A text of a checked form.
     pub(super) fn parse<T: FromStr<Err = NameError>>(&self) -> Result<T> {
         let text = self.text()?;

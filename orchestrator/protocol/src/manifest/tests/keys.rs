@@ -62,6 +62,23 @@ fn what_must_be_there_is_asked_for() {
 }
 
 #[test]
+fn only_a_component_can_be_deterministic() {
+    let python = TICKER.replace("[schedule]", "deterministic = true\n[schedule]");
+    refused(
+        &python,
+        "lambda.toml, line 6: `lambda.deterministic` has no meaning with kind = \"python\"",
+        "remove it: Python's numbers are those of the machine",
+    );
+    let wasm = python.replace("\"python\"", "\"wasm\"");
+    assert!(Manifest::parse(&wasm, "lambda.toml").unwrap().lambda.deterministic);
+    refused(
+        &wasm.replace("= true", "= 1"),
+        "lambda.toml, line 6: `lambda.deterministic` is a whole number",
+        "give true or false",
+    );
+}
+
+#[test]
 fn values_of_another_type_are_refused() {
     let text = "give a text in quotes";
     refused_with("version = \"0.1.0\"", "version = 1", "lambda.toml, line 3: `lambda.version` is a whole number", text);
