@@ -2,6 +2,8 @@
 //!
 //! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the spread of its runs.
 
+mod answers;
+mod isolation;
 mod kernels;
 mod live;
 mod measure;
@@ -25,19 +27,28 @@ struct Args {
     /// Arithmetic in lambdas against the same natively, and calls between lambda and host, instead of drives.
     #[arg(long, conflicts_with = "live")]
     kernels: bool,
+    /// What a lambda feels of another one that misbehaves, in a private network, and what a process costs, instead of drives; needs
+    /// gleaner-player.
+    #[arg(long, conflicts_with_all = ["live", "kernels"])]
+    isolation: bool,
 }
 
 fn main() -> ExitCode {
-    let Args { quick, live, kernels } = Args::parse();
-    if live {
-        return match live::elsewhere() {
-            Some(Ok(true)) => ExitCode::SUCCESS,
-            Some(Ok(false)) => ExitCode::FAILURE,
-            Some(Err(why)) => {
+    let Args { quick, live, kernels, isolation } = Args::parse();
+    if live || isolation {
+        let figures = match live::elsewhere() {
+            Some(Ok(true)) => return ExitCode::SUCCESS,
+            Some(Ok(false)) => return ExitCode::FAILURE,
+            Some(Err(why)) => Err(why),
+            None if isolation => isolation::figures(quick),
+            None => Ok(live::figures(quick)),
+        };
+        return match figures {
+            Ok(figures) => tell(&figures, quick),
+            Err(why) => {
                 println!("skipped: {why}");
                 ExitCode::SUCCESS
             }
-            None => tell(&live::figures(quick), quick),
         };
     }
     let rounds = if quick { 2 } else { 9 };

@@ -36,10 +36,19 @@ impl Kind {
 
 /// Binds this process and its children to the first core that it may use.
 pub fn stay_on_one_core() -> std::io::Result<()> {
+    stay_on(cores()?.first().copied().unwrap_or(0))
+}
+
+/// The cores that this thread may use.
+pub fn cores() -> std::io::Result<Vec<usize>> {
     let allowed = rustix::thread::sched_getaffinity(None)?;
-    let first = (0..rustix::thread::CpuSet::MAX_CPU).find(|core| allowed.is_set(*core)).unwrap_or(0);
+    Ok((0..rustix::thread::CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect())
+}
+
+/// Binds this thread, and the threads and processes that it will start, to one core.
+pub fn stay_on(core: usize) -> std::io::Result<()> {
     let mut one = rustix::thread::CpuSet::new();
-    one.set(first);
+    one.set(core);
     Ok(rustix::thread::sched_setaffinity(None, &one)?)
 }
 

@@ -1,6 +1,7 @@
 //! Live topics: what arrives, how fast it is answered, and what that costs. In a private network, with our player on Cyclone DDS.
 
 mod bare;
+mod footprint;
 mod rounds;
 
 use std::path::{Path, PathBuf};
@@ -68,10 +69,11 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     }
     rounds::figures(seconds(60), &mut figures);
     many(16, seconds(20), &mut figures);
+    footprint::figures(seconds(10), &mut figures);
     figures
 }
 
-fn lambda(name: &str, kind: Kind) -> PathBuf {
+pub(crate) fn lambda(name: &str, kind: Kind) -> PathBuf {
     let folder = if matches!(kind, Kind::Rust) { "rust" } else { "python" };
     root().join("bench/lambdas").join(name).join(folder)
 }
@@ -86,6 +88,17 @@ fn start(lambda: &Path, args: &[&str]) -> (Started, Folder) {
 /// Plays to the end, with a player for each of `players`, and then asks how the lambdas were. The statuses of the first one
 /// meanwhile go to `seen`.
 fn to_the_end(started: Vec<(Started, Folder)>, players: &[Vec<&str>], seen: &mut Vec<Live>) -> Vec<Live> {
+    played(&started, players, seen);
+    ended(started)
+}
+
+fn ended(started: Vec<(Started, Folder)>) -> Vec<Live> {
+    started.iter().for_each(|(started, _)| started.signal("INT"));
+    started.into_iter().map(|(started, _out)| started.finish().ended()).collect()
+}
+
+/// As [`to_the_end`], and the lambdas go on.
+fn played(started: &[(Started, Folder)], players: &[Vec<&str>], seen: &mut Vec<Live>) {
     let playing: Vec<_> = players.iter().map(|player| play(player)).collect();
     let mut is_over = false;
     while !is_over {
@@ -97,8 +110,6 @@ fn to_the_end(started: Vec<(Started, Folder)>, players: &[Vec<&str>], seen: &mut
         let played = played.finish();
         assert!(played.status.success(), "{}", played.said);
     }
-    started.iter().for_each(|(started, _)| started.signal("INT"));
-    started.into_iter().map(|(started, _out)| started.finish().ended()).collect()
 }
 
 /// What the empty `lambdas` receive, each in a process of its own, and what that takes.
@@ -155,7 +166,9 @@ fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
     let started: Vec<_> = (0..count).map(|_| start(&lambda("imu", Kind::Rust), &["--no-record"])).collect();
     let (count, duration) = (count.to_string(), seconds.to_string());
     let player = vec!["--imu", "100", "--wait", &count, "--duration", &duration];
-    let ended = to_the_end(started, &[player], &mut Vec::new());
+    played(&started, &[player], &mut Vec::new());
+    let pss: Vec<f64> = started.iter().map(|(started, _)| footprint::megabytes(started)).collect();
+    let ended = ended(started);
     let heard = ended.iter().filter(|live| live.topics[0].received > 0).count();
     let whole = ended.iter().filter(|live| live.topics[0].lost == Some(0)).count();
     figures.push(Figure::at_least(
@@ -170,8 +183,9 @@ fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
         ended.len() as f64,
         &[whole as f64],
     ));
-    let pss: Vec<f64> = ended.iter().map(|live| live.rss_bytes as f64 / f64::from(1 << 20)).collect();
-    figures.push(Figure::told(&format!("{count} runtimes: resident memory of each"), "MiB", &pss));
+    let rss: Vec<f64> = ended.iter().map(|live| live.rss_bytes as f64 / f64::from(1 << 20)).collect();
+    figures.push(Figure::told(&format!("{count} runtimes: resident memory of each"), "MiB", &rss));
+    figures.push(Figure::told(&format!("{count} runtimes: PSS of each"), "MB", &pss));
     let cpu: Vec<f64> = ended.iter().map(|live| 100.0 * live.cpu_s / live.up_s).collect();
     figures.push(Figure::told(&format!("{count} runtimes: share of a core of each"), "%", &cpu));
 }

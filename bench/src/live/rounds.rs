@@ -1,64 +1,20 @@
 //! The way from a sample to its answer: an empty lambda of each kind, and a reader that does nothing but that, in one run.
 
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use gleaner_transport::dds::{Dds, Options};
-use gleaner_transport::message::{Definitions, FieldPath, Sources};
-use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::bare::Bare;
 use super::{lambda, start, to_the_end};
+use crate::answers::Answers;
 use crate::measure::{Figure, Kind, quantile};
 
-const ANSWER: &str = "sensor_msgs/msg/TimeReference";
 /// Goal: how many times as long as the bare reader a lambda may take.
 const RATIO: f64 = 1.5;
 
-/// Collects answers, in ns from input to decision.
-struct Answers {
-    paths: [FieldPath; 4],
-    ns: Mutex<Vec<f64>>,
-}
-
-impl Answers {
-    fn new() -> Arc<Self> {
-        let sources = Sources::new(&[], &[]);
-        let text = sources.find(ANSWER).expect("bundled definitions are sound").expect("a type of common_interfaces");
-        let definitions = Definitions::parse(ANSWER, &text).expect("bundled definitions are sound");
-        let path = |path: &str| FieldPath::compile(&definitions, path).expect("a field of the type");
-        let paths = ["header.stamp.sec", "header.stamp.nanosec", "time_ref.sec", "time_ref.nanosec"].map(path);
-        Arc::new(Self { paths, ns: Mutex::default() })
-    }
-
-    fn take(&self) -> Vec<f64> {
-        std::mem::take(&mut self.ns.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-}
-
-impl Sink for Answers {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        let [a, b, c, d] = [0, 1, 2, 3].map(|n| self.paths[n].number(cdr, meta.endian).unwrap_or(f64::NAN));
-        self.ns.lock().unwrap_or_else(PoisonError::into_inner).push((c - a) * 1e9 + (d - b));
-        Verdict::Taken
-    }
-}
-
 pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
     let mut dds = Dds::open(Options::new("/gleaner_bench/answers")).expect("a private network can be joined");
-    let mut collect = |topic: &str| {
-        let answers = Answers::new();
-        let spec = TopicSpec {
-            topic: topic.to_owned(),
-            type_name: ANSWER.to_owned(),
-            queue: 1024,
-            max_bytes: 4096,
-            qos: Qos::Auto,
-        };
-        dds.subscribe(&spec, answers.clone()).expect("a topic of ours");
-        answers
-    };
-    let kinds = [Kind::Rust, Kind::Python].map(|kind| (kind, collect(&format!("/rtt/{kind}"))));
+    let kinds = [Kind::Rust, Kind::Python].map(|kind| (kind, Answers::on(&mut dds, &format!("/rtt/{kind}"))));
     let bare = Bare::start("/imu/synthetic", "/rtt/bare");
     let started =
         kinds.iter().map(|(kind, _)| start(&lambda("imu", *kind), &["--no-record", "--rtt", &format!("/rtt/{kind}")]));
@@ -72,7 +28,7 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
     told("bare reader", &base, figures);
     let base = quantile(&base, 0.5);
     for (((kind, answers), live), goals) in kinds.iter().zip(&ended).zip([[20.0, 100.0], [30.0, 150.0]]) {
-        let ns = answers.take();
+        let ns = answers.take().iter().map(|answer| answer.ns).collect::<Vec<_>>();
         told(&format!("empty lambda, {kind}"), &ns, figures);
         figures.push(Figure::at_most(
             &format!("IMU round trip at 100 Hz, empty lambda, {kind}, against the bare reader"),

@@ -1,5 +1,8 @@
 """A lambda that attacks whatever is around it, once, in its third wake. It says with an event what came of that: `refused` with
-the error, or `escaped`."""
+the error, or `escaped`.
+
+For a bench it attacks again and again instead: every other `every_ms` milliseconds of the day's time. Two good wakes come before each
+attack that is a fault, so that it is never made to rest."""
 
 from __future__ import annotations
 
@@ -24,11 +27,15 @@ class Lambda:
     def __init__(self, ctx: Context) -> None:
         self.attack: str = ctx.config["attack"]
         self.target: int = ctx.config["target"]
+        self.every_ms: int = ctx.config["every_ms"]
+        self.touch_mib: int = ctx.config["touch_mib"]
         self.wakes = 0
+        # Of the attack before, after which this object was made anew.
+        KEPT.clear()
 
     def on_tick(self, ctx: Context) -> None:
         self.wakes += 1
-        if self.wakes != 3 or self.attack == "none":
+        if not self.is_due(ctx) or self.attack == "none":
             return
         attack: Callable[[Context], object] = getattr(self, self.attack)
         try:
@@ -38,13 +45,18 @@ class Lambda:
         else:
             ctx.event("escaped", 1.0, found=repr(result)[:200])
 
+    def is_due(self, ctx: Context) -> bool:
+        if self.every_ms == 0:
+            return self.wakes == 3
+        return self.wakes >= 3 and ctx.now_ns() // (self.every_ms * 1_000_000) % 2 == 1
+
     def endless(self, ctx: Context) -> None:
         while True:
             pass
 
     def host_calls(self, ctx: Context) -> None:
         while True:
-            ctx.now_ns
+            ctx.now_ns()
 
     def recurse(self, ctx: Context) -> None:
         self.recurse(ctx)
@@ -52,6 +64,22 @@ class Lambda:
     def memory(self, ctx: Context) -> None:
         while True:
             KEPT.append(bytearray(1 << 20))
+
+    def touch(self, ctx: Context) -> None:
+        """All memory that it may have, over and over: what caches and the bus have to carry."""
+        pieces = [bytearray(1 << 20) for _ in range(self.touch_mib)]
+        ones = bytes([1]) * (1 << 20)
+        while True:
+            for piece in pieces:
+                piece[:] = ones
+
+    def numpy(self, ctx: Context) -> None:
+        """Native code that keeps its core busy, and comes back to the interpreter only now and then."""
+        import numpy
+
+        a = numpy.ones((256, 256))
+        while True:
+            a = a @ a * 0.0 + 1.0
 
     def log_flood(self, ctx: Context) -> None:
         for i in range(5000):

@@ -1,5 +1,8 @@
 //! A lambda that attacks whatever is around it, once, in its third wake. It says with an event what came of that: `refused` with
 //! the error, or `escaped`.
+//!
+//! For a bench it attacks again and again instead: every other `every_ms` milliseconds of the day's time. Two good wakes come before
+//! each attack that is a fault, so that it is never made to rest.
 
 use std::time::Duration;
 
@@ -7,6 +10,8 @@ use gleaner_sdk::{Config, Error, Field, Lambda, Result, Tick, event, input, log,
 
 struct Attack {
     attack: String,
+    every_ms: i64,
+    touch_mib: i64,
     wakes: u64,
     fields: Vec<Field>,
     bytes: Vec<Vec<u8>>,
@@ -15,12 +20,13 @@ struct Attack {
 impl Lambda for Attack {
     fn init(config: &Config) -> Result<Self> {
         let attack = config.text("attack")?.to_owned();
-        Ok(Attack { attack, wakes: 0, fields: Vec::new(), bytes: Vec::new() })
+        let (every_ms, touch_mib) = (config.integer("every_ms")?, config.integer("touch_mib")?);
+        Ok(Attack { attack, every_ms, touch_mib, wakes: 0, fields: Vec::new(), bytes: Vec::new() })
     }
 
     fn on_tick(&mut self, _tick: Tick) -> Result<()> {
         self.wakes += 1;
-        if self.wakes != 3 || self.attack == "none" {
+        if !self.is_due() || self.attack == "none" {
             return Ok(());
         }
         match self.attack() {
@@ -31,6 +37,13 @@ impl Lambda for Attack {
 }
 
 impl Attack {
+    fn is_due(&self) -> bool {
+        match self.every_ms {
+            0 => self.wakes == 3,
+            every_ms => self.wakes >= 3 && now_ns() / (every_ms * 1_000_000) % 2 == 1,
+        }
+    }
+
     fn attack(&mut self) -> Result<()> {
         match self.attack.as_str() {
             "endless" => loop {
@@ -43,6 +56,13 @@ impl Attack {
             "memory" => loop {
                 self.bytes.push(std::hint::black_box(Vec::with_capacity(1 << 20)));
             },
+            // All memory that it may have, over and over: what caches and the bus have to carry.
+            "touch" => {
+                self.bytes = (0..self.touch_mib).map(|_| vec![0; 1 << 20]).collect();
+                loop {
+                    self.bytes.iter_mut().for_each(|piece| piece.fill(std::hint::black_box(1)));
+                }
+            }
             "log_flood" => (0..5000).for_each(|_| log::info(&"x".repeat(100))),
             "event_flood" => (0..5000).try_for_each(|_| event("flood", 1.0).send())?,
             "handles" => loop {
