@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use gleaner_protocol::link::RecorderReport;
 use gleaner_protocol::{Clip, Decision, Report};
 use gleaner_tests::live::{self, Line, Started, below, decisions, no_player, play, run, signal};
-use gleaner_tests::{Folder, namespace, replay_to, root, sample_drive, times};
+use gleaner_tests::{Copy, Folder, namespace, replay_to, root, sample_drive, times};
 use libtest_mimic::{Arguments, Trial};
 
 /// Names the case that this process is to run in the network that it was started in.
@@ -25,6 +25,7 @@ const CASES: &[Case] = &[
     ("a_lambda_whose_process_is_killed_is_started_again_and_loses_no_decision", || killed("start.py")),
     ("a_recorder_that_is_killed_is_started_again_and_its_clip_recovered", || killed("gleaner-recorder")),
     ("a_topic_that_nobody_writes_is_said", nobody_writes),
+    ("a_reader_that_has_stopped_does_not_hold_up_the_lambda_that_it_listens_to", stopped),
     ("a_lambda_does_not_outlive_the_command_that_started_it", || outlives(None)),
     ("a_lambda_does_not_outlive_its_shim", || outlives(Some("gleaner-shim"))),
 ];
@@ -230,6 +231,30 @@ fn outlives(who: Option<&str>) {
     // A process that has ended has no command line, even where nobody asks how it ended.
     let line = format!("/proc/{}/cmdline", left[0]);
     wait_for("the end of the lambda's process", || std::fs::read(&line).unwrap_or_default().is_empty());
+}
+
+fn stopped() {
+    const TOLD: &str = "/told";
+    let talker = Copy::of("tests/lambdas/ticker/rust", |manifest| manifest.replace("\"100ms\"", "\"5ms\""));
+    let listener = Copy::of("bench/lambdas/imu/rust", |manifest| {
+        manifest.replace("/imu/synthetic", TOLD).replace("sensor_msgs/msg/Imu", "std_msgs/msg/String")
+    });
+    let (told, heard) = (Folder::new(), Folder::new());
+    let talks = run(talker.path(), told.path(), &["--no-record", "--decisions", TOLD]);
+    let listens = run(listener.path(), heard.path(), &["--no-record"]);
+    listens.until_live("decisions", |live| live.topics[0].received > 0);
+    let stopped = below(listens.pid(), "gleaner-runtime").into_iter().next_back().expect("its runtime");
+    signal(stopped, "STOP");
+    let from = talks.until_live("what cannot be sent any more", |live| live.unsent > 0);
+    let to = talks.until_live("a second more", |live| live.up_s > from.up_s + 1.0);
+    signal(stopped, "CONT");
+    // 200 a second are due. Waiting for the reader, it would be 10.
+    let rate = (to.wakes - from.wakes) as f64 / (to.up_s - from.up_s);
+    assert!(rate > 50.0 && to.unsent > from.unsent, "{rate} wakes in a second, {} not sent", to.unsent);
+    talks.signal("INT");
+    assert!(talks.finish().ended().unsent >= to.unsent);
+    listens.signal("INT");
+    listens.finish();
 }
 
 fn nobody_writes() {

@@ -115,6 +115,7 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         (live.triggers_refused, "trigger", "refused: over `events_per_minute`"),
         (live.passed_over, "wake", "passed over after repeated faults"),
         (live.unwritten, "decision or log line", "not written"),
+        (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` does not keep up"),
         (live.recorder.map_or(0, |recorder| recorder.wakes_dropped), "wake", "not told to the recorder"),
         (live.recorder.map_or(0, |recorder| recorder.triggers_lost), "trigger", "not told to the recorder"),
         (live.network.socket_drops, "datagram", "dropped by the system: a socket buffer was full"),

@@ -30,6 +30,11 @@ impl Announcer {
         Ok(Self { speaker: Speaker::open(dds, topic, TYPE, DEPTH)?, lambda: lambda.to_owned() })
     }
 
+    /// Decisions that were not sent.
+    pub(super) fn unsent(&self) -> u64 {
+        self.speaker.unsent()
+    }
+
     /// Publishes a decision, if it is one to tell.
     pub(super) fn decision(&mut self, decision: &Decision) {
         if decision.triggers.is_empty() && decision.fault.is_none() {

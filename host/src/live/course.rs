@@ -104,6 +104,12 @@ impl Course {
         told
     }
 
+    /// Messages that were not sent on topics that were asked for.
+    pub(super) fn unsent(&self) -> u64 {
+        let answers = self.round_trip.as_ref().map_or(0, RoundTrip::unsent);
+        answers + self.announcer.as_ref().map_or(0, Announcer::unsent)
+    }
+
     fn look_after(&mut self, now: i64) -> Result<(), Failure> {
         if let Some(recorder) = &mut self.recorder {
             recorder.poll()?;
@@ -124,6 +130,7 @@ impl Course {
             schedule: &self.schedule,
             session: &self.session,
             unwritten: self.ledger.unwritten(),
+            unsent: self.unsent(),
             recorder: self.recorder.as_ref().map(ToRecorder::dropped),
         });
         self.ledger.report(Report::Live(Box::new(live)));

@@ -112,6 +112,7 @@ impl Job {
         let ended = course.run(&stop);
         let faults = course.watch.faults();
         course.schedule.finish();
+        let unsent = course.unsent();
         let Course { ledger, watch, inputs, schedule, session, recorder, dds, .. } = course;
         let dropped = recorder.map(ToRecorder::leave);
         let last = watch.ended(&Around {
@@ -121,6 +122,7 @@ impl Job {
             schedule: &schedule,
             session: &session,
             unwritten: ledger.unwritten(),
+            unsent,
             recorder: dropped,
         });
         ledger.finish(Some(last))?;

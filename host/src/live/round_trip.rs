@@ -39,6 +39,11 @@ impl RoundTrip {
         }
     }
 
+    /// Answers that were not sent.
+    pub(super) fn unsent(&self) -> u64 {
+        self.speaker.unsent()
+    }
+
     /// Sends the answer to one wake.
     pub(super) fn answer(&mut self, cause_ns: i64, decision: &Decision) {
         let labels: Vec<&str> = decision.triggers.iter().map(|trigger| trigger.label.as_str()).collect();

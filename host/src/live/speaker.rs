@@ -20,6 +20,11 @@ impl Speaker {
         Ok(Self { topic: topic.to_owned(), writer, unsent: 0, message: CdrWriter::new() })
     }
 
+    /// Messages that were not sent.
+    pub(super) fn unsent(&self) -> u64 {
+        self.unsent
+    }
+
     /// Sends the message that `fill` writes.
     pub(super) fn say(&mut self, fill: impl FnOnce(&mut CdrWriter) -> &mut CdrWriter) {
         self.message.clear();

@@ -38,6 +38,8 @@ pub(super) struct Around<'a> {
     pub(super) session: &'a Session,
     /// Decisions and lines that could not be written.
     pub(super) unwritten: u64,
+    /// Messages that were not sent on topics that were asked for.
+    pub(super) unsent: u64,
     /// Where there is a recorder, what it could not be told.
     pub(super) recorder: Option<ToRecorder>,
 }
@@ -84,6 +86,7 @@ impl Watch {
             triggers_refused: 0,
             passed_over: 0,
             unwritten: 0,
+            unsent: 0,
             wake_up: None,
             run: None,
             hand_out: None,
@@ -148,7 +151,7 @@ impl Watch {
     }
 
     fn as_of_now(&mut self, around: &Around, [wake_up, run, hand_out]: [Option<Spread>; 3]) -> Live {
-        let Around { dds, health, inputs, schedule, session, unwritten, recorder } = *around;
+        let Around { dds, health, inputs, schedule, session, unwritten, unsent, recorder } = *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
         self.reported = now;
@@ -187,6 +190,7 @@ impl Watch {
             triggers_refused: session.triggers_refused(),
             passed_over: session.passed_over(),
             unwritten,
+            unsent,
             recorder,
             wake_up,
             run,

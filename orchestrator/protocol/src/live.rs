@@ -40,6 +40,9 @@ pub struct Live {
     pub passed_over: u64,
     /// Decisions and log lines that could not be written: the disk failed, or was too slow.
     pub unwritten: u64,
+    /// Messages on the topics of `--rtt` and `--decisions` that were not sent, since a reader does not keep up.
+    #[serde(default)]
+    pub unsent: u64,
     /// Sample received, or tick due, until the lambda is entered. `None` without wakes.
     pub wake_up: Option<Spread>,
     /// Time in the lambda.
@@ -76,6 +79,7 @@ impl Live {
             (&mut self.triggers_refused, before.triggers_refused),
             (&mut self.passed_over, before.passed_over),
             (&mut self.unwritten, before.unwritten),
+            (&mut self.unsent, before.unsent),
             (&mut self.network.socket_drops, before.network.socket_drops),
             (&mut self.network.filtered, before.network.filtered),
         ];
@@ -221,6 +225,7 @@ mod tests {
             triggers_refused: count,
             passed_over: count,
             unwritten: count,
+            unsent: count,
             wake_up: Some(Spread { n: count, p50_ns: count, p99_ns: count, max_ns: count }),
             run: None,
             hand_out: None,

@@ -12,8 +12,9 @@ use super::raw::RawWriter;
 use super::receive::{Command, Line};
 use super::state::State;
 
-/// How long a write waits for room, as in ROS 2.
-const PATIENCE: Duration = Duration::from_millis(100);
+/// How long a write waits for room: whoever writes is about to judge the next sample, and one reader that has stopped shall not hold
+/// that up.
+const PATIENCE: Duration = Duration::ZERO;
 /// Samples that are kept for readers that ask again.
 const DEPTH: std::ops::RangeInclusive<usize> = 1..=65_536;
 
@@ -60,11 +61,9 @@ impl Writer {
 
     /// Sends a message: little-endian CDR without its four bytes of encapsulation.
     ///
-    /// Waits, at most 100 ms, while readers have not yet confirmed what was sent before.
-    ///
     /// # Errors
     ///
-    /// [`DdsError`] if DDS refuses it.
+    /// [`DdsError`] if DDS refuses it, as it does while a reader has not confirmed the last `depth` messages.
     pub fn write(&self, cdr: &[u8]) -> Result<(), DdsError> {
         let why = |error: WriteError<Bytes>| match error {
             WriteError::WouldBlock { .. } => "readers do not keep up".to_owned(),

@@ -11,7 +11,7 @@ pub const TESTS: &[Test] = &[
 fn written() {
     let domain = domain();
     let dds = open(domain);
-    let writer = dds.writer("/event", "std_msgs/msg/String", 10).unwrap();
+    let writer = dds.writer("/event", "std_msgs/msg/String", 50).unwrap();
     assert_eq!(writer.readers(), 0);
     writer.write(b"nobody hears").unwrap();
     let peer = Peer::join(domain);
