@@ -85,13 +85,21 @@ fn a_smaller_stack_is_full_earlier() {
     // Each call takes some stack and a little fuel, and nothing else.
     let endless = component("", "", "(func $wake (call $wake) (call $wake))");
     let deep = |stack: ByteSize| {
-        let mut room = Room::written_within(&endless, &with(|limits| limits.stack = stack));
-        let outcome = room.wake();
-        is(&outcome.result.unwrap_err(), FaultKind::Stack, None, stack.bytes());
-        outcome.fuel.unwrap()
+        let fuel_lasts = |fuel: &u64| {
+            let outcome =
+                Room::written_within(&endless, &with(|limits| (limits.stack, limits.fuel) = (stack, *fuel))).wake();
+            let fault = outcome.result.unwrap_err();
+            if fault.kind == FaultKind::Stack {
+                is(&fault, FaultKind::Stack, None, stack.bytes());
+                // A journal would not be the same on another processor, whose code takes another amount of stack.
+                assert_eq!(outcome.fuel, None);
+            }
+            fault.kind == FaultKind::Stack
+        };
+        (0..24).map(|power| 64 << power).find(fuel_lasts).expect("some fuel lasts until the stack is full")
     };
     let (least, most) = (deep(STACK.min), deep(STACK.max));
-    assert!((20..45).contains(&(most / least)), "{least} and {most}");
+    assert!((16..=64).contains(&(most / least)), "{least} and {most}");
 }
 
 #[test]

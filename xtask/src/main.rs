@@ -3,6 +3,7 @@
 //! `checkout` knows where things are, `setup` makes what is missing, `examples` replays the sample drive, and each
 //! command is a file that says what it does after that. Nothing here is part of what is installed.
 
+mod aarch64;
 mod bless;
 mod checkout;
 mod demo;
@@ -32,6 +33,7 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   peers  build programs on other DDS for the tests of live topics; --install fetches their packages first
   player build gleaner-player, which plays drives with Cyclone DDS, and fetch what that takes
   fuzz   feed what reads foreign bytes with made-up ones; [TARGET...] [--seconds N] [--seed N]
+  aarch64  build for vehicles with an ARM processor, and compare what lambdas decide there, emulated
   build  only set up: wasm target, Python environment, programs, lambdas";
 
 fn main() -> ExitCode {
@@ -61,6 +63,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "fuzz" => fuzz::run(&checkout, rest),
         "peers" => peers::build(&checkout, rest),
         "player" => player::run(&checkout),
+        "aarch64" => aarch64::run(&checkout),
         "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS), &FAMILIES).map(|()| Exit::Ok),
         _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
     }

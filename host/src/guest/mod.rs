@@ -34,6 +34,6 @@ pub trait Guest {
 pub struct Outcome {
     /// What went wrong, if anything did.
     pub result: Result<(), Fault>,
-    /// Fuel used by this wake, where the kind counts it.
+    /// Fuel used by this wake, where the kind counts it and it is the same on every machine.
     pub fuel: Option<u64>,
 }

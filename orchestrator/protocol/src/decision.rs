@@ -23,7 +23,8 @@ pub struct Decision {
     pub triggers: Vec<Trigger>,
     /// Why the wake ended early, if it did. Triggers that came before the fault still count.
     pub fault: Option<Fault>,
-    /// Fuel that the wake burnt; `None` for Python, which has none.
+    /// Fuel that the wake burnt; `None` for Python, which has none, and after [`FaultKind::Stack`]: how much it is until a stack is
+    /// full depends on the processor.
     pub fuel: Option<u64>,
     /// Time in the lambda, in ns. It differs from run to run, so twins are not compared by it.
     pub run_ns: u64,

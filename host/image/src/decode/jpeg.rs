@@ -7,7 +7,9 @@
 //! Compared with libjpeg-turbo on files of every subsampling, `zune-jpeg` 0.5.15 silently makes
 //! wrong pictures of two rare kinds: components in scans of their own (sequential), and luma that is
 //! coarser than chroma. Both are refused here. On x86-64, its vector and scalar code made the same
-//! bytes of 85 photographs and of 60,000 damaged files, so its vector code stays on.
+//! bytes of 85 photographs and of 60,000 damaged files, so its vector code stays on. NEON, emulated,
+//! made the bytes of x86-64 and of its own scalar code of 16,000 files, most of them damaged, of every
+//! subsampling.
 
 use zune_core::bytestream::ZCursor;
 use zune_core::colorspace::ColorSpace;

@@ -10,7 +10,9 @@ from gleaner import Context, Error, Model, Roi, Sample
 
 class Lambda:
     def __init__(self, ctx: Context) -> None:
-        if dict(ctx.config) != {"number": 1.5, "count": 3, "yes": True, "word": "probe"} or ctx.inputs() != ["camera", "imu"]:
+        config = dict(ctx.config)
+        self.every: int = config.pop("every")
+        if config != {"number": 1.5, "count": 3, "yes": True, "word": "probe"} or ctx.inputs() != ["camera", "imu"]:
             raise ValueError(f"unexpected {ctx.config}")
         self.camera, self.imu = ctx.input("camera"), ctx.input("imu")
         self.forward = self.imu.field("linear_acceleration.x")
@@ -21,7 +23,7 @@ class Lambda:
 
     def on_event(self, ctx: Context, sample: Sample) -> None:
         # Hashing is slow in Python: some of the pictures will do.
-        if sample.identity.seq % 40 != 0:
+        if sample.identity.seq % self.every != 0:
             return
         self.topics(ctx)
         self.samples(ctx, sample)

@@ -107,14 +107,20 @@ impl Digest {
     }
 }
 
-struct Kernels;
+struct Kernels {
+    said: bool,
+}
 
 impl Lambda for Kernels {
     fn init(_config: &Config) -> Result<Self> {
-        Ok(Self)
+        Ok(Self { said: false })
     }
 
     fn on_event(&mut self, _sample: Sample) -> Result<()> {
+        // It would be the same at every wake.
+        if std::mem::replace(&mut self.said, true) {
+            return Ok(());
+        }
         for Made { kernel, digest, number } in results()? {
             event(&format!("{kernel} {digest:016x}"), number).send()?;
         }

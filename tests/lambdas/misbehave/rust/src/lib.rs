@@ -56,6 +56,11 @@ impl Lambda for Misbehave {
                 panic!("after the event");
             }
             "nan_score" => event("x", f64::NAN).send()?,
+            // Which NaN it is depends on the processor.
+            "nan_bits" => {
+                let [a, b] = std::hint::black_box([0.0_f64, 0.0]);
+                event("nan", 0.0).with("bits", format!("{:016x}", (a / b).to_bits()).as_str()).send()?;
+            }
             "hold" => self.held.push(sample),
             "log_flood" => (0..1000).for_each(|i| log::info(&format!("line {i}"))),
             "print" => println!("hello from {}", self.wakes),

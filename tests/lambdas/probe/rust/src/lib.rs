@@ -7,6 +7,7 @@ use gleaner_sdk::{
 };
 
 struct Probe {
+    every: u64,
     camera: Topic,
     imu: Topic,
     forward: Field,
@@ -24,6 +25,7 @@ impl Lambda for Probe {
         }
         let (camera, imu) = (input("camera")?, input("imu")?);
         Ok(Self {
+            every: config.integer("every")?.unsigned_abs().max(1),
             forward: imu.field("linear_acceleration.x")?,
             covariance: imu.field("orientation_covariance")?,
             frame_id: imu.field("header.frame_id")?,
@@ -36,7 +38,7 @@ impl Lambda for Probe {
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         // Hashing is slow in Python: some of the pictures will do.
-        if !sample.identity().seq.is_multiple_of(40) {
+        if !sample.identity().seq.is_multiple_of(self.every) {
             return Ok(());
         }
         self.topics()?;

@@ -1,0 +1,242 @@
+//! What is replayed, and on what machine: this one, or the emulated one.
+
+use std::fs;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::Instant;
+
+use gleaner_protocol::{Exit, Failure, Summary, Verified};
+
+use super::compare::{Replayed, read};
+use crate::checkout::Checkout;
+use crate::examples::DRIVE;
+
+/// Where results go, in the checkout.
+pub(super) const OUT: &str = "out/aarch64";
+
+/// A lambda with settings.
+pub(super) struct Case {
+    lambda: &'static str,
+    set: &'static [&'static str],
+    /// A limit that a vehicle makes smaller.
+    limit: Option<&'static str>,
+    /// Whether its manifest says so, instead of what it says there.
+    deterministic: bool,
+    /// Why its decisions are known to differ, which also shows that a difference would be seen.
+    pub(super) known: Option<&'static str>,
+}
+
+const fn case(lambda: &'static str, set: &'static [&'static str]) -> Case {
+    Case { lambda, set, limit: None, deterministic: false, known: None }
+}
+
+/// Triggers, all pixels of all pictures, floating point, and every way to fault that a processor has a part in.
+pub(super) const CASES: [Case; 13] = [
+    case("examples/hello/rust", &["brake_mps2=-1.4"]),
+    case("examples/brake-dark/rust", &["brake_mps2=-1.4", "dark_luma=50"]),
+    // Every picture is bright enough, and the car always brakes.
+    case("examples/brake-dark/rust", &["brake_mps2=100", "dark_luma=255"]),
+    case("tests/lambdas/probe/rust", &["every=1"]),
+    case("tests/lambdas/kernels/rust", &[]),
+    case("tests/lambdas/misbehave/rust", &["behaviour=recurse"]),
+    case("tests/lambdas/misbehave/rust", &["behaviour=endless"]),
+    case("tests/lambdas/misbehave/rust", &["behaviour=panic"]),
+    case("tests/lambdas/misbehave/rust", &["behaviour=memory"]),
+    case("tests/lambdas/misbehave/rust", &["behaviour=host_calls"]),
+    Case { limit: Some("stack = \"16 KiB\""), ..case("tests/lambdas/misbehave/rust", &["behaviour=recurse"]) },
+    Case {
+        known: Some("a NaN that arithmetic makes has a sign here and none there"),
+        ..case("tests/lambdas/misbehave/rust", &["behaviour=nan_bits"])
+    },
+    Case { deterministic: true, ..case("tests/lambdas/misbehave/rust", &["behaviour=nan_bits"]) },
+];
+
+/// The folders of the lambdas in [`CASES`], each once, relative to the checkout.
+pub(super) fn lambdas() -> Vec<PathBuf> {
+    let mut lambdas = CASES.iter().map(|case| PathBuf::from(case.lambda)).collect::<Vec<_>>();
+    lambdas.dedup();
+    lambdas
+}
+
+/// Programs for one processor.
+pub(super) struct Machine<'c> {
+    checkout: &'c Checkout,
+    name: &'static str,
+    programs: PathBuf,
+}
+
+impl<'c> Machine<'c> {
+    pub(super) fn here(checkout: &'c Checkout) -> Self {
+        Self { checkout, name: std::env::consts::ARCH, programs: checkout.target().join("release") }
+    }
+
+    /// `programs` holds a script for each.
+    pub(super) fn emulated(checkout: &'c Checkout, programs: PathBuf) -> Self {
+        Self { checkout, name: "aarch64", programs }
+    }
+
+    fn program(&self, name: &str) -> Command {
+        let mut program = self.checkout.command(self.programs.join(name));
+        // Else they would start the programs beside what the emulator runs.
+        program.env("GLEANER_HOME", &self.programs).stdin(Stdio::null());
+        program
+    }
+
+    fn run(&self, mut command: Command) -> Result<Output, Failure> {
+        command.output().map_err(|error| {
+            let program = command.get_program().display();
+            Failure::caused_by(Exit::Internal, format!("cannot start `{program}` for {}", self.name), &error)
+        })
+    }
+
+    /// What `gleaner --json` reports, however it exits.
+    fn report<T: serde::de::DeserializeOwned>(&self, command: Command) -> Result<T, Failure> {
+        let output = self.run(command)?;
+        serde_json::from_slice(&output.stdout).map_err(|_| {
+            let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+            let mut failure = Failure::new(Exit::Internal, format!("no result on {} ({})", self.name, output.status));
+            failure.causes = vec![if said.is_empty() { "it said nothing".to_owned() } else { said }];
+            failure
+        })
+    }
+}
+
+impl Case {
+    /// As a person would type it.
+    pub(super) fn name(&self) -> String {
+        let set: String = self.set.iter().map(|set| format!(" {set}")).collect();
+        let limit: String = self.limit.iter().map(|limit| format!(" with {limit}")).collect();
+        let deterministic = if self.deterministic { " with deterministic = true" } else { "" };
+        format!("{}{set}{limit}{deterministic}", self.lambda.trim_end_matches("/rust"))
+    }
+
+    /// The lambda's folder, relative to the checkout; if it is to be deterministic, a copy that is.
+    fn lambda(&self, checkout: &Checkout) -> Result<PathBuf, Failure> {
+        if !self.deterministic {
+            return Ok(PathBuf::from(self.lambda));
+        }
+        let copy = Path::new(OUT).join("deterministic");
+        copy_deterministic(&checkout.path(self.lambda), &checkout.path(&copy)).map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot copy `{}` to `{}`", self.lambda, copy.display()), &error)
+        })?;
+        Ok(copy)
+    }
+
+    /// The folder of its results on `machine`, relative to the checkout.
+    fn out(&self, machine: &Machine<'_>) -> PathBuf {
+        let plain = |character: char| if character.is_ascii_alphanumeric() { character } else { '-' };
+        Path::new(OUT).join(self.name().chars().map(plain).collect::<String>()).join(machine.name)
+    }
+
+    /// Replays the sample drive, with a journal.
+    pub(super) fn replay(&self, machine: &Machine<'_>) -> Result<Replayed, Failure> {
+        let out = self.out(machine);
+        let folder = machine.checkout.path(&out);
+        let failed = |error: std::io::Error| {
+            Failure::caused_by(Exit::Internal, format!("cannot make `{}`", out.display()), &error)
+        };
+        fs::create_dir_all(&folder).map_err(failed)?;
+        let mut replay = machine.program("gleaner");
+        replay
+            .arg("replay")
+            .arg(self.lambda(machine.checkout)?)
+            .arg(DRIVE)
+            .args(["--all", "--json", "--out"])
+            .arg(&out);
+        replay.args(self.set.iter().flat_map(|set| ["--set", set]));
+        replay.arg("--journal").arg(journal(&out));
+        if let Some(limit) = self.limit {
+            let vehicle = folder.join("vehicle.toml");
+            fs::write(&vehicle, format!("[limits]\n{limit}\n")).map_err(failed)?;
+            replay.arg("--vehicle").arg(vehicle);
+        }
+        let started = Instant::now();
+        let summary: Summary = machine.report(replay)?;
+        read(&folder, summary.wakes, started.elapsed().as_secs_f64())
+    }
+
+    /// Makes every decision of `writer`'s journal again on `reader`; says how many there were.
+    pub(super) fn verify(&self, writer: &Machine<'_>, reader: &Machine<'_>) -> Result<String, Failure> {
+        let mut verify = reader.program("gleaner");
+        verify.arg("replay").arg(self.lambda(reader.checkout)?).arg(DRIVE);
+        verify.arg("--verify").arg(journal(&self.out(writer))).arg("--json");
+        let verified: Verified = reader.report(verify)?;
+        Ok(format!("and {} decisions of the journal of {} made again on {}", verified.wakes, writer.name, reader.name))
+    }
+}
+
+fn copy_deterministic(lambda: &Path, copy: &Path) -> std::io::Result<()> {
+    let build = copy.join("build");
+    fs::create_dir_all(&build)?;
+    for entry in fs::read_dir(lambda.join("build"))? {
+        let file = entry?;
+        if file.path().is_file() {
+            fs::copy(file.path(), build.join(file.file_name()))?;
+        }
+    }
+    let manifest = fs::read_to_string(lambda.join("build/lambda.toml"))?;
+    let manifest = manifest.replace("[lambda]\n", "[lambda]\ndeterministic = true\n");
+    // The build's last: it must not be older than its source.
+    fs::write(copy.join("lambda.toml"), &manifest)?;
+    fs::write(build.join("lambda.toml"), &manifest)
+}
+
+fn journal(out: &Path) -> PathBuf {
+    out.join("wakes.journal")
+}
+
+/// Puts code that was compiled here to where the emulated machine expects its own, and sees that it is not loaded. Says how
+/// it was refused.
+pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<String, Failure> {
+    let lambda = CASES[0].lambda;
+    let cache = Cache::make()?;
+    let compile = |machine: &Machine<'_>, folder: &str| -> Result<PathBuf, Failure> {
+        let mut compile = machine.program("gleaner-compile");
+        let component = machine.checkout.path(lambda).join("build/hello.wasm");
+        compile.arg(component).arg("--cache").arg(cache.0.join(folder)).stderr(Stdio::inherit());
+        let output = machine.run(compile)?;
+        let entry = String::from_utf8_lossy(&output.stdout).trim().to_owned();
+        if output.status.success() {
+            Ok(PathBuf::from(entry))
+        } else {
+            Err(Failure::new(Exit::Internal, format!("cannot compile for {} ({})", machine.name, output.status)))
+        }
+    };
+    // A program finds its cache in the folder `gleaner` of the one that it is told.
+    let (foreign, own) = (compile(here, "here")?, compile(there, "gleaner")?);
+    if foreign.file_name() == own.file_name() {
+        return Err(Failure::new(Exit::Differs, "code of both processors has the same name in the cache"));
+    }
+    fs::copy(&foreign, &own).map_err(|error| Failure::caused_by(Exit::Internal, "cannot copy code", &error))?;
+    let mut replay = there.program("gleaner");
+    replay.env("XDG_CACHE_HOME", &cache.0).arg("replay").arg(lambda).arg(DRIVE).arg("--out").arg(cache.0.join("out"));
+    let output = there.run(replay)?;
+    let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    if output.status.success() || !said.contains("cannot load native code") {
+        let mut failure = Failure::new(Exit::Differs, format!("code of {} was loaded on {}", here.name, there.name));
+        failure.causes = vec![format!("it ended with {}: {said}", output.status)];
+        return Err(failure);
+    }
+    Ok(said)
+}
+
+/// A cache of our own, below a folder where only we may write; else code in it would not be looked at. It goes in the end.
+struct Cache(PathBuf);
+
+impl Cache {
+    fn make() -> Result<Cache, Failure> {
+        let folder = std::env::temp_dir().join(format!("gleaner-aarch64-{}", std::process::id()));
+        fs::DirBuilder::new().mode(0o700).create(&folder).map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot make `{}`", folder.display()), &error)
+        })?;
+        Ok(Cache(folder))
+    }
+}
+
+impl Drop for Cache {
+    fn drop(&mut self) {
+        // What stays in a temporary folder disturbs nobody.
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}

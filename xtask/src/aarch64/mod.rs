@@ -1,0 +1,95 @@
+//! `cargo xtask aarch64`: builds what goes into a vehicle with an ARM processor, and finds out whether lambdas decide there
+//! what they decide here: every decision of the same replays, bit for bit, and the fuel that it took.
+//!
+//! The programs for ARM run in qemu's user mode, which emulates the processor; the kernel remains this machine's. So nothing is
+//! said about speed, and nothing about isolation: qemu knows neither Landlock nor seccomp, and the programs say that these do
+//! not hold. It lacks a call without which `gleaner-shim` does not start, so that one is built but not run: its place is taken by
+//! this machine's.
+
+mod cases;
+mod compare;
+mod tools;
+
+use std::env;
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::{Exit, Failure};
+
+use crate::checkout::Checkout;
+use crate::setup;
+use crate::steps::{self, Steps};
+use cases::{CASES, Case, Machine};
+use tools::{TARGET, Tools};
+
+/// Packages with what goes into a vehicle.
+const PACKAGES: [&str; 6] =
+    ["gleaner-cli", "gleaner-compile", "gleaner-host", "gleaner-python", "gleaner-recorder", "gleaner-shim"];
+/// The programs in them that are run.
+const PROGRAMS: [&str; 3] = ["gleaner", "gleaner-compile", "gleaner-runtime"];
+const SHIM: &str = "gleaner-shim";
+
+/// Builds, replays here and there, and compares.
+pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
+    if env::consts::ARCH == "aarch64" {
+        return Err(Failure::new(Exit::Usage, "this machine is an aarch64 itself").with_help("run `cargo xtask demo`"));
+    }
+    let mut steps = Steps::of(5);
+    steps.begin(&format!("cross compiler, emulator and compilation target {TARGET}"));
+    let tools = Tools::find(checkout)?;
+    steps.begin("programs and lambdas for this machine (the first time this takes minutes)");
+    setup::target(checkout, setup::TARGET)?;
+    setup::programs(checkout)?;
+    setup::lambdas(checkout, &cases::lambdas())?;
+    steps.begin(&format!("programs for {TARGET} (the first time this takes minutes)"));
+    let emulated = build(checkout, &tools)?;
+    println!("built {}", checkout.target().join(TARGET).join("release").display());
+    steps.begin("code of the other processor is refused");
+    let (here, there) = (Machine::here(checkout), Machine::emulated(checkout, emulated));
+    println!("{}", cases::foreign_code(&here, &there)?);
+    steps.begin(&format!("{} replays, each on both processors", CASES.len()));
+    let unexpected = CASES.iter().map(|case| compare(case, &here, &there)).sum::<Result<usize, Failure>>()?;
+    println!("{} of {} replays went as they must", CASES.len() - unexpected, CASES.len());
+    println!("files: {}/", cases::OUT);
+    Ok(if unexpected == 0 { Exit::Ok } else { Exit::Differs })
+}
+
+/// Builds, and puts a script for each program into a folder, by which programs start each other emulated. Gives the folder.
+fn build(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
+    let mut build = tools.cargo(checkout);
+    build.args(["build", "--release", "--target", TARGET]);
+    build.args(PACKAGES.iter().flat_map(|package| ["-p", package]));
+    steps::run(&mut build, "see the first error above")?;
+    let (built, scripts) =
+        (checkout.target().join(TARGET).join("release"), checkout.target().join(TARGET).join("emulated"));
+    let here = (SHIM, Tools::script_here(&checkout.program(SHIM)));
+    for (name, script) in PROGRAMS.map(|name| (name, tools.script(&built.join(name)))).into_iter().chain([here]) {
+        write_program(&scripts, name, &script).map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot write `{}`", scripts.join(name).display()), &error)
+        })?;
+    }
+    Ok(scripts)
+}
+
+fn write_program(folder: &Path, name: &str, script: &str) -> std::io::Result<()> {
+    fs::create_dir_all(folder)?;
+    let path = folder.join(name);
+    fs::write(&path, script)?;
+    fs::set_permissions(path, fs::Permissions::from_mode(0o755))
+}
+
+/// Says how one case went, in a line. 1 if that was not expected.
+fn compare(case: &Case, here: &Machine<'_>, there: &Machine<'_>) -> Result<usize, Failure> {
+    let [a, b] = [case.replay(here)?, case.replay(there)?];
+    let difference = compare::difference(&a, &b);
+    let verdict = match (&difference, case.known) {
+        (None, None) => format!("equal, {}", case.verify(here, there)?),
+        (Some(what), None) => format!("DIFFERS in {what}"),
+        (Some(what), Some(why)) => format!("differs as it must, {why}: {what}"),
+        (None, Some(why)) => format!("EQUAL, but it should not be: {why}"),
+    };
+    let times = format!("{:.1} s here, {:.1} s emulated", a.seconds, b.seconds);
+    println!("{}\n  {}; {times}\n  {verdict}", case.name(), compare::counted(&a.decisions));
+    Ok(usize::from(difference.is_some() != case.known.is_some()))
+}

@@ -1,0 +1,95 @@
+//! What it takes to build for the other processor and to run what was built: a C compiler for it, its C library, and an emulator.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::{Exit, Failure};
+
+use crate::checkout::Checkout;
+use crate::setup;
+use crate::steps;
+
+/// What rustup and cargo call it.
+pub(super) const TARGET: &str = "aarch64-unknown-linux-gnu";
+
+const COMPILER: &str = "aarch64-linux-gnu-gcc";
+/// Either will do; packages of distributions have one or both.
+const EMULATORS: [&str; 2] = ["qemu-aarch64-static", "qemu-aarch64"];
+const LOADER: &str = "ld-linux-aarch64.so.1";
+
+/// The tools of this machine.
+pub(super) struct Tools {
+    emulator: &'static str,
+    /// The folder with `lib/` of the other processor's C library.
+    libraries: PathBuf,
+}
+
+impl Tools {
+    /// Finds the tools; fetches Rust's own libraries.
+    pub(super) fn find(checkout: &Checkout) -> Result<Tools, Failure> {
+        let has = |program: &str| steps::succeeds(checkout.command(program).arg("--version"));
+        let emulator = EMULATORS.into_iter().find(|program| has(program));
+        let compiler = has(COMPILER);
+        let libraries = if compiler { libraries(checkout)? } else { None };
+        let packages = [
+            (compiler, "gcc-aarch64-linux-gnu"),
+            (libraries.is_some(), "libc6-dev-arm64-cross"),
+            (emulator.is_some(), "qemu-user-static"),
+        ];
+        let missing = packages.iter().filter(|(there, _)| !there).map(|(_, package)| *package).collect::<Vec<_>>();
+        let (Some(emulator), Some(libraries), true) = (emulator, libraries, compiler) else {
+            let help = format!("as root, on Debian and Ubuntu: apt-get install {}", missing.join(" "));
+            return Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help));
+        };
+        // Who cannot fetch it may do without; what does not compile is another matter.
+        setup::target(checkout, TARGET).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
+        Ok(Tools { emulator, libraries })
+    }
+
+    /// A cargo that builds for the other processor, if it is told [`TARGET`].
+    pub(super) fn cargo(&self, checkout: &Checkout) -> Command {
+        let name = TARGET.replace('-', "_");
+        let mut cargo = checkout.cargo();
+        cargo.env(format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), COMPILER).env(format!("CC_{name}"), COMPILER);
+        // The extension module takes its symbols from whatever interpreter loads it, and keeps to what 3.9 had: no Python
+        // of the other processor is asked for anything.
+        cargo.env("PYO3_NO_PYTHON", "1");
+        cargo
+    }
+
+    /// A script for `sh` that is `program`, emulated.
+    pub(super) fn script(&self, program: &Path) -> String {
+        format!("#!/bin/sh\nexec {} -L {} {} \"$@\"\n", self.emulator, quoted(&self.libraries), quoted(program))
+    }
+
+    /// A script for `sh` that is `program` of this machine.
+    pub(super) fn script_here(program: &Path) -> String {
+        format!("#!/bin/sh\nexec {} \"$@\"\n", quoted(program))
+    }
+}
+
+/// The C compiler knows where the C library is.
+fn libraries(checkout: &Checkout) -> Result<Option<PathBuf>, Failure> {
+    let mut ask = checkout.command(COMPILER);
+    let loader = steps::output(ask.arg(format!("-print-file-name={LOADER}")), "see the error above")?;
+    // Its bare name, if it does not. Else it lies in FOLDER/lib, by way of the compiler's own folder.
+    let loader = Path::new(loader.trim()).canonicalize().ok().filter(|loader| loader.is_file());
+    Ok(loader.and_then(|loader| Some(loader.parent()?.parent()?.to_owned())))
+}
+
+/// `path` as one word of `sh`.
+fn quoted(path: &Path) -> String {
+    format!("'{}'", path.display().to_string().replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_script_takes_any_path_as_one_word() {
+        let tools = Tools { emulator: "emulator", libraries: "/usr/arm".into() };
+        let script = tools.script(Path::new("/it's a/program"));
+        assert_eq!(script, "#!/bin/sh\nexec emulator -L '/usr/arm' '/it'\\''s a/program' \"$@\"\n");
+    }
+}
