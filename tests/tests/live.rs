@@ -235,7 +235,7 @@ fn outlives(who: Option<&str>) {
 
 fn stopped() {
     const TOLD: &str = "/told";
-    let talker = Copy::of("tests/lambdas/ticker/rust", |manifest| manifest.replace("\"100ms\"", "\"5ms\""));
+    let talker = Copy::of("tests/lambdas/ticker/rust", |manifest| manifest.replace("\"100ms\"", "\"1ms\""));
     let listener = Copy::of("bench/lambdas/imu/rust", |manifest| {
         manifest.replace("/imu/synthetic", TOLD).replace("sensor_msgs/msg/Imu", "std_msgs/msg/String")
     });
@@ -248,7 +248,7 @@ fn stopped() {
     let from = talks.until_live("what cannot be sent any more", |live| live.unsent > 0);
     let to = talks.until_live("a second more", |live| live.up_s > from.up_s + 1.0);
     signal(stopped, "CONT");
-    // 200 a second are due. Waiting for the reader, it would be 10.
+    // 1,000 a second are due. Waiting for the reader, it would be 10.
     let rate = (to.wakes - from.wakes) as f64 / (to.up_s - from.up_s);
     assert!(rate > 50.0 && to.unsent > from.unsent, "{rate} wakes in a second, {} not sent", to.unsent);
     talks.signal("INT");

@@ -52,6 +52,7 @@ const CALLS: &[i64] = &[
     libc::SYS_finit_module,
     libc::SYS_delete_module,
     libc::SYS_kexec_load,
+    libc::SYS_kexec_file_load,
     libc::SYS_syslog,
     libc::SYS_lookup_dcookie,
     libc::SYS_personality,
@@ -99,8 +100,7 @@ const CALLS: &[i64] = &[
 ];
 
 #[cfg(target_arch = "x86_64")]
-const MACHINE_CALLS: &[i64] =
-    &[libc::SYS_iopl, libc::SYS_ioperm, libc::SYS_modify_ldt, libc::SYS_uselib, libc::SYS_kexec_file_load];
+const MACHINE_CALLS: &[i64] = &[libc::SYS_iopl, libc::SYS_ioperm, libc::SYS_modify_ldt, libc::SYS_uselib];
 #[cfg(not(target_arch = "x86_64"))]
 const MACHINE_CALLS: &[i64] = &[];
 

@@ -63,7 +63,8 @@ impl Writer {
     ///
     /// # Errors
     ///
-    /// [`DdsError`] if DDS refuses it, as it does while a reader has not confirmed the last `depth` messages.
+    /// [`DdsError`] if DDS refuses it, as it does while a reader has not confirmed the last 8,192 messages.
+    /// It never waits for one.
     pub fn write(&self, cdr: &[u8]) -> Result<(), DdsError> {
         let why = |error: WriteError<Bytes>| match error {
             WriteError::WouldBlock { .. } => "readers do not keep up".to_owned(),
