@@ -25,12 +25,16 @@ impl fmt::Display for Kind {
 }
 
 impl Kind {
-    fn folder(self, example: &str) -> PathBuf {
-        let kind = match self {
+    /// The folder of this kind's twin.
+    pub fn folder(self) -> &'static str {
+        match self {
             Self::Rust => "rust",
             Self::Python => "python",
-        };
-        root().join("examples").join(example).join(kind)
+        }
+    }
+
+    fn example(self, name: &str) -> PathBuf {
+        root().join("examples").join(name).join(self.folder())
     }
 }
 
@@ -73,12 +77,12 @@ impl Setting {
 
     /// `hello` over the sample drive: a wake for each of 4,170 IMU samples.
     pub fn hello(&self, kind: Kind) -> Summary {
-        self.run(&kind.folder("hello"), &["--set", "brake_mps2=-1.4", "--no-record"])
+        self.run(&kind.example("hello"), &["--set", "brake_mps2=-1.4", "--no-record"])
     }
 
     /// `brake-dark` over the sample drive, brought to look at each of its 400 pictures.
     pub fn every_frame_decoded(&self, kind: Kind) -> Summary {
-        self.run(&kind.folder("brake-dark"), &["--set", "brake_mps2=1000", "--set", "dark_luma=0", "--no-record"])
+        self.run(&kind.example("brake-dark"), &["--set", "brake_mps2=1000", "--set", "dark_luma=0", "--no-record"])
     }
 
     fn run(&self, lambda: &Path, args: &[&str]) -> Summary {
@@ -88,7 +92,7 @@ impl Setting {
     /// By how many per cent memory after the 10th replay of `example` in one process exceeds that after the 2nd.
     pub fn growth_from_2nd_to_10th(&self, example: &str, kind: Kind) -> f64 {
         let args = ["--set", "brake_mps2=-1.4", "--repeat", "10"];
-        let rounds = self.rounds(&kind.folder(example), &self.sample, &args);
+        let rounds = self.rounds(&kind.example(example), &self.sample, &args);
         100.0 * (rounds[9].rss_bytes as f64 / rounds[1].rss_bytes as f64 - 1.0)
     }
 
@@ -103,7 +107,7 @@ impl Setting {
             "clips" => {}
             _ => args.push("--no-record"),
         }
-        let rounds = self.rounds(&Kind::Rust.folder("hello"), drive, &args);
+        let rounds = self.rounds(&Kind::Rust.example("hello"), drive, &args);
         let mut rates = rounds.iter().map(|round| round.wakes_per_s).collect::<Vec<_>>();
         rates.sort_by(f64::total_cmp);
         rates[rates.len() / 2]
@@ -124,7 +128,7 @@ impl Setting {
         let folder = Folder::new();
         let journal = folder.path().join("wakes.journal");
         let args = ["--set", "brake_mps2=-1.4", "--no-record", "--journal", journal.to_str().expect("a plain name")];
-        let summary = self.run(&Kind::Rust.folder(example), &args);
+        let summary = self.run(&Kind::Rust.example(example), &args);
         std::fs::metadata(&journal).expect("a journal").len() as f64 / summary.wakes as f64
     }
 

@@ -11,6 +11,7 @@ use gleaner_protocol::{Exit, Explain, Failure, Parts, Report, Summary, Verified,
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::listen::Listener;
+use crate::sibling::starter;
 
 /// Why the runtime did not do what it was asked for, where it could not say so itself.
 #[derive(Debug, thiserror::Error)]
@@ -94,7 +95,7 @@ pub(crate) fn run(arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Fai
 /// Starts the runtime below its shim.
 fn start(program: PathBuf, runtime: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
     Command::new(&program)
-        .args([&format!("--starter={}", std::process::id()), "--"])
+        .args([starter(), "--".into()])
         .arg(runtime)
         .args(arguments)
         .stdin(Stdio::null())

@@ -10,6 +10,11 @@ use crate::args::{NetworkArgs, TopicsArgs};
 use crate::say::say;
 use crate::show;
 
+/// For `gleaner-shim`: that it ends its runtime when this process dies.
+pub(crate) fn starter() -> OsString {
+    format!("--starter={}", std::process::id()).into()
+}
+
 /// Becomes `gleaner-player`.
 pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
     let program = Parts::find()?.program("gleaner-player")?;

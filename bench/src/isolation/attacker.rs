@@ -86,8 +86,7 @@ impl Attacker {
     /// Starts it on `core`, and waits until it has had its `init`.
     pub(super) fn start(attack: &Attack, core: usize) -> Self {
         let Some((behaviour, kind)) = attack.by else { return Self::Neighbour { core } };
-        let folder = if matches!(kind, Kind::Rust) { "rust" } else { "python" };
-        let lambda = Copy::of(&format!("tests/lambdas/attack/{folder}"), |manifest| hungry(&manifest));
+        let lambda = Copy::of(&format!("tests/lambdas/attack/{}", kind.folder()), |manifest| hungry(&manifest));
         let out = Folder::new();
         let settings =
             [format!("attack={behaviour}"), format!("every_ms={BLOCK_MS}"), format!("touch_mib={TOUCHED_MIB}")];

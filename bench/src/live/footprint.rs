@@ -9,8 +9,7 @@ use crate::measure::{Figure, Kind};
 /// A runtime alone, that is without others to share its pages with, and with next to no memory for samples.
 pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
     for kind in [Kind::Rust, Kind::Python] {
-        let folder = if matches!(kind, Kind::Rust) { "rust" } else { "python" };
-        let lambda = Copy::of(&format!("bench/lambdas/imu/{folder}"), |manifest| {
+        let lambda = Copy::of(&format!("bench/lambdas/imu/{}", kind.folder()), |manifest| {
             assert!(manifest.contains("depth = 512"), "it has another depth");
             manifest.replace("depth = 512", "depth = 1")
         });

@@ -74,8 +74,7 @@ pub fn figures(quick: bool) -> Vec<Figure> {
 }
 
 pub(crate) fn lambda(name: &str, kind: Kind) -> PathBuf {
-    let folder = if matches!(kind, Kind::Rust) { "rust" } else { "python" };
-    root().join("bench/lambdas").join(name).join(folder)
+    root().join("bench/lambdas").join(name).join(kind.folder())
 }
 
 fn start(lambda: &Path, args: &[&str]) -> (Started, Folder) {

@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_protocol::hex;
 use gleaner_protocol::journal::{FileDigest, Header};
 use gleaner_protocol::link::{Add, Control, RecorderLink, RecorderReport, RecorderStatus, Said};
 use gleaner_recorder::program::{Feed, Options, Pulse, run};
@@ -202,7 +203,7 @@ fn lambda(out: &Path, traffic: &Traffic) -> (PathBuf, Header) {
     let folder = out.join("load");
     fs::create_dir_all(folder.join("build")).expect("a folder of its own");
     fs::write(folder.join("build/lambda.toml"), &manifest).expect("a folder of its own");
-    let sha256 = Sha256::digest(&manifest).iter().map(|byte| format!("{byte:02x}")).collect();
+    let sha256 = hex(&Sha256::digest(&manifest));
     let file = FileDigest { path: "lambda.toml".to_owned(), bytes: manifest.len() as u64, sha256 };
     (folder, Header { files: vec![file], ..header() })
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::args::RunArgs;
-use crate::sibling::network;
+use crate::sibling::{network, starter};
 
 /// The runtime's arguments.
 pub(super) fn runtime(
@@ -41,7 +41,7 @@ pub(super) fn runtime(
 
 /// The arguments of the runtime's shim.
 pub(super) fn shim(args: &RunArgs, exit_record: &Path) -> Vec<OsString> {
-    let mut line = vec![word("--exit-record", exit_record), format!("--starter={}", std::process::id()).into()];
+    let mut line = vec![word("--exit-record", exit_record), starter()];
     line.extend(args.cgroup.as_ref().map(|folder| word("--cgroup", folder)));
     line
 }

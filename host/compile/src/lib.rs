@@ -5,13 +5,12 @@
 //! the component's digest, to wasmtime's version, to the settings below and to the CPU, and must belong to this user alone.
 //! A component is hostile until proven otherwise, so compiling has a limit of memory and of time.
 
-use std::fmt::Write as _;
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Explain};
+use gleaner_protocol::{Exit, Explain, hex};
 use sha2::{Digest, Sha256};
 use wasmtime::{Config, Engine};
 
@@ -146,11 +145,7 @@ pub fn cache_entry(cache: &Path, component: &[u8], nans: Nans) -> PathBuf {
         key.update((part.len() as u64).to_le_bytes());
         key.update(part);
     }
-    let mut name = String::with_capacity(70);
-    for byte in key.finalize() {
-        let _ = write!(name, "{byte:02x}");
-    }
-    cache.join(name + ".cwasm")
+    cache.join(hex(&key.finalize()) + ".cwasm")
 }
 
 /// What this machine's CPU can do, as the kernel says: a cache in a home folder may be shared by several machines.

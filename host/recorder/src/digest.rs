@@ -1,5 +1,6 @@
 //! Digests as texts.
 
+use gleaner_protocol::hex;
 use gleaner_protocol::journal::FileDigest;
 use sha2::{Digest, Sha256};
 
@@ -11,11 +12,6 @@ pub fn lambda_digest(files: &[FileDigest]) -> String {
         digest.update(format!("{}  {}\n", file.sha256, file.path));
     }
     hex(&digest.finalize())
-}
-
-/// In hexadecimal digits.
-pub fn hex(digest: &[u8]) -> String {
-    digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]

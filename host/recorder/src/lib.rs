@@ -28,7 +28,7 @@ mod support;
 mod thumbnail;
 mod window;
 
-pub use digest::{hex, lambda_digest};
+pub use digest::lambda_digest;
 pub use error::RecordError;
 pub use file::{Folder, LossList, Topic};
 pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TopicId, Work};

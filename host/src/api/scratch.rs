@@ -74,27 +74,31 @@ impl Scratch {
 
     /// Keeps `bytes` behind what is there, or in place of it.
     fn keep(&mut self, name: &str, bytes: &[u8], in_place: bool) -> Result<(), ScratchError> {
-        let named = || visible(name);
         if name.is_empty() || name.len() > NAME_BYTES || name.chars().any(char::is_control) {
-            return Err(ScratchError::WrongName(visible(&name.chars().take(NAME_BYTES).collect::<String>())));
+            return Err(ScratchError::WrongName(shown(name)));
         }
         let there = self.entries.get(name).map(Pieces::len);
         if there.is_none() && self.entries.len() >= ENTRIES {
-            return Err(ScratchError::TooMany(named()));
+            return Err(ScratchError::TooMany(shown(name)));
         }
         let given_back = if in_place { there.unwrap_or(0) } else { 0 };
         let new = there.map_or(ENTRY_BYTES + name.len() as u64, |_| 0) + bytes.len() as u64;
-        let no_room = |free| ScratchError::NoRoom { name: named(), needed: new.saturating_sub(given_back), free };
+        let no_room = |free| ScratchError::NoRoom { name: shown(name), needed: new.saturating_sub(given_back), free };
         if new > self.free() + given_back {
             return Err(no_room(self.free()));
         }
-        // All of it is made before anything changes.
-        let mut pieces = if in_place { None } else { self.entries.remove(name) }.unwrap_or_default();
-        let made = pieces.append(bytes);
-        let is_kept = made || there.is_some() && !in_place;
-        if is_kept {
-            self.entries.insert(name.to_owned(), pieces);
-        }
+        // What was there stays until all of the new is made.
+        let made = match self.entries.get_mut(name).filter(|_| !in_place) {
+            Some(pieces) => pieces.append(bytes),
+            None => {
+                let mut pieces = Pieces::default();
+                let made = pieces.append(bytes);
+                if made {
+                    self.entries.insert(name.to_owned(), pieces);
+                }
+                made
+            }
+        };
         if !made {
             // The process may not have what it was granted.
             return Err(no_room(0));
@@ -104,21 +108,22 @@ impl Scratch {
     }
 
     fn get(&self, name: &str, offset: u64, len: u64) -> Result<Vec<u8>, ScratchError> {
-        let pieces = self.entries.get(name).ok_or_else(|| no_such(name))?;
+        let pieces = self.entries.get(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
         let from = offset.min(pieces.len());
         let len = len.min(pieces.len() - from).min(self.most_given as u64);
         Ok(pieces.read(from as usize, len as usize))
     }
 
     fn remove(&mut self, name: &str) -> Result<(), ScratchError> {
-        let pieces = self.entries.remove(name).ok_or_else(|| no_such(name))?;
+        let pieces = self.entries.remove(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
         self.used -= ENTRY_BYTES + name.len() as u64 + pieces.len();
         Ok(())
     }
 }
 
-fn no_such(name: &str) -> ScratchError {
-    ScratchError::NoSuchEntry(visible(&name.chars().take(NAME_BYTES).collect::<String>()))
+/// A name in a message, which may be none that can be.
+fn shown(name: &str) -> String {
+    visible(&name.chars().take(NAME_BYTES).collect::<String>())
 }
 
 /// Bytes in pieces, of which all but the last are full.

@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 
 use gleaner_protocol::journal::{FileDigest, Header, JournalInput};
 use gleaner_protocol::manifest::{ConfigValue, Manifest, Schedule};
-use gleaner_protocol::{BuildDir, Explain};
-use gleaner_recorder::hex;
+use gleaner_protocol::{BuildDir, Explain, hex};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 

@@ -38,4 +38,4 @@ pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
 pub use sources::Sources;
 pub use vehicle::Vehicle;
 pub use whole::write_whole;
-pub use words::visible;
+pub use words::{hex, visible};

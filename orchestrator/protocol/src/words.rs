@@ -57,6 +57,11 @@ pub fn visible(text: &str) -> String {
     shown
 }
 
+/// `bytes` in hexadecimal digits, as digests are written.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 /// Whether it makes a terminal show text in another order than it is written: the bidirectional controls of Unicode.
 fn turns_text(character: char) -> bool {
     matches!(character, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')

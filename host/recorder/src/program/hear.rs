@@ -8,12 +8,11 @@ use std::thread::{Builder, Thread};
 
 use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::link::{Add, Answers, Controlled, Heard, LambdaLink, LinkError, Order};
-use gleaner_protocol::{BuildDir, Exit, Failure, Manifest};
+use gleaner_protocol::{BuildDir, Exit, Failure, Manifest, hex};
 use sha2::{Digest, Sha256};
 use tracing::warn;
 
 use super::watch::Seen;
-use crate::digest::hex;
 
 /// What one lambda said waits for the loop, up to this; then its socket waits, and then the lambda's own queue.
 const SPOKEN: usize = 64;

@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use gleaner_protocol::journal::{FileDigest, Header};
 use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
-use gleaner_protocol::{Clip, Failure};
+use gleaner_protocol::{Clip, Failure, hex};
 use gleaner_recorder::program::{Feed, Options, Pulse, run};
 use gleaner_transport::dds::Clock;
 use gleaner_transport::loopback::Loopback;
@@ -159,7 +159,7 @@ pub fn lambda(scratch: &Scratch, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, 
 
 /// The header of a lambda with this manifest.
 pub fn with_manifest(header: Header, text: &str) -> Header {
-    let sha256 = Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect();
+    let sha256 = hex(&Sha256::digest(text));
     let manifest = FileDigest { path: "lambda.toml".to_owned(), bytes: text.len() as u64, sha256 };
     Header { files: vec![manifest], ..header }
 }

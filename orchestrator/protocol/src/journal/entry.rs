@@ -1,10 +1,8 @@
-use std::fmt::Write;
-
 use serde_json::Value;
 
 use super::header::{Difference, JournalInput};
 use super::{FAULTS, fault_code};
-use crate::words::excerpt;
+use crate::words::{excerpt, hex};
 use crate::{Fault, Trigger};
 
 /// One wake: what the lambda saw, and what it decided.
@@ -131,11 +129,7 @@ fn identity((writer, seq): ([u8; 16], u64), writers: bool) -> String {
     if !writers {
         return (seq & u64::from(u32::MAX)).to_string();
     }
-    let mut text = format!("{seq} of writer ");
-    for byte in writer {
-        write!(text, "{byte:02x}").expect("a text takes whatever is written to it");
-    }
-    text
+    format!("{seq} of writer {}", hex(&writer))
 }
 
 fn digest(digest: u32) -> String {
