@@ -38,14 +38,16 @@ pub fn figures(quick: bool) -> Result<Vec<Figure>, String> {
 /// A victim of each kind through all attacks, the attacker on the core `theirs`.
 fn attacks(quick: bool, theirs: usize, figures: &mut Vec<Figure>) {
     let clock = Clock::of_today();
-    let mut dds = Dds::open(Options::new("/gleaner_bench/answers")).expect("a private network can be joined");
-    let mut victims = [Kind::Rust, Kind::Python].map(|kind| Victim::start(kind, &mut dds));
+    let mut victims = [Kind::Rust, Kind::Python].map(Victim::start);
     let readers = victims.len().to_string();
     // Far longer than this takes: it is told when to stop.
     let player = play(&["--imu", RATE, "--stamp", "monotonic", "--wait", &readers, "--duration", "36000"]);
     victims.iter().for_each(Victim::until_fed);
     for attack in ATTACKS.iter().filter(|attack| !quick || attack.is_quick()) {
+        // A new one for each attack, so that one that dies costs no more than that.
+        let mut dds = Dds::open(Options::new("/gleaner_bench/answers")).expect("a private network can be joined");
         let mut attacker = Attacker::start(attack, theirs);
+        victims.iter_mut().for_each(|victim| victim.hear(&mut dds));
         let course = Course::after(clock.now(), if quick { 2 } else { PAIRS });
         let course = &course;
         std::thread::scope(|scope| {
@@ -58,6 +60,7 @@ fn attacks(quick: bool, theirs: usize, figures: &mut Vec<Figure>) {
             victim.figures(attack, course, clock, figures);
         }
         attacker.end(course, figures);
+        assert_eq!(dds.health().dead, None, "answers were not heard during: {attack}");
     }
     player.signal("INT");
     let played = player.finish();

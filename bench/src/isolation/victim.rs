@@ -1,9 +1,10 @@
 //! An empty lambda that answers each sample, and says how late that was.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use gleaner_tests::Folder;
-use gleaner_tests::live::{Started, run};
+use gleaner_tests::live::{PATIENCE, Started, run};
 use gleaner_transport::dds::{Clock, Dds};
 
 use super::RATE_HZ;
@@ -18,7 +19,9 @@ const STATUS_NS: i64 = 1_050_000_000;
 
 pub(super) struct Victim {
     kind: Kind,
-    answers: Arc<Answers>,
+    topic: String,
+    /// Of this attack.
+    answers: Option<Arc<Answers>>,
     started: Started,
     out: Folder,
     /// When each status came, and the 99 % of what it took from a sample received to the lambda entered, in us.
@@ -26,12 +29,21 @@ pub(super) struct Victim {
 }
 
 impl Victim {
-    pub(super) fn start(kind: Kind, dds: &mut Dds) -> Self {
-        let topic = format!("/rtt/{kind}");
-        let (answers, out) = (Answers::on(dds, &topic), Folder::new());
+    pub(super) fn start(kind: Kind) -> Self {
+        let (topic, out) = (format!("/rtt/{kind}"), Folder::new());
         let started = run(&lambda("imu", kind), out.path(), &["--no-record", "--rtt", &topic]);
         started.until_ready();
-        Self { kind, answers, started, out, entered: Vec::new() }
+        Self { kind, topic, answers: None, started, out, entered: Vec::new() }
+    }
+
+    /// From now on its answers are heard by `dds`.
+    pub(super) fn hear(&mut self, dds: &mut Dds) {
+        let answers = self.answers.insert(Answers::on(dds, &self.topic));
+        let deadline = Instant::now() + PATIENCE;
+        while answers.take().is_empty() {
+            assert!(Instant::now() < deadline, "{}: no answer is heard", self.kind);
+            std::thread::sleep(Duration::from_millis(10));
+        }
     }
 
     pub(super) fn until_fed(&self) {
@@ -49,7 +61,7 @@ impl Victim {
 
     /// What the attack did to it. To be asked once for each attack.
     pub(super) fn figures(&mut self, attack: &Attack, course: &Course, clock: Clock, figures: &mut Vec<Figure>) {
-        let answers = self.answers.take();
+        let answers = self.answers.take().map(|answers| answers.take()).unwrap_or_default();
         // A late answer counts where its sample came.
         let in_us = answers.iter().map(|answer| {
             let sample_ns = answer.at_ns - answer.ns as i64 + clock.offset_ns();

@@ -32,6 +32,7 @@ mod peers;
 mod presence;
 mod raw;
 mod receive;
+mod shield;
 mod sockets;
 mod state;
 mod watch;
@@ -58,6 +59,7 @@ use feed::Feed;
 use guard::Guard;
 use known::Known;
 use receive::{Command, Line};
+use shield::Shield;
 use sockets::Sockets;
 use state::{State, Told, lock};
 use watch::Watch;
@@ -129,7 +131,9 @@ impl Dds {
             builder = builder.with_only_networks(options.interfaces.iter().copied());
         }
         let join = |error: rustdds::dds::CreateError| DdsError::Join { domain: options.domain, source: error.into() };
+        let shield = Shield::up();
         let participant = builder.build().map_err(join)?;
+        drop(shield);
         let made: HashSet<u32> = sockets::library_threads().difference(&before).copied().collect();
         // If there are more, somebody else made a participant at the same time, and which are ours is not known.
         let threads = if made.len() == LIBRARY_THREADS { made } else { HashSet::new() };

@@ -1,5 +1,7 @@
 //! Whether a participant lives, and how it ends.
 
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -14,6 +16,7 @@ use super::peer::{Kept, Peer, connected, domain, matched, open, options, spec, u
 
 pub const TESTS: &[Test] = &[
     ("the_buffer_that_was_granted_is_told", buffer),
+    ("no_signal_interrupts_the_threads_of_the_library_and_ours_take_them_as_before", signals),
     ("an_idle_writer_is_no_death_and_a_sink_that_keeps_a_sample_is", stuck),
     ("a_sink_that_panics_is_death_with_a_name_and_other_topics_go_on", panicking),
     ("a_participant_that_is_dropped_ends_in_the_middle_of_samples", dropped),
@@ -27,6 +30,29 @@ fn buffer() {
         let Health { buffer_asked, buffer_granted, .. } = dds.health();
         let limit = std::fs::read_to_string("/proc/sys/net/core/rmem_max").unwrap().trim().parse::<usize>().unwrap();
         assert_eq!((buffer_asked, buffer_granted), (asked, asked.min(limit)));
+    }
+}
+
+/// RustDDS ends at the first wait that is interrupted.
+fn signals() {
+    let blocked = |thread: &Path| {
+        let status = fs::read_to_string(thread.join("status")).unwrap();
+        let mask = status.lines().find_map(|line| line.strip_prefix("SigBlk:")).unwrap();
+        u64::from_str_radix(mask.trim(), 16).unwrap()
+    };
+    let own = Path::new("/proc/thread-self");
+    let before = blocked(own);
+    let _dds = open(domain());
+    assert_eq!(blocked(own), before);
+    // SIGALRM, SIGTERM, SIGCHLD; SIGSEGV is a thread's own.
+    let bits = [14, 15, 17].map(|signal| 1 << (signal - 1)).iter().sum::<u64>();
+    let threads = fs::read_dir("/proc/self/task").unwrap().map(|entry| entry.unwrap().path());
+    let name = |thread: &PathBuf| fs::read_to_string(thread.join("comm")).unwrap();
+    let library: Vec<_> = threads.filter(|thread| name(thread).starts_with("RustDDS")).collect();
+    assert!(library.len() >= 2, "{library:?}");
+    for thread in library {
+        assert_eq!(blocked(&thread) & bits, bits, "{}", name(&thread));
+        assert_eq!(blocked(&thread) & 1 << 10, 0, "{}", name(&thread));
     }
 }
 
