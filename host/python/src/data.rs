@@ -165,7 +165,7 @@ impl Sample {
 
     #[pyo3(signature = (offset = 0, len = None))]
     fn cdr<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> Bound<'py, PyBytes> {
-        PyBytes::new(py, self.inner.cdr(offset, len.unwrap_or(u32::MAX)))
+        PyBytes::new(py, &self.inner.cdr(offset, len.unwrap_or(u32::MAX)))
     }
 
     fn as_frame(&self, py: Python<'_>) -> PyResult<Frame> {

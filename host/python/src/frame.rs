@@ -72,7 +72,7 @@ impl Frame {
 
     #[pyo3(signature = (offset = 0, len = None))]
     fn read<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> Bound<'py, PyBytes> {
-        PyBytes::new(py, self.0.read(offset, len.unwrap_or(u32::MAX)))
+        PyBytes::new(py, &self.0.read(offset, len.unwrap_or(u32::MAX)))
     }
 
     fn array<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {

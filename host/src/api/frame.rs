@@ -5,11 +5,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use gleaner_buffers::{Lease, Pool, Refusal};
-use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
 
 use super::data::{DataError, Due, Identity, Sample, Stamps};
-use super::sample::piece;
+use super::piece::Piece;
 use gleaner_image::{self as image, Encoding, ImageError, Roi, View, ops};
 
 /// Bytes of a frame between two looks at the time.
@@ -137,7 +136,7 @@ impl Drop for Taken {
 pub struct Frame {
     source: Source,
     info: Info,
-    pixels: Pixels,
+    pixels: Piece,
     _taken: Taken,
 }
 
@@ -147,17 +146,6 @@ struct Source {
     topic: Arc<super::data::Topic>,
     identity: Identity,
     stamps: Stamps,
-}
-
-enum Pixels {
-    /// Within a cell of the ring.
-    Raw {
-        lease: Lease<SampleMeta>,
-        start: usize,
-        len: usize,
-    },
-    Decoded(Lease<Info>),
-    Made(Box<[u8]>),
 }
 
 impl Frame {
@@ -179,7 +167,7 @@ impl Frame {
         let len = view.step() * (view.height() as usize - 1) + view.width() as usize * encoding.bytes_per_pixel();
         // The pixels were borrowed from the message, so they lie within it.
         let start = raw.data.as_ptr().addr() - sample.bytes().as_ptr().addr();
-        let pixels = Pixels::Raw { lease: sample.lease().clone(), start, len };
+        let pixels = Piece::of_message(sample.lease()).part(start as u64, len);
         Ok(Self { source, info, pixels, _taken: taken })
     }
 
@@ -208,7 +196,7 @@ impl Frame {
     }
 
     fn of_decoded(source: Source, lease: Lease<Info>, taken: Taken) -> Self {
-        Self { source, info: *lease.meta(), pixels: Pixels::Decoded(lease), _taken: taken }
+        Self { source, info: *lease.meta(), pixels: Piece::of_decoded(lease), _taken: taken }
     }
 
     /// The shape.
@@ -239,16 +227,12 @@ impl Frame {
 
     /// All pixel bytes: `step * (height - 1)` and the last row.
     pub fn bytes(&self) -> &[u8] {
-        match &self.pixels {
-            Pixels::Raw { lease, start, len } => &lease[*start..*start + *len],
-            Pixels::Decoded(lease) => lease,
-            Pixels::Made(bytes) => bytes,
-        }
+        &self.pixels
     }
 
     /// Bytes from `offset`, `len` at most, clamped to the frame and to `call_bytes` of `[limits]`.
-    pub fn read(&self, offset: u64, len: u32) -> &[u8] {
-        piece(self.bytes(), offset, len, self.source.topic.per_call.bytes)
+    pub fn read(&self, offset: u64, len: u32) -> Piece {
+        self.pixels.part(offset, self.source.topic.per_call.bytes.min(len as usize))
     }
 
     /// Mean BT.601 luma, 0 to 255, computed in integers.
@@ -332,7 +316,7 @@ impl Frame {
         let taken = self.source.topic.images.made.take(len)?;
         let mut bytes = vec![0; len].into_boxed_slice();
         fill(&mut bytes)?;
-        Ok(Self { source: self.source.clone(), info, pixels: Pixels::Made(bytes), _taken: taken })
+        Ok(Self { source: self.source.clone(), info, pixels: Piece::made(bytes), _taken: taken })
     }
 
     fn view(&self) -> Result<View<'_>, DataError> {

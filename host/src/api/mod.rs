@@ -9,6 +9,7 @@ mod error;
 pub mod frame;
 pub mod inference;
 pub mod log;
+mod piece;
 mod sample;
 pub mod scratch;
 pub mod trace;

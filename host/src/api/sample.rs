@@ -8,6 +8,7 @@ use gleaner_transport::message::{Endian, Value};
 
 use super::data::{DataError, Field, Topic};
 use super::frame::{Frame, Picture};
+use super::piece::Piece;
 use super::values::{Identity, Stamps};
 
 /// One message; holds its cell of the ring until dropped.
@@ -84,8 +85,8 @@ impl Sample {
     }
 
     /// Bytes from `offset`, `len` at most, clamped to the message and to `call_bytes` of `[limits]`.
-    pub fn cdr(&self, offset: u64, len: u32) -> &[u8] {
-        piece(&self.lease, offset, len, self.topic.per_call.bytes)
+    pub fn cdr(&self, offset: u64, len: u32) -> Piece {
+        Piece::of_message(&self.lease).part(offset, self.topic.per_call.bytes.min(len as usize))
     }
 
     /// Bytes that [`Sample::as_frame`] would have to decode: by the header, and none if that is done already.
@@ -132,11 +133,4 @@ impl Sample {
     pub fn topic(&self) -> &Arc<Topic> {
         &self.topic
     }
-}
-
-/// `len` bytes from `offset`, clamped to `bytes` and to `most`.
-pub(super) fn piece(bytes: &[u8], offset: u64, len: u32, most: usize) -> &[u8] {
-    let start = usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
-    let len = (len as usize).min(most).min(bytes.len() - start);
-    &bytes[start..start + len]
 }

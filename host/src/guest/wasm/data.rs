@@ -1,6 +1,7 @@
 //! `gleaner:lambda/data` and `types` over [`api::data`](crate::api::data) and [`api::frame`](crate::api::frame).
 
-use wasmtime::component::Resource;
+use bytes::Bytes;
+use wasmtime::component::{Linker, Resource};
 
 use super::Hosted;
 use super::bindings::gleaner::lambda::data::{Host, HostField, HostFrame, HostSample, HostTopic};
@@ -10,6 +11,9 @@ use super::bindings::gleaner::lambda::types::{
 use super::bindings::handles::{Field, Frame, Sample, Topic};
 use crate::api::{data, frame};
 use gleaner_image as image;
+
+/// As in `wit/`.
+const DATA: &str = "gleaner:lambda/data@0.1.0";
 
 type Answer<T> = wasmtime::Result<Result<T, DataError>>;
 
@@ -149,10 +153,9 @@ impl HostSample for Hosted {
         Ok(self.handles.get(&sample)?.big_endian())
     }
 
+    /// Never called: see [`add_reads_to_linker`].
     fn cdr(&mut self, sample: Resource<Sample>, offset: u64, len: u32) -> wasmtime::Result<Vec<u8>> {
-        let bytes = self.handles.get(&sample)?.cdr(offset, len);
-        self.meter.charge(bytes.len())?;
-        Ok(bytes.to_vec())
+        Ok(self.sample_cdr(&sample, offset, len)?.to_vec())
     }
 
     fn as_frame(&mut self, sample: Resource<Sample>) -> Answer<Resource<Frame>> {
@@ -213,10 +216,9 @@ impl HostFrame for Hosted {
         self.hand_out(gray)
     }
 
+    /// Never called: see [`add_reads_to_linker`].
     fn read(&mut self, frame: Resource<Frame>, offset: u64, len: u32) -> wasmtime::Result<Vec<u8>> {
-        let bytes = self.handles.get(&frame)?.read(offset, len);
-        self.meter.charge(bytes.len())?;
-        Ok(bytes.to_vec())
+        Ok(self.frame_read(&frame, offset, len)?.to_vec())
     }
 
     fn drop(&mut self, frame: Resource<Frame>) -> wasmtime::Result<()> {
@@ -225,7 +227,34 @@ impl HostFrame for Hosted {
     }
 }
 
+/// Defines what hands out bytes once more, so that they go from their cell into the guest's memory in one copy: what is generated
+/// wants them as a `Vec`.
+pub(super) fn add_reads_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
+    linker.allow_shadowing(true);
+    let mut data = linker.instance(DATA)?;
+    data.func_wrap("[method]sample.cdr", |mut store, (sample, offset, len): (Resource<Sample>, u64, u32)| {
+        Ok((store.data_mut().sample_cdr(&sample, offset, len)?,))
+    })?;
+    data.func_wrap("[method]frame.read", |mut store, (frame, offset, len): (Resource<Frame>, u64, u32)| {
+        Ok((store.data_mut().frame_read(&frame, offset, len)?,))
+    })?;
+    linker.allow_shadowing(false);
+    Ok(())
+}
+
 impl Hosted {
+    fn sample_cdr(&mut self, sample: &Resource<Sample>, offset: u64, len: u32) -> wasmtime::Result<Bytes> {
+        let bytes = self.handles.get(sample)?.cdr(offset, len);
+        self.meter.charge(bytes.len())?;
+        Ok(Bytes::from_owner(bytes))
+    }
+
+    fn frame_read(&mut self, frame: &Resource<Frame>, offset: u64, len: u32) -> wasmtime::Result<Bytes> {
+        let bytes = self.handles.get(frame)?.read(offset, len);
+        self.meter.charge(bytes.len())?;
+        Ok(Bytes::from_owner(bytes))
+    }
+
     fn hand_out<T: Send + 'static>(&mut self, made: Result<T, data::DataError>) -> Answer<Resource<T>> {
         Ok(match answer(made)? {
             Ok(value) => Ok(self.handles.push(value)?),

@@ -15,6 +15,7 @@ use wasmtime::{Engine, Store};
 
 use super::Hosted;
 use super::bindings::{Lambda, LambdaPre};
+use super::data::add_reads_to_linker;
 use super::wasi;
 
 /// Why a component cannot be run.
@@ -105,6 +106,7 @@ impl Loaded {
         let mut linker = Linker::new(engine);
         wasi::add_to_linker(&mut linker).map_err(world)?;
         Lambda::add_to_linker::<_, wasmtime::component::HasSelf<_>>(&mut linker, |hosted| hosted).map_err(world)?;
+        add_reads_to_linker(&mut linker).map_err(world)?;
         linker.instantiate_pre(code).and_then(LambdaPre::new).map_err(world)
     }
 
