@@ -55,6 +55,8 @@ class _Messages:
     def __init__(self, topic: str, type_name: str, table: Table, types: Types) -> None:
         self._topic, self._type_name, self._types = topic, type_name, types
         self.at_ns = _times(topic, table)
+        # One for all: each message is written over the one before it, in the same fields.
+        self._message = types.blank(type_name)
         self._columns: List[Tuple[Path, Any]] = []
         fields = {path: values for path, values in table.items() if path not in ("t", "t_ns")}
         for path, values in self._pictures(fields).items():
@@ -90,7 +92,7 @@ class _Messages:
             yield number, Delivery(self._topic, arrival)
 
     def _cdr(self, n: int, at_ns: int) -> bytes:
-        message = self._types.blank(self._type_name)
+        message = self._message
         first = self._types.members(self._type_name)[0]
         if first.element == HEADER and first.length is None:
             stamp = getattr(message, first.name).stamp

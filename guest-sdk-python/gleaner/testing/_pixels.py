@@ -26,6 +26,8 @@ LAYOUTS = {
     **{f"bayer_{pattern}8": (1, 1) for pattern in ("rggb", "bggr", "gbrg", "grbg")},
     **{f"bayer_{pattern}16": (2, 1) for pattern in ("rggb", "bggr", "gbrg", "grbg")},
 }
+# What ROS calls them now, where that is not the name of the WIT.
+IN_ROS = {"yuv422": "uyvy", "yuv422_yuy2": "yuyv"}
 # Other names that ROS has for some.
 NAMES = {"8UC3": "bgr8", "8UC1": "mono8", "16UC1": "mono16", "uyvy": "yuv422", "yuyv": "yuv422_yuy2"}
 # Where red, green and blue are in a pixel.
@@ -62,18 +64,19 @@ def picture(width: int, height: int, encoding: str, step: int, big_endian: bool,
     name = NAMES.get(encoding, encoding)
     if name not in LAYOUTS:
         raise ImageError(f"encoding `{encoding[:40]}` is not supported; supported are {', '.join([*LAYOUTS, *NAMES])}")
+    said = IN_ROS.get(name, name)
     for side in (width, height):
         if not 1 <= side <= MAX_SIDE:
             raise ImageError(f"image says it is {width}x{height}; each side must be 1 to {MAX_SIDE}")
     if name in PAIRS and width % 2:
-        raise ImageError(f"image of {encoding} is {width} pixels wide; two pixels share a colour, so the width must be even")
+        raise ImageError(f"image of {said} is {width} pixels wide; two pixels share a colour, so the width must be even")
     row = width * LAYOUTS[name][0]
     if step < row:
-        raise ImageError(f"image of {width}x{height} {encoding} says a row has {step} bytes; it needs {row}")
+        raise ImageError(f"image of {width}x{height} {said} says a row has {step} bytes; it needs {row}")
     needed = step * (height - 1) + row
     if len(data) < needed:
         raise ImageError(
-            f"image of {width}x{height} {encoding} with {step} bytes per row needs {needed} bytes; it has {len(data)}"
+            f"image of {width}x{height} {said} with {step} bytes per row needs {needed} bytes; it has {len(data)}"
         )
     return Picture(width, height, name, step, big_endian, data[:needed])
 

@@ -210,7 +210,7 @@ def _check(label: str, score: Optional[float], attributes: Mapping[str, Attribut
     if size > LABEL_BYTES:
         raise _invalid(f"the label has {size} bytes; at most {LABEL_BYTES} are allowed")
     if score is not None and not math.isfinite(score):
-        raise _invalid(f"the score of `{label}` is {score}; it must be finite")
+        raise _invalid(f"the score of `{label}` is {'NaN' if math.isnan(score) else score}; it must be finite")
     if len(attributes) > ATTRIBUTES:
         raise _invalid(f"`{label}` has {len(attributes)} attributes; at most {ATTRIBUTES} are allowed")
     for key, value in attributes.items():
