@@ -51,6 +51,7 @@ class AtDesk(Hosted):
         out.mkdir(exist_ok=True)
         lines(out / "decisions.jsonl", [decision.as_json() for decision in run.decisions])
         lines(out / "log.jsonl", [vars(line) for line in run.log])
+        lines(out / "clips.jsonl", [window._asdict() for window in run.windows])
         summary = {"log_lines": len(run.log), "log_dropped": run.log_dropped}
         (out / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
 

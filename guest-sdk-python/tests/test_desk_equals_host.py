@@ -42,14 +42,18 @@ class Examples(unittest.TestCase):
             command = [sys.executable, "-I", str(home.SDK / "start.py"), extension, "gleaner-runtime", "replay", folder]
             for key, value in config.items():
                 command += ["--set", f"{key}={value}"]
-            ended = subprocess.run([*command, str(SAMPLE), "--all", "--no-record"], capture_output=True, text=True, timeout=300)
+            ended = subprocess.run([*command, str(SAMPLE), "--all"], capture_output=True, text=True, timeout=300)
             self.assertEqual(ended.returncode, 0, ended.stderr)
-            lines = (Path(folder) / "out" / "decisions.jsonl").read_text(encoding="utf-8").splitlines()
+            out = Path(folder) / "out"
+            lines = (out / "decisions.jsonl").read_text(encoding="utf-8").splitlines()
+            clips = [json.loads(clip) for clip in (out / "clips.jsonl").read_text(encoding="utf-8").splitlines()]
         run = replay(python, SAMPLE, config=config)
         decided = [decision.as_json() for decision in run.decisions]
         self.assertEqual(len(decided), len(lines))
         for n, (ours, theirs) in enumerate(zip(decided, map(json.loads, lines))):
             self.assertEqual(self.comparable(ours), self.comparable(theirs), f"decision {n}")
+        kept = [(clip["from_ns"], clip["to_ns"]) for clip in clips]
+        self.assertEqual([(window.from_ns, window.to_ns) for window in run.windows], kept)
         return run
 
     def comparable(self, decision: Dict[str, Any]) -> Dict[str, Any]:

@@ -12,7 +12,7 @@
 
 Rings with their depth and what a lambda holds, schedules, fields, limits of triggers, log and scratch, faults and what follows
 them are those of a replay by the host. Not here: time and memory, so no deadline and no ``memory`` but for frames that are made;
-the jail; clips; models. ``docs/python.md`` has more. It wants Python 3.10.
+the jail; clips, but for their windows; models. ``docs/python.md`` has more. It wants Python 3.10.
 """
 
 import sys
@@ -23,7 +23,8 @@ if sys.version_info < (3, 10):
 from ._drive import Drive
 from ._error import ReplayError, StartError
 from ._replay import replay
-from ._run import Decision, Fault, Moment, Run
+from ._run import Decision, Fault, Run
 from ._session import Line
+from ._windows import Moment, Window
 
-__all__ = ["Decision", "Drive", "Fault", "Line", "Moment", "ReplayError", "Run", "StartError", "replay"]
+__all__ = ["Decision", "Drive", "Fault", "Line", "Moment", "ReplayError", "Run", "StartError", "Window", "replay"]

@@ -14,9 +14,10 @@ from ._error import ReplayError, quoted
 from ._frame import Budget, Pictures
 from ._guest import Given, Guest, Wake, guarded, manifest_beside
 from ._manifest import Manifest
-from ._run import Decision, Fault, Moment, Run
+from ._run import Decision, Fault, Run
 from ._schedule import Event, Periodic, Schedule, Tick
 from ._session import Session
+from ._windows import Moment, windows
 
 FAULTS_IN_A_ROW = 8
 SHORTEST_REST_NS, LONGEST_REST_NS = 100_000_000, 10_000_000_000
@@ -99,6 +100,7 @@ class _Pass:
             self._guest.init()
             self._course()
         session, drive = self._session, self._drive
+        triggers = [trigger for decision in self._decisions for trigger in decision.triggers]
         return Run(
             decisions=self._decisions,
             log=session.lines,
@@ -109,6 +111,7 @@ class _Pass:
             triggers_refused=session.triggers_refused,
             passed_over=session.passed_over,
             missed_ticks=self._schedule.missed_total,
+            windows=windows(self._manifest.record, triggers, drive.start_ns, drive.end_ns),
         )
 
     def _course(self) -> None:

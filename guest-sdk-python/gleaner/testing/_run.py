@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Dict, List, Optional, Tuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..data import Counts
-from ..trigger import AttributeValue
 from ._session import Line
-
-
-@dataclass(frozen=True)
-class Moment:
-    """A trigger, with the time of its wake."""
-
-    at_s: float
-    """Seconds since the start of the drive; of arrays, the time that they have."""
-    at_ns: int
-    kind: str
-    """``event``, ``start`` or ``stop``."""
-    label: str
-    score: Optional[float]
-    """None unless it is an event."""
-    attributes: Dict[str, AttributeValue] = field(default_factory=dict)
+from ._windows import Moment, Window
 
 
 @dataclass(frozen=True)
@@ -84,6 +69,8 @@ class Run:
     passed_over: int
     """Wakes that did not happen, because the lambda had faulted again and again."""
     missed_ticks: int
+    windows: List[Window]
+    """What ``[record]`` keeps, by time: windows that overlap as one. Empty without it."""
 
     @property
     def triggers(self) -> List[Moment]:

@@ -135,8 +135,8 @@ class Scratch:
 
     def _keep(self, name: str, given: bytes, in_place: bool) -> None:
         _must_be_text(name)
-        if not 1 <= len(name.encode()) <= NAME_BYTES or not _is_visible(name):
-            raise ScratchError(f"`{name!r}` is no name for scratch; give 1 to 128 bytes without control characters", "wrong-name")
+        if not 1 <= len(name.encode()) <= NAME_BYTES or any(map(_is_control, name)):
+            raise ScratchError(f"`{_visible(name[:NAME_BYTES])}` is no name for scratch; give 1 to 128 bytes without control characters", "wrong-name")
         there = self._entries.get(name)
         if there is None and len(self._entries) >= ENTRIES:
             raise ScratchError(f"there is no room for `{name}` beside {ENTRIES} entries; remove some, or append to one of them", "no-room")
@@ -195,8 +195,14 @@ def _must_be_text(value: Any) -> None:
         raise TypeError(f"'{type(value).__name__}' object cannot be converted to 'str'")
 
 
-def _is_visible(name: str) -> bool:
-    return not any(ord(char) < 0x20 or 0x7F <= ord(char) < 0xA0 for char in name)
+def _is_control(char: str) -> bool:
+    return ord(char) < 0x20 or 0x7F <= ord(char) < 0xA0
+
+
+def _visible(name: str) -> str:
+    """With its control characters written out, as the host does it."""
+    short = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
+    return "".join(short.get(char, f"\\u{{{ord(char):x}}}") if _is_control(char) else char for char in name)
 
 
 def _invalid(message: str) -> TriggerError:
