@@ -7,15 +7,20 @@ import copy
 import io
 import types
 import unittest
-from typing import Any, Dict, List
+import zlib
+from typing import Any, Dict, List, Tuple
 
 import home  # noqa: F401
 import numpy as np
+from PIL import Image
 
-from gleaner import Context, Sample
+from gleaner import Context, DataError, Sample
 from gleaner.testing import ReplayError, StartError, _manifest, replay
 
 IMU = "/imu/data"
+
+# What is given, and what the refusal says.
+Cases = List[Tuple[Dict[str, Any], str]]
 
 
 def manifest(**tables: Any) -> Dict[str, Any]:
@@ -30,6 +35,17 @@ def manifest(**tables: Any) -> Dict[str, Any]:
 
 def imu(z: List[float]) -> Dict[str, Any]:
     return {IMU: {"t": np.arange(len(z)) / 10, "linear_acceleration.z": z}}
+
+
+def encoded(form: str, size: Tuple[int, int], mode: str) -> bytes:
+    file = io.BytesIO()
+    Image.new(mode, size, 128 if mode == "L" else (200, 100, 50)).save(file, form)
+    return file.getvalue()
+
+
+def chunk(kind_and_data: bytes) -> bytes:
+    """Of a PNG."""
+    return (len(kind_and_data) - 4).to_bytes(4, "big") + kind_and_data + zlib.crc32(kind_and_data).to_bytes(4, "big")
 
 
 class Above:
@@ -57,12 +73,13 @@ class Arrays(unittest.TestCase):
         items = {"limit": {"default": 1.0, "max": 10, "unit": "m/s^2"}}
         run = replay(Above, imu([0, 2, 0, 0, 3]), manifest=manifest(config=items), config={"limit": np.float32(2.5)})
         self.assertEqual([t.score for t in run.triggers], [3.0])
-        for config, why in [
+        refused: Cases = [
             ({"limt": 1}, "did you mean `limit`"),
             ({"limit": "1"}, "give a number"),
             ({"limit": float("nan")}, "give a number"),
             ({"limit": 11}, "its max is 10"),
-        ]:
+        ]
+        for config, why in refused:
             with self.assertRaisesRegex(ReplayError, why):
                 replay(Above, imu([0]), manifest=manifest(config=items), config=config)
 
@@ -90,6 +107,32 @@ class Arrays(unittest.TestCase):
                          [("mono8", 7.0, "(2, 3)"), ("rgb8", 9.0, "(4, 5, 3)")])
         with self.assertRaisesRegex(ReplayError, "give uint8 of shape"):
             replay(Lambda, {"/camera": {"t": [0], "image": [np.zeros((2, 3))]}}, manifest=manifest(input=inputs))
+
+    def test_compressed_pictures_are_decoded_within_their_room(self) -> None:
+        kept: List[Any] = []
+
+        class Lambda(Above):
+            def on_event(self, ctx: Context, event: Sample) -> None:
+                try:
+                    frame = event.as_frame()
+                    assert event.as_frame().array() is not frame.array(), "decoded once, seen twice"
+                    ctx.event(frame.info.encoding, frame.mean_luma(), size=frame.info.size)
+                    kept.append(frame)
+                except DataError as error:
+                    ctx.event(error.kind, 0.0, why=str(error))
+
+        inputs = [{"name": "imu", "topic": "/camera", "type": "sensor_msgs/msg/CompressedImage", "decoded_size": "600 B"}]
+        small, grey, large = encoded("JPEG", (20, 10), "RGB"), encoded("PNG", (5, 4), "L"), encoded("JPEG", (21, 10), "RGB")
+        header = b"IHDR" + (60_000).to_bytes(4, "big") * 2 + b"\x08\2\0\0\0"
+        bomb = b"\x89PNG\r\n\x1a\n" + chunk(header) + chunk(b"IDAT" + zlib.compress(b"")) + chunk(b"IEND")
+        data = [small, grey, large, bomb, small[:400], b"GIF89a", b"", small, small, small]
+        run = replay(Lambda, {"/camera": {"t": range(len(data)), "data": data}}, manifest=manifest(input=inputs))
+        self.assertEqual(run.faults, [])
+        found = [(t.label, t.attributes.get("size", t.attributes.get("why"))) for t in run.triggers]
+        self.assertEqual(found[:2], [("rgb8", 600), ("rgb8", 60)])
+        self.assertEqual([label for label, _ in found[2:]], ["no-room", "no-room", *["not-a-frame"] * 3, "rgb8", "no-room", "no-room"])
+        self.assertIn("21x10 (630 bytes as rgb8); this input's decoded_size is 600 bytes", str(found[2][1]))
+        self.assertIn("every slot for decoded images of `/camera` is held", str(found[-1][1]))
 
     def test_types_of_ones_own_are_defined_by_their_text(self) -> None:
         class Lambda(Above):
@@ -120,7 +163,7 @@ class Arrays(unittest.TestCase):
         self.assertEqual([t.score for t in replay(Lambda, imu([0]), manifest=declared).triggers], [-1.0])
 
     def test_arrays_that_contradict_themselves_are_refused(self) -> None:
-        for table, why in [
+        refused: Cases = [
             ({"linear_acceleration.z": [1]}, "it needs one of `t` and `t_ns`"),
             ({"t": [0], "t_ns": [0]}, "it needs one of `t` and `t_ns`"),
             ({"t": [1, 0]}, "times fall"),
@@ -130,7 +173,8 @@ class Arrays(unittest.TestCase):
             ({"t": [0, 1], "linear_acceleration.z": [1]}, "has 1 values, and there are 2 times"),
             ({"t": [0], "orientation_covariance": [[1, 2]]}, "message 0 cannot be made: .* has 9 elements, and 2 were given"),
             ({"t": [0], "header.stamp.sec": [0.5]}, "is a whole number, and 0.5 is none"),
-        ]:
+        ]
+        for table, why in refused:
             with self.subTest(table=table), self.assertRaisesRegex(ReplayError, why):
                 replay(Above, {IMU: table}, manifest=manifest())
         with self.assertRaisesRegex(ReplayError, "no input of the lambda has this topic"):
@@ -142,7 +186,7 @@ class Arrays(unittest.TestCase):
 class Manifests(unittest.TestCase):
     def test_what_no_manifest_has_is_refused_by_its_name(self) -> None:
         one = manifest()["input"][0]
-        for tables, why in [
+        refused: Cases = [
             ({"schedul": {}}, "did you mean `schedule`"),
             ({"schedule": {"event": "imo"}}, "names no input: `imo`"),
             ({"schedule": {"event": "imu", "period": "1s"}}, "needs one of `event` and `period`"),
@@ -160,7 +204,8 @@ class Manifests(unittest.TestCase):
             ({"limits": {"deadline": 5}}, 'for example "50ms"'),
             ({"config": {"a": {"unit": "m"}}}, "`config.a` has no `default`"),
             ({"config": {"a": [1]}}, "`default` of another type"),
-        ]:
+        ]
+        for tables, why in refused:
             with self.subTest(why=why), self.assertRaisesRegex(ReplayError, why):
                 replay(Above, imu([0]), manifest=manifest(**tables))
 

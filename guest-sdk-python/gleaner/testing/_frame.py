@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 import weakref
 from typing import Any, Callable, List, Mapping, Optional, Tuple, TypeVar
 
@@ -89,11 +90,11 @@ class Pictures:
             return self._newest[1]
         # The older image's slot may be the one that is needed now.
         self._newest = None
-        opened, width, height = _open(data)
+        opened = _open(declared, data)
+        width, height = opened.size
         if 3 * width * height > self._slot_bytes:
             says = f"image says it is {width}x{height} ({_size(3 * width * height)} as rgb8)"
-            why = f"{says}; this input's decoded_size is {_size(self._slot_bytes)}"
-            raise DataError(f"an image of `{declared.topic}` is too large: {why}", "no-room")
+            raise _too_large(declared, f"{says}; this input's decoded_size is {_size(self._slot_bytes)}")
         self._held = [held for held in self._held if held() is not None]
         if len(self._held) >= self._slots:
             why = f"drop frames that are not needed, or raise `hold` of input `{declared.name}`"
@@ -104,18 +105,28 @@ class Pictures:
         return decoded
 
 
-def _open(data: bytes) -> Tuple[Any, int, int]:
+def _open(declared: Input, data: bytes) -> Any:
+    """Reads the header. Raises ImageError; DataError for sides that Pillow takes for an attack."""
     from PIL import Image
 
     if not data.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")):
         raise ImageError(f"data is neither JPEG nor PNG: its {len(data)} bytes start with {list(data[:8])}")
     try:
-        opened = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
+        with warnings.catch_warnings():
+            # Large, but not too large for Pillow: `decoded_size` decides.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            opened = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
+    except Image.DecompressionBombError as error:
+        raise _too_large(declared, str(error)) from None
     except Exception as error:
         raise ImageError(str(error)) from None
     if opened.mode == "CMYK":
         raise ImageError("JPEG is of four colours, which is not supported")
-    return opened, opened.width, opened.height
+    return opened
+
+
+def _too_large(declared: Input, why: str) -> DataError:
+    return DataError(f"an image of `{declared.topic}` is too large: {why}", "no-room")
 
 
 def _rgb(opened: Any) -> Bytes:
