@@ -33,10 +33,12 @@ def comparable(decision: Dict[str, Any]) -> Dict[str, Any]:
 class Examples(unittest.TestCase):
     """Examples on the sample drive. What they find there stands in their `expected.txt`."""
 
-    def both(self, example: str, config: Dict[str, Union[int, float]]) -> Run:
+    def example(self, name: str, config: Dict[str, Union[int, float]]) -> Run:
+        return self.both(home.CHECKOUT / "examples" / name / "python", config)
+
+    def both(self, python: Path, config: Dict[str, Union[int, float]]) -> Run:
         """What the host decides in each of its wakes is what the desk decides."""
         extension = home.extension_path()
-        python = home.CHECKOUT / "examples" / example / "python"
         with tempfile.TemporaryDirectory() as folder:
             shutil.copytree(python, Path(folder) / "build", ignore=shutil.ignore_patterns("build", "out", "__pycache__"))
             command = [sys.executable, "-I", str(home.SDK / "start.py"), extension, "gleaner-runtime", "replay", folder]
@@ -60,12 +62,47 @@ class Examples(unittest.TestCase):
         self.assertEqual(comparable(ours), comparable(theirs), which)
 
     def test_hello(self) -> None:
-        run = self.both("hello", {"brake_mps2": -1.4})
+        run = self.example("hello", {"brake_mps2": -1.4})
         self.assertEqual([(round(t.at_s, 2), t.label) for t in run.triggers], [(at, "hard-brake") for at in (4.14, 10.8, 38.22)])
 
     def test_imu_fft(self) -> None:
-        run = self.both("imu-fft", {"rough": 0.02})
+        run = self.example("imu-fft", {"rough": 0.02})
         self.assertGreater(len(run.triggers), 50)
+
+
+    def test_ticks_begin_with_the_first_sample_that_is_seen_or_recorded(self) -> None:
+        first = []
+        with tempfile.TemporaryDirectory() as folder:
+            for recorded in ('topics = ["/imu/data"]', 'topics = ["/camera/front/compressed", "/imu/data"]'):
+                (Path(folder) / "main.py").write_text(TICKS, encoding="utf-8")
+                (Path(folder) / "lambda.toml").write_text(PERIODIC + recorded, encoding="utf-8")
+                run = self.both(Path(folder), {})
+                first.append(run.decisions[0].at_ns)
+        self.assertLess(first[1], first[0], "the camera begins before the IMU")
+
+
+PERIODIC = """
+[lambda]
+name = "ticks"
+version = "0.1.0"
+kind = "python"
+entry = "main.py"
+[schedule]
+period = "100ms"
+[[input]]
+name = "imu"
+topic = "/imu/data"
+type = "sensor_msgs/msg/Imu"
+[record]
+postroll = "10ms"
+preroll = "10ms"
+"""
+
+TICKS = """
+def on_tick(ctx):
+    newest = ctx.input("imu").newest()
+    ctx.event("tick", newest.number("linear_acceleration.z"), seq=newest.identity.seq, age=ctx.now_ns() - newest.stamps.at_ns)
+"""
 
 
 class Pictures(Examples):
@@ -78,9 +115,10 @@ class Pictures(Examples):
             self.assertAlmostEqual(luma, expected, delta=0.01)
 
     test_hello = test_imu_fft = None  # type: ignore[assignment]
+    test_ticks_begin_with_the_first_sample_that_is_seen_or_recorded = None  # type: ignore[assignment]
 
     def test_brake_dark(self) -> None:
-        run = self.both("brake-dark", {"brake_mps2": -1.4, "dark_luma": 50})
+        run = self.example("brake-dark", {"brake_mps2": -1.4, "dark_luma": 50})
         self.assertEqual([(round(t.at_s, 1), t.label) for t in run.triggers], [(11.0, "brake-dark"), (38.3, "brake-dark")])
 
 

@@ -117,11 +117,11 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     ])
 }
 
-/// What mypy checks, relative to the checkout: the SDK, and each lambda by itself, as all are called `main`.
+/// What mypy checks, relative to the checkout: the SDK and its tests, and each lambda by itself, as all are called `main`.
 fn typed(checkout: &Checkout) -> Vec<PathBuf> {
     let mains = checkout.lambdas(&FAMILIES).into_iter().map(|lambda| lambda.join("main.py"));
     let mains = mains.filter(|main| checkout.path(main).is_file());
-    [PathBuf::from("guest-sdk-python/gleaner")].into_iter().chain(mains).collect()
+    ["guest-sdk-python/gleaner", "guest-sdk-python/tests"].map(PathBuf::from).into_iter().chain(mains).collect()
 }
 
 fn miri(checkout: &Checkout) -> How {
