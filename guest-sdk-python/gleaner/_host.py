@@ -70,7 +70,9 @@ def _import(entry: str) -> ModuleType:
     folder = os.path.dirname(entry)
     # A replay that is repeated begins with fresh globals, those of the lambda's own modules included.
     for name, known in list(sys.modules.items()):
-        if str(getattr(known, "__file__", None)).startswith(folder + os.sep):
+        file = str(getattr(known, "__file__", None))
+        # An environment that lies in the lambda's folder is no part of the lambda.
+        if file.startswith(folder + os.sep) and not file.startswith(sys.prefix + os.sep):
             del sys.modules[name]
     # As for any script, what lies beside the file can be imported.
     if folder not in sys.path:

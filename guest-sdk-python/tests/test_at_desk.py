@@ -5,6 +5,7 @@ Left out is what only a process of its own can do or refuse."""
 from __future__ import annotations
 
 import sys
+import types
 import unittest
 
 import test_hosted
@@ -56,6 +57,21 @@ class Streams(AtDesk):
         self.replay("def on_event(ctx, event): print('a')", [GREY])
         self.assertEqual((sys.stdout, sys.stderr, list(sys.path), sys.modules.get("main")), before)
         self.assertEqual(self.log(), [("info", "a")])
+
+    def test_modules_beside_a_lambda_are_fresh_in_each_run_and_those_of_a_test_stay(self) -> None:
+        beside = self.folder / "build" / "beside.py"
+        beside.parent.mkdir()
+        beside.write_text("seen = []\n", encoding="utf-8")
+        mine = types.ModuleType("test_beside")
+        mine.__file__ = str(beside.parent / "test_beside.py")
+        sys.modules["test_beside"] = mine
+        self.addCleanup(sys.modules.pop, "test_beside")
+        self.addCleanup(sys.modules.pop, "beside", None)
+        source = "import beside\ndef on_event(ctx, event): beside.seen.append(1); ctx.event('e', len(beside.seen))"
+        for _ in range(2):
+            decisions = self.replay(source, [GREY, GREY])
+            self.assertEqual([decision["triggers"][0]["score"] for decision in decisions], [1, 2])
+        self.assertIs(sys.modules["test_beside"], mine)
 
 
 if __name__ == "__main__":

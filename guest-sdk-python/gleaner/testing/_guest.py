@@ -145,7 +145,7 @@ def manifest_beside(given: Given) -> Path:
 def guarded(log: Optional[Callable[[Any, str], None]]) -> Iterator[None]:
     """While it lasts, what is printed goes to ``log``, if there is one; afterwards the interpreter is as it was."""
     streams, path, writes = (sys.stdout, sys.stderr), list(sys.path), sys.dont_write_bytecode
-    main = sys.modules.get("main")
+    modules = dict(sys.modules)
     if log is not None:
         _host.print_to(log)
     try:
@@ -155,11 +155,7 @@ def guarded(log: Optional[Callable[[Any, str], None]]) -> Iterator[None]:
             _host.print_to(None)
             sys.stdout, sys.stderr = streams
         sys.path[:], sys.dont_write_bytecode = path, writes
-        _put_back("main", main)
-
-
-def _put_back(name: str, module: Optional[ModuleType]) -> None:
-    if module is None:
-        sys.modules.pop(name, None)
-    else:
-        sys.modules[name] = module
+        if "main" not in modules:
+            sys.modules.pop("main", None)
+        # Fresh globals for a lambda must not mean that a test beside it is gone.
+        sys.modules.update(modules)
