@@ -10,7 +10,8 @@ The rules, which every twin keeps to the letter. All arithmetic is in 64-bit flo
 4. *A run* is a row of samples without a gap: no interval in it is below 1 ns or above 2.5 periods. A sample behind a gap is the
    first of a new run; no window reaches across a gap. The 33 samples of rule 2 count as well.
 5. A window is *complete* with the sample that is number ``n``, ``n + n/4``, ``n + 2n/4`` and so on in its run; it holds the newest ``n``
-   samples of the ring. Windows that would have been complete before the period was known are left out.
+   samples of the ring, and is left out if there are fewer, as where the host had to drop some. Windows that would have been complete
+   before the period was known are left out, too.
 6. *The rate* of a window follows from its own stamps: ``(n - 1) * 1e9 / (last - first)`` Hz. Bin ``k`` lies at ``k * (rate / n)`` Hz.
 7. The mean of the window is taken out, since gravity would fill the lowest bins; then its one-sided power spectral density is taken, with
    the periodic Hann window ``w[j] = (1 - cos(2 pi j / n)) / 2``, as in ``docs/kernels.md``::
