@@ -18,8 +18,8 @@ A lambda is a class, or plain functions, in the file that ``entry`` of its ``lam
 
 An exception that leaves a handler is a fault of that wake. The lambda is then made anew; the globals of its module stay.
 
-The classes here describe what the host hands out. Importing them needs no host, so a lambda can be checked and tested at
-a desk. The names are those of the WIT package ``gleaner:lambda``, with ``_`` for ``-``.
+The classes here describe what the host hands out. Importing them needs no host, so a lambda can be checked at a desk, and
+run there by `gleaner.testing`. The names are those of the WIT package ``gleaner:lambda``, with ``_`` for ``-``.
 """
 
 from .context import Context

@@ -1,5 +1,5 @@
 """The part of hosting that is written in Python: finding a lambda in its file, telling its exceptions, taking down what it
-prints, and keeping the garbage collector out of its wakes. `_gleaner` calls it; no lambda imports it."""
+prints, and keeping the garbage collector out of its wakes. `_gleaner` calls it, and so does `gleaner.testing`; no lambda imports it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ from ._printed import end_call, print_to
 from .context import Context
 from .error import DeadlineExceeded
 
-__all__ = ["attempt", "load", "print_to", "settle", "tidy"]
+__all__ = ["attempt", "load", "maker", "print_to", "settle", "tidy"]
 
 Handler = Callable[..., object]
 
 # A message has room for about so many entries of a traceback. Without a bound an endless recursion, a thousand entries
 # deep, would take 16 ms to tell.
 TRACE_ENTRIES = 40
+
+# Code of this package, which is not what a lambda's author wants to see.
+OURS = os.path.dirname(__file__) + os.sep
 
 HANDLERS: Dict[str, str] = {"on_event": "on_event(ctx, event)", "on_tick": "on_tick(ctx)"}
 
@@ -35,16 +38,22 @@ def load(entry: str, handler: str) -> Callable[[Context], Handler]:
     """Imports the file ``entry``; returns what makes a fresh lambda and gives its ``handler``: ``on_event`` or ``on_tick``.
 
     Raises LambdaError, and whatever the file raises."""
-    module = _import(entry)
-    lambda_class = getattr(module, "Lambda", None)
-    owner: Any = module if lambda_class is None else lambda_class
+    return maker(_import(entry), handler, os.path.basename(entry))
+
+
+def maker(found: Any, handler: str, where: str) -> Callable[[Context], Handler]:
+    """As `load`, of what is imported already: a module, or the class of a lambda. ``where`` is its name.
+
+    Raises LambdaError."""
+    lambda_class = getattr(found, "Lambda", None) if isinstance(found, ModuleType) else found
+    owner: Any = found if lambda_class is None else lambda_class
     if not callable(getattr(owner, handler, None)):
-        raise LambdaError(_missing(owner, entry, handler))
+        raise LambdaError(_missing(owner, where, handler))
 
     def make(ctx: Context) -> Handler:
         if lambda_class is None:
-            getattr(module, "init", _nothing)(ctx)
-            made: Any = module
+            getattr(found, "init", _nothing)(ctx)
+            made: Any = found
         else:
             made = lambda_class(ctx)
         bound: Handler = getattr(made, handler)
@@ -61,7 +70,9 @@ def _import(entry: str) -> ModuleType:
     folder = os.path.dirname(entry)
     # A replay that is repeated begins with fresh globals, those of the lambda's own modules included.
     for name, known in list(sys.modules.items()):
-        if str(getattr(known, "__file__", None)).startswith(folder + os.sep):
+        file = str(getattr(known, "__file__", None))
+        # An environment that lies in the lambda's folder is no part of the lambda.
+        if file.startswith(folder + os.sep) and not file.startswith(sys.prefix + os.sep):
             del sys.modules[name]
     # As for any script, what lies beside the file can be imported.
     if folder not in sys.path:
@@ -77,8 +88,8 @@ def _import(entry: str) -> ModuleType:
     return module
 
 
-def _missing(owner: Any, entry: str, handler: str) -> str:
-    where, wanted = f"`{os.path.basename(entry)}`", HANDLERS[handler]
+def _missing(owner: Any, where: str, handler: str) -> str:
+    where, wanted = f"`{where}`", HANDLERS[handler]
     if not isinstance(owner, ModuleType):
         where, wanted = f"`Lambda` of {where}", wanted.replace("(", "(self, ")
     schedule = "event" if handler == "on_event" else "period"
@@ -131,7 +142,7 @@ def explain(error: BaseException) -> str:
 
 def _is_ours(trace: TracebackType) -> bool:
     file = trace.tb_frame.f_code.co_filename
-    return file == __file__ or file.startswith("<frozen importlib")
+    return file.startswith((OURS, "<frozen importlib"))
 
 
 def settle() -> None:

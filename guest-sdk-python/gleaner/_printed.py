@@ -73,32 +73,51 @@ class Lines(io.RawIOBase):
                 self._log(self._level, text)
 
 
-def _text(lines: Lines) -> io.TextIOWrapper:
-    return io.TextIOWrapper(lines, encoding="utf-8", errors="backslashreplace", line_buffering=True)
+class Stream:
+    """What ``sys.stdout`` or ``sys.stderr`` is for a lambda, and the lines below it."""
+
+    def __init__(self, name: str, level: Level) -> None:
+        self.name, self.level = name, level
+        self.make()
+
+    def make(self) -> None:
+        self.lines = Lines(self.name, self.level)
+        self.text = io.TextIOWrapper(self.lines, encoding="utf-8", errors="backslashreplace", line_buffering=True)
+
+    def is_whole(self) -> bool:
+        """Whether no lambda closed it, or put a stream of its own on what is below."""
+        try:
+            return not self.text.closed
+        except ValueError:
+            return False
 
 
 # They outlive a lambda: `logging`, for one, keeps the stream that it was set up with.
-_stdout, _stderr = Lines("<stdout>", "info"), Lines("<stderr>", "warn")
-_streams = ((_text(_stdout), _stdout), (_text(_stderr), _stderr))
+_streams = (Stream("<stdout>", "info"), Stream("<stderr>", "warn"))
 
 
 def print_to(log: Optional[Log]) -> None:
     """From now on ``sys.stdout`` and ``sys.stderr`` lead to ``log``; with None to standard error."""
     end_call()
-    _stdout.lead_to(log)
-    _stderr.lead_to(log)
-    sys.stdout, sys.stderr = (text for text, _ in _streams)
+    for stream in _streams:
+        if not stream.is_whole():
+            stream.lines.lead_to(None)
+            stream.make()
+        stream.lines.lead_to(log)
+    sys.stdout, sys.stderr = (stream.text for stream in _streams)
 
 
 def end_call() -> None:
     """Writes down what has been printed, the beginnings of lines included."""
-    for text, lines in _streams:
-        try:
-            text.flush()
-        except ValueError:
-            pass  # The lambda closed it, or put a stream of its own on what is below.
-        lines.end_line()
+    for stream in _streams:
+        if stream.is_whole():
+            stream.text.flush()
+        stream.lines.end_line()
 
 
-os.register_at_fork(after_in_child=_stdout.forked)
-os.register_at_fork(after_in_child=_stderr.forked)
+def _forked() -> None:
+    for stream in _streams:
+        stream.lines.forked()
+
+
+os.register_at_fork(after_in_child=_forked)

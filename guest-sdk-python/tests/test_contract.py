@@ -17,6 +17,15 @@ import wit
 
 import gleaner
 from gleaner import data, inference, log, scratch, trigger
+from gleaner.testing import _context, _data, _frame, _session
+
+class Desk:
+    """What `gleaner.testing` hands out. There are no models at the desk."""
+
+    Context, Scratch = _context.Context, _session.Scratch
+    Topic, Field, Sample, Frame = _data.Topic, _data.Field, _data.Sample, _frame.Frame
+    Tensor, Model = gleaner.Tensor, gleaner.Model
+
 
 INTERFACES = wit.read(home.CHECKOUT / "wit")
 OF_CONTEXT = ("data", "trigger", "log")
@@ -111,12 +120,20 @@ class Surface(unittest.TestCase):
     def test_the_extension_has_the_names_of_the_wit(self) -> None:
         self.holds(home.extension())
 
+    def test_the_desk_has_the_names_of_the_wit(self) -> None:
+        self.holds(Desk)
+
     def test_the_extension_takes_arguments_as_the_package_says(self) -> None:
-        extension = home.extension()
+        self.takes_arguments_as_described(home.extension())
+
+    def test_the_desk_takes_arguments_as_the_package_says(self) -> None:
+        self.takes_arguments_as_described(Desk)
+
+    def takes_arguments_as_described(self, module: Any) -> None:
         for cls, functions in wanted().items():
             for name in set(functions) - PROPERTIES[cls]:
                 with self.subTest(cls=cls, name=name):
-                    given, described = getattr(extension, cls), getattr(gleaner, cls)
+                    given, described = getattr(module, cls), getattr(gleaner, cls)
                     self.assertEqual(parameters(given, name), parameters(described, name))
 
     def test_there_is_something_to_compare(self) -> None:

@@ -99,12 +99,15 @@ class Arrays(Hosted):
 
 
 class Data(Hosted):
+    # As `drive` writes it, 5 ns before the log time.
+    PUBLISHED_NS = 999_999_995
+
     def test_a_sample_says_what_it_is(self) -> None:
         source = """
             import gleaner
 
             def on_event(ctx, event):
-                assert event.stamps == gleaner.Stamps(1_000_000_000, 999_999_995, 7_000_000_500), event.stamps
+                assert event.stamps == gleaner.Stamps(1_000_000_000, PUBLISHED_NS, 7_000_000_500), event.stamps
                 assert event.stamps.at_ns == ctx.now_ns()
                 assert (event.identity.topic, event.identity.seq) == ("/camera", 1), event.identity
                 assert event.get("encoding") == "mono8" and event.get("is_bigendian") == 0
@@ -121,7 +124,7 @@ class Data(Hosted):
                 assert frame.resize(4, 2).info.size == 8 and frame.to_gray().read(1) == b"\\x09"
                 ctx.event(str(event.identity.writer), 0.0)
         """
-        decision = self.replay(source, [GREY])[0]
+        decision = self.replay(source.replace("PUBLISHED_NS", str(self.PUBLISHED_NS)), [GREY])[0]
         self.assertEqual(decision["triggers"][0]["label"], decision["writer"])
 
     def test_a_topic_shows_its_ring(self) -> None:

@@ -1,6 +1,6 @@
 //! `.venv`: Python with numpy, for Python lambdas; mypy, for the check of the SDK's types; and the readers of others, by which
 //! tests read our clips. No version is pinned: the newest that this Python takes, so that a user's environment is the one that
-//! is tested.
+//! is tested. But for mypy, of which the newest may find new faults in old code: it has an upper bound.
 
 use std::fs;
 use std::process::Command;
@@ -13,23 +13,27 @@ use crate::steps::{run, succeeds};
 /// What pip calls each, and what Python does.
 const PACKAGES: [(&str, &str); 5] = [
     ("numpy", "numpy"),
-    ("mypy", "mypy"),
+    ("mypy<2.5", "mypy"),
     ("mcap", "mcap"),
     ("mcap-ros2-support", "mcap_ros2"),
     ("rosbags", "rosbags"),
 ];
 
+/// What only tests need: `gleaner.testing` on pictures, tests of lambdas, and notebooks.
+const FOR_TESTS: [(&str, &str); 5] = [
+    ("pillow", "PIL"),
+    ("pytest", "pytest"),
+    ("nbclient", "nbclient"),
+    ("ipykernel", "ipykernel"),
+    ("matplotlib", "matplotlib"),
+];
+
 /// Makes the environment, or completes it. One whose Python does not run, since the system's Python went, is made anew.
 pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
-    let python = |code: &str| {
-        let mut python = checkout.command(checkout.python());
-        python.args(["-I", "-c", code]);
-        python
-    };
-    if succeeds(&mut python(&format!("import {}", PACKAGES.map(|(_, module)| module).join(", ")))) {
+    if has(checkout, &PACKAGES) {
         return Ok(());
     }
-    if !succeeds(&mut python("import pip")) {
+    if !succeeds(&mut python(checkout, "import pip")) {
         let folder = checkout.path(".venv");
         if folder.exists() {
             println!("making it anew: its Python does not run");
@@ -44,7 +48,28 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
         make.args(["-m", "venv"]).arg(folder);
         run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
     }
-    let packages = PACKAGES.map(|(package, _)| package);
+    fetch(checkout, &PACKAGES)
+}
+
+/// Adds what tests need to the environment.
+pub(crate) fn set_up_for_tests(checkout: &Checkout) -> Result<(), Failure> {
+    if has(checkout, &FOR_TESTS) { Ok(()) } else { fetch(checkout, &FOR_TESTS) }
+}
+
+/// The environment's Python, which is to run `code`.
+fn python(checkout: &Checkout, code: &str) -> Command {
+    let mut python = checkout.command(checkout.python());
+    python.args(["-I", "-c", code]);
+    python
+}
+
+fn has(checkout: &Checkout, packages: &[(&str, &str)]) -> bool {
+    let modules: Vec<_> = packages.iter().map(|(_, module)| *module).collect();
+    succeeds(&mut python(checkout, &format!("import {}", modules.join(", "))))
+}
+
+fn fetch(checkout: &Checkout, packages: &[(&str, &str)]) -> Result<(), Failure> {
+    let packages: Vec<_> = packages.iter().map(|(package, _)| *package).collect();
     pip(checkout.command(checkout.python()), &packages, "see that the network is there, or configure pip for a mirror")
 }
 

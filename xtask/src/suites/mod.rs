@@ -17,6 +17,7 @@ use crate::checkout::{Checkout, FAMILIES};
 use crate::player;
 use crate::setup;
 use crate::steps::{Steps, succeeds};
+use crate::venv;
 use tally::{Speech, Tally};
 
 struct Suite {
@@ -34,8 +35,10 @@ enum How {
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut suites = suites(checkout);
     suites.extend(player_suites(checkout)?);
-    let mut steps = Steps::of(setup::STEPS + suites.len());
+    let mut steps = Steps::of(setup::STEPS + 1 + suites.len());
     setup::run(checkout, &mut steps, &FAMILIES)?;
+    steps.begin("pytest, and what runs notebooks");
+    venv::set_up_for_tests(checkout)?;
     let mut total = Tally::new(Speech::None);
     let mut table = format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
     for suite in suites {
@@ -73,11 +76,19 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         .args(["-m", "unittest", "discover", "-v", "guest-sdk-python/tests"])
         .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"));
 
+    // As users test lambdas, with the SDK of this checkout.
+    let mut pytest = checkout.command(checkout.python());
+    pytest
+        .args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "examples"])
+        .env("PYTHONPATH", checkout.path("guest-sdk-python"))
+        .env("PYTHONDONTWRITEBYTECODE", "1");
+
     let mut suites = vec![
         suite("cargo test", tests, Speech::Libtest),
         suite("loom: orders of threads in gleaner-buffers", loom, Speech::Libtest),
         Suite { name: "miri: memory in gleaner-buffers".to_owned(), how: miri(checkout) },
         suite("unittest: Python SDK", unittest, Speech::Unittest),
+        suite("pytest: examples and notebooks", pytest, Speech::Pytest),
     ];
     suites.extend(typed(checkout).into_iter().map(|file| {
         let mut mypy = checkout.command(checkout.python());
@@ -106,11 +117,11 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     ])
 }
 
-/// What mypy checks, relative to the checkout: the SDK, and each lambda by itself, as all are called `main`.
+/// What mypy checks, relative to the checkout: the SDK and its tests, and each lambda by itself, as all are called `main`.
 fn typed(checkout: &Checkout) -> Vec<PathBuf> {
     let mains = checkout.lambdas(&FAMILIES).into_iter().map(|lambda| lambda.join("main.py"));
     let mains = mains.filter(|main| checkout.path(main).is_file());
-    [PathBuf::from("guest-sdk-python/gleaner")].into_iter().chain(mains).collect()
+    ["guest-sdk-python/gleaner", "guest-sdk-python/tests"].map(PathBuf::from).into_iter().chain(mains).collect()
 }
 
 fn miri(checkout: &Checkout) -> How {

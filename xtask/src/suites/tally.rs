@@ -7,6 +7,8 @@ pub(super) enum Speech {
     Libtest,
     /// As Python's unittest does with `-v`.
     Unittest,
+    /// As pytest does with `-q`.
+    Pytest,
     /// Not at all: the exit status stands for one test.
     None,
 }
@@ -47,6 +49,7 @@ impl Tally {
         match self.speech {
             Speech::Libtest => self.hear_libtest(line),
             Speech::Unittest => self.hear_unittest(line),
+            Speech::Pytest => self.hear_pytest(line),
             Speech::None => {}
         }
     }
@@ -106,6 +109,19 @@ impl Tally {
             self.skipped = count("skipped=");
             // An error in a fixture counts as an error, but its tests were not run.
             self.passed = self.ran.saturating_sub(self.failed + self.skipped);
+        }
+    }
+
+    fn hear_pytest(&mut self, line: &str) {
+        if let Some(name) = line.strip_prefix("FAILED ").or_else(|| line.strip_prefix("ERROR ")) {
+            self.names.push(name.split(" - ").next().unwrap_or(name).to_owned());
+        } else if let Some((counts, _)) =
+            line.rsplit_once(" in ").filter(|_| line.starts_with(|c: char| c.is_ascii_digit()))
+        {
+            // Its last line, such as `1 failed, 3 passed, 2 skipped in 0.50s`.
+            self.passed = count_before(counts, " passed");
+            self.failed = count_before(counts, " failed") + count_before(counts, " error");
+            self.skipped = count_before(counts, " skipped");
         }
     }
 
@@ -198,6 +214,17 @@ mod tests {
         assert_eq!(tally.names, ["test_a (m.C)", "test_b (m.C)"]);
         assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 1 test in 0.1s\n\nOK")), [1, 0, 0]);
         assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 3 tests in 0.1s\n\nOK (skipped=1)")), [2, 0, 1]);
+    }
+
+    #[test]
+    fn pytest_says_its_counts_in_its_last_line() {
+        let text = "..F.s  [100%]\nFAILED examples/a/tests/test_a.py::test_x[1] - assert 1 in [2]\nERROR b/test_b.py\n\
+                    1 failed, 12 passed, 3 skipped, 2 errors in 4.52s";
+        let tally = heard(Speech::Pytest, false, text);
+        assert_eq!(counts(&tally), [12, 3, 3]);
+        assert_eq!(tally.names, ["examples/a/tests/test_a.py::test_x[1]", "b/test_b.py"]);
+        assert_eq!(counts(&heard(Speech::Pytest, true, "17 passed in 62.21s (0:01:02)")), [17, 0, 0]);
+        assert_eq!(counts(&heard(Speech::Pytest, false, "no tests ran in 0.01s")), [0, 1, 0]);
     }
 
     #[test]

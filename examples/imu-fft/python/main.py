@@ -1,0 +1,118 @@
+"""Road roughness: how much of the vertical acceleration lies at frequencies at which a road shakes a car.
+
+The rules, which every twin keeps to the letter. All arithmetic is in 64-bit floats.
+
+1. *Stamps* are ``at_ns``, by which the host orders samples. Every sample of the input wakes the lambda.
+2. *The period* is learnt once, from the first 33 stamps: of their 32 intervals, sorted, the one at index 16. A stamp that is not later
+   than the one before it, while the period is being learnt, makes the learning begin anew, with that sample as the first.
+3. *A window* has ``n`` samples: the power of two nearest to ``window_s * 1e9 / period``, the larger one if two are as near, and within
+   16 and 4096. It stays so for as long as the lambda lives.
+4. *A run* is a row of samples without a gap: no interval in it is below 1 ns or above 2.5 periods. A sample behind a gap is the
+   first of a new run; no window reaches across a gap. The 33 samples of rule 2 count as well.
+5. A window is *complete* with the sample that is number ``n``, ``n + n/4``, ``n + 2n/4`` and so on in its run; it holds the newest ``n``
+   samples of the ring, and is left out if there are fewer, as where the host had to drop some. Windows that would have been complete
+   before the period was known are left out, too.
+6. *The rate* of a window follows from its own stamps: ``(n - 1) * 1e9 / (last - first)`` Hz. Bin ``k`` lies at ``k * (rate / n)`` Hz.
+7. The mean of the window is taken out, since gravity would fill the lowest bins; then its one-sided power spectral density is taken, with
+   the periodic Hann window ``w[j] = (1 - cos(2 pi j / n)) / 2``, as in ``docs/kernels.md``::
+
+       density[k] = c[k] |sum over j of w[j] x[j] exp(-2 pi i j k / n)|^2 / (rate * sum over j of w[j]^2)
+
+   for ``k`` of 0 to ``n/2``, where ``c`` is 1 for the first and the last bin and 2 for those between.
+8. *The power* in a band is the sum of its bins, from its lower edge on and below its upper one, times ``rate / n``, in (m/s^2)^2. *The score*
+   is 0.2 of that from 0.5 to 2 Hz, 0.5 of that from 2 to 8 Hz, and all of that from 8 to 20 Hz.
+9. ``peak_hz`` is where the largest bin from 1 to 6 Hz lies, both included; the lowest of equal ones; 0 if there is none.
+10. A score above ``rough`` is an event ``rough-road`` of that score, at the window's last sample. Anything that is no number is not above.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from gleaner import Context, Sample
+
+LEARN = 33
+SMALLEST, LARGEST = 16, 4096
+GAP_PERIODS = 2.5
+# Lower and upper edge in Hz, and weight.
+BANDS = ((0.5, 2.0, 0.2), (2.0, 8.0, 0.5), (8.0, 20.0, 1.0))
+PEAK_HZ = (1.0, 6.0)
+
+Floats = npt.NDArray[np.float64]
+
+
+class Lambda:
+    def __init__(self, ctx: Context) -> None:
+        self.imu = ctx.input("imu")
+        self.vertical = self.imu.field("linear_acceleration.z")
+        self.window_s: float = ctx.config["window_s"]
+        self.rough: float = ctx.config["rough"]
+        self.learning: list[int] = []
+        self.period_ns = 0
+        self.last_ns = 0
+        self.run = 0
+        self.weights: Floats = np.empty(0)
+
+    def on_event(self, ctx: Context, event: Sample) -> None:
+        now = event.stamps.at_ns
+        if self.period_ns == 0:
+            self.learn(now)
+        else:
+            self.run = self.run + 1 if follows(now - self.last_ns, self.period_ns) else 1
+        self.last_ns = now
+        n = len(self.weights)
+        if n == 0 or self.run < n or (self.run - n) % (n // 4) != 0:
+            return
+        window = self.imu.column(self.vertical, n)
+        if len(window.values) < n:
+            return
+        rate = (n - 1) * 1e9 / float(window.at_ns[-1] - window.at_ns[0])
+        score, peak_hz = roughness(window.values, rate, self.weights)
+        if score > self.rough:
+            ctx.event("rough-road", score, peak_hz=peak_hz)
+
+    def learn(self, now: int) -> None:
+        """Rules 2 to 4, for the first samples."""
+        if self.learning and now <= self.learning[-1]:
+            self.learning.clear()
+        self.learning.append(now)
+        if len(self.learning) < LEARN:
+            return
+        intervals = [later - earlier for earlier, later in zip(self.learning, self.learning[1:])]
+        self.period_ns = sorted(intervals)[len(intervals) // 2]
+        self.run = 1
+        for interval in intervals:
+            self.run = self.run + 1 if follows(interval, self.period_ns) else 1
+        n = samples(self.window_s * 1e9 / self.period_ns)
+        self.weights = (1 - np.cos(2 * np.pi * np.arange(n) / n)) / 2
+        self.learning.clear()
+
+
+def follows(interval_ns: int, period_ns: int) -> bool:
+    """Whether a sample goes on with the run of the one before it."""
+    return 0 < interval_ns <= GAP_PERIODS * period_ns
+
+
+def samples(wanted: float) -> int:
+    """The power of two nearest to `wanted`."""
+    n = SMALLEST
+    while n < LARGEST and wanted >= 1.5 * n:
+        n *= 2
+    return n
+
+
+def roughness(signal: Floats, rate: float, weights: Floats) -> tuple[float, float]:
+    """Score in (m/s^2)^2 and peak in Hz of one window; `signal` is in m/s^2, shape (n,), oldest first."""
+    n = len(signal)
+    bin_hz = rate / n
+    amplitudes = np.fft.rfft(weights * (signal - signal.mean()))
+    density = 2 * np.abs(amplitudes) ** 2 / (rate * np.sum(weights**2))
+    density[[0, -1]] /= 2
+    at_hz = np.arange(len(density)) * bin_hz
+    score = sum(
+        weight * float(density[(low <= at_hz) & (at_hz < high)].sum()) * bin_hz for low, high, weight in BANDS
+    )
+    within = np.flatnonzero((PEAK_HZ[0] <= at_hz) & (at_hz <= PEAK_HZ[1]))
+    peak_hz = float(at_hz[within[density[within].argmax()]]) if len(within) else 0.0
+    return float(score), peak_hz

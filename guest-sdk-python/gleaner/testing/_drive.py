@@ -1,0 +1,159 @@
+"""Recorded drives, message by message in the order of the host's replay. Files are read by `rosbags`."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from pathlib import Path
+from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Sequence, Tuple, Union
+
+import numpy as np
+
+from ..data import Column, Guid
+from ._error import ReplayError, nearest, quoted
+from ._path import Missing, NotANumber, compile_path
+from ._ring import Arrival
+from ._types import Types
+
+Name = Union[str, "os.PathLike[str]"]
+
+
+class Delivery(NamedTuple):
+    """A message and the topic that it came on."""
+
+    topic: str
+    arrival: Arrival
+
+
+class Drive:
+    """A recorded drive: MCAP files, or rosbag2 directories of either storage; several are read as one.
+
+    ``topics`` is the type of each topic. Raises ReplayError for files that cannot be read. ``path`` is one, or a list."""
+
+    def __init__(self, path: Union[Name, Sequence[Name]]) -> None:
+        single = isinstance(path, (str, os.PathLike))
+        self.paths: List[Path] = [Path(path)] if single else [Path(one) for one in path]  # type: ignore[arg-type, union-attr]
+        self._shown = ", ".join(map(str, self.paths))
+        self.topics: Dict[str, str] = {}
+        with _opened(self.paths) as reader:
+            for connection in reader.connections:
+                first = self.topics.setdefault(connection.topic, connection.msgtype)
+                if first != connection.msgtype:
+                    cause = f"topic `{connection.topic}` is of type `{first}` and of `{connection.msgtype}`"
+                    raise ReplayError(f"cannot use drive `{self._shown}`", cause)
+            self.types = Types(reader.typestore)
+            spans = [(one.start_time, one.end_time) for one in reader.readers if one.message_count]
+        self.start_ns: int = min((start for start, _ in spans), default=0)
+        """Stamp of the first message of any topic, in ns; 0 if there is none."""
+        self.end_ns: int = max((end for _, end in spans), default=1) - 1
+        """Stamp of the last message of any topic."""
+
+    def __repr__(self) -> str:
+        return f"<Drive {self._shown}: {(self.end_ns - self.start_ns) / 1e9:.1f} s, {len(self.topics)} topics>"
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether topics of a lambda may be missing."""
+        return False
+
+    def type_of(self, topic: str) -> str:
+        """Raises ReplayError, which names the nearest topic."""
+        if topic not in self.topics:
+            near = nearest(topic, self.topics)
+            help = f"did you mean `{near}`?" if near else "pass remap={FROM: TO} if the lambda calls it by another name"
+            cause = f"it has no topic `{topic}`; it has {quoted(self.topics)}"
+            raise ReplayError(f"cannot use drive `{self._shown}`", cause, help)
+        return self.topics[topic]
+
+    def deliveries(self, topics: Iterable[str]) -> Iterator[Delivery]:
+        """The messages of these topics by stamp; equal stamps in the order of the files, then of the channels."""
+        wanted = set(topics)
+        counted: Dict[Tuple[str, Guid], int] = {}
+        with _opened(self.paths) as reader:
+            chosen = [connection for connection in reader.connections if connection.topic in wanted]
+            files = {id(c.owner): file for file, owner in enumerate(reader.readers) for c in owner.connections}
+            messages = _readable(self._shown, reader.messages(connections=chosen) if chosen else iter(()))
+            for at_ns, group in itertools.groupby(messages, key=lambda message: message[1]):
+                # Stable: what one channel has of one instant stays as it lies in the file.
+                ordered = sorted(((files[id(c.owner)], c.id, c, raw) for c, _, raw in group), key=lambda it: it[:2])
+                for file, channel, connection, raw in ordered:
+                    writer = _writer(file, channel)
+                    seq = counted[connection.topic, writer] = counted.get((connection.topic, writer), 0) + 1
+                    data = _checked(self._shown, connection.topic, raw)
+                    yield Delivery(connection.topic, Arrival(at_ns, at_ns, writer, seq, data))
+
+    def column(self, topic: str, path: str) -> Column:
+        """A numeric field of all messages of a topic: two arrays, ``at_ns`` and ``values``.
+
+        Raises ReplayError for a topic that the drive does not have, DataError for a field that is none."""
+        type_name = self.type_of(topic)
+        field = compile_path(self.types, type_name, path)
+        at_ns, values = [], []
+        for _, arrival in self.deliveries([topic]):
+            try:
+                values.append(field.number(self.types.decode(arrival.cdr, type_name)))
+            except NotANumber:
+                raise ReplayError(f"field `{path}` of `{type_name}` is no number") from None
+            except Missing as error:
+                raise ReplayError(f"cannot read `{path}` of `{topic}`", str(error)) from None
+            at_ns.append(arrival.at_ns)
+        return Column(np.array(at_ns, dtype=np.int64), np.array(values, dtype=np.float64))
+
+
+def _opened(paths: Sequence[Path]) -> Any:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    shown = ", ".join(map(str, paths))
+    missing = [path for path in paths if not path.exists()]
+    if missing or not paths:
+        raise ReplayError(f"there is no drive `{missing[0] if missing else ''}`", help="give MCAP files or rosbag2 directories")
+    try:
+        # A directory is a bag of its own; only files are read together.
+        return _Reader(AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_HUMBLE)))
+    except Exception as error:
+        raise _unreadable(shown, error) from None
+
+
+class _Reader:
+    """An `AnyReader` whose refusals are ours."""
+
+    def __init__(self, inner: Any) -> None:
+        self._inner = inner
+
+    def __enter__(self) -> Any:
+        try:
+            return self._inner.__enter__()
+        except Exception as error:
+            raise _unreadable(", ".join(map(str, self._inner.paths)), error) from None
+
+    def __exit__(self, *raised: Any) -> None:
+        self._inner.__exit__(*raised)
+
+
+def _readable(shown: str, messages: Iterator[Any]) -> Iterator[Any]:
+    while True:
+        try:
+            message = next(messages)
+        except StopIteration:
+            return
+        except Exception as error:
+            raise _unreadable(shown, error) from None
+        yield message
+
+
+def _unreadable(shown: str, error: Exception) -> ReplayError:
+    help = "`gleaner replay` reads a damaged MCAP file up to the damage; rosbags wants a whole one"
+    return ReplayError(f"cannot read drive `{shown}`", str(error) or type(error).__name__, help)
+
+
+def _checked(shown: str, topic: str, raw: Any) -> bytes:
+    data = bytes(raw)
+    if data[:2] not in (b"\0\0", b"\0\1") or len(data) < 4:
+        raise ReplayError(f"cannot read drive `{shown}`", f"a message of `{topic}` is no CDR: it begins with {data[:4]!r}")
+    return data
+
+
+def _writer(file: int, channel: int) -> Guid:
+    """As the host makes one up for a channel: `mcap`, the file's place in the drive, the channel's id."""
+    return Guid(int.from_bytes(b"mcap", "big") << 32 | file, (channel & 0xFFFF_FFFF) << 32)

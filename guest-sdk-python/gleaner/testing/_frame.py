@@ -1,0 +1,244 @@
+"""A sample seen as an image. Raw pixels stay where they are; JPEG and PNG are decoded once, by Pillow, within `decoded_size`."""
+
+from __future__ import annotations
+
+import io
+import warnings
+import weakref
+from typing import Any, Callable, List, Mapping, Optional, Tuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from ..data import DataError, FrameInfo, Identity, Roi, Stamps
+from . import _pixels
+from ._manifest import COMPRESSED_IMAGE, MIB, Input
+from ._pixels import LAYOUTS, Bytes, ImageError, Picture, RangeError
+from ._ring import Lease
+from ._session import piece, unsigned
+
+About = Tuple[Identity, Stamps]
+T = TypeVar("T")
+
+
+class Budget:
+    """Frames that a lambda holds at a time, and bytes of those it made."""
+
+    def __init__(self, limits: Mapping[str, int]) -> None:
+        self.frames_allowed = self.frames = limits["frames"]
+        self.bytes = limits["memory"]
+        self.call_bytes = limits["call_bytes"]
+
+    def take(self, size: int) -> Taken:
+        """Raises DataError (``no-room``)."""
+        if self.frames == 0:
+            why = "drop frames that are not needed, or raise `frames` in [limits]"
+            raise DataError(f"the lambda holds {self.frames_allowed} frames; {why}", "no-room")
+        if size > self.bytes:
+            why = "drop frames that are not needed, or raise `memory` in [limits]"
+            raise DataError(f"{size} bytes for a new frame, {self.bytes} are left; {why}", "no-room")
+        return Taken(self, size)
+
+
+class Taken:
+    """Given back when nothing refers to it any more: neither a frame nor an array over its pixels."""
+
+    def __init__(self, budget: Budget, size: int) -> None:
+        self.budget, self._size = budget, size
+        budget.frames -= 1
+        budget.bytes -= size
+
+    def __del__(self) -> None:
+        self.budget.frames += 1
+        self.budget.bytes += self._size
+
+
+class Decoded:
+    """The pixels of a JPEG or PNG; one slot of the input."""
+
+    def __init__(self, shown: Picture) -> None:
+        self.picture = shown
+
+
+class Pictures:
+    """Room for the images of one input."""
+
+    def __init__(self, declared: Input, budget: Budget) -> None:
+        self._slots, self._slot_bytes, self.budget = declared.hold + 1, declared.decoded_size, budget
+        self._held: List[weakref.ref[Decoded]] = []
+        self._newest: Optional[Tuple[int, Decoded]] = None
+
+    def frame(self, declared: Input, message: Callable[[], Any], lease: Lease, about: About) -> Frame:
+        """Raises DataError."""
+        if declared.type_name not in ("sensor_msgs/msg/Image", COMPRESSED_IMAGE):
+            raise DataError(f"a sample of `{declared.topic}` is no image: its type is `{declared.type_name}`", "not-a-frame")
+        given = message()
+        taken = self.budget.take(0)
+        try:
+            if declared.type_name == COMPRESSED_IMAGE:
+                decoded = self._decoded(declared, lease.cell.position, np.asarray(given.data).tobytes())
+                return Frame(about, decoded.picture, taken, decoded)
+            data = np.asarray(given.data, dtype=np.uint8)
+            size = int(given.width), int(given.height)
+            raw = _pixels.picture(*size, str(given.encoding), int(given.step), bool(given.is_bigendian), data)
+            return Frame(about, raw, taken, lease)
+        except ImageError as error:
+            raise _not_a_frame(declared.topic, error) from None
+
+    def _decoded(self, declared: Input, position: int, data: bytes) -> Decoded:
+        if self._newest is not None and self._newest[0] == position:
+            return self._newest[1]
+        # The older image's slot may be the one that is needed now.
+        self._newest = None
+        opened = _open(declared, data)
+        width, height = opened.size
+        if 3 * width * height > self._slot_bytes:
+            says = f"image says it is {width}x{height} ({_size(3 * width * height)} as rgb8)"
+            raise _too_large(declared, f"{says}; this input's decoded_size is {_size(self._slot_bytes)}")
+        self._held = [held for held in self._held if held() is not None]
+        if len(self._held) >= self._slots:
+            why = f"drop frames that are not needed, or raise `hold` of input `{declared.name}`"
+            raise DataError(f"every slot for decoded images of `{declared.topic}` is held; {why}", "no-room")
+        decoded = Decoded(_pixels.tight(_rgb(opened), "rgb8"))
+        self._held.append(weakref.ref(decoded))
+        self._newest = (position, decoded)
+        return decoded
+
+
+def _open(declared: Input, data: bytes) -> Any:
+    """Reads the header. Raises ImageError; DataError for sides that Pillow takes for an attack."""
+    from PIL import Image
+
+    if not data.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")):
+        raise ImageError(f"data is neither JPEG nor PNG: its {len(data)} bytes start with {list(data[:8])}")
+    try:
+        with warnings.catch_warnings():
+            # Large, but not too large for Pillow: `decoded_size` decides.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            opened = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
+    except Image.DecompressionBombError as error:
+        raise _too_large(declared, str(error)) from None
+    except Exception as error:
+        raise ImageError(str(error)) from None
+    if opened.mode == "CMYK":
+        raise ImageError("JPEG is of four colours, which is not supported")
+    return opened
+
+
+def _too_large(declared: Input, why: str) -> DataError:
+    return DataError(f"an image of `{declared.topic}` is too large: {why}", "no-room")
+
+
+def _rgb(opened: Any) -> Bytes:
+    try:
+        return np.asarray(opened.convert("RGB"), dtype=np.uint8)
+    except Exception as error:
+        raise ImageError(f"cannot decode the {opened.format} of {opened.width}x{opened.height}: {error}") from None
+
+
+def _size(count: int) -> str:
+    return f"{count} bytes" if count < MIB else f"{count / MIB:.1f} MiB"
+
+
+def _not_a_frame(topic: str, error: ImageError) -> DataError:
+    return DataError(f"a sample of `{topic}` is no image that can be read: {error}", "not-a-frame")
+
+
+class View:
+    """What numpy makes an array over. It keeps what the pixels lie in for as long as a view of them lives."""
+
+    def __init__(self, shown: Picture, holds: Tuple[Any, ...]) -> None:
+        pixel, channels = LAYOUTS[shown.encoding]
+        item = pixel // channels
+        shape: Tuple[int, ...] = (shown.height, shown.width, channels)
+        strides: Tuple[int, ...] = (shown.step, pixel, item)
+        if channels == 1:
+            shape, strides = shape[:2], strides[:2]
+        self._holds = (*holds, shown.data)
+        self.__array_interface__ = {
+            "version": 3,
+            "shape": shape,
+            "strides": strides,
+            "typestr": "|u1" if item == 1 else ">u2" if shown.big_endian else "<u2",
+            "data": (shown.data.__array_interface__["data"][0], True),
+        }
+
+
+class Frame:
+    """A sample seen as an image. Holds its pixels."""
+
+    def __init__(self, about: About, shown: Picture, taken: Taken, holds: Any) -> None:
+        self._about, self._picture, self._taken, self._holds = about, shown, taken, holds
+
+    @property
+    def info(self) -> FrameInfo:
+        width, height, encoding, step, big_endian, data = self._picture
+        return FrameInfo(width, height, encoding, step, big_endian, len(data))  # type: ignore[arg-type]
+
+    @property
+    def identity(self) -> Identity:
+        return self._about[0]
+
+    @property
+    def stamps(self) -> Stamps:
+        return self._about[1]
+
+    def mean_luma(self, roi: Optional[Roi | tuple[int, int, int, int]] = None) -> float:
+        return self._ask(lambda: _pixels.mean_luma(self._picture, _roi(roi)))
+
+    def histogram(self, roi: Optional[Roi | tuple[int, int, int, int]] = None) -> npt.NDArray[np.uint32]:
+        return self._ask(lambda: _pixels.histogram(self._picture, _roi(roi)))
+
+    def resize(self, width: int, height: int) -> Frame:
+        width, height = unsigned(width), unsigned(height)
+        size = width * height * (1 if self._picture.is_grey else 3)
+        return self._made("resize", (width, height), size, lambda: _pixels.resize(self._picture, width, height))
+
+    def to_gray(self) -> Frame:
+        shown = self._picture
+        return self._made("grey image", None, shown.width * shown.height, lambda: _pixels.to_gray(shown))
+
+    def read(self, offset: int = 0, len: Optional[int] = None) -> bytes:
+        return piece(self._picture.data.tobytes(), offset, len, self._taken.budget.call_bytes)
+
+    def array(self) -> npt.NDArray[Any]:
+        return np.asarray(View(self._picture, (self._holds, self._taken)))
+
+    def __array__(self, *arguments: Any, **named: Any) -> npt.NDArray[Any]:
+        return self.array().__array__(*arguments, **named)
+
+    def __dlpack__(self, **options: Any) -> Any:
+        return self.array().__dlpack__(**options)
+
+    def __dlpack_device__(self) -> Tuple[int, int]:
+        return 1, 0
+
+    def _ask(self, operation: Callable[[], T]) -> T:
+        try:
+            return operation()
+        except RangeError as error:
+            raise DataError(str(error), "out-of-range") from None
+        except ImageError as error:
+            raise _not_a_frame(self.identity.topic, error) from None
+
+    def _made(
+        self, operation: str, size: Optional[Tuple[int, int]], needed: int, make: Callable[[], Picture]
+    ) -> Frame:
+        def made() -> Frame:
+            # What is asked for is checked before room is taken for it, and that before it is made.
+            _pixels.check(self._picture, operation, size)
+            taken = self._taken.budget.take(needed)
+            return Frame(self._about, make(), taken, None)
+
+        return self._ask(made)
+
+    def __repr__(self) -> str:
+        shown = self._picture
+        return f"<Frame {self.identity.topic}, {shown.width}x{shown.height} {shown.encoding}>"
+
+
+def _roi(roi: Optional[Roi | tuple[int, int, int, int]]) -> Optional[Tuple[int, int, int, int]]:
+    if roi is None:
+        return None
+    x, y, width, height = (unsigned(number) for number in roi)
+    return x, y, width, height

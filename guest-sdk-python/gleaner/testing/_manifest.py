@@ -1,0 +1,239 @@
+"""`lambda.toml`, as far as a replay at the desk needs it. `gleaner build` reads all of it, and is stricter in places."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Dict, List, Mapping, Optional, Tuple, Union
+
+from ._error import ReplayError, nearest, quoted
+from ._table import Table
+
+ConfigValue = Union[bool, int, float, str]
+Source = Union[str, "os.PathLike[str]", Mapping[str, Any]]
+
+KIB, MIB, SECOND = 1 << 10, 1 << 20, 1_000_000_000
+
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+LARGE = ("sensor_msgs/msg/Image", COMPRESSED_IMAGE, "sensor_msgs/msg/PointCloud2")
+
+LAMBDA_NAME = re.compile(r"[a-z][a-z0-9-]*")
+ITEM_NAME = re.compile(r"[a-z][a-z0-9_-]*")
+TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
+
+# Minimum, default and maximum. Those of a manifest, in `bounds.rs`.
+LIMITS: Dict[str, Tuple[int, int, int]] = {
+    "fuel": (1_000, 50_000_000, 10**12),
+    "init_fuel": (1_000, 10**9, 10**12),
+    "memory": (MIB, 64 * MIB, 1024 * MIB),
+    "tables": (1, 20_000, 1_000_000),
+    "stack": (16 * KIB, 512 * KIB, 512 * KIB),
+    "handles": (16, 4096, 65_536),
+    "frames": (1, 256, 4096),
+    "call_bytes": (64 * KIB, MIB, MIB),
+    "call_items": (16, 65_536, 65_536),
+    "scratch": (0, 0, 256 * MIB),
+    "log_lines": (1, 100, 10_000),
+    "log_bytes": (4 * KIB, 400 * KIB, 16 * MIB),
+    "events_per_minute": (1, 12_000, 60_000),
+}
+SIZES = ("memory", "stack", "call_bytes", "scratch", "log_bytes")
+DEADLINES = {"deadline": (10**6, 50 * 10**6, 60 * SECOND), "init_deadline": (10**6, 10 * SECOND, 300 * SECOND)}
+
+
+@dataclass(frozen=True)
+class Input:
+    """One ``[[input]]``."""
+
+    name: str
+    topic: str
+    type_name: str
+    depth: int
+    hold: int
+    max_size: int
+    decoded_size: int
+
+
+@dataclass(frozen=True)
+class Record:
+    """``[record]``; durations in ns."""
+
+    topics: List[str]
+    preroll: int
+    postroll: int
+    cooldown: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A manifest that was checked."""
+
+    name: str
+    kind: str
+    entry: str
+    event: Optional[str]
+    backlog: str
+    period_ns: int
+    inputs: List[Input]
+    record: Optional[Record]
+    limits: Dict[str, int]
+    config: Dict[str, ConfigValue]
+
+    @property
+    def handler(self) -> str:
+        return "on_tick" if self.event is None else "on_event"
+
+
+def read(source: Source, config: Mapping[str, Any]) -> Manifest:
+    """Reads a manifest from its file, or as the ``dict`` that its file would be, and lays ``config`` over its own.
+
+    Raises ReplayError."""
+    if isinstance(source, Mapping):
+        return _manifest("manifest", source, config)
+    path = Path(source)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReplayError(f"cannot read manifest `{path}`", str(error), "pass manifest=\"path/to/lambda.toml\"") from None
+    return _manifest(str(path), _parsed(path, text), config)
+
+
+def _parsed(path: Path, text: str) -> Mapping[str, Any]:
+    try:
+        import tomllib as toml
+    except ImportError:  # Before Python 3.11.
+        import tomli as toml  # type: ignore[no-redef, import-not-found, unused-ignore]
+    try:
+        parsed: Dict[str, Any] = toml.loads(text)
+    except toml.TOMLDecodeError as error:
+        raise ReplayError(f"cannot use manifest `{path}`", f"it is no TOML: {error}") from None
+    return parsed
+
+
+def _manifest(file: str, entries: Mapping[str, Any], overrides: Mapping[str, Any]) -> Manifest:
+    root = Table(file, "the file", entries, ["lambda", "schedule", "input", "model", "record", "limits", "config"])
+    known = ["name", "version", "kind", "entry", "description", "deterministic"]
+    about = Table(file, "[lambda]", root.need("lambda", "[lambda] with name, version, kind and entry"), known)
+    inputs = [_input(file, entry) for entry in root.list("input")]
+    for what, values in {"name": [i.name for i in inputs], "topic": [i.topic for i in inputs]}.items():
+        twice = [value for value in values if values.count(value) > 1]
+        if twice:
+            raise root.refusal(f"has two [[input]] with the {what} `{twice[0]}`", "keep one [[input]] entry per topic")
+    event, backlog, period_ns = _schedule(root, inputs)
+    return Manifest(
+        name=about.form("name", 'name = "brake-dark"', LAMBDA_NAME, 63),
+        kind=about.choice("kind", ["python", "wasm"], ""),
+        entry=about.text("entry", 'entry = "main.py"'),
+        event=event,
+        backlog=backlog,
+        period_ns=period_ns,
+        inputs=inputs,
+        record=_record(root),
+        limits=_limits(root),
+        config=_config(root, overrides),
+    )
+
+
+def _schedule(root: Table, inputs: List[Input]) -> Tuple[Optional[str], str, int]:
+    entry = root.need("schedule", '[schedule] with event = "<an input\'s name>" or period = "100ms"')
+    table = Table(root.file, "[schedule]", entry, ["event", "period", "backlog"])
+    if ("event" in table) == ("period" in table):
+        raise table.refusal("needs one of `event` and `period`", "a lambda runs on one input or on the clock")
+    if "period" in table:
+        if "backlog" in table:
+            raise table.refusal("has a `backlog` beside `period`", "remove it: missed ticks are counted, never queued")
+        return None, "each", table.duration("period", (10**6, 0, 3600 * SECOND))
+    event = table.text("event", 'event = "<an input\'s name>"')
+    woken_by = [one for one in inputs if one.name == event]
+    if not woken_by:
+        raise table.refusal(f"names no input: `{event}`", f"the inputs are {quoted(one.name for one in inputs)}")
+    default = "latest" if woken_by[0].type_name in LARGE else "each"
+    return event, table.choice("backlog", ["each", "latest"], default), 0
+
+
+def _input(file: str, entry: Any) -> Input:
+    known = ["name", "topic", "type", "depth", "max_size", "decoded_size", "hold", "qos"]
+    table = Table(file, "[[input]]", entry, known)
+    type_name = table.form("type", 'type = "sensor_msgs/msg/Imu"', TYPE, 255)
+    large = type_name in LARGE
+    compressed = type_name == COMPRESSED_IMAGE
+    if "decoded_size" in table and not compressed:
+        raise table.refusal(f"has a `decoded_size`, and {type_name} is not decoded", "remove it")
+    return Input(
+        name=table.form("name", 'name = "camera"', ITEM_NAME, 63),
+        topic=table.form("topic", 'topic = "/camera/front"', TOPIC, 247),
+        type_name=type_name,
+        depth=table.integer("depth", (1, 4 if large else 64, 65_536)),
+        hold=table.integer("hold", (1, 2 if large else 8, 1024)),
+        max_size=table.size("max_size", (1, 8 * MIB if large else 4 * KIB, 256 * MIB)),
+        decoded_size=table.size("decoded_size", (1, 8 * MIB, 256 * MIB)) if compressed else 0,
+    )
+
+
+def _record(root: Table) -> Optional[Record]:
+    if "record" not in root:
+        return None
+    known = ["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"]
+    table = Table(root.file, "[record]", root.entries["record"], known)
+    table.need("topics", 'topics = ["/imu/data"]: what a clip holds')
+    roll = (0, 5 * SECOND, 600 * SECOND)
+    return Record(
+        topics=[str(topic) for topic in table.list("topics")],
+        preroll=table.duration("preroll", roll),
+        postroll=table.duration("postroll", roll),
+        cooldown=table.duration("cooldown", (0, 0, 3600 * SECOND)),
+    )
+
+
+def _limits(root: Table) -> Dict[str, int]:
+    table = Table(root.file, "[limits]", root.entries.get("limits", {}), [*LIMITS, *DEADLINES])
+    limits = {
+        key: table.size(key, bounds) if key in SIZES else table.integer(key, bounds) for key, bounds in LIMITS.items()
+    }
+    return {**limits, **{key: table.duration(key, bounds) for key, bounds in DEADLINES.items()}}
+
+
+def _config(root: Table, overrides: Mapping[str, Any]) -> Dict[str, ConfigValue]:
+    entries = root.entries.get("config", {})
+    items = Table(root.file, "[config]", entries, list(entries) if isinstance(entries, Mapping) else [])
+    for name in overrides:
+        if name not in items:
+            near = nearest(name, items.entries)
+            help = f"did you mean `{near}`?" if near else f"its config values are {quoted(items.entries)}"
+            raise ReplayError(f"the lambda has no config value `{name}`", help=help)
+    return {name: _item(root.file, name, entry, overrides) for name, entry in items.entries.items()}
+
+
+def _item(file: str, name: str, entry: Any, overrides: Mapping[str, Any]) -> ConfigValue:
+    entry = entry if isinstance(entry, Mapping) else {"default": entry}
+    table = Table(file, f"`config.{name}`", entry, ["default", "min", "max", "unit", "description"])
+    default = table.need("default", "default = 1.0, or another value that says what type it is")
+    if not isinstance(default, (bool, int, float, str)) or not _is_finite(default):
+        raise table.refusal("has a `default` of another type", "give a number, a text, or true or false")
+    value: Any = default if name not in overrides else _same_type(name, default, overrides[name])
+    for key in ("min", "max"):
+        limit: Any = table.entries.get(key, value)
+        if (value < limit) if key == "min" else (value > limit):
+            raise ReplayError(f"config value `{name}` cannot be {value}", f"its {key} is {limit}")
+    checked: ConfigValue = value
+    return checked
+
+
+def _same_type(name: str, default: ConfigValue, given: Any) -> ConfigValue:
+    """``given`` as a value of the type of ``default``; a whole number also serves as a number."""
+    plain = given.item() if hasattr(given, "item") else given
+    if type(default) is float and type(plain) is int:
+        plain = float(plain)
+    if type(plain) is not type(default) or not _is_finite(plain):
+        wanted = {bool: "True or False", int: "a whole number", float: "a number", str: "a text"}[type(default)]
+        raise ReplayError(f"config value `{name}` cannot be {given!r}", help=f"give {wanted}")
+    value: ConfigValue = plain
+    return value
+
+
+def _is_finite(value: ConfigValue) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)

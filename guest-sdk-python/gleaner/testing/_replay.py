@@ -1,0 +1,190 @@
+"""A replay: every sample delivered, and every wake that the schedule asks for, in the drive's time."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple, Union
+
+from . import _manifest, _types
+from ._arrays import Arrays
+from ._data import Source
+from ._drive import Drive, Name
+from ._error import ReplayError, quoted
+from ._frame import Budget, Pictures
+from ._guest import Given, Guest, Wake, guarded, manifest_beside
+from ._manifest import Manifest
+from ._run import Decision, Fault, Run
+from ._schedule import Event, Periodic, Schedule, Tick
+from ._session import Session
+from ._windows import Moment, windows
+
+FAULTS_IN_A_ROW = 8
+SHORTEST_REST_NS, LONGEST_REST_NS = 100_000_000, 10_000_000_000
+
+MADE_ANEW = (
+    "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone "
+    "(in Python, all but the globals of its module)"
+)
+RESTS = (
+    "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and twice as "
+    "long after each further fault, 10 s at most, until a wake ends well"
+)
+
+Tables = Mapping[str, Mapping[str, Any]]
+
+
+def replay(
+    lambda_: Given,
+    drive: Union[Name, Sequence[Name], Drive, Tables],
+    *,
+    manifest: Optional[_manifest.Source] = None,
+    config: Optional[Mapping[str, Any]] = None,
+    remap: Optional[Mapping[str, str]] = None,
+    types: Optional[Mapping[str, str]] = None,
+    prints_to_log: bool = True,
+) -> Run:
+    """Takes a lambda through a drive, as ``gleaner replay`` does, and returns what it decided.
+
+    ``lambda_`` is its class, its module, or the folder that it lies in; ``manifest`` the path of its ``lambda.toml``, or a dict
+    of what would stand there, by default what lies beside the lambda. ``drive`` is the path of an MCAP file or a rosbag2
+    directory, a list of them, a :class:`Drive`, or arrays by topic::
+
+        replay(Lambda, {"/imu/data": {"t": seconds, "linear_acceleration.z": az}})
+
+    ``config`` lies over ``[config]``; ``remap`` gives topics of the manifest the names that they have in the drive; ``types``
+    are definitions, the text of a ``.msg`` by its type's name, for arrays of types that ROS 2 does not have. What the lambda
+    prints is its log, unless ``prints_to_log`` is false, as a debugger wants it.
+
+    Raises ReplayError if one of these cannot be used, StartError if the lambda's import or ``init`` raises. What a wake raises
+    is a fault of its decision. Ctrl-C ends the replay."""
+    source = manifest if manifest is not None else manifest_beside(lambda_)
+    read = _manifest.read(source, config or {})
+    if isinstance(lambda_, (str, os.PathLike)) and read.kind != "python":
+        raise ReplayError(f"lambda `{lambda_}` is of kind `{read.kind}`", help="only lambdas in Python run here; use gleaner replay")
+    return _Pass(lambda_, read, drive, dict(remap or {}), types or {}).run(prints_to_log)
+
+
+class _Pass:
+    """One pass of a lambda over its drive."""
+
+    def __init__(self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], types: Mapping[str, str]) -> None:
+        self._manifest, self._session = manifest, Session(manifest.limits)
+        names = {one.topic: remap.get(one.topic, one.topic) for one in manifest.inputs}
+        self._drive = _drive(drive, manifest, names, types)
+        self._sources = self._inputs(names)
+        self._by_topic = {names[source.declared.topic]: source for source in self._sources}
+        # Topics that are recorded are a part of the drive, too: the first of their samples begins the time of a periodic schedule.
+        recorded = manifest.record.topics if manifest.record is not None else []
+        self._topics = {*self._by_topic, *(remap.get(topic, topic) for topic in recorded)}
+        self._guest = Guest(given, manifest, self._session, self._sources)
+        woken_by = [source for source in self._sources if source.declared.name == manifest.event]
+        self._schedule: Schedule = Event(woken_by[0]) if woken_by else Periodic(manifest.period_ns)
+        self._decisions: List[Decision] = []
+        self._in_a_row, self._rest_ns = 0, 0
+        self._rest: Tuple[int, int] = (0, 0)
+
+    def _inputs(self, names: Mapping[str, str]) -> List[Source]:
+        drive, limits = self._drive, self._manifest.limits
+        budget, sources = Budget(limits), []
+        for declared in self._manifest.inputs:
+            found = drive.type_of(names[declared.topic])
+            if found != declared.type_name:
+                cause = f"topic `{names[declared.topic]}` is of type `{found}`"
+                raise ReplayError(f"input `{declared.name}` is of type `{declared.type_name}`", cause)
+            sources.append(Source(declared, drive.types, limits, Pictures(declared, budget)))
+        return sources
+
+    def run(self, prints_to_log: bool) -> Run:
+        with guarded(self._session.log if prints_to_log else None):
+            self._guest.init()
+            self._course()
+        session, drive = self._session, self._drive
+        triggers = [trigger for decision in self._decisions for trigger in decision.triggers]
+        return Run(
+            decisions=self._decisions,
+            log=session.lines,
+            counts={source.declared.name: source.counts() for source in self._sources},
+            start_ns=drive.start_ns,
+            end_ns=drive.end_ns,
+            log_dropped=session.log_dropped,
+            triggers_refused=session.triggers_refused,
+            passed_over=session.passed_over,
+            missed_ticks=self._schedule.missed_total,
+            windows=windows(self._manifest.record, triggers, drive.start_ns, drive.end_ns),
+        )
+
+    def _course(self) -> None:
+        at_ns = None
+        for topic, arrival in self._drive.deliveries(self._topics):
+            at_ns = arrival.at_ns
+            self._ticks(at_ns)
+            source = self._by_topic.get(topic)
+            if source is not None:
+                source.ring.push(arrival)
+            for wake in self._schedule.events():
+                self._wake(wake[1].arrival.at_ns, wake)
+        if at_ns is not None:
+            # A tick of the very last instant is still due.
+            self._ticks(at_ns + 1)
+
+    def _ticks(self, now_ns: int) -> None:
+        for tick in self._schedule.ticks(now_ns):
+            self._wake(tick.at_ns, tick)
+
+    def _wake(self, at_ns: int, wake: Wake) -> None:
+        """From cause to decision. What a lambda triggers before it faults still counts."""
+        session = self._session
+        if self._rest[0] <= at_ns < self._rest[1]:
+            session.passed_over += 1
+            return
+        session.begin(at_ns)
+        if self._in_a_row > 0:
+            session.note(MADE_ANEW)
+        started = time.perf_counter_ns()
+        fault = self._guest.wake(wake)
+        run_ns = time.perf_counter_ns() - started
+        at_s = (at_ns - self._drive.start_ns) / 1e9
+        triggers = [Moment(at_s, at_ns, it.kind, it.label, it.score, it.attributes) for it in session.end()]
+        told = None if fault is None else Fault(fault.kind, fault.message, None, fault.allowed)
+        self._decisions.append(Decision(at_ns=at_ns, **_cause(wake), triggers=triggers, fault=told, run_ns=run_ns))
+        self._count(at_ns, fault is not None)
+
+    def _count(self, at_ns: int, faulted: bool) -> None:
+        """After so many faults in a row the lambda rests, for twice as long after each further one."""
+        if not faulted:
+            self._in_a_row, self._rest_ns, self._rest = 0, 0, (0, 0)
+            return
+        self._in_a_row += 1
+        if self._in_a_row >= FAULTS_IN_A_ROW:
+            self._rest_ns = min(max(2 * self._rest_ns, SHORTEST_REST_NS), LONGEST_REST_NS)
+            self._rest = (at_ns, at_ns + self._rest_ns)
+        if self._in_a_row == FAULTS_IN_A_ROW:
+            self._session.note(RESTS)
+
+
+def _cause(wake: Wake) -> Dict[str, Any]:
+    if isinstance(wake, Tick):
+        return {"cause": "tick", "input": None, "topic": None, "writer": None, "seq": None}
+    source, cell = wake
+    arrival, declared = cell.arrival, source.declared
+    woken_by = {"writer": str(arrival.writer), "seq": arrival.seq}
+    return {"cause": "event", "input": declared.name, "topic": declared.topic, **woken_by}
+
+
+def _drive(given: Any, manifest: Manifest, names: Mapping[str, str], types: Mapping[str, str]) -> Union[Drive, Arrays]:
+    if isinstance(given, Drive):
+        return given
+    if not isinstance(given, Mapping):
+        return Drive(given)
+    known = _types.standard(types)
+    for one in manifest.inputs:
+        if one.type_name not in known:
+            help = 'pass types={"%s": "the text of its .msg"}' % one.type_name
+            raise ReplayError(f"input `{one.name}` is of type `{one.type_name}`, which is no type of ROS 2", help=help)
+    type_names = {names[one.topic]: one.type_name for one in manifest.inputs}
+    woken_by = next((names[one.topic] for one in manifest.inputs if one.name == manifest.event), None)
+    if woken_by is not None and woken_by not in given:
+        cause = f"there are arrays of {quoted(given)}, and the lambda is woken by `{woken_by}`"
+        raise ReplayError("nothing would wake the lambda", cause, "give arrays of that topic")
+    return Arrays(given, known, type_names)

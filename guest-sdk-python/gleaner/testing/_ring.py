@@ -1,0 +1,107 @@
+"""The newest samples of one input, within a number of cells: what is held by the lambda stays, and may cost others their place."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any, Callable, Dict, List, NamedTuple, Optional
+
+from ..data import Guid
+
+
+class Arrival(NamedTuple):
+    """One message of a drive, on its way into a ring."""
+
+    at_ns: int
+    publish_ns: int
+    writer: Guid
+    seq: int
+    cdr: bytes
+    """With its encapsulation, which is four bytes."""
+
+
+class Lease:
+    """Held by whatever a lambda was given of a sample. While one lives, the sample's cell is taken."""
+
+    __slots__ = ("cell", "__weakref__")
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+
+
+class Cell:
+    """One sample. What is read from its bytes is kept with it."""
+
+    __slots__ = ("arrival", "position", "message", "_lease")
+
+    def __init__(self, arrival: Arrival, position: int) -> None:
+        self.arrival = arrival
+        self.position = position
+        self.message: Any = None
+        self._lease: Optional[weakref.ref[Lease]] = None
+
+    def lease(self) -> Lease:
+        """The one that is out, or a new one."""
+        lease = self._lease() if self._lease is not None else None
+        if lease is None:
+            lease = Lease(self)
+            self._lease = weakref.ref(lease)
+        return lease
+
+    @property
+    def is_held(self) -> bool:
+        return self._lease is not None and self._lease() is not None
+
+
+class Ring:
+    """Shows ``depth`` samples, over ``depth + hold + 1`` cells of ``max_size`` bytes."""
+
+    def __init__(self, depth: int, hold: int, max_size: int) -> None:
+        self.depth, self.cells, self.max_size = depth, depth + hold + 1, max_size
+        self.head = 0
+        self.overwritten = self.no_slot = self.too_big = 0
+        self._shown: Dict[int, Cell] = {}
+        self._left: List[Cell] = []
+
+    def push(self, arrival: Arrival) -> None:
+        """Takes a sample in, or counts why not."""
+        if len(arrival.cdr) - 4 > self.max_size:
+            self.too_big += 1
+            return
+        self._left = [cell for cell in self._left if cell.is_held]
+        if len(self._shown) + len(self._left) >= self.cells and not self._evict():
+            self.no_slot += 1
+            return
+        self._shown[self.head] = Cell(arrival, self.head)
+        leaving = self._shown.pop(self.head - self.depth, None)
+        self.head += 1
+        if leaving is not None:
+            self.overwritten += 1
+            if leaving.is_held:
+                self._left.append(leaving)
+
+    def _evict(self) -> bool:
+        """Lets the oldest sample go that nobody holds."""
+        for position, cell in self._shown.items():
+            if not cell.is_held:
+                del self._shown[position]
+                self.overwritten += 1
+                return True
+        return False
+
+    def get(self, position: int) -> Optional[Cell]:
+        return self._shown.get(position)
+
+    def newest(self) -> Optional[Cell]:
+        cells = self.newest_while(1, lambda _: True)
+        return cells[0] if cells else None
+
+    def newest_while(self, most: int, keep: Callable[[Arrival], bool]) -> List[Cell]:
+        """The newest samples back to the first one that ``keep`` refuses, ``most`` at most; oldest first."""
+        found: List[Cell] = []
+        # A dict is in the order of its positions: they only ever rise.
+        for cell in reversed(self._shown.values()):
+            if len(found) >= most or not keep(cell.arrival):
+                break
+            found.append(cell)
+        found.reverse()
+        return found

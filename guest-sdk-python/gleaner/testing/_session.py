@@ -1,0 +1,245 @@
+"""What one lambda causes: triggers, log lines and what it keeps by name, each within its limits and counted beyond them."""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass
+from typing import Any, Dict, List, Mapping, Optional, Tuple
+
+from ..log import Level
+from ..scratch import Entry, ScratchError
+from ..trigger import AttributeValue, TriggerError
+
+PER_WAKE, ATTRIBUTES = 16, 16
+LABEL_BYTES, KEY_BYTES, TEXT_BYTES, LINE_BYTES, NAME_BYTES = 128, 64, 1024, 4096, 128
+ENTRIES, ENTRY_BYTES = 1024, 64
+MINUTE_NS, SECOND_NS = 60_000_000_000, 1_000_000_000
+LEVELS = ("error", "warn", "info", "debug", "trace")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the log: a line of ``log.jsonl``."""
+
+    at_ns: int
+    """Time of the wake that wrote it; 0 before the first."""
+    level: Level
+    message: str
+
+
+@dataclass(frozen=True)
+class Caused:
+    """A trigger, before anybody knows of which wake."""
+
+    kind: str
+    label: str
+    score: Optional[float]
+    attributes: Dict[str, AttributeValue]
+
+
+class Session:
+    """Lives as long as the replay; a lambda that is made anew finds it as it was."""
+
+    def __init__(self, limits: Mapping[str, int]) -> None:
+        self.limits = limits
+        self.now_ns = 0
+        self.lines: List[Line] = []
+        self.log_dropped = self.triggers_refused = self.passed_over = 0
+        self._triggers: Optional[List[Caused]] = None
+        self._minute, self._caused = 0, 0
+        self._second, self._said, self._said_bytes = 0, 0, 0
+        self._notes: Tuple[int, List[str]] = (0, [])
+
+    def begin(self, now_ns: int) -> None:
+        """Begins a wake."""
+        self.now_ns, self._triggers = now_ns, []
+
+    def end(self) -> List[Caused]:
+        """Ends a wake and takes what it caused."""
+        caused, self._triggers = self._triggers or [], None
+        return caused
+
+    def suspend(self) -> Optional[List[Caused]]:
+        """An ``init`` begins, which may come in the midst of a wake but is no part of it; gives what `resume` wants."""
+        caused, self._triggers = self._triggers, None
+        return caused
+
+    def resume(self, caused: Optional[List[Caused]]) -> None:
+        self._triggers = caused
+
+    def cause(self, kind: str, label: Any, score: Optional[float], attributes: Mapping[str, Any]) -> None:
+        _must_be_text(label)
+        plain = {key: _attribute(label, key, value) for key, value in attributes.items()}
+        if self._triggers is None:
+            raise _invalid("triggers belong to a wake: in init, and between two wakes, there are none")
+        # Who has used up the minute may still end what was begun.
+        if kind != "stop":
+            self._check_rate()
+        if len(self._triggers) >= PER_WAKE:
+            raise TriggerError(
+                f"this wake has caused {PER_WAKE} triggers already; further ones are refused", "too-many"
+            )
+        _check(label, score, plain)
+        self._triggers.append(Caused(kind, label, score, plain))
+        self._caused += 1
+
+    def _check_rate(self) -> None:
+        minute, allowed = self.now_ns // MINUTE_NS, self.limits["events_per_minute"]
+        if self._minute != minute:
+            self._minute, self._caused = minute, 0
+        if self._caused >= allowed:
+            self.triggers_refused += 1
+            why = f"the lambda has caused {allowed} triggers in this minute already, `events_per_minute` in [limits]"
+            raise TriggerError(f"{why}; further ones are refused", "too-many")
+
+    def log(self, level: Any, message: Any) -> None:
+        """What a lambda may write in one second of its time is bounded; the rest is counted."""
+        _must_be_text(level)
+        _must_be_text(message)
+        if level not in LEVELS:
+            raise ValueError("the level of a log line is `error`, `warn`, `info`, `debug` or `trace`")
+        message = cut(message, LINE_BYTES)
+        size, second = len(message.encode()), self.now_ns // SECOND_NS
+        if self._second != second:
+            self._second, self._said, self._said_bytes = second, 0, 0
+        if self._said >= self.limits["log_lines"] or self._said_bytes + size > self.limits["log_bytes"]:
+            self.log_dropped += 1
+            return
+        self._said, self._said_bytes = self._said + 1, self._said_bytes + size
+        self.lines.append(Line(self.now_ns, level, message))
+
+    def note(self, text: str) -> None:
+        """The host says something: the same thing once in a second."""
+        second = self.now_ns // SECOND_NS
+        if self._notes[0] != second:
+            self._notes = (second, [])
+        if text not in self._notes[1]:
+            self._notes[1].append(text)
+            self.lines.append(Line(self.now_ns, "warn", text))
+
+
+class Scratch:
+    """``ctx.scratch``, within ``scratch`` of ``[limits]``."""
+
+    def __init__(self, limits: Mapping[str, int]) -> None:
+        self._granted, self._most_given = limits["scratch"], limits["call_bytes"]
+        self._used = 0
+        self._entries: Dict[str, bytes] = {}
+
+    def put(self, name: str, bytes: Any) -> None:
+        self._keep(name, memoryview(bytes).tobytes(), in_place=True)
+
+    def append(self, name: str, bytes: Any) -> None:
+        self._keep(name, memoryview(bytes).tobytes(), in_place=False)
+
+    def _keep(self, name: str, given: bytes, in_place: bool) -> None:
+        _must_be_text(name)
+        if not 1 <= len(name.encode()) <= NAME_BYTES or any(map(_is_control, name)):
+            raise ScratchError(f"`{_visible(name[:NAME_BYTES])}` is no name for scratch; give 1 to 128 bytes without control characters", "wrong-name")
+        there = self._entries.get(name)
+        if there is None and len(self._entries) >= ENTRIES:
+            raise ScratchError(f"there is no room for `{name}` beside {ENTRIES} entries; remove some, or append to one of them", "no-room")
+        given_back = len(there) if there is not None and in_place else 0
+        needed = len(given) + (ENTRY_BYTES + len(name.encode()) if there is None else 0)
+        if needed > self.free() + given_back:
+            why = f"`{name}` needs {needed - given_back} bytes of scratch and {self.free()} are free"
+            raise ScratchError(f"{why}; remove entries, or ask for more by `scratch` in [limits]", "no-room")
+        self._entries[name] = given if in_place or there is None else there + given
+        self._used += needed - given_back
+
+    def get(self, name: str, offset: int = 0, len: Optional[int] = None) -> bytes:
+        return piece(self._there(name), offset, len, self._most_given)
+
+    def remove(self, name: str) -> None:
+        kept = self._there(name)
+        del self._entries[name]
+        self._used -= ENTRY_BYTES + len(name.encode()) + len(kept)
+
+    def _there(self, name: str) -> bytes:
+        _must_be_text(name)
+        if name not in self._entries:
+            raise ScratchError(f"scratch has no `{name}`; it is empty when the lambda's process starts", "no-such-entry")
+        return self._entries[name]
+
+    def entries(self) -> List[Entry]:
+        kept = sorted(self._entries.items(), key=lambda item: item[0].encode())
+        return [Entry(name, len(bytes)) for name, bytes in kept]
+
+    def free(self) -> int:
+        return self._granted - self._used
+
+
+def piece(data: bytes, offset: int, length: Optional[int], most: int) -> bytes:
+    """``length`` bytes from ``offset``, clamped to what is there and to ``most``."""
+    start = min(unsigned(offset), len(data))
+    wanted = most if length is None else min(unsigned(length), most)
+    return data[start : start + wanted]
+
+
+def unsigned(number: Any) -> int:
+    """A whole number from 0 on, as the host takes it."""
+    whole = operator.index(number)
+    if whole < 0:
+        raise OverflowError("can't convert negative int to unsigned")
+    return whole
+
+
+def cut(text: str, most: int) -> str:
+    """The longest start of ``text`` that has so many bytes at most."""
+    return text.encode()[:most].decode(errors="ignore")
+
+
+def _must_be_text(value: Any) -> None:
+    if not isinstance(value, str):
+        raise TypeError(f"'{type(value).__name__}' object cannot be converted to 'str'")
+
+
+def _is_control(char: str) -> bool:
+    return ord(char) < 0x20 or 0x7F <= ord(char) < 0xA0
+
+
+def _visible(name: str) -> str:
+    """With its control characters written out, as the host does it."""
+    short = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
+    return "".join(short.get(char, f"\\u{{{ord(char):x}}}") if _is_control(char) else char for char in name)
+
+
+def _invalid(message: str) -> TriggerError:
+    return TriggerError(message, "invalid")
+
+
+def _check(label: str, score: Optional[float], attributes: Mapping[str, AttributeValue]) -> None:
+    size = len(label.encode())
+    if size == 0:
+        raise _invalid("the label is empty")
+    if size > LABEL_BYTES:
+        raise _invalid(f"the label has {size} bytes; at most {LABEL_BYTES} are allowed")
+    if score is not None and not math.isfinite(score):
+        raise _invalid(f"the score of `{label}` is {'NaN' if math.isnan(score) else score}; it must be finite")
+    if len(attributes) > ATTRIBUTES:
+        raise _invalid(f"`{label}` has {len(attributes)} attributes; at most {ATTRIBUTES} are allowed")
+    for key, value in attributes.items():
+        why = ""
+        if not 1 <= len(key.encode()) <= KEY_BYTES:
+            why = "the key must have 1 to 64 bytes"
+        elif isinstance(value, float) and not math.isfinite(value):
+            why = "the value must be finite"
+        elif isinstance(value, str) and len(value.encode()) > TEXT_BYTES:
+            why = "the text must have at most 1,024 bytes"
+        if why:
+            raise _invalid(f"attribute `{cut(key, KEY_BYTES)}` of `{label}`: {why}")
+
+
+def _attribute(label: str, key: str, value: Any) -> AttributeValue:
+    for plain in (value, value.item() if hasattr(value, "item") else None):
+        if isinstance(plain, (bool, str)):
+            return plain
+        if isinstance(plain, float):
+            return float(plain)
+        if isinstance(plain, int):
+            if not -(2**63) <= plain < 2**63:
+                raise OverflowError("int too big to convert")
+            return plain
+    given = type(value).__name__
+    raise TypeError(f"attribute `{key}` of `{label}` is of type `{given}`; give bool, int, float or str")

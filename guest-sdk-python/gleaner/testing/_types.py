@@ -1,0 +1,127 @@
+"""Message types: what fields they have, and their messages as CDR and back. Reading them is the work of `rosbags`."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from ._error import ReplayError
+
+HEADER, TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
+INTEGERS = ("int8", "int16", "int32", "int64", "uint16", "uint32", "uint64")
+
+
+class Member(NamedTuple):
+    """One field of a message type."""
+
+    name: str
+    element: str
+    """A primitive, or the name of another type."""
+    length: Optional[int]
+    """None for one value, -1 for a sequence of any length, else the length of an array."""
+
+    @property
+    def is_primitive(self) -> bool:
+        return "/" not in self.element
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it is a `wstring`, whose size on the wire is not defined."""
+        return self.element == "wstring" or self.element.endswith("/wstring")
+
+
+class Types:
+    """The types of one drive."""
+
+    def __init__(self, store: Typestore) -> None:
+        self._store = store
+        self._members: Dict[str, List[Member]] = {}
+
+    def __contains__(self, type_name: str) -> bool:
+        return type_name in self._store.fielddefs
+
+    def members(self, type_name: str) -> List[Member]:
+        """The fields of a type, in the order of the wire."""
+        known = self._members.get(type_name)
+        if known is None:
+            known = [_member(name, description) for name, description in self._store.fielddefs[type_name][1]]
+            self._members[type_name] = known
+        return known
+
+    def is_stamped(self, type_name: str) -> bool:
+        """Whether messages begin with a stamp: a header, or a time of the name `stamp`."""
+        first = self.members(type_name)[0]
+        return first.length is None and (first.element == HEADER or (first.name, first.element) == ("stamp", TIME))
+
+    def decode(self, cdr: bytes, type_name: str) -> Any:
+        """The message in ``cdr``, which begins with the encapsulation. Raises whatever `rosbags` does for one that is none."""
+        return self._store.deserialize_cdr(cdr, type_name)
+
+    def encode(self, message: Any, type_name: str) -> bytes:
+        """CDR with its encapsulation."""
+        return bytes(self._store.serialize_cdr(message, type_name))
+
+    def blank(self, type_name: str) -> Any:
+        """A message in which every number is 0, every text and every sequence empty."""
+        members = self.members(type_name)
+        return self._store.types[type_name](**{member.name: self._blank(member) for member in members})
+
+    def _blank(self, member: Member) -> Any:
+        if member.length is None:
+            return self._one(member.element)
+        if member.is_primitive and member.element not in ("string", "wstring"):
+            return np.zeros(max(member.length, 0), dtype(member.element))
+        return [self._one(member.element) for _ in range(member.length)]
+
+    def _one(self, element: str) -> Any:
+        if "/" in element:
+            return self.blank(element)
+        return {"string": "", "wstring": "", "bool": False, "float32": 0.0, "float64": 0.0}.get(element, 0)
+
+
+def dtype(element: str) -> Any:
+    """numpy's type of the elements of an array; `byte` and `char` are as `rosbags` has them."""
+    return np.dtype({"bool": np.bool_, "byte": np.int8, "char": np.uint8}.get(element, element))
+
+
+def standard(definitions: Mapping[str, str]) -> Types:
+    """The types of ROS 2, and those defined here: the text of a `.msg` file by its type's name.
+
+    Raises ReplayError for a text that is no definition."""
+    if not definitions:
+        return Types(_humble())
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for type_name, text in definitions.items():
+        try:
+            store.register(get_types_from_msg(text, type_name))
+        except Exception as error:
+            raise ReplayError(f"cannot use the definition of `{type_name}`", str(error), "give the text of its .msg") from None
+    return Types(store)
+
+
+@functools.lru_cache(maxsize=None)
+def _humble() -> Typestore:
+    """Made once: it compiles what it reads and writes."""
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _member(name: str, description: Any) -> Member:
+    kind, inner = description
+    if kind == Nodetype.BASE:
+        return Member(name, inner[0], None)
+    if kind == Nodetype.NAME:
+        return Member(name, inner, None)
+    element = _member(name, inner[0]).element
+    return Member(name, element, inner[1] if kind == Nodetype.ARRAY else -1)
+
+
+def stamp_of(message: Any, type_name: str, types: Types) -> Tuple[int, int]:
+    """Seconds and nanoseconds of the stamp with which messages of this type begin."""
+    first = getattr(message, types.members(type_name)[0].name)
+    stamp = getattr(first, "stamp", first)
+    return int(stamp.sec), int(stamp.nanosec)

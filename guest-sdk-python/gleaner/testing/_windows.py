@@ -1,0 +1,80 @@
+"""Triggers, and what `[record]` keeps of a drive for their sake: windows, where they overlap as one. `docs/clips.md` has the rules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
+
+from ..trigger import AttributeValue
+from ._manifest import Record
+
+STARTED_MAX = 64
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A trigger, with the time of its wake."""
+
+    at_s: float
+    """Seconds since the start of the drive; of arrays, the time that they have."""
+    at_ns: int
+    kind: str
+    """``event``, ``start`` or ``stop``."""
+    label: str
+    score: Optional[float]
+    """None unless it is an event."""
+    attributes: Dict[str, AttributeValue] = field(default_factory=dict)
+
+
+class Window(NamedTuple):
+    """A stretch of time that clips would hold, both ends included."""
+
+    from_s: float
+    """Seconds, as of :class:`Moment`."""
+    to_s: float
+    from_ns: int
+    to_ns: int
+
+
+def windows(record: Optional[Record], triggers: Iterable[Moment], start_ns: int, end_ns: int) -> List[Window]:
+    """In the order of time. A recording that nobody stops ends with the drive; clips that are too long would be parted."""
+    if record is None:
+        return []
+    stretches, started, started_from, opened_at = list[Tuple[int, int]](), set[str](), 0, None
+    for trigger in triggers:
+        at_ns = trigger.at_ns
+        if trigger.kind == "stop":
+            if trigger.label in started:
+                started.discard(trigger.label)
+                # Together they are one window: it lasts until the last stop.
+                if not started:
+                    stretches.append((started_from, at_ns + record.postroll))
+            continue
+        if trigger.kind == "start" and not _may_start(started, trigger.label):
+            continue
+        if opened_at is not None and abs(at_ns - opened_at) < record.cooldown:
+            continue
+        opened_at = at_ns
+        if trigger.kind == "event":
+            stretches.append((at_ns - record.preroll, at_ns + record.postroll))
+            continue
+        if not started:
+            started_from = at_ns - record.preroll
+        started.add(trigger.label)
+    if started:
+        stretches.append((started_from, max(end_ns, started_from)))
+    return [Window((a - start_ns) / 1e9, (b - start_ns) / 1e9, a, b) for a, b in _joined(stretches)]
+
+
+def _may_start(started: Set[str], label: str) -> bool:
+    return label not in started and len(started) < STARTED_MAX
+
+
+def _joined(stretches: List[Tuple[int, int]]) -> List[Tuple[int, int]]:
+    joined: List[Tuple[int, int]] = []
+    for begin, end in sorted(stretches):
+        if joined and begin <= joined[-1][1]:
+            joined[-1] = joined[-1][0], max(joined[-1][1], end)
+        else:
+            joined.append((begin, end))
+    return joined

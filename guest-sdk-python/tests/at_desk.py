@@ -1,0 +1,60 @@
+"""The same lambda at the desk: `gleaner.testing` in place of the real host, behind the same door as in `hosted`.
+
+So a test of hosted behaviour, which looks at decisions and log, holds for both by inheriting from `AtDesk` first."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+import textwrap
+from pathlib import Path
+from typing import Any, Dict, List, Sequence
+
+import drive
+import home  # noqa: F401
+from drive import Image
+from hosted import EACH, MANIFEST, Hosted
+
+from gleaner.testing import Run, StartError, replay
+
+
+class AtDesk(Hosted):
+    def setUp(self) -> None:
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name).resolve()
+
+    def start(
+        self,
+        source: str,
+        images: List[Image],
+        schedule: str = EACH,
+        depth: int = 4,
+        at_ms: Sequence[int] = range(1000, 10_000, 100),
+    ) -> "subprocess.CompletedProcess[str]":
+        """As in the host, with what it would have written and said."""
+        build = self.folder / "build"
+        build.mkdir(exist_ok=True)
+        (build / "main.py").write_text(textwrap.dedent(source), encoding="utf-8")
+        (build / "lambda.toml").write_text(MANIFEST.format(schedule=schedule, depth=depth), encoding="utf-8")
+        drive.write(self.folder / "drive.mcap", images, at_ms)
+        try:
+            run = replay(build, self.folder / "drive.mcap")
+        except StartError as error:
+            return subprocess.CompletedProcess([], 6, "", f"error: {error}")
+        self.keep(run)
+        return subprocess.CompletedProcess([], 6 if run.faults else 0, "", "")
+
+    def keep(self, run: Run) -> None:
+        out = self.folder / "out"
+        out.mkdir(exist_ok=True)
+        lines(out / "decisions.jsonl", [decision.as_json() for decision in run.decisions])
+        lines(out / "log.jsonl", [vars(line) for line in run.log])
+        lines(out / "clips.jsonl", [window._asdict() for window in run.windows])
+        summary = {"log_lines": len(run.log), "log_dropped": run.log_dropped}
+        (out / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+
+
+def lines(path: Path, objects: List[Dict[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(one) + "\n" for one in objects), encoding="utf-8")
