@@ -4,7 +4,8 @@ use std::ffi::OsString;
 use std::net::IpAddr;
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use gleaner_protocol::manifest::Kind;
 
 /// Small functions next to the sensors, that keep the data worth keeping.
 #[derive(Parser, Debug)]
@@ -18,8 +19,14 @@ pub struct Cli {
 /// What `gleaner` can do.
 #[derive(Subcommand, Debug)]
 pub enum Command {
+    /// Make the folder of a new lambda, with its SDK, a test, and something to begin with
+    New(NewArgs),
     /// Make the build folder DIR/build of a lambda
     Build(BuildArgs),
+    /// Load a built lambda as on a vehicle, run its init, and say what it will need
+    ///
+    /// Finds inputs and fields that are not there, and shows how much memory and disk it takes.
+    Check(CheckArgs),
     /// Run a built lambda over recorded drives
     ///
     /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json and the clips that the manifest asks for, and shows a
@@ -159,12 +166,54 @@ pub struct DoctorArgs {
     pub json: bool,
 }
 
+/// Arguments of `gleaner new`.
+#[derive(Args, Debug)]
+pub struct NewArgs {
+    /// The folder to make; its name becomes the lambda's
+    #[arg(value_name = "DIR")]
+    pub path: PathBuf,
+    /// What it is written in
+    #[arg(long, value_enum, default_value = "rust")]
+    pub kind: Language,
+    /// Replace the SDK in the folder of a lambda by that of this gleaner, and nothing else
+    #[arg(long, conflicts_with = "kind")]
+    pub update: bool,
+}
+
+/// What a lambda is written in.
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Language {
+    Rust,
+    Python,
+}
+
+impl From<Language> for Kind {
+    fn from(language: Language) -> Self {
+        match language {
+            Language::Rust => Self::Wasm,
+            Language::Python => Self::Python,
+        }
+    }
+}
+
 /// Arguments of `gleaner build`.
 #[derive(Args, Debug)]
 pub struct BuildArgs {
     /// The lambda's folder, with its lambda.toml
     #[arg(value_name = "DIR")]
     pub lambda: PathBuf,
+}
+
+/// Arguments of `gleaner check`.
+#[derive(Args, Debug)]
+pub struct CheckArgs {
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub asked: AskedArgs,
+    /// Print the result as one JSON object
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Arguments of `gleaner replay`.

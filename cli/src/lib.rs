@@ -1,4 +1,4 @@
-//! The command `gleaner`: `build` makes a lambda's build folder, `runtime` starts `gleaner-runtime` for `replay` and
+//! The command `gleaner`: `new` makes a lambda's folder, `build` its build folder, `runtime` starts `gleaner-runtime` for `check`, `replay` and
 //! `verify`, `run` keeps it and the recorder going live,
 //! `results` reads back what a replay left, and `show` is what people see of it.
 //!
@@ -7,8 +7,10 @@
 
 pub mod args;
 mod build;
+mod check;
 mod doctor;
 mod listen;
+mod new;
 mod replay;
 pub mod results;
 mod run;
@@ -28,7 +30,9 @@ use args::{Cli, Command};
 /// What the user is to see, with the exit code.
 pub fn run(cli: Cli) -> Result<Exit, Failure> {
     match cli.command {
+        Command::New(args) => new::run(&args),
         Command::Build(args) => build::run(&args.lambda),
+        Command::Check(args) => check::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Verify(args) => replay::verify(&args),
         Command::Run(args) => run::run(&args),

@@ -24,11 +24,14 @@ pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
     show_result(runtime::run(line)?, args.json)
 }
 
-fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> Result<Exit, Failure> {
+/// Shows what the runtime reported last, and ends as it ended.
+pub(crate) fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> Result<Exit, Failure> {
     let text = match heard {
         None => return Ok(exit),
         Some(Heard::Summary(summary)) if json => show::json_line(&summary),
         Some(Heard::Verified(verified)) if json => show::json_line(&verified),
+        Some(Heard::Checked(checked)) if json => show::json_line(&checked),
+        Some(Heard::Checked(checked)) => show::checked(&checked, paint()),
         Some(Heard::Summary(summary)) => summary_text(&summary)?,
         Some(Heard::Verified(verified)) => show::verified(&verified, paint()),
     };

@@ -7,7 +7,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use gleaner_protocol::{Exit, Explain, Failure, Parts, Report, Summary, Verified, visible};
+use gleaner_protocol::{Checked, Exit, Explain, Failure, Parts, Report, Summary, Verified, visible};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::listen::Listener;
@@ -49,6 +49,7 @@ impl Explain for RuntimeError {
 pub(crate) enum Heard {
     Summary(Box<Summary>),
     Verified(Verified),
+    Checked(Box<Checked>),
 }
 
 /// Runs the runtime with these arguments to its end. Gives its result and how it ended; no result if it has said why there
@@ -117,6 +118,7 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
                 bar.set_position(done);
             }
             Ok(Report::Summary(summary)) => return Ok(Some(Heard::Summary(summary))),
+            Ok(Report::Checked(checked)) => return Ok(Some(Heard::Checked(checked))),
             Ok(Report::Verified(verified)) => return Ok(Some(Heard::Verified(verified))),
             // Of a replay that makes several passes; and what is only reported live.
             Ok(_) => {}

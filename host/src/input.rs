@@ -72,6 +72,11 @@ fn spare(input: &Input) -> usize {
     if input.max_size.bytes() <= SMALL_BYTES { input.depth } else { input.depth.min(SPARE_LARGE) }
 }
 
+/// Slots for the samples of an input on a vehicle: one more is for the newest of those that a wake sees, which is held while it runs.
+pub fn live_slots(input: &Input) -> usize {
+    input.slots() + spare(input) + 1
+}
+
 /// Subscribes every input of `manifest` and returns its topics, in the manifest's order.
 ///
 /// # Errors
@@ -121,9 +126,9 @@ fn open_input(
         qos: qos(input.qos),
     };
 
-    // Live, one more is for the newest of those that a wake sees, which is held while it runs.
-    let (spare, pinned) = live.map_or((0, 0), |_| (spare(input), 1));
-    let samples = pool(input, input.slots() + spare + pinned, spec.max_bytes)?;
+    let spare = live.map_or(0, |_| spare(input));
+    let slots = live.map_or(input.slots(), |_| live_slots(input));
+    let samples = pool(input, slots, spec.max_bytes)?;
     let (writer, reader) = ring(samples, input.depth + spare).map_err(layout)?;
     let decoded = match input.decoded_size {
         Some(bytes) => Some(pool(input, input.decoded_slots(), bytes.as_usize())?),

@@ -6,6 +6,7 @@
 //! outside `guest` knows which kind of lambda it runs.
 
 pub mod api;
+mod check;
 pub mod guest;
 pub mod input;
 pub mod isolation;

@@ -11,6 +11,7 @@ use gleaner_jail::Paths;
 use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
 
+use crate::check::{self, CheckArgs};
 use crate::guest::watched::{Patience, Watched};
 use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
@@ -34,6 +35,8 @@ enum Command {
     Replay(ReplayArgs),
     /// Makes the decisions in a clip again and compares.
     Verify(VerifyArgs),
+    /// Runs the `init` of a built lambda, and reports what it will need.
+    Check(CheckArgs),
     /// Runs a built lambda on live topics, until SIGTERM.
     #[cfg(feature = "dds")]
     Run(live::RunArgs),
@@ -45,6 +48,7 @@ enum Command {
 /// What there is to do with a lambda.
 enum Job {
     Replay(replay::Job),
+    Check(check::Job),
     #[cfg(feature = "dds")]
     Live(live::Job),
 }
@@ -53,6 +57,7 @@ impl Job {
     fn lambda(&self) -> (&Asked, &Manifest) {
         match self {
             Self::Replay(job) => (&job.options.asked, &job.manifest),
+            Self::Check(job) => (&job.asked, &job.manifest),
             #[cfg(feature = "dds")]
             Self::Live(job) => (&job.asked, &job.manifest),
         }
@@ -65,6 +70,7 @@ impl Job {
                 job.make_journal()?;
                 job.results()
             }
+            Self::Check(_) => None,
             #[cfg(feature = "dds")]
             Self::Live(job) => Some(job.results()),
         };
@@ -79,6 +85,7 @@ impl Job {
     fn inside(&self) -> Inside {
         let (paths, ours) = match self {
             Self::Replay(job) => (job.paths(), job.own_memory()),
+            Self::Check(job) => (job.paths(), 0),
             #[cfg(feature = "dds")]
             Self::Live(job) => (job.paths(), job.own_memory()),
         };
@@ -97,6 +104,7 @@ impl Job {
     fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {
         match self {
             Self::Replay(job) => job.run(load, isolation, &mut reports),
+            Self::Check(job) => job.run(load, &mut reports),
             #[cfg(feature = "dds")]
             Self::Live(job) => job.run(load, isolation, reports),
         }
@@ -109,6 +117,7 @@ impl Command {
         Ok(match self {
             Self::Replay(args) => Ok(Job::Replay(replay::Job::replay(args)?)),
             Self::Verify(args) => Ok(Job::Replay(replay::Job::verify(args)?)),
+            Self::Check(args) => Ok(Job::Check(check::Job::new(args)?)),
             #[cfg(feature = "dds")]
             Self::Run(args) => Ok(Job::Live(live::Job::new(args)?)),
             #[cfg(feature = "dds")]

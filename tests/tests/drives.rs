@@ -12,15 +12,20 @@ use libtest_mimic::{Arguments, Failed, Trial};
 
 const KINDS: [&str; 2] = ["rust", "python"];
 
+/// Those with values that suit the sample drive, whose braking is gentle.
+const EXAMPLES: [(&str, &[&str]); 3] =
+    [("hello", &["--set", "brake_mps2=-1.4"]), ("brake-dark", &["--set", "brake_mps2=-1.4"]), ("imu-fft", &[])];
+
 fn main() -> ExitCode {
     let mut trials = Vec::new();
-    for example in ["hello", "brake-dark"] {
+    for (example, set) in EXAMPLES {
         for kind in KINDS {
-            trials
-                .push(Trial::test(format!("{example}_in_{kind}_decides_as_expected"), move || expected(example, kind)));
+            trials.push(Trial::test(format!("{example}_in_{kind}_decides_as_expected"), move || {
+                expected(example, kind, set)
+            }));
         }
         trials.push(Trial::test(format!("the_twins_of_{example}_agree_on_every_wake"), move || {
-            twins(&format!("examples/{example}"), &sample_drive(), &["--all", "--set", "brake_mps2=-1.4"])
+            twins(&format!("examples/{example}"), &sample_drive(), &[&["--all"], set].concat())
         }));
     }
     trials.push(Trial::test("every_function_answers_both_twins_the_same", every_answer));
@@ -35,6 +40,9 @@ fn main() -> ExitCode {
             move |drive| pixels(&drive, kind)
         }));
     }
+    trials.push(shared("the_twins_of_imu_fft_agree_on_a_walk".to_owned(), "rec_sync_gopro_walk.mcap", |drive| {
+        twins("examples/imu-fft", &drive, &["--all", "--set", "window_s=5.2", "--set", "rough=0"])
+    }));
     trials.push(shared("the_twins_of_pixels_agree".to_owned(), "rec_raw_image_bgr8_320x180.mcap", |drive| {
         twins("tests/lambdas/pixels", &drive, &["--all"])
     }));
@@ -54,8 +62,8 @@ fn run(lambda: &str, kind: &str, drive: &Path, args: &[&str]) -> Result<Run, Fai
     if run.exit == 0 { Ok(run) } else { Err(format!("exit {}: {}", run.exit, run.stderr).into()) }
 }
 
-fn expected(example: &str, kind: &str) -> Result<(), Failed> {
-    let run = run(&format!("examples/{example}"), kind, &sample_drive(), &["--set", "brake_mps2=-1.4"])?;
+fn expected(example: &str, kind: &str, set: &[&str]) -> Result<(), Failed> {
+    let run = run(&format!("examples/{example}"), kind, &sample_drive(), set)?;
     let expected = std::fs::read_to_string(root().join("examples").join(example).join("expected.txt"))?;
     same(&run.rows(), &expected)
 }

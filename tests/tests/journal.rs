@@ -88,10 +88,16 @@ fn proved(lambda: &Path, args: &[&str]) -> (u64, u64) {
 
 #[test]
 fn every_decision_of_every_lambda_is_made_again() {
-    for lambda in ["examples/hello", "examples/brake-dark", "tests/lambdas/probe", "tests/lambdas/ticker"] {
+    let lambdas: [(&str, &[&str]); 5] = [
+        ("examples/hello", &BRAKING),
+        ("examples/brake-dark", &BRAKING),
+        ("examples/imu-fft", &[]),
+        ("tests/lambdas/probe", &[]),
+        ("tests/lambdas/ticker", &[]),
+    ];
+    for (lambda, args) in lambdas {
         for kind in ["rust", "python"] {
             let lambda = root().join(lambda).join(kind);
-            let args = if lambda.starts_with(root().join("examples")) { &BRAKING[..] } else { &[] };
             assert_eq!(proved(&lambda, args), (0, 0));
         }
     }

@@ -19,9 +19,10 @@ pub(crate) struct Example {
     pub(crate) set: &'static [&'static str],
 }
 
-pub(crate) const EXAMPLES: [Example; 2] = [
+pub(crate) const EXAMPLES: [Example; 3] = [
     Example { name: "hello", set: &["brake_mps2=-1.4"] },
     Example { name: "brake-dark", set: &["brake_mps2=-1.4", "dark_luma=50"] },
+    Example { name: "imu-fft", set: &[] },
 ];
 
 /// What one twin did.

@@ -8,10 +8,12 @@ use gleaner_protocol::{
 
 use crate::results::{ResultsError, grouped, seconds, three_digits};
 
+mod checked;
 mod clips;
 mod isolation;
 mod live;
 
+pub(crate) use checked::checked;
 pub(crate) use isolation::isolation;
 pub(crate) use live::{clip_line, decision, live, recorder, topics};
 

@@ -4,6 +4,7 @@
 //! Nothing here runs a lambda, listens on a socket, or needs more than a few small dependencies, so that the smallest
 //! program can afford it. Programs talk to each other through these types; they never link each other.
 
+mod checked;
 mod clip;
 mod decision;
 mod exit;
@@ -24,6 +25,7 @@ mod vehicle;
 mod whole;
 mod words;
 
+pub use checked::{Checked, Need, Place};
 pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
 pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ};
 pub use exit::Exit;

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::manifest::Kind;
-use crate::{Decision, Layer, Live};
+use crate::{Checked, Decision, Layer, Live};
 
 /// One line of JSON that `gleaner-runtime` writes on its standard output for the program that started it.
 ///
@@ -42,6 +42,8 @@ pub enum Report {
         /// By name.
         topics: Vec<TopicSeen>,
     },
+    /// Sent once, last: a lambda was checked.
+    Checked(Box<Checked>),
     /// Sent once, last, instead of a summary: a journal was compared, and every decision was the same.
     Verified(Verified),
 }

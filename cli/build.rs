@@ -1,0 +1,48 @@
+//! Puts what a new lambda needs into `gleaner`: the SDKs, the WIT, and the example that it begins with.
+
+use std::env;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Folders and files of the repository, and which of their files: all with one of these extensions.
+const PACKED: &[&str] = &[
+    // With it, a new lambda is built of the very versions that Gleaner was tested with; cargo takes out what it does not need.
+    "Cargo.lock",
+    "LICENSE",
+    "examples/hello/python",
+    "examples/hello/rust/lambda.toml",
+    "examples/hello/rust/src",
+    "guest-sdk-python/gleaner",
+    "guest-sdk-python/pyproject.toml",
+    "guest-sdk-rust/src",
+    "wit",
+];
+const EXTENSIONS: &[&str] = &["lock", "py", "pyi", "rs", "toml", "typed", "wit"];
+
+fn main() {
+    let root = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it")).join("..");
+    let mut list = "&[\n".to_owned();
+    for packed in PACKED {
+        println!("cargo::rerun-if-changed=../{packed}");
+        add(&root, Path::new(packed), &mut list);
+    }
+    list.push(']');
+    let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
+    fs::write(out.join("packed.rs"), list).expect("cargo's folder for it can be written to");
+}
+
+fn add(root: &Path, path: &Path, list: &mut String) {
+    let full = root.join(path);
+    if full.is_dir() {
+        let entries = fs::read_dir(&full).expect("a folder of the repository");
+        let mut inside: Vec<_> = entries.map(|entry| entry.expect("the same").file_name()).collect();
+        inside.sort();
+        // `build` is what `gleaner build` made.
+        let inside = inside.iter().filter(|name| *name != "build" && *name != "__pycache__");
+        inside.for_each(|name| add(root, &path.join(name), list));
+    } else if path.extension().is_none_or(|found| EXTENSIONS.iter().any(|extension| found == *extension)) {
+        let full = full.canonicalize().expect("a file of the repository");
+        let _ = writeln!(list, "    ({:?}, include_bytes!({:?})),", path, full);
+    }
+}

@@ -1,0 +1,112 @@
+use gleaner_protocol::Manifest;
+use toml::Table;
+
+use super::*;
+
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new(name: &str) -> Self {
+        let folder = std::env::temp_dir().join(format!("gleaner-new-{}-{name}", std::process::id()));
+        drop(fs::remove_dir_all(&folder));
+        fs::create_dir_all(&folder).unwrap();
+        Self(folder)
+    }
+
+    fn lambda(&self, name: &str, kind: Kind) -> PathBuf {
+        let dir = self.0.join(name);
+        make(&dir, &name.parse().unwrap(), kind).unwrap();
+        dir
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        drop(fs::remove_dir_all(&self.0));
+    }
+}
+
+#[test]
+fn a_new_lambda_has_a_sound_manifest_with_its_own_name_and_entry() {
+    let scratch = Scratch::new("manifest");
+    for (kind, entry) in [(Kind::Wasm, "pot-hole.wasm"), (Kind::Python, "main.py")] {
+        let dir = scratch.lambda("pot-hole", kind);
+        let manifest = Manifest::load(&dir).unwrap();
+        assert_eq!((manifest.lambda.name.as_str(), manifest.lambda.kind), ("pot-hole", kind));
+        assert_eq!(manifest.lambda.entry.to_string(), entry);
+        assert!(dir.join(source(kind)).is_file());
+        let placeholders = ["NAME", "VERSION", "TEST", "SOURCE", "hello"];
+        for file in ["README.md", "lambda.toml"] {
+            let text = fs::read_to_string(dir.join(file)).unwrap();
+            assert!(placeholders.iter().all(|word| !text.contains(word)), "{text}");
+        }
+        fs::remove_dir_all(dir).unwrap();
+    }
+}
+
+#[test]
+fn what_is_there_is_not_touched() {
+    let scratch = Scratch::new("there");
+    let dir = scratch.lambda("mine", Kind::Python);
+    fs::write(dir.join("main.py"), "precious").unwrap();
+    let again = make(&dir, &"mine".parse().unwrap(), Kind::Python).unwrap_err();
+    assert!(matches!(again, NewError::NotEmpty { .. }), "{again}");
+    update(&dir).unwrap();
+    assert_eq!(fs::read_to_string(dir.join("main.py")).unwrap(), "precious");
+    let elsewhere = scratch.0.join("link");
+    std::os::unix::fs::symlink(&dir, &elsewhere).unwrap();
+    assert!(make(&elsewhere, &"link".parse().unwrap(), Kind::Python).is_err());
+}
+
+#[test]
+fn an_update_replaces_the_sdk_and_what_was_added_to_it() {
+    let scratch = Scratch::new("update");
+    for kind in [Kind::Wasm, Kind::Python] {
+        let dir = scratch.lambda("mine", kind);
+        let (stale, wit) = (dir.join(SDK).join("stale"), dir.join(SDK).join("wit"));
+        fs::write(&stale, "").unwrap();
+        fs::remove_dir_all(&wit).unwrap();
+        update(&dir).unwrap();
+        assert!(!stale.exists() && wit.is_dir());
+        assert!(!dir.join(".gleaner.old").exists() && !dir.join(".gleaner.partial").exists());
+        fs::remove_dir_all(dir).unwrap();
+    }
+    assert!(matches!(update(&scratch.0), Err(NewError::NoLambda { .. })));
+}
+
+#[test]
+fn a_folder_needs_a_name_that_a_lambda_can_have() {
+    for (path, wanted) in [("/", "ends with no name"), ("..", "ends with no name"), ("My Lambda", "is no lambda name")]
+    {
+        let error = name_of(Path::new(path)).unwrap_err();
+        assert!(error.to_string().contains(wanted) && error.help().is_some(), "{error}");
+    }
+    assert_eq!(name_of(Path::new("some/where/pot-hole/")).unwrap().as_str(), "pot-hole");
+}
+
+/// What stands twice, since the copy has to work outside of this workspace.
+#[test]
+fn the_packed_sdk_has_the_versions_of_this_workspace() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let read = |path: &str| fs::read_to_string(root.join(path)).unwrap().parse::<Table>().unwrap();
+    let (workspace, ours) = (read("Cargo.toml"), read("guest-sdk-rust/Cargo.toml"));
+    let packed = include_str!("files/sdk.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
+    assert_eq!(packed["features"], ours["features"]);
+    let names = |table: &Table| table["dependencies"].as_table().unwrap().keys().cloned().collect::<Vec<_>>();
+    assert_eq!(names(&packed), names(&ours));
+    for name in names(&packed) {
+        let plain = |table: &Table, key: &str| {
+            let mut value = table[key].as_table().unwrap()[&name].clone();
+            if let Some(table) = value.as_table_mut() {
+                table.remove("optional");
+            }
+            value
+        };
+        let workspace = workspace["workspace"].as_table().unwrap();
+        assert_eq!(plain(&packed, "dependencies"), plain(workspace, "dependencies"), "{name}");
+    }
+    let package = workspace["workspace"]["package"].as_table().unwrap();
+    for key in ["version", "edition", "license"] {
+        assert_eq!(packed["package"][key], package[key], "{key}");
+    }
+}

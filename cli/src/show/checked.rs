@@ -1,0 +1,87 @@
+use std::fmt::{self, Write};
+
+use gleaner_protocol::{Checked, Need, Place, visible};
+
+use super::Paint;
+use crate::results::size;
+
+/// What was found out about a lambda, for a person.
+pub(crate) fn checked(checked: &Checked, paint: Paint) -> String {
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write_checked(&mut text, checked, paint);
+    text
+}
+
+fn write_checked(text: &mut String, checked: &Checked, paint: Paint) -> fmt::Result {
+    let name = format!("{} {}", visible(&checked.lambda), visible(&checked.version));
+    let init = match checked.init_ms {
+        Some(ms) => paint.green(&format!("loads, and its init returns after {ms:.1} ms")),
+        None => paint.yellow("loads; its init was not run"),
+    };
+    writeln!(text, "{} ({}): {init}", paint.bold(&name), visible(&checked.engine))?;
+    for note in &checked.notes {
+        writeln!(text, "  {}", paint.yellow(&visible(note)))?;
+    }
+    for (place, word) in [(Place::Memory, "memory"), (Place::Disk, "disk")] {
+        let needs: Vec<&Need> = checked.needs.iter().filter(|need| need.place == place).collect();
+        if needs.is_empty() {
+            continue;
+        }
+        let sum = |at_once: bool| {
+            let bytes = needs.iter().filter(|need| need.at_once == at_once).map(|need| need.bytes);
+            bytes.fold(0, u64::saturating_add)
+        };
+        let (at_once, later) = (sum(true), sum(false));
+        let most = size(at_once.saturating_add(later));
+        writeln!(text, "{word}: {} from the start, {most} at most", size(at_once))?;
+        for need in needs {
+            let at_most = if need.at_once { "" } else { ", at most" };
+            writeln!(text, "{:>12}  {}{at_most}", size(need.bytes), visible(&need.purpose))?;
+        }
+    }
+    writeln!(text, "its process has {} now, with its rings and before any sample", size(checked.resident_bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_protocol::manifest::Kind;
+
+    use super::*;
+
+    #[test]
+    fn needs_are_summed_up_by_place_and_by_when_they_are_taken() {
+        let need = |purpose: &str, mib: u64, place, at_once| Need {
+            purpose: purpose.to_owned(),
+            bytes: mib << 20,
+            place,
+            at_once,
+        };
+        let found = Checked {
+            lambda: "dip".to_owned(),
+            version: "0.1.0".to_owned(),
+            kind: Kind::Wasm,
+            engine: "wasmtime 48".to_owned(),
+            init_ms: Some(0.25),
+            resident_bytes: 30 << 20,
+            needs: vec![
+                need("input `imu`", 3, Place::Memory, true),
+                need("preroll", 64, Place::Memory, false),
+                need("model `m`", 4, Place::Disk, true),
+            ],
+            notes: Vec::new(),
+        };
+        let expected = "dip 0.1.0 (wasmtime 48): loads, and its init returns after 0.2 ms
+memory: 3.0 MiB from the start, 67.0 MiB at most
+     3.0 MiB  input `imu`
+    64.0 MiB  preroll, at most
+disk: 4.0 MiB from the start, 4.0 MiB at most
+     4.0 MiB  model `m`
+its process has 30.0 MiB now, with its rings and before any sample
+";
+        assert_eq!(checked(&found, Paint::new(false)), expected);
+        let noted = Checked { init_ms: None, notes: vec!["no \u{1b}type".to_owned()], ..found };
+        let text = checked(&noted, Paint::new(false));
+        assert!(text.contains("its init was not run\n  no \\u{1b}type\n"), "{text}");
+    }
+}
