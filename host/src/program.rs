@@ -15,7 +15,7 @@ use crate::guest::watched::{Patience, Watched};
 use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
 use crate::live;
-use crate::replay::{self, ReplayArgs, VerifyArgs};
+use crate::replay::{self, LookArgs, ReplayArgs, VerifyArgs};
 use crate::stage::{Asked, Bounds, Load};
 #[cfg(feature = "dds")]
 use crate::topics::TopicsArgs;
@@ -34,6 +34,8 @@ enum Command {
     Replay(ReplayArgs),
     /// Makes the decisions in a clip again and compares.
     Verify(VerifyArgs),
+    /// Reports what is in recorded drives.
+    Drive(LookArgs),
     /// Runs a built lambda on live topics, until SIGTERM.
     #[cfg(feature = "dds")]
     Run(live::RunArgs),
@@ -109,6 +111,7 @@ impl Command {
         Ok(match self {
             Self::Replay(args) => Ok(Job::Replay(replay::Job::replay(args)?)),
             Self::Verify(args) => Ok(Job::Replay(replay::Job::verify(args)?)),
+            Self::Drive(args) => Err(replay::look(&args, &mut reports()?)?),
             #[cfg(feature = "dds")]
             Self::Run(args) => Ok(Job::Live(live::Job::new(args)?)),
             #[cfg(feature = "dds")]

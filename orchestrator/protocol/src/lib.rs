@@ -6,6 +6,7 @@
 
 mod clip;
 mod decision;
+mod drive_time;
 mod exit;
 mod exit_record;
 mod failure;
@@ -26,6 +27,7 @@ mod words;
 
 pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
 pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ};
+pub use drive_time::{DriveTime, DriveTimeError};
 pub use exit::Exit;
 pub use exit_record::{Doing, ExitRecord, Killed};
 pub use failure::{Explain, Failure};
@@ -34,7 +36,7 @@ pub use layout::{BuildDir, LayoutError};
 pub use live::{Live, LiveTopic, Network, Spread, ToRecorder};
 pub use manifest::{Manifest, ManifestError};
 pub use parts::{Parts, PartsError};
-pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
+pub use report::{DriveSeen, RecordedTopicSeen, Report, Round, Summary, TopicReport, TopicSeen, Verified};
 pub use sources::Sources;
 pub use vehicle::Vehicle;
 pub use whole::write_whole;

@@ -29,14 +29,18 @@ struct DriveError(ReplayError);
 
 impl Explain for DriveError {
     fn help(&self) -> Option<String> {
-        matches!(self.0, ReplayError::Damaged { .. })
-            .then(|| "it was played up to the damage; copy the file again if you can".to_owned())
+        match self.0 {
+            ReplayError::Damaged { .. } => {
+                Some("it was played up to the damage; copy the file again if you can".to_owned())
+            }
+            _ => self.0.help(),
+        }
     }
 
     fn exit(&self) -> Exit {
         match self.0 {
             ReplayError::Damaged { .. } => Exit::DriveDamaged,
-            ReplayError::Read { .. } => Exit::Internal,
+            ReplayError::Read { .. } | ReplayError::Unpack { .. } => Exit::Internal,
             _ => Exit::Usage,
         }
     }
