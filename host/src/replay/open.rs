@@ -49,11 +49,10 @@ pub(super) struct DriveError(pub(super) ReplayError);
 
 impl Explain for DriveError {
     fn help(&self) -> Option<String> {
+        let help = self.0.help();
         match self.0 {
-            ReplayError::Damaged { .. } => {
-                Some("the results up to the damage are kept; copy the file again if you can".to_owned())
-            }
-            _ => self.0.help(),
+            ReplayError::Damaged { .. } => help.map(|help| format!("the results up to the damage are kept; {help}")),
+            _ => help,
         }
     }
 

@@ -29,11 +29,10 @@ struct DriveError(ReplayError);
 
 impl Explain for DriveError {
     fn help(&self) -> Option<String> {
+        let help = self.0.help();
         match self.0 {
-            ReplayError::Damaged { .. } => {
-                Some("it was played up to the damage; copy the file again if you can".to_owned())
-            }
-            _ => self.0.help(),
+            ReplayError::Damaged { .. } => help.map(|help| format!("it was played up to the damage; {help}")),
+            _ => help,
         }
     }
 

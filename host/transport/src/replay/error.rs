@@ -172,6 +172,11 @@ impl ReplayError {
             Self::NoTimes { path } => {
                 format!("make one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'", path.display())
             }
+            Self::Damaged { path, what: Damage::Database(_) | Damage::DatabaseCutOff { .. }, .. } => {
+                let path = path.display();
+                format!("copy the file again if you can; `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more")
+            }
+            Self::Damaged { .. } => "copy the file again if you can".to_owned(),
             _ => return None,
         })
     }

@@ -119,6 +119,8 @@ impl Rows {
             }
             Ok(End::Span) => None,
             Ok(End::Table) => self.last_words.take(),
+            // A page that is missing is no riddle where the file is too short.
+            Err(what @ Damage::Database(_)) => self.last_words.take().or(Some(what)),
             Err(what) => Some(what),
         };
         let behind = self.after.map_or(self.span.from, |(at, _)| at.unsigned_abs().saturating_add(1));
