@@ -10,7 +10,7 @@ use gleaner_tests::{Folder, bag, program, replay, root, sample_drive};
 use crate::measure::Figure;
 
 /// The sample drive so often is 2 GB.
-const ROUNDS: u64 = 400;
+const ROUNDS: u64 = 265;
 
 /// What is measured of a drive of 2 GB in each storage; a tenth of that if `quick`.
 pub fn figures(quick: bool) -> Vec<Figure> {

@@ -245,7 +245,7 @@ pub enum TransportError {
         /// The topic.
         topic: String,
         /// What is wrong with them.
-        source: SourcesError,
+        source: Box<SourcesError>,
     },
     /// Replay: subscriptions are made before the first step.
     #[error("topic `{topic}` was subscribed after the replay started")]

@@ -117,9 +117,10 @@ impl Catalog {
         if topic.found.get().is_none() {
             let found = match sources.find(&topic.type_name) {
                 Err(SourcesError::Name { .. }) => None,
-                found => {
-                    found.map_err(|source| TransportError::UnusableDefinitions { topic: name.to_owned(), source })?
-                }
+                found => found.map_err(|source| TransportError::UnusableDefinitions {
+                    topic: name.to_owned(),
+                    source: Box::new(source),
+                })?,
             };
             // Nobody else can have come first with another text.
             let _ = topic.found.set(found);

@@ -191,7 +191,7 @@ impl Track {
                 }
             }
             // What is larger than all who want it take is too big for them without its end.
-            message = (&*inflate).bytes();
+            message = inflate.bytes();
         }
         let (endian, options, cdr) = match message {
             &[0, 0, a, b, ref cdr @ ..] => (Endian::Big, [a, b], cdr),
