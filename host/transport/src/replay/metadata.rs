@@ -137,7 +137,8 @@ mod tests {
             (START.replace("mcap", "rosbag_v2") + file, "its storage is `rosbag_v2`"),
             (format!("{START}{file}  compression_mode: FILE\n  compression_format: lz4\n"), "compressed with `lz4`"),
             (START.to_owned(), "it names no file"),
-            (String::new(), "rosbag2_bagfile_information"),
+            (String::new(), "unexpected end"),
+            ("other: 7\n".to_owned(), "rosbag2_bagfile_information"),
             ("rosbag2_bagfile_information: 7\n".to_owned(), "line 1"),
             (format!("{START}  relative_file_paths: [a, [b]]\n"), "line 4"),
         ] {
