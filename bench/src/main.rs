@@ -3,6 +3,7 @@
 //! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the spread of its runs.
 
 mod answers;
+mod drives;
 mod isolation;
 mod kernels;
 mod live;
@@ -27,6 +28,9 @@ struct Args {
     /// Arithmetic in lambdas against the same natively, and calls between lambda and host, instead of drives.
     #[arg(long, conflicts_with = "live")]
     kernels: bool,
+    /// Drives of 2 GB in each storage, instead of short ones; takes 5 GB of disk.
+    #[arg(long, conflicts_with_all = ["live", "kernels", "isolation"])]
+    drives: bool,
     /// What a lambda feels of another one that misbehaves, in a private network, and what a process costs, instead of drives; needs
     /// gleaner-player.
     #[arg(long, conflicts_with_all = ["live", "kernels"])]
@@ -34,7 +38,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let Args { quick, live, kernels, isolation } = Args::parse();
+    let Args { quick, live, kernels, drives, isolation } = Args::parse();
     if live || isolation {
         let figures = match live::elsewhere() {
             Some(Ok(true)) => return ExitCode::SUCCESS,
@@ -57,6 +61,9 @@ fn main() -> ExitCode {
     }
     if kernels {
         return tell(&kernels::figures(quick), quick);
+    }
+    if drives {
+        return tell(&drives::figures(quick), quick);
     }
     let setting = Setting::new();
     let mut figures = Vec::new();

@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use gleaner_protocol::DriveTime;
 use gleaner_protocol::manifest::Kind;
 
 /// Small functions next to the sensors, that keep the data worth keeping.
@@ -40,7 +41,7 @@ pub enum Command {
     ///
     /// Records the clips that the manifest asks for, and writes OUT/decisions.jsonl, OUT/log.jsonl and OUT/summary.json.
     Run(RunArgs),
-    /// Show the live topics that are there
+    /// Show the live topics that are there, or those of a recorded drive
     Topics(TopicsArgs),
     /// Play recorded drives as live topics; see `gleaner play --help`
     #[command(disable_help_flag = true)]
@@ -147,6 +148,9 @@ pub struct RunArgs {
 /// Arguments of `gleaner topics`.
 #[derive(Args, Debug)]
 pub struct TopicsArgs {
+    /// MCAP files, .db3 files and directories of rosbag2, instead of the network
+    #[arg(value_name = "DRIVE", conflicts_with_all = ["wait", "domain", "interface"])]
+    pub drives: Vec<PathBuf>,
     /// How long to listen, in seconds [default: 2]
     #[arg(long, value_name = "SECONDS")]
     pub wait: Option<f64>,
@@ -222,9 +226,15 @@ pub struct ReplayArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub asked: AskedArgs,
-    /// MCAP files; several are merged by time
+    /// MCAP files, .db3 files and directories of rosbag2, packed with zstd or not; several are merged by time
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
+    /// Replay from this time on: seconds after the drive's start, as in 12.5 or 2min, or since 1970, as in @1700000000.5
+    #[arg(long, value_name = "TIME", value_parser = drive_time)]
+    pub from: Option<String>,
+    /// Replay until before this time, given likewise
+    #[arg(long, value_name = "TIME", value_parser = drive_time)]
+    pub to: Option<String>,
     /// Where the results go [default: DIR/out]
     #[arg(long)]
     pub out: Option<PathBuf>,
@@ -234,11 +244,14 @@ pub struct ReplayArgs {
     /// Leave out the clips that the table `record` of the manifest asks for
     #[arg(long)]
     pub no_record: bool,
+    /// Have clips hold these topics of the drive instead of those of the table `record`, as in '*' or '/camera/*'
+    #[arg(long, value_name = "PATTERN", conflicts_with_all = ["no_record", "verify"])]
+    pub topics: Vec<String>,
     /// Write a journal: of every wake, what the lambda saw and decided
     #[arg(long, value_name = "FILE")]
     pub journal: Option<PathBuf>,
     /// Make every decision of a journal again and compare, instead of writing results; exit code 4 at the first difference
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["out", "all", "no_record", "journal"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal"])]
     pub verify: Option<PathBuf>,
     /// Print the summary as one JSON object
     #[arg(long)]
@@ -261,7 +274,7 @@ pub struct VerifyArgs {
     pub json: bool,
 }
 
-// Both are passed on as they are: the runtime takes them apart. Here they are only refused early.
+// All are passed on as they are: the runtime takes them apart. Here they are only refused early.
 
 fn assignment(text: &str) -> Result<String, String> {
     match text.split_once('=') {
@@ -275,6 +288,10 @@ fn remap(text: &str) -> Result<String, String> {
         Some((from, to)) if !from.trim().is_empty() && !to.trim().is_empty() => Ok(text.to_owned()),
         _ => Err("write FROM:=TO, as in /imu/data:=/car/imu".to_owned()),
     }
+}
+
+fn drive_time(text: &str) -> Result<String, String> {
+    text.parse::<DriveTime>().map(|_| text.to_owned()).map_err(|error| error.to_string())
 }
 
 #[cfg(test)]
@@ -310,6 +327,7 @@ mod tests {
             (["dir", "a.mcap", "--remap", "/imu=/car"], "write FROM:=TO"),
             (["dir", "a.mcap", "--remap", "/imu:="], "write FROM:=TO"),
             (["dir", "a.mcap", "--sett", "a=b"], "--set"),
+            (["dir", "a.mcap", "--from", "12:30"], "as in 12.5 or 2min"),
         ] {
             let error = replay(&arguments).unwrap_err();
             assert!(error.contains(said), "{error}");

@@ -58,6 +58,10 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
             line.extend([flag.into(), file.into()]);
         }
     }
+    for (flag, time) in [("--from", &args.from), ("--to", &args.to)] {
+        line.extend(time.iter().flat_map(|time| [OsString::from(flag), time.into()]));
+    }
+    line.extend(args.topics.iter().flat_map(|pattern| [OsString::from("--topics"), pattern.into()]));
     for (flag, wanted) in [("--all", args.all), ("--no-record", args.no_record)] {
         if wanted {
             line.push(flag.into());
@@ -84,15 +88,18 @@ mod tests {
                 vehicle: Some("v.toml".into()),
             },
             drives: vec!["a.mcap".into(), "b".into()],
+            from: Some("12.5".to_owned()),
+            to: Some("@7".to_owned()),
             out: Some("out".into()),
             all: true,
             no_record: true,
+            topics: vec!["*".to_owned(), "/a".to_owned()],
             journal: Some("j".into()),
             verify: None,
             json: true,
         };
         let line =
-            "replay --set x=-1 --remap /a:=/b --vehicle v.toml --out out --journal j --all --no-record -- -dir a.mcap b".split(' ');
+            "replay --set x=-1 --remap /a:=/b --vehicle v.toml --out out --journal j --from 12.5 --to @7 --topics * --topics /a --all --no-record -- -dir a.mcap b".split(' ');
         assert_eq!(arguments(&args), line.collect::<Vec<_>>());
     }
 }

@@ -22,33 +22,47 @@ pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
     Err(Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error))
 }
 
-/// Asks `gleaner-runtime` for the topics.
+/// Asks `gleaner-runtime` for the topics, live or of a drive.
 pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
+    let mut line: Vec<OsString> = Vec::new();
+    if args.drives.is_empty() {
+        line.push("topics".into());
+        line.extend(network(&args.network));
+        line.extend(args.wait.map(|wait| format!("--wait={wait}").into()));
+    } else {
+        line.extend(["drive".into(), "--".into()]);
+        line.extend(args.drives.iter().map(OsString::from));
+    }
+    let text = match report(&line)? {
+        Err(exit) => return Ok(exit),
+        Ok(Report::Topics { topics }) if args.json => show::json_line(&topics),
+        Ok(Report::Topics { topics }) => show::topics(&topics),
+        Ok(Report::Drive(drive)) if args.json => show::json_line(&drive),
+        Ok(Report::Drive(drive)) => show::drive(&drive),
+        Ok(_) => return Err(Failure::new(Exit::Internal, "gleaner-runtime reported something else than topics")),
+    };
+    say(&text)?;
+    Ok(Exit::Ok)
+}
+
+/// The one report of a `gleaner-runtime` that is given this command line, or how it ended without.
+fn report(line: &[OsString]) -> Result<Result<Report, Exit>, Failure> {
     let program = Parts::find()?.program("gleaner-runtime")?;
     let failed = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
     let mut runtime = Command::new(&program);
-    runtime.arg("topics").args(network(&args.network));
-    if let Some(wait) = args.wait {
-        runtime.arg(format!("--wait={wait}"));
-    }
+    runtime.args(line);
     // It says itself why it cannot.
     let output = runtime.stderr(std::process::Stdio::inherit()).output();
     let output = output.map_err(|error| failed(&format!("cannot start `{}`", program.display()), &error))?;
     match output.status.code().and_then(Exit::from_code) {
         Some(Exit::Ok) => {}
-        Some(exit) => return Ok(exit),
+        Some(exit) => return Ok(Err(exit)),
         None => {
             return Err(Failure::new(Exit::Internal, format!("gleaner-runtime did not end well ({})", output.status)));
         }
     }
-    let topics = match serde_json::from_slice(&output.stdout) {
-        Ok(Report::Topics { topics }) => topics,
-        Ok(_) => return Err(Failure::new(Exit::Internal, "gleaner-runtime reported something else than topics")),
-        Err(error) => return Err(failed("cannot understand what gleaner-runtime reports", &error)),
-    };
-    let text = if args.json { show::json_line(&topics) } else { show::topics(&topics) };
-    say(&text)?;
-    Ok(Exit::Ok)
+    let report = serde_json::from_slice(&output.stdout);
+    report.map(Ok).map_err(|error| failed("cannot understand what gleaner-runtime reports", &error))
 }
 
 /// The network, as our programs take it.

@@ -13,10 +13,10 @@ use rustix::fs::{MemfdFlags, SeekFrom, ftruncate, memfd_create, seek};
 use crate::budget;
 
 /// So that a few KB can reach them.
-const LIMITS: Limits = Limits { chunk_bytes: 256 << 10, open_bytes: 512 << 10 };
+const LIMITS: Limits = Limits { chunk_bytes: 256 << 10, open_bytes: 512 << 10, unpacked_bytes: 1 << 20 };
 
 /// What a replay may take: the open chunks and the one that is being opened, and what the file itself says of channels.
-const MEMORY: usize = 16 << 20;
+pub(crate) const MEMORY: usize = 16 << 20;
 
 /// What metadata and attachments may take, and what they cost besides.
 const EXTRAS: u64 = 32 << 10;
@@ -65,7 +65,7 @@ fn rewrite(file: impl AsFd, data: &[u8]) {
 }
 
 /// The steps of a drive, as one number, and how it ended.
-fn replay(paths: &[PathBuf], looking: bool) -> (usize, u64, String) {
+pub(crate) fn replay(paths: &[PathBuf], looking: bool) -> (usize, u64, String) {
     let mut replay = match Replay::open_with(paths, LIMITS) {
         Ok(replay) => replay,
         Err(error) => return (0, 0, error.to_string()),

@@ -6,6 +6,7 @@
 //!
 //! What never happens here: a promise that only holds for what our own writers write.
 
+pub mod bag;
 pub mod budget;
 pub mod drive;
 pub mod image;
@@ -31,7 +32,7 @@ pub struct Target {
 }
 
 /// All targets.
-pub const TARGETS: [Target; 6] = [
+pub const TARGETS: [Target; 7] = [
     Target {
         name: "message",
         check: message::check,
@@ -46,6 +47,7 @@ pub const TARGETS: [Target; 6] = [
         seeds: seeds::drive::all,
         words: seeds::drive::WORDS,
     },
+    Target { name: "bag", check: bag::check, longest: 8 << 10, seeds: seeds::bag::all, words: seeds::bag::WORDS },
     Target {
         name: "image",
         check: image::check,

@@ -1,5 +1,6 @@
 //! What the suites share: where things are, running a replay, and drives made by a test.
 
+pub mod bag;
 pub mod drive;
 pub mod greedy;
 pub mod live;

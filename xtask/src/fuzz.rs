@@ -15,7 +15,7 @@ use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
 
 /// The targets. The rest about them is known to `gleaner-fuzz`, which would take too long to be built for this.
-const TARGETS: [&str; 6] = ["message", "drive", "image", "journal", "link", "manifest"];
+const TARGETS: [&str; 7] = ["message", "drive", "bag", "image", "journal", "link", "manifest"];
 
 /// How the compiler counts which code was reached, and what was compared with what.
 const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
@@ -23,7 +23,7 @@ const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-leve
                      -Cllvm-args=-sanitizer-coverage-trace-compares -Cdebug-assertions -Coverflow-checks --cfg fuzzing";
 
 const USAGE: &str = "usage: cargo xtask fuzz [TARGET...] [--seconds N] [--seed N]
-targets: message, drive, image, journal, link, manifest; those named, or all, in turn, for N seconds each (60).
+targets: message, drive, bag, image, journal, link, manifest; those named, or all, in turn, for N seconds each (60).
 With a seed, runs of the same programs from the same inputs go the same way.";
 
 /// Builds the targets and runs those asked for.

@@ -80,6 +80,7 @@ fn header() -> Header {
         config: serde_json::Map::new(),
         remaps: Vec::new(),
         clock: "monotonic".to_owned(),
+        part: Default::default(),
         wakes_before: 0,
         limits: Default::default(),
     }

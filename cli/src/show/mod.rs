@@ -15,7 +15,7 @@ mod live;
 
 pub(crate) use checked::checked;
 pub(crate) use isolation::isolation;
-pub(crate) use live::{clip_line, decision, live, recorder, topics};
+pub(crate) use live::{clip_line, decision, drive, live, recorder, topics};
 
 /// A report for programs: JSON, in one line.
 pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {
@@ -180,7 +180,9 @@ fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::
 
 fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &[Clip], paint: Paint) -> fmt::Result {
     let name = format!("{} {}", visible(&summary.lambda), visible(&summary.version));
-    let span_s = seconds(summary.end_ns, summary.start_ns);
+    let from_ns = summary.part.from_ns.unwrap_or(summary.start_ns).max(summary.start_ns);
+    let to_ns = summary.part.to_ns.unwrap_or(summary.end_ns).min(summary.end_ns);
+    let span_s = seconds(to_ns, from_ns);
     writeln!(
         text,
         "{} ({}): {} in {}, {span_s:.1} s of drive",
@@ -230,6 +232,10 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
         }
     }
 
+    if !summary.part.is_all() {
+        let [from_s, to_s] = [from_ns, to_ns].map(|ns| seconds(ns, summary.start_ns));
+        writeln!(text, "  {}", paint.dim(&format!("part of the drive: from {from_s:.3} s to {to_s:.3} s")))?;
+    }
     write!(text, "  {} wakes/s", grouped(summary.wakes_per_s.round() as u64))?;
     if summary.wall_s > 0.0 && span_s > 0.0 {
         write!(text, " ({}x real time)", grouped((span_s / summary.wall_s).round() as u64))?;

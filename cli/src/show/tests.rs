@@ -1,3 +1,4 @@
+use gleaner_protocol::journal::Part;
 use gleaner_protocol::manifest::Kind;
 use gleaner_protocol::{Cause as Woken, Recovered, TriggerKind};
 
@@ -25,6 +26,7 @@ fn replay() -> Summary {
         passed_over: 0,
         start_ns: START_NS,
         end_ns: START_NS + 40_000_000_000,
+        part: Part::default(),
         wall_s: 0.5,
         run_s: 0.4,
         decode_s: 0.1,
@@ -118,6 +120,14 @@ fn triggers_of_one_label_less_than_a_second_apart_are_one_line() {
         ]
     );
     assert!(!text.contains("more"), "{text}");
+}
+
+#[test]
+fn a_part_of_a_drive_is_shown_with_its_times_and_length() {
+    let part = Part { from_ns: Some(START_NS + 10_500_000_000), to_ns: None };
+    let text = summary(&Summary { part, ..replay() }, &digest(Vec::new()), &[], PLAIN);
+    assert!(text.contains(", 29.5 s of drive"), "{text}");
+    assert!(text.contains("  part of the drive: from 10.500 s to 40.000 s\n"), "{text}");
 }
 
 #[test]

@@ -97,6 +97,7 @@ pub(super) fn header() -> Header {
         config: Map::new(),
         remaps: vec![("/imu".to_owned(), "/car/imu".to_owned())],
         clock: "x".to_owned(),
+        part: Default::default(),
         wakes_before: 0,
         limits: Default::default(),
     }

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::journal::{FileDigest, Header, JournalInput};
+use gleaner_protocol::journal::{FileDigest, Header, JournalInput, Part};
 use gleaner_protocol::manifest::{ConfigValue, Manifest, Schedule};
 use gleaner_protocol::{BuildDir, Explain, hex};
 use serde_json::{Map, Value};
@@ -39,6 +39,8 @@ pub struct Identity<'a> {
     pub engine: String,
     /// What the times of the journal are.
     pub clock: &'a str,
+    /// What it is given of a drive.
+    pub part: Part,
 }
 
 impl Identity<'_> {
@@ -48,7 +50,7 @@ impl Identity<'_> {
     ///
     /// [`IdentityError`] names the file that cannot be read.
     pub fn header(self) -> Result<Header, IdentityError> {
-        let Self { manifest, build, config, remaps, engine, clock } = self;
+        let Self { manifest, build, config, remaps, engine, clock, part } = self;
         let lambda = &manifest.lambda;
         let event = match &manifest.schedule {
             Schedule::Event { input, .. } => manifest.inputs.iter().position(|known| known.name == *input),
@@ -70,6 +72,7 @@ impl Identity<'_> {
             config: config.iter().map(|(key, value)| (key.clone(), json(value))).collect::<Map<_, _>>(),
             remaps: remaps.iter().map(|remap| (remap.from.clone(), remap.to.clone())).collect(),
             clock: clock.to_owned(),
+            part,
             wakes_before: 0,
         })
     }

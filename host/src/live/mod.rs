@@ -19,6 +19,7 @@ use std::io::Write;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use gleaner_protocol::journal::Part;
 use gleaner_protocol::manifest::Schedule as Declared;
 use gleaner_protocol::{Exit, Failure, Report};
 use gleaner_transport::dds::Dds;
@@ -68,7 +69,15 @@ impl Job {
             Some(socket) => {
                 let (build, config, remaps) = (&asked.build, &asked.config, &asked.remaps);
                 let engine = guest.engine();
-                let identity = Identity { manifest: &manifest, build, config, remaps, engine, clock: CLOCK_OF_VEHICLE };
+                let identity = Identity {
+                    manifest: &manifest,
+                    build,
+                    config,
+                    remaps,
+                    engine,
+                    clock: CLOCK_OF_VEHICLE,
+                    part: Part::default(),
+                };
                 Some(ToRecorder::join(socket, &identity.header()?, &inputs)?)
             }
             None => None,

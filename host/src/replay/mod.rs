@@ -3,15 +3,19 @@
 //! Time is the drive's. A sample is delivered, the lambda runs if its schedule says so, then the next: nothing is skipped,
 //! and nothing depends on how fast the machine is.
 
+mod chosen;
 mod course;
 mod digests;
 mod journal_file;
+mod look;
 mod open;
 mod options;
+mod part;
 mod record;
 mod round;
 mod verify;
 
+pub use look::{LookArgs, look};
 pub use options::{Job, Options, ReplayArgs, VerifyArgs};
 
 use std::io::Write;

@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use gleaner_jail::Paths;
 use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{BuildDir, Exit, Failure};
+use gleaner_protocol::{BuildDir, DriveTime, Exit, Failure};
 
+use super::part::Wanted;
 use super::verify::Claim;
 use crate::isolation::definitions;
 use crate::stage::{Asked, AskedArgs, OutputError, RESULTS};
@@ -19,9 +20,15 @@ pub struct ReplayArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub asked: AskedArgs,
-    /// MCAP files; several are merged by time.
+    /// MCAP files, databases and directories of rosbag2; several are merged by time.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
+    /// Replay from this time on: seconds after the drive's start, or since 1970 behind an `@`.
+    #[arg(long, value_name = "TIME")]
+    pub from: Option<DriveTime>,
+    /// Replay until before this time, given likewise.
+    #[arg(long, value_name = "TIME")]
+    pub to: Option<DriveTime>,
     /// Where the results go; `DIR/out` if not given.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
@@ -31,11 +38,14 @@ pub struct ReplayArgs {
     /// Leave out the clips that the table `record` of the manifest asks for.
     #[arg(long)]
     pub no_record: bool,
+    /// Have clips hold these topics of the drive instead of those of the manifest; a `*` stands for any letters.
+    #[arg(long, value_name = "PATTERN", conflicts_with_all = ["no_record", "verify"])]
+    pub topics: Vec<String>,
     /// Write a journal of every wake.
     #[arg(long, value_name = "FILE")]
     pub journal: Option<PathBuf>,
     /// Make every decision of this journal again and compare, instead of writing results.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["out", "all", "no_record", "journal", "repeat"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal", "repeat"])]
     pub verify: Option<PathBuf>,
     /// Replay so many times in this process, each time from the start.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
@@ -60,7 +70,21 @@ pub struct Options {
     /// The lambda.
     pub asked: Asked,
     /// The drives, merged by time.
-    pub drives: Vec<PathBuf>,
+    pub drives: Drives,
+    /// What is replayed of them.
+    pub part: Wanted,
+    /// Which topics of the drive its clips hold, if not those of the manifest.
+    pub topics: Vec<String>,
+    /// The folder for what packed drives hold, if there is one of ours.
+    pub unpack_in: Option<PathBuf>,
+}
+
+/// Drives, as they were named and as they are.
+pub struct Drives {
+    /// Files and directories.
+    pub named: Vec<PathBuf>,
+    /// The files, and those of the directories.
+    pub files: Vec<PathBuf>,
 }
 
 /// What a replay leaves.
@@ -95,11 +119,11 @@ pub struct Job {
 impl Job {
     /// What a replay may open while the lambda runs: drives again in a further pass, the results, the code that was compiled.
     pub fn paths(&self) -> Paths {
-        let Options { asked, drives } = &self.options;
+        let Options { asked, drives, .. } = &self.options;
         let mut read = definitions();
         read.push(asked.lambda.clone());
         read.extend(asked.vehicle.clone());
-        read.extend(drives.iter().cloned());
+        read.extend(drives.named.iter().chain(&drives.files).cloned());
         if let Task::Verify(claim) = &self.task {
             read.push(claim.path().to_owned());
         }
@@ -144,13 +168,10 @@ impl Job {
     pub fn replay(args: ReplayArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.asked.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
-        if let Some(twice) = given_twice(&args.drives) {
-            let failure = Failure::new(Exit::Usage, format!("drive `{}` is given twice", twice.display()));
-            return Err(failure.with_help("its samples would count twice; give each file once"));
-        }
+        let drives = Drives::find(args.drives)?;
         if let Some(journal) = args.verify {
             let claim = Claim::journal(&journal)?;
-            let options = claim.options(args.asked, build, &mut manifest, args.drives)?;
+            let options = claim.options(args.asked, build, &mut manifest, drives)?;
             return Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) });
         }
         let asked = Asked::new(args.asked, build, &mut manifest)?;
@@ -168,7 +189,9 @@ impl Job {
         }
         let results =
             Results { out, all: args.all, record: !args.no_record, journal: args.journal, repeat: args.repeat };
-        let options = Options { asked, drives: args.drives };
+        let part = Wanted { from: args.from, to: args.to };
+        let unpack_in = Some(results.out.clone());
+        let options = Options { asked, drives, part, topics: args.topics, unpack_in };
         Ok(Self { options, manifest, task: Task::Replay(results) })
     }
 
@@ -182,7 +205,8 @@ impl Job {
         let mut manifest = Manifest::load(build.path())?;
         let claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
         let asked = AskedArgs { lambda: args.lambda, set: Vec::new(), remap: Vec::new(), vehicle: args.vehicle };
-        let options = claim.options(asked, build, &mut manifest, vec![args.clip])?;
+        let clip = Drives { named: vec![args.clip.clone()], files: vec![args.clip] };
+        let options = claim.options(asked, build, &mut manifest, clip)?;
         Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
     }
 }
@@ -198,10 +222,4 @@ fn is_result(path: &Path, out: &Path) -> bool {
         a == b || std::fs::canonicalize(a).ok().is_some_and(|a| std::fs::canonicalize(b).ok() == Some(a))
     };
     is_name && same(folder, out)
-}
-
-/// A file that is the same as an earlier one, under whatever name.
-fn given_twice(drives: &[PathBuf]) -> Option<&PathBuf> {
-    let mut seen = std::collections::HashSet::new();
-    drives.iter().find(|drive| std::fs::canonicalize(drive).is_ok_and(|path| !seen.insert(path)))
 }

@@ -12,8 +12,8 @@ use gleaner_recorder::{
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
+use super::chosen::{self, Chosen};
 use super::{CLOCK, Options};
-use crate::input::Remap;
 
 /// A recorder over one lambda's `[record]`.
 pub(super) struct Recording {
@@ -90,16 +90,18 @@ impl Recording {
         options: &Options,
         drive: &mut Replay,
     ) -> Result<Option<Self>, Failure> {
-        let Some(rules) = &manifest.record else { return Ok(None) };
+        let Some(rules) = &manifest.record else {
+            if options.topics.is_empty() {
+                return Ok(None);
+            }
+            let failure = Failure::new(Exit::Usage, "there are no clips whose topics --topics could choose");
+            return Err(failure.with_help("add a table [record] to lambda.toml, which says how long clips are"));
+        };
         let shared = Arc::new(Mutex::new(Shared { recorder: None, failed: None }));
         let known = drive.topics();
         let mut lanes = Vec::new();
-        for wanted in &rules.topics {
-            let name = Remap::apply(&options.asked.remaps, wanted.as_str());
-            // Two topics of the manifest may be one of the drive.
-            if lanes.iter().any(|lane: &Arc<Lane>| lane.topic.name == name) {
-                continue;
-            }
+        for Chosen { name, is_one_of_many } in chosen::topics(rules, options, &known)? {
+            let name = name.as_str();
             let found = known.iter().find(|topic| topic.topic == name);
             if found.is_none() {
                 tracing::warn!(topic = %name, "the drive does not have this topic of [record]: clips are made without it");
@@ -118,10 +120,19 @@ impl Recording {
                     max_bytes: usize::try_from(rules.preroll_size.bytes()).unwrap_or(usize::MAX),
                     qos: Qos::Auto,
                 };
-                drive.subscribe(&spec, lane.clone()).map_err(|error| {
-                    Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error)
-                        .with_help("remove the topic from [record], or replay without clips: --no-record")
-                })?;
+                match drive.subscribe(&spec, lane.clone()) {
+                    Ok(_) => {}
+                    Err(error) if is_one_of_many => {
+                        tracing::warn!(topic = %name, %error, "clips are made without this topic");
+                        continue;
+                    }
+                    Err(error) => {
+                        let failure = Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error);
+                        return Err(
+                            failure.with_help("remove the topic from [record], or replay without clips: --no-record")
+                        );
+                    }
+                }
             }
             lanes.push(lane);
         }

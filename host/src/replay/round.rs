@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::journal::End;
+use gleaner_protocol::journal::{End, Part};
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Explain, Failure, Report, Round, Summary, TopicReport};
-use gleaner_transport::replay::{Replay, Step};
+use gleaner_transport::replay::{Progress, Replay, Step};
 use gleaner_vitals::usage;
 
 use super::course::{self, Course, Reached};
@@ -42,6 +42,7 @@ struct Pass<'a> {
     scribe: Option<Scribe>,
     journal: Option<JournalFile>,
     recording: Option<Recording>,
+    part: Part,
     wakes: u64,
     triggers: u64,
     faults: u64,
@@ -90,7 +91,7 @@ impl Course for Pass<'_> {
             self.looked = Instant::now();
             self.flush()?;
             let progress = drive.progress();
-            let report = Report::Progress { done: progress.done, total: Some(progress.total), at_ns: step.at_ns };
+            let report = Report::Progress { done: progress.done, total: progress.total, at_ns: step.at_ns };
             send(self.reports, &report);
         }
         Ok(())
@@ -113,7 +114,8 @@ impl Pass<'_> {
     fn run(&mut self, drive: &mut Replay) -> Result<(Reached, Recorded), Failure> {
         let reached = course::take(drive, self)?;
         // Of a damaged drive nobody knows what came after the last sample.
-        let end_ns = if reached.broken.is_some() { reached.at_ns } else { drive.end_ns().unwrap_or(0) };
+        let end_ns = drive.end_ns().unwrap_or(0).min(self.part.to_ns.map_or(i64::MAX, |to_ns| to_ns.saturating_sub(1)));
+        let end_ns = if reached.broken.is_some() { reached.at_ns } else { end_ns };
         let recorded = self.recording.as_ref().map_or(Ok(Recorded::default()), |recording| recording.finish(end_ns))?;
         Ok((reached, recorded))
     }
@@ -127,7 +129,7 @@ pub(super) fn replay(
     reports: &mut dyn Write,
 ) -> Result<(Summary, Option<Exit>), Failure> {
     let name = manifest.lambda.name.as_str();
-    let mut drive = open_drives(options)?;
+    let (mut drive, part) = open_drives(options)?;
     let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { inputs, session, mut guest } =
         Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
@@ -138,9 +140,10 @@ pub(super) fn replay(
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {
         let Asked { build, config, remaps, .. } = &options.asked;
-        header = Some(Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK }.header()?);
+        header =
+            Some(Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK, part }.header()?);
     }
-    let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.clone()));
+    let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.files.clone()));
     let journal = results.journal.as_deref().zip(header.as_ref());
     let journal = journal.map(|(path, header)| JournalFile::create(path, header)).transpose()?;
     // Only now does it cost the results of an earlier replay: what could not start must not touch them.
@@ -167,6 +170,7 @@ pub(super) fn replay(
         scribe: header.is_some().then(|| Scribe::new(&inputs)),
         journal,
         recording,
+        part,
         wakes: 0,
         triggers: 0,
         faults: 0,
@@ -193,7 +197,7 @@ pub(super) fn replay(
         lambda: name.to_owned(),
         version: manifest.lambda.version.to_string(),
         kind: manifest.lambda.kind,
-        drive: options.drives.iter().map(|drive| shown(drive)).collect(),
+        drive: options.drives.named.iter().map(|drive| shown(drive)).collect(),
         out: shown(&results.out),
         wakes: pass.wakes,
         triggers: pass.triggers,
@@ -207,6 +211,7 @@ pub(super) fn replay(
         passed_over: pass.session.passed_over(),
         start_ns: drive.start_ns().unwrap_or(0),
         end_ns: drive.end_ns().unwrap_or(0),
+        part,
         wall_s,
         run_s: pass.judge.run().as_secs_f64(),
         decode_s: inputs.iter().map(|topic| topic.decode_ns()).sum::<u64>() as f64 / 1e9,
@@ -217,12 +222,26 @@ pub(super) fn replay(
         clips_replaced,
         in_cooldown: recorded.in_cooldown,
         ignored: recorded.ignored,
-        damaged: broken
-            .as_ref()
-            .map(|error| Failure::because("the drive could not be read to its end", error).to_string()),
+        damaged: broken.as_ref().map(|error| {
+            let mut failure = Failure::because("the drive could not be read to its end", error);
+            failure.causes.push(read_so_far(&drive, reached.at_ns));
+            failure.to_string()
+        }),
     };
     output.finish(&summary)?;
     Ok((summary, broken.map(|error| error.exit())))
+}
+
+/// What was read of a drive that is damaged: what is lost is the rest.
+fn read_so_far(drive: &Replay, at_ns: i64) -> String {
+    let Progress { done, total } = drive.progress();
+    let seconds = at_ns.saturating_sub(drive.start_ns().unwrap_or(0)) as f64 / 1e9;
+    match total.filter(|total| *total > done) {
+        Some(total) if done > 0 => format!("read: {done} of {total} messages, up to {seconds:.3} s"),
+        // Without an index, nobody knows how many there were.
+        None if done > 0 => format!("read: {done} messages, up to {seconds:.3} s; what came later is lost"),
+        _ => "read: no message of these topics".to_owned(),
+    }
 }
 
 pub(super) fn report(n: u32, summary: &Summary) -> Round {

@@ -80,6 +80,9 @@ impl Explain for InputError {
             TransportError::WrongType { found, .. } => {
                 format!("write type = \"{found}\" in lambda.toml, or choose another topic")
             }
+            TransportError::Encoding { what: "schema encoding", .. } => {
+                "put the .msg files of the type, and of those it refers to, into DIR/msg, and build again".to_owned()
+            }
             _ => return None,
         })
     }

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
-use crate::message::{Definitions, Endian, MessageError};
+use crate::message::{Definitions, Endian, MessageError, SourcesError};
 use crate::nearest::hint;
 
 /// One topic that a caller wants to receive.
@@ -17,7 +17,8 @@ pub struct TopicSpec {
     /// pulled and holds none.
     pub queue: usize,
     /// The largest sample, in bytes of CDR, that the sink will take. A live transport sizes its
-    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`].
+    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`]. Of a larger sample that
+    /// is packed, it may be shown the beginning only, which is still too big.
     pub max_bytes: usize,
     /// How a live transport asks for it.
     pub qos: Qos,
@@ -143,7 +144,7 @@ pub struct DiscoveredTopic {
     pub type_name: String,
     /// ros2msg text of the type and all it refers to, where the source carries it.
     pub definitions_text: Option<Arc<str>>,
-    /// How many messages the source holds, where it knows.
+    /// How many messages the source holds, where it says.
     pub messages: Option<u64>,
     /// The quality of service that the topic's writers offered, as rosbag2 notes it: YAML under the
     /// key `offered_qos_profiles`, at most 64 KiB. `None` where the source does not carry it.
@@ -237,6 +238,14 @@ pub enum TransportError {
         topic: String,
         /// What is wrong with them.
         source: MessageError,
+    },
+    /// The definitions that were found for this topic's type, since the source does not carry them, cannot be used.
+    #[error("the message definitions of topic `{topic}` cannot be used")]
+    UnusableDefinitions {
+        /// The topic.
+        topic: String,
+        /// What is wrong with them.
+        source: Box<SourcesError>,
     },
     /// Replay: subscriptions are made before the first step.
     #[error("topic `{topic}` was subscribed after the replay started")]

@@ -2,6 +2,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::journal::Part;
 use crate::manifest::Kind;
 use crate::{Checked, Decision, Layer, Live};
 
@@ -44,6 +45,8 @@ pub enum Report {
     },
     /// Sent once, last: a lambda was checked.
     Checked(Box<Checked>),
+    /// Sent once, last: what is in a recorded drive.
+    Drive(DriveSeen),
     /// Sent once, last, instead of a summary: a journal was compared, and every decision was the same.
     Verified(Verified),
 }
@@ -61,6 +64,30 @@ pub struct TopicSeen {
     pub readers: usize,
     /// What the writers offer, in words, each once.
     pub qos: Vec<String>,
+}
+
+/// What is in a recorded drive, as far as it says without being read through.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DriveSeen {
+    /// Log time of its first message, in ns since the epoch; `None` if there is none.
+    pub start_ns: Option<i64>,
+    /// Log time of its last message, in ns since the epoch.
+    pub end_ns: Option<i64>,
+    /// By name.
+    pub topics: Vec<RecordedTopicSeen>,
+}
+
+/// A topic of a drive.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordedTopicSeen {
+    /// Its absolute name.
+    pub topic: String,
+    /// Its type, for example `sensor_msgs/msg/Imu`.
+    pub type_name: String,
+    /// How many messages there are; `None` if nothing says.
+    pub messages: Option<u64>,
+    /// Whether the drive carries the definitions of the type, or they are known here.
+    pub is_defined: bool,
 }
 
 /// How far a journal was proved.
@@ -138,6 +165,9 @@ pub struct Summary {
     pub start_ns: i64,
     /// Log time of the drive's last message, in ns since the epoch.
     pub end_ns: i64,
+    /// What was replayed of it.
+    #[serde(default, skip_serializing_if = "Part::is_all")]
+    pub part: Part,
     /// Duration of the replay, in s.
     pub wall_s: f64,
     /// Time in the lambda, in s.
@@ -234,6 +264,7 @@ mod tests {
             passed_over: 6,
             start_ns: 1,
             end_ns: 2,
+            part: Part::default(),
             wall_s: 0.25,
             run_s: 0.125,
             decode_s: 0.0,

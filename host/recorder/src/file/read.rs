@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_protocol::Clip;
-use gleaner_transport::replay::{Damage, Limits, Replay, ReplayError, read_extras};
+use gleaner_transport::replay::{Damage, Limits, Place, Replay, ReplayError, read_extras};
 use gleaner_transport::{SampleMeta, TopicSpec, Transport, Verdict};
 
 use super::ending::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};
@@ -12,7 +12,7 @@ use super::{About, Topic};
 use crate::error::RecordError;
 
 /// The largest chunk: one message of any size that a lambda may ask for.
-const LIMITS: Limits = Limits { chunk_bytes: 1 << 30, open_bytes: 1 << 30 };
+const LIMITS: Limits = Limits { chunk_bytes: 1 << 30, open_bytes: 1 << 30, unpacked_bytes: 0 };
 /// Most that the metadata and attachments of a clip may take: the journals of 16 lambdas.
 const EXTRAS_BYTES: u64 = 1 << 30;
 
@@ -57,7 +57,7 @@ pub(super) fn each_message(
                 act(&topics[step.subscription.0], &step.meta, &cdr)?;
             }
             Ok(None) => return Ok(None),
-            Err(ReplayError::Damaged { offset, what, .. }) => return Ok(Some(End { at: offset, why: what })),
+            Err(ReplayError::Damaged { at: Place::Byte(at), what, .. }) => return Ok(Some(End { at, why: what })),
             Err(error) => return Err(cannot_read(error)),
         }
     }

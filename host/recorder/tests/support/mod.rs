@@ -177,6 +177,7 @@ cooldown = "{cooldown}ms"
         config: serde_json::Map::new(),
         remaps: Vec::new(),
         clock: "log time of the drive".to_owned(),
+        part: Default::default(),
         wakes_before: 0,
         limits: Default::default(),
     };

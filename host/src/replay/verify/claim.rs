@@ -13,8 +13,9 @@ use serde_json::Value;
 use super::told::Told;
 use crate::input::Remap;
 use crate::journal::{CLOCK_OF_VEHICLE, Identity};
-use crate::replay::Options;
 use crate::replay::open::DriveError;
+use crate::replay::options::{Drives, Options};
+use crate::replay::part::Wanted;
 use crate::stage::{Asked, AskedArgs, tighten};
 
 /// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at most.
@@ -112,7 +113,7 @@ impl Claim {
         args: AskedArgs,
         build: BuildDir,
         manifest: &mut Manifest,
-        drives: Vec<PathBuf>,
+        drives: Drives,
     ) -> Result<Options, Failure> {
         let AskedArgs { lambda, set, remap: remaps, vehicle } = args;
         let header = self.header();
@@ -133,7 +134,9 @@ impl Claim {
         let set = if set.is_empty() { assignments(header) } else { set };
         asked.config = ConfigSet::resolve(manifest, &set)?;
         compare(header, &asked, manifest)?;
-        Ok(Options { asked, drives })
+        // A clip holds what it holds.
+        let part = if self.is_part { Wanted::default() } else { Wanted::from(header.part) };
+        Ok(Options { asked, drives, part, topics: Vec::new(), unpack_in: None })
     }
 }
 
@@ -150,8 +153,8 @@ fn assignments(header: &Header) -> Vec<(String, String)> {
 
 fn compare(header: &Header, asked: &Asked, manifest: &Manifest) -> Result<(), Failure> {
     let Asked { build, config, remaps, .. } = asked;
-    let (engine, clock) = (header.engine.clone(), header.clock.as_str());
-    let now = Identity { manifest, build, config, remaps, engine, clock }.header()?;
+    let (engine, clock, part) = (header.engine.clone(), header.clock.as_str(), header.part);
+    let now = Identity { manifest, build, config, remaps, engine, clock, part }.header()?;
     match header.differs_from(&now) {
         None => Ok(()),
         Some(difference) => Err(different("this is not the lambda that wrote the journal", &difference).with_help(

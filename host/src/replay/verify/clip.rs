@@ -15,6 +15,7 @@ use super::{Claim, Proved, Remake, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
 use crate::api::trace::offered;
 use crate::replay::Options;
+use crate::replay::open::open;
 use crate::stage::Load;
 
 /// A sample may be newer than the one that caused a wake by so much, where each topic has a thread of its own.
@@ -26,7 +27,7 @@ pub(super) fn prove(
     claim: &mut Claim,
     load: Load<'_>,
 ) -> Result<Proved, Failure> {
-    let clip = Replay::open(&options.drives).map_err(unreadable_clip)?;
+    let clip = open(options).map_err(unreadable_clip)?;
     let header = claim.header().clone();
     holds_all_inputs(&clip, &header)?;
     holds_what_it_says(&clip, &claim.told)?;

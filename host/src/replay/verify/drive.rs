@@ -23,8 +23,8 @@ pub(super) fn prove(
     claim: &mut Claim,
     load: Load<'_>,
 ) -> Result<Proved, Failure> {
-    let digests = Digests::start(options.drives.clone());
-    let drive = open_drives(options)?;
+    let digests = Digests::start(options.drives.files.clone());
+    let (drive, _) = open_drives(options)?;
     let start_ns = drive.start_ns().unwrap_or(0);
     let (remake, mut drive, inputs) = Remake::start(drive, options, manifest, load)?;
     let schedule = Schedule::new(manifest, &inputs);

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use super::error::ReplayError;
-use super::file::{ChannelInfo, Contents};
-use crate::message::Definitions;
+use super::file::Contents;
+use crate::message::{Definitions, Sources, SourcesError};
 use crate::nearest::nearest;
 use crate::transport::{DiscoveredTopic, TopicSpec, TransportError, same_type};
 
@@ -16,13 +16,18 @@ struct Topic {
     /// Index of the file that named the type first.
     named_by: usize,
     text: Option<Arc<str>>,
-    messages: u64,
+    /// `None` if a file does not say.
+    messages: Option<u64>,
     /// (file, channel id), in that order.
     channels: Vec<(usize, u16)>,
-    /// What is encoded in a way we do not read, and how.
-    foreign: Option<(&'static str, String, &'static str)>,
+    /// How messages are encoded that we do not read.
+    foreign: Option<String>,
+    /// How definitions are written that we do not read.
+    foreign_text: Option<String>,
     /// Of the first channel that has it.
     offered_qos: Option<String>,
+    /// What was found elsewhere for want of a text.
+    found: OnceLock<Option<Arc<str>>>,
     definitions: OnceLock<Arc<Definitions>>,
 }
 
@@ -30,14 +35,18 @@ struct Topic {
 pub(super) struct Selected<'a> {
     /// (file, channel id), in that order.
     pub(super) channels: &'a [(usize, u16)],
-    pub(super) messages: u64,
+    pub(super) messages: Option<u64>,
 }
 
-/// All topics by name.
-pub(super) struct Catalog(BTreeMap<String, Topic>);
+/// All topics.
+pub(super) struct Catalog {
+    by_name: BTreeMap<String, Topic>,
+    /// Where definitions are looked for that the files do not carry.
+    sources: Option<Sources>,
+}
 
 impl Catalog {
-    pub(super) fn build(files: &[(&Path, &Contents)]) -> Result<Self, ReplayError> {
+    pub(super) fn build(files: &[(&Path, &Contents)], sources: Option<Sources>) -> Result<Self, ReplayError> {
         let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
         for (file, (path, contents)) in files.iter().enumerate() {
             for (id, channel) in contents.channels.iter() {
@@ -45,10 +54,12 @@ impl Catalog {
                     type_name: channel.type_name.clone(),
                     named_by: file,
                     text: None,
-                    messages: 0,
+                    messages: Some(0),
                     channels: Vec::new(),
                     foreign: None,
+                    foreign_text: None,
                     offered_qos: None,
+                    found: OnceLock::new(),
                     definitions: OnceLock::new(),
                 });
                 if !same_type(&topic.type_name, &channel.type_name) {
@@ -61,29 +72,60 @@ impl Catalog {
                     });
                 }
                 let messages = contents.messages.get(&id).copied().unwrap_or(0);
-                topic.messages = topic.messages.saturating_add(messages);
+                let messages =
+                    topic.messages.filter(|_| !contents.uncounted).map(|known| known.saturating_add(messages));
+                topic.messages = messages;
                 topic.channels.push((file, id));
-                topic.foreign = topic.foreign.take().or_else(|| foreign(channel));
+                if channel.message_encoding != "cdr" {
+                    topic.foreign.get_or_insert_with(|| channel.message_encoding.clone());
+                }
                 if topic.offered_qos.is_none() {
                     topic.offered_qos.clone_from(&channel.offered_qos);
                 }
-                if topic.text.is_none() && channel.schema_encoding == "ros2msg" {
-                    topic.text.clone_from(&channel.definitions_text);
+                match &channel.definitions_text {
+                    Some(text) if channel.schema_encoding == "ros2msg" => {
+                        topic.text.get_or_insert_with(|| text.clone());
+                    }
+                    // A writer that does not know a type leaves its text out, and how it is written with it.
+                    None if !channel.type_name.is_empty() => {}
+                    _ => {
+                        topic.foreign_text.get_or_insert_with(|| channel.schema_encoding.clone());
+                    }
                 }
             }
         }
-        Ok(Self(topics))
+        Ok(Self { by_name: topics, sources })
     }
 
     pub(super) fn topics(&self) -> Vec<DiscoveredTopic> {
         let discovered = |(name, topic): (&String, &Topic)| DiscoveredTopic {
             topic: name.clone(),
             type_name: topic.type_name.clone(),
-            definitions_text: topic.text.clone(),
-            messages: Some(topic.messages),
+            // What is wrong with it is for who reads fields of it.
+            definitions_text: self.text(name, topic).ok().flatten().cloned(),
+            messages: topic.messages,
             offered_qos: topic.offered_qos.clone(),
         };
-        self.0.iter().map(discovered).collect()
+        self.by_name.iter().map(discovered).collect()
+    }
+
+    /// The definitions of a topic's type: as its files have them, or else as they were found.
+    fn text<'a>(&'a self, name: &str, topic: &'a Topic) -> Result<Option<&'a Arc<str>>, TransportError> {
+        let Some(sources) = self.sources.as_ref().filter(|_| topic.text.is_none()) else {
+            return Ok(topic.text.as_ref());
+        };
+        if topic.found.get().is_none() {
+            let found = match sources.find(&topic.type_name) {
+                Err(SourcesError::Name { .. }) => None,
+                found => found.map_err(|source| TransportError::UnusableDefinitions {
+                    topic: name.to_owned(),
+                    source: Box::new(source),
+                })?,
+            };
+            // Nobody else can have come first with another text.
+            let _ = topic.found.set(found);
+        }
+        Ok(topic.found.get().and_then(Option::as_ref))
     }
 
     /// The channels of a topic, if it is as `spec` wants it.
@@ -96,8 +138,16 @@ impl Catalog {
                 found: topic.type_name.clone(),
             });
         }
-        if let Some((what, found, wanted)) = &topic.foreign {
-            return Err(TransportError::Encoding { topic: spec.topic.clone(), what, found: found.clone(), wanted });
+        let encoding = |what, found: &String, wanted| {
+            Err(TransportError::Encoding { topic: spec.topic.clone(), what, found: found.clone(), wanted })
+        };
+        if let Some(found) = &topic.foreign {
+            return encoding("message encoding", found, "cdr");
+        }
+        if let Some(found) = &topic.foreign_text
+            && self.text(&spec.topic, topic)?.is_none()
+        {
+            return encoding("schema encoding", found, "ros2msg");
         }
         Ok(Selected { channels: &topic.channels, messages: topic.messages })
     }
@@ -107,7 +157,7 @@ impl Catalog {
         if let Some(known) = topic.definitions.get() {
             return Ok(known.clone());
         }
-        let text = topic.text.as_deref().ok_or_else(|| TransportError::NoDefinitions {
+        let text = self.text(name, topic)?.ok_or_else(|| TransportError::NoDefinitions {
             topic: name.to_owned(),
             type_name: topic.type_name.clone(),
         })?;
@@ -117,20 +167,10 @@ impl Catalog {
     }
 
     fn get(&self, name: &str) -> Result<&Topic, TransportError> {
-        self.0.get(name).ok_or_else(|| TransportError::NoSuchTopic {
+        self.by_name.get(name).ok_or_else(|| TransportError::NoSuchTopic {
             topic: name.to_owned(),
-            known: self.0.keys().cloned().collect(),
-            nearest: nearest(name, self.0.keys().map(String::as_str)).map(str::to_owned),
+            known: self.by_name.keys().cloned().collect(),
+            nearest: nearest(name, self.by_name.keys().map(String::as_str)).map(str::to_owned),
         })
     }
-}
-
-fn foreign(channel: &ChannelInfo) -> Option<(&'static str, String, &'static str)> {
-    if channel.message_encoding != "cdr" {
-        return Some(("message encoding", channel.message_encoding.clone(), "cdr"));
-    }
-    if channel.schema_encoding != "ros2msg" {
-        return Some(("schema encoding", channel.schema_encoding.clone(), "ros2msg"));
-    }
-    None
 }

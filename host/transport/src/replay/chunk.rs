@@ -4,8 +4,8 @@ use std::io::{self, Read};
 
 use zstd::stream::raw::{Decoder as ZstdDecoder, Operation};
 
-use super::drive::Limits;
 use super::error::{Damage, ReplayError};
+use super::options::{Limits, Span};
 use super::records::{ChunkHead, HEAD, MessageHead, Record, Records, op};
 use super::source::Source;
 
@@ -32,6 +32,7 @@ pub(super) enum SegmentKind {
 #[derive(Copy, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Entry {
     pub(super) log_time: u64,
+    /// 0 in a segment of a database, in whose order channels have no part.
     pub(super) channel: u16,
     /// Where the message record's body starts in [`OpenSegment::bytes`]; its length stands before.
     at: u32,
@@ -77,10 +78,31 @@ impl OpenSegment {
         Records::new(&self.bytes[..self.len])
     }
 
+    /// Forgets everything, for messages that [`OpenSegment::push`] adds.
+    #[cfg(feature = "bags")]
+    pub(super) fn clear(&mut self) {
+        (self.len, self.next) = (0, 0);
+        self.bytes.clear();
+        self.entries.clear();
+    }
+
+    /// Adds a message behind all others, as a record of MCAP. Of equal times, the one added first comes first.
+    #[cfg(feature = "bags")]
+    pub(super) fn push(&mut self, head: &MessageHead, data: &[u8]) {
+        // Fits: a database gives no message larger than a segment may be, and fills one with little more.
+        let at = (self.bytes.len() + HEAD as usize) as u32;
+        self.bytes.push(op::MESSAGE);
+        self.bytes.extend_from_slice(&((super::records::MESSAGE_HEAD + data.len()) as u64).to_le_bytes());
+        self.bytes.extend_from_slice(&head.to_bytes());
+        self.bytes.extend_from_slice(data);
+        self.len = self.bytes.len();
+        self.entries.push(Entry { log_time: head.log_time, channel: 0, at });
+    }
+
     /// Collects the messages of the channels that `wanted` accepts, and sorts them.
     ///
     /// `wanted` answers `None` for a channel that does not exist.
-    fn sort(&mut self, wanted: impl Fn(u16) -> Option<bool>) -> Result<(), Damage> {
+    fn sort(&mut self, span: Span, wanted: impl Fn(u16) -> Option<bool>) -> Result<(), Damage> {
         let mut entries = std::mem::take(&mut self.entries);
         entries.clear();
         self.next = 0;
@@ -89,7 +111,7 @@ impl OpenSegment {
                 continue;
             };
             let head = message_head(body)?;
-            if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))? {
+            if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))? && span.holds(head.log_time) {
                 // Fits: `Opener::new` clamps the size of a segment.
                 entries.push(Entry { log_time: head.log_time, channel: head.channel, at: at as u32 });
             }
@@ -120,16 +142,17 @@ impl Opener {
         Self { limits, zstd: None, compressed: Vec::new() }
     }
 
-    /// Reads a segment into `into` and sorts the wanted messages in it.
+    /// Reads a segment into `into` and sorts the wanted messages of `span` in it.
     pub(super) fn open(
         &mut self,
         source: &mut Source,
         segment: &Segment,
+        span: Span,
         wanted: impl Fn(u16) -> Option<bool>,
         into: &mut OpenSegment,
     ) -> Result<(), ReplayError> {
         self.read(source, segment.offset, segment.len, segment.kind, into)?;
-        into.sort(wanted).map_err(|what| source.damaged(segment.offset, what))
+        into.sort(span, wanted).map_err(|what| source.damaged(segment.offset, what))
     }
 
     /// Reads a segment's records into `into`, unsorted.

@@ -9,63 +9,19 @@ use std::sync::Arc;
 use super::catalog::Catalog;
 use super::chunk::{OpenSegment, Opener};
 use super::error::{Damage, ReplayError};
-use super::scan::scan;
-use super::source::Source;
+use super::inflate::Inflate;
+use super::options::{Limits, Options, Span};
+use super::step::{Progress, Step};
+use super::storage;
 use super::track::{Routed, Track, nanoseconds};
-use super::writers::Writers;
 use crate::message::Definitions;
-use crate::transport::{
-    DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict,
-};
+use crate::transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError};
 
-/// How much memory a replay may use.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Limits {
-    /// The largest chunk, in bytes before or after decompression, that is opened; a larger one is
-    /// damage. At most 2 GiB.
-    pub chunk_bytes: u64,
-    /// Bytes of open chunks beyond which no further one is opened ahead of its turn. Chunks that
-    /// overlap in time are open together; past this limit their messages may come out of order,
-    /// which [`Replay::out_of_order`] counts.
-    pub open_bytes: u64,
-}
-
-impl Default for Limits {
-    /// 256 MiB for a chunk, 512 MiB for all open ones. Usual chunks have 1 to 4 MiB.
-    fn default() -> Self {
-        Self { chunk_bytes: 256 << 20, open_bytes: 512 << 20 }
-    }
-}
-
-/// One delivery.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Step {
-    /// Log time of the message, in ns.
-    pub at_ns: i64,
-    /// To whom it was delivered.
-    pub subscription: Subscription,
-    /// What the sink made of it.
-    pub verdict: Verdict,
-    /// What the sink was told besides the bytes.
-    pub meta: SampleMeta,
-    /// Length of the CDR payload, without encapsulation.
-    pub bytes: usize,
-}
-
-/// How far a replay has come.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Default)]
-pub struct Progress {
-    /// Deliveries made.
-    pub done: u64,
-    /// Deliveries to expect if the files hold what they claim.
-    pub total: u64,
-}
-
-/// A drive: one or more MCAP files, replayed as one.
+/// A drive: one or more files and rosbag2 directories, replayed as one.
 ///
 /// Messages come in log-time order; equal times come in the order of the files, then of the channel
-/// ids, then as they lie in the file. A message with several subscriptions is delivered to each in a
-/// step of its own.
+/// ids, then as they lie in the file; in a database, as they are numbered. A message with several
+/// subscriptions is delivered to each in a step of its own.
 ///
 /// # Damage
 ///
@@ -87,12 +43,19 @@ pub struct Progress {
 /// damaged. Messages outside chunks have no checksum of their own; if the one of the whole data
 /// section is wrong, that too is reported after them. A writer may leave out any checksum; then
 /// only what contradicts itself is noticed.
+///
+/// A database has no checksums: what its pages contradict is noticed when its turn comes, and every
+/// message before was delivered. So it is with a packed file that cannot be unpacked to its end.
 pub struct Replay {
     tracks: Vec<Track>,
     catalog: Catalog,
     sinks: Vec<Arc<dyn Sink>>,
     opener: Opener,
+    /// What takes apart messages that are packed one by one.
+    inflate: Inflate,
     limits: Limits,
+    /// The times that are replayed.
+    span: Span,
     /// The next message of every open segment, earliest on top.
     heads: BinaryHeap<Reverse<Head>>,
     open: Vec<OpenSegment>,
@@ -126,14 +89,16 @@ struct Head {
 impl Replay {
     /// Opens the files of a drive and finds out what is in them.
     ///
-    /// A file with a summary costs a few reads; one without is read through once.
+    /// A directory is one that rosbag2 wrote: all files that its metadata name, or if it has none, those of its
+    /// name that we read. A file with a summary, and a database, cost a few reads; a file without a summary is read through
+    /// once, and a packed one is unpacked.
     ///
     /// # Errors
     ///
-    /// [`ReplayError`] if there is no file, one cannot be opened, is a directory or no MCAP file, or
+    /// [`ReplayError`] if there is no file, one cannot be opened, is nothing that we read or given twice, or
     /// if they disagree on a topic's type. Damage further inside is reported by [`Replay::step`].
     pub fn open(paths: &[PathBuf]) -> Result<Self, ReplayError> {
-        Self::open_with(paths, Limits::default())
+        Self::open_as(paths, &Options::default())
     }
 
     /// As [`Replay::open`], with other limits.
@@ -142,25 +107,30 @@ impl Replay {
     ///
     /// As [`Replay::open`].
     pub fn open_with(paths: &[PathBuf], limits: Limits) -> Result<Self, ReplayError> {
+        Self::open_as(paths, &Options { limits, ..Options::default() })
+    }
+
+    /// As [`Replay::open`], in every way that it can be done.
+    ///
+    /// # Errors
+    ///
+    /// As [`Replay::open`].
+    pub fn open_as(paths: &[PathBuf], options: &Options) -> Result<Self, ReplayError> {
         if paths.is_empty() {
             return Err(ReplayError::NoFiles);
         }
-        let mut opener = Opener::new(limits);
-        let mut writers = Writers::default();
-        let mut tracks = Vec::new();
-        for path in paths {
-            let mut source = Source::open(path)?;
-            let contents = scan(&mut source, &mut opener)?;
-            tracks.push(Track::new(source, contents, &mut writers));
-        }
+        let mut opener = Opener::new(options.limits);
+        let tracks = storage::open(paths, options, &mut opener)?;
         let files: Vec<_> = tracks.iter().map(Track::path_and_contents).collect();
-        let catalog = Catalog::build(&files)?;
+        let catalog = Catalog::build(&files, options.sources.clone())?;
         Ok(Self {
             tracks,
             catalog,
             sinks: Vec::new(),
             opener,
-            limits,
+            inflate: Inflate::new(options.limits.chunk_bytes),
+            limits: options.limits,
+            span: Span::ALL,
             heads: BinaryHeap::new(),
             open: Vec::new(),
             free: Vec::new(),
@@ -172,8 +142,16 @@ impl Replay {
             fan: 0,
             last_at_ns: i64::MIN,
             out_of_order: 0,
-            progress: Progress::default(),
+            progress: Progress { done: 0, total: Some(0) },
         })
+    }
+
+    /// Replays only messages with a log time from `from_ns` on and before `to_ns`; to be called before the first step.
+    ///
+    /// Damage that shows behind all of them is not reported: it costs none.
+    pub fn restrict(&mut self, from_ns: i64, to_ns: i64) {
+        self.span = Span::between(from_ns, to_ns);
+        self.progress.total = None;
     }
 
     /// Delivers the next message of a subscribed topic to its sink; `None` at the end of the drive.
@@ -194,7 +172,7 @@ impl Replay {
         let routed = segment
             .head()
             .ok_or(Damage::Malformed("a chunk lost its place"))
-            .and_then(|entry| track.route(segment.body(entry), self.fan));
+            .and_then(|entry| track.route(segment.body(entry), self.fan, &mut self.inflate));
         let Routed { subscription, is_last, meta, cdr } = match routed {
             Ok(routed) => routed,
             Err(what) => {
@@ -232,13 +210,13 @@ impl Replay {
 
     /// Log time of the first message of any topic, in ns; `None` if there is none.
     pub fn start_ns(&self) -> Option<i64> {
-        let starts = self.tracks.iter().filter_map(|track| track.span().map(|span| span.0));
+        let starts = self.tracks.iter().filter_map(|track| track.times().map(|times| times.0));
         starts.min().map(nanoseconds)
     }
 
     /// Log time of the last message of any topic, in ns; `None` if there is none.
     pub fn end_ns(&self) -> Option<i64> {
-        let ends = self.tracks.iter().filter_map(|track| track.span().map(|span| span.1));
+        let ends = self.tracks.iter().filter_map(|track| track.times().map(|times| times.1));
         ends.max().map(nanoseconds)
     }
 
@@ -282,7 +260,8 @@ impl Replay {
             self.damage = Some((before, error));
         }
         if top.is_none() {
-            if let Some(error) = self.tracks.iter().find_map(Track::missing) {
+            let missing = if self.span == Span::ALL { self.tracks.iter().find_map(Track::missing) } else { None };
+            if let Some(error) = missing {
                 return Err(self.end(error));
             }
             self.ended = true;
@@ -293,7 +272,9 @@ impl Replay {
     fn start(&mut self) {
         self.started = true;
         for track in &mut self.tracks {
-            if let Some((before, error)) = track.start() {
+            if let Some((before, error)) = track.start(self.span)
+                && !self.span.ends_before(before)
+            {
                 keep_earlier(&mut self.damage, before, error);
             }
         }
@@ -372,9 +353,10 @@ impl Transport for Replay {
         let selected = self.catalog.select(spec)?;
         let subscription = Subscription(self.sinks.len());
         for (track, channel) in selected.channels {
-            self.tracks[*track].subscribe(*channel, subscription);
+            self.tracks[*track].subscribe(*channel, subscription, spec.max_bytes);
         }
-        self.progress.total = self.progress.total.saturating_add(selected.messages);
+        let expected = self.progress.total.zip(selected.messages);
+        self.progress.total = expected.map(|(total, messages)| total.saturating_add(messages));
         self.sinks.push(sink);
         Ok(subscription)
     }

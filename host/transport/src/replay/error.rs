@@ -1,5 +1,7 @@
 //! Why a drive cannot be opened, or ends early.
 
+use std::error::Error;
+use std::fmt;
 use std::io;
 use std::path::PathBuf;
 
@@ -7,7 +9,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// No file was given.
-    #[error("a drive needs at least one .mcap file")]
+    #[error("a drive needs at least one file or rosbag2 directory")]
     NoFiles,
     /// A file cannot be opened.
     #[error("cannot open drive `{path}`")]
@@ -17,17 +19,101 @@ pub enum ReplayError {
         /// What the system said.
         source: io::Error,
     },
-    /// A directory was given.
-    #[error("`{path}` is a directory; rosbag2 directories are not supported yet, give the .mcap files in it")]
+    /// A directory is given to who reads a file.
+    #[error("`{path}` is a directory, not a file")]
     Directory {
         /// The directory.
         path: PathBuf,
     },
-    /// The file does not begin like an MCAP file.
-    #[error("`{path}` is not an MCAP file")]
+    /// A directory is no rosbag2 directory.
+    #[error("`{path}` has no metadata.yaml, and no .mcap or .db3 file")]
+    NoBag {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// The metadata of a rosbag2 directory cannot be used.
+    #[error("cannot use `{path}`")]
+    Metadata {
+        /// `metadata.yaml`.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: Box<dyn Error + Send + Sync>,
+    },
+    /// The metadata of a rosbag2 directory name a file that is not there.
+    #[error("`{metadata}` names `{file}`, which is not there")]
+    NoSuchFile {
+        /// `metadata.yaml`.
+        metadata: PathBuf,
+        /// The file as it is named there.
+        file: String,
+    },
+    /// The metadata of a rosbag2 directory name a file elsewhere, by its path or through a link.
+    #[error("`{metadata}` names `{file}`, which is not in its directory")]
+    Outside {
+        /// `metadata.yaml`.
+        metadata: PathBuf,
+        /// The file as it is named there.
+        file: String,
+    },
+    /// Two of the paths given lead to one file.
+    #[error("drive `{path}` is given twice")]
+    Twice {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file does not begin like anything that we read.
+    #[error("`{path}` is not an MCAP file, nor a rosbag2 database, nor one of them packed with zstd")]
     NotMcap {
         /// The file.
         path: PathBuf,
+    },
+    /// A packed file cannot be unpacked.
+    #[error("cannot unpack drive `{path}` into `{folder}`")]
+    Unpack {
+        /// The file.
+        path: PathBuf,
+        /// Where its content was to go.
+        folder: PathBuf,
+        /// Why it cannot.
+        source: io::Error,
+    },
+    /// A packed file holds more than we are ready to write.
+    #[error("drive `{path}` is more than {allowed} bytes once unpacked")]
+    UnpacksTooLarge {
+        /// The file.
+        path: PathBuf,
+        /// [`super::Limits::unpacked_bytes`].
+        allowed: u64,
+    },
+    /// A database cannot be read at all.
+    #[error("cannot use database `{path}`")]
+    Database {
+        /// The file.
+        path: PathBuf,
+        /// What SQLite said, or what of a rosbag2 database is missing.
+        source: Box<dyn Error + Send + Sync>,
+    },
+    /// The newest messages of a database are not in it yet.
+    #[error("database `{path}` was not closed: its newest messages are in `{beside}`")]
+    NotClosed {
+        /// The file.
+        path: PathBuf,
+        /// Its journal.
+        beside: PathBuf,
+    },
+    /// Without an index, each look for the next message would read the whole database.
+    #[error("database `{path}` has no index of the times of its messages")]
+    NoTimes {
+        /// The file.
+        path: PathBuf,
+    },
+    /// This program was built without what reads rosbag2 directories.
+    #[error("`{path}` is {what}, which this program does not read")]
+    NotBuiltIn {
+        /// The file or directory.
+        path: PathBuf,
+        /// What it is.
+        what: &'static str,
     },
     /// Two files, or two channels of one, disagree on the type of a topic.
     #[error("topic `{topic}` has type `{first_type}` in `{first}` and `{second_type}` in `{second}`")]
@@ -54,16 +140,65 @@ pub enum ReplayError {
         source: io::Error,
     },
     /// The file is damaged. All that [`super::Replay`] promises to deliver first was delivered.
-    #[error("drive `{path}` is damaged at byte {offset}")]
+    #[error("drive `{path}` is damaged at {at}")]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// Where the damaged record starts, or where the file ends too early.
-        offset: u64,
+        /// Where.
+        at: Place,
         /// What is wrong there.
         #[source]
         what: Damage,
     },
+}
+
+impl ReplayError {
+    /// What who gave the drive can do, where there is something.
+    pub fn help(&self) -> Option<String> {
+        Some(match self {
+            Self::NoBag { .. } => "name a .mcap or .db3 file, or a directory that `ros2 bag record` wrote".to_owned(),
+            Self::Metadata { path, .. } | Self::NoSuchFile { metadata: path, .. } => {
+                let folder = path.parent().unwrap_or(path).display();
+                format!("write it anew with `ros2 bag reindex {folder}`, or name the files in the directory themselves")
+            }
+            Self::Outside { .. } => "name that file itself, if you trust who wrote this".to_owned(),
+            Self::Twice { .. } => "its samples would count twice; give each file once".to_owned(),
+            Self::Unpack { path, .. } | Self::UnpacksTooLarge { path, .. } => {
+                format!("unpack it yourself: zstd -d {}", path.display())
+            }
+            Self::NotClosed { path, .. } => {
+                format!("close it: sqlite3 {} 'PRAGMA wal_checkpoint(TRUNCATE)'", path.display())
+            }
+            Self::NoTimes { path } => {
+                format!("make one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'", path.display())
+            }
+            Self::Damaged { path, what: Damage::Database(_) | Damage::DatabaseCutOff { .. }, .. } => {
+                let path = path.display();
+                format!("copy the file again if you can; `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more")
+            }
+            Self::Damaged { .. } => "copy the file again if you can".to_owned(),
+            _ => return None,
+        })
+    }
+}
+
+/// Where a file is damaged.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// Where the damaged record starts, or where the file ends too early.
+    Byte(u64),
+    /// Behind the message of a database that has this number; 0 if not even the first can be read.
+    Message(i64),
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Byte(offset) => write!(f, "byte {offset}"),
+            Self::Message(0) => f.write_str("its first message"),
+            Self::Message(number) => write!(f, "the message after number {number}"),
+        }
+    }
 }
 
 /// What is wrong with a damaged file.
@@ -138,6 +273,39 @@ pub enum Damage {
         /// The number found.
         found: usize,
     },
+    /// A message is larger than we are ready to hold once it is unpacked.
+    #[error("a message of topic `{topic}` is more than {allowed} bytes once unpacked")]
+    MessageTooLarge {
+        /// The topic.
+        topic: String,
+        /// [`super::Limits::chunk_bytes`].
+        allowed: u64,
+    },
+    /// A message that is packed by itself cannot be unpacked.
+    #[error("a message of topic `{topic}` cannot be unpacked")]
+    Unpack {
+        /// The topic.
+        topic: String,
+        /// Why.
+        source: io::Error,
+    },
+    /// A packed file ends, or is damaged, before its content does.
+    #[error("the file cannot be unpacked to its end")]
+    UnpackedInPart(#[source] io::Error),
+    /// A page of a database makes no sense.
+    #[error("the database cannot be read on")]
+    Database(#[source] Box<dyn Error + Send + Sync>),
+    /// A database is shorter than it says.
+    #[error("the database has {found} bytes, it should have {expected}: it was cut off")]
+    DatabaseCutOff {
+        /// The size that its header claims.
+        expected: u64,
+        /// The size of the file.
+        found: u64,
+    },
+    /// A message of a database names a topic that it does not define.
+    #[error("a message belongs to topic number {0}, which is not defined")]
+    UnknownTopic(i64),
     /// A message names a channel that the file does not define.
     #[error("a message belongs to channel {0}, which is not defined")]
     UnknownChannel(u16),

@@ -76,8 +76,8 @@ pub fn read_extras(path: &Path, limit_bytes: u64) -> Result<Extras, ReplayError>
     match walk.all() {
         Ok(()) => walk.extras.is_whole = !walk.is_cut_off,
         Err(error @ ReplayError::Damaged { what: Damage::ExtrasTooLarge { .. }, .. }) => return Err(error),
-        Err(ReplayError::Damaged { offset, what, .. }) if walk.is_cut_off => {
-            warn!(path = %path.display(), offset, %what, "file is cut off, its further metadata and attachments are lost");
+        Err(ReplayError::Damaged { at, what, .. }) if walk.is_cut_off => {
+            warn!(path = %path.display(), %at, %what, "file is cut off, its further metadata and attachments are lost");
         }
         Err(error) => return Err(error),
     }

@@ -60,7 +60,17 @@ impl Channels {
         all.into_iter()
     }
 
-    fn make_room(&mut self, bytes: usize) -> Result<(), Damage> {
+    /// Adds a channel that a database calls a topic.
+    #[cfg(feature = "bags")]
+    pub(super) fn add(&mut self, id: u16, info: ChannelInfo) -> Result<(), Damage> {
+        let texts = [&info.topic, &info.type_name, &info.message_encoding, &info.schema_encoding];
+        let texts = texts.into_iter().chain(&info.offered_qos).map(|text| text.len()).sum::<usize>();
+        self.make_room(texts + info.definitions_text.as_ref().map_or(0, |text| text.len()))?;
+        self.by_id.insert(id, info);
+        Ok(())
+    }
+
+    pub(super) fn make_room(&mut self, bytes: usize) -> Result<(), Damage> {
         self.bytes = self.bytes.saturating_add(bytes);
         if self.bytes > KNOWN_BYTES { Err(TOO_MUCH) } else { Ok(()) }
     }
@@ -101,7 +111,7 @@ impl Channels {
                     message_encoding: channel.encoding.to_owned(),
                     schema_encoding: of(|schema| &schema.encoding).unwrap_or_default(),
                     definitions_text: schema.and_then(|schema| schema.text.clone()),
-                    offered_qos: offered_qos(&channel),
+                    offered_qos: offered_qos(channel.topic, channel.metadata.get("offered_qos_profiles")),
                     writer: channel.metadata.get("gleaner.writer").and_then(Guid::from_hex),
                 };
                 self.by_id.insert(channel.id, info);
@@ -112,11 +122,11 @@ impl Channels {
     }
 }
 
-/// What rosbag2 notes of a channel's writers; it is nothing to fail over if it cannot be kept.
-fn offered_qos(channel: &Channel<'_>) -> Option<String> {
-    let found = channel.metadata.get("offered_qos_profiles").filter(|text| !text.is_empty())?;
+/// What rosbag2 notes of a topic's writers; it is nothing to fail over if it cannot be kept.
+pub(super) fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
+    let found = found.filter(|text| !text.is_empty())?;
     if found.len() > QOS_BYTES {
-        warn!(topic = channel.topic, bytes = found.len(), "offered_qos_profiles is longer than 64 KiB, passed over");
+        warn!(topic, bytes = found.len(), "offered_qos_profiles is longer than 64 KiB, passed over");
         return None;
     }
     Some(found.to_owned())
@@ -130,15 +140,22 @@ pub(super) struct Contents {
     pub(super) segments: Vec<Segment>,
     /// Messages per channel: from the summary, or counted.
     pub(super) messages: HashMap<u16, u64>,
+    /// Whether nobody counted them.
+    pub(super) uncounted: bool,
     /// Whether `messages` is a claim of the summary, to be checked against what is delivered.
     pub(super) claimed: bool,
     /// Where the file is damaged and how; everything in `segments` lies before.
     pub(super) damage: Option<(u64, Damage)>,
+    /// First and last log time, in ns, if they are not those of `segments`.
+    pub(super) times: Option<(u64, u64)>,
 }
 
 impl Contents {
     /// First and last log time, in ns.
     pub(super) fn span(&self) -> Option<(u64, u64)> {
+        if self.times.is_some() {
+            return self.times;
+        }
         // A chunk without messages has no times; writers put 0 in both.
         let segments = self.segments.iter().filter(|s| (s.start_time, s.end_time) != (0, 0));
         segments.map(|segment| (segment.start_time, segment.end_time)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))

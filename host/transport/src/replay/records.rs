@@ -93,6 +93,16 @@ impl MessageHead {
             publish_time: fields.u64()?,
         })
     }
+
+    #[cfg(feature = "bags")]
+    pub(super) fn to_bytes(self) -> [u8; MESSAGE_HEAD] {
+        let mut bytes = [0; MESSAGE_HEAD];
+        bytes[..2].copy_from_slice(&self.channel.to_le_bytes());
+        bytes[2..6].copy_from_slice(&self.sequence.to_le_bytes());
+        bytes[6..14].copy_from_slice(&self.log_time.to_le_bytes());
+        bytes[14..].copy_from_slice(&self.publish_time.to_le_bytes());
+        bytes
+    }
 }
 
 /// The front of a chunk record.

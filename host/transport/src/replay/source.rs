@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use super::error::{Damage, ReplayError};
+use super::error::{Damage, Place, ReplayError};
 
 /// How much [`Source::peek`] reads at once. Record heads of small messages lie close together.
 const WINDOW: usize = 64 * 1024;
@@ -26,8 +26,19 @@ impl Source {
         if metadata.is_dir() {
             return Err(ReplayError::Directory { path: path.to_owned() });
         }
-        let len = metadata.len();
-        Ok(Self { file, path: path.to_owned(), len, window: Vec::new(), window_at: 0 })
+        Ok(Self::over(file, path, metadata.len()))
+    }
+
+    /// What is in `file`, which has `len` bytes, under the name `path`.
+    pub(super) fn over(file: File, path: &Path, len: u64) -> Self {
+        Self { file, path: path.to_owned(), len, window: Vec::new(), window_at: 0 }
+    }
+
+    /// The file, to be read from its start.
+    #[cfg(feature = "bags")]
+    pub(super) fn into_file(mut self) -> io::Result<File> {
+        self.file.rewind()?;
+        Ok(self.file)
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -39,7 +50,7 @@ impl Source {
     }
 
     pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
-        ReplayError::Damaged { path: self.path.clone(), offset, what }
+        ReplayError::Damaged { path: self.path.clone(), at: Place::Byte(offset), what }
     }
 
     /// Fills `into` with the bytes from `offset` on, which the caller knows to lie in the file.

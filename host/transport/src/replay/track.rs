@@ -5,17 +5,53 @@ use std::path::Path;
 use super::chunk::{OpenSegment, Opener, Segment, message_head};
 use super::error::{Damage, ReplayError};
 use super::file::Contents;
+use super::inflate::{Inflate, ZSTD};
+use super::options::Span;
 use super::records::MESSAGE_HEAD;
+#[cfg(feature = "bags")]
+use super::rows::Rows;
 use super::source::Source;
 use super::writers::{Writer, Writers};
 use crate::message::Endian;
 use crate::transport::{SampleMeta, Subscription};
 
+/// Bytes in front of the CDR of a message.
+const ENCAPSULATION: usize = 4;
+
+/// Where the messages of a file are.
+pub(super) enum Store {
+    /// In segments that were found when it was opened.
+    Mcap(Source),
+    /// In a database, which makes segments as they are asked for.
+    #[cfg(feature = "bags")]
+    Rows(Box<Rows>),
+}
+
+impl Store {
+    fn path(&self) -> &Path {
+        match self {
+            Self::Mcap(source) => source.path(),
+            #[cfg(feature = "bags")]
+            Self::Rows(rows) => rows.path(),
+        }
+    }
+
+    fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
+        match self {
+            Self::Mcap(source) => source.damaged(offset, what),
+            #[cfg(feature = "bags")]
+            Self::Rows(rows) => rows.damaged(what),
+        }
+    }
+}
+
 /// A file of a drive.
 pub(super) struct Track {
-    source: Source,
+    store: Store,
     contents: Contents,
-    span: Option<(u64, u64)>,
+    times: Option<(u64, u64)>,
+    /// What is replayed of it.
+    span: Span,
     /// By channel id. Most files have a few channels with small ids, so a table beats a map.
     routes: Vec<Channel>,
     /// The segments still to open, the next one last.
@@ -28,6 +64,8 @@ struct Channel {
     /// `None` if the file does not define the channel.
     writer: Option<Writer>,
     subscriptions: Vec<Subscription>,
+    /// The largest message that one of them takes, in bytes of CDR.
+    most: usize,
     seen: u64,
 }
 
@@ -41,65 +79,85 @@ pub(super) struct Routed<'a> {
 }
 
 impl Track {
-    pub(super) fn new(source: Source, contents: Contents, writers: &mut Writers) -> Self {
+    pub(super) fn new(store: Store, contents: Contents, writers: &mut Writers) -> Self {
         let mut routes = Vec::new();
-        for (id, writer) in writers.of_next_file(source.path(), &contents.channels) {
+        for (id, writer) in writers.of_next_file(store.path(), &contents.channels) {
             // Ids come in order, and are 16 bits wide.
             routes.resize_with(usize::from(id) + 1, Channel::default);
             routes[usize::from(id)].writer = Some(writer);
         }
-        Self { span: contents.span(), source, contents, routes, queue: Vec::new() }
+        Self { times: contents.span(), span: Span::ALL, store, contents, routes, queue: Vec::new() }
     }
 
     pub(super) fn path_and_contents(&self) -> (&Path, &Contents) {
-        (self.source.path(), &self.contents)
+        (self.store.path(), &self.contents)
     }
 
     /// First and last log time of any message.
-    pub(super) fn span(&self) -> Option<(u64, u64)> {
-        self.span
+    pub(super) fn times(&self) -> Option<(u64, u64)> {
+        self.times
     }
 
     pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
-        self.source.damaged(offset, what)
+        self.store.damaged(offset, what)
     }
 
-    pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription) {
+    /// `most` is the largest message that is wanted, in bytes of CDR.
+    pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription, most: usize) {
         if let Some(channel) = self.routes.get_mut(usize::from(channel)) {
             channel.subscriptions.push(subscription);
+            channel.most = channel.most.max(most);
         }
     }
 
-    /// Lines up the segments that hold subscribed messages. Returns the damage that the scan found,
+    /// Lines up the segments that hold subscribed messages of `span`. Returns the damage that the scan found,
     /// if any, and the log time before which everything still counts.
-    pub(super) fn start(&mut self) -> Option<(u64, ReplayError)> {
+    pub(super) fn start(&mut self, span: Span) -> Option<(u64, ReplayError)> {
+        self.span = span;
+        #[cfg(feature = "bags")]
+        if let Store::Rows(rows) = &mut self.store {
+            let routes = &self.routes;
+            // It reports by itself what ends it.
+            rows.start(span, self.contents.damage.take().map(|(_, what)| what), |id| wanted(routes, id) == Some(true));
+            return None;
+        }
         let last = self.contents.segments.iter().map(|segment| segment.end_time).max();
         self.queue = std::mem::take(&mut self.contents.segments);
         let routes = &self.routes;
         self.queue.retain(|segment| {
-            segment.channels.as_ref().is_none_or(|channels| {
+            let is_wanted = segment.channels.as_ref().is_none_or(|channels| {
                 // An undefined channel is damage; the segment has to be opened to report it.
                 channels.iter().any(|id| wanted(routes, *id) != Some(false))
-            })
+            });
+            is_wanted && span.meets(segment.start_time, segment.end_time)
         });
         self.queue.sort_by_key(|segment| std::cmp::Reverse((segment.start_time, segment.offset)));
         let (offset, what) = self.contents.damage.take()?;
         let before = last.map_or(0, |last| last.saturating_add(1));
-        Some((before, self.source.damaged(offset, what)))
+        Some((before, self.store.damaged(offset, what)))
     }
 
     /// The log time at which the next segment has to be open.
     pub(super) fn next_start(&self) -> Option<u64> {
-        self.queue.last().map(|segment| segment.start_time)
+        match &self.store {
+            Store::Mcap(_) => self.queue.last().map(|segment| segment.start_time),
+            #[cfg(feature = "bags")]
+            Store::Rows(rows) => rows.next_start(),
+        }
     }
 
-    /// Opens the next segment and returns where it lies. After an error there are no more.
+    /// Opens the next segment and returns where it lies, or of a database, its number. After an error there are no more.
     pub(super) fn open_next(&mut self, opener: &mut Opener, into: &mut OpenSegment) -> Result<u64, ReplayError> {
+        let source = match &mut self.store {
+            Store::Mcap(source) => source,
+            #[cfg(feature = "bags")]
+            Store::Rows(rows) => return rows.open_next(into),
+        };
         let Some(segment) = self.queue.pop() else {
             return Ok(0);
         };
         let routes = &self.routes;
-        let opened = opener.open(&mut self.source, &segment, |id| wanted(routes, id), into);
+        let opened = opener.open(source, &segment, self.span, |id| wanted(routes, id), into);
         match opened {
             Ok(()) => Ok(segment.offset),
             Err(error) => {
@@ -109,19 +167,37 @@ impl Track {
         }
     }
 
-    /// Takes apart the message record in `body`; `fan` says how many subscriptions already have it.
+    /// Takes apart the message record in `body`; `fan` says how many subscriptions already have it. What is packed goes
+    /// through `inflate`, where it stays until the next that is.
     #[inline]
-    pub(super) fn route<'a>(&mut self, body: &'a [u8], fan: usize) -> Result<Routed<'a>, Damage> {
+    pub(super) fn route<'a>(
+        &mut self,
+        body: &'a [u8],
+        fan: usize,
+        inflate: &'a mut Inflate,
+    ) -> Result<Routed<'a>, Damage> {
         let head = message_head(body)?;
         let channel = self.routes.get_mut(usize::from(head.channel)).ok_or(Damage::UnknownChannel(head.channel))?;
         let &subscription = channel.subscriptions.get(fan).ok_or(Damage::UnknownChannel(head.channel))?;
         let writer = channel.writer.as_ref().ok_or(Damage::UnknownChannel(head.channel))?;
-        let (endian, options, cdr) = match &body[MESSAGE_HEAD..] {
+        let mut message = &body[MESSAGE_HEAD..];
+        if message.starts_with(&ZSTD) {
+            if fan == 0 {
+                let topic = || topic_of(&self.contents, head.channel);
+                let unpacked = inflate.unpack(message, channel.most.saturating_add(ENCAPSULATION + 1));
+                unpacked.map_err(|source| Damage::Unpack { topic: topic(), source })?;
+                if inflate.is_full() {
+                    return Err(Damage::MessageTooLarge { topic: topic(), allowed: inflate.allowed() });
+                }
+            }
+            // What is larger than all who want it take is too big for them without its end.
+            message = inflate.bytes();
+        }
+        let (endian, options, cdr) = match message {
             &[0, 0, a, b, ref cdr @ ..] => (Endian::Big, [a, b], cdr),
             &[0, 1, a, b, ref cdr @ ..] => (Endian::Little, [a, b], cdr),
             other => {
-                let topic = self.contents.channels.get(head.channel);
-                let topic = topic.map(|info| info.topic.clone()).unwrap_or_default();
+                let topic = topic_of(&self.contents, head.channel);
                 return Err(Damage::Encapsulation { topic, found: other[..other.len().min(4)].to_vec() });
             }
         };
@@ -155,11 +231,23 @@ impl Track {
             if channel.subscriptions.is_empty() || channel.seen == expected {
                 return None;
             }
-            let topic = info.topic.clone();
-            let what = Damage::Missing { topic, expected, found: channel.seen };
-            Some(self.source.damaged(self.source.len(), what))
+            let (topic, found) = (info.topic.clone(), channel.seen);
+            match &self.store {
+                Store::Mcap(source) => Some(source.damaged(source.len(), Damage::Missing { topic, expected, found })),
+                // rosbag2 also counts what it could not write in time: its recorder lost that, not this file.
+                #[cfg(feature = "bags")]
+                Store::Rows(rows) => {
+                    let path = rows.path().display();
+                    tracing::warn!(%path, topic, expected, found, "metadata.yaml counts another number of messages");
+                    None
+                }
+            }
         })
     }
+}
+
+fn topic_of(contents: &Contents, channel: u16) -> String {
+    contents.channels.get(channel).map(|info| info.topic.clone()).unwrap_or_default()
 }
 
 /// Log times are unsigned; one beyond the year 2262 reads as the end of time.

@@ -1,6 +1,6 @@
 //! Damaged drives: all that is promised comes first, then one error that says where and what.
 
-use gleaner_transport::replay::{Damage, Limits, Replay, ReplayError};
+use gleaner_transport::replay::{Damage, Limits, Place, Replay, ReplayError};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
@@ -23,7 +23,7 @@ fn chunks(bytes: &[u8]) -> Vec<(ChunkIndex, usize)> {
 
 fn damage(error: Option<ReplayError>) -> (u64, Damage) {
     match error {
-        Some(ReplayError::Damaged { offset, what, .. }) => (offset, what),
+        Some(ReplayError::Damaged { at: Place::Byte(offset), what, .. }) => (offset, what),
         other => panic!("expected damage, got {other:?}"),
     }
 }

@@ -43,8 +43,32 @@ pub struct Header {
     pub remaps: Vec<(String, String)>,
     /// What the times are, for example `log time of the drive`.
     pub clock: String,
+    /// What was replayed of the drive.
+    #[serde(default, skip_serializing_if = "Part::is_all")]
+    pub part: Part,
     /// Wakes that came before the first in here: 0, unless this is the part of a journal that a clip holds.
     pub wakes_before: u64,
+}
+
+/// The samples of a drive between two times, by their log time in ns since 1970.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Part {
+    /// The first time that belongs to it; `None` for the start of the drive.
+    pub from_ns: Option<i64>,
+    /// The first time that does not belong to it any more; `None` for the end of the drive.
+    pub to_ns: Option<i64>,
+}
+
+impl Part {
+    /// Whether it is the whole drive.
+    pub fn is_all(&self) -> bool {
+        *self == Part::default()
+    }
+
+    fn in_words(self) -> String {
+        let time = |ns: Option<i64>, all: &str| ns.map_or_else(|| all.to_owned(), |ns| format!("{ns} ns"));
+        format!("from {} to {}", time(self.from_ns, "its start"), time(self.to_ns, "its end"))
+    }
 }
 
 /// A file, by its content.
@@ -133,6 +157,7 @@ impl Header {
             .or_else(|| Difference::of("what wakes the lambda", self.woken_by(), now.woken_by()))
             .or_else(|| Difference::of("remapped topics", self.remaps_in_words(), now.remaps_in_words()))
             .or_else(|| Difference::of("clock", &self.clock, &now.clock))
+            .or_else(|| Difference::of("part of the drive", self.part.in_words(), now.part.in_words()))
     }
 
     fn woken_by(&self) -> String {

@@ -23,7 +23,7 @@ pub use decode::{Decoder, Malformed};
 pub use encode::Encoder;
 pub use entry::{Entry, Said, Seen, Woken};
 pub use error::{Damage, JournalError};
-pub use header::{Difference, DriveDigest, End, FileDigest, Header, JournalInput};
+pub use header::{Difference, DriveDigest, End, FileDigest, Header, JournalInput, Part};
 pub use read::Reader;
 pub use write::Writer;
 

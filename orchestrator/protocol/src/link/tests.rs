@@ -36,6 +36,7 @@ fn header(lambda: &str) -> Header {
         config: serde_json::Map::new(),
         remaps: Vec::new(),
         clock: "x".to_owned(),
+        part: Default::default(),
         wakes_before: 0,
         limits: Default::default(),
     }

@@ -62,6 +62,7 @@ fn header(inputs: usize) -> Header {
         config: Map::from_iter([("brake_mps2".to_owned(), json!(-3.0)), ("dark".to_owned(), json!("x"))]),
         remaps: vec![("/in0".to_owned(), "/wire0".to_owned())],
         clock: "log time of the drive".to_owned(),
+        part: Default::default(),
         wakes_before: 0,
         limits: Default::default(),
     }

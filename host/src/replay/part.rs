@@ -1,0 +1,56 @@
+//! Which part of a drive is replayed.
+
+use gleaner_protocol::journal::Part;
+use gleaner_protocol::{DriveTime, Exit, Failure};
+use gleaner_transport::replay::Replay;
+
+/// The part that is asked for; it means something once a drive is open.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Wanted {
+    /// The first time that belongs to it; the drive's start if `None`.
+    pub from: Option<DriveTime>,
+    /// The first time that does not; the drive's end if `None`.
+    pub to: Option<DriveTime>,
+}
+
+impl From<Part> for Wanted {
+    fn from(part: Part) -> Self {
+        Self { from: part.from_ns.map(DriveTime::At), to: part.to_ns.map(DriveTime::At) }
+    }
+}
+
+impl Wanted {
+    /// Has `drive` replay this part only.
+    pub(super) fn restrict(self, drive: &mut Replay) -> Result<Part, Failure> {
+        let (start_ns, end_ns) = (drive.start_ns().unwrap_or(0), drive.end_ns().unwrap_or(0));
+        let ns = |time: DriveTime| match time {
+            DriveTime::After(duration) => {
+                start_ns.saturating_add(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX))
+            }
+            DriveTime::At(ns) => ns,
+        };
+        let part = Part { from_ns: self.from.map(ns), to_ns: self.to.map(ns) };
+        let (from_ns, to_ns) = (part.from_ns.unwrap_or(start_ns), part.to_ns.unwrap_or(i64::MAX));
+        if from_ns > end_ns || to_ns <= start_ns || to_ns <= from_ns {
+            return Err(nothing_in(part, start_ns, end_ns));
+        }
+        if part != Part::default() {
+            drive.restrict(part.from_ns.unwrap_or(0), to_ns);
+        }
+        Ok(part)
+    }
+}
+
+fn nothing_in(part: Part, start_ns: i64, end_ns: i64) -> Failure {
+    let seconds = |ns: i64| format!("{:.3} s", ns.saturating_sub(start_ns) as f64 / 1e9);
+    let side = |flag: &str, ns: Option<i64>| ns.map(|ns| format!("{flag} is {} after its start", seconds(ns)));
+    let asked = [side("--from", part.from_ns), side("--to", part.to_ns)];
+    let mut failure = Failure::new(Exit::Usage, "the drive has nothing in the part that is asked for");
+    failure.causes = vec![asked.into_iter().flatten().collect::<Vec<_>>().join(", ")];
+    failure.with_help(format!(
+        "the drive is {} long, from @{}.{:09} on",
+        seconds(end_ns),
+        start_ns.div_euclid(1_000_000_000),
+        start_ns.rem_euclid(1_000_000_000)
+    ))
+}

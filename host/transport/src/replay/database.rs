@@ -1,0 +1,254 @@
+//! The databases of rosbag2: opened to be read, and not believed.
+//!
+//! A database brings its own schema, and a schema can bring views, triggers and columns that compute. None of that runs
+//! here: the three tables that count have to be tables, and their columns, columns. Nothing is written, not even beside it.
+//!
+//! Source: `rosbag2_storage_sqlite3`, schema versions 1 to 4.
+
+use std::collections::HashMap;
+use std::error::Error;
+use std::ffi::OsString;
+use std::io::Read;
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use rusqlite::config::DbConfig;
+use rusqlite::limits::Limit;
+use rusqlite::{Connection, OpenFlags, OptionalExtension};
+
+use super::error::{Damage, ReplayError};
+use super::file::{ChannelInfo, Channels, Contents, offered_qos};
+use super::options::Limits;
+use super::rows::{Rows, time};
+
+type Refused = Box<dyn Error + Send + Sync>;
+
+/// SQLite counts the length of a row in 31 bits.
+const LARGEST_ROW: u64 = 1 << 30;
+/// Statements of ours have at most a list of 65536 topics; those of a schema have no reason to be longer.
+const LONGEST_SQL: i32 = 4 << 20;
+/// The suffixes of what SQLite keeps beside a database that was not closed.
+const JOURNALS: [&str; 2] = ["-wal", "-journal"];
+
+/// Where a database is.
+#[derive(Copy, Clone)]
+pub(super) struct File<'a> {
+    /// What it is called.
+    shown: &'a Path,
+    real: &'a Path,
+    /// Whether there may be a journal beside it.
+    may_be_open: bool,
+}
+
+impl<'a> File<'a> {
+    pub(super) fn beside_its_journal(path: &'a Path) -> Self {
+        Self { shown: path, real: path, may_be_open: true }
+    }
+
+    /// The content of `shown`, which was copied to `real`.
+    pub(super) fn elsewhere(shown: &'a Path, real: &'a Path) -> Self {
+        Self { shown, real, may_be_open: false }
+    }
+}
+
+/// Opens a database of `len` bytes.
+pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Contents), ReplayError> {
+    if file.may_be_open {
+        is_closed(file.real)?;
+    }
+    let path = file.shown.to_owned();
+    let refused = |source| ReplayError::Database { path: path.clone(), source };
+    let expected = claimed_len(file.real).map_err(|source| ReplayError::Open { path: path.clone(), source })?;
+    let is_cut_off = expected > len;
+    let db = connect(file.real, limits, is_cut_off).map_err(|error| refused(error.into()))?;
+    let known = topics(&db).map_err(refused)?;
+    let Some(index) = index_of_times(&db).map_err(|error| refused(error.into()))? else {
+        return Err(ReplayError::NoTimes { path });
+    };
+    let first = edge(&db, &index, "ASC");
+    // The newest is lost with the end of the file.
+    let last = edge(&db, &index, "DESC").ok().flatten();
+    let mut contents = Contents { channels: known.channels, uncounted: true, ..Contents::default() };
+    contents.times = first.as_ref().ok().copied().flatten().map(|first| (first, last.unwrap_or(first).max(first)));
+    if is_cut_off {
+        contents.damage = Some((len, Damage::DatabaseCutOff { expected, found: len }));
+    }
+    Ok((Rows::new(file.shown, db, index, known.ids, first), contents))
+}
+
+/// Refuses a database whose newest messages are still in its journal.
+fn is_closed(path: &Path) -> Result<(), ReplayError> {
+    for suffix in JOURNALS {
+        let beside = PathBuf::from(OsString::from_iter([path.as_os_str(), suffix.as_ref()]));
+        let mut start = [0; 1];
+        let read = std::fs::File::open(&beside).and_then(|mut file| file.read(&mut start));
+        // One that was dealt with is empty, or begins with zeros.
+        if matches!(read, Ok(1..)) && start != [0] {
+            return Err(ReplayError::NotClosed { path: path.to_owned(), beside });
+        }
+    }
+    Ok(())
+}
+
+/// The length that the header claims, in bytes; 0 if it claims none. Source: the database file format, section 1.3.
+fn claimed_len(path: &Path) -> std::io::Result<u64> {
+    let mut header = Vec::new();
+    std::fs::File::open(path)?.take(100).read_to_end(&mut header)?;
+    let u32_at =
+        |at: usize| header.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u32::from_be_bytes(*bytes));
+    let page = match header.get(16..18) {
+        Some([0, 1]) => 65_536,
+        Some(&[high, low]) => u64::from(u16::from_be_bytes([high, low])),
+        _ => 0,
+    };
+    // An old writer does not keep the number of pages.
+    let is_kept = u32_at(24) == u32_at(92);
+    Ok(if is_kept { page * u64::from(u32_at(28)) } else { 0 })
+}
+
+fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Connection> {
+    let mut uri = "file:".to_owned();
+    for byte in path.as_os_str().as_bytes() {
+        match byte {
+            b'/' | b'.' | b'-' | b'_' | b'0'..=b'9' | b'A'..=b'Z' | b'a'..=b'z' => uri.push(char::from(*byte)),
+            _ => uri += &format!("%{byte:02X}"),
+        }
+    }
+    // Nobody else writes to it, so no lock is taken, and nothing is made beside it.
+    uri += "?immutable=1";
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_URI | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let db = Connection::open_with_flags(uri, flags)?;
+    for (limit, value) in [
+        (Limit::SQLITE_LIMIT_LENGTH, limits.chunk_bytes.min(LARGEST_ROW) as i32),
+        (Limit::SQLITE_LIMIT_SQL_LENGTH, LONGEST_SQL),
+        (Limit::SQLITE_LIMIT_ATTACHED, 0),
+        (Limit::SQLITE_LIMIT_WORKER_THREADS, 0),
+        (Limit::SQLITE_LIMIT_TRIGGER_DEPTH, 1),
+    ] {
+        db.set_limit(limit, value)?;
+    }
+    for (config, wanted) in [
+        (DbConfig::SQLITE_DBCONFIG_TRUSTED_SCHEMA, false),
+        (DbConfig::SQLITE_DBCONFIG_ENABLE_TRIGGER, false),
+        (DbConfig::SQLITE_DBCONFIG_ENABLE_VIEW, false),
+        (DbConfig::SQLITE_DBCONFIG_DQS_DML, false),
+        (DbConfig::SQLITE_DBCONFIG_DQS_DDL, false),
+        // Otherwise nothing of a file that is too short is read. Nothing can be written anyway.
+        (DbConfig::SQLITE_DBCONFIG_WRITABLE_SCHEMA, is_cut_off),
+        (DbConfig::SQLITE_DBCONFIG_DEFENSIVE, !is_cut_off),
+    ] {
+        db.set_db_config(config, wanted)?;
+    }
+    db.execute_batch("PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0;")?;
+    Ok(db)
+}
+
+/// The topics of a database.
+struct Topics {
+    channels: Channels,
+    /// Channels by what the database calls a topic.
+    ids: HashMap<i64, u16>,
+}
+
+fn topics(db: &Connection) -> Result<Topics, Refused> {
+    table(db, "messages", &["topic_id", "timestamp", "data"])?;
+    let columns = table(db, "topics", &["id", "name", "type", "serialization_format"])?;
+    let has_qos = columns.iter().any(|column| column == "offered_qos_profiles");
+    let texts = definitions(db)?;
+    let qos = if has_qos { "offered_qos_profiles" } else { "NULL" };
+    let sql = format!("SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id");
+    let mut statement = db.prepare(&sql)?;
+    let mut rows = statement.query([])?;
+    let mut known = Topics { channels: Channels::default(), ids: HashMap::new() };
+    while let Some(row) = rows.next()? {
+        let id = u16::try_from(known.ids.len()).map_err(|_| "it has more than 65536 topics")?;
+        let (topic, type_name): (String, String) = (row.get(1)?, row.get(2)?);
+        let text = texts.get(&type_name);
+        known.ids.insert(row.get(0)?, id);
+        let info = ChannelInfo {
+            offered_qos: offered_qos(&topic, row.get::<_, Option<String>>(4)?.as_deref()),
+            topic,
+            message_encoding: row.get(3)?,
+            schema_encoding: text.map(|(encoding, _)| encoding.clone()).unwrap_or_default(),
+            definitions_text: text.map(|(_, text)| text.clone()),
+            type_name,
+            writer: None,
+        };
+        known.channels.add(id, info)?;
+    }
+    Ok(known)
+}
+
+/// The texts of message definitions by type, with how they are written. Databases from before ROS 2 Iron have none.
+fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, Refused> {
+    let name = "message_definitions";
+    let is_there = "SELECT 1 FROM sqlite_schema WHERE name = ?1 COLLATE NOCASE";
+    if db.query_row(is_there, [name], |_| Ok(())).optional()?.is_none() {
+        return Ok(HashMap::new());
+    }
+    table(db, name, &["topic_type", "encoding", "encoded_message_definition"])?;
+    let mut statement =
+        db.prepare("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions ORDER BY rowid")?;
+    let mut rows = statement.query([])?;
+    let (mut texts, mut room) = (HashMap::new(), Channels::default());
+    while let Some(row) = rows.next()? {
+        let (type_name, encoding, text): (String, String, String) = (row.get(0)?, row.get(1)?, row.get(2)?);
+        room.make_room(type_name.len() + encoding.len() + text.len())?;
+        let text = text.trim();
+        if !text.is_empty() {
+            texts.entry(type_name).or_insert_with(|| (encoding, text.into()));
+        }
+    }
+    Ok(texts)
+}
+
+/// The columns of the table `name`, `wanted` among them.
+fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Refused> {
+    let sql = "SELECT type, sql FROM sqlite_schema WHERE name = ?1 COLLATE NOCASE";
+    let found: Option<(String, String)> = db.query_row(sql, [name], |row| Ok((row.get(0)?, row.get(1)?))).optional()?;
+    let Some((kind, text)) = found else {
+        return Err(format!("it has no table `{name}`, so it is not of rosbag2").into());
+    };
+    let is_virtual = text.get(..14).is_none_or(|start| start.eq_ignore_ascii_case("create virtual"));
+    if kind != "table" || is_virtual {
+        return Err(format!("its `{name}` is no plain table").into());
+    }
+    // Columns that compute are hidden ones.
+    let mut statement = db.prepare("SELECT name FROM pragma_table_xinfo(?1) WHERE hidden = 0")?;
+    let columns: Vec<String> = statement.query_map([name], |row| row.get(0))?.collect::<Result<_, _>>()?;
+    match wanted.iter().find(|wanted| !columns.iter().any(|column| column == *wanted)) {
+        None => Ok(columns),
+        Some(column) => Err(format!("its table `{name}` has no column `{column}`").into()),
+    }
+}
+
+/// An index by which all messages can be read in the order of their times, quoted for SQL.
+fn index_of_times(db: &Connection) -> rusqlite::Result<Option<String>> {
+    let mut statement = db.prepare("SELECT name FROM pragma_index_list('messages') WHERE partial = 0")?;
+    let names: Vec<String> = statement.query_map([], |row| row.get(0))?.collect::<Result<_, _>>()?;
+    let mut columns = db.prepare("SELECT name, desc FROM pragma_index_xinfo(?1) ORDER BY seqno")?;
+    for name in names {
+        let found: Vec<(Option<String>, i64)> =
+            columns.query_map([&name], |row| Ok((row.get(0)?, row.get(1)?)))?.collect::<Result<_, _>>()?;
+        // The second is the number of the row.
+        if let [(Some(column), 0), (None, 0)] = found.as_slice()
+            && column == "timestamp"
+        {
+            return Ok(Some(format!("\"{}\"", name.replace('"', "\"\""))));
+        }
+    }
+    Ok(None)
+}
+
+/// The first or the last time; `None` if there are no messages.
+fn edge(db: &Connection, index: &str, order: &str) -> Result<Option<u64>, Damage> {
+    let sql = format!("SELECT timestamp FROM messages INDEXED BY {index} ORDER BY timestamp {order} LIMIT 1");
+    let unreadable = |error: rusqlite::Error| Damage::Database(error.into());
+    let mut statement = db.prepare(&sql).map_err(unreadable)?;
+    let mut rows = statement.query([]).map_err(unreadable)?;
+    let Some(row) = rows.next().map_err(unreadable)? else {
+        return Ok(None);
+    };
+    time(row.get_ref(0).map_err(unreadable)?).map(|at| Some(at.unsigned_abs()))
+}

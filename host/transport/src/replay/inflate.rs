@@ -1,0 +1,105 @@
+//! Messages that are packed one by one, as rosbag2 does it with `compression_mode: message`.
+
+use std::io;
+
+use zstd::stream::raw::{Decoder, Operation};
+
+/// How a frame of zstd begins. No CDR does: its first byte is 0.
+pub(super) const ZSTD: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
+/// The memory to begin with, where a message is small.
+const SMALL: usize = 4 << 10;
+
+/// Unpacks messages, into memory that is used again.
+pub(super) struct Inflate {
+    allowed: u64,
+    decoder: Option<Decoder<'static>>,
+    bytes: Vec<u8>,
+    len: usize,
+}
+
+impl Inflate {
+    /// No message may have `allowed` bytes or more.
+    pub(super) fn new(allowed: u64) -> Self {
+        Self { allowed, decoder: None, bytes: Vec::new(), len: 0 }
+    }
+
+    pub(super) fn allowed(&self) -> u64 {
+        self.allowed
+    }
+
+    /// Whether what was unpacked last is larger than allowed.
+    pub(super) fn is_full(&self) -> bool {
+        self.len as u64 >= self.allowed
+    }
+
+    /// What was unpacked last.
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+
+    /// Unpacks the first `most` bytes in `packed`, or all if there are fewer.
+    pub(super) fn unpack(&mut self, mut packed: &[u8], most: usize) -> io::Result<()> {
+        let most = most.min(usize::try_from(self.allowed).unwrap_or(usize::MAX));
+        let decoder = match &mut self.decoder {
+            Some(decoder) => {
+                decoder.reinit()?;
+                decoder
+            }
+            none => none.insert(Decoder::new()?),
+        };
+        self.len = 0;
+        let mut is_whole = false;
+        while self.len < most && !(is_whole && packed.is_empty()) {
+            if self.len == self.bytes.len() {
+                // Memory grows as data really comes: what a frame claims is not looked at.
+                let room = (self.len * 2).max(packed.len().saturating_mul(4)).max(SMALL);
+                self.bytes.resize(room.min(most), 0);
+            }
+            let end = self.bytes.len().min(most);
+            let status = decoder.run_on_buffers(packed, &mut self.bytes[self.len..end])?;
+            packed = &packed[status.bytes_read..];
+            self.len += status.bytes_written;
+            is_whole = status.remaining == 0;
+            if status.bytes_read == 0 && status.bytes_written == 0 && !is_whole {
+                return Err(io::ErrorKind::UnexpectedEof.into());
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn messages_come_out_as_they_went_in_one_after_the_other() {
+        let mut inflate = Inflate::new(1 << 30);
+        for len in [0, 1, 5_000, 3, 200_000, 4_096] {
+            let message: Vec<u8> = (0..len).map(|n| (n * 7 % 251) as u8).collect();
+            let packed = zstd::encode_all(message.as_slice(), 1).unwrap();
+            inflate.unpack(&packed, usize::MAX).unwrap();
+            assert_eq!(inflate.bytes(), message);
+        }
+    }
+
+    #[test]
+    fn a_bomb_takes_no_more_memory_than_is_allowed() {
+        let packed = zstd::encode_all(vec![0; 64 << 20].as_slice(), 1).unwrap();
+        let mut inflate = Inflate::new(1 << 30);
+        inflate.unpack(&packed, 100_000).unwrap();
+        assert_eq!(inflate.bytes().len(), 100_000);
+        assert!(inflate.bytes.capacity() <= 200_000, "{}", inflate.bytes.capacity());
+    }
+
+    #[test]
+    fn what_is_cut_off_or_no_frame_is_an_error() {
+        let packed = zstd::encode_all(vec![7; 1000].as_slice(), 1).unwrap();
+        let mut inflate = Inflate::new(1 << 30);
+        for bad in [&packed[..packed.len() - 1], &packed[..6], &ZSTD, &[1, 2, 3, 4, 5, 6, 7, 8]] {
+            assert!(inflate.unpack(bad, 1 << 20).is_err(), "{bad:?}");
+        }
+        inflate.unpack(&packed, 1 << 20).unwrap();
+        assert_eq!(inflate.bytes(), [7; 1000]);
+    }
+}

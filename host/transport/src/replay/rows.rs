@@ -1,0 +1,221 @@
+//! The messages of a database, in the order of their times.
+//!
+//! A piece at a time is read, and put into memory as the messages of a chunk are: so whoever merges files need not know
+//! what they are. The index of times gives one row after the other; that they really come in order is checked, so that no
+//! damaged page leads in circles.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use rusqlite::types::ValueRef;
+use rusqlite::{Connection, Row, Rows as Cursor};
+
+use super::chunk::OpenSegment;
+use super::error::{Damage, Place, ReplayError};
+use super::options::Span;
+use super::records::MessageHead;
+
+/// A piece ends behind the message that makes it so long, in bytes.
+const PIECE: usize = 1 << 20;
+
+/// A database, being read.
+pub(super) struct Rows {
+    path: PathBuf,
+    db: Connection,
+    /// The index that the messages are read by, quoted.
+    index: String,
+    /// Channels by what the database calls a topic.
+    channels: HashMap<i64, u16>,
+    /// The first time, if it makes sense.
+    first: Result<Option<u64>, Damage>,
+    /// What ends it when all else is read.
+    last_words: Option<Damage>,
+    span: Span,
+    /// The topics whose messages are wanted, sorted.
+    wanted: Vec<i64>,
+    /// Time and number of the row that was read last.
+    after: Option<(i64, i64)>,
+    /// The time at which the next piece begins.
+    next: Option<u64>,
+    broken: Option<Damage>,
+    pieces: u64,
+}
+
+/// Where a piece ended.
+enum End {
+    /// There is more, from this time on.
+    Piece(u64),
+    /// There is nothing more that is to be replayed.
+    Span,
+    /// There is nothing more.
+    Table,
+}
+
+impl Rows {
+    pub(super) fn new(
+        path: &Path,
+        db: Connection,
+        index: String,
+        channels: HashMap<i64, u16>,
+        first: Result<Option<u64>, Damage>,
+    ) -> Self {
+        Self {
+            path: path.to_owned(),
+            db,
+            index,
+            channels,
+            first,
+            last_words: None,
+            span: Span::ALL,
+            wanted: Vec::new(),
+            after: None,
+            next: None,
+            broken: None,
+            pieces: 0,
+        }
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub(super) fn damaged(&self, what: Damage) -> ReplayError {
+        let at = Place::Message(self.after.map_or(0, |(_, number)| number));
+        ReplayError::Damaged { path: self.path.clone(), at, what }
+    }
+
+    /// Begins with the first message of `span`. `last_words` is the damage that is known already.
+    pub(super) fn start(&mut self, span: Span, last_words: Option<Damage>, is_wanted: impl Fn(u16) -> bool) {
+        self.wanted = self.channels.iter().filter(|(_, id)| is_wanted(**id)).map(|(topic, _)| *topic).collect();
+        self.wanted.sort_unstable();
+        (self.span, self.last_words) = (span, last_words);
+        match std::mem::replace(&mut self.first, Ok(None)) {
+            Ok(Some(first)) => self.next = Some(first.max(span.from)).filter(|next| !span.ends_before(*next)),
+            // No message at all, and perhaps there should be.
+            Ok(None) => self.next = self.last_words.is_some().then_some(span.from),
+            // The first in order makes no sense; from later on all may.
+            Err(_) if span.from > 0 => self.next = Some(span.from),
+            Err(what) => (self.broken, self.next) = (Some(what), Some(0)),
+        }
+    }
+
+    pub(super) fn next_start(&self) -> Option<u64> {
+        self.next
+    }
+
+    /// Reads the next piece, and gives its number. What ends the database ends it in a piece of its own, so that all messages
+    /// before are delivered.
+    pub(super) fn open_next(&mut self, into: &mut OpenSegment) -> Result<u64, ReplayError> {
+        into.clear();
+        self.pieces += 1;
+        if let Some(what) = self.broken.take() {
+            self.next = None;
+            return Err(self.damaged(what));
+        }
+        let what = match self.read(into) {
+            Ok(End::Piece(next)) => {
+                self.next = Some(next);
+                return Ok(self.pieces);
+            }
+            Ok(End::Span) => None,
+            Ok(End::Table) => self.last_words.take(),
+            // A page that is missing is no riddle where the file is too short.
+            Err(what @ Damage::Database(_)) => self.last_words.take().or(Some(what)),
+            Err(what) => Some(what),
+        };
+        let behind = self.after.map_or(self.span.from, |(at, _)| at.unsigned_abs().saturating_add(1));
+        self.next = what.is_some().then_some(behind.max(self.span.from));
+        self.broken = what;
+        Ok(self.pieces)
+    }
+
+    fn read(&mut self, into: &mut OpenSegment) -> Result<End, Damage> {
+        let Self { db, index, channels, wanted, span, after, .. } = self;
+        let list = wanted.iter().map(i64::to_string).collect::<Vec<_>>().join(",");
+        // What nobody wants is not read, but its place in the order is.
+        let rows = |condition: &str| {
+            let sql = format!(
+                "SELECT rowid, timestamp, topic_id, CASE WHEN topic_id IN ({list}) THEN data END \
+                 FROM messages INDEXED BY {index} WHERE {condition} ORDER BY timestamp, rowid"
+            );
+            db.prepare(&sql).map_err(unreadable)
+        };
+        let mut piece = Piece { channels, wanted, span: *span, after, into };
+        if let Some((at, number)) = *piece.after {
+            // First the rest of those that are of one time.
+            let mut same_time = rows("timestamp = ?1 AND rowid > ?2")?;
+            if let Some(end) = piece.fill(same_time.query((at, number)).map_err(unreadable)?)? {
+                return Ok(end);
+            }
+        }
+        // Not only numbers may stand there: whatever comes later is looked at.
+        let behind = match *piece.after {
+            Some((at, _)) => at,
+            None => i64::try_from(span.from).unwrap_or(i64::MAX) - 1,
+        };
+        let mut later = rows("timestamp > ?1")?;
+        Ok(piece.fill(later.query([behind]).map_err(unreadable)?)?.unwrap_or(End::Table))
+    }
+}
+
+fn unreadable(error: rusqlite::Error) -> Damage {
+    Damage::Database(error.into())
+}
+
+/// A piece being filled.
+struct Piece<'a> {
+    channels: &'a HashMap<i64, u16>,
+    wanted: &'a [i64],
+    span: Span,
+    after: &'a mut Option<(i64, i64)>,
+    into: &'a mut OpenSegment,
+}
+
+impl Piece<'_> {
+    /// Takes `rows` until the piece is full; `None` if it is not.
+    fn fill(&mut self, mut rows: Cursor<'_>) -> Result<Option<End>, Damage> {
+        while let Some(row) = rows.next().map_err(unreadable)? {
+            let (number, at) = (row.get(0).map_err(unreadable)?, time(row.get_ref(1).map_err(unreadable)?)?);
+            // `time` gives nothing below 0.
+            let log_time = at.unsigned_abs();
+            if self.after.is_some_and(|after| after >= (at, number)) {
+                return Err(Damage::Malformed("its index of times is not in order"));
+            }
+            if self.span.ends_before(log_time) {
+                return Ok(Some(End::Span));
+            }
+            if self.into.len() >= PIECE {
+                return Ok(Some(End::Piece(log_time)));
+            }
+            self.take(row, log_time)?;
+            *self.after = Some((at, number));
+        }
+        Ok(None)
+    }
+
+    fn take(&mut self, row: &Row<'_>, log_time: u64) -> Result<(), Damage> {
+        let ValueRef::Integer(topic) = row.get_ref(2).map_err(unreadable)? else {
+            return Err(Damage::Malformed("a message names a topic by something that is no number"));
+        };
+        let channel = *self.channels.get(&topic).ok_or(Damage::UnknownTopic(topic))?;
+        match row.get_ref(3).map_err(unreadable)? {
+            ValueRef::Blob(data) => {
+                // rosbag2 keeps no numbers of its writers here, and one time.
+                let head = MessageHead { channel, sequence: 0, log_time, publish_time: log_time };
+                self.into.push(&head, data);
+                Ok(())
+            }
+            ValueRef::Null if self.wanted.binary_search(&topic).is_err() => Ok(()),
+            _ => Err(Damage::Malformed("a message is something else than bytes")),
+        }
+    }
+}
+
+/// The time of a message, in ns.
+pub(super) fn time(value: ValueRef<'_>) -> Result<i64, Damage> {
+    match value {
+        ValueRef::Integer(at) if at >= 0 => Ok(at),
+        ValueRef::Integer(_) => Err(Damage::Malformed("a message is from before 1970")),
+        _ => Err(Damage::Malformed("a message has a time that is no whole number")),
+    }
+}

@@ -1,0 +1,144 @@
+//! What stands behind a path: which files a drive has, and who reads each of them.
+
+use std::collections::{BTreeMap, HashSet};
+use std::path::{Path, PathBuf};
+
+use super::chunk::Opener;
+use super::error::{Damage, ReplayError};
+use super::file::Contents;
+use super::options::Options;
+use super::records::MAGIC;
+use super::scan::scan;
+use super::source::Source;
+use super::track::{Store, Track};
+use super::writers::Writers;
+
+/// What the metadata of a directory say of its files.
+#[derive(Default)]
+pub(super) struct Bag {
+    /// In the order of the metadata.
+    pub(super) files: Vec<PathBuf>,
+    /// Messages by topic, in all files; empty if nobody counted them.
+    pub(super) messages: BTreeMap<String, u64>,
+}
+
+/// The files that these paths name: each itself, and of a rosbag2 directory those that it consists of.
+///
+/// # Errors
+///
+/// [`ReplayError`] if a directory is none of rosbag2, or its metadata cannot be used.
+pub fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReplayError> {
+    paths.iter().map(|path| Ok(bag_of(path)?.files)).collect::<Result<Vec<_>, _>>().map(|files| files.concat())
+}
+
+/// A file alone, or a directory of them.
+fn bag_of(path: &Path) -> Result<Bag, ReplayError> {
+    if !path.is_dir() {
+        return Ok(Bag { files: vec![path.to_owned()], ..Bag::default() });
+    }
+    #[cfg(feature = "bags")]
+    return super::bag::list(path);
+    #[cfg(not(feature = "bags"))]
+    Err(ReplayError::NotBuiltIn { path: path.to_owned(), what: "a rosbag2 directory" })
+}
+
+/// Opens all files that `paths` name.
+pub(super) fn open(paths: &[PathBuf], options: &Options, opener: &mut Opener) -> Result<Vec<Track>, ReplayError> {
+    let mut writers = Writers::default();
+    let mut tracks = Vec::new();
+    let mut seen = HashSet::new();
+    for path in paths {
+        let bag = bag_of(path)?;
+        let mut files = Vec::new();
+        for file in &bag.files {
+            if std::fs::canonicalize(file).is_ok_and(|real| !seen.insert(real)) {
+                return Err(ReplayError::Twice { path: file.clone() });
+            }
+            files.push(open_file(file, options, opener)?);
+        }
+        count(&mut files, &bag.messages);
+        tracks.extend(files.into_iter().map(|(store, contents)| Track::new(store, contents, &mut writers)));
+    }
+    Ok(tracks)
+}
+
+/// Has the files that nobody counted hold what the metadata say. Who holds how much of a topic is not known if there are
+/// several: then the first that has it counts for all.
+fn count(files: &mut [(Store, Contents)], messages: &BTreeMap<String, u64>) {
+    if messages.is_empty() || files.iter().any(|(_, contents)| !contents.uncounted) {
+        return;
+    }
+    let is_alone = files.len() == 1;
+    let mut left = messages.clone();
+    for (_, contents) in files {
+        let channels = contents.channels.iter();
+        contents.messages = channels.filter_map(|(id, info)| Some((id, left.remove(&info.topic)?))).collect();
+        contents.claimed = is_alone && contents.messages.len() == contents.channels.len();
+        contents.uncounted = false;
+    }
+}
+
+/// What a file is, by its first bytes: names are not to be relied on.
+enum Kind {
+    Mcap,
+    Database,
+    Packed,
+}
+
+fn kind_of(source: &mut Source) -> Result<Kind, ReplayError> {
+    let start = source.peek(0, 16)?;
+    if start.starts_with(MAGIC) {
+        Ok(Kind::Mcap)
+    } else if start == b"SQLite format 3\0" {
+        Ok(Kind::Database)
+    } else if start.starts_with(&super::inflate::ZSTD) {
+        Ok(Kind::Packed)
+    } else {
+        Err(ReplayError::NotMcap { path: source.path().to_owned() })
+    }
+}
+
+fn open_file(path: &Path, options: &Options, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
+    let mut source = Source::open(path)?;
+    match kind_of(&mut source)? {
+        Kind::Mcap => mcap(source, opener),
+        #[cfg(feature = "bags")]
+        Kind::Database => database(super::database::File::beside_its_journal(path), source.len(), options),
+        #[cfg(feature = "bags")]
+        Kind::Packed => packed(source, options, opener),
+        #[cfg(not(feature = "bags"))]
+        kind => {
+            let _ = options;
+            let what = if matches!(kind, Kind::Packed) { "packed with zstd" } else { "a database" };
+            Err(ReplayError::NotBuiltIn { path: path.to_owned(), what })
+        }
+    }
+}
+
+fn mcap(mut source: Source, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
+    let contents = scan(&mut source, opener)?;
+    Ok((Store::Mcap(source), contents))
+}
+
+#[cfg(feature = "bags")]
+fn database(file: super::database::File<'_>, len: u64, options: &Options) -> Result<(Store, Contents), ReplayError> {
+    let (rows, contents) = super::database::open(file, len, options.limits)?;
+    Ok((Store::Rows(Box::new(rows)), contents))
+}
+
+/// Unpacks a file into another, which nobody sees and which is gone once it is closed, and opens that.
+#[cfg(feature = "bags")]
+fn packed(source: Source, options: &Options, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
+    let unpacked = super::unpack::unpack(source, options)?;
+    let super::unpack::Unpacked { path, file, name, len, broken } = unpacked;
+    let mut source = Source::over(file, &path, len);
+    let (store, mut contents) = match kind_of(&mut source)? {
+        Kind::Mcap => mcap(source, opener)?,
+        Kind::Database => database(super::database::File::elsewhere(&path, &name), len, options)?,
+        Kind::Packed => return Err(ReplayError::NotMcap { path }),
+    };
+    if let Some(error) = broken {
+        contents.damage.get_or_insert((len, Damage::UnpackedInPart(error)));
+    }
+    Ok((store, contents))
+}

@@ -1,0 +1,203 @@
+//! Drives as people have them: what a lambda decides over a rosbag2 directory is what it decides over the same drive in MCAP.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::DriveSeen;
+use gleaner_tests::bag::directory;
+use gleaner_tests::{Folder, Run, program, replay, replay_to, root, sample_drive, verify};
+
+const OK: u8 = 0;
+const USAGE: u8 = 2;
+const DIFFERS: u8 = 4;
+const DAMAGED: u8 = 7;
+
+fn lambda(example: &str, kind: &str) -> PathBuf {
+    root().join("examples").join(example).join(kind)
+}
+
+fn braking(lambda: &Path, drive: &Path, args: &[&str]) -> Run {
+    replay(lambda, &[drive.to_owned()], &[&["--set", "brake_mps2=-1.4"], args].concat())
+}
+
+/// Time, topic and triggers of each decision: what a lambda makes of a drive, however it is stored.
+fn decided(run: &Run) -> Vec<String> {
+    run.decisions
+        .iter()
+        .map(|decision| format!("{} {:?} {:?}", decision.at_ns, decision.topic, decision.triggers))
+        .collect()
+}
+
+#[test]
+fn a_database_of_an_old_distribution_leads_to_the_same_decisions_and_clips() {
+    let folder = Folder::new();
+    let bag = directory(&folder, 1);
+    for example in ["hello", "brake-dark"] {
+        for kind in ["rust", "python"] {
+            let lambda = lambda(example, kind);
+            let (ours, theirs) = (braking(&lambda, &sample_drive(), &["--all"]), braking(&lambda, &bag, &["--all"]));
+            ours.must_exit(OK);
+            theirs.must_exit(OK);
+            assert!(ours.decisions.len() > 300);
+            assert_eq!(decided(&ours), decided(&theirs), "{example} in {kind}");
+            let clips = |run: &Run| run.clips.iter().map(|clip| (clip.first_ns, clip.last_ns)).collect::<Vec<_>>();
+            assert_eq!(clips(&ours), clips(&theirs), "{example} in {kind}");
+        }
+    }
+}
+
+#[test]
+fn a_packed_drive_is_unpacked_beside_the_results_for_both_kinds() {
+    let (folder, out) = (Folder::new(), Folder::new());
+    let packed = folder.write("drive.mcap.zstd", zstd::encode_all(&fs::read(sample_drive()).unwrap()[..], 1).unwrap());
+    for kind in ["rust", "python"] {
+        let lambda = lambda("hello", kind);
+        let run = replay_to(
+            out.path(),
+            &lambda,
+            std::slice::from_ref(&packed),
+            &["--set", "brake_mps2=-1.4", "--all", "--repeat", "2"],
+        );
+        assert_eq!(decided(run.must_exit(OK)), decided(&braking(&lambda, &sample_drive(), &["--all"])), "{kind}");
+        let left = fs::read_dir(out.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect::<Vec<_>>();
+        assert!(!left.iter().any(|name| name.to_string_lossy().contains("unpacked")), "{left:?}");
+    }
+}
+
+#[test]
+fn a_part_of_a_drive_is_what_lies_between_two_times() {
+    let lambda = lambda("hello", "rust");
+    let all = braking(&lambda, &sample_drive(), &["--all"]);
+    let start_ns = all.summary.as_ref().unwrap().start_ns;
+    let from = format!("@{}.{:09}", start_ns / 1_000_000_000 + 10, start_ns % 1_000_000_000);
+    for from in ["10", "10s", "10000ms", from.as_str()] {
+        let part = braking(&lambda, &sample_drive(), &["--all", "--from", from, "--to", "12.5"]);
+        let span = start_ns + 10_000_000_000..start_ns + 12_500_000_000;
+        let stamps: Vec<_> = part.must_exit(OK).decisions.iter().map(|decision| decision.at_ns).collect();
+        let expected = all.decisions.iter().map(|decision| decision.at_ns).filter(|at_ns| span.contains(at_ns));
+        assert!(expected.eq(stamps), "--from {from}");
+        let summary = part.summary.as_ref().unwrap();
+        // Seconds in the results stay those of the drive.
+        assert_eq!((summary.start_ns, summary.part.from_ns), (start_ns, Some(span.start)));
+    }
+}
+
+#[test]
+fn a_part_that_is_none_is_refused_with_what_there_is() {
+    let lambda = lambda("hello", "rust");
+    for args in [["--from", "41"], ["--to", "0"], ["--from", "@9000000000"], ["--to", "@5"]] {
+        let run = braking(&lambda, &sample_drive(), &args);
+        run.must_exit(USAGE);
+        for said in ["nothing in the part", args[0], "the drive is 39.993 s long", "from @"] {
+            assert!(run.stderr.contains(said), "{args:?}: {}", run.stderr);
+        }
+    }
+    assert!(braking(&lambda, &sample_drive(), &["--from", "5", "--to", "5"]).must_exit(USAGE).stderr.contains("--to"));
+}
+
+#[test]
+fn clips_hold_the_topics_that_the_command_line_chooses() {
+    let lambda = lambda("brake-dark", "rust");
+    let kept = |args: &[&str]| {
+        let run = braking(&lambda, &sample_drive(), args);
+        let clip = &run.must_exit(OK).clips[0];
+        clip.topics.iter().map(|topic| topic.topic.clone()).collect::<Vec<_>>()
+    };
+    assert_eq!(kept(&["--topics", "*"]), ["/camera/front/compressed", "/imu/data", "/vehicle/speed"]);
+    assert_eq!(kept(&["--topics", "/v*d", "--topics", "/imu/data"]), ["/vehicle/speed", "/imu/data"]);
+    let none = braking(&lambda, &sample_drive(), &["--topics", "/lidar/*"]);
+    let said = &none.must_exit(USAGE).stderr;
+    assert!(said.contains("no topic `/lidar/*`") && said.contains("`/imu/data`"), "{said}");
+    let ticker = root().join("tests/lambdas/ticker/rust");
+    let without = replay(&ticker, &[sample_drive()], &["--topics", "*"]);
+    assert!(without.must_exit(USAGE).stderr.contains("[record]"), "{}", without.stderr);
+}
+
+#[test]
+fn a_journal_of_a_part_of_a_directory_is_verified_as_it_is() {
+    let folder = Folder::new();
+    let (bag, lambda) = (directory(&folder, 1), lambda("hello", "rust"));
+    let journal = folder.path().join("part.journal");
+    let journal_arg = journal.to_str().unwrap();
+    braking(&lambda, &bag, &["--from", "5", "--to", "20", "--journal", journal_arg]).must_exit(OK);
+    let again = |args: &[&str]| {
+        let line =
+            [&["replay", lambda.to_str().unwrap(), bag.to_str().unwrap(), "--verify", journal_arg][..], args].concat();
+        verify(&line.iter().map(AsRef::as_ref).collect::<Vec<_>>())
+    };
+    let verified = again(&[]).verified.expect("it is verified");
+    assert!(verified.wakes > 1000 && verified.wakes < 2000 && !verified.cut_off, "{verified:?}");
+    assert!(again(&["--from", "6"]).stderr.contains("cannot be used with"));
+    // Every file of a directory counts, and so does what no lambda reads.
+    let db = rusqlite::Connection::open(bag.join("drive_0.db3")).unwrap();
+    db.execute("UPDATE schema SET ros_distro = 'jammed'", []).unwrap();
+    drop(db);
+    let changed = again(&[]);
+    assert_eq!(changed.exit, i32::from(DIFFERS), "{}", changed.stderr);
+    assert!(changed.stderr.contains("drive `drive_0.db3`"), "{}", changed.stderr);
+}
+
+#[test]
+fn a_database_that_was_cut_off_keeps_what_was_decided_before() {
+    let folder = Folder::new();
+    let bag = directory(&folder, 1);
+    let path = bag.join("drive_0.db3");
+    let bytes = fs::read(&path).unwrap();
+    // Behind the pages on which all others hang.
+    fs::write(&path, &bytes[..bytes.len() / 10 * 9]).unwrap();
+    let run = braking(&lambda("hello", "rust"), &bag, &["--no-record"]);
+    let summary = run.must_exit(DAMAGED).summary.as_ref().unwrap();
+    assert!(summary.wakes > 1000, "{}", summary.wakes);
+    let damaged = summary.damaged.as_deref().unwrap();
+    for said in [
+        "drive_0.db3` is damaged at the message after number",
+        "it was cut off",
+        "of 4170 messages, up to",
+        "results up to the damage are kept",
+        ".recover",
+    ] {
+        assert!(damaged.contains(said), "{damaged}");
+    }
+}
+
+#[test]
+fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
+    let (folder, lambda) = (Folder::new(), lambda("hello", "rust"));
+    let bag = directory(&folder, 1);
+    folder.write("drive/metadata.yaml", "rosbag2_bagfile_information:\n  storage_identifier: bag_v2\n");
+    let run = braking(&lambda, &bag, &[]);
+    run.must_exit(USAGE);
+    for said in
+        ["error: cannot use `", "metadata.yaml`", "cause: its storage is `bag_v2`", "help:  ", "ros2 bag reindex"]
+    {
+        assert!(run.stderr.contains(said), "{}", run.stderr);
+    }
+    fs::remove_file(bag.join("metadata.yaml")).unwrap();
+    let run = braking(&lambda, &bag, &["--no-record"]);
+    assert!(run.must_exit(OK).stderr.contains("no metadata.yaml"), "{}", run.stderr);
+    let twice = replay(&lambda, &[bag.clone(), bag.join("drive_0.db3")], &[]);
+    assert!(twice.must_exit(USAGE).stderr.contains("is given twice"), "{}", twice.stderr);
+}
+
+#[test]
+fn the_topics_of_a_drive_are_shown_without_a_lambda() {
+    let folder = Folder::new();
+    let bag = directory(&folder, 1);
+    let topics = |args: &[&str]| {
+        let output = Command::new(program("gleaner")).arg("topics").args(args).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stdout).into_owned())
+    };
+    for drive in [bag, sample_drive()] {
+        let (code, json) = topics(&[drive.to_str().unwrap(), "--json"]);
+        assert_eq!(code, Some(0));
+        let seen: DriveSeen = serde_json::from_str(&json).unwrap();
+        let found: Vec<_> =
+            seen.topics.iter().map(|topic| (topic.topic.as_str(), topic.messages, topic.is_defined)).collect();
+        let expected = [("/camera/front/compressed", 400), ("/imu/data", 4170), ("/vehicle/speed", 3316)];
+        assert_eq!(found, expected.map(|(topic, messages)| (topic, Some(messages), true)));
+        let (_, text) = topics(&[drive.to_str().unwrap()]);
+        assert!(text.contains("/imu/data") && text.contains("4,170"), "{text}");
+    }
+    assert_eq!(topics(&["nowhere.mcap"]).0, Some(i32::from(USAGE)));
+}
