@@ -33,8 +33,8 @@ pub fn figures(quick: bool) -> Vec<Figure> {
         let growth = summary.peak_rss_bytes as f64 - short as f64;
         let what = format!("{name}: memory of that beyond a replay of the sample drive");
         figures.push(Figure::at_most(&what, "MiB", 16.0, &[growth / 1024.0 / 1024.0]));
-        let opened: Vec<_> = (0..if quick { 2 } else { 9 }).map(|_| topics_ms(drive)).collect();
-        figures.push(Figure::at_most(&format!("{name}: gleaner topics"), "ms", 1000.0, &opened));
+        let opened: Vec<_> = (0..if quick { 2 } else { 9 }).map(|_| inspect_ms(drive)).collect();
+        figures.push(Figure::at_most(&format!("{name}: gleaner inspect"), "ms", 1000.0, &opened));
     }
     figures
 }
@@ -46,11 +46,11 @@ fn hello(drive: &Path) -> Summary {
     run.summary.expect("a replay ends with a summary")
 }
 
-/// How long `gleaner topics` takes, the start of its two programs included.
-fn topics_ms(drive: &Path) -> f64 {
+/// How long `gleaner inspect` takes, the start of its two programs included.
+fn inspect_ms(drive: &Path) -> f64 {
     let started = Instant::now();
     let output =
-        Command::new(program("gleaner")).args(["topics", "--json"]).arg(drive).output().expect("gleaner starts");
+        Command::new(program("gleaner")).args(["inspect", "--json"]).arg(drive).output().expect("gleaner starts");
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let seen: DriveSeen = serde_json::from_slice(&output.stdout).expect("topics of a drive");
     assert_eq!(seen.topics.len(), 3);

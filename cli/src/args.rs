@@ -20,6 +20,8 @@ pub struct Cli {
 /// What `gleaner` can do.
 #[derive(Subcommand, Debug)]
 pub enum Command {
+    /// Show what is in a recorded drive: topics, rates, gaps, sizes, and [[input]] tables for a manifest
+    Inspect(InspectArgs),
     /// Make the folder of a new lambda, with its SDK, a test, and something to begin with
     New(NewArgs),
     /// Make the build folder DIR/build of a lambda
@@ -41,7 +43,7 @@ pub enum Command {
     ///
     /// Records the clips that the manifest asks for, and writes OUT/decisions.jsonl, OUT/log.jsonl and OUT/summary.json.
     Run(RunArgs),
-    /// Show the live topics that are there, or those of a recorded drive
+    /// Show the live topics that are there
     Topics(TopicsArgs),
     /// Play recorded drives as live topics; see `gleaner play --help`
     #[command(disable_help_flag = true)]
@@ -145,12 +147,23 @@ pub struct RunArgs {
     pub network: NetworkArgs,
 }
 
+/// Arguments of `gleaner inspect`.
+#[derive(Args, Debug)]
+pub struct InspectArgs {
+    /// MCAP files, .db3 files and directories of rosbag2; several are one drive
+    #[arg(value_name = "DRIVE", required = true)]
+    pub drives: Vec<PathBuf>,
+    /// Read all of a drive that is larger than 256 MiB, not only three parts of it
+    #[arg(long)]
+    pub all: bool,
+    /// Print what is found as one JSON object
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// Arguments of `gleaner topics`.
 #[derive(Args, Debug)]
 pub struct TopicsArgs {
-    /// MCAP files, .db3 files and directories of rosbag2, instead of the network
-    #[arg(value_name = "DRIVE", conflicts_with_all = ["wait", "domain", "interface"])]
-    pub drives: Vec<PathBuf>,
     /// How long to listen, in seconds [default: 2]
     #[arg(long, value_name = "SECONDS")]
     pub wait: Option<f64>,

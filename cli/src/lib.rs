@@ -30,6 +30,7 @@ use args::{Cli, Command};
 /// What the user is to see, with the exit code.
 pub fn run(cli: Cli) -> Result<Exit, Failure> {
     match cli.command {
+        Command::Inspect(args) => sibling::inspect(&args),
         Command::New(args) => new::run(&args),
         Command::Build(args) => build::run(&args.lambda),
         Command::Check(args) => check::run(&args),

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use gleaner_protocol::{Exit, Failure, Parts, Report};
 
-use crate::args::{NetworkArgs, TopicsArgs};
+use crate::args::{InspectArgs, NetworkArgs, TopicsArgs};
 use crate::say::say;
 use crate::show;
 
@@ -22,27 +22,34 @@ pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
     Err(Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error))
 }
 
-/// Asks `gleaner-runtime` for the topics, live or of a drive.
+/// Asks `gleaner-runtime` for the live topics.
 pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
-    let mut line: Vec<OsString> = Vec::new();
-    if args.drives.is_empty() {
-        line.push("topics".into());
-        line.extend(network(&args.network));
-        line.extend(args.wait.map(|wait| format!("--wait={wait}").into()));
-    } else {
-        line.extend(["drive".into(), "--".into()]);
-        line.extend(args.drives.iter().map(OsString::from));
-    }
+    let mut line: Vec<OsString> = vec!["topics".into()];
+    line.extend(network(&args.network));
+    line.extend(args.wait.map(|wait| format!("--wait={wait}").into()));
     let text = match report(&line)? {
         Err(exit) => return Ok(exit),
         Ok(Report::Topics { topics }) if args.json => show::json_line(&topics),
         Ok(Report::Topics { topics }) => show::topics(&topics),
-        Ok(Report::Drive(drive)) if args.json => show::json_line(&drive),
-        Ok(Report::Drive(drive)) => show::drive(&drive),
         Ok(_) => return Err(Failure::new(Exit::Internal, "gleaner-runtime reported something else than topics")),
     };
     say(&text)?;
     Ok(Exit::Ok)
+}
+
+/// Asks `gleaner-runtime` what is in a drive.
+pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
+    let mut line: Vec<OsString> = vec!["inspect".into()];
+    line.extend(args.all.then(|| "--all".into()));
+    line.push("--".into());
+    line.extend(args.drives.iter().map(OsString::from));
+    let drive = match report(&line)? {
+        Err(exit) => return Ok(exit),
+        Ok(Report::Drive(drive)) => drive,
+        Ok(_) => return Err(Failure::new(Exit::Internal, "gleaner-runtime reported something else than a drive")),
+    };
+    say(&if args.json { show::json_line(&drive) } else { show::drive(&drive) })?;
+    Ok(if drive.damaged.is_some() { Exit::DriveDamaged } else { Exit::Ok })
 }
 
 /// The one report of a `gleaner-runtime` that is given this command line, or how it ended without.

@@ -16,7 +16,7 @@ use crate::guest::watched::{Patience, Watched};
 use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
 use crate::live;
-use crate::replay::{self, LookArgs, ReplayArgs, VerifyArgs};
+use crate::replay::{self, InspectArgs, ReplayArgs, VerifyArgs};
 use crate::stage::{Asked, Bounds, Load};
 #[cfg(feature = "dds")]
 use crate::topics::TopicsArgs;
@@ -38,7 +38,7 @@ enum Command {
     /// Runs the `init` of a built lambda, and reports what it will need.
     Check(CheckArgs),
     /// Reports what is in recorded drives.
-    Drive(LookArgs),
+    Inspect(InspectArgs),
     /// Runs a built lambda on live topics, until SIGTERM.
     #[cfg(feature = "dds")]
     Run(live::RunArgs),
@@ -120,7 +120,7 @@ impl Command {
             Self::Replay(args) => Ok(Job::Replay(replay::Job::replay(args)?)),
             Self::Verify(args) => Ok(Job::Replay(replay::Job::verify(args)?)),
             Self::Check(args) => Ok(Job::Check(check::Job::new(args)?)),
-            Self::Drive(args) => Err(replay::look(&args, &mut reports()?)?),
+            Self::Inspect(args) => Err(replay::inspect(&args, &mut reports()?)?),
             #[cfg(feature = "dds")]
             Self::Run(args) => Ok(Job::Live(live::Job::new(args)?)),
             #[cfg(feature = "dds")]

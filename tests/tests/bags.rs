@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::DriveSeen;
+use gleaner_protocol::{DriveSeen, Manifest};
 use gleaner_tests::bag::directory;
 use gleaner_tests::{Folder, Run, program, replay, replay_to, root, sample_drive, verify};
 
@@ -181,11 +181,11 @@ fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
 }
 
 #[test]
-fn the_topics_of_a_drive_are_shown_without_a_lambda() {
+fn what_is_in_a_drive_is_shown_without_a_lambda() {
     let folder = Folder::new();
     let bag = directory(&folder, 1);
     let topics = |args: &[&str]| {
-        let output = Command::new(program("gleaner")).arg("topics").args(args).output().unwrap();
+        let output = Command::new(program("gleaner")).arg("inspect").args(args).output().unwrap();
         (output.status.code(), String::from_utf8_lossy(&output.stdout).into_owned())
     };
     for drive in [bag, sample_drive()] {
@@ -198,6 +198,18 @@ fn the_topics_of_a_drive_are_shown_without_a_lambda() {
         assert_eq!(found, expected.map(|(topic, messages)| (topic, Some(messages), true)));
         let (_, text) = topics(&[drive.to_str().unwrap()]);
         assert!(text.contains("/imu/data") && text.contains("4,170"), "{text}");
+        let imu = &seen.topics[1];
+        let interval = imu.interval.unwrap();
+        assert_eq!((imu.read, interval.n, imu.missing, imu.largest_bytes), (4170, 4169, Some(0), 324));
+        assert!((9_500_000..9_700_000).contains(&interval.p50_ns), "{interval:?}");
+        let picture = seen.topics[0].picture.clone().unwrap();
+        assert_eq!((picture.width, picture.height, picture.is_compressed), (640, 360, true));
+        // What is suggested is a manifest's.
+        let lambda = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\n";
+        let (_, tables) = text.split_once("for lambda.toml:\n").unwrap();
+        let manifest = folder.path().join("suggested");
+        folder.write("suggested/lambda.toml", format!("{lambda}schedule.event = 'imu'\n{tables}"));
+        assert_eq!(Manifest::load(&manifest).unwrap().inputs.len(), 3);
     }
     assert_eq!(topics(&["nowhere.mcap"]).0, Some(i32::from(USAGE)));
 }

@@ -3,7 +3,7 @@
 use std::fmt::{self, Write};
 
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{Clip, DriveSeen, Live, LiveTopic, Spread, TopicSeen, TriggerKind, visible};
+use gleaner_protocol::{Clip, Live, LiveTopic, Spread, TopicSeen, TriggerKind, visible};
 
 use super::{Paint, counted, grouped, mib, word};
 use crate::results::{clip_span, three_digits};
@@ -40,27 +40,6 @@ pub(crate) fn topics(topics: &[TopicSeen]) -> String {
     });
     let head = ["topic", "type", "writers", "readers", "quality of service"].map(str::to_owned);
     table(std::iter::once(head).chain(rows).collect(), &[2, 3])
-}
-
-/// What is in a drive: how long it is, and its topics as a table.
-pub(crate) fn drive(drive: &DriveSeen) -> String {
-    let rows = drive.topics.iter().map(|topic| {
-        [
-            visible(&topic.topic),
-            visible(&topic.type_name),
-            topic.messages.map_or_else(|| "?".to_owned(), grouped),
-            if topic.is_defined { String::new() } else { "no definitions: read as bytes only".to_owned() },
-        ]
-    });
-    let head = ["topic", "type", "messages", ""].map(str::to_owned);
-    let length = drive.start_ns.zip(drive.end_ns).map_or_else(
-        || "no messages".to_owned(),
-        |(start, end)| {
-            let (seconds, rest) = (start.div_euclid(1_000_000_000), start.rem_euclid(1_000_000_000));
-            format!("{:.3} s, from @{seconds}.{rest:09} on", end.saturating_sub(start) as f64 / 1e9)
-        },
-    );
-    format!("{length}\n{}", table(std::iter::once(head).chain(rows).collect(), &[2]))
 }
 
 /// A clip that was just completed.
@@ -251,7 +230,7 @@ fn in_ms(spread: &Spread) -> String {
 }
 
 /// Columns as wide as their widest cell; those of `numbers` end on the right.
-fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
+pub(super) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..N).map(width).collect();
     let mut text = String::new();
@@ -275,36 +254,12 @@ fn time_of_day(at_ns: i64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::RecordedTopicSeen;
-
     use super::*;
 
     #[test]
     fn columns_are_as_wide_as_their_widest_cell() {
         let rows = vec![["a", "1"].map(str::to_owned), ["topic", "23"].map(str::to_owned)];
         assert_eq!(table(rows, &[1]), "a       1\ntopic  23\n");
-    }
-
-    #[test]
-    fn a_drive_is_shown_with_what_it_does_not_say() {
-        let topic = |topic: &str, messages, is_defined| RecordedTopicSeen {
-            topic: topic.to_owned(),
-            type_name: "a/msg/B".to_owned(),
-            messages,
-            is_defined,
-        };
-        let topics = vec![topic("/a", Some(12_345), true), topic("/other", None, false)];
-        let seen =
-            DriveSeen { start_ns: Some(1_500_000_000_250_000_000), end_ns: Some(1_500_000_002_000_000_000), topics };
-        let lines = [
-            "1.750 s, from @1500000000.250000000 on",
-            "topic   type     messages",
-            "/a      a/msg/B    12,345",
-            "/other  a/msg/B         ?  no definitions: read as bytes only",
-        ];
-        assert_eq!(drive(&seen), lines.join("\n") + "\n");
-        let empty = DriveSeen { start_ns: None, end_ns: None, topics: Vec::new() };
-        assert_eq!(drive(&empty), "no messages\ntopic  type  messages\n");
     }
 
     #[test]

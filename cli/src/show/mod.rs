@@ -10,12 +10,14 @@ use crate::results::{ResultsError, grouped, seconds, three_digits};
 
 mod checked;
 mod clips;
+mod drive;
 mod isolation;
 mod live;
 
 pub(crate) use checked::checked;
+pub(crate) use drive::drive;
 pub(crate) use isolation::isolation;
-pub(crate) use live::{clip_line, decision, drive, live, recorder, topics};
+pub(crate) use live::{clip_line, decision, live, recorder, topics};
 
 /// A report for programs: JSON, in one line.
 pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {

@@ -6,8 +6,8 @@
 mod chosen;
 mod course;
 mod digests;
+mod inspect;
 mod journal_file;
-mod look;
 mod open;
 mod options;
 mod part;
@@ -15,7 +15,7 @@ mod record;
 mod round;
 mod verify;
 
-pub use look::{LookArgs, look};
+pub use inspect::{InspectArgs, inspect};
 pub use options::{Job, Options, ReplayArgs, VerifyArgs};
 
 use std::io::Write;

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::journal::Part;
 use crate::manifest::Kind;
-use crate::{Checked, Decision, Layer, Live};
+use crate::{Checked, Decision, DriveSeen, Layer, Live};
 
 /// One line of JSON that `gleaner-runtime` writes on its standard output for the program that started it.
 ///
@@ -64,30 +64,6 @@ pub struct TopicSeen {
     pub readers: usize,
     /// What the writers offer, in words, each once.
     pub qos: Vec<String>,
-}
-
-/// What is in a recorded drive, as far as it says without being read through.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DriveSeen {
-    /// Log time of its first message, in ns since the epoch; `None` if there is none.
-    pub start_ns: Option<i64>,
-    /// Log time of its last message, in ns since the epoch.
-    pub end_ns: Option<i64>,
-    /// By name.
-    pub topics: Vec<RecordedTopicSeen>,
-}
-
-/// A topic of a drive.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RecordedTopicSeen {
-    /// Its absolute name.
-    pub topic: String,
-    /// Its type, for example `sensor_msgs/msg/Imu`.
-    pub type_name: String,
-    /// How many messages there are; `None` if nothing says.
-    pub messages: Option<u64>,
-    /// Whether the drive carries the definitions of the type, or they are known here.
-    pub is_defined: bool,
 }
 
 /// How far a journal was proved.

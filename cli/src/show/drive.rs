@@ -1,0 +1,219 @@
+//! What is in a drive, for a person, and as tables for a manifest.
+
+use std::collections::HashSet;
+use std::fmt::Write;
+
+use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen, visible};
+
+use super::live::table;
+use crate::results::{grouped, seconds, size};
+
+/// Parts of a topic's name that say nothing of what is measured.
+const EMPTY_WORDS: [&str; 7] = ["data", "raw", "image", "image_raw", "image_color", "compressed", "msg"];
+
+/// How long the drive is, its topics as a table, and `[[input]]` tables.
+pub(crate) fn drive(drive: &DriveSeen) -> String {
+    let (Some(start), Some(end)) = (drive.start_ns, drive.end_ns) else { return "no messages\n".to_owned() };
+    let (whole, rest) = (start.div_euclid(1_000_000_000), start.rem_euclid(1_000_000_000));
+    let mut text = format!("{:.3} s, from @{whole}.{rest:09} on\n", seconds(end, start));
+    if !drive.parts.is_empty() {
+        let parts = drive
+            .parts
+            .iter()
+            .map(|[from, to]| format!("{:.1} to {:.1} s", seconds(*from, start), seconds(*to, start)));
+        let parts = parts.collect::<Vec<_>>().join(", ");
+        // Writing to a string cannot fail, here and below.
+        let _ = writeln!(text, "rates, gaps and sizes are those of {parts}; --all reads everything");
+    }
+    if let Some(damaged) = &drive.damaged {
+        let _ = writeln!(text, "damaged: {}", visible(damaged));
+    }
+    if drive.out_of_order > 0 {
+        let _ = writeln!(text, "{} out of order by log time", super::counted(drive.out_of_order, "message"));
+    }
+    let head = ["topic", "type", "messages", "Hz", "longest gap", "at", "missing", "largest", ""].map(str::to_owned);
+    let rows = drive.topics.iter().map(|topic| row(topic, start));
+    text += &table(std::iter::once(head).chain(rows).collect(), &[2, 3, 4, 5, 6, 7]);
+    text + &inputs(&drive.topics)
+}
+
+fn row(topic: &RecordedTopicSeen, start_ns: i64) -> [String; 9] {
+    let unknown = || "?".to_owned();
+    let notes = [
+        topic.picture.as_ref().map(in_words),
+        (!topic.is_defined).then(|| "no definitions: read as bytes only".to_owned()),
+        topic.unreadable.as_deref().map(visible),
+    ];
+    [
+        visible(&topic.topic),
+        visible(&topic.type_name),
+        topic.messages.map_or_else(unknown, grouped),
+        rate_hz(topic).map_or_else(unknown, |hz| format!("{hz:.1}")),
+        topic.interval.map_or_else(unknown, |interval| format!("{:.1} ms", interval.max_ns as f64 / 1e6)),
+        topic.longest_after_ns.map_or_else(unknown, |at| format!("{:.3} s", seconds(at, start_ns))),
+        topic.missing.map_or_else(unknown, grouped),
+        if topic.read > 0 { size(topic.largest_bytes) } else { unknown() },
+        notes.into_iter().flatten().collect::<Vec<_>>().join("; "),
+    ]
+}
+
+fn in_words(picture: &Picture) -> String {
+    format!("{} {}x{}", visible(&picture.encoding), picture.width, picture.height)
+}
+
+/// By the median of the intervals: a gap is no other rate.
+fn rate_hz(topic: &RecordedTopicSeen) -> Option<f64> {
+    topic.interval.filter(|interval| interval.p50_ns > 0).map(|interval| 1e9 / interval.p50_ns as f64)
+}
+
+/// A table for each topic whose fields can be read.
+fn inputs(topics: &[RecordedTopicSeen]) -> String {
+    let (mut text, mut names) = (String::new(), HashSet::new());
+    for topic in topics.iter().filter(|topic| topic.is_defined && topic.unreadable.is_none() && topic.read > 0) {
+        let base = name_of(&topic.topic);
+        let others = (2..).map(|n| format!("{base}_{n}"));
+        let name = std::iter::once(base.clone()).chain(others).find(|name| !names.contains(name)).unwrap_or_default();
+        let _ = write!(
+            text,
+            "\n[[input]]\nname = \"{name}\"\ntopic = \"{}\"\ntype = \"{}\"\n",
+            visible(&topic.topic),
+            visible(&topic.type_name)
+        );
+        names.insert(name);
+        text += &sizes(topic);
+    }
+    if text.is_empty() { text } else { format!("\nfor lambda.toml:\n{text}") }
+}
+
+/// What differs from the defaults, with room for what was not seen.
+fn sizes(topic: &RecordedTopicSeen) -> String {
+    let kib = |bytes: u64| format!("{} KiB", bytes.div_ceil(1024));
+    if let Some(Picture { width, height, is_compressed, .. }) = &topic.picture {
+        let decoded = 3 * u64::from(*width) * u64::from(*height);
+        return match is_compressed {
+            true => format!(
+                "max_size = \"{}\"\ndecoded_size = \"{}\"\n",
+                kib(topic.largest_bytes.saturating_mul(2).next_power_of_two()),
+                kib(decoded)
+            ),
+            false => format!("max_size = \"{}\"\n", kib(topic.largest_bytes.saturating_add(1024))),
+        };
+    }
+    let mut text = String::new();
+    if let Some(hz) = rate_hz(topic) {
+        let depth = (hz.ceil() as usize).next_power_of_two().clamp(8, 4096);
+        let _ = writeln!(text, "depth = {depth:<20}# {:.1} s", depth as f64 / hz);
+    }
+    if topic.largest_bytes > 4096 {
+        let _ = writeln!(text, "max_size = \"{}\"", kib(topic.largest_bytes.saturating_mul(2).next_power_of_two()));
+    }
+    text
+}
+
+/// A name for an input, from the words of its topic.
+fn name_of(topic: &str) -> String {
+    let words = topic.split('/').filter(|word| !word.is_empty() && !EMPTY_WORDS.contains(word));
+    let words = words.map(str::to_ascii_lowercase).collect::<Vec<_>>();
+    let name = words[words.len().saturating_sub(2)..].join("_");
+    let name: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '_').take(48).collect();
+    if name.starts_with(|first: char| first.is_ascii_lowercase()) { name } else { format!("input{name}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_protocol::Spread;
+
+    use super::*;
+
+    fn topic(topic: &str) -> RecordedTopicSeen {
+        let ms = |ms: u64| ms * 1_000_000;
+        RecordedTopicSeen {
+            topic: topic.to_owned(),
+            type_name: "sensor_msgs/msg/Imu".to_owned(),
+            messages: Some(12_345),
+            is_defined: true,
+            unreadable: None,
+            read: 12_345,
+            interval: Some(Spread { n: 12_344, p50_ns: ms(10), p99_ns: ms(11), max_ns: ms(52) }),
+            longest_after_ns: Some(1_500_000_001_250_000_000),
+            missing: Some(0),
+            largest_bytes: 324,
+            bytes: 324 * 12_345,
+            picture: None,
+        }
+    }
+
+    fn seen(topics: Vec<RecordedTopicSeen>) -> DriveSeen {
+        let [start_ns, end_ns] = [1_500_000_000_250_000_000, 1_500_000_002_000_000_000].map(Some);
+        DriveSeen { start_ns, end_ns, parts: Vec::new(), out_of_order: 0, damaged: None, topics }
+    }
+
+    #[test]
+    fn a_drive_is_shown_with_a_table_of_inputs() {
+        let unknown = RecordedTopicSeen {
+            messages: None,
+            is_defined: false,
+            read: 0,
+            interval: None,
+            longest_after_ns: None,
+            missing: None,
+            ..topic("/other")
+        };
+        let expected = "1.750 s, from @1500000000.250000000 on
+topic      type                 messages     Hz  longest gap       at  missing  largest
+/imu/data  sensor_msgs/msg/Imu    12,345  100.0      52.0 ms  1.000 s        0    324 B
+/other     sensor_msgs/msg/Imu         ?      ?            ?        ?        ?        ?  no definitions: read as bytes only
+
+for lambda.toml:
+
+[[input]]
+name = \"imu\"
+topic = \"/imu/data\"
+type = \"sensor_msgs/msg/Imu\"
+depth = 128                 # 1.3 s
+";
+        assert_eq!(drive(&seen(vec![topic("/imu/data"), unknown])), expected);
+        assert_eq!(drive(&DriveSeen { start_ns: None, ..seen(Vec::new()) }), "no messages\n");
+    }
+
+    #[test]
+    fn pictures_get_the_room_that_they_need() {
+        let shape = |is_compressed| Picture { encoding: "x".to_owned(), width: 1280, height: 720, is_compressed };
+        let camera = |is_compressed, largest_bytes| RecordedTopicSeen {
+            picture: Some(shape(is_compressed)),
+            largest_bytes,
+            ..topic("/camera/front/compressed")
+        };
+        assert_eq!(sizes(&camera(true, 41_000)), "max_size = \"128 KiB\"\ndecoded_size = \"2700 KiB\"\n");
+        assert_eq!(sizes(&camera(false, 2_764_900)), "max_size = \"2702 KiB\"\n");
+    }
+
+    #[test]
+    fn names_are_those_that_a_manifest_takes_and_each_is_given_once() {
+        for (topic, name) in [
+            ("/imu/data", "imu"),
+            ("/camera/front/compressed", "camera_front"),
+            ("/a/b/c/Raw_Points", "c_raw_points"),
+            ("/data", "input"),
+            ("/_hidden", "input_hidden"),
+        ] {
+            assert_eq!(name_of(topic), name);
+            assert!(name.parse::<gleaner_protocol::manifest::ItemName>().is_ok());
+        }
+        let text = inputs(&[topic("/imu/data"), topic("/imu/raw"), topic("/imu")]);
+        assert!(["\"imu\"", "\"imu_2\"", "\"imu_3\""].iter().all(|name| text.contains(name)), "{text}");
+    }
+
+    #[test]
+    fn what_was_not_read_and_what_is_damaged_is_said() {
+        let drive_of_parts = DriveSeen {
+            parts: vec![[1_500_000_000_250_000_000, 1_500_000_000_750_000_000]],
+            damaged: Some("cut\u{1b} off".to_owned()),
+            out_of_order: 2,
+            ..seen(Vec::new())
+        };
+        let text = drive(&drive_of_parts);
+        assert!(text.contains("those of 0.0 to 0.5 s; --all reads everything\n"), "{text}");
+        assert!(text.contains("damaged: cut\\u{1b} off\n2 messages out of order"), "{text}");
+    }
+}

@@ -1,0 +1,240 @@
+//! `gleaner-runtime inspect`: what is in a recorded drive, without a lambda.
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use clap::Args;
+use gleaner_protocol::{DriveSeen, Exit, Failure, Picture, RecordedTopicSeen, Report};
+use gleaner_transport::message::{CompressedView, ImageView, Sources};
+use gleaner_transport::replay::{Options, Replay, Step, files_of};
+use gleaner_transport::{DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_vitals::Spreads;
+
+use super::open::DriveError;
+use crate::isolation::definitions;
+
+/// A larger drive is looked at in parts: so many bytes are read in about a second.
+const WHOLE_BYTES: u64 = 256 << 20;
+/// Its parts: from its begin, its middle and its end.
+const PARTS: i64 = 3;
+const PART_NS: i64 = 2_000_000_000;
+/// A part ends early after so many bytes of messages.
+const PART_BYTES: u64 = 64 << 20;
+/// The largest message that is unpacked to be looked at.
+const LARGEST: usize = 256 << 20;
+
+/// Arguments of `inspect`.
+#[derive(Args, Clone, Debug)]
+pub struct InspectArgs {
+    /// MCAP files, databases and directories of rosbag2.
+    #[arg(required = true)]
+    pub drives: Vec<PathBuf>,
+    /// Read all of it, however large it is.
+    #[arg(long)]
+    pub all: bool,
+}
+
+/// Looks into the drives, and reports what is in them.
+///
+/// # Errors
+///
+/// A failure that names the drive that cannot be opened.
+pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Failure> {
+    let options = Options { sources: Some(Sources::new(&[], &definitions())), ..Options::default() };
+    let open = || Replay::open_as(&args.drives, &options).map_err(DriveError);
+    let mut drive = open()?;
+    let (start_ns, end_ns) = (drive.start_ns(), drive.end_ns());
+    let mut topics: Vec<Look> = drive.topics().into_iter().map(Look::new).collect();
+    let mut parts = if args.all || bytes(&args.drives)? <= WHOLE_BYTES { Vec::new() } else { spread(start_ns, end_ns) };
+    let (mut damaged, mut out_of_order) = (None, 0);
+    if parts.is_empty() {
+        damaged = read(&mut drive, &mut topics, None).1;
+        out_of_order = drive.out_of_order();
+    }
+    for (n, part) in parts.iter_mut().enumerate() {
+        if n > 0 {
+            drive = open()?;
+        }
+        drive.restrict(part[0], part[1]);
+        let (until_ns, broken) = read(&mut drive, &mut topics, Some(PART_BYTES));
+        part[1] = until_ns.unwrap_or(part[1]);
+        out_of_order += drive.out_of_order();
+        damaged = damaged.or(broken);
+    }
+    let mut topics: Vec<_> = topics.into_iter().map(Look::seen).collect();
+    // One who numbers the messages of all topics together leaves as many out in each as there are in the others.
+    let (read, missing) = topics
+        .iter()
+        .fold((0, 0), |(read, missing), topic| (read + topic.read, topic.missing.unwrap_or(0).saturating_add(missing)));
+    if missing > read / 2 {
+        topics.iter_mut().for_each(|topic| topic.missing = None);
+    }
+    let seen = DriveSeen { start_ns, end_ns, parts, out_of_order, damaged, topics };
+    super::report(reports, &Report::Drive(seen));
+    Ok(Exit::Ok)
+}
+
+fn bytes(drives: &[PathBuf]) -> Result<u64, DriveError> {
+    let files = files_of(drives).map_err(DriveError)?;
+    Ok(files.iter().filter_map(|file| file.metadata().ok()).map(|data| data.len()).sum())
+}
+
+/// The parts of a large drive; none if it is shorter than they are.
+fn spread(start_ns: Option<i64>, end_ns: Option<i64>) -> Vec<[i64; 2]> {
+    let (Some(start), Some(end)) = (start_ns, end_ns) else { return Vec::new() };
+    let length = end.saturating_sub(start);
+    if length <= PARTS * PART_NS {
+        return Vec::new();
+    }
+    // The end does not belong to a part, and the last message is to.
+    let from = |n: i64| start + (length + 1 - PART_NS) / (PARTS - 1) * n;
+    (0..PARTS).map(|n| [from(n), from(n) + PART_NS]).collect()
+}
+
+/// Reads what it is restricted to, at most so many bytes of messages. Until when it read, if it ended before; and why, if it is damaged.
+fn read(drive: &mut Replay, topics: &mut [Look], most: Option<u64>) -> (Option<i64>, Option<String>) {
+    let mut subscribed = Vec::new();
+    for (index, topic) in topics.iter_mut().enumerate() {
+        topic.begin();
+        match drive.subscribe(&topic.spec(), topic.first.clone()) {
+            Ok(subscription) => subscribed.push((subscription, index)),
+            Err(error) => topic.seen.unreadable = Some(error.to_string()),
+        }
+    }
+    let mut bytes = 0;
+    loop {
+        match drive.step() {
+            Ok(Some(step)) => {
+                let found = subscribed.iter().find(|(subscription, _)| *subscription == step.subscription);
+                if let Some((_, index)) = found {
+                    topics[*index].add(&step);
+                }
+                bytes += step.bytes as u64;
+                if most.is_some_and(|most| bytes >= most) {
+                    return (Some(step.at_ns + 1), None);
+                }
+            }
+            Ok(None) => return (None, None),
+            Err(error) => return (None, Some(error.to_string())),
+        }
+    }
+}
+
+/// What was seen of a topic so far.
+struct Look {
+    seen: RecordedTopicSeen,
+    first: Arc<First>,
+    intervals: Spreads,
+    longest_ns: i64,
+    /// Of this part.
+    last_ns: Option<i64>,
+    gaps: Gaps,
+}
+
+impl Look {
+    fn new(found: DiscoveredTopic) -> Self {
+        let first = First { type_name: found.type_name.clone(), picture: Mutex::new(None) };
+        let seen = RecordedTopicSeen {
+            topic: found.topic,
+            type_name: found.type_name,
+            messages: found.messages,
+            is_defined: found.definitions_text.is_some(),
+            unreadable: None,
+            read: 0,
+            interval: None,
+            longest_after_ns: None,
+            missing: Some(0),
+            largest_bytes: 0,
+            bytes: 0,
+            picture: None,
+        };
+        let (first, intervals, gaps) = (Arc::new(first), Spreads::new(), Gaps::default());
+        Self { seen, first, intervals, longest_ns: -1, last_ns: None, gaps }
+    }
+
+    fn spec(&self) -> TopicSpec {
+        let RecordedTopicSeen { topic, type_name, .. } = &self.seen;
+        let (topic, type_name) = (topic.clone(), type_name.clone());
+        TopicSpec { topic, type_name, queue: 1, max_bytes: LARGEST, qos: Qos::Auto }
+    }
+
+    /// Another part: what lies between two is no gap.
+    fn begin(&mut self) {
+        self.last_ns = None;
+        self.seen.missing = self.seen.missing.map(|missing| missing + std::mem::take(&mut self.gaps).lost());
+    }
+
+    fn add(&mut self, step: &Step) {
+        self.seen.read += 1;
+        self.seen.bytes += step.bytes as u64;
+        self.seen.largest_bytes = self.seen.largest_bytes.max(step.bytes as u64);
+        self.gaps.note(step.meta.writer, step.meta.seq);
+        if let Some(last) = self.last_ns {
+            let interval = step.at_ns - last;
+            self.intervals.add(interval);
+            if interval > self.longest_ns {
+                self.longest_ns = interval;
+                self.seen.longest_after_ns = Some(last);
+            }
+        }
+        self.last_ns = Some(step.at_ns);
+    }
+
+    fn seen(mut self) -> RecordedTopicSeen {
+        self.begin();
+        let picture = self.first.picture.lock().unwrap_or_else(PoisonError::into_inner).take();
+        RecordedTopicSeen { interval: self.intervals.all(), picture: picture.flatten(), ..self.seen }
+    }
+}
+
+/// Looks at the first message of a topic.
+struct First {
+    type_name: String,
+    /// `None` until there was one.
+    picture: Mutex<Option<Option<Picture>>>,
+}
+
+impl Sink for First {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        let mut picture = self.picture.lock().unwrap_or_else(PoisonError::into_inner);
+        picture.get_or_insert_with(|| self.picture(meta, cdr));
+        Verdict::Taken
+    }
+}
+
+impl First {
+    fn picture(&self, meta: &SampleMeta, cdr: &[u8]) -> Option<Picture> {
+        match self.type_name.as_str() {
+            "sensor_msgs/msg/Image" => {
+                let ImageView { width, height, encoding, .. } = ImageView::read(cdr, meta.endian).ok()?;
+                Some(Picture { encoding: encoding.to_owned(), width, height, is_compressed: false })
+            }
+            "sensor_msgs/msg/CompressedImage" => {
+                let view = CompressedView::read(cdr, meta.endian).ok()?;
+                let header = gleaner_image::probe(view.data).ok()?;
+                let encoding = header.format.to_string();
+                Some(Picture { encoding, width: header.width, height: header.height, is_compressed: true })
+            }
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_parts_of_a_long_drive_hold_its_first_and_its_last_message() {
+        let second = 1_000_000_000;
+        let parts = spread(Some(7), Some(7 + 100 * second));
+        assert_eq!(parts.len(), 3);
+        assert!(parts[0][0] == 7 && parts[2][1] > 7 + 100 * second, "{parts:?}");
+        assert!(
+            parts.array_windows().all(|[a, b]| a[1] < b[0]) && parts.iter().all(|part| part[1] - part[0] == PART_NS)
+        );
+        assert_eq!(spread(Some(0), Some(5 * second)), Vec::<[i64; 2]>::new());
+        assert_eq!(spread(None, None), Vec::<[i64; 2]>::new());
+    }
+}
