@@ -5,12 +5,13 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Folders and files of the repository, and which of their files: all with one of these extensions.
+/// Files of the repository, and folders of which all files with one of the extensions are packed.
 const PACKED: &[&str] = &[
     // With it, a new lambda is built of the very versions that Gleaner was tested with; cargo takes out what it does not need.
     "Cargo.lock",
     "LICENSE",
-    "examples/hello/python",
+    "examples/hello/python/lambda.toml",
+    "examples/hello/python/main.py",
     "examples/hello/rust/lambda.toml",
     "examples/hello/rust/src",
     "guest-sdk-python/gleaner",
@@ -18,7 +19,7 @@ const PACKED: &[&str] = &[
     "guest-sdk-rust/src",
     "wit",
 ];
-const EXTENSIONS: &[&str] = &["lock", "py", "pyi", "rs", "toml", "typed", "wit"];
+const EXTENSIONS: &[&str] = &["py", "pyi", "rs", "typed", "wit"];
 
 fn main() {
     let root = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it")).join("..");
@@ -38,10 +39,12 @@ fn add(root: &Path, path: &Path, list: &mut String) {
         let entries = fs::read_dir(&full).expect("a folder of the repository");
         let mut inside: Vec<_> = entries.map(|entry| entry.expect("the same").file_name()).collect();
         inside.sort();
-        // `build` is what `gleaner build` made.
-        let inside = inside.iter().filter(|name| *name != "build" && *name != "__pycache__");
+        // Hidden is what tools leave.
+        let inside = inside.iter().filter(|name| *name != "__pycache__" && !name.as_encoded_bytes().starts_with(b"."));
         inside.for_each(|name| add(root, &path.join(name), list));
-    } else if path.extension().is_none_or(|found| EXTENSIONS.iter().any(|extension| found == *extension)) {
+    } else if PACKED.iter().any(|packed| Path::new(packed) == path)
+        || path.extension().is_some_and(|found| EXTENSIONS.iter().any(|extension| found == *extension))
+    {
         let full = full.canonicalize().expect("a file of the repository");
         let _ = writeln!(list, "    ({:?}, include_bytes!({:?})),", path, full);
     }

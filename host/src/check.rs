@@ -7,15 +7,21 @@ use std::io::Write;
 use std::time::Instant;
 
 use clap::Args;
+use gleaner_buffers::Pool;
 use gleaner_jail::Paths;
 use gleaner_protocol::manifest::{Manifest, Store};
-use gleaner_protocol::{BuildDir, Checked, Exit, Failure, Need, Place, Report};
+use gleaner_protocol::{BuildDir, Checked, Exit, Failure, Need, Place, Report, visible};
+use gleaner_transport::SampleMeta;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::message::Sources;
 
-use crate::input::{Live, Remap, live_slots};
+use crate::api::frame::Info;
+use crate::input::{Live, Remap, live_slots, unfinished_bytes};
 use crate::isolation::definitions;
 use crate::stage::{Asked, AskedArgs, Bounds, Load, Stage, not_started};
+
+/// What the recorder may take beside the preroll: two staging areas, and what is on its way to the disk.
+const RECORDER: u64 = (2 * 256 + 16) << 20;
 
 /// Arguments of `check`.
 #[derive(Args, Clone, Debug)]
@@ -65,9 +71,16 @@ impl Job {
         let bounds = Bounds::Live(manifest.limits.deadline);
         let mut stage = Stage::set(&mut topics, &asked, &manifest, bounds, Some(&Live { bell: None }), load)?;
         // Without its type, a field that is there would be missing.
+        let mut log = Vec::new();
         let init_ms = if notes.is_empty() {
             let started = Instant::now();
-            stage.guest.init().map_err(|fault| not_started(manifest.lambda.name.as_str(), fault))?;
+            let initialised = stage.guest.init();
+            log.extend(stage.session.take_log().0.into_iter().map(|line| line.message));
+            initialised.map_err(|fault| {
+                // What it said on the way may be why.
+                log.iter().for_each(|line| eprintln!("log: {}", visible(line)));
+                not_started(manifest.lambda.name.as_str(), fault)
+            })?;
             Some(started.elapsed().as_secs_f64() * 1e3)
         } else {
             None
@@ -80,6 +93,7 @@ impl Job {
             init_ms,
             resident_bytes: gleaner_vitals::usage::resident(),
             needs: needs(&asked, &manifest),
+            log,
             notes,
         };
         // Whoever asked may have gone.
@@ -110,39 +124,61 @@ fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>),
     Ok((topics, notes))
 }
 
-/// In the order of the manifest.
+/// Those of the lambda's own process in the order of the manifest, then those of the recorder, then the disk.
 fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
-    let need = |purpose, bytes, at_once| Need { purpose, bytes, place: Place::Memory, at_once };
+    let limits = &manifest.limits;
     let mut needs = Vec::new();
+    let mut need = |place, at_once, purpose: String, bytes| needs.push(Need { purpose, bytes, place, at_once });
     for input in &manifest.inputs {
-        let (slots, name) = (live_slots(input), &input.name);
-        let bytes = (slots as u64).saturating_mul(input.max_size.bytes());
-        needs.push(need(format!("input `{name}`: {slots} slots of {}", input.max_size), bytes, true));
+        let (name, slots) = (&input.name, live_slots(input));
+        let bytes = Pool::<SampleMeta>::bytes_needed(slots, input.max_size.as_usize());
+        let purpose = format!("input `{name}`: {slots} slots of {}", input.max_size);
+        need(Place::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
         if let Some(decoded) = input.decoded_size {
             let slots = input.decoded_slots();
+            let bytes = Pool::<Info>::bytes_needed(slots, decoded.as_usize());
             let purpose = format!("input `{name}`: {slots} decoded pictures of {decoded}");
-            needs.push(need(purpose, (slots as u64).saturating_mul(decoded.bytes()), true));
+            need(Place::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
         }
+    }
+    need(Place::Memory, false, "the lambda itself (`memory`)".to_owned(), Some(limits.memory.bytes()));
+    if manifest.inputs.iter().any(|input| input.type_name.is_frame()) {
+        need(
+            Place::Memory,
+            false,
+            "frames that it makes (`memory`, once more)".to_owned(),
+            Some(limits.memory.bytes()),
+        );
+    }
+    if limits.scratch.bytes() > 0 {
+        let bytes = limits.scratch.bytes().saturating_mul(2);
+        need(Place::Memory, false, "what it keeps (`scratch`, twice while an entry grows)".to_owned(), Some(bytes));
+    }
+    let unfinished = Some(unfinished_bytes(manifest));
+    need(
+        Place::Memory,
+        false,
+        "decisions and messages on their way, while the network loses parts".to_owned(),
+        unfinished,
+    );
+    if let Some(record) = &manifest.record {
+        let (place, at_once) = match record.store {
+            Store::Ram => (Place::Memory, true),
+            Store::Disk => (Place::Disk, false),
+        };
+        need(place, at_once, "recorder: preroll".to_owned(), Some(record.preroll_size.bytes()));
+        need(
+            Place::Memory,
+            false,
+            "recorder: messages on their way, and clips being written".to_owned(),
+            Some(RECORDER),
+        );
+        need(Place::Disk, false, "clips; `gleaner run --clips-max --bytes-max` bounds them".to_owned(), None);
     }
     for model in &manifest.models {
         let file = asked.build.path().join(model.file.as_path());
-        let bytes = file.metadata().map_or(0, |data| data.len());
-        let on_disk = Need { place: Place::Disk, ..need(format!("model `{}`", model.name), bytes, true) };
-        needs.push(on_disk);
+        need(Place::Disk, true, format!("model `{}`", model.name), file.metadata().ok().map(|data| data.len()));
     }
-    if let Some(record) = &manifest.record {
-        let place = match record.store {
-            Store::Ram => Place::Memory,
-            Store::Disk => Place::Disk,
-        };
-        let preroll = need("preroll, in the recorder".to_owned(), record.preroll_size.bytes(), false);
-        needs.push(Need { place, ..preroll });
-    }
-    let limits = &manifest.limits;
-    needs.push(need("the lambda itself (`memory`)".to_owned(), limits.memory.bytes(), false));
-    needs.push(need("frames that it makes (`memory`, once more)".to_owned(), limits.memory.bytes(), false));
-    if limits.scratch.bytes() > 0 {
-        needs.push(need("what it keeps (`scratch`)".to_owned(), limits.scratch.bytes(), false));
-    }
+    need(Place::Disk, false, "decisions.jsonl and log.jsonl".to_owned(), None);
     needs
 }

@@ -72,6 +72,16 @@ fn spare(input: &Input) -> usize {
     if input.max_size.bytes() <= SMALL_BYTES { input.depth } else { input.depth.min(SPARE_LARGE) }
 }
 
+/// Bytes beside the rings that a process takes on a vehicle at most: decisions that wait to be written, and messages that the network puts
+/// together.
+pub fn unfinished_bytes(manifest: &Manifest) -> u64 {
+    const LINES: u64 = 48 << 20;
+    // So many unfinished messages does RustDDS keep of a writer, and where memory is refused to it, it ends the process.
+    const MESSAGES: u64 = 130;
+    let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes().saturating_mul(MESSAGES));
+    sizes.fold(LINES, u64::saturating_add)
+}
+
 /// Slots for the samples of an input on a vehicle: one more is for the newest of those that a wake sees, which is held while it runs.
 pub fn live_slots(input: &Input) -> usize {
     input.slots() + spare(input) + 1

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use gleaner_protocol::manifest::{Kind, LambdaName, NameError};
-use gleaner_protocol::{Exit, Explain, Failure};
+use gleaner_protocol::{Exit, Explain, Failure, Manifest};
 
 use crate::args::NewArgs;
 use crate::say::say;
@@ -19,6 +19,66 @@ const PACKED: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/packed.rs")
 
 /// Where the SDK is.
 const SDK: &str = ".gleaner";
+/// Names that mean something to cargo or to Rust: keywords, and crates that are there already.
+const NO_CRATES: &[&str] = &[
+    "abstract",
+    "alloc",
+    "as",
+    "async",
+    "await",
+    "become",
+    "box",
+    "break",
+    "const",
+    "continue",
+    "core",
+    "crate",
+    "do",
+    "dyn",
+    "else",
+    "enum",
+    "extern",
+    "false",
+    "final",
+    "fn",
+    "for",
+    "gen",
+    "gleaner-sdk",
+    "if",
+    "impl",
+    "in",
+    "let",
+    "loop",
+    "macro",
+    "match",
+    "mod",
+    "move",
+    "mut",
+    "override",
+    "priv",
+    "proc-macro",
+    "pub",
+    "ref",
+    "return",
+    "self",
+    "static",
+    "std",
+    "struct",
+    "super",
+    "test",
+    "trait",
+    "true",
+    "try",
+    "type",
+    "typeof",
+    "unsafe",
+    "unsized",
+    "use",
+    "virtual",
+    "where",
+    "while",
+    "yield",
+];
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Why there is no new lambda.
@@ -31,7 +91,9 @@ enum NewError {
     #[error("there is something in `{}` already", path.display())]
     NotEmpty { path: PathBuf },
     #[error("there is no `{}`", path.display())]
-    NoLambda { path: PathBuf },
+    NoSdk { path: PathBuf },
+    #[error("a crate cannot have the name `{name}`")]
+    CrateName { name: LambdaName },
     #[error("cannot {action} `{}`", path.display())]
     File { action: &'static str, path: PathBuf, source: io::Error },
 }
@@ -46,7 +108,8 @@ impl Explain for NewError {
             Self::NotEmpty { .. } => {
                 Some("choose another name; to replace only the SDK in it: gleaner new --update DIR".to_owned())
             }
-            Self::NoLambda { .. } => Some("give the folder of a lambda that `gleaner new` made".to_owned()),
+            Self::NoSdk { .. } => Some("give the folder of a lambda that `gleaner new` made".to_owned()),
+            Self::CrateName { .. } => Some("it means something to Rust; choose another one".to_owned()),
             Self::File { .. } => None,
         }
     }
@@ -85,11 +148,15 @@ fn name_of(dir: &Path) -> Result<LambdaName, NewError> {
 
 /// All of it or nothing: it is made in a folder beside, which then takes its name.
 fn make(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
+    if kind == Kind::Wasm && NO_CRATES.contains(&name.as_str()) {
+        return Err(NewError::CrateName { name: name.clone() });
+    }
     if dir.symlink_metadata().is_ok() && !is_empty(dir) {
         return Err(NewError::NotEmpty { path: dir.to_owned() });
     }
-    let partial = dir.with_file_name(format!(".{name}.partial"));
-    remove(&partial)?;
+    // One of our own: what has that name already is somebody else's.
+    let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
+    fs::create_dir(&partial).map_err(failed("make", &partial))?;
     let made = fill(&partial, name, kind).and_then(|()| fs::rename(&partial, dir).map_err(failed("make", dir)));
     if made.is_err() {
         // What went wrong tells more than what cannot be cleaned up after it.
@@ -126,21 +193,21 @@ fn fill(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
     unpack_sdk(&dir.join(SDK), kind)
 }
 
-fn update(dir: &Path) -> Result<(), NewError> {
-    let manifest = dir.join("lambda.toml");
-    if !manifest.is_file() {
-        return Err(NewError::NoLambda { path: manifest });
+fn update(dir: &Path) -> Result<(), Failure> {
+    let sdk = dir.join(SDK);
+    if !sdk.is_dir() {
+        return Err(NewError::NoSdk { path: sdk }.into());
     }
-    let kind = if dir.join("Cargo.toml").is_file() { Kind::Wasm } else { Kind::Python };
-    let (sdk, partial, old) = (dir.join(SDK), dir.join(".gleaner.partial"), dir.join(".gleaner.old"));
+    let kind = Manifest::load(dir)?.lambda.kind;
+    let (partial, old) = (dir.join(".gleaner.partial"), dir.join(".gleaner.old"));
     remove(&partial)?;
     remove(&old)?;
     unpack_sdk(&partial, kind)?;
     match fs::rename(&sdk, &old) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(failed("replace", &sdk)(error)),
-        _ => fs::rename(&partial, &sdk).map_err(failed("make", &sdk))?,
+        Err(error) => return Err(failed("replace", &sdk)(error).into()),
+        Ok(()) => fs::rename(&partial, &sdk).map_err(failed("make", &sdk))?,
     }
-    remove(&old)
+    Ok(remove(&old)?)
 }
 
 fn unpack_sdk(to: &Path, kind: Kind) -> Result<(), NewError> {

@@ -36,6 +36,7 @@ fn a_new_lambda_has_a_sound_manifest_with_its_own_name_and_entry() {
         assert_eq!(manifest.lambda.entry.to_string(), entry);
         assert!(dir.join(source(kind)).is_file());
         let placeholders = ["NAME", "VERSION", "TEST", "SOURCE", "hello"];
+        assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 1);
         for file in ["README.md", "lambda.toml"] {
             let text = fs::read_to_string(dir.join(file)).unwrap();
             assert!(placeholders.iter().all(|word| !text.contains(word)), "{text}");
@@ -71,7 +72,7 @@ fn an_update_replaces_the_sdk_and_what_was_added_to_it() {
         assert!(!dir.join(".gleaner.old").exists() && !dir.join(".gleaner.partial").exists());
         fs::remove_dir_all(dir).unwrap();
     }
-    assert!(matches!(update(&scratch.0), Err(NewError::NoLambda { .. })));
+    assert!(update(&scratch.0).unwrap_err().to_string().contains("there is no `"));
 }
 
 #[test]
@@ -82,6 +83,11 @@ fn a_folder_needs_a_name_that_a_lambda_can_have() {
         assert!(error.to_string().contains(wanted) && error.help().is_some(), "{error}");
     }
     assert_eq!(name_of(Path::new("some/where/pot-hole/")).unwrap().as_str(), "pot-hole");
+    let scratch = Scratch::new("names");
+    for name in ["test", "gleaner-sdk", "type"] {
+        let made = make(&scratch.0.join(name), &name.parse().unwrap(), Kind::Wasm);
+        assert!(matches!(made, Err(NewError::CrateName { .. })), "{name}");
+    }
 }
 
 /// What stands twice, since the copy has to work outside of this workspace.
@@ -106,7 +112,11 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
         assert_eq!(plain(&packed, "dependencies"), plain(workspace, "dependencies"), "{name}");
     }
     let package = workspace["workspace"]["package"].as_table().unwrap();
-    for key in ["version", "edition", "license"] {
+    let lambda = include_str!("files/package.toml").parse::<Table>().unwrap();
+    for key in ["edition", "rust-version"] {
+        assert_eq!(lambda["package"][key], package[key], "{key}");
+    }
+    for key in ["version", "edition", "rust-version", "license"] {
         assert_eq!(packed["package"][key], package[key], "{key}");
     }
 }

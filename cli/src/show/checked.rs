@@ -23,21 +23,26 @@ fn write_checked(text: &mut String, checked: &Checked, paint: Paint) -> fmt::Res
     for note in &checked.notes {
         writeln!(text, "  {}", paint.yellow(&visible(note)))?;
     }
+    for line in &checked.log {
+        writeln!(text, "  log: {}", visible(line))?;
+    }
     for (place, word) in [(Place::Memory, "memory"), (Place::Disk, "disk")] {
         let needs: Vec<&Need> = checked.needs.iter().filter(|need| need.place == place).collect();
         if needs.is_empty() {
             continue;
         }
         let sum = |at_once: bool| {
-            let bytes = needs.iter().filter(|need| need.at_once == at_once).map(|need| need.bytes);
+            let bytes = needs.iter().filter(|need| need.at_once == at_once).filter_map(|need| need.bytes);
             bytes.fold(0, u64::saturating_add)
         };
         let (at_once, later) = (sum(true), sum(false));
         let most = size(at_once.saturating_add(later));
-        writeln!(text, "{word}: {} from the start, {most} at most", size(at_once))?;
+        let beyond = if needs.iter().any(|need| need.bytes.is_none()) { ", and what has no bound" } else { "" };
+        writeln!(text, "{word}: {} from the start, {most} at most{beyond}", size(at_once))?;
         for need in needs {
-            let at_most = if need.at_once { "" } else { ", at most" };
-            writeln!(text, "{:>12}  {}{at_most}", size(need.bytes), visible(&need.purpose))?;
+            let bytes = need.bytes.map_or_else(|| "no bound".to_owned(), size);
+            let at_most = if need.at_once || need.bytes.is_none() { "" } else { ", at most" };
+            writeln!(text, "{bytes:>12}  {}{at_most}", visible(&need.purpose))?;
         }
     }
     writeln!(text, "its process has {} now, with its rings and before any sample", size(checked.resident_bytes))
@@ -51,11 +56,9 @@ mod tests {
 
     #[test]
     fn needs_are_summed_up_by_place_and_by_when_they_are_taken() {
-        let need = |purpose: &str, mib: u64, place, at_once| Need {
-            purpose: purpose.to_owned(),
-            bytes: mib << 20,
-            place,
-            at_once,
+        let need = |purpose: &str, mib: u64, place, at_once| {
+            let bytes = (mib > 0).then_some(mib << 20);
+            Need { purpose: purpose.to_owned(), bytes, place, at_once }
         };
         let found = Checked {
             lambda: "dip".to_owned(),
@@ -68,15 +71,19 @@ mod tests {
                 need("input `imu`", 3, Place::Memory, true),
                 need("preroll", 64, Place::Memory, false),
                 need("model `m`", 4, Place::Disk, true),
+                need("clips", 0, Place::Disk, false),
             ],
+            log: vec!["ready".to_owned()],
             notes: Vec::new(),
         };
         let expected = "dip 0.1.0 (wasmtime 48): loads, and its init returns after 0.2 ms
+  log: ready
 memory: 3.0 MiB from the start, 67.0 MiB at most
      3.0 MiB  input `imu`
     64.0 MiB  preroll, at most
-disk: 4.0 MiB from the start, 4.0 MiB at most
+disk: 4.0 MiB from the start, 4.0 MiB at most, and what has no bound
      4.0 MiB  model `m`
+    no bound  clips
 its process has 30.0 MiB now, with its rings and before any sample
 ";
         assert_eq!(checked(&found, Paint::new(false)), expected);

@@ -11,6 +11,7 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, Exit, Failure};
 use gleaner_transport::dds::{self, Clock};
 
+use crate::input::unfinished_bytes;
 use crate::isolation::definitions;
 use crate::network::NetworkArgs;
 use crate::stage::{Asked, AskedArgs};
@@ -83,11 +84,7 @@ impl Job {
     /// Memory that our own threads may still take, in bytes: decisions that wait to be written, and messages that the network puts
     /// together, beside those in the rings.
     pub fn own_memory(&self) -> u64 {
-        const LINES: u64 = 48 << 20;
-        // So many unfinished messages does RustDDS keep of a writer, and where memory is refused to it, it ends the process.
-        const MESSAGES: u64 = 130;
-        let sizes = self.manifest.inputs.iter().map(|input| input.max_size.bytes().saturating_mul(MESSAGES));
-        sizes.fold(LINES, u64::saturating_add)
+        unfinished_bytes(&self.manifest)
     }
 
     /// The folder of the results.

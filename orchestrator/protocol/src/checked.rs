@@ -19,6 +19,8 @@ pub struct Checked {
     pub resident_bytes: u64,
     /// What it will take on a vehicle: what is there from the start, and what it may take at most.
     pub needs: Vec<Need>,
+    /// What it logged and printed on the way.
+    pub log: Vec<String>,
     /// What a user should know, and is no error.
     pub notes: Vec<String>,
 }
@@ -28,8 +30,8 @@ pub struct Checked {
 pub struct Need {
     /// What it is for, for example ``input `imu`, 1,025 slots``.
     pub purpose: String,
-    /// Bytes.
-    pub bytes: u64,
+    /// Bytes; `None` where nothing of the lambda's own bounds it.
+    pub bytes: Option<u64>,
     /// Where.
     pub place: Place,
     /// Taken from the start; else as much as this at most.
