@@ -200,7 +200,7 @@ fn what_is_in_a_drive_is_shown_without_a_lambda() {
         assert!(text.contains("/imu/data") && text.contains("4,170"), "{text}");
         let imu = &seen.topics[1];
         let interval = imu.interval.unwrap();
-        assert_eq!((imu.read, interval.n, imu.missing, imu.largest_bytes), (4170, 4169, Some(0), 324));
+        assert_eq!((imu.read, interval.n, imu.missing, imu.largest_bytes), (4170, 4169, Some(0), 320));
         assert!((9_500_000..9_700_000).contains(&interval.p50_ns), "{interval:?}");
         let picture = seen.topics[0].picture.clone().unwrap();
         assert_eq!((picture.width, picture.height, picture.is_compressed), (640, 360, true));
