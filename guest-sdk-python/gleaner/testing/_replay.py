@@ -69,7 +69,7 @@ class _Pass:
     """One pass of a lambda over its drive."""
 
     def __init__(self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], types: Mapping[str, str]) -> None:
-        self._manifest, self._session = manifest, Session(manifest.limits)
+        self._given, self._manifest, self._session = given, manifest, Session(manifest.limits)
         names = {one.topic: remap.get(one.topic, one.topic) for one in manifest.inputs}
         self._drive = _drive(drive, manifest, names, types)
         self._sources = self._inputs(names)
@@ -96,7 +96,7 @@ class _Pass:
         return sources
 
     def run(self, prints_to_log: bool) -> Run:
-        with guarded(self._session.log if prints_to_log else None):
+        with guarded(self._session.log if prints_to_log else None, self._given):
             self._guest.init()
             self._course()
         session, drive = self._session, self._drive
