@@ -70,13 +70,16 @@ class _Pass:
 
     def __init__(self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], types: Mapping[str, str]) -> None:
         self._given, self._manifest, self._session = given, manifest, Session(manifest.limits)
+        _check_remap(remap, manifest)
         names = {one.topic: remap.get(one.topic, one.topic) for one in manifest.inputs}
         self._drive = _drive(drive, manifest, names, types)
         self._sources = self._inputs(names)
-        self._by_topic = {names[source.declared.topic]: source for source in self._sources}
+        # In the order of the manifest; two inputs may be one topic of the drive.
+        self._by_topic: Dict[str, List[Source]] = {}
+        for source in self._sources:
+            self._by_topic.setdefault(names[source.declared.topic], []).append(source)
         # Topics that are recorded are a part of the drive, too: the first of their samples begins the time of a periodic schedule.
-        recorded = manifest.record.topics if manifest.record is not None else []
-        self._topics = {*self._by_topic, *(remap.get(topic, topic) for topic in recorded)}
+        self._topics = {*self._by_topic, *_recorded(self._drive, manifest, remap)}
         self._guest = Guest(given, manifest, self._session, self._sources)
         woken_by = [source for source in self._sources if source.declared.name == manifest.event]
         self._schedule: Schedule = Event(woken_by[0]) if woken_by else Periodic(manifest.period_ns)
@@ -119,11 +122,10 @@ class _Pass:
         for topic, arrival in self._drive.deliveries(self._topics):
             at_ns = arrival.at_ns
             self._ticks(at_ns)
-            source = self._by_topic.get(topic)
-            if source is not None:
+            for source in self._by_topic.get(topic, []):
                 source.ring.push(arrival)
-            for wake in self._schedule.events():
-                self._wake(wake[1].arrival.at_ns, wake)
+                for wake in self._schedule.events():
+                    self._wake(wake[1].arrival.at_ns, wake)
         if at_ns is not None:
             # A tick of the very last instant is still due.
             self._ticks(at_ns + 1)
@@ -170,6 +172,25 @@ def _cause(wake: Wake) -> Dict[str, Any]:
     arrival, declared = cell.arrival, source.declared
     woken_by = {"writer": str(arrival.writer), "seq": arrival.seq}
     return {"cause": "event", "input": declared.name, "topic": declared.topic, **woken_by}
+
+
+def _check_remap(remap: Mapping[str, str], manifest: Manifest) -> None:
+    known = {one.topic: None for one in manifest.inputs}
+    known.update(dict.fromkeys(manifest.record.topics if manifest.record is not None else []))
+    for topic in remap:
+        if topic not in known:
+            raise ReplayError(f"no input has the topic `{topic}` of remap", help=f"the manifest has {quoted(known)}")
+
+
+def _recorded(drive: Union[Drive, Arrays], manifest: Manifest, remap: Mapping[str, str]) -> List[str]:
+    """The topics of `[record]`, as the drive calls them. It may lack some; where it has none, nothing would be kept."""
+    if manifest.record is None:
+        return []
+    topics = [remap.get(topic, topic) for topic in manifest.record.topics]
+    if not drive.is_partial and not any(topic in drive.topics for topic in topics):
+        help = f"the drive has {quoted(drive.topics)}; pass remap={{FROM: TO}}, or a manifest without [record]"
+        raise ReplayError("the drive has none of the topics of [record]", f"[record] has {quoted(topics)}", help)
+    return topics
 
 
 def _drive(given: Any, manifest: Manifest, names: Mapping[str, str], types: Mapping[str, str]) -> Union[Drive, Arrays]:
