@@ -128,17 +128,24 @@ def folder(given: Union[str, "os.PathLike[str]"]) -> Path:
     return path if path.is_dir() else path.parent
 
 
+def home(given: Given) -> Optional[Path]:
+    """Where a lambda lies, if it lies anywhere: a class of a notebook does not. Raises ReplayError."""
+    if isinstance(given, (str, os.PathLike)):
+        return folder(given)
+    try:
+        return Path(inspect.getfile(given)).parent
+    except (TypeError, OSError):
+        return None
+
+
 def manifest_beside(given: Given) -> Path:
     """The manifest that lies where the lambda does. Raises ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given) / "lambda.toml"
-    try:
-        beside = Path(inspect.getfile(given)).parent / "lambda.toml"
-    except (TypeError, OSError):  # A class of a notebook.
-        beside = None
-    if beside is None or not beside.is_file():
+    beside = home(given)
+    if beside is None or not (beside / "lambda.toml").is_file():
         raise ReplayError(f"no manifest lies beside `{_name(given)}`", help='pass manifest="path/to/lambda.toml", or a dict')
-    return beside
+    return beside / "lambda.toml"
 
 
 @contextlib.contextmanager
