@@ -9,14 +9,14 @@ import os
 import sys
 import traceback
 from types import ModuleType, TracebackType
-from typing import Any, Callable, Dict, Optional, Tuple
+from typing import Any, Callable, Dict, List, Optional, Tuple
 
 from . import _deadline
 from ._printed import end_call, print_to
 from .context import Context
 from .error import DeadlineExceeded
 
-__all__ = ["attempt", "load", "maker", "print_to", "settle", "tidy"]
+__all__ = ["attempt", "load", "maker", "own_modules", "print_to", "settle", "tidy"]
 
 Handler = Callable[..., object]
 
@@ -69,13 +69,10 @@ def _nothing(ctx: Context) -> None:
 def _import(entry: str) -> ModuleType:
     folder = os.path.dirname(entry)
     # A replay that is repeated begins with fresh globals, those of the lambda's own modules included.
-    for name, known in list(sys.modules.items()):
-        file = str(getattr(known, "__file__", None))
-        # An environment that lies in the lambda's folder is no part of the lambda.
-        if file.startswith(folder + os.sep) and not file.startswith(sys.prefix + os.sep):
-            del sys.modules[name]
-    # As for any script, what lies beside the file can be imported.
-    if folder not in sys.path:
+    for name in own_modules(folder):
+        del sys.modules[name]
+    # As for any script, what lies beside the file can be imported, and is found before what lies elsewhere.
+    if sys.path[:1] != [folder]:
         sys.path.insert(0, folder)
     # A build folder is what was built, and nothing else.
     sys.dont_write_bytecode = True
@@ -86,6 +83,38 @@ def _import(entry: str) -> ModuleType:
     sys.modules["main"] = module
     spec.loader.exec_module(module)
     return module
+
+
+def own_modules(folder: str) -> List[str]:
+    """Names of the imported modules that are the lambda's own: that lie below its folder, also by way of links.
+
+    An environment or an SDK that lies there, or what is hidden, is no part of the lambda."""
+    names: Dict[str, List[str]] = {}
+    for name, known in list(sys.modules.items()):
+        names.setdefault(_place(known), []).append(name)
+    return [name for place, there in names.items() if _is_own(folder, place) for name in there]
+
+
+def _place(module: object) -> str:
+    """The folder in which a module lies; of a package without a file, its own."""
+    about: Dict[str, Any] = getattr(module, "__dict__", {})
+    file = about.get("__file__")
+    try:
+        return os.path.abspath(str(os.path.dirname(file) if file else next(iter(about.get("__path__", ())))))
+    except (KeyError, StopIteration, TypeError):
+        # Built in; or a package whose parent is gone.
+        return ""
+
+
+def _is_own(folder: str, place: str) -> bool:
+    if not place or os.path.join(place, "").startswith((OURS, os.path.join(sys.prefix, ""))):
+        return False
+    for form in (os.path.abspath, os.path.realpath):
+        root = os.path.join(form(folder), "")
+        inside = os.path.join(form(place), "")
+        if inside.startswith(root):
+            return not any(part.startswith(".") for part in inside[len(root) :].split(os.sep))
+    return False
 
 
 def _missing(owner: Any, where: str, handler: str) -> str:

@@ -4,14 +4,24 @@ Left out is what only a process of its own can do or refuse."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
 import sys
+import tempfile
+import textwrap
 import types
 import unittest
+from pathlib import Path
+from typing import Dict, List
 
+import home
 import test_hosted
 import test_printed
 from at_desk import AtDesk
-from hosted import GREY
+from hosted import EACH, GREY, MANIFEST
+
+from gleaner.testing import replay
 
 
 class Arrays(AtDesk, test_hosted.Arrays):
@@ -72,6 +82,84 @@ class Streams(AtDesk):
             decisions = self.replay(source, [GREY, GREY])
             self.assertEqual([decision["triggers"][0]["score"] for decision in decisions], [1, 2])
         self.assertIs(sys.modules["test_beside"], mine)
+
+
+class Folders(unittest.TestCase):
+    """Lambdas that are given by their folder, several in one process."""
+
+    def setUp(self) -> None:
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name).resolve()
+        before = set(sys.modules)
+        self.addCleanup(lambda: [sys.modules.pop(name) for name in set(sys.modules) - before])
+        self.addCleanup(setattr, sys, "path", list(sys.path))
+
+    def write(self, name: str, files: Dict[str, str]) -> Path:
+        """The folder of a lambda with its manifest and these files."""
+        folder = self.folder / name
+        for inside, text in {"lambda.toml": MANIFEST.format(schedule=EACH, depth=4), **files}.items():
+            path = folder / inside
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        return folder
+
+    def labels(self, folder: "str | os.PathLike[str]") -> List[str]:
+        run = replay(folder, {"/camera": {"t": [0]}})
+        self.assertEqual(run.faults, [])
+        return [trigger.label for trigger in run.triggers]
+
+    def test_each_has_its_own_module_where_two_have_one_of_the_same_name(self) -> None:
+        uses = "from helper import NAME\nimport inner.deep\ndef on_event(ctx, event): ctx.event(NAME + inner.deep.NAME, 0)\n"
+        for name in ("a", "b"):
+            # The folder `inner` has no `__init__.py`.
+            self.write(name, {"main.py": uses, "helper.py": f"NAME = '{name}'\n", "inner/deep.py": f"NAME = '{name}'\n"})
+        before = set(sys.modules)
+        for name in ("a", "b", "a"):
+            self.assertEqual(self.labels(self.folder / name), [name + name])
+            self.assertEqual({one for one in set(sys.modules) - before if one.startswith(("helper", "inner", "main"))}, set())
+
+    def test_also_where_folders_are_given_by_links_and_from_beside_them(self) -> None:
+        uses = "from helper import NAME\ndef on_event(ctx, event): ctx.event(NAME, 0)\n"
+        for name in ("a", "b"):
+            self.write(name, {"main.py": uses, "helper.py": f"NAME = '{name}'\n", "tests/empty.py": ""})
+            (self.folder / f"link-{name}").symlink_to(self.folder / name)
+        for name in ("a", "b"):
+            self.assertEqual(self.labels(self.folder / f"link-{name}"), [name])
+        self.addCleanup(os.chdir, os.getcwd())
+        for name in ("a", "b"):
+            os.chdir(self.folder / name / "tests")
+            self.assertEqual(self.labels(".."), [name])
+
+    def test_what_a_lambda_has_beside_it_is_found_before_what_a_test_put_on_the_path(self) -> None:
+        uses = "from helper import NAME\ndef on_event(ctx, event): ctx.event(NAME, 0)\n"
+        for name in ("a", "b"):
+            self.write(name, {"main.py": uses, "helper.py": f"NAME = '{name}'\n"})
+        sys.path[:0] = [str(self.folder / "a"), str(self.folder / "b")]
+        self.assertEqual(self.labels(self.folder / "b"), ["b"])
+
+    def test_an_sdk_that_lies_in_the_folder_stays_the_one_that_it_is(self) -> None:
+        # As `gleaner new --kind python` lays it out.
+        source = "from gleaner import DataError\ndef on_event(ctx, event):\n"
+        source += "    try:\n        ctx.input('gone')\n    except DataError as error:\n        ctx.event(error.kind, 0)\n"
+        folder = self.write("new", {"main.py": source})
+        shutil.copytree(home.SDK / "gleaner", folder / ".gleaner/guest-sdk-python/gleaner", ignore=shutil.ignore_patterns("__pycache__"))
+        test = """
+            import sys
+            sys.path[:0] = [".", ".gleaner/guest-sdk-python"]
+            import gleaner, gleaner.testing
+            known = {name: module for name, module in sys.modules.items() if name.split(".")[0] == "gleaner"}
+            assert "/.gleaner/" in gleaner.__file__, gleaner.__file__
+            for _ in range(2):
+                run = gleaner.testing.replay(".", {"/camera": {"t": [0]}})
+                assert not run.faults, run.faults
+                assert [trigger.label for trigger in run.triggers] == ["no-such-input"], run.triggers
+            for name, module in known.items():
+                assert sys.modules[name] is module, name
+        """
+        command = [sys.executable, "-c", textwrap.dedent(test)]
+        ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
+        self.assertEqual(ended.returncode, 0, ended.stderr)
 
 
 if __name__ == "__main__":

@@ -147,6 +147,38 @@ class Data(Hosted):
         """
         self.replay(source, [Image(n, 1, "mono8", n, bytes(n)) for n in (1, 2, 3)])
 
+    def test_a_number_beyond_its_range_is_an_overflow(self) -> None:
+        source = """
+            def on_event(ctx, event):
+                camera, frame = ctx.input("camera"), event.as_frame()
+                whole = (camera.last, lambda n: camera.column("width", n), event.cdr, frame.read)
+                half = (lambda n: event.cdr(0, n), lambda n: frame.read(0, n), lambda n: frame.resize(n, 1), lambda n: frame.mean_luma((n, 0, 1, 1)))
+                signed = (camera.since, lambda n: camera.column_since("width", n))
+                for calls, fitting, others in (
+                    (whole, (0, 2**64 - 1), (-1, 2**64)),
+                    (half, (1,), (-1, 2**32, 2**64)),
+                    (signed, (-2**63, 2**63 - 1), (-2**63 - 1, 2**63)),
+                ):
+                    for n, call in enumerate(calls):
+                        for number in fitting:
+                            call(number)
+                        for number in others:
+                            try:
+                                call(number)
+                            except OverflowError as error:
+                                ctx.log("info", str(error))
+                                continue
+                            raise AssertionError((n, number))
+        """
+        self.replay(source, [GREY])
+        negative, much, range, long = (
+            "can't convert negative int to unsigned",
+            "int too big to convert",
+            "out of range integral type conversion attempted",
+            "Python int too large to convert to C long",
+        )
+        self.assertEqual([text for _, text in self.log()], [negative, much] * 4 + [range, range, long] * 4 + [long, long] * 2)
+
     def test_configuration_has_the_types_of_the_manifest(self) -> None:
         source = """
             def on_event(ctx, event):
@@ -210,8 +242,9 @@ class Triggers(Hosted):
         ])
 
     def test_an_attribute_of_another_type_is_named(self) -> None:
-        told = self.fault("def on_event(ctx, event): ctx.event('e', 1, boxes=[1, 2])")
-        self.assertTrue(told.endswith("attribute `boxes` of `e` is of type `list`; give bool, int, float or str"), told)
+        for boxes, name in (("[1, 2]", "list"), ("numpy.zeros(2)", "ndarray"), ("numpy.zeros(0)", "ndarray")):
+            told = self.fault(f"import numpy\ndef on_event(ctx, event): ctx.event('e', 1, boxes={boxes})")
+            self.assertTrue(told.endswith(f"TypeError: attribute `boxes` of `e` is of type `{name}`; give bool, int, float or str"), told)
 
     def test_there_are_none_outside_of_a_wake(self) -> None:
         source = """

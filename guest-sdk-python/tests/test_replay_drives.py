@@ -117,6 +117,38 @@ class Drives(unittest.TestCase):
         run = replay(Speeds, path, manifest=other, remap={"/velocity": "/speed"})
         self.assertEqual((run.decisions[0].topic, run.triggers[0].score), ("/velocity", 3.5))
 
+    def test_what_is_renamed_has_to_be_in_the_manifest(self) -> None:
+        path = self.folder / "bag"
+        bag(path, [3.5], StoragePlugin.SQLITE3)
+        with self.assertRaisesRegex(ReplayError, "no input has the topic `/velocty` of remap\n.*the manifest has `/speed`, `/other`"):
+            given = {**manifest(), "record": {"topics": ["/speed", "/other"]}}
+            replay(Speeds, path, manifest=given, remap={"/velocty": "/speed"})
+
+    def test_two_inputs_may_be_one_topic_of_the_drive(self) -> None:
+        path = self.folder / "bag"
+        bag(path, [3.5, 4.5], StoragePlugin.SQLITE3)
+
+        class Both(Speeds):
+            def on_event(self, ctx: Context, event: Sample) -> None:
+                ctx.event("seen", event.number("linear.x"), **{name: ctx.input(name).counts().received for name in ctx.inputs()})
+
+        inputs = [{"name": name, "topic": f"/{name}", "type": SPEED} for name in ("first", "speed", "third")]
+        # Each is a delivery of its own: who is woken sees the inputs before its own, and not yet those behind.
+        run = replay(Both, path, manifest={**manifest(), "input": inputs}, remap={f"/{name}": "/speed" for name in ("first", "third")})
+        self.assertEqual([(t.score, t.attributes) for t in run.triggers],
+                         [(3.5, {"first": 1, "speed": 1, "third": 0}), (4.5, {"first": 2, "speed": 2, "third": 1})])
+        self.assertEqual({name: count.received for name, count in run.counts.items()}, {"first": 2, "speed": 2, "third": 2})
+
+    def test_a_record_of_which_the_drive_has_no_topic_is_refused(self) -> None:
+        path = self.folder / "bag"
+        bag(path, [3.5], StoragePlugin.SQLITE3)
+        record = {**manifest(), "record": {"topics": ["/imu", "/camera"]}}
+        with self.assertRaisesRegex(ReplayError, "none of the topics of \\[record\\]\n.*has `/imu`, `/camera`\n.*the drive has `/speed`; pass remap="):
+            replay(Speeds, path, manifest=record)
+        # Some may be missing, and arrays are a part of a drive.
+        self.assertEqual(len(replay(Speeds, path, manifest=record, remap={"/imu": "/speed"}).windows), 1)
+        self.assertEqual(len(replay(Speeds, {"/speed": {"t": [0]}}, manifest=record).windows), 1)
+
     def test_an_input_of_another_type_is_refused(self) -> None:
         with self.assertRaisesRegex(ReplayError, "input `speed` is of type .*\n.*topic `/speed` is of type `geometry_msgs"):
             path = self.folder / "bag"

@@ -13,8 +13,9 @@ The rules, which every twin keeps to the letter. All arithmetic is in 64-bit flo
    samples of the ring, and is left out if there are fewer, as where the host had to drop some. Windows that would have been complete
    before the period was known are left out, too.
 6. *The rate* of a window follows from its own stamps: ``(n - 1) * 1e9 / (last - first)`` Hz. Bin ``k`` lies at ``k * (rate / n)`` Hz.
-7. The mean of the window is taken out, since gravity would fill the lowest bins; then its one-sided power spectral density is taken, with
-   the periodic Hann window ``w[j] = (1 - cos(2 pi j / n)) / 2``, as in ``docs/kernels.md``::
+7. Gravity is taken out, since it would fill the lowest bins: the first sample of the window is subtracted from all, then the mean of
+   what remains. So a constant leaves exactly 0, in whatever order a mean is summed. Then the one-sided power spectral density is
+   taken, with the periodic Hann window ``w[j] = (1 - cos(2 pi j / n)) / 2``, as in ``docs/kernels.md``::
 
        density[k] = c[k] |sum over j of w[j] x[j] exp(-2 pi i j k / n)|^2 / (rate * sum over j of w[j]^2)
 
@@ -106,7 +107,8 @@ def roughness(signal: Floats, rate: float, weights: Floats) -> tuple[float, floa
     """Score in (m/s^2)^2 and peak in Hz of one window; `signal` is in m/s^2, shape (n,), oldest first."""
     n = len(signal)
     bin_hz = rate / n
-    amplitudes = np.fft.rfft(weights * (signal - signal.mean()))
+    risen = signal - signal[0]
+    amplitudes = np.fft.rfft(weights * (risen - risen.mean()))
     density = 2 * np.abs(amplitudes) ** 2 / (rate * np.sum(weights**2))
     density[[0, -1]] /= 2
     at_hz = np.arange(len(density)) * bin_hz

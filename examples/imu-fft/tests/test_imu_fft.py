@@ -99,7 +99,12 @@ def test_of_two_lengths_that_are_as_near_the_larger_one_is_taken() -> None:
 
 def test_what_is_no_number_is_not_rough() -> None:
     assert shaken(np.full(200, np.nan)).triggers == []
-    assert shaken(np.full(200, 9.81)).triggers == []
+
+
+@pytest.mark.parametrize("constant", [9.81, 9.7])
+def test_a_constant_scores_exactly_nothing(constant: float) -> None:
+    run = shaken(np.full(200, constant))
+    assert (run.counts["imu"].received, run.triggers) == (200, [])
 
 
 def test_the_sample_drive_has_two_rough_stretches() -> None:

@@ -12,7 +12,7 @@ from ._drive import Delivery
 from ._error import ReplayError, quoted
 from ._path import Path, compile_path
 from ._ring import Arrival
-from ._types import HEADER, Types, dtype
+from ._types import HEADER, Definitions, Types, dtype, gathered, none
 
 IMAGE = "sensor_msgs/msg/Image"
 
@@ -22,9 +22,10 @@ Table = Mapping[str, Any]
 class Arrays:
     """``tables`` by topic: ``t`` in seconds or ``t_ns`` in ns, and an array for each field by its path."""
 
-    def __init__(self, tables: Mapping[str, Table], types: Types, type_names: Mapping[str, str]) -> None:
-        """``type_names`` is the type of each topic, as the lambda's inputs have it."""
-        self.types = types
+    def __init__(self, tables: Mapping[str, Table], more: Definitions, type_names: Mapping[str, str]) -> None:
+        """``type_names`` is the type of each topic, as the lambda's inputs have it. Raises ReplayError."""
+        types = gathered(none(), type_names.values(), more)
+        self._types = types
         self.topics = dict(type_names)
         for topic in tables:
             if topic not in type_names:
@@ -37,6 +38,10 @@ class Arrays:
     @property
     def is_partial(self) -> bool:
         return True
+
+    def types(self, wanted: Iterable[str], more: Definitions) -> Types:
+        """As it was made with them."""
+        return self._types
 
     def type_of(self, topic: str) -> str:
         return self.topics[topic]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from typing import Any, Callable, Dict, List, Mapping, Optional, Union
 
 import numpy as np
@@ -12,7 +11,7 @@ from ._frame import Frame, Pictures
 from ._manifest import Input
 from ._path import Missing, NotANumber, Path, compile_path
 from ._ring import Cell, Lease, Ring
-from ._session import cut, piece, unsigned
+from ._session import cut, i64, piece, u32, u64
 from ._types import Types, stamp_of
 
 SAMPLES_PER_CALL, TEXTS_PER_FIELD, PATH_BYTES, PATHS = 256, 4096, 1024, 256
@@ -169,7 +168,7 @@ class Sample:
         return self._cell.arrival.cdr[1] == 0
 
     def cdr(self, offset: int = 0, len: Optional[int] = None) -> bytes:
-        return piece(self._cell.arrival.cdr[4:], offset, len, self._source.limits["call_bytes"])
+        return piece(self._cell.arrival.cdr[4:], offset, None if len is None else u32(len), self._source.limits["call_bytes"])
 
     def as_frame(self) -> Frame:
         source, cell = self._source, self._cell
@@ -207,10 +206,10 @@ class Topic:
         return None if cell is None else sample(self, cell)
 
     def last(self, n: int) -> List[Sample]:
-        return self._samples(unsigned(n), lambda _: True)
+        return self._samples(u64(n), lambda _: True)
 
     def since(self, since_ns: int) -> List[Sample]:
-        since = operator.index(since_ns)
+        since = i64(since_ns)
         return self._samples(SAMPLES_PER_CALL, lambda arrival: arrival.at_ns > since)
 
     def _samples(self, most: int, keep: Callable[[Any], bool]) -> List[Sample]:
@@ -225,10 +224,10 @@ class Topic:
 
     def column(self, field: Union[Field, str], n: int) -> Column:
         path = self._fields.of(field)
-        return self._column(path, unsigned(n), lambda _: True)
+        return self._column(path, u64(n), lambda _: True)
 
     def column_since(self, field: Union[Field, str], since_ns: int) -> Column:
-        path, since = self._fields.of(field), operator.index(since_ns)
+        path, since = self._fields.of(field), i64(since_ns)
         return self._column(path, self._source.ring.depth, lambda arrival: arrival.at_ns > since)
 
     def _column(self, path: Path, most: int, keep: Callable[[Any], bool]) -> Column:

@@ -13,7 +13,7 @@ from ..data import Column, Guid
 from ._error import ReplayError, nearest, quoted
 from ._path import Missing, NotANumber, compile_path
 from ._ring import Arrival
-from ._types import Types
+from ._types import Definitions, Types, gathered, none
 
 Name = Union[str, "os.PathLike[str]"]
 
@@ -41,7 +41,7 @@ class Drive:
                 if first != connection.msgtype:
                     cause = f"topic `{connection.topic}` is of type `{first}` and of `{connection.msgtype}`"
                     raise ReplayError(f"cannot use drive `{self._shown}`", cause)
-            self.types = Types(reader.typestore)
+            self._own = reader.typestore
             spans = [(one.start_time, one.end_time) for one in reader.readers if one.message_count]
         self.start_ns: int = min((start for start, _ in spans), default=0)
         """Stamp of the first message of any topic, in ns; 0 if there is none."""
@@ -65,6 +65,10 @@ class Drive:
             raise ReplayError(f"cannot use drive `{self._shown}`", cause, help)
         return self.topics[topic]
 
+    def types(self, wanted: Iterable[str], more: Definitions) -> Types:
+        """Those types: as the files have them, else as ``more`` does. Raises ReplayError for one that is nowhere."""
+        return gathered(self._own, wanted, more)
+
     def deliveries(self, topics: Iterable[str]) -> Iterator[Delivery]:
         """The messages of these topics by stamp; equal stamps in the order of the files, then of the channels."""
         wanted = set(topics)
@@ -87,11 +91,12 @@ class Drive:
 
         Raises ReplayError for a topic that the drive does not have, DataError for a field that is none."""
         type_name = self.type_of(topic)
-        field = compile_path(self.types, type_name, path)
+        types = self.types([type_name], Definitions({}, None))
+        field = compile_path(types, type_name, path)
         at_ns, values = [], []
         for _, arrival in self.deliveries([topic]):
             try:
-                values.append(field.number(self.types.decode(arrival.cdr, type_name)))
+                values.append(field.number(types.decode(arrival.cdr, type_name)))
             except NotANumber:
                 raise ReplayError(f"field `{path}` of `{type_name}` is no number") from None
             except Missing as error:
@@ -102,7 +107,6 @@ class Drive:
 
 def _opened(paths: Sequence[Path]) -> Any:
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
 
     shown = ", ".join(map(str, paths))
     missing = [path for path in paths if not path.exists()]
@@ -110,7 +114,7 @@ def _opened(paths: Sequence[Path]) -> Any:
         raise ReplayError(f"there is no drive `{missing[0] if missing else ''}`", help="give MCAP files or rosbag2 directories")
     try:
         # A directory is a bag of its own; only files are read together.
-        return _Reader(AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_HUMBLE)))
+        return _Reader(AnyReader(paths, default_typestore=none()))
     except Exception as error:
         raise _unreadable(shown, error) from None
 

@@ -15,7 +15,7 @@ from . import _pixels
 from ._manifest import COMPRESSED_IMAGE, MIB, Input
 from ._pixels import LAYOUTS, Bytes, ImageError, Picture, RangeError
 from ._ring import Lease
-from ._session import piece, unsigned
+from ._session import piece, u32
 
 About = Tuple[Identity, Stamps]
 T = TypeVar("T")
@@ -190,7 +190,7 @@ class Frame:
         return self._ask(lambda: _pixels.histogram(self._picture, _roi(roi)))
 
     def resize(self, width: int, height: int) -> Frame:
-        width, height = unsigned(width), unsigned(height)
+        width, height = u32(width), u32(height)
         size = width * height * (1 if self._picture.is_grey else 3)
         return self._made("resize", (width, height), size, lambda: _pixels.resize(self._picture, width, height))
 
@@ -199,7 +199,7 @@ class Frame:
         return self._made("grey image", None, shown.width * shown.height, lambda: _pixels.to_gray(shown))
 
     def read(self, offset: int = 0, len: Optional[int] = None) -> bytes:
-        return piece(self._picture.data.tobytes(), offset, len, self._taken.budget.call_bytes)
+        return piece(self._picture.data.tobytes(), offset, None if len is None else u32(len), self._taken.budget.call_bytes)
 
     def array(self) -> npt.NDArray[Any]:
         return np.asarray(View(self._picture, (self._holds, self._taken)))
@@ -240,5 +240,5 @@ class Frame:
 def _roi(roi: Optional[Roi | tuple[int, int, int, int]]) -> Optional[Tuple[int, int, int, int]]:
     if roi is None:
         return None
-    x, y, width, height = (unsigned(number) for number in roi)
+    x, y, width, height = (u32(number) for number in roi)
     return x, y, width, height

@@ -82,7 +82,7 @@ class Guest:
 
     def _load(self) -> Any:
         if isinstance(self._given, (str, os.PathLike)):
-            return _host.load(str(folder(self._given).absolute() / self._manifest.entry), self._manifest.handler)
+            return _host.load(str(folder(self._given).resolve() / self._manifest.entry), self._manifest.handler)
         return _host.maker(self._given, self._manifest.handler, _name(self._given))
 
     def _attempt(self, when: str, call: Any, *arguments: Any) -> Tuple[Any, Optional[Fault]]:
@@ -128,22 +128,30 @@ def folder(given: Union[str, "os.PathLike[str]"]) -> Path:
     return path if path.is_dir() else path.parent
 
 
+def home(given: Given) -> Optional[Path]:
+    """Where a lambda lies, if it lies anywhere: a class of a notebook does not. Raises ReplayError."""
+    if isinstance(given, (str, os.PathLike)):
+        return folder(given)
+    try:
+        return Path(inspect.getfile(given)).parent
+    except (TypeError, OSError):
+        return None
+
+
 def manifest_beside(given: Given) -> Path:
     """The manifest that lies where the lambda does. Raises ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given) / "lambda.toml"
-    try:
-        beside = Path(inspect.getfile(given)).parent / "lambda.toml"
-    except (TypeError, OSError):  # A class of a notebook.
-        beside = None
-    if beside is None or not beside.is_file():
+    beside = home(given)
+    if beside is None or not (beside / "lambda.toml").is_file():
         raise ReplayError(f"no manifest lies beside `{_name(given)}`", help='pass manifest="path/to/lambda.toml", or a dict')
-    return beside
+    return beside / "lambda.toml"
 
 
 @contextlib.contextmanager
-def guarded(log: Optional[Callable[[Any, str], None]]) -> Iterator[None]:
-    """While it lasts, what is printed goes to ``log``, if there is one; afterwards the interpreter is as it was."""
+def guarded(log: Optional[Callable[[Any, str], None]], given: Given) -> Iterator[None]:
+    """While it lasts, what is printed goes to ``log``, if there is one; afterwards the interpreter is as it was, and knows nothing
+    of what was imported from the folder of the lambda that was ``given``."""
     streams, path, writes = (sys.stdout, sys.stderr), list(sys.path), sys.dont_write_bytecode
     modules = dict(sys.modules)
     if log is not None:
@@ -157,5 +165,9 @@ def guarded(log: Optional[Callable[[Any, str], None]]) -> Iterator[None]:
         sys.path[:], sys.dont_write_bytecode = path, writes
         if "main" not in modules:
             sys.modules.pop("main", None)
+        if isinstance(given, (str, os.PathLike)):
+            # Another lambda may have modules of the same names.
+            for name in _host.own_modules(str(folder(given))):
+                del sys.modules[name]
         # Fresh globals for a lambda must not mean that a test beside it is gone.
         sys.modules.update(modules)

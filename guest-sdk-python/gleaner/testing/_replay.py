@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple, Union
 
-from . import _manifest, _types
+from . import _manifest
 from ._arrays import Arrays
 from ._data import Source
 from ._drive import Drive, Name
 from ._error import ReplayError, quoted
 from ._frame import Budget, Pictures
-from ._guest import Given, Guest, Wake, guarded, manifest_beside
+from ._guest import Given, Guest, Wake, guarded, home, manifest_beside
 from ._manifest import Manifest
 from ._run import Decision, Fault, Run
 from ._schedule import Event, Periodic, Schedule, Tick
 from ._session import Session
+from ._types import Definitions
 from ._windows import Moment, windows
 
 FAULTS_IN_A_ROW = 8
@@ -53,8 +55,8 @@ def replay(
         replay(Lambda, {"/imu/data": {"t": seconds, "linear_acceleration.z": az}})
 
     ``config`` lies over ``[config]``; ``remap`` gives topics of the manifest the names that they have in the drive; ``types``
-    are definitions, the text of a ``.msg`` by its type's name, for arrays of types that ROS 2 does not have. What the lambda
-    prints is its log, unless ``prints_to_log`` is false, as a debugger wants it.
+    are definitions, the text of a ``.msg`` by its type's name, for types that neither the drive nor ``msg/`` beside the lambda nor
+    ROS 2 has. What the lambda prints is its log, unless ``prints_to_log`` is false, as a debugger wants it.
 
     Raises ReplayError if one of these cannot be used, StartError if the lambda's import or ``init`` raises. What a wake raises
     is a fault of its decision. Ctrl-C ends the replay."""
@@ -62,21 +64,26 @@ def replay(
     read = _manifest.read(source, config or {})
     if isinstance(lambda_, (str, os.PathLike)) and read.kind != "python":
         raise ReplayError(f"lambda `{lambda_}` is of kind `{read.kind}`", help="only lambdas in Python run here; use gleaner replay")
-    return _Pass(lambda_, read, drive, dict(remap or {}), types or {}).run(prints_to_log)
+    beside = home(lambda_) if isinstance(source, Mapping) else Path(source).parent
+    more = Definitions(types or {}, None if beside is None else beside / "msg")
+    return _Pass(lambda_, read, drive, dict(remap or {}), more).run(prints_to_log)
 
 
 class _Pass:
     """One pass of a lambda over its drive."""
 
-    def __init__(self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], types: Mapping[str, str]) -> None:
-        self._manifest, self._session = manifest, Session(manifest.limits)
+    def __init__(self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], more: Definitions) -> None:
+        self._given, self._manifest, self._session = given, manifest, Session(manifest.limits)
+        _check_remap(remap, manifest)
         names = {one.topic: remap.get(one.topic, one.topic) for one in manifest.inputs}
-        self._drive = _drive(drive, manifest, names, types)
-        self._sources = self._inputs(names)
-        self._by_topic = {names[source.declared.topic]: source for source in self._sources}
+        self._drive = _drive(drive, manifest, names, more)
+        self._sources = self._inputs(names, more)
+        # In the order of the manifest; two inputs may be one topic of the drive.
+        self._by_topic: Dict[str, List[Source]] = {}
+        for source in self._sources:
+            self._by_topic.setdefault(names[source.declared.topic], []).append(source)
         # Topics that are recorded are a part of the drive, too: the first of their samples begins the time of a periodic schedule.
-        recorded = manifest.record.topics if manifest.record is not None else []
-        self._topics = {*self._by_topic, *(remap.get(topic, topic) for topic in recorded)}
+        self._topics = {*self._by_topic, *_recorded(self._drive, manifest, remap)}
         self._guest = Guest(given, manifest, self._session, self._sources)
         woken_by = [source for source in self._sources if source.declared.name == manifest.event]
         self._schedule: Schedule = Event(woken_by[0]) if woken_by else Periodic(manifest.period_ns)
@@ -84,19 +91,18 @@ class _Pass:
         self._in_a_row, self._rest_ns = 0, 0
         self._rest: Tuple[int, int] = (0, 0)
 
-    def _inputs(self, names: Mapping[str, str]) -> List[Source]:
-        drive, limits = self._drive, self._manifest.limits
-        budget, sources = Budget(limits), []
-        for declared in self._manifest.inputs:
+    def _inputs(self, names: Mapping[str, str], more: Definitions) -> List[Source]:
+        drive, inputs, limits = self._drive, self._manifest.inputs, self._manifest.limits
+        for declared in inputs:
             found = drive.type_of(names[declared.topic])
             if found != declared.type_name:
                 cause = f"topic `{names[declared.topic]}` is of type `{found}`"
                 raise ReplayError(f"input `{declared.name}` is of type `{declared.type_name}`", cause)
-            sources.append(Source(declared, drive.types, limits, Pictures(declared, budget)))
-        return sources
+        types, budget = drive.types([declared.type_name for declared in inputs], more), Budget(limits)
+        return [Source(declared, types, limits, Pictures(declared, budget)) for declared in inputs]
 
     def run(self, prints_to_log: bool) -> Run:
-        with guarded(self._session.log if prints_to_log else None):
+        with guarded(self._session.log if prints_to_log else None, self._given):
             self._guest.init()
             self._course()
         session, drive = self._session, self._drive
@@ -119,11 +125,10 @@ class _Pass:
         for topic, arrival in self._drive.deliveries(self._topics):
             at_ns = arrival.at_ns
             self._ticks(at_ns)
-            source = self._by_topic.get(topic)
-            if source is not None:
+            for source in self._by_topic.get(topic, []):
                 source.ring.push(arrival)
-            for wake in self._schedule.events():
-                self._wake(wake[1].arrival.at_ns, wake)
+                for wake in self._schedule.events():
+                    self._wake(wake[1].arrival.at_ns, wake)
         if at_ns is not None:
             # A tick of the very last instant is still due.
             self._ticks(at_ns + 1)
@@ -172,19 +177,33 @@ def _cause(wake: Wake) -> Dict[str, Any]:
     return {"cause": "event", "input": declared.name, "topic": declared.topic, **woken_by}
 
 
-def _drive(given: Any, manifest: Manifest, names: Mapping[str, str], types: Mapping[str, str]) -> Union[Drive, Arrays]:
+def _check_remap(remap: Mapping[str, str], manifest: Manifest) -> None:
+    known = {one.topic: None for one in manifest.inputs}
+    known.update(dict.fromkeys(manifest.record.topics if manifest.record is not None else []))
+    for topic in remap:
+        if topic not in known:
+            raise ReplayError(f"no input has the topic `{topic}` of remap", help=f"the manifest has {quoted(known)}")
+
+
+def _recorded(drive: Union[Drive, Arrays], manifest: Manifest, remap: Mapping[str, str]) -> List[str]:
+    """The topics of `[record]`, as the drive calls them. It may lack some; where it has none, nothing would be kept."""
+    if manifest.record is None:
+        return []
+    topics = [remap.get(topic, topic) for topic in manifest.record.topics]
+    if not drive.is_partial and not any(topic in drive.topics for topic in topics):
+        help = f"the drive has {quoted(drive.topics)}; pass remap={{FROM: TO}}, or a manifest without [record]"
+        raise ReplayError("the drive has none of the topics of [record]", f"[record] has {quoted(topics)}", help)
+    return topics
+
+
+def _drive(given: Any, manifest: Manifest, names: Mapping[str, str], more: Definitions) -> Union[Drive, Arrays]:
     if isinstance(given, Drive):
         return given
     if not isinstance(given, Mapping):
         return Drive(given)
-    known = _types.standard(types)
-    for one in manifest.inputs:
-        if one.type_name not in known:
-            help = 'pass types={"%s": "the text of its .msg"}' % one.type_name
-            raise ReplayError(f"input `{one.name}` is of type `{one.type_name}`, which is no type of ROS 2", help=help)
     type_names = {names[one.topic]: one.type_name for one in manifest.inputs}
     woken_by = next((names[one.topic] for one in manifest.inputs if one.name == manifest.event), None)
     if woken_by is not None and woken_by not in given:
         cause = f"there are arrays of {quoted(given)}, and the lambda is woken by `{woken_by}`"
         raise ReplayError("nothing would wake the lambda", cause, "give arrays of that topic")
-    return Arrays(given, known, type_names)
+    return Arrays(given, more, type_names)

@@ -149,7 +149,7 @@ class Scratch:
         self._used += needed - given_back
 
     def get(self, name: str, offset: int = 0, len: Optional[int] = None) -> bytes:
-        return piece(self._there(name), offset, len, self._most_given)
+        return piece(self._there(name), offset, None if len is None else u64(len), self._most_given)
 
     def remove(self, name: str) -> None:
         kept = self._there(name)
@@ -172,16 +172,32 @@ class Scratch:
 
 def piece(data: bytes, offset: int, length: Optional[int], most: int) -> bytes:
     """``length`` bytes from ``offset``, clamped to what is there and to ``most``."""
-    start = min(unsigned(offset), len(data))
-    wanted = most if length is None else min(unsigned(length), most)
+    start = min(u64(offset), len(data))
+    wanted = most if length is None else min(length, most)
     return data[start : start + wanted]
 
 
-def unsigned(number: Any) -> int:
-    """A whole number from 0 on, as the host takes it."""
+def u64(number: Any) -> int:
+    """A whole number of 64 bits without a sign, as the host takes it; so are `u32` and `i64`."""
     whole = operator.index(number)
     if whole < 0:
         raise OverflowError("can't convert negative int to unsigned")
+    if whole >= 2**64:
+        raise OverflowError("int too big to convert")
+    return whole
+
+
+def u32(number: Any) -> int:
+    whole = i64(number)
+    if not 0 <= whole < 2**32:
+        raise OverflowError("out of range integral type conversion attempted")
+    return whole
+
+
+def i64(number: Any) -> int:
+    whole = operator.index(number)
+    if not -(2**63) <= whole < 2**63:
+        raise OverflowError("Python int too large to convert to C long")
     return whole
 
 
@@ -231,8 +247,16 @@ def _check(label: str, score: Optional[float], attributes: Mapping[str, Attribut
             raise _invalid(f"attribute `{cut(key, KEY_BYTES)}` of `{label}`: {why}")
 
 
+def _item(value: Any) -> Any:
+    """The plain number that one of numpy stands for. An array of several stands for none."""
+    try:
+        return value.item()
+    except Exception:
+        return None
+
+
 def _attribute(label: str, key: str, value: Any) -> AttributeValue:
-    for plain in (value, value.item() if hasattr(value, "item") else None):
+    for plain in (value, _item(value)):
         if isinstance(plain, (bool, str)):
             return plain
         if isinstance(plain, float):

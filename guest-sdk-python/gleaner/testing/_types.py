@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple
+from pathlib import Path
+from typing import Any, Dict, Iterable, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -36,14 +37,11 @@ class Member(NamedTuple):
 
 
 class Types:
-    """The types of one drive."""
+    """The types that are read of one drive."""
 
     def __init__(self, store: Typestore) -> None:
         self._store = store
         self._members: Dict[str, List[Member]] = {}
-
-    def __contains__(self, type_name: str) -> bool:
-        return type_name in self._store.fielddefs
 
     def members(self, type_name: str) -> List[Member]:
         """The fields of a type, in the order of the wire."""
@@ -89,19 +87,78 @@ def dtype(element: str) -> Any:
     return np.dtype({"bool": np.bool_, "byte": np.int8, "char": np.uint8}.get(element, element))
 
 
-def standard(definitions: Mapping[str, str]) -> Types:
-    """The types of ROS 2, and those defined here: the text of a `.msg` file by its type's name.
+class Definitions:
+    """What a lambda brings along: the texts that were given, by the names of their types, and the `.msg` files of its folder `msg`.
 
-    Raises ReplayError for a text that is no definition."""
-    if not definitions:
-        return Types(_humble())
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for type_name, text in definitions.items():
+    Raises ReplayError for a text that is no definition; a file is read when its type is looked for."""
+
+    def __init__(self, texts: Mapping[str, str], folder: Optional[Path]) -> None:
+        self._folder = folder
+        self._given: Dict[str, Any] = {}
+        for type_name, text in texts.items():
+            self._given.update(_parsed(type_name, text, "give the text of its .msg"))
+
+    def find(self, type_name: str) -> Any:
+        """What `rosbags` knows of a type, or None: what was given is before what lies in the folder, and all of that before ROS 2.
+
+        Raises ReplayError."""
+        package, _, leaf = type_name.partition("/msg/")
+        if type_name in self._given:
+            return self._given[type_name]
+        for path in (f"{package}/msg/{leaf}.msg", f"{package}/{leaf}.msg"):
+            found = self._read(type_name, path)
+            if found is not None:
+                return found
+        # Last, as it says no package: a `Header.msg` of the lambda's own must not stand for that of all others.
+        return _humble().fielddefs.get(type_name) or self._read(type_name, f"{leaf}.msg")
+
+    def _read(self, type_name: str, inside: str) -> Any:
+        if self._folder is None or not (self._folder / inside).is_file():
+            return None
+        path = self._folder / inside
         try:
-            store.register(get_types_from_msg(text, type_name))
-        except Exception as error:
-            raise ReplayError(f"cannot use the definition of `{type_name}`", str(error), "give the text of its .msg") from None
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ReplayError(f"cannot read `{path}`", str(error)) from None
+        return _parsed(type_name, text, f"correct `{path}`").get(type_name)
+
+
+def _parsed(type_name: str, text: str, help: str) -> Dict[str, Any]:
+    try:
+        return dict(get_types_from_msg(text, type_name))
+    except Exception as error:
+        raise ReplayError(f"cannot use the definition of `{type_name}`", str(error), help) from None
+
+
+def gathered(own: Typestore, wanted: Iterable[str], more: Definitions) -> Types:
+    """The types that are wanted, with all that they refer to: as the drive has them of its ``own``, else as ``more`` has them.
+
+    Raises ReplayError for one that is nowhere."""
+    known: Dict[str, Any] = {}
+    rest = [(type_name, type_name) for type_name in wanted]
+    while rest:
+        type_name, root = rest.pop()
+        if type_name in known:
+            continue
+        found = own.fielddefs.get(type_name) or more.find(type_name)
+        if found is None:
+            cause = f"`{root}` refers to it" if root != type_name else ""
+            help = 'pass types={"%s": "the text of its .msg"}, or put its .msg file into msg/ beside the lambda' % type_name
+            raise ReplayError(f"there is no definition of `{type_name}`", cause, help)
+        known[type_name] = found
+        elements = [_member(name, description).element for name, description in found[1]]
+        rest += [(element, root) for element in elements if "/" in element and not element.endswith("/wstring")]
+    for store in (own, _humble()):
+        if all(store.fielddefs.get(type_name) is found for type_name, found in known.items()):
+            return Types(store)
+    store = get_typestore(Stores.EMPTY)
+    store.register(known)
     return Types(store)
+
+
+def none() -> Typestore:
+    """What a drive has that says nothing of its types."""
+    return get_typestore(Stores.EMPTY)
 
 
 @functools.lru_cache(maxsize=None)

@@ -91,13 +91,14 @@ impl Road {
     /// Of the window that was just completed: stamps, and vertical accelerations in m/s², oldest first.
     pub(crate) fn roughness(&mut self, at_ns: &[i64], signal: &[f64]) -> Result<Roughness, SpectrumError> {
         let none = Roughness { score: 0.0, peak_hz: 0.0 };
-        let (Some(plan), [first, .., last]) = (&mut self.plan, at_ns) else { return Ok(none) };
+        let (Some(plan), [first, .., last], [start, ..]) = (&mut self.plan, at_ns, signal) else { return Ok(none) };
         let samples = signal.len() as f64;
         let rate_hz = (samples - 1.0) * 1e9 / (last - first) as f64;
         let bin_hz = rate_hz / samples;
-        let mean = signal.iter().sum::<f64>() / samples;
         plan.centred.clear();
-        plan.centred.extend(signal.iter().map(|value| value - mean));
+        plan.centred.extend(signal.iter().map(|value| value - start));
+        let mean = plan.centred.iter().sum::<f64>() / samples;
+        plan.centred.iter_mut().for_each(|value| *value -= mean);
         plan.spectrum.density(&plan.centred, &mut plan.density)?;
         plan.density.iter_mut().for_each(|power| *power /= rate_hz);
         let in_band = |(low, high, weight): (f64, f64, f64)| weight * band_power(&plan.density, bin_hz, low, high);
@@ -162,6 +163,15 @@ mod tests {
                 assert!((found.score - weight * 4.5).abs() < 0.01, "{hz} Hz at {end}: {found:?}");
                 assert!((found.peak_hz - hz).abs() < 1e-9 || hz > PEAK_HZ.1, "{hz} Hz at {end}: {found:?}");
             }
+        }
+    }
+
+    #[test]
+    fn a_constant_scores_exactly_nothing() {
+        for constant in [9.81, 9.7] {
+            let found = windows(&mut Road::new(1.25), 50.0, &[constant; 200]);
+            let scores: Vec<f64> = found.iter().map(|(_, found)| found.score).collect();
+            assert_eq!(scores, [0.0; 9]);
         }
     }
 
