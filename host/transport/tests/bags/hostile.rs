@@ -283,13 +283,42 @@ fn a_message_that_unpacks_to_too_much_is_too_big_and_the_next_is_not() {
     assert!(error.is_none(), "{error:?}");
     let verdicts: Vec<_> = steps.iter().map(|step| step.verdict).collect();
     assert_eq!(verdicts, [Verdict::Taken, Verdict::TooBig, Verdict::Taken]);
-    assert_eq!(sink.shown.load(Ordering::Relaxed), 1001);
+    assert_eq!(sink.shown.load(Ordering::Relaxed), 8);
     // Whoever takes anything is told where it ends.
     let mut replay = open(Limits { chunk_bytes: 1 << 20, ..Limits::default() });
     replay.subscribe(&TopicSpec { max_bytes: usize::MAX, ..spec("/a") }, Arc::new(Memory::default())).unwrap();
     let (steps, error) = run(&mut replay);
     assert_eq!(steps.len(), 1);
     assert!(matches!(damage(error).1, Damage::MessageTooLarge { allowed: 1_048_576, .. }));
+}
+
+#[test]
+fn a_packed_message_is_whole_or_too_big_even_for_who_takes_anything() {
+    let messages = ticking(&["/a"], 3, 10);
+    let large = [&[0, 1, 0, 0][..], &vec![7; 5000]].concat();
+    let path = file(&mcap_of(&messages, |message| match message.value {
+        1 => packed(&large),
+        _ => packed(&cdr(message)),
+    }));
+    for (limits, lens) in [
+        (&[1000][..], &[8, 8][..]),
+        (&[4999], &[8, 8]),
+        (&[5000], &[8, 5000, 8]),
+        (&[1000, 2000], &[8, 8, 8, 8]),
+        (&[1000, 1 << 30, 2000], &[8, 8, 8, 5000, 8, 8, 8]),
+    ] {
+        let mut replay = Replay::open(std::slice::from_ref(&path)).unwrap();
+        let memory = Arc::new(Memory::default());
+        for &max_bytes in limits {
+            replay.subscribe(&TopicSpec { max_bytes, ..spec("/a") }, memory.clone()).unwrap();
+        }
+        let (steps, error) = run(&mut replay);
+        assert!(error.is_none(), "{error:?}");
+        let taken: Vec<_> = memory.0.lock().unwrap().iter().map(|(_, cdr)| cdr.len()).collect();
+        assert_eq!(taken, lens, "{limits:?}");
+        let too_big = steps.iter().filter(|step| step.verdict == Verdict::TooBig).count();
+        assert_eq!(too_big, 3 * limits.len() - lens.len(), "{limits:?}");
+    }
 }
 
 #[test]
