@@ -183,8 +183,7 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
 /// The texts of message definitions by type, with how they are written. Databases from before ROS 2 Iron have none.
 fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, Refused> {
     let name = "message_definitions";
-    let is_there = "SELECT 1 FROM sqlite_schema WHERE name = ?1 COLLATE NOCASE";
-    if db.query_row(is_there, [name], |_| Ok(())).optional()?.is_none() {
+    if kind(db, name)?.is_none() {
         return Ok(HashMap::new());
     }
     table(db, name, &["topic_type", "encoding", "encoded_message_definition"])?;
@@ -203,16 +202,18 @@ fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, R
     Ok(texts)
 }
 
+/// What SQLite made of what the schema calls `name`: the text of a schema can be written in many ways.
+fn kind(db: &Connection, name: &str) -> rusqlite::Result<Option<String>> {
+    let sql = "SELECT type FROM pragma_table_list WHERE schema = 'main' AND name = ?1 COLLATE NOCASE";
+    db.query_row(sql, [name], |row| row.get(0)).optional()
+}
+
 /// The columns of the table `name`, `wanted` among them.
 fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Refused> {
-    let sql = "SELECT type, sql FROM sqlite_schema WHERE name = ?1 COLLATE NOCASE";
-    let found: Option<(String, String)> = db.query_row(sql, [name], |row| Ok((row.get(0)?, row.get(1)?))).optional()?;
-    let Some((kind, text)) = found else {
-        return Err(format!("it has no table `{name}`, so it is not of rosbag2").into());
-    };
-    let is_virtual = text.get(..14).is_none_or(|start| start.eq_ignore_ascii_case("create virtual"));
-    if kind != "table" || is_virtual {
-        return Err(format!("its `{name}` is no plain table").into());
+    match kind(db, name)?.as_deref() {
+        Some("table") => {}
+        Some(_) => return Err(format!("its `{name}` is no plain table").into()),
+        None => return Err(format!("it has no table `{name}`, so it is not of rosbag2").into()),
     }
     // Columns that compute are hidden ones.
     let mut statement = db.prepare("SELECT name FROM pragma_table_xinfo(?1) WHERE hidden = 0")?;

@@ -175,6 +175,14 @@ fn what_computes_instead_of_holding_is_refused() {
             "no plain table",
         ),
         (
+            // As a program writes it that wants it not to be seen.
+            "CREATE VIRTUAL TABLE other USING fts5(id, name, type, serialization_format); DROP TABLE topics; \
+             PRAGMA writable_schema = ON; UPDATE sqlite_schema SET name = 'topics', tbl_name = 'topics', \
+             sql = 'CREATE /**/  VIRTUAL TABLE topics USING fts5(id, name, type, serialization_format)' WHERE name = 'other';"
+                .to_owned(),
+            "no plain table",
+        ),
+        (
             "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, \
              data BLOB AS (zeroblob(1000000000)));"
                 .to_owned(),
