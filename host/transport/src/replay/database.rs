@@ -7,10 +7,9 @@
 
 use std::collections::HashMap;
 use std::error::Error;
-use std::ffi::OsString;
-use std::io::Read;
+use std::io::{self, Read};
 use std::os::unix::ffi::OsStrExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use rusqlite::config::DbConfig;
@@ -21,6 +20,7 @@ use super::error::{Damage, ReplayError};
 use super::file::{ChannelInfo, Channels, Contents, offered_qos};
 use super::options::Limits;
 use super::rows::{Rows, time};
+use super::storage::journals_of;
 
 type Refused = Box<dyn Error + Send + Sync>;
 
@@ -28,8 +28,6 @@ type Refused = Box<dyn Error + Send + Sync>;
 const LARGEST_ROW: u64 = 1 << 30;
 /// Statements of ours have at most a list of 65536 topics; those of a schema have no reason to be longer.
 const LONGEST_SQL: i32 = 4 << 20;
-/// The suffixes of what SQLite keeps beside a database that was not closed.
-const JOURNALS: [&str; 2] = ["-wal", "-journal"];
 
 /// Where a database is.
 #[derive(Copy, Clone)]
@@ -79,16 +77,27 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
 
 /// Refuses a database whose newest messages are still in its journal.
 fn is_closed(path: &Path) -> Result<(), ReplayError> {
-    for suffix in JOURNALS {
-        let beside = PathBuf::from(OsString::from_iter([path.as_os_str(), suffix.as_ref()]));
-        let mut start = [0; 1];
-        let read = std::fs::File::open(&beside).and_then(|mut file| file.read(&mut start));
-        // One that was dealt with is empty, or begins with zeros.
-        if matches!(read, Ok(1..)) && start != [0] {
-            return Err(ReplayError::NotClosed { path: path.to_owned(), beside });
+    for beside in journals_of(path) {
+        match holds_something(&beside) {
+            Ok(false) => {}
+            Ok(true) => return Err(ReplayError::NotClosed { path: path.to_owned(), beside }),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            // Nobody knows whether messages are in there.
+            Err(source) => return Err(ReplayError::Open { path: beside, source }),
         }
     }
     Ok(())
+}
+
+/// Whether the journal `path` was not dealt with: then it is neither empty nor begins with zeros.
+fn holds_something(path: &Path) -> io::Result<bool> {
+    let found = path.metadata()?;
+    if !found.is_file() {
+        // Not even opened: of a pipe, that would never end.
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no file"));
+    }
+    let mut start = [0; 1];
+    Ok(found.len() > 0 && std::fs::File::open(path)?.read(&mut start)? > 0 && start != [0])
 }
 
 /// The length that the header claims, in bytes; 0 if it claims none. Source: the database file format, section 1.3.

@@ -1,6 +1,7 @@
 //! What stands behind a path: which files a drive has, and who reads each of them.
 
 use std::collections::{BTreeMap, HashSet};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use super::chunk::Opener;
@@ -29,6 +30,11 @@ pub(super) struct Bag {
 /// [`ReplayError`] if a directory is none of rosbag2, or its metadata cannot be used.
 pub fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReplayError> {
     paths.iter().map(|path| Ok(bag_of(path)?.files)).collect::<Result<Vec<_>, _>>().map(|files| files.concat())
+}
+
+/// Where SQLite keeps what is not yet in the database `path`, if there is something; [`super::Replay`] looks.
+pub fn journals_of(path: &Path) -> [PathBuf; 2] {
+    ["-wal", "-journal"].map(|suffix| OsString::from_iter([path.as_os_str(), suffix.as_ref()]).into())
 }
 
 /// A file alone, or a directory of them.

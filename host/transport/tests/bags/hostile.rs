@@ -252,6 +252,37 @@ fn a_database_that_was_not_closed_is_refused_with_the_way_out() {
 }
 
 #[test]
+fn a_journal_that_cannot_be_looked_into_is_not_taken_for_none() {
+    let folder = folder();
+    let path = database_in(&folder, &ticking(&["/a"], 5, 10));
+    for suffix in ["-wal", "-journal"] {
+        let beside = folder.path().join(format!("drive.db3{suffix}"));
+        fs::create_dir(&beside).unwrap();
+        assert!(matches!(refused(&path), ReplayError::Open { path, .. } if path == beside), "{suffix}");
+        fs::remove_dir(&beside).unwrap();
+        // As SQLite leaves it.
+        fs::write(&beside, [0; 512]).unwrap();
+        assert_eq!(replayed(&path).0.len(), 5);
+    }
+}
+
+#[test]
+fn a_pipe_is_refused_and_not_waited_for() {
+    let folder = folder();
+    let path = database_in(&folder, &ticking(&["/a"], 5, 10));
+    let pipe = |name: &str| {
+        let made = std::process::Command::new("mkfifo").arg(folder.path().join(name)).status().unwrap();
+        assert!(made.success());
+    };
+    pipe("drive.db3-wal");
+    assert!(matches!(refused(&path), ReplayError::Open { .. }));
+    pipe("metadata.yaml");
+    assert!(matches!(refused(folder.path()), ReplayError::Metadata { .. }));
+    pipe("pipe.db3");
+    assert!(matches!(refused(&folder.path().join("pipe.db3")), ReplayError::Open { .. }));
+}
+
+#[test]
 fn what_only_begins_like_a_database_is_refused() {
     let start = b"SQLite format 3\0";
     for rest in [&b""[..], &[0; 84], &[0xff; 5000]] {
