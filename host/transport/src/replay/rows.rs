@@ -18,6 +18,18 @@ use super::records::MessageHead;
 /// A piece ends behind the message that makes it so long, in bytes.
 const PIECE: usize = 1 << 20;
 
+/// Which messages: those of a time behind one of it, and those behind a time.
+pub(super) const SAME_TIME: &str = "timestamp = ?1 AND rowid > ?2";
+pub(super) const LATER: &str = "timestamp > ?1";
+
+/// Asks for messages in their order, with the content of those of the topics in `list`.
+pub(super) fn select(index: &str, list: &str, condition: &str) -> String {
+    format!(
+        "SELECT rowid, timestamp, topic_id, CASE WHEN topic_id IN ({list}) THEN data END \
+         FROM messages INDEXED BY {index} WHERE {condition} ORDER BY timestamp, rowid"
+    )
+}
+
 /// A database, being read.
 pub(super) struct Rows {
     path: PathBuf,
@@ -133,17 +145,11 @@ impl Rows {
         let Self { db, index, channels, wanted, span, after, .. } = self;
         let list = wanted.iter().map(i64::to_string).collect::<Vec<_>>().join(",");
         // What nobody wants is not read, but its place in the order is.
-        let rows = |condition: &str| {
-            let sql = format!(
-                "SELECT rowid, timestamp, topic_id, CASE WHEN topic_id IN ({list}) THEN data END \
-                 FROM messages INDEXED BY {index} WHERE {condition} ORDER BY timestamp, rowid"
-            );
-            db.prepare(&sql).map_err(unreadable)
-        };
+        let rows = |condition: &str| db.prepare(&select(index, &list, condition)).map_err(unreadable);
         let mut piece = Piece { channels, wanted, span: *span, after, into };
         if let Some((at, number)) = *piece.after {
             // First the rest of those that are of one time.
-            let mut same_time = rows("timestamp = ?1 AND rowid > ?2")?;
+            let mut same_time = rows(SAME_TIME)?;
             if let Some(end) = piece.fill(same_time.query((at, number)).map_err(unreadable)?)? {
                 return Ok(end);
             }
@@ -153,7 +159,7 @@ impl Rows {
             Some((at, _)) => at,
             None => i64::try_from(span.from).unwrap_or(i64::MAX) - 1,
         };
-        let mut later = rows("timestamp > ?1")?;
+        let mut later = rows(LATER)?;
         Ok(piece.fill(later.query([behind]).map_err(unreadable)?)?.unwrap_or(End::Table))
     }
 }

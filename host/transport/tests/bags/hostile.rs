@@ -216,6 +216,42 @@ fn a_database_without_an_index_of_times_says_how_to_make_one() {
 }
 
 #[test]
+fn what_sqlite_would_have_to_sort_in_memory_is_refused() {
+    let table =
+        "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER";
+    for (columns, index, said) in [
+        ("COLLATE NOCASE, data BLOB", "timestamp COLLATE BINARY", "cannot be read in order"),
+        (", data BLOB, RowID INTEGER", "timestamp", "calls a column `rowid`"),
+        (", data BLOB, rowid INTEGER AS (1)", "timestamp", "calls a column `rowid`"),
+    ] {
+        let (_folder, path) = changed(&format!("{table} {columns}); CREATE INDEX at ON messages ({index});"));
+        let ReplayError::Database { source, .. } = refused(&path) else { panic!("{columns}") };
+        assert!(source.to_string().contains(said), "{columns}: {source}");
+    }
+}
+
+#[test]
+fn a_number_that_two_topics_have_is_refused() {
+    let (_folder, path) = changed(
+        "DROP TABLE topics; CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT);
+         INSERT INTO topics VALUES (1, '/a', 'test_msgs/msg/Number', 'cdr'), (1, '/b', 'test_msgs/msg/Number', 'cdr');",
+    );
+    let ReplayError::Database { source, .. } = refused(&path) else { panic!("it is another error") };
+    assert!(source.to_string().contains("two of its topics have the number 1"), "{source}");
+}
+
+#[test]
+fn more_definitions_than_a_drive_can_need_are_refused_however_short() {
+    let (_folder, path) = changed(
+        "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 600000)
+         INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash)
+         SELECT '', '', '', '' FROM n;",
+    );
+    let ReplayError::Database { source, .. } = refused(&path) else { panic!("it is another error") };
+    assert!(source.to_string().contains("more than 64 MiB"), "{source}");
+}
+
+#[test]
 fn an_index_that_lost_messages_or_their_order_is_noticed_where_it_shows() {
     // The index says another order than the table: what it gives has to come in order.
     let (_folder, path) = changed(
