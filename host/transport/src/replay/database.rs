@@ -19,7 +19,7 @@ use rusqlite::{Connection, OpenFlags, OptionalExtension};
 use super::error::{Damage, ReplayError};
 use super::file::{ChannelInfo, Channels, Contents, offered_qos};
 use super::options::Limits;
-use super::rows::{LATER, Rows, SAME_TIME, select, time};
+use super::rows::{LATER, Rows, SAME_TIME, is_of_system, select, time};
 use super::storage::journals_of;
 
 type Refused = Box<dyn Error + Send + Sync>;
@@ -59,7 +59,12 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
         is_closed(file.real)?;
     }
     let path = file.shown.to_owned();
-    let refused = |source| ReplayError::Database { path: path.clone(), source };
+    let refused = |source: Refused| {
+        if is_of_system(&*source) {
+            return ReplayError::Open { path: path.clone(), source: io::Error::other(source) };
+        }
+        ReplayError::Database { path: path.clone(), source }
+    };
     let expected = claimed_len(file.real).map_err(|source| ReplayError::Open { path: path.clone(), source })?;
     let is_cut_off = expected > len;
     let db = connect(file.real, limits, is_cut_off).map_err(|error| refused(error.into()))?;
@@ -153,7 +158,10 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
     ] {
         db.set_db_config(config, wanted)?;
     }
-    db.execute_batch("PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0;")?;
+    // Pages are read once, in order; a drive may have hundreds of databases, each with a cache (in KiB).
+    db.execute_batch(
+        "PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0; PRAGMA cache_size = -512;",
+    )?;
     Ok(db)
 }
 
