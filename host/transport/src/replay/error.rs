@@ -78,7 +78,7 @@ pub enum ReplayError {
         source: io::Error,
     },
     /// A packed file holds more than we are ready to write.
-    #[error("drive `{path}` is more than {allowed} bytes once unpacked")]
+    #[error("with drive `{path}`, the packed files hold more than {allowed} bytes")]
     UnpacksTooLarge {
         /// The file.
         path: PathBuf,

@@ -405,6 +405,21 @@ fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let error = Replay::open_as(&[file(&packed(&bytes))], &options).err().unwrap();
     assert!(matches!(error, ReplayError::UnpacksTooLarge { allowed: 1_048_576, .. }), "{error}");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    // Nor in parts.
+    let part = [&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 700 << 10]].concat();
+    let parts = [file(&packed(&part)), file(&packed(&part))];
+    Replay::open_as(&parts[..1], &options).unwrap();
+    let error = Replay::open_as(&parts, &options).err().unwrap();
+    assert!(matches!(&error, ReplayError::UnpacksTooLarge { path, .. } if *path == parts[1]), "{error}");
+}
+
+#[test]
+fn what_is_nothing_of_ours_is_not_unpacked() {
+    let folder = folder();
+    let nowhere = folder.path().join("not there");
+    let options = Options { unpack_in: Some(nowhere), ..Options::default() };
+    let error = Replay::open_as(&[file(&packed(&vec![7; 8 << 20]))], &options).err().unwrap();
+    assert!(matches!(error, ReplayError::NotMcap { .. }), "{error}");
 }
 
 #[test]
