@@ -15,6 +15,7 @@ use std::sync::Arc;
 use rusqlite::config::DbConfig;
 use rusqlite::limits::Limit;
 use rusqlite::{Connection, OpenFlags, OptionalExtension};
+use tracing::warn;
 
 use super::error::{Damage, ReplayError};
 use super::file::{ChannelInfo, Channels, Contents, offered_qos};
@@ -79,6 +80,8 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
     let mut contents = Contents { channels: known.channels, uncounted: true, ..Contents::default() };
     contents.times = first.as_ref().ok().copied().flatten().map(|first| (first, last.unwrap_or(first).max(first)));
     if is_cut_off {
+        warn!(path = %path.display(), expected, found = len, "database was cut off, its newest messages are lost");
+        contents.is_end_unknown = last.is_none();
         contents.damage = Some((len, Damage::DatabaseCutOff { expected, found: len }));
     }
     Ok((Rows::new(file.shown, db, index, known.ids, first), contents))

@@ -220,8 +220,12 @@ impl Replay {
         starts.min().map(nanoseconds)
     }
 
-    /// Log time of the last message of any topic, in ns; `None` if there is none.
+    /// Log time of the last message of any topic, in ns; `None` if there is none, or if nobody knows: of a database that was
+    /// cut off.
     pub fn end_ns(&self) -> Option<i64> {
+        if self.tracks.iter().any(Track::is_end_unknown) {
+            return None;
+        }
         let ends = self.tracks.iter().filter_map(|track| track.times().map(|times| times.1));
         ends.max().map(nanoseconds)
     }

@@ -155,6 +155,8 @@ pub(super) struct Contents {
     pub(super) damage: Option<(u64, Damage)>,
     /// First and last log time, in ns, if they are not those of `segments`.
     pub(super) times: Option<(u64, u64)>,
+    /// Whether the second of `times` is not the last: that is lost.
+    pub(super) is_end_unknown: bool,
 }
 
 impl Contents {

@@ -108,6 +108,11 @@ impl Track {
         self.times
     }
 
+    /// Whether the last of [`Track::times`] is lost.
+    pub(super) fn is_end_unknown(&self) -> bool {
+        self.contents.is_end_unknown
+    }
+
     pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
         self.store.damaged(offset, what)
     }
