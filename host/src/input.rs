@@ -236,6 +236,15 @@ impl Sink for Ingest {
         verdict
     }
 
+    fn too_big(&self, _: &SampleMeta, len: usize) {
+        // A ring refuses such a length by itself, and counts it.
+        let refused = self.end().ring.draft(len).err();
+        self.arrivals.refuse();
+        if let Some(refusal) = refused {
+            self.say(refusal);
+        }
+    }
+
     fn copy(&self, cdr: &[u8]) -> Option<Verdict> {
         Some(self.fill(cdr))
     }
@@ -357,6 +366,14 @@ mod tests {
         assert_eq!(&*reader.newest().unwrap(), b"mine");
         let counts = reader.counts();
         assert_eq!((counts.received, counts.overwritten, counts.no_slot, counts.too_big), (1, 0, 0, 0));
+    }
+
+    #[test]
+    fn a_sample_that_is_told_of_as_too_big_counts_as_one_that_was_shown() {
+        let (ingest, reader) = ingest();
+        ingest.too_big(&meta(1), 9);
+        assert!(reader.newest().is_none());
+        assert_eq!(reader.counts().too_big, 1);
     }
 
     #[test]

@@ -30,5 +30,5 @@ mod window;
 
 pub use digest::lambda_digest;
 pub use error::RecordError;
-pub use file::{Folder, LossList, Topic};
+pub use file::{Folder, LossList, MESSAGE_MAX, Topic};
 pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TopicId, Work};

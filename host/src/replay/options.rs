@@ -8,6 +8,7 @@ use clap::Args;
 use gleaner_jail::Paths;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, DriveTime, Exit, Failure};
+use gleaner_transport::replay::journals_of;
 
 use super::part::Wanted;
 use super::verify::Claim;
@@ -124,6 +125,7 @@ impl Job {
         read.push(asked.lambda.clone());
         read.extend(asked.vehicle.clone());
         read.extend(drives.named.iter().chain(&drives.files).cloned());
+        read.extend(drives.files.iter().flat_map(|file| journals_of(file)).filter(|journal| journal.is_file()));
         if let Task::Verify(claim) = &self.task {
             read.push(claim.path().to_owned());
         }

@@ -22,7 +22,12 @@ impl From<Part> for Wanted {
 impl Wanted {
     /// Has `drive` replay this part only.
     pub(super) fn restrict(self, drive: &mut Replay) -> Result<Part, Failure> {
-        let (start_ns, end_ns) = (drive.start_ns().unwrap_or(0), drive.end_ns().unwrap_or(0));
+        if self.from.is_none() && self.to.is_none() {
+            return Ok(Part::default());
+        }
+        let start_ns = drive.start_ns().unwrap_or(0);
+        // Of a database that was cut off, nobody knows it.
+        let end_ns = drive.end_ns();
         let ns = |time: DriveTime| match time {
             DriveTime::After(duration) => {
                 start_ns.saturating_add(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX))
@@ -31,17 +36,15 @@ impl Wanted {
         };
         let part = Part { from_ns: self.from.map(ns), to_ns: self.to.map(ns) };
         let (from_ns, to_ns) = (part.from_ns.unwrap_or(start_ns), part.to_ns.unwrap_or(i64::MAX));
-        if from_ns > end_ns || to_ns <= start_ns || to_ns <= from_ns {
+        if end_ns.is_some_and(|end_ns| from_ns > end_ns) || to_ns <= start_ns || to_ns <= from_ns {
             return Err(nothing_in(part, start_ns, end_ns));
         }
-        if part != Part::default() {
-            drive.restrict(part.from_ns.unwrap_or(0), to_ns);
-        }
+        drive.restrict(part.from_ns.unwrap_or(0), to_ns);
         Ok(part)
     }
 }
 
-fn nothing_in(part: Part, start_ns: i64, end_ns: i64) -> Failure {
+fn nothing_in(part: Part, start_ns: i64, end_ns: Option<i64>) -> Failure {
     let seconds = |ns: i64| format!("{:.3} s", ns.saturating_sub(start_ns) as f64 / 1e9);
     let side = |flag: &str, ns: Option<i64>| ns.map(|ns| format!("{flag} is {} after its start", seconds(ns)));
     let asked = [side("--from", part.from_ns), side("--to", part.to_ns)];
@@ -49,7 +52,7 @@ fn nothing_in(part: Part, start_ns: i64, end_ns: i64) -> Failure {
     failure.causes = vec![asked.into_iter().flatten().collect::<Vec<_>>().join(", ")];
     failure.with_help(format!(
         "the drive is {} long, from @{}.{:09} on",
-        seconds(end_ns),
+        end_ns.map_or("?".to_owned(), seconds),
         start_ns.div_euclid(1_000_000_000),
         start_ns.rem_euclid(1_000_000_000)
     ))

@@ -7,7 +7,7 @@ use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{
-    Counts, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, lambda_digest,
+    Counts, Folder, LambdaId, MESSAGE_MAX, Member, RecordError, Recorder, Settings, Topic, TopicId, lambda_digest,
 };
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
@@ -117,7 +117,7 @@ impl Recording {
                     topic: found.topic.clone(),
                     type_name: found.type_name.clone(),
                     queue: 1,
-                    max_bytes: usize::try_from(rules.preroll_size.bytes()).unwrap_or(usize::MAX),
+                    max_bytes: MESSAGE_MAX,
                     qos: Qos::Auto,
                 };
                 match drive.subscribe(&spec, lane.clone()) {

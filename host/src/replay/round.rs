@@ -114,7 +114,10 @@ impl Pass<'_> {
     fn run(&mut self, drive: &mut Replay) -> Result<(Reached, Recorded), Failure> {
         let reached = course::take(drive, self)?;
         // Of a damaged drive nobody knows what came after the last sample.
-        let end_ns = drive.end_ns().unwrap_or(0).min(self.part.to_ns.map_or(i64::MAX, |to_ns| to_ns.saturating_sub(1)));
+        let end_ns = drive
+            .end_ns()
+            .unwrap_or(reached.at_ns)
+            .min(self.part.to_ns.map_or(i64::MAX, |to_ns| to_ns.saturating_sub(1)));
         let end_ns = if reached.broken.is_some() { reached.at_ns } else { end_ns };
         let recorded = self.recording.as_ref().map_or(Ok(Recorded::default()), |recording| recording.finish(end_ns))?;
         Ok((reached, recorded))
@@ -210,7 +213,7 @@ pub(super) fn replay(
         triggers_refused: pass.session.triggers_refused(),
         passed_over: pass.session.passed_over(),
         start_ns: drive.start_ns().unwrap_or(0),
-        end_ns: drive.end_ns().unwrap_or(0),
+        end_ns: drive.end_ns().unwrap_or(reached.at_ns.max(drive.start_ns().unwrap_or(0))),
         part,
         wall_s,
         run_s: pass.judge.run().as_secs_f64(),

@@ -17,8 +17,8 @@ pub struct TopicSpec {
     /// pulled and holds none.
     pub queue: usize,
     /// The largest sample, in bytes of CDR, that the sink will take. A live transport sizes its
-    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`]. Of a larger sample that
-    /// is packed, it may be shown the beginning only, which is still too big.
+    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`]. A larger sample that is packed is not
+    /// unpacked to its end, and not shown to the sink: it is told by [`Sink::too_big`].
     pub max_bytes: usize,
     /// How a live transport asks for it.
     pub qos: Qos,
@@ -121,6 +121,10 @@ pub trait Sink: Send + Sync {
     ///
     /// Runs on the transport's thread: one copy, no lock that a lambda can hold, never blocks.
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict;
+
+    /// A sample was passed over that is larger than [`TopicSpec::max_bytes`]: it has at least `len` bytes of CDR. The
+    /// verdict is [`Verdict::TooBig`]; whoever counts what it refuses counts it here.
+    fn too_big(&self, _meta: &SampleMeta, _len: usize) {}
 
     /// Copies one sample, where a transport shows its bytes before it knows whose they are. `None`, as here: the sink
     /// wants both at once, so the transport makes a copy of its own for [`deliver`](Self::deliver).

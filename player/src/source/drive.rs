@@ -91,10 +91,13 @@ impl Sink for Inbox {
 impl Drive {
     pub(crate) fn open(args: &Args) -> Result<Drive, Failure> {
         let mut replay = Replay::open(&args.drives).map_err(DriveError)?;
-        let (start_ns, end_ns) = (replay.start_ns().unwrap_or(0), replay.end_ns().unwrap_or(0));
+        let start_ns = replay.start_ns().unwrap_or(0);
+        // Of a database that was cut off, nobody knows it.
+        let known_end_ns = replay.end_ns();
+        let end_ns = known_end_ns.unwrap_or(start_ns);
         let from_ns = start_ns.saturating_add(args.start);
         let to_ns = args.duration.map_or(i64::MAX, |duration| from_ns.saturating_add(duration));
-        if from_ns > end_ns {
+        if known_end_ns.is_some() && from_ns > end_ns {
             let seconds = end_ns.saturating_sub(start_ns) as f64 / 1e9;
             let what = format!("the drive is only {seconds:.1} s long");
             return Err(Failure::new(Exit::Usage, what).with_help("give a smaller --start"));

@@ -40,7 +40,8 @@ use gleaner_protocol::{ClipLambda, Moment};
 
 pub use folder::Folder;
 pub use losses::LossList;
-pub(crate) use unfinished::{MESSAGE_MAX, Unfinished};
+pub use unfinished::MESSAGE_MAX;
+pub(crate) use unfinished::Unfinished;
 
 use crate::error::RecordError;
 

@@ -30,7 +30,7 @@ pub(super) const CHANNELS_MAX: usize = 16 << 10;
 
 /// Most bytes of a message. The fields of the file have room for more, but whoever reads a clip holds a chunk of it in
 /// memory, and our reader no more than 1 GiB: a message with what else may be in its chunk.
-pub(crate) const MESSAGE_MAX: usize = 960 << 20;
+pub const MESSAGE_MAX: usize = 960 << 20;
 /// Most bytes of a metadata record; ours have some KB, and with it the config of a lambda.
 pub(super) const METADATA_MAX: usize = 64 << 20;
 

@@ -42,12 +42,27 @@ struct Gate {
     waiting_bytes: Arc<AtomicUsize>,
 }
 
+/// A sample, or the length of one that is too big.
+enum Held {
+    Whole(Vec<u8>),
+    TooBig(usize),
+}
+
 #[derive(Default)]
 struct State {
     /// How many samples may pass.
     owed: u64,
     /// Samples that came before their turn.
-    waiting: VecDeque<(SampleMeta, Vec<u8>)>,
+    waiting: VecDeque<(SampleMeta, Held)>,
+}
+
+impl Held {
+    fn cost(&self) -> usize {
+        match self {
+            Self::Whole(cdr) => WAITING_COST + cdr.len(),
+            Self::TooBig(_) => WAITING_COST,
+        }
+    }
 }
 
 impl Gate {
@@ -55,15 +70,23 @@ impl Gate {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    fn wait(&self, state: &mut State, meta: SampleMeta, held: Held) {
+        self.waiting_bytes.fetch_add(held.cost(), Ordering::Relaxed);
+        state.waiting.push_back((meta, held));
+    }
+
     /// Lets `n` more samples pass: those that wait at once.
     fn owe(&self, n: u64) {
         let mut state = self.lock();
         state.owed = state.owed.saturating_add(n);
         while state.owed > 0 {
-            let Some((meta, cdr)) = state.waiting.pop_front() else { break };
+            let Some((meta, held)) = state.waiting.pop_front() else { break };
             state.owed -= 1;
-            self.waiting_bytes.fetch_sub(WAITING_COST + cdr.len(), Ordering::Relaxed);
-            self.sink.deliver(&meta, &cdr);
+            self.waiting_bytes.fetch_sub(held.cost(), Ordering::Relaxed);
+            match held {
+                Held::Whole(cdr) => drop(self.sink.deliver(&meta, &cdr)),
+                Held::TooBig(len) => self.sink.too_big(&meta, len),
+            }
         }
     }
 }
@@ -75,9 +98,17 @@ impl Sink for Gate {
             state.owed -= 1;
             return self.sink.deliver(meta, cdr);
         }
-        self.waiting_bytes.fetch_add(WAITING_COST + cdr.len(), Ordering::Relaxed);
-        state.waiting.push_back((*meta, cdr.to_vec()));
+        self.wait(&mut state, *meta, Held::Whole(cdr.to_vec()));
         Verdict::Taken
+    }
+
+    fn too_big(&self, meta: &SampleMeta, len: usize) {
+        let mut state = self.lock();
+        if state.owed > 0 {
+            state.owed -= 1;
+            return self.sink.too_big(meta, len);
+        }
+        self.wait(&mut state, *meta, Held::TooBig(len));
     }
 }
 

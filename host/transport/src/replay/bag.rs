@@ -18,7 +18,8 @@ const PACKED: &str = ".zstd";
 /// The files of the directory `folder`.
 pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
     let path = folder.join("metadata.yaml");
-    let text = match text_of(&path) {
+    let root = folder.canonicalize().map_err(|source| ReplayError::Open { path: folder.to_owned(), source })?;
+    let text = match text_of(&path, &root) {
         Ok(text) => text,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return by_name(folder),
         Err(error) => return Err(ReplayError::Metadata { path, source: error.into() }),
@@ -27,18 +28,26 @@ pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
         Ok(found) => found,
         Err(source) => return Err(ReplayError::Metadata { path, source }),
     };
-    let root = folder.canonicalize().map_err(|source| ReplayError::Open { path: folder.to_owned(), source })?;
     let files = found.files.into_iter().map(|file| named(folder, &root, &path, file)).collect::<Result<_, _>>()?;
     Ok(Bag { files, messages: found.messages })
 }
 
-fn text_of(path: &Path) -> io::Result<String> {
-    let mut bytes = Vec::new();
-    File::open(path)?.take(metadata::MAX_BYTES + 1).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 > metadata::MAX_BYTES {
-        return Err(io::Error::new(io::ErrorKind::InvalidData, "it is larger than 16 MiB"));
+/// The text of the file `path`, which has to be in the folder `root`.
+fn text_of(path: &Path, root: &Path) -> io::Result<String> {
+    let invalid = |what| Err(io::Error::new(io::ErrorKind::InvalidData, what));
+    let real = path.canonicalize()?;
+    if !real.starts_with(root) {
+        return invalid("it is a link that leads out of its directory");
     }
-    String::from_utf8(bytes).map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is not UTF-8"))
+    if !real.is_file() {
+        return invalid("it is no file");
+    }
+    let mut bytes = Vec::new();
+    File::open(real)?.take(metadata::MAX_BYTES + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > metadata::MAX_BYTES {
+        return invalid("it is larger than 16 MiB");
+    }
+    String::from_utf8(bytes).or_else(|_| invalid("it is not UTF-8"))
 }
 
 /// Where the file is that `metadata` name `file`; it has to be in `folder`, whose own path is `root`.

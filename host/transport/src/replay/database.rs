@@ -5,22 +5,23 @@
 //!
 //! Source: `rosbag2_storage_sqlite3`, schema versions 1 to 4.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::error::Error;
-use std::ffi::OsString;
-use std::io::Read;
+use std::io::{self, Read};
 use std::os::unix::ffi::OsStrExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use rusqlite::config::DbConfig;
 use rusqlite::limits::Limit;
 use rusqlite::{Connection, OpenFlags, OptionalExtension};
+use tracing::warn;
 
 use super::error::{Damage, ReplayError};
 use super::file::{ChannelInfo, Channels, Contents, offered_qos};
 use super::options::Limits;
-use super::rows::{Rows, time};
+use super::rows::{LATER, Rows, SAME_TIME, is_of_system, select, time};
+use super::storage::journals_of;
 
 type Refused = Box<dyn Error + Send + Sync>;
 
@@ -28,8 +29,9 @@ type Refused = Box<dyn Error + Send + Sync>;
 const LARGEST_ROW: u64 = 1 << 30;
 /// Statements of ours have at most a list of 65536 topics; those of a schema have no reason to be longer.
 const LONGEST_SQL: i32 = 4 << 20;
-/// The suffixes of what SQLite keeps beside a database that was not closed.
-const JOURNALS: [&str; 2] = ["-wal", "-journal"];
+
+/// What a row takes beside its texts, about. A damaged or made-up table has no end to them.
+const ROW_BYTES: usize = 128;
 
 /// Where a database is.
 #[derive(Copy, Clone)]
@@ -58,7 +60,12 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
         is_closed(file.real)?;
     }
     let path = file.shown.to_owned();
-    let refused = |source| ReplayError::Database { path: path.clone(), source };
+    let refused = |source: Refused| {
+        if is_of_system(&*source) {
+            return ReplayError::Open { path: path.clone(), source: io::Error::other(source) };
+        }
+        ReplayError::Database { path: path.clone(), source }
+    };
     let expected = claimed_len(file.real).map_err(|source| ReplayError::Open { path: path.clone(), source })?;
     let is_cut_off = expected > len;
     let db = connect(file.real, limits, is_cut_off).map_err(|error| refused(error.into()))?;
@@ -66,12 +73,15 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
     let Some(index) = index_of_times(&db).map_err(|error| refused(error.into()))? else {
         return Err(ReplayError::NoTimes { path });
     };
+    in_order(&db, &index).map_err(refused)?;
     let first = edge(&db, &index, "ASC");
     // The newest is lost with the end of the file.
     let last = edge(&db, &index, "DESC").ok().flatten();
     let mut contents = Contents { channels: known.channels, uncounted: true, ..Contents::default() };
     contents.times = first.as_ref().ok().copied().flatten().map(|first| (first, last.unwrap_or(first).max(first)));
     if is_cut_off {
+        warn!(path = %path.display(), expected, found = len, "database was cut off, its newest messages are lost");
+        contents.is_end_unknown = last.is_none();
         contents.damage = Some((len, Damage::DatabaseCutOff { expected, found: len }));
     }
     Ok((Rows::new(file.shown, db, index, known.ids, first), contents))
@@ -79,16 +89,27 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
 
 /// Refuses a database whose newest messages are still in its journal.
 fn is_closed(path: &Path) -> Result<(), ReplayError> {
-    for suffix in JOURNALS {
-        let beside = PathBuf::from(OsString::from_iter([path.as_os_str(), suffix.as_ref()]));
-        let mut start = [0; 1];
-        let read = std::fs::File::open(&beside).and_then(|mut file| file.read(&mut start));
-        // One that was dealt with is empty, or begins with zeros.
-        if matches!(read, Ok(1..)) && start != [0] {
-            return Err(ReplayError::NotClosed { path: path.to_owned(), beside });
+    for beside in journals_of(path) {
+        match holds_something(&beside) {
+            Ok(false) => {}
+            Ok(true) => return Err(ReplayError::NotClosed { path: path.to_owned(), beside }),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            // Nobody knows whether messages are in there.
+            Err(source) => return Err(ReplayError::Open { path: beside, source }),
         }
     }
     Ok(())
+}
+
+/// Whether the journal `path` was not dealt with: then it is neither empty nor begins with zeros.
+fn holds_something(path: &Path) -> io::Result<bool> {
+    let found = path.metadata()?;
+    if !found.is_file() {
+        // Not even opened: of a pipe, that would never end.
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no file"));
+    }
+    let mut start = [0; 1];
+    Ok(found.len() > 0 && std::fs::File::open(path)?.read(&mut start)? > 0 && start != [0])
 }
 
 /// The length that the header claims, in bytes; 0 if it claims none. Source: the database file format, section 1.3.
@@ -140,7 +161,10 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
     ] {
         db.set_db_config(config, wanted)?;
     }
-    db.execute_batch("PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0;")?;
+    // Pages are read once, in order; a drive may have hundreds of databases, each with a cache (in KiB).
+    db.execute_batch(
+        "PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0; PRAGMA cache_size = -512;",
+    )?;
     Ok(db)
 }
 
@@ -157,15 +181,16 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
     let has_qos = columns.iter().any(|column| column == "offered_qos_profiles");
     let texts = definitions(db)?;
     let qos = if has_qos { "offered_qos_profiles" } else { "NULL" };
-    let sql = format!("SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id");
+    let sql = format!("SELECT id, name, type, serialization_format, {qos} FROM topics NOT INDEXED");
     let mut statement = db.prepare(&sql)?;
     let mut rows = statement.query([])?;
-    let mut known = Topics { channels: Channels::default(), ids: HashMap::new() };
+    let (mut found, mut room) = (BTreeMap::<i64, ChannelInfo>::new(), Channels::default());
     while let Some(row) = rows.next()? {
-        let id = u16::try_from(known.ids.len()).map_err(|_| "it has more than 65536 topics")?;
-        let (topic, type_name): (String, String) = (row.get(1)?, row.get(2)?);
+        if found.len() > usize::from(u16::MAX) {
+            return Err("it has more than 65536 topics".into());
+        }
+        let (number, topic, type_name): (_, String, String) = (row.get(0)?, row.get(1)?, row.get(2)?);
         let text = texts.get(&type_name);
-        known.ids.insert(row.get(0)?, id);
         let info = ChannelInfo {
             offered_qos: offered_qos(&topic, row.get::<_, Option<String>>(4)?.as_deref()),
             topic,
@@ -175,6 +200,14 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
             type_name,
             writer: None,
         };
+        room.make_room(ROW_BYTES + info.bytes())?;
+        if found.insert(number, info).is_some() {
+            return Err(format!("two of its topics have the number {number}").into());
+        }
+    }
+    let mut known = Topics { channels: Channels::default(), ids: HashMap::new() };
+    for (id, (number, info)) in (0..=u16::MAX).zip(found) {
+        known.ids.insert(number, id);
         known.channels.add(id, info)?;
     }
     Ok(known)
@@ -183,18 +216,17 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
 /// The texts of message definitions by type, with how they are written. Databases from before ROS 2 Iron have none.
 fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, Refused> {
     let name = "message_definitions";
-    let is_there = "SELECT 1 FROM sqlite_schema WHERE name = ?1 COLLATE NOCASE";
-    if db.query_row(is_there, [name], |_| Ok(())).optional()?.is_none() {
+    if kind(db, name)?.is_none() {
         return Ok(HashMap::new());
     }
     table(db, name, &["topic_type", "encoding", "encoded_message_definition"])?;
     let mut statement =
-        db.prepare("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions ORDER BY rowid")?;
+        db.prepare("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions NOT INDEXED")?;
     let mut rows = statement.query([])?;
     let (mut texts, mut room) = (HashMap::new(), Channels::default());
     while let Some(row) = rows.next()? {
         let (type_name, encoding, text): (String, String, String) = (row.get(0)?, row.get(1)?, row.get(2)?);
-        room.make_room(type_name.len() + encoding.len() + text.len())?;
+        room.make_room(ROW_BYTES + type_name.len() + encoding.len() + text.len())?;
         let text = text.trim();
         if !text.is_empty() {
             texts.entry(type_name).or_insert_with(|| (encoding, text.into()));
@@ -203,20 +235,30 @@ fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, R
     Ok(texts)
 }
 
+/// What SQLite made of what the schema calls `name`: the text of a schema can be written in many ways.
+fn kind(db: &Connection, name: &str) -> rusqlite::Result<Option<String>> {
+    let sql = "SELECT type FROM pragma_table_list WHERE schema = 'main' AND name = ?1 COLLATE NOCASE";
+    db.query_row(sql, [name], |row| row.get(0)).optional()
+}
+
 /// The columns of the table `name`, `wanted` among them.
 fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Refused> {
-    let sql = "SELECT type, sql FROM sqlite_schema WHERE name = ?1 COLLATE NOCASE";
-    let found: Option<(String, String)> = db.query_row(sql, [name], |row| Ok((row.get(0)?, row.get(1)?))).optional()?;
-    let Some((kind, text)) = found else {
-        return Err(format!("it has no table `{name}`, so it is not of rosbag2").into());
-    };
-    let is_virtual = text.get(..14).is_none_or(|start| start.eq_ignore_ascii_case("create virtual"));
-    if kind != "table" || is_virtual {
-        return Err(format!("its `{name}` is no plain table").into());
+    match kind(db, name)?.as_deref() {
+        Some("table") => {}
+        Some(_) => return Err(format!("its `{name}` is no plain table").into()),
+        None => return Err(format!("it has no table `{name}`, so it is not of rosbag2").into()),
     }
     // Columns that compute are hidden ones.
-    let mut statement = db.prepare("SELECT name FROM pragma_table_xinfo(?1) WHERE hidden = 0")?;
-    let columns: Vec<String> = statement.query_map([name], |row| row.get(0))?.collect::<Result<_, _>>()?;
+    let mut statement = db.prepare("SELECT name, hidden FROM pragma_table_xinfo(?1)")?;
+    let all: Vec<(String, i64)> =
+        statement.query_map([name], |row| Ok((row.get(0)?, row.get(1)?)))?.collect::<Result<_, _>>()?;
+    if all.iter().any(|(column, _)| column.eq_ignore_ascii_case("rowid")) {
+        return Err(format!(
+            "its table `{name}` calls a column `rowid`, which is SQLite's own for the number of a row"
+        )
+        .into());
+    }
+    let columns: Vec<_> = all.into_iter().filter(|(_, hidden)| *hidden == 0).map(|(column, _)| column).collect();
     match wanted.iter().find(|wanted| !columns.iter().any(|column| column == *wanted)) {
         None => Ok(columns),
         Some(column) => Err(format!("its table `{name}` has no column `{column}`").into()),
@@ -241,11 +283,33 @@ fn index_of_times(db: &Connection) -> rusqlite::Result<Option<String>> {
     Ok(None)
 }
 
+/// Refuses a database whose index does not give messages in the order of their times by itself, as with an order of its
+/// own for texts: SQLite would read all of them, and sort them in memory, for each piece.
+fn in_order(db: &Connection, index: &str) -> Result<(), Refused> {
+    let pieces = [SAME_TIME, LATER].map(|condition| (select(index, "0", condition), false));
+    let edges = ["ASC", "DESC"].map(|order| (edge_sql(index, order), true));
+    for (sql, may_scan) in pieces.into_iter().chain(edges) {
+        let mut statement = db.prepare(&format!("EXPLAIN QUERY PLAN {sql}"))?;
+        // A plan needs no values, and is the same for all.
+        let mut steps = statement.raw_query();
+        while let Some(step) = steps.next()? {
+            let step: String = step.get("detail")?;
+            if step.contains("TEMP B-TREE") || step.starts_with("SCAN") && !may_scan {
+                return Err(format!("its messages cannot be read in order by the index {index}").into());
+            }
+        }
+    }
+    Ok(())
+}
+
+fn edge_sql(index: &str, order: &str) -> String {
+    format!("SELECT timestamp FROM messages INDEXED BY {index} ORDER BY timestamp {order} LIMIT 1")
+}
+
 /// The first or the last time; `None` if there are no messages.
 fn edge(db: &Connection, index: &str, order: &str) -> Result<Option<u64>, Damage> {
-    let sql = format!("SELECT timestamp FROM messages INDEXED BY {index} ORDER BY timestamp {order} LIMIT 1");
     let unreadable = |error: rusqlite::Error| Damage::Database(error.into());
-    let mut statement = db.prepare(&sql).map_err(unreadable)?;
+    let mut statement = db.prepare(&edge_sql(index, order)).map_err(unreadable)?;
     let mut rows = statement.query([]).map_err(unreadable)?;
     let Some(row) = rows.next().map_err(unreadable)? else {
         return Ok(None);

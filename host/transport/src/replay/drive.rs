@@ -15,7 +15,7 @@ use super::step::{Progress, Step};
 use super::storage;
 use super::track::{Routed, Track, nanoseconds};
 use crate::message::Definitions;
-use crate::transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError};
+use crate::transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict};
 
 /// A drive: one or more files and rosbag2 directories, replayed as one.
 ///
@@ -173,14 +173,20 @@ impl Replay {
             .head()
             .ok_or(Damage::Malformed("a chunk lost its place"))
             .and_then(|entry| track.route(segment.body(entry), self.fan, &mut self.inflate));
-        let Routed { subscription, is_last, meta, cdr } = match routed {
+        let Routed { subscription, is_last, meta, is_too_big, cdr } = match routed {
             Ok(routed) => routed,
             Err(what) => {
                 let error = track.damaged(head.offset, what);
                 return Err(self.end(error));
             }
         };
-        let verdict = self.sinks[subscription.0].deliver(&meta, cdr);
+        let sink = &self.sinks[subscription.0];
+        let verdict = if is_too_big {
+            sink.too_big(&meta, cdr.len());
+            Verdict::TooBig
+        } else {
+            sink.deliver(&meta, cdr)
+        };
         let step = Step { at_ns: meta.at_ns, subscription, verdict, meta, bytes: cdr.len() };
         if meta.at_ns < self.last_at_ns {
             self.out_of_order += u64::from(self.fan == 0);
@@ -214,8 +220,12 @@ impl Replay {
         starts.min().map(nanoseconds)
     }
 
-    /// Log time of the last message of any topic, in ns; `None` if there is none.
+    /// Log time of the last message of any topic, in ns; `None` if there is none, or if nobody knows: of a database that was
+    /// cut off.
     pub fn end_ns(&self) -> Option<i64> {
+        if self.tracks.iter().any(Track::is_end_unknown) {
+            return None;
+        }
         let ends = self.tracks.iter().filter_map(|track| track.times().map(|times| times.1));
         ends.max().map(nanoseconds)
     }

@@ -3,7 +3,7 @@
 use std::error::Error;
 use std::fmt;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Why a drive cannot be opened, or ends before its end.
 #[derive(Debug, thiserror::Error)]
@@ -78,7 +78,7 @@ pub enum ReplayError {
         source: io::Error,
     },
     /// A packed file holds more than we are ready to write.
-    #[error("drive `{path}` is more than {allowed} bytes once unpacked")]
+    #[error("with drive `{path}`, the packed files hold more than {allowed} bytes")]
     UnpacksTooLarge {
         /// The file.
         path: PathBuf,
@@ -158,28 +158,40 @@ impl ReplayError {
         Some(match self {
             Self::NoBag { .. } => "name a .mcap or .db3 file, or a directory that `ros2 bag record` wrote".to_owned(),
             Self::Metadata { path, .. } | Self::NoSuchFile { metadata: path, .. } => {
-                let folder = path.parent().unwrap_or(path).display();
+                let folder = word(path.parent().unwrap_or(path));
                 format!("write it anew with `ros2 bag reindex {folder}`, or name the files in the directory themselves")
             }
             Self::Outside { .. } => "name that file itself, if you trust who wrote this".to_owned(),
             Self::Twice { .. } => "its samples would count twice; give each file once".to_owned(),
             Self::Unpack { path, .. } | Self::UnpacksTooLarge { path, .. } => {
-                format!("unpack it yourself: zstd -d {}", path.display())
+                format!("unpack it yourself: zstd -d {}", word(path))
             }
             Self::NotClosed { path, .. } => {
-                format!("close it: sqlite3 {} 'PRAGMA wal_checkpoint(TRUNCATE)'", path.display())
+                format!("close it: sqlite3 {} 'PRAGMA wal_checkpoint(TRUNCATE)'", word(path))
             }
             Self::NoTimes { path } => {
-                format!("make one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'", path.display())
+                format!("make one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'", word(path))
             }
             Self::Damaged { path, what: Damage::Database(_) | Damage::DatabaseCutOff { .. }, .. } => {
-                let path = path.display();
+                let path = word(path);
                 format!("copy the file again if you can; `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more")
             }
             Self::Damaged { .. } => "copy the file again if you can".to_owned(),
             _ => return None,
         })
     }
+}
+
+/// A path as one word of a command to paste into a shell: whoever made the drive chose the names in it.
+fn word(path: &Path) -> String {
+    let text = path.to_string_lossy();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c);
+    // Else it would be an option.
+    let here = if text.starts_with('-') { "./" } else { "" };
+    if !text.is_empty() && text.chars().all(is_plain) {
+        return format!("{here}{text}");
+    }
+    format!("'{here}{}'", text.replace('\'', "'\\''"))
 }
 
 /// Where a file is damaged.
@@ -327,4 +339,23 @@ pub enum Damage {
         /// The number delivered.
         found: u64,
     },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_to_paste_holds_a_name_as_one_word() {
+        for (path, shown) in [
+            ("/data/drive_0.db3", "/data/drive_0.db3"),
+            ("a b.db3", "'a b.db3'"),
+            ("a;rm -r $HOME.db3", "'a;rm -r $HOME.db3'"),
+            ("it's.db3", "'it'\\''s.db3'"),
+            ("-init.db3", "./-init.db3"),
+        ] {
+            let help = ReplayError::NoTimes { path: path.into() }.help().unwrap();
+            assert!(help.starts_with(&format!("make one: sqlite3 {shown} 'CREATE INDEX")), "{help}");
+        }
+    }
 }

@@ -23,6 +23,15 @@ pub(super) struct ChannelInfo {
     pub(super) writer: Option<Guid>,
 }
 
+#[cfg(feature = "bags")]
+impl ChannelInfo {
+    /// What its texts take, without the definitions, which channels share.
+    pub(super) fn bytes(&self) -> usize {
+        let texts = [&self.topic, &self.type_name, &self.message_encoding, &self.schema_encoding];
+        texts.into_iter().chain(&self.offered_qos).map(|text| text.len()).sum()
+    }
+}
+
 struct SchemaInfo {
     name: String,
     encoding: String,
@@ -63,9 +72,7 @@ impl Channels {
     /// Adds a channel that a database calls a topic.
     #[cfg(feature = "bags")]
     pub(super) fn add(&mut self, id: u16, info: ChannelInfo) -> Result<(), Damage> {
-        let texts = [&info.topic, &info.type_name, &info.message_encoding, &info.schema_encoding];
-        let texts = texts.into_iter().chain(&info.offered_qos).map(|text| text.len()).sum::<usize>();
-        self.make_room(texts + info.definitions_text.as_ref().map_or(0, |text| text.len()))?;
+        self.make_room(info.bytes() + info.definitions_text.as_ref().map_or(0, |text| text.len()))?;
         self.by_id.insert(id, info);
         Ok(())
     }
@@ -148,6 +155,8 @@ pub(super) struct Contents {
     pub(super) damage: Option<(u64, Damage)>,
     /// First and last log time, in ns, if they are not those of `segments`.
     pub(super) times: Option<(u64, u64)>,
+    /// Whether the second of `times` is not the last: that is lost.
+    pub(super) is_end_unknown: bool,
 }
 
 impl Contents {

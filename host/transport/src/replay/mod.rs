@@ -45,4 +45,4 @@ pub use error::{Damage, Place, ReplayError};
 pub use extras::{Attachment, Extras, read_extras};
 pub use options::{Limits, Options};
 pub use step::{Progress, Step};
-pub use storage::files_of;
+pub use storage::{files_of, journals_of};

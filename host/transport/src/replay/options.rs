@@ -25,13 +25,13 @@ pub struct Limits {
     /// overlap in time are open together; past this limit their messages may come out of order,
     /// which [`super::Replay::out_of_order`] counts.
     pub open_bytes: u64,
-    /// The most bytes of disk that the content of one packed file may take.
+    /// The most bytes of disk that the content of all packed files of a replay may take.
     pub unpacked_bytes: u64,
 }
 
 impl Default for Limits {
-    /// 256 MiB for a chunk, 512 MiB for all open ones; usual chunks have 1 to 4 MiB. 64 GiB for a packed file; rosbag2
-    /// splits its files long before.
+    /// 256 MiB for a chunk, 512 MiB for all open ones; usual chunks have 1 to 4 MiB. 64 GiB for what packed files
+    /// hold, all together.
     fn default() -> Self {
         Self { chunk_bytes: 256 << 20, open_bytes: 512 << 20, unpacked_bytes: 64 << 30 }
     }

@@ -5,10 +5,11 @@
 //! damaged page leads in circles.
 
 use std::collections::HashMap;
+use std::error::Error;
 use std::path::{Path, PathBuf};
 
 use rusqlite::types::ValueRef;
-use rusqlite::{Connection, Row, Rows as Cursor};
+use rusqlite::{Connection, ErrorCode, Row, Rows as Cursor};
 
 use super::chunk::OpenSegment;
 use super::error::{Damage, Place, ReplayError};
@@ -18,10 +19,26 @@ use super::records::MessageHead;
 /// A piece ends behind the message that makes it so long, in bytes.
 const PIECE: usize = 1 << 20;
 
+/// Which messages: those of a time behind one of it, and those behind a time.
+pub(super) const SAME_TIME: &str = "timestamp = ?1 AND rowid > ?2";
+pub(super) const LATER: &str = "timestamp > ?1";
+
+/// Asks for messages in their order, with the content of those of the topics in `list`.
+pub(super) fn select(index: &str, list: &str, condition: &str) -> String {
+    format!(
+        "SELECT rowid, timestamp, topic_id, CASE WHEN topic_id IN ({list}) THEN data END \
+         FROM messages INDEXED BY {index} WHERE {condition} ORDER BY timestamp, rowid"
+    )
+}
+
+/// `SQLITE_IOERR_SHORT_READ`.
+const SHORT_READ: i32 = 522;
+
 /// A database, being read.
 pub(super) struct Rows {
     path: PathBuf,
-    db: Connection,
+    /// Until all is read: each keeps pages in memory.
+    db: Option<Connection>,
     /// The index that the messages are read by, quoted.
     index: String,
     /// Channels by what the database calls a topic.
@@ -61,7 +78,7 @@ impl Rows {
     ) -> Self {
         Self {
             path: path.to_owned(),
-            db,
+            db: Some(db),
             index,
             channels,
             first,
@@ -80,6 +97,13 @@ impl Rows {
     }
 
     pub(super) fn damaged(&self, what: Damage) -> ReplayError {
+        let what = match what {
+            Damage::Database(error) if is_of_system(&*error) => {
+                let source = std::io::Error::other(error);
+                return ReplayError::Read { path: self.path.clone(), offset: 0, source };
+            }
+            what => what,
+        };
         let at = Place::Message(self.after.map_or(0, |(_, number)| number));
         ReplayError::Damaged { path: self.path.clone(), at, what }
     }
@@ -120,30 +144,28 @@ impl Rows {
             Ok(End::Span) => None,
             Ok(End::Table) => self.last_words.take(),
             // A page that is missing is no riddle where the file is too short.
-            Err(what @ Damage::Database(_)) => self.last_words.take().or(Some(what)),
+            Err(Damage::Database(error)) if !is_of_system(&*error) => {
+                self.last_words.take().or(Some(Damage::Database(error)))
+            }
             Err(what) => Some(what),
         };
         let behind = self.after.map_or(self.span.from, |(at, _)| at.unsigned_abs().saturating_add(1));
         self.next = what.is_some().then_some(behind.max(self.span.from));
         self.broken = what;
+        self.db = None;
         Ok(self.pieces)
     }
 
     fn read(&mut self, into: &mut OpenSegment) -> Result<End, Damage> {
         let Self { db, index, channels, wanted, span, after, .. } = self;
+        let Some(db) = db else { return Ok(End::Table) };
         let list = wanted.iter().map(i64::to_string).collect::<Vec<_>>().join(",");
         // What nobody wants is not read, but its place in the order is.
-        let rows = |condition: &str| {
-            let sql = format!(
-                "SELECT rowid, timestamp, topic_id, CASE WHEN topic_id IN ({list}) THEN data END \
-                 FROM messages INDEXED BY {index} WHERE {condition} ORDER BY timestamp, rowid"
-            );
-            db.prepare(&sql).map_err(unreadable)
-        };
+        let rows = |condition: &str| db.prepare(&select(index, &list, condition)).map_err(unreadable);
         let mut piece = Piece { channels, wanted, span: *span, after, into };
         if let Some((at, number)) = *piece.after {
             // First the rest of those that are of one time.
-            let mut same_time = rows("timestamp = ?1 AND rowid > ?2")?;
+            let mut same_time = rows(SAME_TIME)?;
             if let Some(end) = piece.fill(same_time.query((at, number)).map_err(unreadable)?)? {
                 return Ok(end);
             }
@@ -153,9 +175,19 @@ impl Rows {
             Some((at, _)) => at,
             None => i64::try_from(span.from).unwrap_or(i64::MAX) - 1,
         };
-        let mut later = rows("timestamp > ?1")?;
+        let mut later = rows(LATER)?;
         Ok(piece.fill(later.query([behind]).map_err(unreadable)?)?.unwrap_or(End::Table))
     }
+}
+
+/// Whether it is the system that failed, and not the database.
+pub(super) fn is_of_system(error: &(dyn Error + 'static)) -> bool {
+    let Some(error) = error.downcast_ref::<rusqlite::Error>() else { return false };
+    // A file that is too short is no fault of the system.
+    let is_short = error.sqlite_error().is_some_and(|error| error.extended_code == SHORT_READ);
+    let codes =
+        [ErrorCode::SystemIoFailure, ErrorCode::OutOfMemory, ErrorCode::CannotOpen, ErrorCode::PermissionDenied];
+    !is_short && error.sqlite_error_code().is_some_and(|code| codes.contains(&code))
 }
 
 fn unreadable(error: rusqlite::Error) -> Damage {
@@ -217,5 +249,34 @@ pub(super) fn time(value: ValueRef<'_>) -> Result<i64, Damage> {
         ValueRef::Integer(at) if at >= 0 => Ok(at),
         ValueRef::Integer(_) => Err(Damage::Malformed("a message is from before 1970")),
         _ => Err(Damage::Malformed("a message has a time that is no whole number")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rusqlite::ffi;
+
+    use super::*;
+
+    #[test]
+    fn a_disk_that_fails_is_no_damage_of_the_drive() {
+        for (code, is_damage) in [
+            (ffi::SQLITE_IOERR, false),
+            (ffi::SQLITE_IOERR_READ, false),
+            (ffi::SQLITE_NOMEM, false),
+            (ffi::SQLITE_CANTOPEN, false),
+            (SHORT_READ, true),
+            (ffi::SQLITE_CORRUPT, true),
+            (ffi::SQLITE_NOTADB, true),
+        ] {
+            let db = Connection::open_in_memory().unwrap();
+            let rows = Rows::new(Path::new("drive.db3"), db, String::new(), HashMap::new(), Ok(None));
+            let what = unreadable(rusqlite::Error::SqliteFailure(ffi::Error::new(code), None));
+            match rows.damaged(what) {
+                ReplayError::Damaged { .. } => assert!(is_damage, "{code}"),
+                ReplayError::Read { .. } => assert!(!is_damage, "{code}"),
+                other => panic!("{code}: {other}"),
+            }
+        }
     }
 }

@@ -21,11 +21,16 @@ pub(super) struct Source {
 impl Source {
     pub(super) fn open(path: &Path) -> Result<Self, ReplayError> {
         let cannot = |source| ReplayError::Open { path: path.to_owned(), source };
-        let file = File::open(path).map_err(cannot)?;
-        let metadata = file.metadata().map_err(cannot)?;
+        // Before it is opened: of a pipe, that would never end.
+        let metadata = path.metadata().map_err(cannot)?;
         if metadata.is_dir() {
             return Err(ReplayError::Directory { path: path.to_owned() });
         }
+        if !metadata.is_file() {
+            return Err(cannot(io::Error::new(io::ErrorKind::InvalidInput, "it is no file")));
+        }
+        let file = File::open(path).map_err(cannot)?;
+        let metadata = file.metadata().map_err(cannot)?;
         Ok(Self::over(file, path, metadata.len()))
     }
 

@@ -13,7 +13,7 @@ pub struct Step {
     pub verdict: Verdict,
     /// What the sink was told besides the bytes.
     pub meta: SampleMeta,
-    /// Length of the CDR payload, without encapsulation.
+    /// Length of the CDR payload, without encapsulation; of one that is packed and too big, as far as it was unpacked.
     pub bytes: usize,
 }
 

@@ -1,6 +1,7 @@
 //! What stands behind a path: which files a drive has, and who reads each of them.
 
 use std::collections::{BTreeMap, HashSet};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use super::chunk::Opener;
@@ -31,6 +32,11 @@ pub fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReplayError> {
     paths.iter().map(|path| Ok(bag_of(path)?.files)).collect::<Result<Vec<_>, _>>().map(|files| files.concat())
 }
 
+/// Where SQLite keeps what is not yet in the database `path`, if there is something; [`super::Replay`] looks.
+pub fn journals_of(path: &Path) -> [PathBuf; 2] {
+    ["-wal", "-journal"].map(|suffix| OsString::from_iter([path.as_os_str(), suffix.as_ref()]).into())
+}
+
 /// A file alone, or a directory of them.
 fn bag_of(path: &Path) -> Result<Bag, ReplayError> {
     if !path.is_dir() {
@@ -47,6 +53,7 @@ pub(super) fn open(paths: &[PathBuf], options: &Options, opener: &mut Opener) ->
     let mut writers = Writers::default();
     let mut tracks = Vec::new();
     let mut seen = HashSet::new();
+    let mut room = options.limits.unpacked_bytes;
     for path in paths {
         let bag = bag_of(path)?;
         let mut files = Vec::new();
@@ -54,7 +61,7 @@ pub(super) fn open(paths: &[PathBuf], options: &Options, opener: &mut Opener) ->
             if std::fs::canonicalize(file).is_ok_and(|real| !seen.insert(real)) {
                 return Err(ReplayError::Twice { path: file.clone() });
             }
-            files.push(open_file(file, options, opener)?);
+            files.push(open_file(file, options, opener, &mut room)?);
         }
         count(&mut files, &bag.messages);
         tracks.extend(files.into_iter().map(|(store, contents)| Track::new(store, contents, &mut writers)));
@@ -79,36 +86,50 @@ fn count(files: &mut [(Store, Contents)], messages: &BTreeMap<String, u64>) {
 }
 
 /// What a file is, by its first bytes: names are not to be relied on.
-enum Kind {
+pub(super) enum Kind {
     Mcap,
     Database,
     Packed,
 }
 
-fn kind_of(source: &mut Source) -> Result<Kind, ReplayError> {
-    let start = source.peek(0, 16)?;
-    if start.starts_with(MAGIC) {
-        Ok(Kind::Mcap)
-    } else if start == b"SQLite format 3\0" {
-        Ok(Kind::Database)
-    } else if start.starts_with(&super::inflate::ZSTD) {
-        Ok(Kind::Packed)
-    } else {
-        Err(ReplayError::NotMcap { path: source.path().to_owned() })
+/// How many bytes tell it.
+pub(super) const START: usize = 16;
+
+impl Kind {
+    pub(super) fn of(start: &[u8]) -> Option<Self> {
+        if start.starts_with(MAGIC) {
+            Some(Self::Mcap)
+        } else if start == b"SQLite format 3\0" {
+            Some(Self::Database)
+        } else if start.starts_with(&super::inflate::ZSTD) {
+            Some(Self::Packed)
+        } else {
+            None
+        }
     }
 }
 
-fn open_file(path: &Path, options: &Options, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
+fn kind_of(source: &mut Source) -> Result<Kind, ReplayError> {
+    let kind = Kind::of(source.peek(0, START)?);
+    kind.ok_or_else(|| ReplayError::NotMcap { path: source.path().to_owned() })
+}
+
+fn open_file(
+    path: &Path,
+    options: &Options,
+    opener: &mut Opener,
+    room: &mut u64,
+) -> Result<(Store, Contents), ReplayError> {
     let mut source = Source::open(path)?;
     match kind_of(&mut source)? {
         Kind::Mcap => mcap(source, opener),
         #[cfg(feature = "bags")]
         Kind::Database => database(super::database::File::beside_its_journal(path), source.len(), options),
         #[cfg(feature = "bags")]
-        Kind::Packed => packed(source, options, opener),
+        Kind::Packed => packed(source, options, opener, room),
         #[cfg(not(feature = "bags"))]
         kind => {
-            let _ = options;
+            let _ = (options, room);
             let what = if matches!(kind, Kind::Packed) { "packed with zstd" } else { "a database" };
             Err(ReplayError::NotBuiltIn { path: path.to_owned(), what })
         }
@@ -128,8 +149,13 @@ fn database(file: super::database::File<'_>, len: u64, options: &Options) -> Res
 
 /// Unpacks a file into another, which nobody sees and which is gone once it is closed, and opens that.
 #[cfg(feature = "bags")]
-fn packed(source: Source, options: &Options, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
-    let unpacked = super::unpack::unpack(source, options)?;
+fn packed(
+    source: Source,
+    options: &Options,
+    opener: &mut Opener,
+    room: &mut u64,
+) -> Result<(Store, Contents), ReplayError> {
+    let unpacked = super::unpack::unpack(source, options, room)?;
     let super::unpack::Unpacked { path, file, name, len, broken } = unpacked;
     let mut source = Source::over(file, &path, len);
     let (store, mut contents) = match kind_of(&mut source)? {

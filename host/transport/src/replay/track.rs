@@ -63,10 +63,18 @@ pub(super) struct Track {
 struct Channel {
     /// `None` if the file does not define the channel.
     writer: Option<Writer>,
-    subscriptions: Vec<Subscription>,
+    subscriptions: Vec<Wanted>,
     /// The largest message that one of them takes, in bytes of CDR.
     most: usize,
     seen: u64,
+}
+
+/// Who wants the messages of a channel.
+#[derive(Copy, Clone)]
+struct Wanted {
+    by: Subscription,
+    /// The largest that is taken, in bytes of CDR.
+    most: usize,
 }
 
 /// A message on its way to a sink.
@@ -75,6 +83,8 @@ pub(super) struct Routed<'a> {
     /// Whether no further subscription wants the message.
     pub(super) is_last: bool,
     pub(super) meta: SampleMeta,
+    /// Whether it is packed and larger than the subscription takes. Then `cdr` may be its beginning only.
+    pub(super) is_too_big: bool,
     pub(super) cdr: &'a [u8],
 }
 
@@ -98,6 +108,11 @@ impl Track {
         self.times
     }
 
+    /// Whether the last of [`Track::times`] is lost.
+    pub(super) fn is_end_unknown(&self) -> bool {
+        self.contents.is_end_unknown
+    }
+
     pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
         self.store.damaged(offset, what)
     }
@@ -105,7 +120,7 @@ impl Track {
     /// `most` is the largest message that is wanted, in bytes of CDR.
     pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription, most: usize) {
         if let Some(channel) = self.routes.get_mut(usize::from(channel)) {
-            channel.subscriptions.push(subscription);
+            channel.subscriptions.push(Wanted { by: subscription, most });
             channel.most = channel.most.max(most);
         }
     }
@@ -178,10 +193,11 @@ impl Track {
     ) -> Result<Routed<'a>, Damage> {
         let head = message_head(body)?;
         let channel = self.routes.get_mut(usize::from(head.channel)).ok_or(Damage::UnknownChannel(head.channel))?;
-        let &subscription = channel.subscriptions.get(fan).ok_or(Damage::UnknownChannel(head.channel))?;
+        let &wanted = channel.subscriptions.get(fan).ok_or(Damage::UnknownChannel(head.channel))?;
         let writer = channel.writer.as_ref().ok_or(Damage::UnknownChannel(head.channel))?;
         let mut message = &body[MESSAGE_HEAD..];
-        if message.starts_with(&ZSTD) {
+        let is_packed = message.starts_with(&ZSTD);
+        if is_packed {
             if fan == 0 {
                 let topic = || topic_of(&self.contents, head.channel);
                 let unpacked = inflate.unpack(message, channel.most.saturating_add(ENCAPSULATION + 1));
@@ -190,7 +206,6 @@ impl Track {
                     return Err(Damage::MessageTooLarge { topic: topic(), allowed: inflate.allowed() });
                 }
             }
-            // What is larger than all who want it take is too big for them without its end.
             message = inflate.bytes();
         }
         let (endian, options, cdr) = match message {
@@ -206,7 +221,7 @@ impl Track {
             channel.seen += 1;
         }
         Ok(Routed {
-            subscription,
+            subscription: wanted.by,
             is_last: fan + 1 == channel.subscriptions.len(),
             meta: SampleMeta {
                 at_ns: nanoseconds(head.log_time),
@@ -216,6 +231,7 @@ impl Track {
                 endian,
                 options,
             },
+            is_too_big: is_packed && cdr.len() > wanted.most,
             cdr,
         })
     }

@@ -175,6 +175,14 @@ fn what_computes_instead_of_holding_is_refused() {
             "no plain table",
         ),
         (
+            // As a program writes it that wants it not to be seen.
+            "CREATE VIRTUAL TABLE other USING fts5(id, name, type, serialization_format); DROP TABLE topics; \
+             PRAGMA writable_schema = ON; UPDATE sqlite_schema SET name = 'topics', tbl_name = 'topics', \
+             sql = 'CREATE /**/  VIRTUAL TABLE topics USING fts5(id, name, type, serialization_format)' WHERE name = 'other';"
+                .to_owned(),
+            "no plain table",
+        ),
+        (
             "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, \
              data BLOB AS (zeroblob(1000000000)));"
                 .to_owned(),
@@ -205,6 +213,42 @@ fn a_database_without_an_index_of_times_says_how_to_make_one() {
     // Any name will do.
     let (_folder, path) = changed("DROP INDEX timestamp_idx; CREATE INDEX \"a \"\" b\" ON messages (timestamp);");
     assert_eq!(replayed(&path).0.len(), 5);
+}
+
+#[test]
+fn what_sqlite_would_have_to_sort_in_memory_is_refused() {
+    let table =
+        "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER";
+    for (columns, index, said) in [
+        ("COLLATE NOCASE, data BLOB", "timestamp COLLATE BINARY", "cannot be read in order"),
+        (", data BLOB, RowID INTEGER", "timestamp", "calls a column `rowid`"),
+        (", data BLOB, rowid INTEGER AS (1)", "timestamp", "calls a column `rowid`"),
+    ] {
+        let (_folder, path) = changed(&format!("{table} {columns}); CREATE INDEX at ON messages ({index});"));
+        let ReplayError::Database { source, .. } = refused(&path) else { panic!("{columns}") };
+        assert!(source.to_string().contains(said), "{columns}: {source}");
+    }
+}
+
+#[test]
+fn a_number_that_two_topics_have_is_refused() {
+    let (_folder, path) = changed(
+        "DROP TABLE topics; CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT);
+         INSERT INTO topics VALUES (1, '/a', 'test_msgs/msg/Number', 'cdr'), (1, '/b', 'test_msgs/msg/Number', 'cdr');",
+    );
+    let ReplayError::Database { source, .. } = refused(&path) else { panic!("it is another error") };
+    assert!(source.to_string().contains("two of its topics have the number 1"), "{source}");
+}
+
+#[test]
+fn more_definitions_than_a_drive_can_need_are_refused_however_short() {
+    let (_folder, path) = changed(
+        "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 600000)
+         INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash)
+         SELECT '', '', '', '' FROM n;",
+    );
+    let ReplayError::Database { source, .. } = refused(&path) else { panic!("it is another error") };
+    assert!(source.to_string().contains("more than 64 MiB"), "{source}");
 }
 
 #[test]
@@ -241,6 +285,37 @@ fn a_database_that_was_not_closed_is_refused_with_the_way_out() {
     let (all, error) = replayed(&path);
     assert!(error.is_none(), "{error:?}");
     assert_eq!(all, [(5, 0)]);
+}
+
+#[test]
+fn a_journal_that_cannot_be_looked_into_is_not_taken_for_none() {
+    let folder = folder();
+    let path = database_in(&folder, &ticking(&["/a"], 5, 10));
+    for suffix in ["-wal", "-journal"] {
+        let beside = folder.path().join(format!("drive.db3{suffix}"));
+        fs::create_dir(&beside).unwrap();
+        assert!(matches!(refused(&path), ReplayError::Open { path, .. } if path == beside), "{suffix}");
+        fs::remove_dir(&beside).unwrap();
+        // As SQLite leaves it.
+        fs::write(&beside, [0; 512]).unwrap();
+        assert_eq!(replayed(&path).0.len(), 5);
+    }
+}
+
+#[test]
+fn a_pipe_is_refused_and_not_waited_for() {
+    let folder = folder();
+    let path = database_in(&folder, &ticking(&["/a"], 5, 10));
+    let pipe = |name: &str| {
+        let made = std::process::Command::new("mkfifo").arg(folder.path().join(name)).status().unwrap();
+        assert!(made.success());
+    };
+    pipe("drive.db3-wal");
+    assert!(matches!(refused(&path), ReplayError::Open { .. }));
+    pipe("metadata.yaml");
+    assert!(matches!(refused(folder.path()), ReplayError::Metadata { .. }));
+    pipe("pipe.db3");
+    assert!(matches!(refused(&folder.path().join("pipe.db3")), ReplayError::Open { .. }));
 }
 
 #[test]
@@ -283,13 +358,42 @@ fn a_message_that_unpacks_to_too_much_is_too_big_and_the_next_is_not() {
     assert!(error.is_none(), "{error:?}");
     let verdicts: Vec<_> = steps.iter().map(|step| step.verdict).collect();
     assert_eq!(verdicts, [Verdict::Taken, Verdict::TooBig, Verdict::Taken]);
-    assert_eq!(sink.shown.load(Ordering::Relaxed), 1001);
+    assert_eq!(sink.shown.load(Ordering::Relaxed), 8);
     // Whoever takes anything is told where it ends.
     let mut replay = open(Limits { chunk_bytes: 1 << 20, ..Limits::default() });
     replay.subscribe(&TopicSpec { max_bytes: usize::MAX, ..spec("/a") }, Arc::new(Memory::default())).unwrap();
     let (steps, error) = run(&mut replay);
     assert_eq!(steps.len(), 1);
     assert!(matches!(damage(error).1, Damage::MessageTooLarge { allowed: 1_048_576, .. }));
+}
+
+#[test]
+fn a_packed_message_is_whole_or_too_big_even_for_who_takes_anything() {
+    let messages = ticking(&["/a"], 3, 10);
+    let large = [&[0, 1, 0, 0][..], &vec![7; 5000]].concat();
+    let path = file(&mcap_of(&messages, |message| match message.value {
+        1 => packed(&large),
+        _ => packed(&cdr(message)),
+    }));
+    for (limits, lens) in [
+        (&[1000][..], &[8, 8][..]),
+        (&[4999], &[8, 8]),
+        (&[5000], &[8, 5000, 8]),
+        (&[1000, 2000], &[8, 8, 8, 8]),
+        (&[1000, 1 << 30, 2000], &[8, 8, 8, 5000, 8, 8, 8]),
+    ] {
+        let mut replay = Replay::open(std::slice::from_ref(&path)).unwrap();
+        let memory = Arc::new(Memory::default());
+        for &max_bytes in limits {
+            replay.subscribe(&TopicSpec { max_bytes, ..spec("/a") }, memory.clone()).unwrap();
+        }
+        let (steps, error) = run(&mut replay);
+        assert!(error.is_none(), "{error:?}");
+        let taken: Vec<_> = memory.0.lock().unwrap().iter().map(|(_, cdr)| cdr.len()).collect();
+        assert_eq!(taken, lens, "{limits:?}");
+        let too_big = steps.iter().filter(|step| step.verdict == Verdict::TooBig).count();
+        assert_eq!(too_big, 3 * limits.len() - lens.len(), "{limits:?}");
+    }
 }
 
 #[test]
@@ -301,6 +405,21 @@ fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let error = Replay::open_as(&[file(&packed(&bytes))], &options).err().unwrap();
     assert!(matches!(error, ReplayError::UnpacksTooLarge { allowed: 1_048_576, .. }), "{error}");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    // Nor in parts.
+    let part = [&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 700 << 10]].concat();
+    let parts = [file(&packed(&part)), file(&packed(&part))];
+    Replay::open_as(&parts[..1], &options).unwrap();
+    let error = Replay::open_as(&parts, &options).err().unwrap();
+    assert!(matches!(&error, ReplayError::UnpacksTooLarge { path, .. } if *path == parts[1]), "{error}");
+}
+
+#[test]
+fn what_is_nothing_of_ours_is_not_unpacked() {
+    let folder = folder();
+    let nowhere = folder.path().join("not there");
+    let options = Options { unpack_in: Some(nowhere), ..Options::default() };
+    let error = Replay::open_as(&[file(&packed(&vec![7; 8 << 20]))], &options).err().unwrap();
+    assert!(matches!(error, ReplayError::NotMcap { .. }), "{error}");
 }
 
 #[test]

@@ -14,6 +14,21 @@ fn refused(path: &std::path::Path) -> ReplayError {
 }
 
 #[test]
+fn metadata_that_are_a_link_out_of_the_directory_are_refused() {
+    let (bag, other) = (bag(Storage::Mcap, Packed::No, &[&ticking(&["/a"], 3, 10)]), folder());
+    let (path, elsewhere) = (bag.path().join("metadata.yaml"), other.path().join("metadata.yaml"));
+    fs::rename(&path, &elsewhere).unwrap();
+    std::os::unix::fs::symlink(&elsewhere, &path).unwrap();
+    let error = Replay::open(&[bag.path().to_owned()]).err().unwrap();
+    assert!(matches!(error, ReplayError::Metadata { .. }), "{error}");
+    // Within, a link is one of the ways to name a file.
+    fs::remove_file(&path).unwrap();
+    fs::rename(&elsewhere, bag.path().join("old.yaml")).unwrap();
+    std::os::unix::fs::symlink("old.yaml", &path).unwrap();
+    Replay::open(&[bag.path().to_owned()]).unwrap();
+}
+
+#[test]
 fn a_path_that_leaves_the_directory_is_refused() {
     let messages = ticking(&["/a"], 5, 10);
     let elsewhere = folder();

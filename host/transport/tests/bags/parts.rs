@@ -63,6 +63,8 @@ fn a_part_of_a_database_that_was_cut_off_is_whole_if_it_lies_before() {
     let (all, error) = part(&path, 1100, 1300);
     assert!(error.is_none(), "{error:?}");
     assert_eq!(all.len(), 20);
+    let replay = Replay::open(std::slice::from_ref(&path)).unwrap();
+    assert_eq!((replay.start_ns(), replay.end_ns()), (Some(1000), None), "where it ended is lost");
     let (_, error) = part(&path, 1100, i64::MAX);
     assert!(matches!(
         error,
