@@ -1,29 +1,26 @@
-//! Databases and packed files that lie, are damaged, or want more than they are given.
+//! Databases that lie, are damaged, or want more than they are given.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
-use gleaner_transport::replay::{Damage, Limits, Options, Place, Replay, ReplayError};
-use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::Transport;
+use gleaner_transport::replay::{Damage, Limits, Place, Replay, ReplayError};
 use rusqlite::Connection;
 
-use crate::bag::{
-    Packed, Storage, add_message, add_topic, bag, cdr, database_in, empty_database, folder, mcap_of, packed,
-};
-use crate::support::{Memory, TYPE, drive, expected, file, listen, run, small_chunks, spec, ticking};
+use crate::bag::{add_message, add_topic, cdr, database_in, empty_database, folder};
+use crate::support::{Memory, TYPE, expected, file, listen, run, spec, ticking};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
 
-fn damage(error: Option<ReplayError>) -> (Place, Damage) {
+pub fn damage(error: Option<ReplayError>) -> (Place, Damage) {
     match error {
         Some(ReplayError::Damaged { at, what, .. }) => (at, what),
         other => panic!("expected damage, got {other:?}"),
     }
 }
 
-fn refused(path: &Path) -> ReplayError {
+pub fn refused(path: &Path) -> ReplayError {
     Replay::open(&[path.to_owned()]).err().expect("it is refused")
 }
 
@@ -325,129 +322,6 @@ fn what_only_begins_like_a_database_is_refused() {
         let path = file(&[&start[..], rest].concat());
         assert!(matches!(refused(&path), ReplayError::Database { .. }), "{} bytes", rest.len());
     }
-}
-
-/// Takes messages up to a size, and notes the largest that it was shown.
-struct UpTo {
-    most: usize,
-    shown: AtomicUsize,
-}
-
-impl Sink for UpTo {
-    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Verdict {
-        self.shown.fetch_max(cdr.len(), Ordering::Relaxed);
-        if cdr.len() > self.most { Verdict::TooBig } else { Verdict::Taken }
-    }
-}
-
-#[test]
-fn a_message_that_unpacks_to_too_much_is_too_big_and_the_next_is_not() {
-    let messages = ticking(&["/a"], 3, 10);
-    let bytes = mcap_of(&messages, |message| match message.value {
-        1 => packed(&[&[0, 1, 0, 0][..], &vec![0; 100 << 20]].concat()),
-        _ => packed(&cdr(message)),
-    });
-    assert!(bytes.len() < 100_000, "{}", bytes.len());
-    let path = file(&bytes);
-    let open = |limits| Replay::open_with(std::slice::from_ref(&path), limits).unwrap();
-    let mut replay = open(Limits::default());
-    let sink = Arc::new(UpTo { most: 1000, shown: AtomicUsize::new(0) });
-    let small = TopicSpec { max_bytes: 1000, ..spec("/a") };
-    replay.subscribe(&small, sink.clone()).unwrap();
-    let (steps, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
-    let verdicts: Vec<_> = steps.iter().map(|step| step.verdict).collect();
-    assert_eq!(verdicts, [Verdict::Taken, Verdict::TooBig, Verdict::Taken]);
-    assert_eq!(sink.shown.load(Ordering::Relaxed), 8);
-    // Whoever takes anything is told where it ends.
-    let mut replay = open(Limits { chunk_bytes: 1 << 20, ..Limits::default() });
-    replay.subscribe(&TopicSpec { max_bytes: usize::MAX, ..spec("/a") }, Arc::new(Memory::default())).unwrap();
-    let (steps, error) = run(&mut replay);
-    assert_eq!(steps.len(), 1);
-    assert!(matches!(damage(error).1, Damage::MessageTooLarge { allowed: 1_048_576, .. }));
-}
-
-#[test]
-fn a_packed_message_is_whole_or_too_big_even_for_who_takes_anything() {
-    let messages = ticking(&["/a"], 3, 10);
-    let large = [&[0, 1, 0, 0][..], &vec![7; 5000]].concat();
-    let path = file(&mcap_of(&messages, |message| match message.value {
-        1 => packed(&large),
-        _ => packed(&cdr(message)),
-    }));
-    for (limits, lens) in [
-        (&[1000][..], &[8, 8][..]),
-        (&[4999], &[8, 8]),
-        (&[5000], &[8, 5000, 8]),
-        (&[1000, 2000], &[8, 8, 8, 8]),
-        (&[1000, 1 << 30, 2000], &[8, 8, 8, 5000, 8, 8, 8]),
-    ] {
-        let mut replay = Replay::open(std::slice::from_ref(&path)).unwrap();
-        let memory = Arc::new(Memory::default());
-        for &max_bytes in limits {
-            replay.subscribe(&TopicSpec { max_bytes, ..spec("/a") }, memory.clone()).unwrap();
-        }
-        let (steps, error) = run(&mut replay);
-        assert!(error.is_none(), "{error:?}");
-        let taken: Vec<_> = memory.0.lock().unwrap().iter().map(|(_, cdr)| cdr.len()).collect();
-        assert_eq!(taken, lens, "{limits:?}");
-        let too_big = steps.iter().filter(|step| step.verdict == Verdict::TooBig).count();
-        assert_eq!(too_big, 3 * limits.len() - lens.len(), "{limits:?}");
-    }
-}
-
-#[test]
-fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
-    let folder = folder();
-    let bytes = [&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 8 << 20]].concat();
-    let limits = Limits { unpacked_bytes: 1 << 20, ..Limits::default() };
-    let options = Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
-    let error = Replay::open_as(&[file(&packed(&bytes))], &options).err().unwrap();
-    assert!(matches!(error, ReplayError::UnpacksTooLarge { allowed: 1_048_576, .. }), "{error}");
-    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
-    // Nor in parts.
-    let part = [&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 700 << 10]].concat();
-    let parts = [file(&packed(&part)), file(&packed(&part))];
-    Replay::open_as(&parts[..1], &options).unwrap();
-    let error = Replay::open_as(&parts, &options).err().unwrap();
-    assert!(matches!(&error, ReplayError::UnpacksTooLarge { path, .. } if *path == parts[1]), "{error}");
-}
-
-#[test]
-fn what_is_nothing_of_ours_is_not_unpacked() {
-    let folder = folder();
-    let nowhere = folder.path().join("not there");
-    let options = Options { unpack_in: Some(nowhere), ..Options::default() };
-    let error = Replay::open_as(&[file(&packed(&vec![7; 8 << 20]))], &options).err().unwrap();
-    assert!(matches!(error, ReplayError::NotMcap { .. }), "{error}");
-}
-
-#[test]
-fn a_packed_file_that_was_cut_off_gives_what_is_before_the_cut() {
-    let messages = ticking(&TOPICS, 3000, 1000);
-    for storage in [Storage::Mcap, Storage::Sqlite3] {
-        let bag = bag(storage, Packed::Files, &[&messages]);
-        let name = if storage == Storage::Mcap { "bag_0.mcap.zstd" } else { "bag_0.db3.zstd" };
-        let path = bag.path().join(name);
-        let mut plain = zstd::decode_all(&fs::read(&path).unwrap()[..]).unwrap();
-        // Noise behind it, so that zstd ends a block before the cut.
-        plain.extend((0..1_000_000_u32).map(|n| (n.wrapping_mul(2_654_435_761) >> 13) as u8));
-        let bytes = packed(&plain);
-        fs::write(&path, &bytes[..bytes.len() - 10]).unwrap();
-        let mut replay = Replay::open(std::slice::from_ref(&path)).unwrap();
-        let memory = listen(&mut replay, &TOPICS);
-        let (_, error) = run(&mut replay);
-        damage(error);
-        assert_eq!(memory.values(), expected(&messages), "{storage:?}");
-    }
-}
-
-#[test]
-fn what_is_packed_twice_or_holds_nothing_of_ours_is_refused() {
-    let bytes = drive(small_chunks(), &ticking(&["/a"], 3, 10));
-    assert!(matches!(refused(&file(&packed(&packed(&bytes)))), ReplayError::NotMcap { .. }));
-    assert!(matches!(refused(&file(&packed(b"notes"))), ReplayError::NotMcap { .. }));
-    assert!(matches!(refused(&file(&packed(&bytes)[..6])), ReplayError::Unpack { .. }));
 }
 
 #[test]

@@ -4,6 +4,7 @@ mod bag;
 mod definitions;
 mod hostile;
 mod metadata;
+mod packed;
 mod parts;
 mod reading;
 #[path = "../suite/support.rs"]
