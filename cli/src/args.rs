@@ -20,7 +20,7 @@ pub struct Cli {
 /// What `gleaner` can do.
 #[derive(Subcommand, Debug)]
 pub enum Command {
-    /// Show what is in a recorded drive: topics, rates, gaps, sizes, and [[input]] tables for a manifest
+    /// Show what is in a recorded drive: topics, rates, gaps, sizes, and the inputs to paste into a manifest
     Inspect(InspectArgs),
     /// Make the folder of a new lambda, with its SDK, a test, and something to begin with
     New(NewArgs),
