@@ -22,6 +22,7 @@ pub mod parts;
 mod report;
 #[cfg(test)]
 mod scratch;
+pub mod signals;
 mod sources;
 mod vehicle;
 mod whole;
