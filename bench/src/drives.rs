@@ -19,14 +19,14 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     let mcap = folder.path().join("drive.mcap");
     bag::mcap(&mcap, rounds);
     let directory = bag::directory(&folder, rounds);
-    let short = hello(&sample_drive()).peak_rss_bytes;
-    let mut figures = Vec::new();
+    let short = hello(&sample_drive(), "rust").peak_rss_bytes;
+    let mut figures = against_rosbags(quick);
     for (name, drive, file) in [("MCAP", &mcap, &mcap), ("sqlite3", &directory, &directory.join("drive_0.db3"))] {
         let bytes = std::fs::metadata(file).expect("it was written").len();
         let mut tell =
             |what: &str, unit, value: f64| figures.push(Figure::told(&format!("{name}: {what}"), unit, &[value]));
         tell("size", "GB", bytes as f64 / 1e9);
-        let summary = hello(drive);
+        let summary = hello(drive, "rust");
         assert_eq!(summary.wakes, rounds * 4170, "every IMU sample wakes");
         tell("replay by hello", "s", summary.wall_s);
         tell("replay by hello", "wakes/s", summary.wakes_per_s);
@@ -39,9 +39,52 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     figures
 }
 
-fn hello(drive: &Path) -> Summary {
-    let args = ["--set", "brake_mps2=-1.4", "--no-record"];
-    let run = replay(&root().join("examples/hello/rust"), &[drive.to_owned()], &args);
+/// The same judgement over the same drive of 200 MB, by lambdas and in a script on rosbags, in turns: wakes for each second from the
+/// first message to the last.
+fn against_rosbags(quick: bool) -> Vec<Figure> {
+    let folder = Folder::new();
+    let drive = folder.path().join("drive.mcap");
+    let rounds = ROUNDS / 10;
+    bag::mcap(&drive, rounds);
+    let mut rates = [const { Vec::new() }; 3];
+    for _ in 0..if quick { 1 } else { 5 } {
+        let (wasm, python) = (hello(&drive, "rust"), hello(&drive, "python"));
+        let (messages, hits, seconds) = rosbags(&drive);
+        assert_eq!((messages, hits), (rounds * 4170, python.triggers), "all judge alike");
+        assert_eq!(wasm.triggers, python.triggers);
+        rates[0].push(wasm.wakes_per_s);
+        rates[1].push(python.wakes_per_s);
+        rates[2].push(messages as f64 / seconds);
+    }
+    let names = ["hello in wasm", "hello in Python", "the same function in a script on rosbags"];
+    let told =
+        names.iter().zip(&rates).map(|(name, rates)| Figure::told(&format!("MCAP, 0.2 GB: {name}"), "wakes/s", rates));
+    let factor = rates[1].iter().zip(&rates[2]).map(|(ours, theirs)| ours / theirs).collect::<Vec<_>>();
+    told.chain([Figure::told("replay in Python against rosbags", "x", &factor)]).collect()
+}
+
+/// Messages, triggers and seconds of the script.
+fn rosbags(drive: &Path) -> (u64, u64, f64) {
+    let output = Command::new(root().join(".venv/bin/python3"))
+        .env("PYTHONPATH", root().join("guest-sdk-python"))
+        .arg(root().join("bench/rosbags_loop.py"))
+        .args([drive, &root().join("examples/hello/python")])
+        .arg(BRAKE_MPS2)
+        .output()
+        .expect("python starts");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
+    let count = |key: &str| told[key].as_u64().expect("a count");
+    (count("messages"), count("hits"), told["seconds"].as_f64().expect("seconds"))
+}
+
+/// Brings `hello` to trigger on the sample drive.
+const BRAKE_MPS2: &str = "-1.4";
+
+fn hello(drive: &Path, kind: &str) -> Summary {
+    let threshold = format!("brake_mps2={BRAKE_MPS2}");
+    let args = ["--set", threshold.as_str(), "--no-record"];
+    let run = replay(&root().join("examples/hello").join(kind), &[drive.to_owned()], &args);
     assert_eq!(run.exit, 0, "{}", run.stderr);
     run.summary.expect("a replay ends with a summary")
 }

@@ -29,7 +29,7 @@ pub struct Event {
     next: u64,
 }
 
-/// Wakes on a period, counted from the first sample of the drive, or live from the start.
+/// Wakes on a period, counted from the start of the drive, or live of the run.
 pub struct Periodic {
     period_ns: i64,
     /// Live, a tick whose successor is due as well is missed: nobody waits for what is late.
@@ -60,6 +60,13 @@ impl Schedule {
             periodic.due_ns = Some(now_ns.saturating_add(periodic.period_ns));
         }
         schedule
+    }
+
+    /// Time begins, in a replay: the first tick comes a period later.
+    pub fn begin(&mut self, at_ns: i64) {
+        if let Self::Periodic(periodic) = self {
+            periodic.due_ns = Some(at_ns.saturating_add(periodic.period_ns));
+        }
     }
 
     /// When the next tick is due, if time causes any.

@@ -1,12 +1,13 @@
 //! Drives as people have them: what a lambda decides over a rosbag2 directory is what it decides over the same drive in MCAP.
 
+use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_protocol::{DriveSeen, Manifest};
 use gleaner_tests::bag::directory;
-use gleaner_tests::{Folder, Run, program, replay, replay_to, root, sample_drive, verify};
+use gleaner_tests::{Copy, Folder, Run, program, replay, replay_to, root, sample_drive, verify};
 
 const OK: u8 = 0;
 const USAGE: u8 = 2;
@@ -112,6 +113,34 @@ fn clips_hold_the_topics_that_the_command_line_chooses() {
     let ticker = root().join("tests/lambdas/ticker/rust");
     let without = replay(&ticker, &[sample_drive()], &["--topics", "*"]);
     assert!(without.must_exit(USAGE).stderr.contains("[record]"), "{}", without.stderr);
+}
+
+#[test]
+fn what_is_recorded_moves_no_tick() {
+    // The wheels' speed begins 3 ms later than the camera.
+    let lambda = Copy::of("tests/lambdas/ticker/python", |manifest| {
+        manifest.replace("/imu/data", "/vehicle/speed").replace("sensor_msgs/msg/Imu", "geometry_msgs/msg/TwistStamped")
+            + "\n[record]\ntopics = [\"/vehicle/speed\"]\npreroll = \"100ms\"\npostroll = \"100ms\"\n"
+    });
+    lambda.replace("main.py", "def on_tick(ctx):\n    pass\n");
+    let folder = Folder::new();
+    let journal = folder.path().join("ticks.journal");
+    let ticks = |args: &[&str]| {
+        let run = replay(lambda.path(), &[sample_drive()], &[&["--all"], args].concat());
+        run.must_exit(OK).decisions.iter().map(|decision| decision.at_ns).collect::<Vec<_>>()
+    };
+    let alone = ticks(&["--no-record"]);
+    assert_eq!(alone.len(), 399, "one each 100 ms of the drive, the first after 100 ms");
+    assert_eq!(ticks(&[]), alone);
+    assert_eq!(ticks(&["--topics", "*", "--journal", journal.to_str().unwrap()]), alone);
+    let line = [
+        OsStr::new("replay"),
+        lambda.path().as_os_str(),
+        sample_drive().as_os_str(),
+        "--verify".as_ref(),
+        journal.as_os_str(),
+    ];
+    assert_eq!(verify(&line).verified.expect("it is verified").wakes, 399);
 }
 
 #[test]

@@ -34,6 +34,7 @@ class Arrays:
         stamps = [at_ns for messages in self._tables.values() for at_ns in messages.at_ns[:1] + messages.at_ns[-1:]]
         # Times of arrays are as they were given: they count from 0.
         self.start_ns, self.end_ns = 0, max(stamps, default=0)
+        self.begins_ns = min(stamps, default=0)
 
     @property
     def is_partial(self) -> bool:

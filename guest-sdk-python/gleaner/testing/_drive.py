@@ -45,6 +45,7 @@ class Drive:
             spans = [(one.start_time, one.end_time) for one in reader.readers if one.message_count]
         self.start_ns: int = min((start for start, _ in spans), default=0)
         """Stamp of the first message of any topic, in ns; 0 if there is none."""
+        self.begins_ns = self.start_ns
         self.end_ns: int = max((end for _, end in spans), default=1) - 1
         """Stamp of the last message of any topic."""
 

@@ -82,8 +82,7 @@ class _Pass:
         self._by_topic: Dict[str, List[Source]] = {}
         for source in self._sources:
             self._by_topic.setdefault(names[source.declared.topic], []).append(source)
-        # Topics that are recorded are a part of the drive, too: the first of their samples begins the time of a periodic schedule.
-        self._topics = {*self._by_topic, *_recorded(self._drive, manifest, remap)}
+        _check_recorded(self._drive, manifest, remap)
         self._guest = Guest(given, manifest, self._session, self._sources)
         woken_by = [source for source in self._sources if source.declared.name == manifest.event]
         self._schedule: Schedule = Event(woken_by[0]) if woken_by else Periodic(manifest.period_ns)
@@ -121,17 +120,15 @@ class _Pass:
         )
 
     def _course(self) -> None:
-        at_ns = None
-        for topic, arrival in self._drive.deliveries(self._topics):
-            at_ns = arrival.at_ns
-            self._ticks(at_ns)
+        self._schedule.begin(self._drive.begins_ns)
+        for topic, arrival in self._drive.deliveries(set(self._by_topic)):
+            self._ticks(arrival.at_ns)
             for source in self._by_topic.get(topic, []):
                 source.ring.push(arrival)
                 for wake in self._schedule.events():
                     self._wake(wake[1].arrival.at_ns, wake)
-        if at_ns is not None:
-            # A tick of the very last instant is still due.
-            self._ticks(at_ns + 1)
+        # A tick of the very last instant is still due.
+        self._ticks(self._drive.end_ns + 1)
 
     def _ticks(self, now_ns: int) -> None:
         for tick in self._schedule.ticks(now_ns):
@@ -185,15 +182,14 @@ def _check_remap(remap: Mapping[str, str], manifest: Manifest) -> None:
             raise ReplayError(f"no input has the topic `{topic}` of remap", help=f"the manifest has {quoted(known)}")
 
 
-def _recorded(drive: Union[Drive, Arrays], manifest: Manifest, remap: Mapping[str, str]) -> List[str]:
-    """The topics of `[record]`, as the drive calls them. It may lack some; where it has none, nothing would be kept."""
-    if manifest.record is None:
-        return []
+def _check_recorded(drive: Union[Drive, Arrays], manifest: Manifest, remap: Mapping[str, str]) -> None:
+    """A drive may lack some of the topics of `[record]`; where it has none, nothing would be kept."""
+    if manifest.record is None or drive.is_partial:
+        return
     topics = [remap.get(topic, topic) for topic in manifest.record.topics]
-    if not drive.is_partial and not any(topic in drive.topics for topic in topics):
+    if not any(topic in drive.topics for topic in topics):
         help = f"the drive has {quoted(drive.topics)}; pass remap={{FROM: TO}}, or a manifest without [record]"
         raise ReplayError("the drive has none of the topics of [record]", f"[record] has {quoted(topics)}", help)
-    return topics
 
 
 def _drive(given: Any, manifest: Manifest, names: Mapping[str, str], more: Definitions) -> Union[Drive, Arrays]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Iterator, NamedTuple, Optional, Tuple, Union
+from typing import Iterator, NamedTuple, Tuple, Union
 
 from ._data import Source
 from ._ring import Cell
@@ -26,6 +26,9 @@ class Event:
         self._next = 0
         self.missed_total = 0
 
+    def begin(self, at_ns: int) -> None:
+        """Time begins."""
+
     def events(self) -> Iterator[Tuple[Source, Cell]]:
         """The wakes caused by samples that have arrived."""
         ring = self._source.ring
@@ -42,21 +45,23 @@ class Event:
 
 
 class Periodic:
-    """Wakes on a period, counted from the first sample of the drive."""
+    """Wakes on a period, counted from the start of the drive."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
-        self._due_ns: Optional[int] = None
+        self._due_ns = 0
         self._missed = 0
         self.missed_total = 0
+
+    def begin(self, at_ns: int) -> None:
+        """Time begins: the first tick comes a period later."""
+        self._due_ns = at_ns + self._period_ns
 
     def events(self) -> Iterator[Tuple[Source, Cell]]:
         return iter(())
 
     def ticks(self, now_ns: int) -> Iterator[Tick]:
         """The wakes that are due before ``now_ns``: a tick sees all samples of its own instant."""
-        if self._due_ns is None:
-            self._due_ns = now_ns + self._period_ns
         while self._due_ns < now_ns:
             behind = (now_ns - self._due_ns - 1) // self._period_ns + 1
             if behind > CATCH_UP_TICKS:

@@ -17,7 +17,7 @@ const DECODED_BYTES: usize = 64 << 20;
 ///
 /// `None` if the type is no image, or if the message or its image is broken, of a kind that we do not read, or larger
 /// than 64 MiB once it is decoded. Images without colour, among them those of raw sensors, become grey.
-pub(crate) fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>> {
+pub fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>> {
     match type_name {
         "sensor_msgs/msg/Image" | "sensor_msgs/Image" => raw(&ImageView::read(cdr, endian).ok()?),
         "sensor_msgs/msg/CompressedImage" | "sensor_msgs/CompressedImage" => {

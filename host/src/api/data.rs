@@ -3,13 +3,14 @@
 //! Every number that a lambda passes is clamped here, and nothing is allocated in proportion to it beyond the clamps below.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use gleaner_buffers::{Lease, RingCounts, RingReader};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::message::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
 
 pub use super::call::{Due, PerCall, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
+use super::curves::{Curves, Pen};
 pub use super::error::DataError;
 use super::frame::Images;
 use super::log::cut;
@@ -52,12 +53,15 @@ pub struct Topic {
     pub(super) looked: Looked,
     /// Reused between column reads, so that they allocate nothing but their result.
     scratch: Mutex<Vec<Lease<SampleMeta>>>,
+    /// Where what is read is drawn, if anybody asked for that.
+    curves: OnceLock<Arc<Curves>>,
 }
 
 /// A compiled path into the messages of one topic.
 pub struct Field {
     topic: Arc<Topic>,
     pub(super) path: FieldPath,
+    pen: Option<Arc<Pen>>,
 }
 
 impl Topic {
@@ -88,6 +92,7 @@ impl Topic {
             arrivals,
             looked: Looked::default(),
             scratch: Mutex::default(),
+            curves: OnceLock::new(),
         })
     }
 
@@ -158,7 +163,7 @@ impl Topic {
             return Err(DataError::WrongField { path: path.to_owned(), why });
         };
         let path = FieldPath::compile(definitions, path).map_err(DataError::NoSuchField)?;
-        Ok(Field { topic: Arc::clone(self), path })
+        Ok(Field { topic: Arc::clone(self), pen: self.pen(|| path.path().to_owned()), path })
     }
 
     /// `field` of the `n` newest samples; at most `call_items` of `[limits]`.
@@ -209,7 +214,21 @@ impl Topic {
         });
         // Nothing of the ring may stay pinned between two calls.
         leases.clear();
+        if let (Some(pen), Ok(column)) = (&field.pen, &column) {
+            pen.column(column);
+        }
         column
+    }
+
+    /// From now on what is read of compiled paths goes into these curves.
+    pub(super) fn keep(&self, curves: &Arc<Curves>) {
+        // Whoever asked first has it.
+        let _ = self.curves.set(Arc::clone(curves));
+    }
+
+    /// What draws the curve of this name, if any is drawn.
+    pub(super) fn pen(&self, name: impl FnOnce() -> String) -> Option<Arc<Pen>> {
+        self.curves.get().and_then(|curves| curves.pen(self, name()))
     }
 
     pub(super) fn number(&self, path: &FieldPath, lease: &Lease<SampleMeta>) -> Result<f64, DataError> {
@@ -314,6 +333,13 @@ impl Field {
     /// The path as it was written.
     pub fn path(&self) -> &str {
         self.path.path()
+    }
+
+    /// Notes what was read of the sample of `at_ns`.
+    pub(super) fn draw(&self, at_ns: i64, value: f64) {
+        if let Some(pen) = &self.pen {
+            pen.number(at_ns, value);
+        }
     }
 
     pub(super) fn must_belong_to(&self, topic: &Arc<Topic>) -> Result<(), DataError> {

@@ -243,7 +243,9 @@ impl Frame {
     /// [`DataError::OutOfTime`].
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
         self.due().allows(self.work(roi, None) as usize, FASTEST_SUM)?;
-        ops::mean_luma(&self.view()?, roi).map_err(|error| self.source.refused(error))
+        let luma = ops::mean_luma(&self.view()?, roi).map_err(|error| self.source.refused(error))?;
+        self.source.draw_luma(roi, luma);
+        Ok(luma)
     }
 
     /// Counts of the 256 luma levels.
@@ -331,6 +333,16 @@ impl Info {
 }
 
 impl Source {
+    fn draw_luma(&self, roi: Option<Roi>, luma: f64) {
+        let name = || match roi {
+            None => "mean luma".to_owned(),
+            Some(Roi { x, y, width, height }) => format!("mean luma of {width}x{height} at {x},{y}"),
+        };
+        if let Some(pen) = self.topic.pen(name) {
+            pen.number(self.stamps.at_ns, luma);
+        }
+    }
+
     fn not_a_frame(&self, source: ImageError) -> DataError {
         DataError::NotAFrame { topic: self.identity.topic.clone(), source }
     }

@@ -4,6 +4,7 @@
 //! (`host/python`) are thin skins over them: they convert arguments and errors, and decide nothing. What is here knows neither.
 
 mod call;
+pub mod curves;
 pub mod data;
 mod error;
 pub mod frame;

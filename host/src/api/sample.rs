@@ -50,6 +50,9 @@ impl Sample {
             .read(&self.lease, self.lease.meta().endian)
             .map_err(|error| self.topic.unreadable(&field.path, error))?;
         let per_call = &self.topic.per_call;
+        if let Some(number) = number(&value) {
+            field.draw(self.lease.meta().at_ns, number);
+        }
         let (len, max) = match &value {
             Value::Text(text) => (text.len(), per_call.bytes),
             Value::Bytes(bytes) => (bytes.len(), per_call.bytes),
@@ -71,7 +74,9 @@ impl Sample {
     /// As [`Topic::column`].
     pub fn number(&self, field: &Field) -> Result<f64, DataError> {
         field.must_belong_to(&self.topic)?;
-        self.topic.number(&field.path, &self.lease)
+        let number = self.topic.number(&field.path, &self.lease)?;
+        field.draw(self.lease.meta().at_ns, number);
+        Ok(number)
     }
 
     /// The whole message as CDR, without the encapsulation header.
@@ -132,5 +137,16 @@ impl Sample {
     /// The topic it arrived on.
     pub fn topic(&self) -> &Arc<Topic> {
         &self.topic
+    }
+}
+
+/// A single number, as [`Sample::number`] gives it.
+fn number(value: &Value<'_>) -> Option<f64> {
+    match value {
+        Value::Bool(value) => Some(f64::from(u8::from(*value))),
+        Value::Signed(value) => Some(*value as f64),
+        Value::Unsigned(value) => Some(*value as f64),
+        Value::Real(value) => Some(*value),
+        Value::Text(_) | Value::Bytes(_) | Value::Numbers(_) | Value::Texts(_) => None,
     }
 }

@@ -1,6 +1,7 @@
 //! The course of a drive: every sample delivered, and every wake that the schedule asks for, in the drive's time.
 
 use gleaner_protocol::Failure;
+use gleaner_protocol::journal::Part;
 use gleaner_transport::replay::{Replay, ReplayError, Step};
 
 use crate::api::data::Wake;
@@ -18,6 +19,24 @@ pub(super) trait Course {
     fn sample(&mut self, drive: &Replay, step: &Step) -> Result<(), Failure>;
 }
 
+/// From when until when a drive is, in ns, both inclusive, and whatever is read of it: ticks must not depend on which topics are
+/// recorded. `None` where nobody knows.
+#[derive(Copy, Clone, Debug, Default)]
+pub(super) struct Span {
+    pub(super) start_ns: Option<i64>,
+    pub(super) end_ns: Option<i64>,
+}
+
+impl Span {
+    /// Of this part of `drive`.
+    pub(super) fn of(drive: &Replay, part: Part) -> Self {
+        let start_ns = drive.start_ns().map(|start_ns| part.from_ns.map_or(start_ns, |from_ns| from_ns.max(start_ns)));
+        let end_ns =
+            drive.end_ns().map(|end_ns| part.to_ns.map_or(end_ns, |to_ns| end_ns.min(to_ns.saturating_sub(1))));
+        Self { start_ns, end_ns }
+    }
+}
+
 /// How far a course went.
 pub(super) struct Reached {
     /// Stamp of the last sample; 0 if there was none.
@@ -29,10 +48,12 @@ pub(super) struct Reached {
 }
 
 /// Takes a lambda through a drive. A sample is delivered, what it wakes runs, then the next; ticks come before the first sample
-/// that is later.
-pub(super) fn take(drive: &mut Replay, course: &mut impl Course) -> Result<Reached, Failure> {
+/// that is later, and go on to the end of the drive.
+pub(super) fn take(drive: &mut Replay, span: Span, course: &mut impl Course) -> Result<Reached, Failure> {
     let mut reached = Reached { at_ns: 0, broken: None, stopped: false };
-    let mut any = false;
+    if let Some(start_ns) = span.start_ns {
+        course.schedule().begin(start_ns);
+    }
     loop {
         match drive.peek_at_ns() {
             Ok(Some(next_ns)) => reached.stopped = !ticks(course, next_ns)?,
@@ -47,7 +68,7 @@ pub(super) fn take(drive: &mut Replay, course: &mut impl Course) -> Result<Reach
         }
         match drive.step() {
             Ok(Some(step)) => {
-                (reached.at_ns, any) = (step.at_ns, true);
+                reached.at_ns = step.at_ns;
                 course.sample(drive, &step)?;
             }
             Ok(None) => break,
@@ -63,10 +84,10 @@ pub(super) fn take(drive: &mut Replay, course: &mut impl Course) -> Result<Reach
             }
         }
     }
-    if any {
-        // A tick of the very last instant is still due.
-        reached.stopped = !ticks(course, reached.at_ns.saturating_add(1))?;
-    }
+    // Of a damaged drive nobody knows what came after the last sample. A tick of the very last instant is still due.
+    let end_ns =
+        span.end_ns.filter(|_| reached.broken.is_none()).map_or(reached.at_ns, |end_ns| end_ns.max(reached.at_ns));
+    reached.stopped = !ticks(course, end_ns.saturating_add(1))?;
     Ok(reached)
 }
 

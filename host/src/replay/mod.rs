@@ -11,8 +11,10 @@ mod journal_file;
 mod open;
 mod options;
 mod part;
+mod pictures;
 mod record;
 mod round;
+mod signals;
 mod verify;
 
 pub use inspect::{InspectArgs, inspect};

@@ -215,7 +215,7 @@ impl Job {
 
 /// Whether `path` is one of the files that a replay writes into `out` anyway.
 fn is_result(path: &Path, out: &Path) -> bool {
-    if path.starts_with(out.join("clips")) {
+    if ["clips", "pictures"].iter().any(|folder| path.starts_with(out.join(folder))) {
         return true;
     }
     let is_name = path.file_name().is_some_and(|name| RESULTS.iter().any(|result| name == *result));

@@ -13,6 +13,7 @@ use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::chosen::{self, Chosen};
+use super::pictures::{Camera, is_image};
 use super::{CLOCK, Options};
 
 /// A recorder over one lambda's `[record]`.
@@ -48,10 +49,14 @@ struct Lane {
     /// Whether the drive has it.
     is_there: bool,
     id: Mutex<Option<TopicId>>,
+    camera: Option<Arc<Camera>>,
 }
 
 impl Sink for Lane {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        if let Some(camera) = &self.camera {
+            camera.see(meta, cdr);
+        }
         let mut shared = lock(&self.shared);
         let Shared { recorder: Some(recorder), failed: failed @ None } = &mut *shared else {
             return Verdict::NoSlot;
@@ -100,17 +105,22 @@ impl Recording {
         let shared = Arc::new(Mutex::new(Shared { recorder: None, failed: None }));
         let known = drive.topics();
         let mut lanes = Vec::new();
+        // One whose images the lambda sees anyway is not kept a second time.
+        let mut is_seen = manifest.inputs.iter().any(|input| is_image(input.type_name.as_str()));
         for Chosen { name, is_one_of_many } in chosen::topics(rules, options, &known)? {
             let name = name.as_str();
             let found = known.iter().find(|topic| topic.topic == name);
             if found.is_none() {
                 tracing::warn!(topic = %name, "the drive does not have this topic of [record]: clips are made without it");
             }
+            let camera = found.filter(|found| !is_seen && is_image(&found.type_name));
+            is_seen |= camera.is_some();
             let lane = Arc::new(Lane {
                 shared: Arc::clone(&shared),
                 topic: topic(name, found),
                 is_there: found.is_some(),
                 id: Mutex::new(None),
+                camera: camera.map(|found| Camera::new(name, &found.type_name)),
             });
             if let Some(found) = found {
                 let spec = TopicSpec {
@@ -148,6 +158,11 @@ impl Recording {
             return Err(failure.with_help(help));
         }
         Ok(Some(Self { shared, lanes, rules: rules.clone(), folder: None, lambda: None }))
+    }
+
+    /// What sees the images of a recorded topic, if the lambda has none.
+    pub(super) fn camera(&self) -> Option<Arc<Camera>> {
+        self.lanes.iter().find_map(|lane| lane.camera.clone())
     }
 
     /// Takes hold of `out`, so that two replays do not write over each other. What a killed one left there is recovered, kept

@@ -11,12 +11,13 @@ use gleaner_protocol::{Exit, Explain, Failure, Report, Round, Summary, TopicRepo
 use gleaner_transport::replay::{Progress, Replay, Step};
 use gleaner_vitals::usage;
 
-use super::course::{self, Course, Reached};
+use super::course::{self, Course, Reached, Span};
 use super::digests::Digests;
 use super::journal_file::JournalFile;
 use super::open::{DriveError, open_drives};
 use super::options::Results;
 use super::record::{Recorded, Recording, remove_clips};
+use super::signals::Gathered;
 use super::{CLOCK, Options, report as send};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
@@ -42,6 +43,7 @@ struct Pass<'a> {
     scribe: Option<Scribe>,
     journal: Option<JournalFile>,
     recording: Option<Recording>,
+    gathered: Gathered,
     part: Part,
     wakes: u64,
     triggers: u64,
@@ -68,6 +70,7 @@ impl Course for Pass<'_> {
         self.triggers += decision.triggers.len() as u64;
         self.faults += u64::from(decision.fault.is_some());
         self.output.decision(&decision)?;
+        self.gathered.wake(&decision);
         let (log, said) = self.session.take_log();
         self.keep(&log)?;
         if let Some(scribe) = &mut self.scribe {
@@ -112,13 +115,10 @@ impl Pass<'_> {
 
     /// Goes through the drive, and closes what is recorded.
     fn run(&mut self, drive: &mut Replay) -> Result<(Reached, Recorded), Failure> {
-        let reached = course::take(drive, self)?;
+        let span = Span::of(drive, self.part);
+        let reached = course::take(drive, span, self)?;
         // Of a damaged drive nobody knows what came after the last sample.
-        let end_ns = drive
-            .end_ns()
-            .unwrap_or(reached.at_ns)
-            .min(self.part.to_ns.map_or(i64::MAX, |to_ns| to_ns.saturating_sub(1)));
-        let end_ns = if reached.broken.is_some() { reached.at_ns } else { end_ns };
+        let end_ns = span.end_ns.filter(|_| reached.broken.is_none()).unwrap_or(reached.at_ns);
         let recorded = self.recording.as_ref().map_or(Ok(Recorded::default()), |recording| recording.finish(end_ns))?;
         Ok((reached, recorded))
     }
@@ -155,6 +155,7 @@ pub(super) fn replay(
         (Some(recording), Some(header)) => recording.start(&results.out, header)?,
         _ => remove_clips(&results.out)?,
     };
+    let gathered = Gathered::of(&inputs, recording.as_ref().and_then(Recording::camera));
     let initialised = guest.init();
     // What `init` says is no part of a wake.
     let (said, _) = session.take_log();
@@ -173,6 +174,7 @@ pub(super) fn replay(
         scribe: header.is_some().then(|| Scribe::new(&inputs)),
         journal,
         recording,
+        gathered,
         part,
         wakes: 0,
         triggers: 0,
@@ -231,6 +233,7 @@ pub(super) fn replay(
             failure.to_string()
         }),
     };
+    pass.gathered.write(&results.out, pass.output, &options.asked.config)?;
     output.finish(&summary)?;
     Ok((summary, broken.map(|error| error.exit())))
 }

@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use gleaner_protocol::signals::Signals;
 use gleaner_protocol::{Decision, Exit, Explain, write_whole};
 use serde::Serialize;
 
@@ -12,8 +13,11 @@ use crate::api::log::Line;
 /// What a run did, as a whole; there once it has ended.
 pub const SUMMARY: &str = "summary.json";
 
+/// What the lambda of a replay read, and what its wakes cost.
+pub const SIGNALS: &str = "signals.json";
+
 /// The files of a run beside its clips.
-pub const RESULTS: [&str; 4] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", SUMMARY];
+pub const RESULTS: [&str; 5] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", SIGNALS, SUMMARY];
 
 /// Why results could not be written.
 #[derive(Debug, thiserror::Error)]
@@ -60,13 +64,13 @@ impl Output {
     /// [`OutputError`] names the file.
     pub fn begin(folder: &Path, all: bool, again: bool) -> Result<Self, OutputError> {
         fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
-        // A summary says that the files beside it are whole.
-        let summary = folder.join(SUMMARY);
-        match fs::remove_file(&summary) {
-            Err(source) if source.kind() != io::ErrorKind::NotFound => {
-                return Err(OutputError { path: summary, source });
+        // A summary says that the files beside it are whole; what an earlier lambda read is not what this one reads.
+        for of_earlier in [SUMMARY, SIGNALS] {
+            let path = folder.join(of_earlier);
+            match fs::remove_file(&path) {
+                Err(source) if source.kind() != io::ErrorKind::NotFound => return Err(OutputError { path, source }),
+                _ => {}
             }
-            _ => {}
         }
         let decisions = Lines::begin(folder.join("decisions.jsonl"), again)?;
         let log = Lines::begin(folder.join("log.jsonl"), again)?;
@@ -119,6 +123,17 @@ impl Output {
         let path = self.folder.join(SUMMARY);
         let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
         text.push(b'\n');
+        write_whole(&path, &text).map_err(|source| OutputError { path, source })
+    }
+
+    /// Adds what the lambda read.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`]
+    pub fn signals(&self, signals: &Signals) -> Result<(), OutputError> {
+        let path = self.folder.join(SIGNALS);
+        let text = serde_json::to_vec(signals).expect("signals are plain data, and finite");
         write_whole(&path, &text).map_err(|source| OutputError { path, source })
     }
 }

@@ -22,9 +22,9 @@ pub struct Signals {
     pub run_ns: Spread,
     /// Fuel of each wake; none in Python, which has no fuel.
     pub fuel: Option<Spread>,
-    /// What a camera saw at triggers; the first [`Signals::PICTURES_MAX`].
+    /// What a camera saw at wakes that triggered: [`Signals::PICTURES_MAX`] at most, spread over all of them.
     pub pictures: Vec<Picture>,
-    /// Triggers for which no picture was kept, since there were more.
+    /// Wakes that triggered and have no picture, since there were more of them, or no image.
     pub pictures_left_out: u64,
 }
 
@@ -99,6 +99,6 @@ pub struct Picture {
     pub topic: String,
     /// Stamp of the image: the newest that had arrived.
     pub image_ns: i64,
-    /// A small JPEG, relative to the folder that holds `signals.json`, for example `pictures/1533199991136000000.jpg`.
+    /// A small JPEG, relative to the folder that holds `signals.json`, for example `pictures/000000.jpg`.
     pub file: PathBuf,
 }

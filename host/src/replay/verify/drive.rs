@@ -11,7 +11,7 @@ use super::{Claim, Proved, Remake, counts_differ, different, seconds};
 use crate::api::data::{Topic, Wake};
 use crate::api::trace::offered;
 use crate::replay::Options;
-use crate::replay::course::{self, Course};
+use crate::replay::course::{self, Course, Span};
 use crate::replay::digests::Digests;
 use crate::replay::open::{DriveError, open_drives};
 use crate::schedule::Schedule;
@@ -24,12 +24,13 @@ pub(super) fn prove(
     load: Load<'_>,
 ) -> Result<Proved, Failure> {
     let digests = Digests::start(options.drives.files.clone());
-    let (drive, _) = open_drives(options)?;
+    let (drive, part) = open_drives(options)?;
+    let span = Span::of(&drive, part);
     let start_ns = drive.start_ns().unwrap_or(0);
     let (remake, mut drive, inputs) = Remake::start(drive, options, manifest, load)?;
     let schedule = Schedule::new(manifest, &inputs);
     let mut proof = Proof { remake, schedule, claim, start_ns, wakes: 0, triggers: 0 };
-    let outcome = course::take(&mut drive, &mut proof).and_then(|reached| match reached.broken {
+    let outcome = course::take(&mut drive, span, &mut proof).and_then(|reached| match reached.broken {
         Some(error) => Err(damaged(error, proof.wakes)),
         None if reached.stopped => Ok(()),
         None => proof.end(&inputs),

@@ -1,0 +1,243 @@
+//! What a camera saw when a lambda triggered: small pictures, for the report.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use gleaner_protocol::Decision;
+use gleaner_protocol::signals::{Picture, Signals};
+use gleaner_recorder::thumbnail;
+use gleaner_transport::SampleMeta;
+
+use crate::api::data::Topic;
+use crate::stage::OutputError;
+
+/// The folder of the pictures, below that of the results.
+const FOLDER: &str = "pictures";
+
+/// Whether messages of this type are images.
+pub(super) fn is_image(type_name: &str) -> bool {
+    matches!(type_name, "sensor_msgs/msg/Image" | "sensor_msgs/msg/CompressedImage")
+}
+
+/// The newest image of a topic that is recorded, and that the lambda itself does not see.
+pub(super) struct Camera {
+    topic: String,
+    type_name: String,
+    newest: Mutex<Option<(SampleMeta, Vec<u8>)>>,
+}
+
+impl Camera {
+    pub(super) fn new(topic: &str, type_name: &str) -> Arc<Self> {
+        Arc::new(Self { topic: topic.to_owned(), type_name: type_name.to_owned(), newest: Mutex::default() })
+    }
+
+    pub(super) fn see(&self, meta: &SampleMeta, cdr: &[u8]) {
+        let mut newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut bytes = newest.take().map(|(_, bytes)| bytes).unwrap_or_default();
+        bytes.clear();
+        bytes.extend_from_slice(cdr);
+        *newest = Some((*meta, bytes));
+    }
+}
+
+/// Pictures at the triggers of one pass over a drive. Where there are too many, every second is given up, again and again, so that
+/// those that stay are spread over all of the drive.
+pub(super) struct Pictures {
+    inputs: Vec<Arc<Topic>>,
+    camera: Option<Arc<Camera>>,
+    /// Wakes that triggered.
+    wakes: u64,
+    /// Each so many of them has a picture.
+    every: u64,
+    made: Vec<Made>,
+}
+
+struct Made {
+    wake: u64,
+    at_ns: i64,
+    topic: String,
+    image_ns: i64,
+    jpeg: Vec<u8>,
+}
+
+impl Pictures {
+    /// Pictures of the first of `inputs` that has images, or else of `camera`.
+    pub(super) fn new(inputs: &[Arc<Topic>], camera: Option<Arc<Camera>>) -> Self {
+        let inputs = inputs.iter().filter(|topic| is_image(topic.type_name())).cloned().collect();
+        Self { inputs, camera, wakes: 0, every: 1, made: Vec::new() }
+    }
+
+    /// After a wake.
+    pub(super) fn wake(&mut self, decision: &Decision) {
+        if decision.triggers.is_empty() {
+            return;
+        }
+        let wake = self.wakes;
+        self.wakes += 1;
+        if self.made.len() >= Signals::PICTURES_MAX {
+            self.every *= 2;
+            self.made.retain(|made| made.wake.is_multiple_of(self.every));
+        }
+        if wake.is_multiple_of(self.every)
+            && let Some(made) = self.make(wake, decision.at_ns)
+        {
+            self.made.push(made);
+        }
+    }
+
+    fn make(&self, wake: u64, at_ns: i64) -> Option<Made> {
+        let made = |topic: &str, image_ns, jpeg| Made { wake, at_ns, topic: topic.to_owned(), image_ns, jpeg };
+        for topic in &self.inputs {
+            // Not as the lambda would: a journal notes how far that one looked back.
+            let Some(lease) = topic.reader().newest() else { continue };
+            let meta = *lease.meta();
+            let jpeg = self.as_before(meta.at_ns).or_else(|| thumbnail(topic.type_name(), &lease, meta.endian));
+            return jpeg.map(|jpeg| made(topic.ros_topic(), meta.at_ns, jpeg));
+        }
+        let camera = self.camera.as_ref()?;
+        let newest = camera.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        let (meta, cdr) = newest.as_ref()?;
+        let jpeg = self.as_before(meta.at_ns).or_else(|| thumbnail(&camera.type_name, cdr, meta.endian));
+        jpeg.map(|jpeg| made(&camera.topic, meta.at_ns, jpeg))
+    }
+
+    /// The picture of the wake before, if it is of the same image.
+    fn as_before(&self, image_ns: i64) -> Option<Vec<u8>> {
+        self.made.last().filter(|made| made.image_ns == image_ns).map(|made| made.jpeg.clone())
+    }
+
+    /// Writes them below `out`, in place of those that were there; also says how many wakes that triggered have none.
+    pub(super) fn write(self, out: &Path) -> Result<(Vec<Picture>, u64), OutputError> {
+        let folder = out.join(FOLDER);
+        remove(&folder)?;
+        let left_out = self.wakes - self.made.len() as u64;
+        if self.made.is_empty() {
+            return Ok((Vec::new(), left_out));
+        }
+        fs::create_dir_all(&folder).map_err(|source| OutputError { path: folder, source })?;
+        let written = self.made.into_iter().map(|Made { at_ns, topic, image_ns, jpeg, wake }| {
+            let file = Path::new(FOLDER).join(format!("{wake:06}.jpg"));
+            let path = out.join(&file);
+            // A new one: what is there may be a link to somewhere else.
+            let written = File::create_new(&path).and_then(|mut file| file.write_all(&jpeg));
+            written.map_err(|source| OutputError { path, source })?;
+            Ok(Picture { at_ns, topic, image_ns, file })
+        });
+        Ok((written.collect::<Result<_, _>>()?, left_out))
+    }
+}
+
+/// Deletes the pictures of an earlier replay, and nothing else that somebody put there.
+fn remove(folder: &Path) -> Result<(), OutputError> {
+    let failed = |source| OutputError { path: folder.to_owned(), source };
+    let entries = match fs::read_dir(folder) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        entries => entries.map_err(failed)?,
+    };
+    for entry in entries {
+        let entry = entry.map_err(failed)?;
+        let name = entry.file_name();
+        let number = name.to_str().and_then(|name| name.strip_suffix(".jpg")).unwrap_or_default();
+        if !number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit()) {
+            fs::remove_file(entry.path()).map_err(|source| OutputError { path: entry.path(), source })?;
+        }
+    }
+    // It stays if it holds what is not ours.
+    let _ = fs::remove_dir(folder);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_protocol::{Cause, Trigger, TriggerKind};
+    use gleaner_transport::{Endian, Guid};
+
+    use super::*;
+
+    /// A grey image of 8x8 pixels as `sensor_msgs/msg/Image`, in CDR.
+    fn image(grey: u8) -> Vec<u8> {
+        let mut cdr = Vec::new();
+        let text = |cdr: &mut Vec<u8>, text: &str| {
+            cdr.resize(cdr.len().next_multiple_of(4), 0);
+            cdr.extend((text.len() as u32 + 1).to_le_bytes());
+            cdr.extend(text.bytes().chain([0]));
+        };
+        cdr.extend([0; 8]);
+        text(&mut cdr, "cam");
+        cdr.resize(cdr.len().next_multiple_of(4), 0);
+        cdr.extend([8_u32, 8].iter().flat_map(|side| side.to_le_bytes()));
+        text(&mut cdr, "mono8");
+        cdr.push(0);
+        cdr.resize(cdr.len().next_multiple_of(4), 0);
+        cdr.extend([8_u32, 64].iter().flat_map(|n| n.to_le_bytes()));
+        cdr.extend([grey; 64]);
+        cdr
+    }
+
+    fn meta(at_ns: i64) -> SampleMeta {
+        let (writer, endian) = (Guid::default(), Endian::Little);
+        SampleMeta { at_ns, publish_ns: 0, writer, seq: at_ns as u64, endian, options: [0; 2] }
+    }
+
+    fn decision(at_ns: i64) -> Decision {
+        let attributes = serde_json::Map::new();
+        let trigger = Trigger { kind: TriggerKind::Event, label: "x".to_owned(), score: None, attributes };
+        Decision {
+            at_ns,
+            cause: Cause::Tick,
+            input: None,
+            topic: None,
+            writer: None,
+            seq: None,
+            triggers: vec![trigger],
+            fault: None,
+            fuel: None,
+            run_ns: 0,
+        }
+    }
+
+    #[test]
+    fn pictures_are_spread_over_all_triggers_and_replace_those_of_before() {
+        let out = tempfile::tempdir().unwrap();
+        let folder = out.path().join(FOLDER);
+        fs::create_dir(&folder).unwrap();
+        for name in ["000007.jpg", "mine.jpg"] {
+            fs::write(folder.join(name), "old").unwrap();
+        }
+        let camera = Camera::new("/cam", "sensor_msgs/msg/Image");
+        let mut pictures = Pictures::new(&[], Some(camera.clone()));
+        pictures.wake(&Decision { triggers: Vec::new(), ..decision(0) });
+        pictures.wake(&decision(0));
+        for n in 1..1000 {
+            camera.see(&meta(10 * n), &image(n as u8));
+            pictures.wake(&decision(10 * n + 1));
+        }
+        let (written, left_out) = pictures.write(out.path()).unwrap();
+        assert!(
+            written.len() <= Signals::PICTURES_MAX && written.len() > Signals::PICTURES_MAX / 3,
+            "{}",
+            written.len()
+        );
+        assert_eq!(written.len() as u64 + left_out, 1000);
+        assert!(written.last().unwrap().at_ns > 9000, "the end of the drive has pictures");
+        for Picture { at_ns, topic, image_ns, file } in written {
+            assert_eq!((topic.as_str(), at_ns), ("/cam", image_ns + 1));
+            assert!(fs::read(out.path().join(file)).unwrap().starts_with(&[0xff, 0xd8]));
+        }
+        assert_eq!(fs::read(folder.join("mine.jpg")).unwrap(), b"old");
+        assert!(!folder.join("000007.jpg").exists());
+    }
+
+    #[test]
+    fn an_image_that_cannot_be_read_makes_no_picture() {
+        let out = tempfile::tempdir().unwrap();
+        let camera = Camera::new("/cam", "sensor_msgs/msg/Image");
+        let mut pictures = Pictures::new(&[], Some(camera.clone()));
+        camera.see(&meta(1), b"no image");
+        pictures.wake(&decision(2));
+        assert_eq!(pictures.write(out.path()).unwrap(), (Vec::new(), 1));
+        assert!(!out.path().join(FOLDER).exists());
+    }
+}

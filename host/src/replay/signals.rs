@@ -1,0 +1,125 @@
+//! What the report of a replay is drawn from, beside its results: what the lambda read, what its wakes cost, what a camera saw.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use gleaner_protocol::Decision;
+use gleaner_protocol::manifest::ConfigValue;
+use gleaner_protocol::signals::{Bin, Signals, Spread};
+use hdrhistogram::Histogram;
+
+use super::pictures::{Camera, Pictures};
+use crate::api::curves::Curves;
+use crate::api::data::Topic;
+use crate::stage::{Output, OutputError};
+
+/// Bins between a number and ten times as much.
+const BINS_PER_DECADE: f64 = 12.0;
+
+/// Gathers it, wake by wake.
+pub(super) struct Gathered {
+    curves: Arc<Curves>,
+    run: Histogram<u64>,
+    fuel: Histogram<u64>,
+    pictures: Pictures,
+}
+
+impl Gathered {
+    /// Of a lambda over these inputs, before its `init`.
+    pub(super) fn of(inputs: &[Arc<Topic>], camera: Option<Arc<Camera>>) -> Self {
+        let empty = || Histogram::new(2).expect("two digits are no problem");
+        let pictures = Pictures::new(inputs, camera);
+        Self { curves: Curves::of(inputs), run: empty(), fuel: empty(), pictures }
+    }
+
+    /// After a wake.
+    pub(super) fn wake(&mut self, decision: &Decision) {
+        self.run.saturating_record(decision.run_ns);
+        if let Some(fuel) = decision.fuel {
+            self.fuel.saturating_record(fuel);
+        }
+        self.pictures.wake(decision);
+    }
+
+    /// Writes it into the folder `out`, which is that of `output`.
+    pub(super) fn write(
+        self,
+        out: &Path,
+        output: &Output,
+        config: &[(String, ConfigValue)],
+    ) -> Result<(), OutputError> {
+        let (curves, curves_left_out) = self.curves.take();
+        let (pictures, pictures_left_out) = self.pictures.write(out)?;
+        output.signals(&Signals {
+            config: config.iter().cloned().collect::<BTreeMap<_, _>>(),
+            curves,
+            curves_left_out,
+            run_ns: spread(&self.run),
+            fuel: (!self.fuel.is_empty()).then(|| spread(&self.fuel)),
+            pictures,
+            pictures_left_out,
+        })
+    }
+}
+
+fn spread(of: &Histogram<u64>) -> Spread {
+    let mut bins: Vec<Bin> = Vec::new();
+    for value in of.iter_recorded() {
+        let (from, to) = bin(value.value_iterated_to());
+        match bins.last_mut().filter(|bin| bin.from == from) {
+            Some(bin) => bin.count += value.count_since_last_iteration(),
+            None => bins.push(Bin { from, to, count: value.count_since_last_iteration() }),
+        }
+    }
+    Spread {
+        count: of.len(),
+        min: of.min(),
+        p50: of.value_at_quantile(0.5),
+        p90: of.value_at_quantile(0.9),
+        p99: of.value_at_quantile(0.99),
+        max: of.max(),
+        bins,
+    }
+}
+
+/// The bin that a number falls into. Below 10 each number has its own.
+fn bin(value: u64) -> (u64, u64) {
+    if value < 10 {
+        return (value, value + 1);
+    }
+    let step = ((value as f64).log10() * BINS_PER_DECADE).floor();
+    let edge = |step: f64| 10_f64.powf(step / BINS_PER_DECADE).ceil() as u64;
+    // Rounding may put an edge just beyond its own value.
+    let step = if edge(step) > value { step - 1.0 } else { step };
+    (edge(step), edge(step + 1.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bins_lie_side_by_side_and_hold_what_falls_into_them() {
+        let mut last = bin(0);
+        assert_eq!(last, (0, 1));
+        for value in 1..2_000_000 {
+            let (from, to) = bin(value);
+            assert!((from..to).contains(&value), "{value} is not in {from}..{to}");
+            assert!((from, to) == last || from == last.1, "{last:?}, then {from}..{to}");
+            last = (from, to);
+        }
+    }
+
+    #[test]
+    fn every_wake_is_in_one_bin() {
+        let mut run = Histogram::new(2).unwrap();
+        for value in [0, 1, 9, 10, 11, 500, 500, 1_000_000] {
+            run.record(value).unwrap();
+        }
+        let Spread { count, min, max, bins, .. } = spread(&run);
+        assert_eq!((count, min, bins.iter().map(|bin| bin.count).sum::<u64>()), (8, 0, 8));
+        assert!((1_000_000..1_010_000).contains(&max), "{max}");
+        assert!(bins.windows(2).all(|pair| pair[0].to <= pair[1].from));
+    }
+}
