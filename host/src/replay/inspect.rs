@@ -88,7 +88,8 @@ fn spread(start_ns: Option<i64>, end_ns: Option<i64>) -> Vec<[i64; 2]> {
         return Vec::new();
     }
     // The end does not belong to a part, and the last message is to.
-    let from = |n: i64| start + (length + 1 - PART_NS) / (PARTS - 1) * n;
+    let room = i128::from(length) + 1 - i128::from(PART_NS);
+    let from = |n: i64| start + (room * i128::from(n) / i128::from(PARTS - 1)) as i64;
     (0..PARTS).map(|n| [from(n), from(n) + PART_NS]).collect()
 }
 
