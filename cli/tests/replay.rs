@@ -78,7 +78,7 @@ fn json_is_the_summary_alone() {
 
 #[test]
 fn a_replay_leaves_a_report_and_says_where() {
-    let installation = Installation::new("report", "cat report");
+    let installation = Installation::new("page", "cat report");
     let page = installation.0.join("report.html");
     let output = installation.replay(&[]);
     assert!(text(&output.stdout).ends_with(&format!("  report: {}\n", page.display())), "{}", text(&output.stdout));
@@ -88,18 +88,18 @@ fn a_replay_leaves_a_report_and_says_where() {
     assert!(page.exists());
     // One that is not of this replay does not stay.
     let output = installation.replay(&["--no-report"]);
-    assert!(!page.exists() && !text(&output.stdout).contains("report"));
+    assert!(!page.exists() && !text(&output.stdout).contains("  report: "));
 }
 
 #[test]
 fn a_report_that_cannot_be_written_is_a_warning() {
-    let installation = Installation::new("no-report", "cat report; exit 6");
+    let installation = Installation::new("no-page", "cat report; exit 6");
     fs::create_dir(installation.0.join("report.html")).unwrap();
     let output = installation.replay(&[]);
     assert_eq!(output.status.code(), Some(6), "the replay's own");
     let said = text(&output.stderr);
     assert!(said.starts_with("warning: cannot write the report") && said.contains("  help:  "), "{said}");
-    assert!(text(&output.stdout).contains("seen") && !text(&output.stdout).contains("report:"));
+    assert!(text(&output.stdout).contains("seen") && !text(&output.stdout).contains("  report: "));
 }
 
 #[test]

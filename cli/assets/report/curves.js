@@ -1,6 +1,8 @@
 // What the lambda read, a plot for each field, grouped by input.
 
-const CURVE_PX = 104;
+const CURVE_PX = 76;
+/** What the numbers of the axis of time take: the last plot of a group has them. */
+const AXIS_PX = 22;
 /** Time between neighbours, over what is usual, from which on nothing is drawn between them: nobody looked there. */
 const GAP = 8;
 
@@ -20,15 +22,16 @@ function drawCurves(page, entries, place) {
   const groups = new Map();
   for (const field of fieldsOf(page)) {
     const key = JSON.stringify([field.input, field.topic]);
-    if (!groups.has(key)) {
-      const title = make("span", { class: "dim" }, make("b", { text: field.input }), ` ${field.topic}`);
-      groups.set(key, place.appendChild(make("div", { class: "group" }, title)));
-    }
-    drawField(page, entries, field, groups.get(key));
+    groups.set(key, [...(groups.get(key) ?? []), field]);
+  }
+  for (const fields of groups.values()) {
+    const title = make("span", { class: "dim" }, make("b", { text: fields[0].input }), ` ${fields[0].topic}`);
+    const group = place.appendChild(make("div", { class: "group" }, title));
+    fields.forEach((field) => drawField(page, entries, field, group, field === fields[fields.length - 1]));
   }
 }
 
-function drawField(page, entries, field, group) {
+function drawField(page, entries, field, group, isLast) {
   const several = page.runs.length > 1;
   const value = make("span", { class: "value dim" });
   const caption = make("div", { class: "caption" }, make("b", { text: field.path }), ...field.of.map(({ index, curve }) => notes(curve, several ? index : null)), value);
@@ -37,8 +40,8 @@ function drawField(page, entries, field, group) {
 
   const { data, series, bands } = drawn(field, page);
   const options = timePlot({
-    height: CURVE_PX, series, bands,
-    axes: { y: { values: (_, splits) => splits.map(number), space: 26 }, x: { space: 70 } },
+    height: CURVE_PX + (isLast ? AXIS_PX : 0), series, bands,
+    axes: { y: { values: (_, splits) => splits.map(number), space: 20 }, x: isLast ? {} : { size: 4, values: () => [] } },
     hooks: {
       drawClear: [(plot) => drawClips(plot, entries)],
       draw: [(plot) => drawMarks(plot, entries)],

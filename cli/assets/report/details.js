@@ -13,7 +13,7 @@ function detailsPanel(page) {
 }
 
 function nothingChosen(page) {
-  const what = page.diff ? "difference" : "trigger";
+  const { what } = timeline;
   const has = timeline.entries.length > 0;
   return [
     make("h2", { text: has ? `Choose a ${what}` : "Nothing to choose" }),
@@ -27,7 +27,7 @@ function detailsOf(page, entry) {
   const { run } = entry;
   const heading = make("h2", {}, swatch(entryStyle(entry)), entry.title);
   const when = make("p", { class: "dim" }, entry.to ? `${seconds(entry.t)} to ${seconds(entry.to)}` : seconds(entry.t), make("br"), date(run, entry.t));
-  const parts = { trigger: triggerDetails, fault: faultDetails, clip: clipDetails, difference: differenceDetails }[entry.kind](entry);
+  const parts = { trigger: triggerDetails, fault: faultDetails, clip: clipDetails, difference: differenceDetails }[entry.kind](entry, page);
   return [heading, when, ...parts, ...logAround(run, entry)];
 }
 
@@ -78,10 +78,16 @@ function clipDetails({ clip }) {
   ];
 }
 
-function differenceDetails({ difference }) {
+/** What is said of it, and what each run has there. */
+function differenceDetails({ difference }, page) {
+  const isThere = (mark) => Math.abs(mark.t - difference.t) < 5e-7;
+  const of = page.runs.flatMap((run, index) => [
+    ...run.triggers.filter(isThere).map((mark) => [make("h2", {}, swatch(paletteStyle(index)), `${"AB"[index]}: ${run.labels[mark.label]}`), ...triggerDetails({ run, mark })]),
+    ...run.faults.filter(isThere).map((mark) => [make("h2", {}, swatch(paletteStyle(index)), `${"AB"[index]}: fault`), ...faultDetails({ mark })]),
+  ]);
   return [
-    terms([["what", `${difference.of}, ${difference.is}`], ["woken by", difference.topic ?? "the clock"]]),
-    make("pre", { text: difference.detail || "–" }),
+    terms([["what", `${difference.of}, ${difference.is}`], ["before → after", difference.is === "changed" ? difference.detail : null]]),
+    ...of.flat(),
   ];
 }
 

@@ -7,10 +7,10 @@ function galleryCard(run, name, entries) {
     const of = entries.filter((entry) => entry.run === run && entry.mark?.pictures?.includes(at));
     const [first] = of;
     const title = first ? first.title + (of.length > 1 ? ` and ${count(of.length - 1)} more` : "") : picture.of;
-    const score = first && first.score !== null ? number(first.score) : "";
+    const score = first && first.score !== null ? `${number(first.score)} · ` : "";
     const button = make("button", { title: pictureWords(picture), on: { click: () => (first ? choose(first) : goTo(picture.t)) } },
       make("img", { src: picture.src, alt: title, loading: "lazy" }),
-      make("span", {}, make("b", { text: title }), make("span", { class: "dim", text: `${score}  ${seconds(picture.t)}` })));
+      make("span", {}, make("b", { text: title }), make("span", { class: "dim", text: score + seconds(picture.t) })));
     of.forEach((entry) => shown.set(entry, button));
     return button;
   });

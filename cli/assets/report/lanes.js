@@ -54,7 +54,6 @@ function drawLanes(lanes, place) {
     series: [{}, { show: true, points: { show: false } }],
     scales: { y: { range: () => [0, lanes.length] } },
     axes: {
-      x: { side: 2 },
       y: {
         splits: () => lanes.map((_, lane) => centre(lane)),
         values: () => lanes.map((lane) => clipped(lane.name)),
@@ -153,7 +152,7 @@ function drawEntry(plot, entry, x, middle, step) {
     ctx.stroke();
     return;
   }
-  ctx.fillRect(x - unit, middle - tall, 2 * unit, 2 * tall);
+  ctx.fillRect(x - 1.5 * unit, middle - tall, 3 * unit, 2 * tall);
   // A recording that begins or ends points to where it is.
   const way = { start: 1, stop: -1 }[entry.mark?.kind];
   if (!way) return;

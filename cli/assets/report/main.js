@@ -23,7 +23,7 @@ function spanOf(page, entries) {
 
 function timelineCard(page, entries) {
   const readout = make("span", { class: "readout dim" });
-  const rest = `${counted(timeline.entries.length, page.diff ? "difference" : "trigger")}`;
+  const rest = counted(timeline.entries.length, timeline.what);
   const show = (t) => { readout.textContent = t === null ? rest : [seconds(t), date(page.runs[0], t)].filter(Boolean).join("  ·  "); };
   timeline.hoverListeners.push(show);
   show(null);
@@ -63,7 +63,10 @@ function main() {
   applyTheme();
   followSystem();
   const entries = entriesOf(page);
-  timeline.entries = entries.filter((entry) => entry.kind === (page.diff ? "difference" : "trigger"));
+  // A lambda that only faulted has nothing better to go through.
+  const isThere = (kind) => entries.some((entry) => entry.kind === kind);
+  timeline.what = page.diff ? "difference" : isThere("trigger") || !isThere("fault") ? "trigger" : "fault";
+  timeline.entries = entries.filter((entry) => entry.kind === timeline.what);
   timeline.all = timeline.view = spanOf(page, entries);
 
   drawHead(page, document.getElementById("head"));
@@ -83,6 +86,7 @@ function main() {
   // Plots are as wide as their places, which have a width now.
   time.draw();
   listenToKeys();
+  point(timeline.entries[0] ?? null);
 }
 
 main();

@@ -34,21 +34,32 @@ function drawSpread(of, place, several) {
   const most = Math.max(least * 2, ...bins.map(([, to]) => to));
   const tallest = Math.max(...bins.map(([, , wakes]) => wakes));
   const axis = { font: "11px system-ui, sans-serif", stroke: () => colour("dim"), grid: { stroke: () => colour("faint"), width: 1 }, ticks: { show: false } };
-  const round = (values) => values.map((value) => (value !== null && /^[125]0*$/.test(String(Math.round(value))) ? value : null));
+  const [left, right, top] = [least / 1.15, most * 1.15, tallest * 1.6];
+  const all = (_, splits) => splits;
   const options = {
     width: Math.max(place.clientWidth, 300), height: SPREAD_PX,
     padding: [14, 16, 0, 0],
     legend: { show: false },
     cursor: { show: false },
-    scales: { x: { time: false, distr: 3, range: () => [least / 1.15, most * 1.15] }, y: { distr: 3, range: () => [0.7, tallest * 1.6] } },
+    scales: { x: { time: false, distr: 3, range: () => [left, right] }, y: { distr: 3, range: () => [0.7, top] } },
     axes: [
-      { ...axis, size: 24, space: 48, filter: (_, splits) => round(splits), values: (_, splits) => splits.map((value) => (value === null ? "" : amount(value, unit))) },
-      { ...axis, size: 64, filter: (_, splits) => splits.map((value) => (value >= 1 && Number.isInteger(Math.log10(value)) ? value : null)), values: (_, splits) => splits.map((value) => (value === null ? "" : count(value))) },
+      { ...axis, size: 24, filter: all, splits: () => roundBetween(left, right), values: (_, splits) => splits.map((value) => amount(value, unit)) },
+      { ...axis, size: 64, filter: all, splits: () => roundBetween(0.7, top), values: (_, splits) => splits.map(count) },
     ],
     series: [{}, { show: true, points: { show: false } }],
     hooks: { draw: [(plot) => of.forEach((one) => drawBins(plot, one, several, least))] },
   };
   keepWidth(new uPlot(options, [[least, most], [null, null]], place), place);
+}
+
+/** Round numbers from `least` to `most`, as many as can be read: those of 1, 2, 5, or only powers of ten. */
+function roundBetween(least, most) {
+  const digits = Math.log10(most / least) > 2.5 ? [1] : [1, 2, 5];
+  const numbers = [];
+  for (let power = Math.floor(Math.log10(least)); power <= Math.log10(most); power += 1) {
+    numbers.push(...digits.map((digit) => Number(`${digit}e${power}`)));
+  }
+  return numbers.filter((number) => number >= Math.max(least, 1) && number <= most);
 }
 
 function drawBins(plot, { index, spread }, several, least) {

@@ -12,6 +12,8 @@ const timeline = {
   plots: [],
   /** What can be chosen one after another, by time: `{ t, run, kind, ... }`. */
   entries: [],
+  /** What they are called: `trigger`. */
+  what: "trigger",
   chosen: null,
   choiceListeners: [],
   hoverListeners: [],
@@ -36,15 +38,20 @@ function goTo(t) {
   zoom(t - span / 2, t + span / 2);
 }
 
-/** Chooses an entry: all that shows one is told. `null` chooses none. */
+/** Chooses an entry, and goes near it: all that shows one is told. `null` chooses none. */
 function choose(entry) {
-  timeline.chosen = entry;
   if (entry) goTo((entry.t + (entry.to ?? entry.t)) / 2);
+  point(entry);
+}
+
+/** Chooses an entry without moving. */
+function point(entry) {
+  timeline.chosen = entry;
   timeline.plots.forEach((plot) => plot.redraw(false));
   timeline.choiceListeners.forEach((listener) => listener(entry));
 }
 
-/** Chooses the next trigger, or the one before: from the chosen one, else from the middle of the view. */
+/** Chooses the next one, or the one before: from the chosen one, else from the middle of the view. */
 function step(by) {
   const marks = timeline.entries;
   if (marks.length === 0) return;
@@ -78,7 +85,7 @@ function timePlot({ height, series, scales, axes, hooks = {}, bands }) {
     legend: { show: false },
     scales: { x: { time: false, range: () => timeline.view }, ...scales },
     axes: [
-      { ...axis, size: 26, gap: 3, values: (_, splits) => splits.map((t) => `${Number(t.toFixed(6))} s`), ...axes?.x },
+      { ...axis, size: 26, gap: 6, values: (_, splits) => splits.map((t) => `${Number(t.toFixed(6))} s`), ...axes?.x },
       { ...axis, size: LEFT, gap: 6, ...axes?.y },
     ],
     cursor: {
