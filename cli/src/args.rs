@@ -32,9 +32,15 @@ pub enum Command {
     Check(CheckArgs),
     /// Run a built lambda over recorded drives
     ///
-    /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json and the clips that the manifest asks for, and shows a
-    /// summary.
+    /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json, the clips that the manifest asks for, and OUT/report.html, and
+    /// shows a summary.
     Replay(ReplayArgs),
+    /// Write OUT/report.html, the page about a replay or a live run, from the files in OUT
+    Report(ReportArgs),
+    /// Show what differs between the results of two runs
+    ///
+    /// Ends with 0 if the decisions are the same, and with 4 if they are not.
+    Diff(DiffArgs),
     /// Make the decisions in a clip again, and compare them with its journal
     ///
     /// Ends with 0 if all are the same, and with 4 at the first that is not.
@@ -266,9 +272,36 @@ pub struct ReplayArgs {
     /// Make every decision of a journal again and compare, instead of writing results; exit code 4 at the first difference
     #[arg(long, value_name = "FILE", conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal"])]
     pub verify: Option<PathBuf>,
+    /// Leave out OUT/report.html
+    #[arg(long)]
+    pub no_report: bool,
     /// Print the summary as one JSON object
     #[arg(long)]
     pub json: bool,
+}
+
+/// Arguments of `gleaner report`.
+#[derive(Args, Debug)]
+pub struct ReportArgs {
+    /// The folder that `gleaner replay` or `gleaner run` wrote to
+    pub out: PathBuf,
+}
+
+/// Arguments of `gleaner diff`.
+#[derive(Args, Debug)]
+pub struct DiffArgs {
+    /// The folder of the first run
+    #[arg(value_name = "OUT1")]
+    pub a: PathBuf,
+    /// The folder of the second run
+    #[arg(value_name = "OUT2")]
+    pub b: PathBuf,
+    /// Print the differences as one JSON object
+    #[arg(long)]
+    pub json: bool,
+    /// Write a page with both runs, their differences marked
+    #[arg(long, value_name = "FILE")]
+    pub report: Option<PathBuf>,
 }
 
 /// Arguments of `gleaner verify`.

@@ -1,6 +1,7 @@
 //! The command `gleaner`: `new` makes a lambda's folder, `build` its build folder, `runtime` starts `gleaner-runtime` for `check`, `replay` and
 //! `verify`, `run` keeps it and the recorder going live,
-//! `results` reads back what a replay left, and `show` is what people see of it.
+//! `results` reads back what a replay left, `show` is what people see of it, `report` the page about it, and `diff` what differs
+//! between two of them.
 //!
 //! It is thin. No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts its
 //! sibling programs and speaks to them through `gleaner-protocol`.
@@ -8,10 +9,12 @@
 pub mod args;
 mod build;
 mod check;
+mod diff;
 mod doctor;
 mod listen;
 mod new;
 mod replay;
+mod report;
 pub mod results;
 mod run;
 mod runtime;
@@ -35,6 +38,8 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         Command::Build(args) => build::run(&args.lambda),
         Command::Check(args) => check::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Report(args) => report::run(&args),
+        Command::Diff(args) => diff::run(&args),
         Command::Verify(args) => replay::verify(&args),
         Command::Run(args) => run::run(&args),
         Command::Topics(args) => sibling::topics(&args),

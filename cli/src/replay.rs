@@ -1,11 +1,14 @@
 //! `gleaner replay DIR DRIVE...` and `gleaner verify CLIP`: what the runtime is asked for, and what people see of its result.
 
 use std::ffi::OsString;
+use std::fs;
 use std::io::{self, IsTerminal};
+use std::path::{Path, PathBuf};
 
 use gleaner_protocol::{Exit, Failure, Summary};
 
 use crate::args::{ReplayArgs, VerifyArgs};
+use crate::report;
 use crate::results::{Decisions, clips};
 use crate::runtime::{self, Heard};
 use crate::say::say;
@@ -13,7 +16,41 @@ use crate::show::{self, Digest, Paint};
 
 /// Replays, and ends as the runtime ends.
 pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
-    show_result(runtime::run(arguments(args))?, args.json)
+    let (heard, exit) = runtime::run(arguments(args))?;
+    let report = match &heard {
+        Some(Heard::Summary(summary)) => report_of(&summary.out, args.no_report),
+        _ => None,
+    };
+    show_result((heard, exit), args.json)?;
+    if let Some(path) = report.filter(|_| !args.json) {
+        say(&format!("  {}\n", paint().dim(&format!("report: {}", path.display()))))?;
+    }
+    Ok(exit)
+}
+
+/// Writes the report of `out`, unless nobody wants it. That of an earlier replay goes in any case: it is about other results.
+///
+/// Without one the replay has still done its work. Its exit code says how that went, and scripts act on it: a warning has to do.
+fn report_of(out: &Path, is_unwanted: bool) -> Option<PathBuf> {
+    let path = out.join(report::NAME);
+    if let Err(error) = fs::remove_file(&path)
+        && error.kind() != io::ErrorKind::NotFound
+    {
+        let failure =
+            Failure::caused_by(Exit::Internal, format!("cannot write the report `{}`", path.display()), &error);
+        warn(&failure.with_help("remove what is there: it is not about this replay"));
+        return None;
+    }
+    if is_unwanted {
+        return None;
+    }
+    report::write(out).map_err(|failure| warn(&failure)).ok()
+}
+
+/// Shows what did not keep the command from its work.
+fn warn(failure: &Failure) {
+    let text = failure.to_string();
+    eprintln!("warning: {}", text.strip_prefix("error: ").unwrap_or(&text));
 }
 
 /// Makes the decisions in a clip again.
@@ -96,6 +133,7 @@ mod tests {
             topics: vec!["*".to_owned(), "/a".to_owned()],
             journal: Some("j".into()),
             verify: None,
+            no_report: true,
             json: true,
         };
         let line =

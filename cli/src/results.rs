@@ -3,7 +3,7 @@
 //! Nothing is written here, and no file is held in memory as a whole: `decisions.jsonl` may have a line per wake.
 
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, Lines};
+use std::io::{self, BufRead, BufReader, Read};
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
@@ -31,7 +31,18 @@ pub enum ResultsError {
         /// Why not.
         source: serde_json::Error,
     },
+    /// A line is longer than any that Gleaner writes.
+    #[error("`{}`, line {line}, is longer than {} MiB", path.display(), LINE_BYTES >> 20)]
+    Long {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+    },
 }
+
+/// Most bytes of a line: what stands in the folder may have been written by others, and a line is held in memory.
+const LINE_BYTES: usize = 16 << 20;
 
 impl Explain for ResultsError {
     fn help(&self) -> Option<String> {
@@ -43,11 +54,13 @@ impl Explain for ResultsError {
     }
 }
 
-/// A file of JSON lines, read one by one.
+/// A file of JSON lines, read one by one. After a line that cannot be used the next one follows; after a file that cannot be read, none.
 #[derive(Debug)]
 pub struct JsonLines<T> {
     path: PathBuf,
-    lines: Lines<BufReader<File>>,
+    /// `None` once it could not be read.
+    reader: Option<BufReader<File>>,
+    text: Vec<u8>,
     line: usize,
     of: PhantomData<T>,
 }
@@ -76,10 +89,37 @@ pub fn clips(out: &Path) -> Result<Vec<Clip>, ResultsError> {
 }
 
 impl<T> JsonLines<T> {
-    fn read(path: PathBuf) -> Result<Self, ResultsError> {
-        match File::open(&path) {
-            Ok(file) => Ok(Self { path, lines: BufReader::new(file).lines(), line: 0, of: PhantomData }),
+    /// The lines of the file `path`.
+    pub(crate) fn read(path: PathBuf) -> Result<Self, ResultsError> {
+        // A pipe in the place of a file would be waited for.
+        let opened = path.metadata().and_then(|found| match found.is_file() {
+            true => File::open(&path),
+            false => Err(io::Error::other("it is no file")),
+        });
+        match opened {
+            Ok(file) => {
+                Ok(Self { path, reader: Some(BufReader::new(file)), text: Vec::new(), line: 0, of: PhantomData })
+            }
             Err(source) => Err(ResultsError::Read { path, source }),
+        }
+    }
+
+    /// Reads the next line; `None` at the end of the file.
+    fn next_line(&mut self) -> Option<Result<(), ResultsError>> {
+        let reader = self.reader.as_mut()?;
+        self.line += 1;
+        self.text.clear();
+        let read = reader.by_ref().take(LINE_BYTES as u64 + 1).read_until(b'\n', &mut self.text);
+        let is_long = self.text.len() > LINE_BYTES;
+        let skipped = if is_long && !self.text.ends_with(b"\n") { reader.skip_until(b'\n').map(drop) } else { Ok(()) };
+        match read.and_then(|read| skipped.map(|()| read)) {
+            Ok(0) => None,
+            Ok(_) if is_long => Some(Err(ResultsError::Long { path: self.path.clone(), line: self.line })),
+            Ok(_) => Some(Ok(())),
+            Err(source) => {
+                self.reader = None;
+                Some(Err(ResultsError::Read { path: self.path.clone(), source }))
+            }
         }
     }
 }
@@ -88,11 +128,13 @@ impl<T: DeserializeOwned> Iterator for JsonLines<T> {
     type Item = Result<T, ResultsError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        let text = self.lines.next()?;
-        self.line += 1;
-        let path = || self.path.clone();
-        Some(text.map_err(|source| ResultsError::Read { path: path(), source }).and_then(|text| {
-            serde_json::from_str(&text).map_err(|source| ResultsError::Line { path: path(), line: self.line, source })
+        let read = self.next_line()?;
+        Some(read.and_then(|()| {
+            serde_json::from_slice(&self.text).map_err(|source| ResultsError::Line {
+                path: self.path.clone(),
+                line: self.line,
+                source,
+            })
         }))
     }
 }
@@ -231,6 +273,21 @@ mod tests {
         .unwrap();
         let lines: Vec<_> = trigger_lines(&decision, 1_700_000_000_000_000_000).collect();
         assert_eq!(lines, ["10.810 hard-brake 1.46", "10.810 a\\u{1b}[2J -"]);
+    }
+
+    #[test]
+    fn a_line_that_cannot_be_used_is_named_and_the_next_one_follows() {
+        let path = std::env::temp_dir().join(format!("gleaner-lines-{}", std::process::id()));
+        let long = "1".repeat(LINE_BYTES + 1);
+        std::fs::write(&path, format!("1\nx\n{long}\n{long}2\n5")).unwrap();
+        let lines: Vec<_> = JsonLines::<u8>::read(path.clone()).unwrap().collect();
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(lines.len(), 5);
+        assert!(matches!(lines[0], Ok(1)));
+        assert!(matches!(lines[1], Err(ResultsError::Line { line: 2, .. })));
+        assert!(matches!(lines[2], Err(ResultsError::Long { line: 3, .. })));
+        assert!(matches!(lines[3], Err(ResultsError::Long { line: 4, .. })));
+        assert!(matches!(lines[4], Ok(5)));
     }
 
     #[test]

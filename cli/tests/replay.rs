@@ -26,6 +26,8 @@ impl Installation {
         let program = folder.join("gleaner-runtime");
         let report = SUMMARY.replacen('{', r#"{"report":"summary","#, 1).replace("OUT", folder.to_str().unwrap());
         fs::write(folder.join("report"), report + "\n").unwrap();
+        fs::write(folder.join("summary.json"), SUMMARY).unwrap();
+        fs::write(folder.join("log.jsonl"), "").unwrap();
         fs::write(folder.join("decisions.jsonl"), format!("{DECISION}\n")).unwrap();
         fs::write(&program, format!("#!/bin/sh\ncd '{}'\n{runtime}\n", folder.display())).unwrap();
         fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
@@ -72,6 +74,32 @@ fn json_is_the_summary_alone() {
     let output = installation.replay(&["--json"]);
     let expected = SUMMARY.replace("OUT", installation.0.to_str().unwrap()) + "\n";
     assert_eq!(text(&output.stdout), expected);
+}
+
+#[test]
+fn a_replay_leaves_a_report_and_says_where() {
+    let installation = Installation::new("page", "cat report");
+    let page = installation.0.join("report.html");
+    let output = installation.replay(&[]);
+    assert!(text(&output.stdout).ends_with(&format!("  report: {}\n", page.display())), "{}", text(&output.stdout));
+    assert!(fs::read_to_string(&page).unwrap().contains(r#""labels":["seen"]"#));
+    fs::remove_file(&page).unwrap();
+    installation.replay(&["--json"]);
+    assert!(page.exists());
+    // One that is not of this replay does not stay.
+    let output = installation.replay(&["--no-report"]);
+    assert!(!page.exists() && !text(&output.stdout).contains("  report: "));
+}
+
+#[test]
+fn a_report_that_cannot_be_written_is_a_warning() {
+    let installation = Installation::new("no-page", "cat report; exit 6");
+    fs::create_dir(installation.0.join("report.html")).unwrap();
+    let output = installation.replay(&[]);
+    assert_eq!(output.status.code(), Some(6), "the replay's own");
+    let said = text(&output.stderr);
+    assert!(said.starts_with("warning: cannot write the report") && said.contains("  help:  "), "{said}");
+    assert!(text(&output.stdout).contains("seen") && !text(&output.stdout).contains("  report: "));
 }
 
 #[test]

@@ -135,7 +135,7 @@ impl Burst {
 }
 
 /// The line of a fault's message that says most: the first, but the last of a Python traceback.
-fn gist(message: &str) -> &str {
+pub(crate) fn gist(message: &str) -> &str {
     let mut lines = message.lines().map(str::trim).filter(|line| !line.is_empty());
     let traceback = message.contains("Traceback (most recent call last)");
     let line = if traceback { lines.next_back() } else { lines.next() };
@@ -285,13 +285,13 @@ fn losses(summary: &Summary) -> Vec<String> {
 }
 
 /// The word of `decisions.jsonl`.
-fn word(kind: FaultKind) -> String {
+pub(crate) fn word(kind: FaultKind) -> String {
     let word = serde_json::to_value(kind).ok();
     word.as_ref().and_then(|word| word.as_str()).unwrap_or("fault").to_owned()
 }
 
 /// `1 wake`, `2,000 wakes`.
-fn counted(count: u64, thing: &str) -> String {
+pub(crate) fn counted(count: u64, thing: &str) -> String {
     format!("{} {thing}{}", grouped(count), if count == 1 { "" } else { "s" })
 }
 
@@ -313,23 +313,23 @@ impl Paint {
         Paint { on: terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()) }
     }
 
-    fn bold(self, text: &str) -> String {
+    pub(crate) fn bold(self, text: &str) -> String {
         self.with("1", text)
     }
 
-    fn dim(self, text: &str) -> String {
+    pub(crate) fn dim(self, text: &str) -> String {
         self.with("2", text)
     }
 
-    fn red(self, text: &str) -> String {
+    pub(crate) fn red(self, text: &str) -> String {
         self.with("31", text)
     }
 
-    fn green(self, text: &str) -> String {
+    pub(crate) fn green(self, text: &str) -> String {
         self.with("32", text)
     }
 
-    fn yellow(self, text: &str) -> String {
+    pub(crate) fn yellow(self, text: &str) -> String {
         self.with("33", text)
     }
 

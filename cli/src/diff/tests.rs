@@ -1,0 +1,210 @@
+//! Runs that are alike, and runs that are not.
+
+use gleaner_protocol::{Exit, Explain};
+use serde_json::{Value, json};
+
+use super::{Diff, Difference, Tally, between, show};
+use crate::report::tests::{Out, START_NS, summary, trigger, wake};
+use crate::show::Paint;
+
+fn out(decisions: &[Value]) -> Out {
+    let out = Out::new();
+    out.decisions(decisions);
+    out
+}
+
+fn diff(a: &[Value], b: &[Value]) -> Diff {
+    between(out(a).path(), out(b).path()).unwrap()
+}
+
+fn one(ms: i64, label: &str, score: f64) -> Value {
+    wake(ms, json!([trigger(label, score)]), Value::Null)
+}
+
+fn faulty(ms: i64, kind: &str, message: &str) -> Value {
+    wake(ms, json!([]), json!({"kind": kind, "message": message, "used": null, "allowed": null}))
+}
+
+/// The differences in words.
+fn lines(diff: &Diff) -> Vec<String> {
+    let line = |one: &Difference| format!("{:?} {:?}: {}, {}", one.of, one.is, one.label, one.detail);
+    diff.differences.iter().map(line).collect()
+}
+
+#[test]
+fn runs_with_the_same_decisions_do_not_differ() {
+    let decisions = [one(1, "brake", 1.5), faulty(2, "trap", "x"), one(3, "brake", 2.5)];
+    let mut twin = decisions.clone();
+    twin[0]["fuel"] = 7.into();
+    twin[0]["run_ns"] = 8.into();
+    // Within the tolerance of scores.
+    twin[2]["triggers"][0]["score"] = 2.500_001.into();
+    let diff = diff(&decisions, &twin);
+    assert!(diff.same);
+    assert_eq!(diff.triggers, Tally { same: 2, ..Tally::default() });
+    assert_eq!(diff.faults, Tally { same: 1, ..Tally::default() });
+    assert!(diff.differences.is_empty());
+}
+
+#[test]
+fn quiet_wakes_are_as_good_as_none() {
+    let quiet = |ms| wake(ms, json!([]), Value::Null);
+    let diff = diff(&[quiet(0), one(1, "brake", 1.5), quiet(2)], &[one(1, "brake", 1.5)]);
+    assert!(diff.same);
+}
+
+#[test]
+fn triggers_are_gone_new_or_changed() {
+    let a = [one(1, "gone", 1.0), one(2, "score", 1.0), one(3, "label", 1.0), one(5, "same", 1.0)];
+    let b = [one(2, "score", 1.5), one(3, "other", 1.0), one(4, "new", 2.0), one(5, "same", 1.0)];
+    let diff = diff(&a, &b);
+    assert!(!diff.same);
+    assert_eq!(diff.triggers, Tally { same: 1, gone: 1, new: 1, changed: 2 });
+    assert_eq!(
+        lines(&diff),
+        [
+            "Trigger Gone: gone, 1",
+            "Trigger Changed: score, score 1 → 1.5",
+            "Trigger Changed: label → other, ",
+            "Trigger New: new, 2",
+        ]
+    );
+    assert_eq!(diff.differences[3].t, 0.004);
+    assert_eq!(diff.differences[3].at_ns, START_NS + 4_000_000);
+}
+
+#[test]
+fn attributes_count_and_numbers_among_them_have_the_tolerance_of_scores() {
+    let with = |attributes: Value| {
+        let mut trigger = trigger("x", 1.0);
+        trigger["attributes"] = attributes;
+        wake(1, json!([trigger]), Value::Null)
+    };
+    let a = with(json!({"mps2": -4.5, "n": 7, "word": "a", "old": true}));
+    assert!(diff(&[a.clone()], &[with(json!({"mps2": -4.500_001, "n": 7, "word": "a", "old": true}))]).same);
+    let diff = diff(&[a], &[with(json!({"mps2": -4.6, "n": 8, "word": "a", "young": null}))]);
+    assert_eq!(lines(&diff), ["Trigger Changed: x, mps2 -4.5 → -4.6, n 7 → 8, old true → none, young none → null"]);
+}
+
+#[test]
+fn several_triggers_of_one_wake_are_paired_by_their_labels() {
+    let wake = |triggers: &[(&str, f64)]| {
+        wake(1, triggers.iter().map(|(label, score)| trigger(label, *score)).collect(), Value::Null)
+    };
+    let diff = diff(
+        &[wake(&[("a", 1.0), ("b", 1.0), ("b", 2.0)])],
+        &[wake(&[("b", 1.0), ("b", 2.0), ("a", 1.0), ("c", 3.0)])],
+    );
+    assert_eq!(diff.triggers, Tally { same: 3, new: 1, ..Tally::default() });
+}
+
+#[test]
+fn wakes_of_one_instant_are_told_apart_by_topic_and_number() {
+    let on = |topic: &str, seq: u64, label: &str| {
+        let mut wake = one(1, label, 1.0);
+        wake["topic"] = topic.into();
+        wake["seq"] = seq.into();
+        wake
+    };
+    let (a, b, c) = (on("/a", 1, "a"), on("/b", 1, "b"), on("/b", 2, "c"));
+    assert!(diff(&[a.clone(), b.clone(), c.clone()], &[c.clone(), a.clone(), b.clone()]).same);
+    assert_eq!(diff(&[a.clone(), b.clone()], &[a, c]).triggers, Tally { same: 1, gone: 1, new: 1, changed: 0 });
+}
+
+#[test]
+fn faults_are_gone_new_or_changed() {
+    let a = [faulty(1, "trap", "x"), faulty(2, "fuel", "y"), faulty(3, "trap", "z"), faulty(4, "trap", "same")];
+    let b = [faulty(2, "memory", "y"), faulty(3, "trap", "zz"), faulty(4, "trap", "same"), faulty(5, "trap", "x")];
+    let diff = diff(&a, &b);
+    assert_eq!(diff.faults, Tally { same: 1, gone: 1, new: 1, changed: 2 });
+    assert_eq!(lines(&diff)[1], "Fault Changed: fuel → memory, y → y");
+}
+
+#[test]
+fn wakes_out_of_order_are_compared_as_far_as_may_be() {
+    let disorder = [one(5, "a", 1.0), one(1, "b", 1.0), one(6, "c", 1.0)];
+    let alike = diff(&disorder, &disorder);
+    assert!(alike.same && alike.notes.iter().any(|note| note.contains("not in the order")), "{:?}", alike.notes);
+}
+
+#[test]
+fn other_lambdas_and_drives_are_said_first() {
+    let (a, b) = (out(&[]), out(&[]));
+    let mut other = summary();
+    other["lambda"] = "brake-dark".into();
+    other["kind"] = "python".into();
+    other["drive"] = json!(["b.mcap"]);
+    other["end_ns"] = (START_NS + 1).into();
+    other["wakes"] = 500.into();
+    other["topics"][0]["lost"] = 4.into();
+    b.write("summary.json", other.to_string());
+    let diff = between(a.path(), b.path()).unwrap();
+    assert!(diff.same, "the decisions are");
+    assert_eq!(
+        diff.notes[..3],
+        [
+            "different lambdas: `hello` and `brake-dark`",
+            "different kinds: wasm and python",
+            "different drives: `a.mcap` and `b.mcap`"
+        ]
+    );
+    let text = show::text(&diff, Paint::new(false));
+    assert!(text.starts_with("different lambdas"), "{text}");
+    assert!(text.contains("  wakes: 400 → 500\n"), "{text}");
+    assert!(text.contains("  samples of `imu`, lost before they reached us: unknown → 4\n"), "{text}");
+}
+
+#[test]
+fn config_and_cost_are_compared_if_both_tell_them() {
+    let signals = |brake: f64, p50: u64| {
+        let spread = json!({"count": 9, "min": 1, "p50": p50, "p90": 3, "p99": 4, "max": 5, "bins": []});
+        json!({"config": {"brake": brake, "same": 1}, "curves": [], "curves_left_out": 0, "run_ns": spread, "fuel": spread,
+            "pictures": [], "pictures_left_out": 0}).to_string()
+    };
+    let (a, b) = (out(&[]), out(&[]));
+    a.write("signals.json", signals(-1.4, 2000));
+    let one_tells = between(a.path(), b.path()).unwrap();
+    assert!(one_tells.config.is_empty() && one_tells.notes[0].contains("config not compared"));
+    assert_eq!((one_tells.cost[0].b, one_tells.cost[0].ratio), (None, None));
+    b.write("signals.json", signals(-2.0, 3000));
+    let diff = between(a.path(), b.path()).unwrap();
+    assert_eq!(diff.notes, [""; 0]);
+    let text = show::text(&diff, Paint::new(false));
+    assert!(text.contains("  config brake: -1.4 → -2.0\n") && !text.contains("config same"), "{text}");
+    assert!(text.contains("  time in the lambda, median: 2 µs → 3 µs (x1.5)\n"), "{text}");
+}
+
+#[test]
+fn of_many_differences_the_first_are_listed_and_all_are_counted() {
+    let a: Vec<_> = (0..3000).map(|ms| one(ms, "gone", 1.0)).collect();
+    let b: Vec<_> = (3000..3030).map(|ms| one(ms, "new", 1.0)).collect();
+    let diff = diff(&a, &b);
+    assert_eq!(diff.triggers, Tally { same: 0, gone: 3000, new: 30, changed: 0 });
+    // What is rare is not crowded out.
+    assert_eq!((diff.differences.len(), diff.left_out), (1020, 2010));
+    let text = show::text(&diff, Paint::new(false));
+    assert!(text.contains("  triggers: 0 the same, 3,000 gone, 30 new, 0 changed\n"), "{text}");
+    assert!(
+        text.contains("and 2,980 more") && text.contains("+     3.000 s  new  1\n") && text.contains("and 10 more"),
+        "{text}"
+    );
+}
+
+#[test]
+fn hostile_texts_do_not_act_on_a_terminal() {
+    let text = show::text(&diff(&[one(1, "\u{1b}[2J", 1.0)], &[]), Paint::new(false));
+    assert!(!text.contains('\u{1b}') && text.contains("\\u{1b}[2J"), "{text}");
+}
+
+#[test]
+fn what_is_no_output_is_refused() {
+    let (whole, broken) = (out(&[]), out(&[]));
+    broken.write("decisions.jsonl", "{\"at_ns\":1");
+    let error = between(whole.path(), broken.path()).unwrap_err();
+    assert_eq!(error.exit(), Exit::Usage);
+    assert!(error.to_string().ends_with("line 1, is not what a replay writes") && error.help().is_some(), "{error}");
+    std::fs::remove_file(broken.path().join("summary.json")).unwrap();
+    let error = between(broken.path(), whole.path()).unwrap_err();
+    assert_eq!(error.exit(), Exit::Usage);
+    assert!(error.to_string().ends_with("holds no results"), "{error}");
+}

@@ -1,0 +1,173 @@
+//! What two runs say of themselves: which lambda, which drive, with which config, how much of what, at which cost.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use gleaner_protocol::manifest::ConfigValue;
+use gleaner_protocol::signals::Signals;
+use gleaner_protocol::{Clip, Live};
+
+use super::{Change, Cost, Diff, DiffError, Side, Tally};
+use crate::report::{Losses, Told, signals};
+use crate::results::{JsonLines, grouped, size};
+
+/// All that can be said without looking at a decision.
+pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
+    let mut notes = Vec::new();
+    let (told_a, told_b) = (Told::of(a)?, Told::of(b)?);
+    apart(&told_a, &told_b, &mut notes);
+    let [read_a, read_b] = [a, b].map(|out| signals(out, &mut notes));
+    let clips = [clips(a)?, clips(b)?];
+    Ok(Diff {
+        same: false,
+        a: side(a, &told_a),
+        b: side(b, &told_b),
+        config: config(read_a.as_ref(), read_b.as_ref(), &mut notes),
+        counts: counts(&told_a, &told_b, clips),
+        cost: cost((&told_a, read_a.as_ref()), (&told_b, read_b.as_ref())),
+        notes,
+        triggers: Tally::default(),
+        faults: Tally::default(),
+        differences: Vec::new(),
+        left_out: 0,
+    })
+}
+
+fn side(out: &Path, told: &Told) -> Side {
+    let (lambda, version, kind) = told.lambda();
+    let (drive, start_ns) = match told {
+        Told::Replay(summary) => {
+            (summary.drive.iter().map(|path| path.display().to_string()).collect(), Some(summary.start_ns))
+        }
+        Told::Live(_) => (Vec::new(), None),
+    };
+    let (lambda, version) = (lambda.to_owned(), version.to_owned());
+    Side { out: out.display().to_string(), lambda, version, kind, drive, start_ns }
+}
+
+/// What makes a comparison doubtful: it is said before all else.
+fn apart(a: &Told, b: &Told, notes: &mut Vec<String>) {
+    let [(name_a, version_a, kind_a), (name_b, version_b, kind_b)] = [a.lambda(), b.lambda()];
+    if name_a != name_b {
+        notes.push(format!("different lambdas: `{name_a}` and `{name_b}`"));
+    } else if version_a != version_b {
+        notes.push(format!("different versions of `{name_a}`: {version_a} and {version_b}"));
+    }
+    if kind_a != kind_b {
+        notes.push(format!("different kinds: {} and {}", kind_a.as_str(), kind_b.as_str()));
+    }
+    let (a, b) = match (a, b) {
+        (Told::Replay(a), Told::Replay(b)) => (a, b),
+        (Told::Live(_), Told::Live(_)) => return notes.push("both ran live, each on what it received".to_owned()),
+        _ => return notes.push("one is a replay, the other ran live".to_owned()),
+    };
+    if (a.start_ns, a.end_ns) != (b.start_ns, b.end_ns) {
+        let names = [a, b].map(|summary| {
+            summary.drive.iter().map(|path| format!("`{}`", path.display())).collect::<Vec<_>>().join(", ")
+        });
+        notes.push(format!("different drives: {} and {}", names[0], names[1]));
+    } else if a.part != b.part {
+        notes.push("different parts of the drive".to_owned());
+    }
+    for (name, summary) in [("first", a), ("second", b)] {
+        if summary.damaged.is_some() {
+            notes.push(format!("the drive of the {name} is damaged; its results end there"));
+        }
+    }
+}
+
+fn config(a: Option<&Signals>, b: Option<&Signals>, notes: &mut Vec<String>) -> Vec<Change> {
+    let (Some(a), Some(b)) = (a, b) else {
+        notes.push("config not compared: an output without `signals.json` does not tell which held".to_owned());
+        return Vec::new();
+    };
+    let word = |of: &BTreeMap<String, ConfigValue>, key: &str| {
+        of.get(key).map(|value| serde_json::to_string(value).unwrap_or_default())
+    };
+    let keys: BTreeSet<_> = a.config.keys().chain(b.config.keys()).collect();
+    let both = keys.into_iter().map(|key| (key, word(&a.config, key), word(&b.config, key)));
+    both.filter(|(_, a, b)| a != b).map(|(key, a, b)| Change { what: key.clone(), a, b }).collect()
+}
+
+/// How many clips there are, and their bytes.
+fn clips(out: &Path) -> Result<[u64; 2], DiffError> {
+    let path = out.join("clips.jsonl");
+    if !path.exists() {
+        return Ok([0, 0]);
+    }
+    let lines = JsonLines::<Clip>::read(path).map_err(DiffError::Read)?;
+    let mut found = [0, 0_u64];
+    for clip in lines {
+        found[0] += 1;
+        found[1] = found[1].saturating_add(clip.map_err(DiffError::Read)?.bytes);
+    }
+    Ok(found)
+}
+
+fn counts(a: &Told, b: &Told, clips: [[u64; 2]; 2]) -> Vec<Change> {
+    let mut changes = Vec::new();
+    let mut add = |what: String, a: Option<String>, b: Option<String>| {
+        if a != b {
+            changes.push(Change { what, a, b });
+        }
+    };
+    // The same things in the same order, first those that both have.
+    let numbers = |told: &Told| told.wakes().into_iter().chain(told.missed()).collect::<Vec<_>>();
+    let (of_a, of_b) = (numbers(a), numbers(b));
+    let find = |list: &[(&'static str, u64)], what: &str| {
+        list.iter().find(|(name, _)| *name == what).map(|(_, count)| grouped(*count))
+    };
+    let only_b = of_b.iter().filter(|(what, _)| find(&of_a, what).is_none());
+    for (what, _) in of_a.iter().chain(only_b) {
+        add((*what).to_owned(), find(&of_a, what), find(&of_b, what));
+    }
+    let [[clips_a, bytes_a], [clips_b, bytes_b]] = clips;
+    add("clips".to_owned(), Some(grouped(clips_a)), Some(grouped(clips_b)));
+    add("size of the clips".to_owned(), Some(size(bytes_a)), Some(size(bytes_b)));
+
+    let (of_a, of_b) = (a.topics(), b.topics());
+    let of = |list: &[Losses], input: &str| list.iter().find(|topic| topic.input == input).cloned();
+    let only_b = of_b.iter().filter(|topic| of(&of_a, &topic.input).is_none());
+    for Losses { input, .. } in of_a.iter().chain(only_b) {
+        let (a, b) = (of(&of_a, input), of(&of_b, input));
+        type Number = fn(&Losses) -> Option<u64>;
+        let numbers: [(&str, Number); 5] = [
+            ("received", |topic| Some(topic.received)),
+            ("lost before they reached us", |topic| topic.lost),
+            ("without a free slot", |topic| Some(topic.no_slot)),
+            ("larger than `max_size`", |topic| Some(topic.too_big)),
+            ("malformed", |topic| topic.malformed),
+        ];
+        if a.as_ref().map(|a| &a.topic) != b.as_ref().map(|b| &b.topic) {
+            let name = |topic: &Option<Losses>| topic.as_ref().map(|topic| topic.topic.clone());
+            add(format!("topic of `{input}`"), name(&a), name(&b));
+        }
+        for (what, number) in numbers {
+            let word = |topic: &Option<Losses>| topic.as_ref().and_then(number).map(grouped);
+            add(format!("samples of `{input}`, {what}"), word(&a), word(&b));
+        }
+    }
+    changes
+}
+
+/// Of a run without `signals.json`, what its summary tells.
+fn cost(a: (&Told, Option<&Signals>), b: (&Told, Option<&Signals>)) -> Vec<Cost> {
+    let time = |(told, signals): (&Told, Option<&Signals>)| match (signals, told) {
+        (Some(signals), _) => Some(signals.run_ns.p50).filter(|_| signals.run_ns.count > 0),
+        (None, Told::Live(live)) => run(live),
+        (None, Told::Replay(_)) => None,
+    };
+    let fuel = |(_, signals): (&Told, Option<&Signals>)| {
+        signals.and_then(|signals| signals.fuel.as_ref()).filter(|fuel| fuel.count > 0).map(|fuel| fuel.p50)
+    };
+    let cost = |what, unit, a: Option<u64>, b: Option<u64>| {
+        let ratio = a.zip(b).filter(|(a, _)| *a > 0).map(|(a, b)| b as f64 / a as f64);
+        (a.is_some() || b.is_some()).then_some(Cost { what, unit, a, b, ratio })
+    };
+    let all = [cost("time in the lambda", "ns", time(a), time(b)), cost("fuel", "fuel", fuel(a), fuel(b))];
+    all.into_iter().flatten().collect()
+}
+
+fn run(live: &Live) -> Option<u64> {
+    live.run.map(|run| run.p50_ns)
+}

@@ -1,0 +1,85 @@
+//! How often something happened over time, in little memory: bins that grow wider as more is counted.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+/// Most bins of all lanes together.
+const BINS_MAX: usize = 4096;
+
+/// Width of the first bins, as a power of two, in ns: about a millisecond.
+const FIRST_SHIFT: u32 = 20;
+
+/// Counts by lane and time.
+#[derive(Debug)]
+pub(super) struct Density {
+    /// A bin is `1 << shift` ns wide.
+    shift: u32,
+    bins: BTreeMap<(usize, i64), u64>,
+}
+
+/// `count` things in `lane`, from `from` to `to`, in s.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Dense {
+    pub(crate) lane: usize,
+    pub(crate) from: f64,
+    pub(crate) to: f64,
+    pub(crate) count: u64,
+}
+
+impl Density {
+    pub(super) fn new() -> Self {
+        Self { shift: FIRST_SHIFT, bins: BTreeMap::new() }
+    }
+
+    /// Counts one in `lane`, `after_ns` after the start.
+    pub(super) fn add(&mut self, lane: usize, after_ns: i64) {
+        *self.bins.entry((lane, after_ns >> self.shift)).or_default() += 1;
+        // Where lanes alone are as many as bins, wider ones would not be fewer.
+        while self.bins.len() > BINS_MAX && self.shift < 62 {
+            self.shift += 1;
+            let narrow = std::mem::take(&mut self.bins);
+            for ((lane, bin), count) in narrow {
+                *self.bins.entry((lane, bin >> 1)).or_default() += count;
+            }
+        }
+    }
+
+    pub(super) fn bins(&self) -> Vec<Dense> {
+        let seconds = |bin: i64| (i128::from(bin) << self.shift) as f64 / 1e9;
+        let dense = |(&(lane, bin), &count): (&(usize, i64), &u64)| Dense {
+            lane,
+            from: seconds(bin),
+            to: seconds(bin.saturating_add(1)),
+            count,
+        };
+        self.bins.iter().map(dense).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_million_moments_stay_few_bins_and_none_is_forgotten() {
+        let mut density = Density::new();
+        for moment in 0..1_000_000_i64 {
+            density.add((moment % 3) as usize, moment * 10_000_000);
+        }
+        let bins = density.bins();
+        assert!(bins.len() <= BINS_MAX && bins.len() > BINS_MAX / 4, "{}", bins.len());
+        assert_eq!(bins.iter().map(|bin| bin.count).sum::<u64>(), 1_000_000);
+        assert!(bins.iter().all(|bin| bin.from < bin.to));
+        assert_eq!(bins.iter().map(|bin| bin.lane).max(), Some(2));
+    }
+
+    #[test]
+    fn times_at_the_ends_of_the_range_are_counted() {
+        let mut density = Density::new();
+        for at in [i64::MIN, -1, 0, i64::MAX] {
+            density.add(0, at);
+        }
+        assert_eq!(density.bins().iter().map(|bin| bin.count).sum::<u64>(), 4);
+    }
+}

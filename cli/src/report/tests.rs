@@ -1,0 +1,316 @@
+//! The report of outputs that the tests write, whole and hostile.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use serde_json::{Value, json};
+
+use super::{Page, gather, page, write};
+
+/// A folder of results, removed when the test ends. It is also what the tests of `diff` compare.
+pub(crate) struct Out(PathBuf);
+
+pub(crate) const START_NS: i64 = 1_700_000_000_000_000_000;
+
+impl Out {
+    /// Results without any wake.
+    pub(crate) fn new() -> Out {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("gleaner-report-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let folder = std::env::temp_dir().join(name);
+        fs::create_dir(&folder).unwrap();
+        let out = Out(folder);
+        out.write("summary.json", summary().to_string());
+        out.write("decisions.jsonl", "");
+        out.write("log.jsonl", "");
+        out
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.0
+    }
+
+    pub(crate) fn write(&self, name: &str, content: impl AsRef<[u8]>) {
+        let path = self.0.join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, content).unwrap();
+    }
+
+    /// Writes these as `decisions.jsonl`.
+    pub(crate) fn decisions(&self, decisions: &[Value]) {
+        self.write("decisions.jsonl", decisions.iter().map(|decision| format!("{decision}\n")).collect::<String>());
+    }
+
+    fn data(&self) -> Value {
+        serde_json::to_value(gather::gather(&self.0, 1).unwrap()).unwrap()
+    }
+}
+
+impl Drop for Out {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// The summary of a replay over 40 s.
+pub(crate) fn summary() -> Value {
+    json!({
+        "lambda": "hello", "version": "0.1.0", "kind": "wasm", "drive": ["a.mcap"], "out": "out", "wakes": 400, "triggers": 2, "faults": 1,
+        "skipped": 0, "missed_ticks": 0, "out_of_order": 0, "log_lines": 1, "log_dropped": 0, "triggers_refused": 0, "passed_over": 0,
+        "start_ns": START_NS, "end_ns": START_NS + 40_000_000_000_i64, "wall_s": 0.5, "run_s": 0.25, "decode_s": 0.0, "wakes_per_s": 800.0,
+        "peak_rss_bytes": 1 << 20, "clips": 0, "clips_replaced": 0, "in_cooldown": 0, "ignored": 0, "damaged": null,
+        "topics": [{
+            "name": "imu", "topic": "/imu", "type_name": "sensor_msgs/msg/Imu", "received": 400, "lost": null, "overwritten": 3, "no_slot": 0,
+            "too_big": 0,
+        }],
+    })
+}
+
+/// A wake `ms` after the start, with these triggers and this fault.
+pub(crate) fn wake(ms: i64, triggers: Value, fault: Value) -> Value {
+    json!({
+        "at_ns": START_NS + ms * 1_000_000, "cause": "event", "input": "imu", "topic": "/imu", "writer": null, "seq": ms, "triggers": triggers,
+        "fault": fault, "fuel": 100, "run_ns": 2000,
+    })
+}
+
+pub(crate) fn trigger(label: &str, score: f64) -> Value {
+    json!({"kind": "event", "label": label, "score": score, "attributes": {"mps2": -1.5, "serial": 9_007_199_254_740_993_i64}})
+}
+
+fn signals() -> Value {
+    let spread = json!({"count": 400, "min": 1000, "p50": 2000, "p90": 3000, "p99": 4000, "max": 9000,
+        "bins": [{"from": 1000, "to": 2000, "count": 150}, {"from": 2000, "to": 9001, "count": 250}]});
+    json!({
+        "config": {"brake_mps2": -1.4, "name": "x"},
+        "curves": [{
+            "input": "imu", "topic": "/imu", "path": "linear_acceleration.x", "samples": 4, "not_finite": 1, "per_point": 2,
+            "at_ns": [START_NS, START_NS + 500_000_000], "min": [0.123456789123, -1.0], "max": [0.5, 2.0],
+        }],
+        "curves_left_out": 3, "run_ns": spread, "fuel": spread,
+        "pictures": [], "pictures_left_out": 0,
+    })
+}
+
+const JPEG: &[u8] = &[0xff, 0xd8, 0xff, 0xe0, 1, 2, 3];
+
+fn clip(thumbnail: &str) -> Value {
+    json!({
+        "file": "clips/a.mcap", "thumbnail": thumbnail, "bytes": 4096, "from_ns": START_NS, "to_ns": START_NS + 9_000_000_000_i64,
+        "first_ns": null, "last_ns": null, "lambdas": [], "triggers": 1, "moments": [], "topics": [], "short": ["it is short"],
+        "recovered": null,
+    })
+}
+
+#[test]
+fn the_page_has_what_the_files_say() {
+    let out = Out::new();
+    let fault = json!({"kind": "fuel", "message": "out of fuel", "used": 50_000_001, "allowed": 50_000_000});
+    out.decisions(&[
+        wake(1500, json!([trigger("brake", 1.5), trigger("dark", 0.5)]), Value::Null),
+        wake(2000, json!([]), fault),
+    ]);
+    out.write("log.jsonl", format!("{}\n", json!({"at_ns": START_NS + 5, "level": "warn", "message": "hm"})));
+    out.write("signals.json", signals().to_string());
+    out.write("clips.jsonl", format!("{}\n", clip("clips/a.jpg")));
+    out.write("clips/a.jpg", JPEG);
+    let run = out.data();
+
+    assert_eq!(run["labels"], json!(["brake", "dark"]));
+    assert_eq!(run["triggers"][0]["t"], 1.5);
+    // A script would make another number of it.
+    assert_eq!(run["triggers"][0]["attributes"], json!([["mps2", "-1.5"], ["serial", "9007199254740993"]]));
+    assert_eq!(run["fault_causes"][0]["amounts"], json!({"used": "50,000,001", "allowed": "50,000,000"}));
+    assert_eq!((&run["from"], &run["to"]), (&json!(0.0), &json!(40.0)));
+    assert_eq!(run["config"], json!({"brake_mps2": -1.4, "name": "x"}));
+    let curve = &run["curves"][0];
+    assert_eq!(
+        (&curve["t"], &curve["min"], &curve["max"]),
+        (&json!([0.0, 0.5]), &json!([0.123456789, -1.0]), &json!([0.5, 2.0]))
+    );
+    assert_eq!(run["spreads"][1]["bins"], json!([[1000, 2000, 150], [2000, 9001, 250]]));
+    assert_eq!(run["topics"][0]["lost"], Value::Null, "unknown is never 0");
+    assert_eq!(run["clips"][0]["short"], json!(["it is short"]));
+    // Both triggers are in the clip, whose thumbnail serves until there is something better.
+    assert_eq!((&run["triggers"][0]["pictures"], &run["triggers"][1]["pictures"]), (&json!([0]), &json!([0])));
+    assert_eq!(run["pictures"][0]["src"], "data:image/jpeg;base64,/9j/4AECAw==");
+    assert_eq!(run["notes"], json!([]));
+}
+
+#[test]
+fn a_picture_of_the_moment_is_preferred_to_a_thumbnail() {
+    let out = Out::new();
+    out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
+    let mut signals = signals();
+    let at_ns = START_NS + 1_500_000_000;
+    signals["pictures"] =
+        json!([{"at_ns": at_ns, "topic": "/camera", "image_ns": at_ns - 20_000_000, "file": "pictures/1.jpg"}]);
+    out.write("signals.json", signals.to_string());
+    out.write("pictures/1.jpg", JPEG);
+    out.write("clips.jsonl", format!("{}\n", clip("clips/a.jpg")));
+    out.write("clips/a.jpg", JPEG);
+    let run = out.data();
+    assert_eq!(run["pictures"].as_array().unwrap().len(), 1);
+    assert_eq!((&run["pictures"][0]["of"], &run["pictures"][0]["age"]), (&json!("/camera"), &json!(0.02)));
+    assert_eq!(run["triggers"][0]["pictures"], json!([0]));
+}
+
+#[test]
+fn without_signals_the_report_does_without() {
+    let run = Out::new().data();
+    assert_eq!((&run["config"], &run["curves"], &run["spreads"]), (&Value::Null, &json!([]), &json!([])));
+    assert_eq!(run["notes"], json!([]));
+}
+
+#[test]
+fn hostile_texts_stay_texts() {
+    let (out, hostile) = (Out::new(), "</script><script>alert(1)</script>\u{2028}");
+    let mut decision = wake(
+        1,
+        json!([trigger(hostile, 1.0)]),
+        json!({"kind": "trap", "message": hostile, "used": null, "allowed": null}),
+    );
+    decision["topic"] = hostile.into();
+    decision["triggers"][0]["attributes"] = json!({hostile: hostile});
+    out.decisions(&[decision]);
+    out.write("log.jsonl", format!("{}\n", json!({"at_ns": START_NS, "level": hostile, "message": hostile})));
+    let path = write(out.path()).unwrap();
+    let html = fs::read_to_string(path).unwrap();
+    assert!(!html.contains("<script>alert") && !html.contains('\u{2028}'));
+    let (_, data) = html.split_once("application/json\">").unwrap();
+    let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
+    assert_eq!(data["runs"][0]["labels"][0], hostile, "what it said is there as it was said");
+}
+
+#[test]
+fn lines_that_say_nothing_are_counted_and_the_others_are_shown() {
+    let out = Out::new();
+    let long = format!("{{\"at_ns\":{}}}", "1".repeat(20 << 20));
+    let good = wake(1500, json!([trigger("brake", 1.5)]), Value::Null);
+    out.write("decisions.jsonl", format!("{{\n{long}\n\u{0}\n{good}\n{{\"at_ns\":5,"));
+    let run = out.data();
+    assert_eq!(run["triggers"].as_array().unwrap().len(), 1);
+    let note = run["notes"][0].as_str().unwrap();
+    assert!(
+        note.starts_with("4 lines of `decisions.jsonl` left out; the first: ") && note.contains("line 1"),
+        "{note}"
+    );
+}
+
+#[test]
+fn nothing_outside_of_the_output_is_read() {
+    let (out, elsewhere) = (Out::new(), Out::new());
+    elsewhere.write("secret.jpg", JPEG);
+    let secret = elsewhere.path().join("secret.jpg");
+    std::os::unix::fs::symlink(&secret, out.path().join("link.jpg")).unwrap();
+    out.write("note.jpg", "no picture");
+    out.write("large.jpg", [JPEG, &vec![0; 1 << 20]].concat());
+    let up = format!("../{}/secret.jpg", elsewhere.path().file_name().unwrap().to_str().unwrap());
+    out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
+    for (file, why) in [
+        (up.as_str(), "outside of the output"),
+        (secret.to_str().unwrap(), "outside of the output"),
+        ("link.jpg", "outside of the output"),
+        ("../../x", "outside of the output"),
+        ("note.jpg", "no JPEG"),
+        ("large.jpg", "larger than 1 MiB"),
+        ("none.jpg", "No such file"),
+        ("", "it is no file"),
+    ] {
+        out.write("clips.jsonl", format!("{}\n", clip(file)));
+        let run = out.data();
+        assert_eq!(run["pictures"], json!([]), "{file}");
+        let note = run["notes"][0].as_str().unwrap();
+        assert!(note.contains(why), "{file}: {note}");
+    }
+}
+
+#[test]
+fn a_page_has_bounds_and_says_what_is_beyond_them() {
+    let out = Out::new();
+    let fault = |n: usize| json!({"kind": "exception", "message": format!("cause {n}"), "used": null, "allowed": null});
+    let many: Vec<_> =
+        (0..6000).map(|n| wake(n as i64, json!([trigger(&format!("l{}", n % 40), 1.0)]), fault(n % 300))).collect();
+    out.decisions(&many);
+    let line = |n: i64| json!({"at_ns": START_NS + n, "level": "info", "message": "x".repeat(5000)}).to_string() + "\n";
+    out.write("log.jsonl", (0..3000).map(line).collect::<String>());
+    let run = out.data();
+    let length = |key: &str| run[key].as_array().unwrap().len();
+    assert_eq!((length("triggers"), &run["totals"]["triggers"]), (5000, &json!(6000)));
+    assert_eq!((length("faults"), &run["totals"]["faults"]), (500, &json!(6000)));
+    assert_eq!((length("fault_causes"), &run["totals"]["faults_in_no_line"]), (100, &json!(4000)));
+    assert_eq!(length("labels"), 25, "the last one stands for all others");
+    let dense = |key: &str| run[key].as_array().unwrap().iter().map(|bin| bin["count"].as_u64().unwrap()).sum::<u64>();
+    assert_eq!((dense("trigger_density"), dense("fault_density")), (6000, 6000));
+    assert!(length("log") < 2000 && run["totals"]["log"] == 3000, "each line is cut, and all of them share a room");
+    let html =
+        page::html(&Page { made_by: String::new(), runs: vec![gather::gather(out.path(), 1).unwrap()], diff: None });
+    assert!(html.len() < 10 << 20, "{}", html.len());
+}
+
+#[test]
+fn texts_that_grow_on_the_page_find_no_more_room_than_others() {
+    let out = Out::new();
+    let mut one = trigger("x", 1.0);
+    one["attributes"] = json!({"text": "<".repeat(300)});
+    out.decisions(&(0..5000).map(|ms| wake(ms, json!([one]), Value::Null)).collect::<Vec<_>>());
+    let run = out.data();
+    let shown = run["triggers"].as_array().unwrap().len();
+    assert!(shown > 500 && shown < 2000, "{shown}");
+    assert_eq!(run["totals"]["triggers"], 5000);
+    assert!(
+        run["trigger_density"].as_array().is_some_and(|bins| !bins.is_empty()),
+        "the others are seen where they are"
+    );
+}
+
+#[test]
+fn signals_that_contradict_themselves_are_left_out_and_named() {
+    let out = Out::new();
+    let mut signals = signals();
+    signals["curves"][0]["min"] = json!([1.0]);
+    out.write("signals.json", signals.to_string());
+    let run = out.data();
+    assert_eq!(run["curves"], json!([]));
+    assert!(run["notes"][0].as_str().unwrap().contains("1 of 1 curves"), "{}", run["notes"]);
+    out.write("signals.json", "{");
+    assert!(out.data()["notes"][0].as_str().unwrap().starts_with("`signals.json` cannot be understood"));
+}
+
+#[test]
+fn a_folder_without_results_is_refused_with_a_way_out() {
+    let out = Out::new();
+    out.write("hello/summary.json", summary().to_string());
+    fs::remove_file(out.path().join("summary.json")).unwrap();
+    let failure = write(out.path()).unwrap_err();
+    assert_eq!(failure.exit, gleaner_protocol::Exit::Usage);
+    assert!(failure.help.as_ref().unwrap().contains("hello`"), "{failure}");
+    out.write("summary.json", "{}");
+    let failure = write(out.path()).unwrap_err();
+    assert!(failure.to_string().contains("missing field `lambda`"), "{failure}");
+    assert!(!out.path().join("report.html").exists());
+}
+
+#[test]
+fn a_live_run_has_a_report_that_begins_with_what_it_saw_first() {
+    let out = Out::new();
+    let topic = json!({"name": "imu", "topic": "/imu", "type_name": "sensor_msgs/msg/Imu", "writers": 1, "rate_hz": 100.0, "received": 7,
+        "lost": 2, "malformed": 1, "overwritten": 0, "no_slot": 0, "too_big": 0, "skipped": 0, "age_ns": null, "qos": null, "trouble": ["it is far"]});
+    let live = json!({"lambda": "hello", "version": "0.1.0", "kind": "python", "out": "x", "restarts": 1, "up_s": 3.0, "wakes": 7, "triggers": 1,
+        "faults": 0, "skipped": 0, "missed_ticks": 0, "log_lines": 0, "log_dropped": 0, "triggers_refused": 0, "passed_over": 0,
+        "unwritten": 4, "unsent": 0, "wake_up": null, "run": {"n": 7, "p50_ns": 10, "p99_ns": 20, "max_ns": 30}, "hand_out": null,
+        "topics": [topic], "network": {"domain": 0, "participants": 1, "buffer_asked": 1, "buffer_granted": 1, "socket_drops": 5},
+        "recorder": null, "rss_bytes": 1, "cpu_s": 0.5});
+    out.write("summary.json", live.to_string());
+    out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
+    let run = out.data();
+    assert_eq!(
+        (&run["is_live"], &run["triggers"][0]["t"], &run["kind"]),
+        (&json!(true), &json!(0.0), &json!("python"))
+    );
+    assert_eq!(run["spreads"][0]["marks"], json!([["half", 10], ["99 %", 20], ["most", 30]]));
+    assert_eq!((&run["topics"][0]["lost"], &run["topics"][0]["malformed"]), (&json!(2), &json!(1)));
+    assert!(run["missed"].as_array().unwrap().contains(&json!(["decisions and log lines not written", 4])));
+    assert!(run["facts"].as_array().unwrap().iter().any(|fact| fact["text"] == "it is far"));
+}

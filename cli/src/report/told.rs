@@ -1,0 +1,271 @@
+//! What the files of an output tell as a whole: `summary.json` of a replay or of a live run, and `signals.json`.
+
+use std::fs::{self, File};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::manifest::Kind;
+use gleaner_protocol::signals::{Curve, Signals};
+use gleaner_protocol::{Exit, Explain, Live, Summary};
+use serde::de::DeserializeOwned;
+
+/// Most bytes of `summary.json`, which is some kilobytes, and of `signals.json`, whose curves and points are bounded.
+const SUMMARY_BYTES: u64 = 4 << 20;
+const SIGNALS_BYTES: u64 = 32 << 20;
+
+/// Why a folder is no output.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum TellError {
+    #[error("`{}` holds no results", out.display())]
+    None { out: PathBuf, inside: Vec<PathBuf>, source: FileError },
+    #[error("`{}` is not what gleaner writes", path.display())]
+    Summary { path: PathBuf, source: FileError },
+}
+
+/// Why a file of an output cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum FileError {
+    #[error("cannot read `{name}`")]
+    Read { name: &'static str, source: io::Error },
+    #[error("`{name}` is larger than {} MiB", bytes >> 20)]
+    Large { name: &'static str, bytes: u64 },
+    #[error("`{name}` cannot be understood")]
+    Json { name: &'static str, source: serde_json::Error },
+}
+
+impl FileError {
+    fn is_absent(&self) -> bool {
+        matches!(self, Self::Read { source, .. } if source.kind() == io::ErrorKind::NotFound)
+    }
+}
+
+impl Explain for TellError {
+    fn help(&self) -> Option<String> {
+        Some(match self {
+            Self::None { inside, .. } if !inside.is_empty() => {
+                let names: Vec<_> = inside.iter().map(|folder| format!("`{}`", folder.display())).collect();
+                format!("name a folder inside of it: {}", names.join(", "))
+            }
+            Self::None { .. } => {
+                "name the folder that `gleaner replay` or `gleaner run` wrote to; it has a summary.json once they have ended"
+                    .to_owned()
+            }
+            Self::Summary { .. } => "replay again, with the gleaner that is to read it".to_owned(),
+        })
+    }
+
+    fn exit(&self) -> Exit {
+        Exit::Usage
+    }
+}
+
+/// What a run did as a whole.
+#[derive(Debug)]
+pub(crate) enum Told {
+    /// It was a replay.
+    Replay(Box<Summary>),
+    /// It was live.
+    Live(Box<Live>),
+}
+
+/// A topic's samples, by what became of them.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub(crate) struct Losses {
+    pub(crate) input: String,
+    pub(crate) topic: String,
+    pub(crate) type_name: String,
+    pub(crate) received: u64,
+    /// Before they reached us; `None` if nobody knows.
+    pub(crate) lost: Option<u64>,
+    pub(crate) no_slot: u64,
+    pub(crate) too_big: u64,
+    /// Live only.
+    pub(crate) malformed: Option<u64>,
+    /// Pushed out by newer ones: how a ring works, and no loss.
+    pub(crate) overwritten: u64,
+}
+
+impl Told {
+    /// Reads `out/summary.json`.
+    pub(crate) fn of(out: &Path) -> Result<Self, TellError> {
+        let text = match bounded(out, "summary.json", SUMMARY_BYTES) {
+            Ok(text) => text,
+            Err(source) if source.is_absent() => {
+                return Err(TellError::None { out: out.to_owned(), inside: outputs_in(out), source });
+            }
+            Err(source) => return Err(TellError::Summary { path: out.join("summary.json"), source }),
+        };
+        // Told apart by a key that only one of them has, so that what is wrong with a summary is said of the right one.
+        let is_live = serde_json::from_slice::<serde_json::Value>(&text).is_ok_and(|value| value.get("up_s").is_some());
+        let told = if is_live {
+            parsed("summary.json", &text).map(Self::Live)
+        } else {
+            parsed("summary.json", &text).map(Self::Replay)
+        };
+        told.map_err(|source| TellError::Summary { path: out.join("summary.json"), source })
+    }
+
+    /// Name, version and kind of the lambda.
+    pub(crate) fn lambda(&self) -> (&str, &str, Kind) {
+        match self {
+            Self::Replay(summary) => (&summary.lambda, &summary.version, summary.kind),
+            Self::Live(live) => (&live.lambda, &live.version, live.kind),
+        }
+    }
+
+    /// Wakes, triggers and faults.
+    pub(crate) fn wakes(&self) -> [(&'static str, u64); 3] {
+        let [wakes, triggers, faults] = match self {
+            Self::Replay(summary) => [summary.wakes, summary.triggers, summary.faults],
+            Self::Live(live) => [live.wakes, live.triggers, live.faults],
+        };
+        [("wakes", wakes), ("triggers", triggers), ("faults", faults)]
+    }
+
+    /// What did not happen or was thrown away, beside samples of topics.
+    pub(crate) fn missed(&self) -> Vec<(&'static str, u64)> {
+        let shared = |skipped, ticks, log, refused, passed| {
+            vec![
+                ("event samples that woke nobody", skipped),
+                ("ticks missed", ticks),
+                ("log lines over the rate limit", log),
+                ("triggers refused, over `events_per_minute`", refused),
+                ("wakes passed over after repeated faults", passed),
+            ]
+        };
+        match self {
+            Self::Replay(told) => {
+                let mut counts =
+                    shared(told.skipped, told.missed_ticks, told.log_dropped, told.triggers_refused, told.passed_over);
+                counts.push(("messages out of order in the drive", told.out_of_order));
+                counts.push(("triggers within the cooldown of another", told.in_cooldown));
+                counts.push(("starts of what ran, stops of what did not", told.ignored));
+                counts
+            }
+            Self::Live(told) => {
+                let mut counts =
+                    shared(told.skipped, told.missed_ticks, told.log_dropped, told.triggers_refused, told.passed_over);
+                counts.push(("decisions and log lines not written", told.unwritten));
+                counts.push(("messages not sent, of `--rtt` and `--decisions`", told.unsent));
+                counts.push(("datagrams dropped by full sockets", told.network.socket_drops));
+                counts.push(("hostile datagrams dropped", told.network.filtered));
+                counts.extend(told.recorder.iter().flat_map(|recorder| {
+                    [
+                        ("wakes not told to the recorder", recorder.wakes_dropped),
+                        ("triggers not told to the recorder", recorder.triggers_lost),
+                    ]
+                }));
+                counts
+            }
+        }
+    }
+
+    /// What became of the samples of each input.
+    pub(crate) fn topics(&self) -> Vec<Losses> {
+        match self {
+            Self::Replay(summary) => summary.topics.iter().map(Losses::from).collect(),
+            Self::Live(live) => live.topics.iter().map(Losses::from).collect(),
+        }
+    }
+}
+
+impl From<&gleaner_protocol::TopicReport> for Losses {
+    fn from(topic: &gleaner_protocol::TopicReport) -> Self {
+        Self {
+            input: topic.name.clone(),
+            topic: topic.topic.clone(),
+            type_name: topic.type_name.clone(),
+            received: topic.received,
+            lost: topic.lost,
+            no_slot: topic.no_slot,
+            too_big: topic.too_big,
+            malformed: None,
+            overwritten: topic.overwritten,
+        }
+    }
+}
+
+impl From<&gleaner_protocol::LiveTopic> for Losses {
+    fn from(topic: &gleaner_protocol::LiveTopic) -> Self {
+        Self {
+            input: topic.name.clone(),
+            topic: topic.topic.clone(),
+            type_name: topic.type_name.clone(),
+            received: topic.received,
+            lost: topic.lost,
+            no_slot: topic.no_slot,
+            too_big: topic.too_big,
+            malformed: Some(topic.malformed),
+            overwritten: topic.overwritten,
+        }
+    }
+}
+
+/// What the lambda read; `None` if the run left no `signals.json`, as a live one does not.
+///
+/// What is more than it may be is cut, and curves whose numbers do not belong together are left out; `notes` says so.
+pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Option<Signals> {
+    let read = bounded(out, "signals.json", SIGNALS_BYTES).and_then(|text| parsed::<Signals>("signals.json", &text));
+    let mut signals = match read {
+        Ok(signals) => signals,
+        Err(error) if error.is_absent() => return None,
+        Err(error) => {
+            notes.push(in_words(&error));
+            return None;
+        }
+    };
+    let found = signals.curves.len();
+    signals.curves.truncate(Signals::CURVES_MAX);
+    signals.curves.retain(is_whole);
+    let dropped = found - signals.curves.len();
+    if dropped > 0 {
+        notes.push(format!("`signals.json`: {dropped} of {found} curves are not as gleaner writes them, and left out"));
+    }
+    signals.pictures.truncate(Signals::PICTURES_MAX);
+    Some(signals)
+}
+
+fn is_whole(curve: &Curve) -> bool {
+    let points = curve.at_ns.len();
+    points <= Signals::POINTS_MAX && curve.min.len() == points && curve.max.len() == points
+}
+
+/// An error and its causes in one line.
+pub(crate) fn in_words(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(error) = source {
+        text = format!("{text}: {error}");
+        source = error.source();
+    }
+    text
+}
+
+fn parsed<T: DeserializeOwned>(name: &'static str, text: &[u8]) -> Result<T, FileError> {
+    serde_json::from_slice(text).map_err(|source| FileError::Json { name, source })
+}
+
+/// The file `name` of `out`, of `bytes` at most.
+fn bounded(out: &Path, name: &'static str, bytes: u64) -> Result<Vec<u8>, FileError> {
+    let path = out.join(name);
+    let read = || {
+        // A pipe in the place of a file would be waited for.
+        if !path.metadata()?.is_file() {
+            return Err(io::Error::other("it is no file"));
+        }
+        let mut text = Vec::new();
+        File::open(&path)?.take(bytes + 1).read_to_end(&mut text)?;
+        Ok(text)
+    };
+    let text = read().map_err(|source| FileError::Read { name, source })?;
+    if text.len() as u64 > bytes { Err(FileError::Large { name, bytes }) } else { Ok(text) }
+}
+
+/// Folders in `out` that hold results: a vehicle has one for each lambda.
+fn outputs_in(out: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(out).into_iter().flatten().flatten();
+    let mut folders: Vec<_> =
+        entries.map(|entry| entry.path()).filter(|path| path.join("summary.json").is_file()).take(8).collect();
+    folders.sort();
+    folders
+}

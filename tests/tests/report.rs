@@ -1,0 +1,110 @@
+//! The page that a replay leaves, and what `gleaner diff` says of two replays, with the real runtime.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use gleaner_tests::{Folder, program, root, sample_drive};
+use serde_json::Value;
+
+const OK: i32 = 0;
+const USAGE: i32 = 2;
+const DIFFERS: i32 = 4;
+
+/// Runs `gleaner` with these arguments, which must end with `code`; what it said on standard output.
+#[track_caller]
+fn gleaner(code: i32, args: &[&str]) -> String {
+    let mut gleaner = Command::new(program("gleaner"));
+    // The tests' own, as for every replay of theirs.
+    gleaner.args(args).env("XDG_CACHE_HOME", root().join("target/test-cache"));
+    let Output { status, stdout, stderr } = gleaner.output().expect("it starts");
+    let [stdout, stderr] = [stdout, stderr].map(|text| String::from_utf8_lossy(&text).into_owned());
+    assert_eq!(status.code(), Some(code), "{stdout}{stderr}");
+    stdout
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("paths of tests are text")
+}
+
+fn replay(out: &Folder, brake: &str) -> String {
+    let (lambda, drive) = (root().join("examples/hello/rust"), sample_drive());
+    gleaner(OK, &["replay", text(&lambda), text(&drive), "--set", brake, "--out", text(out.path())])
+}
+
+fn page(path: &Path) -> (String, Value) {
+    let page = fs::read_to_string(path).expect("the page is there");
+    let (_, data) = page.split_once(r#"<script id="data" type="application/json">"#).expect("the page has data");
+    let data = serde_json::from_str(data.split_once("</script>").expect("it ends").0).expect("data is JSON");
+    (page, data)
+}
+
+#[test]
+fn a_replay_leaves_a_page_that_needs_nothing_else() {
+    let out = Folder::new();
+    let said = replay(&out, "brake_mps2=-1.4");
+    let path = out.path().join("report.html");
+    assert!(said.ends_with(&format!("  report: {}\n", path.display())), "{said}");
+    let (page, data) = page(&path);
+
+    let run = &data["runs"][0];
+    assert_eq!((&run["lambda"], &run["labels"]), (&"hello".into(), &serde_json::json!(["hard-brake"])));
+    let expected = fs::read_to_string(root().join("examples/hello/expected.txt")).expect("expected.txt");
+    let seconds = |line: &str| line.split(' ').next().and_then(|word| word.parse::<f64>().ok()).expect("seconds");
+    let shown: Vec<_> = run["triggers"].as_array().expect("a list").iter().map(|mark| mark["t"].as_f64()).collect();
+    assert_eq!(shown.len(), expected.lines().count());
+    for (shown, line) in shown.iter().zip(expected.lines()) {
+        assert!((shown.expect("a time") - seconds(line)).abs() < 0.001, "{shown:?} {line}");
+    }
+
+    // The plotting library says in its first line where it comes from.
+    let others = page.replacen("/*! https://github.com/leeoniya/uPlot", "", 1);
+    assert_eq!((others.matches("https://").count(), others.matches("http://").count()), (0, 0));
+    assert!(page.contains("default-src 'none'"), "the browser fetches nothing, whatever the page says");
+    for element in ["<link", "<iframe", "<img", "src=", "@import", "url("] {
+        assert!(!page.contains(element), "{element}");
+    }
+
+    fs::remove_file(&path).expect("it is there");
+    assert_eq!(gleaner(OK, &["report", text(out.path())]), format!("{}\n", path.display()));
+    assert_eq!(self::page(&path).1, data, "made again from the same files");
+}
+
+#[test]
+fn two_thresholds_differ_and_a_run_does_not_differ_from_itself() {
+    let (strict, mild) = (Folder::new(), Folder::new());
+    replay(&strict, "brake_mps2=-1.4");
+    replay(&mild, "brake_mps2=-1.2");
+    let decisions = |out: &Folder| fs::read_to_string(out.path().join("decisions.jsonl")).expect("it is there");
+    let times = |out: &Folder| {
+        let at = |line: &str| serde_json::from_str::<Value>(line).expect("JSON")["at_ns"].as_i64().expect("a time");
+        decisions(out).lines().map(at).collect::<std::collections::BTreeSet<_>>()
+    };
+    // Counted another way: hello triggers once in a wake at most.
+    let (a, b) = (times(&strict), times(&mild));
+    let (gone, new) = (a.difference(&b).count() as u64, b.difference(&a).count() as u64);
+    assert!(gone + new > 0, "thresholds that do not differ test nothing");
+
+    let (a, b) = (text(strict.path()), text(mild.path()));
+    let diff: Value = serde_json::from_str(&gleaner(DIFFERS, &["diff", a, b, "--json"])).expect("one object");
+    assert_eq!((&diff["triggers"]["gone"], &diff["triggers"]["new"]), (&gone.into(), &new.into()));
+    assert_eq!(diff["same"], false);
+
+    let file = mild.path().join("diff.html");
+    let said = gleaner(DIFFERS, &["diff", a, b, "--report", text(&file)]);
+    assert!(said.ends_with(&format!("  report: {}\n", file.display())), "{said}");
+    let (_, data) = page(&file);
+    assert_eq!(data["runs"].as_array().map(Vec::len), Some(2));
+    assert_eq!(data["diff"]["triggers"], diff["triggers"]);
+
+    let said = gleaner(OK, &["diff", a, a]);
+    assert!(said.contains("the same") && !said.contains("gone"), "{said}");
+}
+
+#[test]
+fn a_folder_that_holds_no_results_is_refused() {
+    let empty = Folder::new();
+    for args in [&["report", text(empty.path())][..], &["diff", text(empty.path()), text(empty.path())]] {
+        assert_eq!(gleaner(USAGE, args), "");
+    }
+}
