@@ -1,7 +1,7 @@
 //! The command `gleaner`: `new` makes a lambda's folder, `build` its build folder, `runtime` starts `gleaner-runtime` for `check`, `replay` and
 //! `verify`, `run` keeps it and the recorder going live,
-//! `results` reads back what a replay left, `show` is what people see of it, `report` the page about it, and `diff` what differs
-//! between two of them.
+//! `results` reads back what a replay left, `show` is what people see of it, `report` the page about it, `diff` what differs
+//! between two of them, `dev` does all of it again whenever a source is saved, and `generated` is what is made from the command line's definition.
 //!
 //! It is thin. No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts its
 //! sibling programs and speaks to them through `gleaner-protocol`.
@@ -9,8 +9,10 @@
 pub mod args;
 mod build;
 mod check;
+pub mod dev;
 mod diff;
 mod doctor;
+mod generated;
 mod listen;
 mod new;
 mod replay;
@@ -40,10 +42,13 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         Command::Replay(args) => replay::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Diff(args) => diff::run(&args),
+        Command::Dev(args) => dev::run(args),
         Command::Verify(args) => replay::verify(&args),
         Command::Run(args) => run::run(&args),
         Command::Topics(args) => sibling::topics(&args),
         Command::Play { arguments } => sibling::play(&arguments),
         Command::Doctor(args) => doctor::run(&args),
+        Command::Completions { shell } => generated::completions(shell),
+        Command::Man { folder } => generated::man(&folder),
     }
 }

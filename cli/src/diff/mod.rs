@@ -125,7 +125,7 @@ pub(crate) fn run(args: &DiffArgs) -> Result<Exit, Failure> {
     let exit = if diff.same { Exit::Ok } else { Exit::Differs };
     let mut text = match args.json {
         true => json_line(&diff),
-        false => show::text(&diff, Paint::new(io::stdout().is_terminal())),
+        false => diff.text(),
     };
     if let Some(path) = &args.report {
         let path = report::write_both(&args.a, &args.b, diff, path)?;
@@ -135,6 +135,13 @@ pub(crate) fn run(args: &DiffArgs) -> Result<Exit, Failure> {
     }
     say(&text)?;
     Ok(exit)
+}
+
+impl Diff {
+    /// The differences, for a person at this terminal.
+    pub(crate) fn text(&self) -> String {
+        show::text(self, Paint::new(io::stdout().is_terminal()))
+    }
 }
 
 /// What differs between the runs in these folders.

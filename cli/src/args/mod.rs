@@ -5,8 +5,11 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap_complete::Shell;
 use gleaner_protocol::DriveTime;
 use gleaner_protocol::manifest::Kind;
+
+use crate::dev::DevArgs;
 
 /// Small functions next to the sensors, that keep the data worth keeping.
 #[derive(Parser, Debug)]
@@ -41,6 +44,8 @@ pub enum Command {
     ///
     /// Ends with 0 if the decisions are the same, and with 4 if they are not.
     Diff(DiffArgs),
+    /// Build and replay a lambda whenever one of its sources is saved, and show what that changed in its decisions
+    Dev(DevArgs),
     /// Make the decisions in a clip again, and compare them with its journal
     ///
     /// Ends with 0 if all are the same, and with 4 at the first that is not.
@@ -60,6 +65,17 @@ pub enum Command {
     },
     /// Look for what would keep lambdas from running well on this machine
     Doctor(DoctorArgs),
+    /// Print what a shell needs to complete these commands
+    Completions {
+        /// The shell
+        shell: Shell,
+    },
+    /// Write a man page for each command into a folder
+    Man {
+        /// The folder, as in ~/.local/share/man/man1
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+    },
 }
 
 /// Which lambda, with which settings.
@@ -336,48 +352,9 @@ fn remap(text: &str) -> Result<String, String> {
     }
 }
 
-fn drive_time(text: &str) -> Result<String, String> {
+pub(crate) fn drive_time(text: &str) -> Result<String, String> {
     text.parse::<DriveTime>().map(|_| text.to_owned()).map_err(|error| error.to_string())
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn replay(arguments: &[&str]) -> Result<ReplayArgs, String> {
-        let line = ["gleaner", "replay"].iter().chain(arguments);
-        match Cli::try_parse_from(line).map_err(|error| error.to_string())?.command {
-            Command::Replay(args) => Ok(args),
-            other => Err(format!("{other:?}")),
-        }
-    }
-
-    #[test]
-    fn the_definition_of_the_command_line_is_sound() {
-        use clap::CommandFactory;
-        Cli::command().debug_assert();
-    }
-
-    #[test]
-    fn a_value_may_begin_with_a_minus_and_hold_an_equals_sign() {
-        let args = replay(&["dir", "a.mcap", "--set", "brake_mps2=-1.4", "--set", "word=a=b", "b.mcap"]).unwrap();
-        assert_eq!(args.asked.set, ["brake_mps2=-1.4", "word=a=b"]);
-        assert_eq!(args.drives, [PathBuf::from("a.mcap"), PathBuf::from("b.mcap")]);
-    }
-
-    #[test]
-    fn bad_arguments_are_refused_with_an_example() {
-        for (arguments, said) in [
-            (["dir", "a.mcap", "--set", "brake_mps2"], "write KEY=VALUE"),
-            (["dir", "a.mcap", "--set", "=3"], "write KEY=VALUE"),
-            (["dir", "a.mcap", "--remap", "/imu=/car"], "write FROM:=TO"),
-            (["dir", "a.mcap", "--remap", "/imu:="], "write FROM:=TO"),
-            (["dir", "a.mcap", "--sett", "a=b"], "--set"),
-            (["dir", "a.mcap", "--from", "12:30"], "as in 12.5 or 2min"),
-        ] {
-            let error = replay(&arguments).unwrap_err();
-            assert!(error.contains(said), "{error}");
-        }
-        assert!(replay(&["dir"]).unwrap_err().contains("<DRIVE>"));
-    }
-}
+mod tests;

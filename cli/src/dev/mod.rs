@@ -1,0 +1,133 @@
+//! `gleaner dev DIR DRIVE...`: builds and replays a lambda whenever one of its sources is saved, and shows what that changed.
+//!
+//! Nothing here is a way of its own to build, to replay or to compare: it does what the three commands do, one after the other.
+
+mod watch;
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use gleaner_protocol::{Exit, Failure, visible};
+
+use crate::args::{AskedArgs, ReplayArgs};
+use crate::say::say;
+use crate::{build, diff, replay};
+
+use watch::Seen;
+
+/// Arguments of `gleaner dev`.
+#[derive(Args, Debug)]
+pub struct DevArgs {
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub asked: AskedArgs,
+    /// MCAP files, .db3 files and directories of rosbag2; several are merged by time
+    #[arg(value_name = "DRIVE", required = true)]
+    pub drives: Vec<PathBuf>,
+    /// Replay from this time on, as in `gleaner replay`
+    #[arg(long, value_name = "TIME", value_parser = crate::args::drive_time)]
+    pub from: Option<String>,
+    /// Replay until before this time
+    #[arg(long, value_name = "TIME", value_parser = crate::args::drive_time)]
+    pub to: Option<String>,
+    /// Where the results go [default: DIR/out]
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// Leave out the clips that the table `record` of the manifest asks for: a replay is faster without
+    #[arg(long)]
+    pub no_record: bool,
+}
+
+/// Files of a replay from which it is compared with the next.
+const COMPARED: [&str; 4] = ["summary.json", "decisions.jsonl", "signals.json", "clips.jsonl"];
+
+/// Goes on until somebody ends it.
+pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
+    let dir = args.asked.lambda.clone();
+    let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
+    let before = tempfile::tempdir()
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make a folder for earlier results", &error))?;
+    let replay = replay_args(args);
+    // Of the one before this started, if its results still lie there, too: somebody comes back from lunch.
+    let mut has_before = keep(&out, before.path());
+    let mut seen = Seen::of(&dir);
+    loop {
+        match once(&dir, &replay) {
+            Ok(true) => {
+                if has_before && let Err(failure) = compare(before.path(), &out) {
+                    eprintln!("{failure}");
+                }
+                has_before = keep(&out, before.path());
+            }
+            Ok(false) => {}
+            Err(failure) => eprintln!("{failure}"),
+        }
+        say(&format!("\nwaiting for changes in {} (ctrl-C ends)\n", dir.display()))?;
+        let (now, changed) = seen.wait_for_change(&dir);
+        seen = now;
+        let changed = changed.iter().map(|path| visible(&path.to_string_lossy())).collect::<Vec<_>>().join(", ");
+        say(&format!("\n── changed: {changed}\n"))?;
+    }
+}
+
+/// Builds and replays; whether there are results, be they of a lambda with faults or of a damaged drive.
+fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
+    build::run(dir)?;
+    let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
+    replay::run(args)?;
+    // A summary says that the files beside it are whole: a replay begins with its removal.
+    Ok(out.join("summary.json").is_file())
+}
+
+fn compare(before: &Path, out: &Path) -> Result<(), Failure> {
+    let mut changes = diff::between(before, out)?;
+    changes.a.out = "before".to_owned();
+    changes.b.out = "now".to_owned();
+    say(&format!("\n{}", changes.text()))
+}
+
+/// Copies what a later replay is compared with; false if there is nothing whole.
+fn keep(out: &Path, before: &Path) -> bool {
+    let copied = || -> io::Result<()> {
+        for name in COMPARED {
+            match fs::copy(out.join(name), before.join(name)) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound && name != COMPARED[0] => {
+                    let _ = fs::remove_file(before.join(name));
+                }
+                copied => drop(copied?),
+            }
+        }
+        Ok(())
+    };
+    match copied() {
+        Ok(()) => true,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => false,
+        Err(error) => {
+            eprintln!(
+                "warning: these results are not compared with the next: cannot copy them from `{}`: {error}",
+                out.display()
+            );
+            false
+        }
+    }
+}
+
+fn replay_args(args: DevArgs) -> ReplayArgs {
+    let DevArgs { asked, drives, from, to, out, no_record } = args;
+    ReplayArgs {
+        asked,
+        drives,
+        from,
+        to,
+        out,
+        all: false,
+        no_record,
+        topics: Vec::new(),
+        journal: None,
+        verify: None,
+        no_report: false,
+        json: false,
+    }
+}

@@ -1,0 +1,90 @@
+//! Waiting until somebody saves a source of a lambda.
+//!
+//! The sources are looked at, some times a second, by length and date: that is a handful of calls for what one person writes, and
+//! unlike notices of a kernel it works on shared and mounted folders, and with editors that replace files instead of writing them.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, SystemTime};
+
+use gleaner_protocol::{Manifest, Sources};
+
+/// Between two looks: sooner than one notices.
+const EVERY: Duration = Duration::from_millis(200);
+
+/// The sources of a lambda as they were at some time.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Seen(BTreeMap<PathBuf, Option<(u64, SystemTime)>>);
+
+impl Seen {
+    /// As they are now in `dir`. Of a manifest that cannot be read, only the manifest is a source: nothing else tells.
+    pub(super) fn of(dir: &Path) -> Self {
+        let sources = Manifest::load(dir).ok().and_then(|manifest| Sources::of(dir, &manifest).ok());
+        let sources = sources.iter().flat_map(Sources::iter).chain([Path::new("lambda.toml")]);
+        let state = |path: &Path| {
+            let metadata = fs::metadata(dir.join(path)).ok()?;
+            Some((metadata.len(), metadata.modified().ok()?))
+        };
+        Self(sources.map(|path| (path.to_owned(), state(path))).collect())
+    }
+
+    /// Waits until the sources in `dir` differ from these, and nobody is writing them any more. Gives them as they are then, and
+    /// which differ.
+    pub(super) fn wait_for_change(&self, dir: &Path) -> (Self, Vec<PathBuf>) {
+        loop {
+            thread::sleep(EVERY);
+            let now = Self::of(dir);
+            if now == *self {
+                continue;
+            }
+            thread::sleep(EVERY);
+            if Self::of(dir) == now {
+                let changed = self.changed(&now);
+                return (now, changed);
+            }
+        }
+    }
+
+    fn changed(&self, now: &Self) -> Vec<PathBuf> {
+        let paths = self.0.keys().chain(now.0.keys().filter(|path| !self.0.contains_key(*path)));
+        paths.filter(|path| self.0.get(*path) != now.0.get(*path)).cloned().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MANIFEST: &str = "[lambda]\nname = \"x\"\nversion = \"0.1.0\"\nkind = \"python\"\nentry = \"main.py\"\n\
+                            [schedule]\nperiod = \"1s\"\n[[input]]\nname = \"imu\"\ntopic = \"/imu\"\n\
+                            type = \"sensor_msgs/msg/Imu\"\n";
+
+    #[test]
+    fn what_is_saved_is_seen_and_what_is_no_source_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let dir = folder.path();
+        let write = |name: &str, text: &str| {
+            fs::create_dir_all(dir.join(name).parent().unwrap()).unwrap();
+            fs::write(dir.join(name), text).unwrap();
+        };
+        write("lambda.toml", MANIFEST);
+        write("main.py", "a");
+        let before = Seen::of(dir);
+        for other in ["out/decisions.jsonl", "build/main.py", "notes.txt", "tests/test_x.py"] {
+            write(other, "x");
+        }
+        assert_eq!(before, Seen::of(dir));
+        write("main.py", "ab");
+        write("more/part.py", "c");
+        let (after, changed) = before.wait_for_change(dir);
+        assert_eq!(changed, [PathBuf::from("main.py"), PathBuf::from("more/part.py")]);
+        // Broken, and mended: both are changes.
+        write("lambda.toml", "[lambda");
+        let (broken, changed) = after.wait_for_change(dir);
+        assert!(changed.contains(&PathBuf::from("lambda.toml")), "{changed:?}");
+        write("lambda.toml", MANIFEST);
+        assert_ne!(broken, Seen::of(dir));
+    }
+}
