@@ -23,7 +23,9 @@ function spanOf(page, entries) {
 
 function timelineCard(page, entries) {
   const readout = make("span", { class: "readout dim" });
-  const rest = counted(timeline.entries.length, timeline.what);
+  const totals = page.runs.reduce((sum, run) => sum + (timeline.what === "fault" ? run.totals.faults : run.totals.triggers), 0);
+  const all = page.diff ? timeline.entries.length + page.diff.left_out : totals;
+  const rest = (all > timeline.entries.length ? `${count(timeline.entries.length)} of ` : "") + counted(all, timeline.what);
   const show = (t) => { readout.textContent = t === null ? rest : [seconds(t), date(page.runs[0], t)].filter(Boolean).join("  ·  "); };
   timeline.hoverListeners.push(show);
   show(null);
