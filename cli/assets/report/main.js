@@ -77,8 +77,7 @@ function main() {
   const pair = (...cards) => make("div", { class: "pair" }, cards.flat());
   place.append(...[
     page.diff ? pair(differenceCard(page, entries), changeCard(page)) : null,
-    make("div", { class: "wide" }, time.section, detailsPanel(page)),
-    ...cardsOf(page, (run, name) => galleryCard(run, name, entries)),
+    make("div", { class: "wide" }, make("div", {}, time.section, cardsOf(page, (run, name) => galleryCard(run, name, entries))), detailsPanel(page)),
     ...cardsOf(page, faultCard),
     pair(spreadCards(page)),
     pair(cardsOf(page, lossCard), cardsOf(page, (run, name) => clipCard(run, name, entries))),
