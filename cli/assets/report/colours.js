@@ -3,9 +3,13 @@
 const PALETTE = 8;
 const themeListeners = [];
 
+/** Asked for once in each theme: plots need them thousands of times. */
+const colours = new Map();
+
 /** The colour `name` of the style sheet. */
 function colour(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  if (!colours.has(name)) colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  return colours.get(name);
 }
 
 /** The colour of the `index`th thing. */
@@ -31,6 +35,7 @@ let printing = false;
 function applyTheme() {
   const theme = printing ? "light" : chosenTheme ?? (systemIsDark.matches ? "dark" : "light");
   document.documentElement.dataset.theme = theme;
+  colours.clear();
   themeListeners.forEach((listener) => listener());
 }
 

@@ -152,6 +152,7 @@ function drawEntry(plot, entry, x, middle, step) {
     ctx.stroke();
     return;
   }
+  if (entry.kind === "difference") return drawDifference(ctx, entry.is, x, middle, tall);
   ctx.fillRect(x - 1.5 * unit, middle - tall, 3 * unit, 2 * tall);
   // A recording that begins or ends points to where it is.
   const way = { start: 1, stop: -1 }[entry.mark?.kind];
@@ -161,6 +162,17 @@ function drawEntry(plot, entry, x, middle, step) {
   ctx.lineTo(x + way * 7 * unit, middle);
   ctx.lineTo(x, middle + tall);
   ctx.fill();
+}
+
+/** Told apart by more than colour: hollow is gone, full is new, and a lozenge is what changed. */
+function drawDifference(ctx, is, x, middle, size) {
+  ctx.lineWidth = 1.6 * devicePixelRatio;
+  ctx.beginPath();
+  if (is === "changed") [[0, -1], [1, 0], [0, 1], [-1, 0]].forEach(([right, down]) => ctx.lineTo(x + right * size, middle + down * size));
+  else ctx.arc(x, middle, size * 0.75, 0, 2 * Math.PI);
+  ctx.closePath();
+  if (is === "gone") ctx.stroke();
+  else ctx.fill();
 }
 
 /** The entry at this place of the plot, in CSS pixels; the nearest of several. */

@@ -23,7 +23,9 @@ function spanOf(page, entries) {
 
 function timelineCard(page, entries) {
   const readout = make("span", { class: "readout dim" });
-  const rest = counted(timeline.entries.length, timeline.what);
+  const totals = page.runs.reduce((sum, run) => sum + (timeline.what === "fault" ? run.totals.faults : run.totals.triggers), 0);
+  const all = page.diff ? timeline.entries.length + page.diff.left_out : totals;
+  const rest = (all > timeline.entries.length ? `${count(timeline.entries.length)} of ` : "") + counted(all, timeline.what);
   const show = (t) => { readout.textContent = t === null ? rest : [seconds(t), date(page.runs[0], t)].filter(Boolean).join("  ·  "); };
   timeline.hoverListeners.push(show);
   show(null);
@@ -75,8 +77,7 @@ function main() {
   const pair = (...cards) => make("div", { class: "pair" }, cards.flat());
   place.append(...[
     page.diff ? pair(differenceCard(page, entries), changeCard(page)) : null,
-    make("div", { class: "wide" }, time.section, detailsPanel(page)),
-    ...cardsOf(page, (run, name) => galleryCard(run, name, entries)),
+    make("div", { class: "wide" }, make("div", {}, time.section, cardsOf(page, (run, name) => galleryCard(run, name, entries))), detailsPanel(page)),
     ...cardsOf(page, faultCard),
     pair(spreadCards(page)),
     pair(cardsOf(page, lossCard), cardsOf(page, (run, name) => clipCard(run, name, entries))),

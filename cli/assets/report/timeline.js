@@ -1,6 +1,6 @@
 // One time for all plots: what is in view, where the pointer is, and what is chosen.
 
-const LEFT = 84;
+const LEFT = 92;
 const RIGHT = 12;
 const SHORTEST_S = 0.002;
 const NEAR_S = 10;

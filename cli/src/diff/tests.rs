@@ -81,7 +81,9 @@ fn attributes_count_and_numbers_among_them_have_the_tolerance_of_scores() {
         wake(1, json!([trigger]), Value::Null)
     };
     let a = with(json!({"mps2": -4.5, "n": 7, "word": "a", "old": true}));
-    assert!(diff(&[a.clone()], &[with(json!({"mps2": -4.500_001, "n": 7, "word": "a", "old": true}))]).same);
+    assert!(
+        diff(std::slice::from_ref(&a), &[with(json!({"mps2": -4.500_001, "n": 7, "word": "a", "old": true}))]).same
+    );
     let diff = diff(&[a], &[with(json!({"mps2": -4.6, "n": 8, "word": "a", "young": null}))]);
     assert_eq!(lines(&diff), ["Trigger Changed: x, mps2 -4.5 → -4.6, n 7 → 8, old true → none, young none → null"]);
 }

@@ -28,6 +28,11 @@ const ATTRIBUTE_BYTES: usize = 2_048;
 pub(super) struct Room(pub(super) usize);
 
 impl Room {
+    /// Whether something found none.
+    fn is_full(self) -> bool {
+        self.0 == 0
+    }
+
     /// Whether `value` found room.
     pub(super) fn take(&mut self, value: &impl serde::Serialize) -> bool {
         let bytes = page::json(value).len();
@@ -99,7 +104,7 @@ impl Marks {
         self.triggers_seen += 1;
         let label = self.number(&trigger.label);
         self.trigger_density.add(label, decision.at_ns.saturating_sub(self.start_ns));
-        if self.triggers.len() == TRIGGERS_MAX {
+        if self.triggers.len() == TRIGGERS_MAX || self.trigger_room.is_full() {
             return;
         }
         let attributes_cut = page::json(&trigger.attributes).len() > ATTRIBUTE_BYTES;
@@ -152,7 +157,7 @@ impl Marks {
         let t = seconds(decision.at_ns, self.start_ns);
         let message = cut(&fault.message, MESSAGE_CHARS);
         self.count(fault, &message, t);
-        if self.faults.len() == FAULTS_MAX {
+        if self.faults.len() == FAULTS_MAX || self.fault_room.is_full() {
             return;
         }
         let topic = decision.topic.as_deref().map(|topic| cut(topic, LABEL_CHARS));
