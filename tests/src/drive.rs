@@ -53,6 +53,61 @@ pub fn imu_only(folder: &Folder, times: u64) -> PathBuf {
     one_topic(folder, "/imu/data", "sensor_msgs/msg/Imu", &schema, &rounds.collect::<Vec<_>>())
 }
 
+/// A message of the sample drive, to be changed by a test.
+#[derive(Clone, Debug)]
+pub struct Changed {
+    /// Its topic.
+    pub topic: String,
+    /// Seconds after the drive's first message.
+    pub at_s: f64,
+    /// When it is received, in nanoseconds.
+    pub log_time: u64,
+    /// Its CDR, with the encapsulation header.
+    pub data: Vec<u8>,
+}
+
+impl Changed {
+    /// Where the first field behind its header lies, for types of 64-bit floats: behind a stamp and the text of `frame_id`.
+    fn body(&self) -> usize {
+        let length = u32::from_le_bytes(self.data[12..16].try_into().expect("a header has a frame_id"));
+        // Alignment counts from behind the 4 bytes of encapsulation.
+        (12 + length as usize).next_multiple_of(8) + 4
+    }
+
+    /// Replaces the float number `index`, from 0, behind its header.
+    pub fn set(&mut self, index: usize, value: f64) {
+        let at = self.body() + 8 * index;
+        self.data[at..at + 8].copy_from_slice(&value.to_le_bytes());
+    }
+
+    /// Adds so many seconds to `header.stamp`.
+    pub fn shift_stamp(&mut self, seconds: i32) {
+        let stamp = i32::from_le_bytes(self.data[4..8].try_into().expect("a stamp")) + seconds;
+        self.data[4..8].copy_from_slice(&stamp.to_le_bytes());
+    }
+}
+
+/// The sample drive with each message as `change` leaves it, and without those of which it says `false`.
+pub fn changed(folder: &Folder, mut change: impl FnMut(&mut Changed) -> bool) -> PathBuf {
+    let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = mcap::WriteOptions::new().profile("ros2").compression(None).create(&mut file).expect("a drive");
+    let mut start = None;
+    for message in mcap::MessageStream::new(&bytes).expect("a drive").map(|message| message.expect("a whole drive")) {
+        let (topic, log_time, data) = (message.channel.topic.clone(), message.log_time, message.data.to_vec());
+        let at_s = (log_time - *start.get_or_insert(log_time)) as f64 / 1e9;
+        let mut changed = Changed { topic, at_s, log_time, data };
+        if change(&mut changed) {
+            let (publish_time, data) = (message.publish_time, changed.data.into());
+            let message = mcap::Message { log_time: changed.log_time, publish_time, data, ..message };
+            writer.write(&message).expect("a message");
+        }
+    }
+    writer.finish().expect("a whole drive");
+    drop(writer);
+    folder.write("changed.mcap", file.into_inner())
+}
+
 /// Little-endian CDR, field by field.
 #[derive(Default)]
 pub struct Cdr(Vec<u8>);

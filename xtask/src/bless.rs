@@ -1,16 +1,18 @@
 //! `cargo xtask bless`: what the examples decide today becomes what they are expected to decide.
 
 use std::fs;
+use std::path::Path;
 
 use gleaner_cli::results::trigger_lines;
 use gleaner_protocol::{Exit, Failure};
 
 use crate::checkout::Checkout;
-use crate::examples::{DRIVE, EXAMPLES, difference};
+use crate::examples::{DRIVE, EXAMPLES, Recipe, Replayed, difference};
 use crate::setup;
 use crate::steps::Steps;
 
-/// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin. Twins that differ write nothing.
+/// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin, and `examples/cookbook/*/expected.txt`, where the first line is
+/// the command. Twins that differ write nothing.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
     setup::run(checkout, &mut steps, &["examples"])?;
@@ -23,12 +25,26 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
             return Err(failure.with_help("compare their decisions.jsonl in out/demo, and correct one of the two"));
         }
         let [rust, _] = &twins;
-        let lines = rust.decisions.iter().flat_map(|decision| trigger_lines(decision, rust.summary.start_ns));
-        let text: String = lines.map(|line| line + "\n").collect();
-        let file = format!("examples/{}/expected.txt", example.name);
-        fs::write(checkout.path(&file), &text)
-            .map_err(|error| Failure::caused_by(Exit::Internal, format!("cannot write `{file}`"), &error))?;
-        println!("{file}:\n{text}");
+        write(checkout, &Path::new("examples").join(example.name).join("expected.txt"), rows(rust))?;
+    }
+    for recipe in Recipe::all(checkout)? {
+        let rows = rows(&recipe.replay(checkout)?);
+        write(checkout, &recipe.expected(), format!("{}\n{rows}", recipe.command))?;
     }
     Ok(Exit::Ok)
+}
+
+/// A line for each trigger.
+fn rows(run: &Replayed) -> String {
+    let lines = run.decisions.iter().flat_map(|decision| trigger_lines(decision, run.summary.start_ns));
+    lines.map(|line| line + "\n").collect()
+}
+
+/// Writes and shows a file of the checkout.
+fn write(checkout: &Checkout, file: &Path, text: String) -> Result<(), Failure> {
+    let file_name = file.display();
+    fs::write(checkout.path(file), &text)
+        .map_err(|error| Failure::caused_by(Exit::Internal, format!("cannot write `{file_name}`"), &error))?;
+    println!("{file_name}:\n{text}");
+    Ok(())
 }

@@ -1,5 +1,6 @@
-//! The examples on the sample drive: what `demo` shows and `bless` writes down.
+//! The examples and the recipes of the cookbook on the sample drive: what `demo` shows and `bless` writes down.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use gleaner_cli::results::{Decisions, ResultsError, clips};
@@ -12,6 +13,9 @@ use crate::steps;
 pub(crate) const DRIVE: &str = "examples/data/highway_drive.mcap";
 
 const JOURNAL: &str = "wakes.journal";
+
+/// Where the recipes are, relative to the checkout.
+const COOKBOOK: &str = "examples/cookbook";
 
 /// An example, with the values that suit the sample drive: its braking is gentle.
 pub(crate) struct Example {
@@ -44,23 +48,64 @@ impl Example {
 
     fn replay_twin(&self, checkout: &Checkout, language: &str) -> Result<Replayed, Failure> {
         let kind = if language == "rust" { "wasm" } else { language };
-        let out = Path::new("out/demo").join(format!("{}-{kind}", self.name));
         let lambda = Path::new("examples").join(self.name).join(language);
-        let mut replay = checkout.command(checkout.program("gleaner"));
-        replay.arg("replay").arg(&lambda).arg(DRIVE);
-        for set in self.set {
-            replay.args(["--set", set]);
-        }
-        replay.arg("--out").arg(&out).arg("--json");
-        // The folder may not be there yet, and a journal of an earlier demo is replaced.
-        std::fs::create_dir_all(checkout.path(&out))
-            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make `out/demo`", &error))?;
-        replay.arg("--journal").arg(out.join(JOURNAL));
-        let summary: Summary = report(&mut replay)?;
-        let folder = checkout.path(&out);
-        let clips = if summary.clips > 0 { clips(&folder)? } else { Vec::new() };
-        Ok(Replayed { decisions: decisions(&folder)?, clips, summary, lambda, out })
+        let settings = self.set.iter().flat_map(|set| ["--set".to_owned(), (*set).to_owned()]);
+        replay(checkout, &format!("{}-{kind}", self.name), lambda, settings.collect())
     }
+}
+
+/// A lambda of the cookbook: in one language, with an `expected.txt` whose first line is the command that finds the others.
+pub(crate) struct Recipe {
+    name: String,
+    /// That first line.
+    pub(crate) command: String,
+}
+
+impl Recipe {
+    /// All of them.
+    pub(crate) fn all(checkout: &Checkout) -> Result<Vec<Recipe>, Failure> {
+        let folders = checkout.lambdas(&["examples"]).into_iter().filter(|lambda| lambda.starts_with(COOKBOOK));
+        folders.map(|folder| Recipe::read(checkout, &folder)).collect()
+    }
+
+    fn read(checkout: &Checkout, folder: &Path) -> Result<Recipe, Failure> {
+        let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let begin = format!("gleaner replay {} {DRIVE}", folder.display());
+        let file = folder.join("expected.txt");
+        let text = fs::read_to_string(checkout.path(&file)).unwrap_or_default();
+        match text.lines().next().filter(|line| line.starts_with(&begin)) {
+            Some(command) => Ok(Recipe { name, command: command.to_owned() }),
+            None => Err(Failure::new(Exit::Usage, format!("`{}` does not begin with its command", file.display()))
+                .with_help(format!("write into its first line: {begin}, and what else the command needs"))),
+        }
+    }
+
+    /// The file that says what it finds, relative to the checkout.
+    pub(crate) fn expected(&self) -> PathBuf {
+        Path::new(COOKBOOK).join(&self.name).join("expected.txt")
+    }
+
+    /// Does what the command says. Results go to `out/demo/cookbook-<name>/`.
+    pub(crate) fn replay(&self, checkout: &Checkout) -> Result<Replayed, Failure> {
+        // Behind `gleaner replay DIR DRIVE`.
+        let settings = self.command.split_whitespace().skip(4).map(str::to_owned).collect();
+        replay(checkout, &format!("cookbook-{}", self.name), Path::new(COOKBOOK).join(&self.name), settings)
+    }
+}
+
+/// Replays a lambda with `settings` over the sample drive. Results go to `out/demo/<name>/`.
+fn replay(checkout: &Checkout, name: &str, lambda: PathBuf, settings: Vec<String>) -> Result<Replayed, Failure> {
+    let out = Path::new("out/demo").join(name);
+    let mut replay = checkout.command(checkout.program("gleaner"));
+    replay.arg("replay").arg(&lambda).arg(DRIVE).args(settings).arg("--out").arg(&out).arg("--json");
+    // The folder may not be there yet, and a journal of an earlier demo is replaced.
+    fs::create_dir_all(checkout.path(&out))
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make `out/demo`", &error))?;
+    replay.arg("--journal").arg(out.join(JOURNAL));
+    let summary: Summary = report(&mut replay)?;
+    let folder = checkout.path(&out);
+    let clips = if summary.clips > 0 { clips(&folder)? } else { Vec::new() };
+    Ok(Replayed { decisions: decisions(&folder)?, clips, summary, lambda, out })
 }
 
 impl Replayed {

@@ -1,0 +1,101 @@
+//! Pothole: one hard jolt in the vertical acceleration, far above how rough the road is anyway.
+//!
+//! Most samples are answered by the span of a seventh of a second. Only when a jolt has ended is the road around it looked at.
+
+use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, now_ns};
+
+const JOLT_NS: i64 = 150_000_000;
+const ROAD_NS: i64 = 2_000_000_000;
+
+struct Pothole {
+    imu: Topic,
+    vertical: Field,
+    times_usual: f64,
+    jolts: Jolts,
+}
+
+impl Lambda for Pothole {
+    fn init(config: &Config) -> Result<Self> {
+        let imu = input("imu")?;
+        let vertical = imu.field("linear_acceleration.z")?;
+        let jolts = Jolts { limit: config.real("jolt_mps2")?, largest: None };
+        Ok(Self { imu, vertical, times_usual: config.real("times_usual")?, jolts })
+    }
+
+    fn on_event(&mut self, _sample: Sample) -> Result<()> {
+        let now = now_ns();
+        let newest = self.imu.column_since(&self.vertical, now - JOLT_NS)?;
+        let Some(jolt) = self.jolts.note(span(&newest.values)) else { return Ok(()) };
+        let usual = spread(self.imu.column_since(&self.vertical, now - ROAD_NS)?.values);
+        if jolt >= self.times_usual * usual {
+            event("pothole", jolt).with("usual_mps2", usual).send()?;
+        }
+        Ok(())
+    }
+}
+
+/// A jolt begins above the limit and ends below half of it, so that one jolt is one event, with its largest value.
+struct Jolts {
+    limit: f64,
+    largest: Option<f64>,
+}
+
+impl Jolts {
+    /// The largest span of the jolt that ends now, if one does.
+    fn note(&mut self, span: f64) -> Option<f64> {
+        match self.largest {
+            Some(_) if span < self.limit / 2.0 => self.largest.take(),
+            Some(largest) => {
+                self.largest = Some(largest.max(span));
+                None
+            }
+            None => {
+                self.largest = (span >= self.limit).then_some(span);
+                None
+            }
+        }
+    }
+}
+
+/// Largest less smallest value, in their unit; minus infinity for none.
+fn span(values: &[f64]) -> f64 {
+    let (low, high) =
+        values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+    high - low
+}
+
+/// Median distance from the median: a jolt of a few samples hardly changes it, as it would a standard deviation.
+fn spread(values: Vec<f64>) -> f64 {
+    let centre = median(values.clone());
+    median(values.into_iter().map(|value| (value - centre).abs()).collect())
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+gleaner_sdk::lambda!(Pothole);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_jolt_is_told_once_when_it_has_ended_with_its_largest_value() {
+        let mut jolts = Jolts { limit: 8.0, largest: None };
+        let told = [1.0, 7.9, 8.0, 11.0, 9.0, 4.0, 3.9, 1.0, 8.5, 1.0].map(|span| jolts.note(span));
+        let mut expected = [None; 10];
+        (expected[6], expected[9]) = (Some(11.0), Some(8.5));
+        assert_eq!(told, expected);
+    }
+
+    #[test]
+    fn the_spread_of_a_road_does_not_mind_a_jolt() {
+        let road: Vec<f64> = (0..100).map(|i| 9.7 + if i % 2 == 0 { 0.25 } else { -0.25 }).collect();
+        let mut jolted = road.clone();
+        jolted[50..55].copy_from_slice(&[3.0, 15.0, 4.0, 14.0, 9.0]);
+        assert!((spread(road) - spread(jolted)).abs() <= 0.5);
+        assert_eq!((spread(Vec::new()), span(&[3.0, -1.0, 2.0])), (0.0, 4.0));
+    }
+}

@@ -1,0 +1,39 @@
+"""Stopped in traffic: records from when the car has stood for a while until it moves again.
+
+`start` and `stop` keep what is between, however long that is. Two limits, one to stand and one to go: a car that creeps
+at the limit would else begin a new recording with each metre.
+"""
+
+from __future__ import annotations
+
+from gleaner import Context, Sample
+
+LABEL = "stopped"
+
+
+class Lambda:
+    def __init__(self, ctx: Context) -> None:
+        self.speed = ctx.input("speed").field("twist.linear.x")
+        self.stopped_mps: float = ctx.config["stopped_mps"]
+        self.going_mps: float = ctx.config["going_mps"]
+        self.after_ns = int(ctx.config["after_s"] * 1e9)
+        if self.going_mps <= self.stopped_mps:
+            raise ValueError(f"going_mps is {self.going_mps}; it has to be above stopped_mps, which is {self.stopped_mps}")
+        self.slow_since_ns: int | None = None
+        self.recording = False
+
+    def on_event(self, ctx: Context, event: Sample) -> None:
+        now, speed = ctx.now_ns(), abs(event.number(self.speed))
+        if self.recording:
+            if speed > self.going_mps:
+                ctx.stop(LABEL)
+                self.recording, self.slow_since_ns = False, None
+            return
+        if speed > self.stopped_mps:
+            self.slow_since_ns = None
+            return
+        if self.slow_since_ns is None:
+            self.slow_since_ns = now
+        if now - self.slow_since_ns >= self.after_ns:
+            self.recording = True
+            ctx.start(LABEL, stood_s=(now - self.slow_since_ns) / 1e9, speed_mps=speed)

@@ -1,0 +1,171 @@
+//! The recipes of the cookbook in the real host: on the sample drive as `expected.txt` says, and, where that has no such moment, on the
+//! sample drive with the moment put into it.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::PathBuf;
+
+use gleaner_protocol::Manifest;
+use gleaner_protocol::manifest::Kind;
+use gleaner_tests::drive::{Changed, changed};
+use gleaner_tests::{Folder, Run, replay, root, sample_drive};
+
+const IMU: &str = "/imu/data";
+const SPEED: &str = "/vehicle/speed";
+const CAMERA: &str = "/camera/front/compressed";
+
+/// `linear_acceleration.y` of an IMU message: behind orientation, angular velocity and their covariances.
+const LATERAL: usize = 4 + 9 + 3 + 9 + 1;
+/// `twist.linear.x`.
+const FORWARD: usize = 0;
+
+fn recipes() -> Vec<PathBuf> {
+    let folders = fs::read_dir(root().join("examples/cookbook")).expect("there is a cookbook");
+    let folders = folders.map(|folder| folder.expect("it can be listed").path());
+    let mut recipes: Vec<_> = folders.filter(|folder| folder.join("lambda.toml").is_file()).collect();
+    recipes.sort();
+    recipes
+}
+
+/// A recipe on the sample drive with each message as `change` leaves it.
+fn on(recipe: &str, change: impl FnMut(&mut Changed) -> bool) -> Run {
+    let folder = Folder::new();
+    let drive = changed(&folder, change);
+    let run = replay(&root().join("examples/cookbook").join(recipe), &[drive], &[]);
+    run.must_exit(0);
+    run
+}
+
+/// What a run found: labels, and times in seconds, rounded down to tenths.
+fn found(run: &Run) -> Vec<(String, f64)> {
+    run.labels().into_iter().zip(run.seconds().into_iter().map(|second| (second * 10.0).floor() / 10.0)).collect()
+}
+
+fn is(message: &Changed, topic: &str, from_s: f64, to_s: f64) -> bool {
+    message.topic == topic && (from_s..to_s).contains(&message.at_s)
+}
+
+#[test]
+fn there_are_ten_recipes_five_in_each_language() {
+    let kinds = recipes().iter().map(|recipe| Manifest::load(recipe).unwrap().lambda.kind).collect::<Vec<_>>();
+    let count = |kind| kinds.iter().filter(|other| **other == kind).count();
+    assert_eq!((count(Kind::Wasm), count(Kind::Python)), (5, 5));
+}
+
+#[test]
+fn every_recipe_decides_as_expected_on_the_sample_drive() {
+    let mut with_moments = BTreeSet::new();
+    for recipe in recipes() {
+        let name = recipe.file_name().unwrap().to_string_lossy().into_owned();
+        let expected = fs::read_to_string(recipe.join("expected.txt")).unwrap();
+        let (command, rows) = expected.split_once('\n').unwrap_or((&expected, ""));
+        let words: Vec<_> = command.split(' ').collect();
+        let folder = format!("examples/cookbook/{name}");
+        assert_eq!(words[..4], ["gleaner", "replay", &folder, "examples/data/highway_drive.mcap"], "{name}");
+        let run = replay(&recipe, &[sample_drive()], &words[4..]);
+        run.must_exit(0);
+        assert_eq!(run.rows(), rows, "{name}");
+        if !rows.is_empty() {
+            with_moments.insert(name);
+        }
+    }
+    // The others have a test below.
+    let expected = ["dark-to-bright", "every-kilometre", "novelty", "pothole", "stopped"];
+    assert_eq!(with_moments, expected.map(str::to_owned).into());
+}
+
+#[test]
+fn a_push_to_both_sides_is_a_swerve_and_a_bend_is_none() {
+    let swerve = on("swerve", |message| {
+        if is(message, IMU, 20.0, 21.0) {
+            message.set(LATERAL, if message.at_s < 20.5 { 4.0 } else { -4.0 });
+        }
+        true
+    });
+    assert_eq!(found(&swerve), [("swerve".to_owned(), 20.9)]);
+    let bend = on("swerve", |message| {
+        if is(message, IMU, 20.0, 23.0) {
+            message.set(LATERAL, 4.0);
+        }
+        true
+    });
+    assert_eq!(found(&bend), []);
+}
+
+#[test]
+fn standing_is_recorded_from_its_third_second_until_the_car_goes() {
+    let run = on("stopped", |message| {
+        if is(message, SPEED, 12.0, 20.0) {
+            message.set(FORWARD, 0.0);
+        }
+        true
+    });
+    assert_eq!(found(&run), [("stopped".to_owned(), 15.0), ("stopped".to_owned(), 20.0)]);
+    let [clip] = &run.clips[..] else { panic!("{:?}", run.clips) };
+    assert!((11.9..12.1).contains(&((clip.to_ns - clip.from_ns) as f64 / 1e9)), "{clip:?}");
+}
+
+#[test]
+fn a_speed_that_jumps_while_nothing_pushes_is_a_mismatch() {
+    let run = on("speed-mismatch", |message| {
+        if is(message, SPEED, 20.0, 60.0) {
+            message.set(FORWARD, 25.0);
+        }
+        true
+    });
+    assert_eq!(found(&run), [("speed-mismatch".to_owned(), 20.1)]);
+}
+
+#[test]
+fn a_silent_sensor_is_told_once_and_its_return_is_logged() {
+    let run = on("sensor-silent", |message| !is(message, IMU, 10.0, 13.0));
+    let [(label, at_s)] = &found(&run)[..] else { panic!("{:?}", found(&run)) };
+    assert!(label == "sensor-silent" && (10.9..=11.2).contains(at_s), "{at_s}");
+    let trigger = run.decisions.iter().flat_map(|decision| &decision.triggers).next().unwrap();
+    assert_eq!(trigger.attributes["topic"], IMU);
+    let said = run.log.iter().filter_map(|line| line["message"].as_str()).collect::<Vec<_>>();
+    assert!(said.iter().any(|line| line.starts_with("/imu/data is back after 3.")), "{said:?}");
+}
+
+#[test]
+fn a_clock_that_jumps_is_told_once_and_a_late_sample_is_not() {
+    let jumped = on("time-jump", |message| {
+        if is(message, IMU, 20.0, 60.0) {
+            message.shift_stamp(-2);
+        }
+        true
+    });
+    assert_eq!(found(&jumped), [("time-jump".to_owned(), 20.0)]);
+    let trigger = jumped.decisions.iter().flat_map(|decision| &decision.triggers).next().unwrap();
+    assert_eq!((trigger.score, trigger.attributes["jump_s"].as_f64()), (Some(2.0), Some(-2.0)));
+    let mut late = 0;
+    let run = on("time-jump", |message| {
+        if is(message, IMU, 20.0, 20.03) {
+            message.shift_stamp(-2);
+            late += 1;
+        }
+        true
+    });
+    assert_eq!((late, found(&run)), (3, Vec::new()));
+}
+
+#[test]
+fn the_same_picture_again_and_again_is_told_once_if_the_car_moves() {
+    let freeze = |speed: Option<f64>| {
+        let mut kept = Vec::new();
+        on("frozen-image", move |message| {
+            if is(message, CAMERA, 20.0, 22.0) {
+                if kept.is_empty() {
+                    kept.clone_from(&message.data);
+                }
+                message.data.clone_from(&kept);
+            }
+            if let Some(speed) = speed.filter(|_| message.topic == SPEED) {
+                message.set(FORWARD, speed);
+            }
+            true
+        })
+    };
+    assert_eq!(found(&freeze(None)), [("frozen-image".to_owned(), 20.5)]);
+    assert_eq!(found(&freeze(Some(0.0))), []);
+}
