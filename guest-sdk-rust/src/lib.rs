@@ -30,13 +30,15 @@
 //! gleaner_sdk::lambda!(Dip);
 //! ```
 //!
-//! The functions of this crate reach the host only on the vehicle (and in replay); called natively they panic. So keep the
-//! judgement in plain functions over plain numbers: those are tested natively, as any Rust code.
+//! The functions of this crate reach the host on the vehicle and in replay. Natively, in `cargo test`, [`testing`] has a fake host that
+//! keeps the same rules; called outside of it they panic. Judgement in plain functions over plain numbers needs neither, and is
+//! tested as any Rust code.
 //!
 //! [`kernels`] are such functions, for pixels and signals.
 //!
 //! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same five names as the modules here.
 
+#[cfg(target_family = "wasm")]
 #[doc(hidden)]
 pub mod bindings;
 mod config;
@@ -47,6 +49,8 @@ pub mod kernels;
 mod lambda;
 pub mod log;
 pub mod scratch;
+#[cfg(not(target_family = "wasm"))]
+pub mod testing;
 pub mod trigger;
 
 pub use config::{Config, ConfigValue};
@@ -55,4 +59,7 @@ pub use error::{Error, Result};
 pub use lambda::Lambda;
 #[doc(hidden)]
 pub use lambda::{Exported, Instance};
+#[cfg(not(target_family = "wasm"))]
+#[doc(hidden)]
+pub use testing::bindings;
 pub use trigger::{event, start, stop};

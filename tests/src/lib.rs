@@ -2,6 +2,7 @@
 
 pub mod bag;
 pub mod drive;
+pub mod given;
 pub mod greedy;
 pub mod live;
 pub mod namespace;

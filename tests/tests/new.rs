@@ -43,7 +43,7 @@ fn a_new_lambda_in_rust_passes_its_test_builds_and_finds_something() {
     let lambda = new(&folder, "rust");
     let mut test = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     test.args(["test", "--offline"]).env("CARGO_TARGET_DIR", root().join("target/test-new")).current_dir(&lambda);
-    assert!(done(&mut test).contains("2 passed"));
+    assert!(done(&mut test).contains("4 passed"));
     builds_and_finds_brakings(&lambda);
     done(gleaner(&lambda).args(["new", "--update", "."]));
     done(gleaner(&lambda).args(["build", "."]));

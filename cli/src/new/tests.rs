@@ -1,5 +1,5 @@
 use gleaner_protocol::Manifest;
-use toml::Table;
+use toml::{Table, Value};
 
 use super::*;
 
@@ -98,18 +98,28 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
     let (workspace, ours) = (read("Cargo.toml"), read("guest-sdk-rust/Cargo.toml"));
     let packed = include_str!("files/sdk.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
     assert_eq!(packed["features"], ours["features"]);
-    let names = |table: &Table| table["dependencies"].as_table().unwrap().keys().cloned().collect::<Vec<_>>();
+    // For all targets, for components, and natively.
+    let targets = |table: &Table| table["target"].as_table().unwrap().keys().cloned().collect::<Vec<_>>();
+    assert_eq!((targets(&packed), targets(&packed).len()), (targets(&ours), 2));
+    let dependencies = |table: &Table| {
+        let mut all = table["dependencies"].as_table().unwrap().clone();
+        for target in table.get("target").and_then(Value::as_table).into_iter().flat_map(Table::values) {
+            all.extend(target["dependencies"].as_table().unwrap().clone());
+        }
+        all
+    };
+    let names = |table: &Table| dependencies(table).keys().cloned().collect::<Vec<_>>();
     assert_eq!(names(&packed), names(&ours));
+    assert_eq!(names(&packed), ["rustfft", "toml", "wit-bindgen"]);
     for name in names(&packed) {
-        let plain = |table: &Table, key: &str| {
-            let mut value = table[key].as_table().unwrap()[&name].clone();
+        let plain = |table: &Table| {
+            let mut value = dependencies(table)[&name].clone();
             if let Some(table) = value.as_table_mut() {
                 table.remove("optional");
             }
             value
         };
-        let workspace = workspace["workspace"].as_table().unwrap();
-        assert_eq!(plain(&packed, "dependencies"), plain(workspace, "dependencies"), "{name}");
+        assert_eq!(plain(&packed), plain(workspace["workspace"].as_table().unwrap()), "{name}");
     }
     let package = workspace["workspace"]["package"].as_table().unwrap();
     let lambda = include_str!("files/package.toml").parse::<Table>().unwrap();

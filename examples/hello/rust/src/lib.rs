@@ -6,7 +6,8 @@ const WINDOW_NS: i64 = 500_000_000;
 const FULL_NS: i64 = 450_000_000;
 const REFRACTORY_NS: i64 = 3_000_000_000;
 
-struct Hello {
+/// The lambda, and what it keeps between wakes.
+pub struct Hello {
     imu: Topic,
     forward: Field,
     brake_mps2: f64,
@@ -42,7 +43,33 @@ gleaner_sdk::lambda!(Hello);
 
 #[cfg(test)]
 mod tests {
+    use gleaner_sdk::testing::{Host, Message, Run};
+
     use super::*;
+
+    /// What the lambda makes of forward accelerations at 100 Hz, in m/s².
+    fn drive(forward: &[f64]) -> Run<Hello> {
+        let mut run = Host::from_manifest(include_str!("../lambda.toml")).load::<Hello>().unwrap();
+        for (n, forward) in (0..).zip(forward) {
+            run.deliver("imu", n * 10_000_000, Message::new().with("linear_acceleration.x", *forward)).unwrap();
+        }
+        assert_eq!(run.faults().next(), None);
+        run
+    }
+
+    #[test]
+    fn hard_braking_is_found_once() {
+        let run = drive(&[[0.0; 100], [-5.0; 100], [0.0; 100]].concat());
+        let found = run.triggers().collect::<Vec<_>>();
+        assert_eq!((found.len(), found[0].label.as_str()), (1, "hard-brake"));
+        assert!((1_000_000_000..2_000_000_000).contains(&found[0].at_ns));
+    }
+
+    #[test]
+    fn a_tap_on_the_brake_is_none() {
+        let run = drive(&[[0.0; 100].as_slice(), &[-5.0; 10], &[0.0; 100]].concat());
+        assert_eq!(run.triggers().next(), None);
+    }
 
     fn window(values: &[f64]) -> Column {
         let at_ns = (0..values.len() as i64).map(|i| i * 100_000_000).collect();

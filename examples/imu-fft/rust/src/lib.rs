@@ -8,7 +8,8 @@ use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input};
 
 use road::{Road, Roughness};
 
-struct ImuFft {
+/// The lambda, and what it keeps between wakes.
+pub struct ImuFft {
     imu: Topic,
     vertical: Field,
     rough: f64,
@@ -37,3 +38,32 @@ impl Lambda for ImuFft {
 }
 
 gleaner_sdk::lambda!(ImuFft);
+
+#[cfg(test)]
+mod tests {
+    use gleaner_sdk::testing::{AttributeValue, Host, Message, Run};
+
+    use super::*;
+
+    /// Ten seconds at 100 Hz on a road that shakes the car by a sine of 4 Hz, in m/s².
+    fn shake(amplitude: f64) -> Run<ImuFft> {
+        let mut run = Host::from_manifest(include_str!("../lambda.toml")).load::<ImuFft>().unwrap();
+        for n in 0..1000 {
+            let phase = std::f64::consts::TAU * 4.0 * n as f64 / 100.0;
+            let up = Message::new().with("linear_acceleration.z", 9.81 + amplitude * phase.sin());
+            run.deliver("imu", n * 10_000_000, up).unwrap();
+        }
+        assert_eq!(run.faults().next(), None);
+        run
+    }
+
+    #[test]
+    fn a_road_is_rough_that_shakes_the_car() {
+        let run = shake(3.0);
+        let rough = run.triggers().next().expect("a trigger");
+        assert_eq!(rough.label, "rough-road");
+        let Some(AttributeValue::Real(peak_hz)) = rough.attribute("peak_hz") else { panic!("{rough:?}") };
+        assert!((3.0..5.0).contains(peak_hz), "{peak_hz}");
+        assert_eq!(shake(0.1).triggers().next(), None);
+    }
+}

@@ -2,7 +2,8 @@
 
 use gleaner_sdk::{Config, Error, Field, Frame, Lambda, Result, Sample, Topic, event, input, log};
 
-struct Greedy {
+/// The lambda.
+pub struct Greedy {
     behaviour: String,
     bytes: u32,
     camera: Topic,

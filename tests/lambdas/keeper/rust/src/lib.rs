@@ -5,7 +5,8 @@ use gleaner_sdk::{Config, Error, Lambda, Result, Tick, event, scratch};
 /// What is added in each wake until there is no room.
 const BULK: usize = 100_000;
 
-struct Keeper;
+/// The lambda.
+pub struct Keeper;
 
 impl Lambda for Keeper {
     fn init(_config: &Config) -> Result<Self> {

@@ -2,7 +2,8 @@
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, input, log};
 
-struct Misbehave {
+/// The lambda.
+pub struct Misbehave {
     behaviour: String,
     held: Vec<Sample>,
     wakes: u64,

@@ -6,7 +6,8 @@ use gleaner_sdk::{
     Config, Error, Field, Lambda, Result, Sample, Topic, event, input, inputs, log, now_ns, start, stop,
 };
 
-struct Probe {
+/// The lambda.
+pub struct Probe {
     every: u64,
     camera: Topic,
     imu: Topic,

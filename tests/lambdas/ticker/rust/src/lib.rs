@@ -2,7 +2,8 @@
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Tick, Topic, event, input, now_ns};
 
-struct Ticker {
+/// The lambda.
+pub struct Ticker {
     imu: Topic,
     forward: Field,
 }

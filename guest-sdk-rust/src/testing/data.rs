@@ -1,0 +1,316 @@
+//! `gleaner:lambda/data`: samples and fields, as a lambda reads them. Every number that it passes is clamped here.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+pub(crate) use super::frame::Frame;
+use super::frame::Images;
+use super::log::cut;
+use super::manifest::{Input, Limits};
+use super::message::{ENCAPSULATION, Message};
+use super::path::{Found, Missing, Path, known};
+use super::piece;
+use super::ring::{Cell, Ring};
+use super::session::{Handle, Handles, current};
+use super::types::{Column, Counts, DataError, Identity, Stamps, Value};
+
+const SAMPLES_PER_CALL: usize = 256;
+const TEXTS_PER_FIELD: usize = 4096;
+const PATH_BYTES: usize = 1024;
+
+type Answer<T> = Result<T, DataError>;
+
+/// A periodic wake.
+#[derive(Clone, Copy, Debug)]
+pub struct Tick {
+    /// When it was due.
+    pub at_ns: i64,
+    /// Ticks that were due since the previous wake and did not happen.
+    pub missed: u64,
+}
+
+/// Why the lambda runs.
+pub enum Wake {
+    /// A new sample on the input that `[schedule] event` names.
+    Event(Sample),
+    /// The period is over.
+    Tick(Tick),
+}
+
+pub(crate) fn input(name: &str) -> Answer<Topic> {
+    let session = current();
+    session.passed(name.len());
+    let found = session.inputs.iter().find(|source| source.declared.name == name);
+    let source = found.cloned().ok_or_else(|| {
+        let asked = name.chars().take(64).collect::<String>();
+        let names = session.inputs.iter().map(|source| source.declared.name.as_str());
+        DataError::NoSuchInput(format!("no input `{asked}`; the manifest has {}", super::error::quoted(names)))
+    })?;
+    let handle = source.handles.hand_out();
+    Ok(Topic { source, _handle: handle })
+}
+
+pub(crate) fn inputs() -> Vec<String> {
+    current().inputs.iter().map(|source| source.declared.name.clone()).collect()
+}
+
+pub(crate) fn now_ns() -> i64 {
+    current().lock().now_ns
+}
+
+/// What all handles of one input share; it lives as long as the run.
+pub(crate) struct Source {
+    pub(super) declared: Input,
+    pub(super) limits: Limits,
+    pub(super) handles: Arc<Handles>,
+    pub(super) images: Images,
+    /// What stands where a message does not say otherwise, if a test gave that.
+    pub(super) blank: Option<Message>,
+    state: Mutex<Arrived>,
+}
+
+/// What has come so far.
+pub(super) struct Arrived {
+    pub(super) ring: Ring,
+    pub(super) skipped: u64,
+    pub(super) seq: u64,
+}
+
+impl Source {
+    pub(super) fn new(
+        declared: Input,
+        limits: Limits,
+        handles: Arc<Handles>,
+        images: Images,
+        blank: Option<Message>,
+    ) -> Arc<Self> {
+        let ring = Ring::new(declared.depth, declared.hold);
+        let state = Mutex::new(Arrived { ring, skipped: 0, seq: 0 });
+        Arc::new(Self { declared, limits, handles, images, blank, state })
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, Arrived> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn counts(&self) -> Counts {
+        let Arrived { ring, skipped, .. } = &*self.lock();
+        let (received, overwritten, no_slot, too_big) = (ring.head, ring.overwritten, ring.no_slot, ring.too_big);
+        Counts { received, lost: None, overwritten, no_slot, too_big, skipped: *skipped }
+    }
+
+    pub(super) fn sample(self: &Arc<Self>, cell: Arc<Cell>) -> Sample {
+        Sample { source: Arc::clone(self), cell, _handle: self.handles.hand_out() }
+    }
+
+    fn malformed(&self, why: &str) -> DataError {
+        let Input { topic, type_name, .. } = &self.declared;
+        DataError::Malformed(format!("a sample of `{topic}` contradicts its type `{type_name}`: {why}"))
+    }
+
+    fn find<'a>(&self, path: &Path, message: &'a Message) -> Answer<Found<'a>> {
+        path.find(&message.fields).map_err(|missing| match missing {
+            Missing::Element(why) => self.malformed(&why),
+            Missing::Field(known) => {
+                let (topic, text) = (&self.declared.topic, &path.text);
+                DataError::NoSuchField(format!(
+                    "a message that the test gave to `{topic}` has no field `{text}`{known}"
+                ))
+            }
+        })
+    }
+
+    fn number(&self, path: &Path, cell: &Cell) -> Answer<f64> {
+        let found = self.find(path, &cell.arrival.message)?;
+        found.number().ok_or_else(|| {
+            DataError::WrongField(format!("field `{}` of `{}` is no number", path.text, self.declared.type_name))
+        })
+    }
+
+    pub(super) fn identity(&self, cell: &Cell) -> Identity {
+        Identity { topic: self.declared.topic.clone(), writer: cell.arrival.writer, seq: cell.arrival.seq }
+    }
+
+    pub(super) fn stamps(&self, cell: &Cell) -> Stamps {
+        let arrival = &cell.arrival;
+        Stamps { at_ns: arrival.at_ns, publish_ns: arrival.publish_ns, header_ns: arrival.message.header_ns() }
+    }
+}
+
+/// The ring of one `[[input]]`.
+pub struct Topic {
+    source: Arc<Source>,
+    _handle: Handle,
+}
+
+/// A path into the messages of one topic.
+pub struct Field {
+    source: Arc<Source>,
+    path: Path,
+    _handle: Handle,
+}
+
+/// One message; holds its cell of the ring.
+pub struct Sample {
+    pub(super) source: Arc<Source>,
+    pub(super) cell: Arc<Cell>,
+    _handle: Handle,
+}
+
+impl Topic {
+    pub(crate) fn name(&self) -> String {
+        self.source.declared.name.clone()
+    }
+
+    pub(crate) fn ros_topic(&self) -> String {
+        self.source.declared.topic.clone()
+    }
+
+    pub(crate) fn type_name(&self) -> String {
+        self.source.declared.type_name.clone()
+    }
+
+    pub(crate) fn newest(&self) -> Option<Sample> {
+        let newest = self.source.lock().ring.newest();
+        newest.map(|cell| self.source.sample(cell))
+    }
+
+    pub(crate) fn last(&self, n: u32) -> Vec<Sample> {
+        self.samples(n as usize, i64::MIN, true)
+    }
+
+    pub(crate) fn since(&self, since_ns: i64) -> Vec<Sample> {
+        self.samples(usize::MAX, since_ns, false)
+    }
+
+    fn samples(&self, most: usize, since_ns: i64, all: bool) -> Vec<Sample> {
+        let most = most.min(self.source.limits.call_items).min(SAMPLES_PER_CALL);
+        let cells = self.source.lock().ring.newest_while(most, |arrival| all || arrival.at_ns > since_ns);
+        cells.into_iter().map(|cell| self.source.sample(cell)).collect()
+    }
+
+    pub(crate) fn counts(&self) -> Counts {
+        self.source.counts()
+    }
+
+    pub(crate) fn field(&self, path: &str) -> Answer<Field> {
+        if path.len() > PATH_BYTES {
+            let why = format!("has {} bytes; a path has {PATH_BYTES} at most", path.len());
+            return Err(DataError::WrongField(format!("field `{}` {why}", cut(path, 64))));
+        }
+        let path = Path::new(path).map_err(DataError::NoSuchField)?;
+        if let Some(blank) = &self.source.blank
+            && let Err(Missing::Field(known)) = path.find(&blank.fields)
+        {
+            let type_name = &self.source.declared.type_name;
+            let why = format!("type `{type_name}`, as the test has it, has no field `{}`{known}", path.text);
+            return Err(DataError::NoSuchField(why));
+        }
+        Ok(Field { source: Arc::clone(&self.source), path, _handle: self.source.handles.hand_out() })
+    }
+
+    pub(crate) fn column(&self, field: &Field, n: u32) -> Answer<Column> {
+        self.read_column(field, n as usize, |_| true)
+    }
+
+    pub(crate) fn column_since(&self, field: &Field, since_ns: i64) -> Answer<Column> {
+        self.read_column(field, usize::MAX, |at_ns| at_ns > since_ns)
+    }
+
+    fn read_column(&self, field: &Field, most: usize, keep: impl Fn(i64) -> bool) -> Answer<Column> {
+        let source = &self.source;
+        let path = field.of(source)?;
+        let cells = source.lock().ring.newest_while(most.min(source.limits.call_items), |arrival| keep(arrival.at_ns));
+        let values = cells.iter().map(|cell| source.number(path, cell)).collect::<Answer<_>>()?;
+        Ok(Column { at_ns: cells.iter().map(|cell| cell.arrival.at_ns).collect(), values })
+    }
+}
+
+impl Field {
+    pub(crate) fn path(&self) -> String {
+        self.path.text.clone()
+    }
+
+    fn of(&self, source: &Arc<Source>) -> Answer<&Path> {
+        if Arc::ptr_eq(&self.source, source) {
+            return Ok(&self.path);
+        }
+        let (belongs, asked) = (&self.source.declared.name, &source.declared.name);
+        let path = &self.path.text;
+        Err(DataError::WrongField(format!("field `{path}` belongs to input `{belongs}`, not to `{asked}`")))
+    }
+}
+
+impl Sample {
+    pub(crate) fn identity(&self) -> Identity {
+        self.source.identity(&self.cell)
+    }
+
+    pub(crate) fn stamps(&self) -> Stamps {
+        self.source.stamps(&self.cell)
+    }
+
+    pub(crate) fn get(&self, field: &Field) -> Answer<Value> {
+        let path = field.of(&self.source)?;
+        let found = self.source.find(path, &self.cell.arrival.message)?;
+        let limits = &self.source.limits;
+        let (len, most) = match found.value() {
+            Value::Text(text) => (text.len(), limits.call_bytes),
+            Value::Bytes(bytes) => (bytes.len(), limits.call_bytes),
+            Value::Numbers(numbers) => (numbers.len(), limits.call_items),
+            Value::Texts(texts) => (texts.len(), limits.call_items.min(TEXTS_PER_FIELD)),
+            Value::Boolean(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => (0, 0),
+        };
+        if len > most {
+            let why = format!("has {len} items, one call hands out {most}; read it with `cdr`");
+            return Err(DataError::WrongField(format!("field `{}` {why}", path.text)));
+        }
+        Ok(found.value().clone())
+    }
+
+    pub(crate) fn number(&self, field: &Field) -> Answer<f64> {
+        self.source.number(field.of(&self.source)?, &self.cell)
+    }
+
+    pub(crate) fn size(&self) -> u64 {
+        self.bytes().len() as u64
+    }
+
+    pub(crate) fn big_endian(&self) -> bool {
+        self.encapsulated()[1] & 1 == 0
+    }
+
+    pub(crate) fn cdr(&self, offset: u64, len: u32) -> Vec<u8> {
+        piece(self.bytes(), offset, (len as usize).min(self.source.limits.call_bytes)).to_vec()
+    }
+
+    pub(crate) fn as_frame(&self) -> Answer<Frame> {
+        Frame::of(self)
+    }
+
+    fn bytes(&self) -> &[u8] {
+        &self.encapsulated()[ENCAPSULATION..]
+    }
+
+    /// The message as CDR.
+    ///
+    /// # Panics
+    ///
+    /// If the test gave none: there is no honest answer, and no refusal in the interface.
+    fn encapsulated(&self) -> &[u8] {
+        self.cell.arrival.message.cdr.as_deref().unwrap_or_else(|| {
+            let topic = &self.source.declared.topic;
+            panic!("a message that the test gave to `{topic}` has no bytes; give them with `Message::cdr`")
+        })
+    }
+
+    /// A field of an image.
+    pub(super) fn need<'a>(&'a self, path: &str) -> Answer<&'a Value> {
+        let fields = &self.cell.arrival.message.fields;
+        let why = || format!("it has no `{path}`{}; make it with `Message::image`", known(path, fields));
+        fields.get(path).ok_or_else(|| self.source.malformed(&why()))
+    }
+
+    pub(super) fn wrong_sort(&self, path: &str) -> DataError {
+        self.source.malformed(&format!("`{path}` is of another sort; make it with `Message::image`"))
+    }
+}

@@ -1,0 +1,308 @@
+//! `lambda.toml`, as far as the fake host needs it. `gleaner build` reads all of it, and is stricter in places.
+
+use std::collections::BTreeSet;
+
+use toml::Value;
+
+use super::error::{Error, nearest, quoted};
+use super::table::{Bounds, Table};
+use crate::bindings::{ConfigEntry, ConfigValue};
+
+type Result<T> = std::result::Result<T, Error>;
+
+const KIB: u64 = 1 << 10;
+const MIB: u64 = 1 << 20;
+const MS: u64 = 1_000_000;
+const SECOND: u64 = 1_000_000_000;
+
+pub(super) const IMAGE: &str = "sensor_msgs/msg/Image";
+pub(super) const COMPRESSED_IMAGE: &str = "sensor_msgs/msg/CompressedImage";
+
+/// One `[[input]]`.
+#[derive(Clone, Debug)]
+pub(super) struct Input {
+    pub(super) name: String,
+    pub(super) topic: String,
+    pub(super) type_name: String,
+    pub(super) depth: usize,
+    pub(super) hold: usize,
+    pub(super) max_size: usize,
+    /// 0 where nothing is decoded.
+    pub(super) decoded_size: u64,
+}
+
+/// Those of `[limits]` that hold natively.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Limits {
+    /// Bytes of frames that are made.
+    pub(super) memory: usize,
+    pub(super) handles: u64,
+    pub(super) frames: usize,
+    pub(super) call_bytes: usize,
+    pub(super) call_items: usize,
+    pub(super) scratch: u64,
+    pub(super) log_lines: u64,
+    pub(super) log_bytes: u64,
+    pub(super) events_per_minute: u64,
+}
+
+/// A manifest that was checked.
+#[derive(Debug)]
+pub(super) struct Manifest {
+    pub(super) name: String,
+    pub(super) schedule: When,
+    pub(super) inputs: Vec<Input>,
+    pub(super) limits: Limits,
+    items: Vec<Item>,
+}
+
+/// When the lambda runs.
+#[derive(Clone, Debug)]
+pub(super) enum When {
+    /// On each sample of the input of that name.
+    Event(String),
+    /// Every so many nanoseconds.
+    Period(i64),
+}
+
+/// One value of `[config]`.
+#[derive(Debug)]
+struct Item {
+    name: String,
+    default: ConfigValue,
+    min: Option<f64>,
+    max: Option<f64>,
+}
+
+/// Reads the text of a manifest.
+pub(super) fn read(text: &str) -> Result<Manifest> {
+    let entries = text.parse::<toml::Table>();
+    let entries =
+        entries.map_err(|error| Error::new("cannot use the manifest", format!("it is no TOML: {error}"), ""))?;
+    let known = ["lambda", "schedule", "input", "model", "record", "limits", "config"];
+    let root = Table::of("the file", &entries, &known)?;
+    let known = ["name", "version", "kind", "entry", "description", "deterministic"];
+    let lambda = Table::new("[lambda]", root.need("lambda", "[lambda] with name, version, kind and entry")?, &known)?;
+    if lambda.choice("kind", &["wasm", "python"])? != Some("wasm") {
+        return Err(lambda.refusal("is not of kind `wasm`", "a lambda in Rust has kind = \"wasm\""));
+    }
+    lambda.text("entry", "entry = \"brake_dark.wasm\"", |_| true)?;
+    let inputs = root.list("input")?.iter().map(input).collect::<Result<Vec<_>>>()?;
+    unique("name", inputs.iter().map(|input| &input.name))?;
+    unique("topic", inputs.iter().map(|input| &input.topic))?;
+    if let Some(value) = root.get("record") {
+        let known = ["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
+        Table::new("[record]", value, &known)?;
+    }
+    Ok(Manifest {
+        name: lambda.text("name", "name = \"brake-dark\"", |text| is_name(text, b"-"))?,
+        schedule: schedule(&root, &inputs)?,
+        inputs,
+        limits: limits(&root)?,
+        items: items(&root)?,
+    })
+}
+
+fn unique<'a>(what: &str, names: impl Iterator<Item = &'a String>) -> Result<()> {
+    let mut seen = BTreeSet::new();
+    let mut twice = names.filter(|name| !seen.insert(*name));
+    twice.next().map_or(Ok(()), |name| {
+        let cause = format!("there are two [[input]] with the {what} `{name}`");
+        Err(Error::new("cannot use the manifest", cause, "keep one [[input]] entry per topic"))
+    })
+}
+
+fn schedule(root: &Table, inputs: &[Input]) -> Result<When> {
+    let example = "[schedule] with event = \"<an input's name>\" or period = \"100ms\"";
+    let table = Table::new("[schedule]", root.need("schedule", example)?, &["event", "period", "backlog"])?;
+    let backlog = table.choice("backlog", &["each", "latest"])?;
+    match (table.get("event"), table.get("period")) {
+        (Some(_), None) => {
+            let event = table.text("event", "event = \"<an input's name>\"", |_| true)?;
+            if !inputs.iter().any(|input| input.name == event) {
+                let names = quoted(inputs.iter().map(|input| input.name.as_str()));
+                return Err(table.refusal(&format!("names no input: `{event}`"), &format!("the inputs are {names}")));
+            }
+            Ok(When::Event(event))
+        }
+        (None, Some(_)) if backlog.is_none() => {
+            Ok(When::Period(table.duration("period", (MS, 0, 3600 * SECOND))? as i64))
+        }
+        (None, Some(_)) => Err(table.refusal("has a `backlog` beside `period`", "remove it: missed ticks are counted")),
+        _ => Err(table.refusal("needs one of `event` and `period`", "a lambda runs on one input or on the clock")),
+    }
+}
+
+fn input(value: &Value) -> Result<Input> {
+    let known = ["name", "topic", "type", "depth", "max_size", "decoded_size", "hold", "qos"];
+    let table = Table::new("[[input]]", value, &known)?;
+    let type_name = table.text("type", "type = \"sensor_msgs/msg/Imu\"", is_type)?;
+    let is_compressed = type_name == COMPRESSED_IMAGE;
+    let large = is_compressed || type_name == IMAGE || type_name == "sensor_msgs/msg/PointCloud2";
+    let (depth, hold, size) = if large { (4, 2, 8 * MIB) } else { (64, 8, 4 * KIB) };
+    if table.get("decoded_size").is_some() && !is_compressed {
+        return Err(table.refusal(&format!("has a `decoded_size`, and {type_name} is not decoded"), "remove it"));
+    }
+    let decoded_size = table.size("decoded_size", (1, 8 * MIB, 256 * MIB))?;
+    Ok(Input {
+        name: table.text("name", "name = \"camera\"", |text| is_name(text, b"_-"))?,
+        topic: table.text("topic", "topic = \"/camera/front\"", is_topic)?,
+        depth: table.integer("depth", (1, depth, 65_536))? as usize,
+        hold: table.integer("hold", (1, hold, 1024))? as usize,
+        max_size: table.size("max_size", (1, size, 256 * MIB))? as usize,
+        decoded_size: if is_compressed { decoded_size } else { 0 },
+        type_name,
+    })
+}
+
+fn limits(root: &Table) -> Result<Limits> {
+    const FUEL: Bounds = (1_000, 50_000_000, 1_000_000_000_000);
+    let known = [
+        "fuel",
+        "init_fuel",
+        "deadline",
+        "init_deadline",
+        "memory",
+        "tables",
+        "stack",
+        "handles",
+        "frames",
+        "call_bytes",
+        "call_items",
+        "scratch",
+        "log_lines",
+        "log_bytes",
+        "events_per_minute",
+    ];
+    let empty = Value::Table(toml::Table::new());
+    let table = Table::new("[limits]", root.get("limits").unwrap_or(&empty), &known)?;
+    // These have no meaning here, and are still checked.
+    table.integer("fuel", FUEL)?;
+    table.integer("init_fuel", FUEL)?;
+    table.duration("deadline", (MS, 50 * MS, 60 * SECOND))?;
+    table.duration("init_deadline", (MS, 10 * SECOND, 300 * SECOND))?;
+    table.integer("tables", (1, 20_000, 1_000_000))?;
+    table.size("stack", (16 * KIB, 512 * KIB, 512 * KIB))?;
+    Ok(Limits {
+        memory: table.size("memory", (MIB, 64 * MIB, 1024 * MIB))? as usize,
+        handles: table.integer("handles", (16, 4096, 65_536))?,
+        frames: table.integer("frames", (1, 256, 4096))? as usize,
+        call_bytes: table.size("call_bytes", (64 * KIB, MIB, MIB))? as usize,
+        call_items: table.integer("call_items", (16, 65_536, 65_536))? as usize,
+        scratch: table.size("scratch", (0, 0, 256 * MIB))?,
+        log_lines: table.integer("log_lines", (1, 100, 10_000))?,
+        log_bytes: table.size("log_bytes", (4 * KIB, 400 * KIB, 16 * MIB))?,
+        events_per_minute: table.integer("events_per_minute", (1, 12_000, 60_000))?,
+    })
+}
+
+fn items(root: &Table) -> Result<Vec<Item>> {
+    let Some(value) = root.get("config") else { return Ok(Vec::new()) };
+    let entries = value.as_table().ok_or_else(|| root.refusal("has a `config` that is no table", "see the README"))?;
+    entries.iter().map(|(name, value)| item(name, value)).collect()
+}
+
+fn item(name: &str, value: &Value) -> Result<Item> {
+    let title = format!("`config.{name}`");
+    let plain = toml::Table::from_iter([("default".to_owned(), value.clone())]);
+    let entries = value.as_table().unwrap_or(&plain);
+    let table = Table::of(&title, entries, &["default", "min", "max", "unit", "description"])?;
+    let default = match table.need("default", "default = 1.0, or another value that says what type it is")? {
+        Value::Boolean(value) => ConfigValue::Boolean(*value),
+        Value::Integer(value) => ConfigValue::Integer(*value),
+        Value::Float(value) if value.is_finite() => ConfigValue::Real(*value),
+        Value::String(value) => ConfigValue::Text(value.clone()),
+        _ => return Err(table.refusal("has a `default` of another type", "give a number, a text, or true or false")),
+    };
+    let limit = |key: &str| match (table.get(key), &default) {
+        (None, _) => Ok(None),
+        (Some(Value::Integer(limit)), ConfigValue::Integer(_) | ConfigValue::Real(_)) => Ok(Some(*limit as f64)),
+        (Some(Value::Float(limit)), ConfigValue::Real(_)) if limit.is_finite() => Ok(Some(*limit)),
+        _ => Err(table.refusal(&format!("has a `{key}` that does not fit its default"), "give numbers of one type")),
+    };
+    let item = Item { name: name.to_owned(), min: limit("min")?, max: limit("max")?, default };
+    item.within(&item.default)?;
+    Ok(item)
+}
+
+impl Item {
+    fn within(&self, value: &ConfigValue) -> Result<()> {
+        let number = match value {
+            ConfigValue::Integer(value) => *value as f64,
+            ConfigValue::Real(value) => *value,
+            ConfigValue::Boolean(_) | ConfigValue::Text(_) => return Ok(()),
+        };
+        let refuse = |which, limit| {
+            let what = format!("config value `{}` cannot be {number}", self.name);
+            Err(Error::new(what, format!("its {which} is {limit}"), "give a value within its range"))
+        };
+        match (self.min, self.max) {
+            (Some(min), _) if number < min => refuse("min", min),
+            (_, Some(max)) if number > max => refuse("max", max),
+            _ => Ok(()),
+        }
+    }
+
+    /// `given` as a value of the type of the default; a whole number also serves as a number.
+    fn set(&self, given: &ConfigValue) -> Result<ConfigValue> {
+        let value = match (&self.default, given) {
+            (ConfigValue::Real(_), ConfigValue::Integer(given)) => ConfigValue::Real(*given as f64),
+            (ConfigValue::Real(_), ConfigValue::Real(given)) if given.is_finite() => ConfigValue::Real(*given),
+            (ConfigValue::Boolean(_), ConfigValue::Boolean(_))
+            | (ConfigValue::Integer(_), ConfigValue::Integer(_))
+            | (ConfigValue::Text(_), ConfigValue::Text(_)) => given.clone(),
+            (default, _) => {
+                let wanted = match default {
+                    ConfigValue::Boolean(_) => "true or false",
+                    ConfigValue::Integer(_) => "a whole number",
+                    ConfigValue::Real(_) => "a finite number",
+                    ConfigValue::Text(_) => "a text",
+                };
+                let what = format!("config value `{}` cannot be {given:?}", self.name);
+                return Err(Error::new(what, "", format!("give {wanted}")));
+            }
+        };
+        self.within(&value)?;
+        Ok(value)
+    }
+}
+
+impl Manifest {
+    /// `[config]` with the values of a test laid over it.
+    pub(super) fn config(&self, set: &[(String, ConfigValue)]) -> Result<Vec<ConfigEntry>> {
+        let names = || self.items.iter().map(|item| item.name.as_str());
+        if let Some((key, _)) = set.iter().find(|(key, _)| names().all(|name| name != key)) {
+            let many = || format!("its config values are {}", quoted(names()));
+            let help = nearest(key, names()).map_or_else(many, |near| format!("did you mean `{near}`?"));
+            return Err(Error::new(format!("the lambda has no config value `{key}`"), "", help));
+        }
+        let value = |item: &Item| {
+            let given = set.iter().rev().find(|(key, _)| *key == item.name);
+            given.map_or_else(|| Ok(item.default.clone()), |(_, given)| item.set(given))
+        };
+        self.items.iter().map(|item| Ok(ConfigEntry { key: item.name.clone(), value: value(item)? })).collect()
+    }
+}
+
+/// 1 to 63 characters, first a lower-case letter, then those, digits and `extra`.
+fn is_name(text: &str, extra: &[u8]) -> bool {
+    let rest = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
+    text.len() <= 63 && text.starts_with(|first: char| first.is_ascii_lowercase()) && text.bytes().all(rest)
+}
+
+fn is_topic(text: &str) -> bool {
+    let word = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'_';
+    let token = |part: &str| part.starts_with(|first: char| !first.is_ascii_digit()) && part.bytes().all(word);
+    text.len() <= 247 && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
+}
+
+fn is_type(text: &str) -> bool {
+    let word = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'_';
+    text.len() <= 255
+        && text.split_once("/msg/").is_some_and(|(package, name)| {
+            package.starts_with(|first: char| first.is_ascii_alphabetic())
+                && package.bytes().all(word)
+                && name.starts_with(|first: char| first.is_ascii_uppercase())
+                && name.bytes().all(|byte| byte.is_ascii_alphanumeric())
+        })
+}

@@ -1,0 +1,200 @@
+//! A message as a test makes it: fields by their paths, bytes, or a picture.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
+
+use super::types::{Encoding, Value};
+use crate::data::{bytes_per_pixel, encoding_name};
+
+/// One message, by what a test gives of it.
+///
+/// ```
+/// use gleaner_sdk::testing::Message;
+///
+/// let imu = Message::new()
+///     .with("linear_acceleration.x", -4.0)
+///     .with("orientation_covariance", [0.0; 9])
+///     .with("header.frame_id", "imu_link")
+///     .stamped(1_500_000_000);
+/// ```
+///
+/// A lambda reads the fields that are given, and no others: nobody here knows the type. What stands for the rest may be said once for
+/// all messages of an input, by [`Host::blank`](super::Host::blank).
+#[derive(Clone, Default)]
+pub struct Message {
+    pub(super) fields: BTreeMap<String, Value>,
+    /// With its encapsulation.
+    pub(super) cdr: Option<Vec<u8>>,
+    pub(super) picture: Option<Picture>,
+    pub(super) publish_ns: Option<i64>,
+    pub(super) seq: Option<u64>,
+}
+
+/// Pixels in rows without padding.
+#[derive(Clone)]
+pub(super) struct Picture {
+    pub(super) width: u32,
+    pub(super) height: u32,
+    pub(super) encoding: Encoding,
+    pub(super) data: Arc<[u8]>,
+}
+
+impl Message {
+    /// A message of which nothing is given yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// An image of `width` x `height` pixels, rows from top to bottom without padding.
+    ///
+    /// On an input of `sensor_msgs/msg/Image` it is that message, with the fields `height`, `width`, `encoding`, `is_bigendian`,
+    /// `step` and `data`, which [`with`](Self::with) may still change. On one of `sensor_msgs/msg/CompressedImage` it is what the
+    /// host makes of a JPEG or PNG, so `encoding` must be rgb8.
+    pub fn image(width: u32, height: u32, encoding: Encoding, pixels: impl Into<Vec<u8>>) -> Self {
+        let pixels: Vec<u8> = pixels.into();
+        let picture = Picture { width, height, encoding, data: pixels.into() };
+        Self { picture: Some(picture), ..Self::default() }
+    }
+
+    /// Gives the field at `path`, as a lambda would write it, such as `linear_acceleration.x` or `fields[2].name`. An array is given
+    /// as a whole; a lambda may ask for it, and for its elements.
+    ///
+    /// A lambda that asks for [`Value`](crate::data::Value) gets the sort that is given here: `i32` and such are signed, `u32` and
+    /// such unsigned.
+    pub fn with(mut self, path: &str, value: impl Into<FieldValue>) -> Self {
+        self.fields.insert(path.to_owned(), value.into().0);
+        self
+    }
+
+    /// Gives `header.stamp`, in nanoseconds: the fields `header.stamp.sec` and `header.stamp.nanosec`, and with them
+    /// [`Stamps::header_ns`](crate::data::Stamps::header_ns).
+    pub fn stamped(self, header_ns: i64) -> Self {
+        let (sec, nanosec) = (header_ns.div_euclid(SECOND_NS), header_ns.rem_euclid(SECOND_NS));
+        self.with(STAMP[0], sec).with(STAMP[1], nanosec as u64)
+    }
+
+    /// Gives the bytes for [`Sample::cdr`](crate::Sample::cdr) and [`Sample::size`](crate::Sample::size): CDR with its
+    /// encapsulation, four bytes of which the second says the byte order, as drives have it. No field is read from it.
+    pub fn cdr(mut self, bytes: impl Into<Vec<u8>>) -> Self {
+        self.cdr = Some(bytes.into());
+        self
+    }
+
+    /// When the writer published it, in nanoseconds; else the time at which it is delivered.
+    pub fn published(mut self, publish_ns: i64) -> Self {
+        self.publish_ns = Some(publish_ns);
+        self
+    }
+
+    /// Its number, for gaps; else one more than that of the message before, from 1. A message with the same or a smaller number than
+    /// that is refused.
+    pub fn numbered(mut self, seq: u64) -> Self {
+        self.seq = Some(seq);
+        self
+    }
+
+    pub(super) fn header_ns(&self) -> Option<i64> {
+        let whole = |path: &str| match self.fields.get(path)? {
+            Value::Signed(number) => Some(*number),
+            Value::Unsigned(number) => i64::try_from(*number).ok(),
+            _ => None,
+        };
+        whole(STAMP[0])?.checked_mul(SECOND_NS)?.checked_add(whole(STAMP[1])?)
+    }
+
+    /// Gives the fields that stand for the picture in a `sensor_msgs/msg/Image`, unless they are given.
+    pub(super) fn spread_picture(&mut self) {
+        let Some(Picture { width, height, encoding, data }) = self.picture.take() else { return };
+        let step = u64::from(width) * u64::from(bytes_per_pixel(encoding));
+        let fields = [
+            ("height", Value::Unsigned(height.into())),
+            ("width", Value::Unsigned(width.into())),
+            ("encoding", Value::Text(encoding_name(encoding).to_owned())),
+            ("is_bigendian", Value::Unsigned(0)),
+            ("step", Value::Unsigned(step)),
+            ("data", Value::Bytes(data.to_vec())),
+        ];
+        for (path, value) in fields {
+            self.fields.entry(path.to_owned()).or_insert(value);
+        }
+    }
+
+    /// A size that the message has at least: that of its CDR, or of what is surely in it.
+    pub(super) fn bytes_at_least(&self) -> usize {
+        let bytes = |value: &Value| match value {
+            Value::Text(text) => text.len(),
+            Value::Bytes(bytes) => bytes.len(),
+            Value::Texts(texts) => texts.iter().map(String::len).sum(),
+            _ => 0,
+        };
+        let fields = || self.fields.values().map(bytes).sum();
+        self.cdr.as_ref().map_or_else(fields, |cdr| cdr.len().saturating_sub(ENCAPSULATION))
+    }
+}
+
+/// Bytes before the message.
+pub(super) const ENCAPSULATION: usize = 4;
+
+const SECOND_NS: i64 = 1_000_000_000;
+const STAMP: [&str; 2] = ["header.stamp.sec", "header.stamp.nanosec"];
+
+impl fmt::Debug for Message {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Message").field("fields", &self.fields.keys()).finish_non_exhaustive()
+    }
+}
+
+/// What a field of a [`Message`] holds; made from numbers, `bool`, texts, and arrays of numbers, bytes or texts.
+#[derive(Clone, Debug)]
+pub struct FieldValue(Value);
+
+macro_rules! field_value {
+    ($($from:ty => |$value:ident| $make:expr),+ $(,)?) => {
+        $(impl From<$from> for FieldValue {
+            fn from($value: $from) -> Self {
+                Self($make)
+            }
+        })+
+    };
+}
+
+field_value! {
+    bool => |value| Value::Boolean(value),
+    i8 => |value| Value::Signed(value.into()),
+    i16 => |value| Value::Signed(value.into()),
+    i32 => |value| Value::Signed(value.into()),
+    i64 => |value| Value::Signed(value),
+    u8 => |value| Value::Unsigned(value.into()),
+    u16 => |value| Value::Unsigned(value.into()),
+    u32 => |value| Value::Unsigned(value.into()),
+    u64 => |value| Value::Unsigned(value),
+    f32 => |value| Value::Real(value.into()),
+    f64 => |value| Value::Real(value),
+    &str => |value| Value::Text(value.to_owned()),
+    String => |value| Value::Text(value),
+    Vec<u8> => |value| Value::Bytes(value),
+    &[u8] => |value| Value::Bytes(value.to_vec()),
+    Vec<f64> => |value| Value::Numbers(value),
+    &[f64] => |value| Value::Numbers(value.to_vec()),
+    Vec<String> => |value| Value::Texts(value),
+    &[&str] => |value| Value::Texts(value.iter().map(|text| (*text).to_owned()).collect()),
+}
+
+impl<const N: usize> From<[f64; N]> for FieldValue {
+    fn from(value: [f64; N]) -> Self {
+        Self(Value::Numbers(value.to_vec()))
+    }
+}
+
+impl<const N: usize> From<[u8; N]> for FieldValue {
+    fn from(value: [u8; N]) -> Self {
+        Self(Value::Bytes(value.to_vec()))
+    }
+}
+
+impl<const N: usize> From<[&str; N]> for FieldValue {
+    fn from(value: [&str; N]) -> Self {
+        Self::from(value.as_slice())
+    }
+}

@@ -1,0 +1,110 @@
+use gleaner_sdk::data::Value;
+use gleaner_sdk::testing::{FaultKind, Message};
+use gleaner_sdk::{Error, Result, Sample, input};
+
+use super::lambda::{imu, on_event};
+
+fn get(sample: &Sample, path: &str) -> Result<Value> {
+    sample.get(&input("imu")?.field(path)?)
+}
+
+#[test]
+fn fields_are_what_the_test_gave_and_stamps_too() {
+    let mut run = on_event(imu("", ""), |sample| {
+        assert!(matches!(get(&sample, "a")?, Value::Real(-4.0)));
+        assert!(matches!(get(&sample, "b")?, Value::Signed(-4)));
+        assert!(matches!(get(&sample, "c")?, Value::Unsigned(4)));
+        assert!(matches!(get(&sample, "d")?, Value::Boolean(true)));
+        assert!(matches!(get(&sample, "e.f")?, Value::Text(text) if text == "link"));
+        assert!(matches!(get(&sample, "cov")?, Value::Numbers(numbers) if numbers == [1.0, 2.0]));
+        assert!(matches!(get(&sample, "cov[1]")?, Value::Real(2.0)));
+        assert!(matches!(get(&sample, "raw")?, Value::Bytes(bytes) if bytes == [7, 8]));
+        assert!(matches!(get(&sample, "names[0]")?, Value::Text(text) if text == "x"));
+        assert_eq!(sample.number(&input("imu")?.field("d")?)?, 1.0);
+        let (identity, stamps) = (sample.identity(), sample.stamps());
+        assert_eq!((identity.topic.as_str(), identity.seq), ("/imu/data", 7));
+        assert_eq!((stamps.at_ns, stamps.publish_ns, stamps.header_ns), (30, 20, Some(-1_500_000_000)));
+        assert!(matches!(get(&sample, "header.stamp.sec")?, Value::Signed(-2)));
+        assert_eq!((sample.cdr(1, 2), sample.size(), sample.big_endian()), (vec![6, 7], 4, false));
+        assert_eq!((sample.cdr(9, 2), sample.cdr(3, 99)), (vec![], vec![8]));
+        Ok(())
+    });
+    let message = Message::new().with("a", -4.0).with("b", -4).with("c", 4_u8).with("d", true).with("e.f", "link");
+    let message = message.with("cov", [1.0, 2.0]).with("raw", vec![7_u8, 8]).with("names", ["x", "y"]);
+    let message = message.stamped(-1_500_000_000).published(20).numbered(7).cdr([0, 1, 0, 0, 5, 6, 7, 8]);
+    run.deliver("imu", 30, message).unwrap();
+    assert_eq!((run.decisions().len(), run.faults().next()), (1, None));
+}
+
+#[test]
+fn a_field_that_a_message_has_not_got_is_refused_by_name_when_it_is_read() {
+    let mut run = on_event(imu("", ""), |sample| {
+        let imu = input("imu")?;
+        let error = sample.number(&imu.field("linear_aceleration.x")?).unwrap_err();
+        assert_eq!(error.kind(), Some("no-such-field"));
+        let error = imu.column(&imu.field("linear_aceleration.x")?, 1).unwrap_err();
+        Err(error)
+    });
+    run.deliver("imu", 0, Message::new().with("linear_acceleration.x", 1.0)).unwrap();
+    let fault = run.faults().next().unwrap();
+    assert_eq!(fault.kind, FaultKind::Exception);
+    assert!(
+        fault.message.contains("no field `linear_aceleration.x`; did you mean `linear_acceleration.x`?"),
+        "{fault:?}"
+    );
+}
+
+#[test]
+fn a_blank_message_says_which_fields_there_are_and_what_stands_in_them() {
+    let blank = Message::new().with("x", 0.0).with("y", 5.0).with("name", "");
+    let mut run = on_event(imu("", "").blank("imu", blank), |sample| {
+        let imu = input("imu")?;
+        let error = imu.field("z").err().ok_or(Error::new("there is a z"))?;
+        assert_eq!(error.kind(), Some("no-such-field"));
+        assert_eq!([sample.number(&imu.field("x")?)?, sample.number(&imu.field("y")?)?], [2.0, 5.0]);
+        let error = imu.column(&imu.field("name")?, 1).err().ok_or(Error::new("a name is a number"))?;
+        assert_eq!(error.kind(), Some("wrong-field"));
+        Ok(())
+    });
+    // A whole number serves as a number.
+    run.deliver("imu", 0, Message::new().with("x", 2)).unwrap();
+    assert_eq!(run.faults().next(), None);
+    for (message, wanted) in [
+        (Message::new().with("xx", 2.0), "`xx` is not in the blank message of this input; did you mean `x`?"),
+        (Message::new().with("name", 2.0), "`name` is of another sort than that of the blank message"),
+    ] {
+        let refused = run.deliver("imu", 1, message).unwrap_err().to_string();
+        assert!(refused.contains(wanted), "{refused}");
+    }
+    assert_eq!(run.decisions().len(), 1);
+}
+
+#[test]
+fn bytes_that_nobody_gave_are_asked_for_in_a_fault() {
+    let mut run = on_event(imu("", ""), |sample| {
+        sample.cdr(0, 1);
+        Ok(())
+    });
+    run.deliver("imu", 0, Message::new()).unwrap();
+    let fault = run.faults().next().unwrap();
+    assert_eq!(fault.kind, FaultKind::Trap);
+    assert!(fault.message.contains("give them with `Message::cdr`"), "{fault:?}");
+}
+
+#[test]
+fn fields_of_another_input_and_malformed_paths_are_refused() {
+    let more = "[[input]]\nname = \"speed\"\ntopic = \"/speed\"\ntype = \"car/msg/Speed\"\n";
+    let mut run = on_event(imu("", more), |sample| {
+        let (imu, speed) = (input("imu")?, input("speed")?);
+        let kind = |error: Option<Error>| error.and_then(|error| error.kind());
+        assert_eq!(kind(sample.number(&speed.field("x")?).err()), Some("wrong-field"));
+        assert_eq!(kind(speed.column(&imu.field("x")?, 1).err()), Some("wrong-field"));
+        assert_eq!(kind(imu.field("a..b").err()), Some("no-such-field"));
+        assert_eq!(kind(imu.field(&"x".repeat(1025)).err()), Some("wrong-field"));
+        assert_eq!(kind(sample.as_frame().err()), Some("not-a-frame"));
+        assert!(speed.newest().is_none());
+        Ok(())
+    });
+    run.deliver("imu", 0, Message::new().with("x", 1.0)).unwrap();
+    assert_eq!(run.faults().next(), None);
+}
