@@ -16,8 +16,11 @@ pub const SUMMARY: &str = "summary.json";
 /// What the lambda of a replay read, and what its wakes cost.
 pub const SIGNALS: &str = "signals.json";
 
+/// The page that `gleaner` makes of all of it.
+const REPORT: &str = "report.html";
+
 /// The files of a run beside its clips.
-pub const RESULTS: [&str; 5] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", SIGNALS, SUMMARY];
+pub const RESULTS: [&str; 6] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", REPORT, SIGNALS, SUMMARY];
 
 /// Why results could not be written.
 #[derive(Debug, thiserror::Error)]
@@ -64,8 +67,8 @@ impl Output {
     /// [`OutputError`] names the file.
     pub fn begin(folder: &Path, all: bool, again: bool) -> Result<Self, OutputError> {
         fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
-        // A summary says that the files beside it are whole; what an earlier lambda read is not what this one reads.
-        for of_earlier in [SUMMARY, SIGNALS] {
+        // A summary says that the files beside it are whole; what was read earlier, and a page about it, would be taken for this run's.
+        for of_earlier in [SUMMARY, SIGNALS, REPORT] {
             let path = folder.join(of_earlier);
             match fs::remove_file(&path) {
                 Err(source) if source.kind() != io::ErrorKind::NotFound => return Err(OutputError { path, source }),
