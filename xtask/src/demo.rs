@@ -47,7 +47,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         println!("{proof}");
     }
     println!(
-        "\nfiles: out/demo/EXAMPLE-KIND/ with clips/, clips.jsonl, decisions.jsonl, log.jsonl, summary.json and wakes.journal"
+        "\nfiles: out/demo/EXAMPLE-KIND/ with clips/, clips.jsonl, decisions.jsonl, log.jsonl, summary.json, wakes.journal, and report.html to look at"
     );
     let gleaner = checkout.program("gleaner");
     let gleaner = gleaner.strip_prefix(checkout.path("")).unwrap_or(&gleaner).display();
