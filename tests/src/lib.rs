@@ -5,9 +5,11 @@ pub mod drive;
 pub mod given;
 pub mod greedy;
 pub mod live;
+pub mod markdown;
 pub mod namespace;
 pub mod peers;
 pub mod rooms;
+pub mod transcript;
 pub mod tree;
 
 use std::ffi::OsStr;
@@ -216,20 +218,8 @@ pub struct Copy {
 impl Copy {
     /// Copies the lambda in `lambda`, a folder of the checkout, with `change` applied to its manifest.
     pub fn of(lambda: &str, change: impl Fn(String) -> String) -> Self {
-        let (folder, source) = (Folder::new(), root().join(lambda).join("build"));
-        let files = std::fs::read_dir(&source)
-            .unwrap_or_else(|error| panic!("{}: {error}; run: cargo xtask test", source.display()));
-        for file in files {
-            let file = file.expect("the folder can be read");
-            if file.file_name() != "lambda.toml" && file.path().is_file() {
-                let name = format!("build/{}", file.file_name().to_string_lossy());
-                folder.write(&name, std::fs::read(file.path()).expect("a build can be read"));
-            }
-        }
-        let manifest = std::fs::read_to_string(source.join("lambda.toml")).expect("a build has a manifest");
-        // The build's manifest is written last: it must not be older than any source.
-        folder.write("lambda.toml", change(manifest.clone()));
-        folder.write("build/lambda.toml", change(manifest));
+        let folder = Folder::new();
+        copy_lambda(lambda, &folder, ".", change);
         Self { folder }
     }
 
@@ -242,4 +232,22 @@ impl Copy {
     pub fn replace(&self, name: &str, content: impl AsRef<[u8]>) {
         self.folder.write(&format!("build/{name}"), content);
     }
+}
+
+/// Copies the built lambda in `lambda`, a folder of the checkout, to `name` in `folder`, with `change` applied to its manifest.
+pub fn copy_lambda(lambda: &str, folder: &Folder, name: &str, change: impl Fn(String) -> String) {
+    let source = root().join(lambda).join("build");
+    let files = std::fs::read_dir(&source)
+        .unwrap_or_else(|error| panic!("{}: {error}; run: cargo xtask test", source.display()));
+    for file in files {
+        let file = file.expect("the folder can be read");
+        if file.file_name() != "lambda.toml" && file.path().is_file() {
+            let to = format!("{name}/build/{}", file.file_name().to_string_lossy());
+            folder.write(&to, std::fs::read(file.path()).expect("a build can be read"));
+        }
+    }
+    let manifest = std::fs::read_to_string(source.join("lambda.toml")).expect("a build has a manifest");
+    // The build's manifest is written last: it must not be older than any source.
+    folder.write(&format!("{name}/lambda.toml"), change(manifest.clone()));
+    folder.write(&format!("{name}/build/lambda.toml"), change(manifest));
 }

@@ -1,4 +1,5 @@
-//! `cargo xtask bless`: what the examples decide today becomes what they are expected to decide.
+//! `cargo xtask bless`: what the examples decide today becomes what they are expected to decide, and pages that are made of the source
+//! become what it says.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +13,7 @@ use crate::setup;
 use crate::steps::Steps;
 
 /// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin, and `examples/cookbook/*/expected.txt`, where the first line is
-/// the command. Twins that differ write nothing.
+/// the command; and the page on the manifest. Twins that differ write nothing.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
     setup::run(checkout, &mut steps, &["examples"])?;
@@ -27,6 +28,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let [rust, _] = &twins;
         write(checkout, &Path::new("examples").join(example.name).join("expected.txt"), rows(rust))?;
     }
+    write(checkout, Path::new("docs/manifest.md"), gleaner_protocol::manifest::reference())?;
     for recipe in Recipe::all(checkout)? {
         let rows = rows(&recipe.replay(checkout)?);
         write(checkout, &recipe.expected(), format!("{}\n{rows}", recipe.command))?;

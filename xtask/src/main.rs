@@ -7,6 +7,7 @@ mod aarch64;
 mod bless;
 mod checkout;
 mod demo;
+mod docs;
 mod examples;
 mod fuzz;
 mod peers;
@@ -28,7 +29,8 @@ use steps::Steps;
 const USAGE: &str = "usage: cargo xtask COMMAND
   demo   run both twins of every example over the sample drive, and show what they decided
   test   run all tests; the last line is `N passed, M failed, K skipped`
-  bless  write what the examples decide on the sample drive to examples/*/expected.txt
+  bless  write what the examples decide on the sample drive to expected.txt, and the page on the manifest
+  docs   fetch mdBook and build the pages as a book, in target/book
   bench  measure what is promised; what follows goes to gleaner-bench
   peers  build programs on other DDS for the tests of live topics; --install fetches their packages first
   player build gleaner-player, which plays drives with Cyclone DDS, and fetch what that takes
@@ -59,6 +61,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "demo" => demo::run(&checkout),
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
+        "docs" => docs::run(&checkout),
         "bench" => bench(&checkout, rest),
         "fuzz" => fuzz::run(&checkout, rest),
         "peers" => peers::build(&checkout, rest),

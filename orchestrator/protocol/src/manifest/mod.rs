@@ -12,6 +12,7 @@ mod names;
 mod read;
 mod read_config;
 mod read_limits;
+mod reference;
 mod syntax;
 mod table;
 #[cfg(test)]
@@ -24,6 +25,7 @@ pub use config::{ConfigError, ConfigItem, ConfigSet, ConfigValue};
 pub use error::{InputMemory, ManifestError, Place};
 pub use limits::{Limits, Tightened};
 pub use names::{ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version};
+pub use reference::reference;
 pub use types::{Backlog, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store};
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};
 

@@ -71,7 +71,7 @@ impl Kind {
 pub enum Schedule {
     /// On samples of one input.
     Event {
-        /// The input's name; it is one of [`Manifest::inputs`].
+        /// The name of that input.
         #[serde(rename = "event")]
         input: ItemName,
         /// What happens to samples that arrive during a wake.

@@ -7,6 +7,7 @@ use crate::{Exit, Explain};
 
 mod bounds;
 mod keys;
+mod reference;
 mod relations;
 
 /// The example of the design, line by line.

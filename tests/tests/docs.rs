@@ -1,0 +1,238 @@
+//! The pages are true: links lead somewhere, commands exist, code is an excerpt of files that are tested, and what a page says that a
+//! command prints, it prints.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use gleaner_protocol::{Manifest, Parts};
+use gleaner_tests::markdown::{anchors, blocks, links};
+use gleaner_tests::tree::{File, files};
+use gleaner_tests::{program, root};
+
+/// Whose Rust is all excerpts. The other pages show fragments that stand for themselves.
+const EXCERPTS_ONLY: [&str; 4] = ["docs/first-rust.md", "docs/data.md", "docs/cookbook.md", "docs/errors.md"];
+
+fn pages() -> Vec<File> {
+    files().into_iter().filter(|file| file.is_one_of(&["md"]) && !file.path.starts_with("cli/src/new/")).collect()
+}
+
+/// Fails with every problem on a line of its own.
+#[track_caller]
+fn none(problems: Vec<String>) {
+    assert!(problems.is_empty(), "\n{}", problems.join("\n"));
+}
+
+#[test]
+fn every_link_leads_to_a_file_and_to_a_heading_that_is_there() {
+    let mut problems = Vec::new();
+    let mut seen = 0;
+    for page in pages() {
+        let folder = root().join(&page.path).parent().expect("a page lies in a folder").to_owned();
+        for (line, target) in links(&page.text) {
+            if target.contains("://") {
+                continue;
+            }
+            seen += 1;
+            let (path, anchor) = target.split_once('#').map_or((&*target, None), |(path, anchor)| (path, Some(anchor)));
+            let file = if path.is_empty() { root().join(&page.path) } else { folder.join(path) };
+            let known =
+                || fs::read_to_string(&file).is_ok_and(|text| anchors(&text).iter().any(|a| Some(&**a) == anchor));
+            if !file.exists() || anchor.is_some() && !known() {
+                problems.push(format!("{}:{line}: `{target}` leads nowhere", page.path));
+            }
+        }
+    }
+    assert!(seen > 50, "{seen} links were found");
+    none(problems);
+}
+
+#[test]
+fn the_book_has_every_page_once_and_its_pages_link_to_files_and_pages_of_the_book() {
+    let summary = fs::read_to_string(root().join("docs/SUMMARY.md")).expect("docs/SUMMARY.md");
+    let chapters: Vec<_> = links(&summary).into_iter().map(|(_, target)| normal("docs", &target)).collect();
+    let distinct: BTreeSet<_> = chapters.iter().cloned().collect();
+    assert_eq!(distinct.len(), chapters.len(), "a page stands twice in docs/SUMMARY.md");
+    let mut problems = Vec::new();
+    for page in pages() {
+        if page.path.starts_with("docs/") && page.path != "docs/SUMMARY.md" && !distinct.contains(&page.path) {
+            problems.push(format!("docs/SUMMARY.md lacks {}", page.path));
+        }
+        if !distinct.contains(&page.path) {
+            continue;
+        }
+        let folder = page.path.rsplit_once('/').map_or("", |(folder, _)| folder);
+        for (line, target) in links(&page.text) {
+            let to = normal(folder, target.split('#').next().unwrap_or_default());
+            if target.contains("://") || target.starts_with('#') {
+                continue;
+            }
+            // A book has no view of a folder, and renders no page that is none of its own.
+            if root().join(&to).is_dir() || to.ends_with(".md") && !distinct.contains(&to) {
+                problems
+                    .push(format!("{}:{line}: `{target}` is not in the book; link to a file or a chapter", page.path));
+            }
+        }
+    }
+    none(problems);
+}
+
+/// `target` as seen from `folder`, without `..`.
+fn normal(folder: &str, target: &str) -> String {
+    let mut parts: Vec<&str> = folder.split('/').filter(|part| !part.is_empty()).collect();
+    for part in target.split('/').filter(|part| !part.is_empty() && *part != ".") {
+        if part == ".." {
+            parts.pop();
+        } else {
+            parts.push(part);
+        }
+    }
+    parts.join("/")
+}
+
+#[test]
+fn every_excerpt_stands_in_the_file_that_it_names() {
+    let mut problems = Vec::new();
+    let mut seen = 0;
+    for page in pages() {
+        for block in blocks(&page.text) {
+            let Some(file) = &block.file else {
+                if block.language.starts_with("rust") && EXCERPTS_ONLY.contains(&&*page.path) {
+                    problems.push(format!("{}:{}: whose excerpt is this?", page.path, block.line));
+                }
+                continue;
+            };
+            seen += 1;
+            let text = fs::read_to_string(root().join(file)).unwrap_or_default();
+            let lines: Vec<_> = text.lines().collect();
+            let excerpt: Vec<_> = block.lines.iter().map(String::as_str).collect();
+            if excerpt.is_empty() || !lines.windows(excerpt.len()).any(|window| indented_alike(window, &excerpt)) {
+                problems.push(format!("{}:{}: this does not stand in `{file}`", page.path, block.line));
+            }
+        }
+    }
+    assert!(seen >= 10, "{seen} excerpts were found");
+    none(problems);
+}
+
+/// Whether lines are the same, but that all of the first may be further to the right.
+fn indented_alike(lines: &[&str], excerpt: &[&str]) -> bool {
+    let indent = |line: &str| line.len() - line.trim_start().len();
+    let shift = indent(lines[0]).saturating_sub(indent(excerpt[0]));
+    let same = |(line, shown): (&&str, &&str)| line.is_empty() && shown.is_empty() || line.get(shift..) == Some(shown);
+    lines.iter().zip(excerpt).all(same)
+}
+
+#[test]
+fn manifests_that_are_shown_whole_can_be_used() {
+    let mut seen = 0;
+    for page in pages() {
+        for block in blocks(&page.text).into_iter().filter(|block| block.language == "toml") {
+            let text = block.lines.join("\n");
+            if text.contains("[lambda]") && text.contains("[schedule]") {
+                let said = Manifest::parse(&text, "lambda.toml").err().map(|error| error.to_string());
+                assert_eq!(said, None, "{}:{}", page.path, block.line);
+                seen += 1;
+            }
+        }
+    }
+    assert!(seen > 0);
+}
+
+#[test]
+fn python_that_is_shown_compiles() {
+    let mut python = Command::new(Parts::find().and_then(|parts| parts.python(None)).expect("a Python"));
+    // A fragment may return or wait outside of a function, so each is the body of one.
+    let check = "import ast, json, sys, textwrap\nfor name, text in json.load(sys.stdin):\n try:\n  try: ast.parse(text)\n  \
+                 except SyntaxError: ast.parse('async def fragment():\\n' + textwrap.indent(text, ' '))\n except SyntaxError as \
+                 error: print(name, error)";
+    let mut shown = Vec::new();
+    for page in pages() {
+        for block in blocks(&page.text).into_iter().filter(|block| block.language == "python") {
+            shown.push((format!("{}:{}", page.path, block.line), block.lines.join("\n")));
+        }
+    }
+    assert!(shown.len() > 5, "{} blocks were found", shown.len());
+    let mut child =
+        python.args(["-c", check]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("Python starts");
+    let json = serde_json::to_vec(&shown).expect("texts are JSON");
+    child.stdin.take().expect("a pipe").write_all(&json).expect("Python reads");
+    let output = child.wait_with_output().expect("Python ends");
+    assert!(output.status.success());
+    assert_eq!(String::from_utf8_lossy(&output.stdout), "");
+}
+
+#[test]
+fn every_command_that_is_shown_exists_with_its_flags() {
+    let mut helps = BTreeMap::new();
+    let mut problems = Vec::new();
+    let mut seen = 0;
+    for page in pages() {
+        for block in blocks(&page.text).into_iter().filter(|block| ["sh", "text"].contains(&&*block.language)) {
+            for line in &block.lines {
+                let line = line.strip_prefix("$ ").unwrap_or(line);
+                let command = line.split(['#', '|', '>', ';']).next().unwrap_or_default().replace(['[', ']'], " ");
+                let mut words = command.split_whitespace();
+                if words.next() != Some("gleaner") {
+                    continue;
+                }
+                seen += 1;
+                let name = words.next().unwrap_or_default().to_owned();
+                let help = helps.entry(name.clone()).or_insert_with(|| help(&name));
+                match help {
+                    None => problems.push(format!("{}: there is no `gleaner {name}`", page.path)),
+                    // What `play` takes is the player's business, which need not be built.
+                    Some(_) if name == "play" => {}
+                    Some(help) => {
+                        let flags = words.filter(|word| word.starts_with("--"));
+                        let flags = flags.filter_map(|flag| flag.split('=').next().map(str::to_owned));
+                        let lacking = flags.filter(|flag| !help.split([' ', ',', '\n', '=']).any(|word| word == flag));
+                        problems.extend(lacking.map(|flag| format!("{}: `gleaner {name}` has no {flag}", page.path)));
+                    }
+                }
+            }
+        }
+    }
+    assert!(seen > 40, "{seen} commands were found");
+    none(problems);
+}
+
+/// What `gleaner NAME --help` prints; none if there is no such command.
+fn help(name: &str) -> Option<String> {
+    if name.starts_with("--") {
+        return Some(name.to_owned());
+    }
+    if name == "play" {
+        return Some(String::new());
+    }
+    let output = Command::new(program("gleaner")).args([name, "--help"]).output().expect("gleaner starts");
+    output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+#[test]
+fn every_recipe_is_in_the_book_with_what_it_finds() {
+    let book = fs::read_to_string(root().join("docs/cookbook.md")).expect("docs/cookbook.md");
+    for folder in fs::read_dir(root().join("examples/cookbook")).expect("a cookbook") {
+        let folder = folder.expect("it can be listed").path();
+        let Ok(expected) = fs::read_to_string(folder.join("expected.txt")) else { continue };
+        let name = folder.file_name().unwrap().to_string_lossy();
+        assert!(book.contains(&format!("](../examples/cookbook/{name}/lambda.toml)")), "docs/cookbook.md lacks {name}");
+        let transcript = format!("```text\n$ {}\n```", expected.trim_end());
+        assert!(book.contains(&transcript), "docs/cookbook.md should say:\n{transcript}");
+    }
+}
+
+#[test]
+fn the_manifest_reference_is_that_of_the_types() {
+    let page = fs::read_to_string(root().join("docs/manifest.md")).expect("docs/manifest.md");
+    assert!(page == gleaner_protocol::manifest::reference(), "run `cargo xtask bless`, which writes docs/manifest.md");
+}
+
+#[test]
+fn the_book_does_not_leave_the_checkout() {
+    let book = fs::read_to_string(root().join("docs/book.toml")).expect("docs/book.toml");
+    let book: toml::Table = book.parse().expect("TOML");
+    assert!(Path::new(book["build"]["build-dir"].as_str().expect("a folder")).is_relative());
+}

@@ -1,0 +1,141 @@
+//! What pages show of commands is what these print. `GLEANER_BLESS=1 cargo test --release -p gleaner-tests --test transcripts` writes what
+//! they print today into the pages.
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::process::Command;
+use std::time::{Duration, SystemTime};
+
+use gleaner_protocol::Parts;
+use gleaner_tests::drive::{corrupted, truncated};
+use gleaner_tests::transcript::{fits, perform, rewritten, steps};
+use gleaner_tests::{Folder, copy_lambda, root, sample_drive};
+
+/// Does again what a page shows.
+#[track_caller]
+fn holds(page: &str, folder: &Folder) {
+    let path = root().join(page);
+    let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{page}: {error}"));
+    let mut printed = Vec::new();
+    for step in steps(&text) {
+        let lines = perform(folder.path(), &step.command);
+        printed.push((step, lines));
+    }
+    assert!(printed.len() > 3, "{page} shows {} commands", printed.len());
+    if std::env::var_os("GLEANER_BLESS").is_some() {
+        return fs::write(&path, rewritten(&text, &printed)).expect("the page can be written");
+    }
+    for (step, lines) in printed {
+        let (line, command, lines) = (step.line, &step.command, lines.join("\n"));
+        let shown = &step.shown;
+        let fit = fits(shown, &lines.lines().map(str::to_owned).collect::<Vec<_>>());
+        assert!(fit, "{page}:{line}: $ {command}\nshown:\n{}\nprinted:\n{lines}", shown.join("\n"));
+    }
+}
+
+/// A folder with the sample drive.
+fn with_drive() -> Folder {
+    let folder = Folder::new();
+    symlink(sample_drive(), folder.path().join("highway_drive.mcap")).expect("the folder is writable");
+    folder
+}
+
+#[test]
+fn the_first_lambda_in_rust_goes_as_its_page_says() {
+    holds("docs/first-rust.md", &with_drive());
+}
+
+#[test]
+fn the_first_lambda_in_python_goes_as_its_page_says() {
+    holds("docs/first-python.md", &with_drive());
+}
+
+#[test]
+fn the_messages_of_what_goes_wrong_are_those_of_their_page() {
+    holds("docs/errors.md", &kitchen());
+}
+
+const RUST: &str = "examples/hello/rust";
+const PYTHON: &str = "examples/hello/python";
+
+/// Lambdas and drives with one thing wrong each, by the names that the page gives them.
+fn kitchen() -> Folder {
+    let folder = with_drive();
+    let replaced = |from: &'static str, to: &'static str| {
+        move |manifest: String| {
+            assert!(manifest.contains(from), "the manifest has no {from}");
+            manifest.replace(from, to)
+        }
+    };
+    copy_lambda(RUST, &folder, "hello", |manifest| manifest);
+    copy_lambda(PYTHON, &folder, "hello-python", |manifest| manifest);
+    copy_lambda("examples/brake-dark/rust", &folder, "brake-dark", |manifest| manifest);
+    for (name, from, to) in [
+        ("unknown-key", "depth = 512", "dept = 512"),
+        ("too-small", "depth = 512", "depth = 0"),
+        ("no-kind", "kind = \"wasm\"\n", ""),
+        ("no-quotes", "\"/imu/data\"\ntype", "/imu/data\ntype"),
+        ("no-unit", "deadline = \"10ms\"", "deadline = 10"),
+        ("no-input", "event = \"imu\"", "event = \"imi\""),
+        ("no-topic", "topic = \"/imu/data\"", "topic = \"/imu/dta\""),
+        ("other-type", "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"),
+        ("huge", "depth = 512", "depth = 65536\nmax_size = \"1 MiB\""),
+        ("little-fuel", "fuel = 10_000_000", "fuel = 1_000"),
+        ("no-config", "brake_mps2 =", "brake_mps ="),
+    ] {
+        copy_lambda(RUST, &folder, name, replaced(from, to));
+    }
+    // Rings of messages without a field of that name.
+    copy_lambda(PYTHON, &folder, "no-field", replaced("sensor_msgs/msg/Imu", "sensor_msgs/msg/Range"));
+    let main = fs::read_to_string(root().join(PYTHON).join("main.py")).expect("the example's source");
+    for (name, from, to) in [
+        ("syntax-error", "def __init__(self, ctx: Context) -> None:", "def __init__(self, ctx: Context) -> None"),
+        ("misspelt", "ctx.event(\"hard-brake\", -mean)", "ctx.evnt(\"hard-brake\", -mean)"),
+        (
+            "greedy",
+            "self.last_ns: int | None = None",
+            "self.last_ns: int | None = None; self.bulk = bytearray(1 << 30)",
+        ),
+    ] {
+        copy_lambda(PYTHON, &folder, name, |manifest| manifest);
+        assert!(main.contains(from), "main.py has no {from}");
+        folder.write(&format!("{name}/build/main.py"), main.replace(from, to));
+    }
+    let manifest = fs::read_to_string(root().join(RUST).join("lambda.toml")).expect("the example's manifest");
+    folder.write("not-built/lambda.toml", &manifest);
+    folder.write(
+        "python-without-file/lambda.toml",
+        manifest.replace("wasm\"", "python\"").replace("hello.python", "main.py"),
+    );
+    copy_lambda(RUST, &folder, "stale", |manifest| manifest);
+    let source = folder.write("stale/src/lib.rs", "");
+    let newer = SystemTime::now() + Duration::from_secs(60);
+    fs::File::options().write(true).open(source).and_then(|file| file.set_modified(newer)).expect("a time can be set");
+    fs::create_dir(folder.path().join("empty")).expect("the folder is writable");
+    folder.write("empty.mcap", "");
+    folder.write("notes.mcap", "this is no drive");
+    drop(truncated(&folder, 0.5));
+    drop(corrupted(&folder));
+    // An environment as `python -m venv` makes it, without numpy.
+    let python = Parts::find().and_then(|parts| parts.python(None)).expect("a Python");
+    let made = Command::new(python).args(["-m", "venv", "--without-pip", "bare"]).current_dir(folder.path()).status();
+    assert!(made.expect("Python starts").success());
+    folder
+}
+
+#[test]
+fn a_transcript_may_leave_out_what_differs() {
+    let lines = |text: &str| text.lines().map(str::to_owned).collect::<Vec<_>>();
+    let printed = lines("a 1 b\nc\nd\ne 2");
+    for (shown, holds) in [
+        ("a 1 b\nc\nd\ne 2", true),
+        ("a [..] b\nc\nd\n[..]", true),
+        ("...\ne [..]", true),
+        ("a 1 b\n...\nd\n...", true),
+        ("a [..] c\n...", false),
+        ("a 1 b\nc\nd", false),
+        ("...\nf", false),
+    ] {
+        assert_eq!(fits(&lines(shown), &printed), holds, "{shown}");
+    }
+}

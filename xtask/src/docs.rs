@@ -1,0 +1,93 @@
+//! `cargo xtask docs`: the pages as a book, in `target/book`. Tests do without it: they read the pages themselves.
+//!
+//! Pages link to files all over the checkout, and mdBook knows those of one folder only. So it gets a folder with the text files of the
+//! checkout at their places, beside which `SUMMARY.md` of `docs` lies, its links as seen from there.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use gleaner_protocol::{Exit, Failure};
+
+use crate::checkout::Checkout;
+use crate::steps::{self, Steps};
+
+/// The version that the book was looked at with.
+const MDBOOK: &str = "0.5.4";
+
+/// What pages link to, by the ends of the names.
+const LINKED: [&str; 9] = ["md", "rs", "py", "toml", "txt", "wit", "ipynb", "LICENSE", "json"];
+
+/// What is not of the book: what tools make, and what has no page.
+const LEFT_OUT: [&str; 5] = ["target", "out", "build", "fuzz", "__pycache__"];
+
+/// Fetches mdBook if it is not there, and builds the book.
+pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
+    let mut steps = Steps::of(2);
+    let home = checkout.target().join("mdbook");
+    let mdbook = home.join("bin/mdbook");
+    steps.begin(&format!("mdBook {MDBOOK} in target/mdbook (the first time this takes minutes)"));
+    let has = checkout.command(&mdbook).arg("--version").output();
+    if !has.is_ok_and(|output| String::from_utf8_lossy(&output.stdout).trim().ends_with(MDBOOK)) {
+        let mut install = checkout.cargo();
+        install.args(["install", "mdbook", "--locked", "--version", MDBOOK, "--root"]).arg(&home);
+        let help = "see that the network is there; the pages can be read without a book, too";
+        steps::run(&mut install, help).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
+    }
+    steps.begin("the book");
+    let source = checkout.target().join("book-source");
+    stage(checkout, &source).map_err(|error| Failure::caused_by(Exit::Internal, "cannot lay out the book", &error))?;
+    let mut build = checkout.command(&mdbook);
+    let book = checkout.target().join("book");
+    build.arg("build").arg(&source).arg("--dest-dir").arg(&book);
+    steps::run(
+        &mut build,
+        "see the error above; `cargo test --release -p gleaner-tests --test docs` checks the links",
+    )?;
+    println!("built {}", book.join("index.html").display());
+    Ok(Exit::Ok)
+}
+
+/// Lays out what mdBook reads in `to`.
+fn stage(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
+    if to.exists() {
+        fs::remove_dir_all(to)?;
+    }
+    let mut folders = vec![PathBuf::new()];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(checkout.path(&folder))? {
+            let entry = entry?;
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let path = folder.join(&name);
+            let kind = entry.file_type()?;
+            if kind.is_dir() {
+                if !name.starts_with('.') && !LEFT_OUT.contains(&&*name) {
+                    folders.push(path);
+                }
+            } else if kind.is_file() && LINKED.contains(&name.rsplit('.').next().unwrap_or_default()) {
+                let copy = to.join("src").join(path);
+                fs::create_dir_all(copy.parent().unwrap_or(to))?;
+                fs::copy(entry.path(), copy)?;
+            }
+        }
+    }
+    let summary = fs::read_to_string(checkout.path("docs/SUMMARY.md"))?;
+    fs::write(to.join("src/SUMMARY.md"), from_the_root(&summary))?;
+    fs::copy(checkout.path("docs/book.toml"), to.join("book.toml")).map(drop)
+}
+
+/// The links of `docs/SUMMARY.md` as seen from the root of the checkout.
+fn from_the_root(summary: &str) -> String {
+    summary.replace("](", "](docs/").replace("](docs/../", "](")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chapters_are_named_from_the_root() {
+        let summary = "[Gleaner](../README.md)\n\n- [Clips](clips.md)\n    - [X](../examples/hello/README.md)";
+        let moved = "[Gleaner](README.md)\n\n- [Clips](docs/clips.md)\n    - [X](examples/hello/README.md)";
+        assert_eq!(from_the_root(summary), moved);
+    }
+}
