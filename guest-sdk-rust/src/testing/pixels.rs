@@ -205,7 +205,7 @@ impl<'a> View<'a> {
             Layout::Colours(at) => at.map(|at| self.pixel(x, y)[at]),
             Layout::Pairs([u, left, v, right]) => {
                 let byte = |at: usize| i32::from(self.pixel(x - x % 2 + at as u32 / 2, y)[at % 2]);
-                let luma = (byte(if x % 2 == 0 { left } else { right }) << 16) + (1 << 15);
+                let luma = (byte(if x.is_multiple_of(2) { left } else { right }) << 16) + (1 << 15);
                 let (u, v) = (byte(u) - 128, byte(v) - 128);
                 // Factors in 1/65536, rounded to nearest.
                 let channels = [luma + 91_881 * v, luma - 22_554 * u - 46_802 * v, luma + 116_130 * u];
@@ -244,10 +244,9 @@ impl<'a> View<'a> {
                 }
             }
             for taps in &across {
-                for channel in 0..channels {
-                    let sum = taps.iter().map(|(x, weight)| weight * columns[*x as usize][channel]).sum::<u64>();
-                    made.push(((sum + total / 2) / total) as u8);
-                }
+                let sum =
+                    |channel: usize| taps.iter().map(|(x, weight)| weight * columns[*x as usize][channel]).sum::<u64>();
+                made.extend((0..channels).map(|channel| ((sum(channel) + total / 2) / total) as u8));
             }
         }
         Ok(made)

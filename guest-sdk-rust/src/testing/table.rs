@@ -26,7 +26,7 @@ impl<'a> Table<'a> {
     }
 
     pub(super) fn of(title: &str, entries: &'a Entries, known: &[&str]) -> Result<Self> {
-        for key in entries.keys().filter(|key| !known.contains(&key.as_str())) {
+        if let Some(key) = entries.keys().find(|key| !known.contains(&key.as_str())) {
             let near = nearest(key, known.iter().copied());
             let many = || format!("it may have {}", quoted(known.iter().copied()));
             let help = near.map_or_else(many, |near| format!("did you mean `{near}`?"));

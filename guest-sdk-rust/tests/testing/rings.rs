@@ -19,7 +19,7 @@ fn a_lambda_sees_as_many_samples_as_the_ring_is_deep_oldest_first() {
         assert_eq!(column.at_ns, (first..=seq).map(|n| 10 * n as i64).collect::<Vec<_>>());
         assert_eq!(imu.column(&x, 1)?.values, [seq as f64]);
         assert_eq!(imu.column_since(&x, 10 * seq as i64 - 10)?.values, [seq as f64]);
-        assert_eq!(imu.last(2).map(|sample| sample.identity().seq).last(), Some(seq));
+        assert_eq!(imu.last(2).map(|sample| sample.identity().seq).next_back(), Some(seq));
         assert_eq!(imu.since(0).len(), column.len());
         assert_eq!(imu.newest().unwrap().number(&x)?, seq as f64);
         Ok(())
