@@ -35,6 +35,13 @@ fn a_replay_keeps_what_was_read_and_what_it_cost() {
             (signals.run_ns.count, signals.fuel.as_ref().map(|fuel| fuel.count)),
             (4170, has_fuel.then_some(4170))
         );
+        // What wakes are known to take, give or take a machine: their sum is in the summary, too.
+        assert!(
+            signals.run_ns.p50 > 100 && signals.run_ns.max as f64 / 1e9 <= 1.02 * summary.run_s,
+            "{:?}",
+            signals.run_ns
+        );
+        assert!(signals.fuel.as_ref().is_none_or(|fuel| fuel.p50 > 100 && fuel.p50 < fuel.max), "{:?}", signals.fuel);
         assert_eq!(signals.config["brake_mps2"], gleaner_protocol::manifest::ConfigValue::Float(-1.4));
         // The lambda does not see the camera; the recorder does.
         assert_eq!(summary.triggers, 3);

@@ -17,6 +17,9 @@ use crate::stage::{Output, OutputError};
 /// Bins between a number and ten times as much.
 const BINS_PER_DECADE: f64 = 12.0;
 
+/// What is more counts as this: 13 days in ns, and more fuel than a wake may have.
+const MOST: u64 = 1 << 50;
+
 /// Gathers it, wake by wake.
 pub(super) struct Gathered {
     curves: Arc<Curves>,
@@ -28,7 +31,7 @@ pub(super) struct Gathered {
 impl Gathered {
     /// Of a lambda over these inputs, before its `init`.
     pub(super) fn of(inputs: &[Arc<Topic>], camera: Option<Arc<Camera>>) -> Self {
-        let empty = || Histogram::new(2).expect("two digits are no problem");
+        let empty = || Histogram::new_with_max(MOST, 2).expect("two digits are no problem");
         let pictures = Pictures::new(inputs, camera);
         Self { curves: Curves::of(inputs), run: empty(), fuel: empty(), pictures }
     }
@@ -113,11 +116,11 @@ mod tests {
 
     #[test]
     fn every_wake_is_in_one_bin() {
-        let mut run = Histogram::new(2).unwrap();
-        for value in [0, 1, 9, 10, 11, 500, 500, 1_000_000] {
-            run.record(value).unwrap();
+        let mut gathered = Gathered::of(&[], None);
+        for run_ns in [0, 1, 9, 10, 11, 500, 500, 1_000_000] {
+            gathered.run.saturating_record(run_ns);
         }
-        let Spread { count, min, max, bins, .. } = spread(&run);
+        let Spread { count, min, max, bins, .. } = spread(&gathered.run);
         assert_eq!((count, min, bins.iter().map(|bin| bin.count).sum::<u64>()), (8, 0, 8));
         assert!((1_000_000..1_010_000).contains(&max), "{max}");
         assert!(bins.windows(2).all(|pair| pair[0].to <= pair[1].from));
