@@ -133,13 +133,9 @@ fn what_is_recorded_moves_no_tick() {
     assert_eq!(alone.len(), 399, "one each 100 ms of the drive, the first after 100 ms");
     assert_eq!(ticks(&[]), alone);
     assert_eq!(ticks(&["--topics", "*", "--journal", journal.to_str().unwrap()]), alone);
-    let line = [
-        OsStr::new("replay"),
-        lambda.path().as_os_str(),
-        sample_drive().as_os_str(),
-        "--verify".as_ref(),
-        journal.as_os_str(),
-    ];
+    let drive = sample_drive();
+    let line =
+        [OsStr::new("replay"), lambda.path().as_os_str(), drive.as_os_str(), "--verify".as_ref(), journal.as_os_str()];
     assert_eq!(verify(&line).verified.expect("it is verified").wakes, 399);
 }
 

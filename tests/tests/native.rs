@@ -49,7 +49,8 @@ impl Both {
         self
     }
 
-    fn natively<L: Lambda>(&self) -> Result<Run<L>, testing::Error> {
+    /// From the start of the drive to its end, which are those of all its topics.
+    fn natively<L: Lambda>(&self, [start_ns, end_ns]: [i64; 2]) -> Result<Run<L>, testing::Error> {
         let manifest = std::fs::read_to_string(self.folder.join("lambda.toml")).unwrap();
         let mut host = Host::from_manifest(&manifest);
         for (key, value, _) in &self.set {
@@ -61,11 +62,12 @@ impl Both {
             }
         }
         let mut run = host.load::<L>()?;
+        run.pass_to(start_ns)?;
         for Given { input, at_ns, message } in &self.given {
             run.deliver(input, *at_ns, message.clone())?;
         }
         // A tick of the very last instant is still due.
-        run.pass_to(self.given.last().map_or(0, |given| given.at_ns))?;
+        run.pass_to(end_ns)?;
         Ok(run)
     }
 
@@ -77,7 +79,9 @@ impl Both {
 
     /// Both, compared; what happened natively.
     fn agree<L: Lambda>(&self, unlike: &[&str]) -> Run<L> {
-        let (run, hosted) = (self.natively::<L>().unwrap(), self.hosted());
+        let hosted = self.hosted();
+        let span = hosted.summary.as_ref().map(|summary| [summary.start_ns, summary.end_ns]).expect("a summary");
+        let run = self.natively::<L>(span).unwrap();
         assert_eq!(run.decisions().len(), hosted.decisions.len(), "{}", hosted.stderr);
         for (n, (ours, theirs)) in run.decisions().iter().zip(&hosted.decisions).enumerate() {
             same(ours, theirs, unlike, &format!("decision {n}"));
@@ -233,7 +237,7 @@ fn a_lambda_that_does_not_start_says_why_in_the_same_words() {
         ("bad_field", "has no field `"),
     ] {
         let both = Both::on_sample_drive("tests/lambdas/misbehave/rust", &[IMU]).set("behaviour", behaviour);
-        let ours = both.natively::<misbehave::Misbehave>().err().unwrap().to_string();
+        let ours = both.natively::<misbehave::Misbehave>([0, 0]).err().unwrap().to_string();
         let hosted = both.hosted();
         hosted.must_exit(Exit::LambdaFaulted.code());
         for said in [&ours, &hosted.stderr] {
