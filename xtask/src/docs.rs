@@ -66,7 +66,13 @@ fn stage(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
             } else if kind.is_file() && LINKED.contains(&name.rsplit('.').next().unwrap_or_default()) {
                 let copy = to.join("src").join(path);
                 fs::create_dir_all(copy.parent().unwrap_or(to))?;
-                fs::copy(entry.path(), copy)?;
+                if name.ends_with(".md") {
+                    // mdBook calls the page of a README `index.html`, but leaves links to it as they are.
+                    let page = fs::read_to_string(entry.path())?;
+                    fs::write(copy, page.replace("README.md)", "index.md)").replace("README.md#", "index.md#"))?;
+                } else {
+                    fs::copy(entry.path(), copy)?;
+                }
             }
         }
     }
