@@ -156,7 +156,18 @@ impl ReplayError {
     /// What who gave the drive can do, where there is something.
     pub fn help(&self) -> Option<String> {
         Some(match self {
-            Self::NoBag { .. } => "name a .mcap or .db3 file, or a directory that `ros2 bag record` wrote".to_owned(),
+            Self::NoBag { .. } | Self::NoFiles => format!("name {WHAT_IS_ONE}"),
+            Self::Open { source, .. } if source.kind() == io::ErrorKind::NotFound => {
+                format!("look at its name; a drive is {WHAT_IS_ONE}")
+            }
+            Self::Open { source, .. } if source.kind() == io::ErrorKind::PermissionDenied => {
+                "have its owner let you read it".to_owned()
+            }
+            Self::NotMcap { .. } => {
+                format!(
+                    "name {WHAT_IS_ONE}; a bag of ROS 1 becomes one by `rosbags-convert`, of the Python package rosbags"
+                )
+            }
             Self::Metadata { path, .. } | Self::NoSuchFile { metadata: path, .. } => {
                 let folder = word(path.parent().unwrap_or(path));
                 format!("write it anew with `ros2 bag reindex {folder}`, or name the files in the directory themselves")
@@ -181,6 +192,8 @@ impl ReplayError {
         })
     }
 }
+
+const WHAT_IS_ONE: &str = "a .mcap or .db3 file, or a directory that `ros2 bag record` wrote";
 
 /// A path as one word of a command to paste into a shell: whoever made the drive chose the names in it.
 fn word(path: &Path) -> String {
