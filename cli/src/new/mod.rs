@@ -134,7 +134,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<Exit, Failure> {
     make(dir, &name, args.kind.into())?;
     let test = test_command(args.kind.into());
     say(&format!(
-        "made {shown}: what it reads and may use is in lambda.toml, what it decides in {}\nnext:\n  cd {shown}\n  {test}\n  gleaner build .\n  gleaner replay . DRIVE.mcap\n",
+        "made {shown}: what it reads and may use is in lambda.toml, what it decides in {}\nnext:\n  cd {shown}\n  {test}\n  gleaner dev . DRIVE.mcap\n",
         source(args.kind.into()),
     ))?;
     Ok(Exit::Ok)
