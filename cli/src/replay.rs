@@ -16,7 +16,13 @@ use crate::show::{self, Digest, Paint};
 
 /// Replays, and ends as the runtime ends.
 pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
+    results(args).map(|(exit, _)| exit)
+}
+
+/// Replays. How the runtime ended, and whether there are results of this replay: a lambda that could not start leaves those of before.
+pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     let (heard, exit) = runtime::run(arguments(args))?;
+    let has_results = heard.is_some();
     let report = match &heard {
         Some(Heard::Summary(summary)) => report_of(&summary.out, args.no_report),
         _ => None,
@@ -25,7 +31,7 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     if let Some(path) = report.filter(|_| !args.json) {
         say(&format!("  {}\n", paint().dim(&format!("report: {}", path.display()))))?;
     }
-    Ok(exit)
+    Ok((exit, has_results))
 }
 
 /// Writes the report of `out`, unless nobody wants it. That of an earlier replay goes in any case: it is about other results.

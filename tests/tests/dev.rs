@@ -1,8 +1,8 @@
 //! `gleaner dev`: what is saved is built, replayed and compared, until somebody ends it.
 
-use std::io::{BufRead, BufReader, Read};
-use std::process::{Child, Command, Stdio};
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::io::{BufRead, BufReader};
+use std::process::{Child, Command};
+use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
 use gleaner_tests::{Folder, program, root, sample_drive};
@@ -28,10 +28,13 @@ impl Dev {
         let mut gleaner = Command::new(program("gleaner"));
         gleaner.arg("dev").arg(lambda.path()).arg(sample_drive()).arg("--no-record");
         gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache"));
-        let mut child = gleaner.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("gleaner starts");
+        // One pipe for both streams, so that lines come in the order in which they are written.
+        let (reader, writer) = std::io::pipe().expect("a pipe");
+        let child = gleaner.stdout(writer.try_clone().expect("a pipe")).stderr(writer).spawn().expect("gleaner starts");
         let (sender, lines) = channel();
-        pass_on(child.stdout.take().expect("it is piped"), sender.clone());
-        pass_on(child.stderr.take().expect("it is piped"), sender);
+        std::thread::spawn(move || {
+            BufReader::new(reader).lines().map_while(Result::ok).try_for_each(|line| sender.send(line))
+        });
         Self { child, lines }
     }
 
@@ -48,10 +51,6 @@ impl Dev {
             round.push('\n');
         }
     }
-}
-
-fn pass_on(from: impl Read + Send + 'static, to: Sender<String>) {
-    std::thread::spawn(move || BufReader::new(from).lines().map_while(Result::ok).try_for_each(|line| to.send(line)));
 }
 
 #[test]

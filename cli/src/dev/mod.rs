@@ -40,6 +40,9 @@ pub struct DevArgs {
     pub no_record: bool,
 }
 
+/// Where what a replay is compared with is kept, below its results: `gleaner diff` finds it there, too.
+const BEFORE: &str = ".before";
+
 /// Files of a replay from which it is compared with the next.
 const COMPARED: [&str; 4] = ["summary.json", "decisions.jsonl", "signals.json", "clips.jsonl"];
 
@@ -47,19 +50,18 @@ const COMPARED: [&str; 4] = ["summary.json", "decisions.jsonl", "signals.json", 
 pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
     let dir = args.asked.lambda.clone();
     let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
-    let before = tempfile::tempdir()
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make a folder for earlier results", &error))?;
+    let before = out.join(BEFORE);
     let replay = replay_args(args);
     // Of the one before this started, if its results still lie there, too: somebody comes back from lunch.
-    let mut has_before = keep(&out, before.path());
+    let mut has_before = keep(&out, &before);
     let mut seen = Seen::of(&dir);
     loop {
         match once(&dir, &replay) {
             Ok(true) => {
-                if has_before && let Err(failure) = compare(before.path(), &out) {
+                if has_before && let Err(failure) = compare(&before, &out) {
                     eprintln!("{failure}");
                 }
-                has_before = keep(&out, before.path());
+                has_before = keep(&out, &before);
             }
             Ok(false) => {}
             Err(failure) => eprintln!("{failure}"),
@@ -75,10 +77,7 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
 /// Builds and replays; whether there are results, be they of a lambda with faults or of a damaged drive.
 fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
     build::run(dir)?;
-    let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
-    replay::run(args)?;
-    // A summary says that the files beside it are whole: a replay begins with its removal.
-    Ok(out.join("summary.json").is_file())
+    replay::results(args).map(|(_, has_results)| has_results)
 }
 
 fn compare(before: &Path, out: &Path) -> Result<(), Failure> {
@@ -91,6 +90,10 @@ fn compare(before: &Path, out: &Path) -> Result<(), Failure> {
 /// Copies what a later replay is compared with; false if there is nothing whole.
 fn keep(out: &Path, before: &Path) -> bool {
     let copied = || -> io::Result<()> {
+        if !out.join(COMPARED[0]).is_file() {
+            return Err(io::ErrorKind::NotFound.into());
+        }
+        fs::create_dir_all(before)?;
         for name in COMPARED {
             match fs::copy(out.join(name), before.join(name)) {
                 Err(error) if error.kind() == io::ErrorKind::NotFound && name != COMPARED[0] => {

@@ -123,17 +123,14 @@ impl Explain for DiffError {
 pub(crate) fn run(args: &DiffArgs) -> Result<Exit, Failure> {
     let diff = between(&args.a, &args.b)?;
     let exit = if diff.same { Exit::Ok } else { Exit::Differs };
-    let mut text = match args.json {
-        true => json_line(&diff),
-        false => diff.text(),
-    };
+    say(&if args.json { json_line(&diff) } else { diff.text() })?;
+    // Only then: a page that cannot be written must not cost what was found.
     if let Some(path) = &args.report {
         let path = report::write_both(&args.a, &args.b, diff, path)?;
         if !args.json {
-            text.push_str(&format!("  report: {}\n", path.display()));
+            say(&format!("  report: {}\n", path.display()))?;
         }
     }
-    say(&text)?;
     Ok(exit)
 }
 

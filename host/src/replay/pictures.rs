@@ -16,6 +16,9 @@ use crate::stage::OutputError;
 /// The folder of the pictures, below that of the results.
 const FOLDER: &str = "pictures";
 
+/// Begins the names of our pictures: by it they are told from others.
+const PREFIX: &str = "trigger-";
+
 /// Whether messages of this type are images.
 pub(super) fn is_image(type_name: &str) -> bool {
     matches!(type_name, "sensor_msgs/msg/Image" | "sensor_msgs/msg/CompressedImage")
@@ -69,6 +72,11 @@ impl Pictures {
         Self { inputs, camera, wakes: 0, every: 1, made: Vec::new() }
     }
 
+    /// Wakes that triggered so far.
+    pub(super) fn wakes(&self) -> u64 {
+        self.wakes
+    }
+
     /// After a wake.
     pub(super) fn wake(&mut self, decision: &Decision) {
         if decision.triggers.is_empty() {
@@ -118,7 +126,7 @@ impl Pictures {
         }
         fs::create_dir_all(&folder).map_err(|source| OutputError { path: folder, source })?;
         let written = self.made.into_iter().map(|Made { at_ns, topic, image_ns, jpeg, wake }| {
-            let file = Path::new(FOLDER).join(format!("{wake:06}.jpg"));
+            let file = Path::new(FOLDER).join(format!("{PREFIX}{wake:06}.jpg"));
             let path = out.join(&file);
             // A new one: what is there may be a link to somewhere else.
             let written = File::create_new(&path).and_then(|mut file| file.write_all(&jpeg));
@@ -132,6 +140,10 @@ impl Pictures {
 /// Deletes the pictures of an earlier replay, and nothing else that somebody put there.
 fn remove(folder: &Path) -> Result<(), OutputError> {
     let failed = |source| OutputError { path: folder.to_owned(), source };
+    // A link may lead to somebody's pictures.
+    if fs::symlink_metadata(folder).is_ok_and(|metadata| !metadata.is_dir()) {
+        return Err(failed(io::ErrorKind::NotADirectory.into()));
+    }
     let entries = match fs::read_dir(folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         entries => entries.map_err(failed)?,
@@ -139,7 +151,9 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
     for entry in entries {
         let entry = entry.map_err(failed)?;
         let name = entry.file_name();
-        let number = name.to_str().and_then(|name| name.strip_suffix(".jpg")).unwrap_or_default();
+        let number =
+            name.to_str().and_then(|name| name.strip_prefix(PREFIX)).and_then(|name| name.strip_suffix(".jpg"));
+        let number = number.unwrap_or_default();
         if !number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit()) {
             fs::remove_file(entry.path()).map_err(|source| OutputError { path: entry.path(), source })?;
         }
@@ -203,7 +217,7 @@ mod tests {
         let out = tempfile::tempdir().unwrap();
         let folder = out.path().join(FOLDER);
         fs::create_dir(&folder).unwrap();
-        for name in ["000007.jpg", "mine.jpg"] {
+        for name in ["trigger-000007.jpg", "000007.jpg", "mine.jpg"] {
             fs::write(folder.join(name), "old").unwrap();
         }
         let camera = Camera::new("/cam", "sensor_msgs/msg/Image");
@@ -227,7 +241,17 @@ mod tests {
             assert!(fs::read(out.path().join(file)).unwrap().starts_with(&[0xff, 0xd8]));
         }
         assert_eq!(fs::read(folder.join("mine.jpg")).unwrap(), b"old");
-        assert!(!folder.join("000007.jpg").exists());
+        assert_eq!(fs::read(folder.join("000007.jpg")).unwrap(), b"old");
+        assert!(!folder.join("trigger-000007.jpg").exists());
+    }
+
+    #[test]
+    fn a_link_to_other_pictures_is_not_followed() {
+        let (out, others) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        fs::write(others.path().join("trigger-000001.jpg"), "precious").unwrap();
+        std::os::unix::fs::symlink(others.path(), out.path().join(FOLDER)).unwrap();
+        assert!(Pictures::new(&[], None).write(out.path()).is_err());
+        assert!(others.path().join("trigger-000001.jpg").exists());
     }
 
     #[test]

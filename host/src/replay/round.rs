@@ -233,7 +233,10 @@ pub(super) fn replay(
             failure.to_string()
         }),
     };
-    pass.gathered.write(&results.out, pass.output, &options.asked.config)?;
+    // What a report is drawn from is no result: without it, the results are whole.
+    if let Err(error) = pass.gathered.write(&results.out, pass.output, &options.asked.config) {
+        tracing::warn!(%error, why = %error.source, "the report will be without signals");
+    }
     output.finish(&summary)?;
     Ok((summary, broken.map(|error| error.exit())))
 }

@@ -16,7 +16,7 @@ pub struct Signals {
     pub config: BTreeMap<String, ConfigValue>,
     /// What the lambda read of each field, in the order in which it asked first.
     pub curves: Vec<Curve>,
-    /// Fields that it read beyond [`Signals::CURVES_MAX`]: no curve was kept of them.
+    /// Fields that it looked up beyond [`Signals::CURVES_MAX`]: no curve was kept of them.
     pub curves_left_out: u64,
     /// Time in the lambda for each wake, in ns.
     pub run_ns: Spread,
@@ -46,7 +46,7 @@ pub struct Curve {
     pub topic: String,
     /// The path of the field, such as `linear_acceleration.x`, or what the host worked out of a picture: `mean luma`.
     pub path: String,
-    /// Samples that it was read of. Those between them were not looked at.
+    /// Samples that it was read of, with stamps that rise: of equal ones the first. Those between them were not looked at.
     pub samples: u64,
     /// Samples in which it was NaN or infinite: these are in no point.
     pub not_finite: u64,
@@ -60,7 +60,7 @@ pub struct Curve {
     pub max: Vec<f64>,
 }
 
-/// How a number of each wake is spread.
+/// How a number of each wake is spread, to three digits, rounded down.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Spread {
     /// Wakes that had it.
@@ -99,6 +99,6 @@ pub struct Picture {
     pub topic: String,
     /// Stamp of the image: the newest that had arrived.
     pub image_ns: i64,
-    /// A small JPEG, relative to the folder that holds `signals.json`, for example `pictures/000000.jpg`.
+    /// A small JPEG, relative to the folder that holds `signals.json`, for example `pictures/trigger-000000.jpg`.
     pub file: PathBuf,
 }
