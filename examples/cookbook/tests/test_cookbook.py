@@ -58,6 +58,19 @@ def test_pushes_that_are_too_far_apart_are_no_swerve() -> None:
     assert len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}, within_s=10.0))) == 1
 
 
+def test_what_is_no_number_makes_no_swerve_of_a_bend() -> None:
+    t = hundredths(12)
+    y = np.where((t > 2) & (t < 6), 4.0, 0.0)
+    y[400] = np.nan
+    assert times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}})) == []
+
+
+def test_a_swerve_is_found_at_ten_samples_a_second() -> None:
+    t = np.arange(120) / 10 + 0.03 * (np.arange(120) % 2)
+    y = np.where((t > 2) & (t < 3), 4.0, 0.0) - np.where((t > 3) & (t < 4), 4.0, 0.0)
+    assert len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}))) == 1
+
+
 def test_a_car_that_creeps_between_the_limits_stays_stopped() -> None:
     t = hundredths(30)
     v = np.select([t < 5, t < 10, t < 20], [10.0, 0.0, 1.5], 10.0)
