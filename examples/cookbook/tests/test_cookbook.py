@@ -78,6 +78,33 @@ def test_a_car_that_creeps_between_the_limits_stays_stopped() -> None:
     assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [("start", 8.0), ("stop", 20.0)]
 
 
+def test_what_is_no_number_is_no_standing() -> None:
+    t = hundredths(10)
+    assert run("stopped", {SPEED: {"t": t, "twist.linear.x": np.nan * t}}).triggers == []
+
+
+def test_a_recording_ends_even_after_a_fault_in_it(tmp_path: Path) -> None:
+    for name in ("lambda.toml", "main.py"):
+        (tmp_path / name).write_text((COOKBOOK / "stopped" / name).read_text(encoding="utf-8"), encoding="utf-8")
+    with (tmp_path / "main.py").open("a", encoding="utf-8") as main:
+        main.write(FAULT_AT_A_QUARTER)
+    t = hundredths(20)
+    v = np.select([t < 5, t == 10, t < 15], [10.0, 0.25, 0.0], 10.0)
+    done = replay(tmp_path, {SPEED: {"t": t, "twist.linear.x": v}})
+    assert len(done.faults) == 1
+    assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [("start", 8.0), ("stop", 15.0)]
+
+
+# Behind a recipe: a fault where the speed is 0.25 m/s.
+FAULT_AT_A_QUARTER = """
+class Lambda(Lambda):
+    def on_event(self, ctx, event):
+        if event.number(self.speed) == 0.25:
+            raise ValueError("a fault")
+        super().on_event(ctx, event)
+"""
+
+
 def test_limits_the_wrong_way_round_are_refused() -> None:
     with pytest.raises(StartError) as refused:
         run("stopped", SAMPLE, stopped_mps=5.0)
