@@ -121,6 +121,16 @@ def test_an_imu_that_is_not_level_is_no_mismatch() -> None:
     assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
 
 
+def test_a_mismatch_is_found_at_ten_samples_a_second_and_after_what_is_no_number() -> None:
+    t = np.arange(300) / 10 + 0.03 * (np.arange(300) % 2)
+    x = 1.6 + 0 * t
+    x[:3] = np.nan
+    steady = {IMU: {"t": t, "linear_acceleration.x": x}, SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t}}
+    assert times(run("speed-mismatch", steady)) == []
+    slips = {**steady, SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t + np.where((t > 20) & (t < 22), 8.0, 0.0)}}
+    assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
+
+
 def test_a_sensor_that_never_spoke_is_silent() -> None:
     t = hundredths(5)
     done = run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t}})
