@@ -132,9 +132,15 @@ def test_a_mismatch_is_found_at_ten_samples_a_second_and_after_what_is_no_number
 
 
 def test_a_sensor_that_never_spoke_is_silent() -> None:
-    t = hundredths(5)
+    t = hundredths(12)
     done = run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t}})
     assert [trigger.attributes["topic"] for trigger in done.triggers] == ["/camera/front/compressed"]
+    assert times(done) == pytest.approx([10.0], abs=0.2)
+
+
+def test_a_sensor_that_is_found_late_was_not_silent() -> None:
+    t = hundredths(12)
+    assert times(run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t[500:]}}, first_s=20.0)) == []
 
 
 def test_a_picture_is_new_once_and_the_oldest_kind_is_forgotten(tmp_path: Path) -> None:
