@@ -37,7 +37,7 @@ struct Clock {
     elsewhere: Option<Elsewhere>,
 }
 
-/// Samples in a row that agree on another offset than the usual one: when the first was received, its offset, and how many they are.
+/// Samples in a row that agree on another offset than the usual one: when the first came, its offset, and how many there are.
 #[derive(Clone, Copy)]
 struct Elsewhere {
     since_ns: i64,
