@@ -135,7 +135,7 @@ fn a_clock_that_jumps_is_told_once_and_a_late_sample_is_not() {
         }
         true
     });
-    assert_eq!(found(&jumped), [("time-jump".to_owned(), 20.0)]);
+    assert_eq!(found(&jumped), [("time-jump".to_owned(), 20.5)]);
     let trigger = jumped.decisions.iter().flat_map(|decision| &decision.triggers).next().unwrap();
     assert_eq!((trigger.score, trigger.attributes["jump_s"].as_f64()), (Some(2.0), Some(-2.0)));
     let mut late = 0;

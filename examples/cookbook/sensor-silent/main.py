@@ -11,6 +11,7 @@ from gleaner import Context
 class Lambda:
     def __init__(self, ctx: Context) -> None:
         self.silent_ns = int(ctx.config["silent_s"] * 1e9)
+        self.first_ns = int(ctx.config["first_s"] * 1e9)
         self.inputs = [ctx.input(name) for name in ctx.inputs()]
         self.began_ns: int | None = None
         # The inputs that are silent, and since when.
@@ -22,10 +23,12 @@ class Lambda:
             self.began_ns = now
         for topic in self.inputs:
             newest = topic.newest()
-            # Who never spoke is silent since the beginning.
-            heard_ns = self.began_ns if newest is None else newest.stamps.at_ns
+            # Who never spoke is silent since the beginning, but may take longer: on a vehicle a sensor has to be found first.
+            heard_ns, limit_ns = self.began_ns, self.first_ns
+            if newest is not None:
+                heard_ns, limit_ns = newest.stamps.at_ns, self.silent_ns
             quiet_ns = now - heard_ns
-            if quiet_ns < self.silent_ns:
+            if quiet_ns < limit_ns:
                 since_ns = self.silent.pop(topic.name, None)
                 if since_ns is not None:
                     ctx.log("info", f"{topic.ros_topic} is back after {(now - since_ns) / 1e9:.1f} s")

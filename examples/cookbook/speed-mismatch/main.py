@@ -10,7 +10,8 @@ import numpy as np
 from gleaner import Column, Context
 
 SECOND_NS = 1_000_000_000
-FULL_NS = 950_000_000
+# So far from its ends a window may begin and end: a sensor may send ten times a second only.
+EDGE_NS = 200_000_000
 REST_NS = 3_000_000_000
 # The offset is the mean of the first 100 ticks, and then follows within as many.
 TICKS = 100
@@ -32,10 +33,13 @@ class Lambda:
         wheels = self.speed.column_since(self.wheels, now - SECOND_NS)
         if not (full(imu, now) and full(wheels, now)):
             return
-        # Of the second: the wheels' speed at its end less that at its beginning, and the integral of the acceleration.
+        # For one second: the wheels' speed at the end less that at the beginning, by the time between; and the mean acceleration.
         span = max(len(wheels.values) // 10, 1)
-        by_wheels = float(np.median(wheels.values[-span:]) - np.median(wheels.values[:span]))
-        by_imu = float(imu.values.mean()) * float(imu.at_ns[-1] - imu.at_ns[0]) / 1e9
+        gained = float(np.median(wheels.values[-span:]) - np.median(wheels.values[:span]))
+        by_wheels = gained * SECOND_NS / float(wheels.at_ns[-1] - wheels.at_ns[0])
+        by_imu = float(imu.values.mean())
+        if not np.isfinite(by_wheels - by_imu):
+            return
         self.ticks = min(self.ticks + 1, TICKS)
         if self.ticks == 1:
             self.offset_mps = by_wheels - by_imu
@@ -49,4 +53,5 @@ class Lambda:
 
 def full(window: Column, now: int) -> bool:
     """Whether a window reaches over the second: no sensor began, or broke off, in it."""
-    return len(window.at_ns) > 1 and bool(window.at_ns[-1] - window.at_ns[0] >= FULL_NS)
+    at_ns = window.at_ns
+    return len(at_ns) > 1 and bool(at_ns[0] <= now - SECOND_NS + EDGE_NS and at_ns[-1] >= now - EDGE_NS)

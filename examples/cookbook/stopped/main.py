@@ -9,6 +9,8 @@ from __future__ import annotations
 from gleaner import Context, Sample
 
 LABEL = "stopped"
+# In `scratch` while it records: after a fault the new object must know, or nobody would end the recording.
+NAME = "recording"
 
 
 class Lambda:
@@ -20,16 +22,18 @@ class Lambda:
         if self.going_mps <= self.stopped_mps:
             raise ValueError(f"going_mps is {self.going_mps}; it has to be above stopped_mps, which is {self.stopped_mps}")
         self.slow_since_ns: int | None = None
-        self.recording = False
+        self.recording = any(entry.name == NAME for entry in ctx.scratch.entries())
 
     def on_event(self, ctx: Context, event: Sample) -> None:
         now, speed = ctx.now_ns(), abs(event.number(self.speed))
         if self.recording:
             if speed > self.going_mps:
                 ctx.stop(LABEL)
+                ctx.scratch.remove(NAME)
                 self.recording, self.slow_since_ns = False, None
             return
-        if speed > self.stopped_mps:
+        # Written this way round, so that what is no number is no standing either.
+        if not speed <= self.stopped_mps:
             self.slow_since_ns = None
             return
         if self.slow_since_ns is None:
@@ -37,3 +41,4 @@ class Lambda:
         if now - self.slow_since_ns >= self.after_ns:
             self.recording = True
             ctx.start(LABEL, stood_s=(now - self.slow_since_ns) / 1e9, speed_mps=speed)
+            ctx.scratch.put(NAME, b"")

@@ -8,7 +8,8 @@ from __future__ import annotations
 from gleaner import Context, Sample
 
 WINDOW_NS = 500_000_000
-FULL_NS = 450_000_000
+# A window counts if its oldest sample is within 0.2 s of its start: an IMU may send ten times a second only.
+FULL_NS = 300_000_000
 REST_NS = 2_000_000_000
 
 
@@ -32,7 +33,8 @@ class Lambda:
         if now - window.at_ns[0] < FULL_NS:
             return
         mean = float(window.values.mean())
-        if abs(mean) < self.limit:
+        # Written this way round, so that what is no number is no push either.
+        if not abs(mean) >= self.limit:
             return
         side, other = ("left", "right") if mean > 0 else ("right", "left")
         if now - self.seen_ns.get(side, now) > self.within_ns:

@@ -58,11 +58,51 @@ def test_pushes_that_are_too_far_apart_are_no_swerve() -> None:
     assert len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}, within_s=10.0))) == 1
 
 
+def test_what_is_no_number_makes_no_swerve_of_a_bend() -> None:
+    t = hundredths(12)
+    y = np.where((t > 2) & (t < 6), 4.0, 0.0)
+    y[400] = np.nan
+    assert times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}})) == []
+
+
+def test_a_swerve_is_found_at_nine_samples_a_second() -> None:
+    t = np.arange(110) * 0.11
+    y = np.where((t > 2) & (t < 3), 4.0, 0.0) - np.where((t > 3) & (t < 4), 4.0, 0.0)
+    assert len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}))) == 1
+
+
 def test_a_car_that_creeps_between_the_limits_stays_stopped() -> None:
     t = hundredths(30)
     v = np.select([t < 5, t < 10, t < 20], [10.0, 0.0, 1.5], 10.0)
     done = run("stopped", {SPEED: {"t": t, "twist.linear.x": v}})
     assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [("start", 8.0), ("stop", 20.0)]
+
+
+def test_what_is_no_number_is_no_standing() -> None:
+    t = hundredths(10)
+    assert run("stopped", {SPEED: {"t": t, "twist.linear.x": np.nan * t}}).triggers == []
+
+
+def test_a_recording_ends_even_after_a_fault_in_it(tmp_path: Path) -> None:
+    for name in ("lambda.toml", "main.py"):
+        (tmp_path / name).write_text((COOKBOOK / "stopped" / name).read_text(encoding="utf-8"), encoding="utf-8")
+    with (tmp_path / "main.py").open("a", encoding="utf-8") as main:
+        main.write(FAULT_AT_A_QUARTER)
+    t = hundredths(20)
+    v = np.select([t < 5, t == 10, t < 15], [10.0, 0.25, 0.0], 10.0)
+    done = replay(tmp_path, {SPEED: {"t": t, "twist.linear.x": v}})
+    assert len(done.faults) == 1
+    assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [("start", 8.0), ("stop", 15.0)]
+
+
+# Behind a recipe: a fault where the speed is 0.25 m/s.
+FAULT_AT_A_QUARTER = """
+class Lambda(Lambda):
+    def on_event(self, ctx, event):
+        if event.number(self.speed) == 0.25:
+            raise ValueError("a fault")
+        super().on_event(ctx, event)
+"""
 
 
 def test_limits_the_wrong_way_round_are_refused() -> None:
@@ -81,10 +121,26 @@ def test_an_imu_that_is_not_level_is_no_mismatch() -> None:
     assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
 
 
+def test_a_mismatch_is_found_at_ten_samples_a_second_and_after_what_is_no_number() -> None:
+    t = np.arange(300) / 10 + 0.03 * (np.arange(300) % 2)
+    x = 1.6 + 0 * t
+    x[:3] = np.nan
+    steady = {IMU: {"t": t, "linear_acceleration.x": x}, SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t}}
+    assert times(run("speed-mismatch", steady)) == []
+    slips = {**steady, SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t + np.where((t > 20) & (t < 22), 8.0, 0.0)}}
+    assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
+
+
 def test_a_sensor_that_never_spoke_is_silent() -> None:
-    t = hundredths(5)
+    t = hundredths(12)
     done = run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t}})
     assert [trigger.attributes["topic"] for trigger in done.triggers] == ["/camera/front/compressed"]
+    assert times(done) == pytest.approx([10.0], abs=0.2)
+
+
+def test_a_sensor_that_is_found_late_was_not_silent() -> None:
+    t = hundredths(12)
+    assert times(run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t[500:]}}, first_s=20.0)) == []
 
 
 def test_a_picture_is_new_once_and_the_oldest_kind_is_forgotten(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 //! Dark to bright: the picture turns bright within seconds, as at the end of a tunnel. There cameras are blind for a moment.
 //!
 //! Two limits, one for dark and one for bright: what lies between changes nothing, so that lamps in a tunnel are no daylight.
+//! And one dark picture is no tunnel: it must have been dark for a time.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, now_ns};
 
@@ -10,13 +11,14 @@ struct DarkToBright {
 
 impl Lambda for DarkToBright {
     fn init(config: &Config) -> Result<Self> {
-        let within_ns = (config.real("within_s")? * 1e9) as i64;
+        let [dark_ns, within_ns] =
+            [config.real("dark_s")?, config.real("within_s")?].map(|seconds| (seconds * 1e9) as i64);
         let (dark, bright) = (config.real("dark_luma")?, config.real("bright_luma")?);
         if bright <= dark {
             let why = format!("bright_luma is {bright}; it has to be above dark_luma, which is {dark}");
             return Err(Error::new(why));
         }
-        Ok(Self { light: Light { dark, bright, within_ns, last_dark: None } })
+        Ok(Self { light: Light { dark, bright, dark_ns, within_ns, seen: None } })
     }
 
     fn on_event(&mut self, camera: Sample) -> Result<()> {
@@ -31,9 +33,17 @@ impl Lambda for DarkToBright {
 struct Light {
     dark: f64,
     bright: f64,
+    dark_ns: i64,
     within_ns: i64,
-    /// When the last dark picture was, and its mean grey; none once it was bright.
-    last_dark: Option<(i64, f64)>,
+    /// None once it was bright.
+    seen: Option<Dark>,
+}
+
+/// When the first and the last dark picture were, and the mean grey of the last.
+struct Dark {
+    first_ns: i64,
+    last_ns: i64,
+    luma: f64,
 }
 
 #[derive(Debug, PartialEq)]
@@ -46,13 +56,13 @@ impl Light {
     /// The change that a picture of this mean grey, 0 to 255, completes.
     fn note(&mut self, at_ns: i64, luma: f64) -> Option<Change> {
         if luma < self.dark {
-            self.last_dark = Some((at_ns, luma));
+            let first_ns = self.seen.as_ref().map_or(at_ns, |seen| seen.first_ns);
+            self.seen = Some(Dark { first_ns, last_ns: at_ns, luma });
         }
-        let (dark_ns, from) = self.last_dark.filter(|_| luma > self.bright)?;
-        self.last_dark = None;
-        let took_ns = at_ns - dark_ns;
-        // A dawn is no event.
-        (took_ns <= self.within_ns).then_some(Change { from, took_ns })
+        let Dark { first_ns, last_ns, luma: from } = self.seen.take_if(|_| luma > self.bright)?;
+        let (lasted_ns, took_ns) = (last_ns - first_ns, at_ns - last_ns);
+        // A dark picture alone is no tunnel, and a dawn is no event.
+        (lasted_ns >= self.dark_ns && took_ns <= self.within_ns).then_some(Change { from, took_ns })
     }
 }
 
@@ -66,13 +76,19 @@ mod tests {
 
     /// The changes in pictures of these mean greys, one a second.
     fn changes(lumas: &[f64]) -> Vec<Change> {
-        let mut light = Light { dark: 50.0, bright: 80.0, within_ns: 3 * SECOND, last_dark: None };
+        let mut light = Light { dark: 50.0, bright: 80.0, dark_ns: SECOND, within_ns: 3 * SECOND, seen: None };
         (0..).zip(lumas).filter_map(|(second, luma)| light.note(second * SECOND, *luma)).collect()
     }
 
     #[test]
     fn the_end_of_a_tunnel_is_told_once() {
         assert_eq!(changes(&[120.0, 20.0, 30.0, 60.0, 90.0, 130.0]), [Change { from: 30.0, took_ns: 2 * SECOND }]);
+    }
+
+    #[test]
+    fn a_dark_picture_alone_is_no_tunnel() {
+        assert_eq!(changes(&[120.0, 20.0, 120.0]), []);
+        assert_eq!(changes(&[120.0, 20.0, 120.0, 20.0, 120.0]), [], "nor are two with light between them");
     }
 
     #[test]
