@@ -34,7 +34,7 @@ function labelLanes(run, triggers) {
   });
   const lanes = own.map(({ label, number }) => lane(label, new Set([number])));
   const rest = totals.filter((one) => !own.includes(one)).map((one) => one.number);
-  return shared ? [...lanes, lane(`${rest.length} other labels`, new Set(rest))] : lanes;
+  return shared ? [...lanes, lane("other labels", new Set(rest))] : lanes;
 }
 
 /** The colour of an entry. */

@@ -38,9 +38,10 @@ function timelineCard(page, entries) {
   const left = page.runs.reduce((sum, run) => sum + run.totals.curves_left_out, 0);
   const hint = make("p", { class: "hint", text: "Drag to zoom, double click for all; ctrl and wheel zoom, shift and wheel move. ← and → go from one to the next. Curves are what the lambda read; where it did not look, there is no line." });
   const none = page.runs.every((run) => run.curves.length === 0)
-    ? make("p", { class: "hint", text: "No signals were kept (signals.json): a replay keeps what the lambda reads." }) : null;
+    ? make("p", { class: "hint", text: page.runs.every((run) => run.config === null)
+      ? "No signals were kept (signals.json): a replay keeps what the lambda reads." : "The lambda read no numbers of its inputs." }) : null;
   const section = make("section", { class: "card" }, bar, lanes, curves, none ?? hint,
-    left > 0 ? make("p", { class: "more", text: `${counted(left, "more field")} that the lambda read have no curve.` }) : null);
+    left > 0 ? make("p", { class: "more", text: `${counted(left, "more field")} that the lambda looked up have no curve.` }) : null);
   return { section, draw: () => { drawLanes(lanesOf(page, entries), lanes); drawCurves(page, entries, curves); } };
 }
 
