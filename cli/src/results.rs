@@ -7,6 +7,7 @@ use std::io::{self, BufRead, BufReader, Read};
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
+pub use gleaner_protocol::grouped;
 use gleaner_protocol::{Clip, Decision, Exit, Explain, Trigger, visible};
 use serde::de::DeserializeOwned;
 
@@ -177,19 +178,6 @@ pub fn clip_span(clip: &Clip) -> [i64; 2] {
 /// Log time `at_ns` in s after `start_ns`.
 pub fn seconds(at_ns: i64, start_ns: i64) -> f64 {
     at_ns.saturating_sub(start_ns) as f64 / 1e9
-}
-
-/// `count` with a comma between thousands.
-pub fn grouped(count: u64) -> String {
-    let digits = count.to_string();
-    let mut text = String::new();
-    for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
 }
 
 /// `value` as C's `printf("%.3g")` writes it: three significant digits, without zeros at the end, in scientific

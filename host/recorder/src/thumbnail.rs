@@ -13,6 +13,13 @@ const QUALITY: u8 = 80;
 /// Most bytes that a compressed image may have as rgb8; 21 megapixels.
 const DECODED_BYTES: usize = 64 << 20;
 
+/// Whether messages of this type are images, of which there are thumbnails; the name with or without `msg/`.
+pub fn is_image(type_name: &str) -> bool {
+    ["Image", "CompressedImage"].iter().any(|image| {
+        type_name.strip_prefix("sensor_msgs/").is_some_and(|name| name.trim_start_matches("msg/") == *image)
+    })
+}
+
 /// A JPEG of the image message `cdr`, 320x640 pixels at most and never larger than the image.
 ///
 /// `None` if the type is no image, or if the message or its image is broken, of a kind that we do not read, or larger

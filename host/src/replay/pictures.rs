@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_protocol::Decision;
 use gleaner_protocol::signals::{Picture, Signals};
-use gleaner_recorder::thumbnail;
+use gleaner_recorder::{is_image, thumbnail};
 use gleaner_transport::SampleMeta;
 
 use crate::api::data::Topic;
@@ -18,11 +18,6 @@ const FOLDER: &str = "pictures";
 
 /// Begins the names of our pictures: by it they are told from others.
 const PREFIX: &str = "trigger-";
-
-/// Whether messages of this type are images.
-pub(super) fn is_image(type_name: &str) -> bool {
-    matches!(type_name, "sensor_msgs/msg/Image" | "sensor_msgs/msg/CompressedImage")
-}
 
 /// The newest image of a topic that is recorded, and that the lambda itself does not see.
 pub(super) struct Camera {

@@ -7,13 +7,14 @@ use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{
-    Counts, Folder, LambdaId, MESSAGE_MAX, Member, RecordError, Recorder, Settings, Topic, TopicId, lambda_digest,
+    Counts, Folder, LambdaId, MESSAGE_MAX, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image,
+    lambda_digest,
 };
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::chosen::{self, Chosen};
-use super::pictures::{Camera, is_image};
+use super::pictures::Camera;
 use super::{CLOCK, Options};
 
 /// A recorder over one lambda's `[record]`.

@@ -1,5 +1,6 @@
-//! Words in messages: lists of them, the nearest to a misspelt one, and foreign text made fit to print.
+//! Words in messages: lists of them, the nearest to a misspelt one, numbers, and foreign text made fit to print.
 
+use std::fmt::Display;
 use std::path::Path;
 
 /// The one of `known` that `word` was most likely meant to be.
@@ -65,6 +66,19 @@ pub fn hex(bytes: &[u8]) -> String {
 /// Whether it makes a terminal show text in another order than it is written: the bidirectional controls of Unicode.
 fn turns_text(character: char) -> bool {
     matches!(character, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+}
+
+/// A whole number with a comma between thousands.
+pub fn grouped(count: impl Display) -> String {
+    let digits = count.to_string();
+    let mut text = String::new();
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
 }
 
 #[cfg(test)]

@@ -15,6 +15,7 @@ use super::waiting::Waiting;
 use crate::RecordError;
 use crate::file::Topic;
 use crate::preroll::{Held, Losses, Preroll, Walked};
+use crate::thumbnail::is_image;
 use crate::window::{Group, Window};
 
 /// A lambda that records.
@@ -44,11 +45,7 @@ pub(super) struct Lane {
 
 impl Lane {
     pub(super) fn is_image(&self) -> bool {
-        let name = self.topic.type_name.as_str();
-        !self.is_missing
-            && ["Image", "CompressedImage"].iter().any(|image| {
-                name.strip_prefix("sensor_msgs/").is_some_and(|name| name.trim_start_matches("msg/") == *image)
-            })
+        !self.is_missing && is_image(&self.topic.type_name)
     }
 }
 

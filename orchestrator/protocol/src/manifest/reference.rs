@@ -10,6 +10,7 @@ use super::bounds::{self, Bounds};
 use super::{
     ByteSize, ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version, format_duration,
 };
+use crate::grouped;
 
 /// Where the types are that a manifest becomes.
 const SOURCES: [&str; 3] = [include_str!("types.rs"), include_str!("limits.rs"), include_str!("config.rs")];
@@ -228,15 +229,7 @@ fn rule<T: FromStr<Err = NameError>>() -> &'static str {
 }
 
 fn number(number: impl Display) -> String {
-    let digits = number.to_string();
-    let mut text = String::new();
-    for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
+    grouped(number)
 }
 
 fn size(size: ByteSize) -> String {
