@@ -206,6 +206,20 @@ fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
 }
 
 #[test]
+fn files_that_the_metadata_pass_over_are_named() {
+    let (folder, lambda) = (Folder::new(), lambda("hello", "rust"));
+    let bag = directory(&folder, 1);
+    assert!(!braking(&lambda, &bag, &["--no-record"]).must_exit(OK).stderr.contains("not read"));
+    // The same file, packed later: nothing is left out.
+    folder.write("drive/drive_0.db3.zstd", "");
+    assert!(!braking(&lambda, &bag, &["--no-record"]).must_exit(OK).stderr.contains("not read"));
+    fs::copy(bag.join("drive_0.db3"), bag.join("drive_1.db3")).unwrap();
+    let run = braking(&lambda, &bag, &["--no-record"]);
+    assert!(run.must_exit(OK).stderr.contains("the others are not read"), "{}", run.stderr);
+    assert!(run.stderr.contains("files=1") && run.stderr.contains("drive_1.db3"), "{}", run.stderr);
+}
+
+#[test]
 fn what_is_in_a_drive_is_shown_without_a_lambda() {
     let folder = Folder::new();
     let bag = directory(&folder, 1);

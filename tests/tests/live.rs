@@ -2,7 +2,7 @@
 //!
 //! `GLEANER_ROUNDS` says how often a drive is played and compared with its replay; once if it does not.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
@@ -50,7 +50,7 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, CASES.iter().map(trial).collect()).exit_code()
 }
 
-fn lambda(name: &str, language: &str) -> std::path::PathBuf {
+fn lambda(name: &str, language: &str) -> PathBuf {
     root().join(name).join(language)
 }
 
@@ -70,63 +70,87 @@ fn about(decisions: &[Decision]) -> Vec<About> {
 ///
 /// Both lambdas look at half a second of the IMU by receive stamps. Live, these jitter by a millisecond and more, so that a sample
 /// at the edge is in or out; a threshold may then be passed some samples earlier or later. A frame of the camera is 10 of them.
-fn alike(live: &[About], replay: &[About]) -> bool {
+/// Where samples were passed over, it is by as many later.
+fn alike(live: &[About], replay: &[About], skipped: u64) -> bool {
     let is_camera = replay.iter().all(|(label, _)| label == "brake-dark");
-    let slack = if is_camera { 0 } else { 10 };
+    let slack = skipped + if is_camera { 0 } else { 10 };
     let same = |((a, n), (b, m)): (&About, &About)| a == b && n.zip(*m).is_some_and(|(n, m)| n.abs_diff(m) <= slack);
     live.len() == replay.len() && live.iter().zip(replay).all(same)
 }
 
+/// A machine that is busy with others may stop for longer than a window jitters, so a run may differ once; one that differs each
+/// time is wrong.
 fn as_in_replay() {
-    const SET: [&str; 2] = ["--set", "brake_mps2=-1.4"];
-    let args = [SET[0], SET[1], "--no-record"];
-    let rounds = times("GLEANER_ROUNDS", 1);
-    let lambdas = ["examples/hello", "examples/brake-dark"];
-    let all = || lambdas.iter().flat_map(|name| ["rust", "python"].map(|language| lambda(name, language)));
+    /// So often each lambda is played to, until it does as in its replay.
+    const TRIES: usize = 4;
+    let set = ["--set", "brake_mps2=-1.4"];
+    // Nothing here is about time; a fault would take what a lambda has learned.
+    let patient = |manifest: String| {
+        let line = |line: &str| if line.starts_with("deadline") { "deadline = \"5s\"" } else { line }.to_owned();
+        manifest.lines().map(line).collect::<Vec<_>>().join("\n")
+    };
+    let names = ["hello/rust", "hello/python", "brake-dark/rust", "brake-dark/python"];
+    let lambdas = names.map(|name| (name, Copy::of(&format!("examples/{name}"), patient)));
     let drive = sample_drive();
-    let expected: Vec<_> = all()
-        .map(|lambda| {
-            let out = Folder::new();
-            let replayed = replay_to(out.path(), &lambda, std::slice::from_ref(&drive), &SET);
-            about(&replayed.decisions)
-        })
-        .collect();
-    assert!(expected.iter().all(|expected| !expected.is_empty()));
-    for round in 1..=rounds {
-        let outs: Vec<Folder> = all().map(|_| Folder::new()).collect();
-        let runs: Vec<Started> = all().zip(&outs).map(|(lambda, out)| run(&lambda, out.path(), &args)).collect();
-        runs.iter().for_each(Started::until_ready);
-        let path = drive.to_str().expect("the checkout has a plain path");
-        let played = play(&[path, "--wait", "2", "--topics", "/imu/data,/camera/front/compressed"]).finish();
-        assert!(played.status.success(), "{}", played.said);
-        // The last sample may still be on its way, and windows are open for some seconds after it.
-        for started in &runs {
-            started.until_live("the end of the drive", |live| {
-                let is_over = live.topics.iter().all(|topic| topic.writers == Some(0) && topic.received > 0);
-                // Each event sample has been considered: one of the topics causes the wakes.
-                is_over && live.topics.iter().any(|topic| live.wakes + topic.skipped == topic.received)
-            });
-            started.signal("INT");
-        }
-        let mut compared = 0;
-        for (((started, out), expected), lambda) in runs.into_iter().zip(&outs).zip(&expected).zip(all()) {
-            let finished = started.finish();
-            let lambda = lambda.display();
-            let ended = finished.ended();
-            // On a machine that is busy with others, a wake may exceed its deadline.
-            assert!(finished.status.success() || ended.faults > 0, "{lambda}: {}, {}", finished.status, finished.said);
-            let lost: u64 =
-                ended.topics.iter().map(|topic| topic.lost.expect("DDS tells") + topic.no_slot + topic.malformed).sum();
-            let (wakes, skipped, faults) = (ended.wakes, ended.skipped, ended.faults);
-            println!("round {round}: {lambda}: {wakes} wakes, {skipped} skipped, {lost} lost, {faults} faults");
-            if skipped == 0 && lost == 0 && faults == 0 {
-                let live = about(&decisions(out.path()));
-                assert!(alike(&live, expected), "{lambda}, round {round}: {live:?}, but in the replay {expected:?}");
-                compared += 1;
+    let replayed = |(name, lambda): &(&'static str, Copy)| {
+        let out = Folder::new();
+        let replayed = replay_to(out.path(), lambda.path(), std::slice::from_ref(&drive), &set);
+        let expected = about(&replayed.decisions);
+        assert!(!expected.is_empty(), "{}", replayed.stderr);
+        (*name, lambda.path().to_owned(), expected)
+    };
+    let expected: Vec<_> = lambdas.iter().map(replayed).collect();
+    for round in 1..=times("GLEANER_ROUNDS", 1) {
+        let mut left = expected.clone();
+        let mut differences = Vec::new();
+        for _ in 0..TRIES {
+            let found = played(&drive, &set, &left);
+            let told =
+                left.iter().zip(&found).filter_map(|((name, ..), found)| Some(format!("{name}: {}", found.as_ref()?)));
+            differences.extend(told);
+            let mut found = found.into_iter();
+            left.retain(|_| found.next().flatten().is_some());
+            if left.is_empty() {
+                break;
             }
         }
-        assert!(compared > 0, "this machine skipped samples in every run: nothing could be compared");
+        println!("round {round}: {} differences {differences:#?}", differences.len());
+        assert!(left.is_empty(), "round {round}: {TRIES} times another than in the replay: {differences:#?}");
     }
+}
+
+/// Plays the drive to these lambdas at once; in which way each did something else than in its replay, if it did.
+fn played(drive: &Path, set: &[&str; 2], lambdas: &[(&str, PathBuf, Vec<About>)]) -> Vec<Option<String>> {
+    let args = [set[0], set[1], "--no-record"];
+    let outs: Vec<Folder> = lambdas.iter().map(|_| Folder::new()).collect();
+    let runs: Vec<Started> =
+        lambdas.iter().zip(&outs).map(|((_, lambda, _), out)| run(lambda, out.path(), &args)).collect();
+    runs.iter().for_each(Started::until_ready);
+    let path = drive.to_str().expect("the checkout has a plain path");
+    let played = play(&[path, "--wait", "2", "--topics", "/imu/data,/camera/front/compressed"]).finish();
+    assert!(played.status.success(), "{}", played.said);
+    // The last sample may still be on its way, and windows are open for some seconds after it.
+    for started in &runs {
+        started.until_live("the end of the drive", |live| {
+            let is_over = live.topics.iter().all(|topic| topic.writers == Some(0) && topic.received > 0);
+            // Each event sample has been considered: one of the topics causes the wakes.
+            is_over && live.topics.iter().any(|topic| live.wakes + topic.skipped == topic.received)
+        });
+        started.signal("INT");
+    }
+    let compared = |((started, out), (_, _, expected)): ((Started, &Folder), &(&str, PathBuf, Vec<About>))| {
+        let finished = started.finish();
+        assert!(finished.status.success(), "{}, {}", finished.status, finished.said);
+        let ended = finished.ended();
+        assert_eq!(ended.faults, 0, "{}", finished.said);
+        let lost: u64 =
+            ended.topics.iter().map(|topic| topic.lost.expect("DDS tells") + topic.no_slot + topic.malformed).sum();
+        let live = about(&decisions(out.path()));
+        let is_same = lost == 0 && alike(&live, expected, ended.skipped);
+        let told = || format!("{} skipped, {lost} lost: {live:?}, in the replay {expected:?}", ended.skipped);
+        (!is_same).then(told)
+    };
+    runs.into_iter().zip(&outs).zip(lambdas).map(compared).collect()
 }
 
 fn slow(behaviour: &str) {

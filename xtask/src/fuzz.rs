@@ -6,8 +6,11 @@
 
 use std::ffi::OsString;
 use std::fs::{self, File};
+use std::num::NonZero;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
+use std::sync::Mutex;
+use std::thread;
 
 use gleaner_protocol::{Exit, Failure};
 
@@ -23,7 +26,8 @@ const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-leve
                      -Cllvm-args=-sanitizer-coverage-trace-compares -Cdebug-assertions -Coverflow-checks --cfg fuzzing";
 
 const USAGE: &str = "usage: cargo xtask fuzz [TARGET...] [--seconds N] [--seed N]
-targets: message, drive, bag, image, journal, link, manifest; those named, or all, in turn, for N seconds each (60).
+targets: message, drive, bag, image, journal, link, manifest; those named, or all, for N seconds each (60),
+as many at once as there are cores.
 With a seed, runs of the same programs from the same inputs go the same way.";
 
 /// Builds the targets and runs those asked for.
@@ -42,10 +46,7 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     steps.begin("inputs to begin with");
     fuzz.seeds()?;
     steps.begin(&format!("{} s for each of: {}", asked.seconds, asked.targets.join(", ")));
-    let mut found = 0;
-    for name in asked.targets {
-        found += usize::from(fuzz.target(&programs, name)?);
-    }
+    let found = fuzz.targets(&programs, &asked.targets)?;
     Ok(if found == 0 { Exit::Ok } else { Exit::Internal })
 }
 
@@ -114,6 +115,24 @@ impl Fuzz<'_> {
         steps::run(&mut build, "see the first error above")?;
         let mut seeds = self.checkout.command(self.checkout.program("fuzz-seeds"));
         steps::run(seeds.arg(self.build.join("seeds")), "see the error above")
+    }
+
+    /// Runs these, as many at once as there are cores: each is one thread. How many found something.
+    fn targets(&self, programs: &Path, names: &[&str]) -> Result<usize, Failure> {
+        let left = Mutex::new(names.iter());
+        let next = || left.lock().expect("nobody panics here").next();
+        let cores = thread::available_parallelism().map_or(1, NonZero::get);
+        thread::scope(|scope| {
+            let work = || {
+                let mut found = 0;
+                while let Some(name) = next() {
+                    found += usize::from(self.target(programs, name)?);
+                }
+                Ok(found)
+            };
+            let workers: Vec<_> = (0..cores).map(|_| scope.spawn(work)).collect();
+            workers.into_iter().map(|worker| worker.join().expect("a worker does not panic")).sum()
+        })
     }
 
     /// Runs one target and says how it went, in a line. Whether it found anything.

@@ -28,7 +28,8 @@ function detailsOf(page, entry) {
   const heading = make("h2", {}, swatch(entryStyle(entry)), entry.title);
   const when = make("p", { class: "dim" }, entry.to ? `${seconds(entry.t)} to ${seconds(entry.to)}` : seconds(entry.t), make("br"), date(run, entry.t));
   const parts = { trigger: triggerDetails, fault: faultDetails, clip: clipDetails, difference: differenceDetails }[entry.kind](entry, page);
-  return [heading, when, ...parts, ...logAround(run, entry)];
+  const runs = entry.kind === "difference" ? page.runs : [run];
+  return [heading, when, ...parts, ...runs.flatMap((run, index) => logAround(run, entry, runs.length > 1 ? `, ${"AB"[index]}` : ""))];
 }
 
 /** As `entryColour`, for an element of the page. */
@@ -91,12 +92,12 @@ function differenceDetails({ difference }, page) {
   ];
 }
 
-/** What the lambda logged near. */
-function logAround(run, entry) {
+/** What the lambda logged near; `of` tells two runs apart. */
+function logAround(run, entry, of) {
   const end = (entry.to ?? entry.t) + AROUND_S;
   const near = run.log.filter((line) => line.t >= entry.t - AROUND_S && line.t <= end).slice(0, AROUND_LINES);
   if (near.length === 0) return [];
-  return [make("h2", { text: "Log around it" }), logLines(near, "lines narrow")];
+  return [make("h2", { text: `Log around it${of}` }), logLines(near, "lines narrow")];
 }
 
 /** Lines of a log. */

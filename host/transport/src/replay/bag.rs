@@ -28,7 +28,14 @@ pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
         Ok(found) => found,
         Err(source) => return Err(ReplayError::Metadata { path, source }),
     };
-    let files = found.files.into_iter().map(|file| named(folder, &root, &path, file)).collect::<Result<_, _>>()?;
+    let files =
+        found.files.into_iter().map(|file| named(folder, &root, &path, file)).collect::<Result<Vec<PathBuf>, _>>()?;
+    let is_read = |other: &PathBuf| files.iter().any(|file| unpacked(file) == unpacked(other));
+    let others: Vec<_> = of_a_bag(folder)?.into_iter().filter(|other| !is_read(other)).collect();
+    if let [first, ..] = others.as_slice() {
+        let (path, first) = (folder.display(), first.display());
+        warn!(%path, files = others.len(), %first, "metadata.yaml does not name all files beside it: the others are not read");
+    }
     Ok(Bag { files, messages: found.messages })
 }
 
@@ -74,29 +81,37 @@ fn named(folder: &Path, root: &Path, metadata: &Path, file: String) -> Result<Pa
     }
 }
 
-/// All files in `folder` that are called as ours are.
+/// All files in `folder`, where nothing says which belong together.
 fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
-    let failed = |source| ReplayError::Open { path: folder.to_owned(), source };
-    let mut names = Vec::new();
-    for entry in fs::read_dir(folder).map_err(failed)? {
-        let entry = entry.map_err(failed)?;
-        let name = entry.file_name();
-        let is_ours = name.to_str().is_some_and(|name| ENDINGS.iter().any(|ending| name.ends_with(ending)));
-        // Of the entry itself: no link leads out.
-        if is_ours && entry.file_type().map_err(failed)?.is_file() {
-            names.push(name);
-        }
-    }
-    names.sort();
-    // Packed and not packed, it is the same.
-    let is_twin = |name: &OsString| {
-        let unpacked = name.to_str().and_then(|name| name.strip_suffix(PACKED));
-        unpacked.is_some_and(|unpacked| names.iter().any(|other| other == unpacked))
-    };
-    let files: Vec<_> = names.iter().filter(|name| !is_twin(name)).map(|name| folder.join(name)).collect();
+    let files = of_a_bag(folder)?;
     if files.is_empty() {
         return Err(ReplayError::NoBag { path: folder.to_owned() });
     }
     warn!(path = %folder.display(), files = files.len(), "no metadata.yaml: its files are read in the order of their names");
     Ok(Bag { files, ..Bag::default() })
+}
+
+/// The files in `folder` that are called as those of a bag, in the order of their names; one that lies there packed and not
+/// packed is the latter.
+fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
+    let failed = |source| ReplayError::Open { path: folder.to_owned(), source };
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let name = entry.file_name();
+        let is_one = name.to_str().is_some_and(|name| ENDINGS.iter().any(|ending| name.ends_with(ending)));
+        // Of the entry itself: no link leads out.
+        if is_one && entry.file_type().map_err(failed)?.is_file() {
+            names.push(name);
+        }
+    }
+    names.sort();
+    let is_twin =
+        |name: &OsString| names.iter().any(|other| other != name && unpacked(name.as_ref()) == Path::new(other));
+    Ok(names.iter().filter(|name| !is_twin(name)).map(|name| folder.join(name)).collect())
+}
+
+/// The path without the ending of what is packed.
+fn unpacked(path: &Path) -> PathBuf {
+    if path.extension() == Some("zstd".as_ref()) { path.with_extension("") } else { path.to_owned() }
 }

@@ -252,8 +252,8 @@ impl Explain for ManifestError {
                 near.as_ref().map_or(inputs.clone(), |near| format!("did you mean `{near}`? {inputs}"))
             }
             TooMuchMemory { .. } => {
-                "lower `depth`, `hold` or `max_size`: an input takes (depth + hold) x max_size, and hold x decoded_size \
-                 for compressed images"
+                "lower `depth`, `hold` or `max_size`: an input takes (depth + hold + 1) x max_size, and \
+                 (hold + 1) x decoded_size for compressed images"
                     .to_owned()
             }
             Misplaced { way_out, .. } => way_out.clone(),

@@ -10,6 +10,9 @@ use gleaner_sdk::{Config, Error, Lambda, Result, Sample, Tick, now_ns};
 const WIDTH: u32 = 1920;
 const HEIGHT: u32 = 1080;
 
+/// Bytes of a frame at a time.
+const PIECE: u32 = 64 << 10;
+
 /// One kernel with its input and the place for its output.
 pub enum Work {
     /// Density of a signal of `f32`.
@@ -129,11 +132,11 @@ struct Kernels {
 impl Lambda for Kernels {
     fn init(config: &Config) -> Result<Self> {
         let name = config.text("work")?.to_owned();
-        let work = if ["copy", "call"].contains(&name.as_str()) { None } else { Some(Work::new(&name)?) };
+        let work = if ["copy", "stream", "call"].contains(&name.as_str()) { None } else { Some(Work::new(&name)?) };
         Ok(Self { name, rounds: config.integer("rounds")?, work, pixels: Vec::new() })
     }
 
-    /// Work with the host, which has a frame: all pixels copied in pieces, or the smallest call there is.
+    /// Work with the host, which has a frame: all pixels in pieces, kept or only passing through, or the smallest call there is.
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         if self.name == "call" {
             for _ in 0..self.rounds {
@@ -142,7 +145,14 @@ impl Lambda for Kernels {
             return Ok(());
         }
         let frame = sample.as_frame()?;
-        self.pixels.resize(frame.info().size as usize, 0);
+        let size = frame.info().size;
+        if self.name == "stream" {
+            for _ in 0..self.rounds {
+                (0..size).step_by(PIECE as usize).for_each(|offset| drop(black_box(frame.read(offset, PIECE))));
+            }
+            return Ok(());
+        }
+        self.pixels.resize(size as usize, 0);
         for _ in 0..self.rounds {
             frame.copy_to(black_box(&mut self.pixels))?;
         }

@@ -133,8 +133,8 @@ fn inputs_may_not_ask_for_more_memory_than_there_is_for_all_of_them() {
         &text,
         "the inputs in lambda.toml ask for 2325 MiB together, above the maximum of 2 GiB: \
          `wide` (line 8) 1024 MiB, `deep` (line 15) 1301 MiB",
-        "lower `depth`, `hold` or `max_size`: an input takes (depth + hold) x max_size, \
-         and hold x decoded_size for compressed images",
+        "lower `depth`, `hold` or `max_size`: an input takes (depth + hold + 1) x max_size, \
+         and (hold + 1) x decoded_size for compressed images",
     );
 }
 
