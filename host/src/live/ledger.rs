@@ -112,23 +112,14 @@ impl Ledger {
     }
 }
 
-/// Writes pages until there are no more. After an error it only counts.
+/// Writes pages until there are no more. What cannot be written is counted, and what comes later is tried again.
 fn keep(pages: &Receiver<Page>, mut output: Output, unwritten: &AtomicU64) -> Result<(), OutputError> {
-    let mut failed = None;
+    let mut first = None;
+    let (mut is_failing, mut counted) = (false, 0);
     let mut last = None;
     let mut flushed = Instant::now();
     loop {
-        let page = pages.recv_timeout(FLUSH.saturating_sub(flushed.elapsed()));
-        if failed.is_some() {
-            match page {
-                Ok(Page::Last(_)) | Err(RecvTimeoutError::Timeout) => flushed = Instant::now(),
-                Ok(Page::Decision(_)) => drop(unwritten.fetch_add(1, Ordering::Relaxed)),
-                Ok(Page::Log(lines)) => drop(unwritten.fetch_add(lines.len() as u64, Ordering::Relaxed)),
-                Err(RecvTimeoutError::Disconnected) => break,
-            }
-            continue;
-        }
-        let written = match page {
+        let written = match pages.recv_timeout(FLUSH.saturating_sub(flushed.elapsed())) {
             // Whoever is told of a trigger finds it in the file, even if this process is killed a moment later.
             Ok(Page::Decision(decision)) if decision.triggers.is_empty() && decision.fault.is_none() => {
                 output.decision(&decision)
@@ -147,20 +138,31 @@ fn keep(pages: &Receiver<Page>, mut output: Output, unwritten: &AtomicU64) -> Re
         if is_due {
             flushed = Instant::now();
         }
-        if let Err(error) = written {
-            tracing::error!(file = %error.path.display(), error = %error.source, "results are not written any more");
-            unwritten.fetch_add(output.lost(), Ordering::Relaxed);
-            failed = Some(error);
+        unwritten.fetch_add(output.lost() - std::mem::replace(&mut counted, output.lost()), Ordering::Relaxed);
+        match written {
+            Err(error) => {
+                if !is_failing {
+                    tracing::error!(file = %error.path.display(), error = %error.source, "results cannot be written; what comes is tried again");
+                }
+                is_failing = true;
+                first.get_or_insert(error);
+            }
+            Ok(()) if is_failing && is_due => {
+                is_failing = false;
+                let unwritten = unwritten.load(Ordering::Relaxed);
+                tracing::warn!(unwritten, "results are written again");
+            }
+            Ok(()) => {}
         }
     }
-    match (failed, last) {
-        (Some(error), _) => Err(error),
-        (None, Some(mut live)) => {
+    let finished = match last {
+        Some(mut live) => {
             live.unwritten = unwritten.load(Ordering::Relaxed);
             output.finish(&live)
         }
-        (None, None) => output.flush(),
-    }
+        None => output.flush(),
+    };
+    first.map_or(finished, Err)
 }
 
 fn speak(said: &Receiver<Report>, mut reports: impl Write) {
@@ -169,5 +171,63 @@ fn speak(said: &Receiver<Report>, mut reports: impl Write) {
         line.push('\n');
         // Whoever listened may have gone; the results are in files.
         let _ = reports.write_all(line.as_bytes());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+    use std::io::Read;
+    use std::process::Command;
+
+    use gleaner_protocol::Cause;
+    use rustix::fs::OFlags;
+
+    use super::*;
+
+    fn decision(seq: u64) -> Decision {
+        Decision {
+            at_ns: 0,
+            cause: Cause::Event,
+            input: None,
+            topic: None,
+            writer: None,
+            seq: Some(seq),
+            triggers: Vec::new(),
+            fault: None,
+            fuel: None,
+            run_ns: 0,
+        }
+    }
+
+    /// A pipe that nobody empties takes no more, as a full disk does; until somebody does.
+    #[test]
+    fn what_cannot_be_written_is_counted_and_what_comes_later_is_written_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join("decisions.jsonl");
+        assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let mut reader = File::from(rustix::fs::open(&pipe, OFlags::RDONLY | OFlags::NONBLOCK, 0.into()).unwrap());
+        let output = Output::begin(folder.path(), true, true).unwrap();
+        rustix::fs::fcntl_setfl(output.decisions(), OFlags::APPEND | OFlags::NONBLOCK).unwrap();
+        let mut ledger = Ledger::start(output, std::io::sink()).unwrap();
+        let mut seq = 0;
+        let mut write = |ledger: &mut Ledger| {
+            seq += 1;
+            ledger.decision(decision(seq));
+            thread::sleep(Duration::from_micros(100));
+            seq
+        };
+        while ledger.unwritten() == 0 {
+            write(&mut ledger);
+        }
+        let refused = write(&mut ledger);
+        let mut text = Vec::new();
+        while !String::from_utf8_lossy(&text).lines().any(|line| {
+            serde_json::from_str(line).is_ok_and(|decision: Decision| decision.seq.is_some_and(|seq| seq > refused))
+        }) {
+            write(&mut ledger);
+            let _ = reader.read_to_end(&mut text);
+        }
+        assert!(ledger.finish(None).unwrap_err().to_string().contains("decisions.jsonl"));
     }
 }

@@ -116,6 +116,11 @@ impl Output {
         self.decisions.lost + self.log.lost
     }
 
+    #[cfg(test)]
+    pub(crate) fn decisions(&self) -> &File {
+        &self.decisions.file
+    }
+
     /// Completes the files and adds the summary.
     ///
     /// # Errors
