@@ -4,7 +4,8 @@
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
-use std::process::{self, Command, Output};
+use std::process::{self, Command, Output, Stdio};
+use std::sync::{Mutex, PoisonError};
 
 const SUMMARY: &str = concat!(
     r#"{"lambda":"x","version":"0.1.0","kind":"wasm","drive":["a.mcap"],"out":"OUT","wakes":2,"triggers":1,"faults":0,"#,
@@ -15,6 +16,10 @@ const DECISION: &str = concat!(
     r#"{"at_ns":1500000000,"cause":"tick","input":null,"topic":null,"writer":null,"seq":null,"#,
     r#""triggers":[{"kind":"event","label":"seen","score":0.5,"attributes":{}}],"fault":null,"fuel":1,"run_ns":2}"#
 );
+
+/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another test is about to start. Who
+/// writes a program, and who starts one, takes turns.
+static TURN: Mutex<()> = Mutex::new(());
 
 /// A folder with `gleaner-runtime`, removed when the test ends.
 struct Installation(PathBuf);
@@ -29,6 +34,7 @@ impl Installation {
         fs::write(folder.join("summary.json"), SUMMARY).unwrap();
         fs::write(folder.join("log.jsonl"), "").unwrap();
         fs::write(folder.join("decisions.jsonl"), format!("{DECISION}\n")).unwrap();
+        let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
         fs::write(&program, format!("#!/bin/sh\ncd '{}'\n{runtime}\n", folder.display())).unwrap();
         fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
         Installation(folder)
@@ -41,7 +47,7 @@ impl Installation {
     }
 
     fn replay(&self, arguments: &[&str]) -> Output {
-        self.command(arguments).output().unwrap()
+        output(self.command(arguments).stdout(Stdio::piped()))
     }
 }
 
@@ -49,6 +55,13 @@ impl Drop for Installation {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
     }
+}
+
+fn output(command: &mut Command) -> Output {
+    let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let child = command.stdin(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    drop(turn);
+    child.wait_with_output().unwrap()
 }
 
 fn text(bytes: &[u8]) -> &str {
@@ -178,7 +191,7 @@ fn an_output_that_takes_nothing_is_a_failure() {
     let installation = Installation::new("full", "cat report");
     for arguments in [&[][..], &["--json"]] {
         let full = fs::File::options().write(true).open("/dev/full").unwrap();
-        let output = installation.command(arguments).stdout(full).output().unwrap();
+        let output = output(installation.command(arguments).stdout(full));
         assert_eq!(output.status.code(), Some(1));
         assert!(text(&output.stderr).starts_with("error: cannot write to standard output\n  cause: No space left"));
     }

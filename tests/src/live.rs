@@ -106,7 +106,7 @@ impl Started {
     }
 
     /// Waits for a status of the lambda that is as `wanted`.
-    pub fn until_live(&self, what: &str, wanted: impl Fn(&Live) -> bool) -> Live {
+    pub fn until_live(&self, what: &str, mut wanted: impl FnMut(&Live) -> bool) -> Live {
         self.until(what, |line| match line {
             Line::Lambda(Report::Live(live)) if wanted(&live) => Some(*live),
             _ => None,

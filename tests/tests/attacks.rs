@@ -156,16 +156,18 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
 
 /// The decision in which the attack shows; none where it is only counted.
 fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
-    let decision = |wanted: fn(&Decision) -> bool| {
+    let decision = |wanted: &dyn Fn(&Decision) -> bool| {
         started.until("the attack to show", |line| match line {
             Line::Lambda(Report::Decision(decision)) if wanted(&decision) => Some(*decision),
             _ => None,
         })
     };
+    // A machine that stops in a wake may put a deadline before it; the lambda attacks again.
+    let fault = |kind| decision(&|it| it.fault.as_ref().is_some_and(|fault| fault.kind == kind));
     match fate {
-        Fault(_) => Some(decision(|decision| decision.fault.is_some())),
-        Refused(_) => Some(decision(|decision| !decision.triggers.is_empty())),
-        Killed => Some(decision(|it| it.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed))),
+        Fault(kind) => Some(fault(kind)),
+        Refused(_) => Some(decision(&|decision| !decision.triggers.is_empty())),
+        Killed => Some(fault(FaultKind::Killed)),
         Cut => None,
     }
 }

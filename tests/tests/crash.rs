@@ -57,14 +57,22 @@ fn killed(store: &str) -> Result<(), Failed> {
     let out = Folder::new();
     // The first compiles the lambda.
     replay(lambda.path(), out.path()).status()?;
-    let started = Instant::now();
-    replay(lambda.path(), out.path()).status()?;
-    let duration = started.elapsed();
-    let kills = std::env::var("GLEANER_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(25);
+    // One that others held up would put most kills behind the end.
+    let mut duration = Duration::MAX;
+    for _ in 0..3 {
+        let started = Instant::now();
+        replay(lambda.path(), out.path()).status()?;
+        duration = duration.min(started.elapsed());
+    }
+    let kills: u32 = std::env::var("GLEANER_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(25);
     let mut seen = [0_u32; 3];
     let mut out = Folder::new();
     let mut random = 0x9e37_79b9_7f4a_7c15_u64;
-    for kill in 0..kills {
+    let mut killed = 0;
+    // Kills that met nothing show nothing: it goes on until some have.
+    while killed < kills || killed < 10 * kills && (seen[0] == 0 || seen[1] == 0) {
+        let kill = killed;
+        killed += 1;
         // xorshift64: the moments differ, and a run can be repeated as far as a machine repeats itself.
         random ^= random << 13;
         random ^= random >> 7;
@@ -90,11 +98,10 @@ fn killed(store: &str) -> Result<(), Failed> {
         seen[2] += found.recovered as u32;
     }
     println!(
-        "{store}: {kills} kills, three in each folder: {} folders had listed clips, {} something to recover, {} clips",
+        "{store}: {killed} kills, three in each folder: {} folders had listed clips, {} something to recover, {} clips",
         seen[0], seen[1], seen[2]
     );
-    // Else the kills met nothing, and the test shows nothing.
-    if kills >= 25 && (seen[0] == 0 || seen[1] == 0) {
+    if seen[0] == 0 || seen[1] == 0 {
         return Err(format!("no kill met a recorder at work: {seen:?}").into());
     }
     Ok(())

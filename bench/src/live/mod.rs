@@ -99,10 +99,13 @@ fn ended(started: Vec<(Started, Folder)>) -> Vec<Live> {
 /// As [`to_the_end`], and the lambdas go on.
 fn played(started: &[(Started, Folder)], players: &[Vec<&str>], seen: &mut Vec<Live>) {
     let playing: Vec<_> = players.iter().map(|player| play(player)).collect();
+    let mut has_begun = false;
     let mut is_over = false;
     while !is_over {
         let live = started[0].0.until_live("a status", |_| true);
-        is_over = live.topics.iter().all(|topic| topic.received > 0 && topic.writers == Some(0));
+        // Whatever was received: all may be lost.
+        has_begun |= live.topics.iter().all(|topic| topic.writers > Some(0));
+        is_over = has_begun && live.topics.iter().all(|topic| topic.writers == Some(0));
         seen.push(live);
     }
     for played in playing {

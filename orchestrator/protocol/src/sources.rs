@@ -13,8 +13,8 @@ const LEFT_OUT: [&str; 4] = ["build", "out", "target", "tests"];
 /// is still good.
 ///
 /// Paths are relative to the lambda's folder. What the manifest names is listed whether it exists or not; the rest is
-/// found in the folder. Hidden files and folders and `__pycache__/` are left out, and links to folders are not followed:
-/// they may lead in circles.
+/// found in the folder. Hidden files and folders, `__pycache__/` and virtual environments (what holds a `pyvenv.cfg`) are left
+/// out, and links to folders are not followed: they may lead in circles.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sources {
     /// What lies in the build under the same name: models, message definitions (`msg/**/*.msg`), and of a Python lambda
@@ -79,7 +79,7 @@ fn files(
             }
             // Of the entry itself, not of what a link leads to.
             if entry.file_type().map_err(failed)?.is_dir() {
-                if enters(&relative) {
+                if enters(&relative) && !entry.path().join("pyvenv.cfg").is_file() {
                     folders.push(relative);
                 }
             } else if takes(&relative) && entry.path().is_file() {
@@ -131,6 +131,8 @@ mod tests {
             "src/inner/mod.rs",
             "target/t.py",
             "tests/test.py",
+            "venv/lib/python3.11/site-packages/y.py",
+            "venv/pyvenv.cfg",
         ] {
             dir.write(file, "");
         }

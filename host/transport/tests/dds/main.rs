@@ -15,10 +15,14 @@ mod wire;
 mod write;
 
 use std::process::ExitCode;
+use std::sync::{PoisonError, RwLock};
 
 use libtest_mimic::{Arguments, Failed, Trial};
 
 type Test = (&'static str, fn());
+
+/// Held by each test while it runs, and by [`life::ALONE`] alone: that one looks at all threads of this process.
+static RUNNING: RwLock<()> = RwLock::new(());
 
 fn main() -> ExitCode {
     let arguments = Arguments::from_args();
@@ -41,6 +45,9 @@ fn main() -> ExitCode {
     ];
     let trial = |&(name, test): &Test| match &here {
         Ok(()) => Trial::test(name, move || -> Result<(), Failed> {
+            let is_alone = name == life::ALONE;
+            let _alone = is_alone.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
+            let _beside = (!is_alone).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
             test();
             Ok(())
         }),

@@ -11,15 +11,14 @@ class Lambda:
         self.seconds = float(ctx.config["seconds"])
         self.camera = ctx.input("camera")
         self.kept: list[gleaner.Sample] = []
-        # Samples received less the number of the newest, when it first ran.
-        self.ahead: int | None = None
+        # Samples received less the number of the newest, at the least: one that is lost has a number, too.
+        self.least: int | None = None
 
     def on_event(self, ctx: gleaner.Context, sample: gleaner.Sample) -> None:
         ahead = self.camera.counts().received - sample.identity.seq
-        if self.ahead is None:
-            self.ahead = ahead
+        self.least = ahead if self.least is None else min(self.least, ahead)
         # One may arrive between being chosen and being looked at.
-        if ahead - self.ahead > 1:
+        if ahead - self.least > 1:
             ctx.event("stale", float(ahead))
         if self.behaviour == "sleep":
             time.sleep(self.seconds)

@@ -7,8 +7,8 @@ struct Slow {
     rounds: i64,
     camera: Topic,
     kept: Vec<Sample>,
-    /// Samples received less the number of the newest, when it first ran.
-    ahead: Option<u64>,
+    /// Samples received less the number of the newest, at the least: one that is lost has a number, too.
+    least: i64,
 }
 
 impl Lambda for Slow {
@@ -19,14 +19,15 @@ impl Lambda for Slow {
             rounds: config.integer("rounds")?,
             camera: input("camera")?,
             kept: Vec::new(),
-            ahead: None,
+            least: i64::MAX,
         })
     }
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
-        let ahead = self.camera.counts().received.wrapping_sub(sample.identity().seq);
+        let ahead = self.camera.counts().received.cast_signed() - sample.identity().seq.cast_signed();
+        self.least = self.least.min(ahead);
         // One may arrive between being chosen and being looked at.
-        if ahead.wrapping_sub(*self.ahead.get_or_insert(ahead)) > 1 {
+        if ahead - self.least > 1 {
             event("stale", ahead as f64).send()?;
         }
         match self.behaviour.as_str() {
