@@ -200,7 +200,7 @@ fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
     }
     fs::remove_file(bag.join("metadata.yaml")).unwrap();
     let run = braking(&lambda, &bag, &["--no-record"]);
-    assert!(run.must_exit(OK).stderr.contains("no metadata.yaml"), "{}", run.stderr);
+    assert_eq!(run.must_exit(OK).stderr.matches("no metadata.yaml").count(), 1, "{}", run.stderr);
     let twice = replay(&lambda, &[bag.clone(), bag.join("drive_0.db3")], &[]);
     assert!(twice.must_exit(USAGE).stderr.contains("is given twice"), "{}", twice.stderr);
 }
@@ -215,8 +215,8 @@ fn files_that_the_metadata_pass_over_are_named() {
     assert!(!braking(&lambda, &bag, &["--no-record"]).must_exit(OK).stderr.contains("not read"));
     fs::copy(bag.join("drive_0.db3"), bag.join("drive_1.db3")).unwrap();
     let run = braking(&lambda, &bag, &["--no-record"]);
-    assert!(run.must_exit(OK).stderr.contains("the others are not read"), "{}", run.stderr);
-    assert!(run.stderr.contains("files=1") && run.stderr.contains("drive_1.db3"), "{}", run.stderr);
+    assert!(run.must_exit(OK).stderr.contains("1 are not read"), "{}", run.stderr);
+    assert!(run.stderr.contains("drive_1.db3"), "{}", run.stderr);
 }
 
 #[test]

@@ -154,6 +154,9 @@ fn make(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
     if dir.symlink_metadata().is_ok() && !is_empty(dir) {
         return Err(NewError::NotEmpty { path: dir.to_owned() });
     }
+    if let Some(parent) = dir.parent() {
+        fs::create_dir_all(parent).map_err(failed("make", parent))?;
+    }
     // One of our own: what has that name already is somebody else's.
     let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
     fs::create_dir(&partial).map_err(failed("make", &partial))?;

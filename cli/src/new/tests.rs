@@ -76,6 +76,12 @@ fn an_update_replaces_the_sdk_and_what_was_added_to_it() {
 }
 
 #[test]
+fn folders_above_are_made_as_well() {
+    let scratch = Scratch::new("above");
+    assert!(scratch.lambda("far/away", Kind::Python).join("lambda.toml").is_file());
+}
+
+#[test]
 fn a_folder_needs_a_name_that_a_lambda_can_have() {
     for (path, wanted) in [("/", "ends with no name"), ("..", "ends with no name"), ("My Lambda", "is no lambda name")]
     {

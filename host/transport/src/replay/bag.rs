@@ -5,8 +5,6 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Component, Path, PathBuf};
 
-use tracing::warn;
-
 use super::error::ReplayError;
 use super::metadata;
 use super::storage::Bag;
@@ -32,11 +30,11 @@ pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
         found.files.into_iter().map(|file| named(folder, &root, &path, file)).collect::<Result<Vec<PathBuf>, _>>()?;
     let is_read = |other: &PathBuf| files.iter().any(|file| unpacked(file) == unpacked(other));
     let others: Vec<_> = of_a_bag(folder)?.into_iter().filter(|other| !is_read(other)).collect();
-    if let [first, ..] = others.as_slice() {
-        let (path, first) = (folder.display(), first.display());
-        warn!(%path, files = others.len(), %first, "metadata.yaml does not name all files beside it: the others are not read");
-    }
-    Ok(Bag { files, messages: found.messages })
+    let remark = others.first().map(|first| {
+        let (count, first) = (others.len(), first.display());
+        format!("metadata.yaml does not name all files beside it: {count} are not read, `{first}` first")
+    });
+    Ok(Bag { files, messages: found.messages, remark })
 }
 
 /// The text of the file `path`, which has to be in the folder `root`.
@@ -87,8 +85,8 @@ fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
     if files.is_empty() {
         return Err(ReplayError::NoBag { path: folder.to_owned() });
     }
-    warn!(path = %folder.display(), files = files.len(), "no metadata.yaml: its files are read in the order of their names");
-    Ok(Bag { files, ..Bag::default() })
+    let remark = Some(format!("no metadata.yaml: its {} files are read in the order of their names", files.len()));
+    Ok(Bag { files, remark, ..Bag::default() })
 }
 
 /// The files in `folder` that are called as those of a bag, in the order of their names; one that lies there packed and not

@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, HashSet};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+use tracing::warn;
+
 use super::chunk::Opener;
 use super::error::{Damage, ReplayError};
 use super::file::Contents;
@@ -21,6 +23,8 @@ pub(super) struct Bag {
     pub(super) files: Vec<PathBuf>,
     /// Messages by topic, in all files; empty if nobody counted them.
     pub(super) messages: BTreeMap<String, u64>,
+    /// What whoever reads it should know, in a sentence.
+    pub(super) remark: Option<String>,
 }
 
 /// The files that these paths name: each itself, and of a rosbag2 directory those that it consists of.
@@ -56,6 +60,9 @@ pub(super) fn open(paths: &[PathBuf], options: &Options, opener: &mut Opener) ->
     let mut room = options.limits.unpacked_bytes;
     for path in paths {
         let bag = bag_of(path)?;
+        if let Some(remark) = &bag.remark {
+            warn!(path = %path.display(), "{remark}");
+        }
         let mut files = Vec::new();
         for file in &bag.files {
             if std::fs::canonicalize(file).is_ok_and(|real| !seen.insert(real)) {
