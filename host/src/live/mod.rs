@@ -39,6 +39,9 @@ use crate::network::NetworkError;
 use crate::schedule::Schedule;
 use crate::stage::{Bounds, Load, Output, Stage, not_started};
 
+/// Bytes of log in a file; twice as many are kept. A lambda may log 34 GB a day within its limits, and nobody looks after a vehicle's disk.
+const LOG_BYTES: u64 = 256 << 20;
+
 impl Job {
     /// Runs the lambda until SIGTERM, or for as long as was asked, and writes reports to `reports`.
     ///
@@ -86,7 +89,10 @@ impl Job {
         let round_trip = wanted.round_trip.map(|topic| RoundTrip::open(&dds, &topic, clock, name)).transpose()?;
         let announcer = wanted.announce.map(|topic| Announcer::open(&dds, &topic, name)).transpose()?;
         let undecided = (wanted.restarts > 0).then(|| before::undecided(&manifest, &wanted.out)).flatten();
-        let mut ledger = Ledger::start(Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?, reports)?;
+        let mut ledger = {
+            let output = Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?;
+            Ledger::start(output.with_log_of(LOG_BYTES), reports)?
+        };
         ledger.report(Report::Isolation { layers: isolation.close().to_vec() });
         let initialised = guest.init();
         let (said, _) = session.take_log();

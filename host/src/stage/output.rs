@@ -19,8 +19,11 @@ pub const SIGNALS: &str = "signals.json";
 /// The page that `gleaner` makes of all of it.
 const REPORT: &str = "report.html";
 
+/// Earlier lines of a log that is shared out over two files.
+const LOG_BEFORE: &str = "log.before.jsonl";
+
 /// The files of a run beside its clips.
-pub const RESULTS: [&str; 6] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", REPORT, SIGNALS, SUMMARY];
+pub const RESULTS: [&str; 7] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", LOG_BEFORE, REPORT, SIGNALS, SUMMARY];
 
 /// Why results could not be written.
 #[derive(Debug, thiserror::Error)]
@@ -68,7 +71,7 @@ impl Output {
     pub fn begin(folder: &Path, all: bool, again: bool) -> Result<Self, OutputError> {
         fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
         // A summary says that the files beside it are whole; what was read earlier, and a page about it, would be taken for this run's.
-        for of_earlier in [SUMMARY, SIGNALS, REPORT] {
+        for of_earlier in [SUMMARY, SIGNALS, REPORT].into_iter().chain((!again).then_some(LOG_BEFORE)) {
             let path = folder.join(of_earlier);
             match fs::remove_file(&path) {
                 Err(source) if source.kind() != io::ErrorKind::NotFound => return Err(OutputError { path, source }),
@@ -78,6 +81,13 @@ impl Output {
         let decisions = Lines::begin(folder.join("decisions.jsonl"), again)?;
         let log = Lines::begin(folder.join("log.jsonl"), again)?;
         Ok(Self { folder: folder.to_owned(), decisions, log, all })
+    }
+
+    /// Keeps the log from growing for ever: beyond `bytes` it goes on in a new file, and of the earlier ones only the last is kept.
+    #[must_use]
+    pub fn with_log_of(mut self, bytes: u64) -> Self {
+        self.log.most = Some((bytes, self.folder.join(LOG_BEFORE)));
+        self
     }
 
     /// Writes a decision, if it is one to keep.
@@ -155,6 +165,8 @@ struct Lines {
     waiting: u64,
     /// Lines that were taken, and could not be written.
     lost: u64,
+    /// From how many bytes on it goes on in a new file, and where this one is moved.
+    most: Option<(u64, PathBuf)>,
 }
 
 /// Bytes that wait for the next write.
@@ -165,7 +177,7 @@ impl Lines {
         let opened = File::options().create(true).append(true).open(&path);
         let opened = opened.and_then(|file| if again { Ok(file) } else { file.set_len(0).map(|()| file) });
         match opened {
-            Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0 }),
+            Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None }),
             Err(source) => Err(OutputError { path, source }),
         }
     }
@@ -183,7 +195,18 @@ impl Lines {
             return Ok(());
         }
         let before = self.file.metadata().map(|metadata| metadata.len());
-        let written = self.file.write_all(&self.pending);
+        let renewed = match (&before, &self.most) {
+            (Ok(before), Some((most, moved))) if before >= most => Some(self.renewed(moved)),
+            _ => None,
+        };
+        let (before, written) = match renewed {
+            Some(Ok(file)) => {
+                self.file = file;
+                (Ok(0), self.file.write_all(&self.pending))
+            }
+            Some(Err(error)) => (before, Err(error)),
+            None => (before, self.file.write_all(&self.pending)),
+        };
         let waited = std::mem::take(&mut self.waiting);
         self.pending.clear();
         written.map_err(|source| {
@@ -194,5 +217,43 @@ impl Lines {
             }
             OutputError { path: self.path.clone(), source }
         })
+    }
+
+    /// A new file in place of this one, which is `moved`.
+    fn renewed(&self, moved: &Path) -> io::Result<File> {
+        fs::rename(&self.path, moved)?;
+        File::options().create(true).append(true).open(&self.path)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::api::log::Level;
+
+    fn said(folder: &Path, name: &str) -> Vec<i64> {
+        let text = fs::read_to_string(folder.join(name)).unwrap_or_default();
+        text.lines()
+            .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["at_ns"].as_i64().unwrap())
+            .collect()
+    }
+
+    #[test]
+    fn a_long_log_keeps_its_newest_lines_and_those_of_the_file_before() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut output = Output::create(folder.path(), true).unwrap().with_log_of(1000);
+        let line = |at_ns| Line { at_ns, level: Level::Info, message: "x".repeat(100) };
+        for at_ns in 0..100 {
+            output.log(&[line(at_ns)]).unwrap();
+            output.flush().unwrap();
+        }
+        let lines = [said(folder.path(), LOG_BEFORE), said(folder.path(), "log.jsonl")];
+        assert!(lines.iter().all(|lines| !lines.is_empty()), "{lines:?}");
+        let lines = lines.concat();
+        assert!(lines.len() >= 8 && lines.len() < 20, "{lines:?}");
+        assert!(lines.iter().rev().copied().eq((0..100).rev().take(lines.len())), "{lines:?}");
+        // Those of an earlier run are not taken for this one's.
+        drop(Output::create(folder.path(), true).unwrap());
+        assert!(!folder.path().join(LOG_BEFORE).exists());
     }
 }
