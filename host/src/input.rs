@@ -150,6 +150,7 @@ fn open_input(
         end: Mutex::new(End { ring: writer, copied: None }),
         arrivals: arrivals.clone(),
         input: input.name.to_string(),
+        topic: spec.topic.clone(),
         refused: Default::default(),
         bell: live.and_then(|live| live.bell.clone()).filter(|bell| bell.input == input.name.as_str()),
     });
@@ -212,6 +213,8 @@ struct Ingest {
     end: Mutex<End>,
     arrivals: Arc<Arrivals>,
     input: String,
+    /// After remapping.
+    topic: String,
     /// By kind. Each loss is counted in the ring's status, too.
     refused: [Mutex<Refused>; 2],
     bell: Option<Bell>,
@@ -302,10 +305,11 @@ impl Ingest {
         let Some(samples) = refused.lock().unwrap_or_else(PoisonError::into_inner).due() else { return };
         match refusal {
             Refusal::NoSlot => {
-                warn!(input = %self.input, samples, "samples dropped: the lambda holds all slots");
+                warn!(input = %self.input, topic = %self.topic, samples, "samples dropped: the lambda holds all slots");
             }
             Refusal::TooBig { len, max } => {
-                warn!(input = %self.input, samples, bytes = len, max_size = max, "samples dropped: larger than max_size");
+                let topic = &self.topic;
+                warn!(input = %self.input, %topic, samples, bytes = len, max_size = max, "samples dropped: larger than max_size");
             }
         }
     }
@@ -335,7 +339,8 @@ mod tests {
         let region = HeapRegion::zeroed(Pool::<SampleMeta>::bytes_needed(slots, slot_bytes).unwrap()).unwrap();
         let (ring, reader) = ring(Pool::new(region, slots, slot_bytes).unwrap(), 2).unwrap();
         let (end, arrivals) = (Mutex::new(End { ring, copied: None }), Arc::new(Arrivals::new(2)));
-        (Ingest { end, arrivals, input: "camera".to_owned(), refused: Default::default(), bell: None }, reader)
+        let (input, topic) = ("camera".to_owned(), "/camera".to_owned());
+        (Ingest { end, arrivals, input, topic, refused: Default::default(), bell: None }, reader)
     }
 
     fn meta(seq: u64) -> SampleMeta {

@@ -1,7 +1,7 @@
 // A peer on Fast DDS: writes or reads one topic, and says so in lines of JSON.
 //
-//   fast-peer pub|sub Imu|Image TOPIC [--count N] [--rate HZ] [--size WxH] [--depth N] [--readers N]
-//             [--reliability reliable|best_effort] [--durability volatile|transient_local]
+//   fast-peer pub|sub Imu|Image|CompressedImage|PointCloud2 TOPIC [--count N] [--rate HZ] [--size WxH|BYTES] [--depth N]
+//             [--readers N] [--reliability reliable|best_effort] [--durability volatile|transient_local]
 //
 // `pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Either ends with its standard input.
 #include <chrono>
@@ -27,14 +27,16 @@
 
 using namespace eprosima::fastdds::dds;
 using std_msgs::msg::dds_::Header_;
+using sensor_msgs::msg::dds_::CompressedImage_;
 using sensor_msgs::msg::dds_::Image_;
 using sensor_msgs::msg::dds_::Imu_;
+using sensor_msgs::msg::dds_::PointCloud2_;
 
 namespace {
 
 struct Options {
   std::string type, topic;
-  uint32_t count = 0, readers = 1, width = 64, height = 48;
+  uint32_t count = 0, readers = 1, width = 64, height = 48, bytes = 1024;
   int32_t depth = 10;
   double rate = 10;
   bool reliable = true, is_volatile = true;
@@ -69,7 +71,8 @@ Options parse(int argc, char **argv)
     else if (name == "--rate")
       o.rate = std::stod(value);
     else if (name == "--size")
-      need(std::sscanf(value.c_str(), "%ux%u", &o.width, &o.height) == 2, "--size is WxH");
+      need(std::sscanf(value.c_str(), "%ux%u", &o.width, &o.height) == 2 || std::sscanf(value.c_str(), "%u", &o.bytes) == 1,
+           "--size is WxH or a number of bytes");
     else if (name == "--reliability")
       o.reliable = value == "reliable";
     else if (name == "--durability")
@@ -125,6 +128,21 @@ uint32_t sum(const Imu_ &imu)
   return sum_end(sum);
 }
 
+template <typename Bytes>
+void set_bytes(Bytes &bytes, uint32_t n, size_t length)
+{
+  bytes.resize(length);
+  size_t at = 0;
+  for (uint8_t &byte : bytes)
+    byte = content_byte(n, at++);
+}
+
+template <typename Bytes>
+uint32_t sum_sequence(uint32_t sum, const Bytes &bytes)
+{
+  return sum_bytes(sum_u32(sum, static_cast<uint32_t>(bytes.size())), bytes.data(), bytes.size());
+}
+
 void fill(Image_ &image, uint32_t n, const Options &o)
 {
   set_header(image.header(), n);
@@ -133,18 +151,57 @@ void fill(Image_ &image, uint32_t n, const Options &o)
   image.encoding("rgb8");
   image.is_bigendian(0);
   image.step(3 * o.width);
-  image.data().resize(size_t{image.step()} * o.height);
-  size_t at = 0;
-  for (uint8_t &byte : image.data())
-    byte = content_byte(n, at++);
+  set_bytes(image.data(), n, size_t{image.step()} * o.height);
 }
 
 uint32_t sum(const Image_ &image)
 {
   uint32_t sum = sum_u32(sum_u32(sum_header(image.header()), image.height()), image.width());
   sum = sum_u32(sum_u8(sum_text(sum, image.encoding().c_str()), image.is_bigendian()), image.step());
-  sum = sum_u32(sum, static_cast<uint32_t>(image.data().size()));
-  return sum_end(sum_bytes(sum, image.data().data(), image.data().size()));
+  return sum_end(sum_sequence(sum, image.data()));
+}
+
+void fill(CompressedImage_ &image, uint32_t n, const Options &o)
+{
+  set_header(image.header(), n);
+  image.format("jpeg");
+  set_bytes(image.data(), n, o.bytes);
+}
+
+uint32_t sum(const CompressedImage_ &image)
+{
+  return sum_end(sum_sequence(sum_text(sum_header(image.header()), image.format().c_str()), image.data()));
+}
+
+void fill(PointCloud2_ &cloud, uint32_t n, const Options &o)
+{
+  static const char *const names[] = {"x", "y", "z", "intensity"};
+  set_header(cloud.header(), n);
+  cloud.height(1);
+  cloud.width(o.bytes / 16);
+  cloud.fields().resize(4);
+  for (uint32_t k = 0; k < 4; k++) {
+    auto &field = cloud.fields()[k];
+    field.name(names[k]);
+    field.offset(4 * k);
+    field.datatype(7);
+    field.count(1);
+  }
+  cloud.is_bigendian(false);
+  cloud.point_step(16);
+  cloud.row_step(16 * cloud.width());
+  set_bytes(cloud.data(), n, cloud.row_step());
+  cloud.is_dense(true);
+}
+
+uint32_t sum(const PointCloud2_ &cloud)
+{
+  uint32_t sum = sum_u32(sum_u32(sum_header(cloud.header()), cloud.height()), cloud.width());
+  sum = sum_u32(sum, static_cast<uint32_t>(cloud.fields().size()));
+  for (const auto &field : cloud.fields())
+    sum = sum_u32(sum_u8(sum_u32(sum_text(sum, field.name().c_str()), field.offset()), field.datatype()), field.count());
+  sum = sum_u32(sum_u32(sum_u8(sum, cloud.is_bigendian()), cloud.point_step()), cloud.row_step());
+  return sum_end(sum_u8(sum_sequence(sum, cloud.data()), cloud.is_dense()));
 }
 
 template <typename Qos>
@@ -244,6 +301,10 @@ int main(int argc, char **argv)
     run<Imu_, sensor_msgs::msg::dds_::Imu_PubSubType>(argv[1], o);
   else if (o.type == "Image")
     run<Image_, sensor_msgs::msg::dds_::Image_PubSubType>(argv[1], o);
+  else if (o.type == "CompressedImage")
+    run<CompressedImage_, sensor_msgs::msg::dds_::CompressedImage_PubSubType>(argv[1], o);
+  else if (o.type == "PointCloud2")
+    run<PointCloud2_, sensor_msgs::msg::dds_::PointCloud2_PubSubType>(argv[1], o);
   else
     refuse("no type " + o.type);
   return 0;

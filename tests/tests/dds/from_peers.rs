@@ -19,8 +19,10 @@ pub const CASES: &[Case] = &[
     Case { name: "an_imu_of_python_arrives_whole", needs: &[Need::Peer(Kind::Python)], run: || imu(Kind::Python) },
     Case { name: "images_of_cyclone_in_1080p_arrive_whole", needs: CYCLONE, run: || images(Kind::Cyclone) },
     Case { name: "images_of_fast_dds_in_1080p_arrive_whole", needs: FAST, run: || images(Kind::Fast) },
-    Case { name: "compressed_images_arrive_whole", needs: CYCLONE, run: compressed },
-    Case { name: "point_clouds_arrive_whole", needs: CYCLONE, run: clouds },
+    Case { name: "compressed_images_of_cyclone_arrive_whole", needs: CYCLONE, run: || compressed(Kind::Cyclone) },
+    Case { name: "compressed_images_of_fast_dds_arrive_whole", needs: FAST, run: || compressed(Kind::Fast) },
+    Case { name: "point_clouds_of_cyclone_arrive_whole", needs: CYCLONE, run: || clouds(Kind::Cyclone) },
+    Case { name: "point_clouds_of_fast_dds_arrive_whole", needs: FAST, run: || clouds(Kind::Fast) },
     Case { name: "a_best_effort_writer_is_heard", needs: CYCLONE, run: best_effort },
     Case { name: "what_a_transient_local_writer_wrote_before_is_heard", needs: CYCLONE, run: transient_local },
     Case { name: "writers_with_different_offers_are_both_heard", needs: CYCLONE, run: mixed },
@@ -35,12 +37,12 @@ fn images(kind: Kind) -> Result<(), Failed> {
     whole(kind, Type::Image { width: 1920, height: 1080 }, 20, 10)
 }
 
-fn compressed() -> Result<(), Failed> {
-    whole(Kind::Cyclone, Type::CompressedImage(200_000), 100, 30)
+fn compressed(kind: Kind) -> Result<(), Failed> {
+    whole(kind, Type::CompressedImage(200_000), 100, 30)
 }
 
-fn clouds() -> Result<(), Failed> {
-    whole(Kind::Cyclone, Type::PointCloud2(1 << 20), 50, 10)
+fn clouds(kind: Kind) -> Result<(), Failed> {
+    whole(kind, Type::PointCloud2(1 << 20), 50, 10)
 }
 
 fn whole(kind: Kind, ty: Type, count: u32, rate_hz: u32) -> Result<(), Failed> {

@@ -11,6 +11,12 @@ use crate::ours::join;
 use crate::{Case, Need};
 
 const CYCLONE: &[Need] = &[Need::Peer(Kind::Cyclone)];
+const FAST: &[Need] = &[Need::Peer(Kind::Fast)];
+
+/// What goes out in fragments: RustDDS writes 256 bytes in each.
+const IMAGE: Type = Type::Image { width: 64, height: 48 };
+const COMPRESSED: Type = Type::CompressedImage(5_000);
+const CLOUD: Type = Type::PointCloud2(4_096);
 
 pub const CASES: &[Case] = &[
     Case { name: "cyclone_hears_our_imu", needs: CYCLONE, run: || heard_by(Kind::Cyclone, Type::Imu) },
@@ -19,7 +25,13 @@ pub const CASES: &[Case] = &[
         needs: CYCLONE,
         run: || heard_by(Kind::Cyclone, Type::TimeReference),
     },
-    Case { name: "fast_dds_hears_our_imu", needs: &[Need::Peer(Kind::Fast)], run: || heard_by(Kind::Fast, Type::Imu) },
+    Case { name: "cyclone_hears_our_images", needs: CYCLONE, run: || heard_by(Kind::Cyclone, IMAGE) },
+    Case { name: "cyclone_hears_our_compressed_images", needs: CYCLONE, run: || heard_by(Kind::Cyclone, COMPRESSED) },
+    Case { name: "cyclone_hears_our_point_clouds", needs: CYCLONE, run: || heard_by(Kind::Cyclone, CLOUD) },
+    Case { name: "fast_dds_hears_our_imu", needs: FAST, run: || heard_by(Kind::Fast, Type::Imu) },
+    Case { name: "fast_dds_hears_our_images", needs: FAST, run: || heard_by(Kind::Fast, IMAGE) },
+    Case { name: "fast_dds_hears_our_compressed_images", needs: FAST, run: || heard_by(Kind::Fast, COMPRESSED) },
+    Case { name: "fast_dds_hears_our_point_clouds", needs: FAST, run: || heard_by(Kind::Fast, CLOUD) },
     Case {
         name: "python_hears_our_imu",
         needs: &[Need::Peer(Kind::Python)],
