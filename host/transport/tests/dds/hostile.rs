@@ -2,6 +2,7 @@
 
 use std::net::UdpSocket;
 
+use gleaner_transport::dds::Dds;
 use gleaner_transport::{Qos, Transport};
 use rustdds::{GUID, RTPSEntity};
 
@@ -14,6 +15,7 @@ pub const TESTS: &[Test] = &[
     ("thousands_of_broken_packets_stop_nothing", broken),
     ("fragments_that_claim_gibibytes_take_no_memory_and_are_counted", claims),
 ];
+    ("numbers_without_end_in_a_heartbeat_or_a_gap_take_no_memory_and_are_counted", numbers),
 
 /// An RTPS packet of `writer` with one submessage.
 pub fn packet(writer: GUID, kind: u8, body: &[u8]) -> Vec<u8> {
@@ -52,6 +54,19 @@ fn fragment(writer: GUID, seq: u32, size: u32) -> Vec<u8> {
 /// The most memory that this process ever had, in bytes.
 fn most_memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
+/// A HEARTBEAT (7) or a GAP (8) of `numbers`, to all readers, that no other came before.
+fn range(writer: GUID, kind: u8, numbers: [u64; 2]) -> Vec<u8> {
+    let mut body = vec![0; 4];
+    body.extend_from_slice(&writer.to_bytes()[12..]);
+    for number in numbers {
+        body.extend_from_slice(&((number >> 32) as u32).to_le_bytes());
+        body.extend_from_slice(&(number as u32).to_le_bytes());
+    }
+    // The HEARTBEAT's count; the GAP has no more numbers.
+    body.extend_from_slice(&(if kind == 7 { i32::MAX } else { 0 }).to_le_bytes());
+    packet(writer, kind, &body)
+}
+
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
     line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
 }
@@ -59,6 +74,12 @@ fn most_memory() -> u64 {
 /// The port at which the first participant of a domain hears data.
 fn port(domain: u16) -> u16 {
     7400 + 250 * domain + 11
+/// Datagrams that did not come through.
+fn counted(dds: &Dds) -> u64 {
+    let health = dds.health();
+    health.filtered + health.socket_drops
+}
+
 }
 
 fn gaps() {
@@ -149,11 +170,7 @@ fn claims() {
     let before = most_memory();
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     let send = |bytes: &[u8]| assert!(wire.send_to(bytes, ("127.0.0.1", port(domain))).is_ok());
-    let counted = || {
-        let health = dds.health();
-        health.filtered + health.socket_drops
-    };
-    let begun = counted();
+    let begun = counted(&dds);
     let mut stranger = writer.guid().to_bytes();
     stranger[5] ^= 0xff;
     let stranger = GUID::from_bytes(stranger);
@@ -164,10 +181,39 @@ fn claims() {
         send(&fragment(writer.guid(), 2000 + seq, 64 << 20));
         send(&fragment(stranger, 2000 + seq, 1 << 19));
     }
-    until("the count", || counted() - begun >= 2002);
+    until("the count", || counted(&dds) - begun >= 2002);
     let fresh = peer.writer("/claims", true, false);
     sink.mark(&fresh, &[7; 100_000]);
     assert_eq!(dds.health().dead, None);
     // Other tests run at the same time. The claims are 67 GiB.
+    assert!(most_memory() - before < 1 << 30, "{} MiB", (most_memory() - before) >> 20);
+}
+
+fn numbers() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/numbers", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/numbers", true, false);
+    connected(&dds, subscription, 1);
+    sink.mark(&writer, b"before..");
+    assert_eq!(dds.health().unfiltered, None);
+    // The writer of announcements: everybody's reader of them listens to it.
+    let mut announcer = writer.guid().to_bytes();
+    announcer[12..].copy_from_slice(&[0, 0, 3, 0xc2]);
+    let (before, begun) = (most_memory(), counted(&dds));
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    for guid in [writer.guid(), GUID::from_bytes(announcer)] {
+        // Without the filter, some GiB each: enough to be seen, and not the machine's end.
+        for (kind, numbers) in [(7, [1, 1 << 28]), (8, [1 << 20, 1 << 26])] {
+            wire.send_to(&range(guid, kind, numbers), ("127.0.0.1", port(domain))).unwrap();
+        }
+    }
+    until("the count", || counted(&dds) - begun >= 4);
+    sink.mark(&writer, b"after...");
+    let fresh = peer.writer("/numbers", true, false);
+    sink.mark(&fresh, b"still here..");
+    assert_eq!(dds.health().dead, None);
     assert!(most_memory() - before < 1 << 30, "{} MiB", (most_memory() - before) >> 20);
 }
