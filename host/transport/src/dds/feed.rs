@@ -17,6 +17,7 @@ use super::names::{dds_topic, dds_type, ros_type, visible};
 use super::offers::{Offer, Request, in_words};
 use super::raw::{CopyInto, Held, PassOver, Raw, RawReader};
 use super::state::{Once, State, Told, lock, panic_text};
+use super::types::Types;
 use crate::gaps::Gaps;
 use crate::transport::{Guid, Qos, SampleMeta, Sink, TopicSpec};
 
@@ -50,6 +51,7 @@ pub(super) struct Feed {
     /// a new reader, too.
     read_before: HashMap<Guid, u64>,
     gaps: Gaps,
+    types: Types,
     asked_again: Vec<String>,
     once: Once,
     /// Samples may wait.
@@ -102,6 +104,7 @@ impl Feed {
             alone: true,
             read_before: HashMap::new(),
             gaps: Gaps::default(),
+            types: Types::default(),
             asked_again: Vec::new(),
             once: Once::default(),
             ready: false,
@@ -138,7 +141,8 @@ impl Feed {
                 Ok(Some(change)) => {
                     let writer = Guid(change.writer_guid.to_bytes());
                     let seq = u64::try_from(i64::from(change.sequence_number)).unwrap_or(0).max(1);
-                    if self.read_before.get(&writer).is_none_or(|last| seq > *last) {
+                    let other = self.types.passes_over(around.participant, writer, &self.type_name);
+                    if !other && self.read_before.get(&writer).is_none_or(|last| seq > *last) {
                         let publish_ns = change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
                         self.deliver(around, writer, seq, publish_ns, change.sample);
                     }
@@ -209,6 +213,7 @@ impl Feed {
             }
         }
         self.alone = ours.is_empty();
+        self.types.note(&ours, &others);
         let trouble = self.trouble(&ours, &others);
         for (cause, sentence) in &trouble {
             if self.once.first(cause, sentence) {
@@ -220,6 +225,7 @@ impl Feed {
         words.qos = self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
         words.trouble = trouble.into_iter().map(|(_, sentence)| sentence).collect();
         words.trouble.extend_from_slice(&self.asked_again);
+        words.trouble.extend(self.types.trouble(&self.spec.topic));
     }
 
     /// Why writers are not heard, or not as they could be: causes, and sentences.

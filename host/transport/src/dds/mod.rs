@@ -35,6 +35,7 @@ mod receive;
 mod shield;
 mod sockets;
 mod state;
+mod types;
 mod watch;
 mod wire;
 mod writer;
