@@ -11,11 +11,12 @@ use super::peer::{Kept, Peer, connected, domain, matched, open, spec, until, wri
 
 pub const TESTS: &[Test] = &[
     ("gaps_in_the_numbers_are_counted_and_late_samples_taken_back", gaps),
+    ("a_sample_that_cannot_be_read_is_malformed_and_not_lost_as_well", malformed),
     ("a_writer_that_jumps_to_the_last_number_overflows_nothing", last_number),
     ("thousands_of_broken_packets_stop_nothing", broken),
     ("fragments_that_claim_gibibytes_take_no_memory_and_are_counted", claims),
-];
     ("numbers_without_end_in_a_heartbeat_or_a_gap_take_no_memory_and_are_counted", numbers),
+];
 
 /// An RTPS packet of `writer` with one submessage.
 pub fn packet(writer: GUID, kind: u8, body: &[u8]) -> Vec<u8> {
@@ -27,14 +28,16 @@ pub fn packet(writer: GUID, kind: u8, body: &[u8]) -> Vec<u8> {
     packet
 }
 
+/// Little-endian CDR.
+pub const LITTLE: [u8; 2] = [0, 1];
+
 /// A DATA submessage: to all readers, from `writer`, with number `seq`.
-fn data(writer: GUID, seq: i64, payload: &[u8]) -> Vec<u8> {
+pub fn data(writer: GUID, seq: i64, payload: &[u8], encoding: [u8; 2]) -> Vec<u8> {
     let mut body = vec![0, 0, 16, 0, 0, 0, 0, 0];
     body.extend_from_slice(&writer.to_bytes()[12..]);
     body.extend_from_slice(&((seq >> 32) as i32).to_le_bytes());
     body.extend_from_slice(&(seq as u32).to_le_bytes());
-    // Encapsulation: little-endian CDR.
-    body.extend_from_slice(&[0, 1, 0, 0]);
+    body.extend_from_slice(&[encoding, [0; 2]].concat());
     body.extend_from_slice(payload);
     packet(writer, 0x15, &body)
 }
@@ -51,9 +54,6 @@ fn fragment(writer: GUID, seq: u32, size: u32) -> Vec<u8> {
     packet(writer, 0x16, &body)
 }
 
-/// The most memory that this process ever had, in bytes.
-fn most_memory() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
 /// A HEARTBEAT (7) or a GAP (8) of `numbers`, to all readers, that no other came before.
 fn range(writer: GUID, kind: u8, numbers: [u64; 2]) -> Vec<u8> {
     let mut body = vec![0; 4];
@@ -67,19 +67,22 @@ fn range(writer: GUID, kind: u8, numbers: [u64; 2]) -> Vec<u8> {
     packet(writer, kind, &body)
 }
 
+/// The most memory that this process ever had, in bytes.
+fn most_memory() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
     line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
 }
 
-/// The port at which the first participant of a domain hears data.
-fn port(domain: u16) -> u16 {
-    7400 + 250 * domain + 11
 /// Datagrams that did not come through.
 fn counted(dds: &Dds) -> u64 {
     let health = dds.health();
     health.filtered + health.socket_drops
 }
 
+/// The port at which the first participant of a domain hears data.
+pub fn port(domain: u16) -> u16 {
+    7400 + 250 * domain + 11
 }
 
 fn gaps() {
@@ -95,10 +98,32 @@ fn gaps() {
     sink.wait(1);
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     for (count, (seq, lost)) in [(5, 3), (6, 3), (3, 2), (9, 4), (4, 3), (2, 2), (8, 1)].into_iter().enumerate() {
-        wire.send_to(&data(writer.guid(), seq, b"from a hand"), ("127.0.0.1", port(domain))).unwrap();
+        wire.send_to(&data(writer.guid(), seq, b"from a hand", LITTLE), ("127.0.0.1", port(domain))).unwrap();
         assert_eq!(sink.wait(count + 2)[count + 1].0.seq, u64::try_from(seq).unwrap());
         until("the count", || dds.status(subscription).lost == Some(lost));
     }
+}
+
+fn malformed() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/odd", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/odd", false, false);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    write(&writer, b"1...");
+    sink.wait(1);
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    // PL_CDR and XCDR2; the fourth sample is lost indeed.
+    for (seq, encoding) in [(2, [0, 3]), (3, [0, 7]), (5, LITTLE)] {
+        wire.send_to(&data(writer.guid(), seq, b"from a hand.", encoding), ("127.0.0.1", port(domain))).unwrap();
+    }
+    sink.wait(2);
+    until("the loss", || dds.status(subscription).lost != Some(0));
+    let status = dds.status(subscription);
+    assert_eq!((status.malformed, status.lost), (2, Some(1)));
 }
 
 fn last_number() {
@@ -114,7 +139,7 @@ fn last_number() {
     sink.wait(1);
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     for seq in [i64::MAX, i64::MAX - 1, 0, -1, i64::MIN] {
-        wire.send_to(&data(writer.guid(), seq, b"?"), ("127.0.0.1", port(domain))).unwrap();
+        wire.send_to(&data(writer.guid(), seq, b"?", LITTLE), ("127.0.0.1", port(domain))).unwrap();
     }
     sink.mark(&other, b"still here..");
     assert!(dds.status(subscription).lost.unwrap() >= i64::MAX as u64 - 3);
@@ -135,7 +160,7 @@ fn broken() {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 33) as usize
     };
-    let whole = data(writer.guid(), 7, &[0; 64]);
+    let whole = data(writer.guid(), 7, &[0; 64], LITTLE);
     let kinds = [0x01, 0x06, 0x07, 0x08, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x13, 0x15, 0x16, 0x80, 0xff];
     for n in 0..3000 {
         let mut bytes = match n % 3 {
