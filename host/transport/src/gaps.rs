@@ -13,7 +13,7 @@ const OPEN: usize = 64;
 ///
 /// A writer's first sample says where its numbers begin: what it sent before is no loss. A sample that comes late, as
 /// networks may cause without any fault, takes its loss back. A writer that starts again has another [`Guid`].
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub struct Gaps {
     writers: Vec<Writer>,
     /// Samples noted, by which it is known who was silent for longest.
@@ -21,7 +21,7 @@ pub struct Gaps {
     lost: u64,
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Writer {
     guid: Guid,
     /// The number that comes next; `None` when there is none after the last.
@@ -61,10 +61,14 @@ impl Gaps {
         self.lost
     }
 
-    /// The highest number that came from each writer.
+    /// Whether that sample came, or is older than what is known: it is neither the next, nor in a gap that may be filled.
     #[cfg(feature = "dds")]
-    pub(crate) fn newest(&self) -> impl Iterator<Item = (Guid, u64)> {
-        self.writers.iter().map(|writer| (writer.guid, writer.next.map_or(u64::MAX, |next| next.saturating_sub(1))))
+    pub(crate) fn has(&self, writer: Guid, seq: u64) -> bool {
+        let known = self.writers.iter().find(|known| known.guid == writer);
+        known.is_some_and(|known| {
+            let missing = known.open.iter().any(|(first, last)| (*first..=*last).contains(&seq));
+            known.next.is_none_or(|next| seq < next) && !missing
+        })
     }
 
     fn follow(&mut self, guid: Guid, seq: u64) {
@@ -138,6 +142,18 @@ mod tests {
     #[test]
     fn a_sample_that_comes_twice_or_from_before_the_first_changes_nothing() {
         assert_eq!(lost_after(&[5, 7, 7, 5, 1]), 1);
+    }
+
+    #[cfg(feature = "dds")]
+    #[test]
+    fn what_came_is_told_from_what_is_missing() {
+        let mut gaps = Gaps::default();
+        for seq in [5, 6, 9, u64::MAX, 7] {
+            gaps.note(guid(1), seq);
+        }
+        assert!([1, 5, 6, 7, 9, u64::MAX].iter().all(|seq| gaps.has(guid(1), *seq)));
+        assert!([8, 10, 1 << 40].iter().all(|seq| !gaps.has(guid(1), *seq)));
+        assert!(!gaps.has(guid(2), 5));
     }
 
     #[test]

@@ -13,6 +13,7 @@ pub(super) const FAR: usize = 255;
 pub(super) const LD_IMM: u16 = 0x00;
 pub(super) const LDX_IMM: u16 = 0x01;
 pub(super) const ST: u16 = 0x02;
+pub(super) const STX: u16 = 0x03;
 pub(super) const ADD: u16 = 0x04;
 pub(super) const JA: u16 = 0x05;
 pub(super) const RET: u16 = 0x06;
@@ -20,6 +21,7 @@ pub(super) const TAX: u16 = 0x07;
 pub(super) const ADD_X: u16 = 0x0c;
 pub(super) const JEQ: u16 = 0x15;
 pub(super) const RET_A: u16 = 0x16;
+pub(super) const SUB_X: u16 = 0x1c;
 pub(super) const JEQ_X: u16 = 0x1d;
 pub(super) const LD_WORD_AT: u16 = 0x20;
 pub(super) const MUL: u16 = 0x24;
@@ -31,6 +33,7 @@ pub(super) const LD_HALF: u16 = 0x48;
 pub(super) const LD_BYTE: u16 = 0x50;
 pub(super) const AND: u16 = 0x54;
 pub(super) const LD_MEM: u16 = 0x60;
+pub(super) const LDX_MEM: u16 = 0x61;
 pub(super) const LSH: u16 = 0x64;
 pub(super) const RSH: u16 = 0x74;
 pub(super) const LD_LEN: u16 = 0x80;
@@ -63,6 +66,8 @@ pub(super) enum To {
     Cut,
     /// The packet ends here.
     End,
+    /// What stands behind the next island looks at the same submessage.
+    Behind,
 }
 
 pub(super) const NEXT: To = To::Over(0);
@@ -108,11 +113,13 @@ impl Program {
         self.code[from].3 = u32::try_from(self.code.len() - from - 1).expect("a program has 4096 instructions");
     }
 
-    /// Sees to it that all exits reach an island that is written after `instructions` more.
-    pub(super) fn reach(&mut self, instructions: usize) {
-        if self.exits.first().is_some_and(|(at, ..)| self.code.len() + instructions + ISLAND - at > FAR) {
+    /// Sees to it that all exits reach an island that is written after `instructions` more. Whether one is written now.
+    pub(super) fn reach(&mut self, instructions: usize) -> bool {
+        let far = self.exits.first().is_some_and(|(at, ..)| self.code.len() + instructions + ISLAND - at > FAR);
+        if far {
             self.island();
         }
+        far
     }
 
     /// Cuts the packet off.
@@ -151,12 +158,14 @@ impl Program {
         let empty = self.put(JA, 0);
         self.ends.extend([end, empty]);
         self.land(over);
+        let behind = self.code.len();
         for (at, holds, exit) in std::mem::take(&mut self.exits) {
             let place = match exit {
                 To::Drop => drop,
                 To::Endless => endless,
                 To::Cut => cut,
                 To::End => end,
+                To::Behind => behind,
                 To::Over(_) => continue,
             };
             let far = u8::try_from(place - at - 1).expect("there is an island before it is too far");

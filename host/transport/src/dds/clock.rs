@@ -14,8 +14,7 @@ impl Clock {
 
     /// A clock that shows the time of day now.
     pub fn of_today() -> Self {
-        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
-        Self::new(i64::try_from(now.as_nanos()).unwrap_or(0).saturating_sub(monotonic()))
+        Self::new(time_of_day().saturating_sub(monotonic()))
     }
 
     /// How far it is ahead of `CLOCK_MONOTONIC`, in ns.
@@ -34,7 +33,87 @@ impl Clock {
     }
 }
 
+/// The time of day, in ns since 1970.
+pub(super) fn time_of_day() -> i64 {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(now.as_nanos()).unwrap_or(0)
+}
+
+/// Notices that the time of day was set back.
+///
+/// RustDDS orders what readers of best effort get by the time of day at which it came, announcements of participants included,
+/// and shows nothing that is later than now.
+#[derive(Debug)]
+pub(super) struct Day {
+    shown: fn() -> i64,
+    /// How far it was ahead of `CLOCK_MONOTONIC` at the last look, in ns.
+    ahead_ns: Option<i64>,
+}
+
+impl Day {
+    /// Less is not worth a restart: after so long all is well again.
+    const MOST_NS: i64 = 1_000_000_000;
+    /// Between two looks at `CLOCK_MONOTONIC`; if it was longer, the thread was stopped between them.
+    const AT_ONCE_NS: i64 = 100_000_000;
+
+    /// `shown` tells the time of day, in ns.
+    pub(super) fn new(shown: fn() -> i64) -> Self {
+        Self { shown, ahead_ns: None }
+    }
+
+    /// By how many ns it was set back since the last look, if that is more than a second. A clock that is slewed, however
+    /// far, is not set.
+    pub(super) fn set_back(&mut self) -> Option<i64> {
+        let (before, day, after) = (monotonic(), (self.shown)(), monotonic());
+        if after.saturating_sub(before) > Self::AT_ONCE_NS {
+            return None;
+        }
+        let ahead = day.saturating_sub(before);
+        let back = self.ahead_ns.replace(ahead).map(|last| last.saturating_sub(ahead));
+        back.filter(|back| *back > Self::MOST_NS)
+    }
+}
+
 fn monotonic() -> i64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    thread_local! {
+        static SET: Cell<i64> = const { Cell::new(0) };
+    }
+
+    fn shown() -> i64 {
+        SET.get() + monotonic()
+    }
+
+    #[test]
+    fn a_time_of_day_that_is_set_back_by_more_than_a_second_is_noticed_once() {
+        let mut day = Day::new(shown);
+        let mut looks = |set: i64| {
+            SET.set(set * 1_000_000_000);
+            // A thread that is stopped between two looks does not know, and looks again.
+            (0..3).filter_map(|_| day.set_back()).map(|back| (back + 500_000_000) / 1_000_000_000).collect::<Vec<_>>()
+        };
+        assert_eq!(looks(1000), []);
+        assert_eq!(looks(5000), [], "forward");
+        assert_eq!(looks(4000), [1000]);
+        assert_eq!(looks(4000), []);
+        assert_eq!(looks(-10_000), [14_000]);
+    }
+
+    #[test]
+    fn a_time_of_day_that_is_slewed_back_is_not_set_back() {
+        let mut day = Day::new(shown);
+        for step in 0..1000 {
+            SET.set(step * -200_000_000);
+            assert_eq!(day.set_back(), None, "step {step}");
+        }
+    }
 }

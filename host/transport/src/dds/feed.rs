@@ -2,7 +2,6 @@
 
 use std::any::Any;
 use std::cell::RefCell;
-use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -15,8 +14,9 @@ use tracing::{info, warn};
 use super::Clock;
 use super::names::{dds_topic, dds_type, ros_type, visible};
 use super::offers::{Offer, Request, in_words};
-use super::raw::{CopyInto, Held, PassOver, Raw, RawReader};
+use super::raw::{CopyInto, CopyOrSay, Held, PassOver, Raw, RawReader};
 use super::state::{Once, State, Told, lock, panic_text};
+use super::types::Types;
 use crate::gaps::Gaps;
 use crate::transport::{Guid, Qos, SampleMeta, Sink, TopicSpec};
 
@@ -46,10 +46,10 @@ pub(super) struct Feed {
     request: Option<Request>,
     /// No writer offered this topic at the last look.
     alone: bool,
-    /// Of each writer, up to where an earlier reader had read: the samples that RustDDS keeps of a topic are there for
-    /// a new reader, too.
-    read_before: HashMap<Guid, u64>,
+    /// What an earlier reader had read: the samples that RustDDS keeps of a topic are there for a new reader, too.
+    read_before: Gaps,
     gaps: Gaps,
+    types: Types,
     asked_again: Vec<String>,
     once: Once,
     /// Samples may wait.
@@ -100,8 +100,9 @@ impl Feed {
             reader: None,
             request: None,
             alone: true,
-            read_before: HashMap::new(),
+            read_before: Gaps::default(),
             gaps: Gaps::default(),
+            types: Types::default(),
             asked_again: Vec::new(),
             once: Once::default(),
             ready: false,
@@ -131,24 +132,21 @@ impl Feed {
             }
             around.state.deliver(self.index);
             let sink = self.sink.as_deref();
-            let change = reader.try_take_one_with(CopyInto { sink, memory: around.memory, clock: around.clock });
+            let change =
+                reader.try_take_one_with(CopyOrSay(CopyInto { sink, memory: around.memory, clock: around.clock }));
             around.state.deliver(self.index);
             match change {
                 Ok(None) => break,
                 Ok(Some(change)) => {
                     let writer = Guid(change.writer_guid.to_bytes());
                     let seq = u64::try_from(i64::from(change.sequence_number)).unwrap_or(0).max(1);
-                    if self.read_before.get(&writer).is_none_or(|last| seq > *last) {
+                    let other = self.types.passes_over(around.participant, writer, &self.type_name);
+                    if !other && !self.read_before.has(writer, seq) {
                         let publish_ns = change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
                         self.deliver(around, writer, seq, publish_ns, change.sample);
                     }
                 }
-                Err(ReadError::Deserialization { reason }) => {
-                    self.told.malformed.fetch_add(1, Relaxed);
-                    if self.once.first("malformed", "") {
-                        warn!(topic = %self.spec.topic, reason = visible(&reason), "malformed sample");
-                    }
-                }
+                Err(ReadError::Deserialization { reason }) => self.note_malformed(&reason),
                 Err(error) => {
                     around.state.die(format!(
                         "topic `{}` cannot be read: {}",
@@ -164,11 +162,14 @@ impl Feed {
     }
 
     fn deliver(&mut self, around: &Around<'_>, writer: Guid, seq: u64, publish_ns: i64, raw: Raw) {
-        let Some(sink) = &self.sink else { return };
         let missing = self.gaps.note(writer, seq);
         if missing > 0 && self.once.first("lost", "") {
             warn!(topic = %self.spec.topic, %writer, missing, "samples were lost on their way; said once, counted further");
         }
+        if let Held::Unreadable(why) = &raw.held {
+            return self.note_malformed(why);
+        }
+        let Some(sink) = &self.sink else { return };
         let meta = SampleMeta { at_ns: raw.at_ns, publish_ns, writer, seq, endian: raw.endian, options: [0; 2] };
         around.state.deliver(self.index);
         let delivered = match raw.held {
@@ -176,7 +177,7 @@ impl Feed {
             Held::Memory => catch_unwind(AssertUnwindSafe(|| {
                 sink.deliver(&meta, &around.memory.borrow());
             })),
-            Held::Nobody(text) => Err(Box::new(text) as Box<dyn Any + Send>),
+            Held::Nobody(text) | Held::Unreadable(text) => Err(Box::new(text) as Box<dyn Any + Send>),
         };
         around.state.deliver(self.index);
         around.state.handled.fetch_add(1, Relaxed);
@@ -184,6 +185,13 @@ impl Feed {
             let text = panic_text(&*panic);
             around.state.die(format!("the sink of topic `{}` panicked: {text}", self.spec.topic));
             self.sink = None;
+        }
+    }
+
+    fn note_malformed(&mut self, reason: &str) {
+        self.told.malformed.fetch_add(1, Relaxed);
+        if self.once.first("malformed", "") {
+            warn!(topic = %self.spec.topic, reason = visible(reason), "malformed sample");
         }
     }
 
@@ -209,6 +217,7 @@ impl Feed {
             }
         }
         self.alone = ours.is_empty();
+        self.types.note(&ours, &others);
         let trouble = self.trouble(&ours, &others);
         for (cause, sentence) in &trouble {
             if self.once.first(cause, sentence) {
@@ -220,6 +229,7 @@ impl Feed {
         words.qos = self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
         words.trouble = trouble.into_iter().map(|(_, sentence)| sentence).collect();
         words.trouble.extend_from_slice(&self.asked_again);
+        words.trouble.extend(self.types.trouble(&self.spec.topic));
     }
 
     /// Why writers are not heard, or not as they could be: causes, and sentences.
@@ -290,7 +300,7 @@ impl Feed {
         }
         if self.reader.is_some() {
             self.take(around, MOST_KEPT);
-            self.read_before = self.gaps.newest().collect();
+            self.read_before = self.gaps.clone();
             self.give_up(around);
         } else if !request.transient_local {
             // What is kept of the topic from an earlier subscription is none of this one's business.

@@ -1,4 +1,4 @@
-//! Keeps hostile fragments away from RustDDS, by a filter on its sockets.
+//! Keeps hostile packets away from RustDDS, by a filter on its sockets.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -22,7 +22,7 @@ pub(super) struct Guard {
 }
 
 impl Guard {
-    /// Attaches a filter that no fragment passes which claims more than what discovery needs.
+    /// Attaches a filter that nothing passes which claims more than what discovery needs.
     pub(super) fn new(sockets: &Sockets, own: Prefix, state: &State) -> Self {
         let duplicates = sockets.duplicates().and_then(|duplicates| match duplicates.is_empty() {
             true => Err(io::Error::other("the participant's sockets were not found")),

@@ -5,7 +5,7 @@
 //! for what writers offer, as `ros2 bag record` does: it has no reader until there is a writer.
 //!
 //! A sample is copied once: into the sink's memory, if the sink can do so before it knows whose sample it is. The kernel
-//! keeps fragments away that claim more memory than anybody subscribed to. What RustDDS cannot do is told in
+//! keeps packets away that would take more memory than anybody subscribed to. What RustDDS cannot do is told in
 //! `docs/dds-limits.md`.
 //!
 //! What never happens here: a sink that does more than to copy under a lock of RustDDS; a message being understood, apart from those of
@@ -35,6 +35,7 @@ mod receive;
 mod shield;
 mod sockets;
 mod state;
+mod types;
 mod watch;
 mod wire;
 mod writer;
@@ -102,7 +103,7 @@ pub struct Health {
     /// together, so if buffers of others were full as well, some that count here were filtered.
     pub socket_drops: u64,
     /// Datagrams that were not let pass: with fragments that claim more memory than anybody subscribed to, or that come
-    /// from a participant that is not known, or not yet.
+    /// from a participant that is not known, or not yet; or that speak of more numbers of samples than there can be.
     pub filtered: u64,
     /// Why such datagrams are let pass, if they are.
     pub unfiltered: Option<String>,

@@ -5,6 +5,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
 use super::Clock;
+use super::clock::time_of_day;
 
 /// The highest domain whose ports exist.
 const LAST_DOMAIN: u16 = 232;
@@ -41,6 +42,8 @@ pub struct Options {
     pub prefixes: Vec<PathBuf>,
     /// The clock of receive stamps.
     pub clock: Clock,
+    /// What tells the time of day, in ns since 1970. No sample is stamped with it: it is watched, because RustDDS depends on it.
+    pub time_of_day: fn() -> i64,
 }
 
 /// Why DDS does not do what it was asked for.
@@ -102,6 +105,7 @@ impl Options {
             messages: Vec::new(),
             prefixes: Vec::new(),
             clock: Clock::of_today(),
+            time_of_day,
         }
     }
 

@@ -34,17 +34,19 @@ pub(super) enum Held {
     Memory,
     /// Nobody: the sink panicked, with these words.
     Nobody(String),
+    /// Nobody: it cannot be read, for this reason.
+    Unreadable(String),
 }
 
 /// Binds RustDDS to bytes.
 pub(super) struct RawAdapter;
 
 impl no_key::DeserializerAdapter<Raw> for RawAdapter {
-    type Error = NoMemory;
+    type Error = Unreadable;
     type Decoded = Raw;
 
     fn supported_encodings() -> &'static [RepresentationIdentifier] {
-        &[RepresentationIdentifier::CDR_LE, RepresentationIdentifier::CDR_BE]
+        &ENCODINGS
     }
 
     fn transform_decoded(raw: Raw) -> Raw {
@@ -64,11 +66,35 @@ impl no_key::SerializerAdapter<Bytes> for RawAdapter {
     }
 }
 
-/// A sample for which there is no memory.
+/// All that have a name. Only the first two are read; of a sample in one of the others, RustDDS tells whose it is and which,
+/// which it does not of a sample in one that is missing here.
+const ENCODINGS: [RepresentationIdentifier; 17] = [
+    RepresentationIdentifier::CDR_LE,
+    RepresentationIdentifier::CDR_BE,
+    RepresentationIdentifier::PL_CDR_LE,
+    RepresentationIdentifier::PL_CDR_BE,
+    RepresentationIdentifier::XML,
+    RepresentationIdentifier::XCDR2_LE,
+    RepresentationIdentifier::XCDR2_BE,
+    RepresentationIdentifier::D_CDR2_LE,
+    RepresentationIdentifier::D_CDR2_BE,
+    RepresentationIdentifier::PL_XCDR2_LE,
+    RepresentationIdentifier::PL_XCDR2_BE,
+    RepresentationIdentifier::CDR2_LE,
+    RepresentationIdentifier::CDR2_BE,
+    RepresentationIdentifier::PL_CDR2_LE,
+    RepresentationIdentifier::PL_CDR2_BE,
+    RepresentationIdentifier::D_CDR_LE,
+    RepresentationIdentifier::D_CDR_BE,
+];
+
+/// Why a sample cannot be read.
 #[derive(Debug, thiserror::Error)]
-#[error("no memory for {bytes} bytes")]
-pub(super) struct NoMemory {
-    bytes: usize,
+pub(super) enum Unreadable {
+    #[error("no memory for {bytes} bytes")]
+    NoMemory { bytes: usize },
+    #[error("{encoding:?} is not CDR")]
+    Encoding { encoding: RepresentationIdentifier },
 }
 
 /// Copies a sample: into the sink's memory, if the sink can copy before it knows whose sample it is; else into memory of
@@ -84,11 +110,15 @@ pub(super) struct CopyInto<'a> {
 }
 
 impl<'de> no_key::Decode<'de, Raw> for CopyInto<'_> {
-    type Error = NoMemory;
+    type Error = Unreadable;
 
-    fn decode_bytes(self, bytes: &'de [u8], encoding: RepresentationIdentifier) -> Result<Raw, NoMemory> {
+    fn decode_bytes(self, bytes: &'de [u8], encoding: RepresentationIdentifier) -> Result<Raw, Unreadable> {
         let at_ns = self.clock.now();
-        let endian = if encoding == RepresentationIdentifier::CDR_BE { Endian::Big } else { Endian::Little };
+        let endian = match encoding {
+            RepresentationIdentifier::CDR_LE => Endian::Little,
+            RepresentationIdentifier::CDR_BE => Endian::Big,
+            encoding => return Err(Unreadable::Encoding { encoding }),
+        };
         let raw = |held| Ok(Raw { at_ns, endian, held });
         if let Some(sink) = self.sink {
             match catch_unwind(AssertUnwindSafe(|| sink.copy(bytes))) {
@@ -99,9 +129,25 @@ impl<'de> no_key::Decode<'de, Raw> for CopyInto<'_> {
         }
         let mut memory = self.memory.borrow_mut();
         memory.clear();
-        memory.try_reserve(bytes.len()).map_err(|_| NoMemory { bytes: bytes.len() })?;
+        memory.try_reserve(bytes.len()).map_err(|_| Unreadable::NoMemory { bytes: bytes.len() })?;
         memory.extend_from_slice(bytes);
         raw(Held::Memory)
+    }
+}
+
+/// Copies a sample, or says in its place why not: with an error RustDDS does not tell whose sample it was.
+#[derive(Copy, Clone)]
+pub(super) struct CopyOrSay<'a>(pub(super) CopyInto<'a>);
+
+impl<'de> no_key::Decode<'de, Raw> for CopyOrSay<'_> {
+    type Error = Unreadable;
+
+    fn decode_bytes(self, bytes: &'de [u8], encoding: RepresentationIdentifier) -> Result<Raw, Unreadable> {
+        let unreadable = |why: Unreadable| {
+            let held = Held::Unreadable(why.to_string());
+            Raw { at_ns: self.0.clock.now(), endian: Endian::Little, held }
+        };
+        Ok(self.0.decode_bytes(bytes, encoding).unwrap_or_else(unreadable))
     }
 }
 
@@ -110,9 +156,9 @@ impl<'de> no_key::Decode<'de, Raw> for CopyInto<'_> {
 pub(super) struct PassOver;
 
 impl<'de> no_key::Decode<'de, Raw> for PassOver {
-    type Error = NoMemory;
+    type Error = Unreadable;
 
-    fn decode_bytes(self, _: &'de [u8], _: RepresentationIdentifier) -> Result<Raw, NoMemory> {
+    fn decode_bytes(self, _: &'de [u8], _: RepresentationIdentifier) -> Result<Raw, Unreadable> {
         Ok(Raw { at_ns: 0, endian: Endian::Little, held: Held::Memory })
     }
 }

@@ -13,6 +13,7 @@ use mio::{Events, Interest, Poll, Token, Waker};
 use rustdds::{DomainParticipant, DomainParticipantStatusListener, GUID, StatusEvented};
 
 use super::ask::{Ask, Asker};
+use super::clock::Day;
 use super::feed::{self, Around, Feed};
 use super::guard::Guard;
 use super::offers::Offer;
@@ -71,6 +72,7 @@ struct Receiver {
     state: Arc<State>,
     memory: RefCell<Vec<u8>>,
     clock: Clock,
+    day: Day,
     /// Bytes of the largest sample that was announced, whatever is subscribed so far.
     largest: usize,
     /// Something changed since the last look.
@@ -106,6 +108,7 @@ pub(super) fn start(
         state: state.clone(),
         memory: RefCell::new(Vec::with_capacity(KEPT_BYTES)),
         clock: options.clock,
+        day: Day::new(options.time_of_day),
         largest: options.largest,
         changed: true,
         looked: None,
@@ -209,6 +212,13 @@ impl Receiver {
     fn look(&mut self) {
         self.changed = false;
         self.looked = Some(Instant::now());
+        if let Some(back) = self.day.set_back() {
+            let seconds = (back + 500_000_000) / 1_000_000_000;
+            self.state.die(format!(
+                "the time of day was set back by {seconds} s: until it has caught up, nothing of best-effort writers is heard, \
+                 and no participant that is new; a restart cures that"
+            ));
+        }
         let writers = self.participant.discovered_writers();
         let offers: Vec<Offer> = writers.iter().map(wire::offer).collect();
         self.note_events();

@@ -2,13 +2,13 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use gleaner_transport::dds::{Dds, Health, Options};
+use gleaner_transport::dds::{Clock, Dds, Health, Options};
 use gleaner_transport::{Qos, SampleMeta, Sink, Transport, Verdict};
 
 use super::Test;
@@ -24,8 +24,26 @@ pub const TESTS: &[Test] = &[
     ("a_sink_that_panics_is_death_with_a_name_and_other_topics_go_on", panicking),
     ("a_participant_that_is_dropped_ends_in_the_middle_of_samples", dropped),
     ("a_participant_is_not_kept_by_a_sink_that_does_not_come_back", dropped_while_stuck),
+    ("a_time_of_day_that_is_set_back_is_death_with_words", set_back),
     ("a_node_name_that_is_none_is_refused", bad_node),
 ];
+
+fn set_back() {
+    static BACK_NS: AtomicI64 = AtomicI64::new(0);
+    let time_of_day = || Clock::of_today().now() - BACK_NS.load(Ordering::Relaxed);
+    let domain = domain();
+    let mut dds = Dds::open(Options { time_of_day, ..options(domain) }).unwrap();
+    let sink = Kept::new();
+    dds.subscribe(&spec("/clock", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    // Whoever hears this has looked at the clock.
+    sink.mark(&peer.writer("/clock", false, false), b"tick");
+    assert_eq!(dds.health().dead, None);
+    BACK_NS.store(3_600_000_000_000, Ordering::Relaxed);
+    until("death", || dds.health().dead.is_some());
+    let dead = dds.health().dead.unwrap();
+    assert!(dead.starts_with("the time of day was set back by 3600 s: "), "{dead}");
+}
 
 fn buffer() {
     for (largest, asked) in [(1, 8 << 20), (4 << 20, 16 << 20), (usize::MAX, 64 << 20)] {

@@ -1,8 +1,12 @@
 //! What writers offer, and what is asked of them.
 
+use std::net::UdpSocket;
+
 use gleaner_transport::{Qos, Transport};
+use rustdds::RTPSEntity;
 
 use super::Test;
+use super::hostile::{LITTLE, data, port};
 use super::peer::{Kept, Peer, connected, domain, matched, open, policies, spec, until, write};
 
 pub const TESTS: &[Test] = &[
@@ -10,7 +14,8 @@ pub const TESTS: &[Test] = &[
     ("auto_gets_what_a_writer_kept_for_late_readers", auto_transient_local),
     ("auto_asks_for_more_again_when_all_writers_have_gone", auto_recovers),
     ("a_fixed_request_that_a_writer_does_not_satisfy_is_trouble_with_names", fixed_does_not_fit),
-    ("a_writer_of_another_type_is_trouble_with_both_types", another_type),
+    ("a_writer_of_another_type_is_trouble_with_both_types_and_none_of_its_samples_come", another_type),
+    ("a_number_that_is_far_ahead_hides_no_sample_from_a_reader_that_asks_again", far_ahead),
 ];
 
 fn auto_adapts() {
@@ -109,12 +114,41 @@ fn fixed_does_not_fit() {
 fn another_type() {
     let domain = domain();
     let mut dds = open(domain);
-    let subscription = dds.subscribe(&spec("/typed", Qos::Auto), Kept::new()).unwrap();
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/typed", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
+    let ours = peer.writer("/typed", true, false);
+    connected(&dds, subscription, 1);
     let policies = policies(true, false);
     let topic = peer.topic("rt/typed", "sensor_msgs::msg::dds_::Imu_", &policies);
-    let _writer = peer.writer_of::<super::peer::Little>(&topic, &policies);
-    until("trouble", || !dds.status(subscription).trouble.is_empty());
+    let other = peer.writer_of::<super::peer::Little>(&topic, &policies);
+    matched(&other);
+    // At once: nobody has looked at its type yet.
+    write(&other, b"of the other");
+    let passed_over = "1 sample of `/typed`, of another type, passed over";
+    until("trouble", || dds.status(subscription).trouble.iter().any(|line| line == passed_over));
     let trouble = dds.status(subscription).trouble;
     assert!(trouble[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"), "{trouble:?}");
+    sink.mark(&ours, b"of ours.");
+    assert!(sink.bytes(1).iter().all(|bytes| bytes == b"of ours."));
+}
+
+fn far_ahead() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/far", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/far", false, true);
+    assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("best effort, transient local"));
+    matched(&writer);
+    write(&writer, b"1...");
+    sink.wait(1);
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    wire.send_to(&data(writer.guid(), 1 << 40, b"far.", LITTLE), ("127.0.0.1", port(domain))).unwrap();
+    sink.wait(2);
+    let _less = peer.writer("/far", false, false);
+    assert_eq!(connected(&dds, subscription, 2).qos.as_deref(), Some("best effort, volatile"));
+    sink.mark(&writer, b"near");
+    assert!(sink.bytes(3)[2..].iter().all(|bytes| bytes == b"near"), "nothing comes a second time");
 }
