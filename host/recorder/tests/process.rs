@@ -11,7 +11,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use gleaner_protocol::TriggerKind::{Event, Start};
-use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, Said};
+use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
 use gleaner_protocol::{Exit, Failure};
 use gleaner_recorder::program::{Feed, Options, run};
 use gleaner_transport::dds::Clock;
@@ -256,6 +256,29 @@ fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_e
     received(&mut running, 1);
     let specs = network.specs.lock().unwrap();
     assert_eq!(specs.iter().map(|spec| (spec.topic.as_str(), spec.max_bytes)).collect::<Vec<_>>(), [("/a", 3 << 20)]);
+}
+
+#[test]
+fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add_other("/a", "aaa/msg/X");
+    network.add_other("/b", "aaa/msg/X");
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let (folder, header) = lambda(&scratch, "first", (10, 10));
+    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    link.hello(&header, PATIENCE).unwrap();
+    // `/b` is no input, so that any type will do: once it is found, `/a` was looked for as well.
+    let type_of = |status: &RecorderStatus, name: &str| {
+        status.topics.iter().find(|topic| topic.topic == name).and_then(|topic| topic.type_name.clone())
+    };
+    let status = running.status(|status| type_of(status, "/b").is_some());
+    assert_eq!((type_of(&status, "/a"), type_of(&status, "/b").as_deref()), (None, Some("aaa/msg/X")));
+    network.add("/a");
+    let _sensor = Sensor::start(&network, running.clock);
+    received(&mut running, 10);
+    let status = running.status(|_| true);
+    assert_eq!(type_of(&status, "/a").as_deref(), Some("test_msgs/msg/Number"));
 }
 
 #[test]

@@ -91,7 +91,7 @@ pub fn run(
     starter(control, events, reader.clone()).map_err(internal)?;
     let commands = options.commands.clone().map(|name| {
         let (commands, sink) = Commands::new(name.clone(), reader.clone());
-        let _ = wants.send(Want { what: Wanted::Commands, name, sink });
+        let _ = wants.send(Want { what: Wanted::Commands, name, type_name: None, sink });
         commands
     });
     say.say(RecorderReport::Ready);
