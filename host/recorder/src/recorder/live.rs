@@ -154,13 +154,14 @@ impl Recorder {
         self.run()
     }
 
-    /// From now on no clip is begun, and the one that is open ends: `why` says it. `None`: goes on.
+    /// From now on no clip is begun, and the one that is open ends: `why` says it. A preroll on disk gets smaller. `None`: goes on.
     ///
     /// # Errors
     ///
     /// [`RecordError`] if the disk fails.
     pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
         self.held = why.map(Arc::from);
+        self.stock.preroll.shrink(why.is_some());
         // What is open ends at once.
         self.windows.set_grace(if why.is_some() { 0 } else { nanoseconds(GRACE) });
         self.run()
