@@ -177,6 +177,11 @@ pub enum RecordError {
 }
 
 impl RecordError {
+    /// Whether there is no room on the disk.
+    pub(crate) fn is_full_disk(&self) -> bool {
+        matches!(self.system(), Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded))
+    }
+
     /// What the system said, wherever in the chain of causes it stands.
     fn system(&self) -> Option<io::ErrorKind> {
         let mut cause: Option<&(dyn Error + 'static)> = Some(self);

@@ -11,7 +11,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use gleaner_protocol::TriggerKind::{Event, Start};
-use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, Said};
+use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
 use gleaner_protocol::{Exit, Failure};
 use gleaner_recorder::program::{Feed, Options, run};
 use gleaner_transport::dds::Clock;
@@ -159,6 +159,61 @@ fn a_full_disk_is_said_and_no_clip_is_begun() {
     assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains(r#""loss":"held_back""#));
 }
 
+/// A clip whose recorder died.
+fn unfinished(scratch: &Scratch) {
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let lambda = recorder.add_lambda(member("dead", (500, 500, 0), &[a]));
+    drive(&mut recorder, &[a], (0, 3000, 10), &[(2000, lambda, &[Start])]);
+}
+
+#[test]
+fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and_stays() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add("/a");
+    unfinished(&scratch);
+    let find = |ending: &str| {
+        let files = fs::read_dir(scratch.0.join("clips")).unwrap().map(|file| file.unwrap().path());
+        files.filter(|path| path.to_string_lossy().ends_with(ending)).collect::<Vec<_>>()
+    };
+    let [part] = &find(".mcap.part")[..] else { panic!("no clip was left") };
+    let left = fs::read(part).unwrap();
+    // Where the copy is to be, there is something that cannot be removed.
+    let in_the_way = part.with_extension("part2");
+    fs::create_dir(&in_the_way).unwrap();
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let why = running.until(|report| match report {
+        RecorderReport::Loss(Loss::Failed { why, .. }) => Some(why),
+        _ => None,
+    });
+    assert!(why.contains("cannot recover the unfinished clip") && why.contains(".mcap.part2"), "{why}");
+    let (folder, header) = lambda(&scratch, "first", (10, 10));
+    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    link.hello(&header, PATIENCE).unwrap();
+    let _sensor = Sensor::start(&network, running.clock);
+    received(&mut running, 10);
+    link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+    assert!(!scratch.messages(&running.clip()).is_empty());
+    running.control.stop().unwrap();
+    let (last, ended) = running.ended();
+    assert_eq!((last.clips, last.failed, ended), (1, 1, Ok(())));
+    assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains("cannot recover"));
+    assert_eq!(fs::read(part).unwrap(), left);
+    // The way is free; and a recorder that is stopped at once has some seconds for it.
+    fs::remove_dir(&in_the_way).unwrap();
+    let mut running = Running::start(&scratch, &network, |options| options.clips_max = Some(1));
+    running.control.stop().unwrap();
+    let recovered = running.until(|report| match report {
+        RecorderReport::Recovered(clip) => Some(clip),
+        _ => None,
+    });
+    assert!(recovered.recovered.is_some() && recovered.lambdas[0].name == "dead");
+    let (last, ended) = running.ended();
+    assert_eq!((last.clips, last.failed, last.deleted, ended), (0, 0, 1, Ok(())));
+    assert_eq!(find(".mcap"), [scratch.0.join(&recovered.file)]);
+}
+
 #[test]
 fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     let scratch = Scratch::new();
@@ -201,6 +256,29 @@ fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_e
     received(&mut running, 1);
     let specs = network.specs.lock().unwrap();
     assert_eq!(specs.iter().map(|spec| (spec.topic.as_str(), spec.max_bytes)).collect::<Vec<_>>(), [("/a", 3 << 20)]);
+}
+
+#[test]
+fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    network.add_other("/a", "aaa/msg/X");
+    network.add_other("/b", "aaa/msg/X");
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let (folder, header) = lambda(&scratch, "first", (10, 10));
+    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    link.hello(&header, PATIENCE).unwrap();
+    // `/b` is no input, so that any type will do: once it is found, `/a` was looked for as well.
+    let type_of = |status: &RecorderStatus, name: &str| {
+        status.topics.iter().find(|topic| topic.topic == name).and_then(|topic| topic.type_name.clone())
+    };
+    let status = running.status(|status| type_of(status, "/b").is_some());
+    assert_eq!((type_of(&status, "/a"), type_of(&status, "/b").as_deref()), (None, Some("aaa/msg/X")));
+    network.add("/a");
+    let _sensor = Sensor::start(&network, running.clock);
+    received(&mut running, 10);
+    let status = running.status(|_| true);
+    assert_eq!(type_of(&status, "/a").as_deref(), Some("test_msgs/msg/Number"));
 }
 
 #[test]

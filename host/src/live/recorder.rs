@@ -11,7 +11,8 @@ use gleaner_protocol::{Decision, Exit, Failure, ToRecorder as Dropped};
 use crate::api::data::{Topic, Wake};
 use crate::journal::Scribe;
 
-/// How long the recorder may take to get ready: it may have clips of an earlier one to recover.
+/// How long the recorder may take to get ready: on a busy machine, with a large preroll to take from the system. What an earlier one
+/// left it recovers afterwards.
 const READY: Duration = Duration::from_secs(120);
 /// How long it may take for the last wakes.
 const PATIENCE: Duration = Duration::from_secs(10);

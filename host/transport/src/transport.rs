@@ -161,7 +161,8 @@ pub struct Subscription(pub usize);
 
 /// A source of samples. Object safe and synchronous.
 pub trait Transport {
-    /// The topics known now, sorted by name. A live transport may learn of more later.
+    /// The topics known now, sorted by name. A live transport may learn of more later, and may know one of several types: the one
+    /// that most write comes first.
     fn topics(&self) -> Vec<DiscoveredTopic>;
 
     /// Sends each sample of a topic to `sink` from now on. A topic may be subscribed several times;

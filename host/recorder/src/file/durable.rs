@@ -1,10 +1,14 @@
 //! Steps of the file system that are on the disk when they return.
 
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::path::Path;
 
+use super::recover::Pause;
 use crate::error::RecordError;
+
+/// Bytes that are copied at a time.
+const PIECE: u64 = 8 << 20;
 
 /// Makes the names in `folder` durable: a rename is on the disk only when its folder is.
 pub(super) fn sync_folder(folder: &Path) -> Result<(), RecordError> {
@@ -48,12 +52,14 @@ pub(super) fn write_with(
 
 /// Copies the content of `from` into the file `to`, which must not exist yet, and makes it durable there. What was read
 /// is what is on the disk then, even if an earlier attempt to make it durable where it was had failed.
-pub(super) fn copy(from: &Path, to: &Path) -> Result<(), RecordError> {
+pub(super) fn copy(from: &Path, to: &Path, pause: &mut Pause) -> Result<(), RecordError> {
     let cannot_write = |source| RecordError::Write { path: to.to_owned(), source };
-    let mut source = File::open(from).map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
+    let source = File::open(from).map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
     let copy = step("copy", to).and_then(|()| File::create_new(to));
     let mut copy = copy.map_err(|source| RecordError::Create { path: to.to_owned(), source })?;
-    io::copy(&mut source, &mut copy).map_err(cannot_write)?;
+    while io::copy(&mut (&source).take(PIECE), &mut copy).map_err(cannot_write)? > 0 {
+        pause()?;
+    }
     sync_file(to)
 }
 

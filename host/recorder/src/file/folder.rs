@@ -11,11 +11,11 @@ use tracing::warn;
 
 use super::list::{List, Listed};
 use super::losses::LossList;
-use super::part::{Origin, origin};
-use super::place::{AGAIN, CLIP, CLIPS, PART, Place};
+use super::place::{CLIPS, PART, Place};
+use super::recover::Recovery;
 use super::shelf::Shelf;
 use super::unfinished::Unfinished;
-use super::{About, durable, recover};
+use super::{About, durable};
 use crate::error::RecordError;
 
 /// A folder of clips with their list, held by one process at a time.
@@ -23,37 +23,56 @@ pub struct Folder {
     pub(super) place: Arc<Place>,
     shelf: Option<Shelf>,
     losses: Arc<LossList>,
+    left: Recovery,
 }
 
 impl Folder {
     /// Opens the folder `out`, which is made if there is none, and takes it for this process. Whatever an earlier process
-    /// left unfinished is completed first: the clips that came back by that are returned, and listed already.
+    /// left unfinished is completed first: the clips that came back by that are returned, and listed already. What cannot be
+    /// completed, for example because the disk is full, is logged, and left as it is for a later process.
     ///
     /// # Errors
     ///
-    /// [`RecordError::Busy`] if another process records into it; [`RecordError::Recover`] if a clip cannot be recovered,
-    /// for example because the disk is full: it is left as it is then; other [`RecordError`]s if the folder cannot be
-    /// made, locked or read.
+    /// [`RecordError::Busy`] if another process records into it; other [`RecordError`]s if the folder cannot be made, locked
+    /// or read.
     pub fn open(out: &Path) -> Result<(Self, Vec<Clip>), RecordError> {
+        let mut folder = Self::hold(out)?;
+        let mut recovery = folder.take_left();
+        let mut found = Vec::new();
+        while let Some(came) = recovery.next(&mut || true) {
+            match came {
+                Ok(clip) => found.push(clip),
+                Err(error) => {
+                    warn!(
+                        error = &error as &dyn std::error::Error,
+                        "a clip cannot be recovered, left for a later start"
+                    )
+                }
+            }
+        }
+        Ok((folder, found))
+    }
+
+    /// As [`Folder::open`], but what an earlier process left is not completed yet: the thread of [`crate::Recorder::live`] does
+    /// that while it records.
+    ///
+    /// # Errors
+    ///
+    /// As for [`Folder::open`].
+    pub fn hold(out: &Path) -> Result<Self, RecordError> {
         let clips = out.join(CLIPS);
         fs::create_dir_all(&clips).map_err(|source| RecordError::Create { path: clips.clone(), source })?;
         let lock = lock(&clips, out)?;
         let list = List::of(out);
         let taken: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
         let place = Arc::new(Place::new(clips, list, taken, lock));
-        let mut found = Vec::new();
-        for name in files(place.folder(), AGAIN)? {
-            discard_copy(&place, &name)?;
-        }
-        for name in files(place.folder(), PART)? {
-            found.extend(recover::recover(&place, &name)?);
-        }
-        for name in files(place.folder(), CLIP)? {
-            if !place.is_taken(&format!("{name}{CLIP}")) {
-                found.extend(recover::list(&place, &name)?);
-            }
-        }
-        Ok((Self { place, shelf: None, losses: Arc::new(LossList::of(out)) }, found))
+        let left = Recovery::of(&place)?;
+        Ok(Self { place, shelf: None, losses: Arc::new(LossList::of(out)), left })
+    }
+
+    /// What an earlier process left, for whoever completes it.
+    pub(crate) fn take_left(&mut self) -> Recovery {
+        std::mem::take(&mut self.left)
     }
 
     /// Starts anew with the clips in `keep`: deletes the others that are listed, with their thumbnails, and says how
@@ -132,34 +151,5 @@ fn lock(clips: &Path, out: &Path) -> Result<File, RecordError> {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => Err(RecordError::Busy { folder: out.to_owned() }),
         Err(TryLockError::Error(source)) => Err(RecordError::Lock { path, source }),
-    }
-}
-
-/// The files in `folder` that end so, without the ending, sorted. What has another name, or is no file, is not ours.
-fn files(folder: &Path, ending: &str) -> Result<Vec<String>, RecordError> {
-    let cannot_read = |source| RecordError::Read { path: folder.to_owned(), source };
-    let mut names = Vec::new();
-    for entry in fs::read_dir(folder).map_err(cannot_read)? {
-        let entry = entry.map_err(cannot_read)?;
-        if !entry.file_type().is_ok_and(|kind| kind.is_file()) {
-            continue;
-        }
-        if let Some(name) = entry.file_name().to_str().and_then(|name| name.strip_suffix(ending)) {
-            names.push(name.to_owned());
-        }
-    }
-    names.sort();
-    Ok(names)
-}
-
-/// Removes the copy that a recovery had begun; what it was copied from is still there.
-fn discard_copy(place: &Place, name: &str) -> Result<(), RecordError> {
-    let path = place.path(name, AGAIN);
-    match origin(&path).map_err(|source| RecordError::Read { path: path.clone(), source })? {
-        Origin::Foreign => {
-            warn!(path = %path.display(), "file is not of this program, left alone");
-            Ok(())
-        }
-        Origin::Ours | Origin::Nothing => durable::remove(&path).map(drop),
     }
 }

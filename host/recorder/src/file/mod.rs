@@ -12,8 +12,8 @@
 //! ```
 //!
 //! A clip is written chunk by chunk, so that a death costs a second of it; then its metadata, attachments and footer;
-//! then it is synced and gets its name; then it is listed. [`Folder::open`] finishes what a death interrupted, wherever
-//! that was, and a death in the middle of that changes nothing.
+//! then it is synced and gets its name; then it is listed. `Recovery` finishes what a death interrupted, wherever that was,
+//! and a death in the middle of that changes nothing; what it cannot finish stays for the next start.
 //!
 //! Never: a file touched that this program did not write; a clip that was acknowledged deleted other than by
 //! [`Folder::replace`], or that nobody fetched other than by [`Folder::keep_at_most`].
@@ -40,6 +40,7 @@ use gleaner_protocol::{ClipLambda, Moment};
 
 pub use folder::Folder;
 pub use losses::LossList;
+pub(crate) use recover::Recovery;
 pub use unfinished::MESSAGE_MAX;
 pub(crate) use unfinished::Unfinished;
 

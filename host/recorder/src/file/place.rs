@@ -60,8 +60,13 @@ impl Place {
     /// Adds a whole clip to the list.
     pub(super) fn add(&self, name: &str, clip: &Clip) -> Result<(), RecordError> {
         self.list.append(clip)?;
-        self.taken().insert(format!("{name}{CLIP}"));
+        self.take(name);
         Ok(())
+    }
+
+    /// From now on the name is given to no clip.
+    pub(super) fn take(&self, name: &str) {
+        self.taken().insert(format!("{name}{CLIP}"));
     }
 
     pub(super) fn is_taken(&self, file: &str) -> bool {

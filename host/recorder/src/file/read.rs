@@ -8,6 +8,7 @@ use gleaner_transport::replay::{Damage, Limits, Place, Replay, ReplayError, read
 use gleaner_transport::{SampleMeta, TopicSpec, Transport, Verdict};
 
 use super::ending::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};
+use super::recover::Pause;
 use super::{About, Topic};
 use crate::error::RecordError;
 
@@ -77,8 +78,8 @@ impl gleaner_transport::Sink for Held {
 }
 
 /// The line of the clip `path` if it is whole, found out by reading all of it.
-pub(super) fn whole(path: &Path) -> Result<Option<Clip>, RecordError> {
-    if each_message(path, |_, _, _| Ok(()))?.is_some() {
+pub(super) fn whole(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
+    if each_message(path, |_, _, _| pause())?.is_some() {
         return Ok(None);
     }
     let extras = read_extras(path, EXTRAS_BYTES)

@@ -3,6 +3,7 @@
 //! Every step may be the last one of this process, too. So each leaves the folder in a state that the next attempt
 //! reads as it was meant: the unfinished file goes last, and a clip that was saved says from which file.
 
+use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader};
 use std::path::Path;
@@ -19,15 +20,94 @@ use super::unfinished::{CHUNK_SPAN_NS, Saved, Unfinished};
 use super::{Ending, durable};
 use crate::error::RecordError;
 
+/// What an earlier process left in a folder. It is found before this one writes there, and completed one by one.
+#[derive(Default)]
+pub(crate) struct Recovery {
+    place: Option<Arc<Place>>,
+    left: VecDeque<(&'static str, String)>,
+}
+
+/// Is called again and again while something takes long. It may do other things meanwhile; an error of it ends what takes long.
+pub(super) type Pause<'a> = dyn FnMut() -> Result<(), RecordError> + 'a;
+
+impl Recovery {
+    /// What is left in the folder of `place`.
+    pub(super) fn of(place: &Arc<Place>) -> Result<Recovery, RecordError> {
+        let mut left = VecDeque::new();
+        for ending in [AGAIN, PART, CLIP] {
+            left.extend(files(place.folder(), ending)?.into_iter().map(|name| (ending, name)));
+        }
+        Ok(Recovery { place: Some(Arc::clone(place)), left })
+    }
+
+    /// The next clip that came back, which is listed, or why one did not: that is left as it is, for a later process. `go_on` is
+    /// asked again and again; once it says no, what is under way is left as well, and nothing more comes.
+    pub(crate) fn next(&mut self, go_on: &mut dyn FnMut() -> bool) -> Option<Result<Clip, RecordError>> {
+        let place = self.place.as_ref()?;
+        while go_on() {
+            let (ending, name) = self.left.pop_front()?;
+            let mut pause = || match go_on() {
+                true => Ok(()),
+                // Nobody is told of it.
+                false => Err(RecordError::Read {
+                    path: place.path(&name, ending),
+                    source: io::ErrorKind::Interrupted.into(),
+                }),
+            };
+            let came = match ending {
+                AGAIN => discard_copy(place, &name).map(|()| None),
+                PART => recover(place, &name, &mut pause),
+                _ if place.is_taken(&format!("{name}{CLIP}")) => Ok(None),
+                _ => list(place, &name, &mut pause),
+            };
+            match came {
+                Ok(None) => {}
+                Ok(Some(clip)) => return Some(Ok(clip)),
+                Err(error) => return go_on().then_some(Err(error)),
+            }
+        }
+        None
+    }
+}
+
+/// The files in `folder` that end so, without the ending, sorted. What has another name, or is no file, is not ours.
+fn files(folder: &Path, ending: &str) -> Result<Vec<String>, RecordError> {
+    let cannot_read = |source| RecordError::Read { path: folder.to_owned(), source };
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder).map_err(cannot_read)? {
+        let entry = entry.map_err(cannot_read)?;
+        if !entry.file_type().is_ok_and(|kind| kind.is_file()) {
+            continue;
+        }
+        if let Some(name) = entry.file_name().to_str().and_then(|name| name.strip_suffix(ending)) {
+            names.push(name.to_owned());
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+/// Removes the copy that a recovery had begun; what it was copied from is still there.
+fn discard_copy(place: &Place, name: &str) -> Result<(), RecordError> {
+    let path = place.path(name, AGAIN);
+    match origin(&path).map_err(|source| RecordError::Read { path: path.clone(), source })? {
+        Origin::Foreign => {
+            warn!(path = %path.display(), "file is not of this program, left alone");
+            Ok(())
+        }
+        Origin::Ours | Origin::Nothing => durable::remove(&path).map(drop),
+    }
+}
+
 /// Makes a clip of the unfinished clip `name`, if there is anything in it, and lists it.
-pub(super) fn recover(place: &Arc<Place>, name: &str) -> Result<Option<Clip>, RecordError> {
+fn recover(place: &Arc<Place>, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     let part = place.path(name, PART);
-    let recovered = attempt(place, name, &part);
+    let recovered = attempt(place, name, &part, pause);
     recovered.map_err(|source| RecordError::Recover { path: part, source: Box::new(source) })
 }
 
 /// Lists the clip `name`, which has its name and no line, if it is one of ours and whole.
-pub(super) fn list(place: &Place, name: &str) -> Result<Option<Clip>, RecordError> {
+fn list(place: &Place, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     let path = place.path(name, CLIP);
     match origin(&path) {
         Ok(Origin::Ours) => {}
@@ -37,7 +117,7 @@ pub(super) fn list(place: &Place, name: &str) -> Result<Option<Clip>, RecordErro
             return Ok(None);
         }
     }
-    match read::whole(&path) {
+    match read::whole(&path, pause) {
         // A clip that somebody copied here, under a name of theirs, is theirs.
         Ok(Some(clip)) if !is_own_name(name, &clip) => Ok(None),
         Ok(Some(clip)) => {
@@ -64,7 +144,7 @@ fn is_own_name(name: &str, clip: &Clip) -> bool {
     name == own || number.is_some_and(|number| number.bytes().all(|digit| digit.is_ascii_digit()))
 }
 
-fn attempt(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, RecordError> {
+fn attempt(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     match origin(part).map_err(|source| RecordError::Read { path: part.to_owned(), source })? {
         Origin::Foreign => {
             warn!(path = %part.display(), "file is not of this program, left alone");
@@ -82,10 +162,10 @@ fn attempt(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, 
         durable::remove(part)?;
         return Ok(None);
     }
-    match read::whole(part)? {
+    match read::whole(part, pause)? {
         // It died just before the rename.
-        Some(clip) => adopt(place, name, part, clip).map(Some),
-        None => save(place, name, part),
+        Some(clip) => adopt(place, name, part, clip, pause).map(Some),
+        None => save(place, name, part, pause),
     }
 }
 
@@ -126,20 +206,22 @@ fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
 }
 
 /// The name for the clip of the unfinished file `name`: its own, as it was free when the file was begun, unless
-/// somebody has put another file there since.
+/// somebody has put another file there since. No clip that is begun meanwhile gets it.
 fn name_for(place: &Place, name: &str) -> String {
     let is_free = |name: &String| !place.exists(name, CLIP) && !place.is_taken(&format!("{name}{CLIP}"));
-    names(name).find(is_free).expect("numbers do not end before the files do")
+    let free = names(name).find(is_free).expect("numbers do not end before the files do");
+    place.take(&free);
+    free
 }
 
 /// Makes a clip of an unfinished file that is whole.
 ///
 /// Its recorder may have died because the file could not be synced. The system then believes that its pages are on the
 /// disk, and to sync it again would prove nothing: only bytes that are written anew are known to arrive.
-fn adopt(place: &Place, name: &str, part: &Path, clip: Clip) -> Result<Clip, RecordError> {
+fn adopt(place: &Place, name: &str, part: &Path, clip: Clip, pause: &mut Pause) -> Result<Clip, RecordError> {
     let free = name_for(place, name);
     let again = place.path(name, AGAIN);
-    if let Err(error) = durable::copy(part, &again) {
+    if let Err(error) = durable::copy(part, &again, pause) {
         // On a full disk, its room is wanted.
         durable::remove(&again)?;
         return Err(error);
@@ -180,9 +262,9 @@ fn discard(place: &Place, name: &str) -> Result<(), RecordError> {
 }
 
 /// Copies the messages of `part` into a clip of their own.
-fn save(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, RecordError> {
+fn save(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     let again = place.path(name, AGAIN);
-    let saved = copy(place, name, part);
+    let saved = copy(place, name, part, pause);
     if saved.as_ref().is_ok_and(Option::is_some) {
         durable::remove(&place.path(name, JPG_PART))?;
         durable::remove(part)?;
@@ -196,12 +278,15 @@ fn save(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, Rec
     saved
 }
 
-fn copy(place: &Arc<Place>, name: &str, part: &Path) -> Result<Option<Clip>, RecordError> {
+fn copy(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     let len = fs::metadata(part).map_err(|source| RecordError::Read { path: part.to_owned(), source })?.len();
     let about = read::about(part);
     let free = name_for(place, name);
     let mut clip = Unfinished::create(Arc::clone(place), name.to_owned(), AGAIN, about.as_ref())?;
-    let end = read::each_message(part, |topic, meta, cdr| clip.message(topic, meta, cdr))?;
+    let end = read::each_message(part, |topic, meta, cdr| {
+        pause()?;
+        clip.message(topic, meta, cdr)
+    })?;
     let Some((first_ns, last_ns)) = clip.span() else {
         return Ok(None);
     };

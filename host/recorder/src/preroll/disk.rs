@@ -1,13 +1,15 @@
 //! A preroll on disk: chunk files that are written once and deleted whole, with an index in memory.
 //!
 //! The bound holds for files and index together. Room is made by the chunk, so that up to a sixteenth of the bound more
-//! goes than in memory would.
+//! goes than in memory would. Where the disk has less room than the bound, the oldest chunks go as well.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+
+use tracing::warn;
 
 use super::{Held, Place};
 use crate::RecordError;
@@ -41,6 +43,10 @@ pub(super) struct Disk {
     /// The chunk that was read last, and room for what is read.
     reader: Option<(u64, File)>,
     buffer: Vec<u8>,
+    /// Whether more chunks go than come, as the disk has too little room for others.
+    shrinks: bool,
+    /// Whether a full disk was said.
+    was_full: bool,
 }
 
 struct Indexed {
@@ -70,6 +76,8 @@ impl Disk {
             bytes: 0,
             reader: None,
             buffer: Vec::new(),
+            shrinks: false,
+            was_full: false,
         };
         fs::create_dir_all(&disk.folder).map_err(failed(&disk.folder))?;
         for entry in fs::read_dir(&disk.folder).map_err(failed(&disk.folder))? {
@@ -81,7 +89,29 @@ impl Disk {
         Ok(disk)
     }
 
+    /// On a full disk the oldest go for it as well; where that does not help, it goes itself.
     pub(super) fn push(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
+        loop {
+            match self.add(held, bytes, gone) {
+                Err(error) if error.is_full_disk() => {
+                    if !std::mem::replace(&mut self.was_full, true) {
+                        let folder = self.folder.display();
+                        warn!(%folder, "the disk is full: the preroll holds less than it may");
+                    }
+                    let is_alone = self.bytes == 0;
+                    self.drop_oldest(gone)?;
+                    if is_alone {
+                        gone(held);
+                        return Ok(true);
+                    }
+                }
+                added => return added,
+            }
+        }
+    }
+
+    /// As [`push`](Self::push), but a full disk is an error, after which nothing has changed.
+    pub(super) fn add(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
         if !self.fits(bytes.len()) {
             return Ok(false);
         }
@@ -94,6 +124,10 @@ impl Disk {
             self.newest = None;
         }
         if self.newest.is_none() {
+            let too_many = if self.shrinks { 2 } else { 0 };
+            for _ in 0..too_many {
+                self.drop_oldest(gone)?;
+            }
             let path = self.path(self.next_chunk);
             self.newest = Some(File::create(&path).map_err(failed(&path))?);
             let first = self.first + self.index.len() as u64;
@@ -171,6 +205,10 @@ impl Disk {
     pub(super) fn grow(&mut self, bound: u64) {
         self.bound = bound;
         self.chunk_bytes = (bound / 16).clamp(CHUNK_MIN, CHUNK_MAX);
+    }
+
+    pub(super) fn shrink(&mut self, shrinks: bool) {
+        self.shrinks = shrinks;
     }
 
     pub(super) fn fits(&self, len: usize) -> bool {

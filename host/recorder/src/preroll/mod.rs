@@ -184,14 +184,20 @@ impl Preroll {
         let mut next = self.next(None);
         while let Some(walked) = next {
             let held = self.held(walked.place());
-            new.push(held, self.bytes(walked.place())?, &mut |_| {})?;
+            let bytes = self.bytes(walked.place())?;
+            match &mut new.kind {
+                Kind::Ram(_) => new.push(held, bytes, &mut |_| {})?,
+                // On a full disk it stays where it is.
+                Kind::Disk(disk) => disk.add(&held, bytes, &mut |_| {})?,
+            };
             next = self.next(next);
         }
         self.kind = new.kind;
         Ok(true)
     }
 
-    /// Adds an entry; the oldest go to make room for it, and are told to `gone`. `false` if it is larger than the store.
+    /// Adds an entry; the oldest go to make room for it, and are told to `gone`: on a full disk it may be told itself. `false`
+    /// if it is larger than the store.
     ///
     /// # Errors
     ///
@@ -210,6 +216,13 @@ impl Preroll {
         };
         self.highest = self.highest.max(self.bytes_held());
         Ok(taken)
+    }
+
+    /// Whether it gets smaller with what comes, as its disk has too little room. In memory that changes nothing.
+    pub fn shrink(&mut self, shrinks: bool) {
+        if let Kind::Disk(disk) = &mut self.kind {
+            disk.shrink(shrinks);
+        }
     }
 
     /// Gives up what is older than `before`, from the oldest on, and tells it to `aged`.

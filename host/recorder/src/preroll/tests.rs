@@ -170,3 +170,62 @@ fn a_disk_that_fails_is_named() {
     assert!(matches!(&refused, RecordError::Preroll { path, .. } if *path == folder), "{refused:?}");
     fs::remove_file(folder).unwrap();
 }
+
+#[test]
+fn on_a_full_disk_the_oldest_go_and_nothing_fails() {
+    let folder = scratch("full");
+    let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
+    let mut gone = Vec::new();
+    // Larger than what waits to be written together, and smaller.
+    for bytes in [300_000, 100_000] {
+        gone.clear();
+        for at in 0..50 {
+            preroll.push(held(1, at), &vec![at as u8; bytes], &mut |_| panic!("there is room")).unwrap();
+        }
+        let number = |path: fs::DirEntry| path.path().file_stem().unwrap().to_str().unwrap().parse::<u64>().unwrap();
+        let next = 1 + fs::read_dir(&folder).unwrap().map(|path| number(path.unwrap())).max().unwrap();
+        let full = next..next + 30;
+        for number in full.clone() {
+            std::os::unix::fs::symlink("/dev/full", folder.join(format!("{number}.chunk"))).unwrap();
+        }
+        let mut at = 50;
+        while folder.join(format!("{}.chunk", full.end - 1)).symlink_metadata().is_ok() {
+            preroll.push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns)).unwrap();
+            at += 1;
+        }
+        // There is room again.
+        let last = at + 5;
+        for at in at..=last {
+            preroll.push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns)).unwrap();
+        }
+        let all = everything(&mut preroll);
+        assert!(all.len() >= 5 && all.iter().all(|(held, bytes)| bytes.iter().all(|byte| *byte == held.at_ns as u8)));
+        let stamps = gone.iter().copied().chain(all.iter().map(|(held, _)| held.at_ns));
+        assert_eq!(stamps.collect::<Vec<_>>(), (0..=last).collect::<Vec<_>>(), "each is held, or was told");
+        preroll.trim(last + 1, &mut |_| {}).unwrap();
+    }
+}
+
+#[test]
+fn a_disk_with_too_little_room_for_others_holds_less_and_less() {
+    let folder = scratch("shrink");
+    let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
+    let files = || fs::read_dir(&folder).unwrap().count();
+    let push = |preroll: &mut Preroll, stamps: std::ops::Range<i64>| {
+        for at in stamps {
+            preroll.push(held(1, at), &[at as u8; 100_000], &mut |_| {}).unwrap();
+        }
+    };
+    push(&mut preroll, 0..100);
+    let before = files();
+    preroll.shrink(true);
+    push(&mut preroll, 100..130);
+    let less = files();
+    assert!(less < before, "{before} files, then {less}");
+    push(&mut preroll, 130..500);
+    assert_eq!(files(), 1);
+    assert_eq!(everything(&mut preroll).last().unwrap().0.at_ns, 499);
+    preroll.shrink(false);
+    push(&mut preroll, 500..600);
+    assert!(files() >= before);
+}

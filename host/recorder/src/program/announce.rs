@@ -37,7 +37,8 @@ impl Course {
             let input = manifest.inputs.iter().find(|input| input.topic == *wanted);
             let max_bytes = input.map(|input| input.max_size.as_usize());
             largest = largest.max(max_bytes.unwrap_or(USUAL_BYTES));
-            match self.want(remapped.unwrap_or(wanted.as_str()), Largest::of(max_bytes)) {
+            let type_name = input.map(|input| input.type_name.to_string());
+            match self.want(remapped.unwrap_or(wanted.as_str()), type_name, Largest::of(max_bytes)) {
                 Ok(topic) if !topics.contains(&topic) => topics.push(topic),
                 Ok(_) => {}
                 Err(error) => {
@@ -85,7 +86,7 @@ impl Course {
         }
     }
 
-    fn want(&mut self, name: &str, largest: Largest) -> Result<TopicId, RecordError> {
+    fn want(&mut self, name: &str, type_name: Option<String>, largest: Largest) -> Result<TopicId, RecordError> {
         let topic = self.recorder.add_missing_topic(name)?;
         let recorded = self.topics.entry(topic).or_insert_with(|| {
             let lane = Lane { topic, staging: Arc::clone(&self.staging), arrivals: Arc::default() };
@@ -93,7 +94,7 @@ impl Course {
         });
         // The watch takes them as they come.
         let what = Wanted::Recorded { topic, largest };
-        let _ = self.wants.send(Want { what, name: name.to_owned(), sink: recorded.lane.clone() });
+        let _ = self.wants.send(Want { what, name: name.to_owned(), type_name, sink: recorded.lane.clone() });
         Ok(topic)
     }
 }

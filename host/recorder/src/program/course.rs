@@ -60,12 +60,9 @@ pub fn run(
     stop: Arc<AtomicBool>,
 ) -> Result<(), Failure> {
     let internal = |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
-    let (mut folder, recovered) = Folder::open(&options.out)?;
+    let mut folder = Folder::hold(&options.out)?;
     let mut say = Say::start(reports, folder.losses()).map_err(internal)?;
-    for clip in recovered {
-        warn!(clip = %clip.file.display(), "recovered a clip of an earlier recorder, which did not end well");
-        say.say(RecorderReport::Recovered(Box::new(clip)));
-    }
+    // Before anything is recovered, which takes room.
     let mut deleted = Vec::new();
     if options.clips_max.is_some() || options.bytes_max.is_some() {
         deleted = folder.keep_at_most(options.clips_max, options.bytes_max)?;
@@ -94,7 +91,7 @@ pub fn run(
     starter(control, events, reader.clone()).map_err(internal)?;
     let commands = options.commands.clone().map(|name| {
         let (commands, sink) = Commands::new(name.clone(), reader.clone());
-        let _ = wants.send(Want { what: Wanted::Commands, name, sink });
+        let _ = wants.send(Want { what: Wanted::Commands, name, type_name: None, sink });
         commands
     });
     say.say(RecorderReport::Ready);

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_protocol::Failure;
 use gleaner_protocol::link::{Loss, RecordedTopic, RecorderReport, RecorderStatus};
-use tracing::error;
+use tracing::{error, warn};
 
 use super::course::{Course, Recorded};
 use crate::{Counts, TopicId};
@@ -28,6 +28,10 @@ impl Course {
             self.say.say(RecorderReport::Clip(Box::new(clip.clone())));
         }
         self.said.clips = counts.clips;
+        for clip in self.recorder.take_recovered() {
+            warn!(clip = %clip.file.display(), "recovered a clip of an earlier recorder, which did not end well");
+            self.say.say(RecorderReport::Recovered(Box::new(clip)));
+        }
         let at_ns = self.clock.now();
         for error in self.recorder.take_failures() {
             let failure = Failure::from(error);

@@ -1,6 +1,6 @@
 //! Finds the topics that are wanted and subscribes them; looks after the network and the disk once a second.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError};
@@ -88,6 +88,8 @@ impl Transport for Live {
 pub(super) struct Want {
     pub(super) what: Wanted,
     pub(super) name: String,
+    /// Its type, where a manifest says it; else the one that most write.
+    pub(super) type_name: Option<String>,
     pub(super) sink: Arc<dyn Sink>,
 }
 
@@ -163,7 +165,14 @@ struct Heard {
 /// Adds a want; several for one topic are one.
 fn add(wanted: &mut Vec<(Want, u32)>, heard: &[Heard], want: Want) {
     let Wanted::Recorded { topic, largest } = want.what else { return wanted.push((want, 0)) };
+    let is_other = |known: &str| {
+        if let Some(wanted) = want.type_name.as_deref().filter(|wanted| *wanted != known) {
+            let topic = visible(&want.name);
+            warn!(%topic, %wanted, recorded = %visible(known), "a topic is wanted as two types, and recorded as one");
+        }
+    };
     if let Some(of) = heard.iter().find(|of| of.topic == topic) {
+        is_other(&of.type_name);
         let (max_bytes, wanted) = (of.max_bytes, largest.bytes(&of.type_name));
         if wanted > max_bytes {
             let topic = visible(&want.name);
@@ -173,7 +182,14 @@ fn add(wanted: &mut Vec<(Want, u32)>, heard: &[Heard], want: Want) {
     }
     for (known, _) in wanted.iter_mut() {
         match &mut known.what {
-            Wanted::Recorded { topic: of, largest: known } if *of == topic => return *known = known.and(largest),
+            Wanted::Recorded { topic: of, largest: known_largest } if *of == topic => {
+                *known_largest = known_largest.and(largest);
+                match &known.type_name {
+                    Some(known) => is_other(known),
+                    None => known.type_name = want.type_name,
+                }
+                return;
+            }
             _ => {}
         }
     }
@@ -197,6 +213,8 @@ impl Watch {
         let mut beat_at = Instant::now();
         // Since when each topic waits for its definitions.
         let mut asking: HashMap<String, Instant> = HashMap::new();
+        // Topics that were found as several types, or as another than is wanted; what they are was said.
+        let mut odd: HashSet<String> = HashSet::new();
         loop {
             match self.wants.recv_timeout(LOOK) {
                 // All that wait at once: to look for topics takes longer.
@@ -210,7 +228,7 @@ impl Watch {
                 let topics = self.feed.topics();
                 wanted.retain_mut(|(want, wait)| {
                     *wait = wait.saturating_sub(1);
-                    let found = topics.iter().find(|topic| topic.topic == want.name);
+                    let found = choose(&topics, want, &mut odd);
                     match (want.what, found) {
                         _ if *wait > 0 => return true,
                         // Whoever writes it is asked what it is. Until then it is not recorded, so it is not waited for longer.
@@ -301,6 +319,31 @@ impl Watch {
             }
         })
     }
+}
+
+/// Of what is there, the topic that is wanted: of the type that a manifest says, else of the one that most write.
+fn choose<'a>(topics: &'a [DiscoveredTopic], want: &Want, odd: &mut HashSet<String>) -> Option<&'a DiscoveredTopic> {
+    let mut named = topics.iter().filter(|topic| topic.topic == want.name);
+    let is_wanted = |found: &&DiscoveredTopic| want.type_name.as_ref().is_none_or(|wanted| found.type_name == *wanted);
+    // The transport names first what most write.
+    let found = named.clone().find(is_wanted);
+    let chosen = found.map(|found| &found.type_name);
+    if let Some(other) = named.find(|topic| Some(&topic.type_name) != chosen)
+        && matches!(want.what, Wanted::Recorded { .. })
+        && odd.insert(want.name.clone())
+    {
+        let (topic, other) = (visible(&want.name), visible(&other.type_name));
+        match (chosen, &want.type_name) {
+            (Some(chosen), _) => {
+                warn!(%topic, recorded = %visible(chosen), %other, "a topic is written as several types, one is recorded");
+            }
+            (None, wanted) => {
+                let wanted = wanted.as_deref().unwrap_or_default();
+                warn!(%topic, %wanted, %other, "a topic is written as another type than the input says, not recorded so far");
+            }
+        }
+    }
+    found
 }
 
 /// Bytes of the largest sample of a topic of which no manifest says more. What is larger may be dropped before anybody can count

@@ -20,6 +20,8 @@ pub(super) struct Finished {
     pub(super) failures: Vec<RecordError>,
     /// What had to go for them, and was not yet asked for.
     pub(super) deleted: Vec<Loss>,
+    /// Clips of an earlier process, which were not yet asked for.
+    pub(super) recovered: Vec<Clip>,
 }
 
 impl Finished {

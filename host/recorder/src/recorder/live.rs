@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use gleaner_protocol::link::Loss;
 use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Moment, Trigger};
+use gleaner_protocol::{Clip, Moment, Trigger};
 use gleaner_transport::SampleMeta;
 
 use super::finished::KEPT;
@@ -29,6 +29,7 @@ pub(crate) fn counted(losses: &[Loss]) -> (u64, u64) {
 impl Recorder {
     /// A recorder without topics and lambdas, that is fed while it happens. A thread writes its clips; at most 16 MiB and
     /// one message are on their way to it, and the preroll holds what has to wait. Gaps in the numbers of samples are losses.
+    /// What an earlier process left in a folder of [`Folder::hold`] is recovered by that thread, between what it has to write.
     ///
     /// # Errors
     ///
@@ -60,6 +61,12 @@ impl Recorder {
     /// Why clips could not be written since this was asked last; the first of them, 16 at most.
     pub fn take_failures(&mut self) -> Vec<RecordError> {
         std::mem::take(&mut self.finished.failures)
+    }
+
+    /// Clips that an earlier process had left unfinished, and that are whole now, since this was asked last. One that cannot be
+    /// recovered is among the failures.
+    pub fn take_recovered(&mut self) -> Vec<Clip> {
+        std::mem::take(&mut self.finished.recovered)
     }
 
     /// Clips that had to go for others, or could not be deleted, since this was asked last; the first of them.
@@ -147,13 +154,14 @@ impl Recorder {
         self.run()
     }
 
-    /// From now on no clip is begun, and the one that is open ends: `why` says it. `None`: goes on.
+    /// From now on no clip is begun, and the one that is open ends: `why` says it. A preroll on disk gets smaller. `None`: goes on.
     ///
     /// # Errors
     ///
     /// [`RecordError`] if the disk fails.
     pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
         self.held = why.map(Arc::from);
+        self.stock.preroll.shrink(why.is_some());
         // What is open ends at once.
         self.windows.set_grace(if why.is_some() { 0 } else { nanoseconds(GRACE) });
         self.run()
@@ -222,16 +230,24 @@ impl Recorder {
         Ok(())
     }
 
+    fn note_deleted(&mut self, deleted: Vec<Loss>) {
+        let (gone, stuck) = counted(&deleted);
+        self.counts.deleted += gone;
+        self.counts.not_deleted += stuck;
+        self.finished.deleted.extend(deleted);
+        self.finished.deleted.truncate(KEPT);
+    }
+
     fn note(&mut self, outcomes: Vec<Outcome>) {
         for outcome in outcomes {
             match outcome {
                 Outcome::Finished(clip, deleted) => {
-                    let (gone, stuck) = counted(&deleted);
-                    self.counts.deleted += gone;
-                    self.counts.not_deleted += stuck;
                     self.finished.add(Some(*clip));
-                    self.finished.deleted.extend(deleted);
-                    self.finished.deleted.truncate(KEPT);
+                    self.note_deleted(deleted);
+                }
+                Outcome::Recovered(clip, deleted) => {
+                    self.finished.recovered.push(*clip);
+                    self.note_deleted(deleted);
                 }
                 Outcome::Failed(error) => {
                     self.counts.failed += 1;

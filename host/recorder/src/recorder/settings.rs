@@ -35,7 +35,7 @@ pub struct LambdaId(pub(super) usize);
 pub struct Counts {
     /// Clips that are finished.
     pub clips: u64,
-    /// Clips that could not be written. What there is of them is recovered when the folder is opened again.
+    /// Clips that could not be written, or recovered. What there is of them is recovered when the folder is opened again.
     pub failed: u64,
     /// Clips that were deleted to make room, and that nobody had fetched.
     pub deleted: u64,

@@ -184,6 +184,7 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn finish(&mut self, end_ns: i64) -> Result<(), RecordError> {
+        self.stock.desk.pen.end_recovery();
         self.windows.set_grace(0);
         self.pass(end_ns.max(0))?;
         let end = self.now.unwrap_or(end_ns);

@@ -32,11 +32,21 @@ pub struct Network {
     pub dead: Arc<AtomicBool>,
     /// What was subscribed.
     pub specs: Arc<Mutex<Vec<TopicSpec>>>,
+    /// Types under which a topic is written as well, by others.
+    others: Arc<Mutex<Vec<DiscoveredTopic>>>,
 }
 
 impl Network {
     pub fn add(&self, topic: &str) {
         self.loopback.lock().unwrap().add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
+    }
+
+    /// Somebody else writes the topic as another type, and is named first.
+    pub fn add_other(&self, topic: &str, type_name: &str) {
+        let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
+        let definitions_text = Some("string other\n".into());
+        let other = DiscoveredTopic { topic, type_name, definitions_text, messages: None, offered_qos: None };
+        self.others.lock().unwrap().push(other);
     }
 
     pub fn add_texts(&self, topic: &str) {
@@ -55,7 +65,9 @@ impl Network {
 
 impl Transport for Network {
     fn topics(&self) -> Vec<DiscoveredTopic> {
-        self.loopback.lock().unwrap().topics()
+        let mut topics = self.others.lock().unwrap().clone();
+        topics.extend(self.loopback.lock().unwrap().topics());
+        topics
     }
 
     fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {

@@ -194,9 +194,8 @@ impl Dds {
             return Ok(spec.type_name.clone());
         }
         let known = self.discovered();
-        // What is written counts; somebody may only read it as something else.
-        let found = known.iter().filter(|found| found.topic == topic).max_by_key(|found| found.writers > 0);
-        if let Some(found) = found {
+        // The first is the one that most write; somebody may only read it as something else.
+        if let Some(found) = known.iter().find(|found| found.topic == topic) {
             return Ok(found.type_name.clone());
         }
         let known: Vec<String> = known.into_iter().map(|found| found.topic).collect();

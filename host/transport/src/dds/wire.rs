@@ -40,7 +40,8 @@ pub(super) fn offer(writer: &DiscoveredWriterData) -> Offer {
     }
 }
 
-/// The topics of others, sorted by name and type, with what their writers offer as rosbag2 notes it.
+/// The topics of others, sorted by name, and of one name by the number of writers, most first; with what their writers offer as
+/// rosbag2 notes it.
 pub(super) fn topics(participant: &DomainParticipant, distro: Option<Distro>) -> Vec<(TopicOnWire, Option<String>)> {
     let ours = participant.guid().prefix;
     let writers = participant.discovered_writers();
@@ -84,7 +85,10 @@ fn sorted<'a>(
         let offered = as_rosbag2(&offers.iter().collect::<Vec<_>>(), distro);
         (TopicOnWire { topic, type_name, writers: offers.len(), readers, qos }, offered)
     };
-    found.into_iter().map(shown).collect()
+    let mut topics: Vec<_> = found.into_iter().map(shown).collect();
+    // Somebody who announces a topic as another type is not to be taken for the one who is meant.
+    topics.sort_by(|(one, _), (other, _)| one.topic.cmp(&other.topic).then(other.writers.cmp(&one.writers)));
+    topics
 }
 
 #[cfg(test)]
@@ -111,6 +115,15 @@ mod tests {
         assert_eq!(a.qos, ["reliable, volatile", "best effort, volatile"]);
         assert_eq!(offered.as_ref().unwrap().matches("- history").count(), 4);
         assert_eq!(topics[2].1, None);
+    }
+
+    #[test]
+    fn of_a_topic_of_several_types_the_one_that_most_write_comes_first() {
+        let types = ["aaa::msg::dds_::X_", "sensor_msgs::msg::dds_::Imu_", "sensor_msgs::msg::dds_::Imu_"];
+        let writers = types.map(|type_name| offer("rt/imu", type_name, true));
+        let topics = sorted(writers.into_iter(), [("rt/imu", "a")].into_iter(), None);
+        let types: Vec<_> = topics.iter().map(|(topic, _)| (topic.type_name.as_str(), topic.writers)).collect();
+        assert_eq!(types, [("sensor_msgs/msg/Imu", 2), ("aaa/msg/X", 1), ("a", 0)]);
     }
 
     #[test]

@@ -5,6 +5,7 @@ use super::super::Unfinished;
 use super::super::durable::steps;
 use super::super::place::{AGAIN, CLIP, PART};
 use super::*;
+use crate::error::RecordError;
 
 /// The bytes of an unfinished clip of `messages` messages, some of them in a chunk that was not closed.
 fn part(messages: u64) -> Vec<u8> {
@@ -185,7 +186,8 @@ fn a_finished_file_is_recovered_once_though_its_recovery_dies_at_every_step() {
         let mut is_done = false;
         for _ in 0..2 {
             steps::restart(last);
-            is_done = Folder::open(&scratch.0).is_ok();
+            let mut recovery = Folder::hold(&scratch.0).unwrap().take_left();
+            is_done = std::iter::from_fn(|| recovery.next(&mut || true)).all(|came| came.is_ok());
         }
         steps::restart(usize::MAX);
         scratch.open();
@@ -281,4 +283,80 @@ fn several_unfinished_clips_are_recovered_in_the_order_of_their_names() {
     let (_, found) = scratch.open();
     let files: Vec<_> = found.iter().map(|clip| clip.file.to_str().unwrap()).collect();
     assert_eq!(files, ["clips/a.mcap", "clips/b.mcap", "clips/b-2.mcap"]);
+}
+
+#[test]
+fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_keeps_nobody_from_recording() {
+    let scratch = died(&part(14));
+    fs::write(scratch.path("clips/b.mcap.part"), part(8)).unwrap();
+    // What no file is cannot be removed as one.
+    fs::create_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
+    for _ in 0..2 {
+        let mut recovery = Folder::hold(&scratch.0).unwrap().take_left();
+        let why = recovery.next(&mut || true).unwrap().unwrap_err();
+        assert!(matches!(&why, RecordError::Recover { path, .. } if path.ends_with("clips/a.mcap.part")), "{why:?}");
+    }
+    let (mut folder, found) = scratch.open();
+    assert_eq!(found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(), ["clips/b.mcap"]);
+    let mut next = folder.begin("a", &about()).unwrap();
+    add(&mut next, 0, 6);
+    assert_eq!(next.finish(ending()).unwrap().file, Path::new("clips/a-2.mcap"));
+    drop(folder);
+    assert_eq!(fs::read(scratch.path("clips/a.mcap.part")).unwrap(), part(14));
+    fs::remove_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
+    let (_, found) = scratch.open();
+    assert_eq!(found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(), ["clips/a.mcap"]);
+}
+
+#[test]
+fn a_recovery_that_is_ended_at_any_moment_leaves_what_it_was_to_recover() {
+    let part = part(14);
+    let (_, _, whole) = died_before_the_name();
+    for left in [part, whole] {
+        let mut ended = 0;
+        for moments in 0.. {
+            let scratch = died(&left);
+            let mut recovery = Folder::hold(&scratch.0).unwrap().take_left();
+            let mut asked = 0;
+            let came = recovery.next(&mut || {
+                asked += 1;
+                asked <= moments
+            });
+            if let Some(came) = came {
+                assert_eq!(scratch.listed(), [came.unwrap()]);
+                break;
+            }
+            drop(recovery);
+            assert_eq!(scratch.files(), ["a.mcap.part"], "after {moments} moments");
+            assert_eq!(fs::read(scratch.path("clips/a.mcap.part")).unwrap(), left);
+            assert_eq!(scratch.open().1.len(), 1);
+            ended += 1;
+        }
+        assert!(ended > 6, "{ended}");
+    }
+}
+
+#[test]
+fn clips_are_begun_and_finished_while_another_is_recovered() {
+    let scratch = died(&part(14));
+    let mut folder = Folder::hold(&scratch.0).unwrap();
+    // Somebody's file has the name of what is recovered.
+    fs::write(scratch.path("clips/a.mcap"), b"not a clip").unwrap();
+    let mut recovery = folder.take_left();
+    let mut clips = 0;
+    let came = recovery.next(&mut || {
+        let mut clip = folder.begin("a", &about()).unwrap();
+        add(&mut clip, 0, 6);
+        clip.finish(ending()).unwrap();
+        clips += 1;
+        true
+    });
+    let recovered = came.unwrap().unwrap();
+    assert!(clips > 6, "{clips}");
+    let mut files: Vec<_> = scratch.listed().into_iter().map(|clip| clip.file).collect();
+    assert_eq!(files.pop(), Some(recovered.file.clone()));
+    assert_eq!(files.len(), clips);
+    assert!(!files.contains(&recovered.file));
+    assert_eq!(numbers(&scratch.path(recovered.file.to_str().unwrap())).len(), 10);
+    assert!(files.iter().all(|file| numbers(&scratch.path(file.to_str().unwrap())).len() == 6));
 }

@@ -34,6 +34,8 @@ pub(super) enum Pen {
 pub(super) enum Outcome {
     /// It is whole, and listed; others had to go for it, or could not.
     Finished(Box<Clip>, Vec<Loss>),
+    /// It is of an earlier process that left it unfinished, or unlisted; as above.
+    Recovered(Box<Clip>, Vec<Loss>),
     /// It is not; what was written is recovered when the folder is opened again.
     Failed(RecordError),
 }
@@ -144,9 +146,19 @@ impl Pen {
         }
     }
 
+    /// The recording ends: what an earlier process left has some seconds to be recovered.
+    pub(super) fn end_recovery(&self) {
+        if let Pen::There(thread) = self {
+            thread.end_recovery();
+        }
+    }
+
     /// Whether nothing is under way.
     pub(super) fn is_idle(&self) -> bool {
-        self.in_flight() == 0
+        match self {
+            Pen::Here(_) => true,
+            Pen::There(thread) => thread.in_flight() == 0 && !thread.is_recovering(),
+        }
     }
 
     /// Bytes that were handed over and are not yet written.

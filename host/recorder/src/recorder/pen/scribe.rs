@@ -9,7 +9,7 @@ use gleaner_transport::SampleMeta;
 
 use super::part::Part;
 use crate::RecordError;
-use crate::file::{About, Ending, Folder, Topic, Unfinished};
+use crate::file::{About, Ending, Folder, Recovery, Topic, Unfinished};
 use crate::thumbnail::thumbnail;
 
 /// Images that are tried until one can be read. Each costs some milliseconds.
@@ -60,6 +60,11 @@ impl Sheet {
 impl Scribe {
     pub(super) fn new(folder: Folder) -> Scribe {
         Scribe { folder, sheets: Vec::new() }
+    }
+
+    /// What an earlier process left in the folder.
+    pub(super) fn take_left(&mut self) -> Recovery {
+        self.folder.take_left()
     }
 
     fn sheet(&mut self, clip: u64) -> &mut Sheet {

@@ -1,9 +1,10 @@
-//! The thread that writes clips, and what is on its way to it.
+//! The thread that writes clips, and what is on its way to it. It also recovers what an earlier process left, between its jobs.
 
 use std::io;
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
+use std::sync::{Arc, OnceLock};
 use std::thread::{Builder, JoinHandle};
+use std::time::{Duration, Instant};
 
 use gleaner_transport::SampleMeta;
 
@@ -20,6 +21,8 @@ const OVERHEAD: usize = 128;
 const JOB: usize = 4 << 10;
 /// Batches that were written and are kept for the next messages.
 const SPARE: usize = 16;
+/// How long a recovery may still take once the recording ends; what it does not reach is left for the next start.
+const RECOVERY: Duration = Duration::from_secs(5);
 
 /// What the thread is to do.
 enum Job {
@@ -48,6 +51,8 @@ enum Done {
     /// This is empty now, and may be used again.
     Messages(Batch),
     Clip(Outcome),
+    /// Nothing is left to recover, or it is left for another process.
+    Recovery,
 }
 
 /// Messages of one clip.
@@ -100,18 +105,41 @@ pub(in crate::recorder) struct Thread {
     batch: Batch,
     in_flight: usize,
     spare: Vec<Batch>,
+    is_recovering: bool,
+    /// When a recovery gives up, once that is known.
+    until: Arc<OnceLock<Instant>>,
 }
 
 impl Thread {
     pub(super) fn start(scribe: Scribe) -> Result<Thread, RecordError> {
         // Neither queue has a bound of its own: what is in them is counted, and nothing is added beyond what a pen has room for.
         let ((jobs, inbox), (outbox, done)) = (channel(), channel());
+        let until = Arc::<OnceLock<_>>::default();
+        let given_up = Arc::clone(&until);
         let handle = Builder::new()
             .name("clips".to_owned())
-            .spawn(move || write(scribe, &inbox, &outbox))
+            .spawn(move || Writing { scribe, failed: Vec::new(), done: outbox }.run(&inbox, &given_up))
             .map_err(|source| RecordError::Thread { source })?;
         let (batch, spare) = (Batch::default(), Vec::new());
-        Ok(Thread { jobs: Some(jobs), done, handle: Some(handle), batch, in_flight: 0, spare })
+        Ok(Thread {
+            jobs: Some(jobs),
+            done,
+            handle: Some(handle),
+            batch,
+            in_flight: 0,
+            spare,
+            is_recovering: true,
+            until,
+        })
+    }
+
+    /// The recording ends: a recovery has some seconds left.
+    pub(super) fn end_recovery(&self) {
+        self.until.get_or_init(|| Instant::now() + RECOVERY);
+    }
+
+    pub(super) fn is_recovering(&self) -> bool {
+        self.is_recovering
     }
 
     pub(super) fn begin(&mut self, clip: u64, stem: String, about: About) -> Result<(), RecordError> {
@@ -178,7 +206,7 @@ impl Thread {
 
     pub(super) fn wait(&mut self, outcomes: &mut Vec<Outcome>) -> Result<(), RecordError> {
         self.hand_over()?;
-        if self.in_flight > 0 {
+        if self.in_flight > 0 || self.is_recovering {
             let done = self.done.recv().map_err(|_| gone())?;
             self.note(done, outcomes);
         }
@@ -193,6 +221,7 @@ impl Thread {
                 self.spare.push(batch);
             }
             Done::Clip(outcome) => outcomes.push(outcome),
+            Done::Recovery => self.is_recovering = false,
             Done::Messages(_) | Done::Nothing => {}
         }
     }
@@ -224,6 +253,7 @@ impl Drop for Thread {
     /// Waits for what is under way; a clip that is not finished stays for recovery.
     fn drop(&mut self) {
         self.jobs = None;
+        let _ = self.until.set(Instant::now());
         if let Some(handle) = self.handle.take() {
             let _ = handle.join();
         }
@@ -234,45 +264,75 @@ fn gone() -> RecordError {
     RecordError::Thread { source: io::Error::other("the thread that writes clips has ended") }
 }
 
-/// What the thread does until it is told nothing more.
-fn write(mut scribe: Scribe, jobs: &Receiver<(usize, Job)>, done: &Sender<(usize, Done)>) {
-    // Clips that failed: what else is said of them is left out. Each goes with its end.
-    let mut failed: Vec<u64> = Vec::new();
-    for (cost, job) in jobs {
+/// What the thread has in hand.
+struct Writing {
+    scribe: Scribe,
+    /// Clips that failed: what else is said of them is left out. Each goes with its end.
+    failed: Vec<u64>,
+    done: Sender<(usize, Done)>,
+}
+
+impl Writing {
+    /// What the thread does until it is told nothing more. Jobs do not wait for what is recovered.
+    fn run(mut self, jobs: &Receiver<(usize, Job)>, until: &OnceLock<Instant>) {
+        let mut recovery = self.scribe.take_left();
+        while let Some(came) = recovery.next(&mut || {
+            let is_heard = std::iter::from_fn(|| jobs.try_recv().ok()).all(|(cost, job)| self.job(cost, job));
+            is_heard && until.get().is_none_or(|until| Instant::now() < *until)
+        }) {
+            let outcome = match came {
+                Ok(clip) => {
+                    let deleted = self.scribe.make_room(&clip);
+                    Outcome::Recovered(Box::new(clip), deleted)
+                }
+                Err(error) => Outcome::Failed(error),
+            };
+            if self.done.send((0, Done::Clip(outcome))).is_err() {
+                return;
+            }
+        }
+        let _ = self.done.send((0, Done::Recovery));
+        for (cost, job) in jobs {
+            if !self.job(cost, job) {
+                return;
+            }
+        }
+    }
+
+    /// Does a job; `false` if nobody wants to know any more.
+    fn job(&mut self, cost: usize, job: Job) -> bool {
         let clip = job.clip();
         let came = match job {
             Job::Forget(_) => {
-                scribe.forget(clip);
-                failed.retain(|failed| *failed != clip);
+                self.scribe.forget(clip);
+                self.failed.retain(|failed| *failed != clip);
                 Done::Nothing
             }
-            Job::Finish(_) if failed.contains(&clip) => {
-                failed.retain(|failed| *failed != clip);
+            Job::Finish(_) if self.failed.contains(&clip) => {
+                self.failed.retain(|failed| *failed != clip);
                 Done::Nothing
             }
-            Job::Finish(last) => Done::Clip(match scribe.finish(*last) {
+            Job::Finish(last) => Done::Clip(match self.scribe.finish(*last) {
                 Ok(clip) => {
-                    let deleted = scribe.make_room(&clip);
+                    let deleted = self.scribe.make_room(&clip);
                     Outcome::Finished(Box::new(clip), deleted)
                 }
                 Err(error) => {
-                    scribe.forget(clip);
+                    self.scribe.forget(clip);
                     Outcome::Failed(error)
                 }
             }),
-            _ if failed.contains(&clip) => Done::Nothing,
-            job => match act(&mut scribe, job) {
+            _ if self.failed.contains(&clip) => Done::Nothing,
+            job => match act(&mut self.scribe, job) {
                 Ok(came) => came,
                 Err(error) => {
-                    scribe.forget(clip);
-                    failed.push(clip);
+                    self.scribe.forget(clip);
+                    self.failed.push(clip);
                     Done::Clip(Outcome::Failed(error))
                 }
             },
         };
-        if done.send((cost, came)).is_err() {
-            return;
-        }
+        self.done.send((cost, came)).is_ok()
     }
 }
 
