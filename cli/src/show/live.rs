@@ -3,7 +3,7 @@
 use std::fmt::{self, Write};
 
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{Clip, Live, LiveTopic, Spread, TopicSeen, TriggerKind, visible};
+use gleaner_protocol::{Clip, Live, LiveTopic, Network, Spread, TopicSeen, TriggerKind, visible};
 
 use super::{Paint, counted, grouped, mib, word};
 use crate::results::{clip_span, three_digits};
@@ -118,13 +118,22 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` does not keep up"),
         (live.recorder.map_or(0, |recorder| recorder.wakes_dropped), "wake", "not told to the recorder"),
         (live.recorder.map_or(0, |recorder| recorder.triggers_lost), "trigger", "not told to the recorder"),
-        (live.network.socket_drops, "datagram", "dropped by the system: a socket buffer was full"),
-        (live.network.filtered, "datagram", "dropped: fragments that claim too much, or of nobody known"),
     ];
     for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
     }
-    let network = &live.network;
+    write_network(text, &live.network, (live.rss_bytes, live.cpu_s), paint)
+}
+
+/// What the network lost, and what a process takes: bytes of memory, and seconds of CPU time.
+fn write_network(text: &mut String, network: &Network, (rss_bytes, cpu_s): (u64, f64), paint: Paint) -> fmt::Result {
+    let losses = [
+        (network.socket_drops, "dropped by the system: a socket buffer was full"),
+        (network.filtered, "dropped: fragments that claim too much, or of nobody known"),
+    ];
+    for (count, why) in losses.into_iter().filter(|(count, _)| *count > 0) {
+        writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, "datagram"))))?;
+    }
     if let Some(why) = &network.unfiltered {
         writeln!(text, "  {}", paint.yellow(&visible(why)))?;
     }
@@ -133,8 +142,8 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         counted(network.participants as u64, "participant"),
         mib(network.buffer_granted as u64),
         mib(network.buffer_asked as u64),
-        mib(live.rss_bytes),
-        live.cpu_s,
+        mib(rss_bytes),
+        cpu_s,
     );
     writeln!(text, "  {}", paint.dim(&line))
 }
@@ -190,7 +199,10 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
             paint.yellow(&format!("{clips} could not be deleted to make room: losses.jsonl says why"))
         )?;
     }
-    Ok(())
+    match &status.network {
+        Some(network) => write_network(text, network, (status.rss_bytes, status.cpu_s), paint),
+        None => Ok(()),
+    }
 }
 
 fn recorded(topic: &RecordedTopic) -> [String; 7] {
@@ -260,6 +272,32 @@ mod tests {
     fn columns_are_as_wide_as_their_widest_cell() {
         let rows = vec![["a", "1"].map(str::to_owned), ["topic", "23"].map(str::to_owned)];
         assert_eq!(table(rows, &[1]), "a       1\ntopic  23\n");
+    }
+
+    #[test]
+    fn what_the_network_of_a_recorder_lost_is_shown() {
+        let network = Network {
+            domain: 7,
+            participants: 2,
+            buffer_asked: 8 << 20,
+            buffer_granted: 1 << 20,
+            socket_drops: 3,
+            filtered: 1,
+            unfiltered: Some("no filter here".to_owned()),
+        };
+        let status =
+            RecorderStatus { network: Some(network), rss_bytes: 5 << 20, cpu_s: 1.0, ..RecorderStatus::default() };
+        let text = recorder(&status, Paint { on: false });
+        let lines: Vec<_> = text.lines().rev().take(4).collect();
+        assert_eq!(
+            lines,
+            [
+                "  2 participants, socket buffer 1.0 of 8.0 MiB, 5.0 MiB resident, 1.0 s of CPU time",
+                "  no filter here",
+                "  lost: 1 datagram, dropped: fragments that claim too much, or of nobody known",
+                "  lost: 3 datagrams, dropped by the system: a socket buffer was full",
+            ]
+        );
     }
 
     #[test]
