@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use gleaner_protocol::FaultKind;
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, corrupted, image, one_topic, truncated};
-use gleaner_tests::{Copy, Folder, Run, replay, root, runtime, sample_drive};
+use gleaner_tests::{Copy, Folder, Run, replay, replay_to, root, runtime, sample_drive};
 
 const USAGE: u8 = 2;
 const FAULTED: u8 = 6;
@@ -196,6 +196,17 @@ fn a_lambda_that_is_not_built_names_the_command() {
     folder.write("lambda.toml", std::fs::read(root().join("examples/hello/rust/lambda.toml")).unwrap());
     let run = replay(folder.path(), &[sample_drive()], &[]);
     says(run.must_exit(USAGE), &["help:", "gleaner build"]);
+}
+
+#[test]
+fn results_within_the_build_are_refused_under_whatever_name() {
+    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+    std::os::unix::fs::symlink(copy.path().join("build"), copy.path().join("link")).unwrap();
+    for out in ["build", "build/out", "link/out/a"] {
+        let run = replay_to(&copy.path().join(out), copy.path(), &[sample_drive()], &[]);
+        says(run.must_exit(USAGE), &[out, "lies in the build, and would change the lambda", "help:", "--out DIR"]);
+    }
+    assert!(!copy.path().join("build/out").exists() && !copy.path().join("build/.lock").exists());
 }
 
 #[test]
