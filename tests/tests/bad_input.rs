@@ -240,6 +240,18 @@ fn python_that_raises_in_init_ends_the_start_with_its_traceback() {
 }
 
 #[test]
+fn what_a_lambda_said_before_its_init_failed_is_shown() {
+    let copy = Copy::of("tests/lambdas/misbehave/python", |manifest| manifest);
+    let init = "def __init__(self, ctx):\n        print('no tea')\n        raise RuntimeError('no, not today')";
+    copy.replace(
+        "main.py",
+        format!("class Lambda:\n    {init}\n\n    def on_event(self, ctx, event):\n        pass\n"),
+    );
+    let run = replay(copy.path(), &[sample_drive()], &[]);
+    says(run.must_exit(FAULTED), &["log: no tea", "error: cannot start lambda `misbehave`", "no, not today"]);
+}
+
+#[test]
 fn python_that_raises_in_an_event_has_the_traceback_in_its_decision() {
     let run = misbehave("python", "error");
     let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");

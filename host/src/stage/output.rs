@@ -19,8 +19,11 @@ pub const SIGNALS: &str = "signals.json";
 /// The page that `gleaner` makes of all of it.
 const REPORT: &str = "report.html";
 
+/// What a replay locks, so that no other writes into the same folder.
+pub const LOCK: &str = ".lock";
+
 /// The files of a run beside its clips.
-pub const RESULTS: [&str; 6] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", REPORT, SIGNALS, SUMMARY];
+pub const RESULTS: [&str; 7] = [LOCK, "clips.jsonl", "decisions.jsonl", "log.jsonl", REPORT, SIGNALS, SUMMARY];
 
 /// Why results could not be written.
 #[derive(Debug, thiserror::Error)]
