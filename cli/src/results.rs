@@ -125,6 +125,13 @@ impl<T> JsonLines<T> {
     }
 }
 
+impl<T: DeserializeOwned> JsonLines<T> {
+    /// The same, each with the bytes of its line.
+    pub(crate) fn weighed(mut self) -> impl Iterator<Item = Result<(T, usize), ResultsError>> {
+        std::iter::from_fn(move || Some(self.next()?.map(|value| (value, self.text.len()))))
+    }
+}
+
 impl<T: DeserializeOwned> Iterator for JsonLines<T> {
     type Item = Result<T, ResultsError>;
 

@@ -10,7 +10,7 @@ use clap::Args;
 use gleaner_buffers::Pool;
 use gleaner_jail::Paths;
 use gleaner_protocol::manifest::{Manifest, Store};
-use gleaner_protocol::{BuildDir, Checked, Exit, Failure, Need, Place, Report, visible};
+use gleaner_protocol::{BuildDir, Checked, Exit, Failure, Need, Place, Report};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::message::Sources;
@@ -75,12 +75,9 @@ impl Job {
         let init_ms = if notes.is_empty() {
             let started = Instant::now();
             let initialised = stage.guest.init();
-            log.extend(stage.session.take_log().0.into_iter().map(|line| line.message));
-            initialised.map_err(|fault| {
-                // What it said on the way may be why.
-                log.iter().for_each(|line| eprintln!("log: {}", visible(line)));
-                not_started(manifest.lambda.name.as_str(), fault)
-            })?;
+            let (said, _) = stage.session.take_log();
+            initialised.map_err(|fault| not_started(manifest.lambda.name.as_str(), fault, &said))?;
+            log.extend(said.into_iter().map(|line| line.message));
             Some(started.elapsed().as_secs_f64() * 1e3)
         } else {
             None

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use gleaner_protocol::FaultKind;
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, corrupted, image, one_topic, truncated};
-use gleaner_tests::{Copy, Folder, Run, replay, root, runtime, sample_drive};
+use gleaner_tests::{Copy, Folder, Run, replay, replay_to, root, runtime, sample_drive};
 
 const USAGE: u8 = 2;
 const FAULTED: u8 = 6;
@@ -199,6 +199,17 @@ fn a_lambda_that_is_not_built_names_the_command() {
 }
 
 #[test]
+fn results_within_the_build_are_refused_under_whatever_name() {
+    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+    std::os::unix::fs::symlink(copy.path().join("build"), copy.path().join("link")).unwrap();
+    for out in ["build", "build/out", "link/out/a"] {
+        let run = replay_to(&copy.path().join(out), copy.path(), &[sample_drive()], &[]);
+        says(run.must_exit(USAGE), &[out, "lies in the build, and would change the lambda", "help:", "--out DIR"]);
+    }
+    assert!(!copy.path().join("build/out").exists() && !copy.path().join("build/.lock").exists());
+}
+
+#[test]
 fn a_build_older_than_its_sources_names_the_source() {
     let copy = Copy::of("examples/hello/rust", |manifest| manifest);
     std::fs::create_dir_all(copy.path().join("src")).unwrap();
@@ -226,6 +237,18 @@ fn python_that_raises_in_import_ends_the_start_with_its_traceback() {
 fn python_that_raises_in_init_ends_the_start_with_its_traceback() {
     let run = misbehave("python", "error_in_init");
     says(run.must_exit(FAULTED), &["cannot start lambda `misbehave`", "in init", "main.py", "line"]);
+}
+
+#[test]
+fn what_a_lambda_said_before_its_init_failed_is_shown() {
+    let copy = Copy::of("tests/lambdas/misbehave/python", |manifest| manifest);
+    let init = "def __init__(self, ctx):\n        print('no tea')\n        raise RuntimeError('no, not today')";
+    copy.replace(
+        "main.py",
+        format!("class Lambda:\n    {init}\n\n    def on_event(self, ctx, event):\n        pass\n"),
+    );
+    let run = replay(copy.path(), &[sample_drive()], &[]);
+    says(run.must_exit(FAULTED), &["log: no tea", "error: cannot start lambda `misbehave`", "no, not today"]);
 }
 
 #[test]

@@ -7,6 +7,7 @@ use std::process::Command;
 
 use gleaner_protocol::{DriveSeen, Manifest};
 use gleaner_tests::bag::directory;
+use gleaner_tests::drive::{IMAGE, image, one_topic};
 use gleaner_tests::{Copy, Folder, Run, program, replay, replay_to, root, sample_drive, verify};
 
 const OK: u8 = 0;
@@ -217,6 +218,20 @@ fn files_that_the_metadata_pass_over_are_named() {
     let run = braking(&lambda, &bag, &["--no-record"]);
     assert!(run.must_exit(OK).stderr.contains("1 are not read"), "{}", run.stderr);
     assert!(run.stderr.contains("drive_1.db3"), "{}", run.stderr);
+}
+
+#[test]
+fn a_drive_with_hours_between_its_messages_and_hostile_sizes_is_shown_as_it_is() {
+    let message = || image(u32::MAX, u32::MAX, "rgb8", 3, &[0; 3]);
+    for (last, gap) in [(7_200_000_000_001, "  7200000.0 ms  "), (i64::MAX as u64, "  9223372036854.8 ms  ")] {
+        let folder = Folder::new();
+        let messages = [(1, message()), (last, message())];
+        let drive = one_topic(&folder, "/camera", "sensor_msgs/msg/Image", IMAGE, &messages);
+        let output = Command::new(program("gleaner")).arg("inspect").arg(drive).output().unwrap();
+        let text = String::from_utf8_lossy(&output.stdout);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        assert!(text.contains(gap) && text.contains("rgb8 4294967295x4294967295"), "{text}");
+    }
 }
 
 #[test]

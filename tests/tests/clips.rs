@@ -1,5 +1,6 @@
 //! Clips hold exactly the messages of their windows, and the readers of others can read them.
 
+use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
@@ -28,6 +29,8 @@ fn main() -> ExitCode {
         Trial::test("without_record_there_are_no_clips", no_record),
         Trial::test("two_topics_that_are_one_of_the_drive_are_recorded_once", one_of_two),
         Trial::test("where_a_drive_is_damaged_its_clip_ends_short", damaged),
+        Trial::test("a_lambda_that_does_not_start_leaves_every_earlier_result_as_it_was", not_started),
+        Trial::test("a_second_replay_at_once_is_refused_without_clips_too", busy_without_clips),
         Trial::test("a_second_replay_at_once_does_not_touch_the_results_of_the_first", busy),
     ];
     let mut read = |name: &'static str, drive: Result<PathBuf, String>, args: &'static [&'static str]| {
@@ -270,6 +273,52 @@ fn busy() -> Result<(), Failed> {
     same(&std::fs::read_to_string(out.path().join("decisions.jsonl"))?, &before)?;
     drop(first);
     Ok(())
+}
+
+fn busy_without_clips() -> Result<(), Failed> {
+    let args = ["--set", "event_s=10", "--no-record"];
+    let (out, _run) = record(&alarm(), &sample_drive(), &args)?;
+    let lock = std::fs::File::open(out.path().join(".lock"))?;
+    lock.try_lock()?;
+    let before = files(out.path())?;
+    let second = replay_to(out.path(), &alarm(), &[sample_drive()], &args);
+    let said = format!("another replay writes into `{}`", out.path().display());
+    same(&(second.exit, second.stderr.contains(&said), second.stderr.contains("--out DIR")), &(1, true, true))?;
+    same(&(files(out.path())? == before), &true)?;
+    lock.unlock()?;
+    same(&replay_to(out.path(), &alarm(), &[sample_drive()], &args).exit, &0)
+}
+
+fn not_started() -> Result<(), Failed> {
+    for with in [&[][..], &["--no-record"]] {
+        let out = Folder::new();
+        let journal = out.path().join("wakes.journal");
+        let args = [&["--journal", journal.to_str().ok_or("no text")?], with].concat();
+        let replay =
+            |event: &str| replay_to(out.path(), &alarm(), &[sample_drive()], &[&args[..], &["--set", event]].concat());
+        same(&(replay("event_s=10").exit, replay("event_s=10").exit), &(0, 0))?;
+        let before = files(out.path())?;
+        same(&(before.len() > 5), &true)?;
+        let failed = replay("event_s=ten");
+        same(&(failed.exit, failed.stderr.contains("cannot start lambda `alarm`")), &(6, true))?;
+        same(&(files(out.path())? == before), &true)?;
+    }
+    Ok(())
+}
+
+/// Every file in `folder` and below it, with its content.
+fn files(folder: &Path) -> Result<BTreeMap<PathBuf, Vec<u8>>, Failed> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(folder)? {
+        let path = entry?.path();
+        if path.is_dir() {
+            found.extend(files(&path)?);
+        } else {
+            let content = std::fs::read(&path)?;
+            found.insert(path, content);
+        }
+    }
+    Ok(found)
 }
 
 /// Three readers of others find exactly the messages of each clip's window, byte for byte as in the drive.

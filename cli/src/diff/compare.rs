@@ -182,7 +182,8 @@ fn first_line(fault: &Fault) -> String {
     crate::show::gist(&fault.message).to_owned()
 }
 
-fn short(text: &str) -> String {
+/// `text`, or its begin.
+pub(super) fn short(text: &str) -> String {
     match text.char_indices().nth(CHARS) {
         Some((end, _)) => format!("{}…", &text[..end]),
         None => text.to_owned(),

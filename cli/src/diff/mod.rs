@@ -100,7 +100,7 @@ pub(crate) enum DiffError {
     Tell(#[from] TellError),
     #[error(transparent)]
     Read(ResultsError),
-    #[error("`{out}` has more than {} wakes at one instant", wakes::AT_ONCE)]
+    #[error("`{out}` has more than {} wakes, or more than {} MiB of them, at one instant", wakes::AT_ONCE, wakes::BYTES_AT_ONCE >> 20)]
     Crowded { out: String },
 }
 
@@ -146,7 +146,7 @@ pub(crate) fn between(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     let mut diff = whole::compared(a, b)?;
     // Of a live run nothing says when it began: seconds count from its first decision.
     let mut list = List { start_ns: diff.a.start_ns, ..List::default() };
-    let (mut wakes_a, mut wakes_b) = (decisions(a)?, decisions(b)?);
+    let (mut wakes_a, mut wakes_b) = (decisions(a)?.weighed(), decisions(b)?.weighed());
     for pair in wakes::Pairs::new(&mut wakes_a, &mut wakes_b) {
         let pair = pair.map_err(|error| match error {
             wakes::WakesError::Read(source) => DiffError::Read(source),

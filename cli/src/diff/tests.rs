@@ -101,7 +101,7 @@ fn several_triggers_of_one_wake_are_paired_by_their_labels() {
 }
 
 #[test]
-fn wakes_of_one_instant_are_told_apart_by_topic_and_number() {
+fn wakes_of_one_instant_are_told_apart_by_topic_then_by_number_then_by_order() {
     let on = |topic: &str, seq: u64, label: &str| {
         let mut wake = one(1, label, 1.0);
         wake["topic"] = topic.into();
@@ -110,7 +110,19 @@ fn wakes_of_one_instant_are_told_apart_by_topic_and_number() {
     };
     let (a, b, c) = (on("/a", 1, "a"), on("/b", 1, "b"), on("/b", 2, "c"));
     assert!(diff(&[a.clone(), b.clone(), c.clone()], &[c.clone(), a.clone(), b.clone()]).same);
-    assert_eq!(diff(&[a.clone(), b.clone()], &[a, c]).triggers, Tally { same: 1, gone: 1, new: 1, changed: 0 });
+    let other_number = diff(&[a.clone(), b.clone()], &[a.clone(), c]);
+    assert_eq!(lines(&other_number), ["Trigger Changed: b → c, "]);
+    assert_eq!(diff(&[a], &[b]).triggers, Tally { gone: 1, new: 1, ..Tally::default() });
+}
+
+#[test]
+fn a_part_of_a_drive_counts_its_samples_from_its_begin_and_has_the_same_decisions() {
+    let whole: Vec<_> = (0..30).map(|ms| one(ms / 2, "brake", 1.0)).collect();
+    let mut part = whole[10..20].to_vec();
+    for (seq, wake) in (1_u64..).zip(&mut part) {
+        wake["seq"] = seq.into();
+    }
+    assert_eq!(diff(&whole, &part).triggers, Tally { same: 10, gone: 20, ..Tally::default() });
 }
 
 #[test]
@@ -190,6 +202,17 @@ fn of_many_differences_the_first_are_listed_and_all_are_counted() {
         text.contains("and 2,980 more") && text.contains("+     3.000 s  new  1\n") && text.contains("and 10 more"),
         "{text}"
     );
+}
+
+#[test]
+fn what_one_instant_may_hold_is_bounded_in_bytes() {
+    let large = |ms: i64| one(ms, &"x".repeat(9 << 20), 1.0);
+    let apart: Vec<_> = (0..4).map(large).collect();
+    assert_eq!(diff(&apart, &[]).triggers, Tally { gone: 4, ..Tally::default() });
+    let (a, b) = (out(&[]), out(&vec![large(1); 4]));
+    let error = between(a.path(), b.path()).unwrap_err();
+    let named = error.to_string().starts_with(&format!("`{}` has more than", b.path().display()));
+    assert!(named && error.to_string().contains("32 MiB"), "{error}");
 }
 
 #[test]

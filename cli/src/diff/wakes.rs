@@ -6,8 +6,9 @@ use gleaner_protocol::{Cause, Decision};
 
 use crate::results::ResultsError;
 
-/// Most wakes at one instant: so many are held in memory.
+/// Most wakes at one instant, and most bytes of their lines if they are several: so much of each run is held in memory.
 pub(super) const AT_ONCE: usize = 65_536;
+pub(super) const BYTES_AT_ONCE: usize = 32 << 20;
 
 /// Why there are no further pairs.
 #[derive(Debug)]
@@ -39,8 +40,8 @@ pub(super) struct Pairs<'a, A, B> {
 
 impl<'a, A, B> Pairs<'a, A, B>
 where
-    A: Iterator<Item = Result<Decision, ResultsError>>,
-    B: Iterator<Item = Result<Decision, ResultsError>>,
+    A: Iterator<Item = Result<(Decision, usize), ResultsError>>,
+    B: Iterator<Item = Result<(Decision, usize), ResultsError>>,
 {
     pub(super) fn new(a: &'a mut A, b: &'a mut B) -> Self {
         let (a, b) = (Side::new(a, true), Side::new(b, false));
@@ -57,31 +58,35 @@ where
         let (of_a, late_a) = self.a.at(instant)?;
         let (of_b, late_b) = self.b.at(instant)?;
         let out_of_order = late_a || late_b;
-        let mut by_name: HashMap<Name, VecDeque<Decision>> = HashMap::new();
-        let mut names = Vec::new();
-        for decision in of_b {
-            let name = Name::of(&decision);
-            names.push(name.clone());
-            by_name.entry(name).or_default().push_back(decision);
+        let (mut by_number, mut by_name) = (HashMap::new(), HashMap::new());
+        for (place, decision) in of_b.iter().enumerate() {
+            let name = Name::of(decision);
+            by_number.entry((name.clone(), decision.seq)).or_insert_with(VecDeque::new).push_back(place);
+            by_name.entry(name).or_insert_with(VecDeque::new).push_back(place);
         }
+        let mut left: Vec<_> = of_b.into_iter().map(Some).collect();
+        let mut take = |places: Option<&mut VecDeque<usize>>| {
+            let places = places?;
+            std::iter::from_fn(|| places.pop_front()).find_map(|place| left[place].take())
+        };
         for decision in of_a {
-            let b = by_name.get_mut(&Name::of(&decision)).and_then(VecDeque::pop_front);
+            let b = take(by_number.get_mut(&(Name::of(&decision), decision.seq)));
             self.ready.push_back(Pair { a: Some(decision), b, out_of_order });
         }
-        // What is left, in the order of the file.
-        for name in names {
-            if let Some(b) = by_name.get_mut(&name).and_then(VecDeque::pop_front) {
-                self.ready.push_back(Pair { a: None, b: Some(b), out_of_order });
-            }
+        // Then those of other numbers, in the order of the files: of a part of a drive, samples may be counted from its begin.
+        for pair in self.ready.iter_mut().filter(|pair| pair.b.is_none()) {
+            pair.b = pair.a.as_ref().and_then(|a| take(by_name.get_mut(&Name::of(a))));
         }
+        let rest = left.into_iter().flatten();
+        self.ready.extend(rest.map(|b| Pair { a: None, b: Some(b), out_of_order }));
         Ok(())
     }
 }
 
 impl<A, B> Iterator for Pairs<'_, A, B>
 where
-    A: Iterator<Item = Result<Decision, ResultsError>>,
-    B: Iterator<Item = Result<Decision, ResultsError>>,
+    A: Iterator<Item = Result<(Decision, usize), ResultsError>>,
+    B: Iterator<Item = Result<(Decision, usize), ResultsError>>,
 {
     type Item = Result<Pair, WakesError>;
 
@@ -103,13 +108,12 @@ struct Name {
     at_ns: i64,
     cause: Cause,
     topic: Option<String>,
-    seq: Option<u64>,
 }
 
 impl Name {
     fn of(decision: &Decision) -> Self {
-        let Decision { at_ns, cause, topic, seq, .. } = decision;
-        Self { at_ns: *at_ns, cause: *cause, topic: topic.clone(), seq: *seq }
+        let Decision { at_ns, cause, topic, .. } = decision;
+        Self { at_ns: *at_ns, cause: *cause, topic: topic.clone() }
     }
 }
 
@@ -117,14 +121,14 @@ impl Name {
 struct Side<'a, I> {
     decisions: &'a mut I,
     is_first: bool,
-    /// The next one that triggered or faulted, and the instant that it counts to.
-    next: Option<(i64, Decision)>,
+    /// The next one that triggered or faulted, the instant that it counts to, and the bytes of its line.
+    next: Option<(i64, Decision, usize)>,
     /// The latest time so far: who comes later with an earlier one counts to this instant, so that instants never go back.
     latest: i64,
     asked: bool,
 }
 
-impl<'a, I: Iterator<Item = Result<Decision, ResultsError>>> Side<'a, I> {
+impl<'a, I: Iterator<Item = Result<(Decision, usize), ResultsError>>> Side<'a, I> {
     fn new(decisions: &'a mut I, is_first: bool) -> Self {
         Self { decisions, is_first, next: None, latest: i64::MIN, asked: false }
     }
@@ -134,28 +138,28 @@ impl<'a, I: Iterator<Item = Result<Decision, ResultsError>>> Side<'a, I> {
             self.asked = true;
             // With `--all` a run has quiet wakes, too: they are as good as none.
             let speaks = |decision: &Decision| !decision.triggers.is_empty() || decision.fault.is_some();
-            let next = self.decisions.find(|decision| decision.as_ref().map_or(true, speaks));
+            let next = self.decisions.find(|next| next.as_ref().map_or(true, |(decision, _)| speaks(decision)));
             let next = next.transpose().map_err(WakesError::Read)?;
-            self.next = next.map(|decision| {
+            self.next = next.map(|(decision, bytes)| {
                 self.latest = self.latest.max(decision.at_ns);
-                (self.latest, decision)
+                (self.latest, decision, bytes)
             });
         }
-        Ok(self.next.as_ref().map(|(instant, _)| *instant))
+        Ok(self.next.as_ref().map(|(instant, ..)| *instant))
     }
 
     /// The wakes of `instant`, and whether any has another time.
     fn at(&mut self, instant: i64) -> Result<(Vec<Decision>, bool), WakesError> {
-        let (mut wakes, mut is_late) = (Vec::new(), false);
+        let (mut wakes, mut held, mut is_late) = (Vec::new(), 0, false);
         while self.peek()? == Some(instant) {
-            if wakes.len() == AT_ONCE {
+            self.asked = false;
+            let Some((_, decision, bytes)) = self.next.take() else { continue };
+            held += bytes;
+            if wakes.len() == AT_ONCE || (held > BYTES_AT_ONCE && !wakes.is_empty()) {
                 return Err(WakesError::Crowded { first: self.is_first });
             }
-            self.asked = false;
-            if let Some((_, decision)) = self.next.take() {
-                is_late |= decision.at_ns != instant;
-                wakes.push(decision);
-            }
+            is_late |= decision.at_ns != instant;
+            wakes.push(decision);
         }
         Ok((wakes, is_late))
     }

@@ -7,14 +7,18 @@ use gleaner_protocol::manifest::ConfigValue;
 use gleaner_protocol::signals::Signals;
 use gleaner_protocol::{Clip, Live};
 
+use super::compare::short;
 use super::{Change, Cost, Diff, DiffError, Side, Tally};
 use crate::report::{Losses, Told, signals};
 use crate::results::{JsonLines, grouped, size};
 
+/// Most values of a config that are listed.
+const CHANGES_MAX: usize = 200;
+
 /// All that can be said without looking at a decision.
 pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     let mut notes = Vec::new();
-    let (told_a, told_b) = (Told::of(a)?, Told::of(b)?);
+    let (told_a, told_b) = (Told::bounded(a, &mut notes)?, Told::bounded(b, &mut notes)?);
     apart(&told_a, &told_b, &mut notes);
     let [read_a, read_b] = [a, b].map(|out| signals(out, &mut notes));
     let clips = [clips(a)?, clips(b)?];
@@ -86,7 +90,17 @@ fn config(a: Option<&Signals>, b: Option<&Signals>, notes: &mut Vec<String>) -> 
     };
     let keys: BTreeSet<_> = a.config.keys().chain(b.config.keys()).collect();
     let both = keys.into_iter().map(|key| (key, word(&a.config, key), word(&b.config, key)));
-    both.filter(|(_, a, b)| a != b).map(|(key, a, b)| Change { what: key.clone(), a, b }).collect()
+    let mut changed = both.filter(|(_, a, b)| a != b);
+    let shown = |(key, a, b): (&String, Option<String>, Option<String>)| {
+        let [a, b] = [a, b].map(|value| value.as_deref().map(short));
+        Change { what: short(key), a, b }
+    };
+    let changes = changed.by_ref().take(CHANGES_MAX).map(shown).collect();
+    let left_out = changed.count();
+    if left_out > 0 {
+        notes.push(format!("{left_out} more config values differ"));
+    }
+    changes
 }
 
 /// How many clips there are, and their bytes.

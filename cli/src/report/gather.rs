@@ -12,13 +12,14 @@ use serde::de::DeserializeOwned;
 use super::marks::{Marks, Room, cut};
 use super::model::{ClipShown, CurveShown, Fact, LogShown, Run, SpreadShown, Totals};
 use super::pictures::Pictures;
-use super::told::{TellError, Told, in_words, signals};
+use super::told::{TellError, Told, in_words, shown_config, signals};
 use crate::results::{JsonLines, ResultsError, clip_contents, clip_span, grouped, seconds, size};
 
 /// Most clips and lines of the log on a page.
 const CLIPS_MAX: usize = 1_000;
 pub(super) const LOG_MAX: usize = 2_000;
 const LOG_CHARS: usize = 1_000;
+const NOTE_CHARS: usize = 1_000;
 
 /// Bytes that the texts of triggers may take; those of faults, clips and the log each half of it.
 const TEXT_BYTES: usize = 2 << 20;
@@ -31,19 +32,21 @@ struct Line {
     message: String,
 }
 
-/// What the page shows of `out`, which shares it with others: it has one part of `shares`.
-pub(crate) fn gather(out: &Path, shares: usize) -> Result<Run, TellError> {
-    let told = Told::of(out)?;
+/// What the page shows of `out`, which shares it with others: it has one part of `shares`. Times count from `from_ns`; of a run
+/// that is alone, from its own start.
+pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<Run, TellError> {
     let mut notes = Vec::new();
+    let told = Told::bounded(out, &mut notes)?;
     let signals = signals(out, &mut notes);
-    let start_ns = match &told {
+    let begin_ns = match &told {
         Told::Replay(summary) => summary.start_ns,
         Told::Live(_) => first_ns(out).unwrap_or(0),
     };
+    let start_ns = from_ns.unwrap_or(begin_ns);
 
     let room = TEXT_BYTES / shares;
     let mut marks = Marks::new(start_ns, room);
-    let mut last_ns = start_ns;
+    let mut last_ns = begin_ns;
     each(out, "decisions.jsonl", true, &mut notes, |decision: Decision| {
         last_ns = last_ns.max(decision.at_ns);
         marks.add(&decision);
@@ -78,6 +81,9 @@ pub(crate) fn gather(out: &Path, shares: usize) -> Result<Run, TellError> {
     pictures.of_clips(&mut marks.triggers, &clips, &thumbnails);
     notes.extend(pictures.note());
 
+    let config = signals.as_ref().map(|signals| shown_config(&signals.config, &mut notes));
+    // Some quote what was found in a file.
+    let notes = notes.iter().map(|note| cut(note, NOTE_CHARS)).collect();
     let (name, version, kind) = told.lambda();
     let mut run = Run {
         out: out.display().to_string(),
@@ -86,11 +92,12 @@ pub(crate) fn gather(out: &Path, shares: usize) -> Result<Run, TellError> {
         kind,
         is_live: matches!(told, Told::Live(_)),
         drive: Vec::new(),
+        start_ns,
         start_ms: start_ns as f64 / 1e6,
-        from: 0.0,
+        from: seconds(begin_ns, start_ns),
         to: seconds(last_ns, start_ns),
         is_part: false,
-        config: signals.as_ref().map(|signals| signals.config.clone()),
+        config,
         counts: told.wakes().into_iter().collect(),
         damaged: None,
         notes,
@@ -138,8 +145,8 @@ fn place(run: &mut Run, told: &Told) {
     let part = summary.part;
     let from_ns = part.from_ns.unwrap_or(summary.start_ns).max(summary.start_ns);
     let to_ns = part.to_ns.unwrap_or(summary.end_ns).min(summary.end_ns);
-    run.from = seconds(from_ns, summary.start_ns);
-    run.to = seconds(to_ns.max(from_ns), summary.start_ns);
+    run.from = seconds(from_ns, run.start_ns);
+    run.to = seconds(to_ns.max(from_ns), run.start_ns);
     run.is_part = !part.is_all();
     run.damaged.clone_from(&summary.damaged);
 }

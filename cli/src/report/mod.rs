@@ -17,6 +17,7 @@ use gleaner_protocol::{Exit, Failure, write_whole};
 
 use crate::args::ReportArgs;
 use crate::diff::Diff;
+use crate::results::seconds;
 use crate::say::say;
 
 pub(crate) use told::{Losses, TellError, Told, signals};
@@ -35,13 +36,18 @@ pub(crate) fn run(args: &ReportArgs) -> Result<Exit, Failure> {
 
 /// Writes the report of `out` into it.
 pub(crate) fn write(out: &Path) -> Result<PathBuf, Failure> {
-    let page = Page { made_by: made_by(), runs: vec![gather::gather(out, 1)?], diff: None };
+    let page = Page { made_by: made_by(), runs: vec![gather::gather(out, 1, None)?], diff: None };
     save(&page, out.join(NAME))
 }
 
-/// Writes a page about two runs, and what differs between them, to `path`.
-pub(crate) fn write_both(a: &Path, b: &Path, diff: Diff, path: &Path) -> Result<PathBuf, Failure> {
-    let runs = vec![gather::gather(a, 2)?, gather::gather(b, 2)?];
+/// Writes a page about two runs, and what differs between them, to `path`. All of it counts from the start of the first.
+pub(crate) fn write_both(a: &Path, b: &Path, mut diff: Diff, path: &Path) -> Result<PathBuf, Failure> {
+    let a = gather::gather(a, 2, None)?;
+    let b = gather::gather(b, 2, Some(a.start_ns))?;
+    for difference in &mut diff.differences {
+        difference.t = seconds(difference.at_ns, a.start_ns);
+    }
+    let runs = vec![a, b];
     save(&Page { made_by: made_by(), runs, diff: Some(diff) }, path.to_owned())
 }
 

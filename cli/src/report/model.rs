@@ -1,4 +1,4 @@
-//! The data of the page, as its script reads it. Times are in s after the start of the drive; numbers that a script would round are texts.
+//! The data of the page, as its script reads it. Times are in s after the start of the drive, of two runs that of the first; numbers that a script would round are texts.
 
 use std::collections::BTreeMap;
 
@@ -29,7 +29,10 @@ pub(crate) struct Run {
     pub(crate) kind: Kind,
     pub(crate) is_live: bool,
     pub(crate) drive: Vec<String>,
-    /// Start of the drive, in ms since 1970: what a date of the page is made from.
+    /// What times count from.
+    #[serde(skip)]
+    pub(crate) start_ns: i64,
+    /// The same in ms since 1970: what a date of the page is made from.
     pub(crate) start_ms: f64,
     /// What the page shows, in s.
     pub(crate) from: f64,

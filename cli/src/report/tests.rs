@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use serde_json::{Value, json};
 
-use super::{Page, gather, page, write};
+use super::{Page, gather, page, write, write_both};
+use crate::diff::between;
 
 /// A folder of results, removed when the test ends. It is also what the tests of `diff` compare.
 pub(crate) struct Out(PathBuf);
@@ -43,7 +44,7 @@ impl Out {
     }
 
     fn data(&self) -> Value {
-        serde_json::to_value(gather::gather(&self.0, 1).unwrap()).unwrap()
+        serde_json::to_value(gather::gather(&self.0, 1, None).unwrap()).unwrap()
     }
 }
 
@@ -157,6 +158,30 @@ fn a_picture_of_the_moment_is_preferred_to_a_thumbnail() {
 }
 
 #[test]
+fn two_runs_count_from_the_start_of_the_first() {
+    let (a, b) = (Out::new(), Out::new());
+    let mut later = summary();
+    later["start_ns"] = (START_NS + 10_000_000_000).into();
+    later["part"] = json!({"from_ns": START_NS + 12_000_000_000_i64, "to_ns": null});
+    b.write("summary.json", later.to_string());
+    b.write("log.jsonl", format!("{}\n", json!({"at_ns": START_NS + 5_000_000_000, "level": "warn", "message": "hm"})));
+    let both = [wake(15_000, json!([trigger("brake", 1.5)]), Value::Null)];
+    a.decisions(&both);
+    b.decisions(&[&both[..], &[wake(20_000, json!([trigger("brake", 1.5)]), Value::Null)]].concat());
+    for (first, second, new_s, [from_a, from_b]) in [(&a, &b, 20.0, [0.0, 12.0]), (&b, &a, 10.0, [2.0, -10.0])] {
+        let path = first.path().join("both.html");
+        write_both(first.path(), second.path(), between(first.path(), second.path()).unwrap(), &path).unwrap();
+        let html = fs::read_to_string(&path).unwrap();
+        let (_, data) = html.split_once("application/json\">").unwrap();
+        let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
+        let run = |n: usize| &data["runs"][n];
+        assert_eq!(run(0)["triggers"][0]["t"], run(1)["triggers"][0]["t"], "one instant stands at one place");
+        assert_eq!((&run(0)["from"], &run(1)["from"]), (&json!(from_a), &json!(from_b)));
+        assert_eq!((&run(0)["start_ms"], &data["diff"]["differences"][0]["t"]), (&run(1)["start_ms"], &json!(new_s)));
+    }
+}
+
+#[test]
 fn without_signals_the_report_does_without() {
     let run = Out::new().data();
     assert_eq!((&run["config"], &run["curves"], &run["spreads"]), (&Value::Null, &json!([]), &json!([])));
@@ -244,9 +269,45 @@ fn a_page_has_bounds_and_says_what_is_beyond_them() {
     let dense = |key: &str| run[key].as_array().unwrap().iter().map(|bin| bin["count"].as_u64().unwrap()).sum::<u64>();
     assert_eq!((dense("trigger_density"), dense("fault_density")), (6000, 6000));
     assert!(length("log") < 2000 && run["totals"]["log"] == 3000, "each line is cut, and all of them share a room");
-    let html =
-        page::html(&Page { made_by: String::new(), runs: vec![gather::gather(out.path(), 1).unwrap()], diff: None });
+    let html = page::html(&Page {
+        made_by: String::new(),
+        runs: vec![gather::gather(out.path(), 1, None).unwrap()],
+        diff: None,
+    });
     assert!(html.len() < 10 << 20, "{}", html.len());
+}
+
+#[test]
+fn names_values_and_lists_have_bounds_too() {
+    let (out, other, long) = (Out::new(), Out::new(), "<".repeat(10_000));
+    let list = |n: usize| (0..n).map(|n| format!("{n}{long}")).collect::<Vec<_>>();
+    let mut summary = summary();
+    for key in ["lambda", "version", "damaged"] {
+        summary[key] = long.clone().into();
+    }
+    summary["drive"] = list(60).into();
+    let topic = |name: String| json!({"name": name, "topic": name, "type_name": name, "received": 1, "lost": null, "overwritten": 0, "no_slot": 0, "too_big": 0});
+    summary["topics"] = list(270).into_iter().map(|name| topic(name.chars().take(4_000).collect())).collect();
+    out.write("summary.json", summary.to_string());
+    let mut signals = signals();
+    signals["config"] =
+        list(250).into_iter().map(|key| (key.clone(), key.into())).collect::<serde_json::Map<_, _>>().into();
+    out.write("signals.json", signals.to_string());
+    let run = out.data();
+    assert_eq!((run["drive"].as_array().unwrap().len(), run["topics"].as_array().unwrap().len()), (50, 256));
+    assert_eq!(run["config"].as_object().unwrap().len(), 200);
+    let said = run["notes"].to_string();
+    for left_out in ["10 of 60 drives", "14 of 270 topics", "50 of 250 config values"] {
+        assert!(said.contains(left_out), "{said}");
+    }
+    signals["config"] = json!({});
+    other.write("signals.json", signals.to_string());
+    let path = out.path().join("both.html");
+    let diff = between(out.path(), other.path()).unwrap();
+    assert!(diff.notes.iter().any(|note| note == "50 more config values differ"), "{:?}", diff.notes);
+    write_both(out.path(), other.path(), diff, &path).unwrap();
+    let bytes = fs::metadata(path).unwrap().len();
+    assert!(bytes < 8 << 20, "{bytes}");
 }
 
 #[test]

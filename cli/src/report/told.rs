@@ -1,17 +1,30 @@
 //! What the files of an output tell as a whole: `summary.json` of a replay or of a live run, and `signals.json`.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::manifest::Kind;
+use gleaner_protocol::manifest::{ConfigValue, Kind};
 use gleaner_protocol::signals::{Curve, Signals};
 use gleaner_protocol::{Exit, Explain, Live, Summary};
 use serde::de::DeserializeOwned;
 
+use super::marks::cut;
+
 /// Most bytes of `summary.json`, which is some kilobytes, and of `signals.json`, whose curves and points are bounded.
 const SUMMARY_BYTES: u64 = 4 << 20;
 const SIGNALS_BYTES: u64 = 32 << 20;
+
+/// Most topics of a summary, and drives of it: a lambda has fewer, but the file may be by others. Most characters of their names, and of
+/// what else a summary says in a word.
+const TOPICS_MAX: usize = 256;
+const DRIVES_MAX: usize = 50;
+const NAME_CHARS: usize = 300;
+/// Most values of a config.
+const CONFIG_MAX: usize = 200;
+/// Most characters of why something is not whole.
+const WHY_CHARS: usize = 2_000;
 
 /// Why a folder is no output.
 #[derive(Debug, thiserror::Error)]
@@ -87,7 +100,7 @@ pub(crate) struct Losses {
 
 impl Told {
     /// Reads `out/summary.json`.
-    pub(crate) fn of(out: &Path) -> Result<Self, TellError> {
+    fn of(out: &Path) -> Result<Self, TellError> {
         let text = match bounded(out, "summary.json", SUMMARY_BYTES) {
             Ok(text) => text,
             Err(source) if source.is_absent() => {
@@ -103,6 +116,39 @@ impl Told {
             parsed("summary.json", &text).map(Self::Replay)
         };
         told.map_err(|source| TellError::Summary { path: out.join("summary.json"), source })
+    }
+
+    /// As `of`, within what a page has room for. What is left out is said in `notes`.
+    pub(crate) fn bounded(out: &Path, notes: &mut Vec<String>) -> Result<Self, TellError> {
+        let mut told = Self::of(out)?;
+        let mut left_out = |what: &str, found: usize, most: usize| {
+            if found > most {
+                notes.push(format!("`summary.json`: {} of {found} {what} left out", found - most));
+            }
+        };
+        match &mut told {
+            Self::Replay(summary) => {
+                left_out("drives", summary.drive.len(), DRIVES_MAX);
+                left_out("topics", summary.topics.len(), TOPICS_MAX);
+                summary.drive.truncate(DRIVES_MAX);
+                summary.drive.iter_mut().for_each(|drive| *drive = cut(&drive.to_string_lossy(), NAME_CHARS).into());
+                summary.damaged = summary.damaged.as_deref().map(|why| cut(why, WHY_CHARS));
+                summary.topics.truncate(TOPICS_MAX);
+                let topics = summary.topics.iter_mut();
+                let names = topics.flat_map(|topic| [&mut topic.name, &mut topic.topic, &mut topic.type_name]);
+                shorten(names.chain([&mut summary.lambda, &mut summary.version]));
+            }
+            Self::Live(live) => {
+                left_out("topics", live.topics.len(), TOPICS_MAX);
+                live.topics.truncate(TOPICS_MAX);
+                let topics = live.topics.iter_mut();
+                let names = topics.flat_map(|topic| {
+                    [&mut topic.name, &mut topic.topic, &mut topic.type_name].into_iter().chain(&mut topic.trouble)
+                });
+                shorten(names.chain([&mut live.lambda, &mut live.version]));
+            }
+        }
+        Ok(told)
     }
 
     /// Name, version and kind of the lambda.
@@ -169,6 +215,10 @@ impl Told {
     }
 }
 
+fn shorten<'a>(texts: impl Iterator<Item = &'a mut String>) {
+    texts.for_each(|text| *text = cut(text, NAME_CHARS));
+}
+
 impl From<&gleaner_protocol::TopicReport> for Losses {
     fn from(topic: &gleaner_protocol::TopicReport) -> Self {
         Self {
@@ -210,7 +260,8 @@ pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Option<Signals> {
         Ok(signals) => signals,
         Err(error) if error.is_absent() => return None,
         Err(error) => {
-            notes.push(in_words(&error));
+            // It may quote what was found there.
+            notes.push(cut(&in_words(&error), WHY_CHARS));
             return None;
         }
     };
@@ -223,6 +274,21 @@ pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Option<Signals> {
     }
     signals.pictures.truncate(Signals::PICTURES_MAX);
     Some(signals)
+}
+
+/// What a page, or a list of changes, shows of a config; it is compared whole.
+pub(crate) fn shown_config(
+    config: &BTreeMap<String, ConfigValue>,
+    notes: &mut Vec<String>,
+) -> BTreeMap<String, ConfigValue> {
+    if config.len() > CONFIG_MAX {
+        notes.push(format!("`signals.json`: {} of {} config values left out", config.len() - CONFIG_MAX, config.len()));
+    }
+    let value = |value: &ConfigValue| match value {
+        ConfigValue::Text(text) => ConfigValue::Text(cut(text, NAME_CHARS)),
+        other => other.clone(),
+    };
+    config.iter().take(CONFIG_MAX).map(|(key, of)| (cut(key, NAME_CHARS), value(of))).collect()
 }
 
 fn is_whole(curve: &Curve) -> bool {

@@ -89,7 +89,8 @@ fn inputs(topics: &[RecordedTopicSeen]) -> String {
 fn sizes(topic: &RecordedTopicSeen) -> String {
     let kib = |bytes: u64| format!("{} KiB", bytes.div_ceil(1024));
     if let Some(Picture { width, height, is_compressed, .. }) = &topic.picture {
-        let decoded = 3 * u64::from(*width) * u64::from(*height);
+        // What a message says of itself may be anything.
+        let decoded = 3_u64.saturating_mul(u64::from(*width)).saturating_mul(u64::from(*height));
         return match is_compressed {
             true => format!(
                 "max_size = \"{}\"\ndecoded_size = \"{}\"\n",
@@ -186,6 +187,11 @@ depth = 128                 # 1.3 s
         };
         assert_eq!(sizes(&camera(true, 41_000)), "max_size = \"128 KiB\"\ndecoded_size = \"2700 KiB\"\n");
         assert_eq!(sizes(&camera(false, 2_764_900)), "max_size = \"2702 KiB\"\n");
+        for is_compressed in [true, false] {
+            let picture = Picture { width: u32::MAX, height: u32::MAX, ..shape(is_compressed) };
+            let camera = RecordedTopicSeen { picture: Some(picture), ..camera(is_compressed, 1024) };
+            assert!(sizes(&camera).starts_with("max_size = \"2 KiB\"\n"));
+        }
     }
 
     #[test]

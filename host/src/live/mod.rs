@@ -100,7 +100,7 @@ impl Job {
         if let Err(fault) = initialised {
             // What it said on the way may be why.
             ledger.finish(None)?;
-            return Err(not_started(name, fault));
+            return Err(not_started(name, fault, &[]));
         }
         ledger.report(Report::Ready);
         let schedule = Schedule::live(&manifest, &inputs, clock.now());

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use clap::Args;
-use gleaner_protocol::{DriveSeen, Exit, Failure, Picture, RecordedTopicSeen, Report};
+use gleaner_protocol::{DriveSeen, Exit, Failure, Picture, RecordedTopicSeen, Report, Spread};
 use gleaner_transport::message::{CompressedView, ImageView, Sources};
 use gleaner_transport::replay::{Options, Replay, Step, files_of};
 use gleaner_transport::{DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
@@ -90,7 +90,7 @@ fn spread(start_ns: Option<i64>, end_ns: Option<i64>) -> Vec<[i64; 2]> {
     // The end does not belong to a part, and the last message is to.
     let room = i128::from(length) + 1 - i128::from(PART_NS);
     let from = |n: i64| start + (room * i128::from(n) / i128::from(PARTS - 1)) as i64;
-    (0..PARTS).map(|n| [from(n), from(n) + PART_NS]).collect()
+    (0..PARTS).map(|n| [from(n), from(n).saturating_add(PART_NS)]).collect()
 }
 
 /// Reads what it is restricted to, at most so many bytes of messages. Until when it read, if it ended before; and why, if it is damaged.
@@ -113,7 +113,7 @@ fn read(drive: &mut Replay, topics: &mut [Look], most: Option<u64>) -> (Option<i
                 }
                 bytes += step.bytes as u64;
                 if most.is_some_and(|most| bytes >= most) {
-                    return (Some(step.at_ns + 1), None);
+                    return (Some(step.at_ns.saturating_add(1)), None);
                 }
             }
             Ok(None) => return (None, None),
@@ -163,7 +163,8 @@ impl Look {
     /// Another part: what lies between two is no gap.
     fn begin(&mut self) {
         self.last_ns = None;
-        self.seen.missing = self.seen.missing.map(|missing| missing + std::mem::take(&mut self.gaps).lost());
+        self.seen.missing =
+            self.seen.missing.map(|missing| missing.saturating_add(std::mem::take(&mut self.gaps).lost()));
     }
 
     fn add(&mut self, step: &Step) {
@@ -172,7 +173,7 @@ impl Look {
         self.seen.largest_bytes = self.seen.largest_bytes.max(step.bytes as u64);
         self.gaps.note(step.meta.writer, step.meta.seq);
         if let Some(last) = self.last_ns {
-            let interval = step.at_ns - last;
+            let interval = step.at_ns.saturating_sub(last);
             self.intervals.add(interval);
             if interval > self.longest_ns {
                 self.longest_ns = interval;
@@ -185,7 +186,10 @@ impl Look {
     fn seen(mut self) -> RecordedTopicSeen {
         self.begin();
         let picture = self.first.picture.lock().unwrap_or_else(PoisonError::into_inner).take();
-        RecordedTopicSeen { interval: self.intervals.all(), picture: picture.flatten(), ..self.seen }
+        // Of those kept only two digits are, and no more than a day.
+        let max_ns = u64::try_from(self.longest_ns).unwrap_or(0);
+        let interval = self.intervals.all().map(|kept| Spread { max_ns, ..kept });
+        RecordedTopicSeen { interval, picture: picture.flatten(), ..self.seen }
     }
 }
 
@@ -237,5 +241,7 @@ mod tests {
         );
         assert_eq!(spread(Some(0), Some(5 * second)), Vec::<[i64; 2]>::new());
         assert_eq!(spread(None, None), Vec::<[i64; 2]>::new());
+        let to_the_end = spread(Some(7), Some(i64::MAX));
+        assert_eq!((to_the_end.len(), to_the_end[2][1]), (3, i64::MAX));
     }
 }

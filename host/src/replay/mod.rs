@@ -6,6 +6,7 @@
 mod chosen;
 mod course;
 mod digests;
+mod hold;
 mod inspect;
 mod journal_file;
 mod open;
@@ -25,6 +26,7 @@ use std::io::Write;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{Exit, Failure, Report};
 
+use self::hold::Hold;
 use self::options::{Results, Task};
 use crate::isolation::Isolation;
 use crate::stage::Load;
@@ -62,6 +64,7 @@ fn replay(
     isolation: &Isolation,
     reports: &mut dyn Write,
 ) -> Result<Exit, Failure> {
+    let _hold = Hold::take(&results.out)?;
     let mut n = 1;
     let (summary, broken) = loop {
         let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports)?;

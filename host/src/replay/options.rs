@@ -179,13 +179,17 @@ impl Job {
         let asked = Asked::new(args.asked, build, &mut manifest)?;
         let (lambda, build) = (&asked.lambda, &asked.build);
         let out = args.out.unwrap_or_else(|| lambda.join("out"));
+        if lies_in(&out, build.path()) {
+            let message = format!("`{}` lies in the build, and would change the lambda", out.display());
+            return Err(Failure::new(Exit::Usage, message).with_help("choose another folder: --out DIR"));
+        }
         if let Some(journal) = args.journal.as_deref().filter(|journal| is_result(journal, &out)) {
             let message = format!("`{}` is a file of the results", journal.display());
             return Err(
                 Failure::new(Exit::Usage, message).with_help("give the journal a name of its own: --journal FILE")
             );
         }
-        if let Some(journal) = args.journal.as_deref().filter(|journal| journal.starts_with(build.path())) {
+        if let Some(journal) = args.journal.as_deref().filter(|journal| lies_in(journal, build.path())) {
             let message = format!("`{}` lies in the build, and would change the lambda", journal.display());
             return Err(Failure::new(Exit::Usage, message).with_help("write the journal elsewhere: --journal FILE"));
         }
@@ -211,6 +215,14 @@ impl Job {
         let options = claim.options(asked, build, &mut manifest, clip)?;
         Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
     }
+}
+
+/// Whether `path` is within `folder`, under whatever name. What is not there yet is where the nearest folder is that is.
+fn lies_in(path: &Path, folder: &Path) -> bool {
+    let Ok(folder) = folder.canonicalize() else { return path.starts_with(folder) };
+    let Ok(path) = std::path::absolute(path) else { return false };
+    let real = path.ancestors().find_map(|path| path.canonicalize().ok());
+    real.is_some_and(|real| real.starts_with(folder))
 }
 
 /// Whether `path` is one of the files that a replay writes into `out` anyway.

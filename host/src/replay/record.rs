@@ -7,7 +7,7 @@ use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{
-    Counts, Folder, LambdaId, MESSAGE_MAX, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image,
+    Counts, Earlier, Folder, LambdaId, MESSAGE_MAX, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image,
     lambda_digest,
 };
 use gleaner_transport::replay::Replay;
@@ -23,8 +23,8 @@ pub(super) struct Recording {
     /// One for each topic, with what the recorder calls it.
     lanes: Vec<Arc<Lane>>,
     rules: Record,
-    /// Where clips go, and what was recovered there; until the recorder has it.
-    folder: Option<(Folder, Vec<Clip>)>,
+    /// What an earlier replay left, and what of it was recovered only now; until it is replaced.
+    earlier: Option<(Earlier, Vec<Clip>)>,
     lambda: Option<LambdaId>,
 }
 
@@ -37,7 +37,7 @@ pub(super) struct Recorded {
 }
 
 struct Shared {
-    /// There from the moment when the lambda is ready: what could not start must not touch earlier results.
+    /// There once the folder is ours.
     recorder: Option<Recorder>,
     /// Why it stopped. A sink can only say that a sample was not taken.
     failed: Option<RecordError>,
@@ -158,7 +158,7 @@ impl Recording {
             );
             return Err(failure.with_help(help));
         }
-        Ok(Some(Self { shared, lanes, rules: rules.clone(), folder: None, lambda: None }))
+        Ok(Some(Self { shared, lanes, rules: rules.clone(), earlier: None, lambda: None }))
     }
 
     /// What sees the images of a recorded topic, if the lambda has none.
@@ -166,21 +166,14 @@ impl Recording {
         self.lanes.iter().find_map(|lane| lane.camera.clone())
     }
 
-    /// Takes hold of `out`, so that two replays do not write over each other. What a killed one left there is recovered, kept
-    /// until the next, and said.
-    pub(super) fn take_hold(&mut self, out: &Path) -> Result<(), Failure> {
+    /// Makes the recorder, which takes hold of the clips in `out`. What a killed replay left there is recovered, kept
+    /// until the next, and said; what an earlier one left stays until [`Recording::replace`].
+    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
         let (folder, recovered) = Folder::open(out)?;
         for clip in &recovered {
             tracing::warn!(clip = %clip.file.display(), "recovered a clip of an earlier replay, which did not end well");
         }
-        self.folder = Some((folder, recovered));
-        Ok(())
-    }
-
-    /// Makes the recorder. The clips of an earlier replay are replaced, but not those that were recovered; returns how many.
-    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<u64, Failure> {
-        let Some((mut folder, recovered)) = self.folder.take() else { return Ok(0) };
-        let replaced = folder.replace(&recovered)?;
+        self.earlier = Some((folder.earlier(), recovered));
         let settings = Settings {
             store: self.rules.store,
             preroll_bytes: self.rules.preroll_size.bytes(),
@@ -203,7 +196,12 @@ impl Recording {
         let (header, digest) = (header.clone(), lambda_digest(&header.files));
         self.lambda = Some(recorder.add_lambda(Member { header, rules: self.rules.clone(), digest, topics }));
         lock(&self.shared).recorder = Some(recorder);
-        Ok(replaced)
+        Ok(())
+    }
+
+    /// Replaces the clips of an earlier replay, but not those that were recovered; returns how many.
+    pub(super) fn replace(&mut self) -> Result<u64, Failure> {
+        Ok(self.earlier.take().map_or(Ok(0), |(earlier, recovered)| earlier.replace(&recovered))?)
     }
 
     /// After a wake: what it triggered opens or closes windows.

@@ -136,9 +136,6 @@ pub(super) fn replay(
     let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { inputs, session, mut guest } =
         Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
-    if let Some(recording) = &mut recording {
-        recording.take_hold(&results.out)?;
-    }
     let started = Instant::now();
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {
@@ -146,25 +143,24 @@ pub(super) fn replay(
         header =
             Some(Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK, part }.header()?);
     }
+    // The memory of its preroll is none of the lambda's, which is bounded from `init` on.
+    if let (Some(recording), Some(header)) = (&mut recording, &header) {
+        recording.start(&results.out, header)?;
+    }
     let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.files.clone()));
-    let journal = results.journal.as_deref().zip(header.as_ref());
-    let journal = journal.map(|(path, header)| JournalFile::create(path, header)).transpose()?;
-    // Only now does it cost the results of an earlier replay: what could not start must not touch them.
-    let mut output = Output::create(&results.out, results.all)?;
-    let clips_replaced = match (&mut recording, &header) {
-        (Some(recording), Some(header)) => recording.start(&results.out, header)?,
-        _ => remove_clips(&results.out)?,
-    };
     let gathered = Gathered::of(&inputs, recording.as_ref().and_then(Recording::camera));
     let initialised = guest.init();
     // What `init` says is no part of a wake.
     let (said, _) = session.take_log();
-    if let Err(fault) = initialised {
-        // What it said on the way may be why.
-        output.log(&said)?;
-        output.flush()?;
-        return Err(not_started(name, fault));
-    }
+    initialised.map_err(|fault| not_started(name, fault, &said))?;
+    // Only now does it cost the results of an earlier replay: what could not start must not touch them.
+    let journal = results.journal.as_deref().zip(header.as_ref());
+    let journal = journal.map(|(path, header)| JournalFile::create(path, header)).transpose()?;
+    let mut output = Output::create(&results.out, results.all)?;
+    let clips_replaced = match &mut recording {
+        Some(recording) => recording.replace()?,
+        None => remove_clips(&results.out)?,
+    };
     let mut pass = Pass {
         schedule: Schedule::new(manifest, &inputs),
         judge: Judge::new(session.clone(), guest),

@@ -8,14 +8,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Explain, Failure, Fault};
+use gleaner_protocol::{Exit, Explain, Failure, Fault, visible};
 use gleaner_transport::{Transport, TransportError};
 
 pub use asked::{Asked, AskedArgs, tighten};
-pub use output::{Output, OutputError, RESULTS, SUMMARY};
+pub use output::{LOCK, Output, OutputError, RESULTS, SUMMARY};
 
 use crate::api::Session;
 use crate::api::data::Topic;
+use crate::api::log::Line;
 use crate::guest::Guest;
 use crate::input::{InputError, Live, open_inputs};
 
@@ -63,8 +64,10 @@ impl Stage {
     }
 }
 
-/// What a lambda's fault in `init` means for a run.
-pub fn not_started(lambda: &str, fault: Fault) -> Failure {
+/// What a lambda's fault in `init` means for a run. What it `said` on the way may be why: what of that is in no file goes to standard
+/// error.
+pub fn not_started(lambda: &str, fault: Fault, said: &[Line]) -> Failure {
+    said.iter().for_each(|line| eprintln!("log: {}", visible(&line.message)));
     let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{lambda}`"));
     failure.causes = vec![fault.message];
     failure

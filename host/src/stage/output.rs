@@ -22,8 +22,12 @@ const REPORT: &str = "report.html";
 /// Earlier lines of a log that is shared out over two files.
 const LOG_BEFORE: &str = "log.before.jsonl";
 
+/// What a replay locks, so that no other writes into the same folder.
+pub const LOCK: &str = ".lock";
+
 /// The files of a run beside its clips.
-pub const RESULTS: [&str; 7] = ["clips.jsonl", "decisions.jsonl", "log.jsonl", LOG_BEFORE, REPORT, SIGNALS, SUMMARY];
+pub const RESULTS: [&str; 8] =
+    [LOCK, "clips.jsonl", "decisions.jsonl", "log.jsonl", LOG_BEFORE, REPORT, SIGNALS, SUMMARY];
 
 /// Why results could not be written.
 #[derive(Debug, thiserror::Error)]

@@ -3,8 +3,8 @@
 use gleaner_protocol::Spread;
 use hdrhistogram::Histogram;
 
-/// What lasts longer counts as this: a minute.
-const MOST_NS: u64 = 60_000_000_000;
+/// What lasts longer counts as this: a day. There are topics that speak once in an hour.
+const MOST_NS: u64 = 86_400_000_000_000;
 
 /// Durations since the report before, and since the start.
 pub struct Spreads {
@@ -21,7 +21,7 @@ impl Default for Spreads {
 impl Spreads {
     /// None so far.
     pub fn new() -> Self {
-        let empty = || Histogram::new_with_max(MOST_NS, 2).expect("two digits up to a minute are no problem");
+        let empty = || Histogram::new_with_max(MOST_NS, 2).expect("two digits up to a day are no problem");
         Self { now: empty(), all: empty() }
     }
 
@@ -70,5 +70,13 @@ mod tests {
         assert!((49_000..=51_000).contains(&p50_ns) && (100_000..=101_000).contains(&max_ns), "{p50_ns} {max_ns}");
         assert_eq!(spreads.take(), None);
         assert_eq!(spreads.all().unwrap().n, 101);
+    }
+
+    #[test]
+    fn what_lasts_hours_is_told_as_that() {
+        let mut spreads = Spreads::new();
+        spreads.add(7_200_000_000_000);
+        let Spread { p50_ns, max_ns, .. } = spreads.all().unwrap();
+        assert!([p50_ns, max_ns].iter().all(|ns| ns / 100_000_000_000 == 72), "{p50_ns} {max_ns}");
     }
 }

@@ -18,6 +18,12 @@ use super::unfinished::Unfinished;
 use super::{About, durable};
 use crate::error::RecordError;
 
+/// The clips that are listed in a [`Folder`], which stays held. Who starts anew replaces them once nothing is in the way, and then a
+/// recorder has the folder already.
+pub struct Earlier {
+    place: Arc<Place>,
+}
+
 /// A folder of clips with their list, held by one process at a time.
 pub struct Folder {
     pub(super) place: Arc<Place>,
@@ -75,39 +81,18 @@ impl Folder {
         std::mem::take(&mut self.left)
     }
 
-    /// Starts anew with the clips in `keep`: deletes the others that are listed, with their thumbnails, and says how
-    /// many clips these were. Lines of the list that name no clip
-    /// of ours stay.
-    ///
-    /// Only plain files in the folder of clips are deleted, whatever the list names.
+    /// As [`Earlier::replace`].
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if the list cannot be written, and nothing is deleted then.
+    /// As there.
     pub fn replace(&mut self, keep: &[Clip]) -> Result<u64, RecordError> {
-        let place = &self.place;
-        let listed = place.list().read()?;
-        // The list first: it may leave out a whole clip, which is found at the next start, but never names one that
-        // is gone.
-        place.list().replace(keep)?;
-        let kept: HashSet<PathBuf> = keep.iter().map(|clip| clip.file.clone()).collect();
-        let is_kept = |file: &str| kept.contains(Path::new(CLIPS).join(file).as_path());
-        let mut deleted = 0;
-        for Listed { file, thumbnail } in listed.iter().filter(|listed| !is_kept(&listed.file)) {
-            // The thumbnail first: one without its clip would belong to nobody.
-            let thumbnail =
-                thumbnail.as_ref().map_or(Ok(false), |thumbnail| durable::remove(&place.folder().join(thumbnail)));
-            match thumbnail.and_then(|_| durable::remove(&place.folder().join(file))) {
-                Ok(was_there) => deleted += u64::from(was_there),
-                // The list is written: what stays, such as a folder of this name, is no clip of it any more.
-                Err(error) => {
-                    warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, left alone")
-                }
-            }
-        }
-        durable::sync_folder(place.folder())?;
-        place.take_only(listed.into_iter().map(|listed| listed.file).filter(|file| is_kept(file)).collect());
-        Ok(deleted)
+        self.earlier().replace(keep)
+    }
+
+    /// The clips that are listed in it.
+    pub fn earlier(&self) -> Earlier {
+        Earlier { place: Arc::clone(&self.place) }
     }
 
     /// From now on there are at most so many clips, or so many bytes of them: of more, the oldest that nobody fetched are deleted,
@@ -140,6 +125,43 @@ impl Folder {
     pub(crate) fn begin(&mut self, stem: &str, about: &About) -> Result<Unfinished, RecordError> {
         let name = self.place.free_name(stem);
         Unfinished::create(Arc::clone(&self.place), name, PART, Some(about))
+    }
+}
+
+impl Earlier {
+    /// Starts anew with the clips in `keep`: deletes the others that are listed, with their thumbnails, and says how
+    /// many clips these were. Lines of the list that name no clip
+    /// of ours stay.
+    ///
+    /// Only plain files in the folder of clips are deleted, whatever the list names.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the list cannot be written, and nothing is deleted then.
+    pub fn replace(&self, keep: &[Clip]) -> Result<u64, RecordError> {
+        let place = &self.place;
+        let listed = place.list().read()?;
+        // The list first: it may leave out a whole clip, which is found at the next start, but never names one that
+        // is gone.
+        place.list().replace(keep)?;
+        let kept: HashSet<PathBuf> = keep.iter().map(|clip| clip.file.clone()).collect();
+        let is_kept = |file: &str| kept.contains(Path::new(CLIPS).join(file).as_path());
+        let mut deleted = 0;
+        for Listed { file, thumbnail } in listed.iter().filter(|listed| !is_kept(&listed.file)) {
+            // The thumbnail first: one without its clip would belong to nobody.
+            let thumbnail =
+                thumbnail.as_ref().map_or(Ok(false), |thumbnail| durable::remove(&place.folder().join(thumbnail)));
+            match thumbnail.and_then(|_| durable::remove(&place.folder().join(file))) {
+                Ok(was_there) => deleted += u64::from(was_there),
+                // The list is written: what stays, such as a folder of this name, is no clip of it any more.
+                Err(error) => {
+                    warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, left alone")
+                }
+            }
+        }
+        durable::sync_folder(place.folder())?;
+        place.take_only(listed.into_iter().map(|listed| listed.file).filter(|file| is_kept(file)).collect());
+        Ok(deleted)
     }
 }
 

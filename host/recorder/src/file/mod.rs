@@ -16,7 +16,7 @@
 //! and a death in the middle of that changes nothing; what it cannot finish stays for the next start.
 //!
 //! Never: a file touched that this program did not write; a clip that was acknowledged deleted other than by
-//! [`Folder::replace`], or that nobody fetched other than by [`Folder::keep_at_most`].
+//! [`Earlier::replace`], or that nobody fetched other than by [`Folder::keep_at_most`].
 
 mod durable;
 mod ending;
@@ -38,7 +38,7 @@ use std::sync::Arc;
 use gleaner_protocol::journal::Header;
 use gleaner_protocol::{ClipLambda, Moment};
 
-pub use folder::Folder;
+pub use folder::{Earlier, Folder};
 pub use losses::LossList;
 pub(crate) use recover::Recovery;
 pub use unfinished::MESSAGE_MAX;

@@ -90,11 +90,10 @@ impl Remake {
             Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
         let lambda = manifest.lambda.name.to_string();
         let engine = guest.engine();
-        if let Err(fault) = guest.init() {
-            return Err(not_started(&lambda, fault));
-        }
+        let initialised = guest.init();
         // What `init` says is no part of a wake.
-        session.take_log();
+        let (said, _) = session.take_log();
+        initialised.map_err(|fault| not_started(&lambda, fault, &said))?;
         let judge = Judge::new(session.clone(), guest);
         Ok((Self { lambda, session, scribe: Scribe::new(&inputs), judge, engine }, drive, inputs))
     }
