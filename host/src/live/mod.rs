@@ -87,7 +87,7 @@ impl Job {
         let announcer = wanted.announce.map(|topic| Announcer::open(&dds, &topic, name)).transpose()?;
         let undecided = (wanted.restarts > 0).then(|| before::undecided(&manifest, &wanted.out)).flatten();
         let mut ledger = Ledger::start(Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?, reports)?;
-        ledger.report(Report::Isolation { layers: isolation.close().to_vec() });
+        ledger.report(Report::Isolation { layers: isolation.close()?.to_vec() });
         let initialised = guest.init();
         let (said, _) = session.take_log();
         ledger.log(said);
