@@ -13,6 +13,9 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use crate::listen::Listener;
 use crate::sibling::starter;
 
+/// Longest report, as of one trigger with all its attributes or a clip with all that it lists, with much room.
+pub(crate) const REPORT_BYTES: u64 = 16 << 20;
+
 /// Why the runtime did not do what it was asked for, where it could not say so itself.
 #[derive(Debug, thiserror::Error)]
 enum RuntimeError {
@@ -106,11 +109,18 @@ fn start(program: PathBuf, runtime: PathBuf, arguments: Vec<OsString>) -> Result
         .map_err(|source| RuntimeError::Start { program, source })
 }
 
-/// Reads reports up to the result, which is the last; `None` if they end before.
+/// Reads reports up to the result, which is the last; `None` if they end before. What is longer than a report can be is none:
+/// a lambda's process writes here, too.
 fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, RuntimeError> {
-    for line in BufReader::new(reports).lines() {
-        let line = line.map_err(|source| RuntimeError::Read { source })?;
-        match serde_json::from_str(&line) {
+    let mut reports = BufReader::new(reports);
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        let read = (&mut reports).take(REPORT_BYTES).read_until(b'\n', &mut line);
+        if read.map_err(|source| RuntimeError::Read { source })? == 0 {
+            return Ok(None);
+        }
+        match serde_json::from_slice(&line) {
             Ok(Report::Progress { done, total, .. }) => {
                 if let Some(total) = total {
                     bar.set_length(total);
@@ -123,12 +133,13 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
             // Of a replay that makes several passes; and what is only reported live.
             Ok(_) => {}
             Err(source) => {
-                let line = visible(&line.chars().take(200).collect::<String>());
+                let start = line.trim_ascii_end();
+                let start = String::from_utf8_lossy(&start[..start.len().min(800)]);
+                let line = visible(&start.chars().take(200).collect::<String>());
                 return Err(RuntimeError::Report { line, source });
             }
         }
     }
-    Ok(None)
 }
 
 /// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed. A line is cut into

@@ -17,7 +17,7 @@ use gleaner_transport::message::Sources;
 
 use crate::api::frame::Info;
 use crate::input::{Live, Remap, live_slots, unfinished_bytes};
-use crate::isolation::definitions;
+use crate::isolation::{code, definitions};
 use crate::stage::{Asked, AskedArgs, Bounds, Load, Stage, not_started};
 
 /// What the recorder may take beside the preroll: two staging areas, and what is on its way to the disk.
@@ -56,7 +56,7 @@ impl Job {
         let mut read = definitions();
         read.push(self.asked.lambda.clone());
         read.extend(self.asked.vehicle.clone());
-        read.extend(gleaner_protocol::parts::cache_dir().ok());
+        read.extend(code(self.manifest.lambda.kind));
         Paths { read, write: Vec::new() }
     }
 

@@ -7,8 +7,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use gleaner_jail::{Paths, alone, files, memory, tried};
-use gleaner_protocol::{Exit, Failure, LAYERS_ENV, Layer};
+use gleaner_jail::{JailError, Paths, alone, files, memory, tried};
+use gleaner_protocol::manifest::Kind;
+use gleaner_protocol::parts::cache_dir;
+use gleaner_protocol::{Exit, Failure, Holds, LAYERS_ENV, Layer};
 use gleaner_vitals::{PULSE_ENV, Pulse};
 use rustix::process::{Signal, set_parent_process_death_signal};
 
@@ -16,7 +18,7 @@ use rustix::process::{Signal, set_parent_process_death_signal};
 pub struct Isolation {
     inside: Inside,
     pulse: Pulse,
-    layers: OnceLock<Vec<Layer>>,
+    layers: OnceLock<Result<Vec<Layer>, JailError>>,
 }
 
 /// What is left to a lambda's process.
@@ -52,8 +54,12 @@ impl Isolation {
 
     /// Gives up what the lambda's process does not need any more; gives the layers that were seen to hold, and those that are
     /// not there. Later calls change nothing.
-    pub fn close(&self) -> &[Layer] {
-        self.layers.get_or_init(|| {
+    ///
+    /// # Errors
+    ///
+    /// A failure if something in this process cannot be shut in, though the system could do it: the lambda must not be let in.
+    pub fn close(&self) -> Result<&[Layer], Failure> {
+        let layers = self.layers.get_or_init(|| {
             let Inside { paths, memory: allowed } = &self.inside;
             let mut layers = told_by_starter();
             if layers.iter().any(|layer| layer.name == files::NAME) {
@@ -71,8 +77,13 @@ impl Isolation {
             }
             let counted = || Layer::yes(memory::NAME, "the component's memories are counted as they grow");
             layers.push(allowed.map_or_else(counted, memory::limit));
-            layers.extend(alone::stay(allowed.is_some()));
-            tried::tried(layers)
+            layers.extend(alone::stay(allowed.is_some())?);
+            Ok(tried::tried(layers))
+        });
+        layers.as_deref().map_err(|error| {
+            Failure::caused_by(Exit::Denied, "cannot shut in the lambda's process", error).with_help(
+                "look for what its environment starts by itself, in the .pth files of its .venv; or make that anew",
+            )
         })
     }
 }
@@ -83,14 +94,20 @@ fn told_by_starter() -> Vec<Layer> {
     told.unwrap_or_else(|| vec![Layer::no("hard deadline", "started without gleaner-shim: nobody ends what hangs")])
 }
 
-/// Confines the files of this process, and of the interpreter `program` that it is about to become; gives the value of
-/// [`LAYERS_ENV`] for that.
-pub fn before_interpreter(mut paths: Paths, program: &Path) -> String {
+/// Confines the files of this process, and of the interpreter `program` that it is about to become, and bounds its memory; gives the
+/// value of [`LAYERS_ENV`] for that.
+pub fn before_interpreter(inside: Inside, program: &Path) -> String {
+    const NAME: &str = "start of the interpreter";
+    let Inside { mut paths, memory: allowed } = inside;
     paths.interpreter(program);
     let mut layers = told_by_starter();
     layers.push(files::confine(&paths));
-    if let Err(error) = alone::before_interpreter() {
-        layers.push(Layer::no("start of the interpreter", error.told()));
+    let bounded = allowed.map(memory::limit).filter(|layer| layer.holds == Holds::No);
+    layers.extend(bounded.map(|layer| Layer::no(NAME, layer.note)));
+    // Without a shim the process makes the page itself that the shim would read.
+    let has_page = std::env::var_os(PULSE_ENV).is_some();
+    if let Err(error) = alone::before_interpreter(has_page) {
+        layers.push(Layer::no(NAME, error.told()));
     }
     serde_json::to_string(&layers).expect("layers are plain data")
 }
@@ -99,6 +116,14 @@ pub fn before_interpreter(mut paths: Paths, program: &Path) -> String {
 pub fn definitions() -> Vec<PathBuf> {
     let prefixes = std::env::var_os("AMENT_PREFIX_PATH").unwrap_or_default();
     std::env::split_paths(&prefixes).filter(|path| path.is_absolute() && path.parent().is_some()).collect()
+}
+
+/// Where compiled code lies, for a lambda of a kind that is compiled: code of others may lie there, too.
+pub fn code(kind: Kind) -> Option<PathBuf> {
+    match kind {
+        Kind::Wasm => cache_dir().ok(),
+        Kind::Python => None,
+    }
 }
 
 /// Makes sure that results are where they seem to be: `folder` is made now, and is no way out of the lambda's folder.

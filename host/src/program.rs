@@ -7,12 +7,15 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
-use gleaner_jail::Paths;
+use gleaner_buffers::Pool;
 use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
+use gleaner_transport::SampleMeta;
 
+use crate::api::frame::Info;
 use crate::check::{self, CheckArgs};
 use crate::guest::watched::{Patience, Watched};
+use crate::input::live_slots;
 use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
 use crate::live;
@@ -65,8 +68,8 @@ impl Job {
         }
     }
 
-    /// The files that a process needs from its start, its results among them, whose place is made.
-    fn around(&self) -> Result<Paths, Failure> {
+    /// What a process needs from its start: the place of its results, which is made, and memory for itself and its rings.
+    fn around(&self) -> Result<Inside, Failure> {
         let results = match self {
             Self::Replay(job) => {
                 job.make_journal()?;
@@ -76,11 +79,12 @@ impl Job {
             #[cfg(feature = "dds")]
             Self::Live(job) => Some(job.results()),
         };
-        let mut paths = self.inside().paths;
+        let mut inside = self.inside();
         if let Some(folder) = results {
-            paths.write.push(place_of_results(folder, &self.lambda().0.lambda)?);
+            inside.paths.write.push(place_of_results(folder, &self.lambda().0.lambda)?);
         }
-        Ok(paths)
+        inside.memory = inside.memory.map(|more| more.saturating_add(at_start(self.lambda().1)));
+        Ok(inside)
     }
 
     /// What is left to the process once the lambda is in it.
@@ -111,6 +115,18 @@ impl Job {
             Self::Live(job) => job.run(load, isolation, reports),
         }
     }
+}
+
+/// Memory that a process takes before the lambda is in it, at most: an interpreter with numpy and our own part take some 100 MB,
+/// and numpy's threads more where a user asks for many; and the rings.
+fn at_start(manifest: &Manifest) -> u64 {
+    const INTERPRETER: u64 = 1 << 30;
+    let rings = manifest.inputs.iter().flat_map(|input| {
+        let decoded = input.decoded_size.map(|bytes| (input.decoded_slots(), bytes.as_usize()));
+        let decoded = decoded.and_then(|(slots, bytes)| Pool::<Info>::bytes_needed(slots, bytes));
+        [Pool::<SampleMeta>::bytes_needed(live_slots(input), input.max_size.as_usize()), decoded]
+    });
+    rings.flatten().fold(INTERPRETER, |sum, bytes| sum.saturating_add(bytes as u64))
 }
 
 impl Command {

@@ -18,11 +18,10 @@ use serde::de::DeserializeOwned;
 use super::LOOK;
 use super::ear::{Ear, Heard};
 use super::screen::Screen;
+use crate::runtime::REPORT_BYTES;
 
 /// How long a process may take for its end: a wake that runs, clips that are completed.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Longest report, as of one trigger with all its attributes or a clip with all that it lists, with much room.
-const REPORT_BYTES: u64 = 16 << 20;
 
 /// A program of ours that reports.
 pub(super) struct Process {

@@ -6,7 +6,7 @@
 //! A component is hostile until proven otherwise, so compiling has a limit of memory and of time.
 
 use std::fs::{self, File, Metadata, OpenOptions};
-use std::io;
+use std::io::{self, Read};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
@@ -131,11 +131,19 @@ pub fn settings(nans: Nans) -> Config {
 /// [`CompileError::Read`], [`CompileError::TooLarge`].
 pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
     let read = |source| CompileError::Read { path: path.to_owned(), source };
-    let bytes = fs::metadata(path).map_err(read)?.len();
-    if bytes > COMPONENT_BYTES {
-        return Err(CompileError::TooLarge { path: path.to_owned(), bytes });
+    let too_large = |bytes| CompileError::TooLarge { path: path.to_owned(), bytes };
+    // A pipe would be waited for, and a device has no end.
+    let file = OpenOptions::new().read(true).custom_flags(NO_WAITING).open(path).map_err(read)?;
+    let meta = file.metadata().map_err(read)?;
+    if !meta.is_file() {
+        return Err(read(io::Error::new(io::ErrorKind::InvalidInput, "it is no file")));
     }
-    fs::read(path).map_err(read)
+    if meta.len() > COMPONENT_BYTES {
+        return Err(too_large(meta.len()));
+    }
+    let mut component = Vec::with_capacity(meta.len() as usize);
+    let bytes = file.take(COMPONENT_BYTES + 1).read_to_end(&mut component).map_err(read)? as u64;
+    if bytes > COMPONENT_BYTES { Err(too_large(bytes)) } else { Ok(component) }
 }
 
 /// Where the native code of `component` is kept on this machine: `<cache>/<key>.cwasm`.
@@ -202,6 +210,8 @@ pub fn check_folder(folder: &Path) -> Result<(), CompileError> {
 const NOT_OURS: &str = "it belongs to another user";
 /// `O_NOFOLLOW`.
 const NO_FOLLOW: i32 = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
+/// `O_NONBLOCK`.
+const NO_WAITING: i32 = rustix::fs::OFlags::NONBLOCK.bits() as i32;
 
 fn foreign(meta: &Metadata) -> Option<&'static str> {
     if meta.uid() != rustix::process::geteuid().as_raw() {

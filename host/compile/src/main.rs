@@ -46,7 +46,7 @@ fn confine_to(args: &Args) -> Result<(), CompileError> {
     gleaner_compile::make_cache(&args.cache)?;
     let paths = Paths { read: vec![args.component.clone()], write: vec![args.cache.clone()] };
     files::confine(&paths);
-    alone::stay(false);
+    let _ = alone::stay(false);
     Ok(())
 }
 

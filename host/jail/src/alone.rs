@@ -33,13 +33,10 @@ const NEW_PROCESSES: &[i64] = &[libc::SYS_fork, libc::SYS_vfork];
 const NEW_PROCESSES: &[i64] = &[];
 
 /// Signals to others than oneself.
-const SIGNALS: &[i64] = &[
-    libc::SYS_tkill,
-    libc::SYS_rt_sigqueueinfo,
-    libc::SYS_rt_tgsigqueueinfo,
-    libc::SYS_pidfd_send_signal,
-    libc::SYS_pidfd_open,
-];
+const SIGNALS: &[i64] =
+    &[libc::SYS_tkill, libc::SYS_rt_sigqueueinfo, libc::SYS_rt_tgsigqueueinfo, libc::SYS_pidfd_send_signal];
+/// The transport needs them, to find its own sockets.
+const PIDFDS: &[i64] = &[libc::SYS_pidfd_open, libc::SYS_pidfd_getfd];
 
 /// More of the machine than one's share, memory that outlives a process, and the owners and dates of files, which Landlock
 /// leaves alone.
@@ -111,29 +108,29 @@ const TYPE: u64 = 0xf;
 /// Leaves this process alone, in all of its threads. With `only_counted_memory` it can take none that a
 /// [`memory::limit`](crate::memory::limit) does not count. Gives the layers with what was refused; whether they hold is for
 /// [`tried`](crate::tried) to see.
-pub fn stay(only_counted_memory: bool) -> Vec<Layer> {
-    match install_all(only_counted_memory) {
+///
+/// # Errors
+///
+/// [`JailError::Loose`] if filters work here and another thread of this process cannot have this one: then nothing holds it.
+pub fn stay(only_counted_memory: bool) -> Result<Vec<Layer>, JailError> {
+    Ok(match install_all(only_counted_memory) {
         Ok(()) => vec![
             Layer::yes(PROCESSES, "seccomp: no new ones, no programs, no signals to others"),
             Layer::yes(SOCKETS, "seccomp: no new ones, no connections"),
             Layer::yes(SHARE, "seccomp: no priorities, no cores, no shared memory, no owners or dates of files"),
         ],
+        Err(error @ JailError::Loose(_)) => return Err(error),
         Err(error) => [PROCESSES, SOCKETS, SHARE].map(|name| Layer::no(name, error.told())).to_vec(),
-    }
+    })
 }
 
 fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
-    let me = u64::from(std::process::id());
-    let mut refused = no_processes(pairs_only(Refused::default()))
+    let mut refused = no_signals(no_processes(pairs_only(Refused::default())))
         .calls(NEW_SOCKETS)
         .calls(NEW_PROGRAMS)
-        .calls(SIGNALS)
-        .unless(libc::SYS_kill, 0, me)
-        .unless(libc::SYS_tgkill, 0, me)
+        .calls(PIDFDS)
         .calls(SHARED)
         .calls(SHARED_HERE)
-        // The transport needed it, to find its own sockets.
-        .calls(&[libc::SYS_pidfd_getfd])
         // Limits of others, and its own to larger ones.
         .unless(libc::SYS_prlimit64, 0, 0)
         .with_pointer(libc::SYS_prlimit64, 2)
@@ -146,24 +143,23 @@ fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
         refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
     }
     if only_counted_memory {
-        let shared = (libc::MAP_SHARED | libc::MAP_ANONYMOUS) as u64;
-        let down = libc::MAP_GROWSDOWN as u64;
-        refused = refused
-            .bits(libc::SYS_mmap, 3, shared, shared)
-            .bits(libc::SYS_mmap, 3, down, down)
-            .calls(&[libc::SYS_memfd_create, MEMFD_SECRET]);
+        refused = counted_only(refused);
     }
     install_everywhere(&refused.filter(libc::EPERM)?)
 }
 
 /// What a process that is about to become an interpreter does not need any more. From the first line on that runs code of the
-/// lambda's environment, which may leave nothing behind that is not shut later: no other process, and no socket but those of DDS.
+/// lambda's environment, which may leave nothing behind that is not shut later: no other process, no socket but those of DDS, and,
+/// with `only_counted_memory`, no memory as in [`stay`]. Signals to others neither.
 ///
 /// # Errors
 ///
 /// [`JailError`] if the filter cannot be installed.
-pub fn before_interpreter() -> Result<(), JailError> {
-    let mut refused = no_processes(pairs_only(Refused::default()));
+pub fn before_interpreter(only_counted_memory: bool) -> Result<(), JailError> {
+    let mut refused = no_signals(no_processes(pairs_only(Refused::default())));
+    if only_counted_memory {
+        refused = counted_only(refused);
+    }
     for family in 0..FAMILIES {
         if ![libc::AF_INET, libc::AF_INET6, libc::AF_NETLINK].contains(&family) {
             refused = refused.bits(libc::SYS_socket, 0, ALL, u64::from(family.unsigned_abs()));
@@ -174,6 +170,21 @@ pub fn before_interpreter() -> Result<(), JailError> {
 
 fn no_processes(refused: Refused) -> Refused {
     refused.calls(NEW_PROCESSES).bits(libc::SYS_clone, 0, libc::CLONE_THREAD as u64, 0)
+}
+
+fn no_signals(refused: Refused) -> Refused {
+    let me = u64::from(std::process::id());
+    refused.calls(SIGNALS).unless(libc::SYS_kill, 0, me).unless(libc::SYS_tgkill, 0, me)
+}
+
+/// No memory but that of the process itself.
+fn counted_only(refused: Refused) -> Refused {
+    let shared = (libc::MAP_SHARED | libc::MAP_ANONYMOUS) as u64;
+    let down = libc::MAP_GROWSDOWN as u64;
+    refused
+        .bits(libc::SYS_mmap, 3, shared, shared)
+        .bits(libc::SYS_mmap, 3, down, down)
+        .calls(&[libc::SYS_memfd_create, MEMFD_SECRET])
 }
 
 /// Of pairs of sockets only streams: with others one can send to whoever has a name.

@@ -48,14 +48,25 @@ pub struct Paths {
 
 impl Paths {
     /// Adds what the interpreter `program` needs: of its own folder, and of the one that it was made from, programs and libraries.
+    /// Of an environment only what lies in it: whoever made it may have put links there that lead to anything.
     pub fn interpreter(&mut self, program: &Path) {
+        self.read
+            .extend(parts_of(program).into_iter().filter(|(prefix, part)| part.starts_with(prefix)).map(|it| it.1));
+        // What the system's own interpreters link to is theirs to say.
         let real = program.canonicalize().ok();
-        for bin in [Some(program), real.as_deref()].into_iter().flatten().filter_map(Path::parent) {
-            let Some(prefix) = bin.parent() else { continue };
-            self.read.push(bin.to_owned());
-            self.read.extend(["lib", "lib64", "pyvenv.cfg"].map(|name| prefix.join(name)));
-        }
+        self.read.extend(real.as_deref().map(parts_of).unwrap_or_default().into_iter().map(|it| it.1));
     }
+}
+
+/// Of the environment around the interpreter `program`: its real folder, with each real path of what is needed of it.
+fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
+    let Some(prefix) = program.parent().and_then(Path::parent).and_then(|prefix| prefix.canonicalize().ok()) else {
+        return Vec::new();
+    };
+    let bin = program.parent().map(Path::to_owned);
+    let others = ["lib", "lib64", "pyvenv.cfg"].map(|name| prefix.join(name));
+    let real = bin.into_iter().chain(others).filter_map(|part| part.canonicalize().ok());
+    real.map(|part| (prefix.clone(), part)).collect()
 }
 
 /// From now on this thread, and what it starts, can open only `paths` and the system's programs and libraries.
@@ -123,4 +134,46 @@ fn restrict(paths: &Paths) -> Result<Layer, JailError> {
             Layer::partly(NAME, "Landlock: some rules are not known to this kernel")
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    #[test]
+    fn links_that_lead_out_of_an_environment_open_nothing() {
+        let folder = std::env::temp_dir().join(format!("gleaner-jail-files-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let folder = folder.canonicalize().unwrap();
+        let (venv, real) = (folder.join("lambda/.venv"), folder.join("python"));
+        for made in [venv.join("bin"), venv.join("lib"), real.join("bin"), real.join("lib"), folder.join("secret")] {
+            fs::create_dir_all(made).unwrap();
+        }
+        fs::write(folder.join("secret/key"), "").unwrap();
+        fs::write(real.join("bin/python3"), "").unwrap();
+        symlink(real.join("bin/python3"), venv.join("bin/python3")).unwrap();
+        let paths = || {
+            let mut paths = Paths::default();
+            paths.interpreter(&venv.join("bin/python3"));
+            assert!(paths.write.is_empty());
+            paths.read
+        };
+        let ours = [venv.join("bin"), venv.join("lib")];
+        let theirs = [real.join("bin"), real.join("lib")];
+        // As `python3 -m venv` makes it.
+        symlink("lib", venv.join("lib64")).unwrap();
+        assert_eq!(paths(), [&ours[..], &[venv.join("lib")], &theirs].concat());
+        fs::remove_file(venv.join("lib64")).unwrap();
+        // As somebody makes it who wants to read what is not theirs.
+        symlink("/", venv.join("lib64")).unwrap();
+        symlink(folder.join("secret/key"), venv.join("pyvenv.cfg")).unwrap();
+        assert_eq!(paths(), [&ours[..], &theirs].concat());
+        fs::remove_dir(venv.join("lib")).unwrap();
+        symlink(folder.join("secret"), venv.join("lib")).unwrap();
+        assert_eq!(paths(), [&ours[..1], &theirs].concat());
+        fs::remove_dir_all(&folder).unwrap();
+    }
 }

@@ -8,8 +8,9 @@
 //! 4. [`memory`], with it: so much more than there is now.
 //!
 //! [`tried`] then tries what should be impossible: a layer counts as one that holds only if it was seen to. [`cgroup`] is the
-//! supervisor's side, for memory and processes that a lambda starts. What is missing on a system is said and never fatal: a
-//! lambda runs with the layers that are there, and everybody can read which these are.
+//! supervisor's side, for memory and processes that a lambda starts. What is missing on a system is said and not fatal: a
+//! lambda runs with the layers that are there, and everybody can read which these are. What the system has and something in
+//! the process keeps away is fatal.
 
 pub mod alone;
 pub mod cgroup;
@@ -29,6 +30,8 @@ pub enum JailError {
     Build(#[source] seccompiler::BackendError),
     #[error("cannot install the filter of system calls")]
     Install(#[source] seccompiler::Error),
+    #[error("a thread that began before the lambda cannot be shut in")]
+    Loose(#[source] seccompiler::Error),
     #[error("there is no filter of system calls for {0}")]
     Machine(&'static str),
     #[error("cannot confine the files")]

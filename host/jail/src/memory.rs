@@ -13,7 +13,8 @@ pub const NAME: &str = "memory";
 /// From now on this process can take `more` bytes of memory of its own beyond what it has.
 ///
 /// It is a limit of data (RLIMIT_DATA), not of addresses: wasmtime and CUDA reserve many of these and use few. What is mapped
-/// but not yet used counts. Whoever asks for more is refused, as `malloc` is, and may go on.
+/// but not yet used counts. Whoever asks for more is refused, as `malloc` is, and may go on. An earlier limit stays: before a
+/// process becomes another program, one bounds what that can have at all.
 pub fn limit(more: u64) -> Layer {
     match set(more) {
         Ok(()) => Layer::yes(NAME, format!("a limit of data: {} MiB more than at the start", more >> 20)),

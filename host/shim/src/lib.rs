@@ -176,7 +176,8 @@ fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
     layers.push(own_group(args).1);
     layers.push(files::confine(&Paths::default()));
     layers.push(memory::limit(64 << 20));
-    layers.extend(alone::stay(true));
+    let cannot = |error| Failure::caused_by(Exit::Internal, "cannot try what would hold a lambda", &error);
+    layers.extend(alone::stay(true).map_err(cannot)?);
     let layers = tried::tried(layers);
     println!("{}", serde_json::to_string(&layers).expect("layers are plain data"));
     Ok(ExitCode::SUCCESS)

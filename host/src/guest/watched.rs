@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::{Doing, Fault};
+use gleaner_protocol::{Doing, Fault, FaultKind};
 
 use super::{Guest, Outcome};
 use crate::api::data::Wake;
@@ -51,7 +51,10 @@ impl Watched {
 
 impl Guest for Watched {
     fn init(&mut self) -> Result<(), Fault> {
-        self.isolation.close();
+        self.isolation.close().map_err(|failure| {
+            let message = [failure.message, failure.causes.join(": ")].join(": ");
+            Fault { kind: FaultKind::HostCall, message, used: None, allowed: None }
+        })?;
         let _busy = self.isolation.pulse().busy(Doing::Init, self.patience.init, 0);
         self.guest.init()
     }

@@ -93,7 +93,7 @@ impl Job {
             let output = Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?;
             Ledger::start(output.with_log_of(LOG_BYTES), reports)?
         };
-        ledger.report(Report::Isolation { layers: isolation.close().to_vec() });
+        ledger.report(Report::Isolation { layers: isolation.close()?.to_vec() });
         let initialised = guest.init();
         let (said, _) = session.take_log();
         ledger.log(said);

@@ -69,7 +69,7 @@ fn replay(
     let (summary, broken) = loop {
         let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports)?;
         if n == 1 {
-            report(reports, &Report::Isolation { layers: isolation.close().to_vec() });
+            report(reports, &Report::Isolation { layers: isolation.close()?.to_vec() });
         }
         if results.repeat > 1 {
             report(reports, &Report::Round(round::report(n, &summary)));

@@ -12,7 +12,7 @@ use gleaner_transport::replay::journals_of;
 
 use super::part::Wanted;
 use super::verify::Claim;
-use crate::isolation::definitions;
+use crate::isolation::{code, definitions};
 use crate::stage::{Asked, AskedArgs, OutputError, RESULTS};
 
 /// Arguments of `replay`.
@@ -129,7 +129,7 @@ impl Job {
         if let Task::Verify(claim) = &self.task {
             read.push(claim.path().to_owned());
         }
-        read.extend(gleaner_protocol::parts::cache_dir().ok());
+        read.extend(code(self.manifest.lambda.kind));
         let journal = if let Task::Replay(results) = &self.task { results.journal.clone() } else { None };
         Paths { read, write: self.results().map(Path::to_owned).into_iter().chain(journal).collect() }
     }

@@ -8,10 +8,9 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_jail::Paths;
 use gleaner_protocol::{Exit, Explain, LAYERS_ENV, Parts, PartsError};
 
-use crate::isolation;
+use crate::isolation::{self, Inside};
 
 /// Threads of numpy's linear algebra, unless the user says otherwise: receivers share the cores, and with its default
 /// OpenBLAS hangs where memory is capped.
@@ -44,24 +43,24 @@ impl Explain for PythonError {
 }
 
 /// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for our library in it, which can open no files but
-/// `paths`, its own and ours. Returns only errors.
-pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], paths: Paths) -> PythonError {
-    match interpreter(lambda_dir, args, paths) {
+/// those of `inside`, its own and ours, and have as much memory. Returns only errors.
+pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) -> PythonError {
+    match interpreter(lambda_dir, args, inside) {
         Ok((python, mut command)) => PythonError::Start { python, source: command.exec() },
         Err(error) => error.into(),
     }
 }
 
-fn interpreter(lambda_dir: &Path, args: &[OsString], mut paths: Paths) -> Result<(PathBuf, Command), PartsError> {
+fn interpreter(lambda_dir: &Path, args: &[OsString], mut inside: Inside) -> Result<(PathBuf, Command), PartsError> {
     let parts = Parts::find()?;
     let python = parts.python(Some(lambda_dir))?;
     let mut command = Command::new(&python);
     // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.
     let (home, extension) = (parts.python_home()?, parts.extension()?);
     command.arg("-I").arg(home.join("start.py")).arg(&extension).args(args);
-    paths.read.extend([home, extension]);
+    inside.paths.read.extend([home, extension]);
     // From its first line on the interpreter runs code of its environment, which is the lambda's.
-    command.env(LAYERS_ENV, isolation::before_interpreter(paths, &python));
+    command.env(LAYERS_ENV, isolation::before_interpreter(inside, &python));
     for name in ONE_THREAD {
         if std::env::var_os(name).is_none() {
             command.env(name, "1");

@@ -129,13 +129,20 @@ impl Loaded {
     }
 }
 
+/// Most threads that compile at once. Each takes addresses, of which there is a bound, and a lambda's code is soon compiled.
+const COMPILE_THREADS: usize = 8;
+
 fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
     let program = Parts::find()?.program("gleaner-compile")?;
+    let threads = std::thread::available_parallelism().map_or(1, |cores| cores.get().min(COMPILE_THREADS));
     let output = Command::new(&program)
         .arg(path)
         .arg("--cache")
         .arg(cache)
         .args((nans == Nans::Canonical).then_some("--deterministic"))
+        .env("RAYON_NUM_THREADS", threads.to_string())
+        // Else the allocator reserves addresses for each of them.
+        .env("MALLOC_ARENA_MAX", "2")
         .output()
         .map_err(|source| WasmError::Start { program, source })?;
     if output.status.success() {

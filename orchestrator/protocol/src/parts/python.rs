@@ -29,12 +29,13 @@ pub(super) fn candidates(lambda_dir: Option<&Path>, checkout: Option<&Path>) -> 
     candidates
 }
 
-/// The first of `candidates` that runs. What lies in `lambda_dir` is not run unless it is a link to a program elsewhere.
+/// The first of `candidates` that runs. What lies in `lambda_dir` is not run unless it is a link to a program elsewhere, and that
+/// program is then started by its own name: by that of the link, Python looks into the folder of the link.
 pub(super) fn first_that_runs(candidates: Vec<PathBuf>, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
     let mut tried = Vec::new();
     for candidate in candidates {
         let of_lambda = lambda_dir.filter(|dir| candidate.starts_with(dir));
-        match of_lambda.map_or(Ok(()), |dir| is_only_linked(&candidate, dir)).and_then(|()| probe(&candidate)) {
+        match of_lambda.map_or_else(|| probe(&candidate), |dir| linked(&candidate, dir)) {
             Ok(interpreter) => return Ok(interpreter),
             Err(why) => tried.push(Looked { at: candidate, why }),
         }
@@ -42,25 +43,60 @@ pub(super) fn first_that_runs(candidates: Vec<PathBuf>, lambda_dir: Option<&Path
     Err(PartsError::NoPython { tried })
 }
 
-/// Whether `candidate` in a virtual environment in the folder of a lambda is a program from elsewhere, with the libraries of that:
-/// whatever else is in such a folder must not run before it is shut in.
-fn is_only_linked(candidate: &Path, lambda_dir: &Path) -> Result<(), String> {
+/// `candidate`, in the environment of a lambda, if the interpreter that it links to will do; nothing of the environment is run.
+fn linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
+    let program = only_linked(candidate, lambda_dir)?;
+    // A script that chooses an interpreter would choose without the environment.
+    if probe(&program)?.canonicalize().ok() != Some(program) {
+        return Err(format!("links to a program that starts another; {ANEW}"));
+    }
+    std::path::absolute(candidate).map_err(|error| error.to_string())
+}
+
+/// The way out where an environment is not one that can be used.
+const ANEW: &str = "make the environment with `python3 -m venv`, which links";
+/// Longest line of a `pyvenv.cfg`, in bytes: old Pythons take what is longer apart.
+const LINE_BYTES: usize = 4096;
+
+/// The program that `candidate`, in a virtual environment in the folder of a lambda, links to: one from elsewhere, with the libraries
+/// of that. Whatever else is in such a folder must not run before it is shut in.
+fn only_linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
     let real = |path: &Path| path.canonicalize().map_err(|_| "not found".to_owned());
     let (program, lambda) = (real(candidate)?, real(lambda_dir)?);
     if program.starts_with(&lambda) {
-        return Err(
-            "is a program in the lambda's folder; make the environment with `python3 -m venv`, which links".to_owned()
-        );
+        return Err(format!("is a program in the lambda's folder; {ANEW}"));
     }
-    let environment = candidate.parent().and_then(Path::parent).unwrap_or(lambda_dir);
-    let config = std::fs::read_to_string(environment.join("pyvenv.cfg")).unwrap_or_default();
+    let name = program.file_name().unwrap_or_default().to_string_lossy();
+    if !["python", "pypy"].iter().any(|known| name.starts_with(known)) {
+        return Err(format!("links to `{}`, which is no Python; {ANEW}", program.display()));
+    }
+    let bin = candidate.parent().unwrap_or(lambda_dir);
+    if let Some(file) = paths_of_its_own(bin)? {
+        return Err(format!("has `{}` beside it, which names other libraries; {ANEW}", excerpt(&file)));
+    }
+    let config = std::fs::read_to_string(bin.parent().unwrap_or(lambda_dir).join("pyvenv.cfg")).unwrap_or_default();
+    // Python takes some of these for blanks or ends of lines, others not.
+    if config.lines().any(|line| line.len() > LINE_BYTES || line.chars().any(|c| c.is_control() && c != '\t')) {
+        return Err(format!("its pyvenv.cfg has lines that can be read in two ways; {ANEW}"));
+    }
     let entries = config.lines().filter_map(|line| line.split_once('='));
     let homes: Vec<_> = entries.filter(|(key, _)| key.trim().eq_ignore_ascii_case("home")).collect();
     let is_home = |home: &str| Path::new(home.trim()).canonicalize().ok().as_deref() == program.parent();
     if homes.is_empty() || !homes.iter().all(|(_, home)| is_home(home)) {
         return Err("its pyvenv.cfg names another home than that of its program; make the environment anew".to_owned());
     }
-    Ok(())
+    Ok(program)
+}
+
+/// The name of a `._pth` file in `bin`: an interpreter that finds one takes its libraries from where it says.
+fn paths_of_its_own(bin: &Path) -> Result<Option<String>, String> {
+    for entry in bin.read_dir().map_err(|error| error.to_string())? {
+        let name = entry.map_err(|error| error.to_string())?.file_name().to_string_lossy().into_owned();
+        if name.to_ascii_lowercase().ends_with("._pth") {
+            return Ok(Some(name));
+        }
+    }
+    Ok(None)
 }
 
 /// The interpreter that `candidate` starts, or why it will not do.

@@ -130,7 +130,7 @@ fn the_python_that_the_user_wants_comes_before_those_of_lambda_and_checkout() {
     let parts = Parts::around(&exe, None, Some(wanted.clone()));
     assert_eq!(parts.python(Some(&lambda)).unwrap(), wanted);
     let parts = Parts::around(&exe, None, None);
-    assert_eq!(parts.python(Some(&lambda)).unwrap(), own);
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), dir.path("lambda/.venv/bin/python3"));
     assert_eq!(parts.python(None).unwrap(), shared);
     assert_eq!(parts.python(Some(&dir.path("another"))).unwrap(), shared);
 }
@@ -165,6 +165,44 @@ fn nothing_that_came_with_a_lambda_is_run_to_find_its_python() {
     dir.write("lambda/.venv/pyvenv.cfg", &format!("home = {}\n", lambda.display()));
     assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
     assert!(!ran.exists());
+}
+
+#[test]
+fn an_environment_of_a_lambda_is_not_asked_by_way_of_its_own_files() {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let dir = checkout();
+    let lambda = dir.path("lambda");
+    let shared = python(&dir, ".venv/bin/python3", "3 12");
+    let parts = Parts::around(&dir.path("target/release/gleaner"), None, None);
+    // Says by which name it was started, and takes what lies beside that for its own.
+    let asked = dir.path("asked");
+    let home = dir.path("elsewhere/bin");
+    let script =
+        format!("#!/bin/sh\necho \"$0\" >> '{}'\necho '3 12'\necho '{}/python3'\n", asked.display(), home.display());
+    let own = dir.write_program("elsewhere/bin/python3", &script);
+    environment(&dir, &own);
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), lambda.join(".venv/bin/python3"));
+    assert_eq!(std::fs::read_to_string(&asked).unwrap().trim_end(), own.to_str().unwrap());
+    // Libraries that only the interpreter would see.
+    for name in ["python3._pth", "PYTHON._PTH"] {
+        let names = dir.write(&format!("lambda/.venv/bin/{name}"), "../evil\n");
+        assert_eq!(parts.python(Some(&lambda)).unwrap(), shared, "{name}");
+        std::fs::remove_file(names).unwrap();
+    }
+    let home = format!("home = {}\n", home.display());
+    let long = format!("#{}{home}{home}", "x".repeat(10_000));
+    for config in [format!("\u{1f}home = /evil/bin\n{home}"), format!("a = b\rhome = /evil/bin\n{home}"), long] {
+        dir.write("lambda/.venv/pyvenv.cfg", &config);
+        assert_eq!(parts.python(Some(&lambda)).unwrap(), shared, "{config:?}");
+    }
+    dir.write("lambda/.venv/pyvenv.cfg", &home);
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), lambda.join(".venv/bin/python3"));
+    // A program that is no interpreter, and one that starts another.
+    environment(&dir, &dir.write_program("elsewhere/bin/shutdown", &script));
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
+    environment(&dir, &dir.write_program("elsewhere/bin/python3.12", &script));
+    assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
+    assert_eq!(std::fs::read_to_string(&asked).unwrap().lines().count(), 3);
 }
 
 #[test]
