@@ -199,6 +199,36 @@ mod tests {
         assert!(shown.iter().all(|piece| piece.len() <= 8192));
     }
 
+    /// Reports that begin with `text` and go on for ever; counts what was read of them.
+    struct Endless<'a> {
+        text: &'a [u8],
+        read: u64,
+    }
+
+    impl Read for Endless<'_> {
+        fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+            assert!(self.read < 4 * REPORT_BYTES, "what has no end is held");
+            let n = match self.text.read(into)? {
+                0 => io::repeat(b'x').read(into)?,
+                n => n,
+            };
+            self.read += n as u64;
+            Ok(n)
+        }
+    }
+
+    #[test]
+    fn a_report_without_an_end_is_refused_and_not_held() {
+        let bar = ProgressBar::hidden();
+        let progress = "{\"report\":\"progress\",\"done\":1,\"total\":2,\"at_ns\":0}\n";
+        for text in ["", "\"", progress] {
+            let endless = Endless { text: text.as_bytes(), read: 0 };
+            let error = follow(endless, &bar).unwrap_err();
+            assert!(error.to_string().contains("xxxx"), "{error}");
+        }
+        assert!(follow(&b""[..], &bar).unwrap().is_none());
+    }
+
     #[test]
     fn nothing_that_is_passed_on_acts_on_a_terminal() {
         for (said, shown) in [

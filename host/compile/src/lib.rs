@@ -267,6 +267,28 @@ mod tests {
     }
 
     #[test]
+    fn only_a_file_of_a_bounded_size_is_read_as_a_component() {
+        let folder = std::env::temp_dir().join(format!("gleaner-compile-read-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let (plain, pipe, device, large) =
+            (folder.join("plain"), folder.join("pipe"), folder.join("device"), folder.join("large"));
+        fs::write(&plain, b"bytes").unwrap();
+        assert_eq!(read_component(&plain).unwrap(), b"bytes");
+        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::RUSR, 0).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", &device).unwrap();
+        for none in [&pipe, &device, &folder] {
+            let error = read_component(none).unwrap_err();
+            let why = std::error::Error::source(&error).unwrap().to_string();
+            assert!(matches!(error, CompileError::Read { .. }) && why == "it is no file", "{why}");
+        }
+        File::create(&large).unwrap().set_len(COMPONENT_BYTES + 1).unwrap();
+        assert!(
+            matches!(read_component(&large), Err(CompileError::TooLarge { bytes, .. }) if bytes == COMPONENT_BYTES + 1)
+        );
+        fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
     fn code_that_others_may_write_is_not_trusted() {
         use std::os::unix::fs::PermissionsExt;
         let cache = std::env::temp_dir().join(format!("gleaner-compile-test-{}", std::process::id()));
