@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use gleaner_transport::replay::{Limits, Replay, Step, read_extras};
-use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{SampleMeta, Sink, Subscription, TopicSpec, Transport, Verdict};
 use rustix::fs::{MemfdFlags, SeekFrom, ftruncate, memfd_create, seek};
 
 use crate::budget;
@@ -126,7 +126,8 @@ fn digest_of(before: u64, step: &Step, crc: u64) -> u64 {
 struct Order {
     newest_ns: Option<i64>,
     late: u64,
-    numbers: HashMap<[u8; 16], u64>,
+    /// By topic and writer: a file may say that one writes several topics.
+    numbers: HashMap<(Subscription, [u8; 16]), u64>,
 }
 
 impl Order {
@@ -134,7 +135,7 @@ impl Order {
         assert_eq!(step.at_ns, step.meta.at_ns);
         self.late += u64::from(self.newest_ns.is_some_and(|newest| step.at_ns < newest));
         self.newest_ns = self.newest_ns.max(Some(step.at_ns));
-        let before = self.numbers.insert(step.meta.writer.0, step.meta.seq).unwrap_or(0);
+        let before = self.numbers.insert((step.subscription, step.meta.writer.0), step.meta.seq).unwrap_or(0);
         assert!(step.meta.seq > before, "number {} after {before}", step.meta.seq);
     }
 }
