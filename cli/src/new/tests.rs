@@ -78,7 +78,9 @@ fn an_update_replaces_the_sdk_and_what_was_added_to_it() {
 #[test]
 fn folders_above_are_made_as_well() {
     let scratch = Scratch::new("above");
-    assert!(scratch.lambda("far/away", Kind::Python).join("lambda.toml").is_file());
+    let dir = scratch.0.join("far/away");
+    make(&dir, &"away".parse().unwrap(), Kind::Python).unwrap();
+    assert!(dir.join("lambda.toml").is_file());
 }
 
 #[test]
