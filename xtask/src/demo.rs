@@ -6,7 +6,7 @@ use gleaner_cli::results::{clip_contents, clip_span, grouped, seconds};
 use gleaner_protocol::{Decision, Exit, Failure, visible};
 
 use crate::checkout::Checkout;
-use crate::examples::{DRIVE, EXAMPLES, Replayed, difference};
+use crate::examples::{DRIVE, EXAMPLES, Example, Replayed, difference};
 use crate::setup;
 use crate::steps::Steps;
 
@@ -23,15 +23,18 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let twins = example.replay(checkout)?;
         rows.extend(twins.iter().map(|twin| row(example.name, twin)));
         for twin in &twins {
-            proofs.push(prove(checkout, example.name, twin)?);
+            proofs.push(prove(checkout, example, twin)?);
         }
         clips.extend(twins.first().into_iter().flat_map(clip_lines));
         let difference = difference(&twins);
         agree &= difference.is_none();
+        let with = if example.set.is_empty() { "" } else { " with" };
         let settings: String = example.set.iter().map(|set| format!(" --set {set}")).collect();
         verdicts.push(match difference {
-            None => format!("{} with{settings}: the Rust and the Python lambda decide and keep the same", example.name),
-            Some(what) => format!("{} with{settings}: the Rust and the Python lambda DIFFER: {what}", example.name),
+            None => {
+                format!("{}{with}{settings}: the Rust and the Python lambda decide and keep the same", example.name)
+            }
+            Some(what) => format!("{}{with}{settings}: the Rust and the Python lambda DIFFER: {what}", example.name),
         });
     }
     println!("\n{}", table(&rows));
@@ -70,9 +73,14 @@ fn clip_lines(twin: &Replayed) -> Vec<String> {
     lines.collect()
 }
 
-/// Verifies the journal and every clip, and says how many decisions were the same.
-fn prove(checkout: &Checkout, name: &str, twin: &Replayed) -> Result<String, Failure> {
+/// Verifies the journal, and every clip that can be alone, and says how many decisions were the same.
+fn prove(checkout: &Checkout, example: &Example, twin: &Replayed) -> Result<String, Failure> {
+    let (name, kind) = (example.name, twin.summary.kind.as_str());
     let whole = twin.verify(checkout)?;
+    let all = format!("  {name}, {kind}: all {} from the journal and the drive", grouped(whole.wakes));
+    if !example.forgets {
+        return Ok(format!("{all}; not from clips alone, since it remembers what was before them"));
+    }
     let parts = twin.clips.iter().map(|clip| twin.verify_clip(checkout, clip)).collect::<Result<Vec<_>, _>>()?;
     let (wakes, uncovered) = parts.iter().fold((0, 0), |sum, part| (sum.0 + part.wakes, sum.1 + part.uncovered));
     let clips = if parts.len() == 1 { "one clip".to_owned() } else { format!("{} clips", parts.len()) };
@@ -80,12 +88,7 @@ fn prove(checkout: &Checkout, name: &str, twin: &Replayed) -> Result<String, Fai
         0 => String::new(),
         _ => format!(" (in {} the lambda had looked at samples from before)", grouped(uncovered)),
     };
-    Ok(format!(
-        "  {name}, {}: all {} from the journal and the drive; {} from {clips} alone{further}",
-        twin.summary.kind.as_str(),
-        grouped(whole.wakes),
-        grouped(wakes.saturating_sub(uncovered)),
-    ))
+    Ok(format!("{all}; {} from {clips} alone{further}", grouped(wakes.saturating_sub(uncovered))))
 }
 
 fn row(name: &str, Replayed { summary, decisions, .. }: &Replayed) -> [String; 6] {

@@ -21,12 +21,15 @@ const COOKBOOK: &str = "examples/cookbook";
 pub(crate) struct Example {
     pub(crate) name: &'static str,
     pub(crate) set: &'static [&'static str],
+    /// Whether it decides by what it looks at in a wake and shortly before, so that a clip alone tells what it decided.
+    pub(crate) forgets: bool,
 }
 
 pub(crate) const EXAMPLES: [Example; 3] = [
-    Example { name: "hello", set: &["brake_mps2=-1.4"] },
-    Example { name: "brake-dark", set: &["brake_mps2=-1.4", "dark_luma=50"] },
-    Example { name: "imu-fft", set: &[] },
+    Example { name: "hello", set: &["brake_mps2=-1.4"], forgets: true },
+    Example { name: "brake-dark", set: &["brake_mps2=-1.4", "dark_luma=50"], forgets: true },
+    // Its windows follow each other from the first sample of the drive on.
+    Example { name: "imu-fft", set: &[], forgets: false },
 ];
 
 /// What one twin did.
