@@ -103,8 +103,8 @@ fn played(started: &[(Started, Folder)], players: &[Vec<&str>], seen: &mut Vec<L
     let mut is_over = false;
     while !is_over {
         let live = started[0].0.until_live("a status", |_| true);
-        // Whatever was received: all may be lost.
-        has_begun |= live.topics.iter().all(|topic| topic.writers > Some(0));
+        // Whatever was received, as all may be lost; or all were there between two statuses.
+        has_begun |= live.topics.iter().all(|topic| topic.writers > Some(0) || topic.received > 0);
         is_over = has_begun && live.topics.iter().all(|topic| topic.writers == Some(0));
         seen.push(live);
     }
