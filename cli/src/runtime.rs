@@ -14,7 +14,7 @@ use crate::listen::Listener;
 use crate::sibling::starter;
 
 /// Longest report, as of one trigger with all its attributes or a clip with all that it lists, with much room.
-pub(crate) const REPORT_BYTES: u64 = 16 << 20;
+const REPORT_BYTES: u64 = 16 << 20;
 
 /// Why the runtime did not do what it was asked for, where it could not say so itself.
 #[derive(Debug, thiserror::Error)]
@@ -109,17 +109,18 @@ fn start(program: PathBuf, runtime: PathBuf, arguments: Vec<OsString>) -> Result
         .map_err(|source| RuntimeError::Start { program, source })
 }
 
-/// Reads reports up to the result, which is the last; `None` if they end before. What is longer than a report can be is none:
+/// Reads the next report into `line`; `false` if there is none. What is longer than a report can be comes in pieces, which are none:
 /// a lambda's process writes here, too.
+pub(crate) fn next_report(reports: &mut impl BufRead, line: &mut Vec<u8>) -> io::Result<bool> {
+    line.clear();
+    Ok(reports.take(REPORT_BYTES).read_until(b'\n', line)? > 0)
+}
+
+/// Reads reports up to the result, which is the last; `None` if they end before.
 fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, RuntimeError> {
     let mut reports = BufReader::new(reports);
     let mut line = Vec::new();
-    loop {
-        line.clear();
-        let read = (&mut reports).take(REPORT_BYTES).read_until(b'\n', &mut line);
-        if read.map_err(|source| RuntimeError::Read { source })? == 0 {
-            return Ok(None);
-        }
+    while next_report(&mut reports, &mut line).map_err(|source| RuntimeError::Read { source })? {
         match serde_json::from_slice(&line) {
             Ok(Report::Progress { done, total, .. }) => {
                 if let Some(total) = total {
@@ -140,6 +141,7 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
             }
         }
     }
+    Ok(None)
 }
 
 /// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed. A line is cut into

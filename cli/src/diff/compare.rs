@@ -4,6 +4,7 @@ use gleaner_protocol::{Decision, Fault, SCORE_TOLERANCE, Trigger, TriggerKind};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use crate::report::cut;
 use crate::results::{score, seconds, three_digits};
 
 /// Most characters of what is said of one difference.
@@ -184,10 +185,7 @@ fn first_line(fault: &Fault) -> String {
 
 /// `text`, or its begin.
 pub(super) fn short(text: &str) -> String {
-    match text.char_indices().nth(CHARS) {
-        Some((end, _)) => format!("{}…", &text[..end]),
-        None => text.to_owned(),
-    }
+    cut(text, CHARS)
 }
 
 /// `b / a` in words.

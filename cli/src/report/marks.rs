@@ -194,7 +194,7 @@ fn amounts(fault: &Fault) -> Amounts {
 }
 
 /// The first `chars` characters of `text`.
-pub(super) fn cut(text: &str, chars: usize) -> String {
+pub(crate) fn cut(text: &str, chars: usize) -> String {
     match text.char_indices().nth(chars) {
         Some((end, _)) => format!("{}…", &text[..end]),
         None => text.to_owned(),

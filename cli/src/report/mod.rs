@@ -20,6 +20,7 @@ use crate::diff::Diff;
 use crate::results::seconds;
 use crate::say::say;
 
+pub(crate) use marks::cut;
 pub(crate) use told::{Losses, TellError, Told, signals};
 
 use model::Page;

@@ -276,7 +276,7 @@ pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Option<Signals> {
     Some(signals)
 }
 
-/// What a page, or a list of changes, shows of a config; it is compared whole.
+/// What a page shows of a config; it is compared whole.
 pub(crate) fn shown_config(
     config: &BTreeMap<String, ConfigValue>,
     notes: &mut Vec<String>,

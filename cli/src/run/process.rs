@@ -1,7 +1,7 @@
 //! One process of a run.
 
 use std::ffi::OsString;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
@@ -18,7 +18,7 @@ use serde::de::DeserializeOwned;
 use super::LOOK;
 use super::ear::{Ear, Heard};
 use super::screen::Screen;
-use crate::runtime::REPORT_BYTES;
+use crate::runtime::next_report;
 
 /// How long a process may take for its end: a wake that runs, clips that are completed.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -126,12 +126,11 @@ fn watched(
 fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &SyncSender<Heard>) {
     let mut reports = BufReader::new(reports);
     let mut line = Vec::new();
-    while matches!((&mut reports).take(REPORT_BYTES).read_until(b'\n', &mut line), Ok(1..)) {
+    while next_report(&mut reports, &mut line).unwrap_or(false) {
         let garbled =
             |_| Heard::Garbled(visible(&String::from_utf8_lossy(&line).chars().take(200).collect::<String>()));
         if say.send(serde_json::from_slice(&line).map_or_else(garbled, heard)).is_err() {
             return;
         }
-        line.clear();
     }
 }

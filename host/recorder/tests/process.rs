@@ -48,9 +48,10 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     let clip = running.clip();
     assert_eq!(clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(), ["first"]);
     assert_eq!((clip.from_ns, clip.to_ns, clip.triggers), (anchor - 200 * MS, anchor + 100 * MS, 1));
-    // Every number from the first to the last, once.
+    // Every number from the first to the last, once, and all that there are of that time.
     let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
     assert!(numbers.len() > 1 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "{numbers:?}");
+    assert_eq!(numbers, sensor.numbers(clip.from_ns, clip.to_ns));
     let told: Vec<_> =
         clip.topics.iter().map(|topic| (topic.topic.as_str(), topic.lost, topic.type_name.is_some())).collect();
     assert_eq!((told[0].0, told[0].1, told[0].2), ("/a", Some(0), true));

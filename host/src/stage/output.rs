@@ -178,8 +178,7 @@ const PENDING_BYTES: usize = 64 << 10;
 
 impl Lines {
     fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
-        let opened = File::options().create(true).append(true).open(&path);
-        let opened = opened.and_then(|file| if again { Ok(file) } else { file.set_len(0).map(|()| file) });
+        let opened = open(&path).and_then(|file| if again { Ok(file) } else { file.set_len(0).map(|()| file) });
         match opened {
             Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None }),
             Err(source) => Err(OutputError { path, source }),
@@ -198,19 +197,9 @@ impl Lines {
         if self.waiting == 0 {
             return Ok(());
         }
+        let renewed = self.renew();
         let before = self.file.metadata().map(|metadata| metadata.len());
-        let renewed = match (&before, &self.most) {
-            (Ok(before), Some((most, moved))) if before >= most => Some(self.renewed(moved)),
-            _ => None,
-        };
-        let (before, written) = match renewed {
-            Some(Ok(file)) => {
-                self.file = file;
-                (Ok(0), self.file.write_all(&self.pending))
-            }
-            Some(Err(error)) => (before, Err(error)),
-            None => (before, self.file.write_all(&self.pending)),
-        };
+        let written = renewed.and_then(|()| self.file.write_all(&self.pending));
         let waited = std::mem::take(&mut self.waiting);
         self.pending.clear();
         written.map_err(|source| {
@@ -223,11 +212,23 @@ impl Lines {
         })
     }
 
-    /// A new file in place of this one, which is `moved`.
-    fn renewed(&self, moved: &Path) -> io::Result<File> {
-        fs::rename(&self.path, moved)?;
-        File::options().create(true).append(true).open(&self.path)
+    /// Goes on in a new file if this one is as long as it may be; it is moved.
+    fn renew(&mut self) -> io::Result<()> {
+        let Some((most, moved)) = &self.most else { return Ok(()) };
+        if self.file.metadata().is_ok_and(|metadata| metadata.len() >= *most) {
+            match fs::rename(&self.path, moved) {
+                // It was moved before, and no other could be opened.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                renamed => renamed?,
+            }
+            self.file = open(&self.path)?;
+        }
+        Ok(())
     }
+}
+
+fn open(path: &Path) -> io::Result<File> {
+    File::options().create(true).append(true).open(path)
 }
 
 #[cfg(test)]

@@ -169,7 +169,8 @@ pub struct Network {
     pub buffer_granted: usize,
     /// Datagrams that the system dropped because a buffer was full.
     pub socket_drops: u64,
-    /// Datagrams with fragments that nobody should send, dropped before they could do harm: see `docs/dds-limits.md`.
+    /// Datagrams that nobody should send, with fragments that claim too much or with too many numbers, dropped before they could do
+    /// harm: see `docs/dds-limits.md`.
     #[serde(default)]
     pub filtered: u64,
     /// Why such datagrams are let pass, if they are.

@@ -192,6 +192,8 @@ pub fn monotonic(clock: Clock) -> i64 {
 /// A number each ms on `/a`, as long as it lives.
 pub struct Sensor {
     stop: Arc<AtomicBool>,
+    /// Number and stamp of each sample so far.
+    published: Arc<Mutex<Vec<(u64, i64)>>>,
     thread: Option<JoinHandle<u64>>,
 }
 
@@ -199,16 +201,26 @@ impl Sensor {
     pub fn start(network: &Network, clock: Clock) -> Sensor {
         let (stop, network) = (Arc::<AtomicBool>::default(), network.clone());
         let stopped = Arc::clone(&stop);
+        let published = Arc::<Mutex<Vec<_>>>::default();
+        let noted = Arc::clone(&published);
         let thread = thread::spawn(move || {
             let mut seq = 0_u64;
             while !stopped.load(Ordering::Relaxed) {
                 seq += 1;
-                network.publish("/a", clock.now(), seq, &seq.to_le_bytes());
+                let at_ns = clock.now();
+                noted.lock().unwrap().push((seq, at_ns));
+                network.publish("/a", at_ns, seq, &seq.to_le_bytes());
                 thread::sleep(Duration::from_millis(1));
             }
             seq
         });
-        Sensor { stop, thread: Some(thread) }
+        Sensor { stop, published, thread: Some(thread) }
+    }
+
+    /// The numbers of the samples of that time, both ends included.
+    pub fn numbers(&self, from_ns: i64, to_ns: i64) -> Vec<u32> {
+        let published = self.published.lock().unwrap();
+        published.iter().filter(|(_, at_ns)| (from_ns..=to_ns).contains(at_ns)).map(|(seq, _)| *seq as u32).collect()
     }
 }
 

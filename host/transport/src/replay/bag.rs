@@ -1,5 +1,6 @@
 //! The directories that rosbag2 writes: which files belong to them.
 
+use std::collections::HashSet;
 use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::{self, Read};
@@ -28,8 +29,8 @@ pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
     };
     let files =
         found.files.into_iter().map(|file| named(folder, &root, &path, file)).collect::<Result<Vec<PathBuf>, _>>()?;
-    let is_read = |other: &PathBuf| files.iter().any(|file| unpacked(file) == unpacked(other));
-    let others: Vec<_> = of_a_bag(folder)?.into_iter().filter(|other| !is_read(other)).collect();
+    let read: HashSet<_> = files.iter().map(|file| unpacked(file)).collect();
+    let others: Vec<_> = of_a_bag(folder)?.into_iter().filter(|other| !read.contains(&unpacked(other))).collect();
     let remark = others.first().map(|first| {
         let (count, first) = (others.len(), first.display());
         format!("metadata.yaml does not name all files beside it: {count} are not read, `{first}` first")
@@ -104,8 +105,10 @@ fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
         }
     }
     names.sort();
-    let is_twin =
-        |name: &OsString| names.iter().any(|other| other != name && unpacked(name.as_ref()) == Path::new(other));
+    let is_twin = |name: &OsString| {
+        let unpacked = unpacked(name.as_ref()).into_os_string();
+        unpacked != *name && names.binary_search(&unpacked).is_ok()
+    };
     Ok(names.iter().filter(|name| !is_twin(name)).map(|name| folder.join(name)).collect())
 }
 
