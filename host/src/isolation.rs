@@ -7,7 +7,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use gleaner_jail::{JailError, Paths, alone, files, memory, tried};
+use gleaner_jail::{JailError, Paths, alone, cgroup, files, memory, tried};
 use gleaner_protocol::manifest::Kind;
 use gleaner_protocol::parts::cache_dir;
 use gleaner_protocol::{Exit, Failure, Holds, LAYERS_ENV, Layer};
@@ -28,6 +28,8 @@ pub struct Inside {
     pub paths: Paths,
     /// Memory that this process may still take, in bytes, if it is an interpreter; that of a component is counted as it grows.
     pub memory: Option<u64>,
+    /// Memory that it may take in all, its rings and our own part included, in bytes.
+    pub all: u64,
 }
 
 impl Isolation {
@@ -60,8 +62,9 @@ impl Isolation {
     /// A failure if something in this process cannot be shut in, though the system could do it: the lambda must not be let in.
     pub fn close(&self) -> Result<&[Layer], Failure> {
         let layers = self.layers.get_or_init(|| {
-            let Inside { paths, memory: allowed } = &self.inside;
+            let Inside { paths, memory: allowed, all } = &self.inside;
             let mut layers = told_by_starter();
+            fit(&mut layers, *all);
             if layers.iter().any(|layer| layer.name == files::NAME) {
                 // Reading is confined already, by who knew what the interpreter reads.
                 let writes = files::confine_writes(&paths.write);
@@ -97,19 +100,25 @@ fn told_by_starter() -> Vec<Layer> {
 /// Confines the files of this process, and of the interpreter `program` that it is about to become, and bounds its memory; gives the
 /// value of [`LAYERS_ENV`] for that.
 pub fn before_interpreter(inside: Inside, program: &Path) -> String {
-    const NAME: &str = "start of the interpreter";
-    let Inside { mut paths, memory: allowed } = inside;
+    let Inside { mut paths, memory: allowed, all } = inside;
     paths.interpreter(program);
     let mut layers = told_by_starter();
+    fit(&mut layers, all);
     layers.push(files::confine(&paths));
     let bounded = allowed.map(memory::limit).filter(|layer| layer.holds == Holds::No);
-    layers.extend(bounded.map(|layer| Layer::no(NAME, layer.note)));
     // Without a shim the process makes the page itself that the shim would read.
     let has_page = std::env::var_os(PULSE_ENV).is_some();
-    if let Err(error) = alone::before_interpreter(has_page) {
-        layers.push(Layer::no(NAME, error.told()));
-    }
+    let start = alone::before_interpreter(has_page);
+    layers.push(bounded.map_or(start, |layer| Layer::no(alone::START, layer.note)));
     serde_json::to_string(&layers).expect("layers are plain data")
+}
+
+/// Has the control group of this process, if it has one, allow no more than `all` bytes of memory.
+fn fit(layers: &mut Vec<Layer>, all: u64) {
+    if let Some(layer) = cgroup::fit(all) {
+        layers.retain(|layer| layer.name != cgroup::NAME);
+        layers.push(layer);
+    }
 }
 
 /// Where definitions of messages are looked for: everybody may read them.

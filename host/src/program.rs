@@ -96,15 +96,12 @@ impl Job {
             Self::Live(job) => (job.paths(), job.own_memory()),
         };
         let manifest = self.lambda().1;
-        let memory = match manifest.lambda.kind {
-            Kind::Wasm => None,
-            Kind::Python => {
-                // What grows in place may be there twice for a moment.
-                let kept = 2 * manifest.limits.scratch.bytes();
-                Some(manifest.limits.memory.bytes().saturating_add(kept).saturating_add(ours))
-            }
-        };
-        Inside { paths, memory }
+        // What grows in place may be there twice for a moment.
+        let kept = 2 * manifest.limits.scratch.bytes();
+        let memory = manifest.limits.memory.bytes().saturating_add(kept).saturating_add(ours);
+        // Frames that a lambda makes may take `memory` once more.
+        let all = memory.saturating_add(manifest.limits.memory.bytes()).saturating_add(at_start(manifest));
+        Inside { paths, memory: (manifest.lambda.kind == Kind::Python).then_some(memory), all }
     }
 
     fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {

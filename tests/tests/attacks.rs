@@ -22,8 +22,8 @@ enum Fate {
     Refused(&'static str),
     /// It may go on, and what is too much is thrown away and counted.
     Cut,
-    /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault of kind `killed`.
-    Killed,
+    /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault of kind `killed`, with these words.
+    Killed(&'static str),
 }
 
 use Fate::{Cut, Fault, Killed, Refused};
@@ -35,6 +35,7 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("host_calls", Some(Fault(Fuel)), Some(Fault(Deadline))),
     ("recurse", Some(Fault(Trap)), Some(Fault(Exception))),
     ("memory", Some(Fault(Memory)), Some(Fault(Memory))),
+    ("full", None, Some(Killed("needed more memory"))),
     ("log_flood", Some(Cut), Some(Cut)),
     // Even the event that says so is refused then.
     ("event_flood", Some(Fault(Exception)), Some(Fault(Exception))),
@@ -57,12 +58,12 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("uncounted", None, Some(Refused("Operation not permitted"))),
     ("replace", None, Some(Refused("Operation not permitted"))),
     ("sleep", Some(Fault(HostCall)), Some(Fault(Deadline))),
-    ("swallow", None, Some(Killed)),
-    ("deaf", None, Some(Killed)),
+    ("swallow", None, Some(Killed("was in one wake"))),
+    ("deaf", None, Some(Killed("was in one wake"))),
     ("exit", Some(Fault(Trap)), Some(Fault(Exception))),
-    ("exit_now", None, Some(Killed)),
-    ("abort", Some(Fault(Trap)), Some(Killed)),
-    ("corrupt", None, Some(Killed)),
+    ("exit_now", None, Some(Killed("ended by itself"))),
+    ("abort", Some(Fault(Trap)), Some(Killed("ended by signal 6"))),
+    ("corrupt", None, Some(Killed("ended by signal"))),
 ];
 
 fn main() -> ExitCode {
@@ -123,7 +124,7 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
     let started = run(&lambda, out.path(), &["--set", &attack_set, "--set", &target]);
     let decision = fallout(&started, fate);
     // One that dies of it dies again after each start.
-    let live = (fate != Killed).then(|| until_it_goes_on(&started));
+    let live = (!matches!(fate, Killed(_))).then(|| until_it_goes_on(&started));
     started.signal("INT");
     let finished = started.finish();
     println!("{attack}/{language}: {}", in_words(decision.as_ref()));
@@ -142,9 +143,10 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
             assert!(why.contains(words) && !why.contains("unknown attack"), "{why}");
         }
         Cut => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
-        Killed => {
+        Killed(words) => {
             let fault = decision.and_then(|decision| decision.fault).expect("a fault");
             assert_eq!(fault.kind, FaultKind::Killed, "{}", fault.message);
+            assert!(fault.message.contains(words), "{}", fault.message);
             let written = decisions(out.path());
             let killed = |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed);
             assert!(written.iter().any(killed), "{written:?}");
@@ -167,7 +169,7 @@ fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
     match fate {
         Fault(kind) => Some(fault(kind)),
         Refused(_) => Some(decision(&|decision| !decision.triggers.is_empty())),
-        Killed => Some(fault(FaultKind::Killed)),
+        Killed(_) => Some(fault(FaultKind::Killed)),
         Cut => None,
     }
 }

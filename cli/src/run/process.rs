@@ -11,7 +11,7 @@ use std::sync::mpsc::SyncSender;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Exit, Failure, Parts, visible};
+use gleaner_protocol::{Exit, Failure, Parts, UNTIL_KILLED, visible};
 use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
 
@@ -20,8 +20,8 @@ use super::ear::{Ear, Heard};
 use super::screen::Screen;
 use crate::runtime::next_report;
 
-/// How long a process may take for its end: a wake that runs, clips that are completed.
-const PATIENCE: Duration = Duration::from_secs(20);
+/// How long a process may take for its end: a wake that runs, clips that are completed. A shim ends its runtime before.
+const PATIENCE: Duration = UNTIL_KILLED.saturating_add(Duration::from_secs(10));
 
 /// A program of ours that reports.
 pub(super) struct Process {

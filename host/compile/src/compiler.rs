@@ -1,15 +1,18 @@
 //! From a component to its entry in the cache: compiled, written beside its place, synced and renamed.
 
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
+use super::prune::prune;
 use super::{
-    CODE_BYTES, CompileError, GUEST_STACK_BYTES, Nans, cache_entry, check_folder, engine, make_cache, read_component,
+    CACHE_BYTES, CODE_BYTES, CompileError, GUEST_STACK_BYTES, Nans, cache_entry, check_folder, engine, make_cache,
+    note_use, read_component,
 };
 
-/// Compiles the component at `path` into `cache` and returns the entry; an entry that exists is left as it is.
+/// Compiles the component at `path` into `cache` and returns the entry; an entry that exists is left as it is. So that the cache does
+/// not grow without end, what is beyond [`CACHE_BYTES`] leaves it.
 ///
 /// # Errors
 ///
@@ -19,7 +22,8 @@ pub fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<PathBuf, Compile
     make_cache(cache)?;
     check_folder(cache)?;
     let entry = cache_entry(cache, &component, nans);
-    if entry.exists() {
+    if let Ok(code) = File::open(&entry) {
+        note_use(&code);
         return Ok(entry);
     }
     let code = engine(GUEST_STACK_BYTES, nans)?
@@ -28,7 +32,9 @@ pub fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<PathBuf, Compile
     if code.len() > CODE_BYTES {
         return Err(CompileError::CodeTooLarge { path: path.to_owned(), bytes: code.len() });
     }
-    write_whole(&entry, &code).map_err(|source| CompileError::Write { path: entry.clone(), source })?;
+    let write = |source| CompileError::Write { path: entry.clone(), source };
+    write_whole(&entry, &code).map_err(write)?;
+    prune(cache, &entry, CACHE_BYTES).map_err(write)?;
     Ok(entry)
 }
 

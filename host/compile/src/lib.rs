@@ -243,6 +243,9 @@ pub fn make_cache(cache: &Path) -> Result<(), CompileError> {
 mod compiler;
 #[cfg(feature = "compiler")]
 pub use compiler::compile;
+#[cfg_attr(not(feature = "compiler"), allow(dead_code, reason = "who compiles cleans up"))]
+mod prune;
+pub use prune::{CACHE_BYTES, note_use};
 
 #[cfg(test)]
 mod tests {

@@ -4,20 +4,29 @@
 //! that the kernel keeps for them. Version 2 only. The rule of the kernel is that processes live in leaves: the supervisor itself
 //! must not live in the folder that it hands to us.
 
-use std::fs;
+use std::fs::{self, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use gleaner_protocol::Layer;
+
+use crate::enter;
 
 /// The name of this layer.
 pub const NAME: &str = "control group";
 
+/// The environment variable with the folder of a runtime's group, for [`fit`].
+pub const CGROUP_ENV: &str = "GLEANER_CGROUP";
+
+const MEMORY_MAX: &str = "memory.max";
+const TASKS_MAX: &str = "pids.max";
+
 /// What a group may take.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Bounds {
-    /// Bytes of memory, page cache included.
-    pub memory: u64,
+    /// Bytes of memory, page cache included, if they are bounded from the start.
+    pub memory: Option<u64>,
     /// Processes and threads.
     pub tasks: u64,
 }
@@ -26,6 +35,8 @@ pub struct Bounds {
 #[derive(Debug)]
 pub struct Group {
     folder: PathBuf,
+    /// What the kernel had killed in one of the same name, before this was made.
+    killed_before: u64,
 }
 
 impl Group {
@@ -57,14 +68,15 @@ impl Group {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(cannot("make a group", error)),
             _ => {}
         }
-        let group = Self { folder };
+        let killed_before = killed_for_memory(&folder);
+        let group = Self { folder, killed_before };
         let bounds = [
-            ("memory.max", bounds.memory.to_string()),
+            (MEMORY_MAX, bounds.memory.map_or_else(|| "max".to_owned(), |bytes| bytes.to_string())),
             // Else memory beyond the bound would go to disk instead of being refused.
             ("memory.swap.max", "0".to_owned()),
             // All of a lambda's processes, or none: half of it is of no use.
             ("memory.oom.group", "1".to_owned()),
-            ("pids.max", bounds.tasks.to_string()),
+            (TASKS_MAX, bounds.tasks.to_string()),
         ];
         for (file, value) in bounds {
             match fs::write(group.folder.join(file), value) {
@@ -77,27 +89,60 @@ impl Group {
         Ok(group)
     }
 
-    /// Moves a process into it; what that starts is in it from the start.
+    /// Has what `command` starts be in it from its first instruction on; if it cannot be, it does not start. It is told of its
+    /// group, for [`fit`].
     ///
     /// # Errors
     ///
-    /// Those of the file system.
-    pub fn take(&self, pid: u32) -> io::Result<()> {
-        fs::write(self.folder.join("cgroup.procs"), pid.to_string())
+    /// Those of opening the group's list of processes.
+    pub fn holds(&self, command: &mut Command) -> io::Result<()> {
+        let processes = OpenOptions::new().write(true).open(self.folder.join("cgroup.procs"))?;
+        enter::before_program(command.env(CGROUP_ENV, &self.folder), processes);
+        Ok(())
     }
 
     /// How often the kernel killed a process of it, for want of memory.
     pub fn killed_for_memory(&self) -> u64 {
-        let events = fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
-        let count = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
-        count.and_then(|count| count.trim().parse().ok()).unwrap_or(0)
+        killed_for_memory(&self.folder).saturating_sub(self.killed_before)
     }
 
     /// What holds, for people.
-    pub fn layer(&self, bounds: Bounds) -> Layer {
-        let Bounds { memory, tasks } = bounds;
-        Layer::yes(NAME, format!("`{}`: {} MiB, {tasks} tasks", self.folder.display(), memory >> 20))
+    pub fn layer(&self) -> Layer {
+        layer(&self.folder)
     }
+}
+
+/// Bounds the memory of the group of this process by `bytes`, unless its bound is smaller: for a runtime that knows what its lambda may
+/// take, before the lambda is in it. Gives the layer; `None` without a group.
+pub fn fit(bytes: u64) -> Option<Layer> {
+    let folder = PathBuf::from(std::env::var_os(CGROUP_ENV)?);
+    Some(fit_in(&folder, bytes).unwrap_or_else(|error| {
+        let why = format!("cannot bound the memory of `{}` by {} MiB: {error}", folder.display(), bytes >> 20);
+        Layer::partly(NAME, why)
+    }))
+}
+
+fn fit_in(folder: &Path, bytes: u64) -> io::Result<Layer> {
+    let file = folder.join(MEMORY_MAX);
+    let bound = fs::read_to_string(&file)?.trim().parse().map_or(bytes, |bound: u64| bound.min(bytes));
+    fs::write(&file, bound.to_string())?;
+    Ok(layer(folder))
+}
+
+fn layer(folder: &Path) -> Layer {
+    let bound = |file| fs::read_to_string(folder.join(file)).unwrap_or_default();
+    let (memory, tasks) = (bound(MEMORY_MAX), bound(TASKS_MAX));
+    let memory = match memory.trim().parse::<u64>() {
+        Ok(bytes) => format!("{} MiB", bytes >> 20),
+        Err(_) => "as much memory as the lambda needs".to_owned(),
+    };
+    Layer::yes(NAME, format!("`{}`: {memory}, {} tasks", folder.display(), tasks.trim()))
+}
+
+fn killed_for_memory(folder: &Path) -> u64 {
+    let events = fs::read_to_string(folder.join("memory.events")).unwrap_or_default();
+    let count = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
+    count.and_then(|count| count.trim().parse().ok()).unwrap_or(0)
 }
 
 impl Drop for Group {
@@ -111,7 +156,7 @@ impl Drop for Group {
 mod tests {
     use super::*;
 
-    const BOUNDS: Bounds = Bounds { memory: 64 << 20, tasks: 32 };
+    const BOUNDS: Bounds = Bounds { memory: Some(64 << 20), tasks: 32 };
 
     /// A folder that looks as one that was delegated. The kernel's behaviour behind it is not there.
     struct Tree(PathBuf);
@@ -143,10 +188,41 @@ mod tests {
         assert_eq!(tree.text("brake-dark/memory.max"), "67108864");
         assert_eq!(tree.text("brake-dark/memory.oom.group"), "1");
         assert_eq!(tree.text("brake-dark/pids.max"), "32");
-        group.take(4711).unwrap();
-        assert_eq!(tree.text("brake-dark/cgroup.procs"), "4711");
-        fs::write(tree.0.join("brake-dark/memory.events"), "low 0\noom 3\noom_kill 2\n").unwrap();
-        assert_eq!(group.killed_for_memory(), 2);
+        let mut program = Command::new("/bin/true");
+        let missing = group.holds(&mut program).unwrap_err();
+        assert_eq!(missing.kind(), io::ErrorKind::NotFound);
+        fs::write(tree.0.join("brake-dark/cgroup.procs"), "").unwrap();
+        group.holds(&mut program).unwrap();
+        assert!(program.status().unwrap().success());
+        // As a process names itself.
+        assert_eq!(tree.text("brake-dark/cgroup.procs"), "0");
+    }
+
+    #[test]
+    fn what_was_killed_in_an_earlier_group_does_not_count() {
+        let tree = Tree::with("memory pids\n", "again");
+        let events = |count: u32| {
+            let text = format!("low 0\noom 3\noom_kill {count}\n");
+            fs::write(tree.0.join("x/memory.events"), text).unwrap();
+        };
+        fs::create_dir(tree.0.join("x")).unwrap();
+        events(2);
+        let group = Group::make(&tree.0, "x", BOUNDS).unwrap();
+        assert_eq!(group.killed_for_memory(), 0);
+        events(3);
+        assert_eq!(group.killed_for_memory(), 1);
+    }
+
+    #[test]
+    fn a_bound_follows_what_is_needed_and_never_grows() {
+        let tree = Tree::with("memory pids\n", "fits");
+        let group = Group::make(&tree.0, "x", Bounds { memory: None, tasks: 9 }).unwrap();
+        assert_eq!(tree.text("x/memory.max"), "max");
+        let note = |bytes| fit_in(&group.folder, bytes).unwrap().note;
+        assert!(note(96 << 20).ends_with("x`: 96 MiB, 9 tasks"), "{}", note(96 << 20));
+        assert_eq!(tree.text("x/memory.max"), (96 << 20).to_string());
+        assert!(note(97 << 20).ends_with("x`: 96 MiB, 9 tasks"), "{}", note(97 << 20));
+        assert!(fit_in(&tree.0.join("gone"), 1).is_err());
     }
 
     #[test]

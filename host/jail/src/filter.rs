@@ -60,6 +60,11 @@ impl Refused {
         self.0.entry(call).or_default().extend(rules);
     }
 
+    /// Says that there is no `clone3`: a filter cannot read its flags, which are in memory, and libraries take `clone` instead.
+    pub(crate) fn no_clone3() -> Result<BpfProgram, JailError> {
+        Self::default().calls(&[libc::SYS_clone3]).filter(libc::ENOSYS)
+    }
+
     /// The filter, which answers refused calls with `errno`.
     pub(crate) fn filter(mut self, errno: i32) -> Result<BpfProgram, JailError> {
         let machine = std::env::consts::ARCH;

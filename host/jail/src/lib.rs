@@ -14,6 +14,7 @@
 
 pub mod alone;
 pub mod cgroup;
+mod enter;
 pub mod files;
 mod filter;
 pub mod memory;

@@ -5,7 +5,7 @@
 //! classes of the Python package `gleaner`, defined once, there; `sdk` finds them.
 //!
 //! One thread runs all of it. No thread that receives samples ever attaches to the interpreter, and nothing here is
-//! `unsafe` but `array`, which lends the pixels of a frame to numpy.
+//! `unsafe` but `array`, which lends the pixels of a frame to numpy, and `memory`, which notices where there is none left.
 
 mod array;
 mod context;
@@ -14,6 +14,7 @@ mod frame;
 mod guest;
 mod inference;
 mod log;
+mod memory;
 mod scratch;
 mod sdk;
 mod trigger;

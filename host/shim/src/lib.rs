@@ -13,7 +13,7 @@ mod watch;
 
 use std::ffi::OsString;
 use std::path::PathBuf;
-use std::process::{Child, Command, ExitCode};
+use std::process::{Command, ExitCode};
 use std::time::Duration;
 
 use clap::Parser;
@@ -28,6 +28,9 @@ use self::watch::Watched;
 /// How long a runtime may take until it gives a sign of life; compiling alone may take minutes on a small machine.
 const START: Duration = Duration::from_secs(900);
 
+/// The name of the layer that is this program.
+const HARD_DEADLINE: &str = "hard deadline";
+
 /// Starts a runtime in its jail, and watches over it.
 #[derive(Parser)]
 #[command(name = "gleaner-shim", version)]
@@ -41,9 +44,9 @@ struct Args {
     /// Give it a control group of its own in this folder, which was delegated to this user.
     #[arg(long, value_name = "DIR")]
     cgroup: Option<PathBuf>,
-    /// Most memory of the control group, in bytes.
-    #[arg(long, value_name = "BYTES", default_value_t = 2 << 30)]
-    cgroup_memory: u64,
+    /// Most memory of the control group, in bytes; a runtime makes it as small as its lambda allows.
+    #[arg(long, value_name = "BYTES")]
+    cgroup_memory: Option<u64>,
     /// Most processes and threads of the control group.
     #[arg(long, value_name = "N", default_value_t = 512)]
     cgroup_tasks: u64,
@@ -80,13 +83,14 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     pulse.alive(START);
     let number = Pulse::hand_on(&page).map_err(|error| cannot("cannot hand on the pulse", &error))?;
     let mut layers = never::forbid();
-    layers.push(Layer::yes("hard deadline", "gleaner-shim kills what does not come back"));
+    layers.push(hard_deadline());
     let (group, layer) = own_group(args);
     layers.push(layer);
     let layers = serde_json::to_string(&layers).expect("layers are plain data");
     let (program, arguments) = args.program.split_first().expect("clap asks for a program");
     let mut command = Command::new(program);
-    command.args(arguments).env_clear().envs(environment::handed_on()).env(PULSE_ENV, number).env(LAYERS_ENV, layers);
+    command.args(arguments).env_clear().envs(environment::handed_on()).env_remove(cgroup::CGROUP_ENV);
+    command.env(PULSE_ENV, number).env(LAYERS_ENV, layers);
     if let Some(path) = &args.exit_record {
         // Nobody shall take the end of an earlier one for that of this one, which may want to read it. Mostly there is none.
         let mut earlier = path.as_os_str().to_owned();
@@ -94,18 +98,14 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         let _ = std::fs::rename(path, earlier);
     }
     let started_ns = signals::time_of_day_ns();
+    if let Some(group) = &group {
+        group.holds(&mut command).map_err(|error| cannot("cannot have the runtime in its control group", &error))?;
+    }
     let child = command.spawn().map_err(|error| {
         let program = program.to_string_lossy();
         Failure::caused_by(Exit::Internal, format!("cannot start `{program}`"), &error)
     })?;
     drop(page);
-    if let Some(group) = &group
-        && let Err(error) = group.take(child.id())
-    {
-        // It runs without this layer, which it was told it had: rather not at all.
-        end_now(child);
-        return Err(cannot("cannot move the runtime into its control group", &error));
-    }
     let watched = Watched { child, pulse, signals, group };
     let ended = watched.until_its_end().map_err(|error| cannot("cannot watch over the runtime", &error))?;
     let left_behind = left_behind::end();
@@ -150,9 +150,8 @@ fn end_alike(record: &ExitRecord) -> ExitCode {
     u8::try_from(record.code.unwrap_or(1)).unwrap_or(1).into()
 }
 
-fn end_now(mut child: Child) {
-    let _ = child.kill();
-    let _ = child.wait();
+fn hard_deadline() -> Layer {
+    Layer::yes(HARD_DEADLINE, "gleaner-shim kills what does not come back")
 }
 
 /// The control group that was asked for, and what there is to say of it.
@@ -163,7 +162,7 @@ fn own_group(args: &Args) -> (Option<Group>, Layer) {
     let bounds = Bounds { memory: args.cgroup_memory, tasks: args.cgroup_tasks };
     match Group::make(tree, &format!("gleaner-{}", std::process::id()), bounds) {
         Ok(group) => {
-            let layer = group.layer(bounds);
+            let layer = group.layer();
             (Some(group), layer)
         }
         Err(why) => (None, Layer::no(cgroup::NAME, why)),
@@ -173,8 +172,11 @@ fn own_group(args: &Args) -> (Option<Group>, Layer) {
 /// What holds on this machine: each layer is set up in this process, and tried.
 fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
     let mut layers = never::forbid();
+    let cannot_watch = |error: std::io::Error| Layer::no(HARD_DEADLINE, format!("there is no page to watch: {error}"));
+    layers.push(Pulse::make().map_or_else(cannot_watch, |_| hard_deadline()));
     layers.push(own_group(args).1);
     layers.push(files::confine(&Paths::default()));
+    layers.push(alone::before_interpreter(true));
     layers.push(memory::limit(64 << 20));
     let cannot = |error| Failure::caused_by(Exit::Internal, "cannot try what would hold a lambda", &error);
     layers.extend(alone::stay(true).map_err(cannot)?);

@@ -6,7 +6,7 @@ use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
 
 use gleaner_jail::cgroup::Group;
-use gleaner_protocol::{ExitRecord, Killed};
+use gleaner_protocol::{ExitRecord, Killed, UNTIL_KILLED};
 use gleaner_vitals::Pulse;
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
@@ -20,8 +20,6 @@ use crate::signals::{Signals, time_of_day_ns};
 const AGAIN: Duration = Duration::from_millis(100);
 /// Looks that are further apart than this do not count as two: we stood still ourselves.
 const ASLEEP: Duration = Duration::from_secs(1);
-/// How long a runtime may take for its end once it was asked for it.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A runtime that has been started.
 pub(crate) struct Watched {
@@ -67,7 +65,7 @@ impl Watched {
                     patience
                 }
             };
-            if asked.is_some_and(|asked| asked.elapsed() >= PATIENCE) {
+            if asked.is_some_and(|asked| asked.elapsed() >= UNTIL_KILLED) {
                 kill_process(pid, Signal::KILL)?;
             }
             let patience =
@@ -84,7 +82,8 @@ impl Watched {
                 asked = asked.or(Some(Instant::now()));
             }
             if let Some(status) = self.child.try_wait()? {
-                let out_of_memory = self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
+                let full = status.signal() == Some(Signal::ABORT.as_raw()) && self.pulse.was_full();
+                let out_of_memory = full || self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
                 // It may have come back, or ended by itself, just before it was killed.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
                 let pid = self.child.id();

@@ -8,8 +8,8 @@ use std::fs::File;
 use std::io;
 use std::os::fd::{AsFd, AsRawFd, FromRawFd, OwnedFd};
 use std::ptr::{self, NonNull};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use gleaner_protocol::{Doing, Killed};
@@ -30,6 +30,8 @@ struct Page {
     allowed_ns: AtomicU64,
     at_ns: AtomicI64,
     doing: AtomicU32,
+    /// Not 0 once our part of the runtime was refused memory.
+    full: AtomicU32,
 }
 
 /// A view of the page. Clones see the same one.
@@ -44,6 +46,9 @@ struct Mapped {
 unsafe impl Send for Mapped {}
 // SAFETY: as above.
 unsafe impl Sync for Mapped {}
+
+/// The page of this process, for whoever finds that there is no memory left, and so can ask for nothing.
+static OURS: OnceLock<Pulse> = OnceLock::new();
 
 /// How long it may take from the end of one call into a lambda until there is a word again: writing results to a disk that stands
 /// still for a while, or reading on in a drive.
@@ -99,7 +104,20 @@ impl Pulse {
         if rustix::fs::fstat(&copy)?.st_size != size_of::<Page>() as i64 {
             return Err(wrong());
         }
-        Self::over(copy.as_fd())
+        let pulse = Self::over(copy.as_fd())?;
+        Ok(OURS.get_or_init(|| pulse).clone())
+    }
+
+    /// Has the shim know that our part of this process was refused memory, should that be its end. Takes none.
+    pub fn say_full() {
+        if let Some(pulse) = OURS.get() {
+            pulse.page().full.store(1, Ordering::Release);
+        }
+    }
+
+    /// For the shim: whether the runtime was refused memory.
+    pub fn was_full(&self) -> bool {
+        self.page().full.load(Ordering::Acquire) != 0
     }
 
     fn over(file: impl AsFd) -> io::Result<Self> {

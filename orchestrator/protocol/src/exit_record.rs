@@ -1,10 +1,14 @@
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use crate::{Exit, write_whole};
+
+/// How long a runtime may take for its end once it was asked for it; then `gleaner-shim` kills it. Who started both waits longer.
+pub const UNTIL_KILLED: Duration = Duration::from_secs(30);
 
 /// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if it was not there at that time.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -21,7 +25,8 @@ pub struct ExitRecord {
     pub signal: Option<i32>,
     /// Why `gleaner-shim` killed it, if it did.
     pub killed: Option<Killed>,
-    /// The kernel killed some of it, because its control group had no memory left.
+    /// There was no memory left for it: the kernel killed some of it, for its control group had none; or, ended by SIGABRT, it was
+    /// refused more by its own limit.
     pub out_of_memory: bool,
     /// The most memory that it had resident, in bytes.
     pub max_rss_bytes: u64,
@@ -81,6 +86,9 @@ impl Killed {
     }
 }
 
+/// The signal by which a process ends itself, on all of Linux.
+const SIGABRT: i32 = 6;
+
 /// Longest record that is read. One has some 300 bytes.
 const RECORD_MAX: u64 = 16 << 10;
 
@@ -101,6 +109,9 @@ impl ExitRecord {
     pub fn sentence(&self) -> Option<String> {
         match (self.killed, self.out_of_memory, self.signal, self.code) {
             (Some(killed), ..) => Some(killed.sentence()),
+            (None, true, Some(SIGABRT), _) => {
+                Some("ended itself: it needed more memory than `memory` in [limits] leaves it".to_owned())
+            }
             (None, true, ..) => Some("was killed by the kernel: its control group had no memory left".to_owned()),
             (None, false, Some(signal), _) => Some(format!("was ended by signal {signal}")),
             (None, false, None, Some(0)) => None,
@@ -177,6 +188,10 @@ mod tests {
         assert_eq!(record().sentence().unwrap(), "was in one wake for 0.35 s; after 0.35 s it is killed");
         let crashed = ExitRecord { killed: None, signal: Some(11), ..record() };
         assert_eq!(crashed.sentence().unwrap(), "was ended by signal 11");
+        let full =
+            |signal| ExitRecord { out_of_memory: true, signal: Some(signal), ..crashed.clone() }.sentence().unwrap();
+        assert_eq!(full(6), "ended itself: it needed more memory than `memory` in [limits] leaves it");
+        assert_eq!(full(9), "was killed by the kernel: its control group had no memory left");
         assert_eq!(ExitRecord { code: Some(0), signal: None, ..crashed }.sentence(), None);
     }
 }

@@ -34,7 +34,7 @@ pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, 
 pub use drive_seen::{DriveSeen, Picture, RecordedTopicSeen};
 pub use drive_time::{DriveTime, DriveTimeError};
 pub use exit::Exit;
-pub use exit_record::{Doing, ExitRecord, Killed};
+pub use exit_record::{Doing, ExitRecord, Killed, UNTIL_KILLED};
 pub use failure::{Explain, Failure};
 pub use isolation::{Holds, LAYERS_ENV, Layer};
 pub use layout::{BuildDir, LayoutError};

@@ -8,6 +8,7 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use gleaner_jail::cgroup::CGROUP_ENV;
 use gleaner_protocol::{Exit, Explain, LAYERS_ENV, Parts, PartsError};
 
 use crate::isolation::{self, Inside};
@@ -60,7 +61,7 @@ fn interpreter(lambda_dir: &Path, args: &[OsString], mut inside: Inside) -> Resu
     command.arg("-I").arg(home.join("start.py")).arg(&extension).args(args);
     inside.paths.read.extend([home, extension]);
     // From its first line on the interpreter runs code of its environment, which is the lambda's.
-    command.env(LAYERS_ENV, isolation::before_interpreter(inside, &python));
+    command.env(LAYERS_ENV, isolation::before_interpreter(inside, &python)).env_remove(CGROUP_ENV);
     for name in ONE_THREAD {
         if std::env::var_os(name).is_none() {
             command.env(name, "1");

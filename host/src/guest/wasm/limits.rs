@@ -1,5 +1,8 @@
 //! What a store refuses: memory beyond the cap, and host work beyond the fuel.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use gleaner_protocol::manifest::Limits;
 use wasmtime::ResourceLimiter;
 
@@ -88,11 +91,15 @@ impl ResourceLimiter for Caps {
     }
 }
 
-/// Counts the work of host calls as fuel. The guest's own instructions are counted by the store.
+/// Counts the work of host calls as fuel. The guest's own instructions are counted by the store. Clones count together: output and
+/// random numbers of WASI do not see the store. One thread uses them.
+#[derive(Clone, Default)]
+pub(super) struct Meter(Arc<Account>);
+
 #[derive(Default)]
-pub(super) struct Meter {
-    used: u64,
-    allowed: u64,
+struct Account {
+    used: AtomicU64,
+    allowed: AtomicU64,
 }
 
 /// The host has done as much for a guest as its fuel allows.
@@ -101,18 +108,26 @@ pub(super) struct Meter {
 pub(super) struct OutOfFuel;
 
 impl Meter {
-    pub(super) fn new(allowed: u64) -> Self {
-        Self { used: 0, allowed }
+    /// A new call into the guest, in which the host may do as much.
+    pub(super) fn begin(&self, allowed: u64) {
+        self.0.used.store(0, Ordering::Relaxed);
+        self.0.allowed.store(allowed, Ordering::Relaxed);
     }
 
     pub(super) fn used(&self) -> u64 {
-        self.used
+        self.0.used.load(Ordering::Relaxed)
     }
 
     /// Charges one call that touches `bytes`, before it is done.
-    pub(super) fn charge(&mut self, bytes: usize) -> Result<(), OutOfFuel> {
-        self.used = self.used.saturating_add(FUEL_PER_CALL + bytes as u64 / BYTES_PER_FUEL);
-        if self.used > self.allowed { Err(OutOfFuel) } else { Ok(()) }
+    pub(super) fn charge(&self, bytes: usize) -> Result<(), OutOfFuel> {
+        self.charge_fuel(bytes as u64 / BYTES_PER_FUEL)
+    }
+
+    /// Charges one call that takes as long as so many instructions.
+    pub(super) fn charge_fuel(&self, fuel: u64) -> Result<(), OutOfFuel> {
+        let used = self.used().saturating_add(FUEL_PER_CALL).saturating_add(fuel);
+        self.0.used.store(used, Ordering::Relaxed);
+        if used > self.0.allowed.load(Ordering::Relaxed) { Err(OutOfFuel) } else { Ok(()) }
     }
 }
 
@@ -122,10 +137,14 @@ mod tests {
 
     #[test]
     fn work_is_refused_once_the_fuel_is_used() {
-        let mut meter = Meter::new(1000);
+        let meter = Meter::default();
+        meter.begin(1000);
+        let other = meter.clone();
         assert!(meter.charge(4000).is_ok());
-        assert!(meter.charge(4000).is_err());
+        assert!(other.charge(4000).is_err());
         assert_eq!(meter.used(), 1040);
+        meter.begin(100);
+        assert!(meter.charge_fuel(80).is_ok() && meter.charge_fuel(u64::MAX).is_err());
     }
 
     #[test]

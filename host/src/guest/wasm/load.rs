@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_compile::{
-    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans, cache_entry, open_entry, read_component,
+    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans, cache_entry, note_use, open_entry, read_component,
 };
 use gleaner_protocol::{Exit, Explain, Parts, PartsError};
 use sha2::{Digest, Sha256};
@@ -91,6 +91,7 @@ impl Loaded {
             compile(path, cache, nans)?;
         }
         let file = open_entry(&entry)?;
+        note_use(&file);
         let opened = format!("/proc/self/fd/{}", file.as_raw_fd());
         // SAFETY: `open_entry` found that this very file and the folders above it belong to this user or to root, and that
         // nobody else may write to them; and only `gleaner-compile` writes there, under a name made from the component, the

@@ -97,7 +97,8 @@ impl WasmGuest {
     }
 
     fn new_store(&self) -> Store<Hosted> {
-        let printed = Printed::new(&self.session);
+        let meter = Meter::default();
+        let printed = Printed::new(&self.session, &meter);
         let hosted = Hosted {
             session: self.session.clone(),
             handles: handle_table(&self.limits),
@@ -105,7 +106,7 @@ impl WasmGuest {
             printed,
             allowed: self.limits,
             caps: Caps::new(&self.limits),
-            meter: Meter::default(),
+            meter,
             due: None,
         };
         let mut store = Store::new(self.loaded.engine(), hosted);
@@ -173,7 +174,7 @@ impl<'a> Call<'a> {
     fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<(&'a Deadline, Duration)>) -> Self {
         store.set_fuel(fuel).expect("the engine counts fuel");
         let hosted = store.data_mut();
-        hosted.meter = Meter::new(fuel);
+        hosted.meter.begin(fuel);
         hosted.caps.forget_refusal();
         hosted.printed.begin();
         let armed = deadline.map(|(deadline, allowed)| deadline.arm(store, allowed));

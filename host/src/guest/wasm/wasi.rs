@@ -1,7 +1,7 @@
 //! WASI as far as a lambda needs it: output becomes log lines, the clock is the wake's, random numbers are seeded.
 //!
 //! There are no files, no environment, no arguments and no sockets: such calls answer with an error. Sleeping is a fault,
-//! since neither fuel nor a deadline could end it.
+//! since neither fuel nor a deadline could end it. What takes longer the more is asked for costs fuel, as other host calls do.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -12,10 +12,14 @@ use rand::rngs::StdRng;
 use wasmtime::component::{HasData, Linker, Resource};
 use wasmtime_wasi::cli::{IsTerminal, StdoutStream};
 use wasmtime_wasi::p2::bindings::clocks::monotonic_clock;
+use wasmtime_wasi::p2::bindings::random::{insecure, random};
+use wasmtime_wasi::p2::bindings::sync::io::poll;
 use wasmtime_wasi::p2::{DynPollable, OutputStream, Pollable, StreamError, StreamResult};
-use wasmtime_wasi::{HostWallClock, WasiCtx};
+use wasmtime_wasi::random::WasiRandomCtx;
+use wasmtime_wasi::{HostWallClock, WasiCtx, WasiCtxView, WasiView};
 
 use super::Hosted;
+use super::limits::{Meter, OutOfFuel};
 use crate::api::Session;
 use crate::api::log::{LINE_BYTES, Level, cut};
 
@@ -24,6 +28,10 @@ const PANICKED: &str = "panicked at ";
 
 /// Random bytes that one call hands out.
 const RANDOM_BYTES: u64 = 4096;
+/// Fuel for a random byte: each is drawn by itself.
+const FUEL_PER_RANDOM_BYTE: u64 = 4;
+/// Fuel for something that is waited for.
+const FUEL_PER_POLLABLE: u64 = 400;
 
 /// The lambda tried to sleep.
 #[derive(Debug, thiserror::Error)]
@@ -33,7 +41,10 @@ pub(super) struct Asleep;
 pub(super) fn add_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
     wasmtime_wasi::p2::add_to_linker_sync(linker)?;
     linker.allow_shadowing(true);
-    monotonic_clock::add_to_linker::<Hosted, VirtualClock>(linker, |hosted| hosted)?;
+    monotonic_clock::add_to_linker::<Hosted, Bounded>(linker, |hosted| hosted)?;
+    random::add_to_linker::<Hosted, Bounded>(linker, |hosted| hosted)?;
+    insecure::add_to_linker::<Hosted, Bounded>(linker, |hosted| hosted)?;
+    poll::add_to_linker::<Hosted, Bounded>(linker, |hosted| hosted)?;
     linker.allow_shadowing(false);
     Ok(())
 }
@@ -65,13 +76,14 @@ impl HostWallClock for Wall {
     }
 }
 
-/// `wasi:clocks/monotonic-clock`, standing still within a wake.
-struct VirtualClock;
+/// What of WASI is ours, and bounded.
+struct Bounded;
 
-impl HasData for VirtualClock {
+impl HasData for Bounded {
     type Data<'a> = &'a mut Hosted;
 }
 
+/// Standing still within a wake.
 impl monotonic_clock::Host for Hosted {
     fn now(&mut self) -> wasmtime::Result<u64> {
         Ok(u64::try_from(self.session.now_ns()).unwrap_or(0))
@@ -90,6 +102,66 @@ impl monotonic_clock::Host for Hosted {
     }
 }
 
+impl Hosted {
+    fn wasi_random(&mut self) -> &mut WasiRandomCtx {
+        let WasiCtxView { ctx, .. } = self.ctx();
+        ctx.random()
+    }
+
+    fn charge_random(&self, bytes: u64) -> Result<(), OutOfFuel> {
+        // More is refused, without being drawn.
+        self.meter.charge_fuel(bytes.min(RANDOM_BYTES) * FUEL_PER_RANDOM_BYTE)
+    }
+}
+
+impl random::Host for Hosted {
+    fn get_random_bytes(&mut self, bytes: u64) -> wasmtime::Result<Vec<u8>> {
+        self.charge_random(bytes)?;
+        self.wasi_random().get_random_bytes(bytes)
+    }
+
+    fn get_random_u64(&mut self) -> wasmtime::Result<u64> {
+        self.charge_random(8)?;
+        self.wasi_random().get_random_u64()
+    }
+}
+
+impl insecure::Host for Hosted {
+    fn get_insecure_random_bytes(&mut self, bytes: u64) -> wasmtime::Result<Vec<u8>> {
+        self.charge_random(bytes)?;
+        self.wasi_random().get_insecure_random_bytes(bytes)
+    }
+
+    fn get_insecure_random_u64(&mut self) -> wasmtime::Result<u64> {
+        self.charge_random(8)?;
+        self.wasi_random().get_insecure_random_u64()
+    }
+}
+
+/// Output is all that can be waited for, and always ready.
+impl poll::Host for Hosted {
+    fn poll(&mut self, these: Vec<Resource<DynPollable>>) -> wasmtime::Result<Vec<u32>> {
+        self.meter.charge_fuel(FUEL_PER_POLLABLE.saturating_mul(these.len() as u64))?;
+        poll::Host::poll(&mut self.handles, these)
+    }
+}
+
+impl poll::HostPollable for Hosted {
+    fn ready(&mut self, this: Resource<DynPollable>) -> wasmtime::Result<bool> {
+        self.meter.charge_fuel(FUEL_PER_POLLABLE)?;
+        poll::HostPollable::ready(&mut self.handles, this)
+    }
+
+    fn block(&mut self, this: Resource<DynPollable>) -> wasmtime::Result<()> {
+        self.meter.charge_fuel(FUEL_PER_POLLABLE)?;
+        poll::HostPollable::block(&mut self.handles, this)
+    }
+
+    fn drop(&mut self, this: Resource<DynPollable>) -> wasmtime::Result<()> {
+        poll::HostPollable::drop(&mut self.handles, this)
+    }
+}
+
 /// Standard output and standard error of a guest.
 pub(super) struct Printed {
     stdout: Lines,
@@ -97,8 +169,8 @@ pub(super) struct Printed {
 }
 
 impl Printed {
-    pub(super) fn new(session: &Session) -> Self {
-        Self { stdout: Lines::new(session, Level::Info), stderr: Lines::new(session, Level::Warn) }
+    pub(super) fn new(session: &Session, meter: &Meter) -> Self {
+        Self { stdout: Lines::new(session, meter, Level::Info), stderr: Lines::new(session, meter, Level::Warn) }
     }
 
     /// Forgets what an earlier call said on standard error.
@@ -133,6 +205,7 @@ impl Printed {
 #[derive(Clone)]
 struct Lines {
     session: Session,
+    meter: Meter,
     level: Level,
     state: Arc<Mutex<Unfinished>>,
 }
@@ -148,8 +221,8 @@ struct Unfinished {
 }
 
 impl Lines {
-    fn new(session: &Session, level: Level) -> Self {
-        Self { session: session.clone(), level, state: Arc::default() }
+    fn new(session: &Session, meter: &Meter, level: Level) -> Self {
+        Self { session: session.clone(), meter: meter.clone(), level, state: Arc::default() }
     }
 
     fn lock(&self) -> MutexGuard<'_, Unfinished> {
@@ -203,6 +276,7 @@ impl OutputStream for Lines {
         if bytes.len() > LINE_BYTES {
             return Err(StreamError::trap("a lambda wrote more than its stream had said to take"));
         }
+        self.meter.charge(bytes.len()).map_err(|error| StreamError::Trap(error.into()))?;
         self.lock().write(&bytes, &self.session, self.level);
         Ok(())
     }

@@ -65,6 +65,22 @@ class Lambda:
         while True:
             KEPT.append(bytearray(1 << 20))
 
+    def full(self, ctx: Context) -> None:
+        """Keeps all memory that there is, whatever it is told, and leaves the host less than it needs for a line of the log."""
+        line = "x" * 4000
+        pieces: List[List[bytearray]] = [[] for _ in range(5)]
+        KEPT.append(pieces)
+        for piece, size in zip(pieces, (1 << 20, 1 << 16, 4100, 600, 64)):
+            try:
+                while True:
+                    piece.append(bytearray(size))
+            except MemoryError:
+                pass
+        while True:
+            # Room for the bytes of the line in Python, and none for those in the host.
+            pieces[2].pop()
+            ctx.log("info", line)
+
     def touch(self, ctx: Context) -> None:
         """All memory that it may have, over and over: what caches and the bus have to carry."""
         pieces = [bytearray(1 << 20) for _ in range(self.touch_mib)]

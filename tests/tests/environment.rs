@@ -1,0 +1,74 @@
+//! What a Python lambda's own environment starts before the lambda, which it brings along as it likes, is shut in already.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::Parts;
+use gleaner_tests::{Folder, copy_lambda, program, root, runtime, sample_drive};
+
+/// What `sitecustomize.py` tries, each with the name under which it says what came of it.
+const TRIES: &str = r#"
+import ctypes, os, socket, sys
+
+TRIES = {
+    "read": lambda: open("/etc/passwd").read(),
+    "write": lambda: open(__file__ + ".more", "w").write("x"),
+    "fork": lambda: os.fork() or os._exit(0),
+    "program": lambda: os.posix_spawn("/bin/true", ["true"], {}),
+    "signal": lambda: os.kill(os.getppid(), 0),
+    "neighbours": lambda: socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM),
+    "memory": lambda: os.memfd_create("more"),
+    "other_memory": lambda: open(f"/proc/{os.getppid()}/mem", "rb"),
+    "room": lambda: len(bytearray(16 << 30)),
+}
+for name, attempt in TRIES.items():
+    try:
+        print(f"<{name}> went: {attempt()!r}"[:200], file=sys.stderr)
+    except (OSError, MemoryError) as error:
+        print(f"<{name}> refused", file=sys.stderr)
+"#;
+
+/// A lambda with an environment that runs [`TRIES`] when its interpreter starts. It has no numpy, so that is all that comes of it.
+fn hostile(folder: &Folder) -> PathBuf {
+    copy_lambda("tests/lambdas/misbehave/python", folder, "lambda", |manifest| manifest);
+    let lambda = folder.path().join("lambda");
+    let python = Parts::find().and_then(|parts| parts.python(None)).expect("there is a Python");
+    let made = Command::new(python).args(["-m", "venv", "--without-pip", ".venv"]).current_dir(&lambda).status();
+    assert!(made.expect("Python starts").success());
+    let lib = lambda.join(".venv/lib");
+    let version = std::fs::read_dir(&lib).unwrap().next().expect("a folder for the version").unwrap().path();
+    std::fs::write(version.join("site-packages/sitecustomize.py"), TRIES).unwrap();
+    lambda
+}
+
+fn start(lambda: &Path, out: &Path, with_shim: bool) -> String {
+    let mut command = if with_shim {
+        let mut shim = Command::new(program("gleaner-shim"));
+        shim.arg("--").arg(program("gleaner-runtime")).env("XDG_CACHE_HOME", root().join("target/test-cache"));
+        shim
+    } else {
+        runtime()
+    };
+    command.arg("replay").arg(lambda).arg(sample_drive()).arg("--out").arg(out);
+    let output = command.output().expect("it starts");
+    assert_ne!(output.status.code(), Some(0), "an environment without numpy will not do");
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[test]
+fn start_up_code_of_an_environment_is_shut_in_before_it_runs() {
+    let folder = Folder::new();
+    let lambda = hostile(&folder);
+    let tries = TRIES.lines().filter_map(|line| line.strip_prefix("    \"")?.split_once('"')).map(|(name, _)| name);
+    let tries: Vec<_> = tries.collect();
+    assert_eq!(tries.len(), 9);
+    let said = start(&lambda, &folder.path().join("out"), true);
+    for name in &tries {
+        assert!(said.contains(&format!("<{name}> refused")), "{name}: {said}");
+    }
+    // Without a shim it makes the page itself that the shim would read, and is not kept from making more of that kind.
+    let said = start(&lambda, &folder.path().join("out"), false);
+    for name in tries.iter().filter(|name| **name != "memory") {
+        assert!(said.contains(&format!("<{name}> refused")), "{name}: {said}");
+    }
+}
