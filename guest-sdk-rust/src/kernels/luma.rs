@@ -7,8 +7,9 @@ use super::{Colours, Image, ImageError};
 /// Byte positions that are summed side by side: whole pixels of 1 and 3 bytes, and whole vectors of 16.
 const LANES: usize = 48;
 
-/// Bytes that are summed in a turn of the loop: four for each lane.
-const TURN: usize = 4 * LANES;
+/// Bytes that are summed in a turn of the loop: four for each lane. An array of arrays, so that the distance of each vector from the
+/// first stands in the instruction that loads it.
+type Turn = [[u8; LANES]; 4];
 
 /// Turns after which sums of 16 bits must be emptied: 64 * 4 * 255 = 65,280.
 const TURNS: usize = 64;
@@ -50,8 +51,9 @@ pub(super) fn sums(image: &Image<'_>) -> [u64; 3] {
 
 /// Adds each byte of `row` to the lane of its position, modulo [`LANES`].
 fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
-    for block in row.chunks(TURN * TURNS) {
-        let (turns, rest) = block.as_chunks();
+    for block in row.chunks(size_of::<Turn>() * TURNS) {
+        let turns = block.as_chunks().0.as_chunks().0;
+        let rest = &block[size_of_val(turns)..];
         for (lane, sum) in lanes.iter_mut().zip(short_sums(turns)) {
             *lane += u64::from(sum);
         }
@@ -66,13 +68,13 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
 /// Two bytes at a time are a number of 16 bits: the upper bytes are summed, and the whole numbers. What the upper bytes make of the
 /// latter is taken off at the end; modulo 2^16, since that sum wraps. A checked addition would not become a vector's.
 #[inline(never)]
-fn short_sums(turns: &[[u8; TURN]]) -> [u16; LANES] {
+fn short_sums(turns: &[Turn]) -> [u16; LANES] {
     let mut whole = [0_u16; LANES / 2];
     let mut upper = [0_u16; LANES / 2];
     for turn in turns {
         // Or some compilers sum over turns instead, and gather single bytes for that. It changes no result.
         let turn = black_box(turn);
-        for group in turn.as_chunks::<LANES>().0 {
+        for group in turn {
             for (lane, bytes) in group.as_chunks::<2>().0.iter().enumerate() {
                 let number = u16::from_le_bytes(*bytes);
                 whole[lane] = whole[lane].wrapping_add(number);
