@@ -1,7 +1,8 @@
 """Makes this interpreter the host of a Python lambda.
 
-`gleaner-runtime` becomes `python3 -I start.py LIB_GLEANER ARGUMENTS...`, with its own arguments, its name first. The module
-`_gleaner` is loaded from LIB_GLEANER, so that nothing has to be installed and any virtual environment will do.
+`gleaner-runtime` becomes `python3 -I -S start.py LIB_GLEANER ARGUMENTS...`, with its own arguments, its name first. The module
+`_gleaner` is loaded from LIB_GLEANER, so that nothing has to be installed and any virtual environment will do. Nothing of the
+environment is run here: it is the lambda's, and comes when the process is shut, see `gleaner._host`.
 """
 
 from __future__ import annotations
@@ -22,10 +23,6 @@ def main() -> NoReturn:
     # Ctrl-C ends the process. As an exception it would be a fault of the wake that it happens to meet.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
-    try:
-        import numpy  # noqa: F401
-    except ImportError as error:
-        refuse(str(error), f"{sys.executable} -m pip install numpy, or name another interpreter: GLEANER_PYTHON")
     extension = load(sys.argv[1])
     import gleaner
     from gleaner import _host

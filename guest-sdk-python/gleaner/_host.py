@@ -6,6 +6,8 @@ from __future__ import annotations
 import gc
 import importlib.util
 import os
+import re
+import site
 import sys
 import traceback
 from types import ModuleType, TracebackType
@@ -16,7 +18,17 @@ from ._printed import end_call, print_to
 from .context import Context
 from .error import DeadlineExceeded
 
-__all__ = ["attempt", "load", "maker", "own_modules", "print_to", "settle", "tidy"]
+__all__ = [
+    "attempt",
+    "enter_environment",
+    "load",
+    "maker",
+    "numpy_version",
+    "own_modules",
+    "print_to",
+    "settle",
+    "tidy",
+]
 
 Handler = Callable[..., object]
 
@@ -27,11 +39,44 @@ TRACE_ENTRIES = 40
 # Code of this package, which is not what a lambda's author wants to see.
 OURS = os.path.dirname(__file__) + os.sep
 
+# What the environment has for its start was run.
+_entered = False
+
 HANDLERS: Dict[str, str] = {"on_event": "on_event(ctx, event)", "on_tick": "on_tick(ctx)"}
 
 
 class LambdaError(Exception):
     """A file in which there is no lambda for its schedule. The text is for its author, who needs no traceback."""
+
+
+def enter_environment() -> None:
+    """Runs what the environment of this interpreter has for its start, and imports numpy: in the middle of a wake that would cost its
+    deadline. By now the process is shut.
+
+    Raises LambdaError, and whatever the environment raises."""
+    global _entered
+    if sys.flags.no_site and not _entered:
+        site.main()
+    _entered = True
+    try:
+        import numpy  # noqa: F401
+    except ImportError as error:
+        way_out = f"{sys.executable} -m pip install numpy, or name another interpreter: GLEANER_PYTHON"
+        raise LambdaError(f"{error}; {way_out}") from None
+
+
+def numpy_version() -> str:
+    """That of the environment, by the names of what lies there: its code may not run yet."""
+    if "numpy" in sys.modules:
+        return str(sys.modules["numpy"].__version__)
+    # Without `site` this interpreter does not know that it is one of an environment.
+    own = os.path.dirname(os.path.dirname(os.path.abspath(sys.executable)))
+    for folder in filter(os.path.isdir, site.getsitepackages([own, sys.base_prefix])):
+        for name in sorted(os.listdir(folder)):
+            found = re.match(r"numpy-([^-]+?)(?:-py[\d.]+)?\.(?:dist|egg)-info", name)
+            if found:
+                return found.group(1)
+    return "unknown"
 
 
 def load(entry: str, handler: str) -> Callable[[Context], Handler]:

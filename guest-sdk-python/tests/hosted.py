@@ -66,7 +66,7 @@ class Hosted(unittest.TestCase):
         self.assertLessEqual(len(images), len(at_ms))
         drive.write(self.folder / "drive.mcap", images, at_ms)
         arguments = ["gleaner-runtime", "replay", str(self.folder), str(self.folder / "drive.mcap"), "--all"]
-        command = [sys.executable, "-I", str(home.SDK / "start.py"), self.extension, *arguments]
+        command = [sys.executable, "-I", "-S", str(home.SDK / "start.py"), self.extension, *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
     def replay(

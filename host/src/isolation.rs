@@ -19,6 +19,7 @@ pub struct Isolation {
     inside: Inside,
     pulse: Pulse,
     layers: OnceLock<Result<Vec<Layer>, JailError>>,
+    bounded: OnceLock<Option<Layer>>,
 }
 
 /// What is left to a lambda's process.
@@ -46,12 +47,27 @@ impl Isolation {
         let signal = if has_shim { Signal::KILL } else { Signal::TERM };
         set_parent_process_death_signal(Some(signal))
             .map_err(|error| failed("cannot be told of the starter's death", &std::io::Error::from(error)))?;
-        Ok(Self { inside, pulse, layers: OnceLock::new() })
+        Ok(Self { inside, pulse, layers: OnceLock::new(), bounded: OnceLock::new() })
     }
 
     /// The page that the shim looks at.
     pub fn pulse(&self) -> &Pulse {
         &self.pulse
+    }
+
+    /// Bounds the memory of an interpreter, which has its modules by now. An earlier bound holds until then. Once.
+    ///
+    /// # Errors
+    ///
+    /// What keeps that from holding: the lambda must not be let in.
+    pub fn bound_memory(&self) -> Result<(), String> {
+        let layer = self.bounded.get_or_init(|| self.inside.memory.map(memory::limit));
+        match layer {
+            Some(Layer { holds: Holds::No, note, .. }) => {
+                Err(format!("cannot bound the memory of its process: {note}"))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Gives up what the lambda's process does not need any more; gives the layers that were seen to hold, and those that are
@@ -78,8 +94,9 @@ impl Isolation {
             } else {
                 layers.push(files::confine(paths));
             }
-            let counted = || Layer::yes(memory::NAME, "the component's memories are counted as they grow");
-            layers.push(allowed.map_or_else(counted, memory::limit));
+            let bound = allowed.map(|more| format!("a limit of data: {} MiB more than at the start", more >> 20));
+            let counted = "the component's memories are counted as they grow";
+            layers.push(Layer::yes(memory::NAME, bound.as_deref().unwrap_or(counted)));
             layers.extend(alone::stay(allowed.is_some())?);
             Ok(tried::tried(layers))
         });

@@ -1,4 +1,4 @@
-//! What a Python lambda's own environment starts before the lambda, which it brings along as it likes, is shut in already.
+//! What a Python lambda's own environment starts before the lambda, which it brings along as it likes, is shut in as the lambda is.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -8,15 +8,22 @@ use gleaner_tests::{Folder, copy_lambda, program, root, runtime, sample_drive};
 
 /// What `sitecustomize.py` tries, each with the name under which it says what came of it.
 const TRIES: &str = r#"
-import ctypes, os, socket, sys
+import fcntl, os, resource, socket, sys
 
 TRIES = {
     "read": lambda: open("/etc/passwd").read(),
     "write": lambda: open(__file__ + ".more", "w").write("x"),
     "fork": lambda: os.fork() or os._exit(0),
     "program": lambda: os.posix_spawn("/bin/true", ["true"], {}),
+    "other_program": lambda: os.execv(sys.executable, [sys.executable, "-c", ""]),
     "signal": lambda: os.kill(os.getppid(), 0),
     "neighbours": lambda: socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM),
+    "datagrams": lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM),
+    "streams": lambda: socket.socket(socket.AF_INET, socket.SOCK_STREAM, 262),
+    "cores": lambda: os.sched_setaffinity(0, os.sched_getaffinity(0)),
+    "dates": lambda: os.utime(__file__),
+    "lease": lambda: fcntl.fcntl(os.open(__file__, os.O_RDONLY), 1024, fcntl.F_RDLCK),
+    "stack": lambda: resource.setrlimit(resource.RLIMIT_STACK, (1 << 30, 1 << 30)),
     "memory": lambda: os.memfd_create("more"),
     "other_memory": lambda: open(f"/proc/{os.getppid()}/mem", "rb"),
     "room": lambda: len(bytearray(16 << 30)),
@@ -24,7 +31,7 @@ TRIES = {
 for name, attempt in TRIES.items():
     try:
         print(f"<{name}> went: {attempt()!r}"[:200], file=sys.stderr)
-    except (OSError, MemoryError) as error:
+    except (OSError, MemoryError, ValueError):
         print(f"<{name}> refused", file=sys.stderr)
 "#;
 
@@ -61,14 +68,13 @@ fn start_up_code_of_an_environment_is_shut_in_before_it_runs() {
     let lambda = hostile(&folder);
     let tries = TRIES.lines().filter_map(|line| line.strip_prefix("    \"")?.split_once('"')).map(|(name, _)| name);
     let tries: Vec<_> = tries.collect();
-    assert_eq!(tries.len(), 9);
-    let said = start(&lambda, &folder.path().join("out"), true);
-    for name in &tries {
-        assert!(said.contains(&format!("<{name}> refused")), "{name}: {said}");
-    }
-    // Without a shim it makes the page itself that the shim would read, and is not kept from making more of that kind.
-    let said = start(&lambda, &folder.path().join("out"), false);
-    for name in tries.iter().filter(|name| **name != "memory") {
-        assert!(said.contains(&format!("<{name}> refused")), "{name}: {said}");
+    assert_eq!(tries.len(), 16);
+    for with_shim in [true, false] {
+        let said = start(&lambda, &folder.path().join("out"), with_shim);
+        for name in &tries {
+            assert!(said.contains(&format!("<{name}> refused")), "{name}: {said}");
+        }
+        assert!(said.contains("at the start of its environment: No module named 'numpy'; "), "{said}");
+        assert!(said.contains("pip install numpy, or name another interpreter: GLEANER_PYTHON"), "{said}");
     }
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use gleaner_protocol::link::{Add, Control};
 use gleaner_protocol::{Exit, ExitRecord, Failure, Live, Parts};
@@ -20,6 +20,9 @@ const REST: Duration = Duration::from_millis(300);
 
 /// Reports that may wait to be shown. Beyond that they stay in their pipe, and whoever writes them counts what does not go in.
 const UNHEARD: usize = 16;
+
+/// How much longer a process may take than it was told to run; then it is told to end, by a signal.
+const LATE: Duration = Duration::from_secs(10);
 
 /// How a run ended.
 pub(super) enum Ended {
@@ -42,6 +45,8 @@ pub(super) struct Party {
     exit_record: PathBuf,
     recorder: Option<(Process, Control)>,
     ear: Ear,
+    /// How long it was told to run, once it is ready.
+    left: Option<Duration>,
 }
 
 impl Party {
@@ -72,7 +77,7 @@ impl Party {
         let exit_record = arguments::out(args).join(ExitRecord::FILE);
         let shim = Some(arguments::shim(args, &exit_record));
         let runtime = Process::start(&parts, "gleaner-runtime", line, socket, shim, Heard::Runtime, &say)?;
-        Ok(Self { runtime, exit_record, recorder, ear: Ear::new(heard) })
+        Ok(Self { runtime, exit_record, recorder, ear: Ear::new(heard), left })
     }
 
     /// What the lambda's process counted, as it said last.
@@ -82,10 +87,13 @@ impl Party {
 
     /// Shows what they report until they end, which they do when `stop` is raised.
     pub(super) fn attend(&mut self, screen: &mut Screen, stop: &AtomicBool) -> Result<Ended, Failure> {
-        let Self { runtime, exit_record, recorder, ear } = self;
+        let Self { runtime, exit_record, recorder, ear, left } = self;
+        let mut ready: Option<Instant> = None;
         let status = loop {
             ear.look(screen, LOOK);
-            if stop.load(Ordering::Relaxed) {
+            ready = ready.or_else(|| ear.is_ready.then(Instant::now));
+            let is_late = ready.zip(*left).is_some_and(|(ready, left)| ready.elapsed() > left.saturating_add(LATE));
+            if stop.load(Ordering::Relaxed) || is_late {
                 break runtime.end(ear, screen)?;
             }
             if let Some(status) = runtime.status()? {
@@ -124,7 +132,7 @@ impl Party {
             _ => {
                 let record = ExitRecord::read(exit_record).ok();
                 let why = record.as_ref().and_then(ExitRecord::sentence);
-                let killed = record.is_some_and(|record| record.killed.is_some());
+                let killed = record.is_some_and(|record| record.killed.is_some() || record.out_of_memory);
                 Ended::Broken {
                     why: why.map_or_else(
                         || in_words("the lambda's process", status),

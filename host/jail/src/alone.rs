@@ -26,6 +26,9 @@ const NEW_SOCKETS: &[i64] = &[
     libc::SYS_accept4,
     // Those that are open belong to the transport.
     libc::SYS_connect,
+    // With a message files can be sent, of which the kernel counts those on their way for all processes of a user.
+    libc::SYS_sendmsg,
+    libc::SYS_sendmmsg,
 ];
 
 const NEW_PROGRAMS: &[i64] = &[libc::SYS_execve, libc::SYS_execveat];
@@ -76,14 +79,29 @@ const SHARED: &[i64] = &[
     // Landlock has known it since Linux 6.2 only.
     libc::SYS_truncate,
     libc::SYS_setrlimit,
+    // What the user or the system has a few of, and what others would wait for.
+    libc::SYS_inotify_init1,
+    libc::SYS_inotify_add_watch,
+    libc::SYS_fanotify_init,
+    libc::SYS_fanotify_mark,
+    libc::SYS_io_setup,
+    libc::SYS_sync,
+    libc::SYS_syncfs,
     FCHMODAT2,
     SETXATTRAT,
     REMOVEXATTRAT,
     FILE_SETATTR,
 ];
 #[cfg(target_arch = "x86_64")]
-const SHARED_HERE: &[i64] =
-    &[libc::SYS_chmod, libc::SYS_chown, libc::SYS_lchown, libc::SYS_utime, libc::SYS_utimes, libc::SYS_futimesat];
+const SHARED_HERE: &[i64] = &[
+    libc::SYS_chmod,
+    libc::SYS_chown,
+    libc::SYS_lchown,
+    libc::SYS_utime,
+    libc::SYS_utimes,
+    libc::SYS_futimesat,
+    libc::SYS_inotify_init,
+];
 #[cfg(not(target_arch = "x86_64"))]
 const SHARED_HERE: &[i64] = &[];
 
@@ -94,10 +112,13 @@ const SETXATTRAT: i64 = 463;
 const REMOVEXATTRAT: i64 = 466;
 const FILE_SETATTR: i64 = 469;
 
-/// Requests of `fcntl` that have the kernel send signals to others.
-const OWNERS: [u64; 3] = [8, 10, 15];
+/// Requests of `fcntl` that have the kernel send signals to others, and leases and watches, for which others wait.
+const REQUESTS_OF_FILES: [u64; 5] = [8, 10, 15, 1024, 1026];
 /// Requests of `ioctl`: the same for sockets, and typing into somebody's terminal.
 const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
+
+/// Types of sockets that DDS has no use for: streams above all, which may connect.
+const TYPES: [u64; 5] = [1, 4, 5, 6, 10];
 
 /// Families of sockets that Linux knows, with some to come.
 const FAMILIES: i32 = 64;
@@ -133,12 +154,11 @@ fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
         .calls(PIDFDS)
         .calls(SHARED)
         .calls(SHARED_HERE)
-        // Limits of others, and its own to larger ones.
+        // Limits of others. Its own can only become smaller.
         .unless(libc::SYS_prlimit64, 0, 0)
-        .with_pointer(libc::SYS_prlimit64, 2)
         // Else it would outlive `gleaner-shim`, which watches it.
         .bits(libc::SYS_prctl, 0, ALL, libc::PR_SET_PDEATHSIG as u64);
-    for request in OWNERS {
+    for request in REQUESTS_OF_FILES {
         refused = refused.bits(libc::SYS_fcntl, 1, ALL, request);
     }
     for request in REQUESTS {
@@ -172,12 +192,17 @@ fn install_before(only_counted_memory: bool) -> Result<(), JailError> {
             refused = refused.bits(libc::SYS_socket, 0, ALL, u64::from(family.unsigned_abs()));
         }
     }
+    for kind in TYPES {
+        refused = refused.bits(libc::SYS_socket, 1, TYPE, kind);
+    }
     install(&Refused::no_clone3()?)?;
     install(&refused.filter(libc::EPERM)?)
 }
 
 fn no_processes(refused: Refused) -> Refused {
-    refused.calls(NEW_PROCESSES).bits(libc::SYS_clone, 0, libc::CLONE_THREAD as u64, 0)
+    let clone = |refused: Refused, flag: i32| refused.bits(libc::SYS_clone, 0, flag as u64, 0);
+    // A thread with files of its own would have as many as a process.
+    clone(clone(refused.calls(NEW_PROCESSES), libc::CLONE_THREAD), libc::CLONE_FILES)
 }
 
 fn no_signals(refused: Refused) -> Refused {
@@ -185,14 +210,15 @@ fn no_signals(refused: Refused) -> Refused {
     refused.calls(SIGNALS).unless(libc::SYS_kill, 0, me).unless(libc::SYS_tgkill, 0, me)
 }
 
-/// No memory but that of the process itself.
+/// No memory but that of the process itself; that of the stack, moved elsewhere, would still count as stack.
 fn counted_only(refused: Refused) -> Refused {
     let shared = (libc::MAP_SHARED | libc::MAP_ANONYMOUS) as u64;
     let down = libc::MAP_GROWSDOWN as u64;
-    refused
-        .bits(libc::SYS_mmap, 3, shared, shared)
-        .bits(libc::SYS_mmap, 3, down, down)
-        .calls(&[libc::SYS_memfd_create, MEMFD_SECRET])
+    refused.bits(libc::SYS_mmap, 3, shared, shared).bits(libc::SYS_mmap, 3, down, down).calls(&[
+        libc::SYS_memfd_create,
+        MEMFD_SECRET,
+        libc::SYS_mremap,
+    ])
 }
 
 /// Of pairs of sockets only streams: with others one can send to whoever has a name.

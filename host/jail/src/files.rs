@@ -34,8 +34,9 @@ const SYSTEM: [&str; 14] = [
     "/sys/class/net",
     "/sys/devices/virtual/net",
 ];
-/// Devices that everybody may use.
-const DEVICES: [&str; 5] = ["/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom"];
+/// Devices that everybody may use. Who may write to that of zeros could share it as memory, which no limit counts.
+const DEVICES: [&str; 4] = ["/dev/zero", "/dev/full", "/dev/random", "/dev/urandom"];
+const NOTHING: [&str; 1] = ["/dev/null"];
 
 /// What may be opened, beside the system's programs and libraries. What does not exist is left out.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -90,7 +91,7 @@ fn restrict_writes(paths: &[PathBuf]) -> Result<(), JailError> {
         .set_compatibility(CompatLevel::BestEffort)
         .handle_access(write)?
         .create()?
-        .add_rules(path_beneath_rules(DEVICES, write))?
+        .add_rules(path_beneath_rules(NOTHING, write))?
         .add_rules(path_beneath_rules(paths, write))?
         .restrict_self()?;
     Ok(())
@@ -106,7 +107,8 @@ fn restrict(paths: &Paths) -> Result<Layer, JailError> {
         .scope(Scope::from_all(RULES))?
         .create()?
         .add_rules(path_beneath_rules(SYSTEM, read))?
-        .add_rules(path_beneath_rules(DEVICES, all))?
+        .add_rules(path_beneath_rules(DEVICES, read))?
+        .add_rules(path_beneath_rules(NOTHING, all))?
         .add_rules(path_beneath_rules(&paths.read, read))?
         .add_rules(path_beneath_rules(&paths.write, all))?
         .restrict_self()?;

@@ -39,11 +39,6 @@ impl Refused {
         self.when(call, index, SeccompCmpOp::Ne, value)
     }
 
-    /// Refuses `call` if its argument `index`, a pointer, is there.
-    pub(crate) fn with_pointer(self, call: i64, index: u8) -> Self {
-        self.of_width(call, index, SeccompCmpArgLen::Qword, SeccompCmpOp::Ne, 0)
-    }
-
     fn when(self, call: i64, index: u8, operator: SeccompCmpOp, value: u64) -> Self {
         // Flags, process numbers and requests are `int`s: the kernel looks at the lower half only, and so must we.
         self.of_width(call, index, SeccompCmpArgLen::Dword, operator, value)

@@ -54,7 +54,7 @@ pub(crate) fn over<'py>(frame: &Bound<'py, Frame>) -> PyResult<Bound<'py, PyAny>
         1 => dtype::<u8>(py),
         _ => PyArrayDescr::new(py, if info.big_endian { ">u2" } else { "<u2" })?,
     };
-    // SAFETY: `import` of this module imported numpy. `dims` and `strides` have `count` entries or more and are copied. All
+    // SAFETY: `enter_environment` imported numpy. `dims` and `strides` have `count` entries or more and are copied. All
     // elements lie within `bytes`, as checked above, and flags of 0 forbid writing. The reference to `descr` is given away.
     let array = unsafe {
         let array = PY_ARRAY_API.PyArray_NewFromDescr(

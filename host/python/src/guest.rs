@@ -219,6 +219,16 @@ impl From<PyErr> for Raised {
 }
 
 impl Guest for PythonGuest {
+    fn prepare(&mut self) -> Result<(), Fault> {
+        Python::attach(|py| {
+            let enter = || {
+                let enter = self.host.getattr(py, "enter_environment")?;
+                self.attempt(py, self.allowed.init, (self.allowed.init.as_secs_f64(), enter)).map(drop)
+            };
+            enter().map_err(|raised: Raised| raised.fault("at the start of its environment: "))
+        })
+    }
+
     fn init(&mut self) -> Result<(), Fault> {
         Python::attach(|py| {
             self.live = None;
@@ -240,7 +250,7 @@ impl Guest for PythonGuest {
         Python::attach(|py| {
             let version = Python::version_str();
             let python = version.split(' ').next().unwrap_or(version);
-            let numpy = py.import("numpy").and_then(|numpy| numpy.getattr("__version__")).map(|it| it.to_string());
+            let numpy = self.host.call_method0(py, "numpy_version").and_then(|version| version.extract::<String>(py));
             format!("Python {python}, numpy {}", numpy.as_deref().unwrap_or("unknown"))
         })
     }

@@ -21,7 +21,7 @@ mod trigger;
 
 use pyo3::prelude::*;
 
-/// What `start.py` loads. It needs numpy from the start: an import in the middle of a wake would cost its deadline.
+/// What `start.py` loads, before anything of the lambda's environment: `gleaner._host` imports numpy, once the process is shut.
 #[pymodule]
 mod _gleaner {
     use super::*;
@@ -41,7 +41,6 @@ mod _gleaner {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        module.py().import("numpy")?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

@@ -16,6 +16,15 @@ use crate::api::data::Wake;
 
 /// A lambda that can be woken.
 pub trait Guest {
+    /// Runs what comes before the lambda and is as foreign as it. Called once, before the first `init`.
+    ///
+    /// # Errors
+    ///
+    /// The fault that ended it.
+    fn prepare(&mut self) -> Result<(), Fault> {
+        Ok(())
+    }
+
     /// Runs `init`. Called once before the first wake; a guest repeats it by itself after a fault.
     ///
     /// # Errors

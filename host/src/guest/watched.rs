@@ -51,11 +51,11 @@ impl Watched {
 
 impl Guest for Watched {
     fn init(&mut self) -> Result<(), Fault> {
-        self.isolation.close().map_err(|failure| {
-            let message = [failure.message, failure.causes.join(": ")].join(": ");
-            Fault { kind: FaultKind::HostCall, message, used: None, allowed: None }
-        })?;
+        let loose = |message| Fault { kind: FaultKind::HostCall, message, used: None, allowed: None };
+        self.isolation.close().map_err(|failure| loose([failure.message, failure.causes.join(": ")].join(": ")))?;
         let _busy = self.isolation.pulse().busy(Doing::Init, self.patience.init, 0);
+        self.guest.prepare()?;
+        self.isolation.bound_memory().map_err(loose)?;
         self.guest.init()
     }
 

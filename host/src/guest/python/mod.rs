@@ -1,6 +1,6 @@
 //! Python lambdas: this process becomes the interpreter of the lambda's environment.
 //!
-//! `gleaner-runtime` links no libpython. It replaces itself by `python3 -I start.py`, which loads `_gleaner` (crate
+//! `gleaner-runtime` links no libpython. It replaces itself by `python3 -I -S start.py`, which loads `_gleaner` (crate
 //! `host/python`), and that runs the same library again, now inside the interpreter. So any virtual environment works.
 
 use std::ffi::OsString;
@@ -58,9 +58,10 @@ fn interpreter(lambda_dir: &Path, args: &[OsString], mut inside: Inside) -> Resu
     let mut command = Command::new(&python);
     // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.
     let (home, extension) = (parts.python_home()?, parts.extension()?);
-    command.arg("-I").arg(home.join("start.py")).arg(&extension).args(args);
+    // Without `site`: what the environment starts by itself is the lambda's, and waits until this process is shut.
+    command.args(["-I", "-S"]).arg(home.join("start.py")).arg(&extension).args(args);
     inside.paths.read.extend([home, extension]);
-    // From its first line on the interpreter runs code of its environment, which is the lambda's.
+    // It may be any program that calls itself Python, and its libraries are found by what lies around it.
     command.env(LAYERS_ENV, isolation::before_interpreter(inside, &python)).env_remove(CGROUP_ENV);
     for name in ONE_THREAD {
         if std::env::var_os(name).is_none() {

@@ -1,7 +1,6 @@
 //! Frames that wait for the recorder.
 
 use std::collections::VecDeque;
-use std::io::IoSlice;
 
 use super::frame::HEAD;
 
@@ -9,7 +8,7 @@ use super::frame::HEAD;
 const MISSING: std::ops::Range<usize> = HEAD + 8..HEAD + 12;
 
 /// Frames that are sent together.
-pub(super) const TOGETHER: usize = 64;
+const TOGETHER: usize = 64;
 
 /// Wakes that wait, oldest first, in at most so many bytes.
 #[derive(Debug)]
@@ -90,15 +89,14 @@ impl Queue {
         self.frames.front().map(|frame| &frame.bytes[self.sent..])
     }
 
-    /// What is to be sent next, and what follows it: into `slices`, of which the first so many are filled.
-    pub(super) fn together<'a>(&'a self, slices: &mut [IoSlice<'a>; TOGETHER]) -> usize {
+    /// What is to be sent next, and what follows it, instead of what is in `bytes`.
+    pub(super) fn together(&self, bytes: &mut Vec<u8>) {
+        bytes.clear();
         let mut from = self.sent;
-        let count = self.frames.len().min(TOGETHER);
-        for (slice, frame) in slices.iter_mut().zip(&self.frames) {
-            *slice = IoSlice::new(&frame.bytes[from..]);
+        for frame in self.frames.iter().take(TOGETHER) {
+            bytes.extend_from_slice(&frame.bytes[from..]);
             from = 0;
         }
-        count
     }
 
     /// So much of that was sent.
@@ -171,11 +169,9 @@ mod tests {
         let mut queue = Queue::new(1 << 20);
         let all: Vec<u8> = (0..100).flat_map(wake).collect();
         (0..100).for_each(|number| assert!(queue.push(&wake(number), 0)));
-        let mut sent = Vec::new();
+        let (mut sent, mut bytes) = (Vec::new(), Vec::new());
         for step in (1..).map(|n| n * 37 % 500) {
-            let mut slices = [IoSlice::new(&[]); TOGETHER];
-            let count = queue.together(&mut slices);
-            let bytes: Vec<u8> = slices[..count].iter().flat_map(|slice| slice.to_vec()).collect();
+            queue.together(&mut bytes);
             let step = step.min(bytes.len());
             sent.extend_from_slice(&bytes[..step]);
             queue.sent(step);

@@ -1,16 +1,16 @@
 //! From a lambda's process to the recorder.
 
-use std::io::{self, IoSlice};
+use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
 use rustix::io::Errno;
-use rustix::net::{RecvFlags, SendAncillaryBuffer, SendFlags, recv, send, sendmsg};
+use rustix::net::{RecvFlags, SendFlags, recv, send};
 
 use super::LinkError;
 use super::frame::{self, HEAD, tag};
-use super::queue::{Queue, TOGETHER};
+use super::queue::Queue;
 use crate::ToRecorder;
 use crate::journal::{Encoder, Entry, Header};
 
@@ -47,6 +47,8 @@ pub struct RecorderLink {
     encoder: EncoderOf,
     frame: Vec<u8>,
     queue: Queue,
+    /// What is sent together. Not as slices: with what sends these, files could be sent, and a lambda's process may not.
+    together: Vec<u8>,
     /// What came and is not a whole frame.
     heard: Vec<u8>,
 }
@@ -68,6 +70,7 @@ impl RecorderLink {
             encoder: EncoderOf(Encoder::new(0)),
             frame: Vec::new(),
             queue: Queue::new(WAITING),
+            together: Vec::new(),
             heard: Vec::new(),
         }
     }
@@ -176,11 +179,8 @@ impl RecorderLink {
 
     fn flush(&mut self) -> Result<(), LinkError> {
         while self.queue.bytes() > 0 {
-            let mut slices = [IoSlice::new(&[]); TOGETHER];
-            let count = self.queue.together(&mut slices);
-            let mut nothing = SendAncillaryBuffer::default();
-            let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
-            match sendmsg(&self.socket, &slices[..count], &mut nothing, flags) {
+            self.queue.together(&mut self.together);
+            match send(&self.socket, &self.together, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
                 Ok(sent) => self.queue.sent(sent),
                 Err(Errno::AGAIN) => return Ok(()),
                 Err(Errno::INTR) => {}

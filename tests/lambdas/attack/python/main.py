@@ -164,6 +164,38 @@ class Lambda:
     def uncounted(self, ctx: Context) -> object:
         return mmap.mmap(-1, 1 << 30)
 
+    def moved_stack(self, ctx: Context) -> object:
+        """The stack counts as no data, wherever it is."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.mremap.restype = ctypes.c_void_p
+        with open("/proc/self/maps") as maps:
+            line = next(line for line in maps if line.endswith("[stack]\n"))
+        page, may_move = int(line.split("-")[0], 16), 1
+        moved = libc.mremap(ctypes.c_void_p(page), ctypes.c_size_t(4096), ctypes.c_size_t(1 << 30), may_move)
+        if moved == ctypes.c_void_p(-1).value:
+            raise OSError(ctypes.get_errno(), "mremap")
+        return moved
+
+    def zeros(self, ctx: Context) -> object:
+        return mmap.mmap(os.open("/dev/zero", os.O_RDWR), 1 << 30)
+
+    def lease(self, ctx: Context) -> object:
+        """Whoever wants to open the file would wait for us."""
+        lease = 1024
+        return fcntl.fcntl(os.open(__file__, os.O_RDONLY), lease, fcntl.F_RDLCK)
+
+    def in_flight(self, ctx: Context) -> object:
+        """Of files on their way the kernel counts those of all processes of a user."""
+        ours, _theirs = socket.socketpair()
+        return socket.send_fds(ours, [b"x"], [0])
+
+    def watch(self, ctx: Context) -> object:
+        libc = ctypes.CDLL(None, use_errno=True)
+        watch = libc.inotify_init1(0)
+        if watch < 0:
+            raise OSError(ctypes.get_errno(), "inotify_init1")
+        return watch
+
     def replace(self, ctx: Context) -> None:
         os.execv("/bin/true", ["true"])
 
