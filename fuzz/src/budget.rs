@@ -2,6 +2,8 @@
 //! the program, and so is a finding, however short the memory would have been used.
 
 use std::alloc::System;
+use std::panic;
+use std::sync::Once;
 
 use cap::Cap;
 
@@ -12,10 +14,21 @@ static ALLOCATOR: Cap<System> = Cap::new(System, usize::MAX);
 ///
 /// Where several threads allocate, it is all of them together.
 pub fn within<T>(bytes: usize, read: impl FnOnce() -> T) -> T {
+    static TELLS: Once = Once::new();
+    TELLS.call_once(no_limit_for_panics);
     limit(ALLOCATOR.allocated().saturating_add(bytes));
     let value = read();
     limit(usize::MAX);
     value
+}
+
+/// Saying where a panic comes from takes memory, too; without it the program would wait for itself instead.
+fn no_limit_for_panics() {
+    let tell = panic::take_hook();
+    panic::set_hook(Box::new(move |what| {
+        limit(usize::MAX);
+        tell(what);
+    }));
 }
 
 fn limit(bytes: usize) {

@@ -6,13 +6,17 @@ use gleaner_fuzz::TARGETS;
 fn all_seeds_keep_all_promises_also_when_they_are_cut_off() {
     for target in TARGETS {
         let seeds = (target.seeds)();
+        let Some(check) = target.check else {
+            println!("{}: skipped, since this is built without its feature", target.name);
+            continue;
+        };
         assert!(seeds.len() >= 3, "{}", target.name);
         for (number, seed) in seeds.iter().enumerate() {
             // libFuzzer would cut it off.
             assert!(seed.len() <= target.longest, "seed {number} for {} has {} bytes", target.name, seed.len());
-            assert!((target.check)(seed), "seed {number} for {} is not sound", target.name);
+            assert!(check(seed), "seed {number} for {} is not sound", target.name);
             for part in 0..8 {
-                (target.check)(&seed[..seed.len() * part / 8]);
+                check(&seed[..seed.len() * part / 8]);
             }
         }
     }

@@ -15,10 +15,17 @@ use std::thread;
 use gleaner_protocol::{Exit, Failure};
 
 use crate::checkout::Checkout;
+use crate::setup;
 use crate::steps::{self, Steps};
 
 /// The targets. The rest about them is known to `gleaner-fuzz`, which would take too long to be built for this.
-const TARGETS: [&str; 7] = ["message", "drive", "bag", "image", "journal", "link", "manifest"];
+const TARGETS: [&str; 8] = ["message", "drive", "bag", "image", "journal", "link", "manifest", CALLS];
+
+/// The target that runs a lambda. It needs that lambda compiled, and the host, which takes minutes to be built.
+const CALLS: &str = "calls";
+/// The lambda of [`CALLS`], and where its native code is kept, as for tests.
+const DRIVER: &str = "tests/lambdas/driver/rust";
+const CACHE: &str = "target/test-cache/gleaner";
 
 /// How the compiler counts which code was reached, and what was compared with what.
 const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
@@ -26,7 +33,7 @@ const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-leve
                      -Cllvm-args=-sanitizer-coverage-trace-compares -Cdebug-assertions -Coverflow-checks --cfg fuzzing";
 
 const USAGE: &str = "usage: cargo xtask fuzz [TARGET...] [--seconds N] [--seed N]
-targets: message, drive, bag, image, journal, link, manifest; those named, or all, for N seconds each (60),
+targets: message, drive, bag, image, journal, link, manifest, calls; those named, or all, for N seconds each (60),
 as many at once as there are cores.
 With a seed, runs of the same programs from the same inputs go the same way.";
 
@@ -40,9 +47,14 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
         seconds: asked.seconds,
         seed: asked.seed,
     };
-    let mut steps = Steps::of(3);
+    let calls = asked.targets.contains(&CALLS);
+    let mut steps = Steps::of(3 + usize::from(calls));
+    if calls {
+        steps.begin("the lambda whose calls are made up (the first time this takes minutes)");
+        driver(checkout)?;
+    }
     steps.begin("programs, instrumented (the first time this takes minutes)");
-    let programs = fuzz.programs()?;
+    let programs = fuzz.programs(&asked.targets)?;
     steps.begin("inputs to begin with");
     fuzz.seeds()?;
     steps.begin(&format!("{} s for each of: {}", asked.seconds, asked.targets.join(", ")));
@@ -84,6 +96,22 @@ impl Asked {
     }
 }
 
+/// Builds the lambda of [`CALLS`], and compiles it for this machine: the target has no compiler in it.
+fn driver(checkout: &Checkout) -> Result<(), Failure> {
+    setup::target(checkout, setup::TARGET)?;
+    // Of all that is built by default, as there, so that nothing is built twice.
+    let mut build = checkout.cargo();
+    build.args(["build", "--release", "--bin", "gleaner", "--bin", "gleaner-compile"]);
+    steps::run(
+        &mut build,
+        "if a linker or a C compiler is missing, install one (`cc`); else see the first error above",
+    )?;
+    setup::lambdas(checkout, &[PathBuf::from(DRIVER)])?;
+    let mut compile = checkout.command(checkout.program("gleaner-compile"));
+    let code = checkout.path(DRIVER).join("build/driver.wasm");
+    steps::run(compile.arg(code).arg("--cache").arg(checkout.path(CACHE)), "see the error above")
+}
+
 struct Fuzz<'c> {
     checkout: &'c Checkout,
     build: PathBuf,
@@ -93,16 +121,19 @@ struct Fuzz<'c> {
 }
 
 impl Fuzz<'_> {
-    /// Builds the programs; returns where they are.
-    fn programs(&self) -> Result<PathBuf, Failure> {
+    /// Builds the programs of these targets; returns where they are.
+    fn programs(&self, names: &[&str]) -> Result<PathBuf, Failure> {
         let mut rustc = self.checkout.command(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
         let machine = steps::output(rustc.args(["--print", "host-tuple"]), "install Rust with rustup")?;
         let machine = machine.trim();
         let mut build = self.checkout.cargo();
         // With a target named, flags are for it alone, and not for the programs that run while building.
         build.args(["build", "--release", "-p", "gleaner-fuzz", "--target", machine]);
-        for name in TARGETS {
+        for name in names {
             build.args(["--bin", &format!("fuzz-{name}")]);
+        }
+        if names.contains(&CALLS) {
+            build.args(["--features", CALLS]);
         }
         build.env("CARGO_TARGET_DIR", &self.build).env("RUSTFLAGS", FLAGS).env_remove("CARGO_ENCODED_RUSTFLAGS");
         steps::run(&mut build, "if a C++ compiler is missing, install one (`c++`); else see the first error above")?;

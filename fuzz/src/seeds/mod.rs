@@ -1,6 +1,7 @@
 //! What a fuzzer begins with: small sound inputs, made anew when they are needed, so that none has to be kept.
 
 pub mod bag;
+pub mod calls;
 pub mod drive;
 pub mod image;
 pub mod journal;

@@ -21,11 +21,14 @@ struct Args {
     /// Give every NaN the same bits on every CPU.
     #[arg(long)]
     deterministic: bool,
+    /// End after so many seconds of CPU time: not more than this is allowed.
+    #[arg(long, value_name = "N", default_value_t = COMPILE_CPU_SECONDS, value_parser = clap::value_parser!(u64).range(1..=COMPILE_CPU_SECONDS))]
+    cpu_seconds: u64,
 }
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    bound_this_process();
+    bound_this_process(args.cpu_seconds);
     let nans = if args.deterministic { Nans::Canonical } else { Nans::AsMade };
     match confine_to(&args).and_then(|()| gleaner_compile::compile(&args.component, &args.cache, nans)) {
         Ok(entry) => {
@@ -51,9 +54,10 @@ fn confine_to(args: &Args) -> Result<(), CompileError> {
 }
 
 /// Past these limits an allocation fails, or the kernel ends this process; whoever started it says so.
-fn bound_this_process() {
-    let limit = |value| Rlimit { current: Some(value), maximum: Some(value) };
+fn bound_this_process(cpu_seconds: u64) {
+    let limit = |value, hard| Rlimit { current: Some(value), maximum: Some(hard) };
     // They only tighten, so they fail only where something tighter holds already.
-    let _ = setrlimit(Resource::As, limit(COMPILE_MEMORY_BYTES));
-    let _ = setrlimit(Resource::Cpu, limit(COMPILE_CPU_SECONDS));
+    let _ = setrlimit(Resource::As, limit(COMPILE_MEMORY_BYTES, COMPILE_MEMORY_BYTES));
+    // The first comes with a signal by which whoever started this knows the limit; the second cannot be ignored.
+    let _ = setrlimit(Resource::Cpu, limit(cpu_seconds, cpu_seconds + 1));
 }

@@ -2,6 +2,7 @@
 #![allow(unsafe_code)]
 
 use std::os::fd::AsRawFd;
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -30,13 +31,15 @@ pub enum WasmError {
     Start { program: PathBuf, source: std::io::Error },
     #[error("cannot compile component `{}`", path.display())]
     Compiler { path: PathBuf, source: CompilerSaid },
+    #[error("cannot compile component `{}`", path.display())]
+    Limit { path: PathBuf, source: CompilerSaid },
     #[error("cannot load native code `{}`", path.display())]
     Load { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
     #[error("component `{}` does not fit the world `gleaner:lambda/lambda`", path.display())]
     World { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
 }
 
-/// What `gleaner-compile` wrote when it failed.
+/// What `gleaner-compile` wrote when it failed, or which of its limits ended it.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct CompilerSaid(String);
@@ -52,6 +55,9 @@ impl Explain for WasmError {
                     .to_owned(),
             ),
             Self::Compiler { .. } => Some("build the lambda again: gleaner build DIR".to_owned()),
+            Self::Limit { .. } => {
+                Some("leave out what the lambda does not need, or move data to files of a model".to_owned())
+            }
             Self::Load { path, .. } => Some(format!("delete it, it will be made again: rm '{}'", path.display())),
             Self::Start { .. } => None,
         }
@@ -61,7 +67,7 @@ impl Explain for WasmError {
         match self {
             Self::Compile(error) => error.exit(),
             Self::Parts(error) => error.exit(),
-            Self::Compiler { .. } | Self::World { .. } => Exit::Usage,
+            Self::Compiler { .. } | Self::Limit { .. } | Self::World { .. } => Exit::Usage,
             Self::Start { .. } | Self::Load { .. } => Exit::Internal,
         }
     }
@@ -149,11 +155,15 @@ fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
     if output.status.success() {
         return Ok(());
     }
-    if output.status.code().is_none() {
+    if let Some(signal) = output.status.signal() {
         // Ended by a signal: it ran into its limits.
         let memory = COMPILE_MEMORY_BYTES >> 20;
-        let said = format!("it takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s to compile");
-        return Err(WasmError::Compiler { path: path.to_owned(), source: CompilerSaid(said) });
+        let said = match signal {
+            libc::SIGXCPU => format!("it takes more than {COMPILE_CPU_SECONDS} s of CPU time to compile"),
+            libc::SIGABRT => format!("it takes more than {memory} MiB of memory to compile"),
+            _ => format!("it takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s to compile"),
+        };
+        return Err(WasmError::Limit { path: path.to_owned(), source: CompilerSaid(said) });
     }
     let said = String::from_utf8_lossy(&output.stderr);
     let said = said.trim().trim_start_matches("error: ").to_owned();

@@ -26,7 +26,11 @@ impl Lambda for Misbehave {
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         self.wakes += 1;
-        match self.behaviour.as_str() {
+        let behaviour = match self.behaviour.as_str() {
+            "now_and_then" => now_and_then(input("imu")?.counts().received),
+            other => other,
+        };
+        match behaviour {
             "error" => return Err(Error::new("I do not want to")),
             "panic" => panic!("wake {} is one too many", self.wakes),
             "endless" => loop {
@@ -63,12 +67,33 @@ impl Lambda for Misbehave {
                 event("nan", 0.0).with("bits", format!("{:016x}", (a / b).to_bits()).as_str()).send()?;
             }
             "hold" => self.held.push(sample),
+            "measure" => {
+                let x = sample.number(&input("imu")?.field("linear_acceleration.x")?)?;
+                let measured = event("measured", (x * self.wakes as f64).sin()).with("x", x);
+                // In a minute there are more of them than are allowed.
+                log::info(&format!("{:?} of {x}", measured.send()));
+            }
             "log_flood" => (0..1000).for_each(|i| log::info(&format!("line {i}"))),
             "print" => println!("hello from {}", self.wakes),
             "ok" => {}
             other => return Err(Error::new(format!("unknown behaviour `{other}`"))),
         }
         Ok(())
+    }
+}
+
+/// What to do after so many samples: mostly work, but each kind of fault again and again.
+fn now_and_then(received: u64) -> &'static str {
+    match received % 64 {
+        7 => "panic",
+        17 => "error",
+        27 => "endless",
+        37 => "memory",
+        47 => "recurse",
+        52 => "sleep",
+        57 => "event_then_panic",
+        60 => "log_flood",
+        _ => "measure",
     }
 }
 
