@@ -8,7 +8,7 @@ use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 pub use gleaner_protocol::grouped;
-use gleaner_protocol::{Clip, Decision, Exit, Explain, Trigger, visible};
+use gleaner_protocol::{Clip, Decision, Exit, Explain, Trigger, own_file, visible};
 use serde::de::DeserializeOwned;
 
 /// Why results cannot be read.
@@ -92,12 +92,7 @@ pub fn clips(out: &Path) -> Result<Vec<Clip>, ResultsError> {
 impl<T> JsonLines<T> {
     /// The lines of the file `path`.
     pub(crate) fn read(path: PathBuf) -> Result<Self, ResultsError> {
-        // A pipe in the place of a file would be waited for.
-        let opened = path.metadata().and_then(|found| match found.is_file() {
-            true => File::open(&path),
-            false => Err(io::Error::other("it is no file")),
-        });
-        match opened {
+        match own_file::read(&path) {
             Ok(file) => {
                 Ok(Self { path, reader: Some(BufReader::new(file)), text: Vec::new(), line: 0, of: PhantomData })
             }
