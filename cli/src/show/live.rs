@@ -35,7 +35,7 @@ pub(crate) fn topics(topics: &[TopicSeen]) -> String {
             visible(&topic.type_name),
             topic.writers.to_string(),
             topic.readers.to_string(),
-            topic.qos.join("; "),
+            visible(&topic.qos.join("; ")),
         ]
     });
     let head = ["topic", "type", "writers", "readers", "quality of service"].map(str::to_owned);
