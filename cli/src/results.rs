@@ -281,6 +281,18 @@ mod tests {
     }
 
     #[test]
+    fn a_pipe_or_a_link_in_the_place_of_results_is_refused_and_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let [decisions, clips_list] = ["decisions.jsonl", "clips.jsonl"].map(|name| folder.path().join(name));
+        assert!(std::process::Command::new("mkfifo").arg(&decisions).status().unwrap().success());
+        std::os::unix::fs::symlink("/etc/passwd", &clips_list).unwrap();
+        let errors = [Decisions::open(folder.path()).err(), clips(folder.path()).err()];
+        let texts = errors.map(|error| gleaner_protocol::Failure::from(error.unwrap()).to_string());
+        assert!(texts[0].contains("decisions.jsonl`") && texts[0].contains("it is no file"), "{}", texts[0]);
+        assert!(texts[1].contains("clips.jsonl`") && texts[1].contains("it is a link"), "{}", texts[1]);
+    }
+
+    #[test]
     fn times_at_the_ends_of_the_range_do_not_overflow() {
         assert!(seconds(i64::MIN, i64::MAX) < 0.0);
         assert_eq!(seconds(1_500_000_000, 0), 1.5);

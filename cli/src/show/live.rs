@@ -275,6 +275,19 @@ mod tests {
     }
 
     #[test]
+    fn what_a_network_says_of_a_topic_cannot_act_on_the_terminal() {
+        let seen = TopicSeen {
+            topic: "/a\u{1b}[2J".to_owned(),
+            type_name: "t\u{1b}".to_owned(),
+            writers: 1,
+            readers: 0,
+            qos: vec!["reliable\u{1b}]0;".to_owned()],
+        };
+        let text = topics(&[seen]);
+        assert!(!text.contains('\u{1b}') && text.contains("reliable\\u{1b}]0;"), "{text}");
+    }
+
+    #[test]
     fn what_the_network_of_a_recorder_lost_is_shown() {
         let network = Network {
             domain: 7,

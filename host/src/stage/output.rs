@@ -248,7 +248,8 @@ mod tests {
     #[test]
     fn what_is_no_file_of_ours_is_refused_in_words_and_left_as_it_is() {
         use std::os::unix::fs::symlink;
-        let put: [(fn(&Path, &Path), &str); 3] = [
+        type Put = (fn(&Path, &Path), &'static str);
+        let put: [Put; 3] = [
             (|precious, path| symlink(precious, path).unwrap(), "it is a link"),
             (|precious, path| fs::hard_link(precious, path).unwrap(), "the file has other names"),
             (
