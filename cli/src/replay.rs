@@ -21,8 +21,12 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
 
 /// Replays. How the runtime ended, and whether there are results of this replay: a lambda that could not start leaves those of before.
 pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
-    let (heard, exit) = runtime::run(arguments(args))?;
+    let (mut heard, exit) = runtime::run(arguments(args))?;
     let has_results = heard.is_some();
+    if let Some(Heard::Summary(summary)) = &mut heard {
+        // Not where the report says: it comes from the lambda's process.
+        summary.out = args.out.clone().unwrap_or_else(|| args.asked.lambda.join("out"));
+    }
     let report = match &heard {
         Some(Heard::Summary(summary)) => report_of(&summary.out, args.no_report),
         _ => None,

@@ -8,7 +8,7 @@ use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 pub use gleaner_protocol::grouped;
-use gleaner_protocol::{Clip, Decision, Exit, Explain, Trigger, visible};
+use gleaner_protocol::{Clip, Decision, Exit, Explain, Trigger, own_file, visible};
 use serde::de::DeserializeOwned;
 
 /// Why results cannot be read.
@@ -92,12 +92,7 @@ pub fn clips(out: &Path) -> Result<Vec<Clip>, ResultsError> {
 impl<T> JsonLines<T> {
     /// The lines of the file `path`.
     pub(crate) fn read(path: PathBuf) -> Result<Self, ResultsError> {
-        // A pipe in the place of a file would be waited for.
-        let opened = path.metadata().and_then(|found| match found.is_file() {
-            true => File::open(&path),
-            false => Err(io::Error::other("it is no file")),
-        });
-        match opened {
+        match own_file::read(&path) {
             Ok(file) => {
                 Ok(Self { path, reader: Some(BufReader::new(file)), text: Vec::new(), line: 0, of: PhantomData })
             }
@@ -283,6 +278,18 @@ mod tests {
         assert!(matches!(lines[2], Err(ResultsError::Long { line: 3, .. })));
         assert!(matches!(lines[3], Err(ResultsError::Long { line: 4, .. })));
         assert!(matches!(lines[4], Ok(5)));
+    }
+
+    #[test]
+    fn a_pipe_or_a_link_in_the_place_of_results_is_refused_and_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let [decisions, clips_list] = ["decisions.jsonl", "clips.jsonl"].map(|name| folder.path().join(name));
+        assert!(std::process::Command::new("mkfifo").arg(&decisions).status().unwrap().success());
+        std::os::unix::fs::symlink("/etc/passwd", &clips_list).unwrap();
+        let errors = [Decisions::open(folder.path()).err(), clips(folder.path()).err()];
+        let texts = errors.map(|error| gleaner_protocol::Failure::from(error.unwrap()).to_string());
+        assert!(texts[0].contains("decisions.jsonl`") && texts[0].contains("it is no file"), "{}", texts[0]);
+        assert!(texts[1].contains("clips.jsonl`") && texts[1].contains("it is a link"), "{}", texts[1]);
     }
 
     #[test]

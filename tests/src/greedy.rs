@@ -77,9 +77,22 @@ impl Room {
     ///
     /// If `text` is no component.
     pub fn written_within(text: &str, limits: &Limits) -> Self {
+        Self::of_text(text, limits, false)
+    }
+
+    /// As [`Room::written_within`], with the deadlines, which replays do not have.
+    ///
+    /// # Panics
+    ///
+    /// If `text` is no component.
+    pub fn written_timed(text: &str, limits: &Limits) -> Self {
+        Self::of_text(text, limits, true)
+    }
+
+    fn of_text(text: &str, limits: &Limits, timed: bool) -> Self {
         let folder = Folder::new();
         let component = wat::parse_str(text).unwrap_or_else(|error| panic!("{error}"));
-        Self::new(&folder.write("written.wasm", component), Vec::new(), limits, false)
+        Self::new(&folder.write("written.wasm", component), Vec::new(), limits, timed)
     }
 
     fn new(component: &Path, config: Vec<(String, ConfigValue)>, limits: &Limits, timed: bool) -> Self {

@@ -8,7 +8,7 @@ use gleaner_protocol::FaultKind;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::manifest::bounds::{CALL_BYTES, CALL_ITEMS, HANDLES};
 use gleaner_tests::drive::{Cdr, IMAGE, image};
-use gleaner_tests::greedy::{FUEL, MEMORY, PICTURE, Room, component, limits, publish, subscribed};
+use gleaner_tests::greedy::{FUEL, MEMORY, PICTURE, Room, component, publish, subscribed};
 use gleaner_vitals::usage;
 
 /// What one call gives at most.
@@ -51,102 +51,6 @@ fn the_work_of_the_host_costs_fuel_by_the_byte() {
     }
     let (luma, idle) = (Room::greedy("mean_luma", 0).fuel(), Room::greedy("ok", 0).fuel());
     assert!(luma - idle >= u64::from(PICTURE) / 8, "{luma} and {idle}");
-}
-
-/// A component with these imports of WASI, of which `functions` are known to its module by name; `fill` writes a number there as often
-/// as it is told, from 16 on, where the host reads.
-fn calls_wasi(imports: &str, functions: &[&str], wake: &str) -> String {
-    let lowered: String = functions
-        .iter()
-        .map(|name| {
-            format!("(core func ${name} (canon lower (func ${name}) (memory $its-memory) (realloc $its-realloc)))\n")
-        })
-        .collect();
-    let exported: String = functions.iter().map(|name| format!(r#"(export "{name}" (func ${name}))"#)).collect();
-    let parts = format!(
-        r#"{imports}
-           (core module $store
-               (memory (export "memory") 2)
-               (func (export "realloc") (param i32 i32 i32 i32) (result i32) (i32.const 65536))
-               (func (export "fill") (param $value i32) (param $count i32)
-                   (loop
-                       (local.set $count (i32.sub (local.get $count) (i32.const 1)))
-                       (i32.store offset=16 (i32.mul (local.get $count) (i32.const 4)) (local.get $value))
-                       (br_if 0 (local.get $count)))))
-           (core instance $store (instantiate $store))
-           (alias core export $store "memory" (core memory $its-memory))
-           (alias core export $store "realloc" (core func $its-realloc))
-           (alias core export $store "fill" (core func $fill))
-           {lowered}
-           (core instance $host (export "fill" (func $fill)) {exported})"#
-    );
-    component(&parts, r#"(with "host" (instance $host))"#, wake)
-}
-
-/// Asks for so many random bytes, as `wake` says.
-fn random(bytes: u32, wake: &str) -> Room {
-    let imports = r#"
-        (import "wasi:random/random@0.2.0" (instance $random
-            (export "get-random-bytes" (func (param "len" u64) (result (list u8))))))
-        (alias export $random "get-random-bytes" (func $bytes))"#;
-    let body = format!(
-        r#"(import "host" "bytes" (func $bytes (param i64 i32)))
-           (func $random (call $bytes (i64.const {bytes}) (i32.const 16)))
-           (func $wake {wake})"#
-    );
-    Room::written(&calls_wasi(imports, &["bytes"], &body))
-}
-
-#[test]
-fn random_numbers_cost_fuel_by_the_byte() {
-    let [some, more, most] = [1000, 2000, 4000].map(|bytes| random(bytes, "(call $random)").fuel());
-    assert_eq!((more - some, most - more), (4 * 1000, 4 * 2000));
-    let outcome = random(4096, "(loop (call $random) (br 0))").wake();
-    assert_eq!(outcome.result.unwrap_err().kind, FaultKind::Fuel);
-    // The host's part alone ends it, and the last call is not made.
-    let fuel = outcome.fuel.unwrap();
-    assert!((FUEL..FUEL + FUEL / 20).contains(&fuel), "{fuel}");
-    assert_eq!(random(4097, "(call $random)").fault().kind, FaultKind::HostCall);
-}
-
-/// Waits for so many things, all of them the output, with this fuel.
-fn waits_for(these: u32, fuel: u64) -> Room {
-    let imports = r#"
-        (import "wasi:io/poll@0.2.0" (instance $poll
-            (export "pollable" (type $pollable (sub resource)))
-            (export "poll" (func (param "in" (list (borrow $pollable))) (result (list u32))))))
-        (alias export $poll "pollable" (type $pollable))
-        (import "wasi:io/streams@0.2.0" (instance $streams
-            (export "output-stream" (type $out (sub resource)))
-            (alias outer 1 $pollable (type $its-pollable))
-            (export "[method]output-stream.subscribe" (func (param "self" (borrow $out)) (result (own $its-pollable))))))
-        (alias export $streams "output-stream" (type $out))
-        (import "wasi:cli/stdout@0.2.0" (instance $cli
-            (alias outer 1 $out (type $its-out))
-            (export "get-stdout" (func (result (own $its-out))))))
-        (alias export $poll "poll" (func $wait))
-        (alias export $streams "[method]output-stream.subscribe" (func $subscribe))
-        (alias export $cli "get-stdout" (func $stdout))"#;
-    let body = format!(
-        r#"(import "host" "stdout" (func $stdout (result i32)))
-           (import "host" "subscribe" (func $subscribe (param i32) (result i32)))
-           (import "host" "wait" (func $wait (param i32 i32 i32)))
-           (import "host" "fill" (func $fill (param i32 i32)))
-           (func $wake
-               (call $fill (call $subscribe (call $stdout)) (i32.const 2000))
-               (call $wait (i32.const 16) (i32.const {these}) (i32.const 8)))"#
-    );
-    let mut limits = limits();
-    limits.fuel = fuel;
-    Room::written_within(&calls_wasi(imports, &["stdout", "subscribe", "wait"], &body), &limits)
-}
-
-#[test]
-fn a_long_list_of_things_to_wait_for_is_paid_for() {
-    let [some, more] = [1000, 2000].map(|these| waits_for(these, FUEL).fuel());
-    assert_eq!(more - some, 400 * 1000);
-    // It ends as soon as more is asked for than the guest can pay.
-    assert_eq!(waits_for(2000, more - 1).fault().kind, FaultKind::Fuel);
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gleaner_protocol::{Exit, Failure, visible};
+use gleaner_protocol::{Exit, Failure, own_file, visible};
 
 use crate::args::{AskedArgs, ReplayArgs};
 use crate::say::say;
@@ -93,13 +93,13 @@ fn keep(out: &Path, before: &Path) -> bool {
         if !out.join(COMPARED[0]).is_file() {
             return Err(io::ErrorKind::NotFound.into());
         }
-        fs::create_dir_all(before)?;
+        own_file::folder(before)?;
         for name in COMPARED {
-            match fs::copy(out.join(name), before.join(name)) {
+            match own_file::read(&out.join(name)) {
                 Err(error) if error.kind() == io::ErrorKind::NotFound && name != COMPARED[0] => {
                     let _ = fs::remove_file(before.join(name));
                 }
-                copied => drop(copied?),
+                file => drop(io::copy(&mut file?, &mut own_file::anew(&before.join(name))?)?),
             }
         }
         Ok(())
@@ -132,5 +132,35 @@ fn replay_args(args: DevArgs) -> ReplayArgs {
         verify: None,
         no_report: false,
         json: false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_kept_of_results_is_written_to_files_of_ours_only() {
+        let folder = tempfile::tempdir().unwrap();
+        let (out, precious) = (folder.path().join("out"), folder.path().join("precious"));
+        let before = out.join(BEFORE);
+        fs::create_dir_all(&before).unwrap();
+        fs::write(&precious, "precious").unwrap();
+        fs::write(out.join("summary.json"), "{}").unwrap();
+        std::os::unix::fs::symlink(&precious, before.join("summary.json")).unwrap();
+        assert!(keep(&out, &before));
+        assert_eq!(fs::read_to_string(before.join("summary.json")).unwrap(), "{}");
+        assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
+        // What is read is no link, either, and a folder that is one is not written to.
+        fs::remove_file(out.join("summary.json")).unwrap();
+        std::os::unix::fs::symlink(&precious, out.join("summary.json")).unwrap();
+        assert!(!keep(&out, &before));
+        assert_eq!(fs::read_to_string(before.join("summary.json")).unwrap(), "{}");
+        fs::remove_file(out.join("summary.json")).unwrap();
+        fs::write(out.join("summary.json"), "{\"new\": 1}").unwrap();
+        fs::rename(&before, folder.path().join("elsewhere")).unwrap();
+        std::os::unix::fs::symlink(folder.path().join("elsewhere"), &before).unwrap();
+        assert!(!keep(&out, &before));
+        assert_eq!(fs::read_to_string(folder.path().join("elsewhere/summary.json")).unwrap(), "{}");
     }
 }

@@ -1,13 +1,13 @@
 //! What the files of an output tell as a whole: `summary.json` of a replay or of a live run, and `signals.json`.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::manifest::{ConfigValue, Kind};
 use gleaner_protocol::signals::{Curve, Signals};
-use gleaner_protocol::{Exit, Explain, Live, Summary};
+use gleaner_protocol::{Exit, Explain, Live, Summary, own_file};
 use serde::de::DeserializeOwned;
 
 use super::marks::cut;
@@ -315,12 +315,8 @@ fn parsed<T: DeserializeOwned>(name: &'static str, text: &[u8]) -> Result<T, Fil
 fn bounded(out: &Path, name: &'static str, bytes: u64) -> Result<Vec<u8>, FileError> {
     let path = out.join(name);
     let read = || {
-        // A pipe in the place of a file would be waited for.
-        if !path.metadata()?.is_file() {
-            return Err(io::Error::other("it is no file"));
-        }
         let mut text = Vec::new();
-        File::open(&path)?.take(bytes + 1).read_to_end(&mut text)?;
+        own_file::read(&path)?.take(bytes + 1).read_to_end(&mut text)?;
         Ok(text)
     };
     let text = read().map_err(|source| FileError::Read { name, source })?;

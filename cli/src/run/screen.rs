@@ -109,11 +109,11 @@ impl Screen {
         self.below.set_message("");
         self.below.tick();
         self.say(&show::live(live, self.paint));
-        self.say(&format!("  {}: decisions.jsonl, log.jsonl, summary.json\n", live.out.display()));
+        self.say(&format!("  {}: decisions.jsonl, log.jsonl, summary.json\n", visible(&live.out.to_string_lossy())));
     }
 
     pub(super) fn warn(&self, text: &str) {
-        self.err(format!("warning: {text}\n").as_bytes());
+        self.err(format!("warning: {}\n", visible(text)).as_bytes());
     }
 
     /// Passes on what a program said.

@@ -35,7 +35,7 @@ pub(crate) fn topics(topics: &[TopicSeen]) -> String {
             visible(&topic.type_name),
             topic.writers.to_string(),
             topic.readers.to_string(),
-            topic.qos.join("; "),
+            visible(&topic.qos.join("; ")),
         ]
     });
     let head = ["topic", "type", "writers", "readers", "quality of service"].map(str::to_owned);
@@ -272,6 +272,19 @@ mod tests {
     fn columns_are_as_wide_as_their_widest_cell() {
         let rows = vec![["a", "1"].map(str::to_owned), ["topic", "23"].map(str::to_owned)];
         assert_eq!(table(rows, &[1]), "a       1\ntopic  23\n");
+    }
+
+    #[test]
+    fn what_a_network_says_of_a_topic_cannot_act_on_the_terminal() {
+        let seen = TopicSeen {
+            topic: "/a\u{1b}[2J".to_owned(),
+            type_name: "t\u{1b}".to_owned(),
+            writers: 1,
+            readers: 0,
+            qos: vec!["reliable\u{1b}]0;".to_owned()],
+        };
+        let text = topics(&[seen]);
+        assert!(!text.contains('\u{1b}') && text.contains("reliable\\u{1b}]0;"), "{text}");
     }
 
     #[test]

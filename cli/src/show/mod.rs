@@ -248,7 +248,7 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
     }
     writeln!(text, ", {:.1} MiB at most", mib(summary.peak_rss_bytes))?;
     let clips = if clips.is_empty() { "" } else { ", clips.jsonl, clips/" };
-    let files = format!("{}: decisions.jsonl, log.jsonl, summary.json{clips}", summary.out.display());
+    let files = format!("{}: decisions.jsonl, log.jsonl, summary.json{clips}", visible(&summary.out.to_string_lossy()));
     writeln!(text, "  {}", paint.dim(&files))
 }
 

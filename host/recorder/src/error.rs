@@ -5,6 +5,7 @@ use std::error::Error;
 use std::io;
 use std::path::PathBuf;
 
+use gleaner_protocol::own_file::InTheWay;
 use gleaner_protocol::{Exit, Explain};
 use gleaner_transport::TransportError;
 use gleaner_transport::replay::ReplayError;
@@ -184,14 +185,18 @@ impl RecordError {
 
     /// What the system said, wherever in the chain of causes it stands.
     fn system(&self) -> Option<io::ErrorKind> {
-        let mut cause: Option<&(dyn Error + 'static)> = Some(self);
-        while let Some(error) = cause {
-            if let Some(error) = error.downcast_ref::<io::Error>().filter(|error| error.raw_os_error().is_some()) {
-                return Some(error.kind());
-            }
-            cause = error.source();
-        }
-        None
+        self.io().find(|error| error.raw_os_error().is_some()).map(io::Error::kind)
+    }
+
+    /// Whether something that is no file or folder of ours has the name of one.
+    fn is_in_the_way(&self) -> bool {
+        self.io().any(|error| InTheWay::of(error).is_some())
+    }
+
+    /// The errors of the file system in the chain of causes.
+    fn io(&self) -> impl Iterator<Item = &io::Error> {
+        let chain = std::iter::successors(Some(self as &(dyn Error + 'static)), |&error| error.source());
+        chain.filter_map(|error| error.downcast_ref())
     }
 }
 
@@ -208,6 +213,7 @@ impl Explain for RecordError {
             (_, Some(io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem)) => {
                 "choose a folder that you may write to: --out DIR"
             }
+            _ if self.is_in_the_way() => InTheWay::HELP,
             _ => return None,
         };
         Some(help.to_owned())

@@ -21,9 +21,32 @@ const NAMES: [&str; 14] = [
     "NO_COLOR",
 ];
 
+/// Those of CUDA and of NVIDIA's containers, by name: services of the same maker have keys under names that begin like these.
+const CUDA: [&str; 16] = [
+    "CUDA_VISIBLE_DEVICES",
+    "CUDA_DEVICE_ORDER",
+    "CUDA_DEVICE_MAX_CONNECTIONS",
+    "CUDA_HOME",
+    "CUDA_PATH",
+    "CUDA_CACHE_PATH",
+    "CUDA_CACHE_DISABLE",
+    "CUDA_CACHE_MAXSIZE",
+    "CUDA_FORCE_PTX_JIT",
+    "CUDA_MODULE_LOADING",
+    "CUDA_LAUNCH_BLOCKING",
+    "NVIDIA_VISIBLE_DEVICES",
+    "NVIDIA_DRIVER_CAPABILITIES",
+    "NVIDIA_REQUIRE_CUDA",
+    "NVIDIA_DISABLE_REQUIRE",
+    "NVIDIA_TF32_OVERRIDE",
+];
+
 /// Variables by how their names begin or end.
-const BEGINNINGS: [&str; 8] = ["GLEANER_", "ROS_", "LC_", "CUDA_", "NVIDIA_", "PYENV", "ORT_", "OPENCV_"];
+const BEGINNINGS: [&str; 6] = ["GLEANER_", "ROS_", "LC_", "PYENV", "ORT_", "OPENCV_"];
 const ENDINGS: [&str; 1] = ["_NUM_THREADS"];
+
+/// What stands in the name of a secret, however it begins. Letters of either case are the same.
+const SECRETS: [&str; 6] = ["KEY", "TOKEN", "SECRET", "PASSWORD", "PASSWD", "CREDENTIAL"];
 
 /// What a runtime is given.
 pub(crate) fn handed_on() -> impl Iterator<Item = (OsString, OsString)> {
@@ -32,7 +55,12 @@ pub(crate) fn handed_on() -> impl Iterator<Item = (OsString, OsString)> {
 
 fn is_handed_on(name: &OsStr) -> bool {
     let Some(name) = name.to_str() else { return false };
+    let capitals = name.to_ascii_uppercase();
+    if SECRETS.iter().any(|secret| capitals.contains(secret)) {
+        return false;
+    }
     NAMES.contains(&name)
+        || CUDA.contains(&name)
         || BEGINNINGS.iter().any(|beginning| name.starts_with(beginning))
         || ENDINGS.iter().any(|ending| name.ends_with(ending))
 }
@@ -46,8 +74,26 @@ mod tests {
         for name in ["AWS_SECRET_ACCESS_KEY", "SSH_AUTH_SOCK", "PATHS", "XGLEANER_", "LD_PRELOAD"] {
             assert!(!is_handed_on(OsStr::new(name)), "{name}");
         }
-        for name in ["PATH", "ROS_DOMAIN_ID", "OMP_NUM_THREADS", "GLEANER_PYTHON"] {
+        for name in ["PATH", "ROS_DOMAIN_ID", "OMP_NUM_THREADS", "GLEANER_PYTHON", "CUDA_VISIBLE_DEVICES"] {
             assert!(is_handed_on(OsStr::new(name)), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_secret_stays_here_however_its_name_begins() {
+        for name in [
+            "NVIDIA_API_KEY",
+            "NVIDIA_NGC",
+            "CUDA_SOMETHING",
+            "GLEANER_TOKEN",
+            "ROS_MASTER_TOKEN",
+            "ROS_Secret",
+            "GLEANER_password",
+            "PYENV_PASSWD",
+            "ORT_CREDENTIALS",
+            "KEY_NUM_THREADS",
+        ] {
+            assert!(!is_handed_on(OsStr::new(name)), "{name}");
         }
     }
 }

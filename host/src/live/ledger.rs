@@ -207,8 +207,9 @@ mod tests {
         let pipe = folder.path().join("decisions.jsonl");
         assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
         let mut reader = File::from(rustix::fs::open(&pipe, OFlags::RDONLY | OFlags::NONBLOCK, 0.into()).unwrap());
-        let output = Output::begin(folder.path(), true, true).unwrap();
-        rustix::fs::fcntl_setfl(output.decisions(), OFlags::APPEND | OFlags::NONBLOCK).unwrap();
+        let writer = File::from(rustix::fs::open(&pipe, OFlags::WRONLY | OFlags::NONBLOCK, 0.into()).unwrap());
+        let results = tempfile::tempdir().unwrap();
+        let output = Output::begin(results.path(), true, true).unwrap().with_decisions_in(writer);
         let mut ledger = Ledger::start(output, std::io::sink()).unwrap();
         let mut seq = 0;
         let mut write = |ledger: &mut Ledger| {

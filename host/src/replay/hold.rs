@@ -4,6 +4,7 @@ use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use gleaner_protocol::own_file::{self, InTheWay};
 use gleaner_protocol::{Exit, Explain};
 
 use crate::stage::LOCK;
@@ -26,9 +27,7 @@ impl Hold {
     /// Takes `out`, which is made if there is none. Its lock stays there: who removed it could remove that of another.
     pub(super) fn take(out: &Path) -> Result<Self, HoldError> {
         let path = out.join(LOCK);
-        let opened =
-            fs::create_dir_all(out).and_then(|()| File::options().write(true).create(true).truncate(false).open(&path));
-        let lock = match opened {
+        let lock = match fs::create_dir_all(out).and_then(|()| own_file::write(&path)) {
             Ok(lock) => lock,
             Err(source) => return Err(HoldError::Lock { path, source }),
         };
@@ -44,6 +43,7 @@ impl Explain for HoldError {
     fn help(&self) -> Option<String> {
         Some(match self {
             Self::Busy { .. } => "wait until it ends, or choose another folder: --out DIR".to_owned(),
+            Self::Lock { source, .. } if InTheWay::of(source).is_some() => InTheWay::HELP.to_owned(),
             Self::Lock { .. } => "choose a folder that you may write to: --out DIR".to_owned(),
         })
     }

@@ -1,7 +1,5 @@
 //! What to do: the arguments as typed, and what they mean once checked against the build.
 
-use std::fs::File;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -10,10 +8,11 @@ use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, DriveTime, Exit, Failure};
 use gleaner_transport::replay::journals_of;
 
+use super::journal_file;
 use super::part::Wanted;
 use super::verify::Claim;
 use crate::isolation::{code, definitions};
-use crate::stage::{Asked, AskedArgs, OutputError, RESULTS};
+use crate::stage::{Asked, AskedArgs, RESULTS};
 
 /// Arguments of `replay`.
 #[derive(Args, Clone, Debug)]
@@ -139,19 +138,14 @@ impl Job {
         512 << 20
     }
 
-    /// Makes an empty journal where none is: nothing but what exists can be granted.
+    /// Makes an empty journal where none is: nothing but what exists can be granted, and nothing but a file of ours is.
     ///
     /// # Errors
     ///
     /// A failure that names it.
     pub fn make_journal(&self) -> Result<(), Failure> {
         let Task::Replay(Results { journal: Some(path), .. }) = &self.task else { return Ok(()) };
-        match File::options().write(true).create_new(true).open(path) {
-            Err(source) if source.kind() != ErrorKind::AlreadyExists => {
-                Err(OutputError { path: path.clone(), source }.into())
-            }
-            _ => Ok(()),
-        }
+        journal_file::open(path).map(drop)
     }
 
     /// The folder of the results, where there are some.

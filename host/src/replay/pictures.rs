@@ -5,8 +5,8 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_protocol::Decision;
 use gleaner_protocol::signals::{Picture, Signals};
+use gleaner_protocol::{Decision, own_file};
 use gleaner_recorder::{is_image, thumbnail};
 use gleaner_transport::SampleMeta;
 
@@ -119,7 +119,7 @@ impl Pictures {
         if self.made.is_empty() {
             return Ok((Vec::new(), left_out));
         }
-        fs::create_dir_all(&folder).map_err(|source| OutputError { path: folder, source })?;
+        own_file::folder(&folder).map_err(|source| OutputError { path: folder, source })?;
         let written = self.made.into_iter().map(|Made { at_ns, topic, image_ns, jpeg, wake }| {
             let file = Path::new(FOLDER).join(format!("{PREFIX}{wake:06}.jpg"));
             let path = out.join(&file);
@@ -136,8 +136,8 @@ impl Pictures {
 fn remove(folder: &Path) -> Result<(), OutputError> {
     let failed = |source| OutputError { path: folder.to_owned(), source };
     // A link may lead to somebody's pictures.
-    if fs::symlink_metadata(folder).is_ok_and(|metadata| !metadata.is_dir()) {
-        return Err(failed(io::ErrorKind::NotADirectory.into()));
+    if folder.symlink_metadata().is_ok() {
+        own_file::folder(folder).map_err(failed)?;
     }
     let entries = match fs::read_dir(folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),

@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use gleaner_protocol::own_file::{self, InTheWay};
 use gleaner_protocol::signals::Signals;
 use gleaner_protocol::{Decision, Exit, Explain, write_whole};
 use serde::Serialize;
@@ -41,7 +42,10 @@ pub struct OutputError {
 
 impl Explain for OutputError {
     fn help(&self) -> Option<String> {
-        Some("make room or choose another folder: --out DIR".to_owned())
+        Some(match InTheWay::of(&self.source) {
+            Some(_) => InTheWay::HELP.to_owned(),
+            None => "make room or choose another folder: --out DIR".to_owned(),
+        })
     }
 
     fn exit(&self) -> Exit {
@@ -131,8 +135,9 @@ impl Output {
     }
 
     #[cfg(test)]
-    pub(crate) fn decisions(&self) -> &File {
-        &self.decisions.file
+    pub(crate) fn with_decisions_in(mut self, file: File) -> Self {
+        self.decisions.file = file;
+        self
     }
 
     /// Completes the files and adds the summary.
@@ -178,7 +183,8 @@ const PENDING_BYTES: usize = 64 << 10;
 
 impl Lines {
     fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
-        let opened = open(&path).and_then(|file| if again { Ok(file) } else { file.set_len(0).map(|()| file) });
+        let opened =
+            own_file::append(&path).and_then(|file| if again { Ok(file) } else { file.set_len(0).map(|()| file) });
         match opened {
             Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None }),
             Err(source) => Err(OutputError { path, source }),
@@ -221,14 +227,10 @@ impl Lines {
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 renamed => renamed?,
             }
-            self.file = open(&self.path)?;
+            self.file = own_file::append(&self.path)?;
         }
         Ok(())
     }
-}
-
-fn open(path: &Path) -> io::Result<File> {
-    File::options().create(true).append(true).open(path)
 }
 
 #[cfg(test)]
@@ -241,6 +243,51 @@ mod tests {
         text.lines()
             .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["at_ns"].as_i64().unwrap())
             .collect()
+    }
+
+    #[test]
+    fn what_is_no_file_of_ours_is_refused_in_words_and_left_as_it_is() {
+        use std::os::unix::fs::symlink;
+        type Put = (fn(&Path, &Path), &'static str);
+        let put: [Put; 3] = [
+            (|precious, path| symlink(precious, path).unwrap(), "it is a link"),
+            (|precious, path| fs::hard_link(precious, path).unwrap(), "the file has other names"),
+            (
+                |_, path| assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success()),
+                "it is no file",
+            ),
+        ];
+        for (name, (put, why), again) in ["decisions.jsonl", "log.jsonl"]
+            .into_iter()
+            .flat_map(|name| put.into_iter().flat_map(move |put| [(name, put, false), (name, put, true)]))
+        {
+            let folder = tempfile::tempdir().unwrap();
+            let (precious, path) = (folder.path().join("precious"), folder.path().join(name));
+            fs::write(&precious, "precious").unwrap();
+            put(&precious, &path);
+            let error = Output::begin(folder.path(), true, again).err().unwrap();
+            assert_eq!(error.help().unwrap(), "remove it, or choose another folder: --out DIR");
+            let text = gleaner_protocol::Failure::from(error).to_string();
+            assert!(text.contains(&format!("`{}`", path.display())) && text.contains(why), "{text}");
+            assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
+        }
+    }
+
+    #[test]
+    fn a_log_that_was_replaced_by_a_link_goes_on_in_a_file_of_its_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut output = Output::create(folder.path(), true).unwrap().with_log_of(100);
+        let line = Line { at_ns: 1, level: Level::Info, message: "x".repeat(200) };
+        output.log(std::slice::from_ref(&line)).unwrap();
+        output.flush().unwrap();
+        let (precious, log) = (folder.path().join("precious"), folder.path().join("log.jsonl"));
+        fs::write(&precious, "precious").unwrap();
+        fs::remove_file(&log).unwrap();
+        std::os::unix::fs::symlink(&precious, &log).unwrap();
+        output.log(&[line]).unwrap();
+        output.flush().unwrap();
+        assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
+        assert_eq!(said(folder.path(), "log.jsonl"), [1]);
     }
 
     #[test]

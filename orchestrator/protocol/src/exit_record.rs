@@ -1,11 +1,10 @@
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Exit, write_whole};
+use crate::{Exit, own_file, write_whole};
 
 /// How long a runtime may take for its end once it was asked for it; then `gleaner-shim` kills it. Who started both waits longer.
 pub const UNTIL_KILLED: Duration = Duration::from_secs(30);
@@ -137,7 +136,7 @@ impl ExitRecord {
     /// Those of the file system; [`io::ErrorKind::InvalidData`] if it is no record.
     pub fn read(path: &Path) -> io::Result<Self> {
         let mut text = Vec::new();
-        File::open(path)?.take(RECORD_MAX).read_to_end(&mut text)?;
+        own_file::read(path)?.take(RECORD_MAX).read_to_end(&mut text)?;
         serde_json::from_slice(&text).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
     }
 }

@@ -18,6 +18,7 @@ pub mod layout;
 pub mod link;
 mod live;
 pub mod manifest;
+pub mod own_file;
 pub mod parts;
 mod report;
 #[cfg(test)]

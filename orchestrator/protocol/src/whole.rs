@@ -2,6 +2,8 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 
+use crate::own_file;
+
 /// Writes `content` to the file `path` by way of one beside it, so that whatever happens there is the former file or this one, whole.
 ///
 /// # Errors
@@ -10,9 +12,7 @@ use std::path::Path;
 pub fn write_whole(path: &Path, content: &[u8]) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
-    // A new one: what is there may be a link to somewhere else.
-    let _ = fs::remove_file(&part);
-    let mut file = File::create_new(&part)?;
+    let mut file = own_file::anew(Path::new(&part))?;
     file.write_all(content)?;
     file.sync_all()?;
     fs::rename(&part, path)?;

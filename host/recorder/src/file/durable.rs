@@ -4,6 +4,8 @@ use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::Path;
 
+use gleaner_protocol::own_file;
+
 use super::recover::Pause;
 use crate::error::RecordError;
 
@@ -44,7 +46,7 @@ pub(super) fn write_with(
     folder: &Path,
     fill: impl FnOnce(&mut File) -> io::Result<()>,
 ) -> Result<(), RecordError> {
-    let mut file = File::create(part).map_err(|source| RecordError::Create { path: part.to_owned(), source })?;
+    let mut file = own_file::anew(part).map_err(|source| RecordError::Create { path: part.to_owned(), source })?;
     fill(&mut file).map_err(|source| RecordError::Write { path: part.to_owned(), source })?;
     file.sync_all().map_err(|source| RecordError::Sync { path: part.to_owned(), source })?;
     rename(part, to, folder)
@@ -54,7 +56,7 @@ pub(super) fn write_with(
 /// is what is on the disk then, even if an earlier attempt to make it durable where it was had failed.
 pub(super) fn copy(from: &Path, to: &Path, pause: &mut Pause) -> Result<(), RecordError> {
     let cannot_write = |source| RecordError::Write { path: to.to_owned(), source };
-    let source = File::open(from).map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
+    let source = own_file::read(from).map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
     let copy = step("copy", to).and_then(|()| File::create_new(to));
     let mut copy = copy.map_err(|source| RecordError::Create { path: to.to_owned(), source })?;
     while io::copy(&mut (&source).take(PIECE), &mut copy).map_err(cannot_write)? > 0 {

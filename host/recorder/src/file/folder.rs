@@ -1,12 +1,12 @@
 //! The folder that a recorder writes into.
 
 use std::collections::HashSet;
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use gleaner_protocol::Clip;
 use gleaner_protocol::link::Loss;
+use gleaner_protocol::{Clip, own_file};
 use tracing::warn;
 
 use super::list::{List, Listed};
@@ -67,7 +67,7 @@ impl Folder {
     /// As for [`Folder::open`].
     pub fn hold(out: &Path) -> Result<Self, RecordError> {
         let clips = out.join(CLIPS);
-        fs::create_dir_all(&clips).map_err(|source| RecordError::Create { path: clips.clone(), source })?;
+        own_file::folder(&clips).map_err(|source| RecordError::Create { path: clips.clone(), source })?;
         let lock = lock(&clips, out)?;
         let list = List::of(out);
         let taken: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
@@ -167,8 +167,7 @@ impl Earlier {
 
 fn lock(clips: &Path, out: &Path) -> Result<File, RecordError> {
     let path = clips.join(".lock");
-    let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
-    let file = file.map_err(|source| RecordError::Create { path: path.clone(), source })?;
+    let file = own_file::write(&path).map_err(|source| RecordError::Create { path: path.clone(), source })?;
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => Err(RecordError::Busy { folder: out.to_owned() }),

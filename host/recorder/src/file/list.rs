@@ -1,10 +1,10 @@
 //! `clips.jsonl`: a line for each whole clip.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Component, Path, PathBuf};
 
-use gleaner_protocol::Clip;
+use gleaner_protocol::{Clip, own_file};
 use serde::Deserialize;
 use tracing::warn;
 
@@ -44,7 +44,7 @@ impl List {
     /// What the list names. A line that was torn when its writer died is cut off.
     pub(super) fn read(&self) -> Result<Vec<Listed>, RecordError> {
         let failed = |source| RecordError::List { path: self.path.clone(), source };
-        let file = match OpenOptions::new().read(true).write(true).open(&self.path) {
+        let file = match own_file::edit(&self.path) {
             Ok(file) => file,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             Err(error) => return Err(failed(error)),
@@ -61,7 +61,7 @@ impl List {
     pub(super) fn append(&self, clip: &Clip) -> Result<(), RecordError> {
         let failed = |source| RecordError::List { path: self.path.clone(), source };
         let is_new = !self.path.exists();
-        let mut file = OpenOptions::new().append(true).create(true).open(&self.path).map_err(failed)?;
+        let mut file = own_file::append(&self.path).map_err(failed)?;
         let before = file.metadata().map_err(failed)?.len();
         durable::step("append", &self.path).map_err(failed)?;
         if let Err(error) = file.write_all(&line(clip)).and_then(|()| file.sync_all()) {
@@ -76,7 +76,7 @@ impl List {
     pub(super) fn replace(&self, clips: &[Clip]) -> Result<(), RecordError> {
         durable::write_with(&self.folder.join("clips.jsonl.part"), &self.path, &self.folder, |file| {
             let mut new = BufWriter::new(file);
-            match File::open(&self.path) {
+            match own_file::read(&self.path) {
                 Ok(old) => {
                     read_lines(&old, |foreign| new.write_all(foreign))?;
                 }

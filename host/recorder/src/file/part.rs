@@ -1,8 +1,9 @@
 //! Whose file it is, by its first bytes.
 
-use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::Path;
+
+use gleaner_protocol::own_file;
 
 /// Who wrote a file.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -18,7 +19,7 @@ pub(super) enum Origin {
 /// Who wrote the file `path`.
 pub(super) fn origin(path: &Path) -> io::Result<Origin> {
     let header = header();
-    let mut file = BufReader::new(File::open(path)?);
+    let mut file = BufReader::new(own_file::read(path)?);
     let mut begin = Vec::new();
     file.by_ref().take(header.len() as u64).read_to_end(&mut begin)?;
     let is_ours = begin.iter().zip(&header).all(|(found, wanted)| wanted.is_none_or(|wanted| wanted == *found));

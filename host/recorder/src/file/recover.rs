@@ -4,12 +4,12 @@
 //! reads as it was meant: the unfinished file goes last, and a clip that was saved says from which file.
 
 use std::collections::VecDeque;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_protocol::{Clip, Recovered};
+use gleaner_protocol::{Clip, Recovered, own_file};
 use gleaner_transport::replay::Damage;
 use tracing::{info, warn};
 
@@ -173,6 +173,10 @@ fn attempt(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Re
 fn was_saved(place: &Place, name: &str, part: &Path) -> Result<bool, RecordError> {
     let from = format!("{name}{PART}");
     for path in names(name).map(|name| place.path(&name, CLIP)).take_while(|path| path.symlink_metadata().is_ok()) {
+        if !path.symlink_metadata().is_ok_and(|found| found.is_file()) {
+            // Not ours. A pipe would be waited for.
+            continue;
+        }
         let is_copy = || is_same(&path, part).map_err(|source| RecordError::Read { path: path.clone(), source });
         if read::recovered_from(&path).is_some_and(|named| named == from) || is_copy()? {
             return Ok(true);
@@ -183,10 +187,7 @@ fn was_saved(place: &Place, name: &str, part: &Path) -> Result<bool, RecordError
 
 /// Whether two files have the same content.
 fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
-    if !fs::symlink_metadata(one)?.is_file() {
-        return Ok(false);
-    }
-    let (one, other) = (File::open(one)?, File::open(other)?);
+    let (one, other) = (own_file::read(one)?, own_file::read(other)?);
     if one.metadata()?.len() != other.metadata()?.len() {
         return Ok(false);
     }

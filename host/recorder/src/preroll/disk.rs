@@ -9,6 +9,7 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
+use gleaner_protocol::own_file;
 use tracing::warn;
 
 use super::{Held, Place};
@@ -79,7 +80,7 @@ impl Disk {
             shrinks: false,
             was_full: false,
         };
-        fs::create_dir_all(&disk.folder).map_err(failed(&disk.folder))?;
+        own_file::folder(&disk.folder).map_err(failed(&disk.folder))?;
         for entry in fs::read_dir(&disk.folder).map_err(failed(&disk.folder))? {
             let path = entry.map_err(failed(&disk.folder))?.path();
             if is_chunk(&path) {
@@ -129,7 +130,7 @@ impl Disk {
                 self.drop_oldest(gone)?;
             }
             let path = self.path(self.next_chunk);
-            self.newest = Some(File::create(&path).map_err(failed(&path))?);
+            self.newest = Some(begin(&path).map_err(failed(&path))?);
             let first = self.first + self.index.len() as u64;
             self.chunks.push_back(Chunk { number: self.next_chunk, first, bytes: 0 });
             self.next_chunk += 1;
@@ -251,7 +252,7 @@ impl Disk {
         }
         let (number, path) = (chunk.number, path_of(&self.folder, chunk.number));
         if self.reader.as_ref().is_none_or(|(open, _)| *open != number) {
-            self.reader = Some((number, File::open(&path).map_err(failed(&path))?));
+            self.reader = Some((number, own_file::read(&path).map_err(failed(&path))?));
         }
         self.buffer.resize(len, 0);
         if let Some((_, file)) = &self.reader {
@@ -287,6 +288,16 @@ impl Drop for Disk {
         // It stays if somebody else's files are in it.
         let _ = fs::remove_dir(&self.folder);
     }
+}
+
+/// Begins the chunk `path`.
+fn begin(path: &Path) -> io::Result<File> {
+    // A test has links to a full disk.
+    #[cfg(test)]
+    if fs::read_link(path).is_ok_and(|full| full == Path::new("/dev/full")) {
+        return File::create(path);
+    }
+    own_file::anew(path)
 }
 
 fn path_of(folder: &Path, number: u64) -> PathBuf {

@@ -14,6 +14,9 @@ use super::Hosted;
 /// 100 Hz never: waking a thread costs a call more than all else that hosting does.
 const IDLE: Duration = Duration::from_millis(500);
 
+/// How far a call may be over its time and still be in time: an epoch would have ended it about then, and not earlier.
+const TOLERANCE: Duration = Duration::from_millis(2);
+
 /// No call runs.
 const NONE: u64 = 0;
 
@@ -30,6 +33,26 @@ struct Shared {
     /// The ticker sleeps until it is woken.
     sleeps: AtomicBool,
     stop: AtomicBool,
+}
+
+/// How long a call took, and how long it might.
+#[derive(Clone, Copy)]
+pub(super) struct Taken {
+    elapsed: Duration,
+    allowed: Duration,
+}
+
+impl Taken {
+    /// Whether it came back too late. An instruction that fills or copies a large memory is not ended by an epoch, and if it was the
+    /// last, nothing else asks.
+    pub(super) fn is_late(self) -> bool {
+        self.elapsed > self.allowed + TOLERANCE
+    }
+
+    /// Both, in nanoseconds.
+    pub(super) fn elapsed_and_allowed(self) -> (u64, u64) {
+        (self.elapsed.as_nanos() as u64, self.allowed.as_nanos() as u64)
+    }
 }
 
 /// A running call.
@@ -129,9 +152,9 @@ impl Drop for Deadline {
 }
 
 impl Armed<'_> {
-    /// Nanoseconds since the call began, and those it was allowed.
-    pub(super) fn elapsed_and_allowed(&self) -> (u64, u64) {
-        (self.started.elapsed().as_nanos() as u64, self.allowed.as_nanos() as u64)
+    /// How long the call has been running.
+    pub(super) fn taken(&self) -> Taken {
+        Taken { elapsed: self.started.elapsed(), allowed: self.allowed }
     }
 }
 

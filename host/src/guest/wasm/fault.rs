@@ -18,6 +18,13 @@ pub(super) fn fuel(used: u64, allowed: u64) -> Fault {
     Fault { kind: FaultKind::Fuel, message, used: Some(used), allowed: Some(allowed) }
 }
 
+pub(super) fn deadline(time: Option<(u64, u64)>) -> Fault {
+    let (used, allowed) = time.unzip();
+    let ms = |ns: Option<u64>| ns.unwrap_or(0) as f64 / 1e6;
+    let message = format!("ran {:.1} ms; the deadline is {:.1} ms", ms(used), ms(allowed));
+    Fault { kind: FaultKind::Deadline, message, used, allowed }
+}
+
 /// `fuel` and `time` are what was used and what was allowed.
 pub(super) fn from_error(
     error: &wasmtime::Error,
@@ -30,10 +37,7 @@ pub(super) fn from_error(
         return fuel(used, allowed);
     }
     if trap == Some(&Trap::Interrupt) {
-        let (used, allowed) = time.unzip();
-        let ms = |ns: Option<u64>| ns.unwrap_or(0) as f64 / 1e6;
-        let message = format!("ran {:.1} ms; the deadline is {:.1} ms", ms(used), ms(allowed));
-        return Fault { kind: FaultKind::Deadline, message, used, allowed };
+        return deadline(time);
     }
     if let Some(DataError::OutOfTime) = error.downcast_ref() {
         let (used, allowed) = time.unzip();

@@ -38,6 +38,7 @@ impl HostTensor for Hosted {
 
 impl HostModel for Hosted {
     fn open(&mut self, name: String) -> Answer<Resource<Model>> {
+        self.meter.charge(name.len())?;
         self.answer(Model::open(&name))
     }
 

@@ -201,16 +201,18 @@ impl<'a> Call<'a> {
 
     /// Fuel used, and the result with its trap turned into a fault.
     fn end<T>(self, result: wasmtime::Result<T>) -> (u64, Result<T, Fault>) {
-        let late = self.armed.as_ref().map(deadline::Armed::elapsed_and_allowed);
+        let taken = self.armed.as_ref().map(deadline::Armed::taken);
         drop(self.armed);
         self.store.data().printed.end();
         let left = self.store.get_fuel().unwrap_or(0);
         let used = (self.fuel - left.min(self.fuel)).saturating_add(self.store.data().meter.used());
+        let time = taken.map(deadline::Taken::elapsed_and_allowed);
         let result = match result {
             // Guest and host each kept within the allowance; together they must as well.
             Ok(_) if used > self.fuel => Err(fault::fuel(used, self.fuel)),
+            Ok(_) if taken.is_some_and(deadline::Taken::is_late) => Err(fault::deadline(time)),
             Ok(value) => Ok(value),
-            Err(error) => Err(fault::from_error(&error, self.store.data(), (used, self.fuel), late)),
+            Err(error) => Err(fault::from_error(&error, self.store.data(), (used, self.fuel), time)),
         };
         (used, result)
     }

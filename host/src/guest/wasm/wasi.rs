@@ -1,7 +1,7 @@
 //! WASI as far as a lambda needs it: output becomes log lines, the clock is the wake's, random numbers are seeded.
 //!
-//! There are no files, no environment, no arguments and no sockets: such calls answer with an error. Sleeping is a fault,
-//! since neither fuel nor a deadline could end it. What takes longer the more is asked for costs fuel, as other host calls do.
+//! There are no files, no environment, no arguments, no sockets and no names of other machines: such calls answer with an error.
+//! Sleeping is a fault, since neither fuel nor a deadline could end it. What takes longer the more is asked for costs fuel, as other host calls do.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -13,6 +13,8 @@ use wasmtime::component::{HasData, Linker, Resource};
 use wasmtime_wasi::cli::{IsTerminal, StdoutStream};
 use wasmtime_wasi::p2::bindings::clocks::monotonic_clock;
 use wasmtime_wasi::p2::bindings::random::{insecure, random};
+use wasmtime_wasi::p2::bindings::sockets::ip_name_lookup::ResolveAddressStream as Addresses;
+use wasmtime_wasi::p2::bindings::sockets::network::{ErrorCode, Network};
 use wasmtime_wasi::p2::bindings::sync::io::poll;
 use wasmtime_wasi::p2::{DynPollable, OutputStream, Pollable, StreamError, StreamResult};
 use wasmtime_wasi::random::WasiRandomCtx;
@@ -25,6 +27,9 @@ use crate::api::log::{LINE_BYTES, Level, cut};
 
 /// How the standard library begins to tell a panic, behind the name of the thread.
 const PANICKED: &str = "panicked at ";
+
+/// The interface that looks names up, as wasmtime-wasi calls it.
+const NAMES: &str = "wasi:sockets/ip-name-lookup@0.2.12";
 
 /// Random bytes that one call hands out.
 const RANDOM_BYTES: u64 = 4096;
@@ -45,8 +50,23 @@ pub(super) fn add_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()>
     random::add_to_linker::<Hosted, Bounded>(linker, |hosted| hosted)?;
     insecure::add_to_linker::<Hosted, Bounded>(linker, |hosted| hosted)?;
     poll::add_to_linker::<Hosted, Bounded>(linker, |hosted| hosted)?;
+    refuse_names(linker)?;
     linker.allow_shadowing(false);
     Ok(())
+}
+
+/// Has names of other machines looked up by nobody. What is generated would take a name of any length for nothing.
+fn refuse_names(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
+    linker.instance(NAMES)?.func_wrap(
+        "resolve-addresses",
+        |store,
+         (network, name): (Resource<Network>, String)|
+         -> wasmtime::Result<(Result<Resource<Addresses>, ErrorCode>,)> {
+            store.data().meter.charge(name.len())?;
+            store.data().handles.get(&network)?;
+            Ok((Err(ErrorCode::PermanentResolverFailure),))
+        },
+    )
 }
 
 /// A context that grants nothing but output, the wake's time and numbers from `seed`.
@@ -61,6 +81,10 @@ pub(super) fn context(session: &Session, printed: &Printed, seed: [u8; 32]) -> W
         .max_random_size(RANDOM_BYTES)
         .insecure_random_seed(u128::from_le_bytes(std::array::from_fn(|i| seed[i])))
         .allow_blocking_current_thread(true)
+        // None is made, not even one that leads nowhere.
+        .allow_tcp(false)
+        .allow_udp(false)
+        .allow_ip_name_lookup(false)
         .build()
 }
 

@@ -1,12 +1,11 @@
 //! What a journal claims: which lambda decided what, and where that is written.
 
-use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::journal::{Difference, Entry, Header, JournalError, Reader};
 use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
-use gleaner_protocol::{BuildDir, Exit, Failure};
+use gleaner_protocol::{BuildDir, Exit, Failure, own_file};
 use gleaner_transport::replay::{ReplayError, read_extras};
 use serde_json::Value;
 
@@ -34,7 +33,7 @@ pub(in crate::replay) struct Claim {
 impl Claim {
     /// The journal of a replay.
     pub(in crate::replay) fn journal(path: &Path) -> Result<Self, Failure> {
-        let file = File::open(path).map_err(|error| {
+        let file = own_file::read_named(path).map_err(|error| {
             Failure::caused_by(Exit::Usage, format!("cannot open journal `{}`", path.display()), &error)
         })?;
         Self::open(path, Box::new(BufReader::new(file)), false, Told::default())
@@ -191,5 +190,5 @@ pub(super) fn unreadable_clip(error: ReplayError) -> Failure {
 
 fn begins_as_mcap(path: &Path) -> bool {
     let mut start = [0; 5];
-    File::open(path).and_then(|mut file| file.read_exact(&mut start)).is_ok_and(|()| start == *b"\x89MCAP")
+    own_file::read_named(path).and_then(|mut file| file.read_exact(&mut start)).is_ok_and(|()| start == *b"\x89MCAP")
 }

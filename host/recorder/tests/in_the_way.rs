@@ -1,0 +1,174 @@
+//! What others have put where a recorder's files belong: nothing is written to where it leads, and nobody waits for it.
+
+mod support;
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_protocol::link::Loss;
+use gleaner_protocol::manifest::Store;
+use gleaner_protocol::{Clip, Exit, Failure};
+use gleaner_recorder::{Folder, RecordError};
+use support::*;
+
+const PRECIOUS: &str = "precious, and without a newline at its end";
+
+fn pipe(path: &Path) {
+    assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+}
+
+/// A file that nobody may touch.
+fn precious(scratch: &Scratch) -> PathBuf {
+    let path = scratch.0.join("precious");
+    fs::write(&path, PRECIOUS).unwrap();
+    path
+}
+
+fn is_untouched(path: &Path) -> bool {
+    fs::read_to_string(path).unwrap() == PRECIOUS
+}
+
+/// What puts something at the second path, the first being the precious file, and how it is called.
+type Put = (fn(&Path, &Path), &'static str);
+
+const IN_THE_WAY: [Put; 4] = [
+    (|precious, path| symlink(precious, path).unwrap(), "it is a link"),
+    (|precious, path| symlink(precious.with_extension("nothing"), path).unwrap(), "it is a link"),
+    (|precious, path| fs::hard_link(precious, path).unwrap(), "the file has other names"),
+    (|_, path| pipe(path), "it is no file"),
+];
+
+/// Asserts that it is refused in words: which file, why, and what to do.
+fn assert_refused(error: RecordError, path: &Path, why: &str) {
+    let failure = Failure::from(error);
+    let text = failure.to_string();
+    assert!(text.contains(&format!("`{}`", path.display())) && text.contains(why), "{text}");
+    assert!(text.contains("remove it, or choose another folder: --out DIR"), "{text}");
+    assert_eq!(failure.exit, Exit::Internal);
+}
+
+fn one_clip(scratch: &Scratch, store: Store) -> Result<Vec<Clip>, RecordError> {
+    let mut recorder = scratch.recorder(|settings| settings.store = store);
+    let topics = [recorder.add_topic(topic("/a")).unwrap()];
+    let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &topics));
+    for at in (0..2000).step_by(10) {
+        recorder.sample(topics[0], &meta(T0 + at * MS, at as u64), b"x")?;
+        if at == 1000 {
+            recorder.wake(lambda, &entry(T0 + at * MS, &[Event]))?;
+        }
+    }
+    recorder.finish(T0 + 2000 * MS)?;
+    Ok(recorder.clips().to_vec())
+}
+
+#[test]
+fn a_list_or_a_lock_that_is_no_file_of_ours_is_refused() {
+    for name in ["clips.jsonl", "clips/.lock"] {
+        for (put, why) in IN_THE_WAY {
+            let scratch = Scratch::new();
+            let precious = precious(&scratch);
+            let path = scratch.0.join(name);
+            fs::create_dir(scratch.0.join("clips")).unwrap();
+            put(&precious, &path);
+            assert_refused(Folder::open(&scratch.0).err().unwrap(), &path, why);
+            assert!(is_untouched(&precious), "{name}: {why}");
+            assert!(!precious.with_extension("nothing").exists());
+        }
+    }
+}
+
+#[test]
+fn a_list_that_is_replaced_while_the_recorder_runs_is_not_written_to() {
+    for (put, why) in IN_THE_WAY {
+        let scratch = Scratch::new();
+        let precious = precious(&scratch);
+        let (mut folder, _) = Folder::open(&scratch.0).unwrap();
+        let path = scratch.0.join("clips.jsonl");
+        put(&precious, &path);
+        assert_refused(folder.replace(&[]).err().unwrap(), &path, why);
+        assert!(is_untouched(&precious), "{why}");
+    }
+}
+
+#[test]
+fn losses_are_noted_in_a_file_of_ours_only() {
+    for (put, why) in IN_THE_WAY {
+        let scratch = Scratch::new();
+        let precious = precious(&scratch);
+        let (folder, _) = Folder::open(&scratch.0).unwrap();
+        let path = scratch.0.join("losses.jsonl");
+        put(&precious, &path);
+        let loss = Loss::NotDeleted { at_ns: 0, file: "clips/a.mcap".into(), bytes: 1, why: "why".to_owned() };
+        assert_refused(folder.losses().note(&loss).err().unwrap(), &path, why);
+        assert!(is_untouched(&precious), "{why}");
+    }
+}
+
+#[test]
+fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
+    let (scratch, elsewhere) = (Scratch::new(), Scratch::new());
+    let clips = scratch.0.join("clips");
+    symlink(&elsewhere.0, &clips).unwrap();
+    assert_refused(Folder::open(&scratch.0).err().unwrap(), &clips, "it is a link");
+    fs::remove_file(&clips).unwrap();
+    fs::write(&clips, "").unwrap();
+    assert_refused(Folder::open(&scratch.0).err().unwrap(), &clips, "it is no folder");
+    fs::remove_file(&clips).unwrap();
+    let preroll = scratch.0.join("preroll");
+    fs::write(elsewhere.0.join("0.chunk"), PRECIOUS).unwrap();
+    symlink(&elsewhere.0, &preroll).unwrap();
+    let settings = gleaner_recorder::Settings {
+        store: Store::Disk,
+        preroll_bytes: 16 << 20,
+        max_length: std::time::Duration::from_secs(600),
+        folder: scratch.0.clone(),
+        clock: "log time of the drive".to_owned(),
+        prefault: false,
+    };
+    let refused = gleaner_recorder::Recorder::new(Folder::open(&scratch.0).unwrap().0, settings).err().unwrap();
+    assert_refused(refused, &preroll, "it is a link");
+    assert!(is_untouched(&elsewhere.0.join("0.chunk")));
+    assert_eq!(fs::read_dir(&elsewhere.0).unwrap().count(), 1, "nothing was made there");
+}
+
+#[test]
+fn what_has_the_names_of_unfinished_files_loses_them_and_nothing_else() {
+    // A clip begins by a name that nobody has, and a list and the preroll by new files.
+    for (put, why) in IN_THE_WAY {
+        let scratch = Scratch::new();
+        let precious = precious(&scratch);
+        fs::create_dir_all(scratch.0.join("clips")).unwrap();
+        let stem = "clips/hello-20180802T083452.000Z";
+        for name in [&format!("{stem}.mcap.part"), &format!("{stem}-2.jpg.part"), "clips.jsonl.part"] {
+            put(&precious, &scratch.0.join(name));
+        }
+        Folder::open(&scratch.0).unwrap().0.replace(&[]).unwrap();
+        let clips = one_clip(&scratch, Store::Disk).unwrap();
+        assert_eq!(clips.len(), 1, "{why}");
+        assert!(clips[0].file.to_str().unwrap().starts_with(stem), "{:?}", clips[0].file);
+        assert_eq!(stamps(&scratch, &clips[0], "/a"), every(500, 1300, 10), "{why}");
+        assert!(is_untouched(&precious), "{why}");
+        assert!(!precious.with_extension("nothing").exists());
+    }
+}
+
+#[test]
+fn a_pipe_that_is_named_like_a_clip_is_not_waited_for() {
+    let scratch = Scratch::new();
+    {
+        let mut recorder = scratch.recorder(|_| {});
+        let topics = [recorder.add_topic(topic("/a")).unwrap()];
+        let lambda = recorder.add_lambda(member("hello", (500, 500, 0), &topics));
+        drive(&mut recorder, &topics, (0, 3000, 10), &[(2000, lambda, &[Start])]);
+        // It dies: nothing is finished.
+    }
+    let parts = || fs::read_dir(scratch.0.join("clips")).unwrap().map(|entry| entry.unwrap().path());
+    let part = parts().find(|path| path.to_str().unwrap().ends_with(".mcap.part")).unwrap();
+    pipe(&part.with_extension(""));
+    let (_, found) = Folder::open(&scratch.0).unwrap();
+    assert_eq!(found.len(), 1);
+    assert!(found[0].file.to_str().unwrap().ends_with("-2.mcap"), "{:?}", found[0].file);
+}
