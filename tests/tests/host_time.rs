@@ -178,31 +178,31 @@ fn the_name_of_a_model_costs_fuel_by_the_byte() {
     assert_eq!(more - some, 100_000 / 8);
 }
 
-/// Fills a large memory so often, by instructions that no epoch ends.
-fn fills(times: usize) -> String {
+/// Fills a memory of 256 MiB by one instruction, which no epoch ends.
+fn fills() -> String {
     let parts = r#"
-        (core module $large
-            (memory (export "memory") 768))
+        (core module $large (memory (export "memory") 4096))
         (core instance $large (instantiate $large))"#;
-    let fill = "(memory.fill $large (i32.const 0) (i32.const 1) (i32.const 0x3000000))";
-    let body = format!(r#"(import "large" "memory" (memory $large 768)) (func $wake {})"#, fill.repeat(times));
-    component(parts, r#"(with "large" (instance $large))"#, &body)
+    let body = r#"
+        (import "large" "memory" (memory $large 4096))
+        (func $wake (memory.fill $large (i32.const 0) (i32.const 1) (i32.const 0x10000000)))"#;
+    component(parts, r#"(with "large" (instance $large))"#, body)
 }
 
 #[test]
 fn a_wake_that_comes_back_late_is_a_fault_though_nothing_ended_it() {
     let mut limits = limits();
-    limits.memory = ByteSize::mib(64);
+    limits.memory = ByteSize::mib(300);
     limits.fuel = u64::from(u32::MAX);
     limits.deadline = Duration::from_millis(2);
-    let mut room = Room::written_timed(&fills(40), &limits);
+    let mut room = Room::written_timed(&fills(), &limits);
     room.guest.init().unwrap();
     let fault = room.fault();
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(2_000_000)), "{}", fault.message);
     assert!(fault.used > Some(4_000_000), "{}", fault.message);
     assert!(fault.message.ends_with("ms; the deadline is 2.0 ms"), "{}", fault.message);
     // A replay has no deadline, and a wake that is in time is none.
-    Room::written_within(&fills(40), &limits).wake().result.unwrap();
+    Room::written_within(&fills(), &limits).wake().result.unwrap();
     limits.deadline = Duration::from_secs(60);
-    Room::written_timed(&fills(1), &limits).wake().result.unwrap();
+    Room::written_timed(&fills(), &limits).wake().result.unwrap();
 }
