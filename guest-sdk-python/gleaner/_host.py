@@ -71,7 +71,10 @@ def numpy_version() -> str:
         return str(sys.modules["numpy"].__version__)
     # Without `site` this interpreter does not know that it is one of an environment.
     own = os.path.dirname(os.path.dirname(os.path.abspath(sys.executable)))
-    for folder in filter(os.path.isdir, site.getsitepackages([own, sys.base_prefix])):
+    # Debian's says where the system's packages lie, and not those of an environment.
+    python = "python{}.{}".format(*sys.version_info)
+    folders = [os.path.join(own, "lib", python, "site-packages"), *site.getsitepackages([own, sys.base_prefix])]
+    for folder in filter(os.path.isdir, folders):
         for name in sorted(os.listdir(folder)):
             found = re.match(r"numpy-([^-]+?)(?:-py[\d.]+)?\.(?:dist|egg)-info", name)
             if found:

@@ -10,7 +10,7 @@ use clap::Args;
 use gleaner_buffers::Pool;
 use gleaner_jail::Paths;
 use gleaner_protocol::manifest::{Manifest, Store};
-use gleaner_protocol::{BuildDir, Checked, Exit, Failure, Need, Place, Report};
+use gleaner_protocol::{BuildDir, Checked, Exit, Failure, Fault, Need, Place, Report};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::message::Sources;
@@ -72,16 +72,19 @@ impl Job {
         let mut stage = Stage::set(&mut topics, &asked, &manifest, bounds, Some(&Live { bell: None }), load)?;
         // Without its type, a field that is there would be missing.
         let mut log = Vec::new();
-        let init_ms = if notes.is_empty() {
-            let started = Instant::now();
-            let initialised = stage.guest.init();
+        let mut started = |outcome: Result<(), Fault>| {
             let (said, _) = stage.session.take_log();
-            initialised.map_err(|fault| not_started(manifest.lambda.name.as_str(), fault, &said))?;
+            outcome.map_err(|fault| not_started(manifest.lambda.name.as_str(), fault, &said))?;
             log.extend(said.into_iter().map(|line| line.message));
-            Some(started.elapsed().as_secs_f64() * 1e3)
-        } else {
-            None
+            Ok::<_, Failure>(())
         };
+        started(stage.guest.prepare())?;
+        let mut init_ms = None;
+        if notes.is_empty() {
+            let begun = Instant::now();
+            started(stage.guest.init())?;
+            init_ms = Some(begun.elapsed().as_secs_f64() * 1e3);
+        }
         let checked = Checked {
             lambda: manifest.lambda.name.to_string(),
             version: manifest.lambda.version.to_string(),

@@ -10,7 +10,7 @@ use std::sync::OnceLock;
 use gleaner_jail::{JailError, Paths, alone, cgroup, files, memory, tried};
 use gleaner_protocol::manifest::Kind;
 use gleaner_protocol::parts::cache_dir;
-use gleaner_protocol::{Exit, Failure, Holds, LAYERS_ENV, Layer};
+use gleaner_protocol::{Exit, Failure, Holds, LAYERS_ENV, Layer, own_file};
 use gleaner_vitals::{PULSE_ENV, Pulse};
 use rustix::process::{Signal, set_parent_process_death_signal};
 
@@ -19,8 +19,14 @@ pub struct Isolation {
     inside: Inside,
     pulse: Pulse,
     layers: OnceLock<Result<Vec<Layer>, JailError>>,
+    /// Memory that this process had when it was shut.
+    taken: OnceLock<Option<u64>>,
     bounded: OnceLock<Option<Layer>>,
 }
+
+/// Most memory that modules of an interpreter's environment add to what it may have, in bytes: numpy takes some 50 MB, and more for each of
+/// its threads.
+const MODULES: u64 = 256 << 20;
 
 /// What is left to a lambda's process.
 #[derive(Clone, Debug, Default)]
@@ -47,7 +53,7 @@ impl Isolation {
         let signal = if has_shim { Signal::KILL } else { Signal::TERM };
         set_parent_process_death_signal(Some(signal))
             .map_err(|error| failed("cannot be told of the starter's death", &std::io::Error::from(error)))?;
-        Ok(Self { inside, pulse, layers: OnceLock::new(), bounded: OnceLock::new() })
+        Ok(Self { inside, pulse, layers: OnceLock::new(), taken: OnceLock::new(), bounded: OnceLock::new() })
     }
 
     /// The page that the shim looks at.
@@ -55,13 +61,18 @@ impl Isolation {
         &self.pulse
     }
 
-    /// Bounds the memory of an interpreter, which has its modules by now. An earlier bound holds until then. Once.
+    /// Bounds the memory of an interpreter, which has its modules by now: they count for 256 MiB at most. An earlier bound holds until
+    /// then. Once.
     ///
     /// # Errors
     ///
     /// What keeps that from holding: the lambda must not be let in.
     pub fn bound_memory(&self) -> Result<(), String> {
-        let layer = self.bounded.get_or_init(|| self.inside.memory.map(memory::limit));
+        let layer = self.bounded.get_or_init(|| {
+            let before = self.taken.get().copied().flatten();
+            let now = memory::taken().zip(before).map(|(now, before)| now.min(before.saturating_add(MODULES)));
+            self.inside.memory.map(|more| memory::limit_beyond(now, more))
+        });
         match layer {
             Some(Layer { holds: Holds::No, note, .. }) => {
                 Err(format!("cannot bound the memory of its process: {note}"))
@@ -98,6 +109,7 @@ impl Isolation {
             let counted = "the component's memories are counted as they grow";
             layers.push(Layer::yes(memory::NAME, bound.as_deref().unwrap_or(counted)));
             layers.extend(alone::stay(allowed.is_some())?);
+            self.taken.get_or_init(memory::taken);
             Ok(tried::tried(layers))
         });
         layers.as_deref().map_err(|error| {
@@ -162,14 +174,7 @@ pub fn place_of_results(folder: &Path, lambda: &Path) -> Result<PathBuf, Failure
         Failure::caused_by(Exit::Internal, format!("cannot make `{}`", folder.display()), error)
             .with_help("choose another folder: --out DIR")
     };
-    if folder.starts_with(lambda) {
-        // Whoever made the lambda may have put a link there.
-        let within = folder.ancestors().take_while(|path| *path != lambda);
-        if let Some(link) = within.filter(|path| path.is_symlink()).last() {
-            let message = format!("`{}` is a link in the lambda's own folder", link.display());
-            return Err(Failure::new(Exit::Usage, message).with_help("remove it, or name the folder: --out DIR"));
-        }
-    }
+    own_file::real_place(folder, lambda)?;
     std::fs::create_dir_all(folder).map_err(|error| failed(&error))?;
     folder.canonicalize().map_err(|error| failed(&error))
 }

@@ -316,7 +316,7 @@ fn bounded(out: &Path, name: &'static str, bytes: u64) -> Result<Vec<u8>, FileEr
     let path = out.join(name);
     let read = || {
         let mut text = Vec::new();
-        own_file::read(&path)?.take(bytes + 1).read_to_end(&mut text)?;
+        own_file::read_named(&path)?.take(bytes + 1).read_to_end(&mut text)?;
         Ok(text)
     };
     let text = read().map_err(|source| FileError::Read { name, source })?;

@@ -1,13 +1,13 @@
 //! The processes of one run, from their start to their end.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::link::{Add, Control};
-use gleaner_protocol::{Exit, ExitRecord, Failure, Live, Parts};
+use gleaner_protocol::{Exit, ExitRecord, Failure, Live, Parts, own_file};
 
 use super::ear::{Ear, Heard};
 use super::process::Process;
@@ -58,7 +58,8 @@ impl Party {
         left: Option<Duration>,
         restarts: u32,
     ) -> Result<Self, Failure> {
-        real_place(&arguments::out(args), &args.asked.lambda)?;
+        // Recorder and shim write there before the runtime looks.
+        own_file::real_place(&arguments::out(args), &args.asked.lambda)?;
         let parts = Parts::find()?;
         let (say, heard) = mpsc::sync_channel(UNHEARD);
         let failed = |error: &dyn std::error::Error| {
@@ -148,32 +149,4 @@ impl Party {
 
 fn in_words(who: &str, status: ExitStatus) -> String {
     format!("{who} ended by itself ({status})")
-}
-
-/// Refuses a folder of results that is a link in the lambda's own folder: whoever made the lambda may have put it there, and
-/// the recorder and the shim write there before the runtime looks.
-fn real_place(out: &Path, lambda: &Path) -> Result<(), Failure> {
-    let within = out.ancestors().take_while(|path| out.starts_with(lambda) && *path != lambda);
-    let Some(link) = within.filter(|path| path.is_symlink()).last() else { return Ok(()) };
-    let message = format!("`{}` is a link in the lambda's own folder", link.display());
-    Err(Failure::new(Exit::Usage, message).with_help("remove it, or name the folder: --out DIR"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn results_are_no_way_out_of_the_lambdas_folder() {
-        let (lambda, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let live = lambda.path().join("live");
-        real_place(&live, lambda.path()).unwrap();
-        real_place(elsewhere.path(), lambda.path()).unwrap();
-        std::os::unix::fs::symlink(elsewhere.path(), &live).unwrap();
-        for out in [live.clone(), live.join("more")] {
-            let failure = real_place(&out, lambda.path()).unwrap_err().to_string();
-            assert!(failure.contains("live` is a link in the lambda's own folder"), "{failure}");
-            assert!(failure.contains("--out DIR"), "{failure}");
-        }
-    }
 }

@@ -5,8 +5,8 @@
 
 use gleaner_protocol::Layer;
 
-use crate::JailError;
 use crate::filter::{Refused, install, install_everywhere};
+use crate::{JailError, memory};
 
 /// The name of the layer for processes.
 pub const PROCESSES: &str = "processes";
@@ -129,7 +129,7 @@ const ALL: u64 = u32::MAX as u64;
 const TYPE: u64 = 0xf;
 
 /// Leaves this process alone, in all of its threads. With `only_counted_memory` it can take none that a
-/// [`memory::limit`](crate::memory::limit) does not count. Gives the layers with what was refused; whether they hold is for
+/// [`memory::limit`] does not count. Gives the layers with what was refused; whether they hold is for
 /// [`tried`](crate::tried) to see.
 ///
 /// # Errors
@@ -165,16 +165,21 @@ fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
         refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
     }
     if only_counted_memory {
-        refused = counted_only(refused);
+        refused = match memory::stack() {
+            // Moved elsewhere, it would still count as stack, and could be made any size. The allocator moves blocks of data so.
+            Some(stack) => counted_only(refused).between(libc::SYS_mremap, 0, stack),
+            None => counted_only(refused).calls(&[libc::SYS_mremap]),
+        };
     }
     // Without gleaner-shim nobody has done that yet.
     install_everywhere(&Refused::no_clone3()?)?;
     install_everywhere(&refused.filter(libc::EPERM)?)
 }
 
-/// What a process that is about to become an interpreter does not need any more. From the first line on that runs code of the
-/// lambda's environment, which may leave nothing behind that is not shut later: no other process, no socket but those of DDS, and,
-/// with `only_counted_memory`, no memory as in [`stay`]. Signals to others neither.
+/// What a process that is about to become an interpreter does not need any more: no other process, no socket but those of DDS, and,
+/// with `only_counted_memory`, no memory as in [`stay`]. Signals to others neither. Nothing of the lambda's runs until [`stay`], but the
+/// interpreter may be any program that calls itself Python.
+#[must_use]
 pub fn before_interpreter(only_counted_memory: bool) -> Layer {
     match install_before(only_counted_memory) {
         Ok(()) => Layer::yes(START, "seccomp: no processes, no signals to others, no sockets but those of DDS"),
@@ -210,15 +215,14 @@ fn no_signals(refused: Refused) -> Refused {
     refused.calls(SIGNALS).unless(libc::SYS_kill, 0, me).unless(libc::SYS_tgkill, 0, me)
 }
 
-/// No memory but that of the process itself; that of the stack, moved elsewhere, would still count as stack.
+/// No memory but that of the process itself.
 fn counted_only(refused: Refused) -> Refused {
     let shared = (libc::MAP_SHARED | libc::MAP_ANONYMOUS) as u64;
     let down = libc::MAP_GROWSDOWN as u64;
-    refused.bits(libc::SYS_mmap, 3, shared, shared).bits(libc::SYS_mmap, 3, down, down).calls(&[
-        libc::SYS_memfd_create,
-        MEMFD_SECRET,
-        libc::SYS_mremap,
-    ])
+    refused
+        .bits(libc::SYS_mmap, 3, shared, shared)
+        .bits(libc::SYS_mmap, 3, down, down)
+        .calls(&[libc::SYS_memfd_create, MEMFD_SECRET])
 }
 
 /// Of pairs of sockets only streams: with others one can send to whoever has a name.

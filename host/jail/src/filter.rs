@@ -1,6 +1,7 @@
 //! From a list of system calls to a filter in the kernel that refuses them.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use rustix::thread::{SecureComputingMode, secure_computing_mode};
 use seccompiler::{
@@ -37,6 +38,15 @@ impl Refused {
     /// Refuses `call` unless the lower half of its argument `index` is `value`.
     pub(crate) fn unless(self, call: i64, index: u8, value: u64) -> Self {
         self.when(call, index, SeccompCmpOp::Ne, value)
+    }
+
+    /// Refuses `call` where its argument `index`, an address, lies in `range`.
+    pub(crate) fn between(mut self, call: i64, index: u8, range: Range<u64>) -> Self {
+        let condition = |operator, value| SeccompCondition::new(index, SeccompCmpArgLen::Qword, operator, value);
+        let both = condition(SeccompCmpOp::Ge, range.start)
+            .and_then(|from| SeccompRule::new(vec![from, condition(SeccompCmpOp::Lt, range.end)?]));
+        self.insert(call, vec![both.expect("an index below 6, and two conditions")]);
+        self
     }
 
     fn when(self, call: i64, index: u8, operator: SeccompCmpOp, value: u64) -> Self {

@@ -30,8 +30,8 @@ fn apart(name: &str, test: fn()) {
 fn all_threads_are_shut_in() {
     apart("all_threads_are_shut_in", || {
         never::forbid();
-        alone::before_interpreter(true);
-        let layers = alone::stay(true).unwrap();
+        let mut layers = vec![alone::before_interpreter(true)];
+        layers.extend(alone::stay(true).unwrap());
         assert!(layers.iter().all(|layer| layer.holds == Holds::Yes), "{layers:?}");
     });
 }
@@ -43,7 +43,7 @@ fn a_thread_with_a_filter_of_its_own_is_not_left_loose() {
         let (ready, is_ready) = mpsc::channel();
         let (_end, ended) = mpsc::channel::<()>();
         thread::spawn(move || {
-            alone::before_interpreter(false);
+            assert_eq!(alone::before_interpreter(false).holds, Holds::Yes);
             ready.send(()).unwrap();
             let _ = ended.recv();
         });
@@ -58,7 +58,7 @@ fn an_interpreter_that_starts_signals_nobody_and_has_no_memory_that_is_not_count
     apart("an_interpreter_that_starts_signals_nobody_and_has_no_memory_that_is_not_counted", || {
         let parent = getppid().unwrap();
         test_kill_process(parent).unwrap();
-        alone::before_interpreter(true);
+        assert_eq!(alone::before_interpreter(true).holds, Holds::Yes);
         assert_eq!(test_kill_process(parent), Err(Errno::PERM));
         test_kill_process(getpid()).unwrap();
         assert_eq!(memfd_create("more", MemfdFlags::CLOEXEC).unwrap_err(), Errno::PERM);

@@ -16,7 +16,7 @@ use crate::api::data::Wake;
 
 /// A lambda that can be woken.
 pub trait Guest {
-    /// Runs what comes before the lambda and is as foreign as it. Called once, before the first `init`.
+    /// Runs what comes before the lambda and is as foreign as it. Called once, before the first `init`, or by that.
     ///
     /// # Errors
     ///

@@ -38,6 +38,7 @@ pub struct Watched {
     guest: Box<dyn Guest>,
     isolation: Arc<Isolation>,
     patience: Patience,
+    is_prepared: bool,
     /// The next wake begins with an `init`.
     is_new: bool,
 }
@@ -45,17 +46,30 @@ pub struct Watched {
 impl Watched {
     /// `guest`, which has not been entered yet.
     pub fn new(guest: Box<dyn Guest>, isolation: Arc<Isolation>, patience: Patience) -> Self {
-        Self { guest, isolation, patience, is_new: false }
+        Self { guest, isolation, patience, is_prepared: false, is_new: false }
     }
 }
 
+/// How long what comes before a lambda may take: an environment that starts, and numpy from a cold disk.
+const PREPARE: Duration = Duration::from_secs(300);
+
 impl Guest for Watched {
-    fn init(&mut self) -> Result<(), Fault> {
+    fn prepare(&mut self) -> Result<(), Fault> {
         let loose = |message| Fault { kind: FaultKind::HostCall, message, used: None, allowed: None };
         self.isolation.close().map_err(|failure| loose([failure.message, failure.causes.join(": ")].join(": ")))?;
-        let _busy = self.isolation.pulse().busy(Doing::Init, self.patience.init, 0);
+        let busy = self.isolation.pulse().busy(Doing::Init, PREPARE, 0);
         self.guest.prepare()?;
+        drop(busy);
         self.isolation.bound_memory().map_err(loose)?;
+        self.is_prepared = true;
+        Ok(())
+    }
+
+    fn init(&mut self) -> Result<(), Fault> {
+        if !self.is_prepared {
+            self.prepare()?;
+        }
+        let _busy = self.isolation.pulse().busy(Doing::Init, self.patience.init, 0);
         self.guest.init()
     }
 

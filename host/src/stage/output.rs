@@ -183,8 +183,8 @@ const PENDING_BYTES: usize = 64 << 10;
 
 impl Lines {
     fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
-        let opened =
-            own_file::append(&path).and_then(|file| if again { Ok(file) } else { file.set_len(0).map(|()| file) });
+        let begun = if again { Ok(()) } else { own_file::anew(&path).map(drop) };
+        let opened = begun.and_then(|()| own_file::append(&path));
         match opened {
             Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None }),
             Err(source) => Err(OutputError { path, source }),
@@ -257,18 +257,19 @@ mod tests {
                 "it is no file",
             ),
         ];
-        for (name, (put, why), again) in ["decisions.jsonl", "log.jsonl"]
-            .into_iter()
-            .flat_map(|name| put.into_iter().flat_map(move |put| [(name, put, false), (name, put, true)]))
-        {
+        let cases = ["decisions.jsonl", "log.jsonl"].into_iter().flat_map(|name| put.map(|put| (name, put)));
+        for (name, (put, why)) in cases {
             let folder = tempfile::tempdir().unwrap();
             let (precious, path) = (folder.path().join("precious"), folder.path().join(name));
             fs::write(&precious, "precious").unwrap();
             put(&precious, &path);
-            let error = Output::begin(folder.path(), true, again).err().unwrap();
+            let error = Output::begin(folder.path(), true, true).err().unwrap();
             assert_eq!(error.help().unwrap(), "remove it, or choose another folder: --out DIR");
             let text = gleaner_protocol::Failure::from(error).to_string();
             assert!(text.contains(&format!("`{}`", path.display())) && text.contains(why), "{text}");
+            // What begins anew takes its place.
+            Output::begin(folder.path(), true, false).unwrap();
+            assert!(said(folder.path(), name).is_empty());
             assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
         }
     }

@@ -137,6 +137,8 @@ impl Pulse {
 
     /// From now on this process is busy with `doing`, and should be back within `allowed`. `at_ns` is the time of the wake.
     pub fn busy(&self, doing: Doing, allowed: Duration, at_ns: i64) -> Busy<'_> {
+        // What was refused before was no end.
+        self.page().full.store(0, Ordering::Release);
         self.set(doing, allowed, at_ns);
         Busy { pulse: self }
     }

@@ -10,6 +10,8 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
+use crate::{Exit, Failure};
+
 /// Why something that has the name of a file or folder of ours is none. It is the cause in an [`io::Error`].
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InTheWay {
@@ -25,9 +27,6 @@ pub enum InTheWay {
     /// A hard link: what is written appears elsewhere, too.
     #[error("the file has other names")]
     OtherNames,
-    /// Another user's file.
-    #[error("the file belongs to another user")]
-    OthersFile,
 }
 
 impl InTheWay {
@@ -119,14 +118,23 @@ pub fn folder(path: &Path) -> io::Result<()> {
     }
 }
 
+/// Refuses `folder`, of results, if it lies in the folder `lambda` by way of a link: whoever made the lambda may have put it there.
+///
+/// # Errors
+///
+/// A failure that names the link.
+pub fn real_place(folder: &Path, lambda: &Path) -> Result<(), Failure> {
+    let within = folder.ancestors().take_while(|path| folder.starts_with(lambda) && *path != lambda);
+    let Some(link) = within.filter(|path| path.is_symlink()).last() else { return Ok(()) };
+    let message = format!("`{}` is a link in the lambda's own folder", link.display());
+    Err(Failure::new(Exit::Usage, message).with_help("remove it, or name the folder: --out DIR"))
+}
+
 /// A file that nobody but us sees under another name.
 fn own(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
     let (file, found) = open(path, options, OFlags::NOFOLLOW)?;
     if found.nlink() > 1 {
         return Err(io::Error::other(InTheWay::OtherNames));
-    }
-    if found.uid() != rustix::process::geteuid().as_raw() {
-        return Err(io::Error::other(InTheWay::OthersFile));
     }
     Ok(file)
 }
@@ -243,6 +251,20 @@ mod tests {
         let link = folder.path("link");
         symlink(folder.write("drive.journal", "x"), &link).unwrap();
         read_named(&link).unwrap();
+    }
+
+    #[test]
+    fn results_are_no_way_out_of_the_lambdas_folder() {
+        let (lambda, elsewhere) = (Scratch::new(), Scratch::new());
+        let live = lambda.path("live");
+        real_place(&live, lambda.root()).unwrap();
+        real_place(elsewhere.root(), lambda.root()).unwrap();
+        symlink(elsewhere.root(), &live).unwrap();
+        for out in [live.clone(), live.join("more")] {
+            let failure = real_place(&out, lambda.root()).unwrap_err().to_string();
+            assert!(failure.contains("live` is a link in the lambda's own folder"), "{failure}");
+            assert!(failure.contains("--out DIR"), "{failure}");
+        }
     }
 
     #[test]
