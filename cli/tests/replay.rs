@@ -42,7 +42,8 @@ impl Installation {
 
     fn command(&self, arguments: &[&str]) -> Command {
         let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
-        gleaner.args(["replay", "dir", "a.mcap"]).args(arguments).env("GLEANER_HOME", &self.0);
+        // What a runtime reports says what happened, and not where.
+        gleaner.args(["replay", "dir", "a.mcap", "--out"]).arg(&self.0).args(arguments).env("GLEANER_HOME", &self.0);
         gleaner
     }
 
