@@ -13,5 +13,5 @@ pub(crate) fn run(args: &CheckArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["check".into()];
     line.extend(args.asked.settings());
     line.extend(["--".into(), args.asked.lambda.clone().into()]);
-    show_result(runtime::run(line)?, args.json)
+    show_result(runtime::run(&args.asked.lambda, line)?, args.json)
 }

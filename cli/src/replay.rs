@@ -21,10 +21,10 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
 
 /// Replays. How the runtime ended, and whether there are results of this replay: a lambda that could not start leaves those of before.
 pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
-    let (mut heard, exit) = runtime::run(arguments(args))?;
+    let (mut heard, exit) = runtime::run(&args.asked.lambda, arguments(args))?;
     let has_results = heard.is_some();
     if let Some(Heard::Summary(summary)) = &mut heard {
-        // Not where the report says: it comes from the lambda's process.
+        // Not where the report says, which may come from the lambda's process.
         summary.out = args.out.clone().unwrap_or_else(|| args.asked.lambda.join("out"));
     }
     let report = match &heard {
@@ -68,7 +68,7 @@ pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
     let mut line = vec!["verify".into(), "--lambda".into(), args.lambda.clone().into()];
     line.extend(args.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]));
     line.extend(["--".into(), args.clip.clone().into()]);
-    show_result(runtime::run(line)?, args.json)
+    show_result(runtime::run(&args.lambda, line)?, args.json)
 }
 
 /// Shows what the runtime reported last, and ends as it ended.

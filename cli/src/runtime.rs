@@ -2,12 +2,13 @@
 
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, Read, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use gleaner_protocol::{Checked, Exit, Explain, Failure, Parts, Report, Summary, Verified, visible};
+use gleaner_protocol::manifest::{Kind, Manifest};
+use gleaner_protocol::{BuildDir, Checked, Exit, Explain, Failure, Parts, Report, Summary, Verified, visible};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::listen::Listener;
@@ -55,12 +56,12 @@ pub(crate) enum Heard {
     Checked(Box<Checked>),
 }
 
-/// Runs the runtime with these arguments to its end. Gives its result and how it ended; no result if it has said why there
-/// is none.
-pub(crate) fn run(arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Failure> {
+/// Runs the runtime on `lambda` with these arguments to its end. Returns its result and how it ended; no result if it has printed
+/// why there is none.
+pub(crate) fn run(lambda: &Path, arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Failure> {
     let parts = Parts::find()?;
     let runtime = parts.program("gleaner-runtime")?;
-    let shim = parts.program("gleaner-shim")?;
+    let shim = if has_worker(lambda) { None } else { Some(parts.program("gleaner-shim")?) };
     let bar = progress_bar();
     let mut child = start(shim, runtime, arguments)?;
     // Both streams are heard on threads of their own: a lambda may leave processes behind that hold them open for ever.
@@ -96,11 +97,20 @@ pub(crate) fn run(arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Fai
     }
 }
 
-/// Starts the runtime below its shim.
-fn start(program: PathBuf, runtime: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
-    Command::new(&program)
-        .args([starter(), "--".into()])
-        .arg(runtime)
+/// Whether nothing of the lambda runs in the process of `gleaner-runtime`, which starts a worker for it, below a shim: so it is
+/// for Python. Of a lambda that cannot be read, the runtime reports why.
+fn has_worker(lambda: &Path) -> bool {
+    Manifest::load(BuildDir::of(lambda).path()).is_ok_and(|manifest| manifest.lambda.kind == Kind::Python)
+}
+
+/// Starts the runtime, below `shim` if the lambda runs in its process.
+fn start(shim: Option<PathBuf>, runtime: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
+    let mut command = Command::new(shim.as_ref().unwrap_or(&runtime));
+    if shim.is_some() {
+        command.args([starter(), "--".into()]).arg(&runtime);
+    }
+    let program = shim.unwrap_or(runtime);
+    command
         .args(arguments)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())

@@ -91,7 +91,7 @@ impl Job {
             kind: manifest.lambda.kind,
             engine: stage.guest.engine(),
             init_ms,
-            resident_bytes: gleaner_vitals::usage::resident(),
+            resident_bytes: stage.guest.resident_bytes(),
             needs: needs(&asked, &manifest),
             log,
             notes,

@@ -50,9 +50,7 @@ impl Isolation {
         let failed = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
         let pulse = Pulse::inherited().map_err(|error| failed("cannot use the shim's page", &error))?;
         let has_shim = std::env::var_os(PULSE_ENV).is_some();
-        let signal = if has_shim { Signal::KILL } else { Signal::TERM };
-        set_parent_process_death_signal(Some(signal))
-            .map_err(|error| failed("cannot be told of the starter's death", &std::io::Error::from(error)))?;
+        end_with_starter(if has_shim { Signal::KILL } else { Signal::TERM })?;
         Ok(Self { inside, pulse, layers: OnceLock::new(), taken: OnceLock::new(), bounded: OnceLock::new() })
     }
 
@@ -118,6 +116,18 @@ impl Isolation {
             )
         })
     }
+}
+
+/// Has this process end by `signal` when the process that started it dies.
+///
+/// # Errors
+///
+/// A failure if the system refuses that.
+pub fn end_with_starter(signal: Signal) -> Result<(), Failure> {
+    set_parent_process_death_signal(Some(signal)).map_err(|error| {
+        let error = std::io::Error::from(error);
+        Failure::caused_by(Exit::Internal, "cannot have this process end with the one that started it", &error)
+    })
 }
 
 /// The layers that `gleaner-shim`, or the process that became this interpreter, has set up.

@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Cause, Decision};
+use gleaner_protocol::{Cause, Decision, Fault};
 
 use crate::api::Session;
 use crate::api::data::Wake;
-use crate::guest::Guest;
+use crate::guest::{Guest, Totals};
 
 /// Faults in a row that are taken for bad luck, or for one bad second of a sensor. From then on the lambda rests.
 pub const FAULTS_IN_A_ROW: u32 = 8;
@@ -85,7 +85,7 @@ impl Judge {
         }
         let started = Instant::now();
         let outcome = self.guest.wake(wake);
-        let run = started.elapsed();
+        let run = outcome.run_ns.map_or_else(|| started.elapsed(), Duration::from_nanos);
         self.run += run;
         decision.run_ns = run.as_nanos() as u64;
         decision.fuel = outcome.fuel;
@@ -100,6 +100,20 @@ impl Judge {
             }
         }
         decision
+    }
+
+    /// Ends a lambda that runs in another process, after its last wake.
+    ///
+    /// # Errors
+    ///
+    /// As [`Guest::finish`].
+    pub fn finish(&mut self) -> Result<Option<Totals>, Fault> {
+        self.guest.finish()
+    }
+
+    /// The most memory that the lambda's process had, in bytes.
+    pub fn most_resident_bytes(&self) -> u64 {
+        self.guest.most_resident_bytes()
     }
 
     /// Time spent in the lambda so far.
@@ -154,7 +168,7 @@ mod tests {
         fn wake(&mut self, wake: Wake) -> Outcome {
             let fault = Fault { kind: FaultKind::Trap, message: String::new(), used: None, allowed: None };
             let result = if wake.at_ns() < self.until_ns { Err(fault) } else { Ok(()) };
-            Outcome { result, fuel: None }
+            Outcome { result, fuel: None, run_ns: None }
         }
 
         fn engine(&self) -> String {

@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::fs::File;
-use std::io;
+use std::io::{self, Write};
 use std::process::ExitCode;
 use std::sync::Arc;
 
@@ -11,11 +11,20 @@ use gleaner_buffers::Pool;
 use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
 use gleaner_transport::SampleMeta;
+#[cfg(feature = "python")]
+use rustix::process::Signal;
 
+use crate::api::Session;
 use crate::api::frame::Info;
 use crate::check::{self, CheckArgs};
+use crate::guest::Guest;
 use crate::guest::watched::{Patience, Watched};
+#[cfg(feature = "python")]
+use crate::guest::worker::Remote;
+use crate::guest::worker::{Reports, Sender};
 use crate::input::live_slots;
+#[cfg(feature = "python")]
+use crate::isolation;
 use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
 use crate::live;
@@ -28,6 +37,9 @@ use crate::topics::TopicsArgs;
 #[derive(Parser)]
 #[command(name = "gleaner-runtime", version)]
 struct Cli {
+    /// Runs the lambda of a replay, sends each outcome to the process that started this one, and writes nothing.
+    #[arg(long, hide = true)]
+    worker: bool,
     #[command(subcommand)]
     command: Command,
 }
@@ -69,8 +81,9 @@ impl Job {
     }
 
     /// What a process needs from its start: the place of its results, which is made, and memory for itself and its rings.
-    fn around(&self) -> Result<Inside, Failure> {
+    fn around(&self, is_worker: bool) -> Result<Inside, Failure> {
         let results = match self {
+            _ if is_worker => None,
             Self::Replay(job) => {
                 job.make_journal()?;
                 job.results()
@@ -79,7 +92,7 @@ impl Job {
             #[cfg(feature = "dds")]
             Self::Live(job) => Some(job.results()),
         };
-        let mut inside = self.inside();
+        let mut inside = self.inside(is_worker);
         if let Some(folder) = results {
             inside.paths.write.push(place_of_results(folder, &self.lambda().0.lambda)?);
         }
@@ -87,14 +100,17 @@ impl Job {
         Ok(inside)
     }
 
-    /// What is left to the process once the lambda is in it.
-    fn inside(&self) -> Inside {
-        let (paths, ours) = match self {
+    /// What is left to the process once the lambda is in it. A worker writes nothing.
+    fn inside(&self, is_worker: bool) -> Inside {
+        let (mut paths, ours) = match self {
             Self::Replay(job) => (job.paths(), job.own_memory()),
             Self::Check(job) => (job.paths(), 0),
             #[cfg(feature = "dds")]
             Self::Live(job) => (job.paths(), job.own_memory()),
         };
+        if is_worker {
+            paths.write.clear();
+        }
         let manifest = self.lambda().1;
         // What grows in place may be there twice for a moment.
         let kept = 2 * manifest.limits.scratch.bytes();
@@ -104,14 +120,47 @@ impl Job {
         Inside { paths, memory: (manifest.lambda.kind == Kind::Python).then_some(memory), all }
     }
 
-    fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {
+    /// Whether samples arrive while the lambda runs. If not, a Python lambda runs in a worker.
+    #[cfg(feature = "python")]
+    fn is_live(&self) -> bool {
         match self {
-            Self::Replay(job) => job.run(load, isolation, &mut reports),
-            Self::Check(job) => job.run(load, &mut reports),
+            Self::Replay(_) | Self::Check(_) => false,
             #[cfg(feature = "dds")]
-            Self::Live(job) => job.run(load, isolation, reports),
+            Self::Live(_) => true,
         }
     }
+
+    /// Does what is not live, with guests in this process or in a worker.
+    fn run_offline(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
+        match self {
+            Self::Replay(job) => job.run(load, reports),
+            Self::Check(job) => job.run(load, reports),
+            #[cfg(feature = "dds")]
+            Self::Live(_) => Err(no_worker()),
+        }
+    }
+
+    fn work(self, load: Load<'_>, reports: &mut Reports) -> Result<Exit, Failure> {
+        match self {
+            Self::Replay(job) => job.work(load, reports),
+            Self::Check(job) => job.run(load, reports),
+            #[cfg(feature = "dds")]
+            Self::Live(_) => Err(no_worker()),
+        }
+    }
+
+    fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {
+        match self {
+            #[cfg(feature = "dds")]
+            Self::Live(job) => job.run(load, isolation, reports),
+            job => job.run_offline(load, &mut reports),
+        }
+    }
+}
+
+#[cfg(feature = "dds")]
+fn no_worker() -> Failure {
+    Failure::new(Exit::Usage, "a live run has no worker").with_help("leave `--worker` out")
 }
 
 /// Memory that a process takes before the lambda is in it, at most: an interpreter with numpy and our own part take some 100 MB,
@@ -145,31 +194,39 @@ impl Command {
 /// `main` of `gleaner-runtime`.
 pub fn main() -> ExitCode {
     prepare();
-    end(Cli::parse().command.job().and_then(|job| job.map_or_else(Ok, run_any)))
+    let Cli { worker, command } = Cli::parse();
+    end(command.job().and_then(|job| job.map_or_else(Ok, |job| run_any(job, worker))))
 }
 
 /// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: their job, with the guest
 /// that `load` makes. Returns the exit code.
 pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
     prepare();
-    let command = match Cli::try_parse_from(args) {
-        Ok(cli) => cli.command,
+    let Cli { worker, command } = match Cli::try_parse_from(args) {
+        Ok(cli) => cli,
         Err(error) => {
             let _ = error.print();
             return Exit::Usage.code();
         }
     };
-    code(command.job().and_then(|job| job.map_or_else(Ok, |job| run(job, load))))
+    code(command.job().and_then(|job| job.map_or_else(Ok, |job| if worker { work(job, load) } else { run(job, load) })))
 }
 
-fn run_any(job: Job) -> Result<Exit, Failure> {
+fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
     #[allow(unused_variables, reason = "who cannot host Python does not look into the folder")]
     let (asked, manifest) = job.lambda();
     #[allow(unused_variables, reason = "the same")]
-    let around = job.around()?;
+    let around = job.around(is_worker)?;
     match manifest.lambda.kind {
         #[cfg(feature = "wasm")]
         Kind::Wasm => run(job, &mut wasm::load),
+        #[cfg(feature = "python")]
+        Kind::Python if !is_worker && !job.is_live() => {
+            let mut remote =
+                |_: &Asked, manifest: &Manifest, session, _| Ok(Box::new(Remote::start(manifest, session)?) as _);
+            isolation::end_with_starter(Signal::TERM)?;
+            job.run_offline(&mut remote, &mut reports()?)
+        }
         #[cfg(feature = "python")]
         Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
@@ -185,17 +242,40 @@ fn run_any(job: Job) -> Result<Exit, Failure> {
 }
 
 fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
-    let isolation = Arc::new(Isolation::of_this_process(job.inside())?);
-    let mut watched = |asked: &Asked, manifest: &Manifest, session, bounds| {
+    let isolation = Arc::new(Isolation::of_this_process(job.inside(false))?);
+    let mut watched = watched(load, &isolation);
+    job.run(&mut watched, &isolation, reports()?)
+}
+
+/// Does the part of `job` that is the worker's. Once the lambda may have run, what goes wrong is no longer printed: the process
+/// that reads the outcomes finds it too, and nothing here is to be taken for its words.
+fn work(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
+    let isolation = Arc::new(Isolation::of_this_process(job.inside(true))?);
+    let reports = Reports::to(reports()?);
+    let mut watched = watched(load, &isolation);
+    let mut sending = |asked: &Asked, manifest: &Manifest, session: Session, bounds| {
+        let guest: Box<dyn Guest> = watched(asked, manifest, session.clone(), bounds)?;
+        let layers = guest.layers()?;
+        Ok(Box::new(Sender::begin(guest, session, reports.clone(), layers)) as _)
+    };
+    let ended = job.work(&mut sending, &mut reports.clone());
+    if reports.is_ready() { Ok(ended.unwrap_or(Exit::Ok)) } else { ended }
+}
+
+/// Has the guests that `load` makes entered only once this process is sandboxed.
+fn watched<'a>(
+    load: Load<'a>,
+    isolation: &'a Arc<Isolation>,
+) -> impl FnMut(&Asked, &Manifest, Session, Bounds) -> Result<Box<dyn Guest>, Failure> + 'a {
+    move |asked, manifest, session, bounds| {
         let limits = &manifest.limits;
         let patience = match bounds {
             Bounds::Replay => Patience::replay(limits.init_deadline, limits.deadline),
             Bounds::Live(deadline) => Patience::live(limits.init_deadline, deadline),
         };
         let guest = load(asked, manifest, session, bounds)?;
-        Ok(Box::new(Watched::new(guest, Arc::clone(&isolation), patience)) as _)
-    };
-    job.run(&mut watched, &isolation, reports()?)
+        Ok(Box::new(Watched::new(guest, Arc::clone(isolation), patience)) as _)
+    }
 }
 
 /// What was standard output. What a library writes there by itself goes to standard error; what a lambda prints is in its log.

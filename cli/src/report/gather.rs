@@ -100,6 +100,7 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
         config,
         counts: told.wakes().into_iter().collect(),
         damaged: None,
+        stopped: None,
         notes,
         facts: facts(&told),
         totals: Totals {
@@ -149,6 +150,7 @@ fn place(run: &mut Run, told: &Told) {
     run.to = seconds(to_ns.max(from_ns), run.start_ns);
     run.is_part = !part.is_all();
     run.damaged.clone_from(&summary.damaged);
+    run.stopped.clone_from(&summary.stopped);
 }
 
 /// Gives `take` what each line of `name` says. Lines that say nothing are counted in `notes`.

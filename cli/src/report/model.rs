@@ -43,6 +43,7 @@ pub(crate) struct Run {
     pub(crate) config: Option<BTreeMap<String, ConfigValue>>,
     pub(crate) counts: BTreeMap<&'static str, u64>,
     pub(crate) damaged: Option<String>,
+    pub(crate) stopped: Option<String>,
     /// What is missing on the page, and why.
     pub(crate) notes: Vec<String>,
     /// What it took, in words.

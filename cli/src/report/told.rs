@@ -133,6 +133,7 @@ impl Told {
                 summary.drive.truncate(DRIVES_MAX);
                 summary.drive.iter_mut().for_each(|drive| *drive = cut(&drive.to_string_lossy(), NAME_CHARS).into());
                 summary.damaged = summary.damaged.as_deref().map(|why| cut(why, WHY_CHARS));
+                summary.stopped = summary.stopped.as_deref().map(|why| cut(why, WHY_CHARS));
                 summary.topics.truncate(TOPICS_MAX);
                 let topics = summary.topics.iter_mut();
                 let names = topics.flat_map(|topic| [&mut topic.name, &mut topic.topic, &mut topic.type_name]);

@@ -233,6 +233,10 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
             writeln!(text, "    {}", visible(line))?;
         }
     }
+    if let Some(why) = &summary.stopped {
+        writeln!(text, "  {}", paint.red("the lambda's process ended before the drive did; the results end there"))?;
+        writeln!(text, "    {}", visible(why))?;
+    }
 
     if !summary.part.is_all() {
         let [from_s, to_s] = [from_ns, to_ns].map(|ns| seconds(ns, summary.start_ns));

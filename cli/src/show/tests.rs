@@ -47,6 +47,7 @@ fn replay() -> Summary {
         in_cooldown: 0,
         ignored: 0,
         damaged: None,
+        stopped: None,
     }
 }
 

@@ -243,7 +243,7 @@ impl Guest for PythonGuest {
         Python::attach(|py| {
             let result = self.run(py, wake);
             self.tidy(py);
-            Outcome { result, fuel: None }
+            Outcome { result, fuel: None, run_ns: None }
         })
     }
 

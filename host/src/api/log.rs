@@ -2,7 +2,7 @@
 
 use gleaner_protocol::journal::Said;
 use gleaner_protocol::manifest::Limits;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::Session;
 
@@ -10,7 +10,7 @@ use super::Session;
 pub const LINE_BYTES: usize = 4096;
 
 /// How much a line matters.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[allow(missing_docs)]
 pub enum Level {
@@ -73,6 +73,12 @@ impl Log {
 
     pub(super) fn dropped(&self) -> u64 {
         self.dropped
+    }
+
+    /// Adds what was counted in another process, where the lines were written.
+    pub(super) fn relay(&mut self, said: Said, dropped: u64) {
+        self.said = said;
+        self.dropped = self.dropped.saturating_add(dropped);
     }
 
     fn write(&mut self, at_ns: i64, level: Level, message: &str) {

@@ -11,6 +11,7 @@ pub mod frame;
 pub mod inference;
 pub mod log;
 mod piece;
+pub mod relayed;
 mod sample;
 pub mod scratch;
 pub mod trace;

@@ -107,11 +107,24 @@ impl Default for Looked {
 }
 
 impl Looked {
+    pub(super) fn forget(&self) {
+        self.0.store(NONE, Ordering::Relaxed);
+    }
+
+    /// Position of the oldest sample that was handed out.
+    pub(super) fn oldest(&self) -> Option<u64> {
+        Some(self.0.load(Ordering::Relaxed)).filter(|position| *position != NONE)
+    }
+
     /// Notes the oldest of the samples that a call hands out.
     pub(super) fn at(&self, oldest: Option<&Lease<SampleMeta>>) {
-        if let Some(position) = oldest.and_then(Lease::position)
-            && position < self.0.load(Ordering::Relaxed)
-        {
+        if let Some(position) = oldest.and_then(Lease::position) {
+            self.at_position(position);
+        }
+    }
+
+    pub(super) fn at_position(&self, position: u64) {
+        if position < self.0.load(Ordering::Relaxed) {
             self.0.store(position, Ordering::Relaxed);
         }
     }
@@ -155,7 +168,7 @@ impl Trace {
                 _ => topic.reader().newest_before(until).map(|lease| identity(lease.meta())),
             };
         }
-        topic.looked.0.store(NONE, Ordering::Relaxed);
+        topic.looked.forget();
     }
 
     /// After a wake that `woken_by` caused, if it is a sample of this topic: notes how far back the lambda looked.

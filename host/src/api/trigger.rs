@@ -81,6 +81,11 @@ impl Rate {
         self.refused
     }
 
+    /// Adds triggers that were refused in another process.
+    pub(super) fn relay(&mut self, refused: u64) {
+        self.refused = self.refused.saturating_add(refused);
+    }
+
     /// Whether one more may be caused.
     fn check(&mut self, at_ns: i64) -> Result<(), TriggerError> {
         let minute = at_ns.div_euclid(MINUTE_NS);
@@ -101,6 +106,10 @@ pub(super) struct Triggers(Vec<Trigger>);
 impl Triggers {
     pub(super) fn into_list(self) -> Vec<Trigger> {
         self.0
+    }
+
+    pub(super) fn list(&self) -> &[Trigger] {
+        &self.0
     }
 
     fn add(

@@ -1,9 +1,10 @@
 //! Plain values that a lambda is given: they hold nothing and ask nobody.
 
 use gleaner_transport::Guid;
+use serde::{Deserialize, Serialize};
 
 /// What became of a topic's samples since the lambda started.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
     /// Entered the ring.
     pub received: u64,

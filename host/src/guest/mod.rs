@@ -9,10 +9,16 @@ pub mod wasm;
 pub mod python;
 
 pub mod watched;
+pub mod worker;
 
-use gleaner_protocol::Fault;
+use std::sync::Arc;
 
-use crate::api::data::Wake;
+use gleaner_protocol::signals::Curve;
+use gleaner_protocol::{Failure, Fault, Layer};
+use gleaner_vitals::usage;
+
+use crate::api::curves::Curves;
+use crate::api::data::{Counts, Topic, Wake};
 
 /// A lambda that can be woken.
 pub trait Guest {
@@ -37,6 +43,59 @@ pub trait Guest {
 
     /// What runs the lambda, with its version: a decision is only the same again on the same.
     fn engine(&self) -> String;
+
+    /// The layers around the process that runs the lambda. Called before the first `init`.
+    ///
+    /// # Errors
+    ///
+    /// A failure if that process cannot be sandboxed.
+    fn layers(&self) -> Result<Vec<Layer>, Failure> {
+        Ok(Vec::new())
+    }
+
+    /// Resident memory of that process, in bytes.
+    fn resident_bytes(&self) -> u64 {
+        usage::resident()
+    }
+
+    /// The most that it was.
+    fn most_resident_bytes(&self) -> u64 {
+        usage::most_resident()
+    }
+
+    /// Ends a lambda that runs in another process, after its last wake; returns what is known there alone.
+    ///
+    /// # Errors
+    ///
+    /// The fault with which that process ended instead.
+    fn finish(&mut self) -> Result<Option<Totals>, Fault> {
+        Ok(None)
+    }
+}
+
+/// What a course through a drive led to, beside its decisions.
+pub struct Totals {
+    /// What became of the samples of each input, in the manifest's order.
+    pub counts: Vec<Counts>,
+    /// Time spent decoding images, in ns.
+    pub decode_ns: u64,
+    /// What the lambda read.
+    pub curves: Vec<Curve>,
+    /// Fields that it read and that have no curve.
+    pub curves_left_out: u64,
+}
+
+impl Totals {
+    /// Of a lambda over `inputs` in this process, with what it read of them.
+    pub fn of(inputs: &[Arc<Topic>], curves: &Curves) -> Self {
+        let (curves, curves_left_out) = curves.take();
+        Self {
+            counts: inputs.iter().map(|topic| topic.counts()).collect(),
+            decode_ns: inputs.iter().map(|topic| topic.decode_ns()).sum(),
+            curves,
+            curves_left_out,
+        }
+    }
 }
 
 /// How a wake ended.
@@ -45,4 +104,6 @@ pub struct Outcome {
     pub result: Result<(), Fault>,
     /// Fuel used by this wake, where the kind counts it and it is the same on every machine.
     pub fuel: Option<u64>,
+    /// Time in the lambda, if it was measured elsewhere.
+    pub run_ns: Option<u64>,
 }

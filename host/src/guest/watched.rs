@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::{Doing, Fault, FaultKind};
+use gleaner_protocol::{Doing, Failure, Fault, FaultKind, Layer};
 
 use super::{Guest, Outcome};
 use crate::api::data::Wake;
@@ -85,5 +85,9 @@ impl Guest for Watched {
 
     fn engine(&self) -> String {
         self.guest.engine()
+    }
+
+    fn layers(&self) -> Result<Vec<Layer>, Failure> {
+        Ok(self.isolation.close()?.to_vec())
     }
 }

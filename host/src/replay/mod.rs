@@ -17,6 +17,7 @@ mod record;
 mod round;
 mod signals;
 mod verify;
+mod work;
 
 pub use inspect::{InspectArgs, inspect};
 pub use options::{Job, Options, ReplayArgs, VerifyArgs};
@@ -28,7 +29,7 @@ use gleaner_protocol::{Exit, Failure, Report};
 
 use self::hold::Hold;
 use self::options::{Results, Task};
-use crate::isolation::Isolation;
+use crate::guest::worker::Reports;
 use crate::stage::Load;
 
 /// What the times of a replay are.
@@ -43,16 +44,31 @@ impl Job {
     /// # Errors
     ///
     /// A failure if it cannot start, or results cannot be written; of a comparison, the first difference.
-    pub fn run(self, load: Load<'_>, isolation: &Isolation, reports: &mut dyn Write) -> Result<Exit, Failure> {
+    pub fn run(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
         let Self { options, manifest, task } = self;
         match task {
-            Task::Replay(results) => replay(&options, &results, &manifest, load, isolation, reports),
+            Task::Replay(results) => replay(&options, &results, &manifest, load, reports),
             Task::Verify(mut claim) => {
                 let verified = verify::run(&options, &manifest, &mut claim, load)?;
                 report(reports, &Report::Verified(verified));
                 Ok(Exit::Ok)
             }
         }
+    }
+
+    /// Does what a worker has to do for it: the guest that `load` makes sends the outcome of each wake, and the rest goes to
+    /// `reports`.
+    ///
+    /// # Errors
+    ///
+    /// A failure if it cannot start. What is found wrong later, the process that reads the outcomes finds as well.
+    pub fn work(self, load: Load<'_>, reports: &Reports) -> Result<Exit, Failure> {
+        let Self { options, manifest, task } = self;
+        match task {
+            Task::Replay(results) => work::work(&options, &results, &manifest, load, reports)?,
+            Task::Verify(mut claim) => drop(verify::run(&options, &manifest, &mut claim, load)?),
+        }
+        Ok(Exit::Ok)
     }
 }
 
@@ -61,16 +77,12 @@ fn replay(
     results: &Results,
     manifest: &Manifest,
     load: Load<'_>,
-    isolation: &Isolation,
     reports: &mut dyn Write,
 ) -> Result<Exit, Failure> {
     let _hold = Hold::take(&results.out)?;
     let mut n = 1;
     let (summary, broken) = loop {
-        let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports)?;
-        if n == 1 {
-            report(reports, &Report::Isolation { layers: isolation.close()?.to_vec() });
-        }
+        let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports, n == 1)?;
         if results.repeat > 1 {
             report(reports, &Report::Round(round::report(n, &summary)));
         }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_protocol::journal::{End, Part};
 use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Explain, Failure, Report, Round, Summary, TopicReport};
+use gleaner_protocol::{Exit, Explain, Failure, FaultKind, Report, Round, Summary, TopicReport};
 use gleaner_transport::replay::{Progress, Replay, Step};
 use gleaner_vitals::usage;
 
@@ -20,9 +20,10 @@ use super::record::{Recorded, Recording, remove_clips};
 use super::signals::Gathered;
 use super::{CLOCK, Options, report as send};
 use crate::api::Session;
-use crate::api::data::{Topic, Wake};
+use crate::api::data::{Counts, Topic, Wake};
 use crate::api::log::Line;
 use crate::api::trace::offered;
+use crate::guest::Totals;
 use crate::journal::{Identity, Scribe};
 use crate::judge::Judge;
 use crate::schedule::Schedule;
@@ -48,6 +49,8 @@ struct Pass<'a> {
     wakes: u64,
     triggers: u64,
     faults: u64,
+    /// Why the lambda's process could not go on.
+    stopped: Option<String>,
     log_lines: u64,
     samples: u64,
     looked: Instant,
@@ -82,7 +85,9 @@ impl Course for Pass<'_> {
                 recording.wake(entry)?;
             }
         }
-        Ok(true)
+        // In a replay a killed process is not started again: what it kept is gone, and what would follow is no replay of the vehicle.
+        self.stopped = decision.fault.filter(|fault| fault.kind == FaultKind::Killed).map(|fault| fault.message);
+        Ok(self.stopped.is_none())
     }
 
     fn sample(&mut self, drive: &Replay, step: &Step) -> Result<(), Failure> {
@@ -113,12 +118,22 @@ impl Pass<'_> {
         Ok(self.journal.as_mut().map_or(Ok(()), JournalFile::flush)?)
     }
 
+    /// Ends the lambda's process after its last wake, where it has one of its own.
+    fn finish(&mut self) -> Option<Totals> {
+        self.judge.finish().unwrap_or_else(|fault| {
+            self.faults += 1;
+            self.stopped = Some(fault.message);
+            None
+        })
+    }
+
     /// Goes through the drive, and closes what is recorded.
     fn run(&mut self, drive: &mut Replay) -> Result<(Reached, Recorded), Failure> {
         let span = Span::of(drive, self.part);
         let reached = course::take(drive, span, self)?;
         // Of a damaged drive nobody knows what came after the last sample.
-        let end_ns = span.end_ns.filter(|_| reached.broken.is_none()).unwrap_or(reached.at_ns);
+        let is_whole = reached.broken.is_none() && !reached.stopped;
+        let end_ns = span.end_ns.filter(|_| is_whole).unwrap_or(reached.at_ns);
         let recorded = self.recording.as_ref().map_or(Ok(Recorded::default()), |recording| recording.finish(end_ns))?;
         Ok((reached, recorded))
     }
@@ -130,6 +145,7 @@ pub(super) fn replay(
     manifest: &Manifest,
     load: Load<'_>,
     reports: &mut dyn Write,
+    is_first: bool,
 ) -> Result<(Summary, Option<Exit>), Failure> {
     let name = manifest.lambda.name.as_str();
     let (mut drive, part) = open_drives(options)?;
@@ -149,6 +165,10 @@ pub(super) fn replay(
     }
     let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.files.clone()));
     let gathered = Gathered::of(&inputs, recording.as_ref().and_then(Recording::camera));
+    let layers = guest.layers()?;
+    if is_first {
+        send(reports, &Report::Isolation { layers });
+    }
     let initialised = guest.init();
     // What `init` says is no part of a wake.
     let (said, _) = session.take_log();
@@ -175,6 +195,7 @@ pub(super) fn replay(
         wakes: 0,
         triggers: 0,
         faults: 0,
+        stopped: None,
         log_lines: 0,
         samples: 0,
         looked: Instant::now(),
@@ -189,10 +210,12 @@ pub(super) fn replay(
     let broken = reached.broken.map(DriveError);
     if let (Some(journal), Some(digests)) = (pass.journal.take(), digests) {
         let samples = inputs.iter().map(|topic| offered(topic)).collect();
-        // A journal of a damaged drive has no end: it cannot say what comes there.
+        // A journal of a damaged drive, or of a lambda that was killed, has no end: it cannot say what comes there.
         let end = End { wakes: pass.wakes, samples, drives: digests.take()? };
-        journal.finish(broken.is_none().then_some(&end))?;
+        journal.finish((broken.is_none() && pass.stopped.is_none()).then_some(&end))?;
     }
+    let totals = if pass.stopped.is_none() { pass.finish() } else { None };
+    let totals = totals.unwrap_or_else(|| Totals::of(&inputs, pass.gathered.curves()));
     let wall_s = started.elapsed().as_secs_f64();
     let summary = Summary {
         lambda: name.to_owned(),
@@ -203,7 +226,7 @@ pub(super) fn replay(
         wakes: pass.wakes,
         triggers: pass.triggers,
         faults: pass.faults,
-        skipped: inputs.iter().map(|topic| topic.counts().skipped).sum(),
+        skipped: totals.counts.iter().map(|counts| counts.skipped).sum(),
         missed_ticks: pass.schedule.missed(),
         out_of_order: drive.out_of_order(),
         log_lines: pass.log_lines,
@@ -215,10 +238,10 @@ pub(super) fn replay(
         part,
         wall_s,
         run_s: pass.judge.run().as_secs_f64(),
-        decode_s: inputs.iter().map(|topic| topic.decode_ns()).sum::<u64>() as f64 / 1e9,
+        decode_s: totals.decode_ns as f64 / 1e9,
         wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
-        peak_rss_bytes: usage::most_resident(),
-        topics: inputs.iter().map(topic_report).collect(),
+        peak_rss_bytes: pass.judge.most_resident_bytes(),
+        topics: inputs.iter().zip(&totals.counts).map(topic_report).collect(),
         clips: recorded.clips,
         clips_replaced,
         in_cooldown: recorded.in_cooldown,
@@ -228,9 +251,10 @@ pub(super) fn replay(
             failure.causes.push(read_so_far(&drive, reached.at_ns));
             failure.to_string()
         }),
+        stopped: pass.stopped.clone(),
     };
     // What a report is drawn from is no result: without it, the results are whole.
-    if let Err(error) = pass.gathered.write(&results.out, pass.output, &options.asked.config) {
+    if let Err(error) = pass.gathered.write(&results.out, pass.output, &options.asked.config, totals) {
         tracing::warn!(%error, why = %error.source, "the report will be without signals");
     }
     output.finish(&summary)?;
@@ -260,8 +284,7 @@ pub(super) fn report(n: u32, summary: &Summary) -> Round {
     }
 }
 
-fn topic_report(topic: &Arc<Topic>) -> TopicReport {
-    let counts = topic.counts();
+fn topic_report((topic, counts): (&Arc<Topic>, &Counts)) -> TopicReport {
     TopicReport {
         name: topic.name().to_owned(),
         topic: topic.ros_topic().to_owned(),

@@ -12,6 +12,7 @@ use hdrhistogram::Histogram;
 use super::pictures::{Camera, Pictures};
 use crate::api::curves::Curves;
 use crate::api::data::Topic;
+use crate::guest::Totals;
 use crate::stage::{Output, OutputError};
 
 /// Bins between a number and ten times as much.
@@ -45,14 +46,20 @@ impl Gathered {
         self.pictures.wake(decision);
     }
 
+    /// What the lambda reads in this process.
+    pub(super) fn curves(&self) -> &Curves {
+        &self.curves
+    }
+
     /// Writes it into the folder `out`, which is that of `output`.
     pub(super) fn write(
         self,
         out: &Path,
         output: &Output,
         config: &[(String, ConfigValue)],
+        totals: Totals,
     ) -> Result<(), OutputError> {
-        let (curves, curves_left_out) = self.curves.take();
+        let Totals { curves, curves_left_out, .. } = totals;
         let triggered = self.pictures.wakes();
         let (pictures, pictures_left_out) = self.pictures.write(out).unwrap_or_else(|error| {
             tracing::warn!(%error, why = %error.source, "the report will be without pictures");

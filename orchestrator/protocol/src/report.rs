@@ -166,6 +166,9 @@ pub struct Summary {
     pub ignored: u64,
     /// What is wrong with the drive, if it is damaged; the results end there.
     pub damaged: Option<String>,
+    /// Why the lambda's process could not go on to the end of the drive; the results end there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stopped: Option<String>,
 }
 
 /// What arrived on one input, and what was lost on the way.

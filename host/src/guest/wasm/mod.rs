@@ -133,7 +133,7 @@ impl Guest for WasmGuest {
         let _waiting = waiting.enter();
         let mut live = match self.live.take().map_or_else(|| self.session.clone().during_init(|| self.start()), Ok) {
             Ok(live) => live,
-            Err(fault) => return Outcome { result: Err(fault), fuel: None },
+            Err(fault) => return Outcome { result: Err(fault), fuel: None, run_ns: None },
         };
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));
         let mut call = Call::begin(&mut live.store, self.limits.fuel, deadline);
@@ -145,7 +145,7 @@ impl Guest for WasmGuest {
         }
         // How deep a stack reaches depends on the processor, for which the code was compiled, and so does the fuel until it is full.
         let stacked = result.as_ref().is_err_and(|fault| fault.kind == FaultKind::Stack);
-        Outcome { result, fuel: (!stacked).then_some(fuel) }
+        Outcome { result, fuel: (!stacked).then_some(fuel), run_ns: None }
     }
 
     fn engine(&self) -> String {

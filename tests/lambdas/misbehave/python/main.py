@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import signal
+import stat
 import sys
+import time
 
 from gleaner import Context, Sample
 
@@ -13,6 +18,7 @@ class Lambda:
     def __init__(self, ctx: Context) -> None:
         self.behaviour: str = ctx.config["behaviour"]
         self.held: list[object] = []
+        self.target: str = ctx.config["target"]
         self.wakes = 0
         if self.behaviour == "error_in_init":
             raise RuntimeError("no, not today")
@@ -84,3 +90,47 @@ class Lambda:
 
     def print_in_pieces(self, ctx: Context, event: Sample) -> None:
         print("wake", self.wakes, "of", self.behaviour, file=sys.stderr)
+
+    def write(self, ctx: Context, event: Sample) -> None:
+        """Looks for whatever it can write: files that are open, and places in the folder `target`."""
+        for fd in map(int, os.listdir("/proc/self/fd")):
+            try:
+                is_file = stat.S_ISREG(os.fstat(fd).st_mode)
+                writes = fcntl.fcntl(fd, fcntl.F_GETFL) & os.O_ACCMODE != os.O_RDONLY
+                name = os.readlink(f"/proc/self/fd/{fd}")
+            except OSError:
+                continue
+            # The page that the shim reads is memory, and no file of anybody.
+            if is_file and writes and "memfd:" not in name:
+                ctx.event("escaped", 1.0, found=name)
+        for name in ("new", "decisions.jsonl", "log.jsonl", ".lock", "clips.jsonl", "drive.journal"):
+            try:
+                with open(os.path.join(self.target, name), "ab"):
+                    ctx.event("escaped", 1.0, found=name)
+            except OSError:
+                pass
+
+    def forge_end(self, ctx: Context, event: Sample) -> None:
+        """Ends its process as a program of the host would, with a message of that."""
+        ctx.event("before", 1.0)
+        if self.wakes == 3:
+            os.write(2, b"error: the drive is damaged\n")
+            os._exit(7)
+
+    def kill_itself(self, ctx: Context, event: Sample) -> None:
+        if self.wakes == 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def forge_messages(self, ctx: Context, event: Sample) -> None:
+        """Writes a message of the host into each pipe that is open."""
+        message = b"x" * (5 << 20) if self.target == "long" else self.target.encode() + b"\n"
+        if self.wakes == 3:
+            for fd in range(3, 64):
+                try:
+                    if stat.S_ISFIFO(os.fstat(fd).st_mode):
+                        os.write(fd, message)
+                except OSError:
+                    pass
+
+    def sleep(self, ctx: Context, event: Sample) -> None:
+        time.sleep(3600)

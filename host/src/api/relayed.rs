@@ -1,0 +1,126 @@
+//! What a lambda caused in another process: read out there, and taken over here by the rules that hold for its calls.
+
+use gleaner_protocol::journal::Said;
+use gleaner_protocol::{Trigger, TriggerKind};
+use serde_json::Value;
+
+use super::Session;
+use super::data::Topic;
+use super::trigger::{Attribute, AttributeValue, TriggerError};
+
+impl Session {
+    /// Triggers of this wake so far.
+    pub fn triggers(&self) -> Vec<Trigger> {
+        self.lock().triggers.as_ref().map(|triggers| triggers.list().to_vec()).unwrap_or_default()
+    }
+
+    /// Takes a trigger over from another process.
+    ///
+    /// # Errors
+    ///
+    /// [`TriggerError`] if no call could have caused it.
+    pub fn relay_trigger(&self, trigger: Trigger) -> Result<(), TriggerError> {
+        let Trigger { kind, label, score, attributes } = trigger;
+        let wrong = |key: &str, why| TriggerError::Attribute { label: label.clone(), key: key.to_owned(), why };
+        if score.is_some() != (kind == TriggerKind::Event) {
+            return Err(wrong("score", "an event has a score, and nothing else has one"));
+        }
+        let attributes = attributes.into_iter().map(|(key, value)| match attribute(value) {
+            Some(value) => Ok(Attribute { key, value }),
+            None => Err(wrong(&key, "the value must be a truth value, a number or a text")),
+        });
+        let attributes = attributes.collect::<Result<_, _>>()?;
+        match (kind, score) {
+            (TriggerKind::Event, score) => self.event(&label, score.unwrap_or_default(), attributes),
+            (TriggerKind::Start, _) => self.start(&label, attributes),
+            (TriggerKind::Stop, _) => self.stop(&label),
+        }
+    }
+
+    /// Takes over what another process counted in a call: all lines that the lambda logged, of which those that passed the rate
+    /// limit were taken over by [`Session::log`], and what was dropped and refused.
+    pub fn relay_counts(&self, said: Said, log_dropped: u64, triggers_refused: u64) {
+        let mut state = self.lock();
+        state.log.relay(said, log_dropped);
+        state.rate.relay(triggers_refused);
+    }
+}
+
+fn attribute(value: Value) -> Option<AttributeValue> {
+    Some(match value {
+        Value::Bool(value) => AttributeValue::Boolean(value),
+        Value::Number(number) => match number.as_i64() {
+            Some(value) => AttributeValue::Signed(value),
+            None => AttributeValue::Real(number.as_f64()?),
+        },
+        Value::String(text) => AttributeValue::Text(text),
+        Value::Null | Value::Array(_) | Value::Object(_) => return None,
+    })
+}
+
+impl Topic {
+    /// Forgets how far back the lambda has looked.
+    pub fn forget_looked(&self) {
+        self.looked.forget();
+    }
+
+    /// How many samples back from the newest the lambda has looked in this wake; none if at none.
+    pub fn looked_back(&self) -> Option<u64> {
+        self.looked.oldest().map(|oldest| self.reader().head().saturating_sub(oldest))
+    }
+
+    /// Notes that the lambda, in another process, has looked so many samples back from the newest.
+    pub fn relay_looked(&self, back: u64) {
+        self.looked.at_position(self.reader().head().saturating_sub(back));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_protocol::manifest::Limits;
+    use serde_json::json;
+
+    use super::*;
+
+    fn session() -> Session {
+        let session = Session::new(Vec::new(), Vec::new(), &Limits::default());
+        session.begin(0);
+        session
+    }
+
+    fn trigger(text: Value) -> Trigger {
+        serde_json::from_value(text).unwrap()
+    }
+
+    #[test]
+    fn a_trigger_is_taken_over_as_it_was_caused() {
+        let attributes = json!({"n": 1, "x": 1.0, "far": -2.5e300, "is": true, "text": "ä\u{1b}"});
+        let there = [
+            trigger(json!({"kind": "event", "label": "a", "score": 1.0, "attributes": attributes})),
+            trigger(json!({"kind": "start", "label": "b", "score": null, "attributes": {}})),
+            trigger(json!({"kind": "stop", "label": "b", "score": null, "attributes": {}})),
+        ];
+        let here = session();
+        there.iter().for_each(|trigger| here.relay_trigger(trigger.clone()).unwrap());
+        assert_eq!(here.triggers(), there);
+        assert_eq!(here.end(), there);
+    }
+
+    #[test]
+    fn a_trigger_that_no_call_could_have_caused_is_refused() {
+        for (kind, label, score, attributes) in [
+            ("event", "", json!(1.0), json!({})),
+            ("event", "a", json!(null), json!({})),
+            ("start", "a", json!(1.0), json!({})),
+            ("event", "a", json!(1.0), json!({"list": [1]})),
+            ("event", "a", json!(1.0), json!({"": 1})),
+            ("event", "a", json!(1.0), json!({"text": "x".repeat(2000)})),
+        ] {
+            let text = json!({"kind": kind, "label": label, "score": score, "attributes": attributes});
+            assert!(session().relay_trigger(trigger(text.clone())).is_err(), "{text}");
+        }
+        let here = session();
+        let one = || trigger(json!({"kind": "event", "label": "a", "score": 1.0, "attributes": {}}));
+        assert_eq!((0..20).filter(|_| here.relay_trigger(one()).is_ok()).count(), 16);
+    }
+}

@@ -1,0 +1,220 @@
+//! The side of the process that started a worker: a guest whose outcomes come from there.
+
+use gleaner_protocol::journal::Said;
+use gleaner_protocol::manifest::{Limits, Manifest};
+use gleaner_protocol::signals::Signals;
+use gleaner_protocol::{Exit, ExitRecord, Failure, Fault, FaultKind, Layer};
+
+use super::process::{NoMessage, Process};
+use super::{Called, Done, Message, Woken};
+use crate::api::Session;
+use crate::api::data::Wake;
+use crate::api::log::LINE_BYTES;
+use crate::guest::{Guest, Outcome, Totals};
+
+/// A guest in a worker.
+pub struct Remote {
+    /// None once it has ended.
+    worker: Option<Process>,
+    session: Session,
+    engine: String,
+    layers: Vec<Layer>,
+    /// Most log lines of one call: the worker sends no more than its rate limit lets pass.
+    lines_max: u64,
+    is_prepared: bool,
+    resident_bytes: u64,
+    most_resident_bytes: u64,
+}
+
+impl Remote {
+    /// Starts a worker with the arguments of this process, and waits until it is sandboxed.
+    ///
+    /// # Errors
+    ///
+    /// A failure if the worker cannot be started, or ends before it is ready; it has then printed why.
+    pub fn start(manifest: &Manifest, session: Session) -> Result<Self, Failure> {
+        let mut worker = Process::start()?;
+        let (engine, layers) = match worker.next() {
+            Ok(Message::Ready { engine, layers }) => (engine, layers),
+            _ => return Err(not_ready(worker, manifest)),
+        };
+        worker.ready();
+        let Limits { log_lines, .. } = manifest.limits;
+        Ok(Self {
+            worker: Some(worker),
+            session,
+            engine,
+            layers,
+            lines_max: log_lines,
+            is_prepared: false,
+            resident_bytes: 0,
+            most_resident_bytes: 0,
+        })
+    }
+
+    /// Reads messages up to the one that `wanted` accepts; log lines before it are taken over.
+    fn call<T>(&mut self, wanted: impl Fn(Message) -> Result<T, Message>) -> Result<T, Fault> {
+        let mut lines = 0;
+        loop {
+            let Some(worker) = &mut self.worker else { return Err(self.killed(None)) };
+            match worker.next() {
+                Ok(Message::Log { level, message }) => {
+                    lines += 1;
+                    if lines > self.lines_max || message.len() > LINE_BYTES {
+                        return Err(self.killed(Some("more log than its limits allow")));
+                    }
+                    self.session.log(level, &message);
+                }
+                Ok(message) => {
+                    return wanted(message).map_err(|_| self.killed(Some("a message that is not due")));
+                }
+                Err(NoMessage::Ended) => return Err(self.killed(None)),
+                Err(NoMessage::Malformed(why)) => return Err(self.killed(Some(&why))),
+            }
+        }
+    }
+
+    /// Takes over what a call counted; returns how the call ended.
+    fn called(&mut self, called: Called) -> Result<(), Fault> {
+        let Called { fault, said: (lines, digest), log_dropped, triggers_refused, resident_bytes } = called;
+        let lines = u32::try_from(lines).unwrap_or(u32::MAX);
+        self.session.relay_counts(Said { lines, digest }, log_dropped, triggers_refused);
+        self.resident_bytes = self.resident_bytes.max(resident_bytes);
+        fault.map_or(Ok(()), Err)
+    }
+
+    fn woken(&mut self, wake: &Wake) -> Result<Woken, Fault> {
+        let woken = self.call(|message| match message {
+            Message::Woken(woken) => Ok(woken),
+            other => Err(other),
+        })?;
+        if woken.at_ns != wake.at_ns() {
+            return Err(self.killed(Some("a wake of another time")));
+        }
+        Ok(woken)
+    }
+
+    /// The fault of a worker that has ended; one that sent `nonsense` is killed for it.
+    fn killed(&mut self, nonsense: Option<&str>) -> Fault {
+        let record = self.end(nonsense.is_some());
+        let killed = record.as_ref().and_then(|record| record.killed);
+        let how = match (nonsense, record) {
+            (Some(what), _) => format!("reported {what}, and was ended for it"),
+            (None, Some(record)) => record.sentence().unwrap_or_else(|| "ended by itself, with exit code 0".to_owned()),
+            (None, None) => "has ended".to_owned(),
+        };
+        Fault {
+            kind: FaultKind::Killed,
+            message: format!("the lambda's process {how}"),
+            used: killed.map(|killed| killed.ran_ns),
+            allowed: killed.map(|killed| killed.allowed_ns),
+        }
+    }
+
+    fn end(&mut self, at_once: bool) -> Option<ExitRecord> {
+        let record = self.worker.take()?.end(at_once);
+        let record = record.map_err(|error| tracing::warn!(%error, "how the lambda's process ended is not known")).ok();
+        self.most_resident_bytes = record.as_ref().map_or(0, |record| record.max_rss_bytes);
+        record
+    }
+}
+
+/// The failure of a worker that has ended before anything of the lambda ran: its exit code is that of our own programs.
+fn not_ready(worker: Process, manifest: &Manifest) -> Failure {
+    let message = format!("cannot start lambda `{}`", manifest.lambda.name);
+    match worker.end(true) {
+        Ok(record) => {
+            let exit = record.code.and_then(Exit::from_code).filter(|exit| *exit != Exit::Ok);
+            let mut failure = Failure::new(exit.unwrap_or(Exit::Internal), message);
+            let how = record.sentence().unwrap_or_else(|| "ended".to_owned());
+            failure.causes = vec![format!("its process {how}, before the lambda was loaded")];
+            failure
+        }
+        Err(error) => Failure::caused_by(Exit::Internal, message, &error),
+    }
+}
+
+impl Guest for Remote {
+    fn prepare(&mut self) -> Result<(), Fault> {
+        self.is_prepared = true;
+        let called = self.call(|message| match message {
+            Message::Prepared(called) => Ok(called),
+            other => Err(other),
+        })?;
+        self.called(called)
+    }
+
+    fn init(&mut self) -> Result<(), Fault> {
+        if !self.is_prepared {
+            self.prepare()?;
+        }
+        let called = self.call(|message| match message {
+            Message::Initialised(called) => Ok(called),
+            other => Err(other),
+        })?;
+        self.called(called)
+    }
+
+    fn wake(&mut self, wake: Wake) -> Outcome {
+        let Woken { run_ns, call, triggers, looked, .. } = match self.woken(&wake) {
+            Ok(woken) => woken,
+            Err(fault) => return Outcome { result: Err(fault), fuel: None, run_ns: None },
+        };
+        for trigger in triggers {
+            if let Err(error) = self.session.relay_trigger(trigger) {
+                let fault = self.killed(Some(&format!("a trigger that cannot be: {error}")));
+                return Outcome { result: Err(fault), fuel: None, run_ns: None };
+            }
+        }
+        for (topic, back) in self.session.inputs().iter().zip(looked) {
+            back.into_iter().for_each(|back| topic.relay_looked(back));
+        }
+        Outcome { result: self.called(call), fuel: None, run_ns: Some(run_ns) }
+    }
+
+    fn engine(&self) -> String {
+        self.engine.clone()
+    }
+
+    fn layers(&self) -> Result<Vec<Layer>, Failure> {
+        Ok(self.layers.clone())
+    }
+
+    fn resident_bytes(&self) -> u64 {
+        self.resident_bytes
+    }
+
+    fn most_resident_bytes(&self) -> u64 {
+        self.most_resident_bytes
+    }
+
+    fn finish(&mut self) -> Result<Option<Totals>, Fault> {
+        let mut curves = Vec::new();
+        let done = loop {
+            let message = self.call(|message| match message {
+                Message::Curve(_) | Message::Done(_) => Ok(message),
+                other => Err(other),
+            })?;
+            match message {
+                Message::Curve(curve) if curves.len() < Signals::CURVES_MAX => curves.push(curve),
+                Message::Done(done) => break done,
+                _ => return Err(self.killed(Some("more curves than there can be"))),
+            }
+        };
+        let Done { counts, decode_ns, curves_left_out } = done;
+        match self.end(false) {
+            Some(record) if record.code != Some(0) => {
+                let how = record.sentence().unwrap_or_default();
+                let message = format!("the lambda's process {how}, after its last wake");
+                Err(Fault { kind: FaultKind::Killed, message, used: None, allowed: None })
+            }
+            _ => Ok(Some(Totals { counts, decode_ns, curves, curves_left_out })),
+        }
+    }
+}
+
+impl Drop for Remote {
+    fn drop(&mut self) {
+        self.end(true);
+    }
+}

@@ -1,0 +1,65 @@
+//! The course of a replay in a worker: the lambda is woken as its schedule says, and nothing is written.
+
+use gleaner_protocol::Failure;
+use gleaner_protocol::manifest::Manifest;
+use gleaner_transport::replay::{Replay, Step};
+
+use super::Options;
+use super::course::{self, Course, Span};
+use super::open::open_drives;
+use super::options::Results;
+use super::record::Recording;
+use crate::api::curves::Curves;
+use crate::api::data::Wake;
+use crate::guest::Totals;
+use crate::guest::worker::Reports;
+use crate::judge::Judge;
+use crate::schedule::Schedule;
+use crate::stage::{Bounds, Load, Stage};
+
+/// Takes a lambda through its drives once, and sends the totals to `reports`. Its outcomes are sent by the guest that `load` makes.
+pub(super) fn work(
+    options: &Options,
+    results: &Results,
+    manifest: &Manifest,
+    load: Load<'_>,
+    reports: &Reports,
+) -> Result<(), Failure> {
+    let (mut drive, part) = open_drives(options)?;
+    // The steps of a drive are those of all topics that are read, recorded ones included, and ticks may be counted between them.
+    let _recorded = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
+    let Stage { inputs, session, mut guest } =
+        Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
+    let curves = Curves::of(&inputs);
+    if guest.init().is_err() {
+        // The fault was sent.
+        return Ok(());
+    }
+    let mut pass = Pass { schedule: Schedule::new(manifest, &inputs), judge: Judge::new(session, guest) };
+    let span = Span::of(&drive, part);
+    course::take(&mut drive, span, &mut pass)?;
+    reports.done(Totals::of(&inputs, &curves));
+    Ok(())
+}
+
+struct Pass {
+    schedule: Schedule,
+    judge: Judge,
+}
+
+impl Course for Pass {
+    fn schedule(&mut self) -> &mut Schedule {
+        &mut self.schedule
+    }
+
+    fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
+        if !self.judge.passes_over(wake.at_ns()) {
+            self.judge.judge(wake);
+        }
+        Ok(true)
+    }
+
+    fn sample(&mut self, _: &Replay, _: &Step) -> Result<(), Failure> {
+        Ok(())
+    }
+}
