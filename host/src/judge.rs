@@ -66,13 +66,14 @@ impl Judge {
         Self { session, guest, run: Duration::ZERO, faults: Faults::default() }
     }
 
-    /// Whether the wake at that time does not happen, since the lambda has faulted again and again. It is counted then.
-    pub fn passes_over(&mut self, at_ns: i64) -> bool {
-        let rests = self.faults.rests(at_ns);
+    /// Whether this wake does not happen: since the lambda has faulted again and again, which is counted, or since the process that
+    /// runs the lambda had no room for the sample, which that counts.
+    pub fn passes_over(&mut self, wake: &Wake) -> bool {
+        let rests = self.faults.rests(wake.at_ns());
         if rests {
             self.session.pass_over();
         }
-        rests
+        rests || !self.guest.expects(wake)
     }
 
     /// Runs the lambda once. A fault becomes part of the decision; what the lambda triggered before it still counts, since a
@@ -184,14 +185,18 @@ mod tests {
         (Judge::new(session.clone(), Box::new(Faulty { until_ns })), session)
     }
 
+    fn tick(at_ns: i64) -> Wake {
+        Wake::Tick(Tick { at_ns, missed: 0 })
+    }
+
     /// The times at which a lambda runs that is due every 10 ms.
     fn runs(judge: &mut Judge, from_ms: i64, to_ms: i64) -> Vec<i64> {
         let due = (from_ms..to_ms).step_by(10);
         due.filter(|ms| {
             let at_ns = ms * MS;
-            let runs = !judge.passes_over(at_ns);
+            let runs = !judge.passes_over(&tick(at_ns));
             if runs {
-                judge.judge(Wake::Tick(Tick { at_ns, missed: 0 }));
+                judge.judge(tick(at_ns));
             }
             runs
         })
@@ -219,8 +224,8 @@ mod tests {
     fn a_clock_that_went_back_ends_a_rest() {
         let (mut judge, _) = room(i64::MAX);
         runs(&mut judge, 1000, 1080);
-        assert!(judge.passes_over(1100 * MS));
-        assert!(!judge.passes_over(900 * MS));
+        assert!(judge.passes_over(&tick(1100 * MS)));
+        assert!(!judge.passes_over(&tick(900 * MS)));
     }
 
     #[test]

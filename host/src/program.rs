@@ -8,6 +8,8 @@ use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
 use gleaner_buffers::Pool;
+#[cfg(feature = "python")]
+use gleaner_jail::cgroup;
 use gleaner_protocol::manifest::{Kind, Manifest};
 use gleaner_protocol::{Exit, Failure};
 use gleaner_transport::SampleMeta;
@@ -222,8 +224,11 @@ fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
         Kind::Wasm => run(job, &mut wasm::load),
         #[cfg(feature = "python")]
         Kind::Python if !is_worker && !job.is_live() => {
-            let mut remote =
-                |_: &Asked, manifest: &Manifest, session, _| Ok(Box::new(Remote::start(manifest, session)?) as _);
+            // The group of this process is that of its worker, too.
+            let group = cgroup::fit(job.inside(false).all);
+            let mut remote = |_: &Asked, manifest: &Manifest, session, _| {
+                Ok(Box::new(Remote::start(manifest, session, group.clone())?) as _)
+            };
             isolation::end_with_starter(Signal::TERM)?;
             job.run_offline(&mut remote, &mut reports()?)
         }

@@ -75,6 +75,11 @@ impl Log {
         self.dropped
     }
 
+    /// The lines behind the first `n`, which stay, and what a journal notes of all.
+    pub(super) fn behind(&self, n: usize) -> (&[Line], Said) {
+        (self.lines.get(n..).unwrap_or_default(), self.said)
+    }
+
     /// Adds what was counted in another process, where the lines were written.
     pub(super) fn relay(&mut self, said: Said, dropped: u64) {
         self.said = said;

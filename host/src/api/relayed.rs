@@ -6,12 +6,25 @@ use serde_json::Value;
 
 use super::Session;
 use super::data::Topic;
+use super::log::Line;
 use super::trigger::{Attribute, AttributeValue, TriggerError};
 
 impl Session {
     /// Triggers of this wake so far.
     pub fn triggers(&self) -> Vec<Trigger> {
         self.lock().triggers.as_ref().map(|triggers| triggers.list().to_vec()).unwrap_or_default()
+    }
+
+    /// Log lines that wait to be taken.
+    pub fn lines(&self) -> usize {
+        self.lock().log.behind(0).0.len()
+    }
+
+    /// The lines behind the first `n` of them, which stay, and what a journal notes of all.
+    pub fn lines_behind(&self, n: usize) -> (Vec<Line>, Said) {
+        let state = self.lock();
+        let (lines, said) = state.log.behind(n);
+        (lines.to_vec(), said)
     }
 
     /// Takes a trigger over from another process.

@@ -38,6 +38,11 @@ pub trait Guest {
     /// The fault that ended `init`.
     fn init(&mut self) -> Result<(), Fault>;
 
+    /// Whether the lambda runs at `wake`: in another process, the sample that is to wake it may have found no room.
+    fn expects(&mut self, _wake: &Wake) -> bool {
+        true
+    }
+
     /// Runs one wake to its end.
     fn wake(&mut self, wake: Wake) -> Outcome;
 

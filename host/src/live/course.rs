@@ -70,7 +70,7 @@ impl Course {
 
     fn wake(&mut self, wake: Wake) -> Result<(), Failure> {
         let at_ns = wake.at_ns();
-        if self.judge.passes_over(at_ns) {
+        if self.judge.passes_over(&wake) {
             return Ok(());
         }
         let sample = if let Wake::Event(sample) = &wake { Some(sample) } else { None };

@@ -62,7 +62,7 @@ impl Course for Pass<'_> {
     }
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
-        if self.judge.passes_over(wake.at_ns()) {
+        if self.judge.passes_over(&wake) {
             return Ok(true);
         }
         if let Some(scribe) = &mut self.scribe {

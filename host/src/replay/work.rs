@@ -7,8 +7,8 @@ use gleaner_transport::replay::{Replay, Step};
 use super::Options;
 use super::course::{self, Course, Span};
 use super::open::open_drives;
-use super::options::Results;
 use super::record::Recording;
+use crate::api::Session;
 use crate::api::curves::Curves;
 use crate::api::data::Wake;
 use crate::guest::Totals;
@@ -20,14 +20,14 @@ use crate::stage::{Bounds, Load, Stage};
 /// Takes a lambda through its drives once, and sends the totals to `reports`. Its outcomes are sent by the guest that `load` makes.
 pub(super) fn work(
     options: &Options,
-    results: &Results,
+    is_recorded: bool,
     manifest: &Manifest,
     load: Load<'_>,
     reports: &Reports,
 ) -> Result<(), Failure> {
     let (mut drive, part) = open_drives(options)?;
     // The steps of a drive are those of all topics that are read, recorded ones included, and ticks may be counted between them.
-    let _recorded = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
+    let _recorded = if is_recorded { Recording::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { inputs, session, mut guest } =
         Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
     let curves = Curves::of(&inputs);
@@ -35,7 +35,9 @@ pub(super) fn work(
         // The fault was sent.
         return Ok(());
     }
-    let mut pass = Pass { schedule: Schedule::new(manifest, &inputs), judge: Judge::new(session, guest) };
+    session.take_log();
+    let judge = Judge::new(session.clone(), guest);
+    let mut pass = Pass { schedule: Schedule::new(manifest, &inputs), session, judge };
     let span = Span::of(&drive, part);
     course::take(&mut drive, span, &mut pass)?;
     reports.done(Totals::of(&inputs, &curves));
@@ -44,6 +46,7 @@ pub(super) fn work(
 
 struct Pass {
     schedule: Schedule,
+    session: Session,
     judge: Judge,
 }
 
@@ -53,8 +56,10 @@ impl Course for Pass {
     }
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
-        if !self.judge.passes_over(wake.at_ns()) {
+        if !self.judge.passes_over(&wake) {
             self.judge.judge(wake);
+            // It was sent.
+            self.session.take_log();
         }
         Ok(true)
     }

@@ -43,10 +43,10 @@ enum Message {
     Initialised(Called),
     /// A wake has ended.
     Woken(Woken),
-    /// What the lambda read of one field; sent before [`Message::Done`].
-    Curve(Curve),
-    /// Sent last: the course is over.
+    /// The course is over.
     Done(Done),
+    /// What the lambda read of one field; sent behind [`Message::Done`], as often as that says.
+    Curve(Curve),
 }
 
 /// What a call into the lambda led to.
@@ -77,6 +77,9 @@ struct Woken {
     triggers: Vec<Trigger>,
     /// For each input, how many samples back from the newest the lambda looked, if it did.
     looked: Vec<Option<u64>>,
+    /// Samples of all inputs that found no room so far, since the lambda holds others.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    no_slot: u64,
 }
 
 /// What is known only once the course is over.
@@ -85,7 +88,15 @@ struct Done {
     /// Of each input, in the manifest's order.
     counts: Vec<Counts>,
     decode_ns: u64,
+    curves: usize,
     curves_left_out: u64,
+}
+
+#[cfg(feature = "python")]
+impl Done {
+    fn no_slot(&self) -> u64 {
+        self.counts.iter().fold(0, |sum: u64, counts| sum.saturating_add(counts.no_slot))
+    }
 }
 
 fn is_zero(count: &u64) -> bool {

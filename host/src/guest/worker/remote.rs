@@ -9,16 +9,22 @@ use super::process::{NoMessage, Process};
 use super::{Called, Done, Message, Woken};
 use crate::api::Session;
 use crate::api::data::Wake;
-use crate::api::log::LINE_BYTES;
+use crate::api::log::{LINE_BYTES, Level};
 use crate::guest::{Guest, Outcome, Totals};
 
 /// A guest in a worker.
 pub struct Remote {
     /// None once it has ended.
     worker: Option<Process>,
+    /// Why it has ended, if it should not have.
+    fault: Option<Fault>,
     session: Session,
     engine: String,
     layers: Vec<Layer>,
+    /// The next message, if it was read ahead of its turn.
+    read: Option<Read>,
+    /// Samples that should have woken the lambda, and did not in the worker.
+    left_out: u64,
     /// Most log lines of one call: the worker sends no more than its rate limit lets pass.
     lines_max: u64,
     is_prepared: bool,
@@ -26,25 +32,39 @@ pub struct Remote {
     most_resident_bytes: u64,
 }
 
+/// The message that ends a call, and what the lambda logged in it.
+struct Read {
+    log: Vec<(Level, String)>,
+    message: Message,
+}
+
 impl Remote {
-    /// Starts a worker with the arguments of this process, and waits until it is sandboxed.
+    /// Starts a worker with the arguments of this process, in the control group of this process if there is one, and waits until it
+    /// is sandboxed.
     ///
     /// # Errors
     ///
     /// A failure if the worker cannot be started, or ends before it is ready; it has then printed why.
-    pub fn start(manifest: &Manifest, session: Session) -> Result<Self, Failure> {
+    pub fn start(manifest: &Manifest, session: Session, group: Option<Layer>) -> Result<Self, Failure> {
         let mut worker = Process::start()?;
-        let (engine, layers) = match worker.next() {
+        let (engine, mut layers) = match worker.next() {
             Ok(Message::Ready { engine, layers }) => (engine, layers),
             _ => return Err(not_ready(worker, manifest)),
         };
         worker.ready();
+        if let Some(group) = group {
+            layers.retain(|layer| layer.name != group.name);
+            layers.push(group);
+        }
         let Limits { log_lines, .. } = manifest.limits;
         Ok(Self {
             worker: Some(worker),
+            fault: None,
             session,
             engine,
             layers,
+            read: None,
+            left_out: 0,
             lines_max: log_lines,
             is_prepared: false,
             resident_bytes: 0,
@@ -52,26 +72,39 @@ impl Remote {
         })
     }
 
-    /// Reads messages up to the one that `wanted` accepts; log lines before it are taken over.
-    fn call<T>(&mut self, wanted: impl Fn(Message) -> Result<T, Message>) -> Result<T, Fault> {
-        let mut lines = 0;
+    /// Reads the next message that ends a call, and the log lines before it, unless that was done.
+    fn read(&mut self) -> Result<&Read, Fault> {
+        let read = match self.read.take() {
+            Some(read) => read,
+            None => self.read_on()?,
+        };
+        Ok(self.read.insert(read))
+    }
+
+    fn read_on(&mut self) -> Result<Read, Fault> {
+        let mut log = Vec::new();
         loop {
             let Some(worker) = &mut self.worker else { return Err(self.killed(None)) };
             match worker.next() {
                 Ok(Message::Log { level, message }) => {
-                    lines += 1;
-                    if lines > self.lines_max || message.len() > LINE_BYTES {
+                    if log.len() as u64 >= self.lines_max || message.len() > LINE_BYTES {
                         return Err(self.killed(Some("more log than its limits allow")));
                     }
-                    self.session.log(level, &message);
+                    log.push((level, message));
                 }
-                Ok(message) => {
-                    return wanted(message).map_err(|_| self.killed(Some("a message that is not due")));
-                }
+                Ok(message) => return Ok(Read { log, message }),
                 Err(NoMessage::Ended) => return Err(self.killed(None)),
                 Err(NoMessage::Malformed(why)) => return Err(self.killed(Some(&why))),
             }
         }
+    }
+
+    /// Takes over the call that ends with the next message, which `wanted` accepts.
+    fn call<T>(&mut self, wanted: impl Fn(Message) -> Option<T>) -> Result<T, Fault> {
+        self.read()?;
+        let Some(Read { log, message }) = self.read.take() else { return Err(self.killed(None)) };
+        log.iter().for_each(|(level, message)| self.session.log(*level, message));
+        wanted(message).ok_or_else(|| self.killed(Some("a message that is not due")))
     }
 
     /// Takes over what a call counted; returns how the call ended.
@@ -85,8 +118,8 @@ impl Remote {
 
     fn woken(&mut self, wake: &Wake) -> Result<Woken, Fault> {
         let woken = self.call(|message| match message {
-            Message::Woken(woken) => Ok(woken),
-            other => Err(other),
+            Message::Woken(woken) => Some(woken),
+            _ => None,
         })?;
         if woken.at_ns != wake.at_ns() {
             return Err(self.killed(Some("a wake of another time")));
@@ -96,6 +129,9 @@ impl Remote {
 
     /// The fault of a worker that has ended; one that sent `nonsense` is killed for it.
     fn killed(&mut self, nonsense: Option<&str>) -> Fault {
+        if let Some(fault) = &self.fault {
+            return fault.clone();
+        }
         let record = self.end(nonsense.is_some());
         let killed = record.as_ref().and_then(|record| record.killed);
         let how = match (nonsense, record) {
@@ -103,12 +139,9 @@ impl Remote {
             (None, Some(record)) => record.sentence().unwrap_or_else(|| "ended by itself, with exit code 0".to_owned()),
             (None, None) => "has ended".to_owned(),
         };
-        Fault {
-            kind: FaultKind::Killed,
-            message: format!("the lambda's process {how}"),
-            used: killed.map(|killed| killed.ran_ns),
-            allowed: killed.map(|killed| killed.allowed_ns),
-        }
+        let message = format!("the lambda's process {how}");
+        let (used, allowed) = (killed.map(|killed| killed.ran_ns), killed.map(|killed| killed.allowed_ns));
+        self.fault.insert(Fault { kind: FaultKind::Killed, message, used, allowed }).clone()
     }
 
     fn end(&mut self, at_once: bool) -> Option<ExitRecord> {
@@ -138,8 +171,8 @@ impl Guest for Remote {
     fn prepare(&mut self) -> Result<(), Fault> {
         self.is_prepared = true;
         let called = self.call(|message| match message {
-            Message::Prepared(called) => Ok(called),
-            other => Err(other),
+            Message::Prepared(called) => Some(called),
+            _ => None,
         })?;
         self.called(called)
     }
@@ -149,8 +182,8 @@ impl Guest for Remote {
             self.prepare()?;
         }
         let called = self.call(|message| match message {
-            Message::Initialised(called) => Ok(called),
-            other => Err(other),
+            Message::Initialised(called) => Some(called),
+            _ => None,
         })?;
         self.called(called)
     }
@@ -172,6 +205,18 @@ impl Guest for Remote {
         Outcome { result: self.called(call), fuel: None, run_ns: Some(run_ns) }
     }
 
+    fn expects(&mut self, wake: &Wake) -> bool {
+        // Where the lambda holds all cells of a ring, that of the worker refuses a sample, and the next wake is later.
+        let no_slot = match (wake, self.read().map(|read| &read.message)) {
+            (Wake::Event(_), Ok(Message::Woken(woken))) if woken.at_ns > wake.at_ns() => woken.no_slot,
+            (Wake::Event(_), Ok(Message::Done(done))) => done.no_slot(),
+            _ => 0,
+        };
+        let is_left_out = self.left_out < no_slot;
+        self.left_out += u64::from(is_left_out);
+        !is_left_out
+    }
+
     fn engine(&self) -> String {
         self.engine.clone()
     }
@@ -189,19 +234,24 @@ impl Guest for Remote {
     }
 
     fn finish(&mut self) -> Result<Option<Totals>, Fault> {
-        let mut curves = Vec::new();
-        let done = loop {
-            let message = self.call(|message| match message {
-                Message::Curve(_) | Message::Done(_) => Ok(message),
-                other => Err(other),
-            })?;
-            match message {
-                Message::Curve(curve) if curves.len() < Signals::CURVES_MAX => curves.push(curve),
-                Message::Done(done) => break done,
-                _ => return Err(self.killed(Some("more curves than there can be"))),
-            }
-        };
-        let Done { counts, decode_ns, curves_left_out } = done;
+        let done = self.call(|message| match message {
+            Message::Done(done) => Some(done),
+            _ => None,
+        })?;
+        let Done { counts, decode_ns, curves: n, curves_left_out } = done;
+        if n > Signals::CURVES_MAX {
+            return Err(self.killed(Some("more curves than there can be")));
+        }
+        let curves = (0..n).map(|_| {
+            self.call(|message| match message {
+                Message::Curve(curve) => Some(curve),
+                _ => None,
+            })
+        });
+        let curves = curves.collect::<Result<_, _>>()?;
+        if counts.len() != self.session.inputs().len() {
+            return Err(self.killed(Some("counts of other inputs")));
+        }
         match self.end(false) {
             Some(record) if record.code != Some(0) => {
                 let how = record.sentence().unwrap_or_default();

@@ -38,8 +38,8 @@ impl Reports {
     /// Sends what is known once the course is over.
     pub fn done(&self, totals: Totals) {
         let Totals { counts, decode_ns, curves, curves_left_out } = totals;
-        curves.into_iter().for_each(|curve| self.add(&Message::Curve(curve)));
-        self.send(&Message::Done(Done { counts, decode_ns, curves_left_out }));
+        self.send(&Message::Done(Done { counts, decode_ns, curves: curves.len(), curves_left_out }));
+        curves.into_iter().for_each(|curve| self.send(&Message::Curve(curve)));
     }
 
     fn add(&self, message: &Message) {
@@ -91,9 +91,9 @@ impl Sender {
         Self { guest, session, reports, is_prepared: false, log_dropped: 0, triggers_refused: 0 }
     }
 
-    /// Adds the log of a call that has ended.
-    fn called(&mut self, result: &Result<(), Fault>) -> Called {
-        let (lines, said) = self.session.take_log();
+    /// Adds the log of a call that has ended, behind the first `before` lines.
+    fn called(&mut self, result: &Result<(), Fault>, before: usize) -> Called {
+        let (lines, said) = self.session.lines_behind(before);
         for line in lines {
             self.reports.add(&Message::Log { level: line.level, message: line.message });
         }
@@ -107,16 +107,17 @@ impl Sender {
         }
     }
 
-    fn started(&mut self, result: &Result<(), Fault>) -> Called {
-        Called { resident_bytes: usage::resident(), ..self.called(result) }
+    fn started(&mut self, result: &Result<(), Fault>, before: usize) -> Called {
+        Called { resident_bytes: usage::resident(), ..self.called(result, before) }
     }
 }
 
 impl Guest for Sender {
     fn prepare(&mut self) -> Result<(), Fault> {
+        let before = self.session.lines();
         let result = self.guest.prepare();
         self.is_prepared = true;
-        let called = self.started(&result);
+        let called = self.started(&result, before);
         self.reports.send(&Message::Prepared(called));
         result
     }
@@ -125,8 +126,9 @@ impl Guest for Sender {
         if !self.is_prepared {
             self.prepare()?;
         }
+        let before = self.session.lines();
         let result = self.guest.init();
-        let called = self.started(&result);
+        let called = self.started(&result, before);
         self.reports.send(&Message::Initialised(called));
         result
     }
@@ -136,14 +138,15 @@ impl Guest for Sender {
         let inputs = self.session.inputs();
         inputs.iter().for_each(|topic| topic.forget_looked());
         // What the host notes about the lambda, the process that reads the messages notes itself.
-        self.session.take_log();
+        let before = self.session.lines();
         let started = Instant::now();
         let outcome = self.guest.wake(wake);
         let run_ns = started.elapsed().as_nanos() as u64;
-        let call = self.called(&outcome.result);
+        let call = self.called(&outcome.result, before);
         let triggers = self.session.triggers();
         let looked = inputs.iter().map(|topic| topic.looked_back()).collect();
-        self.reports.send(&Message::Woken(Woken { at_ns, run_ns, call, triggers, looked }));
+        let no_slot = inputs.iter().map(|topic| topic.counts().no_slot).sum();
+        self.reports.send(&Message::Woken(Woken { at_ns, run_ns, call, triggers, looked, no_slot }));
         outcome
     }
 

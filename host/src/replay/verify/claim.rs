@@ -25,7 +25,7 @@ pub(in crate::replay) struct Claim {
     path: PathBuf,
     reader: Reader<Box<dyn Read + Send>>,
     /// Whether it is the part in a clip, which begins in the middle.
-    pub(super) is_part: bool,
+    pub(in crate::replay) is_part: bool,
     /// What the clip tells people; nothing for a journal.
     pub(super) told: Told,
 }

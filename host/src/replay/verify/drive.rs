@@ -67,7 +67,7 @@ impl Course for Proof<'_> {
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
         let at_ns = wake.at_ns();
-        if self.remake.judge.passes_over(at_ns) {
+        if self.remake.judge.passes_over(&wake) {
             return Ok(true);
         }
         let Some(entry) = self.claim.next()? else {
