@@ -7,7 +7,7 @@ use std::process::Command;
 
 use gleaner_protocol::{DriveSeen, Manifest};
 use gleaner_tests::bag::directory;
-use gleaner_tests::drive::{IMAGE, image, one_topic};
+use gleaner_tests::drive::{IMAGE, changed, image, one_topic};
 use gleaner_tests::{Copy, Folder, Run, program, replay, replay_to, root, sample_drive, verify};
 
 const OK: u8 = 0;
@@ -185,6 +185,20 @@ fn a_database_that_was_cut_off_keeps_what_was_decided_before() {
     ] {
         assert!(damaged.contains(said), "{damaged}");
     }
+}
+
+#[test]
+fn a_stamp_beyond_all_clocks_ends_the_drive_and_what_was_decided_before_is_kept() {
+    let folder = Folder::new();
+    let drive = changed(&folder, |message| {
+        message.log_time |= u64::from(message.at_s > 30.0) << 63;
+        true
+    });
+    let run = braking(&lambda("hello", "rust"), &drive, &["--no-record", "--all"]);
+    let summary = run.must_exit(DAMAGED).summary.as_ref().unwrap();
+    assert!(summary.wakes > 1000 && run.decisions.iter().all(|decision| decision.at_ns < i64::MAX), "{summary:?}");
+    let damaged = summary.damaged.as_deref().unwrap();
+    assert!(damaged.contains("is damaged at byte") && damaged.contains("after the year 2262"), "{damaged}");
 }
 
 #[test]
