@@ -52,18 +52,18 @@ fn a_database_of_an_old_distribution_leads_to_the_same_decisions_and_clips() {
 #[test]
 fn a_packed_drive_is_unpacked_beside_the_results_for_both_kinds() {
     let (folder, out) = (Folder::new(), Folder::new());
-    let packed = folder.write("drive.mcap.zstd", zstd::encode_all(&fs::read(sample_drive()).unwrap()[..], 1).unwrap());
-    for kind in ["rust", "python"] {
-        let lambda = lambda("hello", kind);
-        let run = replay_to(
-            out.path(),
-            &lambda,
-            std::slice::from_ref(&packed),
-            &["--set", "brake_mps2=-1.4", "--all", "--repeat", "2"],
-        );
-        assert_eq!(decided(run.must_exit(OK)), decided(&braking(&lambda, &sample_drive(), &["--all"])), "{kind}");
-        let left = fs::read_dir(out.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect::<Vec<_>>();
-        assert!(!left.iter().any(|name| name.to_string_lossy().contains("unpacked")), "{left:?}");
+    let database = directory(&folder, 1).join("drive_0.db3");
+    for (name, drive) in [("drive.mcap.zstd", sample_drive()), ("drive.db3.zstd", database)] {
+        let packed = folder.write(name, zstd::encode_all(&fs::read(drive).unwrap()[..], 1).unwrap());
+        for kind in ["rust", "python"] {
+            let lambda = lambda("hello", kind);
+            let args = ["--set", "brake_mps2=-1.4", "--all", "--repeat", "2"];
+            let run = replay_to(out.path(), &lambda, std::slice::from_ref(&packed), &args);
+            let plain = braking(&lambda, &sample_drive(), &["--all"]);
+            assert_eq!(decided(run.must_exit(OK)), decided(&plain), "{name}, {kind}");
+            let left = fs::read_dir(out.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect::<Vec<_>>();
+            assert!(!left.iter().any(|name| name.to_string_lossy().contains("unpacked")), "{left:?}");
+        }
     }
 }
 

@@ -157,7 +157,9 @@ fn content_that_another_process_unpacked_is_read_where_nothing_may_be_written() 
     let mut replays = [0; 2].map(|_| Replay::open_as(&paths, &options).unwrap());
     let memories = replays.each_mut().map(|replay| listen(replay, &TOPICS));
     for _ in 0..30 {
-        replays.iter_mut().for_each(|replay| drop(replay.step().unwrap()));
+        for replay in &mut replays {
+            replay.step().unwrap();
+        }
     }
     for (mut replay, memory) in replays.into_iter().zip(memories) {
         assert!(run(&mut replay).1.is_none());
