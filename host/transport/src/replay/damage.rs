@@ -45,7 +45,7 @@ pub enum Damage {
         /// The first field that differs.
         field: &'static str,
         /// Its first and its second value, where they are names; long ones are cut.
-        values: Option<(String, String)>,
+        values: Option<Box<[String; 2]>>,
     },
     /// A message has a log time that no clock of ours can show.
     #[error("a message has log time {0} ns, which is after the year 2262")]
@@ -176,6 +176,7 @@ pub enum Damage {
     },
 }
 
-fn in_order(values: &Option<(String, String)>) -> String {
-    values.as_ref().map_or_else(String::new, |(first, second)| format!(": first `{first}`, then `{second}`"))
+fn in_order(values: &Option<Box<[String; 2]>>) -> String {
+    let values = values.as_deref();
+    values.map_or_else(String::new, |[first, second]| format!(": first `{first}`, then `{second}`"))
 }

@@ -206,7 +206,12 @@ fn channel_of(body: &[u8]) -> Result<Channel<'_>, Damage> {
 
 fn redefined(what: &'static str, id: u16, field: &'static str, values: Option<(&str, &str)>) -> Result<(), Damage> {
     let shown = |text: &str| text.chars().take(SHOWN_CHARS).collect();
-    Err(Damage::Redefined { what, id, field, values: values.map(|(first, second)| (shown(first), shown(second))) })
+    Err(Damage::Redefined {
+        what,
+        id,
+        field,
+        values: values.map(|(first, second)| Box::new([shown(first), shown(second)])),
+    })
 }
 
 /// What rosbag2 notes of a topic's writers; it is nothing to fail over if it cannot be kept.
