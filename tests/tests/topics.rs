@@ -28,7 +28,9 @@ fn a_file_of_sixty_thousand_topics_is_looked_into_in_bounded_memory() {
     let output = inspect.output().expect("a shell starts");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let reports = String::from_utf8_lossy(&output.stdout);
-    let Some(Ok(Report::Drive(seen))) = reports.lines().map(serde_json::from_str).last() else { panic!("{reports}") };
+    let Some(Ok(Report::Drive(seen))) = reports.lines().map(serde_json::from_str).next_back() else {
+        panic!("{reports}")
+    };
     let DriveSeen { topics, skipped, .. } = seen;
     assert_eq!(topics.len() as u64 + skipped, 60_001);
     assert_eq!(skipped, 60_001 - 4096);

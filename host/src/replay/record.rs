@@ -122,13 +122,11 @@ impl Recording {
                 id: Mutex::new(None),
                 camera: camera.map(|found| Camera::new(name, &found.type_name)),
             });
-            if let Some(found) = found {
-                if let Err(error) = drive.subscribe(&chosen::spec_of(found), lane.clone()) {
-                    let failure = Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error);
-                    return Err(
-                        failure.with_help("remove the topic from [record], or replay without clips: --no-record")
-                    );
-                }
+            if let Some(found) = found
+                && let Err(error) = drive.subscribe(&chosen::spec_of(found), lane.clone())
+            {
+                let failure = Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error);
+                return Err(failure.with_help("remove the topic from [record], or replay without clips: --no-record"));
             }
             lanes.push(lane);
         }
