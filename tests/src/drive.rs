@@ -53,6 +53,32 @@ pub fn imu_only(folder: &Folder, times: u64) -> PathBuf {
     one_topic(folder, "/imu/data", "sensor_msgs/msg/Imu", &schema, &rounds.collect::<Vec<_>>())
 }
 
+/// The IMU of the sample drive, with so many topics beside it: `/many/0` and on, each with ten of its messages.
+pub fn with_topics(folder: &Folder, topics: u16) -> PathBuf {
+    let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = mcap::WriteOptions::new().profile("ros2").create(&mut file).expect("a drive in memory");
+    let messages = mcap::MessageStream::new(&bytes).expect("a drive").map(|message| message.expect("a whole drive"));
+    let imu = messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
+    let schema = imu[0].channel.schema.clone().expect("a schema");
+    let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data).expect("a schema");
+    let mut add = |topic: &str| writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel");
+    let ours = add("/imu/data");
+    let others = (0..topics).map(|n| add(&format!("/many/{n}"))).collect::<Vec<_>>();
+    let apart = imu.len() / 10;
+    for (n, message) in imu.iter().enumerate() {
+        let others = if n % apart == 0 { others.as_slice() } else { &[] };
+        for channel_id in [ours].iter().chain(others) {
+            let (log_time, publish_time) = (message.log_time, message.publish_time);
+            let header = MessageHeader { channel_id: *channel_id, sequence: message.sequence, log_time, publish_time };
+            writer.write_to_known_channel(&header, &message.data).expect("a message");
+        }
+    }
+    writer.finish().expect("a whole drive");
+    drop(writer);
+    folder.write("many.mcap", file.into_inner())
+}
+
 /// A message of the sample drive, to be changed by a test.
 #[derive(Clone, Debug)]
 pub struct Changed {

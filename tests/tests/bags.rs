@@ -7,7 +7,7 @@ use std::process::Command;
 
 use gleaner_protocol::{DriveSeen, Manifest};
 use gleaner_tests::bag::directory;
-use gleaner_tests::drive::{IMAGE, image, one_topic};
+use gleaner_tests::drive::{IMAGE, changed, image, one_topic};
 use gleaner_tests::{Copy, Folder, Run, program, replay, replay_to, root, sample_drive, verify};
 
 const OK: u8 = 0;
@@ -52,18 +52,18 @@ fn a_database_of_an_old_distribution_leads_to_the_same_decisions_and_clips() {
 #[test]
 fn a_packed_drive_is_unpacked_beside_the_results_for_both_kinds() {
     let (folder, out) = (Folder::new(), Folder::new());
-    let packed = folder.write("drive.mcap.zstd", zstd::encode_all(&fs::read(sample_drive()).unwrap()[..], 1).unwrap());
-    for kind in ["rust", "python"] {
-        let lambda = lambda("hello", kind);
-        let run = replay_to(
-            out.path(),
-            &lambda,
-            std::slice::from_ref(&packed),
-            &["--set", "brake_mps2=-1.4", "--all", "--repeat", "2"],
-        );
-        assert_eq!(decided(run.must_exit(OK)), decided(&braking(&lambda, &sample_drive(), &["--all"])), "{kind}");
-        let left = fs::read_dir(out.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect::<Vec<_>>();
-        assert!(!left.iter().any(|name| name.to_string_lossy().contains("unpacked")), "{left:?}");
+    let database = directory(&folder, 1).join("drive_0.db3");
+    for (name, drive) in [("drive.mcap.zstd", sample_drive()), ("drive.db3.zstd", database)] {
+        let packed = folder.write(name, zstd::encode_all(&fs::read(drive).unwrap()[..], 1).unwrap());
+        for kind in ["rust", "python"] {
+            let lambda = lambda("hello", kind);
+            let args = ["--set", "brake_mps2=-1.4", "--all", "--repeat", "2"];
+            let run = replay_to(out.path(), &lambda, std::slice::from_ref(&packed), &args);
+            let plain = braking(&lambda, &sample_drive(), &["--all"]);
+            assert_eq!(decided(run.must_exit(OK)), decided(&plain), "{name}, {kind}");
+            let left = fs::read_dir(out.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect::<Vec<_>>();
+            assert!(!left.iter().any(|name| name.to_string_lossy().contains("unpacked")), "{left:?}");
+        }
     }
 }
 
@@ -185,6 +185,20 @@ fn a_database_that_was_cut_off_keeps_what_was_decided_before() {
     ] {
         assert!(damaged.contains(said), "{damaged}");
     }
+}
+
+#[test]
+fn a_stamp_beyond_all_clocks_ends_the_drive_and_what_was_decided_before_is_kept() {
+    let folder = Folder::new();
+    let drive = changed(&folder, |message| {
+        message.log_time |= u64::from(message.at_s > 30.0) << 63;
+        true
+    });
+    let run = braking(&lambda("hello", "rust"), &drive, &["--no-record", "--all"]);
+    let summary = run.must_exit(DAMAGED).summary.as_ref().unwrap();
+    assert!(summary.wakes > 1000 && run.decisions.iter().all(|decision| decision.at_ns < i64::MAX), "{summary:?}");
+    let damaged = summary.damaged.as_deref().unwrap();
+    assert!(damaged.contains("is damaged at byte") && damaged.contains("after the year 2262"), "{damaged}");
 }
 
 #[test]

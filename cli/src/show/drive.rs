@@ -34,6 +34,9 @@ pub(crate) fn drive(drive: &DriveSeen) -> String {
     let head = ["topic", "type", "messages", "Hz", "longest gap", "at", "missing", "largest", ""].map(str::to_owned);
     let rows = drive.topics.iter().map(|topic| row(topic, start));
     text += &table(std::iter::once(head).chain(rows).collect(), &[2, 3, 4, 5, 6, 7]);
+    if drive.skipped > 0 {
+        let _ = writeln!(text, "and {}, not looked at", super::counted(drive.skipped, "more topic"));
+    }
     text + &inputs(&drive.topics)
 }
 
@@ -146,7 +149,7 @@ mod tests {
 
     fn seen(topics: Vec<RecordedTopicSeen>) -> DriveSeen {
         let [start_ns, end_ns] = [1_500_000_000_250_000_000, 1_500_000_002_000_000_000].map(Some);
-        DriveSeen { start_ns, end_ns, parts: Vec::new(), out_of_order: 0, damaged: None, topics }
+        DriveSeen { start_ns, end_ns, parts: Vec::new(), out_of_order: 0, damaged: None, topics, skipped: 0 }
     }
 
     #[test]
@@ -216,10 +219,12 @@ depth = 128                 # 1.3 s
             parts: vec![[1_500_000_000_250_000_000, 1_500_000_000_750_000_000]],
             damaged: Some("cut\u{1b} off".to_owned()),
             out_of_order: 2,
+            skipped: 61_439,
             ..seen(Vec::new())
         };
         let text = drive(&drive_of_parts);
         assert!(text.contains("those of 0.0 to 0.5 s; --all reads everything\n"), "{text}");
         assert!(text.contains("damaged: cut\\u{1b} off\n2 messages out of order"), "{text}");
+        assert!(text.ends_with("\nand 61,439 more topics, not looked at\n"), "{text}");
     }
 }

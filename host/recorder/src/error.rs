@@ -169,6 +169,12 @@ pub enum RecordError {
         /// How many it holds.
         most: usize,
     },
+    /// Topics whose names and types are longer than a recorder holds.
+    #[error("the names and types of the recorded topics take more than {} KiB", most >> 10)]
+    LongNames {
+        /// How many bytes it holds.
+        most: usize,
+    },
     /// More lambdas than a recorder holds; one that was started again counts again.
     #[error("a recorder holds at most {most} lambdas, counted with each start")]
     TooManyLambdas {
@@ -204,7 +210,9 @@ impl Explain for RecordError {
     fn help(&self) -> Option<String> {
         let help = match (self, self.system()) {
             (Self::Busy { .. }, _) => "wait until it ends, or choose another folder: --out DIR",
-            (Self::TooManyTopics { .. }, _) => "record fewer topics: [record] topics in lambda.toml",
+            (Self::TooManyTopics { .. } | Self::LongNames { .. }, _) => {
+                "record fewer topics: [record] topics in lambda.toml, or --topics of a replay"
+            }
             (Self::PrerollMemory { .. }, _) => "keep less: preroll_size in lambda.toml, or --preroll-memory BYTES",
             (Self::LongTopic { .. }, _) => "remove the topic from [record]",
             (_, Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)) => {
@@ -221,7 +229,10 @@ impl Explain for RecordError {
 
     fn exit(&self) -> Exit {
         match self {
-            Self::TooManyTopics { .. } | Self::LongTopic { .. } | Self::PrerollMemory { .. } => Exit::Usage,
+            Self::TooManyTopics { .. }
+            | Self::LongNames { .. }
+            | Self::LongTopic { .. }
+            | Self::PrerollMemory { .. } => Exit::Usage,
             _ => Exit::Internal,
         }
     }

@@ -31,5 +31,5 @@ mod window;
 pub use digest::lambda_digest;
 pub use error::RecordError;
 pub use file::{Earlier, Folder, LossList, MESSAGE_MAX, Topic};
-pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TopicId, Work};
+pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TOPICS_MAX, TopicId, Work};
 pub use thumbnail::{is_image, thumbnail};

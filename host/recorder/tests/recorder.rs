@@ -4,8 +4,9 @@ mod support;
 
 use std::time::Duration;
 
+use gleaner_protocol::Explain;
 use gleaner_protocol::TriggerKind::{Event, Start, Stop};
-use gleaner_recorder::{Folder, RecordError};
+use gleaner_recorder::{Folder, RecordError, TOPICS_MAX};
 use support::*;
 
 const EVENT: &[gleaner_protocol::TriggerKind] = &[Event];
@@ -200,12 +201,22 @@ fn what_is_before_1970_or_out_of_order_is_counted() {
 fn a_recorder_has_an_end_of_topics() {
     let scratch = Scratch::new();
     let mut recorder = scratch.recorder(|_| {});
-    for index in 0..256 {
+    for index in 0..TOPICS_MAX {
         recorder.add_topic(topic(&format!("/t{index}"))).unwrap();
     }
     assert!(recorder.add_topic(topic("/t7")).is_ok(), "one that it has");
     let refused = recorder.add_topic(topic("/more")).unwrap_err();
-    assert!(matches!(refused, RecordError::TooManyTopics { most: 256 }));
+    assert!(matches!(refused, RecordError::TooManyTopics { most: TOPICS_MAX }));
+}
+
+#[test]
+fn the_names_of_all_topics_have_an_end_before_a_line_of_the_list_has() {
+    let scratch = Scratch::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let name = |index: usize| format!("/t{index:03}{}", "x".repeat(1000));
+    let refused = (0..TOPICS_MAX).find_map(|index| recorder.add_topic(topic(&name(index))).err()).unwrap();
+    assert!(matches!(refused, RecordError::LongNames { most: 262_144 }), "{refused}");
+    assert!(refused.help().unwrap().contains("--topics"));
 }
 
 /// A grey image of 4x4 pixels.

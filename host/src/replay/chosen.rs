@@ -1,44 +1,94 @@
 //! Which topics of a drive its clips hold: those of `[record]`, or those that the command line chooses instead.
 
+use std::collections::HashSet;
+
 use gleaner_protocol::manifest::Record;
 use gleaner_protocol::{Exit, Failure};
-use gleaner_transport::DiscoveredTopic;
+use gleaner_recorder::{MESSAGE_MAX, TOPICS_MAX};
+use gleaner_transport::replay::Replay;
+use gleaner_transport::{DiscoveredTopic, Qos, TopicSpec};
 
 use super::Options;
 use crate::input::Remap;
 
-/// A topic that clips are to hold.
-pub(super) struct Chosen {
-    /// Its name in the drive.
-    pub(super) name: String,
-    /// Whether it is one of all that a pattern matches: then one that cannot be recorded is left out.
-    pub(super) is_one_of_many: bool,
-}
+/// Most topics that are named in a message.
+const NAMED: usize = 20;
 
-/// The topics, each once.
-pub(super) fn topics(rules: &Record, options: &Options, known: &[DiscoveredTopic]) -> Result<Vec<Chosen>, Failure> {
-    let mut chosen: Vec<Chosen> = Vec::new();
-    let mut add = |name: &str, is_one_of_many| {
-        // Two topics of the manifest may be one of the drive.
-        if !chosen.iter().any(|known| known.name == name) {
-            chosen.push(Chosen { name: name.to_owned(), is_one_of_many });
+/// The names in the drive of the topics that clips are to hold, each once.
+pub(super) fn topics(
+    rules: &Record,
+    options: &Options,
+    drive: &Replay,
+    known: &[DiscoveredTopic],
+) -> Result<Vec<String>, Failure> {
+    let (mut chosen, mut names) = (HashSet::new(), Vec::new());
+    // Two topics of the manifest may be one of the drive, and two patterns may match one.
+    let mut add = |name: &str| {
+        if chosen.insert(name.to_owned()) {
+            names.push(name.to_owned());
         }
     };
     if options.topics.is_empty() {
-        rules.topics.iter().for_each(|topic| add(Remap::apply(&options.asked.remaps, topic.as_str()), false));
+        rules.topics.iter().for_each(|topic| add(Remap::apply(&options.asked.remaps, topic.as_str())));
+        return Ok(names);
     }
     for pattern in &options.topics {
-        let mut found = known.iter().filter(|topic| matches(pattern, &topic.topic)).peekable();
-        if found.peek().is_none() {
+        let found: Vec<_> = known.iter().filter(|topic| matches(pattern, &topic.topic)).collect();
+        if found.is_empty() {
             let failure = Failure::new(Exit::Usage, format!("the drive has no topic `{pattern}` of --topics"));
-            let names: Vec<_> = known.iter().map(|topic| topic.topic.as_str()).collect();
-            return Err(
-                failure.with_help(format!("the drive has `{}`; a * stands for any letters", names.join("`, `")))
-            );
+            return Err(failure.with_help(format!("the drive has {}; a * stands for any letters", list(known))));
         }
-        found.for_each(|topic| add(&topic.topic, pattern.contains('*')));
+        let (readable, others): (Vec<_>, Vec<_>) =
+            found.into_iter().partition(|topic| drive.can_subscribe(&spec_of(topic)).is_ok());
+        if readable.is_empty() {
+            let message = format!("no topic that --topics `{pattern}` matches can be recorded");
+            return Err(nothing_readable(message, &others, drive, known));
+        }
+        for topic in others.iter().take(NAMED) {
+            let error = drive.can_subscribe(&spec_of(topic)).err();
+            let error = error.map(|error| error.to_string()).unwrap_or_default();
+            tracing::warn!(topic = %topic.topic, %error, "clips are made without this topic");
+        }
+        if others.len() > NAMED {
+            tracing::warn!(topics = others.len() - NAMED, "clips are made without further topics, for such reasons");
+        }
+        readable.iter().for_each(|topic| add(&topic.topic));
     }
-    Ok(chosen)
+    if names.len() > TOPICS_MAX {
+        let message = format!("--topics chooses {} topics; clips hold at most {TOPICS_MAX}", names.len());
+        return Err(Failure::new(Exit::Usage, message).with_help("choose fewer: --topics PATTERN, as in '/camera/*'"));
+    }
+    Ok(names)
+}
+
+/// How a topic of the drive is subscribed to be recorded.
+pub(super) fn spec_of(found: &DiscoveredTopic) -> TopicSpec {
+    let (topic, type_name) = (found.topic.clone(), found.type_name.clone());
+    TopicSpec { topic, type_name, queue: 1, max_bytes: MESSAGE_MAX, qos: Qos::Auto }
+}
+
+fn nothing_readable(
+    message: String,
+    others: &[&DiscoveredTopic],
+    drive: &Replay,
+    known: &[DiscoveredTopic],
+) -> Failure {
+    let errors = others.iter().filter_map(|topic| drive.can_subscribe(&spec_of(topic)).err());
+    let mut failure = Failure::new(Exit::Usage, message);
+    failure.causes = errors.take(1).map(|error| error.to_string()).collect();
+    let readable = known.iter().filter(|topic| drive.can_subscribe(&spec_of(topic)).is_ok());
+    failure.with_help(format!("the drive has {}, which can be", list(readable)))
+}
+
+/// The names of some topics, for a message.
+pub(super) fn list<'a>(topics: impl IntoIterator<Item = &'a DiscoveredTopic>) -> String {
+    let mut topics = topics.into_iter();
+    let names: Vec<_> = topics.by_ref().take(NAMED).map(|topic| format!("`{}`", topic.topic)).collect();
+    match (names.is_empty(), topics.count()) {
+        (true, _) => "no topic".to_owned(),
+        (false, 0) => names.join(", "),
+        (false, more) => format!("{}, and {more} more", names.join(", ")),
+    }
 }
 
 /// Whether `name` is what `pattern` says, in which a `*` stands for any letters, or none.

@@ -1,5 +1,6 @@
 //! `gleaner-runtime inspect`: what is in a recorded drive, without a lambda.
 
+use std::collections::HashMap;
 use std::io::Write;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -9,7 +10,7 @@ use gleaner_protocol::{DriveSeen, Exit, Failure, Picture, RecordedTopicSeen, Rep
 use gleaner_transport::message::{CompressedView, ImageView, Sources};
 use gleaner_transport::replay::{Options, Replay, Step, files_of};
 use gleaner_transport::{DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
-use gleaner_vitals::Spreads;
+use gleaner_vitals::Durations;
 
 use super::open::DriveError;
 use crate::isolation::definitions;
@@ -23,6 +24,8 @@ const PART_NS: i64 = 2_000_000_000;
 const PART_BYTES: u64 = 64 << 20;
 /// The largest message that is unpacked to be looked at.
 const LARGEST: usize = 256 << 20;
+/// The most topics that are looked at. A vehicle has some hundreds; a file can name 65,536.
+const TOPICS: usize = 4096;
 
 /// Arguments of `inspect`.
 #[derive(Args, Clone, Debug)]
@@ -45,7 +48,7 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
     let open = || Replay::open_as(&args.drives, &options).map_err(DriveError);
     let mut drive = open()?;
     let (start_ns, end_ns) = (drive.start_ns(), drive.end_ns());
-    let mut topics: Vec<Look> = drive.topics().into_iter().map(Look::new).collect();
+    let (mut topics, skipped) = looks(drive.topics());
     let mut parts = if args.all || bytes(&args.drives)? <= WHOLE_BYTES { Vec::new() } else { spread(start_ns, end_ns) };
     let (mut damaged, mut out_of_order) = (None, 0);
     if parts.is_empty() {
@@ -70,9 +73,20 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
     if missing > read / 2 {
         topics.iter_mut().for_each(|topic| topic.missing = None);
     }
-    let seen = DriveSeen { start_ns, end_ns, parts, out_of_order, damaged, topics };
+    let seen = DriveSeen { start_ns, end_ns, parts, out_of_order, damaged, topics, skipped };
     super::report(reports, &Report::Drive(seen));
     Ok(Exit::Ok)
+}
+
+/// The topics that are looked at, by name, and how many there are beyond: those with messages come first.
+fn looks(mut found: Vec<DiscoveredTopic>) -> (Vec<Look>, u64) {
+    let skipped = found.len().saturating_sub(TOPICS);
+    if skipped > 0 {
+        found.sort_by_key(|topic| topic.messages == Some(0));
+        found.truncate(TOPICS);
+        found.sort_by(|a, b| a.topic.cmp(&b.topic));
+    }
+    (found.into_iter().map(Look::new).collect(), skipped as u64)
 }
 
 fn bytes(drives: &[PathBuf]) -> Result<u64, DriveError> {
@@ -95,11 +109,11 @@ fn spread(start_ns: Option<i64>, end_ns: Option<i64>) -> Vec<[i64; 2]> {
 
 /// Reads what it is restricted to, at most so many bytes of messages. Until when it read, if it ended before; and why, if it is damaged.
 fn read(drive: &mut Replay, topics: &mut [Look], most: Option<u64>) -> (Option<i64>, Option<String>) {
-    let mut subscribed = Vec::new();
+    let mut subscribed = HashMap::new();
     for (index, topic) in topics.iter_mut().enumerate() {
         topic.begin();
         match drive.subscribe(&topic.spec(), topic.first.clone()) {
-            Ok(subscription) => subscribed.push((subscription, index)),
+            Ok(subscription) => drop(subscribed.insert(subscription, index)),
             Err(error) => topic.seen.unreadable = Some(error.to_string()),
         }
     }
@@ -107,8 +121,7 @@ fn read(drive: &mut Replay, topics: &mut [Look], most: Option<u64>) -> (Option<i
     loop {
         match drive.step() {
             Ok(Some(step)) => {
-                let found = subscribed.iter().find(|(subscription, _)| *subscription == step.subscription);
-                if let Some((_, index)) = found {
+                if let Some(index) = subscribed.get(&step.subscription) {
                     topics[*index].add(&step);
                 }
                 bytes += step.bytes as u64;
@@ -126,7 +139,8 @@ fn read(drive: &mut Replay, topics: &mut [Look], most: Option<u64>) -> (Option<i
 struct Look {
     seen: RecordedTopicSeen,
     first: Arc<First>,
-    intervals: Spreads,
+    /// There from the second message on: most of what a file names may have none.
+    intervals: Option<Durations>,
     longest_ns: i64,
     /// Of this part.
     last_ns: Option<i64>,
@@ -150,8 +164,8 @@ impl Look {
             bytes: 0,
             picture: None,
         };
-        let (first, intervals, gaps) = (Arc::new(first), Spreads::new(), Gaps::default());
-        Self { seen, first, intervals, longest_ns: -1, last_ns: None, gaps }
+        let (first, gaps) = (Arc::new(first), Gaps::default());
+        Self { seen, first, intervals: None, longest_ns: -1, last_ns: None, gaps }
     }
 
     fn spec(&self) -> TopicSpec {
@@ -174,7 +188,7 @@ impl Look {
         self.gaps.note(step.meta.writer, step.meta.seq);
         if let Some(last) = self.last_ns {
             let interval = step.at_ns.saturating_sub(last);
-            self.intervals.add(interval);
+            self.intervals.get_or_insert_default().add(interval);
             if interval > self.longest_ns {
                 self.longest_ns = interval;
                 self.seen.longest_after_ns = Some(last);
@@ -188,7 +202,7 @@ impl Look {
         let picture = self.first.picture.lock().unwrap_or_else(PoisonError::into_inner).take();
         // Of those kept only two digits are, and no more than a day.
         let max_ns = u64::try_from(self.longest_ns).unwrap_or(0);
-        let interval = self.intervals.all().map(|kept| Spread { max_ns, ..kept });
+        let interval = self.intervals.as_ref().and_then(Durations::all).map(|kept| Spread { max_ns, ..kept });
         RecordedTopicSeen { interval, picture: picture.flatten(), ..self.seen }
     }
 }

@@ -59,7 +59,7 @@ impl Explain for DriveError {
     fn exit(&self) -> Exit {
         match self.0 {
             ReplayError::Damaged { .. } => Exit::DriveDamaged,
-            ReplayError::Read { .. } | ReplayError::Unpack { .. } => Exit::Internal,
+            ReplayError::Read { .. } | ReplayError::Unpack { .. } | ReplayError::NoRoom { .. } => Exit::Internal,
             _ => Exit::Usage,
         }
     }

@@ -7,13 +7,12 @@ use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{
-    Counts, Earlier, Folder, LambdaId, MESSAGE_MAX, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image,
-    lambda_digest,
+    Counts, Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image, lambda_digest,
 };
 use gleaner_transport::replay::Replay;
-use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, Transport, Verdict};
 
-use super::chosen::{self, Chosen};
+use super::chosen;
 use super::pictures::Camera;
 use super::{CLOCK, Options};
 
@@ -108,9 +107,9 @@ impl Recording {
         let mut lanes = Vec::new();
         // One whose images the lambda sees anyway is not kept a second time.
         let mut is_seen = manifest.inputs.iter().any(|input| is_image(input.type_name.as_str()));
-        for Chosen { name, is_one_of_many } in chosen::topics(rules, options, &known)? {
+        for name in chosen::topics(rules, options, drive, &known)? {
             let name = name.as_str();
-            let found = known.iter().find(|topic| topic.topic == name);
+            let found = known.binary_search_by(|topic| topic.topic.as_str().cmp(name)).ok().map(|at| &known[at]);
             if found.is_none() {
                 tracing::warn!(topic = %name, "the drive does not have this topic of [record]: clips are made without it");
             }
@@ -123,27 +122,11 @@ impl Recording {
                 id: Mutex::new(None),
                 camera: camera.map(|found| Camera::new(name, &found.type_name)),
             });
-            if let Some(found) = found {
-                let spec = TopicSpec {
-                    topic: found.topic.clone(),
-                    type_name: found.type_name.clone(),
-                    queue: 1,
-                    max_bytes: MESSAGE_MAX,
-                    qos: Qos::Auto,
-                };
-                match drive.subscribe(&spec, lane.clone()) {
-                    Ok(_) => {}
-                    Err(error) if is_one_of_many => {
-                        tracing::warn!(topic = %name, %error, "clips are made without this topic");
-                        continue;
-                    }
-                    Err(error) => {
-                        let failure = Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error);
-                        return Err(
-                            failure.with_help("remove the topic from [record], or replay without clips: --no-record")
-                        );
-                    }
-                }
+            if let Some(found) = found
+                && let Err(error) = drive.subscribe(&chosen::spec_of(found), lane.clone())
+            {
+                let failure = Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error);
+                return Err(failure.with_help("remove the topic from [record], or replay without clips: --no-record"));
             }
             lanes.push(lane);
         }
@@ -153,8 +136,8 @@ impl Recording {
             failure.causes =
                 vec![format!("[record] has `{}`", list(lanes.iter().map(|lane| lane.topic.name.as_str()).collect()))];
             let help = format!(
-                "the drive has `{}`; pass --remap FROM:=TO, or replay without clips: --no-record",
-                list(known.iter().map(|topic| topic.topic.as_str()).collect())
+                "the drive has {}; pass --remap FROM:=TO, or replay without clips: --no-record",
+                chosen::list(&known)
             );
             return Err(failure.with_help(help));
         }

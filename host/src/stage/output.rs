@@ -42,9 +42,14 @@ pub struct OutputError {
 
 impl Explain for OutputError {
     fn help(&self) -> Option<String> {
-        Some(match InTheWay::of(&self.source) {
-            Some(_) => InTheWay::HELP.to_owned(),
-            None => "make room or choose another folder: --out DIR".to_owned(),
+        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        Some(match (InTheWay::of(&self.source), folder) {
+            (Some(_), _) => InTheWay::HELP.to_owned(),
+            // A folder of results is created; that of a journal is not.
+            (None, Some(folder)) if self.source.kind() == io::ErrorKind::NotFound => {
+                format!("there is no folder `{}`: create it first, or name a file in another", folder.display())
+            }
+            _ => "make room or choose another folder: --out DIR".to_owned(),
         })
     }
 
@@ -272,6 +277,15 @@ mod tests {
             assert!(said(folder.path(), name).is_empty());
             assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
         }
+    }
+
+    #[test]
+    fn a_folder_that_is_missing_is_named_and_a_full_disk_wants_room() {
+        let help = |path: &str, kind: io::ErrorKind| OutputError { path: path.into(), source: kind.into() }.help();
+        let missing = help("o/wakes.journal", io::ErrorKind::NotFound).unwrap();
+        assert_eq!(missing, "there is no folder `o`: create it first, or name a file in another");
+        let full = help("o/wakes.journal", io::ErrorKind::StorageFull).unwrap();
+        assert!(full.contains("make room"), "{full}");
     }
 
     #[test]

@@ -260,11 +260,15 @@ pub enum TransportError {
     },
 }
 
+/// Most topics that are named in an error.
+const NAMED: usize = 20;
+
 fn list(names: &[String]) -> String {
-    if names.is_empty() {
-        return "none".to_owned();
+    match names.split_at_checked(NAMED) {
+        _ if names.is_empty() => "none".to_owned(),
+        Some((first, rest)) if !rest.is_empty() => format!("{}, and {} more", first.join(", "), rest.len()),
+        _ => names.join(", "),
     }
-    names.join(", ")
 }
 
 /// Whether two message type names mean the same type: `pkg/msg/Type` equals `pkg/Type`.
@@ -299,6 +303,14 @@ mod tests {
     fn both_spellings_of_a_type_are_equal() {
         assert!(same_type("sensor_msgs/msg/Imu", "sensor_msgs/Imu"));
         assert!(!same_type("sensor_msgs/msg/Imu", "sensor_msgs/msg/Image"));
+    }
+
+    #[test]
+    fn of_many_topics_a_missing_one_names_some() {
+        let known = (0..1000).map(|n| format!("/t{n:03}")).collect();
+        let error = TransportError::NoSuchTopic { topic: "/imu".to_owned(), known, nearest: None }.to_string();
+        assert!(error.starts_with("no topic `/imu`; there are: /t000, /t001, "), "{error}");
+        assert!(error.ends_with(", /t019, and 980 more"), "{error}");
     }
 
     #[test]

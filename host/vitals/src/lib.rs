@@ -2,7 +2,7 @@
 //!
 //! - [`log`]: lines for people, on standard error.
 //! - [`Pulse`]: what it does, and since when, for the shim that ends it if it does not come back.
-//! - [`Spreads`]: how long things take, in bounded memory.
+//! - [`Spreads`], [`Durations`]: how long things take, in bounded memory.
 //! - [`usage`]: memory and CPU time.
 //!
 //! What never happens here: reports to whoever started us, which are `gleaner_protocol`'s.
@@ -13,4 +13,4 @@ mod spread;
 pub mod usage;
 
 pub use pulse::{Busy, PULSE_ENV, Pulse};
-pub use spread::Spreads;
+pub use spread::{Durations, Spreads};

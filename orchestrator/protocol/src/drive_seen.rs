@@ -17,6 +17,9 @@ pub struct DriveSeen {
     pub damaged: Option<String>,
     /// By name.
     pub topics: Vec<RecordedTopicSeen>,
+    /// Topics beyond those, which were not looked at.
+    #[serde(default)]
+    pub skipped: u64,
 }
 
 /// A topic of a drive.

@@ -12,8 +12,8 @@ use super::durable;
 use super::place::{CLIP, CLIPS, JPG};
 use crate::error::RecordError;
 
-/// Longer lines are not ours. One of ours has some KB; at most 8 MB: 256 topics, whose names of 1 KiB may stand in it twice
-/// and in four texts of `short`, six bytes for each if they are control characters, and 100 moments of some 3 KB.
+/// Longer lines are not ours. One of ours has some KB; at most 13 MB: 1,024 topics, whose names and types of 256 KiB may stand
+/// in it and in six texts of `short`, six bytes for each if they are control characters, and 100 moments of some 3 KB.
 const LINE_MAX: u64 = 16 << 20;
 
 /// The list of clips.

@@ -38,8 +38,12 @@ pub(crate) use live::counted;
 pub use settings::{Commanded, Counts, LambdaId, Settings, TopicId, Work};
 pub use stock::Member;
 
-/// Most topics of one recorder.
-const TOPICS_MAX: usize = 256;
+/// Most topics of one recorder. A vehicle has some hundreds. Of each, the stamps of some thousand lost samples are kept: 100 KiB.
+pub const TOPICS_MAX: usize = 1024;
+
+/// Most bytes of the names of all topics of one recorder, and of their types: they stand in a line of the list of clips, up to
+/// seven times and with six bytes for one, and a line has at most 16 MiB.
+const NAMES_MAX: usize = 256 << 10;
 
 /// Most lambdas of one recorder, counted with each start: of each a header is kept.
 const LAMBDAS_MAX: usize = 1024;
@@ -124,7 +128,8 @@ impl Recorder {
     ///
     /// # Errors
     ///
-    /// [`RecordError::TooManyTopics`] beyond 256; [`RecordError::LongTopic`] if a clip has no room for what it says of itself.
+    /// [`RecordError::TooManyTopics`] beyond [`TOPICS_MAX`]; [`RecordError::LongTopic`] and [`RecordError::LongNames`] if a clip has
+    /// no room for what it says of itself, or all together.
     pub fn add_topic(&mut self, topic: Topic) -> Result<TopicId, RecordError> {
         self.add_lane(topic, false)
     }
@@ -148,6 +153,10 @@ impl Recorder {
             return Err(RecordError::TooManyTopics { most: TOPICS_MAX });
         }
         topic.check()?;
+        let names = |topic: &Topic| topic.name.len() + topic.type_name.len();
+        if lanes.iter().map(|lane| names(&lane.topic)).sum::<usize>() + names(&topic) > NAMES_MAX {
+            return Err(RecordError::LongNames { most: NAMES_MAX });
+        }
         let (topic, lambdas, gaps) = (Arc::new(topic), Vec::new(), Gaps::default());
         lanes.push(Lane { topic, is_missing, found_at: None, lambdas, gaps });
         self.stock.losses.push(Losses::default());

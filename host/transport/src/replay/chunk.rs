@@ -4,7 +4,9 @@ use std::io::{self, Read};
 
 use zstd::stream::raw::{Decoder as ZstdDecoder, Operation};
 
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
+use super::file::Channels;
 use super::options::{Limits, Span};
 use super::records::{ChunkHead, HEAD, MessageHead, Record, Records, op};
 use super::source::Source;
@@ -99,18 +101,31 @@ impl OpenSegment {
         self.entries.push(Entry { log_time: head.log_time, channel: 0, at });
     }
 
-    /// Collects the messages of the channels that `wanted` accepts, and sorts them.
+    /// Collects the messages of the channels that `wanted` accepts, and sorts them. What `segment` says of its times, and
+    /// the file of its `channels`, has to be so.
     ///
     /// `wanted` answers `None` for a channel that does not exist.
-    fn sort(&mut self, span: Span, wanted: impl Fn(u16) -> Option<bool>) -> Result<(), Damage> {
+    fn sort(
+        &mut self,
+        segment: &Segment,
+        channels: &Channels,
+        span: Span,
+        wanted: impl Fn(u16) -> Option<bool>,
+    ) -> Result<(), Damage> {
         let mut entries = std::mem::take(&mut self.entries);
         entries.clear();
         self.next = 0;
         for record in self.records() {
-            let Record { opcode: op::MESSAGE, at, body } = record? else {
+            let Record { opcode, at, body } = record?;
+            if opcode != op::MESSAGE {
+                channels.check(opcode, body)?;
                 continue;
-            };
+            }
             let head = message_head(body)?;
+            if !(segment.start_time..=segment.end_time).contains(&head.log_time) {
+                let (first, last) = (segment.start_time, segment.end_time);
+                return Err(Damage::OutsideChunk { found: head.log_time, first, last });
+            }
             if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))? && span.holds(head.log_time) {
                 // Fits: `Opener::new` clamps the size of a segment.
                 entries.push(Entry { log_time: head.log_time, channel: head.channel, at: at as u32 });
@@ -124,8 +139,13 @@ impl OpenSegment {
     }
 }
 
+/// The front of a message record. Times are signed everywhere else: one that does not fit would become another.
 pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
-    MessageHead::parse(body).ok_or(Damage::Malformed("a message record is shorter than its header"))
+    let head = MessageHead::parse(body).ok_or(Damage::Malformed("a message record is shorter than its header"))?;
+    if i64::try_from(head.log_time).is_err() {
+        return Err(Damage::Late(head.log_time));
+    }
+    Ok(head)
 }
 
 /// Reads segments, with the state that decompression keeps between them.
@@ -147,12 +167,13 @@ impl Opener {
         &mut self,
         source: &mut Source,
         segment: &Segment,
+        channels: &Channels,
         span: Span,
         wanted: impl Fn(u16) -> Option<bool>,
         into: &mut OpenSegment,
     ) -> Result<(), ReplayError> {
         self.read(source, segment.offset, segment.len, segment.kind, into)?;
-        into.sort(span, wanted).map_err(|what| source.damaged(segment.offset, what))
+        into.sort(segment, channels, span, wanted).map_err(|what| source.damaged(segment.offset, what))
     }
 
     /// Reads a segment's records into `into`, unsorted.

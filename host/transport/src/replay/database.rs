@@ -8,6 +8,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::error::Error;
 use std::io::{self, Read};
+use std::ops::RangeInclusive;
 use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 use std::sync::Arc;
@@ -17,13 +18,17 @@ use rusqlite::limits::Limit;
 use rusqlite::{Connection, OpenFlags, OptionalExtension};
 use tracing::warn;
 
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
 use super::file::{ChannelInfo, Channels, Contents, offered_qos};
 use super::options::Limits;
 use super::rows::{LATER, Rows, SAME_TIME, is_of_system, select, time};
 use super::storage::journals_of;
 
 type Refused = Box<dyn Error + Send + Sync>;
+
+/// The schemas of `rosbag2_storage_sqlite3` that can be read.
+const VERSIONS: RangeInclusive<i64> = 1..=4;
 
 /// SQLite counts the length of a row in 31 bits.
 const LARGEST_ROW: u64 = 1 << 30;
@@ -69,6 +74,7 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
     let expected = claimed_len(file.real).map_err(|source| ReplayError::Open { path: path.clone(), source })?;
     let is_cut_off = expected > len;
     let db = connect(file.real, limits, is_cut_off).map_err(|error| refused(error.into()))?;
+    is_known_version(&db).map_err(refused)?;
     let known = topics(&db).map_err(refused)?;
     let Some(index) = index_of_times(&db).map_err(|error| refused(error.into()))? else {
         return Err(ReplayError::NoTimes { path });
@@ -166,6 +172,23 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
         "PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0; PRAGMA cache_size = -512;",
     )?;
     Ok(db)
+}
+
+/// Refuses a database of a later rosbag2: what it changed cannot be known. Version 1 did not say which it is.
+fn is_known_version(db: &Connection) -> Result<(), Refused> {
+    if kind(db, "schema")?.is_none() {
+        return Ok(());
+    }
+    table(db, "schema", &["schema_version"])?;
+    let version: Option<i64> =
+        db.query_row("SELECT max(schema_version) FROM schema NOT INDEXED", [], |row| row.get(0))?;
+    match version.filter(|version| !VERSIONS.contains(version)) {
+        None => Ok(()),
+        Some(version) => {
+            let (first, last) = (VERSIONS.start(), VERSIONS.end());
+            Err(format!("its schema has version {version}; only versions {first} to {last} can be read").into())
+        }
+    }
 }
 
 /// The topics of a database.

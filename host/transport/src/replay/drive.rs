@@ -8,7 +8,8 @@ use std::sync::Arc;
 
 use super::catalog::Catalog;
 use super::chunk::{OpenSegment, Opener};
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
 use super::inflate::Inflate;
 use super::options::{Limits, Options, Span};
 use super::step::{Progress, Step};
@@ -40,7 +41,8 @@ use crate::transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport
 ///
 /// A file that is readable to its end but has no footer, or a damaged summary, or another number of
 /// messages of a subscribed topic than the summary counts, is replayed whole and then reported as
-/// damaged. Messages outside chunks have no checksum of their own; if the one of the whole data
+/// damaged; so is one whose index says other times of a chunk than the chunk itself, which is read as one without.
+/// Messages outside chunks have no checksum of their own; if the one of the whole data
 /// section is wrong, that too is reported after them. A writer may leave out any checksum; then
 /// only what contradicts itself is noticed.
 ///
@@ -230,13 +232,21 @@ impl Replay {
         ends.max().map(nanoseconds)
     }
 
+    /// Whether a topic can be subscribed so.
+    ///
+    /// # Errors
+    ///
+    /// That of [`Transport::subscribe`].
+    pub fn can_subscribe(&self, spec: &TopicSpec) -> Result<(), TransportError> {
+        self.catalog.select(spec).map(drop)
+    }
+
     /// How far the replay has come.
     pub fn progress(&self) -> Progress {
         self.progress
     }
 
-    /// Messages delivered after one with a later log time. 0 unless an index lies or
-    /// [`Limits::open_bytes`] was reached.
+    /// Messages delivered after one with a later log time. 0 unless [`Limits::open_bytes`] was reached.
     pub fn out_of_order(&self) -> u64 {
         self.out_of_order
     }

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use tracing::warn;
 
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
 use super::records::{self, HEAD, MAGIC, Statistics, head, op};
 use super::source::Source;
 use super::summary::footer;

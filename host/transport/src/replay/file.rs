@@ -1,12 +1,13 @@
 //! What one file contains: its channels, and where its messages lie.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::Arc;
 
 use tracing::warn;
 
 use super::chunk::Segment;
-use super::error::Damage;
+use super::damage::Damage;
 use super::records::{Channel, Schema, op};
 use crate::transport::Guid;
 
@@ -51,6 +52,8 @@ pub(super) struct Channels {
 const KNOWN_BYTES: usize = 64 << 20;
 /// The longest description of offered qualities of service that is kept; a usual one has 200 bytes.
 const QOS_BYTES: usize = 64 << 10;
+/// How much of a name of the file stands in an error.
+const SHOWN_CHARS: usize = 100;
 const TOO_MUCH: Damage = Damage::Malformed("its schemas and channels take more than 64 MiB");
 
 impl Channels {
@@ -82,35 +85,25 @@ impl Channels {
         if self.bytes > KNOWN_BYTES { Err(TOO_MUCH) } else { Ok(()) }
     }
 
-    /// Learns from a record; other records are passed over. Writers repeat schemas and channels:
-    /// the first of an id counts.
+    /// Learns from a record; other records are skipped. Writers repeat schemas and channels, always with the same content:
+    /// a repetition that differs is damage, since messages would change their topic or their type.
     pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
         match opcode {
             op::SCHEMA => {
-                let schema = Schema::parse(body).ok_or(Damage::Malformed("a schema record is malformed"))?;
-                if self.schemas.contains_key(&schema.id) {
-                    return Ok(());
+                let schema = schema_of(body)?;
+                if let Some(known) = self.schemas.get(&schema.id) {
+                    return known.check(&schema);
                 }
                 self.make_room(body.len())?;
-                self.schemas.entry(schema.id).or_insert_with(|| SchemaInfo {
-                    name: schema.name.to_owned(),
-                    encoding: schema.encoding.to_owned(),
-                    // Comments in other encodings are common and harmless.
-                    text: Some(String::from_utf8_lossy(schema.data).trim())
-                        .filter(|text| !text.is_empty())
-                        .map(Arc::from),
-                });
+                self.schemas.insert(schema.id, SchemaInfo::of(&schema));
             }
             op::CHANNEL => {
-                let channel = Channel::parse(body).ok_or(Damage::Malformed("a channel record is malformed"))?;
-                if self.by_id.contains_key(&channel.id) {
-                    return Ok(());
+                let channel = channel_of(body)?;
+                if let Some(known) = self.by_id.get(&channel.id) {
+                    return self.check_channel(known, &channel);
                 }
                 self.make_room(body.len())?;
-                let schema = self.schemas.get(&channel.schema);
-                if schema.is_none() && channel.schema != 0 {
-                    return Err(Damage::Malformed("a channel names a schema that is not defined"));
-                }
+                let schema = self.schema_of_channel(&channel)?;
                 let of = |field: fn(&SchemaInfo) -> &String| schema.map(field).cloned();
                 let info = ChannelInfo {
                     topic: channel.topic.to_owned(),
@@ -127,6 +120,98 @@ impl Channels {
         }
         Ok(())
     }
+
+    /// Compares a record with what is known; other records, and what is not known, are skipped.
+    pub(super) fn check(&self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
+        match opcode {
+            op::SCHEMA => {
+                let schema = schema_of(body)?;
+                self.schemas.get(&schema.id).map_or(Ok(()), |known| known.check(&schema))
+            }
+            op::CHANNEL => {
+                let channel = channel_of(body)?;
+                self.by_id.get(&channel.id).map_or(Ok(()), |known| self.check_channel(known, &channel))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn check_channel(&self, known: &ChannelInfo, again: &Channel<'_>) -> Result<(), Damage> {
+        let redefined = |field, first, second| redefined("channel", again.id, field, Some((first, second)));
+        if known.topic != again.topic {
+            return redefined("topic", &known.topic, again.topic);
+        }
+        if known.message_encoding != again.encoding {
+            return redefined("message encoding", &known.message_encoding, again.encoding);
+        }
+        let (type_name, encoding, text) = match self.schema_of_channel(again)? {
+            Some(schema) => (schema.name.as_str(), schema.encoding.as_str(), schema.text.as_ref()),
+            None => ("", "", None),
+        };
+        if known.type_name != type_name {
+            return redefined("type", &known.type_name, type_name);
+        }
+        if known.schema_encoding != encoding {
+            return redefined("schema encoding", &known.schema_encoding, encoding);
+        }
+        match known.definitions_text.as_ref() == text {
+            true => Ok(()),
+            false => self::redefined("channel", again.id, "definition of its type", None),
+        }
+    }
+
+    /// The schema that a channel names; number 0 stands for none.
+    fn schema_of_channel(&self, channel: &Channel<'_>) -> Result<Option<&SchemaInfo>, Damage> {
+        match self.schemas.get(&channel.schema) {
+            None if channel.schema != 0 => Err(Damage::Malformed("a channel names a schema that is not defined")),
+            schema => Ok(schema),
+        }
+    }
+}
+
+impl SchemaInfo {
+    fn of(schema: &Schema<'_>) -> Self {
+        let text = definitions(schema);
+        let (name, encoding) = (schema.name.to_owned(), schema.encoding.to_owned());
+        Self { name, encoding, text: Some(text.trim()).filter(|text| !text.is_empty()).map(Arc::from) }
+    }
+
+    fn check(&self, again: &Schema<'_>) -> Result<(), Damage> {
+        let redefined = |field, values| redefined("schema", again.id, field, values);
+        if self.name != again.name {
+            return redefined("name", Some((&self.name, again.name)));
+        }
+        if self.encoding != again.encoding {
+            return redefined("encoding", Some((&self.encoding, again.encoding)));
+        }
+        match self.text.as_deref().unwrap_or_default() == definitions(again).trim() {
+            true => Ok(()),
+            false => redefined("text", None),
+        }
+    }
+}
+
+/// The text of a schema. Comments in other encodings than UTF-8 are common and harmless.
+fn definitions<'a>(schema: &Schema<'a>) -> Cow<'a, str> {
+    String::from_utf8_lossy(schema.data)
+}
+
+fn schema_of(body: &[u8]) -> Result<Schema<'_>, Damage> {
+    Schema::parse(body).ok_or(Damage::Malformed("a schema record is malformed"))
+}
+
+fn channel_of(body: &[u8]) -> Result<Channel<'_>, Damage> {
+    Channel::parse(body).ok_or(Damage::Malformed("a channel record is malformed"))
+}
+
+fn redefined(what: &'static str, id: u16, field: &'static str, values: Option<(&str, &str)>) -> Result<(), Damage> {
+    let shown = |text: &str| text.chars().take(SHOWN_CHARS).collect();
+    Err(Damage::Redefined {
+        what,
+        id,
+        field,
+        values: values.map(|(first, second)| Box::new([shown(first), shown(second)])),
+    })
 }
 
 /// What rosbag2 notes of a topic's writers; it is nothing to fail over if it cannot be kept.

@@ -17,6 +17,7 @@
 mod bag;
 mod catalog;
 mod chunk;
+mod damage;
 #[cfg(feature = "bags")]
 mod database;
 mod drive;
@@ -40,9 +41,12 @@ mod track;
 mod unpack;
 mod writers;
 
+pub use damage::{Damage, Place};
 pub use drive::Replay;
-pub use error::{Damage, Place, ReplayError};
+pub use error::ReplayError;
 pub use extras::{Attachment, Extras, read_extras};
 pub use options::{Limits, Options};
 pub use step::{Progress, Step};
 pub use storage::{files_of, journals_of};
+#[cfg(feature = "bags")]
+pub use unpack::{Unpacked, unpack};

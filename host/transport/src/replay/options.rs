@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+#[cfg(feature = "bags")]
+use super::unpack::Unpacked;
 use crate::message::Sources;
 
 /// How a drive is opened.
@@ -13,6 +15,10 @@ pub struct Options {
     pub sources: Option<Sources>,
     /// The folder for the content of packed files, which is gone with the replay; the system's for temporary files if `None`.
     pub unpack_in: Option<PathBuf>,
+    /// Packed files whose content is open already, for a process that may not write. Such a database is still given a name in
+    /// `unpack_in` while it is opened.
+    #[cfg(feature = "bags")]
+    pub unpacked: Vec<Unpacked>,
 }
 
 /// How much memory and disk a replay may use.
@@ -25,7 +31,8 @@ pub struct Limits {
     /// overlap in time are open together; past this limit their messages may come out of order,
     /// which [`super::Replay::out_of_order`] counts.
     pub open_bytes: u64,
-    /// The most bytes of disk that the content of all packed files of a replay may take.
+    /// The most bytes of disk that the content of all packed files of a replay may take. One file may take 200 times its own
+    /// size or a 64th of this, whichever is more, and never more than nine tenths of what is free on the disk.
     pub unpacked_bytes: u64,
 }
 

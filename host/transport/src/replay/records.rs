@@ -4,7 +4,7 @@
 //! its indexed reader never checks a chunk's checksum, and neither gives up a chunk's bytes. Ten
 //! record kinds are little enough to read directly. Source: the MCAP specification, version 0.
 
-use super::error::Damage;
+use super::damage::Damage;
 
 /// What every MCAP file begins and ends with.
 pub(super) const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";

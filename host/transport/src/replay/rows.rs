@@ -12,7 +12,8 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, ErrorCode, Row, Rows as Cursor};
 
 use super::chunk::OpenSegment;
-use super::error::{Damage, Place, ReplayError};
+use super::damage::{Damage, Place};
+use super::error::ReplayError;
 use super::options::Span;
 use super::records::MessageHead;
 

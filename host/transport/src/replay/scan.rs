@@ -11,7 +11,8 @@ use std::collections::{BTreeSet, HashMap};
 use tracing::warn;
 
 use super::chunk::{OpenSegment, Opener, Segment, SegmentKind, message_head};
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
 use super::file::Contents;
 use super::records::{ChunkIndex, HEAD, MAGIC, MESSAGE_HEAD, MessageHead, head, op};
 use super::source::Source;
@@ -19,6 +20,11 @@ use super::summary::read_tail;
 
 /// Messages outside chunks are read in runs of about this many bytes.
 const RUN: u64 = 1 << 20;
+/// How many chunks of an index are compared with their own headers when a file is opened. The headers lie far apart: a
+/// disk that turns needs some milliseconds for each.
+const COMPARED: usize = 64;
+/// The head of a chunk record, and its first and last time.
+const TIMES: u64 = HEAD + 16;
 /// The largest schema or channel record outside chunks that is looked at.
 const MAX_RECORD: u64 = 16 << 20;
 
@@ -28,7 +34,14 @@ pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents,
     if source.peek(0, MAGIC.len())? != MAGIC {
         return Err(ReplayError::NotMcap { path: source.path().to_owned() });
     }
-    let tail = read_tail(source)?;
+    let mut tail = read_tail(source)?;
+    if let Some(summary) = &tail.summary
+        && let Some(offset) = chunk_of_other_times(source, &summary.chunks)?
+    {
+        // No time of the index is to be trusted then, so the file is read through, as one that has none.
+        tail.damage = Some((offset, Damage::Summary("it gives a chunk other times than the chunk itself")));
+        tail.summary = None;
+    }
     let mut contents = Contents::default();
     let mut index = HashMap::new();
     if let Some(summary) = tail.summary {
@@ -51,6 +64,29 @@ pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents,
     }
     contents.damage = damage;
     Ok(contents)
+}
+
+/// Looks for a chunk that has other times in `index` than in its own header: among the earliest, the latest, and some
+/// in between. What is read of all others shows later, when they are opened; a chunk that a part of the drive leaves out
+/// is not opened.
+fn chunk_of_other_times(source: &mut Source, index: &HashMap<u64, ChunkIndex>) -> Result<Option<u64>, ReplayError> {
+    let mut chunks: Vec<_> =
+        index.values().filter(|chunk| chunk.offset.saturating_add(TIMES) <= source.len()).collect();
+    chunks.sort_unstable_by_key(|chunk| chunk.offset);
+    let edges = [chunks.iter().min_by_key(|chunk| chunk.start_time), chunks.iter().max_by_key(|chunk| chunk.end_time)];
+    let step = chunks.len().div_ceil(COMPARED).max(1);
+    for chunk in edges.into_iter().flatten().chain(chunks.iter().step_by(step)) {
+        let mut bytes = [0; TIMES as usize];
+        source.read(chunk.offset, &mut bytes)?;
+        let times = [chunk.start_time, chunk.end_time];
+        let is_chunk = bytes[0] == op::CHUNK;
+        let own = [&bytes[HEAD as usize..][..8], &bytes[HEAD as usize + 8..]]
+            .map(|bytes| bytes.try_into().map_or(0, u64::from_le_bytes));
+        if is_chunk && (own != times || times[0] > times[1] || i64::try_from(times[1]).is_err()) {
+            return Ok(Some(chunk.offset));
+        }
+    }
+    Ok(None)
 }
 
 struct Walk<'a> {

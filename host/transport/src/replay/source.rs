@@ -1,17 +1,21 @@
 //! One file, read in pieces and never whole.
 
 use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom};
+use std::io;
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use super::error::{Damage, Place, ReplayError};
+use super::damage::{Damage, Place};
+use super::error::ReplayError;
 
 /// How much [`Source::peek`] reads at once. Record heads of small messages lie close together.
 const WINDOW: usize = 64 * 1024;
 
 /// An open file of known length.
 pub(super) struct Source {
-    file: File,
+    /// Read from where one likes: others may read it, too.
+    file: Arc<File>,
     path: PathBuf,
     len: u64,
     window: Vec<u8>,
@@ -29,21 +33,22 @@ impl Source {
         if !metadata.is_file() {
             return Err(cannot(io::Error::new(io::ErrorKind::InvalidInput, "it is no file")));
         }
-        let file = File::open(path).map_err(cannot)?;
-        let metadata = file.metadata().map_err(cannot)?;
-        Ok(Self::over(file, path, metadata.len()))
+        Self::over(Arc::new(File::open(path).map_err(cannot)?), path)
     }
 
-    /// What is in `file`, which has `len` bytes, under the name `path`.
-    pub(super) fn over(file: File, path: &Path, len: u64) -> Self {
-        Self { file, path: path.to_owned(), len, window: Vec::new(), window_at: 0 }
+    /// What is in `file`, under the name `path`.
+    pub(super) fn over(file: Arc<File>, path: &Path) -> Result<Self, ReplayError> {
+        let path = path.to_owned();
+        match file.metadata() {
+            Ok(metadata) => Ok(Self { file, path, len: metadata.len(), window: Vec::new(), window_at: 0 }),
+            Err(source) => Err(ReplayError::Open { path, source }),
+        }
     }
 
-    /// The file, to be read from its start.
+    /// The file, of which nothing was read from where it is.
     #[cfg(feature = "bags")]
-    pub(super) fn into_file(mut self) -> io::Result<File> {
-        self.file.rewind()?;
-        Ok(self.file)
+    pub(super) fn into_file(self) -> Arc<File> {
+        self.file
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -60,10 +65,7 @@ impl Source {
 
     /// Fills `into` with the bytes from `offset` on, which the caller knows to lie in the file.
     pub(super) fn read(&mut self, offset: u64, into: &mut [u8]) -> Result<(), ReplayError> {
-        self.file
-            .seek(SeekFrom::Start(offset))
-            .and_then(|_| self.file.read_exact(into))
-            .map_err(|source| self.failed(offset, source))
+        self.file.read_exact_at(into, offset).map_err(|source| self.failed(offset, source))
     }
 
     /// The `n` bytes at `offset` (at most [`WINDOW`]), or fewer where the file ends.

@@ -7,13 +7,16 @@ use std::path::{Path, PathBuf};
 use tracing::warn;
 
 use super::chunk::Opener;
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
 use super::file::Contents;
 use super::options::Options;
 use super::records::MAGIC;
 use super::scan::scan;
 use super::source::Source;
 use super::track::{Store, Track};
+#[cfg(feature = "bags")]
+use super::unpack::{Unpacked, unpack_one};
 use super::writers::Writers;
 
 /// What the metadata of a directory say of its files.
@@ -127,13 +130,17 @@ fn open_file(
     opener: &mut Opener,
     room: &mut u64,
 ) -> Result<(Store, Contents), ReplayError> {
+    #[cfg(feature = "bags")]
+    if let Some(unpacked) = options.unpacked.iter().find(|unpacked| unpacked.path == path) {
+        return content(unpacked, options, opener);
+    }
     let mut source = Source::open(path)?;
     match kind_of(&mut source)? {
         Kind::Mcap => mcap(source, opener),
         #[cfg(feature = "bags")]
         Kind::Database => database(super::database::File::beside_its_journal(path), source.len(), options),
         #[cfg(feature = "bags")]
-        Kind::Packed => packed(source, options, opener, room),
+        Kind::Packed => content(&unpack_one(source, options, room)?, options, opener),
         #[cfg(not(feature = "bags"))]
         kind => {
             let _ = (options, room);
@@ -154,23 +161,19 @@ fn database(file: super::database::File<'_>, len: u64, options: &Options) -> Res
     Ok((Store::Rows(Box::new(rows)), contents))
 }
 
-/// Unpacks a file into another, which nobody sees and which is gone once it is closed, and opens that.
+/// Opens the content of a packed file.
 #[cfg(feature = "bags")]
-fn packed(
-    source: Source,
-    options: &Options,
-    opener: &mut Opener,
-    room: &mut u64,
-) -> Result<(Store, Contents), ReplayError> {
-    let unpacked = super::unpack::unpack(source, options, room)?;
-    let super::unpack::Unpacked { path, file, name, len, broken } = unpacked;
-    let mut source = Source::over(file, &path, len);
+fn content(unpacked: &Unpacked, options: &Options, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
+    let path = &unpacked.path;
+    let mut source = Source::over(unpacked.content.clone(), path)?;
+    let len = source.len();
     let (store, mut contents) = match kind_of(&mut source)? {
         Kind::Mcap => mcap(source, opener)?,
-        Kind::Database => database(super::database::File::elsewhere(&path, &name), len, options)?,
-        Kind::Packed => return Err(ReplayError::NotMcap { path }),
+        Kind::Database => database(super::database::File::elsewhere(path, &unpacked.name(options)?), len, options)?,
+        Kind::Packed => return Err(ReplayError::NotMcap { path: path.clone() }),
     };
-    if let Some(error) = broken {
+    if let Some(error) = &unpacked.broken {
+        let error = std::io::Error::other(error.clone());
         contents.damage.get_or_insert((len, Damage::UnpackedInPart(error)));
     }
     Ok((store, contents))

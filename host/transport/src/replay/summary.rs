@@ -2,7 +2,8 @@
 
 use std::collections::HashMap;
 
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
 use super::file::Channels;
 use super::records::{ChunkIndex, FOOTER, HEAD, MAGIC, Records, Statistics, head, op};
 use super::source::Source;

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use super::chunk::{OpenSegment, Opener, Segment, message_head};
-use super::error::{Damage, ReplayError};
+use super::damage::Damage;
+use super::error::ReplayError;
 use super::file::Contents;
 use super::inflate::{Inflate, ZSTD};
 use super::options::Span;
@@ -172,7 +173,7 @@ impl Track {
             return Ok(0);
         };
         let routes = &self.routes;
-        let opened = opener.open(source, &segment, self.span, |id| wanted(routes, id), into);
+        let opened = opener.open(source, &segment, &self.contents.channels, self.span, |id| wanted(routes, id), into);
         match opened {
             Ok(()) => Ok(segment.offset),
             Err(error) => {
@@ -266,7 +267,8 @@ fn topic_of(contents: &Contents, channel: u16) -> String {
     contents.channels.get(channel).map(|info| info.topic.clone()).unwrap_or_default()
 }
 
-/// Log times are unsigned; one beyond the year 2262 reads as the end of time.
+/// A time of a file, where times are unsigned. Log times of messages fit; what an index says, and when a message was published,
+/// may be beyond the year 2262, and then reads as the end of time.
 pub(super) fn nanoseconds(log_time: u64) -> i64 {
     i64::try_from(log_time).unwrap_or(i64::MAX)
 }

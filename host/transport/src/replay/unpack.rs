@@ -1,12 +1,20 @@
 //! Packed files: their content, in a file without a name.
 //!
 //! A packed file cannot be read from where one likes, and messages are not in the order of their times. So it is unpacked
-//! once, to the disk, which has more room than memory.
+//! once, to the disk, which has more room than memory. The content has no name, so nothing of it stays when the process
+//! is killed.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Read, Write};
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
 
+use rustix::fs::{AtFlags, CWD, Mode, OFlags, fstatvfs, linkat, open};
+use rustix::io::Errno;
+use rustix::process::geteuid;
 use tempfile::{Builder, TempPath};
 use tracing::warn;
 use zstd::stream::read::Decoder;
@@ -14,60 +22,211 @@ use zstd::stream::read::Decoder;
 use super::error::ReplayError;
 use super::options::Options;
 use super::source::Source;
-use super::storage::{Kind, START};
+use super::storage::{Kind, START, files_of};
 
 /// Written at once.
 const PIECE: usize = 1 << 20;
+/// How many times its own size a packed file may hold. Sensor data packs to a half or a tenth, pictures of nothing to a
+/// thousandth, and a bomb to less.
+const RATIO: u64 = 200;
+/// The share of all that may be unpacked which one file may take in any case.
+const SHARE: u64 = 64;
+/// How the names begin that content has for a moment, and had all the time in earlier versions.
+const PREFIX: &str = ".unpacked-";
+/// A file of such a name that was not written to for so long belongs to a process that was killed.
+const STALE: Duration = Duration::from_secs(3600);
 
 /// The content of a packed file.
-pub(super) struct Unpacked {
-    /// The packed file.
+#[derive(Clone, Debug)]
+pub struct Unpacked {
+    /// The packed file, as it is named among the files of the drive.
     pub(super) path: PathBuf,
-    pub(super) file: File,
-    /// As long as this is there, the content has a name, which a database needs to be opened.
-    pub(super) name: TempPath,
-    pub(super) len: u64,
-    /// Why there is no more, though there should be.
-    pub(super) broken: Option<io::Error>,
+    pub(super) content: Arc<File>,
+    /// Why there is no more of it, though there should be.
+    pub(super) broken: Option<String>,
+    /// The name that it was made with, where there are no files without one.
+    name: Option<Arc<TempPath>>,
 }
 
-/// Unpacks what is in `source`, if it is something that we read. What that takes is taken from `room`, in bytes.
-pub(super) fn unpack(source: Source, options: &Options, room: &mut u64) -> Result<Unpacked, ReplayError> {
-    let path = source.path().to_owned();
-    let folder = options.unpack_in.clone().unwrap_or_else(std::env::temp_dir);
-    let failed = |source| ReplayError::Unpack { path: path.clone(), folder: folder.clone(), source };
-    let mut packed = Decoder::new(source.into_file().map_err(failed)?).map_err(failed)?;
-    let mut start = Vec::new();
-    packed.by_ref().take(START as u64).read_to_end(&mut start).map_err(failed)?;
-    // The rest is not even unpacked.
-    if !matches!(Kind::of(&start), Some(Kind::Mcap | Kind::Database)) {
-        return Err(ReplayError::NotMcap { path });
+/// What bounds the content of a file.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Bound {
+    /// All packed files together.
+    Drive(u64),
+    /// Its own size.
+    Ratio(u64),
+    /// The room on the disk.
+    Disk(u64),
+}
+
+impl Bound {
+    /// The smallest of a file of `packed` bytes, where all files may take `room` of `most` bytes in all, on a disk with
+    /// `free` bytes.
+    fn smallest(packed: u64, room: u64, most: u64, free: u64) -> Self {
+        let by_size = packed.saturating_mul(RATIO).max(most / SHARE);
+        // The rest is for the results, and for others.
+        let bounds = [Self::Disk(free / 10 * 9), Self::Ratio(by_size), Self::Drive(room)];
+        bounds.into_iter().min_by_key(|bound| bound.bytes()).expect("there are three")
     }
-    let (mut file, name) = new_file(&folder).map_err(failed)?;
-    let mut content = start.as_slice().chain(packed);
+
+    fn bytes(self) -> u64 {
+        let (Self::Drive(bytes) | Self::Ratio(bytes) | Self::Disk(bytes)) = self;
+        bytes
+    }
+
+    fn exceeded(self, path: &Path, folder: &Path, options: &Options) -> ReplayError {
+        let path = path.to_owned();
+        match self {
+            Self::Drive(_) => ReplayError::UnpacksTooLarge { path, allowed: options.limits.unpacked_bytes },
+            Self::Ratio(allowed) => ReplayError::UnpacksManyTimes { path, allowed },
+            Self::Disk(allowed) => ReplayError::NoRoom { path, folder: folder.to_owned(), allowed },
+        }
+    }
+}
+
+/// Unpacks the files of a drive that are packed. A process that may write does it for one that may not, which opens the drive
+/// with [`Options::unpacked`].
+///
+/// # Errors
+///
+/// As [`Replay::open`](super::Replay::open), of what concerns these files.
+pub fn unpack(paths: &[PathBuf], options: &Options) -> Result<Vec<Unpacked>, ReplayError> {
+    let mut room = options.limits.unpacked_bytes;
+    let mut unpacked = Vec::new();
+    for path in files_of(paths)? {
+        let mut source = Source::open(&path)?;
+        if matches!(Kind::of(source.peek(0, START)?), Some(Kind::Packed)) {
+            unpacked.push(unpack_one(source, options, &mut room)?);
+        }
+    }
+    Ok(unpacked)
+}
+
+/// Unpacks what is in `source`, if it is something that we read. What that takes is taken from `room`.
+pub(super) fn unpack_one(source: Source, options: &Options, room: &mut u64) -> Result<Unpacked, ReplayError> {
+    let (path, packed) = (source.path().to_owned(), source.len());
+    let folder = folder(options);
+    let failed = |source| ReplayError::Unpack { path: path.clone(), folder: folder.clone(), source };
+    let mut decoder = Decoder::new(source.into_file()).map_err(failed)?;
+    let mut start = Vec::new();
+    decoder.by_ref().take(START as u64).read_to_end(&mut start).map_err(failed)?;
+    let is_database = match Kind::of(&start) {
+        Some(Kind::Mcap) => false,
+        Some(Kind::Database) => true,
+        // The rest is not even unpacked.
+        _ => return Err(ReplayError::NotMcap { path }),
+    };
+    remove_stale(&folder);
+    let (mut file, name) = new_file(&folder, is_database).map_err(failed)?;
+    let disk = fstatvfs(&file).map_err(|error| failed(error.into()))?;
+    let free = disk.f_bavail.saturating_mul(disk.f_frsize);
+    let bound = Bound::smallest(packed, *room, options.limits.unpacked_bytes, free);
+    let mut content = start.as_slice().chain(decoder);
     let (mut piece, mut len) = (vec![0; PIECE], 0);
     let broken = loop {
         match content.read(&mut piece) {
             Ok(0) => break None,
             Ok(n) => {
                 len += n as u64;
-                let Some(left) = room.checked_sub(n as u64) else {
-                    return Err(ReplayError::UnpacksTooLarge { path, allowed: options.limits.unpacked_bytes });
-                };
-                *room = left;
+                if len > bound.bytes() {
+                    return Err(bound.exceeded(&path, &folder, options));
+                }
                 file.write_all(&piece[..n]).map_err(failed)?;
             }
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
             Err(error) => {
                 warn!(path = %path.display(), unpacked = len, %error, "drive can be unpacked only in part");
-                break Some(error);
+                break Some(error.to_string());
             }
         }
     };
-    Ok(Unpacked { path, file, name, len, broken })
+    *room -= len;
+    Ok(Unpacked { path, content: Arc::new(file), broken, name })
 }
 
-/// A new file in `folder`. A dot before its name: if the process is killed meanwhile, it is left.
-fn new_file(folder: &Path) -> io::Result<(File, TempPath)> {
-    Ok(Builder::new().prefix(".unpacked-").tempfile_in(folder)?.into_parts())
+impl Unpacked {
+    /// `content`, which another process made by [`unpack`] of the packed file `path`; of a file that could be unpacked only in
+    /// part, `broken` says why.
+    pub fn of(path: PathBuf, content: File, broken: Option<String>) -> Self {
+        Self { path, content: Arc::new(content), broken, name: None }
+    }
+
+    /// The packed file, its content, and why there is no more of it, if there should be.
+    pub fn parts(&self) -> (&Path, &File, Option<&str>) {
+        (&self.path, &self.content, self.broken.as_deref())
+    }
+
+    /// Names the content for as long as the result lives: SQLite opens by name only, and follows the links in `/proc` to
+    /// names that are not there.
+    pub(super) fn name(&self, options: &Options) -> Result<Arc<TempPath>, ReplayError> {
+        if let Some(name) = &self.name {
+            return Ok(name.clone());
+        }
+        let folder = folder(options);
+        let link = |name: &Path| {
+            let content = format!("/proc/self/fd/{}", self.content.as_raw_fd());
+            Ok(linkat(CWD, content, CWD, name, AtFlags::SYMLINK_FOLLOW)?)
+        };
+        match Builder::new().prefix(PREFIX).make_in(&folder, link) {
+            Ok(named) => Ok(Arc::new(named.into_temp_path())),
+            Err(source) => Err(ReplayError::Unpack { path: self.path.clone(), folder, source }),
+        }
+    }
+}
+
+fn folder(options: &Options) -> PathBuf {
+    options.unpack_in.clone().unwrap_or_else(std::env::temp_dir)
+}
+
+/// A new file in `folder`, without a name where that is possible: some file systems, as those of networks, have none such, and
+/// then a database keeps its name until it is open.
+fn new_file(folder: &Path, is_database: bool) -> io::Result<(File, Option<Arc<TempPath>>)> {
+    let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
+    match open(folder, flags, Mode::RUSR | Mode::WUSR) {
+        Ok(file) => Ok((file.into(), None)),
+        Err(Errno::OPNOTSUPP | Errno::ISDIR) => {
+            let (file, name) = Builder::new().prefix(PREFIX).tempfile_in(folder)?.into_parts();
+            Ok((file, is_database.then(|| Arc::new(name))))
+        }
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// Removes content that processes left in `folder` that were killed: plain files of this user with one name, to which nothing
+/// has been written for long. Content has a name only until it is written, or opened.
+fn remove_stale(folder: &Path) {
+    let Ok(entries) = fs::read_dir(folder) else { return };
+    for entry in entries.flatten().filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX)) {
+        // Of the entry itself: no link is followed.
+        let Ok(found) = entry.metadata() else { continue };
+        let is_ours = found.is_file() && found.uid() == geteuid().as_raw() && found.nlink() == 1;
+        let is_stale = found.modified().is_ok_and(|at| at.elapsed().is_ok_and(|age| age >= STALE));
+        if is_ours && is_stale {
+            let path = entry.path();
+            match fs::remove_file(&path) {
+                Ok(()) => warn!(path = %path.display(), bytes = found.len(), "removed what a killed process unpacked"),
+                Err(error) => warn!(path = %path.display(), %error, "cannot remove what a killed process unpacked"),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_is_bounded_by_its_size_by_the_disk_and_by_the_other_files() {
+        const GIB: u64 = 1 << 30;
+        let most = 64 * GIB;
+        for (packed, room, free, expected) in [
+            (2_000_000, most, 1000 * GIB, Bound::Ratio(GIB)),
+            (GIB / 10, most, 1000 * GIB, Bound::Ratio(GIB / 10 * RATIO)),
+            (GIB, most, 1000 * GIB, Bound::Drive(most)),
+            (GIB, most, 10 * GIB, Bound::Disk(9 * GIB)),
+            (u64::MAX, 7, u64::MAX, Bound::Drive(7)),
+        ] {
+            assert_eq!(Bound::smallest(packed, room, most, free), expected);
+        }
+    }
 }

@@ -228,6 +228,20 @@ fn what_sqlite_would_have_to_sort_in_memory_is_refused() {
 }
 
 #[test]
+fn a_schema_of_a_version_that_is_not_known_is_refused_by_its_number() {
+    let schema = "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);";
+    for version in [0, 5, 99, -1] {
+        let (_folder, path) = changed(&format!("{schema} INSERT INTO schema VALUES ({version}, 'x');"));
+        let ReplayError::Database { source, .. } = refused(&path) else { panic!("{version}") };
+        assert_eq!(source.to_string(), format!("its schema has version {version}; only versions 1 to 4 can be read"));
+    }
+    for rows in ["", "INSERT INTO schema VALUES (1, 'x');", "INSERT INTO schema VALUES (4, 'x');"] {
+        let (_folder, path) = changed(&format!("{schema} {rows}"));
+        assert_eq!(replayed(&path).0.len(), 5, "{rows}");
+    }
+}
+
+#[test]
 fn a_number_that_two_topics_have_is_refused() {
     let (_folder, path) = changed(
         "DROP TABLE topics; CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT);

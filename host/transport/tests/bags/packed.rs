@@ -1,10 +1,12 @@
 //! Packed files and messages that are damaged, or want more than they are given.
 
 use std::fs;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, SystemTime};
 
-use gleaner_transport::replay::{Damage, Limits, Options, Replay, ReplayError};
+use gleaner_transport::replay::{Damage, Limits, Options, Replay, ReplayError, Unpacked, unpack};
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use crate::bag::{Packed, Storage, bag, cdr, folder, mcap_of, packed};
@@ -82,21 +84,114 @@ fn a_packed_message_is_whole_or_too_big_even_for_who_takes_anything() {
     }
 }
 
+/// Bytes that no compression makes smaller.
+fn noise(len: u32) -> Vec<u8> {
+    let mut state = 1_u32;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as u8
+    };
+    (0..len).map(|_| next()).collect()
+}
+
 #[test]
 fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let folder = folder();
-    let bytes = [&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 8 << 20]].concat();
+    let small = drive(small_chunks(), &ticking(&["/a"], 3, 10));
     let limits = Limits { unpacked_bytes: 1 << 20, ..Limits::default() };
     let options = Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
-    let error = Replay::open_as(&[file(&packed(&bytes))], &options).err().unwrap();
+    let open = |paths: &[PathBuf]| Replay::open_as(paths, &options).map(drop);
+    let error = open(&[file(&packed(&[&small[..], &noise(2 << 20)].concat()))]).unwrap_err();
     assert!(matches!(error, ReplayError::UnpacksTooLarge { allowed: 1_048_576, .. }), "{error}");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     // Nor in parts.
-    let part = [&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 700 << 10]].concat();
+    let part = [&small[..], &noise(700 << 10)].concat();
     let parts = [file(&packed(&part)), file(&packed(&part))];
-    Replay::open_as(&parts[..1], &options).unwrap();
-    let error = Replay::open_as(&parts, &options).err().unwrap();
+    open(&parts[..1]).unwrap();
+    let error = open(&parts).unwrap_err();
     assert!(matches!(&error, ReplayError::UnpacksTooLarge { path, .. } if *path == parts[1]), "{error}");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn a_bomb_is_refused_by_its_size_long_before_the_disk_is_full() {
+    let folder = folder();
+    let bomb = packed(&[&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 64 << 20]].concat());
+    let limits = Limits { unpacked_bytes: 64 << 20, ..Limits::default() };
+    let options = Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+    let error = Replay::open_as(&[file(&bomb)], &options).err().unwrap();
+    let ReplayError::UnpacksManyTimes { allowed, .. } = &error else { panic!("{error}") };
+    assert_eq!(*allowed, (200 * bomb.len() as u64).max(1 << 20));
+    assert!(error.help().unwrap().contains("zstd -d"), "{error}");
+}
+
+#[test]
+fn while_it_is_unpacked_the_content_has_no_name() {
+    let folder = folder();
+    let messages = ticking(&TOPICS, 60, 1000);
+    for storage in [Storage::Mcap, Storage::Sqlite3] {
+        let bag = bag(storage, Packed::Files, &[&messages]);
+        let options = Options { unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+        let unpacked = unpack(&[bag.path().to_owned()], &options).unwrap();
+        assert_eq!(unpacked.len(), 1);
+        // What a kill leaves from here on.
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "{storage:?}");
+    }
+}
+
+#[test]
+fn content_that_another_process_unpacked_is_read_where_nothing_may_be_written() {
+    let messages = ticking(&TOPICS, 60, 1000);
+    let bag = bag(Storage::Mcap, Packed::Files, &[&messages]);
+    let paths = [bag.path().to_owned()];
+    let unpacked = unpack(&paths, &Options::default()).unwrap();
+    let handed = unpacked.iter().map(|one| {
+        let (path, content, broken) = one.parts();
+        Unpacked::of(path.to_owned(), content.try_clone().unwrap(), broken.map(str::to_owned))
+    });
+    let nowhere = Some(bag.path().join("nowhere"));
+    let options = Options { unpack_in: nowhere, unpacked: handed.collect(), ..Options::default() };
+    // Each reads the same file.
+    let mut replays = [0; 2].map(|_| Replay::open_as(&paths, &options).unwrap());
+    let memories = replays.each_mut().map(|replay| listen(replay, &TOPICS));
+    for _ in 0..30 {
+        for replay in &mut replays {
+            replay.step().unwrap();
+        }
+    }
+    for (mut replay, memory) in replays.into_iter().zip(memories) {
+        assert!(run(&mut replay).1.is_none());
+        assert_eq!(memory.values(), expected(&messages));
+    }
+}
+
+#[test]
+fn what_killed_processes_left_is_removed_and_nothing_else() {
+    let folder = folder();
+    let packed = file(&packed(&drive(small_chunks(), &ticking(&["/a"], 3, 10))));
+    let old = SystemTime::now() - Duration::from_secs(7200);
+    let path = |name: &str| folder.path().join(name);
+    for (name, at) in [
+        (".unpacked-old", Some(old)),
+        (".unpacked-new", None),
+        (".unpacked-twice", Some(old)),
+        ("unpacked-old", Some(old)),
+        ("drive.mcap", Some(old)),
+    ] {
+        let left = fs::File::create(path(name)).unwrap();
+        at.map_or(Ok(()), |at| left.set_modified(at)).unwrap();
+    }
+    fs::hard_link(path(".unpacked-twice"), path("second")).unwrap();
+    fs::create_dir(path(".unpacked-folder")).unwrap();
+    std::os::unix::fs::symlink(path("drive.mcap"), path(".unpacked-link")).unwrap();
+    let options = Options { unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+    Replay::open_as(&[packed], &options).unwrap();
+    let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    left.sort();
+    let others = [".unpacked-folder", ".unpacked-link", ".unpacked-new", ".unpacked-twice"];
+    assert_eq!(left, [&others[..], &["drive.mcap", "second", "unpacked-old"]].concat());
 }
 
 #[test]

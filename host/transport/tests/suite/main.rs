@@ -3,6 +3,7 @@
 mod channels;
 mod damage;
 mod extras;
+mod invalid;
 mod loopback;
 mod messages;
 mod replay;

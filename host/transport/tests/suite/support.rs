@@ -131,8 +131,12 @@ pub fn drive(options: WriteOptions, messages: &[Written]) -> Vec<u8> {
 }
 
 pub fn write(writer: &mut Writer<Cursor<Vec<u8>>>, channel_id: u16, message: &Written) {
-    let header =
-        MessageHeader { channel_id, sequence: message.sequence, log_time: message.at, publish_time: message.at + 1 };
+    let header = MessageHeader {
+        channel_id,
+        sequence: message.sequence,
+        log_time: message.at,
+        publish_time: message.at.saturating_add(1),
+    };
     let mut data = vec![0, 1, 0, 0];
     data.extend(message.value.to_le_bytes());
     writer.write_to_known_channel(&header, &data).unwrap();
