@@ -20,6 +20,7 @@ pub(super) struct Caps {
     /// Of all tables together.
     table_elements: usize,
     refused: Option<Refused>,
+    meter: Meter,
 }
 
 /// What was asked for beyond a cap.
@@ -32,10 +33,11 @@ pub(super) struct Refused {
 }
 
 impl Caps {
-    pub(super) fn new(limits: &Limits) -> Self {
+    /// The caps in `limits`; what grows is charged to `meter`.
+    pub(super) fn new(limits: &Limits, meter: Meter) -> Self {
         let tables_allowed = usize::try_from(limits.tables).unwrap_or(usize::MAX);
         let memory_allowed = limits.memory.as_usize();
-        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None }
+        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None, meter }
     }
 
     pub(super) fn forget_refusal(&mut self) {
@@ -50,7 +52,12 @@ impl Caps {
 
 impl ResourceLimiter for Caps {
     fn memory_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
-        let total = self.memory_bytes.saturating_add(desired.saturating_sub(now));
+        let more = desired.saturating_sub(now);
+        // One instruction has the kernel clear all these pages. A memory's first bytes belong to its instance, which is no work of a loop.
+        if now > 0 {
+            self.meter.charge(more)?;
+        }
+        let total = self.memory_bytes.saturating_add(more);
         if total > self.memory_allowed {
             let (asked, allowed) = (total as u64, self.memory_allowed as u64);
             self.refused = Some(Refused { what: "bytes of memory", asked, allowed });
@@ -166,7 +173,21 @@ mod tests {
     fn caps() -> Caps {
         let mut limits = Limits::default();
         (limits.memory, limits.tables) = (gleaner_protocol::manifest::ByteSize::mib(1), 100);
-        Caps::new(&limits)
+        let meter = Meter::default();
+        meter.begin(1_000_000);
+        Caps::new(&limits, meter)
+    }
+
+    #[test]
+    fn growing_costs_fuel_by_the_byte_whether_it_is_granted_or_not() {
+        let mut caps = caps();
+        caps.meter.begin(2 * (MIB as u64 / 8 + FUEL_PER_CALL) - 1);
+        assert!(caps.memory_growing(0, MIB / 2, None).unwrap());
+        assert_eq!(caps.meter.used(), 0);
+        assert!(!caps.memory_growing(MIB / 2, MIB / 2 + MIB, None).unwrap());
+        assert_eq!(caps.meter.used(), MIB as u64 / 8 + FUEL_PER_CALL);
+        let error = caps.memory_growing(MIB / 2, MIB / 2 + MIB, None).unwrap_err();
+        assert!(error.downcast_ref::<OutOfFuel>().is_some());
     }
 
     #[test]
