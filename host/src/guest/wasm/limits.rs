@@ -8,6 +8,8 @@ use wasmtime::ResourceLimiter;
 
 /// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in the same time.
 const BYTES_PER_FUEL: u64 = 8;
+/// Bytes of a page of linear memory.
+const PAGE: usize = 64 << 10;
 /// Fuel for the call itself.
 const FUEL_PER_CALL: u64 = 20;
 
@@ -53,18 +55,20 @@ impl Caps {
 impl ResourceLimiter for Caps {
     fn memory_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
         let more = desired.saturating_sub(now);
-        // One instruction has the kernel clear all these pages. A memory's first bytes belong to its instance, which is no work of a loop.
-        if now > 0 {
-            self.meter.charge(more)?;
-        }
         let total = self.memory_bytes.saturating_add(more);
-        if total > self.memory_allowed {
+        let fits = total <= self.memory_allowed;
+        // Beyond its own maximum it does not grow, and must not be counted as if it had.
+        let grows = fits && max.is_none_or(|max| desired <= max);
+        // One instruction has the kernel clear all these pages, and a loop of refusals takes time, too. A memory's first bytes belong to
+        // its instance, which is no work of a loop.
+        if now > 0 {
+            self.meter.charge(if grows { more } else { PAGE })?;
+        }
+        if !fits {
             let (asked, allowed) = (total as u64, self.memory_allowed as u64);
             self.refused = Some(Refused { what: "bytes of memory", asked, allowed });
             return Ok(false);
         }
-        // Beyond its own maximum it does not grow, and must not be counted as if it had.
-        let grows = max.is_none_or(|max| desired <= max);
         if grows {
             self.memory_bytes = total;
         }
@@ -179,14 +183,17 @@ mod tests {
     }
 
     #[test]
-    fn growing_costs_fuel_by_the_byte_whether_it_is_granted_or_not() {
+    fn growing_costs_fuel_by_the_byte_and_a_refusal_as_much_as_a_page() {
         let mut caps = caps();
-        caps.meter.begin(2 * (MIB as u64 / 8 + FUEL_PER_CALL) - 1);
+        let (grown, refused) = ((MIB / 2) as u64 / 8 + FUEL_PER_CALL, PAGE as u64 / 8 + FUEL_PER_CALL);
+        caps.meter.begin(grown + 2 * refused - 1);
         assert!(caps.memory_growing(0, MIB / 2, None).unwrap());
         assert_eq!(caps.meter.used(), 0);
-        assert!(!caps.memory_growing(MIB / 2, MIB / 2 + MIB, None).unwrap());
-        assert_eq!(caps.meter.used(), MIB as u64 / 8 + FUEL_PER_CALL);
-        let error = caps.memory_growing(MIB / 2, MIB / 2 + MIB, None).unwrap_err();
+        assert!(caps.memory_growing(MIB / 2, MIB, None).unwrap());
+        assert_eq!(caps.meter.used(), grown);
+        assert!(!caps.memory_growing(MIB, 2 * MIB, None).unwrap());
+        assert_eq!(caps.meter.used(), grown + refused);
+        let error = caps.memory_growing(MIB, 2 * MIB, None).unwrap_err();
         assert!(error.downcast_ref::<OutOfFuel>().is_some());
     }
 
