@@ -165,14 +165,6 @@ fn an_import_that_the_host_does_not_have_is_named() {
 }
 
 #[test]
-fn bytes_that_are_no_component_are_refused() {
-    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
-    copy.replace("hello.wasm", b"\0asm but not really");
-    let run = replay(copy.path(), &[sample_drive()], &[]);
-    says(run.must_exit(USAGE), &["cannot compile component", "hello.wasm", "help:", "gleaner build"]);
-}
-
-#[test]
 fn a_small_component_that_grows_while_it_is_compiled_is_refused() {
     // Each component holds sixty instances of the one before: a few kilobytes that stand for thirteen million.
     let mut text = "(component (component $c0 (core module $m) (core instance (instantiate $m)))".to_owned();

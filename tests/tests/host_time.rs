@@ -206,3 +206,13 @@ fn a_wake_that_comes_back_late_is_a_fault_though_nothing_ended_it() {
     limits.deadline = Duration::from_secs(60);
     Room::written_timed(&fills(), &limits).wake().result.unwrap();
 }
+
+#[test]
+fn a_start_function_that_grows_a_memory_for_ever_is_ended_by_its_fuel() {
+    let grow = "(start $grow) (func $grow (loop (drop (memory.grow $large (i32.const 1))) (br 0))) (func $wake)";
+    let text = component("", "", &format!("(memory $large 1) {grow}"));
+    let fault = Room::written(&text).guest.init().unwrap_err();
+    // The host's part alone ends it: 64 KiB cost 8,192 units, and so does a refusal.
+    assert_eq!((fault.kind, fault.allowed), (FaultKind::Fuel, Some(20 * FUEL)), "{}", fault.message);
+    assert!(fault.used < Some(20 * FUEL + 20 * FUEL / 20), "{}", fault.message);
+}

@@ -62,7 +62,7 @@ pub(crate) fn decision(decision: &gleaner_protocol::Decision, paint: Paint) -> S
         text += &format!("{}\n", paint.green(line.trim_end()));
     }
     if let Some(fault) = &decision.fault {
-        let line = format!("{time}  {}: {}", word(fault.kind), visible(super::gist(&fault.message)));
+        let line = format!("{time}  {}: {}", word(fault.kind), super::shown(super::gist(&fault.message)));
         text += &format!("{}\n", paint.red(&line));
     }
     text

@@ -27,6 +27,9 @@ pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {
 /// As many bursts of triggers, and as many causes of faults, are shown; the rest is counted.
 const SHOWN: usize = 20;
 
+/// Characters of a fault's message that are shown; all of it is in `decisions.jsonl`.
+const MESSAGE_CHARS: usize = 200;
+
 /// Triggers of one label that are less than this apart are one burst: most lambdas see an event in several samples.
 const BURST_GAP_S: f64 = 1.0;
 
@@ -106,7 +109,7 @@ impl Digest {
     }
 
     fn count(&mut self, fault: &Fault, first_seconds: f64) {
-        let (kind, message) = (fault.kind, visible(gist(&fault.message)));
+        let (kind, message) = (fault.kind, shown(gist(&fault.message)));
         if let Some(cause) = self.causes.iter_mut().find(|cause| cause.kind == kind && cause.message == message) {
             cause.count += 1;
         } else if self.causes.len() < SHOWN {
@@ -140,6 +143,16 @@ pub(crate) fn gist(message: &str) -> &str {
     let traceback = message.contains("Traceback (most recent call last)");
     let line = if traceback { lines.next_back() } else { lines.next() };
     line.unwrap_or_default()
+}
+
+/// A fault's message, fit to print and no longer than a few lines of a terminal.
+pub(crate) fn shown(message: &str) -> String {
+    // What is written out takes more room than it did.
+    let text = visible(&message.chars().take(MESSAGE_CHARS + 1).collect::<String>());
+    match text.char_indices().nth(MESSAGE_CHARS) {
+        Some((end, _)) => format!("{} … (all of it is in decisions.jsonl)", &text[..end]),
+        None => text,
+    }
 }
 
 /// The summary of a replay, for a person.

@@ -164,6 +164,16 @@ fn faults_with_ever_new_messages_take_no_more_room() {
 }
 
 #[test]
+fn a_long_message_of_a_fault_is_cut_where_a_person_reads_it() {
+    let long = format!("{}{}", "\u{0}".repeat(40), "m".repeat(4000));
+    let fault = decision(500, None, Some((FaultKind::Exception, &long)));
+    let text = summary(&Summary { faults: 1, ..replay() }, &digest(vec![fault]), &[], PLAIN);
+    let line = text.lines().find(|line| line.contains("exception")).unwrap();
+    assert!(line.contains("\\u{0}\\u{0}") && line.ends_with("m … (all of it is in decisions.jsonl)"), "{line}");
+    assert!(line.chars().count() < 300, "{line}");
+}
+
+#[test]
 fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
     assert!(losses(&replay()).is_empty());
     let mut lossy = Summary { skipped: 1, log_dropped: 3000, triggers_refused: 1, passed_over: 2, ..replay() };

@@ -1,17 +1,15 @@
 //! The engine that all lambdas run on, and the cache of their native code.
 //!
-//! Compiling takes a second and 40 MB, loading 0.3 ms and 11 MB; so a component is compiled once, in a process of its own
-//! (`gleaner-compile`), and every runtime loads what that left. Loading native code means trusting it: entries are bound to
-//! the component's digest, to wasmtime's version, to the settings below and to the CPU, and must belong to this user alone.
-//! A component is hostile until proven otherwise, so compiling has a limit of memory and of time.
+//! Compiling takes a second and 40 MB, loading 0.3 ms and 11 MB, and comparing it before 0.2 ms; so a component is compiled
+//! once, in a process of its own (`gleaner-compile`), and every runtime loads what that left. Loading native code means
+//! trusting it: an entry of the cache must belong to this user alone, and has a digest of its code that is bound to the
+//! component, to wasmtime's version, to the settings below and to the CPU. A component is hostile until proven otherwise, so
+//! compiling has a limit of memory and of time.
 
-use std::fs::{self, File, Metadata, OpenOptions};
 use std::io::{self, Read};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Explain, hex};
-use sha2::{Digest, Sha256};
+use gleaner_protocol::{Exit, Explain, own_file};
 use wasmtime::{Config, Engine};
 
 /// Largest component that is compiled, in bytes.
@@ -57,6 +55,8 @@ pub enum CompileError {
     Read { path: PathBuf, source: io::Error },
     #[error("component `{}` has {bytes} bytes; at most {COMPONENT_BYTES} are compiled", path.display())]
     TooLarge { path: PathBuf, bytes: u64 },
+    #[error("`{}` is no WebAssembly component: {}", path.display(), why.what())]
+    NoComponent { path: PathBuf, why: NoComponent },
     #[error("cannot compile component `{}`", path.display())]
     Compile { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
     #[error("component `{}` becomes {bytes} bytes of native code; at most {CODE_BYTES} are kept", path.display())]
@@ -65,19 +65,69 @@ pub enum CompileError {
     Engine { source: Box<dyn std::error::Error + Send + Sync> },
     #[error("cannot write native code to `{}`", path.display())]
     Write { path: PathBuf, source: io::Error },
+    #[error("cannot read native code in `{}`", path.display())]
+    ReadCode { path: PathBuf, source: io::Error },
     #[error("native code in `{}` is not loaded: {why}", path.display())]
-    Untrusted { path: PathBuf, why: &'static str },
+    Untrusted { path: PathBuf, why: String },
+}
+
+/// Contents of a file that is no component, by its first bytes.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum NoComponent {
+    /// Other bytes than those of WebAssembly.
+    Foreign,
+    /// A module without the interface of a component.
+    Module,
+}
+
+impl NoComponent {
+    /// Why `bytes` cannot be a component, if their beginning says so.
+    pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
+        match bytes.get(..8) {
+            Some(b"\0asm\x01\0\0\0") => Some(Self::Module),
+            Some([0, b'a', b's', b'm', ..]) => None,
+            _ => Some(Self::Foreign),
+        }
+    }
+
+    fn what(self) -> &'static str {
+        match self {
+            Self::Foreign => "its first bytes are not those of WebAssembly",
+            Self::Module => "it is a core module, without the types of a component",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::Foreign => "name the component as `entry` in lambda.toml, and build the lambda: gleaner build DIR",
+            Self::Module => "build the lambda with `gleaner build DIR`, which makes a component (target wasm32-wasip2)",
+        }
+    }
+}
+
+/// Whether the compiler refused something of WebAssembly that [`settings`] do not have.
+fn asks_for_a_proposal(error: &(dyn std::error::Error + 'static)) -> bool {
+    let chain = std::iter::successors(Some(error), |error| error.source());
+    chain.map(ToString::to_string).any(|text| text.contains("must be enabled") || text.contains("not enabled"))
 }
 
 impl Explain for CompileError {
     fn help(&self) -> Option<String> {
         match self {
-            Self::Read { .. } | Self::Compile { .. } => Some("build the lambda again: gleaner build DIR".to_owned()),
+            Self::NoComponent { why, .. } => Some(why.help().to_owned()),
+            Self::Compile { source, .. } if asks_for_a_proposal(source.as_ref()) => Some(
+                "build it without that proposal of WebAssembly: leave out flags such as `-C target-feature`, as `gleaner build DIR` does"
+                    .to_owned(),
+            ),
+            Self::Compile { .. } => {
+                Some("the file may be cut off or damaged; build the lambda again: gleaner build DIR".to_owned())
+            }
+            Self::Read { .. } => Some("build the lambda again: gleaner build DIR".to_owned()),
             Self::TooLarge { .. } | Self::CodeTooLarge { .. } => {
                 Some("leave out what the lambda does not need, or move data to files of a model".to_owned())
             }
             Self::Write { .. } => Some("make the folder writable, or set XDG_CACHE_HOME to one that is".to_owned()),
-            Self::Untrusted { path, .. } => {
+            Self::ReadCode { path, .. } | Self::Untrusted { path, .. } => {
                 Some(format!("delete it, it will be made again: rm -r '{}'", path.display()))
             }
             Self::Engine { .. } => None,
@@ -86,9 +136,13 @@ impl Explain for CompileError {
 
     fn exit(&self) -> Exit {
         match self {
-            Self::Read { .. } | Self::TooLarge { .. } | Self::CodeTooLarge { .. } | Self::Compile { .. } => Exit::Usage,
+            Self::Read { .. }
+            | Self::TooLarge { .. }
+            | Self::CodeTooLarge { .. }
+            | Self::NoComponent { .. }
+            | Self::Compile { .. } => Exit::Usage,
             Self::Untrusted { .. } => Exit::Denied,
-            Self::Write { .. } | Self::Engine { .. } => Exit::Internal,
+            Self::Write { .. } | Self::ReadCode { .. } | Self::Engine { .. } => Exit::Internal,
         }
     }
 }
@@ -132,12 +186,8 @@ pub fn settings(nans: Nans) -> Config {
 pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
     let read = |source| CompileError::Read { path: path.to_owned(), source };
     let too_large = |bytes| CompileError::TooLarge { path: path.to_owned(), bytes };
-    // A pipe would be waited for, and a device has no end.
-    let file = OpenOptions::new().read(true).custom_flags(NO_WAITING).open(path).map_err(read)?;
+    let file = own_file::read_named(path).map_err(read)?;
     let meta = file.metadata().map_err(read)?;
-    if !meta.is_file() {
-        return Err(read(io::Error::new(io::ErrorKind::InvalidInput, "it is no file")));
-    }
     if meta.len() > COMPONENT_BYTES {
         return Err(too_large(meta.len()));
     }
@@ -146,119 +196,21 @@ pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
     if bytes > COMPONENT_BYTES { Err(too_large(bytes)) } else { Ok(component) }
 }
 
-/// Where the native code of `component` is kept on this machine: `<cache>/<key>.cwasm`.
-pub fn cache_entry(cache: &Path, component: &[u8], nans: Nans) -> PathBuf {
-    let mut key = Sha256::new();
-    for part in [nans.settings().as_bytes(), std::env::consts::ARCH.as_bytes(), cpu_features().as_bytes(), component] {
-        key.update((part.len() as u64).to_le_bytes());
-        key.update(part);
-    }
-    cache.join(hex(&key.finalize()) + ".cwasm")
-}
-
-/// What this machine's CPU can do, as the kernel says: a cache in a home folder may be shared by several machines.
-/// Wasmtime checks the same again when it loads code, and refuses what does not fit.
-fn cpu_features() -> String {
-    let cpus = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let features = cpus.lines().find(|line| line.starts_with("flags") || line.starts_with("Features"));
-    features.unwrap_or_default().to_owned()
-}
-
-/// Opens `entry` for loading, if nobody else could have written it: it and the folders above it belong to this user or to
-/// root, and nobody else may write to them. What is checked is what was opened.
-///
-/// # Errors
-///
-/// [`CompileError::Untrusted`] says what is wrong; [`CompileError::Read`] if there is no entry.
-pub fn open_entry(entry: &Path) -> Result<File, CompileError> {
-    check_folder(entry.parent().unwrap_or(entry))?;
-    let read = |source| CompileError::Read { path: entry.to_owned(), source };
-    let file = OpenOptions::new().read(true).custom_flags(NO_FOLLOW).open(entry).map_err(read)?;
-    let meta = file.metadata().map_err(read)?;
-    let wrong = if meta.is_file() { foreign(&meta) } else { Some("it is no file") };
-    match wrong {
-        Some(why) => Err(CompileError::Untrusted { path: entry.to_owned(), why }),
-        None => Ok(file),
-    }
-}
-
-/// Checks that only this user can put files into `folder`, or replace it.
-///
-/// # Errors
-///
-/// As [`open_entry`].
-pub fn check_folder(folder: &Path) -> Result<(), CompileError> {
-    let read = |source| CompileError::Read { path: folder.to_owned(), source };
-    let untrusted = |path: &Path, why| Err(CompileError::Untrusted { path: path.to_owned(), why });
-    let whole = fs::canonicalize(folder).map_err(read)?;
-    for (above, path) in whole.ancestors().enumerate() {
-        let meta = fs::symlink_metadata(path).map_err(read)?;
-        let root_owns = meta.uid() == 0;
-        let wrong = match foreign(&meta) {
-            // Folders above may be root's; in one that all may write to, like /tmp, the sticky bit protects what is ours.
-            Some(NOT_OURS) if above > 0 && root_owns && meta.mode() & 0o022 == 0 => None,
-            Some(_) if above > 0 && root_owns && meta.mode() & 0o1000 != 0 => None,
-            wrong => wrong,
-        };
-        if let Some(why) = wrong {
-            return untrusted(path, why);
-        }
-    }
-    Ok(())
-}
-
-const NOT_OURS: &str = "it belongs to another user";
-/// `O_NOFOLLOW`.
-const NO_FOLLOW: i32 = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
-/// `O_NONBLOCK`.
-const NO_WAITING: i32 = rustix::fs::OFlags::NONBLOCK.bits() as i32;
-
-fn foreign(meta: &Metadata) -> Option<&'static str> {
-    if meta.uid() != rustix::process::geteuid().as_raw() {
-        Some(NOT_OURS)
-    } else if meta.mode() & 0o022 != 0 {
-        Some("others may write to it")
-    } else {
-        None
-    }
-}
-
-/// Makes the cache folder, for this user alone.
-///
-/// # Errors
-///
-/// [`CompileError::Write`].
-pub fn make_cache(cache: &Path) -> Result<(), CompileError> {
-    let write = |source| CompileError::Write { path: cache.to_owned(), source };
-    if let Some(parent) = cache.parent() {
-        fs::create_dir_all(parent).map_err(write)?;
-    }
-    match fs::DirBuilder::new().mode(0o700).create(cache) {
-        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => Err(write(error)),
-        _ => Ok(()),
-    }
-}
-
+mod entry;
+pub use entry::{Entry, Found, make_cache};
 #[cfg(feature = "compiler")]
 mod compiler;
 #[cfg(feature = "compiler")]
 pub use compiler::compile;
 #[cfg_attr(not(feature = "compiler"), allow(dead_code, reason = "who compiles cleans up"))]
 mod prune;
-pub use prune::{CACHE_BYTES, note_use};
+pub use prune::CACHE_BYTES;
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use std::fs::{self, File};
 
-    #[test]
-    fn another_component_has_another_entry() {
-        let entry = |bytes: &[u8]| cache_entry(Path::new("/c"), bytes, Nans::AsMade);
-        assert_eq!(entry(b"a"), entry(b"a"));
-        assert_ne!(entry(b"a"), entry(b"b"));
-        assert_ne!(entry(b"a"), cache_entry(Path::new("/c"), b"a", Nans::Canonical));
-        assert_eq!(entry(b"a").file_name().unwrap().len(), 64 + ".cwasm".len());
-    }
+    use super::*;
 
     #[test]
     fn the_settings_name_the_version_that_is_pinned() {
@@ -289,29 +241,5 @@ mod tests {
             matches!(read_component(&large), Err(CompileError::TooLarge { bytes, .. }) if bytes == COMPONENT_BYTES + 1)
         );
         fs::remove_dir_all(&folder).unwrap();
-    }
-
-    #[test]
-    fn code_that_others_may_write_is_not_trusted() {
-        use std::os::unix::fs::PermissionsExt;
-        let cache = std::env::temp_dir().join(format!("gleaner-compile-test-{}", std::process::id()));
-        make_cache(&cache).unwrap();
-        let entry = cache.join("x.cwasm");
-        fs::write(&entry, b"code").unwrap();
-        fs::set_permissions(&entry, fs::Permissions::from_mode(0o600)).unwrap();
-        open_entry(&entry).unwrap();
-        let refused = |path: &Path, mode| {
-            fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
-            open_entry(&entry).unwrap_err().to_string()
-        };
-        let said = refused(&entry, 0o620);
-        assert!(said.contains("x.cwasm` is not loaded: others may write to it"), "{said}");
-        let said = refused(&cache, 0o770);
-        assert!(said.ends_with("others may write to it") && !said.contains("x.cwasm"), "{said}");
-        fs::set_permissions(&cache, fs::Permissions::from_mode(0o700)).unwrap();
-        let link = cache.join("link.cwasm");
-        std::os::unix::fs::symlink(&entry, &link).unwrap();
-        assert!(matches!(open_entry(&link), Err(CompileError::Read { .. })));
-        fs::remove_dir_all(&cache).unwrap();
     }
 }

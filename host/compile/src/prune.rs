@@ -5,6 +5,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
+use gleaner_protocol::own_file;
+
 /// Most bytes of native code that are kept; an ordinary lambda takes half a megabyte. It goes by when code was loaded last, so it is
 /// that of components that were built anew, of earlier versions and of other settings that goes.
 pub const CACHE_BYTES: u64 = 1 << 30;
@@ -13,7 +15,7 @@ pub const CACHE_BYTES: u64 = 1 << 30;
 const DAY: Duration = Duration::from_secs(24 * 3600);
 
 /// Notes that the code in `entry` is in use. What cannot be noted goes earlier, and is made again.
-pub fn note_use(entry: &File) {
+pub(crate) fn note_use(entry: &File) {
     let _ = (|| {
         let used = entry.metadata()?.modified()?;
         let now = SystemTime::now();
@@ -21,8 +23,8 @@ pub fn note_use(entry: &File) {
     })();
 }
 
-/// Removes from `cache` what was not in use for longest, until at most `most` bytes are left, and what was never completed. `keep` stays.
-/// What a process has loaded stays for that. Another process may do the same meanwhile.
+/// Removes from `cache` what was not in use for longest, until at most `most` bytes are left, and what a killed process did not complete.
+/// `keep` stays. What a process has loaded stays for that. Another process may do the same meanwhile.
 ///
 /// # Errors
 ///
@@ -35,7 +37,7 @@ pub(crate) fn prune(cache: &Path, keep: &Path, most: u64) -> io::Result<()> {
         let Ok(meta) = fs::symlink_metadata(&path) else { continue };
         let Ok(modified) = meta.modified() else { continue };
         match path.extension().and_then(|extension| extension.to_str()) {
-            Some("part") if modified.elapsed().is_ok_and(|ago| ago >= DAY) => drop(fs::remove_file(&path)),
+            Some("part") => remove_abandoned(&path),
             Some("cwasm") => {
                 bytes = bytes.saturating_add(meta.len());
                 entries.extend((path != keep).then_some((modified, path, meta.len())));
@@ -53,6 +55,15 @@ pub(crate) fn prune(cache: &Path, keep: &Path, most: u64) -> io::Result<()> {
         }
     }
     Ok(())
+}
+
+/// Removes what no process locks, as those do that write it.
+fn remove_abandoned(part: &Path) {
+    let Ok(file) = own_file::edit(part) else { return };
+    if file.try_lock().is_ok() {
+        // Still locked, so that a process that began it meanwhile sees that it is gone.
+        let _ = fs::remove_file(part);
+    }
 }
 
 #[cfg(test)]
@@ -74,7 +85,9 @@ mod tests {
             file(&cache.join(name), 1000, DAY * (day as u32 + 1));
         }
         file(&cache.join("x.17.part"), 10, DAY * 2);
-        file(&cache.join("y.18.part"), 10, Duration::ZERO);
+        file(&cache.join("y.18.part"), 10, DAY * 2);
+        let writer = own_file::edit(&cache.join("y.18.part")).unwrap();
+        writer.lock().unwrap();
         file(&cache.join("foreign.txt"), 10_000, DAY * 9);
         let left = |most| {
             prune(&cache, &cache.join("kept.cwasm"), most).unwrap();
@@ -88,6 +101,9 @@ mod tests {
         note_use(&File::open(cache.join("older.cwasm")).unwrap());
         assert_eq!(left(2000), "foreign.txt kept.cwasm older.cwasm y.18.part");
         assert_eq!(left(0), "foreign.txt kept.cwasm y.18.part");
+        // Its writer was killed.
+        drop(writer);
+        assert_eq!(left(0), "foreign.txt kept.cwasm");
         fs::remove_dir_all(&cache).unwrap();
     }
 }

@@ -166,6 +166,9 @@ pub enum ImageError {
         /// What is wrong.
         what: &'static str,
     },
+    /// The caller's [`Pace`](super::Pace) ended an operation.
+    #[error("stopped by the caller before the end")]
+    Stopped,
     /// The JPEG decoder gave up.
     #[error("cannot decode the JPEG of {width}x{height}")]
     Jpeg {

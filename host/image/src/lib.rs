@@ -13,9 +13,11 @@ mod decode;
 mod encoding;
 mod error;
 pub mod ops;
+mod pace;
 mod view;
 
-pub use decode::{Format, Header, decode_rgb8, probe};
+pub use decode::{Format, Header, decode_rgb8, decode_rgb8_paced, probe};
 pub use encoding::{Bayer, Encoding};
 pub use error::ImageError;
+pub use pace::Pace;
 pub use view::{MAX_SIDE, Roi, View};

@@ -1,6 +1,6 @@
 //! An image as it lies in memory, once its size has been checked.
 
-use super::{Encoding, ImageError};
+use super::{Encoding, ImageError, Pace};
 
 /// Largest width and height of an image, in pixels.
 pub const MAX_SIDE: u32 = 65_535;
@@ -16,6 +16,7 @@ pub struct View<'a> {
     encoding: Encoding,
     big_endian: bool,
     data: &'a [u8],
+    pace: Option<&'a Pace<'a>>,
 }
 
 impl<'a> View<'a> {
@@ -55,7 +56,18 @@ impl<'a> View<'a> {
             return Err(ImageError::Data { width, height, encoding, step, needed, found });
         }
         let data = &data[..needed];
-        Ok(Self { width, height, step: step as usize, encoding, big_endian, data })
+        Ok(Self { width, height, step: step as usize, encoding, big_endian, data, pace: None })
+    }
+
+    /// The same image, on which operations ask `pace` as they go.
+    #[must_use]
+    pub fn paced(self, pace: &'a Pace<'a>) -> Self {
+        Self { pace: Some(pace), ..self }
+    }
+
+    /// Asks whether an operation may go on to the next so many bytes.
+    pub(super) fn go_on(&self, bytes: usize) -> Result<(), ImageError> {
+        self.pace.map_or(Ok(()), |pace| pace.go_on(bytes))
     }
 
     /// Pixels per row, 1 to [`MAX_SIDE`].

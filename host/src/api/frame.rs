@@ -7,17 +7,31 @@ use std::time::Instant;
 use gleaner_buffers::{Lease, Pool, Refusal};
 use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
 
-use super::data::{DataError, Due, Identity, Sample, Stamps};
+use super::data::{DataError, Identity, Sample, Stamps};
 use super::piece::Piece;
-use gleaner_image::{self as image, Encoding, ImageError, Roi, View, ops};
+use gleaner_image::{self as image, Encoding, ImageError, Pace, Roi, View, ops};
 
-/// Bytes of a frame between two looks at the time.
-const STRIP_BYTES: usize = 1 << 20;
-/// Bytes that the fastest machine goes through in a microsecond: summing up pixels, making a frame of another size, and of what JPEG
-/// or PNG become. The first and the last are four times what was measured (41 and 0.5 GB/s on an x86-64 server), the other is a guess.
-const FASTEST_SUM: u64 = 160_000;
-const FASTEST_RESIZE: u64 = 8_000;
+/// Bytes of pixels that the fastest machine decodes in a microsecond: four times what was measured (0.5 GB/s on an x86-64 server).
 const FASTEST_DECODE: u64 = 2_000;
+
+/// Bytes that are copied while one is worked on, if a copy makes 22 GB/s: then 8 bytes of it take as long as a unit of fuel. Measured on
+/// an x86-64 server: 2.7, 4.3 to 41, and 0.5 GB/s.
+const HISTOGRAM: u64 = 8;
+const GRAY: u64 = 4;
+const DECODE: usize = 40;
+
+/// An operation on the pixels of a frame.
+#[derive(Clone, Copy, Debug)]
+pub enum Operation {
+    /// [`Frame::mean_luma`].
+    MeanLuma(Option<Roi>),
+    /// [`Frame::histogram`].
+    Histogram(Option<Roi>),
+    /// [`Frame::to_gray`].
+    ToGray,
+    /// [`Frame::resize`], to width and height.
+    Resize(u32, u32),
+}
 
 /// Shape of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,14 +87,17 @@ impl Images {
         Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
     }
 
-    /// Bytes that decoding `data` fills, by its header, unless it is the newest decoded image already.
-    pub(super) fn undecoded_bytes(&self, position: Option<u64>, data: &[u8]) -> usize {
+    /// Work of decoding `data`, by its header, as [`Frame::work`]; none if it is the newest decoded image already.
+    pub(super) fn decode_work(&self, position: Option<u64>, data: &[u8]) -> usize {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
         if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {
             return 0;
         }
         let room = self.decoded.as_ref().map_or(0, Pool::slot_bytes);
-        image::probe(data).ok().and_then(|header| header.rgb8_len()).map_or(0, |len| len.min(room))
+        image::probe(data)
+            .ok()
+            .and_then(|header| header.rgb8_len())
+            .map_or(0, |len| len.min(room).saturating_mul(DECODE))
     }
 
     pub(super) fn decode_ns(&self) -> u64 {
@@ -109,6 +126,10 @@ impl Budget {
     pub fn new(frames: usize, bytes: usize) -> Self {
         let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
         Self(Arc::new(Left { frames: left, frames_allowed: frames, bytes }))
+    }
+
+    fn has(&self, bytes: usize) -> bool {
+        bytes <= self.0.bytes.load(Ordering::Relaxed)
     }
 
     fn take(&self, bytes: usize) -> Result<Taken, DataError> {
@@ -214,15 +235,22 @@ impl Frame {
         self.source.stamps
     }
 
-    /// Bytes that one pass over the frame touches, and one that makes a frame of `made` pixels from it.
-    pub fn work(&self, roi: Option<Roi>, made: Option<(u32, u32)>) -> u64 {
-        let view = self.view();
-        let whole = self.bytes().len() as u64;
-        match (view, made) {
-            (Ok(view), Some((width, height))) => ops::resize_work(&view, width, height).unwrap_or(whole),
-            (Ok(view), None) => ops::work(&view, roi).unwrap_or(whole),
-            (Err(_), _) => whole,
-        }
+    /// Work of an operation, in bytes that are copied in the same time: the price of a call, on whatever machine.
+    pub fn work(&self, operation: Operation) -> usize {
+        let work = self.view().and_then(|view| {
+            let work = match operation {
+                Operation::MeanLuma(roi) => ops::work(&view, roi),
+                Operation::Histogram(roi) => ops::work(&view, roi).map(|bytes| HISTOGRAM * bytes),
+                Operation::ToGray => ops::work(&view, None).map(|bytes| GRAY * bytes),
+                Operation::Resize(width, height) => ops::resized(&view, width, height).and_then(|(_, bytes)| {
+                    let has_room = self.source.topic.images.made.has(bytes);
+                    if has_room { ops::resize_work(&view, width, height) } else { Ok(0) }
+                }),
+            };
+            work.map_err(|error| self.source.refused(error))
+        });
+        // What is refused costs as much as a look at the frame.
+        work.map_or(self.bytes().len(), |work| usize::try_from(work).unwrap_or(usize::MAX))
     }
 
     /// All pixel bytes: `step * (height - 1)` and the last row.
@@ -242,8 +270,7 @@ impl Frame {
     /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer encodings;
     /// [`DataError::OutOfTime`].
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
-        self.due().allows(self.work(roi, None) as usize, FASTEST_SUM)?;
-        let luma = ops::mean_luma(&self.view()?, roi).map_err(|error| self.source.refused(error))?;
+        let luma = self.paced(|view| ops::mean_luma(view, roi))?;
         self.source.draw_luma(roi, luma);
         Ok(luma)
     }
@@ -254,27 +281,13 @@ impl Frame {
     ///
     /// As [`Frame::mean_luma`].
     pub fn histogram(&self, roi: Option<Roi>) -> Result<[u32; 256], DataError> {
-        let view = self.view()?;
-        let Roi { x, y, width, height } = view.clip(roi).map_err(|error| self.source.refused(error))?;
-        let mut counts = [0; 256];
-        for (top, rows) in self.strips(y, height) {
-            self.due().check()?;
-            let strip = Roi { x, y: top, width, height: rows };
-            let levels = ops::histogram(&view, Some(strip)).map_err(|error| self.source.refused(error))?;
-            counts.iter_mut().zip(levels).for_each(|(sum, level)| *sum += level);
-        }
-        Ok(counts)
+        self.paced(|view| ops::histogram(view, roi))
     }
 
-    fn due(&self) -> &Due {
-        &self.source.topic.per_call.due
-    }
-
-    /// `height` rows from `y` in strips of some [`STRIP_BYTES`]: the first row and the number of rows of each.
-    fn strips(&self, y: u32, height: u32) -> impl Iterator<Item = (u32, u32)> {
-        let rows = (STRIP_BYTES / self.info.step.max(1) as usize).max(1) as u32;
-        let end = y + height;
-        (y..end).step_by(rows as usize).map(move |top| (top, rows.min(end - top)))
+    /// Works on the pixels until the call is due.
+    fn paced<T>(&self, work: impl FnOnce(&View<'_>) -> Result<T, ImageError>) -> Result<T, DataError> {
+        let in_time = || self.source.topic.per_call.due.check().is_ok();
+        work(&self.view()?.paced(&Pace::new(&in_time))).map_err(|error| self.source.refused(error))
     }
 
     /// A new frame of that size: rgb8, or mono8 for grey encodings.
@@ -285,10 +298,7 @@ impl Frame {
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
         let (encoding, _) = ops::resized(&self.view()?, width, height).map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
-        self.due().allows(self.work(None, Some((width, height))) as usize, FASTEST_RESIZE)?;
-        self.make(info, |out| {
-            ops::resize(&self.view()?, width, height, out).map(drop).map_err(|error| self.source.refused(error))
-        })
+        self.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
     }
 
     /// A new mono8 frame of the same size.
@@ -298,26 +308,18 @@ impl Frame {
     /// [`DataError::NoMemory`]; as [`Frame::mean_luma`].
     pub fn to_gray(&self) -> Result<Self, DataError> {
         let info = Info::tight(self.info.width, self.info.height, Encoding::Mono8);
-        self.make(info, |out| {
-            let (view, mut rest) = (self.view()?, out);
-            for (top, rows) in self.strips(0, view.height()) {
-                self.due().check()?;
-                let (strip, below) = rest.split_at_mut(rows as usize * info.step as usize);
-                rest = below;
-                let part = Info { height: rows, ..self.info };
-                let pixels = &self.bytes()[top as usize * self.info.step as usize..];
-                let part = part.view(pixels).map_err(|error| self.source.not_a_frame(error))?;
-                ops::to_gray(&part, strip).map_err(|error| self.source.refused(error))?;
-            }
-            Ok(())
-        })
+        self.make(info, ops::to_gray)
     }
 
-    fn make(&self, info: Info, fill: impl FnOnce(&mut [u8]) -> Result<(), DataError>) -> Result<Self, DataError> {
+    fn make(
+        &self,
+        info: Info,
+        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), ImageError>,
+    ) -> Result<Self, DataError> {
         let len = info.step as usize * info.height as usize;
         let taken = self.source.topic.images.made.take(len)?;
         let mut bytes = vec![0; len].into_boxed_slice();
-        fill(&mut bytes)?;
+        self.paced(|view| fill(view, &mut bytes))?;
         Ok(Self { source: self.source.clone(), info, pixels: Piece::made(bytes), _taken: taken })
     }
 
@@ -350,6 +352,7 @@ impl Source {
     fn refused(&self, error: ImageError) -> DataError {
         match error {
             ImageError::Roi { .. } | ImageError::ResizeTo { .. } => DataError::OutOfRange(error),
+            ImageError::Stopped => DataError::OutOfTime,
             error => self.not_a_frame(error),
         }
     }
@@ -369,6 +372,8 @@ fn decode(source: &Source, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<Info>
         Refusal::NoSlot => DataError::NoSlot { topic: topic(), input: source.topic.name().to_owned() },
         Refusal::TooBig { .. } => too_large(),
     })?;
-    image::decode_rgb8(data, &header, allowed, &mut draft).map_err(|error| source.not_a_frame(error))?;
+    let in_time = || source.topic.per_call.due.check().is_ok();
+    image::decode_rgb8_paced(data, &header, allowed, &mut draft, &Pace::new(&in_time))
+        .map_err(|error| source.refused(error))?;
     Ok(draft.seal(Info::tight(header.width, header.height, Encoding::Rgb8)))
 }

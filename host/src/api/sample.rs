@@ -94,11 +94,11 @@ impl Sample {
         Piece::of_message(&self.lease).part(offset, self.topic.per_call.bytes.min(len as usize))
     }
 
-    /// Bytes that [`Sample::as_frame`] would have to decode: by the header, and none if that is done already.
-    pub fn undecoded_bytes(&self) -> usize {
+    /// Work of [`Sample::as_frame`], by the header of what it has to decode, as [`Frame::work`]; none if that is done already.
+    pub fn decode_work(&self) -> usize {
         match self.picture() {
             Ok(Picture::Compressed(compressed)) => {
-                self.topic.images.undecoded_bytes(self.lease.position(), compressed.data)
+                self.topic.images.decode_work(self.lease.position(), compressed.data)
             }
             Ok(Picture::Raw(_)) | Err(_) => 0,
         }

@@ -64,6 +64,25 @@ impl Failure {
         self
     }
 
+    /// Reads what another program of ours printed as a failure, and ended with `exit`; `None` if `text` is none.
+    pub fn parse(text: &str, exit: Exit) -> Option<Failure> {
+        let mut lines = text.lines();
+        let mut failure = Failure::new(exit, lines.next()?.strip_prefix(ERROR)?);
+        for line in lines {
+            if let Some(cause) = line.strip_prefix(CAUSE) {
+                failure.causes.push(cause.to_owned());
+            } else if let Some(help) = line.strip_prefix(HELP) {
+                failure.help = Some(help.to_owned());
+            } else {
+                let Failure { message, causes, help, .. } = &mut failure;
+                let last = help.as_mut().unwrap_or_else(|| causes.last_mut().unwrap_or(message));
+                last.push('\n');
+                last.push_str(line.trim_start());
+            }
+        }
+        Some(failure)
+    }
+
     fn add_sources(&mut self, error: &dyn Error) {
         let mut source = error.source();
         while let Some(error) = source {
@@ -81,6 +100,10 @@ impl Failure {
     }
 }
 
+const ERROR: &str = "error: ";
+const CAUSE: &str = "  cause: ";
+const HELP: &str = "  help:  ";
+
 /// The error's own message is what failed; its sources are the causes.
 impl<E: Explain> From<E> for Failure {
     fn from(error: E) -> Failure {
@@ -92,14 +115,14 @@ impl<E: Explain> From<E> for Failure {
 
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write_labelled(f, "error: ", &self.message)?;
+        write_labelled(f, ERROR, &self.message)?;
         for cause in &self.causes {
             f.write_str("\n")?;
-            write_labelled(f, "  cause: ", cause)?;
+            write_labelled(f, CAUSE, cause)?;
         }
         if let Some(help) = &self.help {
             f.write_str("\n")?;
-            write_labelled(f, "  help:  ", help)?;
+            write_labelled(f, HELP, help)?;
         }
         Ok(())
     }
@@ -182,6 +205,20 @@ mod tests {
         let error = io::Error::other("first\nsecond\n");
         let failure = Failure::caused_by(Exit::Unreachable, "cannot connect", &error);
         assert_eq!(failure.to_string(), "error: cannot connect\n  cause: first\n         second");
+    }
+
+    #[test]
+    fn what_was_printed_reads_back() {
+        let mut failure = Failure::new(Exit::Denied, "cannot load\nit");
+        for _ in 0..2 {
+            for help in [None, Some("rm 'x'\nor wait".to_owned())] {
+                failure.help = help;
+                assert_eq!(Failure::parse(&failure.to_string(), Exit::Denied), Some(failure.clone()));
+            }
+            failure.causes = vec!["one".to_owned(), "two\nof two lines".to_owned()];
+        }
+        assert_eq!(Failure::parse("warning: error: x", Exit::Denied), None);
+        assert_eq!(Failure::parse("", Exit::Denied), None);
     }
 
     #[test]

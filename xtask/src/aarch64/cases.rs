@@ -186,8 +186,8 @@ fn journal(out: &Path) -> PathBuf {
     out.join("wakes.journal")
 }
 
-/// Puts code that was compiled here to where the emulated machine expects its own, and sees that it is not loaded. Says how
-/// it was refused.
+/// Puts code that was compiled here to where the emulated machine expects its own, and sees that it is not loaded, but compiled again.
+/// Returns the warning.
 pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<String, Failure> {
     let lambda = CASES[0].lambda;
     let cache = Cache::make()?;
@@ -213,8 +213,9 @@ pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<St
     replay.env("XDG_CACHE_HOME", &cache.0).arg("replay").arg(lambda).arg(DRIVE).arg("--out").arg(cache.0.join("out"));
     let output = there.run(replay)?;
     let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-    if output.status.success() || !said.contains("cannot load native code") {
-        let mut failure = Failure::new(Exit::Differs, format!("code of {} was loaded on {}", here.name, there.name));
+    if !output.status.success() || !said.contains("native code in the cache is damaged") {
+        let mut failure =
+            Failure::new(Exit::Differs, format!("code of {} was not replaced on {}", here.name, there.name));
         failure.causes = vec![format!("it ended with {}: {said}", output.status)];
         return Err(failure);
     }

@@ -11,13 +11,16 @@
 //! made the bytes of x86-64 and of its own scalar code of 16,000 files, most of them damaged, of every
 //! subsampling.
 
-use zune_core::bytestream::ZCursor;
+use std::cell::Cell;
+
 use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
+use super::paced::Paced;
 use super::{Format, Header};
 use crate::error::ImageError;
+use crate::pace::Pace;
 use crate::view::check_size;
 
 /// Start of image, and the start of the marker that must follow.
@@ -33,27 +36,39 @@ pub(super) fn header(data: &[u8]) -> Result<Header, ImageError> {
 
 /// Decodes `data` into `out`, all black and as long as `header` says, with at most `allowed` bytes
 /// of further memory.
-pub(super) fn decode(data: &[u8], header: &Header, allowed: usize, out: &mut [u8]) -> Result<(), ImageError> {
+pub(super) fn decode(
+    data: &[u8],
+    header: &Header,
+    allowed: usize,
+    out: &mut [u8],
+    pace: &Pace<'_>,
+) -> Result<(), ImageError> {
     let &Header { format, width, height } = header;
     let needed = frame(data)?.working_memory();
     if needed > allowed as u64 {
         return Err(ImageError::WorkingMemory { format, width, height, needed, allowed });
     }
     check_structure(data)?;
-    let refused = |source| ImageError::Jpeg { width, height, source };
+    let stopped = Cell::new(false);
+    let refused = |source| match stopped.get() {
+        true => ImageError::Stopped,
+        false => ImageError::Jpeg { width, height, source },
+    };
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(width as usize)
         .set_max_height(height as usize)
         .jpeg_set_max_scans(MAX_SCANS)
         .jpeg_set_out_colorspace(ColorSpace::RGB);
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(data), options);
+    let mut decoder = JpegDecoder::new_with_options(Paced::new(data, pace, &stopped), options);
     decoder.decode_headers().map_err(refused)?;
     // Its reading of the header and ours must be the same.
     if decoder.output_buffer_size() != Some(out.len()) {
         return Err(damaged(0, "its header can be read in two ways"));
     }
-    decoder.decode_into(out).map_err(refused)
+    decoder.decode_into(out).map_err(refused)?;
+    // It makes up the end of some files whose bytes end early.
+    if stopped.get() { Err(ImageError::Stopped) } else { Ok(()) }
 }
 
 /// What the frame header (SOF) says.

@@ -8,6 +8,7 @@
 //! cut off passed as a whole image; pixels of an earlier image left in the output.
 
 mod jpeg;
+mod paced;
 mod png;
 #[cfg(test)]
 mod samples;
@@ -16,7 +17,7 @@ mod tests;
 
 use std::fmt;
 
-use super::ImageError;
+use super::{ImageError, Pace};
 
 /// What the bytes of a file are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,6 +95,22 @@ pub fn probe(data: &[u8]) -> Result<Header, ImageError> {
 /// [`ImageError::CutOff`], [`ImageError::Damaged`], [`ImageError::Unsupported`],
 /// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken, or not of a kind that we read.
 pub fn decode_rgb8(data: &[u8], header: &Header, max_bytes: usize, out: &mut [u8]) -> Result<(), ImageError> {
+    decode_rgb8_paced(data, header, max_bytes, out, &Pace::new(&|| true))
+}
+
+/// As [`decode_rgb8`], for a caller that may want it to end early. The last step of a progressive JPEG, from coefficients to pixels, is
+/// one piece.
+///
+/// # Errors
+///
+/// As [`decode_rgb8`], and [`ImageError::Stopped`].
+pub fn decode_rgb8_paced(
+    data: &[u8],
+    header: &Header,
+    max_bytes: usize,
+    out: &mut [u8],
+    pace: &Pace<'_>,
+) -> Result<(), ImageError> {
     let found = probe(data)?;
     if found != *header {
         return Err(ImageError::OtherImage { expected: *header, found });
@@ -113,8 +130,8 @@ pub fn decode_rgb8(data: &[u8], header: &Header, max_bytes: usize, out: &mut [u8
     // What a broken file leaves unwritten is black, not a piece of whatever was here before.
     out.fill(0);
     match format {
-        Format::Jpeg => jpeg::decode(data, &found, allowed, out),
-        Format::Png => png::decode(data, &found, allowed, out),
+        Format::Jpeg => jpeg::decode(data, &found, allowed, out, pace),
+        Format::Png => png::decode(data, &found, allowed, out, pace),
     }
 }
 

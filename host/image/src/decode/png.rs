@@ -6,6 +6,7 @@ use png::{ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformati
 
 use super::{Format, Header};
 use crate::error::ImageError;
+use crate::pace::Pace;
 use crate::view::check_size;
 
 /// The signature of PNG.
@@ -28,7 +29,13 @@ pub(super) fn header(data: &[u8]) -> Result<Header, ImageError> {
 
 /// Decodes `data` into `out`, as long as `header` says, with at most `allowed` bytes of memory for
 /// chunks. The decoder holds a few rows of at most 8 bytes per pixel, so it needs no more.
-pub(super) fn decode(data: &[u8], header: &Header, allowed: usize, out: &mut [u8]) -> Result<(), ImageError> {
+pub(super) fn decode(
+    data: &[u8],
+    header: &Header,
+    allowed: usize,
+    out: &mut [u8],
+    pace: &Pace<'_>,
+) -> Result<(), ImageError> {
     let &Header { width, height, .. } = header;
     let refused = |source| match source {
         DecodingError::IoError(error) if error.kind() == ErrorKind::UnexpectedEof => cut_off(data),
@@ -51,6 +58,8 @@ pub(super) fn decode(data: &[u8], header: &Header, allowed: usize, out: &mut [u8
     let mut rgb = vec![0; stride];
     let mut rows = 0;
     while let Some(interlace) = reader.read_row(&mut line).map_err(refused)? {
+        // Inflating takes several times as long as other work on as many bytes.
+        pace.go_on(8 * stride)?;
         match interlace {
             InterlaceInfo::Null(_) => {
                 let Some(row) = out.chunks_exact_mut(stride).nth(rows) else {

@@ -24,6 +24,20 @@ pub(super) fn assert_close(rgb: &[u8], tolerance: u8, expected: impl Fn(usize, u
 }
 
 #[test]
+fn decoding_stops_when_its_caller_wants_that() {
+    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY, &samples::INTERLACED] {
+        let header = probe(file).unwrap();
+        let mut out = vec![0; header.rgb8_len().unwrap()];
+        let mut decode = |may_go_on: &dyn Fn() -> bool| {
+            decode_rgb8_paced(file, &header, 1 << 20, &mut out, &Pace::new(may_go_on)).map(|()| out.clone())
+        };
+        let stopped = decode(&|| false);
+        assert!(matches!(stopped, Err(ImageError::Stopped)), "{header}: {stopped:?}");
+        assert_eq!(decode(&|| true).unwrap(), decoded(file).unwrap(), "{header}");
+    }
+}
+
+#[test]
 fn a_jpeg_gives_back_the_colours_that_went_in() {
     for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
         let header = Header { format: Format::Jpeg, width: WIDTH, height: HEIGHT };

@@ -18,7 +18,7 @@ const GROUPS: usize = 257;
 ///
 /// # Errors
 ///
-/// [`ImageError::Roi`] if no pixel is in `roi`, [`ImageError::Raw`] for a Bayer image.
+/// [`ImageError::Roi`] if no pixel is in `roi`, [`ImageError::Raw`] for a Bayer image, [`ImageError::Stopped`].
 ///
 /// Source: luma weights of ITU-R BT.601.
 pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, ImageError> {
@@ -26,6 +26,7 @@ pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, ImageError> {
     let roi = view.clip(roi)?;
     let mut lanes = [0; LANES];
     for row in view.rows_of(roi) {
+        view.go_on(row.len())?;
         add_bytes(row, &mut lanes);
     }
     // Sums per byte of a pixel: lane `i` holds byte `i % bytes_per_pixel` of some pixels.
@@ -70,7 +71,7 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
 ///
 /// # Errors
 ///
-/// [`ImageError::Roi`] if no pixel is in `roi`, [`ImageError::Raw`] for a Bayer image.
+/// [`ImageError::Roi`] if no pixel is in `roi`, [`ImageError::Raw`] for a Bayer image, [`ImageError::Stopped`].
 pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], ImageError> {
     let pixels = Pixels::of(view, "histogram")?;
     let roi = view.clip(roi)?;
@@ -78,6 +79,7 @@ pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], ImageE
     let mut counts = [0; 256];
     let mut levels = [0; 512];
     for row in view.rows_of(roi) {
+        view.go_on(row.len())?;
         let pixel = view.encoding().bytes_per_pixel();
         for piece in row.chunks(levels.len() * pixel) {
             let levels = &mut levels[..piece.len() / pixel];
@@ -97,7 +99,7 @@ pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], ImageE
 ///
 /// # Errors
 ///
-/// [`ImageError::Output`] if `out` has another length, [`ImageError::Raw`] for a Bayer image.
+/// [`ImageError::Output`] if `out` has another length, [`ImageError::Raw`] for a Bayer image, [`ImageError::Stopped`].
 pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
     let pixels = Pixels::of(view, "grey image")?;
     let width = view.width() as usize;
@@ -107,7 +109,9 @@ pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
         return Err(ImageError::Output { operation: "grey image", needed, found: out.len() });
     }
     for (y, levels) in (0..view.height()).zip(out.chunks_exact_mut(width)) {
-        pixels.grey(view.row(y), levels);
+        let row = view.row(y);
+        view.go_on(row.len())?;
+        pixels.grey(row, levels);
     }
     Ok(())
 }

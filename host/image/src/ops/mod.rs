@@ -1,7 +1,7 @@
 //! What the host computes on frames for lambdas.
 //!
 //! Inside: grey levels (`luma`), size (`resize`), and how a pixel of each encoding is read
-//! (`pixels`). All of it is exact integer arithmetic on a checked [`View`], so that every CPU and
+//! (`pixels`). Every operation asks the view between rows whether it may go on ([`View::paced`]). All of it is exact integer arithmetic on a checked [`View`], so that every CPU and
 //! every call gives the same result, however the compiler arranges the loops.
 //!
 //! Never: memory that grows with anything but the width of the image; a result for raw (Bayer)
@@ -10,6 +10,7 @@
 mod luma;
 mod pixels;
 mod resize;
+mod rounded;
 
 pub use luma::{histogram, mean_luma, to_gray};
 pub use resize::{MAX_RESIZED_SIDE, resize, resize_work, resized};

@@ -53,9 +53,20 @@ impl Pixels {
         }
     }
 
+    /// `CHANNELS` numbers of each pixel in `row`, a whole row: grey, or red, green and blue. They are in `row` itself or, if they have to be
+    /// rearranged, in `place`, which has room for them.
+    pub(super) fn row<'a, const CHANNELS: usize>(self, row: &'a [u8], place: &'a mut [u8]) -> &'a [u8] {
+        match (self, CHANNELS) {
+            (Self::Grey8, 1) | (Self::Rgb, 3) => return row,
+            (_, 1) => self.grey(row, place),
+            _ => self.rgb(row, place),
+        }
+        place
+    }
+
     /// Writes red, green and blue of each pixel in `row`, a whole row, to `rgb`, which has three
     /// bytes per pixel.
-    pub(super) fn rgb(self, row: &[u8], rgb: &mut [u8]) {
+    fn rgb(self, row: &[u8], rgb: &mut [u8]) {
         match self {
             Self::Grey8 => spread::<1, 0, 0, 0>(row, rgb),
             Self::Grey16 { high: 0 } => spread::<2, 0, 0, 0>(row, rgb),

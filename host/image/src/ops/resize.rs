@@ -8,8 +8,12 @@
 //!   old pixel is the number of pieces that they share.
 //! - larger: linear between the two old pixels around the middle of the new one, with the middle
 //!   measured in 1 / (2 `to`) of an old pixel. Beyond the outermost middles the edge is repeated.
+//!
+//! The axis along which less is left to do goes first: rows are added up before they get narrower or wider, but where the image grows
+//! downwards each old row gets its new width once, and serves several new rows. Sums are exact, so both give the same bytes.
 
 use super::pixels::Pixels;
+use super::rounded::Rounded;
 use crate::{Encoding, ImageError, View};
 
 /// Largest width and height of a resized image, in pixels.
@@ -33,16 +37,18 @@ pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, us
     Ok((encoding, width as usize * height as usize * encoding.bytes_per_pixel()))
 }
 
-/// Bytes that [`resize`] reads and writes, the measure of its cost. An enlarged image reads rows of
-/// the old one twice for every new row.
+/// Work of [`resize`], in bytes that are copied in the same time: a byte of the old image takes as long as 3, of yuv422 as 64, and a byte
+/// of the new one as 16. Where the image does not grow downwards, each new row goes over sums as wide as the old one, each as long as 8.
 ///
 /// # Errors
 ///
 /// As for [`resized`].
 pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, ImageError> {
-    let (_, out) = resized(view, width, height)?;
-    let rows = u64::from(view.height()) + 2 * u64::from(height);
-    Ok(rows * view.row(0).len() as u64 + out as u64)
+    let (encoding, out) = resized(view, width, height)?;
+    let old_row = u64::from(view.width()) * encoding.bytes_per_pixel() as u64;
+    let sums = if height > view.height() { 0 } else { u64::from(height) * old_row };
+    let old = if view.encoding().is_paired() { 64 } else { 3 };
+    Ok(old * u64::from(view.height()) * view.row(0).len() as u64 + 16 * out as u64 + 8 * sums)
 }
 
 /// Writes the image in `width` x `height` pixels to `out`, without padding, in the encoding that
@@ -51,11 +57,11 @@ pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, Imag
 /// Each axis on its own: the mean of the covered area where the image shrinks, linear interpolation
 /// where it grows, both exact and rounded to nearest (a half goes up). mono16 counts by its high
 /// byte, yuv422 is taken to be BT.601 of full range, alpha is ignored. It allocates 5 bytes per
-/// number in one row of the old image.
+/// number in one row of the old image, 8 in one of the new one, and 16 for each of its columns.
 ///
 /// # Errors
 ///
-/// As for [`resized`], and [`ImageError::Output`] if `out` has another length.
+/// As for [`resized`], [`ImageError::Output`] if `out` has another length, [`ImageError::Stopped`].
 pub fn resize(view: &View<'_>, width: u32, height: u32, out: &mut [u8]) -> Result<Encoding, ImageError> {
     let pixels = Pixels::of(view, "resize")?;
     let (encoding, needed) = resized(view, width, height)?;
@@ -64,52 +70,99 @@ pub fn resize(view: &View<'_>, width: u32, height: u32, out: &mut [u8]) -> Resul
     }
     let across = Axis { from: view.width(), to: width };
     let down = Axis { from: view.height(), to: height };
-    let channels = encoding.bytes_per_pixel();
-    let mut row = vec![0_u8; view.width() as usize * channels];
-    let mut columns = vec![0_u32; row.len()];
-    for (y, line) in (0..height).zip(out.chunks_exact_mut(width as usize * channels)) {
-        columns.fill(0);
-        let taps = down.taps(y);
-        for source in taps.first..=taps.last {
-            if channels == 1 {
-                pixels.grey(view.row(source), &mut row);
-            } else {
-                pixels.rgb(view.row(source), &mut row);
-            }
-            let weight = taps.weight(source);
-            for (sum, value) in columns.iter_mut().zip(&row) {
-                // Weights add up to less than 2^16, so the sum stays below 2^24 and cannot wrap; a
-                // checked addition would not vectorise.
-                *sum = sum.wrapping_add(weight.wrapping_mul(u32::from(*value)));
-            }
-        }
-        let total = u64::from(down.total());
-        if channels == 1 {
-            blend::<1>(&columns, across, total, line);
-        } else {
-            blend::<3>(&columns, across, total, line);
-        }
+    match encoding.bytes_per_pixel() {
+        1 => Resize::<1>::new(pixels, across, down).fill(view, out)?,
+        _ => Resize::<3>::new(pixels, across, down).fill(view, out)?,
     }
     Ok(encoding)
 }
 
-/// Writes a row of `CHANNELS` numbers per pixel from `columns`, sums over weights of `total`.
-fn blend<const CHANNELS: usize>(columns: &[u32], across: Axis, total: u64, line: &mut [u8]) {
-    let (columns, _) = columns.as_chunks::<CHANNELS>();
-    let (line, _) = line.as_chunks_mut::<CHANNELS>();
-    let total = total * u64::from(across.total());
-    for (x, pixel) in (0_u32..).zip(line) {
-        let taps = across.taps(x);
-        // Below 2^24 * 2^16.
-        let mut sums = [0_u64; CHANNELS];
-        let sources = &columns[taps.first as usize..=taps.last as usize];
-        for (source, values) in (taps.first..).zip(sources) {
-            let weight = u64::from(taps.weight(source));
-            for (sum, value) in sums.iter_mut().zip(values) {
-                *sum += weight * u64::from(*value);
+/// A resize of images with `CHANNELS` numbers per pixel.
+struct Resize<const CHANNELS: usize> {
+    pixels: Pixels,
+    down: Axis,
+    /// Of each new column.
+    across: Vec<Taps>,
+    rounded: Rounded,
+    /// An old row, where its pixels have to be rearranged.
+    row: Vec<u8>,
+}
+
+impl<const CHANNELS: usize> Resize<CHANNELS> {
+    fn new(pixels: Pixels, across: Axis, down: Axis) -> Self {
+        let rounded = Rounded::to(u64::from(down.total()) * u64::from(across.total()));
+        let row = vec![0; across.from as usize * CHANNELS];
+        Self { pixels, down, across: (0..across.to).map(|x| across.taps(x)).collect(), rounded, row }
+    }
+
+    fn fill(self, view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
+        if self.down.to > self.down.from { self.grow_down(view, out) } else { self.shrink_down(view, out) }
+    }
+
+    /// Adds up the old rows of each new one, then blends the sums across.
+    fn shrink_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
+        let mut columns = vec![0_u32; self.row.len()];
+        for (y, line) in (0..).zip(out.chunks_exact_mut(self.across.len() * CHANNELS)) {
+            view.go_on(line.len())?;
+            columns.fill(0);
+            let taps = self.down.taps(y);
+            for source in taps.first..=taps.last {
+                view.go_on(columns.len())?;
+                add_weighted(
+                    self.pixels.row::<CHANNELS>(view.row(source), &mut self.row),
+                    taps.weight(source),
+                    &mut columns,
+                );
+            }
+            let (columns, _) = columns.as_chunks::<CHANNELS>();
+            for (pixel, taps) in line.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&self.across) {
+                *pixel = taps.blend(columns).map(|sum| self.rounded.divide(sum));
             }
         }
-        *pixel = sums.map(|sum| ((sum + total / 2) / total) as u8);
+        Ok(())
+    }
+
+    /// Blends each old row across, then two of them into each new row.
+    fn grow_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
+        let width = self.across.len() * CHANNELS;
+        // The two rows that were blended last, the upper one first.
+        let mut blended = [vec![0_u32; width], vec![0_u32; width]];
+        let mut next = 0;
+        for (y, line) in (0..).zip(out.chunks_exact_mut(width)) {
+            let taps = self.down.taps(y);
+            while next <= taps.last {
+                view.go_on(self.row.len() + width)?;
+                blended.swap(0, 1);
+                let row = self.pixels.row::<CHANNELS>(view.row(next), &mut self.row);
+                let (row, _) = row.as_chunks::<CHANNELS>();
+                for (sums, taps) in blended[1].as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&self.across) {
+                    // Below 2^8 * 2^16.
+                    *sums = taps.blend(row).map(|sum| sum as u32);
+                }
+                next += 1;
+            }
+            view.go_on(width)?;
+            // An old row at the edge is alone, and the lower one.
+            let upper = if taps.first == taps.last { &blended[1] } else { &blended[0] };
+            let (head, tail) = (u64::from(taps.head), u64::from(taps.tail));
+            for ((byte, upper), lower) in line.iter_mut().zip(upper).zip(&blended[1]) {
+                // Below 2^24 * 2^15, as the weights add up to at most 2^15.
+                *byte = self
+                    .rounded
+                    .divide(head.wrapping_mul(u64::from(*upper)).wrapping_add(tail.wrapping_mul(u64::from(*lower))));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no sum reaches 2^24; checked
+/// arithmetic would not become a vector's.
+fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
+    // A product of 16 bits is what vectors have at hand.
+    let weight = weight as u16;
+    for (sum, value) in columns.iter_mut().zip(row) {
+        *sum = sum.wrapping_add(u32::from(weight).wrapping_mul(u32::from(*value)));
     }
 }
 
@@ -140,6 +193,26 @@ impl Taps {
             self.middle
         }
     }
+
+    /// Weighted sum of old pixels. Values below 2^24 make sums below 2^40.
+    fn blend<T: Copy + Into<u64>, const CHANNELS: usize>(&self, old: &[[T; CHANNELS]]) -> [u64; CHANNELS] {
+        let times =
+            |values: &[T; CHANNELS], weight: u32| values.map(|value| value.into().wrapping_mul(u64::from(weight)));
+        let add = |sums: &mut [u64; CHANNELS], values: [u64; CHANNELS]| {
+            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum = sum.wrapping_add(value));
+        };
+        let [first, last] = [self.first, self.last].map(|at| at as usize);
+        let mut sums = times(&old[first], self.head);
+        if last > first {
+            if last > first + 1 {
+                let mut middle = [0; CHANNELS];
+                old[first + 1..last].iter().for_each(|values| add(&mut middle, values.map(Into::into)));
+                add(&mut sums, middle.map(|sum| sum.wrapping_mul(u64::from(self.middle))));
+            }
+            add(&mut sums, times(&old[last], self.tail));
+        }
+        sums
+    }
 }
 
 impl Axis {
@@ -162,8 +235,8 @@ impl Axis {
         let middle = ((2 * at + 1) * from).saturating_sub(to);
         let (first, past) = (middle / (2 * to), middle % (2 * to));
         let last = (first + 1).min(from - 1);
-        let head = if last == first { 2 * to } else { 2 * to - past };
-        Taps { first, last, head, middle: 0, tail: past }
+        let tail = if last == first { 0 } else { past };
+        Taps { first, last, head: 2 * to - tail, middle: 0, tail }
     }
 }
 
@@ -301,8 +374,9 @@ mod tests {
     }
 
     #[test]
-    fn work_counts_old_rows_and_new_bytes() {
+    fn work_counts_old_and_new_bytes_and_sums() {
         let view = View::new(4, 6, 12, Encoding::Rgb8, false, &[0; 72]).unwrap();
-        assert_eq!(resize_work(&view, 2, 3).unwrap(), (6 + 2 * 3) * 12 + 18);
+        assert_eq!(resize_work(&view, 2, 3).unwrap(), 3 * 72 + 16 * 18 + 8 * 3 * 12);
+        assert_eq!(resize_work(&view, 2, 7).unwrap(), 3 * 72 + 16 * 42);
     }
 }

@@ -9,6 +9,7 @@ use super::bindings::gleaner::lambda::types::{
     self, Column, Counts, DataError, Encoding, FrameInfo, Guid, Identity, Roi, Stamps, Value,
 };
 use super::bindings::handles::{Field, Frame, Sample, Topic};
+use crate::api::frame::Operation;
 use crate::api::{data, frame};
 use gleaner_image as image;
 
@@ -160,7 +161,7 @@ impl HostSample for Hosted {
 
     fn as_frame(&mut self, sample: Resource<Sample>) -> Answer<Resource<Frame>> {
         let sample = self.handles.get(&sample)?;
-        self.meter.charge(sample.undecoded_bytes())?;
+        self.meter.charge(sample.decode_work())?;
         let frame = sample.as_frame();
         self.hand_out(frame)
     }
@@ -192,26 +193,26 @@ impl HostFrame for Hosted {
 
     fn mean_luma(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<f64> {
         let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
-        self.meter.charge(frame.work(roi, None) as usize)?;
+        self.meter.charge(frame.work(Operation::MeanLuma(roi)))?;
         answer(frame.mean_luma(roi))
     }
 
     fn histogram(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<Vec<u32>> {
         let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
-        self.meter.charge(frame.work(roi, None) as usize)?;
+        self.meter.charge(frame.work(Operation::Histogram(roi)))?;
         answer(frame.histogram(roi).map(Vec::from))
     }
 
     fn resize(&mut self, frame: Resource<Frame>, width: u32, height: u32) -> Answer<Resource<Frame>> {
         let frame = self.handles.get(&frame)?;
-        self.meter.charge(frame.work(None, Some((width, height))) as usize)?;
+        self.meter.charge(frame.work(Operation::Resize(width, height)))?;
         let resized = frame.resize(width, height);
         self.hand_out(resized)
     }
 
     fn to_gray(&mut self, frame: Resource<Frame>) -> Answer<Resource<Frame>> {
         let frame = self.handles.get(&frame)?;
-        self.meter.charge(frame.bytes().len())?;
+        self.meter.charge(frame.work(Operation::ToGray))?;
         let gray = frame.to_gray();
         self.hand_out(gray)
     }

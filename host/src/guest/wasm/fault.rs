@@ -79,6 +79,10 @@ pub(super) fn from_error(
         return Fault { kind: FaultKind::Memory, message, used: Some(asked), allowed: Some(allowed) };
     }
     match trap {
+        // A compiler keeps what it needs for calls at the low end of `memory`, beyond which a deep recursion gets.
+        Some(trap @ Trap::MemoryOutOfBounds) if said.is_none() => {
+            plain(FaultKind::Trap, format!("{trap}; perhaps its stack is exhausted by a deep recursion"))
+        }
         // A panic says why on standard error, and the trap only says that it happened.
         Some(trap) => plain(FaultKind::Trap, said.unwrap_or_else(|| trap.to_string())),
         None => plain(FaultKind::HostCall, format!("{}", error.root_cause())),

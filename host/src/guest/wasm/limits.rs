@@ -8,6 +8,8 @@ use wasmtime::ResourceLimiter;
 
 /// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in the same time.
 const BYTES_PER_FUEL: u64 = 8;
+/// Bytes of a page of linear memory.
+const PAGE: usize = 64 << 10;
 /// Fuel for the call itself.
 const FUEL_PER_CALL: u64 = 20;
 
@@ -20,6 +22,7 @@ pub(super) struct Caps {
     /// Of all tables together.
     table_elements: usize,
     refused: Option<Refused>,
+    meter: Meter,
 }
 
 /// What was asked for beyond a cap.
@@ -32,10 +35,11 @@ pub(super) struct Refused {
 }
 
 impl Caps {
-    pub(super) fn new(limits: &Limits) -> Self {
+    /// The caps in `limits`; what grows is charged to `meter`.
+    pub(super) fn new(limits: &Limits, meter: Meter) -> Self {
         let tables_allowed = usize::try_from(limits.tables).unwrap_or(usize::MAX);
         let memory_allowed = limits.memory.as_usize();
-        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None }
+        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None, meter }
     }
 
     pub(super) fn forget_refusal(&mut self) {
@@ -50,14 +54,21 @@ impl Caps {
 
 impl ResourceLimiter for Caps {
     fn memory_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
-        let total = self.memory_bytes.saturating_add(desired.saturating_sub(now));
-        if total > self.memory_allowed {
+        let more = desired.saturating_sub(now);
+        let total = self.memory_bytes.saturating_add(more);
+        let fits = total <= self.memory_allowed;
+        // Beyond its own maximum it does not grow, and must not be counted as if it had.
+        let grows = fits && max.is_none_or(|max| desired <= max);
+        // One instruction has the kernel clear all these pages, and a loop of refusals takes time, too. A memory's first bytes belong to
+        // its instance, which is no work of a loop.
+        if now > 0 {
+            self.meter.charge(if grows { more } else { PAGE })?;
+        }
+        if !fits {
             let (asked, allowed) = (total as u64, self.memory_allowed as u64);
             self.refused = Some(Refused { what: "bytes of memory", asked, allowed });
             return Ok(false);
         }
-        // Beyond its own maximum it does not grow, and must not be counted as if it had.
-        let grows = max.is_none_or(|max| desired <= max);
         if grows {
             self.memory_bytes = total;
         }
@@ -166,7 +177,24 @@ mod tests {
     fn caps() -> Caps {
         let mut limits = Limits::default();
         (limits.memory, limits.tables) = (gleaner_protocol::manifest::ByteSize::mib(1), 100);
-        Caps::new(&limits)
+        let meter = Meter::default();
+        meter.begin(1_000_000);
+        Caps::new(&limits, meter)
+    }
+
+    #[test]
+    fn growing_costs_fuel_by_the_byte_and_a_refusal_as_much_as_a_page() {
+        let mut caps = caps();
+        let (grown, refused) = ((MIB / 2) as u64 / 8 + FUEL_PER_CALL, PAGE as u64 / 8 + FUEL_PER_CALL);
+        caps.meter.begin(grown + 2 * refused - 1);
+        assert!(caps.memory_growing(0, MIB / 2, None).unwrap());
+        assert_eq!(caps.meter.used(), 0);
+        assert!(caps.memory_growing(MIB / 2, MIB, None).unwrap());
+        assert_eq!(caps.meter.used(), grown);
+        assert!(!caps.memory_growing(MIB, 2 * MIB, None).unwrap());
+        assert_eq!(caps.meter.used(), grown + refused);
+        let error = caps.memory_growing(MIB, 2 * MIB, None).unwrap_err();
+        assert!(error.downcast_ref::<OutOfFuel>().is_some());
     }
 
     #[test]

@@ -1,15 +1,14 @@
 //! From a component to code that can be instantiated: found in the cache, or compiled there by `gleaner-compile`.
 #![allow(unsafe_code)]
 
-use std::os::fd::AsRawFd;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_compile::{
-    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans, cache_entry, note_use, open_entry, read_component,
+    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Entry, Found, Nans, make_cache, read_component,
 };
-use gleaner_protocol::{Exit, Explain, Parts, PartsError};
+use gleaner_protocol::{Exit, Explain, Failure, Parts, PartsError};
 use sha2::{Digest, Sha256};
 use wasmtime::component::{Component, Linker};
 use wasmtime::{Engine, Store};
@@ -29,8 +28,8 @@ pub enum WasmError {
     Parts(#[from] PartsError),
     #[error("cannot start `{}`", program.display())]
     Start { program: PathBuf, source: std::io::Error },
-    #[error("cannot compile component `{}`", path.display())]
-    Compiler { path: PathBuf, source: CompilerSaid },
+    #[error("{message}")]
+    Compiler { message: String, source: Option<Box<CompilerSaid>>, help: Option<String>, exit: Exit },
     #[error("cannot compile component `{}`", path.display())]
     Limit { path: PathBuf, source: CompilerSaid },
     #[error("cannot load native code `{}`", path.display())]
@@ -39,10 +38,13 @@ pub enum WasmError {
     World { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
 }
 
-/// What `gleaner-compile` wrote when it failed, or which of its limits ended it.
+/// A cause that `gleaner-compile` printed when it failed, or the limit that ended it.
 #[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct CompilerSaid(String);
+#[error("{text}")]
+pub struct CompilerSaid {
+    text: String,
+    source: Option<Box<CompilerSaid>>,
+}
 
 impl Explain for WasmError {
     fn help(&self) -> Option<String> {
@@ -54,11 +56,14 @@ impl Explain for WasmError {
                  a component may import `gleaner:lambda` and WASI 0.2, nothing else"
                     .to_owned(),
             ),
-            Self::Compiler { .. } => Some("build the lambda again: gleaner build DIR".to_owned()),
+            Self::Compiler { help, .. } => help.clone(),
             Self::Limit { .. } => {
                 Some("leave out what the lambda does not need, or move data to files of a model".to_owned())
             }
-            Self::Load { path, .. } => Some(format!("delete it, it will be made again: rm '{}'", path.display())),
+            Self::Load { path, .. } => Some(format!(
+                "start it again; if that does not help, delete the file, it will be made again: rm '{}'",
+                path.display()
+            )),
             Self::Start { .. } => None,
         }
     }
@@ -67,7 +72,8 @@ impl Explain for WasmError {
         match self {
             Self::Compile(error) => error.exit(),
             Self::Parts(error) => error.exit(),
-            Self::Compiler { .. } | Self::Limit { .. } | Self::World { .. } => Exit::Usage,
+            Self::Compiler { exit, .. } => *exit,
+            Self::Limit { .. } | Self::World { .. } => Exit::Usage,
             Self::Start { .. } | Self::Load { .. } => Exit::Internal,
         }
     }
@@ -92,18 +98,13 @@ impl Loaded {
     pub fn open(path: &Path, cache: &Path, stack_bytes: usize, nans: Nans) -> Result<Self, WasmError> {
         let component = read_component(path)?;
         let engine = gleaner_compile::engine(stack_bytes, nans)?;
-        let entry = cache_entry(cache, &component, nans);
-        if !entry.exists() {
-            compile(path, cache, nans)?;
-        }
-        let file = open_entry(&entry)?;
-        note_use(&file);
-        let opened = format!("/proc/self/fd/{}", file.as_raw_fd());
-        // SAFETY: `open_entry` found that this very file and the folders above it belong to this user or to root, and that
-        // nobody else may write to them; and only `gleaner-compile` writes there, under a name made from the component, the
-        // engine and the CPU.
-        let code = unsafe { Component::deserialize_file(&engine, opened) }
-            .map_err(|source| WasmError::Load { path: entry, source: source.into() })?;
+        let entry = Entry::of(cache, &component, nans);
+        let code = native_code(&entry, path, cache, nans)?;
+        // SAFETY: these bytes are in memory of our own, where `Entry::read` found their digest to be that which
+        // `gleaner-compile` wrote for this component, engine and CPU, in a file and below folders to which only this user or
+        // root may write.
+        let code = unsafe { Component::deserialize(&engine, &code) }
+            .map_err(|source| WasmError::Load { path: entry.path().to_owned(), source: source.into() })?;
         let lambda = Self::check(path, &engine, &code)?;
         Ok(Self { engine, lambda, seed: Sha256::digest(&component).into(), nans })
     }
@@ -136,6 +137,26 @@ impl Loaded {
     }
 }
 
+/// The code in `entry`; compiled into it first if it is not there, or not as it was written.
+fn native_code(entry: &Entry, path: &Path, cache: &Path, nans: Nans) -> Result<Vec<u8>, WasmError> {
+    make_cache(cache)?;
+    match entry.read()? {
+        Found::Code(code) => return Ok(code),
+        Found::Nothing => {}
+        Found::Damaged(why) => {
+            let file = entry.path().display();
+            tracing::warn!(%file, %why, "native code in the cache is damaged: the component is compiled again");
+        }
+    }
+    compile(path, cache, nans)?;
+    let why = match entry.read()? {
+        Found::Code(code) => return Ok(code),
+        Found::Nothing => "it is gone: the component or the cache was changed meanwhile".to_owned(),
+        Found::Damaged(why) => format!("it was just written, and {why}"),
+    };
+    Err(WasmError::Load { path: entry.path().to_owned(), source: why.into() })
+}
+
 /// Most threads that compile at once. Each takes addresses, of which there is a bound, and a lambda's code is soon compiled.
 const COMPILE_THREADS: usize = 8;
 
@@ -163,9 +184,12 @@ fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
             libc::SIGABRT => format!("it takes more than {memory} MiB of memory to compile"),
             _ => format!("it takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s to compile"),
         };
-        return Err(WasmError::Limit { path: path.to_owned(), source: CompilerSaid(said) });
+        return Err(WasmError::Limit { path: path.to_owned(), source: CompilerSaid { text: said, source: None } });
     }
     let said = String::from_utf8_lossy(&output.stderr);
-    let said = said.trim().trim_start_matches("error: ").to_owned();
-    Err(WasmError::Compiler { path: path.to_owned(), source: CompilerSaid(said) })
+    let exit = output.status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal);
+    let Failure { exit, message, causes, help } =
+        Failure::parse(&said, exit).unwrap_or_else(|| Failure::new(exit, format!("gleaner-compile: {}", said.trim())));
+    let chain = |source, text| Some(Box::new(CompilerSaid { text, source }));
+    Err(WasmError::Compiler { message, source: causes.into_iter().rev().fold(None, chain), help, exit })
 }

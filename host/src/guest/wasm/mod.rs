@@ -105,7 +105,7 @@ impl WasmGuest {
             wasi: wasi::context(&self.session, &printed, self.loaded.seed()),
             printed,
             allowed: self.limits,
-            caps: Caps::new(&self.limits),
+            caps: Caps::new(&self.limits, meter.clone()),
             meter,
             due: None,
         };
