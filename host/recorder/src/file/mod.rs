@@ -4,6 +4,7 @@
 //! OUT/clips.jsonl                 a line for each whole clip
 //! OUT/losses.jsonl                a line for each thing that was wanted and is not there
 //! OUT/clips/.lock                 held by the process that records
+//! OUT/clips/.replaced             clips of an earlier replay that are about to be deleted
 //! OUT/clips/NAME.mcap             a whole clip
 //! OUT/clips/NAME.jpg              its thumbnail
 //! OUT/clips/NAME.mcap.part        a clip that is being written, or whose recorder died
@@ -27,6 +28,7 @@ mod part;
 mod place;
 mod read;
 mod recover;
+mod replaced;
 mod shelf;
 mod sink;
 #[cfg(test)]
