@@ -28,6 +28,7 @@ use gleaner_protocol::{Exit, Failure, Report};
 
 use self::hold::Hold;
 use self::options::{Results, Task};
+use self::round::Ended;
 use crate::isolation::Isolation;
 use crate::stage::Load;
 
@@ -66,23 +67,25 @@ fn replay(
 ) -> Result<Exit, Failure> {
     let _hold = Hold::take(&results.out)?;
     let mut n = 1;
-    let (summary, broken) = loop {
-        let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports)?;
+    let Ended { summary, broken, incomplete } = loop {
+        let ended = round::replay(options, results, manifest, &mut *load, reports)?;
         if n == 1 {
             report(reports, &Report::Isolation { layers: isolation.close()?.to_vec() });
         }
         if results.repeat > 1 {
-            report(reports, &Report::Round(round::report(n, &summary)));
+            report(reports, &Report::Round(round::report(n, &ended.summary)));
         }
         if n >= results.repeat {
-            break (summary, broken);
+            break ended;
         }
         n += 1;
     };
     let faulted = if summary.faults > 0 { Exit::LambdaFaulted } else { Exit::Ok };
     let exit = broken.unwrap_or(faulted);
     report(reports, &Report::Summary(Box::new(summary)));
-    Ok(exit)
+    let Some(error) = incomplete else { return Ok(exit) };
+    let failure = Failure::from(error);
+    Err(Failure { exit: if exit == Exit::Ok { failure.exit } else { exit }, ..failure })
 }
 
 /// Whoever listens may have gone; the results are in files.
