@@ -31,18 +31,23 @@ mod recover;
 mod replaced;
 mod shelf;
 mod sink;
+mod stated;
 #[cfg(test)]
 mod tests;
 mod unfinished;
+mod written;
 
 use std::sync::Arc;
 
 use gleaner_protocol::journal::Header;
 use gleaner_protocol::{ClipLambda, Moment};
 
+pub(crate) use ending::CONTINUES;
 pub use folder::{Earlier, Folder};
 pub use losses::LossList;
+pub(crate) use place::names;
 pub(crate) use recover::Recovery;
+pub use stated::{Stated, Untrue};
 pub use unfinished::MESSAGE_MAX;
 pub(crate) use unfinished::Unfinished;
 
