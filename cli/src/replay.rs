@@ -29,38 +29,34 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     }
     let report = match &heard {
         Some(Heard::Summary(summary)) => report_of(&summary.out, args.no_report),
-        _ => None,
+        _ => Ok(None),
     };
     show_result((heard, exit), args.json)?;
-    if let Some(path) = report.filter(|_| !args.json) {
-        say(&format!("  {}\n", paint().dim(&format!("report: {}", path.display()))))?;
+    match report {
+        Ok(Some(path)) if !args.json => {
+            say(&format!("  {}\n", paint().dim(&format!("report: {}", path.display()))))?;
+        }
+        Ok(_) => {}
+        // The results are whole without it.
+        Err(failure) => {
+            eprintln!("{failure}");
+            return Ok((if exit == Exit::Ok { failure.exit } else { exit }, has_results));
+        }
     }
     Ok((exit, has_results))
 }
 
-/// Writes the report of `out`, unless nobody wants it. That of an earlier replay goes in any case: it is about other results.
-///
-/// Without one the replay has still done its work. Its exit code says how that went, and scripts act on it: a warning has to do.
-fn report_of(out: &Path, is_unwanted: bool) -> Option<PathBuf> {
+/// Writes the report of `out`, unless it was declined. That of an earlier replay goes in any case: it is about other results.
+fn report_of(out: &Path, is_declined: bool) -> Result<Option<PathBuf>, Failure> {
     let path = out.join(report::NAME);
     if let Err(error) = fs::remove_file(&path)
         && error.kind() != io::ErrorKind::NotFound
     {
         let failure =
             Failure::caused_by(Exit::Internal, format!("cannot write the report `{}`", path.display()), &error);
-        warn(&failure.with_help("remove what is there: it is not about this replay"));
-        return None;
+        return Err(failure.with_help("remove what is there: it is not about this replay"));
     }
-    if is_unwanted {
-        return None;
-    }
-    report::write(out).map_err(|failure| warn(&failure)).ok()
-}
-
-/// Shows what did not keep the command from its work.
-fn warn(failure: &Failure) {
-    let text = failure.to_string();
-    eprintln!("warning: {}", text.strip_prefix("error: ").unwrap_or(&text));
+    if is_declined { Ok(None) } else { report::write(out).map(Some) }
 }
 
 /// Makes the decisions in a clip again.

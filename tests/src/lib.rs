@@ -7,6 +7,7 @@ pub mod greedy;
 pub mod live;
 pub mod markdown;
 pub mod namespace;
+pub mod parts;
 pub mod peers;
 pub mod rooms;
 pub mod transcript;

@@ -27,6 +27,8 @@ fn main() -> ExitCode {
             killed("disk")
         }),
     ];
+    let name = "a_replay_killed_while_it_replaces_clips_leaves_none_of_them_to_the_next";
+    trials.push(Trial::test(name, killed_while_replacing));
     let name = "a_full_disk_is_an_error_with_a_name_and_leaves_nothing_broken";
     trials.push(if can_mount() {
         Trial::test(name, full_disk)
@@ -105,6 +107,51 @@ fn killed(store: &str) -> Result<(), Failed> {
         return Err(format!("no kill met a recorder at work: {seen:?}").into());
     }
     Ok(())
+}
+
+/// Clips of an earlier replay that a kill leaves half deleted are never listed as results of the next one.
+fn killed_while_replacing() -> Result<(), Failed> {
+    const EARLIER: u64 = 1000;
+    let lambda = alarm("ram");
+    let other = |out: &Path| {
+        let mut replay = replay(lambda.path(), out);
+        replay.args(["--set", "event_s=30"]);
+        replay
+    };
+    let mut met = 0;
+    for _ in 0..20 {
+        let out = Folder::new();
+        replay(lambda.path(), out.path()).status()?;
+        let clips = out.path().join("clips");
+        let first = listed(out.path())?.remove(0);
+        let stem = first.file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let mut list = std::fs::read_to_string(out.path().join("clips.jsonl"))?;
+        for n in 1000..1000 + EARLIER {
+            let file = format!("{stem}-{n}.mcap");
+            std::fs::hard_link(out.path().join(&first.file), clips.join(&file))?;
+            let clip = Clip { file: Path::new("clips").join(file), thumbnail: None, ..first.clone() };
+            list.push_str(&(serde_json::to_string(&clip)? + "\n"));
+        }
+        std::fs::write(out.path().join("clips.jsonl"), list)?;
+        let earlier = listed_names(out.path())?;
+        let are_left = || earlier.iter().filter(|name| clips.join(name).exists()).count();
+        let mut child = other(out.path()).spawn()?;
+        while out.path().join(&first.file).exists() && child.try_wait()?.is_none() {}
+        child.kill()?;
+        child.wait()?;
+        met += u32::from((1..earlier.len()).contains(&are_left()));
+        other(out.path()).status()?;
+        let strangers: Vec<_> = listed_names(out.path())?.intersection(&earlier).cloned().collect();
+        if !strangers.is_empty() || are_left() > 0 {
+            let first = strangers.first();
+            let (listed, left) = (strangers.len(), are_left());
+            return Err(format!("{listed} clips of an earlier replay are listed, {left} are left: {first:?}").into());
+        }
+        if met >= 3 {
+            return Ok(());
+        }
+    }
+    if met > 0 { Ok(()) } else { Err("no kill met a replay that replaces clips".into()) }
 }
 
 struct Found {

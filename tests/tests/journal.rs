@@ -257,45 +257,6 @@ fn the_wrong_drive_and_a_clip_in_the_place_of_a_journal_are_named() {
 }
 
 #[test]
-fn a_journal_is_not_written_into_a_file_of_the_results() {
-    let folder = Folder::new();
-    for name in ["clips.jsonl", "decisions.jsonl", "summary.json"] {
-        let journal = folder.path().join(name);
-        let args = ["--journal", journal.to_str().unwrap()];
-        let run = replay_to(folder.path(), &root().join(HELLO), &[sample_drive()], &args);
-        run.must_exit(2);
-        assert!(run.stderr.contains("is a file of the results"), "{}", run.stderr);
-    }
-}
-
-#[test]
-fn a_journal_of_another_version_or_that_is_cut_off_is_replaced() {
-    let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let whole = std::fs::read(&journaled.journal).unwrap();
-    let mut newer = whole.clone();
-    newer[8] = 99;
-    for found in [&newer[..], &whole[..20], &whole[..whole.len() - 1], b""] {
-        let journal = journaled.out.write("again.journal", found);
-        let args = [&BRAKING[..], &["--journal", journal.to_str().unwrap()]].concat();
-        replay_to(journaled.out.path(), &root().join(HELLO), &[sample_drive()], &args).must_exit(0);
-        // Where blocks begin depends on the time; what is in them does not.
-        let again = verify_drive(&root().join(HELLO), &sample_drive(), &journal, &[]);
-        let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
-        assert!(!verified.cut_off, "{verified:?}");
-    }
-}
-
-#[test]
-fn a_journal_is_not_written_over_a_drive() {
-    let folder = Folder::new();
-    let drive = folder.write("drive.mcap", std::fs::read(sample_drive()).unwrap());
-    let run = replay_to(folder.path(), &root().join(HELLO), &[sample_drive()], &["--journal", drive.to_str().unwrap()]);
-    run.must_exit(2);
-    assert!(run.stderr.contains("is no journal"), "{}", run.stderr);
-    assert_eq!(std::fs::read(drive).unwrap(), std::fs::read(sample_drive()).unwrap());
-}
-
-#[test]
 fn a_clip_proves_its_decisions_alone_and_says_which_it_cannot() {
     for kind in ["rust", "python"] {
         for example in ["hello", "brake-dark"] {

@@ -108,3 +108,62 @@ fn a_folder_that_holds_no_results_is_refused() {
         assert_eq!(gleaner(USAGE, args), "");
     }
 }
+
+/// Runs `gleaner` where no file may become longer than `bytes`; its exit code, and what it said on standard error.
+fn with_files_of(bytes: u64, args: &[&str]) -> (Option<i32>, String) {
+    let mut limited = Command::new("sh");
+    // The signal would end a process before its write fails. Blocks have 512 bytes.
+    limited.args(["-c", r#"trap "" XFSZ; ulimit -f "$1"; shift; exec "$@""#, "sh", &(bytes / 512).to_string()]);
+    limited.arg(program("gleaner")).args(args).env("XDG_CACHE_HOME", root().join("target/test-cache"));
+    let output = limited.output().expect("it starts");
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+#[test]
+fn what_a_report_needs_and_cannot_be_written_is_an_error_and_the_results_are_there() {
+    let (lambda, drive) = (root().join("examples/brake-dark/rust"), sample_drive());
+    let args = |out: &Path, more: &[&'static str]| {
+        let out = text(out).to_owned();
+        let line = ["replay", text(&lambda), text(&drive), "--set", "brake_mps2=-1.4", "--no-record", "--out"];
+        let line = line.into_iter().map(str::to_owned).chain([out]).chain(more.iter().map(|arg| (*arg).to_owned()));
+        line.collect::<Vec<_>>()
+    };
+    let run = |bytes: u64, out: &Path, more: &[&'static str]| {
+        let args = args(out, more);
+        with_files_of(bytes, &args.iter().map(String::as_str).collect::<Vec<_>>())
+    };
+    let whole = Folder::new();
+    assert_eq!(run(1 << 40, whole.path(), &[]), (Some(OK), String::new()));
+    let len = |name: &str| fs::metadata(whole.path().join(name)).expect("it is there").len();
+    let (report, signals) = (len("report.html"), len("signals.json"));
+    assert!(report > signals + 4096 && signals > len("decisions.jsonl") + 4096 && signals > len("summary.json") + 4096);
+
+    let same_results = |out: &Path| {
+        let triggers = |out: &Path| fs::read_to_string(out.join("decisions.jsonl")).expect("decisions").lines().count();
+        assert_eq!(triggers(out), triggers(whole.path()));
+        assert!(out.join("summary.json").exists());
+        let names = fs::read_dir(out).expect("results").map(|entry| entry.expect("a file").file_name());
+        let parts: Vec<_> = names.filter(|name| name.to_string_lossy().ends_with(".part")).collect();
+        assert!(parts.is_empty(), "{parts:?}");
+    };
+    for (bytes, more, names) in [
+        ((report + signals) / 2, &[][..], "cannot write the report"),
+        (signals - 1024, &["--no-report"][..], "signals.json`"),
+    ] {
+        let out = Folder::new();
+        let (exit, said) = run(bytes, out.path(), more);
+        assert!(exit == Some(1) && said.contains("error: ") && said.contains(names), "{exit:?} {said}");
+        assert!(!out.path().join("report.html").exists());
+        same_results(out.path());
+    }
+
+    let out = Folder::new();
+    out.write("pictures", "no folder");
+    for part in ["report.html.part", "signals.json.part", "summary.json.part"] {
+        out.write(part, "of a replay that was killed");
+    }
+    let (exit, said) = run(1 << 40, out.path(), &[]);
+    assert!(exit == Some(1) && said.contains("pictures`") && said.contains("it is no folder"), "{exit:?} {said}");
+    assert!(out.path().join("report.html").exists() && out.path().join("signals.json").exists());
+    same_results(out.path());
+}

@@ -30,6 +30,9 @@ mod window;
 
 pub use digest::lambda_digest;
 pub use error::RecordError;
-pub use file::{Earlier, Folder, LossList, MESSAGE_MAX, Topic};
+pub use file::{Earlier, Folder, LossList, MESSAGE_MAX, Stated, Topic, Untrue};
 pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TOPICS_MAX, TopicId, Work};
 pub use thumbnail::{is_image, thumbnail};
+
+/// Most lambdas of one recorder, counted with each start, and of one clip: of each a header is kept.
+const LAMBDAS_MAX: usize = 1024;

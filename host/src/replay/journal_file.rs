@@ -1,12 +1,12 @@
 //! The journal of a replay, where one is wanted.
 
-use std::fs::File;
-use std::io::Seek;
+use std::fs::{File, TryLockError};
+use std::io::{self, Seek};
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::journal::{self, End, Entry, Header, JournalError, Reader};
 use gleaner_protocol::own_file::{self, InTheWay};
-use gleaner_protocol::{Exit, Failure};
+use gleaner_protocol::{Exit, Explain, Failure};
 
 use crate::stage::OutputError;
 
@@ -27,12 +27,53 @@ pub(super) fn open(path: &Path) -> Result<File, Failure> {
     })
 }
 
+/// Why a journal cannot be locked.
+#[derive(Debug, thiserror::Error)]
+enum HeldError {
+    #[error("another process writes or verifies journal `{}`", path.display())]
+    Busy { path: PathBuf },
+    #[error("cannot lock journal `{}`", path.display())]
+    Lock { path: PathBuf, source: io::Error },
+}
+
+impl Explain for HeldError {
+    fn help(&self) -> Option<String> {
+        Some(match self {
+            Self::Busy { .. } => "wait until it ends, or choose another file: --journal FILE".to_owned(),
+            Self::Lock { .. } => "choose a file on a file system that has locks: --journal FILE".to_owned(),
+        })
+    }
+
+    fn exit(&self) -> Exit {
+        Exit::Internal
+    }
+}
+
+/// Opens the journal `path` to read it. As long as it is open, no replay writes into it.
+///
+/// # Errors
+///
+/// A failure that names it, also while a replay writes into it: its end would look like damage.
+pub(super) fn read(path: &Path) -> Result<File, Failure> {
+    let file = own_file::read_named(path).map_err(|error| {
+        Failure::caused_by(Exit::Usage, format!("cannot open journal `{}`", path.display()), &error)
+    })?;
+    match file.try_lock_shared() {
+        Err(TryLockError::WouldBlock) => {
+            let message = format!("a replay writes journal `{}` now", path.display());
+            Err(Failure::new(Exit::Usage, message).with_help("wait until it ends"))
+        }
+        // On a file system without locks, a journal can be read all the same.
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
+    }
+}
+
 fn no_journal(path: &Path) -> Failure {
     let message = format!("`{}` is there and is no journal", path.display());
     Failure::new(Exit::Usage, message).with_help("choose another name: --journal FILE")
 }
 
-/// Whether a file begins as a journal does, be it of another version, damaged or cut off: such a one may be replaced.
+/// Returns whether a file begins as a journal does, be it of another version, damaged or cut off: such a one may be replaced.
 fn is_journal(file: &File) -> bool {
     !matches!(Reader::open(file), Err(JournalError::NotAJournal | JournalError::Read { .. }))
 }
@@ -48,6 +89,12 @@ impl JournalFile {
     pub fn create(path: &Path, header: &Header) -> Result<Self, Failure> {
         let failed = |source| OutputError { path: path.to_owned(), source };
         let mut file = open(path)?;
+        // A journal that another process writes must not be emptied. The lock lasts as long as the file is open.
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(HeldError::Busy { path: path.to_owned() }.into()),
+            Err(TryLockError::Error(source)) => return Err(HeldError::Lock { path: path.to_owned(), source }.into()),
+        }
         if file.metadata().map_err(failed)?.len() > 0 && !is_journal(&file) {
             return Err(no_journal(path));
         }
@@ -56,12 +103,14 @@ impl JournalFile {
         Ok(Self { path: path.to_owned(), writer })
     }
 
-    /// Adds a wake.
+    /// Adds a wake. One with triggers is written at once, as its clip may be listed next.
     pub fn wake(&mut self, entry: &Entry) -> Result<(), OutputError> {
-        self.writer.wake(entry).map_err(|source| OutputError { path: self.path.clone(), source })
+        let written = self.writer.wake(entry);
+        let written = written.and_then(|()| if entry.triggers.is_empty() { Ok(()) } else { self.writer.flush() });
+        written.map_err(|source| OutputError { path: self.path.clone(), source })
     }
 
-    /// Writes what waits.
+    /// Writes what waits. Where that happens at a time of the clock, the journals of equal replays differ.
     pub fn flush(&mut self) -> Result<(), OutputError> {
         self.writer.flush().map_err(|source| OutputError { path: self.path.clone(), source })
     }

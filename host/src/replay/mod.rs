@@ -29,6 +29,7 @@ use gleaner_protocol::{Exit, Failure, Report};
 
 use self::hold::Hold;
 use self::options::{Results, Task};
+use self::round::Ended;
 use crate::guest::worker::Reports;
 use crate::stage::Load;
 
@@ -67,7 +68,7 @@ impl Job {
         match task {
             Task::Replay(results) => work::work(&options, results.record, &manifest, load, reports)?,
             // Over a drive the schedule leads, whatever the journal holds; in a clip, the journal.
-            Task::Verify(claim) if !claim.is_part => work::work(&options, false, &manifest, load, reports)?,
+            Task::Verify(claim) if claim.clip.is_none() => work::work(&options, false, &manifest, load, reports)?,
             Task::Verify(mut claim) => drop(verify::run(&options, &manifest, &mut claim, load)?),
         }
         Ok(Exit::Ok)
@@ -83,20 +84,22 @@ fn replay(
 ) -> Result<Exit, Failure> {
     let _hold = Hold::take(&results.out)?;
     let mut n = 1;
-    let (summary, broken) = loop {
-        let (summary, broken) = round::replay(options, results, manifest, &mut *load, reports, n == 1)?;
+    let Ended { summary, broken, incomplete } = loop {
+        let ended = round::replay(options, results, manifest, &mut *load, reports, n == 1)?;
         if results.repeat > 1 {
-            report(reports, &Report::Round(round::report(n, &summary)));
+            report(reports, &Report::Round(round::report(n, &ended.summary)));
         }
         if n >= results.repeat {
-            break (summary, broken);
+            break ended;
         }
         n += 1;
     };
     let faulted = if summary.faults > 0 { Exit::LambdaFaulted } else { Exit::Ok };
     let exit = broken.unwrap_or(faulted);
     report(reports, &Report::Summary(Box::new(summary)));
-    Ok(exit)
+    let Some(error) = incomplete else { return Ok(exit) };
+    let failure = Failure::from(error);
+    Err(Failure { exit: if exit == Exit::Ok { failure.exit } else { exit }, ..failure })
 }
 
 /// Whoever listens may have gone; the results are in files.

@@ -166,7 +166,7 @@ impl Job {
         let mut manifest = Manifest::load(build.path())?;
         let drives = Drives::find(args.drives)?;
         if let Some(journal) = args.verify {
-            let claim = Claim::journal(&journal)?;
+            let mut claim = Claim::journal(&journal)?;
             let options = claim.options(args.asked, build, &mut manifest, drives)?;
             return Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) });
         }
@@ -203,7 +203,7 @@ impl Job {
     pub fn verify(args: VerifyArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
-        let claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
+        let mut claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
         let asked = AskedArgs { lambda: args.lambda, set: Vec::new(), remap: Vec::new(), vehicle: args.vehicle };
         let clip = Drives { named: vec![args.clip.clone()], files: vec![args.clip] };
         let options = claim.options(asked, build, &mut manifest, clip)?;

@@ -27,7 +27,7 @@ use crate::guest::Totals;
 use crate::journal::{Identity, Scribe};
 use crate::judge::Judge;
 use crate::schedule::Schedule;
-use crate::stage::{Asked, Bounds, Load, Output, Stage, not_started};
+use crate::stage::{Asked, Bounds, Load, Output, OutputError, Stage, not_started};
 
 /// How often progress is reported; a person sees no more.
 const PROGRESS: Duration = Duration::from_millis(100);
@@ -81,6 +81,10 @@ impl Course for Pass<'_> {
             if let Some(journal) = &mut self.journal {
                 journal.wake(entry)?;
             }
+            // A clip is listed after the decisions that it is about, wherever a kill meets this process.
+            if !entry.triggers.is_empty() {
+                self.output.flush()?;
+            }
             if let Some(recording) = &self.recording {
                 recording.wake(entry)?;
             }
@@ -97,7 +101,7 @@ impl Course for Pass<'_> {
         self.samples += 1;
         if self.samples.is_multiple_of(SAMPLES_PER_LOOK) && self.looked.elapsed() >= PROGRESS {
             self.looked = Instant::now();
-            self.flush()?;
+            self.output.flush()?;
             let progress = drive.progress();
             let report = Report::Progress { done: progress.done, total: progress.total, at_ns: step.at_ns };
             send(self.reports, &report);
@@ -112,7 +116,7 @@ impl Pass<'_> {
         Ok(self.output.log(log)?)
     }
 
-    /// Writes what waits, so that a reader sees how far the replay is.
+    /// Writes what waits.
     fn flush(&mut self) -> Result<(), Failure> {
         self.output.flush()?;
         Ok(self.journal.as_mut().map_or(Ok(()), JournalFile::flush)?)
@@ -139,6 +143,15 @@ impl Pass<'_> {
     }
 }
 
+/// How a pass ended.
+pub(super) struct Ended {
+    pub(super) summary: Summary,
+    /// Why the drive could not be read to its end.
+    pub(super) broken: Option<Exit>,
+    /// Why signals or pictures are missing.
+    pub(super) incomplete: Option<OutputError>,
+}
+
 pub(super) fn replay(
     options: &Options,
     results: &Results,
@@ -146,7 +159,7 @@ pub(super) fn replay(
     load: Load<'_>,
     reports: &mut dyn Write,
     is_first: bool,
-) -> Result<(Summary, Option<Exit>), Failure> {
+) -> Result<Ended, Failure> {
     let name = manifest.lambda.name.as_str();
     let (mut drive, part) = open_drives(options)?;
     let mut recording = if results.record { Recording::subscribe(manifest, options, &mut drive)? } else { None };
@@ -253,12 +266,10 @@ pub(super) fn replay(
         }),
         stopped: pass.stopped.clone(),
     };
-    // What a report is drawn from is no result: without it, the results are whole.
-    if let Err(error) = pass.gathered.write(&results.out, pass.output, &options.asked.config, totals) {
-        tracing::warn!(%error, why = %error.source, "the report will be without signals");
-    }
+    // A report is drawn from these. The other results are whole without them.
+    let incomplete = pass.gathered.write(&results.out, pass.output, &options.asked.config, totals).err();
     output.finish(&summary)?;
-    Ok((summary, broken.map(|error| error.exit())))
+    Ok(Ended { summary, broken: broken.map(|error| error.exit()), incomplete })
 }
 
 /// What was read of a drive that is damaged: what is lost is the rest.

@@ -52,6 +52,10 @@ impl Gathered {
     }
 
     /// Writes it into the folder `out`, which is that of `output`.
+    ///
+    /// # Errors
+    ///
+    /// [`OutputError`] of the first file that cannot be written. Without pictures, the signals are written all the same.
     pub(super) fn write(
         self,
         out: &Path,
@@ -61,10 +65,12 @@ impl Gathered {
     ) -> Result<(), OutputError> {
         let Totals { curves, curves_left_out, .. } = totals;
         let triggered = self.pictures.wakes();
-        let (pictures, pictures_left_out) = self.pictures.write(out).unwrap_or_else(|error| {
-            tracing::warn!(%error, why = %error.source, "the report will be without pictures");
-            (Vec::new(), triggered)
-        });
+        let (written, failed) = match self.pictures.write(out) {
+            Ok(written) => (written, Ok(())),
+            // The signals are of use without them.
+            Err(error) => ((Vec::new(), triggered), Err(error)),
+        };
+        let (pictures, pictures_left_out) = written;
         output.signals(&Signals {
             config: config.iter().cloned().collect::<BTreeMap<_, _>>(),
             curves,
@@ -73,7 +79,8 @@ impl Gathered {
             fuel: (!self.fuel.is_empty()).then(|| spread(&self.fuel)),
             pictures,
             pictures_left_out,
-        })
+        })?;
+        failed
     }
 }
 

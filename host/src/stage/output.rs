@@ -84,8 +84,11 @@ impl Output {
     pub fn begin(folder: &Path, all: bool, again: bool) -> Result<Self, OutputError> {
         fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
         // A summary says that the files beside it are whole; what was read earlier, and a page about it, would be taken for this run's.
-        for of_earlier in [SUMMARY, SIGNALS, REPORT].into_iter().chain((!again).then_some(LOG_BEFORE)) {
-            let path = folder.join(of_earlier);
+        let replaced = [SUMMARY, SIGNALS, REPORT];
+        // A writer that was killed left its part: it takes room, and the next one may not come so far.
+        let of_earlier = replaced.iter().flat_map(|name| [(*name).to_owned(), format!("{name}.part")]);
+        for name in of_earlier.chain((!again).then(|| LOG_BEFORE.to_owned())) {
+            let path = folder.join(name);
             match fs::remove_file(&path) {
                 Err(source) if source.kind() != io::ErrorKind::NotFound => return Err(OutputError { path, source }),
                 _ => {}

@@ -99,6 +99,18 @@ impl Moment {
     }
 }
 
+impl Moment {
+    /// The first key whose value is another in `other`, with both values as JSON; values are compared as they are written, so that
+    /// `-0.0` is not `0.0`.
+    pub fn differs_from(&self, other: &Moment) -> Option<(String, [String; 2])> {
+        let values = [self, other].map(|moment| serde_json::to_value(moment).expect("a moment is plain data"));
+        let text = |side: usize, key: &str| values[side].get(key).map_or_else(|| "none".to_owned(), Value::to_string);
+        let keys = values.iter().filter_map(Value::as_object).flat_map(Map::keys);
+        let mut both = keys.map(|key| (key, [text(0, key), text(1, key)]));
+        both.find(|(_, [one, other])| one != other).map(|(key, both)| (key.clone(), both))
+    }
+}
+
 fn fits(attributes: &Map<String, Value>) -> bool {
     serde_json::to_string(attributes).is_ok_and(|text| text.len() <= Moment::ATTRIBUTE_BYTES)
 }
@@ -199,6 +211,20 @@ mod tests {
         let line = serde_json::to_string(&moment).unwrap();
         assert!(line.ends_with(r#""at_ns":1,"source":"command on /c"}"#), "{line}");
         assert_eq!(serde_json::from_str::<Moment>(&line).unwrap(), moment);
+    }
+
+    #[test]
+    fn moments_differ_by_their_first_key() {
+        let moment = &clip().moments[0];
+        assert_eq!(moment.differs_from(moment), None);
+        let zero = Moment { score: Some(0.0), ..moment.clone() };
+        let other = Moment { score: Some(-0.0), at_ns: 7, ..moment.clone() };
+        assert_eq!(zero.differs_from(&other), Some(("score".to_owned(), ["0.0", "-0.0"].map(str::to_owned))));
+        let command = Moment { source: Some("command on /c".to_owned()), ..moment.clone() };
+        assert_eq!(
+            moment.differs_from(&command).map(|(key, [one, _])| (key, one)),
+            Some(("source".to_owned(), "none".to_owned()))
+        );
     }
 
     #[test]

@@ -46,4 +46,4 @@ pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
 pub use sources::Sources;
 pub use vehicle::Vehicle;
 pub use whole::write_whole;
-pub use words::{grouped, hex, visible};
+pub use words::{excerpt, grouped, hex, visible};

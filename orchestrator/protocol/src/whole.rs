@@ -5,6 +5,7 @@ use std::path::Path;
 use crate::own_file;
 
 /// Writes `content` to the file `path` by way of one beside it, so that whatever happens there is the former file or this one, whole.
+/// After an error, the one beside it is removed: on a full disk, its room is needed.
 ///
 /// # Errors
 ///
@@ -12,10 +13,13 @@ use crate::own_file;
 pub fn write_whole(path: &Path, content: &[u8]) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
-    let mut file = own_file::anew(Path::new(&part))?;
-    file.write_all(content)?;
-    file.sync_all()?;
-    fs::rename(&part, path)?;
+    let part = Path::new(&part);
+    let mut file = own_file::anew(part)?;
+    let written = file.write_all(content).and_then(|()| file.sync_all()).and_then(|()| fs::rename(part, path));
+    if let Err(error) = written {
+        let _ = fs::remove_file(part);
+        return Err(error);
+    }
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
     File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
 }
@@ -36,5 +40,14 @@ mod tests {
         assert_eq!(fs::read_to_string(&path).unwrap(), "new");
         assert_eq!(fs::read_to_string(&elsewhere).unwrap(), "precious");
         assert!(!part.exists());
+    }
+
+    #[test]
+    fn nothing_is_left_of_what_cannot_take_its_place() {
+        let folder = Scratch::new();
+        let path = folder.path("report.html");
+        fs::create_dir(&path).unwrap();
+        write_whole(&path, b"new").unwrap_err();
+        assert!(path.is_dir() && !folder.path("report.html.part").exists());
     }
 }

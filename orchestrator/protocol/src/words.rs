@@ -28,7 +28,7 @@ pub(crate) fn list<W: AsRef<str>>(words: &[W], last: &str) -> String {
 }
 
 /// A text from a file, short enough for a message and without characters that would act on a terminal.
-pub(crate) fn excerpt(text: &str) -> String {
+pub fn excerpt(text: &str) -> String {
     const SHOWN: usize = 80;
     match text.char_indices().nth(SHOWN) {
         Some((end, _)) => visible(&text[..end]) + "…",

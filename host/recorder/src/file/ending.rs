@@ -1,7 +1,7 @@
-//! What a clip says of itself: its line in the list, and the metadata records in the file.
+//! Statements of a clip about itself: its line in the list, and the metadata records in the file. `stated` compares them with
+//! its content, by making the records once more.
 
-use std::collections::BTreeMap;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashSet};
 use std::fmt::Display;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -9,6 +9,7 @@ use std::sync::Arc;
 use gleaner_protocol::journal::{FileDigest, Header};
 use gleaner_protocol::{Clip, ClipLambda, ClipTopic, Moment};
 
+use super::written::{Written, WrittenTopic, crc32};
 use super::{About, Ending};
 
 /// The program that writes clips, as their header names it.
@@ -17,41 +18,26 @@ pub(super) const LIBRARY: &str = concat!("gleaner ", env!("CARGO_PKG_VERSION"));
 pub(super) const BEGIN: &str = "gleaner.begin";
 /// The record with the line of the list.
 pub(super) const CLIP_RECORD: &str = "gleaner.clip";
+/// The record of a topic.
+pub(super) const TOPIC_RECORD: &str = "gleaner.topic";
+/// The record of a lambda.
+pub(super) const LAMBDA_RECORD: &str = "gleaner.lambda";
+/// The record of a trigger or a command.
+pub(super) const DECISION_RECORD: &str = "gleaner.decision";
+/// The attachment with the thumbnail.
+pub(super) const THUMBNAIL: &str = "thumbnail.jpg";
 /// Key of [`CLIP_RECORD`]: the line of the list, without what only the finished file knows.
-const LINE: &str = "line";
+pub(super) const LINE: &str = "line";
 /// Key of [`CLIP_RECORD`]: the unfinished file that a recovered clip was saved from.
 const RECOVERED_FROM: &str = "recovered_from";
+
+/// In `short`: the clip before has the messages before.
+pub(crate) const CONTINUES: &str = "continues the clip before";
 
 const UNKNOWN: &str = "unknown";
 
 /// A metadata record.
 pub(super) type Record = (String, BTreeMap<String, String>);
-
-/// What was written of the messages.
-#[derive(Default)]
-pub(super) struct Written {
-    /// In the order of their first messages: name, type, messages.
-    pub(super) topics: Vec<(String, String, u64)>,
-    /// Stamps of the first and the last message.
-    pub(super) span: Option<(i64, i64)>,
-}
-
-impl Written {
-    pub(super) fn add_topic(&mut self, name: &str, type_name: &str) -> usize {
-        self.topics.push((name.to_owned(), type_name.to_owned(), 0));
-        self.topics.len() - 1
-    }
-
-    pub(super) fn count(&mut self, topic: usize, at_ns: i64) {
-        self.topics[topic].2 += 1;
-        let (first, last) = self.span.unwrap_or((at_ns, at_ns));
-        self.span = Some((first.min(at_ns), last.max(at_ns)));
-    }
-
-    pub(super) fn messages(&self) -> u64 {
-        self.topics.iter().map(|(_, _, messages)| messages).sum()
-    }
-}
 
 /// The line of a clip, but for its length.
 pub(super) fn clip(ending: &Ending, written: &Written, file: PathBuf, thumbnail: Option<PathBuf>) -> Clip {
@@ -74,59 +60,53 @@ pub(super) fn clip(ending: &Ending, written: &Written, file: PathBuf, thumbnail:
 
 /// The topics that the recorder names, then those that it forgot: their messages are in the file all the same.
 fn topics(ending: &Ending, written: &Written) -> Vec<ClipTopic> {
-    let mut left: HashMap<&str, (&str, u64)> = written
-        .topics
-        .iter()
-        .map(|(name, type_name, messages)| (name.as_str(), (type_name.as_str(), *messages)))
-        .collect();
     let mut topics = Vec::new();
     for counts in &ending.topics {
-        let (type_name, messages) = left.remove(counts.topic.as_str()).unzip();
+        let found = written.topic(&counts.topic);
         topics.push(ClipTopic {
             topic: counts.topic.clone(),
-            type_name: counts.type_name.clone().or_else(|| type_name.map(str::to_owned)),
-            messages: messages.unwrap_or(0),
+            type_name: counts.type_name.clone().or_else(|| found.map(|found| found.type_name.clone())),
+            messages: found.map_or(0, |found| found.messages),
             received: counts.received,
             lost: counts.lost,
             overwritten: counts.overwritten,
             too_big: counts.too_big,
         });
     }
-    for (name, type_name, messages) in &written.topics {
-        if left.contains_key(name.as_str()) {
-            topics.push(ClipTopic {
-                topic: name.clone(),
-                type_name: Some(type_name.clone()),
-                messages: *messages,
-                received: None,
-                lost: None,
-                overwritten: None,
-                too_big: None,
-            });
-        }
+    let named: HashSet<&str> = ending.topics.iter().map(|counts| counts.topic.as_str()).collect();
+    for found in written.topics().iter().filter(|found| !named.contains(found.name.as_str())) {
+        topics.push(ClipTopic {
+            topic: found.name.clone(),
+            type_name: Some(found.type_name.clone()),
+            messages: found.messages,
+            received: None,
+            lost: None,
+            overwritten: None,
+            too_big: None,
+        });
     }
     topics
 }
 
-/// The record in front of the messages.
-pub(super) fn begin(about: &About) -> Record {
+/// The record in front of the messages, of a clip that `library` writes.
+pub(super) fn begin(about: &About, library: &str) -> Record {
     let metadata = pairs([
         ("clock", about.clock.clone()),
         ("from_ns", about.from_ns.to_string()),
         ("lambdas", json(&about.lambdas)),
-        ("library", LIBRARY.to_owned()),
+        ("library", library.to_owned()),
         ("moment", json(&about.moment)),
     ]);
     (BEGIN.to_owned(), metadata)
 }
 
-/// What [`begin`] says, as far as it can be read.
-pub(super) fn read_begin(metadata: &BTreeMap<String, String>) -> Option<About> {
-    Some(About {
-        clock: metadata.get("clock")?.clone(),
-        from_ns: metadata.get("from_ns")?.parse().ok()?,
-        lambdas: serde_json::from_str(metadata.get("lambdas")?).ok()?,
-        moment: serde_json::from_str(metadata.get("moment")?).ok()?,
+/// Reads a record of [`begin`]; the key that is malformed if it is.
+pub(super) fn read_begin(metadata: &BTreeMap<String, String>) -> Result<About, &'static str> {
+    Ok(About {
+        clock: value(metadata, "clock")?.clone(),
+        from_ns: value(metadata, "from_ns")?.parse().map_err(|_| "from_ns")?,
+        lambdas: serde_json::from_str(value(metadata, "lambdas")?).map_err(|_| "lambdas")?,
+        moment: serde_json::from_str(value(metadata, "moment")?).map_err(|_| "moment")?,
     })
 }
 
@@ -144,27 +124,36 @@ pub(super) fn read_recovered_from(metadata: &BTreeMap<String, String>) -> Option
 pub(super) fn records<'a>(
     ending: &'a Ending,
     clip: &'a Clip,
+    written: &'a Written,
     clock: &str,
     recovered_from: Option<&str>,
 ) -> impl Iterator<Item = Record> + 'a {
     let header = |index: usize| ending.headers.get(index).map(Arc::as_ref);
     let lambdas = clip.lambdas.iter().enumerate().map(move |(index, of)| lambda(of, header(index)));
-    std::iter::once(about_clip(clip, clock, recovered_from))
-        .chain(clip.topics.iter().map(topic))
+    std::iter::once(about_clip(clip, clock, LIBRARY, ending.thumbnail.as_deref(), recovered_from))
+        .chain(clip.topics.iter().map(|of| topic(of, written.topic(&of.topic))))
         .chain(lambdas)
         .chain(ending.moments.iter().map(decision))
 }
 
-fn about_clip(clip: &Clip, clock: &str, recovered_from: Option<&str>) -> Record {
+/// The record of the clip as a whole.
+pub(super) fn about_clip(
+    clip: &Clip,
+    clock: &str,
+    library: &str,
+    thumbnail: Option<&[u8]>,
+    recovered_from: Option<&str>,
+) -> Record {
     let mut metadata = pairs([
         ("clock", clock.to_owned()),
         ("file", clip.file.display().to_string()),
         ("first_ns", known(clip.first_ns)),
         ("from_ns", clip.from_ns.to_string()),
         ("last_ns", known(clip.last_ns)),
-        ("library", LIBRARY.to_owned()),
+        ("library", library.to_owned()),
         (LINE, json(clip)),
         ("short", clip.short.join("; ")),
+        ("thumbnail", known(thumbnail.map(crc32))),
         ("to_ns", clip.to_ns.to_string()),
         ("triggers", clip.triggers.to_string()),
     ]);
@@ -178,8 +167,11 @@ fn about_clip(clip: &Clip, clock: &str, recovered_from: Option<&str>) -> Record 
     (CLIP_RECORD.to_owned(), metadata)
 }
 
-fn topic(topic: &ClipTopic) -> Record {
+/// The record of a topic; `found` is its content.
+pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> Record {
     let metadata = pairs([
+        ("checksum", found.map_or_else(|| WrittenTopic::default().checksum(), WrittenTopic::checksum)),
+        ("definitions", known(found.and_then(|found| found.definitions.clone()))),
         ("lost", known(topic.lost)),
         ("messages", topic.messages.to_string()),
         ("overwritten", known(topic.overwritten)),
@@ -188,10 +180,11 @@ fn topic(topic: &ClipTopic) -> Record {
         ("topic", topic.topic.clone()),
         ("type", known(topic.type_name.as_deref())),
     ]);
-    ("gleaner.topic".to_owned(), metadata)
+    (TOPIC_RECORD.to_owned(), metadata)
 }
 
-fn lambda(lambda: &ClipLambda, header: Option<&Header>) -> Record {
+/// The record of a lambda, with the header of its journal.
+pub(super) fn lambda(lambda: &ClipLambda, header: Option<&Header>) -> Record {
     let model = |model: &FileDigest| format!("{}={}", model.path, model.sha256);
     let metadata = pairs([
         ("config", known(header.map(|header| json(&header.config)))),
@@ -204,10 +197,11 @@ fn lambda(lambda: &ClipLambda, header: Option<&Header>) -> Record {
         ("version", lambda.version.clone()),
         ("windows", lambda.windows.to_string()),
     ]);
-    ("gleaner.lambda".to_owned(), metadata)
+    (LAMBDA_RECORD.to_owned(), metadata)
 }
 
-fn decision(moment: &Moment) -> Record {
+/// The record of a trigger or a command.
+pub(super) fn decision(moment: &Moment) -> Record {
     let mut metadata = pairs([
         ("at_ns", moment.at_ns.to_string()),
         ("kind", moment.kind.as_str().to_owned()),
@@ -222,14 +216,36 @@ fn decision(moment: &Moment) -> Record {
         metadata.insert("source".to_owned(), source.clone());
     }
     metadata.insert("attributes".to_owned(), moment.attributes.as_ref().map_or(UNKNOWN.to_owned(), json));
-    ("gleaner.decision".to_owned(), metadata)
+    (DECISION_RECORD.to_owned(), metadata)
+}
+
+/// Reads a record of [`decision`]; the key that is malformed if it is.
+pub(super) fn read_decision(metadata: &BTreeMap<String, String>) -> Result<Moment, &'static str> {
+    let score = metadata.get("score").map(|score| score.parse::<f64>()).transpose().map_err(|_| "score")?;
+    let attributes = match value(metadata, "attributes")?.as_str() {
+        UNKNOWN => None,
+        text => Some(serde_json::from_str(text).map_err(|_| "attributes")?),
+    };
+    Ok(Moment {
+        lambda: value(metadata, "lambda")?.clone(),
+        kind: serde_json::from_value(value(metadata, "kind")?.as_str().into()).map_err(|_| "kind")?,
+        label: value(metadata, "label")?.clone(),
+        score,
+        attributes,
+        at_ns: value(metadata, "at_ns")?.parse().map_err(|_| "at_ns")?,
+        source: metadata.get("source").cloned(),
+    })
+}
+
+fn value<'a>(metadata: &'a BTreeMap<String, String>, key: &'static str) -> Result<&'a String, &'static str> {
+    metadata.get(key).ok_or(key)
 }
 
 fn known(value: Option<impl Display>) -> String {
     value.map_or_else(|| UNKNOWN.to_owned(), |value| value.to_string())
 }
 
-fn json(value: &impl serde::Serialize) -> String {
+pub(super) fn json(value: &impl serde::Serialize) -> String {
     serde_json::to_string(value).expect("what a clip says is plain data")
 }
 

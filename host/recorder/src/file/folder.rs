@@ -15,7 +15,7 @@ use super::place::{CLIPS, PART, Place};
 use super::recover::Recovery;
 use super::shelf::Shelf;
 use super::unfinished::Unfinished;
-use super::{About, durable};
+use super::{About, replaced};
 use crate::error::RecordError;
 
 /// The clips that are listed in a [`Folder`], which stays held. Who starts anew replaces them once nothing is in the way, and then a
@@ -70,6 +70,7 @@ impl Folder {
         own_file::folder(&clips).map_err(|source| RecordError::Create { path: clips.clone(), source })?;
         let lock = lock(&clips, out)?;
         let list = List::of(out);
+        replaced::complete(&clips, &list)?;
         let taken: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
         let place = Arc::new(Place::new(clips, list, taken, lock));
         let left = Recovery::of(&place)?;
@@ -140,27 +141,15 @@ impl Earlier {
     /// [`RecordError`] if the list cannot be written, and nothing is deleted then.
     pub fn replace(&self, keep: &[Clip]) -> Result<u64, RecordError> {
         let place = &self.place;
-        let listed = place.list().read()?;
-        // The list first: it may leave out a whole clip, which is found at the next start, but never names one that
-        // is gone.
-        place.list().replace(keep)?;
         let kept: HashSet<PathBuf> = keep.iter().map(|clip| clip.file.clone()).collect();
-        let is_kept = |file: &str| kept.contains(Path::new(CLIPS).join(file).as_path());
-        let mut deleted = 0;
-        for Listed { file, thumbnail } in listed.iter().filter(|listed| !is_kept(&listed.file)) {
-            // The thumbnail first: one without its clip would belong to nobody.
-            let thumbnail =
-                thumbnail.as_ref().map_or(Ok(false), |thumbnail| durable::remove(&place.folder().join(thumbnail)));
-            match thumbnail.and_then(|_| durable::remove(&place.folder().join(file))) {
-                Ok(was_there) => deleted += u64::from(was_there),
-                // The list is written: what stays, such as a folder of this name, is no clip of it any more.
-                Err(error) => {
-                    warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, left alone")
-                }
-            }
-        }
-        durable::sync_folder(place.folder())?;
-        place.take_only(listed.into_iter().map(|listed| listed.file).filter(|file| is_kept(file)).collect());
+        let is_kept = |listed: &Listed| kept.contains(Path::new(CLIPS).join(&listed.file).as_path());
+        let (listed, doomed): (Vec<_>, Vec<_>) = place.list().read()?.into_iter().partition(is_kept);
+        // The list never names a clip that is gone, and what it does not name any more is noted before: else the next start would
+        // find whole clips that no list names, and list them as results of another replay.
+        replaced::note(place.folder(), &doomed)?;
+        place.list().replace(keep)?;
+        let deleted = replaced::complete(place.folder(), place.list())?;
+        place.take_only(listed.into_iter().map(|listed| listed.file).collect());
         Ok(deleted)
     }
 }

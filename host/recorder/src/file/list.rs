@@ -97,7 +97,10 @@ fn line(clip: &Clip) -> Vec<u8> {
 
 /// The clips in `file`, how many of its bytes are whole lines, and how many there are. The lines that are not ours are given
 /// to `foreign`, each in one piece or, if it is longer than any of ours, in several.
-fn read_lines(file: &File, mut foreign: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<(Vec<Listed>, u64, u64)> {
+pub(super) fn read_lines(
+    file: &File,
+    mut foreign: impl FnMut(&[u8]) -> io::Result<()>,
+) -> io::Result<(Vec<Listed>, u64, u64)> {
     let mut reader = BufReader::new(file);
     let mut listed = Vec::new();
     let (mut at, mut whole, mut malformed) = (0, 0, 0_u64);
@@ -139,7 +142,7 @@ fn names(line: Line) -> Option<Listed> {
 
 /// The file name of `path` if it is `clips/NAME` with that ending and nothing else: what a list says is deleted, and
 /// nobody but us may say so of other files.
-fn plain_name(path: &Path, ending: &str) -> Option<String> {
+pub(super) fn plain_name(path: &Path, ending: &str) -> Option<String> {
     let mut components = path.components();
     let (folder, name) = (components.next()?, components.next()?);
     let (Component::Normal(folder), Component::Normal(name), None) = (folder, name, components.next()) else {

@@ -4,6 +4,7 @@
 //! OUT/clips.jsonl                 a line for each whole clip
 //! OUT/losses.jsonl                a line for each thing that was wanted and is not there
 //! OUT/clips/.lock                 held by the process that records
+//! OUT/clips/.replaced             clips of an earlier replay that are about to be deleted
 //! OUT/clips/NAME.mcap             a whole clip
 //! OUT/clips/NAME.jpg              its thumbnail
 //! OUT/clips/NAME.mcap.part        a clip that is being written, or whose recorder died
@@ -27,20 +28,26 @@ mod part;
 mod place;
 mod read;
 mod recover;
+mod replaced;
 mod shelf;
 mod sink;
+mod stated;
 #[cfg(test)]
 mod tests;
 mod unfinished;
+mod written;
 
 use std::sync::Arc;
 
 use gleaner_protocol::journal::Header;
 use gleaner_protocol::{ClipLambda, Moment};
 
+pub(crate) use ending::CONTINUES;
 pub use folder::{Earlier, Folder};
 pub use losses::LossList;
+pub(crate) use place::names;
 pub(crate) use recover::Recovery;
+pub use stated::{Stated, Untrue};
 pub use unfinished::MESSAGE_MAX;
 pub(crate) use unfinished::Unfinished;
 

@@ -95,7 +95,7 @@ impl Place {
 }
 
 /// `stem`, `stem-2`, `stem-3` and so on.
-pub(super) fn names(stem: &str) -> impl Iterator<Item = String> + '_ {
+pub(crate) fn names(stem: &str) -> impl Iterator<Item = String> + '_ {
     (1_u64..).map(move |n| if n == 1 { stem.to_owned() } else { format!("{stem}-{n}") })
 }
 

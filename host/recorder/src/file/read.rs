@@ -9,6 +9,7 @@ use gleaner_transport::{SampleMeta, TopicSpec, Transport, Verdict};
 
 use super::ending::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};
 use super::recover::Pause;
+use super::written::Written;
 use super::{About, Topic};
 use crate::error::RecordError;
 
@@ -23,45 +24,79 @@ pub(super) struct End {
     pub(super) why: Damage,
 }
 
+/// A clip that is read.
+struct Reading {
+    replay: Replay,
+    held: Arc<Held>,
+    topics: Vec<Topic>,
+}
+
+impl Reading {
+    fn open(path: &Path, limits: Limits) -> Result<Reading, RecordError> {
+        let mut replay = Replay::open_with(&[path.to_owned()], limits).map_err(unreadable(path))?;
+        let held = Arc::new(Held::default());
+        let mut topics = Vec::new();
+        for found in replay.topics() {
+            let spec = TopicSpec {
+                topic: found.topic,
+                type_name: found.type_name,
+                queue: 1,
+                max_bytes: usize::MAX,
+                qos: Default::default(),
+            };
+            replay
+                .subscribe(&spec, Arc::clone(&held) as Arc<dyn gleaner_transport::Sink>)
+                .map_err(|source| RecordError::Topic { path: path.to_owned(), source: Box::new(source) })?;
+            topics.push(Topic {
+                name: spec.topic,
+                type_name: spec.type_name,
+                definitions: found.definitions_text,
+                offered_qos: found.offered_qos,
+            });
+        }
+        Ok(Reading { replay, held, topics })
+    }
+
+    /// Gives the next message, with the index of its topic, to `act`; `None` at the end.
+    fn next<T>(&mut self, act: impl FnOnce(usize, &SampleMeta, &[u8]) -> T) -> Result<Option<T>, ReplayError> {
+        Ok(self.replay.step()?.map(|step| {
+            let cdr = self.held.0.lock().unwrap_or_else(PoisonError::into_inner);
+            act(step.subscription.0, &step.meta, &cdr)
+        }))
+    }
+}
+
 /// Gives each message of the clip `path` to `act`, in the order of their stamps, up to the end or to the damage that
 /// it returns.
 pub(super) fn each_message(
     path: &Path,
     mut act: impl FnMut(&Topic, &SampleMeta, &[u8]) -> Result<(), RecordError>,
 ) -> Result<Option<End>, RecordError> {
-    let cannot_read = |source| RecordError::Unreadable { path: path.to_owned(), source: Box::new(source) };
-    let mut replay = Replay::open_with(&[path.to_owned()], LIMITS).map_err(cannot_read)?;
-    let held = Arc::new(Held::default());
-    let mut topics = Vec::new();
-    for found in replay.topics() {
-        let spec = TopicSpec {
-            topic: found.topic,
-            type_name: found.type_name,
-            queue: 1,
-            max_bytes: usize::MAX,
-            qos: Default::default(),
-        };
-        replay
-            .subscribe(&spec, Arc::clone(&held) as Arc<dyn gleaner_transport::Sink>)
-            .map_err(|source| RecordError::Topic { path: path.to_owned(), source: Box::new(source) })?;
-        topics.push(Topic {
-            name: spec.topic,
-            type_name: spec.type_name,
-            definitions: found.definitions_text,
-            offered_qos: found.offered_qos,
-        });
-    }
+    let mut reading = Reading::open(path, LIMITS)?;
+    let topics = std::mem::take(&mut reading.topics);
     loop {
-        match replay.step() {
-            Ok(Some(step)) => {
-                let cdr = held.0.lock().unwrap_or_else(PoisonError::into_inner);
-                act(&topics[step.subscription.0], &step.meta, &cdr)?;
-            }
+        match reading.next(|topic, meta, cdr| act(&topics[topic], meta, cdr)) {
+            Ok(Some(done)) => done?,
             Ok(None) => return Ok(None),
             Err(ReplayError::Damaged { at: Place::Byte(at), what, .. }) => return Ok(Some(End { at, why: what })),
-            Err(error) => return Err(cannot_read(error)),
+            Err(error) => return Err(unreadable(path)(error)),
         }
     }
+}
+
+/// The messages of the clip `path`, counted. It may come from anywhere: its chunks are bounded as those of a drive.
+pub(super) fn written(path: &Path) -> Result<Written, RecordError> {
+    let mut reading = Reading::open(path, Limits::default())?;
+    let mut written = Written::default();
+    for topic in &reading.topics {
+        written.add_topic(topic);
+    }
+    while reading.next(|topic, meta, cdr| written.count(topic, meta, cdr)).map_err(unreadable(path))?.is_some() {}
+    Ok(written)
+}
+
+fn unreadable(path: &Path) -> impl Fn(ReplayError) -> RecordError + '_ {
+    |source| RecordError::Unreadable { path: path.to_owned(), source: Box::new(source) }
 }
 
 /// The message that was delivered last.
@@ -82,15 +117,14 @@ pub(super) fn whole(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, Reco
     if each_message(path, |_, _, _| pause())?.is_some() {
         return Ok(None);
     }
-    let extras = read_extras(path, EXTRAS_BYTES)
-        .map_err(|source| RecordError::Unreadable { path: path.to_owned(), source: Box::new(source) })?;
+    let extras = read_extras(path, EXTRAS_BYTES).map_err(unreadable(path))?;
     Ok(extras.metadata.iter().find(|(name, _)| name == CLIP_RECORD).and_then(|(_, metadata)| read_line(metadata)))
 }
 
 /// What the clip `path` says of its begin; `None` if that cannot be read.
 pub(super) fn about(path: &Path) -> Option<About> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
-    extras.metadata.iter().find(|(name, _)| name == BEGIN).and_then(|(_, metadata)| read_begin(metadata))
+    extras.metadata.iter().find(|(name, _)| name == BEGIN).and_then(|(_, metadata)| read_begin(metadata).ok())
 }
 
 /// The file that the clip `path` was saved from, if it was.

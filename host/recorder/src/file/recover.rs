@@ -245,6 +245,9 @@ fn add(place: &Place, name: &str, mut clip: Clip) -> Result<Clip, RecordError> {
     clip.file = format!("{CLIPS}/{name}{CLIP}").into();
     clip.thumbnail = place.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
     clip.bytes = metadata.len();
+    // It is a result of the process that died, and not of the one that finds it.
+    let what = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
+    clip.recovered.get_or_insert(Recovered { lost_bytes: 0, what });
     place.add(name, &clip)?;
     info!(path = %path.display(), "clip was whole but not listed, now it is");
     Ok(clip)

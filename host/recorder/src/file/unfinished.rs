@@ -7,14 +7,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use gleaner_protocol::{Clip, Recovered};
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 
 use super::durable;
-use super::ending::{self, Written};
+use super::ending::{self, THUMBNAIL};
 use super::place::{CLIP, CLIPS, JPG, JPG_PART, Place};
 use super::sink::Sink;
+use super::written::{Written, encapsulation, stamp};
 use super::{About, Ending, Topic};
 use crate::error::RecordError;
 
@@ -122,7 +123,7 @@ impl Unfinished {
             frame: Vec::new(),
             written: Written::default(),
         };
-        if let Some((name, metadata)) = about.map(ending::begin) {
+        if let Some((name, metadata)) = about.map(|about| ending::begin(about, ending::LIBRARY)) {
             clip.metadata(name, metadata)?;
         }
         clip.flush()?;
@@ -141,13 +142,9 @@ impl Unfinished {
             self.flush()?;
         }
         let Channel { index, id: channel_id, new_bytes } = self.channel(topic, Some(meta.writer))?;
-        let endian = match meta.endian {
-            Endian::Big => 0,
-            Endian::Little => 1,
-        };
         let mut frame = std::mem::take(&mut self.frame);
         frame.clear();
-        frame.extend_from_slice(&[0, endian, meta.options[0], meta.options[1]]);
+        frame.extend_from_slice(&encapsulation(meta));
         frame.extend_from_slice(cdr);
         let header = MessageHeader {
             channel_id,
@@ -160,7 +157,7 @@ impl Unfinished {
         let bytes = frame.len() as u64 + new_bytes;
         self.frame = frame;
         written?;
-        self.written.count(index, meta.at_ns);
+        self.written.count(index, meta, cdr);
         let chunk = self.chunk.get_or_insert(Chunk { first_ns: meta.at_ns, last_ns: meta.at_ns, bytes: 0 });
         chunk.first_ns = chunk.first_ns.min(meta.at_ns);
         chunk.last_ns = chunk.last_ns.max(meta.at_ns);
@@ -215,14 +212,15 @@ impl Unfinished {
         let mut clip = ending::clip(&ending, &self.written, format!("{CLIPS}/{name}{CLIP}").into(), thumbnail);
         clip.recovered = saved.as_ref().map(|saved| saved.recovered.clone());
         let from = saved.as_ref().map(|saved| saved.from.as_str());
-        for (name, metadata) in ending::records(&ending, &clip, &self.clock, from) {
+        let written = std::mem::take(&mut self.written);
+        for (name, metadata) in ending::records(&ending, &clip, &written, &self.clock, from) {
             self.metadata(name, metadata)?;
         }
         for (lambda, journal) in ending.journals {
             self.attach(format!("journal/{lambda}.journal"), "application/octet-stream", journal, ending.to_ns)?;
         }
         if let Some(jpeg) = ending.thumbnail {
-            self.attach("thumbnail.jpg".to_owned(), "image/jpeg", jpeg, ending.to_ns)?;
+            self.attach(THUMBNAIL.to_owned(), "image/jpeg", jpeg, ending.to_ns)?;
         }
         self.with_writer(|writer| writer.finish().map(drop))?;
         let cannot_sync = |source| RecordError::Sync { path: self.path.clone(), source };
@@ -295,10 +293,11 @@ impl Unfinished {
             writer.add_channel(schema, &topic.name, "cdr", &metadata)
         })?;
         let written = &mut self.written;
-        let known = self.channels.by_topic.entry(topic.name.clone()).or_insert_with(|| TopicChannels {
-            index: written.add_topic(&topic.name, &topic.type_name),
-            by_writer: HashMap::new(),
-        });
+        let known = self
+            .channels
+            .by_topic
+            .entry(topic.name.clone())
+            .or_insert_with(|| TopicChannels { index: written.add_topic(topic), by_writer: HashMap::new() });
         known.by_writer.insert(key, id);
         self.channels.count += 1;
         Ok(Channel { index: known.index, id, new_bytes: new_bytes as u64 })
@@ -341,11 +340,6 @@ fn options() -> WriteOptions {
         .chunk_size(None)
         // A chunk is put together in memory and written whole, so a torn one is always the last.
         .disable_seeking(true)
-}
-
-/// MCAP has no time before the epoch.
-fn stamp(ns: i64) -> u64 {
-    u64::try_from(ns).unwrap_or(0)
 }
 
 fn cannot_write(path: &Path, error: McapError) -> RecordError {

@@ -11,7 +11,7 @@ use super::pen::part::Part;
 use super::stem::stem;
 use super::stock::{Desk, Settled};
 use crate::RecordError;
-use crate::file::{About, Ending, TopicCounts};
+use crate::file::{About, CONTINUES, Ending, TopicCounts, names};
 use crate::window::Group;
 
 /// What one topic has in a clip, and what it has not.
@@ -268,7 +268,7 @@ impl Draft {
     /// Why the clip does not begin and end where its windows do.
     fn say_ends(&self, group: &Group, close: &Close, short: &mut Vec<String>) {
         if self.continues {
-            short.push("continues the clip before".to_owned());
+            short.push(CONTINUES.to_owned());
         }
         if self.begins_late_ns > 0 {
             let late = seconds(self.begins_late_ns);
@@ -364,11 +364,6 @@ impl Draft {
         }
         part
     }
-}
-
-/// `name`, `name-2`, `name-3` and so on.
-fn names(name: &str) -> impl Iterator<Item = String> + '_ {
-    (1_u64..).map(move |n| if n == 1 { name.to_owned() } else { format!("{name}-{n}") })
 }
 
 /// The item at `index` of a list that grows as far as it is asked for. Topics and lambdas are numbered from 0.

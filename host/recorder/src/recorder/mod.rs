@@ -20,10 +20,10 @@ use gleaner_protocol::journal::{Encoder, Entry};
 use gleaner_protocol::{Clip, Moment, TriggerKind};
 use gleaner_transport::{Gaps, SampleMeta};
 
-use crate::RecordError;
 use crate::file::{Folder, Topic};
 use crate::preroll::{Held, Losses, Preroll, Walked};
 use crate::window::{Heard, Rules, Windows, nanoseconds};
+use crate::{LAMBDAS_MAX, RecordError};
 use draft::Draft;
 use finished::Finished;
 use limits::Limits;
@@ -44,9 +44,6 @@ pub const TOPICS_MAX: usize = 1024;
 /// Most bytes of the names of all topics of one recorder, and of their types: they stand in a line of the list of clips, up to
 /// seven times and with six bytes for one, and a line has at most 16 MiB.
 const NAMES_MAX: usize = 256 << 10;
-
-/// Most lambdas of one recorder, counted with each start: of each a header is kept.
-const LAMBDAS_MAX: usize = 1024;
 
 /// Cuts clips out of what passes by. Time is what stamps and [`Recorder::advance`] say, and never goes back.
 ///

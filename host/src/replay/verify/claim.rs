@@ -4,14 +4,15 @@ use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::journal::{Difference, Entry, Header, JournalError, Reader};
-use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest};
-use gleaner_protocol::{BuildDir, Exit, Failure, own_file};
+use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
+use gleaner_protocol::{BuildDir, Exit, Failure, excerpt, own_file};
+use gleaner_recorder::{Stated, Untrue};
 use gleaner_transport::replay::{ReplayError, read_extras};
 use serde_json::Value;
 
-use super::told::Told;
 use crate::input::Remap;
 use crate::journal::{CLOCK_OF_VEHICLE, Identity};
+use crate::replay::journal_file;
 use crate::replay::open::DriveError;
 use crate::replay::options::{Drives, Options};
 use crate::replay::part::Wanted;
@@ -24,19 +25,17 @@ const EXTRAS_BYTES: u64 = 256 << 20;
 pub(in crate::replay) struct Claim {
     path: PathBuf,
     reader: Reader<Box<dyn Read + Send>>,
-    /// Whether it is the part in a clip, which begins in the middle.
-    pub(in crate::replay) is_part: bool,
-    /// What the clip tells people; nothing for a journal.
-    pub(super) told: Told,
+    /// Statements of the clip that it is a part of, and begins in the middle of; none for the journal of a replay.
+    pub(in crate::replay) clip: Option<Stated>,
+    /// Limits that held by the journal and not by the manifest.
+    pub(super) limits: Vec<String>,
 }
 
 impl Claim {
     /// The journal of a replay.
     pub(in crate::replay) fn journal(path: &Path) -> Result<Self, Failure> {
-        let file = own_file::read_named(path).map_err(|error| {
-            Failure::caused_by(Exit::Usage, format!("cannot open journal `{}`", path.display()), &error)
-        })?;
-        Self::open(path, Box::new(BufReader::new(file)), false, Told::default())
+        let file = journal_file::read(path)?;
+        Self::open(path, Box::new(BufReader::new(file)))
     }
 
     /// The file that it is in.
@@ -46,22 +45,16 @@ impl Claim {
 
     /// The part of the journal of `lambda` that a clip holds.
     pub(in crate::replay) fn clip(path: &Path, lambda: &str) -> Result<Self, Failure> {
-        let extras = read_extras(path, EXTRAS_BYTES).map_err(unreadable_clip)?;
+        let mut extras = read_extras(path, EXTRAS_BYTES).map_err(unreadable_clip)?;
         if !extras.is_whole {
             let message = format!("clip `{}` is cut off or was never finished", path.display());
             return Err(Failure::new(Exit::Usage, message).with_help("copy it again; a clip of Gleaner has its end"));
         }
-        let told = Told::of(&extras.metadata, lambda);
         let wanted = format!("journal/{lambda}.journal");
-        let mut journals = extras.attachments.into_iter().filter(|attachment| attachment.name.starts_with("journal/"));
-        let mut others = Vec::new();
-        let part = journals.find_map(|attachment| {
-            let found = attachment.name == wanted;
-            others.push(attachment.name);
-            found.then_some(attachment.data)
-        });
-        let Some(part) = part else {
+        let Some(part) = extras.attachments.iter_mut().find(|attachment| attachment.name == wanted) else {
             let message = format!("clip `{}` holds no journal of lambda `{lambda}`", path.display());
+            let names = extras.attachments.iter().map(|attachment| attachment.name.as_str());
+            let others = names.filter(|name| name.starts_with("journal/")).map(excerpt).collect::<Vec<_>>();
             let help = if others.is_empty() {
                 "it was recovered after its recorder had died, or is no clip of Gleaner".to_owned()
             } else {
@@ -69,10 +62,14 @@ impl Claim {
             };
             return Err(Failure::new(Exit::Usage, message).with_help(help));
         };
-        Self::open(path, Box::new(Cursor::new(part)), true, told)
+        let part = std::mem::take(&mut part.data);
+        let mut claim = Self::open(path, Box::new(Cursor::new(part)))?;
+        let stated = Stated::read(&extras, claim.header()).map_err(|error| untrue(path, &error))?;
+        claim.clip = Some(stated);
+        Ok(claim)
     }
 
-    fn open(path: &Path, bytes: Box<dyn Read + Send>, is_part: bool, told: Told) -> Result<Self, Failure> {
+    fn open(path: &Path, bytes: Box<dyn Read + Send>) -> Result<Self, Failure> {
         let reader = Reader::open(bytes).map_err(|error| unusable(path, &error))?;
         if reader.header().clock == CLOCK_OF_VEHICLE {
             let message = format!("`{}` was recorded live, and cannot be verified yet", path.display());
@@ -83,7 +80,7 @@ impl Claim {
             ];
             return Err(failure.with_help("replay the lambda over the clip: gleaner replay DIR CLIP"));
         }
-        Ok(Self { path: path.to_owned(), reader, is_part, told })
+        Ok(Self { path: path.to_owned(), reader, clip: None, limits: Vec::new() })
     }
 
     /// A comparison of nothing proves nothing.
@@ -105,20 +102,30 @@ impl Claim {
         &self.reader
     }
 
-    /// What the journal was made with, unless `set`, `remaps` and the vehicle say otherwise, which then has to be the same. Limits
-    /// of the journal count as those of a vehicle: they cannot be wider than those of the manifest.
+    /// Returns what the journal was made with, unless `set`, `remaps` and the vehicle say otherwise, which then has to be the same.
+    /// Without a vehicle, limits of the journal that are tighter than those of the manifest count as those of the vehicle of then,
+    /// and are noted; they cannot be wider.
     pub(in crate::replay) fn options(
-        &self,
+        &mut self,
         args: AskedArgs,
         build: BuildDir,
         manifest: &mut Manifest,
         drives: Drives,
     ) -> Result<Options, Failure> {
         let AskedArgs { lambda, set, remap: remaps, vehicle } = args;
-        let header = self.header();
+        let header = self.reader.header();
         match &vehicle {
             Some(file) => tighten(manifest, file)?,
-            None => manifest.limits = manifest.limits.tightened_by(&header.limits).0,
+            None => {
+                let (limits, tightened) = manifest.limits.tightened_by(&header.limits);
+                manifest.limits = limits;
+                let note = |Tightened { key, from, to }| {
+                    format!(
+                        "limit `{key}`: {to} in the journal, which holds, {from} in lambda.toml; --vehicle FILE compares it"
+                    )
+                };
+                self.limits = tightened.into_iter().map(note).collect();
+            }
         }
         let remaps = if remaps.is_empty() {
             let journaled = header.remaps.iter();
@@ -134,7 +141,7 @@ impl Claim {
         asked.config = ConfigSet::resolve(manifest, &set)?;
         compare(header, &asked, manifest)?;
         // A clip holds what it holds.
-        let part = if self.is_part { Wanted::default() } else { Wanted::from(header.part) };
+        let part = if self.clip.is_some() { Wanted::default() } else { Wanted::from(header.part) };
         Ok(Options { asked, drives, part, topics: Vec::new(), unpack_in: None })
     }
 }
@@ -168,6 +175,15 @@ pub(super) fn different(message: impl Into<String>, difference: &Difference) -> 
     let mut failure = Failure::new(Exit::Differs, message);
     failure.causes = vec![format!("{what}\nin the journal: {journal}\nnow:            {now}")];
     failure
+}
+
+/// A failure: the clip makes an untrue statement about itself.
+pub(super) fn untrue(path: &Path, Untrue { what, stated, found }: &Untrue) -> Failure {
+    let mut failure = Failure::new(Exit::Differs, format!("clip `{}` contradicts itself", path.display()));
+    failure.causes = vec![format!("{what}\nthe clip says:  {stated}\nit should be:   {found}")];
+    failure.with_help(
+        "it was changed since it was made, or an older gleaner made it: replay the lambda over its drive again",
+    )
 }
 
 fn unusable(path: &Path, error: &JournalError) -> Failure {

@@ -1,16 +1,18 @@
 //! The part of a journal against the clip that holds it: the journal leads.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use gleaner_protocol::journal::{Difference, Entry, Header, Woken};
 use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Failure};
+use gleaner_protocol::{Exit, Failure, excerpt};
+use gleaner_recorder::{RecordError, Stated};
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Transport};
 
-use super::claim::unreadable_clip;
+use super::claim::{unreadable_clip, untrue};
 use super::paced::{PaceError, Paced};
-use super::told::Told;
+use super::triggers::Triggers;
 use super::{Claim, Proved, Remake, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
 use crate::api::trace::offered;
@@ -30,7 +32,8 @@ pub(super) fn prove(
     let clip = open(options).map_err(unreadable_clip)?;
     let header = claim.header().clone();
     holds_all_inputs(&clip, &header)?;
-    holds_what_it_says(&clip, &claim.told)?;
+    let stated = claim.clip.take().expect("a part of a journal is in a clip");
+    holds_what_it_states(claim.path(), &stated)?;
     let (remake, clip, inputs) = Remake::start(Paced::new(clip), options, manifest, load)?;
     let engine = remake.engine.clone();
     let mut proof = Proof {
@@ -42,21 +45,25 @@ pub(super) fn prove(
         wakes: 0,
         uncovered: 0,
         uncovered_triggers: 0,
-        told: Told::default(),
+        losses: losses(&stated),
+        triggers: Triggers::of(&header.lambda),
     };
     while let Some(entry) = claim.next()? {
-        proof.wake(&entry, &claim.told)?;
+        proof.wake(&entry)?;
     }
-    let Proof { wakes, uncovered, uncovered_triggers, told, .. } = proof;
+    let Proof { wakes, uncovered, uncovered_triggers, triggers, .. } = proof;
     if wakes == 0 {
         return Err(claim.empty());
     }
-    let end = claim.reader().end().map_or(wakes, |end| end.wakes);
-    let wrong = counts_differ("wakes", end, wakes).or_else(|| told.moments_differ(&claim.told));
+    let Some(end) = claim.reader().end() else {
+        let message = format!("the journal in clip `{}` has no end", claim.path().display());
+        return Err(Failure::new(Exit::Differs, message).with_help(CHANGED));
+    };
+    let wrong = counts_differ("wakes", end.wakes, wakes).or_else(|| triggers.differ(&stated));
     if let Some(difference) = wrong {
-        return Err(different("the clip does not tell what its journal says", &difference).with_help(CHANGED));
+        return Err(different("the clip and its journal name different triggers", &difference).with_help(CHANGED));
     }
-    let triggers = told.triggers;
+    let triggers = triggers.count;
     if uncovered == wakes || triggers > 0 && uncovered_triggers == triggers {
         let message = format!("the clip alone proves no trigger of lambda `{}`", header.lambda);
         let mut failure = Failure::new(Exit::Usage, message);
@@ -83,21 +90,26 @@ fn holds_all_inputs(clip: &Replay, header: &Header) -> Result<(), Failure> {
     Err(Failure::new(Exit::Usage, message).with_help(help))
 }
 
-/// As many messages of each topic as it tells people.
-fn holds_what_it_says(clip: &Replay, told: &Told) -> Result<(), Failure> {
-    let topics = clip.topics();
-    let held =
-        |name: &str| topics.iter().find(|topic| topic.topic == name).and_then(|topic| topic.messages).unwrap_or(0);
-    let wrong = told
-        .messages
-        .iter()
-        .find_map(|(topic, told)| counts_differ(format!("messages of `{topic}`"), *told, held(topic)));
-    match wrong {
-        None => Ok(()),
-        Some(difference) => {
-            Err(different("the clip does not hold what it says that it holds", &difference).with_help(CHANGED))
-        }
+/// Refuses a clip whose messages contradict its records.
+fn holds_what_it_states(path: &Path, stated: &Stated) -> Result<(), Failure> {
+    match stated.contradicted(path) {
+        Ok(None) => Ok(()),
+        Ok(Some(error)) => Err(untrue(path, &error)),
+        Err(RecordError::Unreadable { source, .. }) => Err(unreadable_clip(*source)),
+        Err(error) => Err(Failure { exit: Exit::Usage, ..error.into() }),
     }
+}
+
+/// Losses that the clip states, in words; none if there are none.
+fn losses(stated: &Stated) -> Option<String> {
+    let count = |count: Option<u64>| count.map_or("unknown".to_owned(), |count| count.to_string());
+    let lost = stated.clip().topics.iter().flat_map(|topic| {
+        let causes = [(topic.overwritten, "pushed out"), (topic.too_big, "too big")];
+        let lost = causes.into_iter().filter(|(lost, _)| *lost != Some(0));
+        lost.map(|(lost, why)| format!("{}: {} {why}", excerpt(&topic.topic), count(lost)))
+    });
+    let lost = lost.collect::<Vec<_>>();
+    (!lost.is_empty()).then(|| lost.join(", "))
 }
 
 /// A lambda that runs again from the begin of a clip.
@@ -111,19 +123,21 @@ struct Proof<'a> {
     /// Wakes in which the lambda had looked at samples from before the clip, and their triggers.
     uncovered: u64,
     uncovered_triggers: u64,
-    /// What the journal says of the lambda's triggers.
-    told: Told,
+    /// Losses that the clip states.
+    losses: Option<String>,
+    /// The triggers of the journal.
+    triggers: Triggers,
 }
 
 impl Proof<'_> {
-    fn wake(&mut self, entry: &Entry, told: &Told) -> Result<(), Failure> {
+    fn wake(&mut self, entry: &Entry) -> Result<(), Failure> {
         let before: Vec<_> = self.inputs.iter().map(|topic| offered(topic)).collect();
         if self.wakes == 0 {
             self.join(entry)?
         } else {
             self.deliver(entry.seen.iter().map(|seen| seen.new))?
         }
-        let wake = self.cause(entry, told)?;
+        let wake = self.cause(entry)?;
         let mut now = self.remake.wake(wake).clone();
         for ((topic, before), (now, journal)) in
             self.inputs.iter().zip(before).zip(now.seen.iter_mut().zip(&entry.seen))
@@ -151,13 +165,13 @@ impl Proof<'_> {
             return Err(if saw_the_same && self.header.wakes_before > 0 {
                 self.unsettled(entry, &difference)
             } else {
-                self.differs(entry, &difference, told)
+                self.differs(entry, &difference)
             });
         }
         self.wakes += 1;
         self.uncovered += u64::from(!is_covered);
         self.uncovered_triggers += if is_covered { 0 } else { entry.triggers.len() as u64 };
-        self.told.add(entry);
+        self.triggers.add(entry);
         Ok(())
     }
 
@@ -184,16 +198,13 @@ impl Proof<'_> {
         self.clip.deliver(owed).map_err(unreadable)
     }
 
-    fn cause(&self, entry: &Entry, told: &Told) -> Result<Wake, Failure> {
+    fn cause(&self, entry: &Entry) -> Result<Wake, Failure> {
         let (writer, seq) = match (entry.cause, self.header.event_input) {
             (Woken::Tick { missed }, None) => return Ok(Wake::Tick(Tick { at_ns: entry.at_ns, missed })),
             (Woken::Tick { .. }, Some(_)) => {
                 let (journal, now) = ("a tick".to_owned(), "samples, by its manifest".to_owned());
-                return Err(self.differs(
-                    entry,
-                    &Difference { what: "what woke the lambda".to_owned(), journal, now },
-                    told,
-                ));
+                let what = "what woke the lambda".to_owned();
+                return Err(self.differs(entry, &Difference { what, journal, now }));
             }
             (Woken::Sample { writer, seq }, _) => (writer, seq),
         };
@@ -211,7 +222,7 @@ impl Proof<'_> {
                 journal: format!("number {seq}"),
                 now: "it is not there".to_owned(),
             };
-            self.differs(entry, &difference, told)
+            self.differs(entry, &difference)
         })
     }
 
@@ -221,8 +232,8 @@ impl Proof<'_> {
         inputs.all(|(topic, seen)| seen.reach.min(topic.reader().depth() as u64) <= topic.reader().head())
     }
 
-    fn differs(&self, entry: &Entry, difference: &Difference, told: &Told) -> Failure {
-        match told.losses() {
+    fn differs(&self, entry: &Entry, difference: &Difference) -> Failure {
+        match &self.losses {
             None => different(format!("{} differs", self.wake_in_words(entry)), difference).with_help(CHANGED),
             Some(losses) => {
                 let message = format!("the clip alone does not settle {}", self.wake_in_words(entry));

@@ -23,6 +23,10 @@ pub(super) fn prove(
     claim: &mut Claim,
     load: Load<'_>,
 ) -> Result<Proved, Failure> {
+    if let Some(difference) = counts_differ("wakes before the first one", claim.header().wakes_before, 0) {
+        let failure = different("this journal does not begin with its lambda", &difference);
+        return Err(failure.with_help("name the journal of a whole replay; a clip: gleaner verify CLIP --lambda DIR"));
+    }
     let digests = Digests::start(options.drives.files.clone());
     let (drive, part) = open_drives(options)?;
     let span = Span::of(&drive, part);

@@ -8,7 +8,7 @@ mod claim;
 mod clip;
 mod drive;
 mod paced;
-mod told;
+mod triggers;
 
 pub(super) use claim::Claim;
 
@@ -35,7 +35,7 @@ pub(super) fn run(
     load: Load<'_>,
 ) -> Result<Verified, Failure> {
     let started = Instant::now();
-    let proved = match claim.is_part {
+    let proved = match claim.clip.is_some() {
         true => clip::prove(options, manifest, claim, load)?,
         false => drive::prove(options, manifest, claim, load)?,
     };
@@ -56,7 +56,7 @@ pub(super) fn run(
         uncovered_triggers: proved.uncovered_triggers,
         cut_off,
         wall_s: started.elapsed().as_secs_f64(),
-        notes: notes.into_iter().flatten().collect(),
+        notes: notes.into_iter().flatten().chain(claim.limits.iter().cloned()).collect(),
     })
 }
 

@@ -9,8 +9,12 @@ use super::header::{End, Header};
 use super::number::{NUMBER_MAX, put};
 use super::{ATTRIBUTES_MAX, INPUTS_MAX, TRIGGERS_MAX, VERSION};
 
-/// A block of wakes is written when it is as long: some 2000 wakes, and small enough that its checksum names a place.
+/// A block of wakes is written when it is as long: small enough that its checksum names a place.
 const CLOSE_AT: usize = 32 << 10;
+
+/// A block is written when it has as many wakes: a writer that dies loses fewer. Where a block ends depends on what is in it and
+/// on nothing else, so that the journals of equal runs are equal. Of 4 KB, its head and its first wake take some 60 bytes.
+const CLOSE_AT_WAKES: u64 = 256;
 
 /// Room for what comes before the wakes of a block, and is known when it is full.
 const ROOM: usize = HEAD_LEN + NUMBER_MAX;
@@ -72,7 +76,7 @@ impl<W: Write> Writer<W> {
             return Err(refused("a wake is larger than a block of a journal"));
         }
         self.wakes += 1;
-        if payload >= CLOSE_AT { self.write_wakes() } else { Ok(()) }
+        if payload >= CLOSE_AT || self.wakes >= CLOSE_AT_WAKES { self.write_wakes() } else { Ok(()) }
     }
 
     /// Writes the wakes that wait, and flushes `out`.

@@ -4,6 +4,7 @@ use std::io::Write;
 use gleaner_protocol::link::Loss;
 
 use super::super::Folder;
+use super::super::durable::steps;
 use super::*;
 use crate::error::RecordError;
 
@@ -52,12 +53,14 @@ fn a_torn_last_line_is_cut_off_and_its_clip_listed_again() {
         fs::write(scratch.path("clips.jsonl"), &list[..len]).unwrap();
         let (_, found) = scratch.open();
         let whole = list[..len].iter().filter(|byte| **byte == b'\n').count();
-        assert_eq!(found, clips[whole..], "{len} bytes");
-        assert_eq!(scratch.listed(), clips, "{len} bytes");
+        let unlisted: Vec<_> = clips[whole..].iter().map(unlisted).collect();
+        assert_eq!(found, unlisted, "{len} bytes");
+        assert_eq!(scratch.listed(), [&clips[..whole], &unlisted].concat(), "{len} bytes");
     }
     fs::remove_file(scratch.path("clips.jsonl")).unwrap();
-    assert_eq!(scratch.open().1, clips);
-    assert_eq!(scratch.listed(), clips);
+    let unlisted = clips.each_ref().map(unlisted);
+    assert_eq!(scratch.open().1, unlisted);
+    assert_eq!(scratch.listed(), unlisted);
 }
 
 #[test]
@@ -110,6 +113,54 @@ fn replacing_keeps_what_is_to_be_kept() {
     assert_eq!(folder.replace(&[]).unwrap(), 2);
     assert_eq!(folder.replace(&[]).unwrap(), 0);
     assert!(scratch.files().is_empty() && scratch.listed().is_empty());
+}
+
+#[test]
+fn a_replacement_that_dies_at_any_step_is_completed_or_never_begun() {
+    let mut died = 0;
+    for last in 0.. {
+        let scratch = Scratch::new();
+        let (mut folder, _) = scratch.open();
+        let [a, keep, c] = ["a", "b", "c"].map(|stem| record(&mut folder, stem));
+        steps::restart(last);
+        let replaced = folder.replace(std::slice::from_ref(&keep));
+        steps::restart(usize::MAX);
+        drop(folder);
+        let (mut folder, found) = scratch.open();
+        assert!(found.is_empty(), "died after {last} steps, and {} clips are found that no list named", found.len());
+        let listed = scratch.listed();
+        match listed.len() {
+            1 => assert_eq!((&listed[0], scratch.files()), (&keep, vec!["b.jpg".to_owned(), "b.mcap".to_owned()])),
+            _ => assert_eq!((listed, scratch.files().len()), (vec![a, keep, c], 6), "died after {last} steps"),
+        }
+        // What is noted does not outlive the next clip of the same name.
+        let next = record(&mut folder, "a");
+        drop(folder);
+        assert!(scratch.open().1.is_empty());
+        assert!(scratch.listed().contains(&next) && scratch.path(next.file.to_str().unwrap()).is_file());
+        died += usize::from(replaced.is_err());
+        if replaced.is_ok() {
+            break;
+        }
+    }
+    assert!(died > 6, "it died {died} times");
+}
+
+#[test]
+fn a_note_of_others_deletes_no_more_than_a_list_does() {
+    let scratch = Scratch::new();
+    let (mut folder, _) = scratch.open();
+    let clip = record(&mut folder, "a");
+    drop(folder);
+    let victims = ["x.mcap", "clips/notes.txt"].map(|name| scratch.path(name));
+    victims.iter().for_each(|victim| fs::write(victim, b"precious").unwrap());
+    let files = ["clips/a.mcap", "clips/../x.mcap", "../x.mcap", "clips/notes.txt"];
+    let lines = files.map(|file| format!("{{\"file\":\"{file}\",\"thumbnail\":\"clips/../x.jpg\"}}\n")).concat();
+    fs::write(scratch.path("clips/.replaced"), lines + "no line").unwrap();
+    assert!(scratch.open().1.is_empty());
+    assert!(scratch.path(clip.file.to_str().unwrap()).is_file(), "the list names it");
+    assert!(victims.iter().all(|victim| fs::read(victim).unwrap() == b"precious"));
+    assert!(!scratch.path("clips/.replaced").exists());
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Clip, ClipLambda, Moment, TriggerKind};
+use gleaner_protocol::{Clip, ClipLambda, Moment, Recovered, TriggerKind};
 use gleaner_transport::{Endian, Guid, SampleMeta};
 
 use super::{About, Ending, Folder, Topic, TopicCounts, Unfinished};
@@ -128,6 +128,12 @@ fn ending() -> Ending {
         journals: vec![("hello".to_owned(), b"a journal".to_vec())],
         headers: Vec::new(),
     }
+}
+
+/// The clip as the next start lists it, if its recorder died before.
+fn unlisted(clip: &Clip) -> Clip {
+    let what = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
+    Clip { recovered: Some(Recovered { lost_bytes: 0, what }), ..clip.clone() }
 }
 
 /// Adds messages `from..to` of the IMU, four a second from second 10 on.

@@ -101,7 +101,7 @@ fn zeros_that_a_loss_of_power_left_at_the_end_are_torn_and_no_damage() {
 }
 
 #[test]
-fn a_long_journal_is_written_in_blocks_of_32_kib() {
+fn a_long_journal_is_written_in_blocks_of_256_wakes() {
     let entries = usual_entries(2, 20_000);
     let bytes = journal(&header(2), &entries, usize::MAX);
     let mut at = PREAMBLE_LEN;
@@ -112,8 +112,9 @@ fn a_long_journal_is_written_in_blocks_of_32_kib() {
         lengths.push(head.len as usize);
         at += HEAD_LEN + head.len as usize;
     }
-    let wakes = &lengths[1..lengths.len() - 2];
-    assert!(wakes.len() >= 8 && wakes.iter().all(|len| (32_000..33_000).contains(len)), "{lengths:?}");
+    let wakes = &lengths[1..lengths.len() - 1];
+    assert_eq!(wakes.len(), 20_000_usize.div_ceil(256), "{lengths:?}");
+    assert!(wakes.iter().all(|len| (256..32_000).contains(len)), "{lengths:?}");
 }
 
 /// Takes so many bytes, then fails in the middle of a write.

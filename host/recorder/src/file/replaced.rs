@@ -1,0 +1,62 @@
+//! `clips/.replaced`: the clips that a replay is about to delete, noted before the list loses them. It is gone once they are.
+
+use std::collections::HashSet;
+use std::io;
+use std::path::Path;
+
+use gleaner_protocol::own_file;
+use tracing::warn;
+
+use super::durable;
+use super::list::{List, Listed, read_lines};
+use super::place::CLIPS;
+use crate::error::RecordError;
+
+const NOTE: &str = ".replaced";
+
+/// Notes in the folder of clips that these go.
+pub(super) fn note(folder: &Path, doomed: &[Listed]) -> Result<(), RecordError> {
+    if doomed.is_empty() {
+        return Ok(());
+    }
+    let lines: Vec<u8> = doomed.iter().flat_map(line).collect();
+    durable::write(&folder.join(".replaced.part"), &folder.join(NOTE), folder, &lines)
+}
+
+/// A line as the list has it, as far as it names files.
+fn line(Listed { file, thumbnail }: &Listed) -> Vec<u8> {
+    let path = |name: &String| format!("{CLIPS}/{name}");
+    let line = serde_json::json!({ "file": path(file), "thumbnail": thumbnail.as_ref().map(path) });
+    format!("{line}\n").into_bytes()
+}
+
+/// Deletes the noted clips, and returns how many these were. Clips that the list names stay: the process died before it wrote the
+/// list.
+pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
+    let path = folder.join(NOTE);
+    let cannot_read = |source| RecordError::Read { path: path.clone(), source };
+    let note = match own_file::read(&path) {
+        Ok(note) => note,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
+        Err(error) => return Err(cannot_read(error)),
+    };
+    let (doomed, _, _) = read_lines(&note, |_| Ok(())).map_err(cannot_read)?;
+    let listed: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
+    let mut deleted = 0;
+    for Listed { file, thumbnail } in doomed.iter().filter(|doomed| !listed.contains(&doomed.file)) {
+        // The thumbnail first: one without its clip would belong to nothing.
+        let thumbnail = thumbnail.as_ref().map_or(Ok(false), |thumbnail| durable::remove(&folder.join(thumbnail)));
+        match thumbnail.and_then(|_| durable::remove(&folder.join(file))) {
+            Ok(was_there) => deleted += u64::from(was_there),
+            // A folder of this name, for example: it stays, and is no clip of the list any more.
+            Err(error) => {
+                warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, left alone");
+            }
+        }
+    }
+    durable::sync_folder(folder)?;
+    // A clip of the same name may come next: the note must not outlive it.
+    durable::remove(&path)?;
+    durable::sync_folder(folder)?;
+    Ok(deleted)
+}

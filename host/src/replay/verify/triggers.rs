@@ -1,0 +1,79 @@
+//! The triggers of a clip, compared with those of its journal.
+
+use gleaner_protocol::journal::{Difference, Entry};
+use gleaner_protocol::{Moment, excerpt};
+use gleaner_recorder::Stated;
+
+use super::counts_differ;
+
+/// As many triggers as a clip keeps.
+const KEPT: usize = 10_000;
+
+/// The triggers in the part of a journal.
+pub(super) struct Triggers {
+    lambda: String,
+    pub(super) count: u64,
+    /// The first of them.
+    moments: Vec<Moment>,
+    /// Stamps of the first and the last wake.
+    span: Option<(i64, i64)>,
+}
+
+impl Triggers {
+    pub(super) fn of(lambda: &str) -> Self {
+        Self { lambda: lambda.to_owned(), count: 0, moments: Vec::new(), span: None }
+    }
+
+    /// Adds those of a wake.
+    pub(super) fn add(&mut self, entry: &Entry) {
+        let (first, _) = self.span.unwrap_or((entry.at_ns, entry.at_ns));
+        self.span = Some((first, entry.at_ns));
+        for trigger in &entry.triggers {
+            self.count += 1;
+            if self.moments.len() < KEPT {
+                self.moments.push(Moment::of(&self.lambda, trigger, entry.at_ns));
+            }
+        }
+    }
+
+    /// The first difference between these and the triggers that the clip names.
+    pub(super) fn differ(&self, stated: &Stated) -> Option<Difference> {
+        let clip = stated.clip();
+        // In `short`, a clip states that its journal lacks wakes; the triggers of these cannot be made again.
+        let lacking = format!("the journal of {} lacks ", self.lambda);
+        let is_short = clip.short.iter().any(|why| why.starts_with(&lacking));
+        let is_here = |at_ns: i64| !is_short || self.span.is_some_and(|(first, last)| (first..=last).contains(&at_ns));
+        // A command is no trigger of the lambda: its journal does not have it.
+        let ours = |moment: &&Moment| moment.lambda == self.lambda && moment.source.is_none();
+        let mut named = stated.moments().iter().filter(ours).filter(|moment| is_here(moment.at_ns));
+        let mut made = self.moments.iter();
+        // The limit of the clip is for all its lambdas.
+        let is_full = stated.moments().len() >= KEPT;
+        for number in 1.. {
+            let (journal, now) = (made.next(), named.next());
+            if now.is_none() && (journal.is_none() || is_full) {
+                break;
+            }
+            let record = format!("record gleaner.decision of trigger {number} of lambda `{}`", self.lambda);
+            let label = |moment: &Moment| {
+                excerpt(&format!("{} `{}` at {} ns", moment.kind.as_str(), moment.label, moment.at_ns))
+            };
+            let (what, journal, now) = match (journal, now) {
+                (Some(journal), Some(now)) => match journal.differs_from(now) {
+                    None => continue,
+                    Some((key, [journal, now])) => (format!("`{key}` of {record}"), excerpt(&journal), excerpt(&now)),
+                },
+                (journal, now) => {
+                    let side = |moment: Option<&Moment>| moment.map_or_else(|| "none".to_owned(), label);
+                    (record, side(journal), side(now))
+                }
+            };
+            return Some(Difference { what, journal, now });
+        }
+        let others = stated.moments().iter().filter(|moment| !ours(moment)).count() as u64;
+        match is_short || is_full && others > 0 {
+            true => None,
+            false => counts_differ("`triggers` of record gleaner.clip", self.count + others, clip.triggers),
+        }
+    }
+}
