@@ -8,19 +8,27 @@ use std::io;
 use std::ptr::{self, NonNull};
 
 use gleaner_buffers::Region;
+#[cfg(target_env = "gnu")]
+use gleaner_vitals::own::LARGE_BYTES;
 use rustix::mm::{MapFlags, ProtFlags, mmap_anonymous, munmap};
 
-/// From this size on the allocator maps a block and gives it back when it is freed, as it does before it learns otherwise.
-#[cfg(target_env = "gnu")]
-const LARGE_BLOCK_BYTES: libc::c_int = 128 << 10;
-
-/// Keeps the allocator from holding on to large blocks. Call it once, at the start of a program.
+/// Keeps the allocator from holding on to large blocks: it maps each and gives it back when it is freed, as it does before it learns
+/// otherwise. Call it once, at the start of a program.
 pub fn give_large_blocks_back() {
     #[cfg(target_env = "gnu")]
     // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only for a parameter it does not know,
     // and then nothing has changed.
     unsafe {
-        libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BLOCK_BYTES);
+        libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BYTES as libc::c_int);
+    }
+}
+
+/// Gives back to the system what the allocator keeps of memory that was freed.
+pub fn give_freed_back() {
+    #[cfg(target_env = "gnu")]
+    // SAFETY: `malloc_trim` takes a number by value, and locks what it gives back, which nothing uses.
+    unsafe {
+        libc::malloc_trim(0);
     }
 }
 

@@ -235,7 +235,12 @@ fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
         #[cfg(feature = "python")]
         Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(&asked.lambda, &args, around);
+            let error = crate::guest::python::become_interpreter(
+                &asked.lambda,
+                asked.build.entry_path(manifest),
+                &args,
+                around,
+            );
             Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]
@@ -278,8 +283,10 @@ fn watched<'a>(
             Bounds::Replay => Patience::replay(limits.init_deadline, limits.deadline),
             Bounds::Live(deadline) => Patience::live(limits.init_deadline, deadline),
         };
+        // A component's is counted as it grows.
+        let memory = (manifest.lambda.kind == Kind::Python).then_some(limits.memory.bytes());
         let guest = load(asked, manifest, session, bounds)?;
-        Ok(Box::new(Watched::new(guest, Arc::clone(isolation), patience)) as _)
+        Ok(Box::new(Watched::new(guest, Arc::clone(isolation), patience, memory)) as _)
     }
 }
 

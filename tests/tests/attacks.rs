@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, Stdio};
 
-use gleaner_protocol::{Decision, FaultKind, Live, Report};
+use gleaner_protocol::{Decision, Exit, FaultKind, Live, Report};
 use gleaner_tests::live::{Line, Started, decisions, run};
 use gleaner_tests::{Folder, namespace, root};
 use libtest_mimic::{Arguments, Trial};
@@ -24,9 +24,11 @@ enum Fate {
     Cut,
     /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault of kind `killed`, with these words.
     Killed(&'static str),
+    /// The process cannot go on, says why and ends, each time that it is started. Nobody killed it, and the run has not gone well.
+    Broken,
 }
 
-use Fate::{Cut, Fault, Killed, Refused};
+use Fate::{Broken, Cut, Fault, Killed, Refused};
 use FaultKind::{Deadline, Exception, Fuel, HostCall, Memory, Trap};
 
 /// An attack, and its fate in WebAssembly and in Python; none where the language has no words for it.
@@ -35,6 +37,9 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("host_calls", Some(Fault(Fuel)), Some(Fault(Deadline))),
     ("recurse", Some(Fault(Trap)), Some(Fault(Exception))),
     ("memory", Some(Fault(Memory)), Some(Fault(Memory))),
+    ("read_only_memory", None, Some(Killed("needed more memory"))),
+    ("page_tables", None, Some(Killed("needed more memory"))),
+    ("threads", None, Some(Killed("threads, and may have 512"))),
     ("full", None, Some(Killed("needed more memory"))),
     ("log_flood", Some(Cut), Some(Cut)),
     // Even the event that says so is refused then.
@@ -61,13 +66,22 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("lease", None, Some(Refused("Operation not permitted"))),
     ("in_flight", None, Some(Refused("Operation not permitted"))),
     ("watch", None, Some(Refused("PermissionError(1"))),
+    ("timer", None, Some(Refused("PermissionError(1"))),
+    ("descriptors", None, Some(Refused("Too many open files"))),
+    ("large_pipe", None, Some(Refused("Operation not permitted"))),
+    ("settings", None, Some(Refused("Permission denied"))),
     ("replace", None, Some(Refused("Operation not permitted"))),
     ("sleep", Some(Fault(HostCall)), Some(Fault(Deadline))),
     ("swallow", None, Some(Killed("was in one wake"))),
     ("deaf", None, Some(Killed("was in one wake"))),
+    ("late", None, Some(Fault(Deadline))),
+    ("timer_off", None, Some(Fault(Deadline))),
+    ("terminate", None, Some(Killed("ended by itself"))),
+    ("stop", None, Some(Killed("was stopped by a signal"))),
     ("exit", Some(Fault(Trap)), Some(Fault(Exception))),
     ("exit_now", None, Some(Killed("ended by itself"))),
     ("abort", Some(Fault(Trap)), Some(Killed("ended by signal 6"))),
+    ("descriptors_closed", None, Some(Broken)),
     ("corrupt", None, Some(Killed("ended by signal"))),
 ];
 
@@ -129,9 +143,17 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
     let started = run(&lambda, out.path(), &["--set", &attack_set, "--set", &target]);
     let decision = fallout(&started, fate);
     // One that dies of it dies again after each start.
-    let live = (!matches!(fate, Killed(_))).then(|| until_it_goes_on(&started));
+    let live = (!matches!(fate, Killed(_) | Broken)).then(|| until_it_goes_on(&started));
     started.signal("INT");
     let finished = started.finish();
+    let code = match fate {
+        Fault(_) | Killed(_) => Some(Exit::LambdaFaulted),
+        Broken => Some(Exit::Internal),
+        Refused(_) | Cut => None,
+    };
+    if let Some(code) = code {
+        assert_eq!(finished.status.code(), Some(i32::from(code.code())), "{}", finished.said);
+    }
     println!("{attack}/{language}: {}", in_words(decision.as_ref()));
     match fate {
         Fault(kind) => {
@@ -147,6 +169,7 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
             let why = event.attributes["why"].as_str().expect("a text");
             assert!(why.contains(words) && !why.contains("unknown attack"), "{why}");
         }
+        Broken => assert!(finished.said.contains("the run broke"), "{}", finished.said),
         Cut => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
         Killed(words) => {
             let fault = decision.and_then(|decision| decision.fault).expect("a fault");
@@ -175,6 +198,13 @@ fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
         Fault(kind) => Some(fault(kind)),
         Refused(_) => Some(decision(&|decision| !decision.triggers.is_empty())),
         Killed(_) => Some(fault(FaultKind::Killed)),
+        Broken => {
+            started.until("a start after the first", |line| {
+                let is_again = |live: &Live| live.restarts > 0;
+                matches!(line, Line::Lambda(Report::Live(live) | Report::Ended(live)) if is_again(&live)).then_some(())
+            });
+            None
+        }
         Cut => None,
     }
 }

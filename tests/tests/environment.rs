@@ -79,3 +79,30 @@ fn start_up_code_of_an_environment_is_shut_in_before_it_runs() {
         assert!(said.contains("pip install numpy, or name another interpreter: GLEANER_PYTHON"), "{said}");
     }
 }
+
+#[test]
+fn an_environment_that_is_not_used_is_named_with_the_way_out() {
+    let folder = Folder::new();
+    copy_lambda("tests/lambdas/misbehave/python", &folder, "lambda", |manifest| manifest);
+    let lambda = folder.path().join("lambda");
+    let python = Parts::find().and_then(|parts| parts.python(None)).expect("there is a Python");
+    let environment = ["-m", "venv", "--copies", "--without-pip", ".venv"];
+    assert!(Command::new(python).args(environment).current_dir(&lambda).status().expect("Python starts").success());
+    let output = runtime().env_remove("GLEANER_PYTHON").arg("check").arg(&lambda).output().expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("warning: the lambda's environment is not used"), "{said}");
+    assert!(said.contains("make the environment with `python3 -m venv`, which links"), "{said}");
+}
+
+#[test]
+fn a_lambda_whose_file_is_a_pipe_is_refused_and_not_waited_for() {
+    let folder = Folder::new();
+    copy_lambda("tests/lambdas/misbehave/python", &folder, "lambda", |manifest| manifest);
+    let entry = folder.path().join("lambda/build/main.py");
+    std::fs::remove_file(&entry).unwrap();
+    assert!(Command::new("mkfifo").arg(&entry).status().expect("there is a `mkfifo`").success());
+    let output = runtime().arg("check").arg(folder.path().join("lambda")).output().expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.contains("main.py` is no file") && said.contains("gleaner build"), "{said}");
+}

@@ -2,19 +2,12 @@
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use crate::args::RunArgs;
 use crate::sibling::{network, starter};
 
 /// The runtime's arguments.
-pub(super) fn runtime(
-    args: &RunArgs,
-    has_recorder: bool,
-    offset_ns: i64,
-    left: Option<Duration>,
-    restarts: u32,
-) -> Vec<OsString> {
+pub(super) fn runtime(args: &RunArgs, has_recorder: bool, offset_ns: i64, restarts: u32) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["run".into(), format!("--clock-offset={offset_ns}").into()];
     line.extend(args.asked.settings());
     line.push(word("--out", out(args)));
@@ -22,9 +15,6 @@ pub(super) fn runtime(
         if let Some(topic) = topic {
             line.push(word(flag, topic));
         }
-    }
-    if let Some(left) = left {
-        line.push(format!("--last={}", left.as_secs().max(1)).into());
     }
     if restarts > 0 {
         line.push(format!("--restarts={restarts}").into());

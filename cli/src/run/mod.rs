@@ -8,13 +8,14 @@ mod party;
 mod process;
 mod screen;
 mod summary;
+mod undecided;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{BuildDir, Exit, Failure, Manifest};
+use gleaner_protocol::{BuildDir, Exit, Failure, Manifest, Report};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::party::{Ended, Party};
@@ -44,44 +45,76 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let started = Instant::now();
     let mut pause = PAUSE;
     let mut restarts = 0;
-    // A fault stays one, though the process that had it was replaced.
-    let mut worst = Exit::Ok;
+    let mut broken = Broken::default();
     let mut earlier = Earlier::default();
+    let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
     loop {
         let left = args.last.map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let begun = Instant::now();
         let mut party = Party::start(args, largest, offset_ns, left, restarts)?;
-        let (why, faulted) = match party.attend(&mut screen, &stop)? {
+        match party.attend(&mut screen, &stop)? {
             Ended::Well(exit) => {
                 earlier.complete(party.last(), &arguments::out(args))?;
-                return Ok(if exit == Exit::Ok { worst } else { exit });
+                return broken.end(exit);
             }
             // It has said why. What ran before may run again: a network may be down for a while.
             Ended::Never(exit) if restarts == 0 => return Ok(exit),
-            Ended::Never(_) => ("it could not start".to_owned(), false),
-            Ended::Broken { why, faulted } => (why, faulted),
-        };
-        if faulted {
-            worst = Exit::LambdaFaulted;
+            Ended::Never(exit) => broken.add("it could not start".to_owned(), exit == Exit::LambdaFaulted),
+            Ended::Broken { why, faulted } => broken.add(why, faulted),
         }
-        let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
         earlier.add(party.last());
-        if stop.load(Ordering::Relaxed) || is_over() {
-            earlier.complete(None, &arguments::out(args))?;
-            return Err(Failure::new(Exit::Internal, why));
-        }
         restarts += 1;
         pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
+        let why = broken.why.as_deref().unwrap_or_default();
         screen.warn(&format!("{why}; starting again in {} s (restart {restarts})", pause.as_secs()));
         let until = Instant::now() + pause;
-        while Instant::now() < until && !stop.load(Ordering::Relaxed) && !is_over() {
+        let ends = || stop.load(Ordering::Relaxed) || is_over();
+        while Instant::now() < until && !ends() {
             thread::sleep(LOOK);
         }
-        if stop.load(Ordering::Relaxed) || is_over() {
+        if ends() {
+            if let Some(decision) = undecided::add(&manifest, &arguments::out(args))? {
+                screen.decision(&decision);
+                screen.report(&Report::Decision(Box::new(decision)));
+                earlier.add_fault();
+            }
             earlier.complete(None, &arguments::out(args))?;
-            return Ok(worst);
+            return broken.end(Exit::Ok);
         }
         pause = (pause * 2).min(PAUSE_MAX);
+    }
+}
+
+/// Processes of a run that broke. Whether the run ends while one works, or in the pause before the next, it did not go well.
+#[derive(Default)]
+struct Broken {
+    /// Why the last one did.
+    why: Option<String>,
+    times: u32,
+    /// A fault stays one, though the process that had it was replaced.
+    faulted: bool,
+}
+
+impl Broken {
+    fn add(&mut self, why: String, faulted: bool) {
+        self.why = Some(why);
+        self.times += 1;
+        self.faulted |= faulted;
+    }
+
+    /// How the run ends whose last process ended with `exit`.
+    fn end(self, exit: Exit) -> Result<Exit, Failure> {
+        match self.why {
+            _ if exit != Exit::Ok => Ok(exit),
+            None => Ok(Exit::Ok),
+            Some(_) if self.faulted => Ok(Exit::LambdaFaulted),
+            Some(why) => {
+                let times = if self.times == 1 { "once".to_owned() } else { format!("{} times", self.times) };
+                let mut failure = Failure::new(Exit::Internal, format!("the run broke {times}"));
+                failure.causes = vec![why];
+                Err(failure.with_help("results are whole but for what happened between an end and the next start"))
+            }
+        }
     }
 }
 
@@ -103,4 +136,33 @@ fn clock_offset() -> i64 {
         now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec)
     };
     ns(ClockId::Realtime).saturating_sub(ns(ClockId::Monotonic))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// How a run ends in which these processes broke, and whose last one ended so.
+    fn end(broke: &[bool], exit: Exit) -> Exit {
+        let mut broken = Broken::default();
+        broke.iter().for_each(|faulted| broken.add("it ended".to_owned(), *faulted));
+        broken.end(exit).unwrap_or_else(|failure| failure.exit)
+    }
+
+    #[test]
+    fn a_run_in_which_a_process_broke_never_ends_as_if_none_had() {
+        assert_eq!(end(&[], Exit::Ok), Exit::Ok);
+        assert_eq!(end(&[], Exit::LambdaFaulted), Exit::LambdaFaulted);
+        assert_eq!(end(&[false], Exit::Ok), Exit::Internal);
+        assert_eq!(end(&[true, false], Exit::Ok), Exit::LambdaFaulted);
+        assert_eq!(end(&[false, false], Exit::LambdaFaulted), Exit::LambdaFaulted);
+    }
+
+    #[test]
+    fn how_often_a_run_broke_and_why_is_told() {
+        let mut broken = Broken::default();
+        ["a disk", "a network"].into_iter().for_each(|why| broken.add(why.to_owned(), false));
+        let failure = broken.end(Exit::Ok).unwrap_err().to_string();
+        assert!(failure.contains("the run broke 2 times") && failure.contains("a network"), "{failure}");
+    }
 }

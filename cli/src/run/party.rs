@@ -21,9 +21,6 @@ const REST: Duration = Duration::from_millis(300);
 /// Reports that may wait to be shown. Beyond that they stay in their pipe, and whoever writes them counts what does not go in.
 const UNHEARD: usize = 16;
 
-/// How much longer a process may take than it was told to run; then it is told to end, by a signal.
-const LATE: Duration = Duration::from_secs(10);
-
 /// How a run ended.
 pub(super) enum Ended {
     /// It was told to, or its time was over.
@@ -45,7 +42,7 @@ pub(super) struct Party {
     exit_record: PathBuf,
     recorder: Option<(Process, Control)>,
     ear: Ear,
-    /// How long it was told to run, once it is ready.
+    /// How long it is to run, once it is ready.
     left: Option<Duration>,
 }
 
@@ -75,7 +72,7 @@ impl Party {
             socket = Some(control.add(&add).map_err(|error| failed(&error))?);
             recorder = Some((process, control));
         }
-        let line = arguments::runtime(args, socket.is_some(), offset_ns, left, restarts);
+        let line = arguments::runtime(args, socket.is_some(), offset_ns, restarts);
         let exit_record = arguments::out(args).join(ExitRecord::FILE);
         let shim = Some(arguments::shim(args, &exit_record));
         let runtime = Process::start(&parts, "gleaner-runtime", line, socket, shim, Heard::Runtime, &say)?;
@@ -91,11 +88,13 @@ impl Party {
     pub(super) fn attend(&mut self, screen: &mut Screen, stop: &AtomicBool) -> Result<Ended, Failure> {
         let Self { runtime, exit_record, recorder, ear, left } = self;
         let mut ready: Option<Instant> = None;
+        let mut asked = false;
         let status = loop {
             ear.look(screen, LOOK);
             ready = ready.or_else(|| ear.is_ready.then(Instant::now));
-            let is_late = ready.zip(*left).is_some_and(|(ready, left)| ready.elapsed() > left.saturating_add(LATE));
-            if stop.load(Ordering::Relaxed) || is_late {
+            let is_over = ready.zip(*left).is_some_and(|(ready, left)| ready.elapsed() >= left);
+            if stop.load(Ordering::Relaxed) || is_over {
+                asked = true;
                 break runtime.end(ear, screen)?;
             }
             if let Some(status) = runtime.status()? {
@@ -125,23 +124,22 @@ impl Party {
             }
         }
         ear.listen(screen, REST);
-        // Told to end before it could listen for that.
-        let is_early = stop.load(Ordering::Relaxed) && !ear.is_ready;
+        let record = ExitRecord::read(exit_record).ok();
+        // A lambda can have its own process end as if we had asked for it. Only we, and the shim, know whether somebody did.
+        let asked = asked || stop.load(Ordering::Relaxed) || record.as_ref().is_some_and(|record| record.asked);
         Ok(match status.code().and_then(Exit::from_code) {
-            None if is_early => Ended::Well(Exit::Ok),
-            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if ear.has_ended => Ended::Well(exit),
+            // Told to end before it could listen for that.
+            None if asked && !ear.is_ready => Ended::Well(Exit::Ok),
+            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if asked && ear.has_ended => Ended::Well(exit),
             Some(exit) if !ear.is_ready && exit != Exit::Ok => Ended::Never(exit),
             _ => {
-                let record = ExitRecord::read(exit_record).ok();
                 let why = record.as_ref().and_then(ExitRecord::sentence);
-                let killed = record.is_some_and(|record| record.killed.is_some() || record.out_of_memory);
-                Ended::Broken {
-                    why: why.map_or_else(
-                        || in_words("the lambda's process", status),
-                        |why| format!("the lambda's process {why}"),
-                    ),
-                    faulted: ear.has_faulted || killed,
-                }
+                let faulted = ear.has_faulted || record.is_some_and(|record| record.is_the_lambdas());
+                let why = why.map_or_else(
+                    || in_words("the lambda's process", status),
+                    |why| format!("the lambda's process {why}"),
+                );
+                Ended::Broken { why, faulted }
             }
         })
     }

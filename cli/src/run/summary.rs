@@ -18,6 +18,13 @@ impl Earlier {
         };
     }
 
+    /// A wake ended with the last process.
+    pub(super) fn add_fault(&mut self) {
+        if let Some(counted) = &mut self.0 {
+            counted.faults += 1;
+        }
+    }
+
     /// There will be no further one. Writes the counts of all, if there were others than the last one, which has written its own:
     /// `last`, if it ended well.
     ///

@@ -82,6 +82,7 @@ pub enum NoComponent {
 
 impl NoComponent {
     /// Why `bytes` cannot be a component, if their beginning says so.
+    #[cfg(feature = "compiler")]
     pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
         match bytes.get(..8) {
             Some(b"\0asm\x01\0\0\0") => Some(Self::Module),

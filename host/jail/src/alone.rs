@@ -6,7 +6,7 @@
 use gleaner_protocol::Layer;
 
 use crate::filter::{Refused, install, install_everywhere};
-use crate::{JailError, memory};
+use crate::{JailError, memory, never};
 
 /// The name of the layer for processes.
 pub const PROCESSES: &str = "processes";
@@ -85,6 +85,7 @@ const SHARED: &[i64] = &[
     libc::SYS_fanotify_init,
     libc::SYS_fanotify_mark,
     libc::SYS_io_setup,
+    libc::SYS_timer_create,
     libc::SYS_sync,
     libc::SYS_syncfs,
     FCHMODAT2,
@@ -112,13 +113,17 @@ const SETXATTRAT: i64 = 463;
 const REMOVEXATTRAT: i64 = 466;
 const FILE_SETATTR: i64 = 469;
 
-/// Requests of `fcntl` that have the kernel send signals to others, and leases and watches, for which others wait.
-const REQUESTS_OF_FILES: [u64; 5] = [8, 10, 15, 1024, 1026];
+/// Requests of `fcntl` that have the kernel send signals to others, leases and watches, for which others wait, and larger pipes, of
+/// which a user has a few.
+const REQUESTS_OF_FILES: [u64; 6] = [8, 10, 15, 1024, 1026, 1031];
 /// Requests of `ioctl`: the same for sockets, and typing into somebody's terminal.
 const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
 
 /// Types of sockets that DDS has no use for: streams above all, which may connect.
 const TYPES: [u64; 5] = [1, 4, 5, 6, 10];
+
+/// Descriptors that a process may still open: a drive's files again, modules, and what the transport makes for a new writer.
+const MORE_FILES: u64 = 512;
 
 /// Families of sockets that Linux knows, with some to come.
 const FAMILIES: i32 = 64;
@@ -136,6 +141,8 @@ const TYPE: u64 = 0xf;
 ///
 /// [`JailError::Loose`] if filters work here and another thread of this process cannot have this one: then nothing holds it.
 pub fn stay(only_counted_memory: bool) -> Result<Vec<Layer>, JailError> {
+    // An epoll can watch each of the others, and of these watches the user has a few: so many descriptors can make 70,000 of them.
+    never::open_files_beyond(MORE_FILES);
     Ok(match install_all(only_counted_memory) {
         Ok(()) => vec![
             Layer::yes(PROCESSES, "seccomp: no new ones, no programs, no signals to others"),

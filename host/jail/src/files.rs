@@ -17,9 +17,19 @@ pub const NAME: &str = "files";
 const RULES: ABI = ABI::V6;
 
 /// Programs and libraries, and what they read to begin: nothing in them is somebody's secret. Not `/etc`, but for what the
-/// loader and the calendar need.
-const SYSTEM: [&str; 14] = [
-    "/usr",
+/// loader and the calendar need, and not `/usr/local/etc`, where installed programs keep tokens.
+const SYSTEM: [&str; 24] = [
+    "/usr/bin",
+    "/usr/lib",
+    "/usr/lib32",
+    "/usr/lib64",
+    "/usr/libexec",
+    "/usr/share",
+    "/usr/local/bin",
+    "/usr/local/cuda",
+    "/usr/local/lib",
+    "/usr/local/lib64",
+    "/usr/local/share",
     "/lib",
     "/lib64",
     "/bin",

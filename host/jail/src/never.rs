@@ -159,13 +159,29 @@ fn core_dumps() -> Layer {
 fn open_files() -> Layer {
     const NAME: &str = "open files";
     const MOST: u64 = 4096;
-    let now = getrlimit(Resource::Nofile);
-    let most = now.maximum.map_or(MOST, |maximum| maximum.min(MOST));
-    let current = now.current.map_or(most, |current| current.min(most));
-    match setrlimit(Resource::Nofile, Rlimit { current: Some(current), maximum: Some(most) }) {
-        Ok(()) => Layer::yes(NAME, format!("{most} at most")),
+    match limit_files(MOST) {
+        Ok(most) => Layer::yes(NAME, format!("{most} at most, and fewer once a lambda is in")),
         Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
     }
+}
+
+/// From now on this process can open only `more` files beyond those that it has. Where its own cannot be counted, the limit stays.
+pub(crate) fn open_files_beyond(more: u64) {
+    let highest = std::fs::read_dir("/proc/self/fd")
+        .ok()
+        .and_then(|open| open.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse::<u64>().ok()).max());
+    if let Some(highest) = highest {
+        // It can only become smaller, which is never refused.
+        let _ = limit_files(highest.saturating_add(more));
+    }
+}
+
+fn limit_files(most: u64) -> rustix::io::Result<u64> {
+    let now = getrlimit(Resource::Nofile);
+    let most = now.maximum.map_or(most, |maximum| maximum.min(most));
+    let current = now.current.map_or(most, |current| current.min(most));
+    setrlimit(Resource::Nofile, Rlimit { current: Some(current), maximum: Some(most) })?;
+    Ok(most)
 }
 
 fn calls() -> Layer {

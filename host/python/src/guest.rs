@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 use gleaner_host::api::Session;
 use gleaner_host::api::data::Wake;
 use gleaner_host::api::log::LINE_BYTES;
-use gleaner_host::guest::{Guest, Outcome};
-use gleaner_host::program;
+use gleaner_host::guest::{Guest, Outcome, is_late};
 use gleaner_host::stage::Bounds;
+use gleaner_host::{memory, program};
 use gleaner_protocol::manifest::{Limits, Manifest, Schedule};
 use gleaner_protocol::{Fault, FaultKind};
 use pyo3::call::PyCallArgs;
@@ -161,12 +161,17 @@ impl PythonGuest {
     ) -> Result<Bound<'py, PyAny>, Raised> {
         let started = Instant::now();
         let ended = self.host.bind(py).call_method1(intern!(py, "attempt"), call)?;
+        let elapsed = started.elapsed();
         match ended.extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>, Bound<'py, PyString>)>()? {
+            // The signal never came: a lambda can ignore it, block it, or switch its timer off.
+            (_, None, _) if !allowed.is_zero() && is_late(elapsed, allowed) => {
+                Err(Raised::late("the call came back by itself, too late", elapsed, allowed))
+            }
             (result, None, _) => Ok(result),
             (_, Some(told), kind) => {
                 let told = told.to_string_lossy().into_owned();
                 Err(match &*kind.to_string_lossy() {
-                    "deadline" => Raised::late(&told, started.elapsed(), allowed),
+                    "deadline" => Raised::late(&told, elapsed, allowed),
                     "memory" => {
                         Raised { kind: FaultKind::Memory, told, used: None, allowed: Some(self.allowed.memory) }
                     }
@@ -245,6 +250,15 @@ impl Guest for PythonGuest {
             self.tidy(py);
             Outcome { result, fuel: None, run_ns: None }
         })
+    }
+
+    fn discard(&mut self) {
+        Python::attach(|py| {
+            self.live = None;
+            // All objects, since the wake that was one too many may have left cycles.
+            let _ = self.host.call_method1(py, "tidy", (0,));
+        });
+        memory::give_freed_back();
     }
 
     fn engine(&self) -> String {

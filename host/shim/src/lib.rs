@@ -1,13 +1,14 @@
 //! `gleaner-shim [OPTIONS] -- PROGRAM ARGUMENTS...`: the parent of every runtime, whoever wants it started.
 //!
 //! It takes from itself, and so from the runtime, what no lambda's process needs; hands on a small part of its environment;
-//! kills the runtime when it does not come back from a lambda in time; ends what the runtime left behind; and writes down how it
+//! kills the runtime when it does not come back from a lambda in time, is stopped, or takes more memory or threads than it may; ends what the runtime left behind; and writes down how it
 //! ended. Its own exit is that of the runtime. It has one thread, allocates next to nothing, and looks ten times a second.
 //!
 //! It lives as long as its runtime, even if whoever started it goes away; with `--starter` it then asks the runtime to end.
 
 mod environment;
 mod left_behind;
+mod look;
 mod signals;
 mod watch;
 
@@ -138,10 +139,15 @@ fn end_with(starter: u32) -> Result<(), Failure> {
 
 /// Ends this process as the runtime ended.
 fn end_alike(record: &ExitRecord) -> ExitCode {
-    if let Some(killed) = &record.killed {
+    // Where the lambda could be made to fit, the user should read how, whichever of us ended it.
+    let help = match &record.killed {
+        Some(killed) => Some(killed.help()),
+        None => record.out_of_memory.then_some("keep less, or raise `memory` in [limits]"),
+    };
+    if let Some((help, why)) = help.zip(record.sentence()) {
         let mut failure = Failure::new(Exit::LambdaFaulted, "the lambda was killed");
-        failure.causes = vec![format!("its process {}", killed.sentence())];
-        eprintln!("{}", failure.with_help("raise `deadline` in [limits], or do less in one wake"));
+        failure.causes = vec![format!("its process {why}")];
+        eprintln!("{}", failure.with_help(help));
         return Exit::LambdaFaulted.code().into();
     }
     if let Some(signal) = record.signal {

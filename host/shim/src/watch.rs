@@ -13,13 +13,11 @@ use nix::sys::time::TimeValLike;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open};
 
+use crate::look::Look;
 use crate::signals::{Signals, time_of_day_ns};
 
-/// What is found late twice, so far apart, is late. Where the whole machine stood still, or all of us were stopped, whoever was about
-/// to come back has so much time to do so.
-const AGAIN: Duration = Duration::from_millis(100);
-/// Looks that are further apart than this do not count as two: we stood still ourselves.
-const ASLEEP: Duration = Duration::from_secs(1);
+/// How long to wait for the end of what was killed, before it is killed again.
+const UNTIL_GONE: Duration = Duration::from_millis(100);
 
 /// A runtime that has been started.
 pub(crate) struct Watched {
@@ -35,6 +33,7 @@ pub(crate) struct Ended {
     status: ExitStatus,
     killed: Option<Killed>,
     out_of_memory: bool,
+    asked: bool,
     /// Removed last: what was left behind is still in it.
     _group: Option<Group>,
 }
@@ -45,25 +44,16 @@ impl Watched {
         let pid = Pid::from_child(&self.child);
         let process = pidfd_open(pid, PidfdFlags::empty())?;
         let mut killed = None;
-        let mut late_since: Option<Instant> = None;
+        let mut look = Look::at(self.child.id());
         let mut asked: Option<Instant> = None;
         loop {
-            let patience = match self.pulse.overdue() {
-                Ok(late) => {
-                    let waited = late_since.map(|since| since.elapsed()).filter(|waited| *waited < ASLEEP);
-                    if waited.is_none() {
-                        late_since = Some(Instant::now());
-                    }
-                    if waited.is_some_and(|waited| waited >= AGAIN) {
-                        killed = killed.or(Some(late));
-                        kill_process(pid, Signal::KILL)?;
-                    }
-                    AGAIN
+            let patience = match look.again(&self.pulse) {
+                Ok(why) => {
+                    killed = killed.or(Some(why));
+                    kill_process(pid, Signal::KILL)?;
+                    UNTIL_GONE
                 }
-                Err(patience) => {
-                    late_since = None;
-                    patience
-                }
+                Err(patience) => patience,
             };
             if asked.is_some_and(|asked| asked.elapsed() >= UNTIL_KILLED) {
                 kill_process(pid, Signal::KILL)?;
@@ -87,7 +77,7 @@ impl Watched {
                 // It may have come back, or ended by itself, just before it was killed.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
                 let pid = self.child.id();
-                return Ok(Ended { pid, status, killed, out_of_memory, _group: self.group });
+                return Ok(Ended { pid, status, killed, out_of_memory, asked: asked.is_some(), _group: self.group });
             }
         }
     }
@@ -109,6 +99,7 @@ impl Ended {
             max_rss_bytes: usage.map_or(0, |usage| u64::try_from(usage.max_rss()).unwrap_or(0) * 1024),
             cpu_ns: u64::try_from(cpu).unwrap_or(0) * 1000,
             left_behind,
+            asked: self.asked,
         }
     }
 }

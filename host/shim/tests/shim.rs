@@ -1,14 +1,16 @@
 //! The shim as a program, around small programs that stand for a runtime.
 
 use std::fs;
+use std::hint::black_box;
 use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
-use gleaner_protocol::{Doing, ExitRecord, Holds, Layer};
-use gleaner_vitals::{PULSE_ENV, Pulse};
-use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+use gleaner_protocol::{Doing, ExitRecord, Holds, Killed, Layer, Why};
+use gleaner_vitals::usage::Process;
+use gleaner_vitals::{PULSE_ENV, Pulse, Share};
+use rustix::process::{Pid, Resource, Rlimit, Signal, getpid, kill_process, setrlimit, test_kill_process};
 
 const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
 
@@ -60,6 +62,7 @@ fn the_exit_code_is_that_of_the_runtime_and_is_written_down() {
     let written = record.read();
     assert_eq!((written.code, written.signal, written.killed, written.left_behind), (Some(7), None, None, 0));
     assert!(written.ended_ns > written.started_ns && written.max_rss_bytes > 0);
+    assert!(!written.asked);
 }
 
 #[test]
@@ -76,7 +79,7 @@ fn a_signal_to_the_shim_reaches_the_runtime() {
     let (mut shim, _) = start(&record, "trap 'exit 5' TERM; echo ready; while :; do sleep 0.01; done");
     kill_process(pid(shim.id()), Signal::TERM).unwrap();
     assert_eq!(shim.wait().unwrap().code(), Some(5));
-    assert_eq!(record.read().code, Some(5));
+    assert_eq!((record.read().code, record.read().asked), (Some(5), true));
 }
 
 #[test]
@@ -88,31 +91,95 @@ fn what_a_runtime_leaves_behind_is_ended_even_in_a_session_of_its_own() {
     assert!(record.read().left_behind >= 1);
 }
 
-#[test]
-fn what_does_not_come_back_is_killed_and_the_record_says_what_it_did() {
-    let record = Record::of("late");
+/// Runs the test `name` of this program below a shim, which kills it. Gives why, and what was said.
+#[track_caller]
+fn killed(name: &str) -> (Killed, String) {
+    let record = Record::of(name);
     let me = std::env::current_exe().unwrap();
-    let hang = [me.to_str().unwrap(), "--exact", "a_runtime_that_hangs"];
-    let output = shim(&record, &hang).stdout(Stdio::null()).output().unwrap();
-    assert_eq!(output.status.code(), Some(6), "{}", String::from_utf8_lossy(&output.stderr));
-    let killed = record.read().killed.unwrap();
-    assert_eq!((killed.doing, killed.at_ns, killed.allowed_ns), (Doing::Wake, 42, 50_000_000));
-    assert!(killed.ran_ns >= killed.allowed_ns);
+    let runtime = [me.to_str().unwrap(), "--exact", name];
+    let output = shim(&record, &runtime).stdout(Stdio::null()).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
-    assert!(said.contains(&format!("its process {}", killed.sentence())), "{said}");
+    assert_eq!(output.status.code(), Some(6), "{said}");
+    let killed = record.read().killed.unwrap();
+    assert!(said.contains(&format!("its process {}", killed.sentence())) && said.contains(killed.help()), "{said}");
+    (killed, said)
 }
 
-/// What the test before starts, this program being the runtime. By itself it is over at once.
-#[test]
-fn a_runtime_that_hangs() {
-    if std::env::var_os(PULSE_ENV).is_none() {
-        return;
-    }
-    let pulse = Pulse::inherited().unwrap();
-    let _busy = pulse.busy(Doing::Wake, Duration::from_millis(50), 42);
+/// The page of the shim, in a test that [`killed`] starts as a runtime. By itself such a test is over at once.
+fn below_shim() -> Option<Pulse> {
+    std::env::var_os(PULSE_ENV).map(|_| Pulse::inherited().unwrap())
+}
+
+fn hang() -> ! {
     loop {
         std::thread::park();
     }
+}
+
+#[test]
+fn what_does_not_come_back_is_killed_and_the_record_says_what_it_did() {
+    let (killed, _) = killed("a_runtime_that_hangs");
+    assert_eq!((killed.doing, killed.at_ns, killed.allowed_ns), (Doing::Wake, 42, 50_000_000));
+    assert!(killed.why == Why::Late && killed.ran_ns >= killed.allowed_ns, "{killed:?}");
+}
+
+#[test]
+fn a_runtime_that_hangs() {
+    let Some(pulse) = below_shim() else { return };
+    let _busy = pulse.busy(Doing::Wake, Duration::from_millis(50), 42);
+    hang();
+}
+
+#[test]
+fn a_runtime_that_was_stopped_between_two_wakes_is_killed_though_nothing_is_overdue() {
+    let (killed, said) = killed("a_runtime_that_stops_itself");
+    assert_eq!((killed.doing, killed.why), (Doing::Rounds, Why::Stopped));
+    assert!(killed.ran_ns >= killed.allowed_ns && !said.contains("deadline"), "{killed:?}, {said}");
+}
+
+#[test]
+fn a_runtime_that_stops_itself() {
+    let Some(pulse) = below_shim() else { return };
+    pulse.alive(Duration::from_secs(3600));
+    kill_process(getpid(), Signal::STOP).unwrap();
+    hang();
+}
+
+#[test]
+fn a_runtime_that_keeps_more_memory_than_its_lambda_may_is_killed_with_both_numbers() {
+    const MAY: u64 = 1 << 20;
+    let (killed, _) = killed("a_runtime_that_keeps_memory");
+    let Why::Memory { used, allowed } = killed.why else { panic!("{killed:?}") };
+    assert!(allowed == MAY && used > 40 << 20, "{used} of {allowed}");
+}
+
+#[test]
+fn a_runtime_that_keeps_memory() {
+    let Some(pulse) = below_shim() else { return };
+    let base = Process::seen(None).unwrap().held;
+    pulse.set_share(Share { base, most: 1 << 20 });
+    let kept = black_box(vec![1_u8; 48 << 20]);
+    pulse.alive(Duration::from_secs(3600));
+    black_box(&kept);
+    hang();
+}
+
+#[test]
+fn memory_that_the_limit_of_data_does_not_count_any_more_is_counted_still() {
+    let (killed, _) = killed("a_runtime_with_more_than_its_limit_of_data");
+    let Why::Memory { used, allowed } = killed.why else { panic!("{killed:?}") };
+    assert!(allowed == 8 << 20 && used > 128 << 20, "{used} of {allowed}");
+}
+
+#[test]
+fn a_runtime_with_more_than_its_limit_of_data() {
+    let Some(pulse) = below_shim() else { return };
+    let kept = black_box(vec![1_u8; 128 << 20]);
+    let bound = Some(8 << 20);
+    setrlimit(Resource::Data, Rlimit { current: bound, maximum: bound }).unwrap();
+    pulse.alive(Duration::from_secs(3600));
+    black_box(&kept);
+    hang();
 }
 
 #[test]

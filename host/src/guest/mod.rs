@@ -8,10 +8,12 @@ pub mod wasm;
 #[cfg(feature = "python")]
 pub mod python;
 
+mod meter;
 pub mod watched;
 pub mod worker;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use gleaner_protocol::signals::Curve;
 use gleaner_protocol::{Failure, Fault, Layer};
@@ -19,6 +21,14 @@ use gleaner_vitals::usage;
 
 use crate::api::curves::Curves;
 use crate::api::data::{Counts, Topic, Wake};
+
+/// Whether a call that came back by itself after `elapsed` is a fault, though nothing ended it when `allowed` was over. All time counts,
+/// also that in which the machine did something else.
+pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
+    /// What would have ended it comes about so late.
+    const TOLERANCE: Duration = Duration::from_millis(2);
+    elapsed > allowed.saturating_add(TOLERANCE)
+}
 
 /// A lambda that can be woken.
 pub trait Guest {
@@ -45,6 +55,9 @@ pub trait Guest {
 
     /// Runs one wake to its end.
     fn wake(&mut self, wake: Wake) -> Outcome;
+
+    /// Gives up the lambda after a wake that was good in itself, as after a fault: the next wake begins with a fresh one.
+    fn discard(&mut self) {}
 
     /// What runs the lambda, with its version: a decision is only the same again on the same.
     fn engine(&self) -> String;

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use gleaner_protocol::{Doing, Failure, Fault, FaultKind, Layer};
 
+use super::meter::Meter;
 use super::{Guest, Outcome};
 use crate::api::data::Wake;
 use crate::isolation::Isolation;
@@ -38,16 +39,29 @@ pub struct Watched {
     guest: Box<dyn Guest>,
     isolation: Arc<Isolation>,
     patience: Patience,
+    /// Memory that the lambda may take of this process, in bytes; none where its kind counts that by itself.
+    memory: Option<u64>,
+    meter: Option<Meter>,
     is_prepared: bool,
     /// The next wake begins with an `init`.
     is_new: bool,
 }
 
 impl Watched {
-    /// `guest`, which has not been entered yet.
-    pub fn new(guest: Box<dyn Guest>, isolation: Arc<Isolation>, patience: Patience) -> Self {
-        Self { guest, isolation, patience, is_prepared: false, is_new: false }
+    /// `guest`, which has not been entered yet. `memory` is what it may take of this process, in bytes, where it shares that with
+    /// our code.
+    pub fn new(guest: Box<dyn Guest>, isolation: Arc<Isolation>, patience: Patience, memory: Option<u64>) -> Self {
+        Self { guest, isolation, patience, memory, meter: None, is_prepared: false, is_new: false }
     }
+}
+
+/// The fault of a guest that came back well, and has taken too much memory for it.
+fn excess(guest: &mut dyn Guest, meter: &mut Option<Meter>) -> Option<Fault> {
+    let fault = meter.as_mut()?.fault();
+    if fault.is_some() {
+        guest.discard();
+    }
+    fault
 }
 
 /// How long what comes before a lambda may take: an environment that starts, and numpy from a cold disk.
@@ -61,6 +75,8 @@ impl Guest for Watched {
         self.guest.prepare()?;
         drop(busy);
         self.isolation.bound_memory().map_err(loose)?;
+        let meter = self.memory.map(|memory| Meter::start(memory, self.isolation.pulse())).transpose();
+        self.meter = meter.map_err(|error| loose(format!("cannot count the memory of the lambda: {error}")))?;
         self.is_prepared = true;
         Ok(())
     }
@@ -70,14 +86,23 @@ impl Guest for Watched {
             self.prepare()?;
         }
         let _busy = self.isolation.pulse().busy(Doing::Init, self.patience.init, 0);
-        self.guest.init()
+        self.guest.init()?;
+        match excess(&mut *self.guest, &mut self.meter) {
+            Some(fault) => Err(Fault { message: format!("in init: {}", fault.message), ..fault }),
+            None => Ok(()),
+        }
     }
 
     fn wake(&mut self, wake: Wake) -> Outcome {
         let Patience { init, wake: patience } = self.patience;
         let patience = if self.is_new { patience.saturating_add(init) } else { patience };
         let busy = self.isolation.pulse().busy(Doing::Wake, patience, wake.at_ns());
-        let outcome = self.guest.wake(wake);
+        let mut outcome = self.guest.wake(wake);
+        if outcome.result.is_ok()
+            && let Some(fault) = excess(&mut *self.guest, &mut self.meter)
+        {
+            outcome.result = Err(fault);
+        }
         drop(busy);
         self.is_new = outcome.result.is_err();
         outcome

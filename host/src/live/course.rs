@@ -38,21 +38,17 @@ pub(super) struct Course {
     pub(super) dds: Dds,
     pub(super) clock: Clock,
     pub(super) pulse: Pulse,
-    /// How long to run, if not until the end.
-    pub(super) last: Option<Duration>,
 }
 
 impl Course {
-    /// Goes on until `stop`, or until the time is over.
+    /// Goes on until `stop`.
     pub(super) fn run(&mut self, stop: &AtomicBool) -> Result<(), Failure> {
-        let started = self.clock.now();
-        let end = self.last.map(|last| started.saturating_add(nanoseconds(last)));
-        let mut looked = started;
+        let mut looked = self.clock.now();
         loop {
             let now = self.clock.now();
             if now.saturating_sub(looked) >= nanoseconds(ROUND) {
                 looked = now;
-                if stop.load(Ordering::Relaxed) || end.is_some_and(|end| now >= end) {
+                if stop.load(Ordering::Relaxed) {
                     return Ok(());
                 }
                 self.pulse.alive(ALIVE);

@@ -43,7 +43,7 @@ use crate::stage::{Bounds, Load, Output, Stage, not_started};
 const LOG_BYTES: u64 = 256 << 20;
 
 impl Job {
-    /// Runs the lambda until SIGTERM, or for as long as was asked, and writes reports to `reports`.
+    /// Runs the lambda until SIGTERM, and writes reports to `reports`.
     ///
     /// The exit is [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
     ///
@@ -122,7 +122,6 @@ impl Job {
             dds,
             clock,
             pulse: isolation.pulse().clone(),
-            last: wanted.last,
         };
         let ended = course.run(&stop);
         let faults = course.watch.faults();

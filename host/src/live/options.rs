@@ -3,7 +3,6 @@
 use std::io;
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use clap::Args;
 use gleaner_jail::Paths;
@@ -46,9 +45,6 @@ pub struct RunArgs {
     /// How often this lambda's process was started before: results are then added to those that are there.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub restarts: u32,
-    /// Stop after so many seconds.
-    #[arg(long, value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..))]
-    pub last: Option<u32>,
 }
 
 /// How to run.
@@ -60,7 +56,6 @@ pub(super) struct Wanted {
     pub(super) restarts: u32,
     pub(super) round_trip: Option<String>,
     pub(super) announce: Option<String>,
-    pub(super) last: Option<Duration>,
 }
 
 /// A lambda to run live.
@@ -116,7 +111,6 @@ impl Job {
             restarts: args.restarts,
             round_trip: args.rtt,
             announce: args.decisions,
-            last: args.last.map(|seconds| Duration::from_secs(seconds.into())),
         };
         Ok(Self { asked, manifest, wanted })
     }

@@ -1,6 +1,7 @@
 //! How a process of ours is doing, and what it says of itself: the same for the runtime and for the recorder.
 //!
 //! - [`log`]: lines for people, on standard error.
+//! - [`own`]: memory of our own code in a process that a lambda shares.
 //! - [`Pulse`]: what it does, and since when, for the shim that ends it if it does not come back.
 //! - [`Spreads`], [`Durations`]: how long things take, in bounded memory.
 //! - [`usage`]: memory and CPU time.
@@ -8,9 +9,10 @@
 //! What never happens here: reports to whoever started us, which are `gleaner_protocol`'s.
 
 pub mod log;
+pub mod own;
 mod pulse;
 mod spread;
 pub mod usage;
 
-pub use pulse::{Busy, PULSE_ENV, Pulse};
+pub use pulse::{Busy, PULSE_ENV, Pulse, Share};
 pub use spread::{Durations, Spreads};

@@ -12,11 +12,13 @@ use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use gleaner_protocol::{Doing, Killed};
+use gleaner_protocol::{Doing, Killed, Why};
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
 use rustix::io::{FdFlags, fcntl_getfd, fcntl_setfd};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use rustix::time::{ClockId, clock_gettime};
+
+use crate::own;
 
 /// The environment variable with the number of the page's file.
 pub const PULSE_ENV: &str = "GLEANER_PULSE";
@@ -32,6 +34,35 @@ struct Page {
     doing: AtomicU32,
     /// Not 0 once our part of the runtime was refused memory.
     full: AtomicU32,
+    /// The lambda's share of the process, in bytes: memory before it was entered, without that of our own code.
+    base: AtomicU64,
+    /// Memory that it may take beyond that; 0 if it is counted elsewhere. Written after `base`.
+    most: AtomicU64,
+    /// Memory of our own code.
+    own: AtomicU64,
+}
+
+/// What a lambda has of the memory of its process.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Share {
+    /// Memory of the process before the lambda was entered, without that of our own code, in bytes.
+    pub base: u64,
+    /// Memory that the lambda may take.
+    pub most: u64,
+}
+
+impl Share {
+    /// What of the memory `held` of the process is the lambda's, where our code has `own`.
+    pub fn used(self, held: u64, own: u64) -> u64 {
+        held.saturating_sub(own).saturating_sub(self.base)
+    }
+
+    /// Whether `used` is more than the lambda may have. Not all in the process can be told apart: stacks of our threads, what C
+    /// libraries of ours take, pages that are kept for the next small object, and the kernel's own rounding.
+    pub fn is_exceeded_by(self, used: u64) -> bool {
+        const TOLERANCE: u64 = 16 << 20;
+        used > self.most.saturating_add(TOLERANCE)
+    }
 }
 
 /// A view of the page. Clones see the same one.
@@ -120,6 +151,27 @@ impl Pulse {
         self.page().full.load(Ordering::Acquire) != 0
     }
 
+    /// Has the shim know the lambda's share of this process.
+    pub fn set_share(&self, share: Share) {
+        self.page().base.store(share.base, Ordering::Relaxed);
+        self.page().most.store(share.most, Ordering::Release);
+    }
+
+    /// For the shim: the lambda's share, if it has one, and what of `held` it uses.
+    pub fn share(&self, held: u64) -> Option<(Share, u64)> {
+        let page = self.page();
+        let most = page.most.load(Ordering::Acquire);
+        let share = Share { base: page.base.load(Ordering::Relaxed), most };
+        (most > 0).then(|| (share, share.used(held, page.own.load(Ordering::Relaxed))))
+    }
+
+    /// Has the shim know what our own code has taken. Takes none.
+    pub(crate) fn tell_own() {
+        if let Some(pulse) = OURS.get() {
+            pulse.page().own.store(own::held(), Ordering::Relaxed);
+        }
+    }
+
     fn over(file: impl AsFd) -> io::Result<Self> {
         // SAFETY: a new mapping at an address that the kernel chooses overlaps nothing of ours.
         let page = unsafe {
@@ -150,6 +202,7 @@ impl Pulse {
 
     fn set(&self, doing: Doing, allowed: Duration, at_ns: i64) {
         let page = self.page();
+        page.own.store(own::held(), Ordering::Relaxed);
         // Whoever reads meanwhile must not take the old allowance with the new time, or the other way round.
         page.allowed_ns.store(0, Ordering::Release);
         page.since_ns.store(now_ns(), Ordering::Release);
@@ -176,9 +229,22 @@ impl Pulse {
         }
         let ran_ns = now_ns().saturating_sub(since_ns);
         if ran_ns >= allowed_ns {
-            return Ok(Killed { doing, ran_ns, allowed_ns, at_ns });
+            return Ok(Killed { doing, ran_ns, allowed_ns, at_ns, why: Why::Late });
         }
         Err(Duration::from_nanos(allowed_ns - ran_ns).min(LOOK))
+    }
+
+    /// For the shim: what the runtime does, killed for `why`. A runtime that writes meanwhile is seen in one of both states.
+    pub fn killed(&self, why: Why) -> Killed {
+        let page = self.page();
+        let since_ns = page.since_ns.load(Ordering::Acquire);
+        Killed {
+            doing: Doing::from_number(page.doing.load(Ordering::Acquire)),
+            ran_ns: now_ns().saturating_sub(since_ns),
+            allowed_ns: page.allowed_ns.load(Ordering::Acquire),
+            at_ns: page.at_ns.load(Ordering::Acquire),
+            why,
+        }
     }
 }
 
@@ -220,5 +286,18 @@ mod tests {
         assert!(seen.overdue().is_err(), "it came back, and has some time again");
         pulse.alive(Duration::from_nanos(1));
         assert_eq!(seen.overdue().unwrap().doing, Doing::Rounds);
+    }
+
+    #[test]
+    fn a_lambda_is_charged_for_what_neither_we_nor_its_start_have_taken() {
+        let (pulse, file) = Pulse::make().unwrap();
+        let seen = Pulse::over(file.as_fd()).unwrap();
+        assert_eq!(seen.share(1 << 30), None, "it is counted elsewhere");
+        pulse.set_share(Share { base: 40 << 20, most: 64 << 20 });
+        pulse.page().own.store(10 << 20, Ordering::Relaxed);
+        let (share, used) = seen.share(100 << 20).unwrap();
+        assert_eq!(used, 50 << 20);
+        assert!(!share.is_exceeded_by(used) && share.is_exceeded_by(81 << 20));
+        assert_eq!(seen.share(20 << 20).unwrap().1, 0);
     }
 }

@@ -1,5 +1,9 @@
 //! What a process takes, as the system tells it.
 
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::FileExt;
+
 /// Resident memory of this process, in bytes; 0 where the system does not tell.
 pub fn resident() -> u64 {
     told("VmRSS:")
@@ -16,12 +20,88 @@ pub fn cpu_seconds() -> f64 {
     used.tv_sec as f64 + used.tv_nsec as f64 / 1e9
 }
 
+/// A process as `/proc` shows it.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Process {
+    /// A signal has stopped it.
+    pub is_stopped: bool,
+    /// Its threads.
+    pub threads: u64,
+    /// Memory that is its own: private pages, in RAM or swapped out, and page tables, in bytes. Pages of files count for nobody, and
+    /// shared memory is refused to a lambda.
+    pub held: u64,
+}
+
+impl Process {
+    /// The process `pid`, or this one. None where the system does not show it.
+    pub fn seen(pid: Option<u32>) -> Option<Self> {
+        Self::parse(&fs::read_to_string(of(pid, "status")).ok()?)
+    }
+
+    fn parse(status: &str) -> Option<Self> {
+        let mut seen = Self { is_stopped: false, threads: 0, held: 0 };
+        let mut has_memory = false;
+        for (name, value) in status.lines().filter_map(|line| line.split_once(':')) {
+            match name {
+                "State" => seen.is_stopped = value.trim_start().starts_with('T'),
+                "Threads" => seen.threads = value.trim().parse().ok()?,
+                "RssAnon" => {
+                    seen.held += kib(value)?;
+                    has_memory = true;
+                }
+                "VmSwap" | "VmPTE" | "HugetlbPages" => seen.held += kib(value)?,
+                _ => {}
+            }
+        }
+        has_memory.then_some(seen)
+    }
+}
+
+/// The most private writable memory that process `pid` may map, in bytes: its own limit, which it cannot raise. None if it has none.
+pub fn data_limit(pid: u32) -> Option<u64> {
+    let limits = fs::read_to_string(of(Some(pid), "limits")).ok()?;
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max data size"))?;
+    line.split_whitespace().nth(1)?.parse().ok()
+}
+
+/// Private pages of this process in RAM: most of [`Process::held`], for a tenth of its time.
+#[derive(Debug)]
+pub struct PrivatePages(File);
+
+impl PrivatePages {
+    /// Opens the list of this process.
+    ///
+    /// # Errors
+    ///
+    /// Those of opening a file of `/proc`.
+    pub fn open() -> io::Result<Self> {
+        File::open("/proc/self/statm").map(Self)
+    }
+
+    /// Their size, in bytes. None if the list cannot be read any more: a lambda in this process may have closed it.
+    pub fn bytes(&self) -> Option<u64> {
+        let mut text = [0; 128];
+        let length = self.0.read_at(&mut text, 0).ok()?;
+        let text = std::str::from_utf8(&text[..length]).ok()?;
+        let mut pages = text.split_ascii_whitespace().skip(1).map_while(|count| count.parse::<u64>().ok());
+        let (resident, shared) = (pages.next()?, pages.next()?);
+        Some(resident.saturating_sub(shared) * rustix::param::page_size() as u64)
+    }
+}
+
+fn of(pid: Option<u32>, file: &str) -> String {
+    pid.map_or_else(|| format!("/proc/self/{file}"), |pid| format!("/proc/{pid}/{file}"))
+}
+
 /// A line of `/proc/self/status`, in bytes.
 fn told(name: &str) -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix(name));
-    let kib = line.and_then(|line| line.trim().strip_suffix(" kB")).and_then(|kib| kib.parse::<u64>().ok());
-    kib.unwrap_or(0) * 1024
+    let status = fs::read_to_string(of(None, "status")).unwrap_or_default();
+    status.lines().find_map(|line| line.strip_prefix(name)).and_then(kib).unwrap_or(0)
+}
+
+/// A number of KiB, in bytes.
+fn kib(value: &str) -> Option<u64> {
+    value.trim().strip_suffix(" kB")?.parse::<u64>().ok()?.checked_mul(1024)
 }
 
 #[cfg(test)]
@@ -36,5 +116,29 @@ mod tests {
             std::hint::black_box(resident());
         }
         assert!(cpu_seconds() > before);
+    }
+
+    #[test]
+    fn memory_that_is_written_to_is_held() {
+        const BYTES: u64 = 32 << 20;
+        let pages = PrivatePages::open().unwrap();
+        let before = (pages.bytes().unwrap(), Process::seen(None).unwrap());
+        assert!(!before.1.is_stopped && before.1.threads > 0, "{before:?}");
+        let taken = std::hint::black_box(vec![1_u8; BYTES as usize]);
+        let after = (pages.bytes().unwrap(), Process::seen(Some(std::process::id())).unwrap());
+        // Other tests run beside this one, and the kernel counts in pieces.
+        let about = |more: u64| more.abs_diff(BYTES) < BYTES / 4;
+        assert!(about(after.0 - before.0) && about(after.1.held - before.1.held), "{before:?} {after:?}");
+        assert_eq!(data_limit(std::process::id()), None);
+        drop(taken);
+    }
+
+    #[test]
+    fn a_process_is_read_from_its_lines() {
+        let status = "Name:\tx\nState:\tT (stopped)\nRssAnon:\t 10 kB\nRssFile:\t 99 kB\nRssShmem:\t 9 kB\n\
+                      VmPTE:\t 2 kB\nVmSwap:\t 1 kB\nHugetlbPages:\t 4 kB\nThreads:\t3\n";
+        assert_eq!(Process::parse(status), Some(Process { is_stopped: true, threads: 3, held: 17 * 1024 }));
+        // One that has ended has no memory.
+        assert_eq!(Process::parse("Name:\tx\nState:\tZ (zombie)\nThreads:\t1\n"), None);
     }
 }

@@ -33,19 +33,50 @@ pub struct ExitRecord {
     pub cpu_ns: u64,
     /// Processes that it left behind, which were killed.
     pub left_behind: u32,
+    /// `gleaner-shim` had been asked to end it. A lambda can ask its own process only, and not the shim.
+    #[serde(default)]
+    pub asked: bool,
 }
 
-/// What a runtime was doing when it was killed for not coming back.
+/// What a runtime was doing when `gleaner-shim` killed it, and why.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Killed {
     /// What it did.
     pub doing: Doing,
-    /// How long it had been at it, in ns.
+    /// How long it had been at it, or had been stopped, in ns.
     pub ran_ns: u64,
     /// How long that may take before it is killed, in ns.
     pub allowed_ns: u64,
     /// Time of the wake, in ns of the lambda's clock; 0 if there was none.
     pub at_ns: i64,
+    /// The limit that it exceeded.
+    #[serde(default)]
+    pub why: Why,
+}
+
+/// The limit of a process that was killed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Why {
+    /// It did not come back in time.
+    #[default]
+    Late,
+    /// A signal had stopped it.
+    Stopped,
+    /// It kept more memory than it may, in bytes.
+    Memory {
+        /// Memory that it had.
+        used: u64,
+        /// Memory that it may have.
+        allowed: u64,
+    },
+    /// It had more threads than it may.
+    Threads {
+        /// Threads that it had.
+        used: u64,
+        /// Threads that it may have.
+        allowed: u64,
+    },
 }
 
 /// What a runtime is doing.
@@ -75,13 +106,54 @@ impl Doing {
 impl Killed {
     /// A sentence for people, without what was killed.
     pub fn sentence(&self) -> String {
-        let seconds = |ns: u64| ns as f64 / 1e9;
-        let what = match self.doing {
-            Doing::Rounds => "gave no sign of life",
-            Doing::Init => "was in its init",
-            Doing::Wake => "was in one wake",
+        let (ran, allowed) = (self.ran_ns as f64 / 1e9, self.allowed_ns as f64 / 1e9);
+        let what = match (self.why, self.doing) {
+            (Why::Late, Doing::Rounds) => "gave no sign of life",
+            (Why::Late, Doing::Init) => "was in its init",
+            (Why::Late, Doing::Wake) => "was in one wake",
+            (Why::Stopped, _) => "was stopped by a signal",
+            (Why::Memory { used, allowed }, _) => {
+                let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+                let (used, allowed) = (mib(used), mib(allowed));
+                return format!("needed more memory than it may have: {used:.1} MiB, of {allowed:.1} MiB");
+            }
+            (Why::Threads { used, allowed }, _) => return format!("had {used} threads, and may have {allowed}"),
         };
-        format!("{what} for {:.2} s; after {:.2} s it is killed", seconds(self.ran_ns), seconds(self.allowed_ns))
+        format!("{what} for {ran:.2} s; after {allowed:.2} s it is killed")
+    }
+
+    /// The way out.
+    pub fn help(&self) -> &'static str {
+        match (self.why, self.doing) {
+            (Why::Late, Doing::Wake) => {
+                "do less in one wake, or raise `deadline` in [limits]: a process is killed after twice that and 0.35 s; \
+                 in a replay, after 100 times that, or a minute if that is longer"
+            }
+            (Why::Late, Doing::Init) => {
+                "do less in `init`, or raise `init_deadline` in [limits]: a process is killed after twice that and \
+                 0.35 s; in a replay, after 10 times that, or a minute if that is longer"
+            }
+            (Why::Late, Doing::Rounds) => {
+                "no wake ran, so no deadline is too short: look for threads or native code of the lambda that keep its \
+                 process busy, and for a disk that does not answer"
+            }
+            (Why::Stopped, _) => {
+                "a lambda must not stop its own process, as SIGSTOP does; if it was stopped by hand, go on"
+            }
+            (Why::Memory { .. }, _) => {
+                "keep less, or raise `memory` in [limits]; what native code has taken and not freed stays taken when \
+                 the lambda is made again"
+            }
+            (Why::Threads { .. }, _) => "start fewer threads, and join those that are done",
+        }
+    }
+
+    /// What was used and what is allowed, in the unit of the limit: bytes, threads, or ns.
+    pub fn used_and_allowed(&self) -> (u64, u64) {
+        match self.why {
+            Why::Late | Why::Stopped => (self.ran_ns, self.allowed_ns),
+            Why::Memory { used, allowed } | Why::Threads { used, allowed } => (used, allowed),
+        }
     }
 }
 
@@ -98,10 +170,11 @@ impl ExitRecord {
     /// What `gleaner-shim` adds to the name of the record of the process before, which it keeps beside that of its own.
     pub const EARLIER: &'static str = ".before";
 
-    /// Whether the lambda ended the process, and not the programs around it: these tell how by their own exit codes.
+    /// Whether the lambda ended the process, and not a request from outside or the programs around it, which report failures by
+    /// their own exit codes. A process that nobody asked to end, and that ends as if it had been, is the lambda's doing.
     pub fn is_the_lambdas(&self) -> bool {
-        let is_ours = |code| Exit::from_code(code).is_some_and(|exit| exit != Exit::Ok);
-        self.killed.is_some() || self.out_of_memory || !self.code.is_some_and(is_ours)
+        let is_ours = |code| Exit::from_code(code).is_some_and(|exit| !matches!(exit, Exit::Ok | Exit::LambdaFaulted));
+        self.killed.is_some() || self.out_of_memory || !self.asked && !self.code.is_some_and(is_ours)
     }
 
     /// Why it did not end well, as the end of a sentence about the process; `None` if it did.
@@ -155,11 +228,54 @@ mod tests {
             ended_ns: 2,
             code: None,
             signal: Some(9),
-            killed: Some(Killed { doing: Doing::Wake, ran_ns: 350_000_000, allowed_ns: 350_000_000, at_ns: 5 }),
+            killed: Some(Killed {
+                doing: Doing::Wake,
+                ran_ns: 350_000_000,
+                allowed_ns: 350_000_000,
+                at_ns: 5,
+                why: Why::Late,
+            }),
             out_of_memory: false,
             max_rss_bytes: 1 << 20,
             cpu_ns: 3,
             left_behind: 0,
+            asked: false,
+        }
+    }
+
+    #[test]
+    fn a_record_of_an_earlier_version_is_read_as_one_of_a_late_process_that_was_not_asked() {
+        let mut json = serde_json::to_value(record()).unwrap();
+        json.as_object_mut().unwrap().remove("asked");
+        json["killed"].as_object_mut().unwrap().remove("why");
+        assert_eq!(serde_json::from_value::<ExitRecord>(json).unwrap(), record());
+    }
+
+    #[test]
+    fn a_process_that_ends_unasked_as_if_asked_was_ended_by_its_lambda() {
+        let ended = ExitRecord { killed: None, signal: None, code: Some(0), ..record() };
+        assert!(ended.is_the_lambdas());
+        assert!(ExitRecord { code: Some(6), ..ended.clone() }.is_the_lambdas(), "it had faulted before");
+        assert!(!ExitRecord { asked: true, ..ended.clone() }.is_the_lambdas());
+        assert!(!ExitRecord { code: Some(5), ..ended.clone() }.is_the_lambdas(), "our programs have said why");
+        assert!(ExitRecord { asked: true, killed: record().killed, ..ended }.is_the_lambdas());
+    }
+
+    #[test]
+    fn help_fits_the_limit_that_was_exceeded() {
+        let killed = |why, doing| Killed { why, doing, ..record().killed.unwrap() };
+        let memory = killed(Why::Memory { used: 96 << 20, allowed: 64 << 20 }, Doing::Wake);
+        assert_eq!(memory.sentence(), "needed more memory than it may have: 96.0 MiB, of 64.0 MiB");
+        assert_eq!(memory.used_and_allowed(), (96 << 20, 64 << 20));
+        for (why, doing, word) in [
+            (Why::Late, Doing::Wake, "raise `deadline`"),
+            (Why::Late, Doing::Init, "raise `init_deadline`"),
+            (Why::Late, Doing::Rounds, "no wake ran"),
+            (Why::Stopped, Doing::Wake, "SIGSTOP"),
+            (memory.why, Doing::Wake, "raise `memory`"),
+            (Why::Threads { used: 600, allowed: 512 }, Doing::Wake, "fewer threads"),
+        ] {
+            assert!(killed(why, doing).help().contains(word), "{why:?} {doing:?}");
         }
     }
 

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_jail::cgroup::CGROUP_ENV;
-use gleaner_protocol::{Exit, Explain, LAYERS_ENV, Parts, PartsError};
+use gleaner_protocol::{Exit, Explain, LAYERS_ENV, Looked, Parts, PartsError};
 
 use crate::isolation::{self, Inside};
 
@@ -23,6 +23,8 @@ const ONE_THREAD: [&str; 4] = ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_N
 pub enum PythonError {
     #[error(transparent)]
     Parts(#[from] PartsError),
+    #[error("`{}` is no file", entry.display())]
+    Entry { entry: PathBuf },
     #[error("cannot start `{}`", python.display())]
     Start { python: PathBuf, source: std::io::Error },
 }
@@ -31,6 +33,7 @@ impl Explain for PythonError {
     fn help(&self) -> Option<String> {
         match self {
             Self::Parts(error) => error.help(),
+            Self::Entry { .. } => Some("build the lambda again: gleaner build".to_owned()),
             Self::Start { .. } => Some("name another interpreter: GLEANER_PYTHON=/path/to/python3".to_owned()),
         }
     }
@@ -38,14 +41,18 @@ impl Explain for PythonError {
     fn exit(&self) -> Exit {
         match self {
             Self::Parts(error) => error.exit(),
-            Self::Start { .. } => Exit::Usage,
+            Self::Entry { .. } | Self::Start { .. } => Exit::Usage,
         }
     }
 }
 
-/// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for our library in it, which can open no files but
-/// those of `inside`, its own and ours, and have as much memory. Returns only errors.
-pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) -> PythonError {
+/// Becomes the interpreter that hosts the lambda in `lambda_dir`, whose file is `entry`, with `args` for our library in it, which can
+/// open no files but those of `inside`, its own and ours, and have as much memory. Returns only errors.
+pub fn become_interpreter(lambda_dir: &Path, entry: PathBuf, args: &[OsString], inside: Inside) -> PythonError {
+    // A pipe would be waited for until the deadline of `init`.
+    if !entry.is_file() {
+        return PythonError::Entry { entry };
+    }
     match interpreter(lambda_dir, args, inside) {
         Ok((python, mut command)) => PythonError::Start { python, source: command.exec() },
         Err(error) => error.into(),
@@ -54,7 +61,11 @@ pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) 
 
 fn interpreter(lambda_dir: &Path, args: &[OsString], mut inside: Inside) -> Result<(PathBuf, Command), PartsError> {
     let parts = Parts::find()?;
-    let python = parts.python(Some(lambda_dir))?;
+    let (python, unused) = parts.python_or_why(Some(lambda_dir))?;
+    if let Some(Looked { at, why }) = unused {
+        let instead = python.display();
+        tracing::warn!(environment = %at.display(), %why, %instead, "the lambda's environment is not used");
+    }
     let mut command = Command::new(&python);
     // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.
     let (home, extension) = (parts.python_home()?, parts.extension()?);

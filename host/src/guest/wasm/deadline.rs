@@ -9,13 +9,11 @@ use std::time::{Duration, Instant};
 use wasmtime::{Engine, Store, Trap, UpdateDeadline};
 
 use super::Hosted;
+use crate::guest::is_late;
 
 /// How long nothing must have run for the ticker to sleep until something does. A lambda at 1 Hz wakes it with each call, one at
 /// 100 Hz never: waking a thread costs a call more than all else that hosting does.
 const IDLE: Duration = Duration::from_millis(500);
-
-/// How far a call may be over its time and still be in time: an epoch would have ended it about then, and not earlier.
-const TOLERANCE: Duration = Duration::from_millis(2);
 
 /// No call runs.
 const NONE: u64 = 0;
@@ -46,7 +44,7 @@ impl Taken {
     /// Whether it came back too late. An instruction that fills or copies a large memory is not ended by an epoch, and if it was the
     /// last, nothing else asks.
     pub(super) fn is_late(self) -> bool {
-        self.elapsed > self.allowed + TOLERANCE
+        is_late(self.elapsed, self.allowed)
     }
 
     /// Both, in nanoseconds.

@@ -9,8 +9,8 @@ use crate::{Exit, Explain};
 /// Why two programs do not understand each other.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// The other side is not there any more.
-    #[error("{who} has ended")]
+    /// The other side has closed the connection: it has ended, or does not want to be connected any more.
+    #[error("{who} has ended, or closed the connection")]
     Gone {
         /// Who: "the recorder", "the lambda" or "the starter".
         who: &'static str,

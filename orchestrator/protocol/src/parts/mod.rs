@@ -93,10 +93,23 @@ impl Parts {
     /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` will not do, [`PartsError::NoPython`] with every candidate and
     /// why it was refused.
     pub fn python(&self, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
-        match &self.wanted_python {
-            Some(wanted) => python::wanted(wanted),
-            None => python::first_that_runs(python::candidates(lambda_dir, self.places.checkout()), lambda_dir),
+        self.python_or_why(lambda_dir).map(|(python, _)| python)
+    }
+
+    /// As [`Parts::python`], and the environment that `lambda_dir` has though another interpreter was chosen, with why it is not used.
+    ///
+    /// # Errors
+    ///
+    /// As [`Parts::python`].
+    pub fn python_or_why(&self, lambda_dir: Option<&Path>) -> Result<(PathBuf, Option<Looked>), PartsError> {
+        if let Some(wanted) = &self.wanted_python {
+            return Ok((python::wanted(wanted)?, None));
         }
+        let candidates = python::candidates(lambda_dir, self.places.checkout());
+        let (python, tried) = python::first_that_runs(candidates, lambda_dir)?;
+        let environment = lambda_dir.map(|dir| dir.join(".venv")).filter(|it| it.symlink_metadata().is_ok());
+        let unused = environment.and_then(|it| tried.into_iter().find(|looked| looked.at.starts_with(&it)));
+        Ok((python, unused))
     }
 }
 

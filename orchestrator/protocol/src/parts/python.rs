@@ -29,14 +29,17 @@ pub(super) fn candidates(lambda_dir: Option<&Path>, checkout: Option<&Path>) -> 
     candidates
 }
 
-/// The first of `candidates` that runs. What lies in `lambda_dir` is not run unless it is a link to a program elsewhere, and that
+/// The first of `candidates` that runs, and those before it with why they will not do. What lies in `lambda_dir` is not run unless it is a link to a program elsewhere, and that
 /// program is then started by its own name: by that of the link, Python looks into the folder of the link.
-pub(super) fn first_that_runs(candidates: Vec<PathBuf>, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
+pub(super) fn first_that_runs(
+    candidates: Vec<PathBuf>,
+    lambda_dir: Option<&Path>,
+) -> Result<(PathBuf, Vec<Looked>), PartsError> {
     let mut tried = Vec::new();
     for candidate in candidates {
         let of_lambda = lambda_dir.filter(|dir| candidate.starts_with(dir));
         match of_lambda.map_or_else(|| probe(&candidate), |dir| linked(&candidate, dir)) {
-            Ok(interpreter) => return Ok(interpreter),
+            Ok(interpreter) => return Ok((interpreter, tried)),
             Err(why) => tried.push(Looked { at: candidate, why }),
         }
     }

@@ -154,9 +154,13 @@ fn nothing_that_came_with_a_lambda_is_run_to_find_its_python() {
     let parts = Parts::around(&dir.path("target/release/gleaner"), None, None);
     let ran = dir.path("ran");
     let script = format!("#!/bin/sh\ntouch '{}'\n", ran.display());
-    // A program of its own, and one behind a link within the folder.
+    assert_eq!(parts.python_or_why(Some(&lambda)).unwrap(), (shared.clone(), None), "it has no environment");
+    // A program of its own, as `python3 -m venv --copies` makes it, and one behind a link within the folder.
     let own = dir.write_program("lambda/.venv/bin/python3", &script);
-    assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
+    let (chosen, unused) = parts.python_or_why(Some(&lambda)).unwrap();
+    assert_eq!(chosen, shared);
+    let why = "is a program in the lambda's folder; make the environment with `python3 -m venv`, which links";
+    assert_eq!(unused.unwrap(), Looked { at: own.clone(), why: why.to_owned() });
     std::fs::rename(own, dir.path("lambda/python3")).unwrap();
     environment(&dir, &dir.path("lambda/python3"));
     assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);

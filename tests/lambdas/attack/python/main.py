@@ -15,6 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from typing import Callable, List
 
@@ -64,6 +65,31 @@ class Lambda:
     def memory(self, ctx: Context) -> None:
         while True:
             KEPT.append(bytearray(1 << 20))
+
+    def read_only_memory(self, ctx: Context) -> None:
+        """What is filled and then made read-only the kernel's limit of data forgets."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.mmap.restype = ctypes.c_void_p
+        size, private_anonymous, writable, readable = 16 << 20, 0x22, 3, 1
+        for _ in range(6):
+            place = ctypes.c_void_p(libc.mmap(None, ctypes.c_size_t(size), writable, private_anonymous, -1, 0))
+            ctypes.memset(place, 1, size)
+            libc.mprotect(place, ctypes.c_size_t(size), readable)
+
+    def page_tables(self, ctx: Context) -> None:
+        """Reads a page in each 2 MiB of addresses: of nothing but zeros, each with a page of tables."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.mmap.restype = ctypes.c_void_p
+        size, private_anonymous, readable = 64 << 30, 0x22, 1
+        place = libc.mmap(None, ctypes.c_size_t(size), readable, private_anonymous, -1, 0)
+        for page in range(place, place + size, 2 << 20):
+            ctypes.string_at(page, 1)
+
+    def threads(self, ctx: Context) -> None:
+        """As many as there can be, each with a small stack."""
+        threading.stack_size(32 << 10)
+        for _ in range(2000):
+            threading.Thread(target=time.sleep, args=(3600,), daemon=True).start()
 
     def full(self, ctx: Context) -> None:
         """Keeps all memory that there is, whatever it is told, and leaves the host less than it needs for a line of the log."""
@@ -196,6 +222,25 @@ class Lambda:
             raise OSError(ctypes.get_errno(), "inotify_init1")
         return watch
 
+    def timer(self, ctx: Context) -> object:
+        """One counts as a signal that waits, of which a user has a few."""
+        libc, timer = ctypes.CDLL(None, use_errno=True), ctypes.c_void_p()
+        if libc.timer_create(0, None, ctypes.byref(timer)) != 0:
+            raise OSError(ctypes.get_errno(), "timer_create")
+        return timer.value
+
+    def descriptors(self, ctx: Context) -> object:
+        """With half of them one could watch the other half."""
+        return [os.dup(0) for _ in range(1000)]
+
+    def large_pipe(self, ctx: Context) -> object:
+        set_size = 1031
+        return fcntl.fcntl(os.pipe()[1], set_size, 1 << 20)
+
+    def settings(self, ctx: Context) -> object:
+        """Programs that were installed by hand keep them in `etc` there, tokens included."""
+        return os.listdir("/usr/local")
+
     def replace(self, ctx: Context) -> None:
         os.execv("/bin/true", ["true"])
 
@@ -214,6 +259,28 @@ class Lambda:
         signal.signal(signal.SIGALRM, signal.SIG_IGN)
         while True:
             pass
+
+    def late(self, ctx: Context) -> None:
+        """Comes back before it is killed."""
+        signal.signal(signal.SIGALRM, signal.SIG_IGN)
+        until = time.monotonic() + 0.6
+        while time.monotonic() < until:
+            pass
+
+    def timer_off(self, ctx: Context) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        time.sleep(0.6)
+
+    def descriptors_closed(self, ctx: Context) -> None:
+        """Its sockets, its results and its reports, ours included."""
+        os.closerange(3, 4096)
+
+    def terminate(self, ctx: Context) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def stop(self, ctx: Context) -> None:
+        """Between two wakes nothing is overdue."""
+        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGSTOP)).start()
 
     def exit(self, ctx: Context) -> None:
         sys.exit(3)

@@ -58,6 +58,10 @@ class Lambda:
             line = next(line for line in status if line.startswith("VmHWM:"))
         ctx.event("was", 1.0, kib=int(line.split()[1]))
 
+    def hoard(self, ctx: Context, event: Sample) -> None:
+        """Has more and more memory of its own, which goes with this object."""
+        self.held.append(b"x" * (1 << 20))
+
     def exit(self, ctx: Context, event: Sample) -> None:
         sys.exit(3)
 
