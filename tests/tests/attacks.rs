@@ -22,11 +22,13 @@ enum Fate {
     Refused(&'static str),
     /// It may go on, and what is too much is thrown away and counted.
     Cut,
+    /// It may go on, and what it wrote in place of results is counted, and changes no others.
+    Garbled,
     /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault of kind `killed`, with these words.
     Killed(&'static str),
 }
 
-use Fate::{Cut, Fault, Killed, Refused};
+use Fate::{Cut, Fault, Garbled, Killed, Refused};
 use FaultKind::{Deadline, Exception, Fuel, HostCall, Memory, Trap};
 
 /// An attack, and its fate in WebAssembly and in Python; none where the language has no words for it.
@@ -47,6 +49,8 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("socket", Some(Refused("")), Some(Refused("Operation not permitted"))),
     ("connect", Some(Refused("")), Some(Refused("Operation not permitted"))),
     ("write_outside", Some(Refused("")), Some(Refused("Permission denied"))),
+    ("results", None, Some(Refused("Permission denied"))),
+    ("forge", None, Some(Garbled)),
     ("chmod", None, Some(Refused("Operation not permitted"))),
     ("kill", None, Some(Refused("Operation not permitted"))),
     ("ptrace", None, Some(Refused("PermissionError(1"))),
@@ -130,6 +134,9 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
     let decision = fallout(&started, fate);
     // One that dies of it dies again after each start.
     let live = (!matches!(fate, Killed(_))).then(|| until_it_goes_on(&started));
+    if fate == Garbled {
+        started.until_live("garbage to be counted", |live| live.unwritten >= 100);
+    }
     started.signal("INT");
     let finished = started.finish();
     println!("{attack}/{language}: {}", in_words(decision.as_ref()));
@@ -148,6 +155,17 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
             assert!(why.contains(words) && !why.contains("unknown attack"), "{why}");
         }
         Cut => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
+        Garbled => {
+            let written = decisions(out.path());
+            let forged = |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.message == "forged");
+            assert!(written.iter().any(forged), "{written:?}");
+            // Its other results are as ever: that it came back from the attack is one of them.
+            assert!(
+                written.iter().any(|it| it.triggers.iter().any(|trigger| trigger.label == "escaped")),
+                "{written:?}"
+            );
+            assert_eq!(finished.ended().restarts, 0, "the process lives on");
+        }
         Killed(words) => {
             let fault = decision.and_then(|decision| decision.fault).expect("a fault");
             assert_eq!(fault.kind, FaultKind::Killed, "{}", fault.message);
@@ -175,7 +193,7 @@ fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
         Fault(kind) => Some(fault(kind)),
         Refused(_) => Some(decision(&|decision| !decision.triggers.is_empty())),
         Killed(_) => Some(fault(FaultKind::Killed)),
-        Cut => None,
+        Cut | Garbled => None,
     }
 }
 

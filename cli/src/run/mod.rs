@@ -65,7 +65,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             worst = Exit::LambdaFaulted;
         }
         let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
-        earlier.add(party.last());
+        earlier.add(party.last(), party.has_lost_wake());
         if stop.load(Ordering::Relaxed) || is_over() {
             earlier.complete(None, &arguments::out(args))?;
             return Err(Failure::new(Exit::Internal, why));

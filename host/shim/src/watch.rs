@@ -35,6 +35,8 @@ pub(crate) struct Ended {
     status: ExitStatus,
     killed: Option<Killed>,
     out_of_memory: bool,
+    /// Whether it was asked to end.
+    pub(crate) was_asked: bool,
     /// Removed last: what was left behind is still in it.
     _group: Option<Group>,
 }
@@ -87,7 +89,8 @@ impl Watched {
                 // It may have come back, or ended by itself, just before it was killed.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
                 let pid = self.child.id();
-                return Ok(Ended { pid, status, killed, out_of_memory, _group: self.group });
+                let was_asked = asked.is_some();
+                return Ok(Ended { pid, status, killed, out_of_memory, was_asked, _group: self.group });
             }
         }
     }

@@ -1,5 +1,6 @@
 //! How a process of ours is doing, and what it says of itself: the same for the runtime and for the recorder.
 //!
+//! - [`hand_on`], [`inherited`]: open files that the shim hands to its runtime.
 //! - [`log`]: lines for people, on standard error.
 //! - [`Pulse`]: what it does, and since when, for the shim that ends it if it does not come back.
 //! - [`Spreads`]: how long things take, in bounded memory.
@@ -7,10 +8,12 @@
 //!
 //! What never happens here: reports to whoever started us, which are `gleaner_protocol`'s.
 
+mod handed_on;
 pub mod log;
 mod pulse;
 mod spread;
 pub mod usage;
 
+pub use handed_on::{hand_on, inherited};
 pub use pulse::{Busy, PULSE_ENV, Pulse};
 pub use spread::Spreads;

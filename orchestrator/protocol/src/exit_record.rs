@@ -95,13 +95,16 @@ impl ExitRecord {
     /// Its name in the folder of a run's results.
     pub const FILE: &'static str = "exit.json";
 
-    /// What `gleaner-shim` adds to the name of the record of the process before, which it keeps beside that of its own.
-    pub const EARLIER: &'static str = ".before";
-
     /// Whether the lambda ended the process, and not the programs around it: these tell how by their own exit codes.
     pub fn is_the_lambdas(&self) -> bool {
         let is_ours = |code| Exit::from_code(code).is_some_and(|exit| exit != Exit::Ok);
         self.killed.is_some() || self.out_of_memory || !self.code.is_some_and(is_ours)
+    }
+
+    /// Whether it ended by itself with an exit code of a run that was completed.
+    pub fn is_in_order(&self) -> bool {
+        let exit = self.code.and_then(Exit::from_code);
+        self.killed.is_none() && matches!(exit, Some(Exit::Ok | Exit::LambdaFaulted))
     }
 
     /// Why it did not end well, as the end of a sentence about the process; `None` if it did.
