@@ -22,13 +22,15 @@ enum Fate {
     Refused(&'static str),
     /// It may go on, and what is too much is thrown away and counted.
     Cut,
+    /// It may go on, and what it wrote in place of results is counted, and changes no others.
+    Garbled,
     /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault of kind `killed`, with these words.
     Killed(&'static str),
     /// The process cannot go on, says why and ends, each time that it is started. Nobody killed it, and the run has not gone well.
     Broken,
 }
 
-use Fate::{Broken, Cut, Fault, Killed, Refused};
+use Fate::{Broken, Cut, Fault, Garbled, Killed, Refused};
 use FaultKind::{Deadline, Exception, Fuel, HostCall, Memory, Trap};
 
 /// An attack, and its fate in WebAssembly and in Python; none where the language has no words for it.
@@ -52,6 +54,8 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("socket", Some(Refused("")), Some(Refused("Operation not permitted"))),
     ("connect", Some(Refused("")), Some(Refused("Operation not permitted"))),
     ("write_outside", Some(Refused("")), Some(Refused("Permission denied"))),
+    ("results", None, Some(Refused("Permission denied"))),
+    ("forge", None, Some(Garbled)),
     ("chmod", None, Some(Refused("Operation not permitted"))),
     ("kill", None, Some(Refused("Operation not permitted"))),
     ("ptrace", None, Some(Refused("PermissionError(1"))),
@@ -144,12 +148,15 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
     let decision = fallout(&started, fate);
     // One that dies of it dies again after each start.
     let live = (!matches!(fate, Killed(_) | Broken)).then(|| until_it_goes_on(&started));
+    if fate == Garbled {
+        started.until_live("garbage to be counted", |live| live.unwritten >= 100);
+    }
     started.signal("INT");
     let finished = started.finish();
     let code = match fate {
         Fault(_) | Killed(_) => Some(Exit::LambdaFaulted),
         Broken => Some(Exit::Internal),
-        Refused(_) | Cut => None,
+        Refused(_) | Cut | Garbled => None,
     };
     if let Some(code) = code {
         assert_eq!(finished.status.code(), Some(i32::from(code.code())), "{}", finished.said);
@@ -171,6 +178,17 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
         }
         Broken => assert!(finished.said.contains("the run broke"), "{}", finished.said),
         Cut => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
+        Garbled => {
+            let written = decisions(out.path());
+            let forged = |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.message == "forged");
+            assert!(written.iter().any(forged), "{written:?}");
+            // Its other results are as ever: that it came back from the attack is one of them.
+            assert!(
+                written.iter().any(|it| it.triggers.iter().any(|trigger| trigger.label == "escaped")),
+                "{written:?}"
+            );
+            assert_eq!(finished.ended().restarts, 0, "the process lives on");
+        }
         Killed(words) => {
             let fault = decision.and_then(|decision| decision.fault).expect("a fault");
             assert_eq!(fault.kind, FaultKind::Killed, "{}", fault.message);
@@ -205,7 +223,7 @@ fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
             });
             None
         }
-        Cut => None,
+        Cut | Garbled => None,
     }
 }
 

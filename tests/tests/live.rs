@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::link::RecorderReport;
-use gleaner_protocol::{Clip, Decision, Live, Report};
+use gleaner_protocol::{Clip, Decision, FaultKind, Live, Report};
 use gleaner_tests::live::{self, Line, Started, below, decisions, no_player, play, run, signal};
 use gleaner_tests::{Copy, Folder, namespace, replay_to, root, sample_drive, times};
 use libtest_mimic::{Arguments, Trial};
@@ -17,37 +17,47 @@ const CASE: &str = "GLEANER_LIVE_CASE";
 
 type Case = (&'static str, fn());
 
-const CASES: &[Case] = &[
+/// Cases with a player.
+const PLAYED: &[Case] = &[
     ("a_drive_played_live_is_decided_as_in_its_replay", as_in_replay),
     ("a_lambda_slower_than_its_camera_sees_the_newest_frame_and_skips_are_counted", || slow("sleep")),
     ("a_lambda_that_keeps_every_frame_does_not_stop_the_reception_and_refusals_are_counted", || slow("keep")),
     ("ctrl_c_ends_in_order_and_clips_that_are_open_are_closed", ctrl_c),
     ("a_lambda_whose_process_is_killed_is_started_again_and_loses_no_decision", || killed("start.py")),
     ("a_recorder_that_is_killed_is_started_again_and_its_clip_recovered", || killed("gleaner-recorder")),
+];
+
+/// Cases with nothing but lambdas.
+const ALONE: &[Case] = &[
     ("a_topic_that_nobody_writes_is_said", nobody_writes),
     ("a_reader_that_has_stopped_does_not_hold_up_the_lambda_that_it_listens_to", stopped),
     ("a_lambda_does_not_outlive_the_command_that_started_it", || outlives(None)),
     ("a_lambda_does_not_outlive_its_shim", || outlives(Some("gleaner-shim"))),
+    ("every_wake_at_1_khz_is_written_if_all_are_asked_for", every_wake),
+    ("what_was_reported_is_in_the_file_though_the_process_is_killed_at_once", killed_at_once),
 ];
 
 fn main() -> ExitCode {
     if let Ok(name) = std::env::var(CASE) {
-        let (_, case) = CASES.iter().find(|(known, _)| *known == name).expect("a case of this suite");
+        let (_, case) = PLAYED.iter().chain(ALONE).find(|(known, _)| *known == name).expect("a case of this suite");
         case();
         return ExitCode::SUCCESS;
     }
-    let missing = namespace::unavailable().or(no_player());
-    let trial = |(name, _): &Case| {
-        let run = || namespace::case(CASE, name);
+    let trial = |(name, _): &Case, missing: Option<&str>| {
+        let name = *name;
+        let run = move || namespace::case(CASE, name);
         match missing {
             Some(why) => Trial::test(format!("{name} [{why}]"), run).with_ignored_flag(true),
-            None => Trial::test(*name, run),
+            None => Trial::test(name, run),
         }
     };
     let mut arguments = Arguments::from_args();
     // They measure nothing, but starving each other would make samples skip.
     arguments.test_threads = Some(1);
-    libtest_mimic::run(&arguments, CASES.iter().map(trial).collect()).exit_code()
+    let (no_network, no_player) = (namespace::unavailable(), no_player());
+    let played = PLAYED.iter().map(|case| trial(case, no_network.or(no_player)));
+    let trials = played.chain(ALONE.iter().map(|case| trial(case, no_network))).collect();
+    libtest_mimic::run(&arguments, trials).exit_code()
 }
 
 fn lambda(name: &str, language: &str) -> PathBuf {
@@ -288,6 +298,50 @@ fn outlives(who: Option<&str>) {
     // A process that has ended has no command line, even where nobody asks how it ended.
     let line = format!("/proc/{}/cmdline", left[0]);
     wait_for("the end of the lambda's process", || std::fs::read(&line).unwrap_or_default().is_empty());
+}
+
+fn every_wake() {
+    for language in ["rust", "python"] {
+        let lambda =
+            Copy::of(&format!("tests/lambdas/attack/{language}"), |manifest| manifest.replace("\"20ms\"", "\"1ms\""));
+        let out = Folder::new();
+        let started = run(lambda.path(), out.path(), &["--no-record", "--all"]);
+        started.until_live("some thousand wakes", |live| live.wakes >= 3000);
+        started.signal("INT");
+        let finished = started.finish();
+        let (ended, written) = (finished.ended(), decisions(out.path()));
+        assert_eq!((written.len() as u64, ended.unwritten), (ended.wakes, 0), "{}", finished.said);
+        assert!(written.is_sorted_by(|a, b| a.at_ns < b.at_ns));
+        let summary: Live = serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap()).unwrap();
+        assert_eq!((summary.wakes, summary.unwritten), (ended.wakes, 0));
+    }
+}
+
+fn killed_at_once() {
+    let lambda = Copy::of("tests/lambdas/ticker/python", |manifest| manifest.replace("\"100ms\"", "\"1ms\""));
+    let out = Folder::new();
+    let started = run(lambda.path(), out.path(), &["--no-record"]);
+    started.until_ready();
+    let process = below(started.pid(), "start.py")[0];
+    let mut told = Vec::new();
+    started.until("the end of the process", |line| {
+        let Line::Lambda(Report::Decision(decision)) = line else { return None };
+        if told.is_empty() {
+            signal(process, "KILL");
+        }
+        let is_killed = decision.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed);
+        told.push(*decision);
+        is_killed.then_some(())
+    });
+    let written = decisions(out.path());
+    assert!(told.len() > 1 && told.iter().all(|decision| written.contains(decision)), "{told:?}, written {written:?}");
+    started.until_live("the next process", |live| live.restarts == 1);
+    started.signal("INT");
+    let finished = started.finish();
+    assert!(finished.said.contains("was ended by signal 9"), "{}", finished.said);
+    // The process that broke could not count its last wake.
+    let summary: Live = serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap()).unwrap();
+    assert_eq!(summary.faults, finished.ended().faults + 1);
 }
 
 fn stopped() {

@@ -30,8 +30,9 @@ pub(super) fn runtime(args: &RunArgs, has_recorder: bool, offset_ns: i64, restar
 }
 
 /// The arguments of the runtime's shim.
-pub(super) fn shim(args: &RunArgs, exit_record: &Path) -> Vec<OsString> {
-    let mut line = vec![word("--exit-record", exit_record), starter()];
+pub(super) fn shim(args: &RunArgs, exit_record: &Path, restarts: u32) -> Vec<OsString> {
+    let mut line = vec![word("--exit-record", exit_record), word("--results", out(args)), starter()];
+    line.extend((restarts > 0).then(|| "--again".into()));
     line.extend(args.cgroup.as_ref().map(|folder| word("--cgroup", folder)));
     line
 }

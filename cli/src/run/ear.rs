@@ -5,7 +5,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::link::{Loss, RecorderReport};
-use gleaner_protocol::{Live, Report};
+use gleaner_protocol::{FaultKind, Live, Report};
 
 use super::screen::Screen;
 use crate::show;
@@ -29,6 +29,8 @@ pub(super) struct Ear {
     pub(super) is_ready: bool,
     /// It has faulted.
     pub(super) has_faulted: bool,
+    /// A wake has ended with its process, which could not count that.
+    pub(super) has_lost_wake: bool,
     /// Its last report has come.
     pub(super) has_ended: bool,
     /// What it counted, as it said last.
@@ -37,7 +39,7 @@ pub(super) struct Ear {
 
 impl Ear {
     pub(super) fn new(heard: Receiver<Heard>) -> Self {
-        Self { heard, is_ready: false, has_faulted: false, has_ended: false, last: None }
+        Self { heard, is_ready: false, has_faulted: false, has_lost_wake: false, has_ended: false, last: None }
     }
 
     /// Shows what is heard for so long, or until all streams are closed.
@@ -89,7 +91,9 @@ impl Ear {
                 screen.say("running; ctrl-C ends it\n");
             }
             Report::Decision(decision) => {
-                self.has_faulted |= decision.fault.is_some();
+                let fault = decision.fault.as_ref().map(|fault| fault.kind);
+                self.has_faulted |= fault.is_some();
+                self.has_lost_wake |= fault == Some(FaultKind::Killed);
                 screen.decision(&decision);
             }
             Report::Live(live) => {

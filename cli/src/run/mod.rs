@@ -8,14 +8,13 @@ mod party;
 mod process;
 mod screen;
 mod summary;
-mod undecided;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{BuildDir, Exit, Failure, Manifest, Report};
+use gleaner_protocol::{BuildDir, Exit, Failure, Manifest};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::party::{Ended, Party};
@@ -62,7 +61,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             Ended::Never(exit) => broken.add("it could not start".to_owned(), exit == Exit::LambdaFaulted),
             Ended::Broken { why, faulted } => broken.add(why, faulted),
         }
-        earlier.add(party.last());
+        earlier.add(party.last(), party.has_lost_wake());
         restarts += 1;
         pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
         let why = broken.why.as_deref().unwrap_or_default();
@@ -73,11 +72,6 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             thread::sleep(LOOK);
         }
         if ends() {
-            if let Some(decision) = undecided::add(&manifest, &arguments::out(args))? {
-                screen.decision(&decision);
-                screen.report(&Report::Decision(Box::new(decision)));
-                earlier.add_fault();
-            }
             earlier.complete(None, &arguments::out(args))?;
             return broken.end(Exit::Ok);
         }

@@ -74,7 +74,7 @@ impl Party {
         }
         let line = arguments::runtime(args, socket.is_some(), offset_ns, restarts);
         let exit_record = arguments::out(args).join(ExitRecord::FILE);
-        let shim = Some(arguments::shim(args, &exit_record));
+        let shim = Some(arguments::shim(args, &exit_record, restarts));
         let runtime = Process::start(&parts, "gleaner-runtime", line, socket, shim, Heard::Runtime, &say)?;
         Ok(Self { runtime, exit_record, recorder, ear: Ear::new(heard), left })
     }
@@ -82,6 +82,11 @@ impl Party {
     /// What the lambda's process counted, as it said last.
     pub(super) fn last(&mut self) -> Option<Live> {
         self.ear.last.take()
+    }
+
+    /// Whether a wake ended with the lambda's process.
+    pub(super) fn has_lost_wake(&self) -> bool {
+        self.ear.has_lost_wake
     }
 
     /// Shows what they report until they end, which they do when `stop` is raised.

@@ -127,6 +127,10 @@ fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &
     let mut reports = BufReader::new(reports);
     let mut line = Vec::new();
     while next_report(&mut reports, &mut line).unwrap_or(false) {
+        // A shim ends the line that its runtime may have begun.
+        if line == b"\n" {
+            continue;
+        }
         let garbled =
             |_| Heard::Garbled(visible(&String::from_utf8_lossy(&line).chars().take(200).collect::<String>()));
         if say.send(serde_json::from_slice(&line).map_or_else(garbled, heard)).is_err() {

@@ -32,7 +32,7 @@ pub(crate) fn end() -> u32 {
     }
 }
 
-/// Our children, from the list that the kernel keeps for each thread. We have one thread.
+/// Our children, from the list that the kernel keeps for each thread: the first one starts and adopts them.
 fn children() -> Vec<Pid> {
     let list = fs::read_to_string(format!("/proc/self/task/{}/children", std::process::id())).unwrap_or_default();
     list.split_whitespace().filter_map(|pid| pid.parse().ok().and_then(Pid::from_raw)).collect()

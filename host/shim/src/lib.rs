@@ -1,14 +1,19 @@
 //! `gleaner-shim [OPTIONS] -- PROGRAM ARGUMENTS...`: the parent of every runtime, whoever wants it started.
 //!
 //! It takes from itself, and so from the runtime, what no lambda's process needs; hands on a small part of its environment;
-//! kills the runtime when it does not come back from a lambda in time, is stopped, or takes more memory or threads than it may; ends what the runtime left behind; and writes down how it
-//! ended. Its own exit is that of the runtime. It has one thread, allocates next to nothing, and looks ten times a second.
+//! kills the runtime when it does not come back from a lambda in time, is stopped, or takes more memory or threads than it may; ends
+//! what the runtime left behind; and writes down how it ended. Its own exit is that of the runtime. The thread that does so allocates
+//! next to nothing, and looks ten times a second.
+//!
+//! With `--results` a second thread writes the files of the lambda's results, so that the process of the lambda can write none.
 //!
 //! It lives as long as its runtime, even if whoever started it goes away; with `--starter` it then asks the runtime to end.
 
 mod environment;
 mod left_behind;
+mod lines;
 mod look;
+mod results;
 mod signals;
 mod watch;
 
@@ -20,9 +25,10 @@ use std::time::Duration;
 use clap::Parser;
 use gleaner_jail::cgroup::{Bounds, Group};
 use gleaner_jail::{Paths, alone, cgroup, files, memory, never, tried};
-use gleaner_protocol::{Exit, ExitRecord, Failure, LAYERS_ENV, Layer};
-use gleaner_vitals::{PULSE_ENV, Pulse};
+use gleaner_protocol::{Exit, ExitRecord, Failure, LAYERS_ENV, Layer, RESULTS_ENV};
+use gleaner_vitals::{PULSE_ENV, Pulse, hand_on};
 
+use self::results::Results;
 use self::signals::Signals;
 use self::watch::Watched;
 
@@ -39,6 +45,12 @@ struct Args {
     /// Write down here how it ended.
     #[arg(long, value_name = "FILE")]
     exit_record: Option<PathBuf>,
+    /// Write the results of a live lambda into this folder.
+    #[arg(long, value_name = "DIR")]
+    results: Option<PathBuf>,
+    /// Add them to those that are there, of an earlier process of the same run.
+    #[arg(long, requires = "results")]
+    again: bool,
     /// Ask it to end when this process dies, which started this shim.
     #[arg(long, value_name = "PID")]
     starter: Option<u32>,
@@ -82,7 +94,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let (pulse, page) = Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
     // Finding an interpreter, compiling, discovery: until the first word of its own.
     pulse.alive(START);
-    let number = Pulse::hand_on(&page).map_err(|error| cannot("cannot hand on the pulse", &error))?;
+    let number = hand_on(&page).map_err(|error| cannot("cannot hand on the pulse", &error))?;
     let mut layers = never::forbid();
     layers.push(hard_deadline());
     let (group, layer) = own_group(args);
@@ -91,12 +103,15 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let (program, arguments) = args.program.split_first().expect("clap asks for a program");
     let mut command = Command::new(program);
     command.args(arguments).env_clear().envs(environment::handed_on()).env_remove(cgroup::CGROUP_ENV);
-    command.env(PULSE_ENV, number).env(LAYERS_ENV, layers);
+    command.env(PULSE_ENV, number).env(LAYERS_ENV, layers).env_remove(RESULTS_ENV);
     if let Some(path) = &args.exit_record {
-        // Nobody shall take the end of an earlier one for that of this one, which may want to read it. Mostly there is none.
-        let mut earlier = path.as_os_str().to_owned();
-        earlier.push(ExitRecord::EARLIER);
-        let _ = std::fs::rename(path, earlier);
+        // Else the end of an earlier one could be taken for that of this one. Mostly there is none.
+        let _ = std::fs::remove_file(path);
+    }
+    let begun = args.results.as_ref().map(|folder| Results::begin(folder, args.again, &pulse)).transpose()?;
+    let (results, pipe) = begun.unzip();
+    if let Some(pipe) = &pipe {
+        command.env(RESULTS_ENV, hand_on(pipe).map_err(|error| cannot("cannot hand on the results' pipe", &error))?);
     }
     let started_ns = signals::time_of_day_ns();
     if let Some(group) = &group {
@@ -106,7 +121,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         let program = program.to_string_lossy();
         Failure::caused_by(Exit::Internal, format!("cannot start `{program}`"), &error)
     })?;
-    drop(page);
+    drop((page, pipe));
     let watched = Watched { child, pulse, signals, group };
     let ended = watched.until_its_end().map_err(|error| cannot("cannot watch over the runtime", &error))?;
     let left_behind = left_behind::end();
@@ -120,7 +135,16 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         // How it ended is more important than that this is not written.
         eprintln!("gleaner-shim: cannot write `{}`: {error}", path.display());
     }
-    Ok(end_alike(&record))
+    let written = results.map_or(Ok(()), |results| results.end().finish(&record));
+    match written {
+        // A runtime that ended well does not know of it.
+        Err(failure) if record.is_in_order() => Err(failure),
+        Err(failure) => {
+            eprintln!("{failure}");
+            Ok(end_alike(&record))
+        }
+        Ok(()) => Ok(end_alike(&record)),
+    }
 }
 
 /// Has SIGTERM sent to this process when `starter` dies, which is not said twice: it may be gone already.

@@ -2,35 +2,12 @@
 
 use gleaner_protocol::journal::Said;
 use gleaner_protocol::manifest::Limits;
-use serde::{Deserialize, Serialize};
+pub use gleaner_protocol::{LogLevel as Level, LogLine as Line};
 
 use super::Session;
 
 /// Longest line in bytes; the rest is cut at a character boundary.
 pub const LINE_BYTES: usize = 4096;
-
-/// How much a line matters.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-#[allow(missing_docs)]
-pub enum Level {
-    Error,
-    Warn,
-    Info,
-    Debug,
-    Trace,
-}
-
-/// One line that a lambda wrote.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Line {
-    /// Time of the wake that wrote it, in nanoseconds.
-    pub at_ns: i64,
-    /// How much it matters.
-    pub level: Level,
-    /// The text, at most [`LINE_BYTES`] long.
-    pub message: String,
-}
 
 pub(super) struct Log {
     lines: Vec<Line>,

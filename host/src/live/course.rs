@@ -52,6 +52,7 @@ impl Course {
                     return Ok(());
                 }
                 self.pulse.alive(ALIVE);
+                self.ledger.flush();
                 self.look_after(now)?;
             }
             if let Some(wake) = self.schedule.next_tick(now).or_else(|| self.schedule.next_event()) {

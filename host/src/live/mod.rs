@@ -1,13 +1,13 @@
 //! A lambda live: on the topics of a vehicle, in its time, with a deadline, until it is told to stop.
 //!
-//! One thread owns the lambda and waits here; the transport's thread fills the rings and rings a bell. What is written, to files
-//! and to whoever started us, is written by a thread of its own. Nothing here knows which kind of lambda runs.
+//! One thread owns the lambda and waits here; the transport's thread fills the rings and rings a bell. Files of results are written by
+//! another process, and reports to the starter by a thread of their own. Nothing here knows which kind of lambda runs.
 
 mod announce;
-mod before;
 mod course;
 mod ledger;
 mod options;
+mod pages;
 mod recorder;
 mod round_trip;
 mod speaker;
@@ -21,13 +21,14 @@ use std::sync::atomic::AtomicBool;
 
 use gleaner_protocol::journal::Part;
 use gleaner_protocol::manifest::Schedule as Declared;
-use gleaner_protocol::{Exit, Failure, Report};
+use gleaner_protocol::{Exit, Failure, Page, Report, WokenBy};
 use gleaner_transport::dds::Dds;
 
 use self::announce::Announcer;
 use self::course::Course;
 use self::ledger::Ledger;
 use self::options::take_stdin;
+use self::pages::Pages;
 use self::recorder::ToRecorder;
 use self::round_trip::RoundTrip;
 use self::status::{Around, Watch};
@@ -37,10 +38,7 @@ use crate::journal::{CLOCK_OF_VEHICLE, Identity};
 use crate::judge::Judge;
 use crate::network::NetworkError;
 use crate::schedule::Schedule;
-use crate::stage::{Bounds, Load, Output, Stage, not_started};
-
-/// Bytes of log in a file; twice as many are kept. A lambda may log 34 GB a day within its limits, and nobody looks after a vehicle's disk.
-const LOG_BYTES: u64 = 256 << 20;
+use crate::stage::{Bounds, Load, Stage, not_started};
 
 impl Job {
     /// Runs the lambda until SIGTERM, and writes reports to `reports`.
@@ -49,7 +47,7 @@ impl Job {
     ///
     /// # Errors
     ///
-    /// A failure if it cannot start, if the network or the recorder fails, or if results could not be written.
+    /// A failure if it cannot start, if the network or the recorder fails, or if results could not be handed on.
     pub fn run(
         self,
         load: Load<'_>,
@@ -88,11 +86,9 @@ impl Job {
         let name = manifest.lambda.name.as_str();
         let round_trip = wanted.round_trip.map(|topic| RoundTrip::open(&dds, &topic, clock, name)).transpose()?;
         let announcer = wanted.announce.map(|topic| Announcer::open(&dds, &topic, name)).transpose()?;
-        let undecided = (wanted.restarts > 0).then(|| before::undecided(&manifest, &wanted.out)).flatten();
-        let mut ledger = {
-            let output = Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?;
-            Ledger::start(output.with_log_of(LOG_BYTES), reports)?
-        };
+        let pages = Pages::open(isolation.pulse().clone())?;
+        let mut ledger = Ledger::start(pages, wanted.all, reports)?;
+        ledger.page(&Page::Woken(WokenBy::schedule_of(&manifest)));
         ledger.report(Report::Isolation { layers: isolation.close()?.to_vec() });
         let initialised = guest.init();
         let (said, _) = session.take_log();
@@ -104,11 +100,7 @@ impl Job {
         }
         ledger.report(Report::Ready);
         let schedule = Schedule::live(&manifest, &inputs, clock.now());
-        let mut watch = Watch::new(&manifest, &asked.remaps, wanted.out, wanted.restarts, domain, clock);
-        if let Some(decision) = undecided {
-            watch.lost_wake();
-            ledger.decision(decision);
-        }
+        let watch = Watch::new(&manifest, &asked.remaps, wanted.out, wanted.restarts, domain, clock);
         let mut course = Course {
             judge: Judge::new(session.clone(), guest),
             schedule,

@@ -2,7 +2,7 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use gleaner_jail::Paths;
@@ -21,7 +21,7 @@ pub struct RunArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub asked: AskedArgs,
-    /// Where the results go.
+    /// Where the results go, for reports: the process that made the pipe for them writes there.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Write every decision, not only those with a trigger or a fault.
@@ -42,7 +42,7 @@ pub struct RunArgs {
     /// Publish decisions with a trigger or a fault on this topic, as std_msgs/msg/String.
     #[arg(long, value_name = "TOPIC")]
     pub decisions: Option<String>,
-    /// How often this lambda's process was started before: results are then added to those that are there.
+    /// How often this lambda's process was started before.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub restarts: u32,
 }
@@ -68,7 +68,7 @@ pub struct Job {
 }
 
 impl Job {
-    /// What may be opened while the lambda runs. Its results are open by then.
+    /// What may be opened while the lambda runs.
     pub fn paths(&self) -> Paths {
         let mut read = definitions();
         read.push(self.asked.lambda.clone());
@@ -76,15 +76,9 @@ impl Job {
         Paths { read, write: Vec::new() }
     }
 
-    /// Memory that our own threads may still take, in bytes: decisions that wait to be written, and messages that the network puts
-    /// together, beside those in the rings.
+    /// Memory that our own threads may still take, in bytes: messages that the network puts together, beside those in the rings.
     pub fn own_memory(&self) -> u64 {
         unfinished_bytes(&self.manifest)
-    }
-
-    /// The folder of the results.
-    pub fn results(&self) -> &Path {
-        &self.wanted.out
     }
 
     /// Checks the arguments against the build and its manifest.

@@ -121,11 +121,6 @@ impl Watch {
         self.hand_out.add(times.out.saturating_sub(times.left));
     }
 
-    /// A wake of the process before this one ended with it.
-    pub(super) fn lost_wake(&mut self) {
-        self.base.faults += 1;
-    }
-
     /// Wakes that ended in a fault.
     pub(super) fn faults(&self) -> u64 {
         self.base.faults

@@ -2,7 +2,6 @@
 //! sees them, and the files of its decisions.
 
 mod asked;
-mod output;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +11,7 @@ use gleaner_protocol::{Exit, Explain, Failure, Fault, visible};
 use gleaner_transport::{Transport, TransportError};
 
 pub use asked::{Asked, AskedArgs, tighten};
-pub use output::{LOCK, Output, OutputError, RESULTS, SUMMARY};
+pub use gleaner_protocol::{LOCK, Output, OutputError, RESULTS};
 
 use crate::api::Session;
 use crate::api::data::Topic;

@@ -6,7 +6,7 @@
 
 use std::fs::File;
 use std::io;
-use std::os::fd::{AsFd, AsRawFd, FromRawFd, OwnedFd};
+use std::os::fd::{AsFd, OwnedFd};
 use std::ptr::{self, NonNull};
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -14,10 +14,10 @@ use std::time::Duration;
 
 use gleaner_protocol::{Doing, Killed, Why};
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
-use rustix::io::{FdFlags, fcntl_getfd, fcntl_setfd};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use rustix::time::{ClockId, clock_gettime};
 
+use crate::handed_on::{hand_on, inherited};
 use crate::own;
 
 /// The environment variable with the number of the page's file.
@@ -40,6 +40,8 @@ struct Page {
     most: AtomicU64,
     /// Memory of our own code.
     own: AtomicU64,
+    /// Pages of results that the shim did not write. Written by the shim alone.
+    unwritten: AtomicU64,
 }
 
 /// What a lambda has of the memory of its process.
@@ -112,8 +114,7 @@ impl Pulse {
     ///
     /// Those of `fcntl`.
     pub fn hand_on(file: &OwnedFd) -> io::Result<String> {
-        fcntl_setfd(file, fcntl_getfd(file)? - FdFlags::CLOEXEC)?;
-        Ok(file.as_raw_fd().to_string())
+        hand_on(file)
     }
 
     /// The page of this process's shim, or one that nobody reads.
@@ -122,20 +123,11 @@ impl Pulse {
     ///
     /// If the variable is set and names no such page, or there is no memory.
     pub fn inherited() -> io::Result<Self> {
-        let Some(number) = std::env::var_os(PULSE_ENV) else { return Ok(Self::make()?.0) };
-        let wrong = || io::Error::new(io::ErrorKind::InvalidInput, format!("{PULSE_ENV} names no page"));
-        let number: i32 = number.to_str().and_then(|text| text.parse().ok()).filter(|n| *n > 2).ok_or_else(wrong)?;
-        // SAFETY: `dup` of a number that is no open file fails and does nothing else, and what it gives is ours alone.
-        let copy = unsafe { libc::fcntl(number, libc::F_DUPFD_CLOEXEC, 3) };
-        if copy < 0 {
-            return Err(wrong());
+        let Some(file) = inherited(PULSE_ENV)? else { return Ok(Self::make()?.0) };
+        if rustix::fs::fstat(&file)?.st_size != size_of::<Page>() as i64 {
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, format!("{PULSE_ENV} names no page")));
         }
-        // SAFETY: the number was made a line above and nobody else knows it.
-        let copy = unsafe { OwnedFd::from_raw_fd(copy) };
-        if rustix::fs::fstat(&copy)?.st_size != size_of::<Page>() as i64 {
-            return Err(wrong());
-        }
-        let pulse = Self::over(copy.as_fd())?;
+        let pulse = Self::over(file.as_fd())?;
         Ok(OURS.get_or_init(|| pulse).clone())
     }
 
@@ -170,6 +162,16 @@ impl Pulse {
         if let Some(pulse) = OURS.get() {
             pulse.page().own.store(own::held(), Ordering::Relaxed);
         }
+    }
+
+    /// For the shim: so many pages of results were not written so far.
+    pub fn set_unwritten(&self, pages: u64) {
+        self.page().unwritten.store(pages, Ordering::Relaxed);
+    }
+
+    /// Pages of results that the shim did not write so far.
+    pub fn unwritten(&self) -> u64 {
+        self.page().unwritten.load(Ordering::Relaxed)
     }
 
     fn over(file: impl AsFd) -> io::Result<Self> {

@@ -167,14 +167,17 @@ impl ExitRecord {
     /// Its name in the folder of a run's results.
     pub const FILE: &'static str = "exit.json";
 
-    /// What `gleaner-shim` adds to the name of the record of the process before, which it keeps beside that of its own.
-    pub const EARLIER: &'static str = ".before";
-
     /// Whether the lambda ended the process, and not a request from outside or the programs around it, which report failures by
     /// their own exit codes. A process that nobody asked to end, and that ends as if it had been, is the lambda's doing.
     pub fn is_the_lambdas(&self) -> bool {
         let is_ours = |code| Exit::from_code(code).is_some_and(|exit| !matches!(exit, Exit::Ok | Exit::LambdaFaulted));
         self.killed.is_some() || self.out_of_memory || !self.asked && !self.code.is_some_and(is_ours)
+    }
+
+    /// Whether it ended by itself with an exit code of a run that was completed.
+    pub fn is_in_order(&self) -> bool {
+        let exit = self.code.and_then(Exit::from_code);
+        self.killed.is_none() && matches!(exit, Some(Exit::Ok | Exit::LambdaFaulted))
     }
 
     /// Why it did not end well, as the end of a sentence about the process; `None` if it did.

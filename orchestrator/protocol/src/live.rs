@@ -38,7 +38,8 @@ pub struct Live {
     pub triggers_refused: u64,
     /// Wakes that did not happen, since the lambda had faulted again and again.
     pub passed_over: u64,
-    /// Decisions and log lines that could not be written: the disk failed, or was too slow.
+    /// Decisions and log lines that could not be written: the disk failed, or was too slow; and what native code of the lambda handed on
+    /// in their place, which is none.
     pub unwritten: u64,
     /// Messages on the topics of `--rtt` and `--decisions` that were not sent, since a reader does not keep up.
     #[serde(default)]

@@ -1,27 +1,22 @@
-use crate::manifest::{Manifest, Schedule};
-use crate::{Cause, Decision, Doing, ExitRecord, Fault, FaultKind};
+use crate::{Decision, Doing, ExitRecord, Fault, FaultKind, WokenBy};
 
 impl ExitRecord {
-    /// The decision that the process of the lambda with this manifest did not live to write: a fault of kind `killed`. None if it was
-    /// asked to end, or if something around the lambda failed.
-    pub fn undecided(&self, manifest: &Manifest) -> Option<Decision> {
+    /// The decision that the process of a lambda did not live to write: a fault of kind `killed`. None if it was asked to end, or if
+    /// something around the lambda failed.
+    pub fn undecided(&self, woken_by: WokenBy) -> Option<Decision> {
         if !self.is_the_lambdas() {
             return None;
         }
-        let why = self.sentence().unwrap_or_else(|| "ended by itself, as if it had been told to".to_owned());
+        let why = self.sentence().unwrap_or_else(|| "ended by itself, as if that had been asked for".to_owned());
         let amounts = self.killed.map(|killed| killed.used_and_allowed());
         let wake = self.killed.filter(|killed| killed.doing == Doing::Wake);
-        let (cause, input) = match &manifest.schedule {
-            Schedule::Event { input, .. } => (Cause::Event, Some(input)),
-            Schedule::Periodic { .. } => (Cause::Tick, None),
-        };
-        let topic = input.and_then(|name| manifest.inputs.iter().find(|input| input.name == *name));
+        let WokenBy { cause, input, topic } = woken_by;
         Some(Decision {
-            // Of what ended by itself nobody knows the wake; the clocks agree to what the time of day was set meanwhile.
+            // Of a process that ended by itself the wake is not known; the clocks agree but for what the time of day was set meanwhile.
             at_ns: wake.map_or(self.ended_ns, |killed| killed.at_ns),
             cause,
-            input: input.map(ToString::to_string),
-            topic: topic.map(|input| input.topic.to_string()),
+            input,
+            topic,
             writer: None,
             seq: None,
             triggers: Vec::new(),

@@ -13,6 +13,7 @@ import os
 import resource
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import threading
@@ -157,6 +158,42 @@ class Lambda:
     def write_outside(self, ctx: Context) -> int:
         with open("/tmp/gleaner-escaped", "w") as file:
             return file.write("here I was")
+
+    def results(self, ctx: Context) -> object:
+        """Looks for a file that this process could write: cutting it to a terabyte would be the next step."""
+        writable = []
+        for number in map(int, os.listdir("/proc/self/fd")):
+            try:
+                mode, flags = os.fstat(number).st_mode, fcntl.fcntl(number, fcntl.F_GETFL)
+                path = os.readlink(f"/proc/self/fd/{number}")
+            except OSError:
+                continue  # That of the listing.
+            # The page that the shim watches has a size that cannot be changed.
+            if stat.S_ISREG(mode) and flags & os.O_ACCMODE != os.O_RDONLY and "gleaner-pulse" not in path:
+                writable.append(path)
+        with open("/proc/self/cmdline") as file:
+            out = next(word[6:] for word in file.read().split("\0") if word.startswith("--out="))
+        refused = OSError()
+        for name in ("decisions.jsonl", "log.jsonl", "summary.json", "new"):
+            for flag in (os.O_WRONLY, os.O_WRONLY | os.O_CREAT):
+                try:
+                    os.open(os.path.join(out, name), flag)
+                    writable.append(name)
+                except OSError as error:
+                    refused = error if flag & os.O_CREAT else refused
+        if not writable:
+            raise refused
+        return writable
+
+    def forge(self, ctx: Context) -> None:
+        """Writes garbage, and a decision that was never made, into every pipe."""
+        forged = b'{"decision":{"at_ns":7,"cause":"tick","triggers":[],"fault":{"kind":"trap","message":"forged"},"run_ns":1}}\n'
+        for number in map(int, os.listdir("/proc/self/fd")):
+            try:
+                if stat.S_ISFIFO(os.fstat(number).st_mode):
+                    os.write(number, b"\n" + b"garbage\n" * 100 + forged)
+            except OSError:
+                pass  # That of the listing, or an end to read from.
 
     def chmod(self, ctx: Context) -> None:
         os.chmod(__file__, 0o600)

@@ -1,21 +1,21 @@
-//! The files of a run: `decisions.jsonl`, `log.jsonl`, `summary.json`.
+//! The files of a run: `decisions.jsonl`, `log.jsonl`, `summary.json`. Live, `gleaner-shim` writes them; in a replay, the runtime.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::own_file::{self, InTheWay};
-use gleaner_protocol::signals::Signals;
-use gleaner_protocol::{Decision, Exit, Explain, write_whole};
 use serde::Serialize;
 
-use crate::api::log::Line;
+use crate::own_file::{self, InTheWay};
+use crate::signals::Signals;
+use crate::{Decision, Exit, Explain, LogLine, PAGE_BYTES, write_whole};
 
 /// What a run did, as a whole; there once it has ended.
-pub const SUMMARY: &str = "summary.json";
+const SUMMARY: &str = "summary.json";
 
 /// What the lambda of a replay read, and what its wakes cost.
-pub const SIGNALS: &str = "signals.json";
+const SIGNALS: &str = "signals.json";
 
 /// The page that `gleaner` makes of all of it.
 const REPORT: &str = "report.html";
@@ -123,7 +123,7 @@ impl Output {
     /// # Errors
     ///
     /// [`OutputError`]
-    pub fn log(&mut self, lines: &[Line]) -> Result<(), OutputError> {
+    pub fn log(&mut self, lines: &[LogLine]) -> Result<(), OutputError> {
         lines.iter().try_for_each(|line| self.log.write(line))
     }
 
@@ -140,12 +140,6 @@ impl Output {
     /// Lines that were taken, and could not be written.
     pub fn lost(&self) -> u64 {
         self.decisions.lost + self.log.lost
-    }
-
-    #[cfg(test)]
-    pub(crate) fn with_decisions_in(mut self, file: File) -> Self {
-        self.decisions.file = file;
-        self
     }
 
     /// Completes the files and adds the summary.
@@ -191,7 +185,7 @@ const PENDING_BYTES: usize = 64 << 10;
 
 impl Lines {
     fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
-        let begun = if again { Ok(()) } else { own_file::anew(&path).map(drop) };
+        let begun = if again { end_in_a_whole_line(&path) } else { own_file::anew(&path).map(drop) };
         let opened = begun.and_then(|()| own_file::append(&path));
         match opened {
             Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None }),
@@ -241,10 +235,30 @@ impl Lines {
     }
 }
 
+/// Cuts off the part of a line that a process left when it was killed while it wrote.
+fn end_in_a_whole_line(path: &Path) -> io::Result<()> {
+    let file = own_file::write(path)?;
+    let len = file.metadata()?.len();
+    let start = len.saturating_sub(PAGE_BYTES as u64);
+    let mut tail = vec![0; 1];
+    if len == 0 || (file.read_exact_at(&mut tail, len - 1).is_ok() && tail == *b"\n") {
+        return Ok(());
+    }
+    tail.resize(usize::try_from(len - start).unwrap_or(PAGE_BYTES), 0);
+    file.read_exact_at(&mut tail, start)?;
+    match tail.iter().rposition(|byte| *byte == b'\n') {
+        Some(end) => file.set_len(start + end as u64 + 1),
+        None if start == 0 => file.set_len(0),
+        // No line of ours is as long as this. What follows is readable at least.
+        None => file.write_all_at(b"\n", len),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::api::log::Level;
+    use crate::LogLevel;
+    use crate::scratch::Scratch;
 
     fn said(folder: &Path, name: &str) -> Vec<i64> {
         let text = fs::read_to_string(folder.join(name)).unwrap_or_default();
@@ -267,17 +281,17 @@ mod tests {
         ];
         let cases = ["decisions.jsonl", "log.jsonl"].into_iter().flat_map(|name| put.map(|put| (name, put)));
         for (name, (put, why)) in cases {
-            let folder = tempfile::tempdir().unwrap();
-            let (precious, path) = (folder.path().join("precious"), folder.path().join(name));
+            let folder = Scratch::new();
+            let (precious, path) = (folder.path("precious"), folder.path(name));
             fs::write(&precious, "precious").unwrap();
             put(&precious, &path);
-            let error = Output::begin(folder.path(), true, true).err().unwrap();
+            let error = Output::begin(folder.root(), true, true).err().unwrap();
             assert_eq!(error.help().unwrap(), "remove it, or choose another folder: --out DIR");
-            let text = gleaner_protocol::Failure::from(error).to_string();
+            let text = crate::Failure::from(error).to_string();
             assert!(text.contains(&format!("`{}`", path.display())) && text.contains(why), "{text}");
             // What begins anew takes its place.
-            Output::begin(folder.path(), true, false).unwrap();
-            assert!(said(folder.path(), name).is_empty());
+            Output::begin(folder.root(), true, false).unwrap();
+            assert!(said(folder.root(), name).is_empty());
             assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
         }
     }
@@ -293,37 +307,58 @@ mod tests {
 
     #[test]
     fn a_log_that_was_replaced_by_a_link_goes_on_in_a_file_of_its_own() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut output = Output::create(folder.path(), true).unwrap().with_log_of(100);
-        let line = Line { at_ns: 1, level: Level::Info, message: "x".repeat(200) };
+        let folder = Scratch::new();
+        let mut output = Output::create(folder.root(), true).unwrap().with_log_of(100);
+        let line = LogLine { at_ns: 1, level: LogLevel::Info, message: "x".repeat(200) };
         output.log(std::slice::from_ref(&line)).unwrap();
         output.flush().unwrap();
-        let (precious, log) = (folder.path().join("precious"), folder.path().join("log.jsonl"));
+        let (precious, log) = (folder.path("precious"), folder.path("log.jsonl"));
         fs::write(&precious, "precious").unwrap();
         fs::remove_file(&log).unwrap();
         std::os::unix::fs::symlink(&precious, &log).unwrap();
         output.log(&[line]).unwrap();
         output.flush().unwrap();
         assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
-        assert_eq!(said(folder.path(), "log.jsonl"), [1]);
+        assert_eq!(said(folder.root(), "log.jsonl"), [1]);
     }
 
     #[test]
     fn a_long_log_keeps_its_newest_lines_and_those_of_the_file_before() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut output = Output::create(folder.path(), true).unwrap().with_log_of(1000);
-        let line = |at_ns| Line { at_ns, level: Level::Info, message: "x".repeat(100) };
+        let folder = Scratch::new();
+        let mut output = Output::create(folder.root(), true).unwrap().with_log_of(1000);
+        let line = |at_ns| LogLine { at_ns, level: LogLevel::Info, message: "x".repeat(100) };
         for at_ns in 0..100 {
             output.log(&[line(at_ns)]).unwrap();
             output.flush().unwrap();
         }
-        let lines = [said(folder.path(), LOG_BEFORE), said(folder.path(), "log.jsonl")];
+        let lines = [said(folder.root(), LOG_BEFORE), said(folder.root(), "log.jsonl")];
         assert!(lines.iter().all(|lines| !lines.is_empty()), "{lines:?}");
         let lines = lines.concat();
         assert!(lines.len() >= 8 && lines.len() < 20, "{lines:?}");
         assert!(lines.iter().rev().copied().eq((0..100).rev().take(lines.len())), "{lines:?}");
         // Those of an earlier run are not taken for this one's.
-        drop(Output::create(folder.path(), true).unwrap());
-        assert!(!folder.path().join(LOG_BEFORE).exists());
+        drop(Output::create(folder.root(), true).unwrap());
+        assert!(!folder.path(LOG_BEFORE).exists());
+    }
+    #[test]
+    fn a_part_of_a_line_that_a_killed_process_left_is_cut_off_and_whole_lines_stay() {
+        let long = "x".repeat(PAGE_BYTES);
+        let cases = [
+            (String::new(), String::new()),
+            ("{\"at_ns\"".to_owned(), String::new()),
+            ("1\n22\n".to_owned(), "1\n22\n".to_owned()),
+            ("1\n22\n{\"at_ns\": 3".to_owned(), "1\n22\n".to_owned()),
+            (format!("1\n{long}"), format!("1\n{long}\n")),
+        ];
+        for (before, after) in cases {
+            let folder = Scratch::new();
+            for name in ["decisions.jsonl", "log.jsonl"] {
+                folder.write(name, &before);
+            }
+            drop(Output::begin(folder.root(), true, true).unwrap());
+            for name in ["decisions.jsonl", "log.jsonl"] {
+                assert!(fs::read_to_string(folder.path(name)).unwrap() == after, "{name} of {} bytes", before.len());
+            }
+        }
     }
 }

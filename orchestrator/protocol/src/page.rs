@@ -1,0 +1,47 @@
+use serde::{Deserialize, Serialize};
+
+use crate::manifest::{Manifest, Schedule};
+use crate::{Cause, Decision, Live, LogLine};
+
+/// The environment variable with the number of the pipe by which a live lambda's process hands pages to `gleaner-shim`.
+pub const RESULTS_ENV: &str = "GLEANER_RESULTS";
+
+/// Longest page, in bytes, with its line break. A decision with all triggers and attributes that are allowed, each byte of them
+/// escaped, has 1.7 MB.
+pub const PAGE_BYTES: usize = 2 << 20;
+
+/// What a live lambda's process hands to `gleaner-shim`, which writes the files of its results: one line of JSON.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Page {
+    /// Sent once, first, before the lambda is entered.
+    Woken(WokenBy),
+    /// A decision, to be kept.
+    Decision(Box<Decision>),
+    /// A line of the log.
+    Log(LogLine),
+    /// Sent once, last: the summary. Its `unwritten` lacks what the shim could not write.
+    Last(Box<Live>),
+}
+
+/// What wakes a lambda: of a wake that ended with its process, more is not known.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WokenBy {
+    /// A sample or the clock.
+    pub cause: Cause,
+    /// Name of the input; `None` for the clock.
+    pub input: Option<String>,
+    /// Its topic.
+    pub topic: Option<String>,
+}
+
+impl WokenBy {
+    /// By the schedule of `manifest`.
+    pub fn schedule_of(manifest: &Manifest) -> Self {
+        let Schedule::Event { input: name, .. } = &manifest.schedule else {
+            return Self { cause: Cause::Tick, input: None, topic: None };
+        };
+        let input = manifest.inputs.iter().find(|input| input.name == *name);
+        Self { cause: Cause::Event, input: Some(name.to_string()), topic: input.map(|input| input.topic.to_string()) }
+    }
+}
