@@ -357,10 +357,10 @@ fn stopped() {
     let stopped = below(listens.pid(), "gleaner-runtime").into_iter().next_back().expect("its runtime");
     // Its shim first, which would not stand by.
     let shim = below(listens.pid(), "gleaner-shim")[0];
-    [shim, stopped].map(|pid| signal(pid, "STOP"));
+    [shim, stopped].into_iter().for_each(|pid| signal(pid, "STOP"));
     let from = talks.until_live("what cannot be sent any more", |live| live.unsent > 0);
     let to = talks.until_live("a second more", |live| live.up_s > from.up_s + 1.0);
-    [stopped, shim].map(|pid| signal(pid, "CONT"));
+    [stopped, shim].into_iter().for_each(|pid| signal(pid, "CONT"));
     // 1,000 a second are due. Waiting for the reader, it would be 10.
     let rate = (to.wakes - from.wakes) as f64 / (to.up_s - from.up_s);
     assert!(rate > 50.0 && to.unsent > from.unsent, "{rate} wakes in a second, {} not sent", to.unsent);
