@@ -2,8 +2,9 @@ use std::io;
 use std::path::PathBuf;
 use std::process::ExitStatus;
 
+use gleaner_protocol::layout::{BUILD_MAX, FILES_MAX};
 use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Exit, Explain, LayoutError};
+use gleaner_protocol::{Exit, Explain, LayoutError, ManifestError, NotPlain};
 
 /// Why a lambda cannot be built.
 #[derive(Debug, thiserror::Error)]
@@ -24,6 +25,10 @@ pub(super) enum BuildError {
     NoComponent { package: PathBuf },
     #[error("cannot {action} `{}`", path.display())]
     File { action: &'static str, path: PathBuf, source: io::Error },
+    #[error("it would have more than {FILES_MAX} files, or more than {BUILD_MAX}")]
+    TooMuch,
+    #[error(transparent)]
+    Manifest(ManifestError),
     #[error("`{}` is newer than the build that was just made of it", source_file.display())]
     Changed { source_file: PathBuf },
     #[error("the lambda's files cannot be listed")]
@@ -55,15 +60,21 @@ impl Explain for BuildError {
             BuildError::Changed { .. } => {
                 "it changed meanwhile: build again; if its date lies in the future, `touch` it first".to_owned()
             }
-            BuildError::Compile { .. } | BuildError::File { .. } | BuildError::Sources(_) | BuildError::Layout(_) => {
-                return None;
+            BuildError::TooMuch => {
+                "keep in the lambda's folder what belongs to it: data that a lambda does not need goes elsewhere"
+                    .to_owned()
             }
+            BuildError::File { source, .. } => return NotPlain::of(source).map(NotPlain::help),
+            BuildError::Manifest(error) => return error.help(),
+            BuildError::Sources(error) | BuildError::Layout(error) => return error.help(),
+            BuildError::Compile { .. } => return None,
         })
     }
 
     fn exit(&self) -> Exit {
         match self {
-            BuildError::File { .. } | BuildError::Sources(_) | BuildError::Layout(_) => Exit::Internal,
+            BuildError::File { source, .. } if NotPlain::of(source).is_none() => Exit::Internal,
+            BuildError::Sources(error) | BuildError::Layout(error) => error.exit(),
             _ => Exit::Usage,
         }
     }

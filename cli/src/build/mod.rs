@@ -12,8 +12,9 @@ use std::fs::File;
 use std::path::Path;
 use std::time::SystemTime;
 
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, Sources};
+use gleaner_protocol::layout::{COMPONENT_MAX, FILE_MAX};
+use gleaner_protocol::manifest::{ByteSize, Kind};
+use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, PlainFile, SOURCE_MAX, Sources};
 
 use error::BuildError;
 use folder::{Built, Partial};
@@ -40,14 +41,16 @@ fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, 
     // Two builds of one lambda take turns. Where a folder cannot be locked, they are on their own.
     let turn = File::open(dir).and_then(|folder| folder.lock().map(|()| folder));
 
+    let mut partial = Partial::begin(dir)?;
     let sources = Sources::of(dir, manifest).map_err(BuildError::Sources)?;
     check_named(dir, manifest)?;
-    let mut partial = Partial::begin(dir)?;
     if manifest.lambda.kind == Kind::Wasm {
-        partial.add(&component::compile(dir)?, manifest.lambda.entry.as_path())?;
+        let component = component::compile(dir)?;
+        partial.add(&component, PlainFile::named(&component, COMPONENT_MAX), manifest.lambda.entry.as_path())?;
     }
     for source in &sources.copied {
-        partial.add(&dir.join(source), source)?;
+        let opened = PlainFile::inside(dir, source, longest(manifest, source));
+        partial.add(&dir.join(source), opened, source)?;
     }
     let built = partial.finish(started)?;
 
@@ -57,6 +60,12 @@ fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, 
         Err(LayoutError::Older { source_file, .. }) => Err(BuildError::Changed { source_file }),
         Err(error) => Err(BuildError::Layout(error)),
     }
+}
+
+/// The bound of a file that a build copies.
+fn longest(manifest: &Manifest, source: &Path) -> ByteSize {
+    let is_model = manifest.models.iter().any(|model| model.file.as_path() == source);
+    if is_model { FILE_MAX } else { SOURCE_MAX }
 }
 
 /// What a clip of this lambda will not be able to prove, if there is anything.
@@ -89,7 +98,8 @@ fn check_entry(manifest: &Manifest) -> Result<(), BuildError> {
 fn check_named(dir: &Path, manifest: &Manifest) -> Result<(), BuildError> {
     let entry = (manifest.lambda.kind == Kind::Python).then(|| (manifest.lambda.entry.as_path(), "`entry`"));
     let models = manifest.models.iter().map(|model| (model.file.as_path(), "`file` of a [[model]]"));
-    match entry.into_iter().chain(models).find(|(file, _)| !dir.join(file).is_file()) {
+    // What is there and no file is refused by name when it is copied.
+    match entry.into_iter().chain(models).find(|(file, _)| !dir.join(file).exists()) {
         Some((file, named_by)) => Err(BuildError::Missing { path: dir.join(file), named_by }),
         None => Ok(()),
     }

@@ -6,16 +6,14 @@
 //! A component is hostile until proven otherwise, so compiling has a limit of memory and of time.
 
 use std::fs::{self, File, Metadata, OpenOptions};
-use std::io::{self, Read};
+use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Explain, hex};
+use gleaner_protocol::layout::COMPONENT_MAX;
+use gleaner_protocol::{Exit, Explain, NotPlain, PlainFile, hex};
 use sha2::{Digest, Sha256};
 use wasmtime::{Config, Engine};
-
-/// Largest component that is compiled, in bytes.
-pub const COMPONENT_BYTES: u64 = 64 << 20;
 
 /// Largest native code that is kept, in bytes.
 pub const CODE_BYTES: usize = 256 << 20;
@@ -55,7 +53,7 @@ impl Nans {
 pub enum CompileError {
     #[error("cannot read component `{}`", path.display())]
     Read { path: PathBuf, source: io::Error },
-    #[error("component `{}` has {bytes} bytes; at most {COMPONENT_BYTES} are compiled", path.display())]
+    #[error("component `{}` has {bytes} bytes; at most {COMPONENT_MAX} are compiled", path.display())]
     TooLarge { path: PathBuf, bytes: u64 },
     #[error("cannot compile component `{}`", path.display())]
     Compile { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
@@ -130,20 +128,12 @@ pub fn settings(nans: Nans) -> Config {
 ///
 /// [`CompileError::Read`], [`CompileError::TooLarge`].
 pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
-    let read = |source| CompileError::Read { path: path.to_owned(), source };
-    let too_large = |bytes| CompileError::TooLarge { path: path.to_owned(), bytes };
-    // A pipe would be waited for, and a device has no end.
-    let file = OpenOptions::new().read(true).custom_flags(NO_WAITING).open(path).map_err(read)?;
-    let meta = file.metadata().map_err(read)?;
-    if !meta.is_file() {
-        return Err(read(io::Error::new(io::ErrorKind::InvalidInput, "it is no file")));
-    }
-    if meta.len() > COMPONENT_BYTES {
-        return Err(too_large(meta.len()));
-    }
-    let mut component = Vec::with_capacity(meta.len() as usize);
-    let bytes = file.take(COMPONENT_BYTES + 1).read_to_end(&mut component).map_err(read)? as u64;
-    if bytes > COMPONENT_BYTES { Err(too_large(bytes)) } else { Ok(component) }
+    PlainFile::named(path, COMPONENT_MAX).and_then(PlainFile::read_whole).map_err(|source| {
+        match NotPlain::of(&source) {
+            Some(NotPlain::TooLong { bytes, .. }) => CompileError::TooLarge { path: path.to_owned(), bytes: *bytes },
+            _ => CompileError::Read { path: path.to_owned(), source },
+        }
+    })
 }
 
 /// Where the native code of `component` is kept on this machine: `<cache>/<key>.cwasm`.
@@ -210,8 +200,6 @@ pub fn check_folder(folder: &Path) -> Result<(), CompileError> {
 const NOT_OURS: &str = "it belongs to another user";
 /// `O_NOFOLLOW`.
 const NO_FOLLOW: i32 = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
-/// `O_NONBLOCK`.
-const NO_WAITING: i32 = rustix::fs::OFlags::NONBLOCK.bits() as i32;
 
 fn foreign(meta: &Metadata) -> Option<&'static str> {
     if meta.uid() != rustix::process::geteuid().as_raw() {
@@ -284,9 +272,9 @@ mod tests {
             let why = std::error::Error::source(&error).unwrap().to_string();
             assert!(matches!(error, CompileError::Read { .. }) && why == "it is no file", "{why}");
         }
-        File::create(&large).unwrap().set_len(COMPONENT_BYTES + 1).unwrap();
+        File::create(&large).unwrap().set_len(COMPONENT_MAX.bytes() + 1).unwrap();
         assert!(
-            matches!(read_component(&large), Err(CompileError::TooLarge { bytes, .. }) if bytes == COMPONENT_BYTES + 1)
+            matches!(read_component(&large), Err(CompileError::TooLarge { bytes, .. }) if bytes == COMPONENT_MAX.bytes() + 1)
         );
         fs::remove_dir_all(&folder).unwrap();
     }

@@ -21,6 +21,7 @@ use std::sync::atomic::AtomicBool;
 
 use gleaner_protocol::journal::Part;
 use gleaner_protocol::manifest::Schedule as Declared;
+use gleaner_protocol::results::LIVE_LOG_MAX;
 use gleaner_protocol::{Exit, Failure, Report};
 use gleaner_transport::dds::Dds;
 
@@ -38,9 +39,6 @@ use crate::judge::Judge;
 use crate::network::NetworkError;
 use crate::schedule::Schedule;
 use crate::stage::{Bounds, Load, Output, Stage, not_started};
-
-/// Bytes of log in a file; twice as many are kept. A lambda may log 34 GB a day within its limits, and nobody looks after a vehicle's disk.
-const LOG_BYTES: u64 = 256 << 20;
 
 impl Job {
     /// Runs the lambda until SIGTERM, or for as long as was asked, and writes reports to `reports`.
@@ -91,7 +89,7 @@ impl Job {
         let undecided = (wanted.restarts > 0).then(|| before::undecided(&manifest, &wanted.out)).flatten();
         let mut ledger = {
             let output = Output::begin(&wanted.out, wanted.all, wanted.restarts > 0)?;
-            Ledger::start(output.with_log_of(LOG_BYTES), reports)?
+            Ledger::start(output.with_log_of(LIVE_LOG_MAX.bytes()), reports)?
         };
         ledger.report(Report::Isolation { layers: isolation.close()?.to_vec() });
         let initialised = guest.init();
