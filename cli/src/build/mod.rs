@@ -1,18 +1,19 @@
 //! `gleaner build DIR`: a lambda's sources become its build folder, which every other command uses.
 //!
-//! `component` compiles Rust, `folder` puts everything together beside the old build and swaps the two, so that a build
+//! `component` compiles Rust, in a `sandbox` if that is asked for, `folder` puts everything together beside the old build and swaps the two, so that a build
 //! that fails leaves the old one as it was. Which files make up a lambda is said by `gleaner_protocol::Sources`. Nothing
 //! here runs a lambda or looks into a component.
 
 mod component;
 mod error;
 mod folder;
+mod sandbox;
 
 use std::fs::File;
 use std::path::Path;
 use std::time::SystemTime;
 
-use gleaner_protocol::layout::{COMPONENT_MAX, FILE_MAX};
+use gleaner_protocol::layout::FILE_MAX;
 use gleaner_protocol::manifest::{ByteSize, Kind};
 use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, PlainFile, SOURCE_MAX, Sources};
 
@@ -22,12 +23,12 @@ use folder::{Built, Partial};
 use crate::results::size;
 use crate::say::say;
 
-/// Builds the lambda in `dir` and says so.
-pub(crate) fn run(dir: &Path) -> Result<Exit, Failure> {
+/// Builds the lambda in `dir` and says so. If it is `sandboxed`, code of its author runs in a jail meanwhile.
+pub(crate) fn run(dir: &Path, sandboxed: bool) -> Result<Exit, Failure> {
     // A change that comes while we build makes the build older than its source, as it should.
     let started = SystemTime::now();
     let manifest = Manifest::load(dir)?;
-    let built = build(dir, &manifest, started).map_err(|error| {
+    let built = build(dir, &manifest, started, sandboxed).map_err(|error| {
         Failure::because(format!("cannot build lambda `{}` in `{}`", manifest.lambda.name, dir.display()), &error)
     })?;
     let (path, files) = (BuildDir::of(dir), built.files);
@@ -36,7 +37,7 @@ pub(crate) fn run(dir: &Path) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, BuildError> {
+fn build(dir: &Path, manifest: &Manifest, started: SystemTime, sandboxed: bool) -> Result<Built, BuildError> {
     check_entry(manifest)?;
     // Two builds of one lambda take turns. Where a folder cannot be locked, they are on their own.
     let turn = File::open(dir).and_then(|folder| folder.lock().map(|()| folder));
@@ -45,8 +46,8 @@ fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, 
     let sources = Sources::of(dir, manifest).map_err(BuildError::Sources)?;
     check_named(dir, manifest)?;
     if manifest.lambda.kind == Kind::Wasm {
-        let component = component::compile(dir)?;
-        partial.add(&component, PlainFile::named(&component, COMPONENT_MAX), manifest.lambda.entry.as_path())?;
+        let component = component::compile(dir, sandboxed)?;
+        partial.add(&component.path, component.opened, manifest.lambda.entry.as_path())?;
     }
     for source in &sources.copied {
         let opened = PlainFile::inside(dir, source, longest(manifest, source));

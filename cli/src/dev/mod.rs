@@ -80,7 +80,7 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
 
 /// Builds and replays; whether there are results, be they of a lambda with faults or of a damaged drive.
 fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
-    build::run(dir)?;
+    build::run(dir, false)?;
     replay::results(args).map(|(_, has_results)| has_results)
 }
 
