@@ -37,7 +37,7 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
     match cli.command {
         Command::Inspect(args) => sibling::inspect(&args),
         Command::New(args) => new::run(&args),
-        Command::Build(args) => build::run(&args.lambda),
+        Command::Build(args) => build::run(&args.lambda, args.sandboxed),
         Command::Check(args) => check::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Report(args) => report::run(&args),

@@ -2,13 +2,13 @@
 //!
 //! Nothing is written here, and no file is held in memory as a whole: `decisions.jsonl` may have a line per wake.
 
-use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 pub use gleaner_protocol::grouped;
-use gleaner_protocol::{Clip, Decision, Exit, Explain, Trigger, own_file, visible};
+use gleaner_protocol::results::{LINE_MAX, LINES_MAX};
+use gleaner_protocol::{Clip, Decision, Exit, Explain, PlainFile, Trigger, visible};
 use serde::de::DeserializeOwned;
 
 /// Why results cannot be read.
@@ -33,7 +33,7 @@ pub enum ResultsError {
         source: serde_json::Error,
     },
     /// A line is longer than any that Gleaner writes.
-    #[error("`{}`, line {line}, is longer than {} MiB", path.display(), LINE_BYTES >> 20)]
+    #[error("`{}`, line {line}, is longer than {LINE_MAX}", path.display())]
     Long {
         /// The file.
         path: PathBuf,
@@ -41,9 +41,6 @@ pub enum ResultsError {
         line: usize,
     },
 }
-
-/// Most bytes of a line: what stands in the folder may have been written by others, and a line is held in memory.
-const LINE_BYTES: usize = 16 << 20;
 
 impl Explain for ResultsError {
     fn help(&self) -> Option<String> {
@@ -55,12 +52,13 @@ impl Explain for ResultsError {
     }
 }
 
-/// A file of JSON lines, read one by one. After a line that cannot be used the next one follows; after a file that cannot be read, none.
+/// A file of JSON lines, read one by one. After a line that cannot be used the next one follows; after one that is too long none, since a
+/// sparse file is one line without an end; and after a file that cannot be read, none.
 #[derive(Debug)]
 pub struct JsonLines<T> {
     path: PathBuf,
     /// `None` once it could not be read.
-    reader: Option<BufReader<File>>,
+    reader: Option<BufReader<PlainFile>>,
     text: Vec<u8>,
     line: usize,
     of: PhantomData<T>,
@@ -92,8 +90,7 @@ pub fn clips(out: &Path) -> Result<Vec<Clip>, ResultsError> {
 impl<T> JsonLines<T> {
     /// The lines of the file `path`.
     pub(crate) fn read(path: PathBuf) -> Result<Self, ResultsError> {
-        // The user named the folder; what lies in archives may be links.
-        match own_file::read_named(&path) {
+        match PlainFile::result(&path, LINES_MAX) {
             Ok(file) => {
                 Ok(Self { path, reader: Some(BufReader::new(file)), text: Vec::new(), line: 0, of: PhantomData })
             }
@@ -106,12 +103,12 @@ impl<T> JsonLines<T> {
         let reader = self.reader.as_mut()?;
         self.line += 1;
         self.text.clear();
-        let read = reader.by_ref().take(LINE_BYTES as u64 + 1).read_until(b'\n', &mut self.text);
-        let is_long = self.text.len() > LINE_BYTES;
-        let skipped = if is_long && !self.text.ends_with(b"\n") { reader.skip_until(b'\n').map(drop) } else { Ok(()) };
-        match read.and_then(|read| skipped.map(|()| read)) {
+        match reader.by_ref().take(LINE_MAX.bytes() + 1).read_until(b'\n', &mut self.text) {
             Ok(0) => None,
-            Ok(_) if is_long => Some(Err(ResultsError::Long { path: self.path.clone(), line: self.line })),
+            Ok(_) if self.text.len() as u64 > LINE_MAX.bytes() => {
+                self.reader = None;
+                Some(Err(ResultsError::Long { path: self.path.clone(), line: self.line }))
+            }
             Ok(_) => Some(Ok(())),
             Err(source) => {
                 self.reader = None;
@@ -267,30 +264,49 @@ mod tests {
     }
 
     #[test]
-    fn a_line_that_cannot_be_used_is_named_and_the_next_one_follows() {
-        let path = std::env::temp_dir().join(format!("gleaner-lines-{}", std::process::id()));
-        let long = "1".repeat(LINE_BYTES + 1);
-        std::fs::write(&path, format!("1\nx\n{long}\n{long}2\n5")).unwrap();
-        let lines: Vec<_> = JsonLines::<u8>::read(path.clone()).unwrap().collect();
-        std::fs::remove_file(&path).unwrap();
-        assert_eq!(lines.len(), 5);
+    fn a_line_that_cannot_be_used_is_named_and_the_next_one_follows_unless_it_is_too_long() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("decisions.jsonl");
+        let long = "1".repeat(LINE_MAX.bytes() as usize + 1);
+        std::fs::write(&path, format!("1\nx\n3\n{long}\n5")).unwrap();
+        let lines: Vec<_> = JsonLines::<u8>::read(path).unwrap().collect();
+        assert_eq!(lines.len(), 4);
         assert!(matches!(lines[0], Ok(1)));
         assert!(matches!(lines[1], Err(ResultsError::Line { line: 2, .. })));
-        assert!(matches!(lines[2], Err(ResultsError::Long { line: 3, .. })));
+        assert!(matches!(lines[2], Ok(3)));
         assert!(matches!(lines[3], Err(ResultsError::Long { line: 4, .. })));
-        assert!(matches!(lines[4], Ok(5)));
     }
 
     #[test]
-    fn a_pipe_in_the_place_of_results_is_refused_and_not_waited_for() {
+    fn a_file_without_an_end_is_refused_or_ends_with_its_first_line_without_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let sparse = |bytes| {
+            let file = std::fs::File::create(folder.path().join("decisions.jsonl")).unwrap();
+            file.set_len(bytes).unwrap();
+            Decisions::open(folder.path())
+        };
+        let text = gleaner_protocol::Failure::from(sparse(1 << 40).unwrap_err()).to_string();
+        assert!(
+            text.contains("decisions.jsonl`\n  cause: it has 1099511627776 bytes; at most 32 GiB are read"),
+            "{text}"
+        );
+        let lines: Vec<_> = sparse(LINES_MAX.bytes()).unwrap().collect();
+        assert!(matches!(lines[..], [Err(ResultsError::Long { line: 1, .. })]));
+    }
+
+    #[test]
+    fn a_pipe_or_a_link_in_the_place_of_results_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let [decisions, clips_list] = ["decisions.jsonl", "clips.jsonl"].map(|name| folder.path().join(name));
         assert!(std::process::Command::new("mkfifo").arg(&decisions).status().unwrap().success());
-        std::os::unix::fs::symlink(&decisions, &clips_list).unwrap();
+        std::fs::write(folder.path().join("other"), "").unwrap();
+        std::os::unix::fs::symlink("other", &clips_list).unwrap();
         let errors = [Decisions::open(folder.path()).err(), clips(folder.path()).err()];
-        for (error, name) in errors.into_iter().zip(["decisions.jsonl`", "clips.jsonl`"]) {
+        for (error, said) in
+            errors.into_iter().zip(["decisions.jsonl`\n  cause: it is no file", "clips.jsonl`\n  cause: it is a link"])
+        {
             let text = gleaner_protocol::Failure::from(error.unwrap()).to_string();
-            assert!(text.contains(name) && text.contains("it is no file"), "{text}");
+            assert!(text.contains(said), "{text}");
         }
     }
 

@@ -186,6 +186,60 @@ fn a_crash_names_its_signal() {
     assert!(text(&output.stderr).contains("without a result (signal: 11 (SIGSEGV)"), "{}", text(&output.stderr));
 }
 
+/// Runs `gleaner` with arguments that name the folder of `installation` as OUT.
+fn with_out(installation: &Installation, arguments: &[&str]) -> Output {
+    let out = installation.0.to_str().unwrap();
+    let arguments = arguments.iter().map(|argument| if *argument == "OUT" { out } else { *argument });
+    // Seconds after which it counts as one that waits for ever; it takes some milliseconds.
+    let mut gleaner = Command::new("timeout");
+    output(gleaner.arg("120").arg(env!("CARGO_BIN_EXE_gleaner")).args(arguments).stdout(Stdio::piped()))
+}
+
+#[test]
+fn results_without_an_end_are_refused_with_their_name_and_bound() {
+    let commands: [&[&str]; 3] =
+        [&["report", "OUT"], &["diff", "OUT", "OUT"], &["diff", "OUT", "OUT", "--report", "/dev/null"]];
+    for (name, bound, refusing) in [
+        ("decisions.jsonl", "32 GiB", &commands[..]),
+        ("clips.jsonl", "32 GiB", &commands),
+        ("log.jsonl", "32 GiB", &commands[..1]),
+        ("summary.json", "4 MiB", &commands),
+        ("signals.json", "32 MiB", &commands),
+    ] {
+        let installation = Installation::new(&format!("sparse-{name}"), &format!("truncate -s 1T {name}; cat report"));
+        let refused = format!("cause: it has 1099511627776 bytes; at most {bound} are read");
+        let shown = installation.replay(&[]);
+        let said = text(&shown.stderr);
+        // The decisions are shown, and the rest goes into the report: a replay has done its work without.
+        assert_eq!(shown.status.code(), Some(if name == "decisions.jsonl" { 1 } else { 0 }), "{said}");
+        assert!(said.contains(name) && said.contains(&refused), "{name}: {said}");
+        for arguments in refusing {
+            let output = with_out(&installation, arguments);
+            let said = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{arguments:?}: {said}");
+            assert!(said.contains(name) && said.contains(&refused) && said.contains("help:"), "{arguments:?}: {said}");
+        }
+    }
+}
+
+#[test]
+fn results_of_others_are_not_shown_as_those_of_a_run() {
+    let other = "the log of another lambda";
+    for name in ["log.jsonl", "decisions.jsonl", "summary.json"] {
+        let installation = Installation::new(
+            &format!("link-{name}"),
+            &format!("echo '{other}' > other; ln -sf other {name}; cat report"),
+        );
+        let page = installation.0.join("report.html");
+        installation.replay(&[]);
+        let output = with_out(&installation, &["report", "OUT"]);
+        let said = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains(name) && said.contains("cause: it is a link") && !said.contains(other), "{said}");
+        assert!(!page.exists(), "{name}");
+    }
+}
+
 #[cfg(target_os = "linux")]
 #[test]
 fn an_output_that_takes_nothing_is_a_failure() {

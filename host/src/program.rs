@@ -30,7 +30,9 @@ use crate::isolation;
 use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
 use crate::live;
-use crate::replay::{self, InspectArgs, ReplayArgs, VerifyArgs};
+#[cfg(feature = "python")]
+use crate::replay::Lent;
+use crate::replay::{self, InspectArgs, ReplayArgs, UnpackedArgs, VerifyArgs};
 use crate::stage::{Asked, Bounds, Load};
 #[cfg(feature = "dds")]
 use crate::topics::TopicsArgs;
@@ -42,6 +44,8 @@ struct Cli {
     /// Runs the lambda of a replay, sends each outcome to the process that started this one, and writes nothing.
     #[arg(long, hide = true)]
     worker: bool,
+    #[command(flatten)]
+    unpacked: UnpackedArgs,
     #[command(subcommand)]
     command: Command,
 }
@@ -178,6 +182,18 @@ fn at_start(manifest: &Manifest) -> u64 {
     rings.flatten().fold(INTERPRETER, |sum, bytes| sum.saturating_add(bytes as u64))
 }
 
+impl Cli {
+    /// The job, or how it ended where no lambda is needed for it.
+    fn job(self) -> Result<Result<Job, Exit>, Failure> {
+        let Self { unpacked, command, .. } = self;
+        let mut job = command.job()?;
+        if let Ok(Job::Replay(job)) = &mut job {
+            job.take(unpacked)?;
+        }
+        Ok(job)
+    }
+}
+
 impl Command {
     /// The job, or how it ended where no lambda is needed for it.
     fn job(self) -> Result<Result<Job, Exit>, Failure> {
@@ -197,26 +213,28 @@ impl Command {
 /// `main` of `gleaner-runtime`.
 pub fn main() -> ExitCode {
     prepare();
-    let Cli { worker, command } = Cli::parse();
-    end(command.job().and_then(|job| job.map_or_else(Ok, |job| run_any(job, worker))))
+    let cli = Cli::parse();
+    let worker = cli.worker;
+    end(cli.job().and_then(|job| job.map_or_else(Ok, |job| run_any(job, worker))))
 }
 
 /// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: their job, with the guest
 /// that `load` makes. Returns the exit code.
 pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
     prepare();
-    let Cli { worker, command } = match Cli::try_parse_from(args) {
+    let cli = match Cli::try_parse_from(args) {
         Ok(cli) => cli,
         Err(error) => {
             let _ = error.print();
             return Exit::Usage.code();
         }
     };
-    code(command.job().and_then(|job| job.map_or_else(Ok, |job| if worker { work(job, load) } else { run(job, load) })))
+    let worker = cli.worker;
+    code(cli.job().and_then(|job| job.map_or_else(Ok, |job| if worker { work(job, load) } else { run(job, load) })))
 }
 
 fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
-    #[allow(unused_variables, reason = "who cannot host Python does not look into the folder")]
+    #[allow(unused_variables, reason = "the folder is looked at only where Python can be hosted")]
     let (asked, manifest) = job.lambda();
     #[allow(unused_variables, reason = "the same")]
     let around = job.around(is_worker)?;
@@ -224,15 +242,7 @@ fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
         #[cfg(feature = "wasm")]
         Kind::Wasm => run(job, &mut wasm::load),
         #[cfg(feature = "python")]
-        Kind::Python if !is_worker && !job.is_live() => {
-            // The group of this process is that of its worker, too.
-            let group = cgroup::fit(job.inside(false).all);
-            let mut remote = |_: &Asked, manifest: &Manifest, session, _| {
-                Ok(Box::new(Remote::start(manifest, session, group.clone())?) as _)
-            };
-            isolation::end_with_starter(Signal::TERM)?;
-            job.run_offline(&mut remote, &mut reports()?)
-        }
+        Kind::Python if !is_worker && !job.is_live() => run_with_worker(job),
         #[cfg(feature = "python")]
         Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
@@ -250,6 +260,23 @@ fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
             format!("this gleaner-runtime was built without lambdas of kind {}", kind.as_str()),
         )),
     }
+}
+
+/// Does `job` but for what its worker does.
+#[cfg(feature = "python")]
+fn run_with_worker(mut job: Job) -> Result<Exit, Failure> {
+    isolation::end_with_starter(Signal::TERM)?;
+    // The group of this process is that of its worker, too.
+    let group = cgroup::fit(job.inside(false).all);
+    let lent = if let Job::Replay(job) = &mut job { job.unpack()? } else { Lent::default() };
+    let mut remote = |_: &Asked, manifest: &Manifest, session, _| {
+        let (arguments, names) = lent.arguments()?;
+        let guest = Remote::start(arguments, manifest, session, group.clone())?;
+        // It has opened its drives.
+        drop(names);
+        Ok(Box::new(guest) as _)
+    };
+    job.run_offline(&mut remote, &mut reports()?)
 }
 
 fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {

@@ -239,6 +239,9 @@ impl From<Language> for Kind {
 /// Arguments of `gleaner build`.
 #[derive(Args, Debug)]
 pub struct BuildArgs {
+    /// Compile a Rust lambda where its build scripts and macros reach no network and no files but its own; see docs/security.md
+    #[arg(long)]
+    pub sandboxed: bool,
     /// The lambda's folder, with its lambda.toml
     #[arg(value_name = "DIR")]
     pub lambda: PathBuf,

@@ -3,13 +3,16 @@
 use std::env;
 use std::ffi::OsString;
 use std::fs;
-use std::io::{BufRead, BufReader};
+use std::io::{self, BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use gleaner_protocol::layout::COMPONENT_MAX;
+use gleaner_protocol::{Exit, PlainFile};
 use serde_json::Value;
 
 use super::error::{BuildError, TARGET};
+use super::sandbox::Sandbox;
 
 /// Cargo's own variable for what is left out of a component.
 const STRIP: &str = "CARGO_PROFILE_RELEASE_STRIP";
@@ -18,8 +21,14 @@ const STRIP: &str = "CARGO_PROFILE_RELEASE_STRIP";
 /// `relaxed-simd`, whose results depend on the CPU.
 const SIMD: &str = "-Ctarget-feature=+simd128";
 
-/// Compiles the package in `dir`. The result is the component, in cargo's target folder.
-pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
+/// A component in cargo's target folder.
+pub(super) struct Compiled {
+    pub(super) path: PathBuf,
+    pub(super) opened: io::Result<PlainFile>,
+}
+
+/// Compiles the package in `dir`, in a sandbox if that is asked for.
+pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildError> {
     let package = dir.join("Cargo.toml");
     if !package.is_file() {
         return Err(BuildError::NoPackage { path: package });
@@ -28,14 +37,15 @@ pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
     // Cargo names manifests by their full path.
     let package = fs::canonicalize(&package).map_err(read)?;
 
-    let cargo = program("CARGO", "cargo");
-    let no_cargo = |source| BuildError::NoCargo { program: cargo.clone(), source };
-    let mut build = Command::new(&cargo);
+    let sandbox = if sandboxed { Some(Sandbox::prepare(&package)?) } else { None };
+    let mut build = sandbox.as_ref().map_or_else(cargo, Sandbox::cargo);
+    let program = PathBuf::from(build.get_program());
+    let no_cargo = |source| BuildError::NoCargo { program: program.clone(), source };
     if env::var_os(STRIP).is_none() {
         // The standard library's line tables are most of a component: 2.6 MB with them, a tenth without. Names stay.
         build.env(STRIP, "debuginfo");
     }
-    let mut child = with_simd(build.arg("build"), |variable| env::var_os(variable))
+    let mut child = with_simd(&mut build, |variable| env::var_os(variable))
         .args(["--release", "--target", TARGET, "--message-format=json-render-diagnostics", "--manifest-path"])
         .arg(&package)
         .stdin(Stdio::null())
@@ -51,9 +61,27 @@ pub(super) fn compile(dir: &Path) -> Result<PathBuf, BuildError> {
     }
     let status = child.wait().map_err(no_cargo)?;
     if !status.success() {
-        return Err(if target_is_missing() { BuildError::NoTarget } else { BuildError::Compile { status } });
+        return Err(match &sandbox {
+            // Cargo itself ends with 1 or 101.
+            Some(_) if status.code() == Some(i32::from(Exit::Denied.code())) => BuildError::NoSandbox,
+            Some(_) => BuildError::CompileSandboxed { status },
+            None if target_is_missing() => BuildError::NoTarget,
+            None => BuildError::Compile { status },
+        });
     }
-    component.ok_or(BuildError::NoComponent { package })
+    let path = component.ok_or(BuildError::NoComponent { package })?;
+    let opened = match &sandbox {
+        // What was built says where it is, and could name anything.
+        Some(sandbox) => PlainFile::inside(sandbox.target(), &path, COMPONENT_MAX),
+        None => PlainFile::named(&path, COMPONENT_MAX),
+    };
+    Ok(Compiled { path, opened })
+}
+
+fn cargo() -> Command {
+    let mut cargo = Command::new(program("CARGO", "cargo"));
+    cargo.arg("build");
+    cargo
 }
 
 /// Adds [`SIMD`] to the flags that the compiler gets. Cargo takes those of one place only, and of a variable first; so they are

@@ -2,8 +2,9 @@ use std::io;
 use std::path::PathBuf;
 use std::process::ExitStatus;
 
+use gleaner_protocol::layout::{BUILD_MAX, FILES_MAX};
 use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Exit, Explain, LayoutError};
+use gleaner_protocol::{Exit, Explain, LayoutError, ManifestError, NotPlain, PartsError};
 
 /// Why a lambda cannot be built.
 #[derive(Debug, thiserror::Error)]
@@ -20,10 +21,26 @@ pub(super) enum BuildError {
     NoTarget,
     #[error("cargo ended with {status}; its messages are above")]
     Compile { status: ExitStatus },
+    #[error("cargo ended with {status} in its sandbox; its messages are above")]
+    CompileSandboxed { status: ExitStatus },
+    #[error("cargo is not sandboxed; gleaner-shim says above what is missing")]
+    NoSandbox,
+    #[error("what the lambda depends on cannot be fetched: cargo ended with {status}; its messages are above")]
+    Fetch { status: ExitStatus },
+    #[error("the lambda belongs to the workspace `{}`, and all of that could be read", workspace.display())]
+    Workspace { workspace: PathBuf },
+    #[error("the toolchain of `{}` is none of rustup's", rustc.display())]
+    Toolchain { rustc: PathBuf },
+    #[error(transparent)]
+    Parts(PartsError),
     #[error("the package `{}` makes no component", package.display())]
     NoComponent { package: PathBuf },
     #[error("cannot {action} `{}`", path.display())]
     File { action: &'static str, path: PathBuf, source: io::Error },
+    #[error("it would have more than {FILES_MAX} files, or more than {BUILD_MAX}")]
+    TooMuch,
+    #[error(transparent)]
+    Manifest(ManifestError),
     #[error("`{}` is newer than the build that was just made of it", source_file.display())]
     Changed { source_file: PathBuf },
     #[error("the lambda's files cannot be listed")]
@@ -55,15 +72,35 @@ impl Explain for BuildError {
             BuildError::Changed { .. } => {
                 "it changed meanwhile: build again; if its date lies in the future, `touch` it first".to_owned()
             }
-            BuildError::Compile { .. } | BuildError::File { .. } | BuildError::Sources(_) | BuildError::Layout(_) => {
-                return None;
+            BuildError::TooMuch => {
+                "keep in the lambda's folder what belongs to it: data that a lambda does not need goes elsewhere"
+                    .to_owned()
             }
+            BuildError::File { source, .. } => return NotPlain::of(source).map(NotPlain::help),
+            BuildError::CompileSandboxed { .. } => {
+                "where a build script or a macro was refused something, it was by the layer `files` (all but the toolchain, crates and its \
+                 own workspace to read, all but its target folder to write) or `sockets` (any): leave that out, or build without --sandboxed \
+                 if you trust its author"
+                    .to_owned()
+            }
+            BuildError::Workspace { .. } => "move the lambda into a folder of its own".to_owned(),
+            BuildError::Toolchain { .. } => {
+                "remove the rust-toolchain.toml that names it, or name the toolchain: RUSTUP_TOOLCHAIN".to_owned()
+            }
+            BuildError::Parts(error) => return error.help(),
+            BuildError::NoSandbox | BuildError::Fetch { .. } => return None,
+            BuildError::Manifest(error) => return error.help(),
+            BuildError::Sources(error) | BuildError::Layout(error) => return error.help(),
+            BuildError::Compile { .. } => return None,
         })
     }
 
     fn exit(&self) -> Exit {
         match self {
-            BuildError::File { .. } | BuildError::Sources(_) | BuildError::Layout(_) => Exit::Internal,
+            BuildError::File { source, .. } if NotPlain::of(source).is_none() => Exit::Internal,
+            BuildError::Sources(error) | BuildError::Layout(error) => error.exit(),
+            BuildError::Parts(error) => error.exit(),
+            BuildError::NoSandbox => Exit::Denied,
             _ => Exit::Usage,
         }
     }

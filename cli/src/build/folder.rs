@@ -2,10 +2,12 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use gleaner_protocol::BuildDir;
+use gleaner_protocol::layout::{BUILD_MAX, FILES_MAX};
+use gleaner_protocol::{BuildDir, Manifest, PlainFile};
 
 use super::error::BuildError;
 
@@ -14,48 +16,60 @@ use super::error::BuildError;
 pub(super) struct Partial {
     dir: PathBuf,
     path: PathBuf,
+    built: Built,
 }
 
 /// What a build holds.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Built {
     pub(super) files: u64,
     pub(super) bytes: u64,
 }
 
 impl Partial {
-    /// An empty build of the lambda in `dir`.
+    /// An empty build of the lambda in `dir`. What a build that was killed has left goes.
     pub(super) fn begin(dir: &Path) -> Result<Partial, BuildError> {
         let path = dir.join(".build.partial");
         remove(&path)?;
         fs::create_dir(&path).map_err(failed("create", &path))?;
-        Ok(Partial { dir: dir.to_owned(), path })
+        Ok(Partial { dir: dir.to_owned(), path, built: Built::default() })
     }
 
-    /// Copies the file `from` to `to`, relative to the build.
-    pub(super) fn add(&mut self, from: &Path, to: &Path) -> Result<(), BuildError> {
+    /// Copies the file that was `opened`, of the name `from`, to `to`, relative to the build.
+    pub(super) fn add(&mut self, from: &Path, opened: io::Result<PlainFile>, to: &Path) -> Result<(), BuildError> {
+        let file = opened.map_err(failed("copy", from))?;
+        // Before the disk is full of it.
+        self.count(file.length())?;
         let to = self.path.join(to);
         if let Some(folder) = to.parent() {
             fs::create_dir_all(folder).map_err(failed("create", folder))?;
         }
-        fs::copy(from, &to).map(drop).map_err(failed("copy", from))
+        let created = File::options().write(true).create_new(true).mode(file.mode()).open(&to);
+        let mut copy = created.map_err(failed("create", &to))?;
+        file.copy_to(&mut copy).map_err(failed("copy", from))
+    }
+
+    fn count(&mut self, bytes: u64) -> Result<(), BuildError> {
+        self.built.files += 1;
+        self.built.bytes = self.built.bytes.saturating_add(bytes);
+        let is_within = self.built.files <= FILES_MAX as u64 && self.built.bytes <= BUILD_MAX.bytes();
+        if is_within { Ok(()) } else { Err(BuildError::TooMuch) }
     }
 
     /// Adds the manifest, by whose time the age of a build is told, and puts the build into its place. `started` is
     /// when its first source was read.
-    pub(super) fn finish(self, started: SystemTime) -> Result<Built, BuildError> {
-        let source = self.dir.join("lambda.toml");
-        let text = fs::read(&source).map_err(failed("read", &source))?;
+    pub(super) fn finish(mut self, started: SystemTime) -> Result<Built, BuildError> {
+        let text = Manifest::read(&self.dir).map_err(BuildError::Manifest)?;
+        self.count(text.len() as u64)?;
         let manifest = self.path.join("lambda.toml");
-        let write = |text: &[u8]| -> io::Result<()> {
-            let mut file = File::create(&manifest)?;
-            file.write_all(text)?;
+        let write = || -> io::Result<()> {
+            let mut file = File::create_new(&manifest)?;
+            file.write_all(text.as_bytes())?;
             file.set_modified(started)
         };
-        write(&text).map_err(failed("write", &manifest))?;
-        let built = contents(&self.path).map_err(failed("list", &self.path))?;
+        write().map_err(failed("write", &manifest))?;
         self.swap()?;
-        Ok(built)
+        Ok(self.built)
     }
 
     fn swap(&self) -> Result<(), BuildError> {
@@ -90,21 +104,6 @@ fn remove(folder: &Path) -> Result<(), BuildError> {
         Err(error) if error.kind() != io::ErrorKind::NotFound => Err(failed("remove", folder)(error)),
         _ => Ok(()),
     }
-}
-
-fn contents(folder: &Path) -> io::Result<Built> {
-    let mut built = Built { files: 0, bytes: 0 };
-    for entry in fs::read_dir(folder)? {
-        let entry = entry?;
-        let data = entry.metadata()?;
-        let inside = match data.is_dir() {
-            true => contents(&entry.path())?,
-            false => Built { files: 1, bytes: data.len() },
-        };
-        built.files += inside.files;
-        built.bytes += inside.bytes;
-    }
-    Ok(built)
 }
 
 fn failed(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> BuildError {

@@ -1,19 +1,21 @@
 //! `gleaner build DIR`: a lambda's sources become its build folder, which every other command uses.
 //!
-//! `component` compiles Rust, `folder` puts everything together beside the old build and swaps the two, so that a build
+//! `component` compiles Rust, in a `sandbox` if that is asked for, `folder` puts everything together beside the old build and swaps the two, so that a build
 //! that fails leaves the old one as it was. Which files make up a lambda is said by `gleaner_protocol::Sources`. Nothing
 //! here runs a lambda or looks into a component.
 
 mod component;
 mod error;
 mod folder;
+mod sandbox;
 
 use std::fs::File;
 use std::path::Path;
 use std::time::SystemTime;
 
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, Sources};
+use gleaner_protocol::layout::FILE_MAX;
+use gleaner_protocol::manifest::{ByteSize, Kind};
+use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, PlainFile, SOURCE_MAX, Sources};
 
 use error::BuildError;
 use folder::{Built, Partial};
@@ -21,12 +23,12 @@ use folder::{Built, Partial};
 use crate::results::size;
 use crate::say::say;
 
-/// Builds the lambda in `dir` and says so.
-pub(crate) fn run(dir: &Path) -> Result<Exit, Failure> {
+/// Builds the lambda in `dir` and says so. If it is `sandboxed`, code of its author runs in a jail meanwhile.
+pub(crate) fn run(dir: &Path, sandboxed: bool) -> Result<Exit, Failure> {
     // A change that comes while we build makes the build older than its source, as it should.
     let started = SystemTime::now();
     let manifest = Manifest::load(dir)?;
-    let built = build(dir, &manifest, started).map_err(|error| {
+    let built = build(dir, &manifest, started, sandboxed).map_err(|error| {
         Failure::because(format!("cannot build lambda `{}` in `{}`", manifest.lambda.name, dir.display()), &error)
     })?;
     let (path, files) = (BuildDir::of(dir), built.files);
@@ -35,19 +37,21 @@ pub(crate) fn run(dir: &Path) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, BuildError> {
+fn build(dir: &Path, manifest: &Manifest, started: SystemTime, sandboxed: bool) -> Result<Built, BuildError> {
     check_entry(manifest)?;
     // Two builds of one lambda take turns. Where a folder cannot be locked, they are on their own.
     let turn = File::open(dir).and_then(|folder| folder.lock().map(|()| folder));
 
+    let mut partial = Partial::begin(dir)?;
     let sources = Sources::of(dir, manifest).map_err(BuildError::Sources)?;
     check_named(dir, manifest)?;
-    let mut partial = Partial::begin(dir)?;
     if manifest.lambda.kind == Kind::Wasm {
-        partial.add(&component::compile(dir)?, manifest.lambda.entry.as_path())?;
+        let component = component::compile(dir, sandboxed)?;
+        partial.add(&component.path, component.opened, manifest.lambda.entry.as_path())?;
     }
     for source in &sources.copied {
-        partial.add(&dir.join(source), source)?;
+        let opened = PlainFile::inside(dir, source, longest(manifest, source));
+        partial.add(&dir.join(source), opened, source)?;
     }
     let built = partial.finish(started)?;
 
@@ -57,6 +61,12 @@ fn build(dir: &Path, manifest: &Manifest, started: SystemTime) -> Result<Built, 
         Err(LayoutError::Older { source_file, .. }) => Err(BuildError::Changed { source_file }),
         Err(error) => Err(BuildError::Layout(error)),
     }
+}
+
+/// The bound of a file that a build copies.
+fn longest(manifest: &Manifest, source: &Path) -> ByteSize {
+    let is_model = manifest.models.iter().any(|model| model.file.as_path() == source);
+    if is_model { FILE_MAX } else { SOURCE_MAX }
 }
 
 /// What a clip of this lambda will not be able to prove, if there is anything.
@@ -89,7 +99,8 @@ fn check_entry(manifest: &Manifest) -> Result<(), BuildError> {
 fn check_named(dir: &Path, manifest: &Manifest) -> Result<(), BuildError> {
     let entry = (manifest.lambda.kind == Kind::Python).then(|| (manifest.lambda.entry.as_path(), "`entry`"));
     let models = manifest.models.iter().map(|model| (model.file.as_path(), "`file` of a [[model]]"));
-    match entry.into_iter().chain(models).find(|(file, _)| !dir.join(file).is_file()) {
+    // What is there and no file is refused by name when it is copied.
+    match entry.into_iter().chain(models).find(|(file, _)| !dir.join(file).exists()) {
         Some((file, named_by)) => Err(BuildError::Missing { path: dir.join(file), named_by }),
         None => Ok(()),
     }

@@ -29,7 +29,7 @@ impl Lambda {
 
     fn build(&self) -> Result<Built, BuildError> {
         let started = SystemTime::now();
-        build(&self.0, &Manifest::load(&self.0).unwrap(), started)
+        build(&self.0, &Manifest::load(&self.0).unwrap(), started, false)
     }
 
     fn read(&self, relative: &str) -> Option<String> {

@@ -9,7 +9,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gleaner_protocol::{Exit, Failure, own_file, visible};
+use gleaner_protocol::manifest::ByteSize;
+use gleaner_protocol::{Exit, Failure, PlainFile, own_file, visible};
 
 use crate::args::{AskedArgs, ReplayArgs};
 use crate::say::say;
@@ -46,6 +47,9 @@ const BEFORE: &str = ".before";
 /// Files of a replay from which it is compared with the next.
 const COMPARED: [&str; 4] = ["summary.json", "decisions.jsonl", "signals.json", "clips.jsonl"];
 
+/// Longest file that is kept: it is there twice.
+const KEPT_MAX: ByteSize = ByteSize::gib(1);
+
 /// Goes on until somebody ends it.
 pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
     let dir = args.asked.lambda.clone();
@@ -76,7 +80,7 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
 
 /// Builds and replays; whether there are results, be they of a lambda with faults or of a damaged drive.
 fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
-    build::run(dir)?;
+    build::run(dir, false)?;
     replay::results(args).map(|(_, has_results)| has_results)
 }
 
@@ -95,11 +99,11 @@ fn keep(out: &Path, before: &Path) -> bool {
         }
         own_file::folder(before)?;
         for name in COMPARED {
-            match own_file::read(&out.join(name)) {
+            match PlainFile::result(&out.join(name), KEPT_MAX) {
                 Err(error) if error.kind() == io::ErrorKind::NotFound && name != COMPARED[0] => {
                     let _ = fs::remove_file(before.join(name));
                 }
-                file => drop(io::copy(&mut file?, &mut own_file::anew(&before.join(name))?)?),
+                file => file?.copy_to(&mut own_file::anew(&before.join(name))?)?,
             }
         }
         Ok(())

@@ -20,7 +20,7 @@ pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     let mut notes = Vec::new();
     let (told_a, told_b) = (Told::bounded(a, &mut notes)?, Told::bounded(b, &mut notes)?);
     apart(&told_a, &told_b, &mut notes);
-    let [read_a, read_b] = [a, b].map(|out| signals(out, &mut notes));
+    let (read_a, read_b) = (signals(a, &mut notes)?, signals(b, &mut notes)?);
     let clips = [clips(a)?, clips(b)?];
     Ok(Diff {
         same: false,

@@ -5,7 +5,7 @@ use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::signals::{Curve, Signals, Spread};
-use gleaner_protocol::{Clip, Decision, visible};
+use gleaner_protocol::{Clip, Decision, NotPlain, visible};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
@@ -37,7 +37,7 @@ struct Line {
 pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<Run, TellError> {
     let mut notes = Vec::new();
     let told = Told::bounded(out, &mut notes)?;
-    let signals = signals(out, &mut notes);
+    let signals = signals(out, &mut notes)?;
     let begin_ns = match &told {
         Told::Replay(summary) => summary.start_ns,
         Told::Live(_) => first_ns(out).unwrap_or(0),
@@ -50,7 +50,7 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
     each(out, "decisions.jsonl", true, &mut notes, |decision: Decision| {
         last_ns = last_ns.max(decision.at_ns);
         marks.add(&decision);
-    });
+    })?;
 
     let (mut log, mut log_seen, mut log_room) = (Vec::new(), 0, Room(room / 2));
     each(out, "log.jsonl", true, &mut notes, |line: Line| {
@@ -61,7 +61,7 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
         if log.len() < LOG_MAX && log_room.take(&shown) {
             log.push(shown);
         }
-    });
+    })?;
 
     let (mut clips, mut clips_seen, mut clip_room) = (Vec::new(), 0, Room(room / 2));
     let mut thumbnails = Vec::new();
@@ -74,7 +74,7 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
             thumbnails.push(clip.thumbnail);
             clips.push(shown);
         }
-    });
+    })?;
 
     let mut pictures = Pictures::new(out, start_ns, shares);
     pictures.at_triggers(&mut marks.triggers, signals.as_ref().map_or(&[][..], |signals| &signals.pictures));
@@ -154,13 +154,17 @@ fn place(run: &mut Run, told: &Told) {
 }
 
 /// Gives `take` what each line of `name` says. Lines that say nothing are counted in `notes`.
+///
+/// # Errors
+///
+/// If the file is a link, or something else that no run leaves: a page without it would hide that.
 fn each<T: DeserializeOwned>(
     out: &Path,
     name: &str,
     is_expected: bool,
     notes: &mut Vec<String>,
     mut take: impl FnMut(T),
-) {
+) -> Result<(), ResultsError> {
     let path: PathBuf = out.join(name);
     let lines = match JsonLines::read(path) {
         Ok(lines) => lines,
@@ -168,9 +172,15 @@ fn each<T: DeserializeOwned>(
             if is_expected {
                 notes.push(format!("`{name}` is not there: the page does without"));
             }
-            return;
+            return Ok(());
         }
-        Err(error) => return notes.push(in_words(&error)),
+        Err(ResultsError::Read { path, source }) if NotPlain::of(&source).is_some() => {
+            return Err(ResultsError::Read { path, source });
+        }
+        Err(error) => {
+            notes.push(in_words(&error));
+            return Ok(());
+        }
     };
     let (mut bad, mut first) = (0_u64, String::new());
     for line in lines {
@@ -188,6 +198,7 @@ fn each<T: DeserializeOwned>(
     if bad > 0 {
         notes.push(format!("{} of `{name}` left out; the first: {first}", crate::show::counted(bad, "line")));
     }
+    Ok(())
 }
 
 /// When a live run is seen for the first time: nothing else tells when it began.

@@ -2,10 +2,11 @@
 //!
 //! Where they lie is said by files that others may have written: nothing outside of the output is read, and nothing but a small JPEG.
 
-use std::io::{self, Read};
+use std::io;
 use std::path::{Component, Path, PathBuf};
 
-use gleaner_protocol::own_file;
+use gleaner_protocol::PlainFile;
+use gleaner_protocol::results::PICTURE_MAX;
 use gleaner_protocol::signals::Picture;
 
 use super::gather::{named, places};
@@ -14,8 +15,7 @@ use super::model::{ClipShown, Mark, PictureShown};
 use super::page::jpeg_address;
 use crate::results::seconds;
 
-/// Most bytes of one picture, and of all on a page.
-const PICTURE_BYTES: u64 = 1 << 20;
+/// Most bytes of all pictures on a page.
 const ALL_BYTES: usize = 2 << 20;
 
 /// Most pictures of clips.
@@ -102,17 +102,10 @@ impl<'a> Pictures<'a> {
 /// The JPEG `file` of `out`.
 fn read(out: &Path, file: &Path) -> io::Result<Vec<u8>> {
     // By its name, and by where links lead.
-    let is_inside = file.components().all(|part| matches!(part, Component::Normal(_)));
-    let outside = || io::Error::other("it is outside of the output");
-    let path = if is_inside { out.join(file).canonicalize()? } else { return Err(outside()) };
-    if !path.starts_with(out.canonicalize()?) {
-        return Err(outside());
+    if !file.components().all(|part| matches!(part, Component::Normal(_))) {
+        return Err(io::Error::other("it is outside of the output"));
     }
-    let mut jpeg = Vec::new();
-    own_file::read(&path)?.take(PICTURE_BYTES + 1).read_to_end(&mut jpeg)?;
-    if jpeg.len() as u64 > PICTURE_BYTES {
-        return Err(io::Error::other("it is larger than 1 MiB"));
-    }
+    let jpeg = PlainFile::inside(out, file, PICTURE_MAX)?.read_whole()?;
     if !jpeg.starts_with(&[0xff, 0xd8, 0xff]) {
         return Err(io::Error::other("it is no JPEG"));
     }

@@ -2,19 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::manifest::{ConfigValue, Kind};
+use gleaner_protocol::manifest::{ByteSize, ConfigValue, Kind};
+use gleaner_protocol::results::{SIGNALS_MAX, SUMMARY_MAX};
 use gleaner_protocol::signals::{Curve, Signals};
-use gleaner_protocol::{Exit, Explain, Live, Summary, own_file};
+use gleaner_protocol::{Exit, Explain, Live, NotPlain, PlainFile, Summary};
 use serde::de::DeserializeOwned;
 
 use super::marks::cut;
-
-/// Most bytes of `summary.json`, which is some kilobytes, and of `signals.json`, whose curves and points are bounded.
-const SUMMARY_BYTES: u64 = 4 << 20;
-const SIGNALS_BYTES: u64 = 32 << 20;
+use crate::results::ResultsError;
 
 /// Most topics of a summary, and drives of it: a lambda has fewer, but the file may be by others. Most characters of their names, and of
 /// what else a summary says in a word.
@@ -33,6 +31,9 @@ pub(crate) enum TellError {
     None { out: PathBuf, inside: Vec<PathBuf>, source: FileError },
     #[error("`{}` is not what gleaner writes", path.display())]
     Summary { path: PathBuf, source: FileError },
+    /// A file of lines that no run of ours has left so.
+    #[error(transparent)]
+    Lines(#[from] ResultsError),
 }
 
 /// Why a file of an output cannot be used.
@@ -40,13 +41,16 @@ pub(crate) enum TellError {
 pub(crate) enum FileError {
     #[error("cannot read `{name}`")]
     Read { name: &'static str, source: io::Error },
-    #[error("`{name}` is larger than {} MiB", bytes >> 20)]
-    Large { name: &'static str, bytes: u64 },
     #[error("`{name}` cannot be understood")]
     Json { name: &'static str, source: serde_json::Error },
 }
 
 impl FileError {
+    /// Whether it is a link or a pipe, or too long: no run leaves such a file.
+    fn is_no_result(&self) -> bool {
+        matches!(self, Self::Read { source, .. } if NotPlain::of(source).is_some())
+    }
+
     fn is_absent(&self) -> bool {
         matches!(self, Self::Read { source, .. } if source.kind() == io::ErrorKind::NotFound)
     }
@@ -63,6 +67,7 @@ impl Explain for TellError {
                 "name the folder that `gleaner replay` or `gleaner run` wrote to; it has a summary.json once they have ended"
                     .to_owned()
             }
+            Self::Lines(error) => return error.help(),
             Self::Summary { .. } => "replay again, with the gleaner that is to read it".to_owned(),
         })
     }
@@ -101,7 +106,7 @@ pub(crate) struct Losses {
 impl Told {
     /// Reads `out/summary.json`.
     fn of(out: &Path) -> Result<Self, TellError> {
-        let text = match bounded(out, "summary.json", SUMMARY_BYTES) {
+        let text = match bounded(out, "summary.json", SUMMARY_MAX) {
             Ok(text) => text,
             Err(source) if source.is_absent() => {
                 return Err(TellError::None { out: out.to_owned(), inside: outputs_in(out), source });
@@ -255,15 +260,22 @@ impl From<&gleaner_protocol::LiveTopic> for Losses {
 /// What the lambda read; `None` if the run left no `signals.json`, as a live one does not.
 ///
 /// What is more than it may be is cut, and curves whose numbers do not belong together are left out; `notes` says so.
-pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Option<Signals> {
-    let read = bounded(out, "signals.json", SIGNALS_BYTES).and_then(|text| parsed::<Signals>("signals.json", &text));
+///
+/// # Errors
+///
+/// If the file is a link, or something else that no run leaves.
+pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Result<Option<Signals>, TellError> {
+    let read = bounded(out, "signals.json", SIGNALS_MAX).and_then(|text| parsed::<Signals>("signals.json", &text));
     let mut signals = match read {
         Ok(signals) => signals,
-        Err(error) if error.is_absent() => return None,
+        Err(error) if error.is_absent() => return Ok(None),
+        Err(source) if source.is_no_result() => {
+            return Err(TellError::Summary { path: out.join("signals.json"), source });
+        }
         Err(error) => {
             // It may quote what was found there.
             notes.push(cut(&in_words(&error), WHY_CHARS));
-            return None;
+            return Ok(None);
         }
     };
     let found = signals.curves.len();
@@ -274,7 +286,7 @@ pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Option<Signals> {
         notes.push(format!("`signals.json`: {dropped} of {found} curves are not as gleaner writes them, and left out"));
     }
     signals.pictures.truncate(Signals::PICTURES_MAX);
-    Some(signals)
+    Ok(Some(signals))
 }
 
 /// What a page shows of a config; it is compared whole.
@@ -312,16 +324,10 @@ fn parsed<T: DeserializeOwned>(name: &'static str, text: &[u8]) -> Result<T, Fil
     serde_json::from_slice(text).map_err(|source| FileError::Json { name, source })
 }
 
-/// The file `name` of `out`, of `bytes` at most.
-fn bounded(out: &Path, name: &'static str, bytes: u64) -> Result<Vec<u8>, FileError> {
-    let path = out.join(name);
-    let read = || {
-        let mut text = Vec::new();
-        own_file::read_named(&path)?.take(bytes + 1).read_to_end(&mut text)?;
-        Ok(text)
-    };
-    let text = read().map_err(|source| FileError::Read { name, source })?;
-    if text.len() as u64 > bytes { Err(FileError::Large { name, bytes }) } else { Ok(text) }
+/// The file `name` of `out`.
+fn bounded(out: &Path, name: &'static str, most: ByteSize) -> Result<Vec<u8>, FileError> {
+    let read = PlainFile::result(&out.join(name), most).and_then(PlainFile::read_whole);
+    read.map_err(|source| FileError::Read { name, source })
 }
 
 /// Folders in `out` that hold results: a vehicle has one for each lambda.

@@ -6,14 +6,12 @@
 //! component, to wasmtime's version, to the settings below and to the CPU. A component is hostile until proven otherwise, so
 //! compiling has a limit of memory and of time.
 
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Explain, own_file};
+use gleaner_protocol::layout::COMPONENT_MAX;
+use gleaner_protocol::{Exit, Explain, NotPlain, PlainFile};
 use wasmtime::{Config, Engine};
-
-/// Largest component that is compiled, in bytes.
-pub const COMPONENT_BYTES: u64 = 64 << 20;
 
 /// Largest native code that is kept, in bytes.
 pub const CODE_BYTES: usize = 256 << 20;
@@ -53,7 +51,7 @@ impl Nans {
 pub enum CompileError {
     #[error("cannot read component `{}`", path.display())]
     Read { path: PathBuf, source: io::Error },
-    #[error("component `{}` has {bytes} bytes; at most {COMPONENT_BYTES} are compiled", path.display())]
+    #[error("component `{}` has {bytes} bytes; at most {COMPONENT_MAX} are compiled", path.display())]
     TooLarge { path: PathBuf, bytes: u64 },
     #[error("`{}` is no WebAssembly component: {}", path.display(), why.what())]
     NoComponent { path: PathBuf, why: NoComponent },
@@ -185,16 +183,12 @@ pub fn settings(nans: Nans) -> Config {
 ///
 /// [`CompileError::Read`], [`CompileError::TooLarge`].
 pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
-    let read = |source| CompileError::Read { path: path.to_owned(), source };
-    let too_large = |bytes| CompileError::TooLarge { path: path.to_owned(), bytes };
-    let file = own_file::read_named(path).map_err(read)?;
-    let meta = file.metadata().map_err(read)?;
-    if meta.len() > COMPONENT_BYTES {
-        return Err(too_large(meta.len()));
-    }
-    let mut component = Vec::with_capacity(meta.len() as usize);
-    let bytes = file.take(COMPONENT_BYTES + 1).read_to_end(&mut component).map_err(read)? as u64;
-    if bytes > COMPONENT_BYTES { Err(too_large(bytes)) } else { Ok(component) }
+    PlainFile::named(path, COMPONENT_MAX).and_then(PlainFile::read_whole).map_err(|source| {
+        match NotPlain::of(&source) {
+            Some(NotPlain::TooLong { bytes, .. }) => CompileError::TooLarge { path: path.to_owned(), bytes: *bytes },
+            _ => CompileError::Read { path: path.to_owned(), source },
+        }
+    })
 }
 
 mod entry;
@@ -237,9 +231,9 @@ mod tests {
             let why = std::error::Error::source(&error).unwrap().to_string();
             assert!(matches!(error, CompileError::Read { .. }) && why == "it is no file", "{why}");
         }
-        File::create(&large).unwrap().set_len(COMPONENT_BYTES + 1).unwrap();
+        File::create(&large).unwrap().set_len(COMPONENT_MAX.bytes() + 1).unwrap();
         assert!(
-            matches!(read_component(&large), Err(CompileError::TooLarge { bytes, .. }) if bytes == COMPONENT_BYTES + 1)
+            matches!(read_component(&large), Err(CompileError::TooLarge { bytes, .. }) if bytes == COMPONENT_MAX.bytes() + 1)
         );
         fs::remove_dir_all(&folder).unwrap();
     }

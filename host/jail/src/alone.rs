@@ -18,7 +18,7 @@ pub const SHARE: &str = "others' share";
 pub const START: &str = "start of the interpreter";
 
 /// Sockets. A pair of connected streams, which reaches nobody else, can still be made.
-const NEW_SOCKETS: &[i64] = &[
+pub(crate) const NEW_SOCKETS: &[i64] = &[
     libc::SYS_socket,
     libc::SYS_bind,
     libc::SYS_listen,
@@ -233,7 +233,7 @@ fn counted_only(refused: Refused) -> Refused {
 }
 
 /// Of pairs of sockets only streams: with others one can send to whoever has a name.
-fn pairs_only(refused: Refused) -> Refused {
+pub(crate) fn pairs_only(refused: Refused) -> Refused {
     refused
         .unless(libc::SYS_socketpair, 0, libc::AF_UNIX as u64)
         .bits(libc::SYS_socketpair, 1, TYPE, libc::SOCK_DGRAM as u64)

@@ -7,6 +7,8 @@
 //! 3. [`alone`], once sockets and files are open: no further ones, no new processes, no signals to others.
 //! 4. [`memory`], with it: so much more than there is now.
 //!
+//! A compiler of a lambda whose author is not trusted enters [`compiler`] instead.
+//!
 //! [`tried`] then tries what should be impossible: a layer counts as one that holds only if it was seen to. [`cgroup`] is the
 //! supervisor's side, for memory and processes that a lambda starts. What is missing on a system is said and not fatal: a
 //! lambda runs with the layers that are there, and everybody can read which these are. What the system has and something in
@@ -14,6 +16,7 @@
 
 pub mod alone;
 pub mod cgroup;
+pub mod compiler;
 mod enter;
 pub mod files;
 mod filter;

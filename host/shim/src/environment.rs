@@ -48,17 +48,31 @@ const ENDINGS: [&str; 1] = ["_NUM_THREADS"];
 /// What stands in the name of a secret, however it begins. Letters of either case are the same.
 const SECRETS: [&str; 6] = ["KEY", "TOKEN", "SECRET", "PASSWORD", "PASSWD", "CREDENTIAL"];
 
+/// Variables of cargo and of rustc, by how their names begin.
+const COMPILER: [&str; 2] = ["CARGO_", "RUST"];
+
 /// What a runtime is given.
 pub(crate) fn handed_on() -> impl Iterator<Item = (OsString, OsString)> {
     env::vars_os().filter(|(name, _)| is_handed_on(name))
 }
 
-fn is_handed_on(name: &OsStr) -> bool {
-    let Some(name) = name.to_str() else { return false };
+/// What a compiler is given.
+pub(crate) fn of_compiler() -> impl Iterator<Item = (OsString, OsString)> {
+    env::vars_os().filter(|(name, _)| is_of_compiler(name))
+}
+
+fn is_of_compiler(name: &OsStr) -> bool {
+    let is_its_own = |name: &str| NAMES.contains(&name) || COMPILER.iter().any(|beginning| name.starts_with(beginning));
+    name.to_str().is_some_and(|name| is_its_own(name) && !is_secret(name))
+}
+
+fn is_secret(name: &str) -> bool {
     let capitals = name.to_ascii_uppercase();
-    if SECRETS.iter().any(|secret| capitals.contains(secret)) {
-        return false;
-    }
+    SECRETS.iter().any(|secret| capitals.contains(secret))
+}
+
+fn is_handed_on(name: &OsStr) -> bool {
+    let Some(name) = name.to_str().filter(|name| !is_secret(name)) else { return false };
     NAMES.contains(&name)
         || CUDA.contains(&name)
         || BEGINNINGS.iter().any(|beginning| name.starts_with(beginning))
@@ -76,6 +90,18 @@ mod tests {
         }
         for name in ["PATH", "ROS_DOMAIN_ID", "OMP_NUM_THREADS", "GLEANER_PYTHON", "CUDA_VISIBLE_DEVICES"] {
             assert!(is_handed_on(OsStr::new(name)), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_compiler_gets_its_own_and_no_secrets() {
+        for name in ["PATH", "CARGO_HOME", "CARGO_NET_OFFLINE", "RUSTC", "RUSTFLAGS", "RUST_BACKTRACE", "TMPDIR"] {
+            assert!(is_of_compiler(OsStr::new(name)), "{name}");
+        }
+        for name in
+            ["CARGO_REGISTRY_TOKEN", "CARGO_REGISTRIES_X_SECRET_KEY", "GLEANER_HOME", "SSH_AUTH_SOCK", "XCARGO_"]
+        {
+            assert!(!is_of_compiler(OsStr::new(name)), "{name}");
         }
     }
 

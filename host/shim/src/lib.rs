@@ -9,6 +9,7 @@
 //!
 //! It lives as long as its runtime, even if whoever started it goes away; with `--starter` it then asks the runtime to end.
 
+mod compiler;
 mod environment;
 mod left_behind;
 mod lines;
@@ -66,6 +67,15 @@ struct Args {
     /// Start nothing: set up every layer here, try each, and write what holds, as JSON.
     #[arg(long, conflicts_with = "program")]
     layers: bool,
+    /// Start a compiler instead of a runtime, without sockets; refused where a layer of its jail does not hold.
+    #[arg(long, requires = "write", conflicts_with_all = ["exit_record", "cgroup", "cgroup_memory", "layers"])]
+    compiler: bool,
+    /// What a compiler may read beside the system's programs and libraries.
+    #[arg(long, value_name = "PATH", requires = "compiler")]
+    read: Vec<PathBuf>,
+    /// What a compiler may read and write.
+    #[arg(long, value_name = "PATH", requires = "compiler")]
+    write: Vec<PathBuf>,
     /// The runtime and its arguments.
     #[arg(last = true, required_unless_present = "layers")]
     program: Vec<OsString>,
@@ -89,6 +99,9 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let signals = Signals::hear().map_err(|error| cannot("cannot listen for signals", &error))?;
     if let Some(starter) = args.starter {
         end_with(starter)?;
+    }
+    if args.compiler {
+        return compiler::run(args, signals);
     }
     left_behind::adopt().map_err(|error| cannot("cannot adopt what a runtime leaves behind", &error))?;
     let (pulse, page) = Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use gleaner_protocol::results::LIVE_LOG_MAX;
 use gleaner_protocol::{
     Decision, Exit, ExitRecord, Failure, Live, Output, OutputError, PAGE_BYTES, Page, Report, WokenBy, visible,
 };
@@ -23,8 +24,6 @@ use crate::lines::{Lines, PIECE};
 
 /// How long lines may wait until they are written to the file. Decisions with a trigger or a fault do not wait.
 const FLUSH: Duration = Duration::from_millis(500);
-/// Bytes of log in a file; twice as many are kept. A lambda may log 34 GB a day within its limits, and vehicles have no administrator.
-const LOG_BYTES: u64 = 256 << 20;
 /// Bytes that are read in a turn. More stay in the pipe: a flood of 16 MiB or 65,000 lines a second is no lambda's honest work, and
 /// must not take a core or the disk from others.
 const TURN_BYTES: usize = 1600 << 10;
@@ -271,7 +270,7 @@ impl Writer {
 
 /// The files in `folder`.
 fn begun(folder: &Path, again: bool) -> Result<Output, OutputError> {
-    Ok(Output::begin(folder, true, again)?.with_log_of(LOG_BYTES))
+    Ok(Output::begin(folder, true, again)?.with_log_of(LIVE_LOG_MAX.bytes()))
 }
 
 /// Waits for `pages`, if there are any to wait for, but not longer than `patience`. Returns whether `ended` is closed.

@@ -1,29 +1,42 @@
 //! Which lambda made a decision: its files with their digests, its config, and what it ran on.
 
-use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::journal::{FileDigest, Header, JournalInput, Part};
+use gleaner_protocol::layout::FILE_MAX;
 use gleaner_protocol::manifest::{ConfigValue, Manifest, Schedule};
-use gleaner_protocol::{BuildDir, Explain, hex};
+use gleaner_protocol::{BuildDir, Exit, Explain, LayoutError, PlainFile, hex};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use crate::input::Remap;
 
-/// More files than a build has, by far; with names of 255 bytes they fit into the header of a journal.
-const FILES_MAX: usize = 4_000;
-
-/// A build cannot be identified.
+/// Why a build cannot be identified.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot take the digest of `{}`", path.display())]
-pub struct IdentityError {
-    path: PathBuf,
-    source: io::Error,
+#[allow(missing_docs)]
+pub enum IdentityError {
+    #[error("cannot take the digest of `{}`", path.display())]
+    Digest { path: PathBuf, source: io::Error },
+    #[error(transparent)]
+    Build(#[from] LayoutError),
 }
 
-impl Explain for IdentityError {}
+impl Explain for IdentityError {
+    fn help(&self) -> Option<String> {
+        match self {
+            Self::Digest { .. } => None,
+            Self::Build(error) => error.help(),
+        }
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            Self::Digest { .. } => Exit::Internal,
+            Self::Build(error) => error.exit(),
+        }
+    }
+}
 
 /// What makes a lambda what it is.
 pub struct Identity<'a> {
@@ -125,38 +138,12 @@ fn json(value: &ConfigValue) -> Value {
 
 /// Every file of a build, by its path in it.
 fn build_digests(build: &BuildDir) -> Result<Vec<FileDigest>, IdentityError> {
-    let mut files = Vec::new();
-    collect(build.path(), &mut files)?;
-    files.sort();
-    files
-        .into_iter()
-        .map(|path| {
-            let name = path.strip_prefix(build.path()).unwrap_or(&path).to_string_lossy().into_owned();
-            digest_of_file(&path).map(|digest| FileDigest { path: name, ..digest })
-        })
-        .collect()
+    build.files()?.iter().map(|path| digest_of_file(build, path)).collect()
 }
 
-fn collect(folder: &Path, files: &mut Vec<PathBuf>) -> Result<(), IdentityError> {
-    let failed = |source| IdentityError { path: folder.to_owned(), source };
-    for entry in fs::read_dir(folder).map_err(failed)? {
-        let entry = entry.map_err(failed)?;
-        let kind = entry.file_type().map_err(failed)?;
-        if kind.is_dir() {
-            collect(&entry.path(), files)?;
-        } else {
-            files.push(entry.path());
-        }
-        if files.len() > FILES_MAX {
-            return Err(failed(io::Error::other(format!("it holds more than {FILES_MAX} files"))));
-        }
-    }
-    Ok(())
-}
-
-fn digest_of_file(path: &Path) -> Result<FileDigest, IdentityError> {
-    let failed = |source| IdentityError { path: path.to_owned(), source };
-    let mut file = File::open(path).map_err(failed)?;
+fn digest_of_file(build: &BuildDir, path: &Path) -> Result<FileDigest, IdentityError> {
+    let failed = |source| IdentityError::Digest { path: build.path().join(path), source };
+    let mut file = PlainFile::inside(build.path(), path, FILE_MAX).map_err(failed)?;
     let mut digest = Sha256::new();
     let bytes = io::copy(&mut file, &mut digest).map_err(failed)?;
     Ok(FileDigest { path: path.to_string_lossy().into_owned(), bytes, sha256: hex(&digest.finalize()) })

@@ -11,6 +11,7 @@ mod inspect;
 mod journal_file;
 mod open;
 mod options;
+mod packed;
 mod part;
 mod pictures;
 mod record;
@@ -21,6 +22,7 @@ mod work;
 
 pub use inspect::{InspectArgs, inspect};
 pub use options::{Job, Options, ReplayArgs, VerifyArgs};
+pub use packed::{Lent, UnpackedArgs};
 
 use std::io::Write;
 

@@ -37,8 +37,8 @@ pub(super) fn open_drives(options: &Options) -> Result<(Replay, Part), Failure> 
 /// installed.
 pub(super) fn open(options: &Options) -> Result<Replay, ReplayError> {
     let sources = Sources::new(&[options.asked.build.path().join("msg")], &definitions());
-    let unpack_in = options.unpack_in.clone();
-    let opening = replay::Options { sources: Some(sources), unpack_in, ..replay::Options::default() };
+    let (unpack_in, unpacked) = (options.unpack_in.clone(), options.unpacked.clone());
+    let opening = replay::Options { sources: Some(sources), unpack_in, unpacked, ..replay::Options::default() };
     Replay::open_as(&options.drives.named, &opening)
 }
 

@@ -6,7 +6,7 @@ use clap::Args;
 use gleaner_jail::Paths;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, DriveTime, Exit, Failure};
-use gleaner_transport::replay::journals_of;
+use gleaner_transport::replay::{Unpacked, journals_of};
 
 use super::journal_file;
 use super::part::Wanted;
@@ -77,6 +77,8 @@ pub struct Options {
     pub topics: Vec<String>,
     /// The folder for what packed drives hold, if there is one of ours.
     pub unpack_in: Option<PathBuf>,
+    /// What packed drives hold, where that is open already.
+    pub unpacked: Vec<Unpacked>,
 }
 
 /// Drives, as they were named and as they are.
@@ -119,11 +121,12 @@ pub struct Job {
 impl Job {
     /// What a replay may open while the lambda runs: drives again in a further pass, the results, the code that was compiled.
     pub fn paths(&self) -> Paths {
-        let Options { asked, drives, .. } = &self.options;
+        let Options { asked, drives, unpacked, .. } = &self.options;
         let mut read = definitions();
         read.push(asked.lambda.clone());
         read.extend(asked.vehicle.clone());
         read.extend(drives.named.iter().chain(&drives.files).cloned());
+        read.extend(unpacked.iter().filter_map(Unpacked::given_name).map(Path::to_owned));
         read.extend(drives.files.iter().flat_map(|file| journals_of(file)).filter(|journal| journal.is_file()));
         if let Task::Verify(claim) = &self.task {
             read.push(claim.path().to_owned());
@@ -191,7 +194,7 @@ impl Job {
             Results { out, all: args.all, record: !args.no_record, journal: args.journal, repeat: args.repeat };
         let part = Wanted { from: args.from, to: args.to };
         let unpack_in = Some(results.out.clone());
-        let options = Options { asked, drives, part, topics: args.topics, unpack_in };
+        let options = Options { asked, drives, part, topics: args.topics, unpack_in, unpacked: Vec::new() };
         Ok(Self { options, manifest, task: Task::Replay(results) })
     }
 

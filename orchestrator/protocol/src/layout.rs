@@ -1,15 +1,29 @@
 //! The build folder of a lambda, `DIR/build/`: what `gleaner build DIR` leaves and every other command uses.
 //!
 //! It is complete: manifest, entry, models, and the message definitions in `msg/`, for when a transport cannot tell
-//! them. Nothing here builds, and no reader of a build folder writes into it.
+//! them. Nothing here builds, and no reader of a build folder writes into it. Whoever made the folder may have put anything there, so
+//! that its files are checked before one of them is used.
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use crate::manifest::ByteSize;
 use crate::words::shell_word;
-use crate::{Exit, Explain, Manifest, ManifestError, Sources};
+use crate::{Exit, Explain, Manifest, ManifestError, NotPlain, PlainFile, Sources};
+
+/// Longest file of a build. No model is longer: ONNX is protobuf, whose messages end at 2 GiB.
+pub const FILE_MAX: ByteSize = ByteSize::gib(2);
+
+/// Most bytes of all files of a build together.
+pub const BUILD_MAX: ByteSize = ByteSize::gib(4);
+
+/// Most files of a build: more than any has, by far. With names of 255 bytes they fit into the header of a journal.
+pub const FILES_MAX: usize = 4_000;
+
+/// Longest component that is compiled.
+pub const COMPONENT_MAX: ByteSize = ByteSize::mib(64);
 
 /// `DIR/build/` of one lambda.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -32,7 +46,7 @@ impl BuildDir {
     ///
     /// [`LayoutError::NoFolder`], [`LayoutError::File`] or [`LayoutError::IsBuild`] if `lambda_dir` is no lambda's
     /// folder, [`LayoutError::Missing`], [`LayoutError::Older`], [`LayoutError::Manifest`] if the build's manifest is
-    /// refused, or [`LayoutError::Read`] if a folder cannot be listed.
+    /// refused, or [`LayoutError::Read`], [`LayoutError::TooMany`] and [`LayoutError::TooLarge`] as for [`files`](Self::files).
     pub fn check_fresh(lambda_dir: impl AsRef<Path>) -> Result<BuildDir, LayoutError> {
         let dir = lambda_dir.as_ref();
         let build = BuildDir::of(dir);
@@ -56,8 +70,42 @@ impl BuildDir {
         let sources = Sources::of(dir, &Manifest::load(build.path())?)?;
         match sources.iter().filter_map(|source| age(source).map(|age| (age, source))).max() {
             Some((_, source)) => Err(older(source)),
-            None => Ok(build),
+            // The interpreter would wait for a pipe, and a digest of a file without an end would not end.
+            None => build.files().map(|_| build),
         }
+    }
+
+    /// The paths of its files in it, in order. All of them are regular files that lie in it, wherever links lead, and they are no more
+    /// and no longer than those of a build may be.
+    ///
+    /// # Errors
+    ///
+    /// [`LayoutError::Read`] if a folder cannot be listed or one of them is something else, [`LayoutError::TooMany`], [`LayoutError::TooLarge`].
+    pub fn files(&self) -> Result<Vec<PathBuf>, LayoutError> {
+        let (mut files, mut bytes, mut folders) = (Vec::new(), 0_u64, vec![PathBuf::new()]);
+        while let Some(folder) = folders.pop() {
+            let failed = |source| LayoutError::Read { path: self.path.join(&folder), source };
+            for entry in fs::read_dir(self.path.join(&folder)).map_err(failed)? {
+                let entry = entry.map_err(failed)?;
+                let path = folder.join(entry.file_name());
+                if entry.file_type().map_err(failed)?.is_dir() {
+                    folders.push(path);
+                    continue;
+                }
+                let file = PlainFile::inside(&self.path, &path, FILE_MAX)
+                    .map_err(|source| LayoutError::Read { path: entry.path(), source })?;
+                bytes = bytes.saturating_add(file.length());
+                files.push(path);
+                if files.len() > FILES_MAX {
+                    return Err(LayoutError::TooMany { build: self.path.clone() });
+                }
+                if bytes > BUILD_MAX.bytes() {
+                    return Err(LayoutError::TooLarge { build: self.path.clone() });
+                }
+            }
+        }
+        files.sort();
+        Ok(files)
     }
 
     /// The folder itself.
@@ -116,6 +164,18 @@ pub enum LayoutError {
     /// The manifest of the build is refused.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
+    /// More files than a build has.
+    #[error("`{}` holds more than {FILES_MAX} files", build.display())]
+    TooMany {
+        /// The build folder.
+        build: PathBuf,
+    },
+    /// More bytes than a build has.
+    #[error("the files in `{}` have more than {BUILD_MAX}", build.display())]
+    TooLarge {
+        /// The build folder.
+        build: PathBuf,
+    },
     /// A file or folder of the lambda cannot be read.
     #[error("cannot read `{}`", path.display())]
     Read {
@@ -137,7 +197,10 @@ impl Explain for LayoutError {
                 Some(format!("run `gleaner build {}`", shell_word(dir)))
             }
             LayoutError::Manifest(error) => error.help(),
-            LayoutError::Read { .. } => None,
+            LayoutError::TooMany { .. } | LayoutError::TooLarge { .. } => {
+                Some("keep in the lambda's folder what belongs to it, and build it again".to_owned())
+            }
+            LayoutError::Read { source, .. } => NotPlain::of(source).map(NotPlain::help),
         }
     }
 
@@ -268,6 +331,43 @@ mod tests {
             let dir = lambda("wasm", &["lambda.toml", "src/lib.rs", "build/lambda.toml", file]);
             assert!(BuildDir::check_fresh(dir.root()).is_ok(), "{file}");
         }
+    }
+
+    #[test]
+    fn a_build_holds_files_of_its_own_of_a_bounded_number_and_length() {
+        let dir = lambda("python", &["lambda.toml", "build/main.py", "build/msg/a/msg/B.msg", "build/lambda.toml"]);
+        let refused = |said: &str| {
+            let error = BuildDir::check_fresh(dir.root()).unwrap_err();
+            assert_eq!(error.exit(), Exit::Usage);
+            let text = crate::Failure::from(error).to_string();
+            assert!(text.contains(said) && text.contains("help:"), "{text}");
+        };
+        let build = BuildDir::check_fresh(dir.root()).unwrap();
+        assert_eq!(build.files().unwrap(), ["lambda.toml", "main.py", "msg/a/msg/B.msg"].map(PathBuf::from));
+
+        let outside = dir.write("secret", "secret");
+        std::os::unix::fs::symlink(&outside, dir.path("build/x")).unwrap();
+        refused(&format!("build/x`\n  cause: it is a link to `{}`, outside of", outside.display()));
+        fs::remove_file(dir.path("build/x")).unwrap();
+
+        let sparse = |name: &str, length: u64| {
+            dir.write(name, "");
+            File::options().write(true).open(dir.path(name)).unwrap().set_len(length).unwrap();
+        };
+        sparse("build/x", 1 << 40);
+        refused("build/x`\n  cause: it has 1099511627776 bytes; at most 2 GiB are read");
+        for name in ["build/x", "build/y", "build/z"] {
+            sparse(name, FILE_MAX.bytes());
+        }
+        refused("have more than 4 GiB");
+        for name in ["build/x", "build/y", "build/z"] {
+            fs::remove_file(dir.path(name)).unwrap();
+        }
+
+        for number in 3..=FILES_MAX {
+            dir.write(&format!("build/many/{number}"), "");
+        }
+        refused("holds more than 4000 files");
     }
 
     #[test]

@@ -3,11 +3,14 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::manifest::Kind;
-use crate::{LayoutError, Manifest};
+use crate::manifest::{ByteSize, Kind};
+use crate::{LayoutError, Manifest, NotPlain};
 
 /// Folders beside the manifest that hold no Python of the lambda: what tools made, and its tests.
 const LEFT_OUT: [&str; 4] = ["build", "out", "target", "tests"];
+
+/// Longest Python file or message definition that a build takes. The longest of the standard library has 700 KiB.
+pub const SOURCE_MAX: ByteSize = ByteSize::mib(16);
 
 /// What a build is made of besides `lambda.toml`: the one rule for whoever builds, and for whoever asks whether a build
 /// is still good.
@@ -29,7 +32,7 @@ impl Sources {
     ///
     /// # Errors
     ///
-    /// [`LayoutError::Read`] if a folder cannot be listed.
+    /// [`LayoutError::Read`] if a folder cannot be listed, or is a link that leads out of the lambda's folder.
     pub fn of(lambda_dir: impl AsRef<Path>, manifest: &Manifest) -> Result<Sources, LayoutError> {
         let dir = lambda_dir.as_ref();
         let models = manifest.models.iter().map(|model| model.file.as_path().to_owned());
@@ -62,6 +65,7 @@ fn files(
     enters: impl Fn(&Path) -> bool,
     takes: impl Fn(&Path) -> bool,
 ) -> Result<Vec<PathBuf>, LayoutError> {
+    lies_in(dir, start)?;
     let mut found = Vec::new();
     let mut folders = vec![PathBuf::from(start)];
     while let Some(folder) = folders.pop() {
@@ -88,6 +92,16 @@ fn files(
         }
     }
     Ok(found)
+}
+
+/// Refuses the folder `start` of `dir` if it is a link that leads elsewhere: anything could be listed there.
+fn lies_in(dir: &Path, start: &str) -> Result<(), LayoutError> {
+    let path = dir.join(start);
+    let (Ok(target), Ok(folder)) = (path.canonicalize(), dir.canonicalize()) else { return Ok(()) };
+    if target.starts_with(&folder) {
+        return Ok(());
+    }
+    Err(LayoutError::Read { path, source: io::Error::other(NotPlain::Outside { target, folder }) })
 }
 
 fn has_extension(file: &Path, wanted: &str) -> bool {
@@ -157,6 +171,28 @@ mod tests {
         let [copied, compiled] = sources(&folder(), "wasm", "x.wasm");
         assert_eq!(copied, ["models/m.onnx", "msg/a/msg/B.msg"]);
         assert_eq!(compiled, ["Cargo.toml", "build.rs", "src/data.bin", "src/inner/mod.rs"]);
+    }
+
+    #[test]
+    fn a_folder_of_sources_that_leads_elsewhere_is_refused_by_name() {
+        let (dir, elsewhere) = (Scratch::new(), folder());
+        for (name, kind) in [("msg", "python"), ("src", "wasm")] {
+            std::os::unix::fs::symlink(elsewhere.root(), dir.path(name)).unwrap();
+            let manifest = format!(
+                "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = 'x' }}\nschedule.period = '1s'\n"
+            );
+            let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
+            let error = gleaner_failure(Sources::of(dir.root(), &manifest).unwrap_err());
+            assert!(
+                error.contains(&format!("{name}`\n  cause: it is a link to `{}`", elsewhere.root().display())),
+                "{error}"
+            );
+            std::fs::remove_file(dir.path(name)).unwrap();
+        }
+    }
+
+    fn gleaner_failure(error: LayoutError) -> String {
+        crate::Failure::from(error).to_string()
     }
 
     #[cfg(unix)]

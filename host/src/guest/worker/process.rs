@@ -40,8 +40,8 @@ pub(super) enum NoMessage {
 }
 
 impl Process {
-    /// Starts this program again as a worker, with the arguments that this process was given.
-    pub(super) fn start() -> Result<Self, Failure> {
+    /// Starts this program again as a worker, with `arguments` and those that this process was given.
+    pub(super) fn start(arguments: Vec<OsString>) -> Result<Self, Failure> {
         let failed = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
         let parts = Parts::find()?;
         let (shim, runtime) = (parts.program("gleaner-shim")?, parts.program("gleaner-runtime")?);
@@ -49,7 +49,7 @@ impl Process {
         let starter: OsString = format!("--starter={}", std::process::id()).into();
         let mut command = Command::new(&shim);
         command.arg(starter).arg("--exit-record").arg(folder.path().join(ExitRecord::FILE)).arg("--");
-        command.arg(runtime).arg(WORKER).args(std::env::args_os().skip(1));
+        command.arg(runtime).arg(WORKER).args(arguments).args(std::env::args_os().skip(1));
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut shim =
             command.spawn().map_err(|error| failed(&format!("cannot start `{}`", shim.display()), &error))?;

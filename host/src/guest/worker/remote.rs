@@ -1,5 +1,7 @@
 //! The side of the process that started a worker: a guest whose outcomes come from there.
 
+use std::ffi::OsString;
+
 use gleaner_protocol::journal::Said;
 use gleaner_protocol::manifest::{Limits, Manifest};
 use gleaner_protocol::signals::Signals;
@@ -39,14 +41,19 @@ struct Read {
 }
 
 impl Remote {
-    /// Starts a worker with the arguments of this process, in the control group of this process if there is one, and waits until it
+    /// Starts a worker with `arguments` and those of this process, in the control group of this process if there is one, and waits until it
     /// is sandboxed.
     ///
     /// # Errors
     ///
     /// A failure if the worker cannot be started, or ends before it is ready; it has then printed why.
-    pub fn start(manifest: &Manifest, session: Session, group: Option<Layer>) -> Result<Self, Failure> {
-        let mut worker = Process::start()?;
+    pub fn start(
+        arguments: Vec<OsString>,
+        manifest: &Manifest,
+        session: Session,
+        group: Option<Layer>,
+    ) -> Result<Self, Failure> {
+        let mut worker = Process::start(arguments)?;
         let (engine, mut layers) = match worker.next() {
             Ok(Message::Ready { engine, layers }) => (engine, layers),
             _ => return Err(not_ready(worker, manifest)),

@@ -142,7 +142,7 @@ impl Claim {
         compare(header, &asked, manifest)?;
         // A clip holds what it holds.
         let part = if self.clip.is_some() { Wanted::default() } else { Wanted::from(header.part) };
-        Ok(Options { asked, drives, part, topics: Vec::new(), unpack_in: None })
+        Ok(Options { asked, drives, part, topics: Vec::new(), unpack_in: None, unpacked: Vec::new() })
     }
 }
 

@@ -49,4 +49,4 @@ pub use options::{Limits, Options};
 pub use step::{Progress, Step};
 pub use storage::{files_of, journals_of};
 #[cfg(feature = "bags")]
-pub use unpack::{Unpacked, unpack};
+pub use unpack::{Name, Unpacked, unpack};

@@ -169,7 +169,9 @@ fn content(unpacked: &Unpacked, options: &Options, opener: &mut Opener) -> Resul
     let len = source.len();
     let (store, mut contents) = match kind_of(&mut source)? {
         Kind::Mcap => mcap(source, opener)?,
-        Kind::Database => database(super::database::File::elsewhere(path, &unpacked.name(options)?), len, options)?,
+        Kind::Database => {
+            database(super::database::File::elsewhere(path, unpacked.name(options)?.as_ref()), len, options)?
+        }
         Kind::Packed => return Err(ReplayError::NotMcap { path: path.clone() }),
     };
     if let Some(error) = &unpacked.broken {

@@ -44,8 +44,26 @@ pub struct Unpacked {
     pub(super) content: Arc<File>,
     /// Why there is no more of it, though there should be.
     pub(super) broken: Option<String>,
-    /// The name that it was made with, where there are no files without one.
-    name: Option<Arc<TempPath>>,
+    /// The name that it has already.
+    name: Option<Name>,
+}
+
+/// A name of the content of a packed file.
+#[derive(Clone, Debug)]
+pub enum Name {
+    /// Removed with the last clone.
+    Ours(Arc<TempPath>),
+    /// Given by the process that unpacked it, and removed there.
+    Given(PathBuf),
+}
+
+impl AsRef<Path> for Name {
+    fn as_ref(&self) -> &Path {
+        match self {
+            Self::Ours(name) => name,
+            Self::Given(name) => name,
+        }
+    }
 }
 
 /// What bounds the content of a file.
@@ -145,20 +163,36 @@ pub(super) fn unpack_one(source: Source, options: &Options, room: &mut u64) -> R
 }
 
 impl Unpacked {
-    /// `content`, which another process made by [`unpack`] of the packed file `path`; of a file that could be unpacked only in
-    /// part, `broken` says why.
-    pub fn of(path: PathBuf, content: File, broken: Option<String>) -> Self {
-        Self { path, content: Arc::new(content), broken, name: None }
+    /// The content of the packed file `path`, which another process made by [`unpack`] and calls `name` for now; of a file that could
+    /// be unpacked only in part, `broken` says why.
+    ///
+    /// # Errors
+    ///
+    /// Those of opening `name`.
+    pub fn named(path: PathBuf, name: PathBuf, broken: Option<String>) -> io::Result<Self> {
+        Ok(Self { path, content: Arc::new(File::open(&name)?), broken, name: Some(Name::Given(name)) })
     }
 
-    /// The packed file, its content, and why there is no more of it, if there should be.
-    pub fn parts(&self) -> (&Path, &File, Option<&str>) {
-        (&self.path, &self.content, self.broken.as_deref())
+    /// The name that another process gave the content, if one did.
+    pub fn given_name(&self) -> Option<&Path> {
+        match &self.name {
+            Some(Name::Given(name)) => Some(name),
+            _ => None,
+        }
+    }
+
+    /// The packed file, and why its content is not whole, if it is not.
+    pub fn parts(&self) -> (&Path, Option<&str>) {
+        (&self.path, self.broken.as_deref())
     }
 
     /// Names the content for as long as the result lives: SQLite opens by name only, and follows the links in `/proc` to
     /// names that are not there.
-    pub(super) fn name(&self, options: &Options) -> Result<Arc<TempPath>, ReplayError> {
+    ///
+    /// # Errors
+    ///
+    /// [`ReplayError::Unpack`] names the folder in which there can be no such name.
+    pub fn name(&self, options: &Options) -> Result<Name, ReplayError> {
         if let Some(name) = &self.name {
             return Ok(name.clone());
         }
@@ -168,7 +202,7 @@ impl Unpacked {
             Ok(linkat(CWD, content, CWD, name, AtFlags::SYMLINK_FOLLOW)?)
         };
         match Builder::new().prefix(PREFIX).make_in(&folder, link) {
-            Ok(named) => Ok(Arc::new(named.into_temp_path())),
+            Ok(named) => Ok(Name::Ours(Arc::new(named.into_temp_path()))),
             Err(source) => Err(ReplayError::Unpack { path: self.path.clone(), folder, source }),
         }
     }
@@ -180,13 +214,13 @@ fn folder(options: &Options) -> PathBuf {
 
 /// A new file in `folder`, without a name where that is possible: some file systems, as those of networks, have none such, and
 /// then a database keeps its name until it is open.
-fn new_file(folder: &Path, is_database: bool) -> io::Result<(File, Option<Arc<TempPath>>)> {
+fn new_file(folder: &Path, is_database: bool) -> io::Result<(File, Option<Name>)> {
     let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
     match open(folder, flags, Mode::RUSR | Mode::WUSR) {
         Ok(file) => Ok((file.into(), None)),
         Err(Errno::OPNOTSUPP | Errno::ISDIR) => {
             let (file, name) = Builder::new().prefix(PREFIX).tempfile_in(folder)?.into_parts();
-            Ok((file, is_database.then(|| Arc::new(name))))
+            Ok((file, is_database.then(|| Name::Ours(Arc::new(name)))))
         }
         Err(error) => Err(error.into()),
     }

@@ -147,9 +147,10 @@ fn content_that_another_process_unpacked_is_read_where_nothing_may_be_written() 
     let bag = bag(Storage::Mcap, Packed::Files, &[&messages]);
     let paths = [bag.path().to_owned()];
     let unpacked = unpack(&paths, &Options::default()).unwrap();
-    let handed = unpacked.iter().map(|one| {
-        let (path, content, broken) = one.parts();
-        Unpacked::of(path.to_owned(), content.try_clone().unwrap(), broken.map(str::to_owned))
+    let names: Vec<_> = unpacked.iter().map(|one| one.name(&Options::default()).unwrap()).collect();
+    let handed = unpacked.iter().zip(&names).map(|(one, name)| {
+        let (path, broken) = one.parts();
+        Unpacked::named(path.to_owned(), name.as_ref().to_owned(), broken.map(str::to_owned)).unwrap()
     });
     let nowhere = Some(bag.path().join("nowhere"));
     let options = Options { unpack_in: nowhere, unpacked: handed.collect(), ..Options::default() };

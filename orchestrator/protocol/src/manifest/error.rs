@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use super::ByteSize;
 use super::bounds::INPUTS_MEMORY_MAX;
 use crate::words::list;
-use crate::{Exit, Explain};
+use crate::{Exit, Explain, NotPlain};
 
 /// A key in a manifest, as a user finds it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -226,7 +226,7 @@ impl Explain for ManifestError {
                 format!("name {wanted}")
             }
             Read { source, .. } if source.kind() == io::ErrorKind::InvalidData => "save it as UTF-8".to_owned(),
-            Read { .. } => return None,
+            Read { source, .. } => return NotPlain::of(source).map(NotPlain::help),
             TooLong { .. } => "check that this is a manifest; data of a lambda belongs into files of its own".to_owned(),
             Syntax { .. } => {
                 "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there can be several"

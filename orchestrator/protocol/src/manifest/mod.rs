@@ -29,9 +29,10 @@ pub use reference::reference;
 pub use types::{Backlog, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store};
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};
 
-use std::fs::File;
-use std::io::{self, Read};
+use std::io;
 use std::path::Path;
+
+use crate::{NotPlain, PlainFile};
 
 /// Name of the file.
 const FILE: &str = "lambda.toml";
@@ -61,9 +62,11 @@ impl Manifest {
     ///
     /// # Errors
     ///
-    /// If `dir/lambda.toml` cannot be read, is longer than [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no UTF-8.
+    /// If `dir/lambda.toml` cannot be read, is no file of that folder, is longer than [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no
+    /// UTF-8.
     pub fn read(dir: impl AsRef<Path>) -> Result<String, ManifestError> {
-        read_text(&dir.as_ref().join(FILE))
+        let dir = dir.as_ref();
+        text(&dir.join(FILE), PlainFile::inside(dir, Path::new(FILE), bounds::MANIFEST_MAX))
     }
 }
 
@@ -72,19 +75,19 @@ pub(crate) fn vehicle_limits(text: &str, file: &str) -> Result<Limits, ManifestE
     read_limits::vehicle(&table::Document { text, file })
 }
 
-/// The text of a manifest, or of what is written alike.
+/// The text of what is written as a manifest is, in a file that a user has named.
 pub(crate) fn read_text(path: &Path) -> Result<String, ManifestError> {
-    let limit = bounds::MANIFEST_MAX;
-    let read = || -> io::Result<Vec<u8>> {
-        let mut bytes = Vec::new();
-        // One byte more than allowed is enough to know.
-        File::open(path)?.take(limit.bytes() + 1).read_to_end(&mut bytes)?;
-        Ok(bytes)
-    };
-    let failed = |source| ManifestError::Read { path: path.to_owned(), source };
-    let bytes = read().map_err(failed)?;
-    if bytes.len() > limit.as_usize() {
-        return Err(ManifestError::TooLong { path: path.to_owned(), limit });
-    }
-    String::from_utf8(bytes).map_err(|error| failed(io::Error::new(io::ErrorKind::InvalidData, error.utf8_error())))
+    text(path, PlainFile::named(path, bounds::MANIFEST_MAX))
+}
+
+fn text(path: &Path, opened: io::Result<PlainFile>) -> Result<String, ManifestError> {
+    let path = || path.to_owned();
+    let bytes = opened.and_then(PlainFile::read_whole).map_err(|source| match NotPlain::of(&source) {
+        Some(NotPlain::TooLong { most, .. }) => ManifestError::TooLong { path: path(), limit: *most },
+        _ => ManifestError::Read { path: path(), source },
+    })?;
+    String::from_utf8(bytes).map_err(|error| {
+        let source = io::Error::new(io::ErrorKind::InvalidData, error.utf8_error());
+        ManifestError::Read { path: path(), source }
+    })
 }

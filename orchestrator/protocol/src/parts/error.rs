@@ -1,7 +1,7 @@
 use std::io;
 use std::path::PathBuf;
 
-use crate::{Exit, Explain};
+use crate::{Exit, Explain, NotPlain};
 
 /// A place or program that was tried, and why it would not do.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -32,6 +32,14 @@ pub enum PartsError {
     WantedPython {
         /// The interpreter, and why not.
         wanted: Looked,
+    },
+    /// The environment of a lambda is one that was tampered with.
+    #[error("cannot read `{}`", config.display())]
+    Environment {
+        /// Its `pyvenv.cfg`.
+        config: PathBuf,
+        /// Why not.
+        source: io::Error,
     },
     /// A part is in none of its places.
     #[error("cannot find {part}; looked in{}", lines(folders.iter().map(|folder| folder.display().to_string())))]
@@ -65,6 +73,8 @@ impl Explain for PartsError {
             PartsError::WantedPython { .. } => Some(
                 "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip, or unset it".to_owned(),
             ),
+            PartsError::Environment { source, .. } => NotPlain::of(source)
+                .map(|why| format!("{}: `python3 -m venv` writes a new one", why.help())),
             PartsError::Missing { made_by, .. } => {
                 Some(format!("in a checkout run `{made_by}`, else set GLEANER_HOME to the folder of the installation"))
             }
@@ -78,7 +88,7 @@ impl Explain for PartsError {
 
     fn exit(&self) -> Exit {
         match self {
-            PartsError::Home { .. } | PartsError::WantedPython { .. } => Exit::Usage,
+            PartsError::Home { .. } | PartsError::WantedPython { .. } | PartsError::Environment { .. } => Exit::Usage,
             _ => Exit::Internal,
         }
     }

@@ -90,8 +90,8 @@ impl Parts {
     ///
     /// # Errors
     ///
-    /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` will not do, [`PartsError::NoPython`] with every candidate and
-    /// why it was refused.
+    /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` will not do, [`PartsError::Environment`] if `pyvenv.cfg` of the lambda is no file,
+    /// [`PartsError::NoPython`] with every candidate and why it was refused.
     pub fn python(&self, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
         self.python_or_why(lambda_dir).map(|(python, _)| python)
     }

@@ -1,8 +1,11 @@
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use super::{Looked, PartsError};
+use crate::manifest::ByteSize;
 use crate::words::excerpt;
+use crate::{NotPlain, PlainFile};
 
 /// Prints the version and the path of the interpreter itself: `python3` is often a script that chooses one, and would
 /// choose again at every start. Fails where the system's Python comes in pieces and lacks the two modules. They are looked for and
@@ -38,6 +41,13 @@ pub(super) fn first_that_runs(
     let mut tried = Vec::new();
     for candidate in candidates {
         let of_lambda = lambda_dir.filter(|dir| candidate.starts_with(dir));
+        if of_lambda.is_some()
+            && let Err(source) = config_of(&candidate)
+            && NotPlain::of(&source).is_some()
+        {
+            // Made on purpose: another interpreter would hide that.
+            return Err(PartsError::Environment { config: environment_of(&candidate).join(CONFIG), source });
+        }
         match of_lambda.map_or_else(|| probe(&candidate), |dir| linked(&candidate, dir)) {
             Ok(interpreter) => return Ok((interpreter, tried)),
             Err(why) => tried.push(Looked { at: candidate, why }),
@@ -58,6 +68,10 @@ fn linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
 
 /// The way out where an environment is not one that can be used.
 const ANEW: &str = "make the environment with `python3 -m venv`, which links";
+/// What an environment says of itself.
+const CONFIG: &str = "pyvenv.cfg";
+/// Longest `pyvenv.cfg` that is read. `python3 -m venv` writes 200 bytes.
+const CONFIG_MAX: ByteSize = ByteSize::mib(1);
 /// Longest line of a `pyvenv.cfg`, in bytes: old Pythons take what is longer apart.
 const LINE_BYTES: usize = 4096;
 
@@ -77,7 +91,7 @@ fn only_linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
     if let Some(file) = paths_of_its_own(bin)? {
         return Err(format!("has `{}` beside it, which names other libraries; {ANEW}", excerpt(&file)));
     }
-    let config = std::fs::read_to_string(bin.parent().unwrap_or(lambda_dir).join("pyvenv.cfg")).unwrap_or_default();
+    let config = config_of(candidate).unwrap_or_default();
     // Python takes some of these for blanks or ends of lines, others not.
     if config.lines().any(|line| line.len() > LINE_BYTES || line.chars().any(|c| c.is_control() && c != '\t')) {
         return Err(format!("its pyvenv.cfg has lines that can be read in two ways; {ANEW}"));
@@ -89,6 +103,17 @@ fn only_linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
         return Err("its pyvenv.cfg names another home than that of its program; make the environment anew".to_owned());
     }
     Ok(program)
+}
+
+/// The folder of the environment that has the interpreter `candidate` in its `bin`.
+fn environment_of(candidate: &Path) -> &Path {
+    candidate.parent().and_then(Path::parent).unwrap_or(candidate)
+}
+
+/// The `pyvenv.cfg` of that environment.
+fn config_of(candidate: &Path) -> io::Result<String> {
+    let config = PlainFile::inside(environment_of(candidate), Path::new(CONFIG), CONFIG_MAX)?.read_whole()?;
+    String::from_utf8(config).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
 }
 
 /// The name of a `._pth` file in `bin`: an interpreter that finds one takes its libraries from where it says.

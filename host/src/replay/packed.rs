@@ -1,0 +1,87 @@
+//! Packed drives, which a process that may write unpacks for its worker, too.
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+
+use gleaner_protocol::{Exit, Failure};
+use gleaner_transport::replay::{self, Name, Unpacked, unpack};
+
+use super::open::DriveError;
+use super::{Job, Options};
+
+/// The argument of a worker with a packed file and the name of its content.
+const UNPACKED: &str = "--unpacked";
+/// The argument with a packed file whose content is not whole, and why not.
+const BROKEN: &str = "--unpacked-in-part";
+
+/// Contents of packed drives, as a worker is given them.
+#[derive(clap::Args, Clone, Debug, Default)]
+pub struct UnpackedArgs {
+    #[arg(long, hide = true, num_args = 2)]
+    unpacked: Vec<PathBuf>,
+    #[arg(long, hide = true, num_args = 2)]
+    unpacked_in_part: Vec<OsString>,
+}
+
+/// Contents of packed drives, to be handed to a worker.
+#[derive(Default)]
+pub struct Lent {
+    unpacked: Vec<Unpacked>,
+    options: replay::Options,
+}
+
+impl Job {
+    /// Unpacks the packed files among the drives, and returns what a worker needs of them.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the file.
+    pub fn unpack(&mut self) -> Result<Lent, Failure> {
+        let Options { drives, unpack_in, unpacked, .. } = &mut self.options;
+        let options = replay::Options { unpack_in: unpack_in.clone(), ..replay::Options::default() };
+        unpacked.clone_from(&unpack(&drives.named, &options).map_err(DriveError)?);
+        Ok(Lent { unpacked: unpacked.clone(), options })
+    }
+
+    /// Has this process, a worker, read contents that it was given.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the content which cannot be opened.
+    pub fn take(&mut self, args: UnpackedArgs) -> Result<(), Failure> {
+        let UnpackedArgs { unpacked, unpacked_in_part } = args;
+        let broken = |path: &PathBuf| {
+            let mut pairs = unpacked_in_part.chunks_exact(2);
+            pairs.find(|pair| pair[0] == *path).map(|pair| pair[1].to_string_lossy().into_owned())
+        };
+        for pair in unpacked.chunks_exact(2) {
+            let [path, name] = pair else { continue };
+            let named = Unpacked::named(path.clone(), name.clone(), broken(path)).map_err(|error| {
+                Failure::caused_by(Exit::Internal, format!("cannot open the content of `{}`", path.display()), &error)
+            })?;
+            self.options.unpacked.push(named);
+        }
+        Ok(())
+    }
+}
+
+impl Lent {
+    /// Arguments of a worker, and names that have to last until the worker is ready.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the folder in which content can have no name.
+    pub fn arguments(&self) -> Result<(Vec<OsString>, Vec<Name>), Failure> {
+        let (mut arguments, mut names) = (Vec::new(), Vec::new());
+        for unpacked in &self.unpacked {
+            let name = unpacked.name(&self.options).map_err(DriveError)?;
+            let (path, broken) = unpacked.parts();
+            arguments.extend([UNPACKED.into(), path.into(), name.as_ref().as_os_str().to_owned()]);
+            if let Some(why) = broken {
+                arguments.extend([BROKEN.into(), path.into(), why.into()]);
+            }
+            names.push(name);
+        }
+        Ok((arguments, names))
+    }
+}
