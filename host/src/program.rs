@@ -31,7 +31,7 @@ use crate::isolation::{Inside, Isolation, place_of_results};
 #[cfg(feature = "dds")]
 use crate::live;
 #[cfg(feature = "python")]
-use crate::replay::Lent;
+use crate::replay::Packed;
 use crate::replay::{self, InspectArgs, ReplayArgs, UnpackedArgs, VerifyArgs};
 use crate::stage::{Asked, Bounds, Load};
 #[cfg(feature = "dds")]
@@ -246,12 +246,7 @@ fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
         #[cfg(feature = "python")]
         Kind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(
-                &asked.lambda,
-                asked.build.entry_path(manifest),
-                &args,
-                around,
-            );
+            let error = crate::guest::python::become_interpreter(&asked.lambda, &args, around);
             Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]
@@ -264,17 +259,16 @@ fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
 
 /// Does `job` but for what its worker does.
 #[cfg(feature = "python")]
-fn run_with_worker(mut job: Job) -> Result<Exit, Failure> {
+fn run_with_worker(job: Job) -> Result<Exit, Failure> {
     isolation::end_with_starter(Signal::TERM)?;
     // The group of this process is that of its worker, too.
     let group = cgroup::fit(job.inside(false).all);
-    let lent = if let Job::Replay(job) = &mut job { job.unpack()? } else { Lent::default() };
+    let packed = if let Job::Replay(job) = &job { Some(job.packed()) } else { None };
     let mut remote = |_: &Asked, manifest: &Manifest, session, _| {
-        let (arguments, names) = lent.arguments()?;
-        let guest = Remote::start(arguments, manifest, session, group.clone())?;
-        // It has opened its drives.
-        drop(names);
-        Ok(Box::new(guest) as _)
+        let lent = packed.as_ref().map(Packed::lend).transpose()?;
+        let arguments = lent.iter().flat_map(|lent| lent.arguments.clone()).collect();
+        // When it is ready it has opened its drives.
+        Ok(Box::new(Remote::start(arguments, manifest, session, group.clone())?) as _)
     };
     job.run_offline(&mut remote, &mut reports()?)
 }

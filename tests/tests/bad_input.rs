@@ -377,6 +377,6 @@ fn a_page_of_the_shim_that_is_none_is_refused() {
             replay.arg(sample_drive()).arg("--out").arg(folder.path()).output().expect("gleaner-runtime starts");
         let said = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{number}: {said}");
-        assert!(said.contains("cannot use the shim's page") && said.contains("GLEANER_PULSE names no page"), "{said}");
+        assert!(said.contains("cannot use the shim's page") && said.contains("cause: GLEANER_PULSE "), "{said}");
     }
 }

@@ -22,7 +22,7 @@ mod work;
 
 pub use inspect::{InspectArgs, inspect};
 pub use options::{Job, Options, ReplayArgs, VerifyArgs};
-pub use packed::{Lent, UnpackedArgs};
+pub use packed::{Packed, UnpackedArgs};
 
 use std::io::Write;
 

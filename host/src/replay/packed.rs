@@ -23,24 +23,26 @@ pub struct UnpackedArgs {
     unpacked_in_part: Vec<OsString>,
 }
 
-/// Contents of packed drives, to be handed to a worker.
-#[derive(Default)]
-pub struct Lent {
-    unpacked: Vec<Unpacked>,
+/// Packed drives, where a worker may have to be given their contents.
+pub struct Packed {
+    named: Vec<PathBuf>,
     options: replay::Options,
 }
 
+/// Contents of packed drives that a worker is about to open.
+pub struct Lent {
+    /// Those of the worker that name them.
+    pub arguments: Vec<OsString>,
+    /// Names that last as long as this.
+    _names: Vec<Name>,
+}
+
 impl Job {
-    /// Unpacks the packed files among the drives, and returns what a worker needs of them.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the file.
-    pub fn unpack(&mut self) -> Result<Lent, Failure> {
-        let Options { drives, unpack_in, unpacked, .. } = &mut self.options;
+    /// The packed files among the drives.
+    pub fn packed(&self) -> Packed {
+        let Options { drives, unpack_in, .. } = &self.options;
         let options = replay::Options { unpack_in: unpack_in.clone(), ..replay::Options::default() };
-        unpacked.clone_from(&unpack(&drives.named, &options).map_err(DriveError)?);
-        Ok(Lent { unpacked: unpacked.clone(), options })
+        Packed { named: drives.named.clone(), options }
     }
 
     /// Has this process, a worker, read contents that it was given.
@@ -65,15 +67,15 @@ impl Job {
     }
 }
 
-impl Lent {
-    /// Arguments of a worker, and names that have to last until the worker is ready.
+impl Packed {
+    /// Unpacks them once more: content whose name has gone, as it has to when the worker is ready, cannot be named again.
     ///
     /// # Errors
     ///
-    /// A failure that names the folder in which content can have no name.
-    pub fn arguments(&self) -> Result<(Vec<OsString>, Vec<Name>), Failure> {
+    /// A failure that names the file.
+    pub fn lend(&self) -> Result<Lent, Failure> {
         let (mut arguments, mut names) = (Vec::new(), Vec::new());
-        for unpacked in &self.unpacked {
+        for unpacked in unpack(&self.named, &self.options).map_err(DriveError)? {
             let name = unpacked.name(&self.options).map_err(DriveError)?;
             let (path, broken) = unpacked.parts();
             arguments.extend([UNPACKED.into(), path.into(), name.as_ref().as_os_str().to_owned()]);
@@ -82,6 +84,6 @@ impl Lent {
             }
             names.push(name);
         }
-        Ok((arguments, names))
+        Ok(Lent { arguments, _names: names })
     }
 }

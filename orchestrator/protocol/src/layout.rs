@@ -59,6 +59,8 @@ impl BuildDir {
                 return Err(LayoutError::Read { path: build.manifest_path(), source });
             }
         };
+        // Of a link, the age would be that of another file.
+        let text = Manifest::read(build.path())?;
         // An editor may have removed a file meanwhile: then it is no source.
         let age = |source: &Path| modified(&dir.join(source)).ok().filter(|age| *age > built);
         let older = |source: &Path| LayoutError::Older { dir: dir.to_owned(), source_file: source.to_owned() };
@@ -67,7 +69,7 @@ impl BuildDir {
         if age(manifest).is_some() {
             return Err(older(manifest));
         }
-        let sources = Sources::of(dir, &Manifest::load(build.path())?)?;
+        let sources = Sources::of(dir, &Manifest::parse(&text, build.manifest_path())?)?;
         match sources.iter().filter_map(|source| age(source).map(|age| (age, source))).max() {
             Some((_, source)) => Err(older(source)),
             // The interpreter would wait for a pipe, and a digest of a file without an end would not end.

@@ -23,8 +23,6 @@ const ONE_THREAD: [&str; 4] = ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_N
 pub enum PythonError {
     #[error(transparent)]
     Parts(#[from] PartsError),
-    #[error("`{}` is no file", entry.display())]
-    Entry { entry: PathBuf },
     #[error("cannot start `{}`", python.display())]
     Start { python: PathBuf, source: std::io::Error },
 }
@@ -33,7 +31,6 @@ impl Explain for PythonError {
     fn help(&self) -> Option<String> {
         match self {
             Self::Parts(error) => error.help(),
-            Self::Entry { .. } => Some("build the lambda again: gleaner build".to_owned()),
             Self::Start { .. } => Some("name another interpreter: GLEANER_PYTHON=/path/to/python3".to_owned()),
         }
     }
@@ -41,18 +38,14 @@ impl Explain for PythonError {
     fn exit(&self) -> Exit {
         match self {
             Self::Parts(error) => error.exit(),
-            Self::Entry { .. } | Self::Start { .. } => Exit::Usage,
+            Self::Start { .. } => Exit::Usage,
         }
     }
 }
 
-/// Becomes the interpreter that hosts the lambda in `lambda_dir`, whose file is `entry`, with `args` for our library in it, which can
-/// open no files but those of `inside`, its own and ours, and have as much memory. Returns only errors.
-pub fn become_interpreter(lambda_dir: &Path, entry: PathBuf, args: &[OsString], inside: Inside) -> PythonError {
-    // A pipe would be waited for until the deadline of `init`.
-    if !entry.is_file() {
-        return PythonError::Entry { entry };
-    }
+/// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for our library in it, which can open no files but
+/// those of `inside`, its own and ours, and have as much memory. Returns only errors.
+pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) -> PythonError {
     match interpreter(lambda_dir, args, inside) {
         Ok((python, mut command)) => PythonError::Start { python, source: command.exec() },
         Err(error) => error.into(),
