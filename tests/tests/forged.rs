@@ -150,7 +150,6 @@ fn statements() -> Vec<Forgery> {
 /// Changes of messages.
 fn messages() -> Vec<Forgery> {
     let camera = &["gleaner.topic", CAMERA];
-    let messages = &["gleaner.topic", CAMERA, "messages"];
     let checksum = &["gleaner.topic", CAMERA, "checksum"];
     let state_none = |parts: &mut Parts| {
         parts.topic(CAMERA).insert("messages".to_owned(), "0".to_owned());
@@ -236,7 +235,7 @@ fn messages() -> Vec<Forgery> {
 
 /// Changes of the files within the clip. `other` is the journal of another clip.
 fn attachments(other: Attached) -> Vec<Forgery> {
-    let picture = |parts: &mut Parts| parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap();
+    let picture = |parts: &Parts| parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap();
     vec![
         forgery("a second journal of garbage", &["attachment `journal/hello.journal`"], |parts| {
             let garbage = Attached { data: b"garbage".to_vec(), ..parts.journal().clone() };
