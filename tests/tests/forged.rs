@@ -215,7 +215,7 @@ fn messages() -> Vec<Forgery> {
             let index = parts.channel_of(CAMERA);
             let mut channel = Channel::clone(&parts.channels[index]);
             let mut schema = mcap::Schema::clone(channel.schema.as_ref().unwrap());
-            schema.data = Cow::Owned([&schema.data[..], b"\n"].concat());
+            schema.data = Cow::Owned([&schema.data[..], b"\nfloat64 more\n"].concat());
             channel.schema = Some(Arc::new(schema));
             parts.channels[index] = Arc::new(channel);
         }),
@@ -258,7 +258,7 @@ fn attachments(other: Attached) -> Vec<Forgery> {
         }),
         forgery("a journal that is cut off", &["has no end"], |parts| {
             let data = &mut parts.journal().data;
-            data.truncate(data.len() / 4);
+            data.truncate(data.len() - 5);
         }),
         forgery("the journal of another clip", &["sample", "journal"], move |parts| *parts.journal() = other.clone()),
         forgery("no journal", &["no journal"], |parts| {
