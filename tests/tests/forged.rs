@@ -150,7 +150,6 @@ fn statements() -> Vec<Forgery> {
 /// Changes of messages.
 fn messages() -> Vec<Forgery> {
     let camera = &["gleaner.topic", CAMERA];
-    let messages = &["gleaner.topic", CAMERA, "messages"];
     let checksum = &["gleaner.topic", CAMERA, "checksum"];
     let state_none = |parts: &mut Parts| {
         parts.topic(CAMERA).insert("messages".to_owned(), "0".to_owned());
@@ -216,7 +215,7 @@ fn messages() -> Vec<Forgery> {
             let index = parts.channel_of(CAMERA);
             let mut channel = Channel::clone(&parts.channels[index]);
             let mut schema = mcap::Schema::clone(channel.schema.as_ref().unwrap());
-            schema.data = Cow::Owned([&schema.data[..], b"\n"].concat());
+            schema.data = Cow::Owned([&schema.data[..], b"\nfloat64 more\n"].concat());
             channel.schema = Some(Arc::new(schema));
             parts.channels[index] = Arc::new(channel);
         }),
@@ -236,7 +235,7 @@ fn messages() -> Vec<Forgery> {
 
 /// Changes of the files within the clip. `other` is the journal of another clip.
 fn attachments(other: Attached) -> Vec<Forgery> {
-    let picture = |parts: &mut Parts| parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap();
+    let picture = |parts: &Parts| parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap();
     vec![
         forgery("a second journal of garbage", &["attachment `journal/hello.journal`"], |parts| {
             let garbage = Attached { data: b"garbage".to_vec(), ..parts.journal().clone() };
@@ -259,7 +258,7 @@ fn attachments(other: Attached) -> Vec<Forgery> {
         }),
         forgery("a journal that is cut off", &["has no end"], |parts| {
             let data = &mut parts.journal().data;
-            data.truncate(data.len() / 4);
+            data.truncate(data.len() - 5);
         }),
         forgery("the journal of another clip", &["sample", "journal"], move |parts| *parts.journal() = other.clone()),
         forgery("no journal", &["no journal"], |parts| {

@@ -37,7 +37,8 @@ pub(super) struct Written {
 impl Written {
     /// Adds a topic, which is not there yet; returns its index.
     pub(super) fn add_topic(&mut self, topic: &Topic) -> usize {
-        let definitions = topic.definitions.as_deref().filter(|text| !text.is_empty());
+        // Readers trim them.
+        let definitions = topic.definitions.as_deref().map(str::trim).filter(|text| !text.is_empty());
         self.topics.push(WrittenTopic {
             name: topic.name.clone(),
             type_name: topic.type_name.clone(),
@@ -110,6 +111,17 @@ mod tests {
 
     fn meta(at_ns: i64) -> SampleMeta {
         SampleMeta { at_ns, publish_ns: 2, writer: Guid([0; 16]), seq: 3, endian: Endian::Little, options: [4, 5] }
+    }
+
+    #[test]
+    fn definitions_count_without_the_white_space_around_them() {
+        let mut written = Written::default();
+        for (name, text) in [("/a", "float64 x"), ("/b", "\nfloat64 x\n"), ("/c", " \n")] {
+            let (name, definitions) = (name.to_owned(), Some(text.into()));
+            written.add_topic(&Topic { name, type_name: "T".to_owned(), definitions, offered_qos: None });
+        }
+        let [a, b, c] = written.topics() else { panic!("three topics") };
+        assert_eq!((&a.definitions, &c.definitions), (&b.definitions, &None));
     }
 
     fn checksum_of(messages: &[(i64, &[u8])]) -> String {
