@@ -172,6 +172,8 @@ fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
         refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
     }
     if only_counted_memory {
+        // Others would wait for a file that is locked, and a file that can only be read can be locked.
+        refused = refused.calls(&[libc::SYS_flock]);
         refused = match memory::stack() {
             // Moved elsewhere, it would still count as stack, and could be made any size. The allocator moves blocks of data so.
             Some(stack) => counted_only(refused).between(libc::SYS_mremap, 0, stack),

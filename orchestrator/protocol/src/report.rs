@@ -255,6 +255,7 @@ mod tests {
             in_cooldown: 3,
             ignored: 0,
             damaged: None,
+            stopped: None,
         };
         reads_back(
             &Report::Summary(Box::new(summary)),

@@ -247,6 +247,10 @@ class Lambda:
         lease = 1024
         return fcntl.fcntl(os.open(__file__, os.O_RDONLY), lease, fcntl.F_RDLCK)
 
+    def lock(self, ctx: Context) -> object:
+        """Other programs that lock the file would wait for this one."""
+        return fcntl.flock(os.open(__file__, os.O_RDONLY), fcntl.LOCK_EX)
+
     def in_flight(self, ctx: Context) -> object:
         """Of files on their way the kernel counts those of all processes of a user."""
         ours, _theirs = socket.socketpair()
