@@ -17,6 +17,7 @@ pub const UNSAFE_FILES: &[&str] = &[
     "host/python/src/memory.rs",
     "host/src/guest/wasm/load.rs",
     "host/src/memory.rs",
+    "host/transport/src/dds/joins.rs",
     "host/vitals/src/handed_on.rs",
     "host/vitals/src/pulse.rs",
     "player/src/cyclone.rs",

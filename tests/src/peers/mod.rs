@@ -193,6 +193,11 @@ impl Peer {
         self.wait("a peer to be connected", |said| matches!(said, Said::Matched { count: 1.. }).then_some(()))
     }
 
+    /// How it ended, in words; `None` while it runs.
+    pub fn ended(&mut self) -> Option<String> {
+        self.child.try_wait().map_or_else(|error| Some(error.to_string()), |ended| Some(ended?.to_string()))
+    }
+
     /// Ends it at once, without its knowing.
     pub fn kill(mut self) {
         let _ = self.child.kill();

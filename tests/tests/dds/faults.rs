@@ -140,7 +140,7 @@ fn still_heard(dds: &mut Dds) -> Result<(), Failed> {
 }
 
 /// The ports of all sockets in this network: called while only we have some.
-fn udp_ports() -> Result<Vec<u16>, Failed> {
+pub fn udp_ports() -> Result<Vec<u16>, Failed> {
     let table = std::fs::read_to_string("/proc/self/net/udp")?;
     let port = |line: &str| u16::from_str_radix(line.split_whitespace().nth(1)?.split_once(':')?.1, 16).ok();
     let mut ports: Vec<u16> = table.lines().skip(1).filter_map(port).collect();
@@ -152,7 +152,7 @@ fn udp_ports() -> Result<Vec<u16>, Failed> {
 /// What a participant says when it introduces itself, in the name of one that does not exist.
 ///
 /// Ours is sent to the first ports that others on this machine might have: a plain socket on one of those hears it.
-fn announcement(ours: &[u16]) -> Result<Vec<u8>, Failed> {
+pub fn announcement(ours: &[u16]) -> Result<Vec<u8>, Failed> {
     // DDSI-RTPS 2.3, section 9.6.1: unicast discovery in domain 0 is at 7410 and two more for each participant.
     let sockets = (1..12).map(|participant| 7410 + 2 * participant).filter(|port| !ours.contains(port));
     let socket = sockets.filter_map(|port| UdpSocket::bind(("127.0.0.1", port)).ok()).next_back();

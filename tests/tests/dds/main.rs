@@ -10,6 +10,7 @@ mod graph;
 mod ours;
 mod rtps;
 mod to_peers;
+mod together;
 
 use std::process::{ExitCode, Stdio};
 
@@ -37,7 +38,8 @@ struct Case {
 const CASE: &str = "GLEANER_DDS_CASE";
 
 fn main() -> ExitCode {
-    let cases = || [from_peers::CASES, to_peers::CASES, graph::CASES, faults::CASES].into_iter().flatten();
+    let cases =
+        || [from_peers::CASES, to_peers::CASES, graph::CASES, faults::CASES, together::CASES].into_iter().flatten();
     if let Ok(name) = std::env::var(CASE) {
         let case = cases().find(|case| case.name == name).expect("this program gives itself the names of its cases");
         return match (case.run)() {

@@ -23,6 +23,7 @@ mod feed;
 mod filter;
 mod graph;
 mod guard;
+mod joins;
 mod known;
 mod names;
 mod nodes;
@@ -58,6 +59,7 @@ use crate::nearest::nearest;
 use crate::transport::{DiscoveredTopic, Sink, Status, Subscription, TopicSpec, Transport, TransportError};
 use feed::Feed;
 use guard::Guard;
+use joins::NoJoin;
 use known::Known;
 use receive::{Command, Line};
 use shield::Shield;
@@ -133,7 +135,9 @@ impl Dds {
         }
         let join = |error: rustdds::dds::CreateError| DdsError::Join { domain: options.domain, source: error.into() };
         let shield = Shield::up();
+        let no_join = NoJoin::at(sockets::port_of_samples(options.domain));
         let participant = builder.build().map_err(join)?;
+        drop(no_join);
         drop(shield);
         let made: HashSet<u32> = sockets::library_threads().difference(&before).copied().collect();
         // If there are more, somebody else made a participant at the same time, and which are ours is not known.

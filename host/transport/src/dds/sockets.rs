@@ -14,6 +14,13 @@ const LIBRARY: &str = "RustDDS ";
 /// The one that reads the sockets; the kernel keeps 15 bytes of `RustDDS Participant 0 event loop`.
 const READS: &str = "RustDDS Partici";
 
+/// The port at which all participants of a domain receive samples by multicast.
+///
+/// RTPS, "Default Port Numbers": multicast for discovery and for samples, and from the tenth on, two ports for each participant.
+pub(super) fn port_of_samples(domain: u16) -> u16 {
+    7401 + 250 * domain
+}
+
 /// The sockets at which a participant listens.
 #[derive(Debug, Default)]
 pub(super) struct Sockets {
@@ -37,10 +44,9 @@ pub(super) struct Queues {
 impl Sockets {
     /// The sockets of this process at the ports of a participant.
     pub(super) fn of(domain: u16, participant: u16) -> Self {
-        // RTPS, "Default Port Numbers": multicast for discovery and for data, and two ports of the participant's own.
-        let first = 7400 + 250 * u32::from(domain);
-        let own = first + 10 + 2 * u32::from(participant);
-        let ports = [first, first + 1, own, own + 1];
+        let samples = u32::from(port_of_samples(domain));
+        let own = samples + 9 + 2 * u32::from(participant);
+        let ports = [samples - 1, samples, own, own + 1];
         let mut mine = inodes();
         let rows = rows().into_iter().filter(|row| ports.contains(&row.port));
         let open = rows.filter_map(|row| mine.remove_entry(&row.inode)).collect();
