@@ -40,7 +40,7 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
         // The results are whole without it.
         Err(failure) => {
             eprintln!("{failure}");
-            return Ok((if exit == Exit::Ok { failure.exit } else { exit }, has_results));
+            return Ok((if exit == Exit::Ok { Exit::Internal } else { exit }, has_results));
         }
     }
     Ok((exit, has_results))

@@ -165,7 +165,7 @@ fn faults_with_ever_new_messages_take_no_more_room() {
 
 #[test]
 fn a_long_message_of_a_fault_is_cut_where_a_person_reads_it() {
-    let long = format!("{}{}", "\u{0}".repeat(40), "m".repeat(4000));
+    let long = format!("{}{}", "\u{0}".repeat(4), "m".repeat(4000));
     let fault = decision(500, None, Some((FaultKind::Exception, &long)));
     let text = summary(&Summary { faults: 1, ..replay() }, &digest(vec![fault]), &[], PLAIN);
     let line = text.lines().find(|line| line.contains("exception")).unwrap();

@@ -11,12 +11,13 @@ use rustix::process::{Pid, Signal, kill_process};
 const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
 
 /// What a script begins with: `page TEXT` writes one, `woken` the first one, `log N` a line of the log, `tick N` a decision without a
-/// trigger.
+/// trigger. `asked` has the script asked to end, by its shim.
 const PAGES: &str = r#"
 page() { printf '%s\n' "$1" > "/proc/self/fd/$GLEANER_RESULTS"; }
 log() { page '{"log":{"at_ns":'$1',"level":"info","message":"m"}}'; }
 tick() { page '{"decision":{"at_ns":'$1',"cause":"tick","triggers":[],"run_ns":1}}'; }
 woken() { page '{"woken":{"cause":"event","input":"camera","topic":"/camera"}}'; }
+asked() { local is=; trap 'is=1' TERM; kill -TERM $PPID; until [ "$is" ]; do sleep 0.01; done; }
 last() { page '{"last":{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,"up_s":1.0,"wakes":2,"triggers":0,"faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"passed_over":0,"unwritten":5,"topics":[],"network":{"domain":0,"participants":0,"buffer_asked":0,"buffer_granted":0,"socket_drops":0,"filtered":0},"rss_bytes":0,"cpu_s":0.0}}'; }
 "#;
 
@@ -134,7 +135,7 @@ fn what_is_no_page_is_counted_and_named_once_and_what_comes_after_it_is_written(
     let pages: String = garbage.iter().map(|page| format!("page '{page}'\n")).collect();
     let pipe = "\"/proc/self/fd/$GLEANER_RESULTS\"";
     let script = format!(
-        "woken\n{pages}printf '\\377\\376\\n' > {pipe}; head -c {} /dev/zero > {pipe}; page; tick 7; log 8; last; printf half > {pipe}",
+        "woken\n{pages}printf '\\377\\376\\n' > {pipe}; head -c {} /dev/zero > {pipe}; page; tick 7; log 8; last; printf half > {pipe}; asked",
         3 * PAGE_BYTES
     );
     let output = run(&folder, &script);
@@ -195,12 +196,13 @@ fn what_a_full_disk_refuses_is_counted_and_what_comes_later_is_written_again() {
     let folder = Folder::of("full");
     let said = folder.0.join("stderr");
     let script = format!(
-        "woken; until grep -q 'tried again' {said}; do log 1; done; : > {out}/log.jsonl; until grep -q 'written again' {said}; do log 2; done",
+        "woken; until grep -q 'tried again' {said}; do for n in {{1..200}}; do log 1; done; done; : > {out}/log.jsonl; \
+         until grep -q 'written again' {said}; do log 2; done; asked",
         said = said.display(),
         out = folder.out().display()
     );
     let output = Command::new("bash")
-        .args(["-c", "trap '' XFSZ; ulimit -f 4; exec \"$@\"", "bash", SHIM, "--results"])
+        .args(["-c", "trap '' XFSZ; ulimit -f 256; exec \"$@\"", "bash", SHIM, "--results"])
         .arg(folder.out())
         .args(["--", "bash", "-c", &format!("{PAGES}{script}")])
         .stderr(fs::File::create(&said).unwrap())
