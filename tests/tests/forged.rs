@@ -69,7 +69,7 @@ fn records(parts: &Parts) -> Vec<Forgery> {
         forgeries.push(forgery(&of("a key more"), &[name, "more"], move |parts| {
             parts.metadata[index].metadata.insert("more".to_owned(), "1".to_owned());
         }));
-        for key in metadata.keys().cloned() {
+        for key in metadata.keys() {
             let (gone, words) = (key.clone(), &[name.as_str(), key.as_str()]);
             forgeries.push(forgery(&of(&format!("without `{key}`")), words, move |parts| {
                 parts.metadata[index].metadata.remove(&gone);

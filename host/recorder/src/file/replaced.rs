@@ -1,6 +1,7 @@
 //! `clips/.replaced`: the clips that a replay is about to delete, noted before the list loses them. It is gone once they are.
 
 use std::collections::HashSet;
+use std::fs;
 use std::io;
 use std::path::Path;
 
@@ -13,6 +14,8 @@ use super::place::CLIPS;
 use crate::error::RecordError;
 
 const NOTE: &str = ".replaced";
+/// The note while it is written.
+const NOTE_PART: &str = ".replaced.part";
 
 /// Notes in the folder of clips that these go.
 pub(super) fn note(folder: &Path, doomed: &[Listed]) -> Result<(), RecordError> {
@@ -20,7 +23,7 @@ pub(super) fn note(folder: &Path, doomed: &[Listed]) -> Result<(), RecordError> 
         return Ok(());
     }
     let lines: Vec<u8> = doomed.iter().flat_map(line).collect();
-    durable::write(&folder.join(".replaced.part"), &folder.join(NOTE), folder, &lines)
+    durable::write(&folder.join(NOTE_PART), &folder.join(NOTE), folder, &lines)
 }
 
 /// A line as the list has it, as far as it names files.
@@ -33,6 +36,8 @@ fn line(Listed { file, thumbnail }: &Listed) -> Vec<u8> {
 /// Deletes the noted clips, and returns how many these were. Clips that the list names stay: the process died before it wrote the
 /// list.
 pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
+    // A process that died while it wrote the note had changed nothing else.
+    let _ = fs::remove_file(folder.join(NOTE_PART));
     let path = folder.join(NOTE);
     let cannot_read = |source| RecordError::Read { path: path.clone(), source };
     let note = match own_file::read(&path) {
