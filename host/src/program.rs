@@ -68,7 +68,8 @@ enum Command {
     Topics(TopicsArgs),
 }
 
-/// What there is to do with a lambda.
+/// A task with a lambda. There is one in a process, so that its size matters little.
+#[allow(clippy::large_enum_variant)]
 enum Job {
     Replay(replay::Job),
     Check(check::Job),
@@ -153,14 +154,6 @@ impl Job {
             Self::Check(job) => job.run(load, reports),
             #[cfg(feature = "dds")]
             Self::Live(_) => Err(no_worker()),
-        }
-    }
-
-    fn run(self, load: Load<'_>, isolation: &Isolation, mut reports: File) -> Result<Exit, Failure> {
-        match self {
-            #[cfg(feature = "dds")]
-            Self::Live(job) => job.run(load, isolation, reports),
-            job => job.run_offline(load, &mut reports),
         }
     }
 }
@@ -276,7 +269,11 @@ fn run_with_worker(job: Job) -> Result<Exit, Failure> {
 fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
     let isolation = Arc::new(Isolation::of_this_process(job.inside(false))?);
     let mut watched = watched(load, &isolation);
-    job.run(&mut watched, &isolation, reports()?)
+    match job {
+        #[cfg(feature = "dds")]
+        Job::Live(job) => job.run(&mut watched, &isolation, reports()?),
+        job => job.run_offline(&mut watched, &mut reports()?),
+    }
 }
 
 /// Does the part of `job` that is the worker's. Once the lambda may have run, what goes wrong is no longer printed: the process

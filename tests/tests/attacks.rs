@@ -218,9 +218,10 @@ fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
         Refused(_) => Some(decision(&|decision| !decision.triggers.is_empty())),
         Killed(_) => Some(fault(FaultKind::Killed)),
         Broken => {
+            let mut starts = 0;
             started.until("a start after the first", |line| {
-                let is_again = |live: &Live| live.restarts > 0;
-                matches!(line, Line::Lambda(Report::Live(live) | Report::Ended(live)) if is_again(&live)).then_some(())
+                starts += u32::from(matches!(line, Line::Lambda(Report::Ready)));
+                (starts > 1).then_some(())
             });
             None
         }

@@ -36,13 +36,16 @@ fn descriptors() -> usize {
 fn faults_in_a_row_leave_memory_slots_and_handles_where_they_were() {
     let faults = times("GLEANER_FAULTS", 2000);
     let greedy = |behaviour: &str| Room::within(behaviour, 0, &small());
+    // Memory costs fuel by the byte.
+    let mut roomy = small();
+    roomy.fuel *= 10;
     let mut stacked = small();
     stacked.stack = ByteSize::kib(16);
     let endless = component("", "", "(func $wake (call $wake) (call $wake))");
     let rooms = [
         ("fuel", greedy("endless"), FaultKind::Fuel),
         ("trap", greedy("panic"), FaultKind::Trap),
-        ("memory", greedy("memory"), FaultKind::Memory),
+        ("memory", Room::within("memory", 0, &roomy), FaultKind::Memory),
         ("stack", Room::written_within(&endless, &stacked), FaultKind::Stack),
         ("handles kept", greedy("topics"), FaultKind::HostCall),
         ("a handle of nothing", misuse(), FaultKind::HostCall),

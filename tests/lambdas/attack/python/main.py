@@ -272,7 +272,14 @@ class Lambda:
 
     def descriptors(self, ctx: Context) -> object:
         """With half of them one could watch the other half."""
-        return [os.dup(0) for _ in range(1000)]
+        held: List[int] = []
+        try:
+            while len(held) < 1000:
+                held.append(os.dup(0))
+        finally:
+            for fd in held:
+                os.close(fd)
+        return held
 
     def large_pipe(self, ctx: Context) -> object:
         set_size = 1031
