@@ -22,7 +22,7 @@ use crate::check::{self, CheckArgs};
 use crate::guest::Guest;
 use crate::guest::watched::{Patience, Watched};
 #[cfg(feature = "python")]
-use crate::guest::worker::Remote;
+use crate::guest::worker::{NotReady, Remote};
 use crate::guest::worker::{Reports, Sender};
 use crate::input::live_slots;
 #[cfg(feature = "python")]
@@ -257,13 +257,22 @@ fn run_with_worker(job: Job) -> Result<Exit, Failure> {
     // The group of this process is that of its worker, too.
     let group = cgroup::fit(job.inside(false).all);
     let packed = if let Job::Replay(job) = &job { Some(job.packed()) } else { None };
+    let mut explained = None;
     let mut remote = |_: &Asked, manifest: &Manifest, session, _| {
         let lent = packed.as_ref().map(Packed::lend).transpose()?;
         let arguments = lent.iter().flat_map(|lent| lent.arguments.clone()).collect();
         // When it is ready it has opened its drives.
-        Ok(Box::new(Remote::start(arguments, manifest, session, group.clone())?) as _)
+        match Remote::start(arguments, manifest, session, group.clone()) {
+            Ok(guest) => Ok(Box::new(guest) as _),
+            Err(NotReady::Failed(failure)) => Err(failure),
+            Err(NotReady::Explained(exit)) => {
+                explained = Some(exit);
+                Err(Failure::new(exit, "the lambda's process could not start"))
+            }
+        }
     };
-    job.run_offline(&mut remote, &mut reports()?)
+    let ended = job.run_offline(&mut remote, &mut reports()?);
+    explained.map_or(ended, Ok)
 }
 
 fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {

@@ -109,7 +109,7 @@ mod tests {
             durations.add(ns);
             assert_eq!(durations.all(), spreads.all());
         }
-        assert!(durations.0.distinct_values() * size_of::<u32>() <= 20 << 10);
+        assert!(durations.0.distinct_values() * size_of::<u32>() <= 24 << 10);
     }
 
     #[test]

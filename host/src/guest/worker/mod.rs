@@ -1,6 +1,6 @@
 //! A lambda in a process of its own, the *worker*: so a Python lambda runs in a replay.
 //!
-//! The worker opens the drives itself, follows the same schedule as the process that started it, and sends one [`Message`] for
+//! The worker opens the drives itself, follows the same schedule as the process that started it, and sends one message for
 //! each wake through what was its standard output. The process that started it reads the same drives, takes each outcome over
 //! as if the lambda had run there ([`Remote`]), and writes all results. So the worker needs no file that it may write, and
 //! nothing that native code in it does can change the cause of a decision, an exit code, or the results of an earlier wake.
@@ -19,7 +19,7 @@ use gleaner_protocol::{Fault, Layer, Trigger};
 use serde::{Deserialize, Serialize};
 
 #[cfg(feature = "python")]
-pub use remote::Remote;
+pub use remote::{NotReady, Remote};
 pub use sender::{Reports, Sender};
 
 use crate::api::data::Counts;

@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::process::{Child, ChildStderr, ChildStdout, Command, Stdio};
-use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
+use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -27,8 +27,15 @@ pub(super) struct Process {
     folder: TempDir,
     /// Whether what the worker writes to standard error is to be marked as the lambda's; decided once.
     is_ready: Sender<bool>,
-    /// Closed when all of it was passed on.
-    passed_on: Receiver<()>,
+    /// Whether it said why it failed; sent when all of it was passed on.
+    passed_on: Receiver<bool>,
+}
+
+/// How a worker ended.
+pub(super) struct Ended {
+    pub(super) record: ExitRecord,
+    /// Whether our own part of it printed why, before anything of the lambda could.
+    pub(super) is_explained: bool,
 }
 
 /// Why there is no further message.
@@ -57,7 +64,7 @@ impl Process {
         let (is_ready, decided) = mpsc::channel();
         let (end, passed_on) = mpsc::channel();
         let from = shim.stderr.take().expect("it is piped");
-        thread::spawn(move || pass_on(from, &decided, end));
+        thread::spawn(move || pass_on(from, &decided, &end));
         Ok(Self { shim, messages, line: Vec::new(), folder, is_ready, passed_on })
     }
 
@@ -84,7 +91,7 @@ impl Process {
     }
 
     /// Ends the process if it has not ended by itself; returns how it ended. With `at_once` it is not given the time for that.
-    pub(super) fn end(mut self, at_once: bool) -> io::Result<ExitRecord> {
+    pub(super) fn end(mut self, at_once: bool) -> io::Result<Ended> {
         let _ = self.is_ready.send(false);
         let asked = Instant::now();
         let mut is_killed = at_once;
@@ -99,10 +106,10 @@ impl Process {
             }
             thread::sleep(Duration::from_millis(1));
         }
-        if let Err(RecvTimeoutError::Timeout) = self.passed_on.recv_timeout(UNTIL_ENDED) {
-            tracing::debug!("a process that the worker left behind holds its standard error open");
-        }
-        ExitRecord::read(&self.folder.path().join(ExitRecord::FILE))
+        // A process that the worker left behind may hold its standard error open.
+        let is_explained = self.passed_on.recv_timeout(UNTIL_ENDED).unwrap_or(false);
+        let record = ExitRecord::read(&self.folder.path().join(ExitRecord::FILE))?;
+        Ok(Ended { record, is_explained })
     }
 
     fn ask_to_end(&self) {
@@ -110,18 +117,21 @@ impl Process {
     }
 }
 
-/// Passes on what a worker writes to standard error, as it is if the worker never became ready.
-fn pass_on(from: ChildStderr, is_ready: &Receiver<bool>, _end: Sender<()>) {
+/// Passes on what a worker writes to standard error, as it is if the worker never became ready. Sends to `end` whether it was an error
+/// of our own then.
+fn pass_on(from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>) {
     // Longest piece of a line that is held.
     const PIECE: u64 = 8192;
     // Until it is known who writes, nothing is read: the pipe holds what our own part of the process writes before it is ready.
     let mark = if is_ready.recv() == Ok(true) { "lambda: " } else { "" };
     let (mut from, mut piece) = (BufReader::new(from), Vec::new());
-    let mut begins_line = true;
+    let (mut begins_line, mut is_explained) = (true, false);
     while matches!((&mut from).take(PIECE).read_until(b'\n', &mut piece), Ok(1..)) {
+        is_explained |= begins_line && mark.is_empty() && piece.starts_with(b"error: ");
         let mut text = if begins_line { mark.as_bytes().to_vec() } else { Vec::new() };
         text.append(&mut piece);
         begins_line = text.ends_with(b"\n");
         let _ = io::stderr().write_all(&text);
     }
+    let _ = end.send(is_explained);
 }

@@ -7,7 +7,7 @@ use gleaner_protocol::manifest::{Limits, Manifest};
 use gleaner_protocol::signals::Signals;
 use gleaner_protocol::{Exit, ExitRecord, Failure, Fault, FaultKind, Layer};
 
-use super::process::{NoMessage, Process};
+use super::process::{Ended, NoMessage, Process};
 use super::{Called, Done, Message, Woken};
 use crate::api::Session;
 use crate::api::data::Wake;
@@ -46,14 +46,14 @@ impl Remote {
     ///
     /// # Errors
     ///
-    /// A failure if the worker cannot be started, or ends before it is ready; it has then printed why.
+    /// [`NotReady`] if the worker cannot be started, or ends before it is ready.
     pub fn start(
         arguments: Vec<OsString>,
         manifest: &Manifest,
         session: Session,
         group: Option<Layer>,
-    ) -> Result<Self, Failure> {
-        let mut worker = Process::start(arguments)?;
+    ) -> Result<Self, NotReady> {
+        let mut worker = Process::start(arguments).map_err(NotReady::Failed)?;
         let (engine, mut layers) = match worker.next() {
             Ok(Message::Ready { engine, layers }) => (engine, layers),
             _ => return Err(not_ready(worker, manifest)),
@@ -152,26 +152,37 @@ impl Remote {
     }
 
     fn end(&mut self, at_once: bool) -> Option<ExitRecord> {
-        let record = self.worker.take()?.end(at_once);
+        let record = self.worker.take()?.end(at_once).map(|ended| ended.record);
         let record = record.map_err(|error| tracing::warn!(%error, "how the lambda's process ended is not known")).ok();
         self.most_resident_bytes = record.as_ref().map_or(0, |record| record.max_rss_bytes);
         record
     }
 }
 
-/// The failure of a worker that has ended before anything of the lambda ran: its exit code is that of our own programs.
-fn not_ready(worker: Process, manifest: &Manifest) -> Failure {
+/// Why there is no worker.
+pub enum NotReady {
+    /// It has printed why, and this is how it ended.
+    Explained(Exit),
+    /// It has not.
+    Failed(Failure),
+}
+
+/// How a worker failed that has ended before anything of the lambda ran: its exit code is that of our own programs.
+fn not_ready(worker: Process, manifest: &Manifest) -> NotReady {
     let message = format!("cannot start lambda `{}`", manifest.lambda.name);
-    match worker.end(true) {
-        Ok(record) => {
+    NotReady::Failed(match worker.end(true) {
+        Ok(Ended { record, is_explained }) => {
             let exit = record.code.and_then(Exit::from_code).filter(|exit| *exit != Exit::Ok);
+            if let Some(exit) = exit.filter(|_| is_explained) {
+                return NotReady::Explained(exit);
+            }
             let mut failure = Failure::new(exit.unwrap_or(Exit::Internal), message);
             let how = record.sentence().unwrap_or_else(|| "ended".to_owned());
             failure.causes = vec![format!("its process {how}, before the lambda was loaded")];
             failure
         }
         Err(error) => Failure::caused_by(Exit::Internal, message, &error),
-    }
+    })
 }
 
 impl Guest for Remote {
