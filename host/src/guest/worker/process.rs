@@ -8,6 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::{Exit, ExitRecord, Failure, Parts};
+use rustix::io::ioctl_fionbio;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
@@ -22,13 +23,41 @@ const UNTIL_ENDED: Duration = Duration::from_secs(2);
 /// A worker that was started.
 pub(super) struct Process {
     shim: Child,
-    messages: BufReader<ChildStdout>,
+    messages: BufReader<Napping>,
     line: Vec<u8>,
     folder: TempDir,
     /// Whether what the worker writes to standard error is to be marked as the lambda's; decided once.
     is_ready: Sender<bool>,
     /// Whether it said why it failed; sent when all of it was passed on.
     passed_on: Receiver<bool>,
+}
+
+/// The reading end of the messages. It looks for them now and then and does not wait in the kernel, where each message would have to
+/// wake it: of a lambda that does nothing, a replay made 135,000 wakes a second with such wake-ups, and 190,000 without.
+struct Napping(ChildStdout);
+
+impl Napping {
+    /// The first pause; each further one without a message is twice as long.
+    const FIRST: Duration = Duration::from_micros(100);
+    const LONGEST: Duration = Duration::from_millis(2);
+
+    fn over(messages: ChildStdout) -> io::Result<Self> {
+        ioctl_fionbio(&messages, true)?;
+        Ok(Self(messages))
+    }
+}
+
+impl Read for Napping {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        let mut pause = Self::FIRST;
+        loop {
+            match self.0.read(into) {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => thread::sleep(pause),
+                read => return read,
+            }
+            pause = (2 * pause).min(Self::LONGEST);
+        }
+    }
 }
 
 /// How a worker ended.
@@ -60,7 +89,9 @@ impl Process {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut shim =
             command.spawn().map_err(|error| failed(&format!("cannot start `{}`", shim.display()), &error))?;
-        let messages = BufReader::with_capacity(1 << 16, shim.stdout.take().expect("it is piped"));
+        let messages = Napping::over(shim.stdout.take().expect("it is piped"));
+        let messages = messages.map_err(|error| failed("cannot read from the lambda's process", &error))?;
+        let messages = BufReader::with_capacity(1 << 16, messages);
         let (is_ready, decided) = mpsc::channel();
         let (end, passed_on) = mpsc::channel();
         let from = shim.stderr.take().expect("it is piped");
