@@ -26,9 +26,9 @@ enum RuntimeError {
     Read { source: io::Error },
     #[error("gleaner-runtime reports what this gleaner does not understand: {line}")]
     Report { line: String, source: serde_json::Error },
-    #[error("the lambda's process ended without a result ({status})")]
+    #[error("gleaner-runtime ended without a result ({status})")]
     NoResult { status: ExitStatus },
-    #[error("the lambda's process did not end well after its result ({status})")]
+    #[error("gleaner-runtime did not end well after its result ({status})")]
     Code { status: ExitStatus },
 }
 
@@ -40,7 +40,7 @@ impl Explain for RuntimeError {
                 Some("the system kills the largest process when memory runs out; see `dmesg`".to_owned())
             }
             RuntimeError::NoResult { .. } | RuntimeError::Code { .. } => Some(
-                "the lambda or a library that it uses may have ended the process, as `os._exit` does, or crashed it"
+                "no code of a lambda ends this process: run again with GLEANER_LOG=debug, and report what it prints"
                     .to_owned(),
             ),
             RuntimeError::Start { .. } | RuntimeError::Read { .. } => None,

@@ -131,9 +131,7 @@ fn a_runtime_that_is_killed_has_a_cause_of_its_own() {
     let output = Installation::new("killed", "kill -9 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
     let said = text(&output.stderr);
-    assert!(
-        said.starts_with("error: the lambda's process ended without a result (signal: 9 (SIGKILL))\n  help:  the ")
-    );
+    assert!(said.starts_with("error: gleaner-runtime ended without a result (signal: 9 (SIGKILL))\n  help:  the "));
     assert!(said.contains("dmesg"), "{said}");
 }
 
@@ -173,8 +171,9 @@ fn an_exit_code_that_nothing_explains_is_not_trusted() {
         let test = format!("unexplained-{code}-{}", said.len());
         let output = Installation::new(&test, &format!("printf '{said}' >&2; exit {code}")).replay(&[]);
         assert_eq!(output.status.code(), Some(1));
-        let ended =
-            format!("error: the lambda's process ended without a result (exit status: {code})\n  help:  the lambda ");
+        let ended = format!(
+            "error: gleaner-runtime ended without a result (exit status: {code})\n  help:  no code of a lambda "
+        );
         assert!(text(&output.stderr).starts_with(&format!("{said}{ended}")), "{}", text(&output.stderr));
     }
 }

@@ -66,8 +66,8 @@ impl Judge {
         Self { session, guest, run: Duration::ZERO, faults: Faults::default() }
     }
 
-    /// Whether this wake does not happen: since the lambda has faulted again and again, which is counted, or since the process that
-    /// runs the lambda had no room for the sample, which that counts.
+    /// Returns whether to skip this wake. A lambda that rests after faults skips it, and it is counted. So does a worker that had no
+    /// room for the sample, which the worker counts.
     pub fn passes_over(&mut self, wake: &Wake) -> bool {
         let rests = self.faults.rests(wake.at_ns());
         if rests {

@@ -108,7 +108,7 @@ impl Job {
         Ok(inside)
     }
 
-    /// What is left to the process once the lambda is in it. A worker writes nothing.
+    /// Returns the permissions of the process after the lambda is loaded. A worker writes nothing.
     fn inside(&self, is_worker: bool) -> Inside {
         let (mut paths, ours) = match self {
             Self::Replay(job) => (job.paths(), job.own_memory()),
@@ -128,7 +128,7 @@ impl Job {
         Inside { paths, memory: (manifest.lambda.kind == Kind::Python).then_some(memory), all }
     }
 
-    /// Whether samples arrive while the lambda runs. If not, a Python lambda runs in a worker.
+    /// Returns whether the job is a live run. If not, a Python lambda runs in a worker.
     #[cfg(feature = "python")]
     fn is_live(&self) -> bool {
         match self {

@@ -29,6 +29,8 @@ pub(super) enum BuildError {
     Fetch { status: ExitStatus },
     #[error("the lambda belongs to the workspace `{}`, and all of that could be read", workspace.display())]
     Workspace { workspace: PathBuf },
+    #[error("HOME is no absolute path, and cargo's own folder is not known")]
+    NoHome,
     #[error("the toolchain of `{}` is none of rustup's", rustc.display())]
     Toolchain { rustc: PathBuf },
     #[error(transparent)]
@@ -84,6 +86,7 @@ impl Explain for BuildError {
                     .to_owned()
             }
             BuildError::Workspace { .. } => "move the lambda into a folder of its own".to_owned(),
+            BuildError::NoHome => "set HOME".to_owned(),
             BuildError::Toolchain { .. } => {
                 "remove the rust-toolchain.toml that names it, or name the toolchain: RUSTUP_TOOLCHAIN".to_owned()
             }

@@ -42,7 +42,8 @@ impl Sandbox {
     /// Fetches what `package`, a `Cargo.toml`, depends on.
     pub(super) fn prepare(package: &Path) -> Result<Self, BuildError> {
         let shim = Parts::find().and_then(|parts| parts.program("gleaner-shim")).map_err(BuildError::Parts)?;
-        let home = env::var_os("HOME").map(PathBuf::from).unwrap_or_default();
+        let home = env::var_os("HOME").map(PathBuf::from).filter(|home| home.is_absolute());
+        let home = home.ok_or(BuildError::NoHome)?;
         let sysroot = sysroot(&home)?;
         let Metadata { workspace_root, target_directory } = metadata(&sysroot, package)?;
         if !package.starts_with(&workspace_root) || home.starts_with(&workspace_root) {

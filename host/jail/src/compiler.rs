@@ -1,4 +1,4 @@
-//! What a compiler gives up, which runs code of a lambda's author: build scripts and macros.
+//! The sandbox of a compiler, which runs code of a lambda's author: build scripts and macros.
 //!
 //! It has to start programs, and to change modes and dates of what it writes, so that less can be taken from it than from a lambda's
 //! process. It is not started without all of this: whoever asked for it does not trust that code.

@@ -56,7 +56,7 @@ pub(crate) fn handed_on() -> impl Iterator<Item = (OsString, OsString)> {
     env::vars_os().filter(|(name, _)| is_handed_on(name))
 }
 
-/// What a compiler is given.
+/// Returns the environment of a compiler.
 pub(crate) fn of_compiler() -> impl Iterator<Item = (OsString, OsString)> {
     env::vars_os().filter(|(name, _)| is_of_compiler(name))
 }

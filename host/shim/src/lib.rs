@@ -150,7 +150,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     }
     let written = results.map_or(Ok(()), |results| results.end().finish(&record));
     match written {
-        // A runtime that ended well does not know of it.
+        // The runtime's exit code does not include this failure.
         Err(failure) if record.is_in_order() => Err(failure),
         Err(failure) => {
             eprintln!("{failure}");
@@ -160,7 +160,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     }
 }
 
-/// Has SIGTERM sent to this process when `starter` dies, which is not said twice: it may be gone already.
+/// Requests SIGTERM for when `starter` dies. The kernel sends it once, so an earlier death is checked here.
 fn end_with(starter: u32) -> Result<(), Failure> {
     use rustix::process::{Signal, getppid, set_parent_process_death_signal};
     let cannot = "cannot be told of the starter's death";
@@ -171,7 +171,7 @@ fn end_with(starter: u32) -> Result<(), Failure> {
         return Ok(());
     }
     let help = "it has ended meanwhile; else give `--starter` the number of the process that starts gleaner-shim";
-    Err(Failure::new(Exit::Internal, format!("process {starter} is not who started this")).with_help(help))
+    Err(Failure::new(Exit::Internal, format!("process {starter} is not the parent of gleaner-shim")).with_help(help))
 }
 
 /// Ends this process as the runtime ended.

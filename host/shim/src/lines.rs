@@ -41,7 +41,7 @@ impl Lines {
         cost
     }
 
-    /// Whether a line has begun and not ended, that nothing was made of yet.
+    /// Returns whether an unfinished line is held.
     pub(crate) fn is_within(&self) -> bool {
         !self.line.is_empty()
     }

@@ -6,22 +6,21 @@ use gleaner_protocol::{Doing, Killed, Why};
 use gleaner_vitals::Pulse;
 use gleaner_vitals::usage::{Process, data_limit};
 
-/// What is found late twice, so far apart, is late. Where the whole machine stood still, or all of us were stopped, whoever was about
-/// to come back has so much time to do so.
+/// Time between two looks that both find a runtime late, before it is killed. After a suspend it has this long to return.
 const AGAIN: Duration = Duration::from_millis(100);
-/// How long a signal may keep a runtime stopped. Between two wakes nothing is overdue, and it would stay so.
+/// Longest time that a runtime may be stopped by a signal. Between two wakes nothing is overdue, and it would stay so.
 const STOPPED: Duration = Duration::from_millis(350);
-/// How long a lambda may have too much memory, over the end of a wake: its own process makes that a fault, and takes the memory away.
+/// Longest time above the memory limit, in which a wake must have ended: its own process makes that a fault, and takes the memory away.
 const TOO_MUCH: Duration = Duration::from_secs(1);
-/// Looks that are further apart than this do not count as two: we stood still ourselves.
+/// Looks that are further apart than this do not count as two: the shim itself did not run.
 const ASLEEP: Duration = Duration::from_secs(1);
 
 /// Most threads of a runtime, its own twenty included. Each costs the kernel some memory that no limit of a process counts.
 const THREADS: u64 = 512;
-/// Memory of a process that its limit of data does not count, though it is well: stacks, what the loader has made read-only, page tables.
+/// Memory that RLIMIT_DATA does not count in a healthy process: stacks, what the loader has made read-only, page tables.
 const UNCOUNTED: u64 = 64 << 20;
 
-/// What was seen so far.
+/// State of the looks at one process.
 pub(crate) struct Look {
     pid: u32,
     late: Lasting,
@@ -35,7 +34,7 @@ impl Look {
         Self { pid, late: Lasting::default(), stopped: Lasting::default(), too_much: Lasting::default() }
     }
 
-    /// Why the runtime has to be killed, or how long it is before there is reason to look again.
+    /// Returns why to kill the runtime, or the time until the next look.
     pub(crate) fn again(&mut self, pulse: &Pulse) -> Result<Killed, Duration> {
         let overdue = pulse.overdue();
         let late_for = self.late.seen(overdue.is_ok());
@@ -50,7 +49,7 @@ impl Look {
         }
     }
 
-    /// What its process alone shows, whatever the runtime says.
+    /// Checks the process in `/proc`, which the runtime cannot forge.
     fn by_itself(&mut self, pulse: &Pulse) -> Option<Killed> {
         // One that has just ended has no memory.
         let seen = Process::seen(Some(self.pid))?;

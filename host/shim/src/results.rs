@@ -159,7 +159,9 @@ impl Writer {
     pub(crate) fn finish(mut self, record: &ExitRecord) -> Result<(), Failure> {
         // A lambda can have its process end as if that had been asked for.
         let is_complete = self.last.is_some() && record.asked && record.signal.is_none() && record.killed.is_none();
-        if !is_complete && let Some(decision) = self.undecided(record) {
+        // None if the lambda was not entered.
+        let undecided = self.woken_by.clone().and_then(|woken_by| record.undecided(woken_by));
+        if let Some(decision) = undecided.filter(|_| !is_complete) {
             self.keep(&decision);
             self.flush();
             report(decision);
@@ -246,7 +248,7 @@ impl Writer {
     fn written(&mut self, result: Result<(), OutputError>) {
         let Err(error) = result else { return };
         if !std::mem::replace(&mut self.is_failing, true) {
-            say(format_args!("{error}: {}; what comes is tried again", error.source));
+            say(format_args!("{error}: {}; later lines are tried again", error.source));
         }
         self.first.get_or_insert(error);
     }
@@ -257,14 +259,11 @@ impl Writer {
         if self.refused == 1 {
             // It may quote what a lambda wrote.
             let why: String = why.to_string().chars().take(200).collect();
-            say(format_args!("no page of results: {}; further ones are counted as not written", visible(&why)));
+            say(format_args!(
+                "a line is no page of results: {}; further ones are counted as not written",
+                visible(&why)
+            ));
         }
-    }
-
-    /// The decision of the wake that ended with its process; none if the lambda was not entered, if the end was asked for, or if
-    /// something around the lambda failed.
-    fn undecided(&self, record: &ExitRecord) -> Option<Decision> {
-        record.undecided(self.woken_by.clone()?)
     }
 }
 

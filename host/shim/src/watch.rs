@@ -6,7 +6,7 @@ use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
 
 use gleaner_jail::cgroup::Group;
-use gleaner_protocol::{ExitRecord, Killed, UNTIL_KILLED};
+use gleaner_protocol::{Doing, ExitRecord, Killed, UNTIL_KILLED};
 use gleaner_vitals::Pulse;
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
@@ -34,6 +34,7 @@ pub(crate) struct Ended {
     killed: Option<Killed>,
     out_of_memory: bool,
     asked: bool,
+    doing: Option<Doing>,
     /// Removed last: what was left behind is still in it.
     _group: Option<Group>,
 }
@@ -77,7 +78,8 @@ impl Watched {
                 // It may have come back, or ended by itself, just before it was killed.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
                 let pid = self.child.id();
-                return Ok(Ended { pid, status, killed, out_of_memory, asked: asked.is_some(), _group: self.group });
+                let (asked, doing) = (asked.is_some(), Some(self.pulse.doing()));
+                return Ok(Ended { pid, status, killed, out_of_memory, asked, doing, _group: self.group });
             }
         }
     }
@@ -100,6 +102,7 @@ impl Ended {
             cpu_ns: u64::try_from(cpu).unwrap_or(0) * 1000,
             left_behind,
             asked: self.asked,
+            doing: self.doing,
         }
     }
 }

@@ -221,7 +221,7 @@ fn a_starter_that_is_not_there_any_more_gets_nothing_started() {
     let folder = std::env::temp_dir().join(format!("gleaner-shim-starter-{}", std::process::id()));
     let output = Command::new(SHIM).args(["--starter=1", "--", "/bin/mkdir"]).arg(&folder).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8(output.stderr).unwrap().contains("process 1 is not who started this"));
+    assert!(String::from_utf8(output.stderr).unwrap().contains("process 1 is not the parent of gleaner-shim"));
     assert!(!folder.exists());
     let starter = format!("--starter={}", std::process::id());
     let status = Command::new(SHIM).args([&starter, "--", "/bin/mkdir"]).arg(&folder).status().unwrap();

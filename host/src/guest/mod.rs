@@ -91,13 +91,13 @@ pub trait Guest {
     }
 }
 
-/// What a course through a drive led to, beside its decisions.
+/// Totals of a replay, beside its decisions.
 pub struct Totals {
-    /// What became of the samples of each input, in the manifest's order.
+    /// Counts of the samples of each input, in the manifest's order.
     pub counts: Vec<Counts>,
     /// Time spent decoding images, in ns.
     pub decode_ns: u64,
-    /// What the lambda read.
+    /// Values that the lambda read.
     pub curves: Vec<Curve>,
     /// Fields that it read and that have no curve.
     pub curves_left_out: u64,

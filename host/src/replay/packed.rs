@@ -17,9 +17,9 @@ const BROKEN: &str = "--unpacked-in-part";
 /// Contents of packed drives, as a worker is given them.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct UnpackedArgs {
-    #[arg(long, hide = true, num_args = 2)]
+    #[arg(long, hide = true, num_args = 2, allow_hyphen_values = true)]
     unpacked: Vec<PathBuf>,
-    #[arg(long, hide = true, num_args = 2)]
+    #[arg(long, hide = true, num_args = 2, allow_hyphen_values = true)]
     unpacked_in_part: Vec<OsString>,
 }
 
@@ -68,7 +68,7 @@ impl Job {
 }
 
 impl Packed {
-    /// Unpacks them once more: content whose name has gone, as it has to when the worker is ready, cannot be named again.
+    /// Unpacks the files again for a worker: the content that this process reads has no name any more, and cannot be given one.
     ///
     /// # Errors
     ///

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_protocol::journal::{End, Part};
 use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Explain, Failure, FaultKind, Report, Round, Summary, TopicReport};
+use gleaner_protocol::{Exit, Explain, Failure, FaultKind, Report, Round, Summary, TopicReport, WokenBy};
 use gleaner_transport::replay::{Progress, Replay, Step};
 use gleaner_vitals::usage;
 
@@ -123,12 +123,16 @@ impl Pass<'_> {
     }
 
     /// Ends the lambda's process after its last wake, where it has one of its own.
-    fn finish(&mut self) -> Option<Totals> {
-        self.judge.finish().unwrap_or_else(|fault| {
-            self.faults += 1;
-            self.stopped = Some(fault.message);
-            None
-        })
+    fn finish(&mut self, at_ns: i64, manifest: &Manifest) -> Result<Option<Totals>, Failure> {
+        match self.judge.finish() {
+            Ok(totals) => Ok(totals),
+            Err(fault) => {
+                self.faults += 1;
+                self.stopped = Some(fault.message.clone());
+                self.output.decision(&WokenBy::schedule_of(manifest).faulted(at_ns, 0, fault))?;
+                Ok(None)
+            }
+        }
     }
 
     /// Goes through the drive, and closes what is recorded.
@@ -221,13 +225,13 @@ pub(super) fn replay(
     let (reached, recorded) = ran?;
     flushed?;
     let broken = reached.broken.map(DriveError);
+    let totals = if pass.stopped.is_none() { pass.finish(reached.at_ns, manifest)? } else { None };
     if let (Some(journal), Some(digests)) = (pass.journal.take(), digests) {
         let samples = inputs.iter().map(|topic| offered(topic)).collect();
         // A journal of a damaged drive, or of a lambda that was killed, has no end: it cannot say what comes there.
         let end = End { wakes: pass.wakes, samples, drives: digests.take()? };
         journal.finish((broken.is_none() && pass.stopped.is_none()).then_some(&end))?;
     }
-    let totals = if pass.stopped.is_none() { pass.finish() } else { None };
     let totals = totals.unwrap_or_else(|| Totals::of(&inputs, pass.gathered.curves()));
     let wall_s = started.elapsed().as_secs_f64();
     let summary = Summary {
@@ -239,7 +243,7 @@ pub(super) fn replay(
         wakes: pass.wakes,
         triggers: pass.triggers,
         faults: pass.faults,
-        skipped: totals.counts.iter().map(|counts| counts.skipped).sum(),
+        skipped: totals.counts.iter().fold(0, |sum: u64, counts| sum.saturating_add(counts.skipped)),
         missed_ticks: pass.schedule.missed(),
         out_of_order: drive.out_of_order(),
         log_lines: pass.log_lines,

@@ -213,6 +213,11 @@ impl Pulse {
         page.allowed_ns.store(u64::try_from(allowed.as_nanos()).unwrap_or(u64::MAX), Ordering::Release);
     }
 
+    /// For the shim: what the runtime reported last that it does.
+    pub fn doing(&self) -> Doing {
+        Doing::from_number(self.page().doing.load(Ordering::Acquire))
+    }
+
     /// For the shim: what the runtime was to be done with by now, or how long it is before there is reason to look again.
     pub fn overdue(&self) -> Result<Killed, Duration> {
         /// A call that begins just after a look is seen this much later, at the most.

@@ -36,6 +36,9 @@ pub struct ExitRecord {
     /// `gleaner-shim` had been asked to end it. A lambda can ask its own process only, and not the shim.
     #[serde(default)]
     pub asked: bool,
+    /// What it was doing when it ended, if it reported that.
+    #[serde(default)]
+    pub doing: Option<Doing>,
 }
 
 /// What a runtime was doing when `gleaner-shim` killed it, and why.
@@ -167,11 +170,12 @@ impl ExitRecord {
     /// Its name in the folder of a run's results.
     pub const FILE: &'static str = "exit.json";
 
-    /// Whether the lambda ended the process, and not a request from outside or the programs around it, which report failures by
-    /// their own exit codes. A process that nobody asked to end, and that ends as if it had been, is the lambda's doing.
+    /// Returns whether the lambda caused the end. Without a request, an end within a call into the lambda counts as caused by it, and so
+    /// does an exit code of success: our own failures come between two calls and have their own exit codes.
     pub fn is_the_lambdas(&self) -> bool {
         let is_ours = |code| Exit::from_code(code).is_some_and(|exit| !matches!(exit, Exit::Ok | Exit::LambdaFaulted));
-        self.killed.is_some() || self.out_of_memory || !self.asked && !self.code.is_some_and(is_ours)
+        let is_within = matches!(self.doing, Some(Doing::Init | Doing::Wake));
+        self.killed.is_some() || self.out_of_memory || !self.asked && (is_within || !self.code.is_some_and(is_ours))
     }
 
     /// Whether it ended by itself with an exit code of a run that was completed.
@@ -243,6 +247,7 @@ mod tests {
             cpu_ns: 3,
             left_behind: 0,
             asked: false,
+            doing: None,
         }
     }
 

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use crate::own_file::{self, InTheWay};
+use crate::results::LINES_MAX;
 use crate::signals::Signals;
 use crate::{Decision, Exit, Explain, LogLine, PAGE_BYTES, write_whole};
 
@@ -207,7 +208,9 @@ impl Lines {
         }
         let renewed = self.renew();
         let before = self.file.metadata().map(|metadata| metadata.len());
-        let written = renewed.and_then(|()| self.file.write_all(&self.pending));
+        let is_full = before.as_ref().is_ok_and(|before| before + self.pending.len() as u64 > LINES_MAX.bytes());
+        let bounded = renewed.and_then(|()| if is_full { Err(io::ErrorKind::FileTooLarge.into()) } else { Ok(()) });
+        let written = bounded.and_then(|()| self.file.write_all(&self.pending));
         let waited = std::mem::take(&mut self.waiting);
         self.pending.clear();
         written.map_err(|source| {
@@ -303,6 +306,17 @@ mod tests {
         assert_eq!(missing, "there is no folder `o`: create it first, or name a file in another");
         let full = help("o/wakes.journal", io::ErrorKind::StorageFull).unwrap();
         assert!(full.contains("make room"), "{full}");
+    }
+
+    #[test]
+    fn what_no_program_would_read_is_not_written_and_counted() {
+        let folder = Scratch::new();
+        let mut output = Output::create(folder.root(), true).unwrap();
+        let log = File::options().write(true).open(folder.path("log.jsonl")).unwrap();
+        log.set_len(LINES_MAX.bytes() - 10).unwrap();
+        output.log(&[LogLine { at_ns: 1, level: LogLevel::Info, message: "x".to_owned() }]).unwrap();
+        assert_eq!(output.flush().unwrap_err().source.kind(), io::ErrorKind::FileTooLarge);
+        assert_eq!((output.lost(), log.metadata().unwrap().len()), (1, LINES_MAX.bytes() - 10));
     }
 
     #[test]

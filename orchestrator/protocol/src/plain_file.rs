@@ -1,4 +1,4 @@
-//! Files that others put where we look: a lambda's folder and build, its environment, results, whatever a user names.
+//! Opens files that a user or another program provided: a lambda's folder and build, its environment, results.
 //!
 //! What is opened here is a regular file of a bounded length. A pipe is not waited for, a device is not opened, and a file that is
 //! too long, such as a sparse one, is refused before its first byte. Of a lambda's folder only what lies in it is opened, wherever

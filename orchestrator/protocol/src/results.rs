@@ -1,6 +1,6 @@
 //! How long the files of results become: the bounds of their writers, by which their readers refuse what no writer of ours has made.
 //!
-//! A lambda in a replay can put anything in their place, and a sparse file of a terabyte takes no disk.
+//! Another program may have put anything in their place, and a sparse file of a terabyte takes no disk.
 
 use crate::manifest::ByteSize;
 

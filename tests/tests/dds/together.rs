@@ -1,7 +1,9 @@
 //! Several of our participants read one topic: its writer keeps running, and each of them receives samples.
 
+use gleaner_tests::live::run;
 use gleaner_tests::peers::message::Type;
 use gleaner_tests::peers::{Kind, Peer};
+use gleaner_tests::{Folder, root};
 use gleaner_transport::Qos;
 use gleaner_transport::dds::Dds;
 use libtest_mimic::Failed;
@@ -21,7 +23,19 @@ pub const CASES: &[Case] = &[
         needs: &[Need::Peer(Kind::Cyclone)],
         run: || outlived(Kind::Cyclone),
     },
-    Case { name: "no_multicast_address_is_announced_for_samples", needs: &[], run: announced },
+    Case { name: "no_multicast_address_is_announced_for_samples", needs: &[], run: || announced(|| join(None)) },
+    Case {
+        name: "no_multicast_address_is_announced_by_a_python_lambda",
+        needs: &[],
+        run: || {
+            let out = Folder::new();
+            announced(|| {
+                let lambda = run(&root().join("tests/lambdas/ticker/python"), out.path(), &["--no-record"]);
+                lambda.until_ready();
+                Ok(lambda)
+            })
+        },
+    },
 ];
 
 const TOPIC: &str = "/sensor";
@@ -70,8 +84,9 @@ fn receives(writer: &mut Peer, heard: &[Heard]) -> Result<(), Failed> {
     Ok(())
 }
 
-fn announced() -> Result<(), Failed> {
-    let _dds = join(None)?;
+/// Looks at what the one participant in this network announces, which lives as long as the result of `start`.
+fn announced<T>(start: impl FnOnce() -> Result<T, Failed>) -> Result<(), Failed> {
+    let _participant = start()?;
     let packet = announcement(&udp_ports()?)?;
     let announces = |parameter: u16| {
         // A locator has 24 bytes.

@@ -40,28 +40,35 @@ pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
     let _ = fs::remove_file(folder.join(NOTE_PART));
     let path = folder.join(NOTE);
     let cannot_read = |source| RecordError::Read { path: path.clone(), source };
-    let note = match own_file::read(&path) {
-        Ok(note) => note,
+    let noted = match own_file::read(&path) {
+        Ok(noted) => noted,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
         Err(error) => return Err(cannot_read(error)),
     };
-    let (doomed, _, _) = read_lines(&note, |_| Ok(())).map_err(cannot_read)?;
+    let (doomed, _, _) = read_lines(&noted, |_| Ok(())).map_err(cannot_read)?;
     let listed: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
-    let mut deleted = 0;
-    for Listed { file, thumbnail } in doomed.iter().filter(|doomed| !listed.contains(&doomed.file)) {
+    let (mut deleted, mut left) = (0, Vec::new());
+    for doomed in doomed.into_iter().filter(|doomed| !listed.contains(&doomed.file)) {
+        let Listed { file, thumbnail } = &doomed;
         // The thumbnail first: one without its clip would belong to nothing.
         let thumbnail = thumbnail.as_ref().map_or(Ok(false), |thumbnail| durable::remove(&folder.join(thumbnail)));
         match thumbnail.and_then(|_| durable::remove(&folder.join(file))) {
             Ok(was_there) => deleted += u64::from(was_there),
             // A folder of this name, for example: it stays, and is no clip of the list any more.
             Err(error) => {
-                warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, left alone");
+                warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, which is tried again at the next start");
+                left.push(doomed);
             }
         }
     }
     durable::sync_folder(folder)?;
-    // A clip of the same name may come next: the note must not outlive it.
-    durable::remove(&path)?;
-    durable::sync_folder(folder)?;
+    // A clip of the same name may come next: the note must not outlive it. One that is still there would be taken for a clip that no
+    // process had listed.
+    if left.is_empty() {
+        durable::remove(&path)?;
+        durable::sync_folder(folder)?;
+    } else {
+        note(folder, &left)?;
+    }
     Ok(deleted)
 }

@@ -37,7 +37,7 @@ enum Message {
     Ready { engine: String, layers: Vec<Layer> },
     /// A line that the lambda logged; sent before the message of the call that it belongs to.
     Log { level: Level, message: String },
-    /// What comes before the lambda, and is as foreign as it, has ended.
+    /// The start of the lambda's environment has ended.
     Prepared(Called),
     /// `init` has ended.
     Initialised(Called),
@@ -45,11 +45,11 @@ enum Message {
     Woken(Woken),
     /// The course is over.
     Done(Done),
-    /// What the lambda read of one field; sent behind [`Message::Done`], as often as that says.
+    /// Values of one field that the lambda read. [`Message::Done`] says how many of these follow it.
     Curve(Curve),
 }
 
-/// What a call into the lambda led to.
+/// Outcome of a call into the lambda.
 #[derive(Debug, Default, Serialize, Deserialize)]
 struct Called {
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -82,7 +82,7 @@ struct Woken {
     no_slot: u64,
 }
 
-/// What is known only once the course is over.
+/// Totals of the course, sent after the last wake.
 #[derive(Debug, Serialize, Deserialize)]
 struct Done {
     /// Of each input, in the manifest's order.

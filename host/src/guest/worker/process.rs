@@ -8,6 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::{Exit, ExitRecord, Failure, Parts};
+use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::ioctl_fionbio;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
@@ -17,8 +18,12 @@ use super::{MESSAGE_MAX, Message};
 /// The argument that makes `gleaner-runtime` a worker; it comes first.
 pub const WORKER: &str = "--worker";
 
-/// How long a worker may take to end by itself once its last message was read. What it wrote to standard error may take as long.
-const UNTIL_ENDED: Duration = Duration::from_secs(2);
+/// How long a worker may take to end once that was requested. What it wrote to standard error may take as long.
+const UNTIL_KILLED: Duration = Duration::from_secs(2);
+/// Longest piece of a line of standard error that is passed on at once.
+const PIECE: u64 = 8192;
+/// Bytes of standard error that are held while it is not known whether they come from the lambda.
+const HELD: usize = 4 << 20;
 
 /// A worker that was started.
 pub(super) struct Process {
@@ -26,9 +31,9 @@ pub(super) struct Process {
     messages: BufReader<Napping>,
     line: Vec<u8>,
     folder: TempDir,
-    /// Whether what the worker writes to standard error is to be marked as the lambda's; decided once.
+    /// Receives, once, whether standard error may come from the lambda.
     is_ready: Sender<bool>,
-    /// Whether it said why it failed; sent when all of it was passed on.
+    /// Receives whether the worker printed an error of our own, once its standard error has ended.
     passed_on: Receiver<bool>,
 }
 
@@ -52,18 +57,29 @@ impl Read for Napping {
         let mut pause = Self::FIRST;
         loop {
             match self.0.read(into) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => thread::sleep(pause),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
                 read => return read,
             }
-            pause = (2 * pause).min(Self::LONGEST);
+            if pause < Self::LONGEST {
+                thread::sleep(pause);
+                pause *= 2;
+            } else {
+                // A long wake: one wake-up costs less than looking again and again. A signal may end it early.
+                let _ = poll(&mut [PollFd::new(&self.0, PollFlags::IN)], None);
+            }
         }
     }
 }
 
 /// How a worker ended.
 pub(super) struct Ended {
-    pub(super) record: ExitRecord,
-    /// Whether our own part of it printed why, before anything of the lambda could.
+    /// As the shim wrote it down, if it lived to do so.
+    pub(super) record: Option<ExitRecord>,
+    /// Exit code of the shim, which ends as its runtime does.
+    pub(super) code: Option<i32>,
+    /// This process has ended it.
+    pub(super) was_forced: bool,
+    /// Our own part of it printed why, before anything of the lambda could run.
     pub(super) is_explained: bool,
 }
 
@@ -71,7 +87,7 @@ pub(super) struct Ended {
 pub(super) enum NoMessage {
     /// The process has ended, or has closed its standard output.
     Ended,
-    /// There is one that no worker sends.
+    /// The message is malformed.
     Malformed(String),
 }
 
@@ -121,48 +137,65 @@ impl Process {
         let _ = self.is_ready.send(true);
     }
 
-    /// Ends the process if it has not ended by itself; returns how it ended. With `at_once` it is not given the time for that.
-    pub(super) fn end(mut self, at_once: bool) -> io::Result<Ended> {
+    /// Ends the process, or with `patience` waits so long for its own end; returns how it ended.
+    pub(super) fn end(mut self, patience: Duration) -> io::Result<Ended> {
         let _ = self.is_ready.send(false);
-        let asked = Instant::now();
-        let mut is_killed = at_once;
-        if at_once {
-            self.ask_to_end();
-        }
-        // The shim ends with its runtime, which it kills where it has to.
-        while self.shim.try_wait()?.is_none() {
-            if !is_killed && asked.elapsed() >= UNTIL_ENDED {
+        let started = Instant::now();
+        let (mut was_forced, mut is_killed) = (false, false);
+        let status = loop {
+            if let Some(status) = self.shim.try_wait()? {
+                break status;
+            }
+            if !was_forced && started.elapsed() >= patience {
+                was_forced = true;
+                let _ = kill_process(Pid::from_child(&self.shim), Signal::TERM);
+            }
+            // Native code may ignore that. The runtime does not outlive its shim.
+            if !is_killed && started.elapsed() >= patience + UNTIL_KILLED {
                 is_killed = true;
-                self.ask_to_end();
+                let _ = kill_process(Pid::from_child(&self.shim), Signal::KILL);
             }
             thread::sleep(Duration::from_millis(1));
-        }
+        };
         // A process that the worker left behind may hold its standard error open.
-        let is_explained = self.passed_on.recv_timeout(UNTIL_ENDED).unwrap_or(false);
-        let record = ExitRecord::read(&self.folder.path().join(ExitRecord::FILE))?;
-        Ok(Ended { record, is_explained })
-    }
-
-    fn ask_to_end(&self) {
-        let _ = kill_process(Pid::from_child(&self.shim), Signal::TERM);
+        let is_explained = self.passed_on.recv_timeout(UNTIL_KILLED).unwrap_or(false);
+        let record = ExitRecord::read(&self.folder.path().join(ExitRecord::FILE)).ok();
+        Ok(Ended { record, code: status.code(), was_forced, is_explained })
     }
 }
 
-/// Passes on what a worker writes to standard error, as it is if the worker never became ready. Sends to `end` whether it was an error
-/// of our own then.
-fn pass_on(from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>) {
-    // Longest piece of a line that is held.
-    const PIECE: u64 = 8192;
-    // Until it is known who writes, nothing is read: the pipe holds what our own part of the process writes before it is ready.
-    let mark = if is_ready.recv() == Ok(true) { "lambda: " } else { "" };
-    let (mut from, mut piece) = (BufReader::new(from), Vec::new());
-    let (mut begins_line, mut is_explained) = (true, false);
+/// Passes on what a worker writes to standard error: as it is if the worker never became ready, and else with a mark. Sends to `end`
+/// whether it was an error of our own.
+fn pass_on(mut from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>) {
+    let mut held = Vec::new();
+    // Nothing of the lambda has run until it is decided, and our own part writes no more than this.
+    let mut piece = [0; 8192];
+    let is_ready = loop {
+        match from.read(&mut piece) {
+            Ok(read @ 1..) if held.len() < HELD => held.extend_from_slice(&piece[..read]),
+            Ok(read) => {
+                held.extend_from_slice(&piece[..read]);
+                break is_ready.recv();
+            }
+            Err(_) => break is_ready.recv(),
+        }
+        if let Ok(decided) = is_ready.try_recv() {
+            break Ok(decided);
+        }
+    };
+    let mark = if is_ready == Ok(true) { "lambda: " } else { "" };
+    let mut from = BufReader::new(io::Cursor::new(held).chain(from));
+    let (mut piece, mut begins_line, mut is_explained) = (Vec::new(), true, false);
     while matches!((&mut from).take(PIECE).read_until(b'\n', &mut piece), Ok(1..)) {
         is_explained |= begins_line && mark.is_empty() && piece.starts_with(b"error: ");
         let mut text = if begins_line { mark.as_bytes().to_vec() } else { Vec::new() };
         text.append(&mut piece);
         begins_line = text.ends_with(b"\n");
         let _ = io::stderr().write_all(&text);
+    }
+    if !begins_line {
+        // Else the next line of this process would be a part of it.
+        let _ = io::stderr().write_all(b"\n");
     }
     let _ = end.send(is_explained);
 }

@@ -1,17 +1,20 @@
 //! The side of the process that started a worker: a guest whose outcomes come from there.
 
 use std::ffi::OsString;
+use std::sync::Arc;
+use std::time::Duration;
 
 use gleaner_protocol::journal::Said;
 use gleaner_protocol::manifest::{Limits, Manifest};
-use gleaner_protocol::signals::Signals;
-use gleaner_protocol::{Exit, ExitRecord, Failure, Fault, FaultKind, Layer};
+use gleaner_protocol::signals::{Curve, Signals};
+use gleaner_protocol::{Exit, Failure, Fault, FaultKind, Layer, UNTIL_KILLED};
 
 use super::process::{Ended, NoMessage, Process};
 use super::{Called, Done, Message, Woken};
 use crate::api::Session;
-use crate::api::data::Wake;
-use crate::api::log::{LINE_BYTES, Level};
+use crate::api::data::{Counts, Topic, Wake};
+use crate::api::log::{LINE_BYTES, Level, cut};
+use crate::api::trace::offered;
 use crate::guest::{Guest, Outcome, Totals};
 
 /// A guest in a worker.
@@ -120,7 +123,7 @@ impl Remote {
         let lines = u32::try_from(lines).unwrap_or(u32::MAX);
         self.session.relay_counts(Said { lines, digest }, log_dropped, triggers_refused);
         self.resident_bytes = self.resident_bytes.max(resident_bytes);
-        fault.map_or(Ok(()), Err)
+        fault.map_or(Ok(()), |fault| Err(Fault { message: cut(&fault.message, LINE_BYTES).to_owned(), ..fault }))
     }
 
     fn woken(&mut self, wake: &Wake) -> Result<Woken, Fault> {
@@ -134,12 +137,13 @@ impl Remote {
         Ok(woken)
     }
 
-    /// The fault of a worker that has ended; one that sent `nonsense` is killed for it.
+    /// Returns the fault of a worker that has ended; one that sent `nonsense` is ended for it.
     fn killed(&mut self, nonsense: Option<&str>) -> Fault {
         if let Some(fault) = &self.fault {
             return fault.clone();
         }
-        let record = self.end(nonsense.is_some());
+        let patience = if nonsense.is_some() { Duration::ZERO } else { UNTIL_KILLED };
+        let record = self.end(patience).and_then(|ended| ended.record);
         let killed = record.as_ref().and_then(|record| record.killed);
         let how = match (nonsense, record) {
             (Some(what), _) => format!("reported {what}, and was ended for it"),
@@ -151,12 +155,37 @@ impl Remote {
         self.fault.insert(Fault { kind: FaultKind::Killed, message, used, allowed }).clone()
     }
 
-    fn end(&mut self, at_once: bool) -> Option<ExitRecord> {
-        let record = self.worker.take()?.end(at_once).map(|ended| ended.record);
-        let record = record.map_err(|error| tracing::warn!(%error, "how the lambda's process ended is not known")).ok();
-        self.most_resident_bytes = record.as_ref().map_or(0, |record| record.max_rss_bytes);
-        record
+    fn end(&mut self, patience: Duration) -> Option<Ended> {
+        let ended = self.worker.take()?.end(patience);
+        let ended = ended.map_err(|error| tracing::warn!(%error, "the lambda's process cannot be waited for")).ok()?;
+        self.most_resident_bytes = ended.record.as_ref().map_or(0, |record| record.max_rss_bytes);
+        Some(ended)
     }
+
+    /// Waits for the end of a worker that has sent everything.
+    fn ended_well(&mut self) -> Result<(), Fault> {
+        let Some(ended) = self.end(UNTIL_KILLED) else { return Ok(()) };
+        if ended.was_forced {
+            tracing::warn!("the lambda's process did not end after its last wake, and was ended");
+            return Ok(());
+        }
+        if ended.code == Some(0) {
+            return Ok(());
+        }
+        let how =
+            ended.record.and_then(|record| record.sentence()).unwrap_or_else(|| "did not end in order".to_owned());
+        let message = format!("the lambda's process {how}, after its last wake");
+        Err(Fault { kind: FaultKind::Killed, message, used: None, allowed: None })
+    }
+}
+
+/// Returns whether a lambda over `inputs` can have read this.
+fn is_possible(curve: &Curve, inputs: &[Arc<Topic>]) -> bool {
+    let points = curve.at_ns.len();
+    points <= Signals::POINTS_MAX
+        && [curve.min.len(), curve.max.len()] == [points; 2]
+        && curve.path.len() <= LINE_BYTES
+        && inputs.iter().any(|topic| topic.name() == curve.input && topic.ros_topic() == curve.topic)
 }
 
 /// Why there is no worker.
@@ -167,17 +196,17 @@ pub enum NotReady {
     Failed(Failure),
 }
 
-/// How a worker failed that has ended before anything of the lambda ran: its exit code is that of our own programs.
+/// Returns the failure of a worker that ended before any code of the lambda ran: its exit code is that of our own programs.
 fn not_ready(worker: Process, manifest: &Manifest) -> NotReady {
     let message = format!("cannot start lambda `{}`", manifest.lambda.name);
-    NotReady::Failed(match worker.end(true) {
-        Ok(Ended { record, is_explained }) => {
-            let exit = record.code.and_then(Exit::from_code).filter(|exit| *exit != Exit::Ok);
+    NotReady::Failed(match worker.end(UNTIL_KILLED) {
+        Ok(Ended { record, code, is_explained, .. }) => {
+            let exit = code.and_then(Exit::from_code).filter(|exit| *exit != Exit::Ok);
             if let Some(exit) = exit.filter(|_| is_explained) {
                 return NotReady::Explained(exit);
             }
             let mut failure = Failure::new(exit.unwrap_or(Exit::Internal), message);
-            let how = record.sentence().unwrap_or_else(|| "ended".to_owned());
+            let how = record.and_then(|record| record.sentence()).unwrap_or_else(|| "ended".to_owned());
             failure.causes = vec![format!("its process {how}, before the lambda was loaded")];
             failure
         }
@@ -230,7 +259,8 @@ impl Guest for Remote {
             (Wake::Event(_), Ok(Message::Done(done))) => done.no_slot(),
             _ => 0,
         };
-        let is_left_out = self.left_out < no_slot;
+        let offered = self.session.inputs().iter().fold(0_u64, |sum, topic| sum.saturating_add(offered(topic)));
+        let is_left_out = self.left_out < no_slot.min(offered);
         self.left_out += u64::from(is_left_out);
         !is_left_out
     }
@@ -256,6 +286,7 @@ impl Guest for Remote {
             Message::Done(done) => Some(done),
             _ => None,
         })?;
+        let no_slot = done.no_slot();
         let Done { counts, decode_ns, curves: n, curves_left_out } = done;
         if n > Signals::CURVES_MAX {
             return Err(self.killed(Some("more curves than there can be")));
@@ -266,23 +297,25 @@ impl Guest for Remote {
                 _ => None,
             })
         });
-        let curves = curves.collect::<Result<_, _>>()?;
-        if counts.len() != self.session.inputs().len() {
-            return Err(self.killed(Some("counts of other inputs")));
+        let curves = curves.collect::<Result<Vec<_>, _>>()?;
+        let inputs = self.session.inputs();
+        if !curves.iter().all(|curve| is_possible(curve, &inputs)) {
+            return Err(self.killed(Some("a curve that cannot be")));
         }
-        match self.end(false) {
-            Some(record) if record.code != Some(0) => {
-                let how = record.sentence().unwrap_or_default();
-                let message = format!("the lambda's process {how}, after its last wake");
-                Err(Fault { kind: FaultKind::Killed, message, used: None, allowed: None })
-            }
-            _ => Ok(Some(Totals { counts, decode_ns, curves, curves_left_out })),
+        let is_counted = |(topic, counts): (&Arc<Topic>, &Counts)| {
+            let parts = [counts.received, counts.no_slot, counts.too_big];
+            parts.into_iter().try_fold(0, u64::checked_add) == Some(offered(topic)) && counts.skipped <= offered(topic)
+        };
+        if counts.len() != inputs.len() || !inputs.iter().zip(&counts).all(is_counted) || self.left_out > no_slot {
+            return Err(self.killed(Some("counts of samples that cannot be")));
         }
+        self.ended_well()?;
+        Ok(Some(Totals { counts, decode_ns, curves, curves_left_out }))
     }
 }
 
 impl Drop for Remote {
     fn drop(&mut self) {
-        self.end(true);
+        self.end(Duration::ZERO);
     }
 }
