@@ -68,6 +68,7 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("moved_stack", None, Some(Refused("PermissionError(1"))),
     ("zeros", None, Some(Refused("Permission denied"))),
     ("lease", None, Some(Refused("Operation not permitted"))),
+    ("pinned", None, Some(Refused("Operation not permitted"))),
     ("lock", None, Some(Refused("PermissionError(1"))),
     ("in_flight", None, Some(Refused("Operation not permitted"))),
     ("watch", None, Some(Refused("PermissionError(1"))),

@@ -18,6 +18,9 @@ use super::error::{BuildError, TARGET};
 /// Where cargo is started.
 const ROOT: &str = "/";
 
+/// The target folder of cargo before it is in its jail: nothing can be written there, whatever links the lambda's own has.
+const NOWHERE: &str = "/dev/null/target";
+
 /// What is needed of cargo's own folder: crates, and where they come from. Its credentials are not.
 const OF_CARGO: [&str; 4] = ["registry", "git", "config.toml", "config"];
 
@@ -35,7 +38,6 @@ pub(super) struct Sandbox {
 #[derive(Deserialize)]
 struct Metadata {
     workspace_root: PathBuf,
-    target_directory: PathBuf,
 }
 
 impl Sandbox {
@@ -45,21 +47,24 @@ impl Sandbox {
         let home = env::var_os("HOME").map(PathBuf::from).filter(|home| home.is_absolute());
         let home = home.ok_or(BuildError::NoHome)?;
         let sysroot = sysroot(&home)?;
-        let Metadata { workspace_root, target_directory } = metadata(&sysroot, package)?;
+        let Metadata { workspace_root } = metadata(&sysroot, package)?;
         if !package.starts_with(&workspace_root) || home.starts_with(&workspace_root) {
             return Err(BuildError::Workspace { workspace: workspace_root });
         }
         let lock = workspace_root.join("Cargo.lock");
-        if lock.is_symlink() {
-            // Cargo would write to where it leads.
-            return Err(file("write", &lock)(io::Error::other(NotPlain::Link)));
+        // Cargo would write to where a link leads, and wait for a pipe.
+        match lock.symlink_metadata() {
+            Ok(found) if found.is_symlink() => return Err(file("write", &lock)(io::Error::other(NotPlain::Link))),
+            Ok(found) if !found.is_file() => return Err(file("write", &lock)(io::Error::other(NotPlain::NoFile))),
+            _ => {}
         }
         fetch(&sysroot, package)?;
         // One for each lambda, which else could change what was compiled for another.
         let name = hex(&Sha256::digest(package.as_os_str().as_encoded_bytes())[..8]);
-        let sandboxed = target_directory.join("sandboxed");
+        let all = workspace_root.join("target");
+        let sandboxed = all.join("sandboxed");
         let target = sandboxed.join(name);
-        for folder in [&sandboxed, &target, &target.join("tmp")] {
+        for folder in [&all, &sandboxed, &target, &target.join("tmp")] {
             own_file::folder(folder).map_err(file("create", folder))?;
         }
         let target = target.canonicalize().map_err(file("create", &target))?;
@@ -121,7 +126,12 @@ fn metadata(sysroot: &Path, package: &Path) -> Result<Metadata, BuildError> {
     let cargo = program_of(sysroot, "cargo");
     let mut command = Command::new(&cargo);
     command.args(["metadata", "--no-deps", "--offline", "--format-version", "1", "--manifest-path"]).arg(package);
-    let output = command.current_dir(ROOT).stdin(Stdio::null()).stderr(Stdio::inherit()).output();
+    let output = command
+        .env("CARGO_TARGET_DIR", NOWHERE)
+        .current_dir(ROOT)
+        .stdin(Stdio::null())
+        .stderr(Stdio::inherit())
+        .output();
     let output = output.map_err(|source| BuildError::NoCargo { program: cargo, source })?;
     if !output.status.success() {
         return Err(BuildError::Compile { status: output.status });
@@ -135,6 +145,7 @@ fn fetch(sysroot: &Path, package: &Path) -> Result<(), BuildError> {
         .map_err(|source| BuildError::NoCargo { program: rustc, source })?;
     let mut command = Command::new(&cargo);
     command.arg("fetch").arg("--manifest-path").arg(package).args(["--target", TARGET, "--target", &host]);
+    command.env("CARGO_TARGET_DIR", NOWHERE);
     let status = command.current_dir(ROOT).stdin(Stdio::null()).status();
     let status = status.map_err(|source| BuildError::NoCargo { program: cargo, source })?;
     if status.success() { Ok(()) } else { Err(BuildError::Fetch { status }) }

@@ -86,6 +86,9 @@ const SHARED: &[i64] = &[
     libc::SYS_fanotify_mark,
     libc::SYS_io_setup,
     libc::SYS_timer_create,
+    // Pages that a pipe holds are counted by no limit.
+    libc::SYS_vmsplice,
+    libc::SYS_tee,
     libc::SYS_sync,
     libc::SYS_syncfs,
     FCHMODAT2,

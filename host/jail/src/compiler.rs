@@ -1,7 +1,7 @@
 //! The sandbox of a compiler, which runs code of a lambda's author: build scripts and macros.
 //!
 //! It has to start programs, and to change modes and dates of what it writes, so that less can be taken from it than from a lambda's
-//! process. It is not started without all of this: whoever asked for it does not trust that code.
+//! process. It is not started without all of this: the user who requests it does not trust that code.
 
 use gleaner_protocol::{Holds, Layer};
 
@@ -29,13 +29,24 @@ const CALLS: &[i64] = &[
     libc::SYS_msgctl,
     libc::SYS_mq_open,
     libc::SYS_mq_unlink,
+    libc::SYS_setpriority,
+    libc::SYS_ioprio_set,
+];
+
+/// Limits and schedules of processes, of which each may set its own.
+const OF_PROCESSES: &[i64] = &[
+    libc::SYS_prlimit64,
+    libc::SYS_sched_setaffinity,
+    libc::SYS_sched_setattr,
+    libc::SYS_sched_setparam,
+    libc::SYS_sched_setscheduler,
 ];
 #[cfg(target_arch = "x86_64")]
 const CALLS_HERE: &[i64] = &[libc::SYS_chown, libc::SYS_lchown];
 #[cfg(not(target_arch = "x86_64"))]
 const CALLS_HERE: &[i64] = &[];
 
-/// Requests of `ioctl` that type into somebody's terminal.
+/// Requests of `ioctl` that insert input into a terminal.
 const TYPING: [u64; 2] = [libc::TIOCSTI, 0x541C];
 
 /// From now on this process, and what it starts, can open only `paths` and the system's programs and libraries, and no socket.
@@ -55,6 +66,9 @@ pub fn enter(paths: &Paths) -> Result<(), Layer> {
 
 fn filter() -> Result<(), JailError> {
     let mut refused = pairs_only(Refused::default()).calls(NEW_SOCKETS).calls(CALLS).calls(CALLS_HERE);
+    for call in OF_PROCESSES {
+        refused = refused.unless(*call, 0, 0);
+    }
     for request in TYPING {
         refused = refused.bits(libc::SYS_ioctl, 1, u64::from(u32::MAX), request);
     }

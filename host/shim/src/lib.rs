@@ -43,7 +43,7 @@ const HARD_DEADLINE: &str = "hard deadline";
 #[derive(Parser)]
 #[command(name = "gleaner-shim", version)]
 struct Args {
-    /// Write down here how it ended.
+    /// Write down here how it ended; `-` is for standard output, as the last line.
     #[arg(long, value_name = "FILE")]
     exit_record: Option<PathBuf>,
     /// Write the results of a live lambda into this folder.
@@ -76,6 +76,9 @@ struct Args {
     /// What a compiler may read and write.
     #[arg(long, value_name = "PATH", requires = "compiler")]
     write: Vec<PathBuf>,
+    /// Be the compiler's own process.
+    #[arg(long, hide = true, requires = "compiler")]
+    inside: bool,
     /// The runtime and its arguments.
     #[arg(last = true, required_unless_present = "layers")]
     program: Vec<OsString>,
@@ -84,7 +87,14 @@ struct Args {
 /// `main` of `gleaner-shim`.
 pub fn main() -> ExitCode {
     let args = Args::parse();
-    let ended = if args.layers { show_layers(&args) } else { run(&args) };
+    // Files that the starter happened to have open are none of the lambda's.
+    let closed = gleaner_vitals::close_on_exec()
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot close files of the starter", &error));
+    let ended = closed.and_then(|()| match () {
+        () if args.layers => show_layers(&args),
+        () if args.inside => Err(compiler::enter(&args)),
+        () => run(&args),
+    });
     match ended {
         Ok(code) => code,
         Err(failure) => {
@@ -117,7 +127,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let mut command = Command::new(program);
     command.args(arguments).env_clear().envs(environment::handed_on()).env_remove(cgroup::CGROUP_ENV);
     command.env(PULSE_ENV, number).env(LAYERS_ENV, layers).env_remove(RESULTS_ENV);
-    if let Some(path) = &args.exit_record {
+    if let Some(path) = args.exit_record.as_ref().filter(|path| path.as_os_str() != "-") {
         // Else the end of an earlier one could be taken for that of this one. Mostly there is none.
         let _ = std::fs::remove_file(path);
     }
@@ -142,11 +152,12 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         eprintln!("gleaner-shim: ended {left_behind} processes that the runtime had left behind");
     }
     let record = ended.record(started_ns, left_behind);
-    if let Some(path) = &args.exit_record
-        && let Err(error) = record.write(path)
-    {
-        // How it ended is more important than that this is not written.
-        eprintln!("gleaner-shim: cannot write `{}`: {error}", path.display());
+    if let Some(path) = &args.exit_record {
+        let written = if path.as_os_str() == "-" { record.print() } else { record.write(path) };
+        if let Err(error) = written {
+            // How it ended is more important than that this is not written.
+            eprintln!("gleaner-shim: cannot write `{}`: {error}", path.display());
+        }
     }
     let written = results.map_or(Ok(()), |results| results.end().finish(&record));
     match written {

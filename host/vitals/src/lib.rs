@@ -1,6 +1,6 @@
 //! How a process of ours is doing, and what it says of itself: the same for the runtime and for the recorder.
 //!
-//! - [`hand_on`], [`inherited`]: open files that the shim hands to its runtime.
+//! - [`hand_on`], [`inherited`], [`close_on_exec`]: open files that the shim hands to its runtime.
 //! - [`log`]: lines for people, on standard error.
 //! - [`own`]: memory of our own code in a process that a lambda shares.
 //! - [`Pulse`]: what it does, and since when, for the shim that ends it if it does not come back.
@@ -16,6 +16,6 @@ mod pulse;
 mod spread;
 pub mod usage;
 
-pub use handed_on::{hand_on, inherited};
+pub use handed_on::{close_on_exec, hand_on, inherited};
 pub use pulse::{Busy, PULSE_ENV, Pulse, Share};
 pub use spread::{Durations, Spreads};

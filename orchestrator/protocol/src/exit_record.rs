@@ -1,4 +1,4 @@
-use std::io::{self, Read};
+use std::io::{self, Read, Write};
 use std::path::Path;
 use std::time::Duration;
 
@@ -207,6 +207,16 @@ impl ExitRecord {
         let mut text = serde_json::to_vec_pretty(self).expect("a record is plain data");
         text.push(b'\n');
         write_whole(path, &text)
+    }
+
+    /// Prints it as the last line of standard output, where its process may have left a part of a line.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing.
+    pub fn print(&self) -> io::Result<()> {
+        let text = serde_json::to_string(self).expect("a record is plain data");
+        writeln!(io::stdout(), "\n{text}")
     }
 
     /// Reads the record at `path`.

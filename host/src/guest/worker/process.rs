@@ -11,7 +11,6 @@ use gleaner_protocol::{Exit, ExitRecord, Failure, Parts};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::ioctl_fionbio;
 use rustix::process::{Pid, Signal, kill_process};
-use tempfile::TempDir;
 
 use super::{MESSAGE_MAX, Message};
 
@@ -28,9 +27,11 @@ const HELD: usize = 4 << 20;
 /// A worker that was started.
 pub(super) struct Process {
     shim: Child,
-    messages: BufReader<Napping>,
+    /// None once they are not read any more.
+    messages: Option<BufReader<Napping>>,
     line: Vec<u8>,
-    folder: TempDir,
+    /// How it ended, as the shim sent it last.
+    record: Option<ExitRecord>,
     /// Receives, once, whether standard error may come from the lambda.
     is_ready: Sender<bool>,
     /// Receives whether the worker printed an error of our own, once its standard error has ended.
@@ -39,7 +40,11 @@ pub(super) struct Process {
 
 /// The reading end of the messages. It looks for them now and then and does not wait in the kernel, where each message would have to
 /// wake it: of a lambda that does nothing, a replay made 135,000 wakes a second with such wake-ups, and 190,000 without.
-struct Napping(ChildStdout);
+struct Napping {
+    messages: ChildStdout,
+    /// Whether there may come more.
+    waits: bool,
+}
 
 impl Napping {
     /// The first pause; each further one without a message is twice as long.
@@ -48,7 +53,7 @@ impl Napping {
 
     fn over(messages: ChildStdout) -> io::Result<Self> {
         ioctl_fionbio(&messages, true)?;
-        Ok(Self(messages))
+        Ok(Self { messages, waits: true })
     }
 }
 
@@ -56,8 +61,8 @@ impl Read for Napping {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
         let mut pause = Self::FIRST;
         loop {
-            match self.0.read(into) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            match self.messages.read(into) {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock && self.waits => {}
                 read => return read,
             }
             if pause < Self::LONGEST {
@@ -65,7 +70,7 @@ impl Read for Napping {
                 pause *= 2;
             } else {
                 // A long wake: one wake-up costs less than looking again and again. A signal may end it early.
-                let _ = poll(&mut [PollFd::new(&self.0, PollFlags::IN)], None);
+                let _ = poll(&mut [PollFd::new(&self.messages, PollFlags::IN)], None);
             }
         }
     }
@@ -97,39 +102,46 @@ impl Process {
         let failed = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
         let parts = Parts::find()?;
         let (shim, runtime) = (parts.program("gleaner-shim")?, parts.program("gleaner-runtime")?);
-        let folder = tempfile::tempdir().map_err(|error| failed("cannot make a temporary folder", &error))?;
         let starter: OsString = format!("--starter={}", std::process::id()).into();
         let mut command = Command::new(&shim);
-        command.arg(starter).arg("--exit-record").arg(folder.path().join(ExitRecord::FILE)).arg("--");
+        command.arg(starter).args(["--exit-record", "-", "--"]);
         command.arg(runtime).arg(WORKER).args(arguments).args(std::env::args_os().skip(1));
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut shim =
             command.spawn().map_err(|error| failed(&format!("cannot start `{}`", shim.display()), &error))?;
         let messages = Napping::over(shim.stdout.take().expect("it is piped"));
         let messages = messages.map_err(|error| failed("cannot read from the lambda's process", &error))?;
-        let messages = BufReader::with_capacity(1 << 16, messages);
+        let messages = Some(BufReader::with_capacity(1 << 16, messages));
         let (is_ready, decided) = mpsc::channel();
         let (end, passed_on) = mpsc::channel();
         let from = shim.stderr.take().expect("it is piped");
         thread::spawn(move || pass_on(from, &decided, &end));
-        Ok(Self { shim, messages, line: Vec::new(), folder, is_ready, passed_on })
+        Ok(Self { shim, messages, line: Vec::new(), record: None, is_ready, passed_on })
     }
 
     /// Waits for the next message.
     pub(super) fn next(&mut self) -> Result<Message, NoMessage> {
-        self.line.clear();
-        let read = (&mut self.messages).take(MESSAGE_MAX).read_until(b'\n', &mut self.line);
-        if !matches!(read, Ok(1..)) {
-            return Err(NoMessage::Ended);
+        let Some(messages) = &mut self.messages else { return Err(NoMessage::Ended) };
+        loop {
+            self.line.clear();
+            let read = messages.take(MESSAGE_MAX).read_until(b'\n', &mut self.line);
+            // A process that is killed while it writes leaves a part of a message, which the shim ends before its own.
+            match (read, &*self.line) {
+                (Ok(1..), b"\n") => {}
+                (Ok(1..), line) if line.ends_with(b"\n") => break,
+                (Ok(1..), line) if line.len() as u64 == MESSAGE_MAX => {
+                    return Err(NoMessage::Malformed(format!("a message of more than {MESSAGE_MAX} bytes")));
+                }
+                _ => return Err(NoMessage::Ended),
+            }
         }
-        if !self.line.ends_with(b"\n") && self.line.len() as u64 == MESSAGE_MAX {
-            return Err(NoMessage::Malformed(format!("a message of more than {MESSAGE_MAX} bytes")));
-        }
-        // A process that is killed while it writes leaves a part of a message.
-        if !self.line.ends_with(b"\n") {
-            return Err(NoMessage::Ended);
-        }
-        serde_json::from_slice(&self.line).map_err(|error| NoMessage::Malformed(error.to_string()))
+        serde_json::from_slice(&self.line).map_err(|error| match serde_json::from_slice(&self.line) {
+            Ok(record) => {
+                self.record = Some(record);
+                NoMessage::Ended
+            }
+            Err(_) => NoMessage::Malformed(error.to_string()),
+        })
     }
 
     /// From now on what the process writes to standard error may come from the lambda: each line is marked as such.
@@ -140,6 +152,10 @@ impl Process {
     /// Ends the process, or with `patience` waits so long for its own end; returns how it ended.
     pub(super) fn end(mut self, patience: Duration) -> io::Result<Ended> {
         let _ = self.is_ready.send(false);
+        if patience.is_zero() {
+            // What it would still write could keep it, and its shim, from ending.
+            self.messages = None;
+        }
         let started = Instant::now();
         let (mut was_forced, mut is_killed) = (false, false);
         let status = loop {
@@ -159,7 +175,15 @@ impl Process {
         };
         // A process that the worker left behind may hold its standard error open.
         let is_explained = self.passed_on.recv_timeout(UNTIL_KILLED).unwrap_or(false);
-        let record = ExitRecord::read(&self.folder.path().join(ExitRecord::FILE)).ok();
+        // The last line is the shim's, whatever the lambda wrote before. A pipe holds less than a message may have.
+        if let Some(messages) = &mut self.messages {
+            messages.get_mut().waits = false;
+            let mut rest = Vec::new();
+            let _ = messages.take(MESSAGE_MAX).read_to_end(&mut rest);
+            let last = rest.split(|byte| *byte == b'\n').rfind(|line| !line.is_empty());
+            self.record = last.and_then(|line| serde_json::from_slice(line).ok()).or(self.record);
+        }
+        let record = self.record;
         Ok(Ended { record, code: status.code(), was_forced, is_explained })
     }
 }

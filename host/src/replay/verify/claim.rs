@@ -50,6 +50,12 @@ impl Claim {
             let message = format!("clip `{}` is cut off or was never finished", path.display());
             return Err(Failure::new(Exit::Usage, message).with_help("copy it again; a clip of Gleaner has its end"));
         }
+        if let Some(misfit) = &extras.misfit {
+            let mut failure =
+                Failure::new(Exit::Differs, format!("clip `{}` is not as a recorder writes it", path.display()));
+            failure.causes = vec![format!("it has {misfit}")];
+            return Err(failure.with_help("it was changed since it was made; readers may see other messages in it"));
+        }
         let wanted = format!("journal/{lambda}.journal");
         let Some(part) = extras.attachments.iter_mut().find(|attachment| attachment.name == wanted) else {
             let message = format!("clip `{}` holds no journal of lambda `{lambda}`", path.display());

@@ -7,6 +7,7 @@ use tracing::warn;
 
 use super::damage::Damage;
 use super::error::ReplayError;
+use super::indexes::{INDEX_BYTES, Indexes};
 use super::records::{self, HEAD, MAGIC, Statistics, head, op};
 use super::source::Source;
 use super::summary::footer;
@@ -29,6 +30,8 @@ pub struct Extras {
     pub attachments: Vec<Attachment>,
     /// Whether the file was finished and read to its end. If it was cut off, the rest is missing here.
     pub is_whole: bool,
+    /// Where its indexes and its records do not fit, if so: a reader that goes by index would see something else.
+    pub misfit: Option<String>,
 }
 
 /// A file within a file.
@@ -72,6 +75,7 @@ pub fn read_extras(path: &Path, limit_bytes: u64) -> Result<Extras, ReplayError>
         allowed: limit_bytes,
         left: limit_bytes,
         extras: Extras::default(),
+        indexes: Indexes::default(),
         claimed: None,
     };
     match walk.all() {
@@ -82,6 +86,7 @@ pub fn read_extras(path: &Path, limit_bytes: u64) -> Result<Extras, ReplayError>
         }
         Err(error) => return Err(error),
     }
+    walk.extras.misfit = walk.indexes.misfit().filter(|_| walk.extras.is_whole);
     Ok(walk.extras)
 }
 
@@ -93,6 +98,7 @@ struct Walk {
     allowed: u64,
     left: u64,
     extras: Extras,
+    indexes: Indexes,
     /// What the summary says of the file.
     claimed: Option<Statistics>,
 }
@@ -132,6 +138,13 @@ impl Walk {
         if next > self.end {
             return Err(self.source.damaged(at, Damage::Truncated("a record")));
         }
+        let begins = match opcode {
+            op::CHUNK_INDEX | op::ATTACHMENT_INDEX | op::METADATA_INDEX => {
+                self.source.peek(at + HEAD, INDEX_BYTES.min(len as usize))?
+            }
+            _ => &[],
+        };
+        self.indexes.add(opcode, at, HEAD + len, begins);
         let looked = match opcode {
             0 => Err(Damage::Malformed("a record has kind 0, which does not exist")),
             op::FOOTER => Err(Damage::Malformed("a footer stands in the middle of the file")),

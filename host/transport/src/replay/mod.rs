@@ -24,6 +24,7 @@ mod drive;
 mod error;
 mod extras;
 mod file;
+mod indexes;
 mod inflate;
 #[cfg(feature = "bags")]
 mod metadata;

@@ -17,6 +17,7 @@ pub(super) const FOOTER: u64 = HEAD + 20 + 8;
 
 /// Record kinds.
 pub(super) mod op {
+    pub(in super::super) const HEADER: u8 = 0x01;
     pub(in super::super) const FOOTER: u8 = 0x02;
     pub(in super::super) const SCHEMA: u8 = 0x03;
     pub(in super::super) const CHANNEL: u8 = 0x04;
@@ -24,8 +25,10 @@ pub(super) mod op {
     pub(in super::super) const CHUNK: u8 = 0x06;
     pub(in super::super) const CHUNK_INDEX: u8 = 0x08;
     pub(in super::super) const ATTACHMENT: u8 = 0x09;
+    pub(in super::super) const ATTACHMENT_INDEX: u8 = 0x0a;
     pub(in super::super) const STATISTICS: u8 = 0x0b;
     pub(in super::super) const METADATA: u8 = 0x0c;
+    pub(in super::super) const METADATA_INDEX: u8 = 0x0d;
     pub(in super::super) const DATA_END: u8 = 0x0f;
 }
 

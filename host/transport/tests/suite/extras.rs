@@ -35,6 +35,7 @@ fn held() -> Extras {
             attachment("journal/späh.journal", "", &[]),
         ],
         is_whole: true,
+        misfit: None,
     }
 }
 
@@ -93,16 +94,18 @@ fn finished(records: &[Vec<u8>]) -> Vec<u8> {
 
 #[test]
 fn every_layout_of_a_file_gives_its_extras_in_order() {
-    for options in [
-        small_chunks(),
-        small_chunks().compression(None),
-        small_chunks().use_chunks(false),
-        small_chunks().emit_summary_records(false).emit_summary_offsets(false),
-        small_chunks().emit_attachment_indexes(false).emit_metadata_indexes(false),
-        small_chunks().calculate_attachment_crcs(false),
-        small_chunks().emit_statistics(false),
+    for (options, is_indexed) in [
+        (small_chunks(), true),
+        (small_chunks().compression(None), true),
+        (small_chunks().use_chunks(false), true),
+        (small_chunks().emit_summary_records(false).emit_summary_offsets(false), false),
+        (small_chunks().emit_attachment_indexes(false).emit_metadata_indexes(false), false),
+        (small_chunks().calculate_attachment_crcs(false), true),
+        (small_chunks().emit_statistics(false), true),
     ] {
-        assert_eq!(read(&clip(options), LIMIT).unwrap(), held());
+        let found = read(&clip(options), LIMIT).unwrap();
+        assert_eq!(found.misfit.is_none(), is_indexed, "{:?}", found.misfit);
+        assert_eq!(Extras { misfit: None, ..found }, held());
     }
 }
 
