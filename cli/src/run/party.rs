@@ -130,8 +130,8 @@ impl Party {
         }
         ear.listen(screen, REST);
         let record = ExitRecord::read(exit_record).ok();
-        // A lambda can have its own process end as if that had been asked for. Only this process and the shim know whether it was.
-        let asked = asked || record.as_ref().is_some_and(|record| record.asked);
+        // A lambda can have its own process end as if that had been requested. The shim knows whether it was, and whether in time.
+        let asked = record.as_ref().map_or(asked, |record| record.asked);
         Ok(match status.code().and_then(Exit::from_code) {
             // Told to end before it could listen for that.
             None if asked && !ear.is_ready => Ended::Well(Exit::Ok),

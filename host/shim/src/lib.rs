@@ -153,7 +153,8 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     }
     let record = ended.record(started_ns, left_behind);
     if let Some(path) = &args.exit_record {
-        let written = if path.as_os_str() == "-" { record.print() } else { record.write(path) };
+        // A starter that does not read any more has no use for it.
+        let written = if path.as_os_str() == "-" { record.print().or(Ok(())) } else { record.write(path) };
         if let Err(error) = written {
             // How it ended is more important than that this is not written.
             eprintln!("gleaner-shim: cannot write `{}`: {error}", path.display());
