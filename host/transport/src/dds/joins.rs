@@ -20,6 +20,7 @@ use std::net::SocketAddrV4;
 use std::os::fd::BorrowedFd;
 
 use nix::errno::Errno;
+use socket2::SockRef;
 
 thread_local! {
     /// The port at which sockets join no group; 0 for none. It has no destructor, so it can be read as long as the thread runs.
@@ -65,15 +66,23 @@ unsafe extern "C" fn setsockopt(
     if answer < 0 { -1 } else { 0 }
 }
 
+/// Whether the socket is to join no group. Then it receives from none.
 fn is_refused(socket: c_int) -> bool {
     let refused = REFUSED.get();
     if refused == 0 || socket < 0 {
         return false;
     }
-    // SAFETY: it is not -1, and is asked for one name only: if it is not open, the kernel says so.
+    // SAFETY: it is not -1, and is only handed to the kernel: if it is not open, the kernel says so.
     let socket = unsafe { BorrowedFd::borrow_raw(socket) };
     let here = rustix::net::getsockname(socket).ok().and_then(|here| SocketAddrV4::try_from(here).ok());
-    here.is_some_and(|here| here.port() == refused)
+    let is_refused = here.is_some_and(|here| here.port() == refused);
+    if is_refused {
+        // Otherwise Linux delivers what is sent to groups that any socket of the machine has joined. A writer sends to its readers with
+        // multicast by multicast and to us by unicast: each fragment would come twice, and one that comes after its sample is
+        // complete takes as much memory as the whole sample. It fails on no socket of IPv4.
+        let _ = SockRef::from(&socket).set_multicast_all_v4(false);
+    }
+    is_refused
 }
 
 #[cfg(test)]
@@ -96,8 +105,7 @@ mod tests {
         let no_join = NoJoin::at(one.local_addr().unwrap().port());
         assert_eq!(join(&one).unwrap_err().kind(), ErrorKind::PermissionDenied);
         join(&other).unwrap();
-        one.set_broadcast(true).unwrap();
-        assert!(one.broadcast().unwrap());
+        assert_eq!([&one, &other].map(|socket| SockRef::from(socket).multicast_all_v4().unwrap()), [false, true]);
         thread::scope(|scope| scope.spawn(|| join(&one)).join().unwrap()).unwrap();
         one.leave_multicast_v4(&GROUP, &Ipv4Addr::LOCALHOST).unwrap();
         drop(no_join);
