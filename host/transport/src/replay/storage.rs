@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use tracing::warn;
 
 use super::chunk::Opener;
+#[cfg(feature = "bags")]
 use super::damage::Damage;
 use super::error::ReplayError;
 use super::file::Contents;
