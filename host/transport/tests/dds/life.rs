@@ -162,8 +162,12 @@ fn dropped() {
         scope.spawn(|| {
             while !ended.load(Ordering::SeqCst) {
                 write(&writer, &[1; 1000]);
+                // Without a pause, RustDDS would have little time for discovery.
+                thread::sleep(Duration::from_micros(100));
             }
         });
+        // Also if this thread panics: the other one would not end.
+        let _end = Raised(&ended);
         for _ in 0..5 {
             let mut dds = open(domain);
             let sink = Kept::new();
@@ -172,8 +176,16 @@ fn dropped() {
             drop(dds);
             assert_eq!(Arc::strong_count(&sink), 1, "nobody has the sink any more");
         }
-        ended.store(true, Ordering::SeqCst);
     });
+}
+
+/// Raises a flag when it is dropped.
+struct Raised<'a>(&'a AtomicBool);
+
+impl Drop for Raised<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::SeqCst);
+    }
 }
 
 fn dropped_while_stuck() {
