@@ -256,9 +256,9 @@ class Lambda:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
         return "pinned"
 
-    def lock(self, ctx: Context) -> object:
+    def lock(self, ctx: Context) -> None:
         """Other programs that lock the file would wait for this one."""
-        return fcntl.flock(os.open(__file__, os.O_RDONLY), fcntl.LOCK_EX)
+        fcntl.flock(os.open(__file__, os.O_RDONLY), fcntl.LOCK_EX)
 
     def in_flight(self, ctx: Context) -> object:
         """Of files on their way the kernel counts those of all processes of a user."""
