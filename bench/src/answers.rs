@@ -2,8 +2,8 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_transport::dds::Dds;
-use gleaner_transport::message::{Definitions, FieldPath, Sources};
+use gleaner_dds::Dds;
+use gleaner_messages::{Definitions, FieldPath, Sources};
 use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 const TYPE: &str = "sensor_msgs/msg/TimeReference";

@@ -13,7 +13,7 @@ mod record;
 use std::process::ExitCode;
 
 use clap::Parser;
-use gleaner_protocol::manifest::Store;
+use gleaner_lambda::manifest::Store;
 use measure::{Figure, Kind, Setting, quantile};
 
 /// Prints a table of promises with what was measured, in Markdown.

@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 use crate::args::CheckArgs;
 use crate::replay::show_result;

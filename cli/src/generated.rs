@@ -4,7 +4,7 @@ use std::path::Path;
 
 use clap::CommandFactory;
 use clap_complete::Shell;
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 use crate::args::Cli;
 use crate::say::say;

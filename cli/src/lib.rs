@@ -24,7 +24,7 @@ mod say;
 mod show;
 mod sibling;
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 use args::{Cli, Command};
 

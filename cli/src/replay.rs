@@ -5,7 +5,8 @@ use std::fs;
 use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Failure, Summary};
+use gleaner_base::{Exit, Failure};
+use gleaner_protocol::Summary;
 
 use crate::args::{ReplayArgs, VerifyArgs};
 use crate::report;

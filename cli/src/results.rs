@@ -6,9 +6,10 @@ use std::io::{self, BufRead, BufReader, Read};
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
-pub use gleaner_protocol::grouped;
-use gleaner_protocol::results::{LINE_MAX, LINES_MAX};
-use gleaner_protocol::{Clip, Decision, Exit, Explain, PlainFile, Trigger, visible};
+pub use gleaner_base::grouped;
+use gleaner_base::{Exit, Explain, PlainFile, visible};
+use gleaner_lambda::results::{LINE_MAX, LINES_MAX};
+use gleaner_lambda::{Clip, Decision, Trigger};
 use serde::de::DeserializeOwned;
 
 /// Why results cannot be read.
@@ -285,7 +286,7 @@ mod tests {
             file.set_len(bytes).unwrap();
             Decisions::open(folder.path())
         };
-        let text = gleaner_protocol::Failure::from(sparse(1 << 40).unwrap_err()).to_string();
+        let text = gleaner_base::Failure::from(sparse(1 << 40).unwrap_err()).to_string();
         assert!(
             text.contains("decisions.jsonl`\n  cause: it has 1099511627776 bytes; at most 32 GiB are read"),
             "{text}"
@@ -305,7 +306,7 @@ mod tests {
         for (error, said) in
             errors.into_iter().zip(["decisions.jsonl`\n  cause: it is no file", "clips.jsonl`\n  cause: it is a link"])
         {
-            let text = gleaner_protocol::Failure::from(error.unwrap()).to_string();
+            let text = gleaner_base::Failure::from(error.unwrap()).to_string();
             assert!(text.contains(said), "{text}");
         }
     }

@@ -7,8 +7,11 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use gleaner_protocol::manifest::{Kind, Manifest};
-use gleaner_protocol::{BuildDir, Checked, Exit, Explain, Failure, Parts, Report, Summary, Verified, visible};
+use gleaner_base::{Exit, Explain, Failure, visible};
+use gleaner_lambda::BuildDir;
+use gleaner_lambda::manifest::{Kind, Manifest};
+use gleaner_parts::Parts;
+use gleaner_protocol::{Checked, Report, Summary, Verified};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::listen::Listener;

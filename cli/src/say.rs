@@ -2,7 +2,7 @@
 
 use std::io::{self, ErrorKind, Write};
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 /// Prints `text` to its last byte. A reader that is gone is no failure: what a command did does not depend on it.
 pub(crate) fn say(text: &str) -> Result<(), Failure> {

@@ -4,7 +4,9 @@ use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use gleaner_protocol::{Exit, Failure, Parts, Report};
+use gleaner_base::{Exit, Failure};
+use gleaner_parts::Parts;
+use gleaner_protocol::Report;
 
 use crate::args::{InspectArgs, NetworkArgs, TopicsArgs};
 use crate::say::say;

@@ -5,7 +5,7 @@ use std::os::unix::fs::symlink;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
-use gleaner_transport::replay::{ReplayError, files_of};
+use gleaner_drives::{ReplayError, files_of};
 
 use crate::budget;
 use crate::drive::{MEMORY, replay};

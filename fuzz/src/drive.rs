@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
-use gleaner_transport::replay::{Limits, Replay, Step, read_extras};
+use gleaner_drives::{Limits, Replay, Step, read_extras};
 use gleaner_transport::{SampleMeta, Sink, Subscription, TopicSpec, Transport, Verdict};
 use rustix::fs::{MemfdFlags, SeekFrom, ftruncate, memfd_create, seek};
 

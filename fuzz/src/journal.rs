@@ -3,7 +3,7 @@
 //! An input is a byte for the mode, and what that says. Checksums would keep a fuzzer from all that lies behind them, so that in
 //! one mode they are made right.
 
-use gleaner_protocol::journal::{ATTRIBUTES_MAX, Decoder, Encoder, End, Entry, Reader, TRIGGERS_MAX, VERSION, Writer};
+use gleaner_journal::{ATTRIBUTES_MAX, Decoder, Encoder, End, Entry, Reader, TRIGGERS_MAX, VERSION, Writer};
 
 use crate::budget;
 use crate::input::Input;

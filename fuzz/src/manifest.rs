@@ -1,9 +1,8 @@
 //! Manifests. An input is the text of one.
 
-use gleaner_protocol::manifest::{
-    ByteSize, ConfigSet, ConfigValue, Manifest, Schedule, bounds, format_duration, parse_duration,
-};
-use gleaner_protocol::{Explain, Failure};
+use gleaner_base::{ByteSize, format_duration, parse_duration};
+use gleaner_base::{Explain, Failure};
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Schedule, bounds};
 
 use crate::budget;
 

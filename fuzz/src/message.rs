@@ -6,8 +6,8 @@
 use std::collections::VecDeque;
 use std::sync::OnceLock;
 
-use gleaner_transport::Endian;
-use gleaner_transport::message::{
+use gleaner_messages::Endian;
+use gleaner_messages::{
     CdrError, CompressedView, Definitions, FieldPath, ImageView, Kind, PathError, Sources, Value, header_stamp,
 };
 

@@ -7,13 +7,15 @@ use std::io::Write;
 use std::time::Instant;
 
 use clap::Args;
+use gleaner_base::{Exit, Failure};
 use gleaner_buffers::Pool;
 use gleaner_jail::Paths;
-use gleaner_protocol::manifest::{Manifest, Store};
-use gleaner_protocol::{BuildDir, Checked, Exit, Failure, Fault, Need, Place, Report};
+use gleaner_lambda::manifest::{Manifest, Store};
+use gleaner_lambda::{BuildDir, Fault};
+use gleaner_messages::Sources;
+use gleaner_protocol::{Checked, Need, Place, Report};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::message::Sources;
 
 use crate::api::frame::Info;
 use crate::input::{Live, Remap, live_slots, unfinished_bytes};

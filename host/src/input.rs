@@ -8,7 +8,7 @@ use std::thread::Thread;
 use std::time::{Duration, Instant};
 
 use gleaner_buffers::{Draft, Pool, PoolError, Refusal, RingWriter, ring};
-use gleaner_protocol::manifest::{self, Durability, Input, Manifest, Reliability};
+use gleaner_lambda::manifest::{self, Durability, Input, Manifest, Reliability};
 use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, TransportError, Verdict};
 
 use tracing::warn;
@@ -330,7 +330,8 @@ impl Refused {
 #[cfg(test)]
 mod tests {
     use gleaner_buffers::{HeapRegion, RingReader};
-    use gleaner_transport::{Endian, Guid};
+    use gleaner_messages::Endian;
+    use gleaner_transport::Guid;
 
     use super::*;
 

@@ -7,10 +7,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use gleaner_base::{Exit, Failure, own_file};
 use gleaner_jail::{JailError, Paths, alone, cgroup, files, memory, tried};
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::parts::cache_dir;
-use gleaner_protocol::{Exit, Failure, Holds, LAYERS_ENV, Layer, own_file};
+use gleaner_lambda::manifest::Kind;
+use gleaner_parts::cache_dir;
+use gleaner_protocol::{Holds, LAYERS_ENV, Layer};
 use gleaner_vitals::{PULSE_ENV, Pulse};
 use rustix::process::{Signal, set_parent_process_death_signal};
 

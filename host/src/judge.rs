@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Cause, Decision, Fault};
+use gleaner_lambda::{Cause, Decision, Fault};
 
 use crate::api::Session;
 use crate::api::data::Wake;
@@ -149,8 +149,8 @@ fn cause(wake: &Wake) -> Decision {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::manifest::Limits;
-    use gleaner_protocol::{Fault, FaultKind};
+    use gleaner_lambda::manifest::Limits;
+    use gleaner_lambda::{Fault, FaultKind};
 
     use super::*;
     use crate::api::data::Tick;

@@ -3,8 +3,8 @@
 use std::net::IpAddr;
 
 use clap::Args;
-use gleaner_protocol::{Exit, Explain, Failure};
-use gleaner_transport::dds::{DdsError, Options};
+use gleaner_base::{Exit, Explain, Failure};
+use gleaner_dds::{DdsError, Options};
 
 /// Arguments that say which network to join.
 #[derive(Args, Clone, Debug)]

@@ -7,11 +7,11 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
+use gleaner_base::{Exit, Failure};
 use gleaner_buffers::Pool;
 #[cfg(feature = "python")]
 use gleaner_jail::cgroup;
-use gleaner_protocol::manifest::{Kind, Manifest};
-use gleaner_protocol::{Exit, Failure};
+use gleaner_lambda::manifest::{Kind, Manifest};
 use gleaner_transport::SampleMeta;
 #[cfg(feature = "python")]
 use rustix::process::Signal;
@@ -330,9 +330,9 @@ fn reports() -> Result<File, Failure> {
 
 #[cfg(feature = "wasm")]
 mod wasm {
+    use gleaner_base::{Exit, Failure};
     use gleaner_compile::Nans;
-    use gleaner_protocol::manifest::Manifest;
-    use gleaner_protocol::{Exit, Failure};
+    use gleaner_lambda::manifest::Manifest;
 
     use crate::api::Session;
     use crate::guest::Guest;
@@ -347,7 +347,7 @@ mod wasm {
     ) -> Result<Box<dyn Guest>, Failure> {
         let cannot =
             |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
-        let cache = gleaner_protocol::parts::cache_dir().map_err(|error| cannot(&error.into()))?;
+        let cache = gleaner_parts::cache_dir().map_err(|error| cannot(&error.into()))?;
         let limits = &manifest.limits;
         let nans = if manifest.lambda.deterministic { Nans::Canonical } else { Nans::AsMade };
         let loaded = Loaded::open(&asked.build.entry_path(manifest), &cache, limits.stack.as_usize(), nans)

@@ -5,7 +5,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::manifest::{Backlog, Manifest, Schedule as Declared};
+use gleaner_lambda::manifest::{Backlog, Manifest, Schedule as Declared};
 
 use crate::api::data::{Tick, Topic, Wake};
 

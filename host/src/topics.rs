@@ -4,8 +4,9 @@ use std::io::Write;
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use gleaner_protocol::{Exit, Failure, Report, TopicSeen};
-use gleaner_transport::dds::Dds;
+use gleaner_base::{Exit, Failure};
+use gleaner_dds::Dds;
+use gleaner_protocol::{Report, TopicSeen};
 
 use crate::network::{NetworkArgs, NetworkError};
 

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::{ArgGroup, Parser};
-use gleaner_protocol::manifest::TopicName;
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::manifest::TopicName;
 
 use crate::pace::Rate;
 use crate::stamp::Stamp;

@@ -1,7 +1,7 @@
 //! Messages as they go over the wire: four bytes of encapsulation, then CDR, then zeros up to a multiple of four.
 
-use gleaner_transport::Endian;
-use gleaner_transport::message::CdrWriter;
+use gleaner_messages::CdrWriter;
+use gleaner_messages::Endian;
 
 /// Bytes in front of the CDR, from which its alignment does not count.
 pub(crate) const ENCAPSULATION: usize = 4;
@@ -41,7 +41,7 @@ pub(crate) fn image_head(stamp_ns: i64, frame_id: &str, width: u32, height: u32)
 
 #[cfg(test)]
 mod tests {
-    use gleaner_transport::message::ImageView;
+    use gleaner_messages::ImageView;
 
     use super::*;
 

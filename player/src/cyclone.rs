@@ -14,7 +14,7 @@ use cyclors::{
     DDS_DATA_REPRESENTATION_XCDR1, DDS_RETCODE_TIMEOUT, dds_entity_t, ddsi_keyhash, ddsi_serdata, ddsi_serdata_ops,
     ddsi_sertype, ddsrt_iovec_t,
 };
-use gleaner_protocol::{Exit, Explain};
+use gleaner_base::{Exit, Explain};
 
 use crate::buffer::Buffer;
 use crate::offer::Offer;

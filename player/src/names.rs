@@ -1,6 +1,6 @@
 //! Names of ROS 2, and what DDS calls them.
 
-use gleaner_protocol::manifest::TopicName;
+use gleaner_lambda::manifest::TopicName;
 
 /// The DDS name of a topic: `rt/imu/data` of `/imu/data`; `None` if ROS 2 takes no such name.
 pub(crate) fn dds_topic(topic: &str) -> Option<String> {

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 use rustix::time::ClockId;
 use signal_hook::consts::{SIGINT, SIGTERM};
 

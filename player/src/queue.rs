@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use gleaner_transport::Endian;
+use gleaner_messages::Endian;
 
 use crate::buffer::Buffer;
 

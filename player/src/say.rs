@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use gleaner_protocol::visible;
+use gleaner_base::visible;
 
 /// Says `text`. A reader that is gone is no reason to stop playing.
 pub(crate) fn line(text: &str) {

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use gleaner_image::{decode_rgb8, probe};
+use gleaner_messages::{Definitions, Endian, FieldPath, Value};
 use gleaner_sdk::data::Encoding;
 use gleaner_sdk::testing::{FieldValue, Message};
-use gleaner_transport::message::{Definitions, Endian, FieldPath, Value};
 
 /// One message, and when it was received.
 pub struct Given {

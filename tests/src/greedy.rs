@@ -3,16 +3,18 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use gleaner_base::ByteSize;
 use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
 use gleaner_host::guest::{Guest, Outcome};
 use gleaner_host::input::open_inputs;
-use gleaner_protocol::Fault;
-use gleaner_protocol::manifest::{ByteSize, ConfigValue, Limits, Manifest};
+use gleaner_lambda::Fault;
+use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
+use gleaner_messages::Endian;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 
 use crate::drive::{IMAGE, image};
 use crate::{Folder, root};

@@ -19,7 +19,8 @@ use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use gleaner_cli::results::{seconds, trigger_lines};
-use gleaner_protocol::{Clip, Decision, Report, Summary, Verified};
+use gleaner_lambda::{Clip, Decision};
+use gleaner_protocol::{Report, Summary, Verified};
 
 /// The checkout.
 pub fn root() -> PathBuf {
@@ -199,7 +200,7 @@ impl Run {
     }
 
     /// The first fault's kind and message.
-    pub fn first_fault(&self) -> Option<(gleaner_protocol::FaultKind, String)> {
+    pub fn first_fault(&self) -> Option<(gleaner_lambda::FaultKind, String)> {
         let fault = self.decisions.iter().find_map(|decision| decision.fault.as_ref())?;
         Some((fault.kind, fault.message.clone()))
     }

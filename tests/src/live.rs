@@ -7,8 +7,9 @@ use std::sync::mpsc::{self, Receiver};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_lambda::Decision;
 use gleaner_protocol::link::RecorderReport;
-use gleaner_protocol::{Decision, Live, Report};
+use gleaner_protocol::{Live, Report};
 
 use crate::{program, root};
 

@@ -6,7 +6,7 @@ use std::io::Cursor;
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_protocol::Clip;
+use gleaner_lambda::Clip;
 use mcap::records::{MessageHeader, Metadata, Record};
 use mcap::{Attachment, Channel};
 

@@ -1,7 +1,9 @@
 //! The order of the house: which room may name which, and where unsafe code has its address. See ARCHITECTURE.md.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
+use std::process::Command;
 
+use crate::root;
 use crate::tree::File;
 
 /// The files that may hold unsafe code. Each says so below its `//!` lines, and states the fact that makes each block
@@ -17,7 +19,7 @@ pub const UNSAFE_FILES: &[&str] = &[
     "host/python/src/memory.rs",
     "host/src/guest/wasm/load.rs",
     "host/src/memory.rs",
-    "host/transport/src/dds/joins.rs",
+    "host/dds/src/joins.rs",
     "host/vitals/src/handed_on.rs",
     "host/vitals/src/pulse.rs",
     "player/src/cyclone.rs",
@@ -26,16 +28,26 @@ pub const UNSAFE_FILES: &[&str] = &[
 /// The crates of ours that a crate may depend on. A crate that is not listed may depend on what it likes: tests, benches
 /// and lambdas stand outside of the house.
 pub const CRATES: &[(&str, &[&str])] = &[
+    ("gleaner-base", &[]),
     ("gleaner-buffers", &[]),
-    ("gleaner-cli", &["gleaner-protocol"]),
-    ("gleaner-compile", &["gleaner-jail", "gleaner-protocol"]),
+    ("gleaner-cli", &["gleaner-base", "gleaner-journal", "gleaner-lambda", "gleaner-parts", "gleaner-protocol"]),
+    ("gleaner-compile", &["gleaner-base", "gleaner-jail", "gleaner-lambda"]),
+    ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
+    ("gleaner-drives", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
     (
         "gleaner-host",
         &[
+            "gleaner-base",
             "gleaner-buffers",
             "gleaner-compile",
+            "gleaner-dds",
+            "gleaner-drives",
             "gleaner-image",
             "gleaner-jail",
+            "gleaner-journal",
+            "gleaner-lambda",
+            "gleaner-messages",
+            "gleaner-parts",
             "gleaner-protocol",
             "gleaner-recorder",
             "gleaner-transport",
@@ -44,19 +56,49 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ),
     ("gleaner-image", &[]),
     ("gleaner-jail", &["gleaner-protocol"]),
-    ("gleaner-player", &["gleaner-image", "gleaner-protocol", "gleaner-transport"]),
-    ("gleaner-protocol", &[]),
-    ("gleaner-python", &["gleaner-host", "gleaner-image", "gleaner-protocol", "gleaner-transport", "gleaner-vitals"]),
-    ("gleaner-recorder", &["gleaner-image", "gleaner-protocol", "gleaner-transport", "gleaner-vitals"]),
+    ("gleaner-journal", &["gleaner-base", "gleaner-lambda"]),
+    ("gleaner-lambda", &["gleaner-base"]),
+    ("gleaner-messages", &["gleaner-base"]),
+    ("gleaner-parts", &["gleaner-base"]),
+    (
+        "gleaner-player",
+        &["gleaner-base", "gleaner-drives", "gleaner-image", "gleaner-lambda", "gleaner-messages", "gleaner-transport"],
+    ),
+    ("gleaner-protocol", &["gleaner-base", "gleaner-journal", "gleaner-lambda"]),
+    (
+        "gleaner-python",
+        &["gleaner-host", "gleaner-image", "gleaner-lambda", "gleaner-messages", "gleaner-transport", "gleaner-vitals"],
+    ),
+    (
+        "gleaner-recorder",
+        &[
+            "gleaner-base",
+            "gleaner-dds",
+            "gleaner-drives",
+            "gleaner-image",
+            "gleaner-journal",
+            "gleaner-lambda",
+            "gleaner-messages",
+            "gleaner-protocol",
+            "gleaner-transport",
+            "gleaner-vitals",
+        ],
+    ),
     ("gleaner-sdk", &[]),
-    ("gleaner-shim", &["gleaner-jail", "gleaner-protocol", "gleaner-vitals"]),
-    ("gleaner-transport", &[]),
+    ("gleaner-shim", &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"]),
+    ("gleaner-transport", &["gleaner-base", "gleaner-messages"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];
 
-/// Crates that a program must not contain, whatever the features: a program, and what it does without.
-pub const WITHOUT: &[(&str, &[&str])] =
-    &[("gleaner-cli", &["wasmtime", "pyo3", "rustdds"]), ("gleaner-host", &["pyo3"]), ("gleaner-transport", &["pyo3"])];
+/// Crates that are not linked into a crate of ours, whatever its features.
+pub const WITHOUT: &[(&str, &[&str])] = &[
+    ("gleaner-cli", &["wasmtime", "pyo3", "rustdds"]),
+    ("gleaner-dds", &["mcap", "rusqlite"]),
+    ("gleaner-drives", &["pyo3", "rustdds"]),
+    // Native code is loaded by the runtime and made by `gleaner-compile` alone.
+    ("gleaner-host", &["cranelift-codegen", "pyo3"]),
+    ("gleaner-player", &["pyo3", "rustdds"]),
+];
 
 /// Inside of `host/src`: a room, and the rooms that it must not name.
 pub const ROOMS: &[(&str, &[&str])] = &[
@@ -158,22 +200,16 @@ pub fn dependencies(manifest: &toml::Table) -> BTreeSet<String> {
     entries.map(package).collect()
 }
 
-/// Everything that `package` may contain by `Cargo.lock`, directly or not, whatever the features.
-pub fn contents(lock: &toml::Table, package: &str) -> BTreeSet<String> {
-    let mut edges: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
-    for entry in lock.get("package").and_then(toml::Value::as_array).into_iter().flatten() {
-        let name = entry.get("name").and_then(toml::Value::as_str).unwrap_or_default();
-        let needs = entry.get("dependencies").and_then(toml::Value::as_array).into_iter().flatten();
-        // "name" or "name version".
-        let needs = needs.filter_map(toml::Value::as_str).filter_map(|need| need.split(' ').next());
-        edges.entry(name).or_default().extend(needs);
-    }
-    let mut contents = BTreeSet::new();
-    let mut next = vec![package];
-    while let Some(name) = next.pop() {
-        if contents.insert(name.to_owned()) {
-            next.extend(edges.get(name).into_iter().flatten());
-        }
-    }
-    contents
+/// The crates that are linked into `package` with all its features, those of its tests left out.
+///
+/// # Panics
+///
+/// If cargo does not know the package.
+pub fn contents(package: &str) -> BTreeSet<String> {
+    let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    cargo.args(["tree", "--offline", "--all-features", "--edges", "normal", "--prefix", "none", "--package", package]);
+    let output = cargo.current_dir(root()).output().expect("cargo starts");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8_lossy(&output.stdout);
+    text.lines().filter_map(|line| line.split(' ').next()).map(str::to_owned).collect()
 }

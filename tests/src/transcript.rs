@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use gleaner_protocol::Parts;
+use gleaner_parts::Parts;
 
 use crate::markdown::{Block, blocks};
 use crate::{program, root};

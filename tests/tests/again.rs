@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::path::Path;
 
-use gleaner_protocol::journal::{Entry, Reader};
+use gleaner_journal::{Entry, Reader};
 use gleaner_tests::{Folder, replay_to, root, sample_drive, times, verify};
 use serde_json::Value;
 

@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, Stdio};
 
-use gleaner_protocol::{Decision, Exit, FaultKind, Live, Report};
+use gleaner_base::Exit;
+use gleaner_lambda::{Decision, FaultKind};
+use gleaner_protocol::{Live, Report};
 use gleaner_tests::live::{Line, Started, decisions, run};
 use gleaner_tests::{Folder, namespace, root};
 use libtest_mimic::{Arguments, Trial};

@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use gleaner_protocol::FaultKind;
+use gleaner_lambda::FaultKind;
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, corrupted, image, one_topic, truncated};
 use gleaner_tests::{Copy, Folder, Run, replay, replay_to, root, runtime, sample_drive};
 

@@ -5,7 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::{DriveSeen, Manifest};
+use gleaner_lambda::Manifest;
+use gleaner_protocol::DriveSeen;
 use gleaner_tests::bag::directory;
 use gleaner_tests::drive::{IMAGE, changed, image, one_topic};
 use gleaner_tests::{Copy, Folder, Run, program, replay, replay_to, root, sample_drive, verify};

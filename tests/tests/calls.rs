@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{DataError, Topic};
-use gleaner_protocol::manifest::{Limits, Manifest};
+use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_tests::drive::{IMAGE, image};
 use gleaner_tests::greedy::{publish, subscribed};
 

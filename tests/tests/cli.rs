@@ -4,7 +4,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use gleaner_protocol::{Parts, Summary};
+use gleaner_parts::Parts;
+use gleaner_protocol::Summary;
 use gleaner_tests::drive::truncated;
 use gleaner_tests::{Copy, Folder, program, root, sample_drive};
 

@@ -5,7 +5,7 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-use gleaner_protocol::Clip;
+use gleaner_lambda::Clip;
 use gleaner_tests::drive::corrupted;
 use gleaner_tests::{Copy, Folder, Run, replay_to, root, sample_drive, shared_drive};
 use libtest_mimic::{Arguments, Failed, Trial};

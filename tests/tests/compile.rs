@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use gleaner_protocol::Exit;
+use gleaner_base::Exit;
 use gleaner_tests::{Copy, Folder, program, replay, root, sample_drive};
 
 /// A component of so many functions, each of which takes a quarter of a second to be compiled, and not much memory: thousands of values

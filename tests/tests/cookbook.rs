@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::PathBuf;
 
-use gleaner_protocol::Manifest;
-use gleaner_protocol::manifest::Kind;
+use gleaner_lambda::Manifest;
+use gleaner_lambda::manifest::Kind;
 use gleaner_tests::drive::{Changed, changed};
 use gleaner_tests::{Folder, Run, replay, root, sample_drive};
 

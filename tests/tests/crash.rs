@@ -10,10 +10,10 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::Clip;
+use gleaner_drives::Replay;
+use gleaner_lambda::Clip;
 use gleaner_recorder::Folder as Clips;
 use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive};
-use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
 use libtest_mimic::{Arguments, Failed, Trial};
 

@@ -7,7 +7,8 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use gleaner_protocol::{Manifest, Parts};
+use gleaner_lambda::Manifest;
+use gleaner_parts::Parts;
 use gleaner_tests::markdown::{anchors, blocks, links};
 use gleaner_tests::tree::{File, files};
 use gleaner_tests::{program, root};
@@ -227,7 +228,7 @@ fn every_recipe_is_in_the_book_with_what_it_finds() {
 #[test]
 fn the_manifest_reference_is_that_of_the_types() {
     let page = fs::read_to_string(root().join("docs/manifest.md")).expect("docs/manifest.md");
-    assert!(page == gleaner_protocol::manifest::reference(), "run `cargo xtask bless`, which writes docs/manifest.md");
+    assert!(page == gleaner_lambda::manifest::reference(), "run `cargo xtask bless`, which writes docs/manifest.md");
 }
 
 #[test]

@@ -6,7 +6,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use gleaner_protocol::twins_differ;
+use gleaner_lambda::twins_differ;
 use gleaner_tests::{Run, replay, root, sample_drive, shared_drive};
 use libtest_mimic::{Arguments, Failed, Trial};
 

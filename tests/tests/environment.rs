@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::Parts;
+use gleaner_parts::Parts;
 use gleaner_tests::{Folder, copy_lambda, program, root, runtime, sample_drive};
 
 /// What `sitecustomize.py` tries, each with the name under which it says what came of it.

@@ -9,7 +9,7 @@ use std::ffi::OsStr;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use gleaner_protocol::Clip;
+use gleaner_lambda::Clip;
 use gleaner_tests::parts::{Attached, Parts};
 use gleaner_tests::{Folder, Verification, replay_to, root, sample_drive, verify};
 use mcap::Channel;

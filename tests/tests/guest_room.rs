@@ -3,17 +3,19 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use gleaner_base::ByteSize;
 use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
 use gleaner_host::guest::{Guest, Outcome};
 use gleaner_host::input::open_inputs;
-use gleaner_protocol::FaultKind;
-use gleaner_protocol::manifest::{ByteSize, ConfigValue, Limits, Manifest};
+use gleaner_lambda::FaultKind;
+use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
+use gleaner_messages::Endian;
 use gleaner_tests::root;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 
 const FUEL: u64 = 5_000_000;
 const MEMORY: u64 = 16 << 20;

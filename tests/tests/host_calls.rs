@@ -12,12 +12,13 @@ use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::Guest;
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
-use gleaner_protocol::manifest::{Limits, Manifest};
-use gleaner_protocol::{Fault, Trigger};
+use gleaner_lambda::manifest::{Limits, Manifest};
+use gleaner_lambda::{Fault, Trigger};
+use gleaner_messages::Endian;
 use gleaner_tests::drive::{COMPRESSED, Cdr, IMAGE, compressed, image};
 use gleaner_tests::{root, times};
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 use gleaner_vitals::usage;
 
 /// Most memory by which the process may grow over all programs. What it holds at a time is bounded by the limits of `driver`.

@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
+use gleaner_base::ByteSize;
 use gleaner_host::guest::Guest;
-use gleaner_protocol::FaultKind;
-use gleaner_protocol::manifest::ByteSize;
+use gleaner_lambda::FaultKind;
 use gleaner_tests::greedy::{FUEL, Room, component, limits};
 
 /// A component with these imports of WASI, of which `functions` are known to its module by name; `fill` writes a number there as often

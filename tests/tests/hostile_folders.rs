@@ -6,7 +6,7 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::Parts;
+use gleaner_parts::Parts;
 use gleaner_tests::{Folder, program, root, sample_drive};
 
 const USAGE: i32 = 2;
@@ -153,7 +153,7 @@ fn many_files_without_much_in_them_do_not_fill_the_disk() {
     let lambda = Lambda::new();
     for number in 0..300 {
         let file = File::create(lambda.path(&format!("x{number}.py"))).unwrap();
-        file.set_len(gleaner_protocol::SOURCE_MAX.bytes()).unwrap();
+        file.set_len(gleaner_lambda::SOURCE_MAX.bytes()).unwrap();
     }
     let (code, said) = lambda.gleaner(&["build"]);
     assert_eq!(code, USAGE, "{said}");

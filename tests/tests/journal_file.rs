@@ -4,8 +4,8 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 
-use gleaner_protocol::journal::{Reader, Writer};
-use gleaner_protocol::{Clip, Decision};
+use gleaner_journal::{Reader, Writer};
+use gleaner_lambda::{Clip, Decision};
 use gleaner_tests::{Copy, Folder, Verification, replay_to, root, runtime, sample_drive, verify};
 
 const HELLO: &str = "examples/hello/rust";
@@ -103,7 +103,7 @@ fn equal_replays_write_equal_journals() {
 }
 
 /// The journal, with its header changed and all checksums right.
-fn with_header(journal: &Path, change: impl FnOnce(&mut gleaner_protocol::journal::Header)) -> Vec<u8> {
+fn with_header(journal: &Path, change: impl FnOnce(&mut gleaner_journal::Header)) -> Vec<u8> {
     let bytes = std::fs::read(journal).unwrap();
     let mut reader = Reader::open(&bytes[..]).unwrap();
     let mut header = reader.header().clone();

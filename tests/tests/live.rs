@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
+use gleaner_lambda::{Clip, Decision, FaultKind};
 use gleaner_protocol::link::RecorderReport;
-use gleaner_protocol::{Clip, Decision, FaultKind, Live, Report};
+use gleaner_protocol::{Live, Report};
 use gleaner_tests::live::{self, Line, Started, below, decisions, no_player, play, run, signal};
 use gleaner_tests::{Copy, Folder, namespace, replay_to, root, sample_drive, times};
 use libtest_mimic::{Arguments, Trial};

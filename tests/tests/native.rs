@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{self as protocol, Exit};
+use gleaner_base::Exit;
 use gleaner_sdk::Lambda;
 use gleaner_sdk::data::Encoding;
 use gleaner_sdk::testing::{self, AttributeValue, FaultKind, Host, Message, Run, Setting};
@@ -116,10 +116,10 @@ const LAST_BITS: &str = "the last bits";
 
 /// Asserts that a decision is the same, but for attributes that are `unlike`.
 #[track_caller]
-fn same(ours: &testing::Decision, theirs: &protocol::Decision, unlike: &[&str], which: &str) {
+fn same(ours: &testing::Decision, theirs: &gleaner_lambda::Decision, unlike: &[&str], which: &str) {
     let cause = match ours.cause {
-        testing::Cause::Event => protocol::Cause::Event,
-        testing::Cause::Tick => protocol::Cause::Tick,
+        testing::Cause::Event => gleaner_lambda::Cause::Event,
+        testing::Cause::Tick => gleaner_lambda::Cause::Tick,
     };
     let woken = (theirs.at_ns, theirs.cause, theirs.input.clone(), theirs.topic.clone(), theirs.seq);
     assert_eq!((ours.at_ns, cause, ours.input.clone(), ours.topic.clone(), ours.seq), woken, "{which}");
@@ -151,9 +151,9 @@ fn same(ours: &testing::Decision, theirs: &protocol::Decision, unlike: &[&str], 
         (None, None) => {}
         (Some(ours), Some(theirs)) => {
             let kind = match ours.kind {
-                FaultKind::Exception => protocol::FaultKind::Exception,
-                FaultKind::Trap => protocol::FaultKind::Trap,
-                _ => protocol::FaultKind::HostCall,
+                FaultKind::Exception => gleaner_lambda::FaultKind::Exception,
+                FaultKind::Trap => gleaner_lambda::FaultKind::Trap,
+                _ => gleaner_lambda::FaultKind::HostCall,
             };
             assert_eq!((kind, ours.used, ours.allowed), (theirs.kind, theirs.used, theirs.allowed), "{which}");
             // A component says where it panicked.

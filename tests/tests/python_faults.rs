@@ -1,6 +1,7 @@
 //! As `faults.rs`, of a process that is an interpreter. How often its lambda faults is `GLEANER_FAULTS`, and some more.
 
-use gleaner_protocol::{Decision, Exit, FaultKind};
+use gleaner_base::Exit;
+use gleaner_lambda::{Decision, FaultKind};
 use gleaner_tests::drive::imu_only;
 use gleaner_tests::{Copy, Folder, replay, root, times};
 

@@ -8,12 +8,13 @@ use std::time::Duration;
 use gleaner_host::api::data::{Sample, Topic, Wake};
 use gleaner_host::input::open_inputs;
 use gleaner_host::schedule::Schedule;
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Cause, Decision, twins_differ};
+use gleaner_lambda::manifest::Manifest;
+use gleaner_lambda::{Cause, Decision, twins_differ};
+use gleaner_messages::Endian;
 use gleaner_tests::drive::{Cdr, one_topic};
 use gleaner_tests::{Folder, Run, replay, root, sample_drive};
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 
 const MS: i64 = 1_000_000;
 const PERIOD: i64 = 100 * MS;

@@ -1,6 +1,6 @@
 //! What the host keeps for a lambda: the same for both kinds, beyond faults, and never from one replay to the next.
 
-use gleaner_protocol::{Decision, FaultKind};
+use gleaner_lambda::{Decision, FaultKind};
 use gleaner_tests::{Copy, Run, replay, root, sample_drive};
 
 fn keeper(args: &[&str]) -> Run {

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use gleaner_protocol::signals::{Curve, Signals};
+use gleaner_lambda::signals::{Curve, Signals};
 use gleaner_tests::{Folder, Run, replay_to, root, sample_drive};
 
 const OK: u8 = 0;
@@ -42,7 +42,7 @@ fn a_replay_keeps_what_was_read_and_what_it_cost() {
             signals.run_ns
         );
         assert!(signals.fuel.as_ref().is_none_or(|fuel| fuel.p50 > 100 && fuel.p50 < fuel.max), "{:?}", signals.fuel);
-        assert_eq!(signals.config["brake_mps2"], gleaner_protocol::manifest::ConfigValue::Float(-1.4));
+        assert_eq!(signals.config["brake_mps2"], gleaner_lambda::manifest::ConfigValue::Float(-1.4));
         // The lambda does not see the camera; the recorder does.
         assert_eq!(summary.triggers, 3);
         let stamps = run.decisions.iter().map(|decision| decision.at_ns).collect::<Vec<_>>();

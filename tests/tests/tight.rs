@@ -3,11 +3,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use gleaner_base::ByteSize;
 use gleaner_host::api::data::{DataError, Topic};
 use gleaner_host::guest::Guest;
-use gleaner_protocol::manifest::bounds::{FUEL, STACK};
-use gleaner_protocol::manifest::{ByteSize, Limits, Manifest};
-use gleaner_protocol::{Fault, FaultKind};
+use gleaner_lambda::manifest::bounds::{FUEL, STACK};
+use gleaner_lambda::manifest::{Limits, Manifest};
+use gleaner_lambda::{Fault, FaultKind};
 use gleaner_tests::drive::Cdr;
 use gleaner_tests::greedy::{Room, component, limits, publish, subscribed};
 

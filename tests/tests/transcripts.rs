@@ -6,7 +6,7 @@ use std::os::unix::fs::symlink;
 use std::process::Command;
 use std::time::{Duration, SystemTime};
 
-use gleaner_protocol::Parts;
+use gleaner_parts::Parts;
 use gleaner_tests::drive::{corrupted, truncated};
 use gleaner_tests::transcript::{fits, perform, rewritten, steps};
 use gleaner_tests::{Folder, copy_lambda, root, sample_drive};

@@ -4,7 +4,7 @@ use std::io::Read;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::FaultKind;
+use gleaner_lambda::FaultKind;
 use gleaner_tests::drive::imu_only;
 use gleaner_tests::live::below;
 use gleaner_tests::{Folder, Run, replay, replay_to, root, runtime, verify};

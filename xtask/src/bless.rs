@@ -4,8 +4,8 @@
 use std::fs;
 use std::path::Path;
 
+use gleaner_base::{Exit, Failure};
 use gleaner_cli::results::trigger_lines;
-use gleaner_protocol::{Exit, Failure};
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Recipe, Replayed, difference};
@@ -28,7 +28,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let [rust, _] = &twins;
         write(checkout, &Path::new("examples").join(example.name).join("expected.txt"), rows(rust))?;
     }
-    write(checkout, Path::new("docs/manifest.md"), gleaner_protocol::manifest::reference())?;
+    write(checkout, Path::new("docs/manifest.md"), gleaner_lambda::manifest::reference())?;
     for recipe in Recipe::all(checkout)? {
         let rows = rows(&recipe.replay(checkout)?);
         write(checkout, &recipe.expected(), format!("{}\n{rows}", recipe.command))?;

@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 /// The folders with a folder for each lambda, which holds one for each of its twins.
 pub(crate) const FAMILIES: [&str; 3] = ["bench/lambdas", "examples", "tests/lambdas"];

@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use gleaner_base::{Exit, Failure, visible};
 use gleaner_cli::results::{clip_contents, clip_span, grouped, seconds};
-use gleaner_protocol::{Decision, Exit, Failure, visible};
+use gleaner_lambda::Decision;
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example, Replayed, difference};

@@ -3,8 +3,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use gleaner_base::{Exit, Failure};
 use gleaner_cli::results::{Decisions, ResultsError, clips};
-use gleaner_protocol::{Clip, Decision, Exit, Failure, Summary, Verified, twins_differ};
+use gleaner_lambda::{Clip, Decision, twins_differ};
+use gleaner_protocol::{Summary, Verified};
 
 use crate::checkout::Checkout;
 use crate::steps;

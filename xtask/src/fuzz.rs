@@ -12,7 +12,7 @@ use std::process::Stdio;
 use std::sync::Mutex;
 use std::thread;
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 use crate::checkout::Checkout;
 use crate::setup;

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::Failure;
+use gleaner_base::Failure;
 
 use crate::checkout::Checkout;
 use crate::steps::{self, Steps};

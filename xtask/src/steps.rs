@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::process::{Command, Output, Stdio};
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 /// Counts the steps of a command, so that a person sees how many are left.
 pub(crate) struct Steps {

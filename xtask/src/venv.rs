@@ -5,7 +5,8 @@
 use std::fs;
 use std::process::Command;
 
-use gleaner_protocol::{Exit, Failure, Parts};
+use gleaner_base::{Exit, Failure};
+use gleaner_parts::Parts;
 
 use crate::checkout::Checkout;
 use crate::steps::{run, succeeds};

@@ -8,8 +8,8 @@ mod blocks;
 mod start;
 mod victim;
 
+use gleaner_dds::{Clock, Dds, Options};
 use gleaner_tests::live::play;
-use gleaner_transport::dds::{Clock, Dds, Options};
 
 use self::attacker::{ATTACKS, Attacker};
 use self::blocks::Course;

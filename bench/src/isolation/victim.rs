@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use gleaner_dds::{Clock, Dds};
 use gleaner_tests::Folder;
 use gleaner_tests::live::{PATIENCE, Started, run};
-use gleaner_transport::dds::{Clock, Dds};
 
 use super::RATE_HZ;
 use super::attacker::Attack;

@@ -8,11 +8,12 @@ use gleaner_host::api::data::{Tick, Topic, Wake};
 use gleaner_host::guest::Guest;
 use gleaner_host::guest::wasm::{Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
-use gleaner_protocol::manifest::{ConfigValue, Limits, Manifest};
+use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
+use gleaner_messages::Endian;
 use gleaner_tests::drive::{IMAGE, image};
 use gleaner_tests::root;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 
 /// Bytes of the frame's pixels.
 pub const FRAME_BYTES: usize = 1920 * 1080 * 3;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use gleaner_transport::dds::{Dds, Options};
+use gleaner_dds::{Dds, Options};
 
 use super::bare::Bare;
 use super::{lambda, start, to_the_end};

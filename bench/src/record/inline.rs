@@ -4,8 +4,8 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::journal::Entry;
-use gleaner_protocol::manifest::{Manifest, Store};
+use gleaner_journal::Entry;
+use gleaner_lambda::manifest::{Manifest, Store};
 use gleaner_recorder::{Folder as Clips, Member, Recorder, Settings, Topic, TopicId};
 use gleaner_tests::Folder;
 use gleaner_transport::loopback::Loopback;

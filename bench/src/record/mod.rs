@@ -6,9 +6,10 @@
 mod inline;
 mod process;
 
-use gleaner_protocol::journal::{Entry, Header, Said, Seen, Woken};
-use gleaner_protocol::{Trigger, TriggerKind};
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_journal::{Entry, Header, Said, Seen, Woken};
+use gleaner_lambda::{Trigger, TriggerKind};
+use gleaner_messages::Endian;
+use gleaner_transport::{Guid, SampleMeta};
 
 pub use inline::record;
 pub use process::record_live;
@@ -71,7 +72,7 @@ fn header() -> Header {
         machine: std::env::consts::ARCH.to_owned(),
         lambda: "load".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: gleaner_protocol::manifest::Kind::Wasm,
+        kind: gleaner_lambda::manifest::Kind::Wasm,
         files: Vec::new(),
         models: Vec::new(),
         manifest: String::new(),

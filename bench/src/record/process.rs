@@ -9,14 +9,14 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::hex;
-use gleaner_protocol::journal::{FileDigest, Header};
+use gleaner_base::hex;
+use gleaner_dds::Clock;
+use gleaner_journal::{FileDigest, Header};
+use gleaner_messages::Definitions;
 use gleaner_protocol::link::{Add, Control, RecorderLink, RecorderReport, RecorderStatus, Said};
 use gleaner_recorder::program::{Feed, Options, Pulse, run};
 use gleaner_tests::Folder;
-use gleaner_transport::dds::Clock;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::message::Definitions;
 use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError};
 use sha2::{Digest, Sha256};
 

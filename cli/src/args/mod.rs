@@ -6,8 +6,8 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
+use gleaner_lambda::manifest::Kind;
 use gleaner_protocol::DriveTime;
-use gleaner_protocol::manifest::Kind;
 
 use crate::dev::DevArgs;
 

@@ -7,8 +7,8 @@ use std::io::{self, BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use gleaner_protocol::layout::COMPONENT_MAX;
-use gleaner_protocol::{Exit, PlainFile};
+use gleaner_base::{Exit, PlainFile};
+use gleaner_lambda::layout::COMPONENT_MAX;
 use serde_json::Value;
 
 use super::error::{BuildError, TARGET};

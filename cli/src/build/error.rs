@@ -2,9 +2,11 @@ use std::io;
 use std::path::PathBuf;
 use std::process::ExitStatus;
 
-use gleaner_protocol::layout::{BUILD_MAX, FILES_MAX};
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Exit, Explain, LayoutError, ManifestError, NotPlain, PartsError};
+use gleaner_base::{Exit, Explain, NotPlain};
+use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
+use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::{LayoutError, ManifestError};
+use gleaner_parts::PartsError;
 
 /// Why a lambda cannot be built.
 #[derive(Debug, thiserror::Error)]

@@ -6,8 +6,9 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use gleaner_protocol::layout::{BUILD_MAX, FILES_MAX};
-use gleaner_protocol::{BuildDir, Manifest, PlainFile};
+use gleaner_base::PlainFile;
+use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
+use gleaner_lambda::{BuildDir, Manifest};
 
 use super::error::BuildError;
 

@@ -1,7 +1,7 @@
 //! `gleaner build DIR`: a lambda's sources become its build folder, which every other command uses.
 //!
 //! `component` compiles Rust, in a `sandbox` if that is asked for, `folder` puts everything together beside the old build and swaps the two, so that a build
-//! that fails leaves the old one as it was. Which files make up a lambda is said by `gleaner_protocol::Sources`. Nothing
+//! that fails leaves the old one as it was. Which files make up a lambda is said by `gleaner_lambda::Sources`. Nothing
 //! here runs a lambda or looks into a component.
 
 mod component;
@@ -13,9 +13,11 @@ use std::fs::File;
 use std::path::Path;
 use std::time::SystemTime;
 
-use gleaner_protocol::layout::FILE_MAX;
-use gleaner_protocol::manifest::{ByteSize, Kind};
-use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, PlainFile, SOURCE_MAX, Sources};
+use gleaner_base::ByteSize;
+use gleaner_base::{Exit, Failure, PlainFile};
+use gleaner_lambda::layout::FILE_MAX;
+use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::{BuildDir, LayoutError, Manifest, SOURCE_MAX, Sources};
 
 use error::BuildError;
 use folder::{Built, Partial};

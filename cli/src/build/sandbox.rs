@@ -9,7 +9,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use gleaner_protocol::{NotPlain, Parts, hex, own_file};
+use gleaner_base::{NotPlain, hex, own_file};
+use gleaner_parts::Parts;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 

@@ -157,7 +157,7 @@ fn an_entry_has_the_extension_of_its_kind() {
 
 #[test]
 fn a_wasm_lambda_without_a_package_is_told_how_to_make_one() {
-    use gleaner_protocol::Explain;
+    use gleaner_base::Explain;
     let lambda = Lambda::new(&PYTHON.replace("python", "wasm").replace("main.py", "x.wasm"));
     let error = lambda.build().unwrap_err();
     assert_eq!(error.to_string(), format!("there is no `{}`", lambda.0.join("Cargo.toml").display()));

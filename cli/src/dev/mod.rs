@@ -9,8 +9,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gleaner_protocol::manifest::ByteSize;
-use gleaner_protocol::{Exit, Failure, PlainFile, own_file, visible};
+use gleaner_base::ByteSize;
+use gleaner_base::{Exit, Failure, PlainFile, own_file, visible};
 
 use crate::args::{AskedArgs, ReplayArgs};
 use crate::say::say;

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, SystemTime};
 
-use gleaner_protocol::{Manifest, Sources};
+use gleaner_lambda::{Manifest, Sources};
 
 /// Between two looks: sooner than one notices.
 const EVERY: Duration = Duration::from_millis(200);

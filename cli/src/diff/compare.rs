@@ -1,6 +1,6 @@
 //! What differs between two wakes.
 
-use gleaner_protocol::{Decision, Fault, SCORE_TOLERANCE, Trigger, TriggerKind};
+use gleaner_lambda::{Decision, Fault, SCORE_TOLERANCE, Trigger, TriggerKind};
 use serde::Serialize;
 use serde_json::{Map, Value};
 

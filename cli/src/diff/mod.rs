@@ -14,8 +14,9 @@ use std::collections::BTreeMap;
 use std::io::{self, IsTerminal};
 use std::path::Path;
 
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Decision, Exit, Explain, Failure};
+use gleaner_base::{Exit, Explain, Failure};
+use gleaner_lambda::Decision;
+use gleaner_lambda::manifest::Kind;
 use serde::Serialize;
 
 use crate::args::DiffArgs;

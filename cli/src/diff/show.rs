@@ -2,7 +2,7 @@
 
 use std::fmt::{self, Write};
 
-use gleaner_protocol::visible;
+use gleaner_base::visible;
 
 use super::compare::{Is, Of, ratio};
 use super::{Change, Cost, Diff, Difference, Side, Tally};

@@ -1,6 +1,6 @@
 //! Runs that are alike, and runs that are not.
 
-use gleaner_protocol::{Exit, Explain};
+use gleaner_base::{Exit, Explain};
 use serde_json::{Value, json};
 
 use super::{Diff, Difference, Tally, between, show};

@@ -2,7 +2,7 @@
 
 use std::collections::{HashMap, VecDeque};
 
-use gleaner_protocol::{Cause, Decision};
+use gleaner_lambda::{Cause, Decision};
 
 use crate::results::ResultsError;
 

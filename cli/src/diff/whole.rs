@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use gleaner_protocol::manifest::ConfigValue;
-use gleaner_protocol::signals::Signals;
-use gleaner_protocol::{Clip, Live};
+use gleaner_lambda::Clip;
+use gleaner_lambda::manifest::ConfigValue;
+use gleaner_lambda::signals::Signals;
+use gleaner_protocol::Live;
 
 use super::compare::short;
 use super::{Change, Cost, Diff, DiffError, Side, Tally};

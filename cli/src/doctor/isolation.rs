@@ -2,7 +2,8 @@
 
 use std::process::Command;
 
-use gleaner_protocol::{Holds, Layer, Parts};
+use gleaner_parts::Parts;
+use gleaner_protocol::{Holds, Layer};
 
 use super::{Finding, State};
 

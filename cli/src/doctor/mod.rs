@@ -5,7 +5,8 @@
 mod isolation;
 mod network;
 
-use gleaner_protocol::{Exit, Failure, Parts};
+use gleaner_base::{Exit, Failure};
+use gleaner_parts::Parts;
 use serde::Serialize;
 
 use crate::args::DoctorArgs;

@@ -108,7 +108,7 @@ fn domain(id: Option<&str>) -> Finding {
         None | Some("") => Finding::fine(ABOUT, "not set: domain 0"),
         Some(id) => match id.parse::<u16>() {
             Ok(domain) if domain <= 232 => Finding::fine(ABOUT, format!("domain {domain}")),
-            _ => Finding::warning(ABOUT, format!("`{}` is no domain", gleaner_protocol::visible(id)), "use 0 to 232"),
+            _ => Finding::warning(ABOUT, format!("`{}` is no domain", gleaner_base::visible(id)), "use 0 to 232"),
         },
     }
 }

@@ -8,8 +8,9 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use gleaner_protocol::manifest::{Kind, LambdaName, NameError};
-use gleaner_protocol::{Exit, Explain, Failure, Manifest};
+use gleaner_base::{Exit, Explain, Failure};
+use gleaner_lambda::Manifest;
+use gleaner_lambda::manifest::{Kind, LambdaName, NameError};
 
 use crate::args::NewArgs;
 use crate::say::say;

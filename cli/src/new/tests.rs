@@ -1,4 +1,4 @@
-use gleaner_protocol::Manifest;
+use gleaner_lambda::Manifest;
 use toml::{Table, Value};
 
 use super::*;

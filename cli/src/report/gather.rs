@@ -4,8 +4,9 @@ use std::collections::HashMap;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::signals::{Curve, Signals, Spread};
-use gleaner_protocol::{Clip, Decision, NotPlain, visible};
+use gleaner_base::{NotPlain, visible};
+use gleaner_lambda::signals::{Curve, Signals, Spread};
+use gleaner_lambda::{Clip, Decision};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use gleaner_protocol::{Decision, Fault, FaultKind, Trigger};
+use gleaner_lambda::{Decision, Fault, FaultKind, Trigger};
 
 use super::density::Density;
 use super::model::{Amounts, FaultCause, FaultMark, Mark};

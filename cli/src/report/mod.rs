@@ -13,7 +13,7 @@ mod told;
 
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Failure, write_whole};
+use gleaner_base::{Exit, Failure, write_whole};
 
 use crate::args::ReportArgs;
 use crate::diff::Diff;

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_protocol::manifest::{ConfigValue, Kind};
-use gleaner_protocol::{Cause, FaultKind};
+use gleaner_lambda::manifest::{ConfigValue, Kind};
+use gleaner_lambda::{Cause, FaultKind};
 use serde::Serialize;
 
 use super::density::Dense;

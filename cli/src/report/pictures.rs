@@ -5,9 +5,9 @@
 use std::io;
 use std::path::{Component, Path, PathBuf};
 
-use gleaner_protocol::PlainFile;
-use gleaner_protocol::results::PICTURE_MAX;
-use gleaner_protocol::signals::Picture;
+use gleaner_base::PlainFile;
+use gleaner_lambda::results::PICTURE_MAX;
+use gleaner_lambda::signals::Picture;
 
 use super::gather::{named, places};
 use super::marks::cut;

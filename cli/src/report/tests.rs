@@ -345,7 +345,7 @@ fn a_folder_without_results_is_refused_with_a_way_out() {
     out.write("hello/summary.json", summary().to_string());
     fs::remove_file(out.path().join("summary.json")).unwrap();
     let failure = write(out.path()).unwrap_err();
-    assert_eq!(failure.exit, gleaner_protocol::Exit::Usage);
+    assert_eq!(failure.exit, gleaner_base::Exit::Usage);
     assert!(failure.help.as_ref().unwrap().contains("hello`"), "{failure}");
     out.write("summary.json", "{}");
     let failure = write(out.path()).unwrap_err();

@@ -5,10 +5,12 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::manifest::{ByteSize, ConfigValue, Kind};
-use gleaner_protocol::results::{SIGNALS_MAX, SUMMARY_MAX};
-use gleaner_protocol::signals::{Curve, Signals};
-use gleaner_protocol::{Exit, Explain, Live, NotPlain, PlainFile, Summary};
+use gleaner_base::ByteSize;
+use gleaner_base::{Exit, Explain, NotPlain, PlainFile};
+use gleaner_lambda::manifest::{ConfigValue, Kind};
+use gleaner_lambda::results::{SIGNALS_MAX, SUMMARY_MAX};
+use gleaner_lambda::signals::{Curve, Signals};
+use gleaner_protocol::{Live, Summary};
 use serde::de::DeserializeOwned;
 
 use super::marks::cut;

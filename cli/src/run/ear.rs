@@ -4,8 +4,9 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_lambda::FaultKind;
 use gleaner_protocol::link::{Loss, RecorderReport};
-use gleaner_protocol::{FaultKind, Live, Report};
+use gleaner_protocol::{Live, Report};
 
 use super::screen::Screen;
 use crate::show;

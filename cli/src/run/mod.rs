@@ -14,7 +14,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{BuildDir, Exit, Failure, Manifest};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::{BuildDir, Manifest};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::party::{Ended, Party};

@@ -6,8 +6,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use gleaner_base::{Exit, Failure, own_file};
+use gleaner_parts::Parts;
 use gleaner_protocol::link::{Add, Control};
-use gleaner_protocol::{Exit, ExitRecord, Failure, Live, Parts, own_file};
+use gleaner_protocol::{ExitRecord, Live};
 
 use super::ear::{Ear, Heard};
 use super::process::Process;

@@ -11,7 +11,9 @@ use std::sync::mpsc::SyncSender;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Exit, Failure, Parts, UNTIL_KILLED, visible};
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_parts::Parts;
+use gleaner_protocol::UNTIL_KILLED;
 use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
 

@@ -3,8 +3,10 @@
 use std::collections::HashSet;
 use std::io::{self, IsTerminal, Write};
 
+use gleaner_base::visible;
+use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::link::RecorderStatus;
-use gleaner_protocol::{Clip, Decision, Live, LiveTopic, visible};
+use gleaner_protocol::{Live, LiveTopic};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 

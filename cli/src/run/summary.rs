@@ -3,7 +3,8 @@
 
 use std::path::Path;
 
-use gleaner_protocol::{Exit, Failure, Live, write_whole};
+use gleaner_base::{Exit, Failure, write_whole};
+use gleaner_protocol::Live;
 
 /// What the processes of a lambda counted that have ended.
 #[derive(Default)]

@@ -1,6 +1,7 @@
 use std::fmt::{self, Write};
 
-use gleaner_protocol::{Checked, Need, Place, visible};
+use gleaner_base::visible;
+use gleaner_protocol::{Checked, Need, Place};
 
 use super::Paint;
 use crate::results::size;
@@ -50,7 +51,7 @@ fn write_checked(text: &mut String, checked: &Checked, paint: Paint) -> fmt::Res
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::manifest::Kind;
+    use gleaner_lambda::manifest::Kind;
 
     use super::*;
 

@@ -2,7 +2,9 @@
 
 use std::fmt::{self, Write};
 
-use gleaner_protocol::{Clip, Summary, visible};
+use gleaner_base::visible;
+use gleaner_lambda::Clip;
+use gleaner_protocol::Summary;
 
 use super::{Paint, SHOWN, counted, more};
 use crate::results::{clip_contents, clip_span, seconds};

@@ -3,7 +3,8 @@
 use std::collections::HashSet;
 use std::fmt::Write;
 
-use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen, visible};
+use gleaner_base::visible;
+use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen};
 
 use super::live::table;
 use crate::results::{grouped, seconds, size};
@@ -207,7 +208,7 @@ depth = 128                 # 1.3 s
             ("/_hidden", "input_hidden"),
         ] {
             assert_eq!(name_of(topic), name);
-            assert!(name.parse::<gleaner_protocol::manifest::ItemName>().is_ok());
+            assert!(name.parse::<gleaner_lambda::manifest::ItemName>().is_ok());
         }
         let text = inputs(&[topic("/imu/data"), topic("/imu/raw"), topic("/imu")]);
         assert!(["\"imu\"", "\"imu_2\"", "\"imu_3\""].iter().all(|name| text.contains(name)), "{text}");

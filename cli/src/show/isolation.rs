@@ -1,4 +1,5 @@
-use gleaner_protocol::{Holds, Layer, visible};
+use gleaner_base::visible;
+use gleaner_protocol::{Holds, Layer};
 
 /// The layers of isolation in a line: those that hold by name, the others with the reason.
 pub(crate) fn isolation(layers: &[Layer]) -> String {

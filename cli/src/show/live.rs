@@ -2,8 +2,10 @@
 
 use std::fmt::{self, Write};
 
+use gleaner_base::visible;
+use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{Clip, Live, LiveTopic, Network, Spread, TopicSeen, TriggerKind, visible};
+use gleaner_protocol::{Live, LiveTopic, Network, Spread, TopicSeen};
 
 use super::{Paint, counted, grouped, mib, word};
 use crate::results::{clip_span, three_digits};
@@ -52,7 +54,7 @@ pub(crate) fn clip_line(clip: &Clip, paint: Paint) -> String {
 }
 
 /// A wake with a trigger or a fault, in a line for each.
-pub(crate) fn decision(decision: &gleaner_protocol::Decision, paint: Paint) -> String {
+pub(crate) fn decision(decision: &gleaner_lambda::Decision, paint: Paint) -> String {
     let time = time_of_day(decision.at_ns);
     let mut text = String::new();
     for trigger in &decision.triggers {

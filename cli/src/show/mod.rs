@@ -2,9 +2,9 @@
 
 use std::fmt::{self, Write};
 
-use gleaner_protocol::{
-    Clip, Decision, Fault, FaultKind, Summary, TopicReport, Trigger, TriggerKind, Verified, visible,
-};
+use gleaner_base::visible;
+use gleaner_lambda::{Clip, Decision, Fault, FaultKind, Trigger, TriggerKind};
+use gleaner_protocol::{Summary, TopicReport, Verified};
 
 use crate::results::{ResultsError, grouped, seconds, three_digits};
 

@@ -1,6 +1,6 @@
-use gleaner_protocol::journal::Part;
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Cause as Woken, Recovered, TriggerKind};
+use gleaner_journal::Part;
+use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::{Cause as Woken, Recovered, TriggerKind};
 
 use super::*;
 

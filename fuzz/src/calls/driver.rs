@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
+use gleaner_base::ByteSize;
 use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
@@ -11,12 +12,12 @@ use gleaner_host::api::trigger::{ATTRIBUTES, LABEL_BYTES, PER_WAKE};
 use gleaner_host::guest::Guest;
 use gleaner_host::guest::wasm::{Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
-use gleaner_protocol::Manifest;
-use gleaner_protocol::journal::{Decoder, Encoder, Entry, Woken};
-use gleaner_protocol::manifest::ByteSize;
+use gleaner_journal::{Decoder, Encoder, Entry, Woken};
+use gleaner_lambda::Manifest;
+use gleaner_messages::Endian;
+use gleaner_messages::Sources;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::message::Sources;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 
 use super::picture;
 use super::pictures::{coded, raw};

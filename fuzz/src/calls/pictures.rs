@@ -1,6 +1,6 @@
 //! Pictures that lambdas see, as messages: raw ones in four encodings, and four files.
 
-use gleaner_transport::message::CdrWriter;
+use gleaner_messages::CdrWriter;
 use jpeg_encoder::{ColorType, Encoder};
 
 const WIDTH: u16 = 64;

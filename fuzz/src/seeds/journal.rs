@@ -1,8 +1,8 @@
 //! Journals of a lambda with two inputs, with every kind of wake.
 
-use gleaner_protocol::journal::{Encoder, End, Entry, Header, JournalInput, Said, Seen, Woken, Writer};
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Fault, FaultKind, Trigger, TriggerKind};
+use gleaner_journal::{Encoder, End, Entry, Header, JournalInput, Said, Seen, Woken, Writer};
+use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 use serde_json::{Map, json};
 
 use crate::journal::mode;

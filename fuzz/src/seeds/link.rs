@@ -1,6 +1,6 @@
 //! Conversations with the recorder, frame by frame.
 
-use gleaner_protocol::journal::Encoder;
+use gleaner_journal::Encoder;
 
 use super::journal::{entries, header};
 use crate::link::mode;

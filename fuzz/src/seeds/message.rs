@@ -1,6 +1,6 @@
 //! Messages full of ones, which are lengths too, of every type.
 
-use gleaner_transport::message::{CdrWriter, Sources};
+use gleaner_messages::{CdrWriter, Sources};
 
 use crate::message::{TYPES, mode};
 

@@ -8,8 +8,8 @@ use std::io::{self, Read};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::hex;
-use gleaner_protocol::own_file::{self, InTheWay};
+use gleaner_base::hex;
+use gleaner_base::own_file::{self, InTheWay};
 use sha2::{Digest, Sha256};
 
 use super::prune::note_use;

@@ -9,8 +9,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::layout::COMPONENT_MAX;
-use gleaner_protocol::{Exit, Explain, NotPlain, PlainFile};
+use gleaner_base::{Exit, Explain, NotPlain, PlainFile};
+use gleaner_lambda::layout::COMPONENT_MAX;
 use wasmtime::{Config, Engine};
 
 /// Largest native code that is kept, in bytes.

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
+use gleaner_base::{Exit, Failure};
 use gleaner_compile::{COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans};
 use gleaner_jail::{Paths, alone, files};
-use gleaner_protocol::{Exit, Failure};
 use rustix::process::{Resource, Rlimit, setrlimit};
 
 /// Compiles a WebAssembly component to native code for this machine.

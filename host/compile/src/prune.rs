@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-use gleaner_protocol::own_file;
+use gleaner_base::own_file;
 
 /// Most bytes of native code that are kept; an ordinary lambda takes half a megabyte. It goes by when code was loaded last, so it is
 /// that of components that were built anew, of earlier versions and of other settings that goes.

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use gleaner_host::api::Session;
 use gleaner_host::api::data;
-use gleaner_protocol::manifest::ConfigValue;
+use gleaner_lambda::manifest::ConfigValue;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 

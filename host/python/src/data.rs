@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use gleaner_host::api::data::{self, DataError};
-use gleaner_transport::message::Value;
+use gleaner_messages::Value;
 use numpy::PyArray1;
 use pyo3::IntoPyObjectExt;
 use pyo3::exceptions::PyTypeError;

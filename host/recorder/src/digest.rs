@@ -1,7 +1,7 @@
 //! Digests as texts.
 
-use gleaner_protocol::hex;
-use gleaner_protocol::journal::FileDigest;
+use gleaner_base::hex;
+use gleaner_journal::FileDigest;
 use sha2::{Digest, Sha256};
 
 /// One digest for all files of a lambda: SHA-256 of their digests and paths, a line each, as `sha256sum` writes them; in

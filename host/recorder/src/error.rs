@@ -5,10 +5,10 @@ use std::error::Error;
 use std::io;
 use std::path::PathBuf;
 
-use gleaner_protocol::own_file::InTheWay;
-use gleaner_protocol::{Exit, Explain};
+use gleaner_base::own_file::InTheWay;
+use gleaner_base::{Exit, Explain};
+use gleaner_drives::ReplayError;
 use gleaner_transport::TransportError;
-use gleaner_transport::replay::ReplayError;
 
 /// Why something cannot be recorded, or kept, or found again.
 #[derive(Debug, thiserror::Error)]

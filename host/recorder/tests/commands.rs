@@ -6,9 +6,9 @@ mod support;
 
 use std::time::Instant;
 
-use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_lambda::TriggerKind::{Event, Start};
+use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_protocol::link::{CommandStatus, RecorderLink};
-use gleaner_protocol::{Clip, TriggerKind};
 use gleaner_transport::Verdict;
 use running::*;
 use support::*;
@@ -71,7 +71,7 @@ impl Commanded {
 }
 
 fn moments(clip: &Clip) -> Vec<(&str, TriggerKind, &str, Option<&str>)> {
-    let moment = |moment: &gleaner_protocol::Moment| moment.source.is_some();
+    let moment = |moment: &gleaner_lambda::Moment| moment.source.is_some();
     assert!(clip.moments.iter().any(moment));
     let told = clip.moments.iter();
     told.map(|m| (m.lambda.as_str(), m.kind, m.label.as_str(), m.source.as_deref())).collect()

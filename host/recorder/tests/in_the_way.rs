@@ -7,10 +7,11 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::Clip;
+use gleaner_lambda::TriggerKind::{Event, Start};
+use gleaner_lambda::manifest::Store;
 use gleaner_protocol::link::Loss;
-use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{Folder, RecordError};
 use support::*;
 

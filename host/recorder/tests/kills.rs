@@ -11,12 +11,12 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::Clip;
-use gleaner_protocol::TriggerKind::Event;
+use gleaner_dds::Clock;
+use gleaner_lambda::Clip;
+use gleaner_lambda::TriggerKind::Event;
 use gleaner_protocol::link::{Control, RecorderLink, RecorderReport};
 use gleaner_recorder::Folder;
 use gleaner_recorder::program::{Feed, run};
-use gleaner_transport::dds::Clock;
 use running::*;
 use support::*;
 

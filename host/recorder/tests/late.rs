@@ -4,8 +4,8 @@ mod support;
 
 use std::time::Duration;
 
-use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
-use gleaner_protocol::manifest::Store;
+use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
+use gleaner_lambda::manifest::Store;
 use gleaner_recorder::{Folder, LambdaId, Recorder, Settings, TopicId};
 use support::*;
 

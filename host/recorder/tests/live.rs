@@ -4,8 +4,8 @@ mod support;
 
 use std::time::Duration;
 
-use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
-use gleaner_protocol::manifest::Store;
+use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
+use gleaner_lambda::manifest::Store;
 use gleaner_recorder::{Folder, Recorder, Settings, Work};
 use gleaner_transport::{Guid, SampleMeta};
 use support::*;

@@ -4,9 +4,9 @@ mod support;
 
 use std::fs;
 
-use gleaner_protocol::TriggerKind::Event;
-use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Clip, TriggerKind};
+use gleaner_lambda::TriggerKind::Event;
+use gleaner_lambda::manifest::Store;
+use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_recorder::{RecordError, Recorder};
 use support::*;
 

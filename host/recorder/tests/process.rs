@@ -10,11 +10,11 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_base::{Exit, Failure};
+use gleaner_dds::Clock;
+use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
-use gleaner_protocol::{Exit, Failure};
 use gleaner_recorder::program::{Feed, Options, run};
-use gleaner_transport::dds::Clock;
 use running::*;
 use support::*;
 

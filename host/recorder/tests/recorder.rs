@@ -4,12 +4,12 @@ mod support;
 
 use std::time::Duration;
 
-use gleaner_protocol::Explain;
-use gleaner_protocol::TriggerKind::{Event, Start, Stop};
+use gleaner_base::Explain;
+use gleaner_lambda::TriggerKind::{Event, Start, Stop};
 use gleaner_recorder::{Folder, RecordError, TOPICS_MAX};
 use support::*;
 
-const EVENT: &[gleaner_protocol::TriggerKind] = &[Event];
+const EVENT: &[gleaner_lambda::TriggerKind] = &[Event];
 
 #[test]
 fn a_clip_holds_exactly_its_window_and_says_what_it_is() {
@@ -45,7 +45,7 @@ fn messages_are_written_byte_for_byte() {
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[a]));
     let mut sample = meta(T0, 5);
-    (sample.endian, sample.options, sample.publish_ns) = (gleaner_transport::Endian::Big, [3, 4], -9);
+    (sample.endian, sample.options, sample.publish_ns) = (gleaner_messages::Endian::Big, [3, 4], -9);
     recorder.sample(a, &sample, b"before").unwrap();
     recorder.wake(lambda, &entry(T0, EVENT)).unwrap();
     recorder.sample(a, &meta(T0, 6), b"after").unwrap();

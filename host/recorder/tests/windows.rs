@@ -5,8 +5,8 @@ mod support;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
-use gleaner_protocol::manifest::Store;
+use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
+use gleaner_lambda::manifest::Store;
 use support::*;
 
 /// A drive and what is done with it, all in ms.

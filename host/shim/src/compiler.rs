@@ -5,8 +5,8 @@ use std::os::unix::process::CommandExt;
 use std::process::{Command, ExitCode};
 use std::time::Duration;
 
+use gleaner_base::{Exit, Failure};
 use gleaner_jail::{Paths, compiler};
-use gleaner_protocol::{Exit, Failure};
 use gleaner_vitals::Pulse;
 
 use crate::environment;

@@ -24,9 +24,10 @@ use std::process::{Command, ExitCode};
 use std::time::Duration;
 
 use clap::Parser;
+use gleaner_base::{Exit, Failure};
 use gleaner_jail::cgroup::{Bounds, Group};
 use gleaner_jail::{Paths, alone, cgroup, files, memory, never, tried};
-use gleaner_protocol::{Exit, ExitRecord, Failure, LAYERS_ENV, Layer, RESULTS_ENV};
+use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, RESULTS_ENV};
 use gleaner_vitals::{PULSE_ENV, Pulse, hand_on};
 
 use self::results::Results;

@@ -1,6 +1,6 @@
 //! Bytes of a pipe as lines of bounded length.
 
-use gleaner_protocol::PAGE_BYTES;
+use gleaner_lambda::PAGE_BYTES;
 
 /// Bytes that are read at once.
 pub(crate) const PIECE: usize = 64 << 10;

@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::results::LIVE_LOG_MAX;
-use gleaner_protocol::{
-    Decision, Exit, ExitRecord, Failure, Live, Output, OutputError, PAGE_BYTES, Page, Report, WokenBy, visible,
-};
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_lambda::results::LIVE_LOG_MAX;
+use gleaner_lambda::{Decision, Output, OutputError, PAGE_BYTES};
+use gleaner_protocol::{ExitRecord, Live, Page, Report, WokenBy};
 use gleaner_vitals::Pulse;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Access, access};

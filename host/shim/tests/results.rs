@@ -5,7 +5,8 @@ use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use gleaner_protocol::{Decision, FaultKind, Live, LogLine, PAGE_BYTES, Report};
+use gleaner_lambda::{Decision, FaultKind, LogLine, PAGE_BYTES};
+use gleaner_protocol::{Live, Report};
 use rustix::process::{Pid, Signal, kill_process};
 
 const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");

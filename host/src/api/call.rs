@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::manifest::Limits;
+use gleaner_lambda::manifest::Limits;
 
 use super::error::DataError;
 

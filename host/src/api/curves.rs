@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_protocol::signals::{Curve, Signals};
+use gleaner_lambda::signals::{Curve, Signals};
 
 use super::data::{Column, Topic};
 

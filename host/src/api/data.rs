@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use gleaner_buffers::{Lease, RingCounts, RingReader};
+use gleaner_messages::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
 use gleaner_transport::SampleMeta;
-use gleaner_transport::message::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
 
 pub use super::call::{Due, PerCall, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
 use super::curves::{Curves, Pen};

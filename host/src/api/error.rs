@@ -1,6 +1,6 @@
 //! Why a read of data failed, in words for the lambda's author.
 
-use gleaner_transport::message::{CdrError, PathError};
+use gleaner_messages::{CdrError, PathError};
 
 use gleaner_image::ImageError;
 

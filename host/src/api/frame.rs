@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use gleaner_buffers::{Lease, Pool, Refusal};
-use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
+use gleaner_messages::{CdrError, CompressedView, Endian, ImageView};
 
 use super::data::{DataError, Identity, Sample, Stamps};
 use super::piece::Piece;

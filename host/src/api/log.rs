@@ -1,8 +1,8 @@
 //! Lines for people: cut, rate-limited, and every dropped one counted.
 
-use gleaner_protocol::journal::Said;
-use gleaner_protocol::manifest::Limits;
-pub use gleaner_protocol::{LogLevel as Level, LogLine as Line};
+use gleaner_journal::Said;
+use gleaner_lambda::manifest::Limits;
+pub use gleaner_lambda::{LogLevel as Level, LogLine as Line};
 
 use super::Session;
 
@@ -140,7 +140,7 @@ mod tests {
     #[test]
     fn bytes_are_limited_beside_lines() {
         let mut limits = Limits::default();
-        limits.log_bytes = gleaner_protocol::manifest::ByteSize::kib(4);
+        limits.log_bytes = gleaner_base::ByteSize::kib(4);
         let mut log = Log::new(&limits);
         for _ in 0..5 {
             log.write(10, Level::Info, &"x".repeat(1000));

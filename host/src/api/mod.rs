@@ -20,9 +20,9 @@ mod values;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_protocol::Trigger;
-use gleaner_protocol::journal::Said;
-use gleaner_protocol::manifest::{ConfigValue, Limits};
+use gleaner_journal::Said;
+use gleaner_lambda::Trigger;
+use gleaner_lambda::manifest::{ConfigValue, Limits};
 
 use data::{DataError, Due, Topic};
 use log::{Line, Log};

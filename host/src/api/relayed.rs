@@ -1,7 +1,7 @@
 //! What a lambda caused in another process: read out there, and taken over here by the rules that hold for its calls.
 
-use gleaner_protocol::journal::Said;
-use gleaner_protocol::{Trigger, TriggerKind};
+use gleaner_journal::Said;
+use gleaner_lambda::{Trigger, TriggerKind};
 use serde_json::Value;
 
 use super::Session;
@@ -90,7 +90,7 @@ impl Topic {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::manifest::Limits;
+    use gleaner_lambda::manifest::Limits;
     use serde_json::json;
 
     use super::*;

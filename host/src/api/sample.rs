@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use gleaner_buffers::Lease;
+use gleaner_messages::{Endian, Value};
 use gleaner_transport::SampleMeta;
-use gleaner_transport::message::{Endian, Value};
 
 use super::data::{DataError, Field, Topic};
 use super::frame::{Frame, Picture};

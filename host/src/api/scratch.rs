@@ -5,8 +5,8 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_protocol::manifest::Limits;
-use gleaner_protocol::visible;
+use gleaner_base::visible;
+use gleaner_lambda::manifest::Limits;
 
 use super::Session;
 
@@ -232,7 +232,7 @@ impl Session {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::manifest::ByteSize;
+    use gleaner_base::ByteSize;
 
     use super::*;
 

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 
 use gleaner_buffers::{Lease, RingCounts};
-use gleaner_protocol::journal::Seen;
+use gleaner_journal::Seen;
 use gleaner_transport::SampleMeta;
 
 use super::data::Topic;

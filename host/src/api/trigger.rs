@@ -1,7 +1,7 @@
 //! What a lambda causes: events, and the start and stop of recordings.
 
-use gleaner_protocol::manifest::Limits;
-use gleaner_protocol::{Trigger, TriggerKind};
+use gleaner_lambda::manifest::Limits;
+use gleaner_lambda::{Trigger, TriggerKind};
 use serde_json::{Map, Value};
 
 use super::Session;

@@ -6,7 +6,7 @@
 use std::io;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Fault, FaultKind};
+use gleaner_lambda::{Fault, FaultKind};
 use gleaner_vitals::usage::{PrivatePages, Process};
 use gleaner_vitals::{Pulse, Share, own};
 

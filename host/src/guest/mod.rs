@@ -15,8 +15,10 @@ pub mod worker;
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::signals::Curve;
-use gleaner_protocol::{Failure, Fault, Layer};
+use gleaner_base::Failure;
+use gleaner_lambda::Fault;
+use gleaner_lambda::signals::Curve;
+use gleaner_protocol::Layer;
 use gleaner_vitals::usage;
 
 use crate::api::curves::Curves;

@@ -3,7 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::{Doing, Failure, Fault, FaultKind, Layer};
+use gleaner_base::Failure;
+use gleaner_lambda::{Fault, FaultKind};
+use gleaner_protocol::{Doing, Layer};
 
 use super::meter::Meter;
 use super::{Guest, Outcome};

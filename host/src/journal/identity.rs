@@ -3,10 +3,11 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::journal::{FileDigest, Header, JournalInput, Part};
-use gleaner_protocol::layout::FILE_MAX;
-use gleaner_protocol::manifest::{ConfigValue, Manifest, Schedule};
-use gleaner_protocol::{BuildDir, Exit, Explain, LayoutError, PlainFile, hex};
+use gleaner_base::{Exit, Explain, PlainFile, hex};
+use gleaner_journal::{FileDigest, Header, JournalInput, Part};
+use gleaner_lambda::layout::FILE_MAX;
+use gleaner_lambda::manifest::{ConfigValue, Manifest, Schedule};
+use gleaner_lambda::{BuildDir, LayoutError};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
@@ -113,11 +114,11 @@ fn without_descriptions(json: &mut Value) {
     }
 }
 
-fn model(model: &gleaner_protocol::manifest::Model) -> FileDigest {
+fn model(model: &gleaner_lambda::manifest::Model) -> FileDigest {
     FileDigest { path: model.file.to_string(), bytes: 0, sha256: model.sha256.to_string() }
 }
 
-fn journal_input(input: &gleaner_protocol::manifest::Input, remaps: &[Remap]) -> JournalInput {
+fn journal_input(input: &gleaner_lambda::manifest::Input, remaps: &[Remap]) -> JournalInput {
     let topic = input.topic.as_str();
     JournalInput {
         name: input.name.to_string(),

@@ -1,5 +1,5 @@
 //! What is written down of each wake, so that the decision can be made again and compared. The format is
-//! `gleaner_protocol::journal`; here it is filled in.
+//! `gleaner_journal`; here it is filled in.
 
 mod identity;
 
@@ -7,8 +7,8 @@ pub use identity::{Identity, IdentityError};
 
 use std::sync::Arc;
 
-use gleaner_protocol::Decision;
-use gleaner_protocol::journal::{Entry, Said, Seen, Woken};
+use gleaner_journal::{Entry, Said, Seen, Woken};
+use gleaner_lambda::Decision;
 
 use crate::api::data::{Topic, Wake};
 use crate::api::trace::Trace;

@@ -3,8 +3,9 @@
 //! `std_msgs/msg/String`, a type that every ROS 2 has; its text is a line of `decisions.jsonl`, with the lambda's name before it:
 //! `{"lambda": "hello", "decision": {...}}`.
 
-use gleaner_protocol::{Decision, Failure};
-use gleaner_transport::dds::Dds;
+use gleaner_base::Failure;
+use gleaner_dds::Dds;
+use gleaner_lambda::Decision;
 use serde::Serialize;
 
 use super::speaker::Speaker;

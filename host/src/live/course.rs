@@ -5,8 +5,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use gleaner_protocol::{Exit, Failure, Report};
-use gleaner_transport::dds::{Clock, Dds};
+use gleaner_base::{Exit, Failure};
+use gleaner_dds::{Clock, Dds};
+use gleaner_protocol::Report;
 use gleaner_vitals::Pulse;
 
 use super::announce::Announcer;

@@ -6,7 +6,9 @@ use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Decision, Exit, Failure, Live, Page, Report};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::Decision;
+use gleaner_protocol::{Live, Page, Report};
 
 use super::pages::Pages;
 use crate::api::log::Line;

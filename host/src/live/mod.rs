@@ -19,10 +19,11 @@ use std::io::Write;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use gleaner_protocol::journal::Part;
-use gleaner_protocol::manifest::Schedule as Declared;
-use gleaner_protocol::{Exit, Failure, Page, Report, WokenBy};
-use gleaner_transport::dds::Dds;
+use gleaner_base::{Exit, Failure};
+use gleaner_dds::Dds;
+use gleaner_journal::Part;
+use gleaner_lambda::manifest::Schedule as Declared;
+use gleaner_protocol::{Page, Report, WokenBy};
 
 use self::announce::Announcer;
 use self::course::Course;

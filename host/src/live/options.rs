@@ -5,10 +5,12 @@ use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 
 use clap::Args;
+use gleaner_base::{Exit, Failure};
+use gleaner_dds as dds;
+use gleaner_dds::Clock;
 use gleaner_jail::Paths;
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{BuildDir, Exit, Failure};
-use gleaner_transport::dds::{self, Clock};
+use gleaner_lambda::BuildDir;
+use gleaner_lambda::manifest::Manifest;
 
 use crate::input::unfinished_bytes;
 use crate::isolation::definitions;

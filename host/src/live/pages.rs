@@ -8,7 +8,9 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Exit, Failure, PAGE_BYTES, Page, RESULTS_ENV};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::PAGE_BYTES;
+use gleaner_protocol::{Page, RESULTS_ENV};
 use gleaner_vitals::{Pulse, inherited};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FileType, fstat};
@@ -133,7 +135,7 @@ mod tests {
     use std::io::{BufRead, BufReader, Read, pipe};
     use std::os::fd::OwnedFd;
 
-    use gleaner_protocol::{LogLevel, LogLine};
+    use gleaner_lambda::{LogLevel, LogLine};
     use rustix::io::ioctl_fionbio;
 
     use super::*;

@@ -4,9 +4,11 @@ use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::journal::{Header, Said};
+use gleaner_base::{Exit, Failure};
+use gleaner_journal::{Header, Said};
+use gleaner_lambda::Decision;
+use gleaner_protocol::ToRecorder as Dropped;
 use gleaner_protocol::link::{LinkError, RecorderLink};
-use gleaner_protocol::{Decision, Exit, Failure, ToRecorder as Dropped};
 
 use crate::api::data::{Topic, Wake};
 use crate::journal::Scribe;

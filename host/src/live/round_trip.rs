@@ -5,8 +5,9 @@
 //! `LAMBDA:WAKE:TRIGGERS` with the labels of the triggers in between commas. Both stamps are of CLOCK_MONOTONIC if the
 //! message's is, as with `gleaner play --stamp monotonic`.
 
-use gleaner_protocol::{Decision, Failure};
-use gleaner_transport::dds::{Clock, Dds};
+use gleaner_base::Failure;
+use gleaner_dds::{Clock, Dds};
+use gleaner_lambda::Decision;
 
 use super::speaker::Speaker;
 use crate::api::data::Wake;

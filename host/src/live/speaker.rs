@@ -1,8 +1,8 @@
 //! A topic that a lambda's process writes on request. Nothing waits for it: what cannot be sent is counted, and said now and then.
 
-use gleaner_protocol::Failure;
-use gleaner_transport::dds::{Dds, Writer};
-use gleaner_transport::message::CdrWriter;
+use gleaner_base::Failure;
+use gleaner_dds::{Dds, Writer};
+use gleaner_messages::CdrWriter;
 
 use crate::network::NetworkError;
 

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Decision, Live, LiveTopic, Network, Spread, ToRecorder};
-use gleaner_transport::dds::{Clock, Dds, Health};
+use gleaner_dds::{Clock, Dds, Health};
+use gleaner_lambda::Decision;
+use gleaner_lambda::manifest::Manifest;
+use gleaner_protocol::{Live, LiveTopic, Network, Spread, ToRecorder};
 use gleaner_transport::{Subscription, Transport};
 use gleaner_vitals::{Spreads, usage};
 

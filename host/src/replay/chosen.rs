@@ -2,10 +2,10 @@
 
 use std::collections::HashSet;
 
-use gleaner_protocol::manifest::Record;
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
+use gleaner_drives::Replay;
+use gleaner_lambda::manifest::Record;
 use gleaner_recorder::{MESSAGE_MAX, TOPICS_MAX};
-use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, Qos, TopicSpec};
 
 use super::Options;

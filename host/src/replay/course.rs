@@ -1,8 +1,8 @@
 //! The course of a drive: every sample delivered, and every wake that the schedule asks for, in the drive's time.
 
-use gleaner_protocol::Failure;
-use gleaner_protocol::journal::Part;
-use gleaner_transport::replay::{Replay, ReplayError, Step};
+use gleaner_base::Failure;
+use gleaner_drives::{Replay, ReplayError, Step};
+use gleaner_journal::Part;
 
 use crate::api::data::Wake;
 use crate::schedule::Schedule;

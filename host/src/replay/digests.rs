@@ -5,8 +5,8 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::thread::{self, JoinHandle};
 
-use gleaner_protocol::Explain;
-use gleaner_protocol::journal::DriveDigest;
+use gleaner_base::Explain;
+use gleaner_journal::DriveDigest;
 
 /// Read at once.
 const PIECE: usize = 64 << 10;

@@ -4,8 +4,8 @@ use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::own_file::{self, InTheWay};
-use gleaner_protocol::{Exit, Explain};
+use gleaner_base::own_file::{self, InTheWay};
+use gleaner_base::{Exit, Explain};
 
 use crate::stage::LOCK;
 

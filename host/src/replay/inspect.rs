@@ -6,9 +6,10 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use clap::Args;
-use gleaner_protocol::{DriveSeen, Exit, Failure, Picture, RecordedTopicSeen, Report, Spread};
-use gleaner_transport::message::{CompressedView, ImageView, Sources};
-use gleaner_transport::replay::{Options, Replay, Step, files_of};
+use gleaner_base::{Exit, Failure};
+use gleaner_drives::{Options, Replay, Step, files_of};
+use gleaner_messages::{CompressedView, ImageView, Sources};
+use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen, Report, Spread};
 use gleaner_transport::{DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 use gleaner_vitals::Durations;
 

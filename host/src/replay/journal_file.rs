@@ -4,9 +4,10 @@ use std::fs::{File, TryLockError};
 use std::io::{self, Seek};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::journal::{self, End, Entry, Header, JournalError, Reader};
-use gleaner_protocol::own_file::{self, InTheWay};
-use gleaner_protocol::{Exit, Explain, Failure};
+use gleaner_base::own_file::{self, InTheWay};
+use gleaner_base::{Exit, Explain, Failure};
+use gleaner_journal as journal;
+use gleaner_journal::{End, Entry, Header, JournalError, Reader};
 
 use crate::stage::OutputError;
 

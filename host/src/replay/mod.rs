@@ -26,8 +26,9 @@ pub use packed::{Packed, UnpackedArgs};
 
 use std::io::Write;
 
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Failure, Report};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::manifest::Manifest;
+use gleaner_protocol::Report;
 
 use self::hold::Hold;
 use self::options::{Results, Task};

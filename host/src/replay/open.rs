@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
-use gleaner_protocol::journal::Part;
-use gleaner_protocol::{Exit, Explain, Failure};
-use gleaner_transport::message::Sources;
-use gleaner_transport::replay::{self, Replay, ReplayError, files_of};
+use gleaner_base::{Exit, Explain, Failure};
+use gleaner_drives as replay;
+use gleaner_drives::{Replay, ReplayError, files_of};
+use gleaner_journal::Part;
+use gleaner_messages::Sources;
 
 use super::Options;
 use super::options::Drives;

@@ -3,10 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use gleaner_base::{Exit, Failure};
+use gleaner_drives::{Unpacked, journals_of};
 use gleaner_jail::Paths;
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{BuildDir, DriveTime, Exit, Failure};
-use gleaner_transport::replay::{Unpacked, journals_of};
+use gleaner_lambda::BuildDir;
+use gleaner_lambda::manifest::Manifest;
+use gleaner_protocol::DriveTime;
 
 use super::journal_file;
 use super::part::Wanted;

@@ -3,8 +3,9 @@
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-use gleaner_protocol::{Exit, Failure};
-use gleaner_transport::replay::{self, Name, Unpacked, unpack};
+use gleaner_base::{Exit, Failure};
+use gleaner_drives as replay;
+use gleaner_drives::{Name, Unpacked, unpack};
 
 use super::open::DriveError;
 use super::{Job, Options};

@@ -1,8 +1,9 @@
 //! Which part of a drive is replayed.
 
-use gleaner_protocol::journal::Part;
-use gleaner_protocol::{DriveTime, Exit, Failure};
-use gleaner_transport::replay::Replay;
+use gleaner_base::{Exit, Failure};
+use gleaner_drives::Replay;
+use gleaner_journal::Part;
+use gleaner_protocol::DriveTime;
 
 /// The part that is asked for; it means something once a drive is open.
 #[derive(Clone, Copy, Debug, Default)]

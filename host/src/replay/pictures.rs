@@ -5,8 +5,9 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_protocol::signals::{Picture, Signals};
-use gleaner_protocol::{Decision, own_file};
+use gleaner_base::own_file;
+use gleaner_lambda::Decision;
+use gleaner_lambda::signals::{Picture, Signals};
 use gleaner_recorder::{is_image, thumbnail};
 use gleaner_transport::SampleMeta;
 
@@ -160,8 +161,9 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::{Cause, Trigger, TriggerKind};
-    use gleaner_transport::{Endian, Guid};
+    use gleaner_lambda::{Cause, Trigger, TriggerKind};
+    use gleaner_messages::Endian;
+    use gleaner_transport::Guid;
 
     use super::*;
 

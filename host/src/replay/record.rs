@@ -3,13 +3,14 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_protocol::journal::{Entry, Header};
-use gleaner_protocol::manifest::{Manifest, Record};
-use gleaner_protocol::{Clip, Exit, Failure};
+use gleaner_base::{Exit, Failure};
+use gleaner_drives::Replay;
+use gleaner_journal::{Entry, Header};
+use gleaner_lambda::Clip;
+use gleaner_lambda::manifest::{Manifest, Record};
 use gleaner_recorder::{
     Counts, Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image, lambda_digest,
 };
-use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, Transport, Verdict};
 
 use super::chosen;

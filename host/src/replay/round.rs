@@ -5,10 +5,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::journal::{End, Part};
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Explain, Failure, FaultKind, Report, Round, Summary, TopicReport, WokenBy};
-use gleaner_transport::replay::{Progress, Replay, Step};
+use gleaner_base::{Exit, Explain, Failure};
+use gleaner_drives::{Progress, Replay, Step};
+use gleaner_journal::{End, Part};
+use gleaner_lambda::FaultKind;
+use gleaner_lambda::manifest::Manifest;
+use gleaner_protocol::{Report, Round, Summary, TopicReport, WokenBy};
 use gleaner_vitals::usage;
 
 use super::course::{self, Course, Reached, Span};

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_protocol::Decision;
-use gleaner_protocol::manifest::ConfigValue;
-use gleaner_protocol::signals::{Bin, Signals, Spread};
+use gleaner_lambda::Decision;
+use gleaner_lambda::manifest::ConfigValue;
+use gleaner_lambda::signals::{Bin, Signals, Spread};
 use hdrhistogram::Histogram;
 
 use super::pictures::{Camera, Pictures};

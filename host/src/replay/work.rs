@@ -1,8 +1,8 @@
 //! The course of a replay in a worker: the lambda is woken as its schedule says, and nothing is written.
 
-use gleaner_protocol::Failure;
-use gleaner_protocol::manifest::Manifest;
-use gleaner_transport::replay::{Replay, Step};
+use gleaner_base::Failure;
+use gleaner_drives::{Replay, Step};
+use gleaner_lambda::manifest::Manifest;
 
 use super::Options;
 use super::course::{self, Course, Span};

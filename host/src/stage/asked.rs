@@ -3,8 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
-use gleaner_protocol::{BuildDir, Exit, Failure, Vehicle};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
+use gleaner_lambda::{BuildDir, Vehicle};
 
 use crate::input::Remap;
 

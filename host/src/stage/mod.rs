@@ -6,12 +6,13 @@ mod asked;
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Explain, Failure, Fault, visible};
+use gleaner_base::{Exit, Explain, Failure, visible};
+use gleaner_lambda::Fault;
+use gleaner_lambda::manifest::Manifest;
 use gleaner_transport::{Transport, TransportError};
 
 pub use asked::{Asked, AskedArgs, tighten};
-pub use gleaner_protocol::{LOCK, Output, OutputError, RESULTS};
+pub use gleaner_lambda::{LOCK, Output, OutputError, RESULTS};
 
 use crate::api::Session;
 use crate::api::data::Topic;

@@ -62,8 +62,7 @@ impl Gaps {
     }
 
     /// Whether that sample came, or is older than what is known: it is neither the next, nor in a gap that may be filled.
-    #[cfg(feature = "dds")]
-    pub(crate) fn has(&self, writer: Guid, seq: u64) -> bool {
+    pub fn has(&self, writer: Guid, seq: u64) -> bool {
         let known = self.writers.iter().find(|known| known.guid == writer);
         known.is_some_and(|known| {
             let missing = known.open.iter().any(|(first, last)| (*first..=*last).contains(&seq));
@@ -144,7 +143,6 @@ mod tests {
         assert_eq!(lost_after(&[5, 7, 7, 5, 1]), 1);
     }
 
-    #[cfg(feature = "dds")]
     #[test]
     fn what_came_is_told_from_what_is_missing() {
         let mut gaps = Gaps::default();

@@ -5,11 +5,11 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 
-use crate::message::Definitions;
-use crate::nearest::nearest;
 use crate::transport::{
     DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict, same_type,
 };
+use gleaner_base::words::nearest;
+use gleaner_messages::Definitions;
 
 /// The in-process transport.
 #[derive(Default)]

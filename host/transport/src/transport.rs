@@ -3,8 +3,8 @@
 use std::fmt;
 use std::sync::Arc;
 
-use crate::message::{Definitions, Endian, MessageError, SourcesError};
-use crate::nearest::hint;
+use gleaner_base::words::hint;
+use gleaner_messages::{Definitions, Endian, MessageError, SourcesError};
 
 /// One topic that a caller wants to receive.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -272,8 +272,8 @@ fn list(names: &[String]) -> String {
 }
 
 /// Whether two message type names mean the same type: `pkg/msg/Type` equals `pkg/Type`.
-pub(crate) fn same_type(a: &str, b: &str) -> bool {
-    crate::message::short_name(a) == crate::message::short_name(b)
+pub fn same_type(a: &str, b: &str) -> bool {
+    gleaner_messages::short_name(a) == gleaner_messages::short_name(b)
 }
 
 #[cfg(test)]

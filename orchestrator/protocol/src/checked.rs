@@ -1,6 +1,6 @@
 use serde::{Deserialize, Serialize};
 
-use crate::manifest::Kind;
+use gleaner_lambda::manifest::Kind;
 
 /// What was found out about a built lambda without any sample: it could be loaded, it fits the interface, and its `init` returned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,7 +1,7 @@
 use std::str::FromStr;
 use std::time::Duration;
 
-use crate::manifest::parse_duration;
+use gleaner_base::parse_duration;
 
 /// A time in a drive, as people give it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

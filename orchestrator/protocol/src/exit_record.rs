@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Exit, own_file, write_whole};
+use gleaner_base::{Exit, own_file, write_whole};
 
 /// How long a runtime may take for its end once it was asked for it; then `gleaner-shim` kills it. Who started both waits longer.
 pub const UNTIL_KILLED: Duration = Duration::from_secs(30);

@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::manifest::Kind;
+use gleaner_lambda::manifest::Kind;
 
 /// How a lambda is doing on live topics. Counts are since its start; spreads are since the report before, and in the last report
 /// since the start.

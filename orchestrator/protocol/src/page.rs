@@ -1,14 +1,11 @@
 use serde::{Deserialize, Serialize};
 
-use crate::manifest::{Manifest, Schedule};
-use crate::{Cause, Decision, Live, LogLine};
+use crate::Live;
+use gleaner_lambda::manifest::{Manifest, Schedule};
+use gleaner_lambda::{Cause, Decision, LogLine};
 
 /// The environment variable with the number of the pipe by which a live lambda's process hands pages to `gleaner-shim`.
 pub const RESULTS_ENV: &str = "GLEANER_RESULTS";
-
-/// Longest page, in bytes, with its line break. A decision with all triggers and attributes that are allowed, each byte of them
-/// escaped, has 1.7 MB.
-pub const PAGE_BYTES: usize = 2 << 20;
 
 /// What a live lambda's process hands to `gleaner-shim`, which writes the files of its results: one line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

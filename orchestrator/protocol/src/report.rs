@@ -2,9 +2,10 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::journal::Part;
-use crate::manifest::Kind;
-use crate::{Checked, Decision, DriveSeen, Layer, Live};
+use crate::{Checked, DriveSeen, Layer, Live};
+use gleaner_journal::Part;
+use gleaner_lambda::Decision;
+use gleaner_lambda::manifest::Kind;
 
 /// One line of JSON that `gleaner-runtime` writes on its standard output for the program that started it.
 ///

@@ -1,4 +1,5 @@
-use crate::{Decision, Doing, ExitRecord, Fault, FaultKind, WokenBy};
+use crate::{Doing, ExitRecord, WokenBy};
+use gleaner_lambda::{Decision, Fault, FaultKind};
 
 impl ExitRecord {
     /// Returns the decision of the wake in which the process of a lambda ended: a fault of kind `killed`. None if the end was requested,

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_protocol::{Exit, Explain, Failure};
-use gleaner_transport::replay::{Replay, ReplayError};
-use gleaner_transport::{DiscoveredTopic, Endian, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_base::{Exit, Explain, Failure};
+use gleaner_drives::{Replay, ReplayError};
+use gleaner_messages::Endian;
+use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 
 use super::images::Decoder;
 use super::{Renamed, Source, Topic};
@@ -251,7 +252,7 @@ impl Source for Drive {
 #[cfg(test)]
 mod tests {
     use clap::Parser;
-    use gleaner_transport::message::ImageView;
+    use gleaner_messages::ImageView;
 
     use super::*;
 

@@ -1,10 +1,8 @@
 //! Compressed images become raw ones, in another size if asked for.
 
 use gleaner_image::{ImageError, decode_rgb8, probe};
-use gleaner_transport::Endian;
-use gleaner_transport::message::{
-    CdrError, CompressedView, Definitions, FieldPath, HeaderStamp, Sources, Value, header_stamp,
-};
+use gleaner_messages::Endian;
+use gleaner_messages::{CdrError, CompressedView, Definitions, FieldPath, HeaderStamp, Sources, Value, header_stamp};
 
 use crate::args::Size;
 use crate::buffer::{Buffer, Pool};
@@ -88,7 +86,7 @@ fn scale_to_bgr(rgb: &[u8], from: Size, bgr: &mut [u8], to: Size) {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_transport::message::ImageView;
+    use gleaner_messages::ImageView;
     use jpeg_encoder::{ColorType, Encoder};
 
     use super::*;

@@ -6,7 +6,7 @@ mod synthetic;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 use crate::args::Args;
 use crate::offer::Offer;

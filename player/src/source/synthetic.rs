@@ -3,8 +3,8 @@
 //! The pixels of all frames are equal, and equal in every run. Each message has its number, from 0, in `header.frame_id`,
 //! ten digits long, so that a reader can tell what was lost.
 
-use gleaner_protocol::Failure;
-use gleaner_transport::Endian;
+use gleaner_base::Failure;
+use gleaner_messages::Endian;
 
 use super::{Renamed, Source, Topic};
 use crate::args::{Args, Camera, Size};
@@ -136,8 +136,8 @@ fn imu(number: u64) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use clap::Parser;
-    use gleaner_protocol::Exit;
-    use gleaner_transport::message::{Definitions, FieldPath, ImageView, Sources, Value};
+    use gleaner_base::Exit;
+    use gleaner_messages::{Definitions, FieldPath, ImageView, Sources, Value};
 
     use super::*;
 

@@ -2,7 +2,7 @@
 //!
 //! The same formulas stand in `tests/peers/sum.h` and `tests/peers/python/peer.py`.
 
-use gleaner_transport::message::Endian;
+use gleaner_messages::Endian;
 
 /// A type that peers speak, and how large its messages are.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]

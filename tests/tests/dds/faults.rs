@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 use std::net::UdpSocket;
 use std::process::Command;
 
+use gleaner_dds::Dds;
 use gleaner_tests::peers::message::Type;
 use gleaner_tests::peers::{Kind, PATIENCE, Peer};
-use gleaner_transport::dds::Dds;
 use gleaner_transport::{Qos, Transport};
 use gleaner_vitals::usage;
 use libtest_mimic::Failed;

@@ -1,9 +1,9 @@
 //! Nodes of others see us: `ros_discovery_info`, as a program reads it that knows one size of Gid.
 
+use gleaner_dds::Distro;
 use gleaner_tests::peers::message::Type;
 use gleaner_tests::peers::{Kind, Node, Peer, Said};
 use gleaner_transport::Qos;
-use gleaner_transport::dds::Distro;
 use libtest_mimic::Failed;
 
 use crate::ours::{Heard, join};

@@ -3,9 +3,9 @@
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
+use gleaner_dds::{Dds, Distro, Options};
 use gleaner_tests::peers::PATIENCE;
 use gleaner_tests::peers::message::Type;
-use gleaner_transport::dds::{Dds, Distro, Options};
 use gleaner_transport::{Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
 use libtest_mimic::Failed;
 

@@ -1,11 +1,11 @@
 //! Several of our participants read one topic: its writer keeps running, and each of them receives samples.
 
+use gleaner_dds::Dds;
 use gleaner_tests::live::run;
 use gleaner_tests::peers::message::Type;
 use gleaner_tests::peers::{Kind, Peer};
 use gleaner_tests::{Folder, root};
 use gleaner_transport::Qos;
-use gleaner_transport::dds::Dds;
 use libtest_mimic::Failed;
 
 use crate::faults::{announcement, udp_ports};

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 
-use gleaner_protocol::{Exit, Failure, Summary, Verified};
+use gleaner_base::{Exit, Failure};
+use gleaner_protocol::{Summary, Verified};
 
 use super::compare::{Replayed, read};
 use crate::checkout::Checkout;

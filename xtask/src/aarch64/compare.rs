@@ -5,7 +5,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 use serde_json::{Map, Value};
 
 /// What a replay left, less how long it took.

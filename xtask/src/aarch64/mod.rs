@@ -15,7 +15,7 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::{Exit, Failure};
+use gleaner_base::{Exit, Failure};
 
 use crate::checkout::Checkout;
 use crate::setup;

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::Path;
 
-use gleaner_protocol::own_file;
+use gleaner_base::own_file;
 
 use super::recover::Pause;
 use crate::error::RecordError;

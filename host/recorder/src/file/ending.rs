@@ -6,8 +6,8 @@ use std::fmt::Display;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use gleaner_protocol::journal::{FileDigest, Header};
-use gleaner_protocol::{Clip, ClipLambda, ClipTopic, Moment};
+use gleaner_journal::{FileDigest, Header};
+use gleaner_lambda::{Clip, ClipLambda, ClipTopic, Moment};
 
 use super::written::{Written, WrittenTopic, crc32};
 use super::{About, Ending};

@@ -5,8 +5,9 @@ use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use gleaner_base::own_file;
+use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
-use gleaner_protocol::{Clip, own_file};
 use tracing::warn;
 
 use super::list::{List, Listed};

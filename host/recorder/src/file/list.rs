@@ -4,7 +4,8 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Component, Path, PathBuf};
 
-use gleaner_protocol::{Clip, own_file};
+use gleaner_base::own_file;
+use gleaner_lambda::Clip;
 use serde::Deserialize;
 use tracing::warn;
 

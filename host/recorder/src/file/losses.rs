@@ -5,8 +5,8 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
+use gleaner_base::own_file;
 use gleaner_protocol::link::Loss;
-use gleaner_protocol::own_file;
 
 use crate::error::RecordError;
 

@@ -39,8 +39,8 @@ mod written;
 
 use std::sync::Arc;
 
-use gleaner_protocol::journal::Header;
-use gleaner_protocol::{ClipLambda, Moment};
+use gleaner_journal::Header;
+use gleaner_lambda::{ClipLambda, Moment};
 
 pub(crate) use ending::CONTINUES;
 pub use folder::{Earlier, Folder};

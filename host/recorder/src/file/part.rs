@@ -3,7 +3,7 @@
 use std::io::{self, BufReader, Read};
 use std::path::Path;
 
-use gleaner_protocol::own_file;
+use gleaner_base::own_file;
 
 /// Who wrote a file.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use gleaner_protocol::Clip;
+use gleaner_lambda::Clip;
 
 use super::list::List;
 use crate::error::RecordError;

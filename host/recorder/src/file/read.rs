@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_protocol::Clip;
-use gleaner_transport::replay::{Damage, Limits, Place, Replay, ReplayError, read_extras};
+use gleaner_drives::{Damage, Limits, Place, Replay, ReplayError, read_extras};
+use gleaner_lambda::Clip;
 use gleaner_transport::{SampleMeta, TopicSpec, Transport, Verdict};
 
 use super::ending::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};

@@ -9,8 +9,9 @@ use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_protocol::{Clip, Recovered, own_file};
-use gleaner_transport::replay::Damage;
+use gleaner_base::own_file;
+use gleaner_drives::Damage;
+use gleaner_lambda::{Clip, Recovered};
 use tracing::{info, warn};
 
 use super::part::{Origin, origin};

@@ -5,7 +5,7 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
-use gleaner_protocol::own_file;
+use gleaner_base::own_file;
 use tracing::warn;
 
 use super::durable;

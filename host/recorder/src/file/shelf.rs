@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use gleaner_base::Failure;
+use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
-use gleaner_protocol::{Clip, Failure};
 use tracing::{error, warn};
 
 use super::durable;

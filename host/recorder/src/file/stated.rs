@@ -6,9 +6,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use gleaner_protocol::journal::Header;
-use gleaner_protocol::{Clip, ClipLambda, ClipTopic, Moment, excerpt, visible};
-use gleaner_transport::replay::{Attachment, Extras};
+use gleaner_base::{excerpt, visible};
+use gleaner_drives::{Attachment, Extras};
+use gleaner_journal::Header;
+use gleaner_lambda::{Clip, ClipLambda, ClipTopic, Moment};
 
 use super::ending::{
     self, BEGIN, CLIP_RECORD, CONTINUES, DECISION_RECORD, LAMBDA_RECORD, LINE, THUMBNAIL, TOPIC_RECORD, json,

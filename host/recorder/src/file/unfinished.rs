@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use gleaner_protocol::{Clip, Recovered};
+use gleaner_lambda::{Clip, Recovered};
 use gleaner_transport::{Guid, SampleMeta};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};

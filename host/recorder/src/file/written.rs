@@ -2,7 +2,8 @@
 
 use std::collections::HashMap;
 
-use gleaner_transport::{Endian, SampleMeta};
+use gleaner_messages::Endian;
+use gleaner_transport::SampleMeta;
 
 use super::Topic;
 

@@ -9,7 +9,7 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::own_file;
+use gleaner_base::own_file;
 use tracing::warn;
 
 use super::{Held, Place};

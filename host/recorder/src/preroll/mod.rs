@@ -9,8 +9,9 @@ mod ram;
 
 use std::path::PathBuf;
 
-use gleaner_protocol::manifest::Store;
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_lambda::manifest::Store;
+use gleaner_messages::Endian;
+use gleaner_transport::{Guid, SampleMeta};
 
 pub use losses::Losses;
 

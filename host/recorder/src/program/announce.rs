@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use gleaner_protocol::Failure;
-use gleaner_protocol::manifest::Store;
+use gleaner_base::Failure;
+use gleaner_lambda::manifest::Store;
 use tracing::warn;
 
 use super::course::{Course, Recorded, STAGING};

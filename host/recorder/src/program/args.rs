@@ -4,9 +4,10 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 
 use clap::Parser;
-use gleaner_protocol::manifest::TopicName;
-use gleaner_protocol::{Exit, Failure};
-use gleaner_transport::dds::{self, Clock, Dds};
+use gleaner_base::{Exit, Failure};
+use gleaner_dds as dds;
+use gleaner_dds::{Clock, Dds};
+use gleaner_lambda::manifest::TopicName;
 
 use super::{Feed, Options};
 

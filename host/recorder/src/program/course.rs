@@ -10,10 +10,10 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, Builder};
 use std::time::{Duration, Instant};
 
+use gleaner_base::{Exit, Failure};
+use gleaner_dds::Clock;
+use gleaner_lambda::manifest::Store;
 use gleaner_protocol::link::RecorderReport;
-use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Exit, Failure};
-use gleaner_transport::dds::Clock;
 use gleaner_vitals::Spreads;
 use tracing::{error, warn};
 

@@ -6,9 +6,10 @@ use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{Builder, Thread};
 
-use gleaner_protocol::journal::{Entry, Header};
+use gleaner_base::{Exit, Failure, hex};
+use gleaner_journal::{Entry, Header};
+use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::link::{Add, Answers, Controlled, Heard, LambdaLink, LinkError, Order};
-use gleaner_protocol::{BuildDir, Exit, Failure, Manifest, hex};
 use sha2::{Digest, Sha256};
 use tracing::warn;
 

@@ -3,9 +3,9 @@
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Instant;
 
-use gleaner_protocol::journal::Entry;
+use gleaner_journal::Entry;
+use gleaner_lambda::manifest::Record;
 use gleaner_protocol::link::Answers;
-use gleaner_protocol::manifest::Record;
 use gleaner_vitals::Spreads;
 use tracing::warn;
 

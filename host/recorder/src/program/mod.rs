@@ -32,8 +32,8 @@ use std::sync::atomic::AtomicBool;
 use std::{fs::File, io};
 
 use clap::Parser;
-use gleaner_protocol::{Exit, Failure};
-use gleaner_transport::dds::Clock;
+use gleaner_base::{Exit, Failure};
+use gleaner_dds::Clock;
 use rustix::process::{Signal, set_parent_process_death_signal};
 
 use args::Args;

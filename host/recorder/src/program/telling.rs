@@ -3,7 +3,7 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::Failure;
+use gleaner_base::Failure;
 use gleaner_protocol::link::{Loss, RecordedTopic, RecorderReport, RecorderStatus};
 use tracing::{error, warn};
 

@@ -7,9 +7,10 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError};
 use std::thread::Thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Network, visible};
-use gleaner_transport::dds::Dds;
-use gleaner_transport::message::Definitions;
+use gleaner_base::visible;
+use gleaner_dds::Dds;
+use gleaner_messages::Definitions;
+use gleaner_protocol::Network;
 use gleaner_transport::{DiscoveredTopic, Qos, Sink, Status, Subscription, TopicSpec, Transport, TransportError};
 use gleaner_vitals::usage;
 use tracing::{error, warn};

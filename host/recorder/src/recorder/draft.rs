@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use gleaner_protocol::{Clip, Moment};
+use gleaner_lambda::{Clip, Moment};
 use gleaner_transport::SampleMeta;
 
 use super::limits::Limits;

@@ -1,6 +1,6 @@
 //! Clips that are finished. Their list is on disk: of many, only the newest are remembered.
 
-use gleaner_protocol::Clip;
+use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 
 use crate::RecordError;

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use gleaner_lambda::manifest::Store;
+use gleaner_lambda::{Clip, Moment, Trigger};
 use gleaner_protocol::link::Loss;
-use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Clip, Moment, Trigger};
 use gleaner_transport::SampleMeta;
 
 use super::finished::KEPT;

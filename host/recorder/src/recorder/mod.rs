@@ -16,8 +16,8 @@ mod walk;
 
 use std::sync::Arc;
 
-use gleaner_protocol::journal::{Encoder, Entry};
-use gleaner_protocol::{Clip, Moment, TriggerKind};
+use gleaner_journal::{Encoder, Entry};
+use gleaner_lambda::{Clip, Moment, TriggerKind};
 use gleaner_transport::{Gaps, SampleMeta};
 
 use crate::file::{Folder, Topic};

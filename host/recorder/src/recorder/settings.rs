@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use gleaner_protocol::manifest::Store;
+use gleaner_lambda::manifest::Store;
 
 /// How a recorder works.
 #[derive(Clone, Debug)]

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use gleaner_protocol::journal::{Encoder, Header};
-use gleaner_protocol::manifest::Record;
-use gleaner_protocol::{Clip, ClipLambda, Moment};
+use gleaner_journal::{Encoder, Header};
+use gleaner_lambda::manifest::Record;
+use gleaner_lambda::{Clip, ClipLambda, Moment};
 
 use gleaner_transport::{Gaps, SampleMeta};
 
@@ -253,7 +253,7 @@ impl Stock {
         let (lambda, at_ns) = group.first;
         self.waiting.find(lambda, at_ns).cloned().unwrap_or_else(|| Moment {
             lambda: self.desk.crews[lambda].header.lambda.clone(),
-            kind: gleaner_protocol::TriggerKind::Event,
+            kind: gleaner_lambda::TriggerKind::Event,
             label: String::new(),
             score: None,
             attributes: None,

@@ -1,6 +1,6 @@
 //! Bounds, which here are lowered, and what is remembered from wake to wake.
 
-use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_lambda::TriggerKind::{Event, Start};
 
 use super::*;
 use crate::support::*;

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::RangeInclusive;
 
-use gleaner_protocol::Moment;
+use gleaner_lambda::Moment;
 
 use crate::window::{Group, Windows};
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use gleaner_protocol::TriggerKind;
+use gleaner_lambda::TriggerKind;
 
 use super::{Group, Rules, Window};
 

@@ -1,4 +1,4 @@
-use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
+use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 
 use super::*;
 

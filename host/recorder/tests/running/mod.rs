@@ -11,13 +11,14 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use gleaner_protocol::journal::{FileDigest, Header};
+use gleaner_base::{Failure, hex};
+use gleaner_dds::Clock;
+use gleaner_journal::{FileDigest, Header};
+use gleaner_lambda::Clip;
+use gleaner_messages::Definitions;
 use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
-use gleaner_protocol::{Clip, Failure, hex};
 use gleaner_recorder::program::{Feed, Options, Pulse, run};
-use gleaner_transport::dds::Clock;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::message::Definitions;
 use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict};
 use sha2::{Digest, Sha256};
 

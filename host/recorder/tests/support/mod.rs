@@ -8,11 +8,12 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use gleaner_protocol::journal::{Entry, Header, JournalInput, Reader, Said, Seen, Woken};
-use gleaner_protocol::manifest::{Kind, Manifest, Store};
-use gleaner_protocol::{Clip, Trigger, TriggerKind};
+use gleaner_journal::{Entry, Header, JournalInput, Reader, Said, Seen, Woken};
+use gleaner_lambda::manifest::{Kind, Manifest, Store};
+use gleaner_lambda::{Clip, Trigger, TriggerKind};
+use gleaner_messages::Endian;
 use gleaner_recorder::{Folder, LambdaId, Member, Recorder, Settings, Topic, TopicId};
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_transport::{Guid, SampleMeta};
 
 pub const MS: i64 = 1_000_000;
 pub const S: i64 = 1_000 * MS;

@@ -8,8 +8,10 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use gleaner_base::{Exit, Explain};
 use gleaner_jail::cgroup::CGROUP_ENV;
-use gleaner_protocol::{Exit, Explain, LAYERS_ENV, Looked, Parts, PartsError};
+use gleaner_parts::{Looked, Parts, PartsError};
+use gleaner_protocol::LAYERS_ENV;
 
 use crate::isolation::{self, Inside};
 

@@ -301,8 +301,8 @@ fn roi_in(Roi { x, y, width, height }: Roi) -> image::Roi {
     image::Roi { x, y, width, height }
 }
 
-fn value(value: gleaner_transport::message::Value<'_>) -> Value {
-    use gleaner_transport::message::Value as Read;
+fn value(value: gleaner_messages::Value<'_>) -> Value {
+    use gleaner_messages::Value as Read;
     match value {
         Read::Bool(value) => Value::Boolean(value),
         Read::Signed(value) => Value::Signed(value),

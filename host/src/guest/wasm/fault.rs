@@ -1,6 +1,6 @@
 //! From a trap to a fault with a named cause.
 
-use gleaner_protocol::{Fault, FaultKind};
+use gleaner_lambda::{Fault, FaultKind};
 use wasmtime::component::ResourceTableError;
 use wasmtime::{Trap, WasmBacktrace};
 use wasmtime_wasi::I32Exit;

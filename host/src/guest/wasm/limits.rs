@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use gleaner_protocol::manifest::Limits;
+use gleaner_lambda::manifest::Limits;
 use wasmtime::ResourceLimiter;
 
 /// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in the same time.
@@ -176,7 +176,7 @@ mod tests {
     /// Of a mebibyte and 100 elements.
     fn caps() -> Caps {
         let mut limits = Limits::default();
-        (limits.memory, limits.tables) = (gleaner_protocol::manifest::ByteSize::mib(1), 100);
+        (limits.memory, limits.tables) = (gleaner_base::ByteSize::mib(1), 100);
         let meter = Meter::default();
         meter.begin(1_000_000);
         Caps::new(&limits, meter)

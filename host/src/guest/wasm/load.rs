@@ -5,10 +5,11 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use gleaner_base::{Exit, Explain, Failure};
 use gleaner_compile::{
     COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Entry, Found, Nans, make_cache, read_component,
 };
-use gleaner_protocol::{Exit, Explain, Failure, Parts, PartsError};
+use gleaner_parts::{Parts, PartsError};
 use sha2::{Digest, Sha256};
 use wasmtime::component::{Component, Linker};
 use wasmtime::{Engine, Store};

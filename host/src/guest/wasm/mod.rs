@@ -20,8 +20,8 @@ pub use load::{Loaded, WasmError};
 
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::manifest::{ConfigValue, Limits};
-use gleaner_protocol::{Fault, FaultKind};
+use gleaner_lambda::manifest::{ConfigValue, Limits};
+use gleaner_lambda::{Fault, FaultKind};
 use tokio::runtime::{self, Runtime};
 use wasmtime::Store;
 use wasmtime::component::ResourceTable;

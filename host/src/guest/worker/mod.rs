@@ -14,8 +14,9 @@ mod process;
 mod remote;
 mod sender;
 
-use gleaner_protocol::signals::Curve;
-use gleaner_protocol::{Fault, Layer, Trigger};
+use gleaner_lambda::signals::Curve;
+use gleaner_lambda::{Fault, Trigger};
+use gleaner_protocol::Layer;
 use serde::{Deserialize, Serialize};
 
 #[cfg(feature = "python")]

@@ -7,7 +7,9 @@ use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{Exit, ExitRecord, Failure, Parts};
+use gleaner_base::{Exit, Failure};
+use gleaner_parts::Parts;
+use gleaner_protocol::ExitRecord;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::ioctl_fionbio;
 use rustix::process::{Pid, Signal, kill_process};

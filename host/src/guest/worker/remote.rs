@@ -4,10 +4,12 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_protocol::journal::Said;
-use gleaner_protocol::manifest::{Limits, Manifest};
-use gleaner_protocol::signals::{Curve, Signals};
-use gleaner_protocol::{Exit, Failure, Fault, FaultKind, Layer, UNTIL_KILLED};
+use gleaner_base::{Exit, Failure};
+use gleaner_journal::Said;
+use gleaner_lambda::manifest::{Limits, Manifest};
+use gleaner_lambda::signals::{Curve, Signals};
+use gleaner_lambda::{Fault, FaultKind};
+use gleaner_protocol::{Layer, UNTIL_KILLED};
 
 use super::process::{Ended, NoMessage, Process};
 use super::{Called, Done, Message, Woken};

@@ -5,7 +5,9 @@ use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use gleaner_protocol::{Exit, Fault, Layer};
+use gleaner_base::Exit;
+use gleaner_lambda::Fault;
+use gleaner_protocol::Layer;
 use gleaner_vitals::usage;
 
 use super::{Called, Done, Message, Woken};

@@ -3,11 +3,12 @@
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::journal::{Difference, Entry, Header, JournalError, Reader};
-use gleaner_protocol::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
-use gleaner_protocol::{BuildDir, Exit, Failure, excerpt, own_file};
+use gleaner_base::{Exit, Failure, excerpt, own_file};
+use gleaner_drives::{ReplayError, read_extras};
+use gleaner_journal::{Difference, Entry, Header, JournalError, Reader};
+use gleaner_lambda::BuildDir;
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
 use gleaner_recorder::{Stated, Untrue};
-use gleaner_transport::replay::{ReplayError, read_extras};
 use serde_json::Value;
 
 use crate::input::Remap;

@@ -3,11 +3,11 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_protocol::journal::{Difference, Entry, Header, Woken};
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Failure, excerpt};
+use gleaner_base::{Exit, Failure, excerpt};
+use gleaner_drives::Replay;
+use gleaner_journal::{Difference, Entry, Header, Woken};
+use gleaner_lambda::manifest::Manifest;
 use gleaner_recorder::{RecordError, Stated};
-use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Transport};
 
 use super::claim::{unreadable_clip, untrue};

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use gleaner_protocol::journal::{Difference, DriveDigest, End, Entry, Woken};
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Exit, Failure};
-use gleaner_transport::replay::{Replay, Step};
+use gleaner_base::{Exit, Failure};
+use gleaner_drives::{Replay, Step};
+use gleaner_journal::{Difference, DriveDigest, End, Entry, Woken};
+use gleaner_lambda::manifest::Manifest;
 
 use super::{Claim, Proved, Remake, counts_differ, different, seconds};
 use crate::api::data::{Topic, Wake};
@@ -130,7 +130,7 @@ fn in_words(at_ns: i64, start_ns: i64) -> String {
     format!("at {:.6} s", seconds(at_ns, start_ns))
 }
 
-fn damaged(error: gleaner_transport::replay::ReplayError, wakes: u64) -> Failure {
+fn damaged(error: gleaner_drives::ReplayError, wakes: u64) -> Failure {
     let help = format!("the {wakes} decisions before the damage are the same; copy the file again if you can");
     Failure::from(DriveError(error)).with_help(help)
 }

@@ -15,9 +15,10 @@ pub(super) use claim::Claim;
 use std::sync::Arc;
 use std::time::Instant;
 
-use gleaner_protocol::journal::{Difference, Entry};
-use gleaner_protocol::manifest::Manifest;
-use gleaner_protocol::{Failure, Verified};
+use gleaner_base::Failure;
+use gleaner_journal::{Difference, Entry};
+use gleaner_lambda::manifest::Manifest;
+use gleaner_protocol::Verified;
 use gleaner_transport::Transport;
 
 use self::claim::different;

@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_transport::message::Definitions;
-use gleaner_transport::replay::{Replay, ReplayError};
+use gleaner_drives::{Replay, ReplayError};
+use gleaner_messages::Definitions;
 use gleaner_transport::{
     DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict,
 };

@@ -1,7 +1,8 @@
 //! The triggers of a clip, compared with those of its journal.
 
-use gleaner_protocol::journal::{Difference, Entry};
-use gleaner_protocol::{Moment, excerpt};
+use gleaner_base::excerpt;
+use gleaner_journal::{Difference, Entry};
+use gleaner_lambda::Moment;
 use gleaner_recorder::Stated;
 
 use super::counts_differ;

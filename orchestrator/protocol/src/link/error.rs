@@ -3,8 +3,8 @@ use std::io;
 use rustix::io::Errno;
 
 use super::FRAME_MAX;
-use crate::journal::Malformed;
-use crate::{Exit, Explain};
+use gleaner_base::{Exit, Explain};
+use gleaner_journal::Malformed;
 
 /// Why two programs do not understand each other.
 #[derive(Debug, thiserror::Error)]

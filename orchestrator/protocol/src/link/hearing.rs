@@ -9,7 +9,7 @@ use rustix::net::{SendFlags, send};
 
 use super::LinkError;
 use super::frame::{self, tag};
-use crate::journal::{Decoder, Entry, Header, INPUTS_MAX};
+use gleaner_journal::{Decoder, Entry, Header, INPUTS_MAX};
 
 const LAMBDA: &str = "the lambda";
 

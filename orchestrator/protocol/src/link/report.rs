@@ -2,7 +2,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Clip, Network, Spread};
+use crate::{Network, Spread};
+use gleaner_lambda::Clip;
 
 /// One line of JSON that `gleaner-recorder` writes on its standard output for the program that started it.
 ///

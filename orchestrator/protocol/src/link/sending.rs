@@ -12,7 +12,7 @@ use super::LinkError;
 use super::frame::{self, HEAD, tag};
 use super::queue::Queue;
 use crate::ToRecorder;
-use crate::journal::{Encoder, Entry, Header};
+use gleaner_journal::{Encoder, Entry, Header};
 
 const RECORDER: &str = "the recorder";
 
@@ -231,7 +231,7 @@ impl RecorderLink {
         let Some(payload) = self.heard.get(HEAD..HEAD + len) else { return Ok(None) };
         let said = match tag {
             tag::READY => Said::Ready,
-            tag::REFUSED => Said::Refused(crate::visible(&String::from_utf8_lossy(payload))),
+            tag::REFUSED => Said::Refused(gleaner_base::visible(&String::from_utf8_lossy(payload))),
             tag::OPENED => {
                 let wait = payload.try_into().map_err(|_| LinkError::Malformed {
                     who: RECORDER,

@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use super::frame::{self, tag};
 use super::*;
-use crate::journal::{Entry, Header, JournalInput, Said as Lines, Seen, Woken};
-use crate::manifest::Kind;
-use crate::{Fault, FaultKind, Trigger, TriggerKind};
+use gleaner_journal::{Entry, Header, JournalInput, Said as Lines, Seen, Woken};
+use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 

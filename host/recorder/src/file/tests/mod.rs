@@ -8,9 +8,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use gleaner_protocol::manifest::Kind;
-use gleaner_protocol::{Clip, ClipLambda, Moment, Recovered, TriggerKind};
-use gleaner_transport::{Endian, Guid, SampleMeta};
+use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::{Clip, ClipLambda, Moment, Recovered, TriggerKind};
+use gleaner_messages::Endian;
+use gleaner_transport::{Guid, SampleMeta};
 
 use super::{About, Ending, Folder, Topic, TopicCounts, Unfinished};
 

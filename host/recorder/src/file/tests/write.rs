@@ -1,9 +1,11 @@
 use std::collections::BTreeMap;
 use std::fs::{self, OpenOptions};
 
-use gleaner_protocol::journal::FileDigest;
-use gleaner_protocol::{Clip, Explain};
-use gleaner_transport::{Endian, Guid, SampleMeta, Transport};
+use gleaner_base::Explain;
+use gleaner_journal::FileDigest;
+use gleaner_lambda::Clip;
+use gleaner_messages::Endian;
+use gleaner_transport::{Guid, SampleMeta, Transport};
 
 use super::super::place::PART;
 use super::super::sink::Sink;
@@ -177,7 +179,7 @@ fn a_topic_without_a_message_has_a_channel_all_the_same() {
     let seen = channels.values().find(|channel| channel.topic == "/camera").unwrap();
     assert_eq!(seen.schema.as_ref().unwrap().data.len(), 1 << 20);
     assert_eq!(replayed(&path).len(), 3);
-    let replay = gleaner_transport::replay::Replay::open(std::slice::from_ref(&path)).unwrap();
+    let replay = gleaner_drives::Replay::open(std::slice::from_ref(&path)).unwrap();
     let mut names: Vec<_> = replay.topics().into_iter().map(|topic| topic.topic).collect();
     names.sort();
     assert_eq!(names, ["/camera", "/imu/data", "/second"]);

@@ -15,8 +15,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::Thread;
 use std::time::{Duration, Instant};
 
+use gleaner_base::visible;
+use gleaner_lambda::TriggerKind;
 use gleaner_protocol::link::CommandStatus;
-use gleaner_protocol::{TriggerKind, visible};
 use gleaner_transport::{SampleMeta, Sink, Status, Verdict};
 use tracing::warn;
 

@@ -1,7 +1,7 @@
 //! One command, as it is written: a `std_msgs/msg/String` whose text is a JSON object.
 
-use gleaner_protocol::{Trigger, TriggerKind};
-use gleaner_transport::Endian;
+use gleaner_lambda::{Trigger, TriggerKind};
+use gleaner_messages::Endian;
 use serde::Deserialize;
 
 /// Longest text.

@@ -9,7 +9,7 @@ mod thread;
 
 use std::sync::Arc;
 
-use gleaner_protocol::Clip;
+use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 use gleaner_transport::SampleMeta;
 

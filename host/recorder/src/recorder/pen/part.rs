@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::io;
 
-use gleaner_protocol::journal::{Decoder, End, Header, Writer};
+use gleaner_journal::{Decoder, End, Header, Writer};
 
 /// What a wake takes beside its bytes, about.
 const OVERHEAD: usize = 64;

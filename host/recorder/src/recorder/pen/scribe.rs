@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use gleaner_protocol::Clip;
-use gleaner_protocol::journal::Header;
+use gleaner_journal::Header;
+use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 use gleaner_transport::SampleMeta;
 

@@ -1,0 +1,132 @@
+//! Words in messages: lists of them, the nearest to a misspelt one, numbers, and foreign text made fit to print.
+
+use std::fmt::Display;
+use std::path::Path;
+
+/// The one of `known` that `word` was most likely meant to be.
+pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
+    // The distance takes time in proportion to both lengths, and nobody misspells a key with a page of text.
+    if word.len() > 64 {
+        return None;
+    }
+    let allowed = (word.chars().count() / 3).max(1);
+    known
+        .into_iter()
+        .map(|candidate| (strsim::damerau_levenshtein(word, candidate), candidate))
+        .filter(|(distance, _)| *distance <= allowed)
+        .min_by_key(|(distance, _)| *distance)
+        .map(|(_, candidate)| candidate)
+}
+
+/// Returns " (did you mean `x`?)", or nothing, for the end of an error message.
+pub fn hint(nearest: &Option<String>) -> String {
+    nearest.as_ref().map(|name| format!(" (did you mean `{name}`?)")).unwrap_or_default()
+}
+
+/// `` `a` ``, `` `a` and `b` ``, `` `a`, `b` and `c` `` with `and` or another last word.
+pub fn list<W: AsRef<str>>(words: &[W], last: &str) -> String {
+    let quoted: Vec<String> = words.iter().map(|word| format!("`{}`", word.as_ref())).collect();
+    match quoted.split_last() {
+        Some((end, rest)) if !rest.is_empty() => format!("{} {last} {end}", rest.join(", ")),
+        _ => quoted.concat(),
+    }
+}
+
+/// A text from a file, short enough for a message and without characters that would act on a terminal.
+pub fn excerpt(text: &str) -> String {
+    const SHOWN: usize = 80;
+    match text.char_indices().nth(SHOWN) {
+        Some((end, _)) => visible(&text[..end]) + "…",
+        None => visible(text),
+    }
+}
+
+/// `path` as a word of a shell command: quoted where a shell would take it apart.
+pub fn shell_word(path: &Path) -> String {
+    let text = path.to_string_lossy();
+    let plain = |character: char| character.is_alphanumeric() || "/._-+=:,@%".contains(character);
+    match !text.is_empty() && text.chars().all(plain) {
+        true => text.into_owned(),
+        false => format!("'{}'", text.replace('\'', r"'\''")),
+    }
+}
+
+/// `text` with its control characters written out, so that none acts on a terminal.
+pub fn visible(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character.is_control() || turns_text(character) {
+            true => shown.extend(character.escape_default()),
+            false => shown.push(character),
+        }
+    }
+    shown
+}
+
+/// `bytes` in hexadecimal digits, as digests are written.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Whether it makes a terminal show text in another order than it is written: the bidirectional controls of Unicode.
+fn turns_text(character: char) -> bool {
+    matches!(character, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+}
+
+/// A whole number with a comma between thousands.
+pub fn grouped(count: impl Display) -> String {
+    let digits = count.to_string();
+    let mut text = String::new();
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_nearest_word_is_offered_only_if_it_is_near() {
+        let known = ["event", "period", "backlog"];
+        assert_eq!(nearest("evnt", known), Some("event"));
+        assert_eq!(nearest("peroid", known), Some("period"));
+        assert_eq!(nearest("colour", known), None);
+        assert_eq!(nearest("", known), None);
+        assert_eq!(nearest(&"event".repeat(100), known), None);
+    }
+
+    #[test]
+    fn lists_end_with_their_last_word() {
+        assert_eq!(list::<&str>(&[], "and"), "");
+        assert_eq!(list(&["a"], "and"), "`a`");
+        assert_eq!(list(&["a", "b"], "or"), "`a` or `b`");
+        assert_eq!(list(&["a", "b", "c"], "and"), "`a`, `b` and `c`");
+    }
+
+    #[test]
+    fn a_path_that_a_shell_would_take_apart_is_quoted() {
+        for (path, word) in [
+            ("examples/hello/rust-2", "examples/hello/rust-2"),
+            ("föhr/a", "föhr/a"),
+            ("my lambda", "'my lambda'"),
+            ("it's", r"'it'\''s'"),
+            ("a;b", "'a;b'"),
+            ("~", "'~'"),
+            ("", "''"),
+        ] {
+            assert_eq!(shell_word(Path::new(path)), word);
+        }
+    }
+
+    #[test]
+    fn foreign_text_is_cut_and_cannot_act_on_a_terminal() {
+        assert_eq!(excerpt("plain"), "plain");
+        assert_eq!(excerpt("\u{1b}[2J\n"), "\\u{1b}[2J\\n");
+        assert_eq!(excerpt(&"ä".repeat(81)), format!("{}…", "ä".repeat(80)));
+    }
+}

@@ -1,0 +1,366 @@
+//! Definitions that only the node has which writes the type: asked for at a node of ros2-client.
+
+use std::net::UdpSocket;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use gleaner_dds::{Dds, Options};
+use gleaner_messages::FieldPath;
+use gleaner_transport::{Transport, TransportError};
+use ros2_client::qos::{Durability, History, WhenFull};
+use ros2_client::{Context, Message, MessageTypeName, Name, Node, NodeName, NodeOptions, QosProfile, ServiceTypeName};
+use ros2_client::{Server, ServiceMapping};
+use rustdds::no_key::SerializerAdapter;
+use rustdds::{CDRSerializerAdapter, DomainParticipant, GUID};
+use serde::{Deserialize, Serialize};
+
+use super::Test;
+use super::peer::{Little, Peer, domain, options, policies, take, until, write};
+
+pub const TESTS: &[Test] = &[
+    ("a_node_is_asked_for_definitions_that_nobody_else_has", || answered(ServiceMapping::Enhanced)),
+    ("a_node_that_wants_a_header_is_asked_with_one", || answered(ServiceMapping::Cyclone)),
+    ("a_long_answer_passes_the_filter_although_nothing_large_is_subscribed", long),
+    ("a_node_that_says_no_is_asked_three_times", refused),
+    ("an_answer_that_has_not_the_hash_that_was_announced_is_not_believed", lied),
+    ("a_type_without_a_hash_is_asked_for_nowhere", no_hash),
+    ("a_node_without_the_service_is_given_up", no_service),
+    ("a_type_that_nobody_writes_is_given_up", nobody),
+];
+
+/// Worked out with Python's `json` and `hashlib`.
+const WHEEL: &str = "RIHS01_e02cfbfb2ca59b49ca956f751f81f5f9dc3ec4867dbfe44f53a662fd24cbacff";
+const TYRE: &str = "RIHS01_809c10637226ef205824b02220c1a10979ffd2fc7ea39c73dda560cc539ea50f";
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Request {
+    type_name: String,
+    type_hash: String,
+    include_type_sources: bool,
+}
+
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+struct Response {
+    successful: bool,
+    failure_reason: String,
+    root: Described,
+    referenced: Vec<Described>,
+    /// Type, encoding, text.
+    sources: Vec<(String, String, String)>,
+    extra: Vec<(String, String)>,
+}
+
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+struct Described {
+    name: String,
+    fields: Vec<Field>,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Field {
+    name: String,
+    kind: u8,
+    capacity: u64,
+    text_capacity: u64,
+    nested: String,
+    default: String,
+}
+
+impl Message for Request {}
+impl Message for Response {}
+
+fn described(name: &str, fields: &[(&str, u8, &str)]) -> Described {
+    let field = |(name, kind, nested): &(&str, u8, &str)| Field {
+        name: (*name).to_owned(),
+        kind: *kind,
+        capacity: 0,
+        text_capacity: 0,
+        nested: (*nested).to_owned(),
+        default: String::new(),
+    };
+    Described { name: format!("car_msgs/msg/{name}"), fields: fields.iter().map(field).collect() }
+}
+
+fn source(name: &str, text: &str) -> (String, String, String) {
+    (format!("car_msgs/msg/{name}"), "msg".to_owned(), text.to_owned())
+}
+
+/// What an honest node says of a type.
+fn honest(request: &Request) -> Response {
+    let tyre = described("Tyre", &[("bar", 11, "")]);
+    let tyre_source = source("Tyre", "float64 bar\n");
+    match request.type_name.as_str() {
+        "car_msgs/msg/Tyre" => {
+            Response { successful: true, root: tyre, sources: vec![tyre_source], ..Response::default() }
+        }
+        "car_msgs/msg/Wheel" => Response {
+            successful: true,
+            root: described("Wheel", &[("tyre", 1, "car_msgs/msg/Tyre"), ("bolts", 151, "")]),
+            referenced: vec![tyre],
+            sources: vec![source("Wheel", "# One of four.\nTyre tyre\nuint32[] bolts\n"), tyre_source],
+            ..Response::default()
+        },
+        _ => Response { failure_reason: "unknown type".to_owned(), ..Response::default() },
+    }
+}
+
+type Say = fn(&Request) -> Response;
+
+/// A node of ros2-client that writes `/wheel` and `/tyre`.
+struct Car {
+    participant: DomainParticipant,
+    _node: Node,
+    writers: [GUID; 2],
+    asked: Arc<Mutex<Vec<Request>>>,
+    stop: Arc<AtomicBool>,
+    serving: Option<JoinHandle<()>>,
+}
+
+impl Car {
+    fn join(domain: u16, service: Option<(ServiceMapping, Say)>) -> Self {
+        let participant = DomainParticipant::new(domain).unwrap();
+        let context = Context::from_domain_participant(participant.clone()).unwrap();
+        let name = NodeName::new("/front", "car").unwrap();
+        let mut node =
+            context.new_node(name, NodeOptions::new().enable_rosout(false).start_parameter_services(false)).unwrap();
+        let qos = QosProfile::publisher_default()
+            .reliability_reliable(WhenFull::DEFAULT)
+            .durability(Durability::Volatile)
+            .history(History::KeepLast { depth: 10 });
+        let (asked, stop) = (Arc::<Mutex<Vec<Request>>>::default(), Arc::<AtomicBool>::default());
+        let serving = service.map(|(mapping, say)| {
+            let name = Name::new("/front/car", "get_type_description").unwrap();
+            let ty = ServiceTypeName::new("type_description_interfaces", "GetTypeDescription");
+            let server =
+                node.create_server::<Request, Response>(mapping, &name, &ty, qos.clone(), qos.clone()).unwrap();
+            let (asked, stop) = (asked.clone(), stop.clone());
+            thread::spawn(move || serve(&server, say, &asked, &stop))
+        });
+        // Last, so that what follows in discovery is ours to say.
+        let writers = ["Wheel", "Tyre"].map(|ty| {
+            let topic = Name::new("/", &ty.to_lowercase()).unwrap();
+            let topic = node.create_topic(&topic, MessageTypeName::new("car_msgs", ty), &qos).unwrap();
+            let publisher = node.create_publisher::<String>(&topic, None).unwrap();
+            let guid = publisher.guid();
+            // It lives as long as the process.
+            std::mem::forget(publisher);
+            guid
+        });
+        Self { participant, _node: node, writers, asked, stop, serving }
+    }
+
+    /// Announces the writers once more, with the hashes of their types: RustDDS has no way to say them.
+    fn announce_hashes(&self, dds: &Dds, domain: u16) {
+        both(dds);
+        let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+        // Numbers that were used are not looked at again. What is said last was heard last.
+        for seq in 1..60 {
+            let (guid, topic, ty, hash) = match seq {
+                50.. => (GUID::default(), "rt/mark", "car_msgs::msg::dds_::Mark_", WHEEL),
+                _ if seq % 2 == 0 => (self.writers[0], "rt/wheel", "car_msgs::msg::dds_::Wheel_", WHEEL),
+                _ => (self.writers[1], "rt/tyre", "car_msgs::msg::dds_::Tyre_", TYRE),
+            };
+            let prefix = self.writers[0].to_bytes();
+            let guid = if guid == GUID::default() {
+                [&prefix[..12], &[9, 9, 9, 3]].concat()
+            } else {
+                guid.to_bytes().to_vec()
+            };
+            let guid = GUID::from_bytes(guid.try_into().unwrap());
+            wire.send_to(&announcement(guid, seq, topic, ty, hash), ("127.0.0.1", 7400 + 250 * domain + 10)).unwrap();
+        }
+        until("the hashes", || dds.discovered().iter().any(|topic| topic.topic == "/mark"));
+    }
+}
+
+impl Drop for Car {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(serving) = self.serving.take() {
+            serving.join().unwrap();
+        }
+    }
+}
+
+fn serve(server: &Server<Request, Response>, say: Say, asked: &Mutex<Vec<Request>>, stop: &AtomicBool) {
+    while !stop.load(Ordering::Relaxed) {
+        match server.receive_request() {
+            Ok(Some((id, request))) => {
+                let response = say(&request);
+                asked.lock().unwrap().push(request);
+                server.send_response(id, response).unwrap();
+            }
+            // Also what is not meant for this mapping.
+            Ok(None) | Err(_) => thread::sleep(Duration::from_millis(2)),
+        }
+    }
+}
+
+/// A writer, as discovery announces it: DATA of the writer of publications.
+fn announcement(writer: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Vec<u8> {
+    let text = |text: &str| {
+        let mut value = (text.len() as u32 + 1).to_le_bytes().to_vec();
+        value.extend_from_slice(text.as_bytes());
+        value.resize((value.len() + 1).next_multiple_of(4), 0);
+        value
+    };
+    let user_data = format!("typehash={hash};");
+    let mut octets = (user_data.len() as u32).to_le_bytes().to_vec();
+    octets.extend_from_slice(user_data.as_bytes());
+    octets.resize(octets.len().next_multiple_of(4), 0);
+    let reliable = [2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0].to_vec();
+    let mut body = vec![0, 0, 16, 0, 0, 0, 3, 0xc7, 0, 0, 3, 0xc2, 0, 0, 0, 0];
+    body.extend_from_slice(&seq.to_le_bytes());
+    // Encapsulation: a list of parameters, little-endian.
+    body.extend_from_slice(&[0, 3, 0, 0]);
+    for (id, value) in
+        [(0x5a_u16, writer.to_bytes().to_vec()), (5, text(topic)), (7, text(ty)), (0x1a, reliable), (0x2c, octets)]
+    {
+        body.extend_from_slice(&id.to_le_bytes());
+        body.extend_from_slice(&(value.len() as u16).to_le_bytes());
+        body.extend_from_slice(&value);
+    }
+    body.extend_from_slice(&[1, 0, 0, 0]);
+    super::hostile::packet(writer, 0x15, &body)
+}
+
+fn both(dds: &Dds) {
+    // A node writes a topic of its own accord, too.
+    let found = |name: &str| dds.discovered().iter().any(|topic| topic.topic == name);
+    until("both topics", || found("/wheel") && found("/tyre"));
+}
+
+/// Waits as whoever records does: until there are definitions, or none will come.
+fn wait(dds: &Dds, topic: &str) -> bool {
+    until("the end of asking", || dds.definitions(topic).is_ok() || !dds.definitions_may_come(topic));
+    let found = dds.definitions(topic);
+    assert!(matches!(found, Ok(_) | Err(TransportError::NoDefinitions { .. })), "{found:?}");
+    found.is_ok()
+}
+
+fn text(dds: &Dds, topic: &str) -> Option<String> {
+    let topics = dds.topics();
+    let found = topics.iter().find(|found| found.topic == topic).unwrap();
+    found.definitions_text.as_deref().map(str::to_owned)
+}
+
+fn open(domain: u16) -> Dds {
+    Dds::open(Options { largest: 0, ..options(domain) }).unwrap()
+}
+
+fn answered(mapping: ServiceMapping) {
+    let domain = domain();
+    let dds = open(domain);
+    let car = Car::join(domain, Some((mapping, honest)));
+    car.announce_hashes(&dds, domain);
+    assert_eq!(text(&dds, "/wheel"), None);
+    // One after the other, whoever asks first.
+    assert!(dds.definitions_may_come("/wheel") && dds.definitions_may_come("/tyre"));
+    assert!(wait(&dds, "/tyre") && wait(&dds, "/wheel"));
+    let definitions = dds.definitions("/wheel").unwrap();
+    assert!(FieldPath::compile(&definitions, "tyre.bar").is_ok());
+    assert!(text(&dds, "/wheel").unwrap().starts_with("# One of four.\n"));
+    let request = |type_name: &str, hash: &str| Request {
+        type_name: type_name.to_owned(),
+        type_hash: hash.to_owned(),
+        include_type_sources: true,
+    };
+    // As often as it took, on a slow machine.
+    let mut asked = car.asked.lock().unwrap().clone();
+    asked.sort_by(|a, b| b.type_name.cmp(&a.type_name));
+    asked.dedup();
+    assert_eq!(asked, [request("car_msgs/msg/Wheel", WHEEL), request("car_msgs/msg/Tyre", TYRE)]);
+}
+
+/// By plain RustDDS, with a header: see `docs/dds-limits.md` on what happens without.
+fn long() {
+    const TEXT: usize = 400_000;
+    let domain = domain();
+    let dds = open(domain);
+    let car = Car::join(domain, None);
+    let peer = Peer(car.participant.clone());
+    let policies = policies(true, false);
+    let service = |name: &str, part: &str| {
+        let ty = format!("type_description_interfaces::srv::dds_::GetTypeDescription_{part}_");
+        (format!("{name}/front/car/get_type_description"), ty)
+    };
+    let (name, ty) = service("rq", "Request");
+    let requests = peer.reader(&format!("{name}Request"), &ty, &policies);
+    let (name, ty) = service("rr", "Response");
+    let replies = peer.writer_of::<Little>(&peer.topic(&format!("{name}Reply"), &ty, &policies), &policies);
+    let _ready = peer.writer("/ready", true, false);
+    until("the service", || dds.discovered().iter().any(|topic| topic.topic == "/ready"));
+    car.announce_hashes(&dds, domain);
+
+    let request =
+        Request { type_name: "car_msgs/msg/Wheel".to_owned(), type_hash: WHEEL.to_owned(), include_type_sources: true };
+    let mut answer = honest(&request);
+    answer.sources[0].2 += &"# A long story.\n".repeat(TEXT / 16);
+    let answer = CDRSerializerAdapter::<Response>::to_bytes(&answer).unwrap();
+    until("the end of asking", || {
+        // With a header there is a number in front of the name's length.
+        if let Some(request) = take(&requests).filter(|request| request[4..8] != *b"car_") {
+            let padding = vec![0; answer.len().next_multiple_of(4) - answer.len()];
+            write(&replies, &[&request[..16], &answer, &padding].concat());
+        }
+        dds.definitions("/wheel").is_ok() || !dds.definitions_may_come("/wheel")
+    });
+    assert!(dds.definitions("/wheel").is_ok(), "{:?}", dds.health());
+    assert!(text(&dds, "/wheel").unwrap().len() > TEXT);
+}
+
+fn refused() {
+    let domain = domain();
+    let dds = open(domain);
+    let say: Say = |_| Response { failure_reason: "not today".to_owned(), ..Response::default() };
+    let car = Car::join(domain, Some((ServiceMapping::Enhanced, say)));
+    car.announce_hashes(&dds, domain);
+    assert!(!wait(&dds, "/wheel"));
+    // On a slow machine, one that answers late may be asked in the other way, which it does not understand.
+    assert!((1..=3).contains(&car.asked.lock().unwrap().len()), "{:?}", car.asked);
+    assert!(!dds.definitions_may_come("/wheel"), "that was all");
+}
+
+fn lied() {
+    let domain = domain();
+    let dds = open(domain);
+    let say: Say = |request| {
+        let mut response = honest(request);
+        response.root.fields.pop();
+        response
+    };
+    let car = Car::join(domain, Some((ServiceMapping::Enhanced, say)));
+    car.announce_hashes(&dds, domain);
+    assert!(!wait(&dds, "/wheel"));
+    assert!(!car.asked.lock().unwrap().is_empty());
+}
+
+fn no_hash() {
+    let domain = domain();
+    let dds = open(domain);
+    let car = Car::join(domain, Some((ServiceMapping::Enhanced, honest)));
+    both(&dds);
+    assert!(!wait(&dds, "/wheel"));
+    assert!(car.asked.lock().unwrap().is_empty());
+}
+
+fn no_service() {
+    let domain = domain();
+    let dds = open(domain);
+    let car = Car::join(domain, None);
+    car.announce_hashes(&dds, domain);
+    assert!(!wait(&dds, "/wheel"));
+}
+
+fn nobody() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let spec = gleaner_transport::TopicSpec {
+        type_name: "car_msgs/msg/Wheel".to_owned(),
+        ..super::peer::spec("/wheel", gleaner_transport::Qos::Auto)
+    };
+    dds.subscribe(&spec, super::peer::Kept::new()).unwrap();
+    assert!(!wait(&dds, "/wheel"));
+}

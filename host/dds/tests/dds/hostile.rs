@@ -1,0 +1,244 @@
+//! What somebody may send who means harm, or whose software is broken: packets made by hand.
+
+use std::net::UdpSocket;
+
+use gleaner_dds::Dds;
+use gleaner_transport::{Qos, Transport};
+use rustdds::{GUID, RTPSEntity};
+
+use super::Test;
+use super::peer::{Kept, Peer, connected, domain, matched, open, spec, until, write};
+
+pub const TESTS: &[Test] = &[
+    ("gaps_in_the_numbers_are_counted_and_late_samples_taken_back", gaps),
+    ("a_sample_that_cannot_be_read_is_malformed_and_not_lost_as_well", malformed),
+    ("a_writer_that_jumps_to_the_last_number_overflows_nothing", last_number),
+    ("thousands_of_broken_packets_stop_nothing", broken),
+    ("fragments_that_claim_gibibytes_take_no_memory_and_are_counted", claims),
+    ("numbers_without_end_in_a_heartbeat_or_a_gap_take_no_memory_and_are_counted", numbers),
+];
+
+/// An RTPS packet of `writer` with one submessage.
+pub fn packet(writer: GUID, kind: u8, body: &[u8]) -> Vec<u8> {
+    let mut packet = b"RTPS\x02\x04\x01\x10".to_vec();
+    packet.extend_from_slice(&writer.to_bytes()[..12]);
+    packet.extend_from_slice(&[kind, 5]);
+    packet.extend_from_slice(&u16::try_from(body.len()).unwrap().to_le_bytes());
+    packet.extend_from_slice(body);
+    packet
+}
+
+/// Little-endian CDR.
+pub const LITTLE: [u8; 2] = [0, 1];
+
+/// A DATA submessage: to all readers, from `writer`, with number `seq`.
+pub fn data(writer: GUID, seq: i64, payload: &[u8], encoding: [u8; 2]) -> Vec<u8> {
+    let mut body = vec![0, 0, 16, 0, 0, 0, 0, 0];
+    body.extend_from_slice(&writer.to_bytes()[12..]);
+    body.extend_from_slice(&((seq >> 32) as i32).to_le_bytes());
+    body.extend_from_slice(&(seq as u32).to_le_bytes());
+    body.extend_from_slice(&[encoding, [0; 2]].concat());
+    body.extend_from_slice(payload);
+    packet(writer, 0x15, &body)
+}
+
+/// A DATA_FRAG submessage: the first fragment, for all readers, of a sample that is said to have `size` bytes.
+fn fragment(writer: GUID, seq: u32, size: u32) -> Vec<u8> {
+    let mut body = vec![0, 0, 28, 0, 0, 0, 0, 0];
+    body.extend_from_slice(&writer.to_bytes()[12..]);
+    body.extend_from_slice(&[0; 4]);
+    for word in [seq, 1, 1000 << 16 | 1, size] {
+        body.extend_from_slice(&word.to_le_bytes());
+    }
+    body.extend_from_slice(&[0; 1000]);
+    packet(writer, 0x16, &body)
+}
+
+/// A HEARTBEAT (7) or a GAP (8) of `numbers`, to all readers, that no other came before.
+fn range(writer: GUID, kind: u8, numbers: [u64; 2]) -> Vec<u8> {
+    let mut body = vec![0; 4];
+    body.extend_from_slice(&writer.to_bytes()[12..]);
+    for number in numbers {
+        body.extend_from_slice(&((number >> 32) as u32).to_le_bytes());
+        body.extend_from_slice(&(number as u32).to_le_bytes());
+    }
+    // The HEARTBEAT's count; the GAP has no more numbers.
+    body.extend_from_slice(&(if kind == 7 { i32::MAX } else { 0 }).to_le_bytes());
+    packet(writer, kind, &body)
+}
+
+/// The most memory that this process ever had, in bytes.
+fn most_memory() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
+}
+
+/// Datagrams that did not come through.
+fn counted(dds: &Dds) -> u64 {
+    let health = dds.health();
+    health.filtered + health.socket_drops
+}
+
+/// The port at which the first participant of a domain hears data.
+pub fn port(domain: u16) -> u16 {
+    7400 + 250 * domain + 11
+}
+
+fn gaps() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/gaps", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/gaps", false, false);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    write(&writer, b"1...");
+    sink.wait(1);
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    for (count, (seq, lost)) in [(5, 3), (6, 3), (3, 2), (9, 4), (4, 3), (2, 2), (8, 1)].into_iter().enumerate() {
+        wire.send_to(&data(writer.guid(), seq, b"from a hand", LITTLE), ("127.0.0.1", port(domain))).unwrap();
+        assert_eq!(sink.wait(count + 2)[count + 1].0.seq, u64::try_from(seq).unwrap());
+        until("the count", || dds.status(subscription).lost == Some(lost));
+    }
+}
+
+fn malformed() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/odd", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/odd", false, false);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    write(&writer, b"1...");
+    sink.wait(1);
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    // PL_CDR and XCDR2; the fourth sample is lost indeed.
+    for (seq, encoding) in [(2, [0, 3]), (3, [0, 7]), (5, LITTLE)] {
+        wire.send_to(&data(writer.guid(), seq, b"from a hand.", encoding), ("127.0.0.1", port(domain))).unwrap();
+    }
+    sink.wait(2);
+    until("the loss", || dds.status(subscription).lost != Some(0));
+    let status = dds.status(subscription);
+    assert_eq!((status.malformed, status.lost), (2, Some(1)));
+}
+
+fn last_number() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/jump", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let (writer, other) = (peer.writer("/jump", false, false), peer.writer("/jump", false, false));
+    connected(&dds, subscription, 2);
+    matched(&writer);
+    write(&writer, b"1...");
+    sink.wait(1);
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    for seq in [i64::MAX, i64::MAX - 1, 0, -1, i64::MIN] {
+        wire.send_to(&data(writer.guid(), seq, b"?", LITTLE), ("127.0.0.1", port(domain))).unwrap();
+    }
+    sink.mark(&other, b"still here..");
+    assert!(dds.status(subscription).lost.unwrap() >= i64::MAX as u64 - 3);
+    assert_eq!(dds.health().dead, None);
+}
+
+fn broken() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/broken", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/broken", true, false);
+    connected(&dds, subscription, 1);
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let mut state = 1_u64;
+    let mut random = move || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as usize
+    };
+    let whole = data(writer.guid(), 7, &[0; 64], LITTLE);
+    let kinds = [0x01, 0x06, 0x07, 0x08, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x13, 0x15, 0x16, 0x80, 0xff];
+    for n in 0..3000 {
+        let mut bytes = match n % 3 {
+            // Cut anywhere; some bytes changed; and every kind of submessage with bytes that mean nothing.
+            0 => whole[..random() % whole.len()].to_vec(),
+            1 => whole.clone(),
+            _ => packet(writer.guid(), kinds[random() % kinds.len()], &vec![random() as u8; random() % 80]),
+        };
+        for _ in 0..3 {
+            // Neither the sender nor what makes it RTPS.
+            let at = 20 + random() % 200;
+            if let Some(byte) = bytes.get_mut(at) {
+                *byte = random() as u8;
+            }
+        }
+        wire.send_to(&bytes, ("127.0.0.1", port(domain) - u16::from(n % 5 == 0))).unwrap();
+    }
+    let fresh = peer.writer("/broken", true, false);
+    sink.mark(&fresh, b"still here..");
+    assert_eq!(dds.health().dead, None);
+}
+
+fn claims() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/claims", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/claims", true, false);
+    connected(&dds, subscription, 1);
+    assert_eq!(dds.health().unfiltered, None);
+    let before = most_memory();
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let send = |bytes: &[u8]| assert!(wire.send_to(bytes, ("127.0.0.1", port(domain))).is_ok());
+    let begun = counted(&dds);
+    let mut stranger = writer.guid().to_bytes();
+    stranger[5] ^= 0xff;
+    let stranger = GUID::from_bytes(stranger);
+    for guid in [writer.guid(), stranger] {
+        send(&fragment(guid, 1000, u32::MAX));
+    }
+    for seq in 0..1000 {
+        send(&fragment(writer.guid(), 2000 + seq, 64 << 20));
+        send(&fragment(stranger, 2000 + seq, 1 << 19));
+    }
+    until("the count", || counted(&dds) - begun >= 2002);
+    let fresh = peer.writer("/claims", true, false);
+    sink.mark(&fresh, &[7; 100_000]);
+    assert_eq!(dds.health().dead, None);
+    // Other tests run at the same time. The claims are 67 GiB.
+    assert!(most_memory() - before < 1 << 30, "{} MiB", (most_memory() - before) >> 20);
+}
+
+fn numbers() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/numbers", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/numbers", true, false);
+    connected(&dds, subscription, 1);
+    sink.mark(&writer, b"before..");
+    assert_eq!(dds.health().unfiltered, None);
+    // The writer of announcements: everybody's reader of them listens to it.
+    let mut announcer = writer.guid().to_bytes();
+    announcer[12..].copy_from_slice(&[0, 0, 3, 0xc2]);
+    let (before, begun) = (most_memory(), counted(&dds));
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    for guid in [writer.guid(), GUID::from_bytes(announcer)] {
+        // Without the filter, some GiB each: enough to be seen, and not the machine's end.
+        for (kind, numbers) in [(7, [1, 1 << 28]), (8, [1 << 20, 1 << 26])] {
+            wire.send_to(&range(guid, kind, numbers), ("127.0.0.1", port(domain))).unwrap();
+        }
+    }
+    until("the count", || counted(&dds) - begun >= 4);
+    sink.mark(&writer, b"after...");
+    let fresh = peer.writer("/numbers", true, false);
+    sink.mark(&fresh, b"still here..");
+    assert_eq!(dds.health().dead, None);
+    assert!(most_memory() - before < 1 << 30, "{} MiB", (most_memory() - before) >> 20);
+}

@@ -1,0 +1,194 @@
+//! The other side: a participant of plain RustDDS, and sinks that remember.
+
+use std::convert::Infallible;
+use std::sync::atomic::{AtomicU16, Ordering};
+use std::sync::{Arc, Condvar, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use gleaner_dds::{Clock, Dds, Options};
+use gleaner_transport::{Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
+use rustdds::no_key::{DataWriter, Decode, DeserializerAdapter, SerializerAdapter, SimpleDataReader};
+use rustdds::policy::{Durability, History, Reliability};
+use rustdds::{
+    DataWriterStatus, DomainParticipant, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, StatusEvented, Topic,
+    TopicKind,
+};
+
+/// How long something may take that happens at all.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A domain that no other test has.
+pub fn domain() -> u16 {
+    static NEXT: AtomicU16 = AtomicU16::new(1);
+    NEXT.fetch_add(1, Ordering::Relaxed)
+}
+
+pub fn options(domain: u16) -> Options {
+    Options { domain, largest: 1 << 20, clock: Clock::new(0), ..Options::new("/gleaner/test") }
+}
+
+pub fn open(domain: u16) -> Dds {
+    Dds::open(options(domain)).unwrap()
+}
+
+pub fn spec(topic: &str, qos: Qos) -> TopicSpec {
+    let type_name = "std_msgs/msg/String".to_owned();
+    TopicSpec { topic: topic.to_owned(), type_name, queue: 10, max_bytes: 1 << 20, qos }
+}
+
+/// Waits until `done`.
+pub fn until(what: &str, mut done: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !done() {
+        assert!(begun.elapsed() < PATIENCE, "{what}: not within {PATIENCE:?}");
+        thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Waits for as many writers.
+pub fn connected(dds: &Dds, subscription: Subscription, writers: usize) -> Status {
+    until("writers", || dds.status(subscription).writers == Some(writers));
+    dds.status(subscription)
+}
+
+pub fn policies(reliable: bool, transient_local: bool) -> QosPolicies {
+    let max_blocking_time = rustdds::Duration::from_secs(10);
+    let reliability = if reliable { Reliability::Reliable { max_blocking_time } } else { Reliability::BestEffort };
+    let durability = if transient_local { Durability::TransientLocal } else { Durability::Volatile };
+    let history = History::KeepLast { depth: 100 };
+    QosPolicyBuilder::new().reliability(reliability).durability(durability).history(history).build()
+}
+
+/// A participant of plain RustDDS.
+pub struct Peer(pub DomainParticipant);
+
+pub type LittleWriter = DataWriter<Bytes, Little>;
+
+impl Peer {
+    pub fn join(domain: u16) -> Self {
+        Self(DomainParticipant::new(domain).unwrap())
+    }
+
+    pub fn topic(&self, name: &str, type_name: &str, policies: &QosPolicies) -> Topic {
+        self.0.create_topic(name.to_owned(), type_name.to_owned(), policies, TopicKind::NoKey).unwrap()
+    }
+
+    pub fn writer_of<A: SerializerAdapter<Bytes>>(
+        &self,
+        topic: &Topic,
+        policies: &QosPolicies,
+    ) -> DataWriter<Bytes, A> {
+        let publisher = self.0.create_publisher(policies).unwrap();
+        publisher.create_datawriter_no_key(topic, Some(policies.clone())).unwrap()
+    }
+
+    /// A writer of `std_msgs/msg/String`.
+    pub fn writer(&self, topic: &str, reliable: bool, transient_local: bool) -> LittleWriter {
+        let policies = policies(reliable, transient_local);
+        self.writer_of(&self.topic(&format!("rt{topic}"), "std_msgs::msg::dds_::String_", &policies), &policies)
+    }
+
+    pub fn reader(&self, topic: &str, type_name: &str, policies: &QosPolicies) -> SimpleDataReader<Vec<u8>, Little> {
+        let topic = self.topic(topic, type_name, policies);
+        let subscriber = self.0.create_subscriber(policies).unwrap();
+        subscriber.create_simple_datareader_no_key(&topic, Some(policies.clone())).unwrap()
+    }
+}
+
+/// What came, if something did.
+pub fn take(reader: &SimpleDataReader<Vec<u8>, Little>) -> Option<Vec<u8>> {
+    reader.drain_read_notifications();
+    reader.try_take_one_with(Whole).unwrap().map(|change| change.into_value())
+}
+
+/// Waits until a writer knows its reader; what it writes before is not for that one.
+pub fn matched<A: SerializerAdapter<Bytes>>(writer: &DataWriter<Bytes, A>) {
+    until("a reader", || matches!(writer.try_recv_status(), Some(DataWriterStatus::PublicationMatched { .. })));
+}
+
+/// Writes what RTPS does not have to fill up: its messages have multiples of four bytes.
+pub fn write<A: SerializerAdapter<Bytes>>(writer: &DataWriter<Bytes, A>, bytes: &[u8]) {
+    assert_eq!(bytes.len() % 4, 0);
+    writer.write(Bytes::copy_from_slice(bytes), None).unwrap();
+}
+
+macro_rules! adapters {
+    ($($name:ident = $encoding:ident),*) => {$(
+        pub struct $name;
+        impl SerializerAdapter<Bytes> for $name {
+            type Error = Infallible;
+            fn output_encoding() -> RepresentationIdentifier {
+                RepresentationIdentifier::$encoding
+            }
+            fn to_bytes(value: &Bytes) -> Result<Bytes, Infallible> {
+                Ok(value.clone())
+            }
+        }
+    )*};
+}
+adapters!(Little = CDR_LE, Big = CDR_BE, Parameters = PL_CDR_LE);
+
+impl DeserializerAdapter<Vec<u8>> for Little {
+    type Error = Infallible;
+    type Decoded = Vec<u8>;
+    fn supported_encodings() -> &'static [RepresentationIdentifier] {
+        &[RepresentationIdentifier::CDR_LE]
+    }
+    fn transform_decoded(bytes: Vec<u8>) -> Vec<u8> {
+        bytes
+    }
+}
+
+#[derive(Clone)]
+pub struct Whole;
+
+impl<'de> Decode<'de, Vec<u8>> for Whole {
+    type Error = Infallible;
+    fn decode_bytes(self, bytes: &'de [u8], _: RepresentationIdentifier) -> Result<Vec<u8>, Infallible> {
+        Ok(bytes.to_vec())
+    }
+}
+
+/// A sink that remembers.
+#[derive(Default)]
+pub struct Kept {
+    samples: Mutex<Vec<(SampleMeta, Vec<u8>)>>,
+    came: Condvar,
+}
+
+impl Sink for Kept {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        self.samples.lock().unwrap().push((*meta, cdr.to_vec()));
+        self.came.notify_all();
+        Verdict::Taken
+    }
+}
+
+impl Kept {
+    pub fn new() -> Arc<Self> {
+        Arc::default()
+    }
+
+    /// Waits until there are `count`, and returns all there are.
+    pub fn wait(&self, count: usize) -> Vec<(SampleMeta, Vec<u8>)> {
+        let samples = self.samples.lock().unwrap();
+        let (samples, late) = self.came.wait_timeout_while(samples, PATIENCE, |samples| samples.len() < count).unwrap();
+        assert!(!late.timed_out(), "{} of {count} samples came", samples.len());
+        samples.clone()
+    }
+
+    /// The bytes of all samples there are, when there are `count`.
+    pub fn bytes(&self, count: usize) -> Vec<Vec<u8>> {
+        self.wait(count).into_iter().map(|(_, bytes)| bytes).collect()
+    }
+
+    /// Publishes `mark` until it arrives, which tells that everything from before has arrived or never will.
+    pub fn mark(&self, writer: &LittleWriter, mark: &[u8]) {
+        until("a sample", || {
+            write(writer, mark);
+            self.samples.lock().unwrap().iter().any(|(_, bytes)| bytes == mark)
+        });
+    }
+}

@@ -1,0 +1,235 @@
+//! Samples on their way to a sink.
+
+use std::sync::{Arc, Mutex};
+
+use bytes::Bytes;
+use gleaner_messages::Endian;
+use gleaner_transport::{Guid, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use rustdds::{RTPSEntity, Timestamp};
+
+use super::Test;
+use super::peer::{Big, Kept, Parameters, Peer, connected, domain, matched, open, policies, spec, until, write};
+
+pub const TESTS: &[Test] = &[
+    ("samples_arrive_whole_with_who_wrote_them_and_when", samples_arrive),
+    ("a_sample_of_many_fragments_arrives_whole", fragments),
+    ("the_first_sample_of_many_fragments_arrives_even_if_nothing_is_sent_again", first_fragments),
+    ("a_sink_that_can_copy_gets_the_bytes_once", copied),
+    ("a_sink_that_panics_while_it_copies_is_death_with_a_name_and_other_topics_go_on", panics_in_copy),
+    ("the_byte_order_of_each_sample_is_known", byte_order),
+    ("a_sample_in_an_encoding_that_nobody_reads_is_counted_and_the_next_arrives", malformed),
+    ("two_subscriptions_of_a_topic_both_get_every_sample", two_subscriptions),
+    ("names_that_ros_does_not_have_are_refused", bad_names),
+    ("a_writer_that_is_made_anew_a_hundred_times_is_heard_each_time", anew),
+];
+
+const FIXED: Qos = Qos::Fixed { reliable: true, transient_local: false, depth: 10 };
+
+fn samples_arrive() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/imu/data", FIXED), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/imu/data", true, false);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    // 2.5 s after 1970.
+    writer.write(Bytes::from(vec![7; 324]), Some(Timestamp::from_ticks(2 << 32 | 1 << 31))).unwrap();
+    write(&writer, b"the second..");
+    let samples = sink.wait(2);
+    let (first, bytes) = &samples[0];
+    assert_eq!(*bytes, [7; 324]);
+    assert_eq!((first.seq, first.publish_ns, first.options), (1, 2_500_000_000, [0, 0]));
+    assert_eq!((first.writer, first.endian), (Guid(writer.guid().to_bytes()), Endian::Little));
+    let (second, bytes) = &samples[1];
+    assert_eq!((second.seq, second.writer, bytes.as_slice()), (2, first.writer, b"the second..".as_slice()));
+    assert!(second.at_ns > first.at_ns && first.at_ns > 0);
+    let status = dds.status(subscription);
+    assert_eq!((status.writers, status.lost, status.malformed), (Some(1), Some(0), 0));
+    assert_eq!((status.qos.as_deref(), status.trouble.as_slice()), (Some("reliable, volatile"), [].as_slice()));
+    drop(writer);
+    connected(&dds, subscription, 0);
+}
+
+fn fragments() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/image", FIXED), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/image", true, false);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    let image: Vec<u8> = (0..1_000_004_u32).map(|n| (n % 251) as u8).collect();
+    write(&writer, &image);
+    assert!(sink.bytes(1)[0] == image);
+    // Whatever size came before, the next has its own.
+    write(&writer, b"small one...");
+    assert_eq!(sink.bytes(2)[1], b"small one...");
+}
+
+fn first_fragments() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    dds.subscribe(&spec("/image", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/image", false, false);
+    matched(&writer);
+    write(&writer, &[7; 100_000]);
+    assert!(sink.bytes(1)[0] == [7; 100_000]);
+}
+
+/// Copies as soon as it is shown something, and refuses what is longer than 8 bytes.
+#[derive(Default)]
+struct Copies {
+    copied: Mutex<Option<Vec<u8>>>,
+    accepted: Mutex<Vec<(u64, Option<Vec<u8>>)>>,
+}
+
+impl Sink for Copies {
+    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
+        unreachable!("it copies")
+    }
+
+    fn copy(&self, cdr: &[u8]) -> Option<Verdict> {
+        let taken = (cdr.len() <= 8).then(|| cdr.to_vec());
+        let verdict = if taken.is_some() { Verdict::Taken } else { Verdict::TooBig };
+        *self.copied.lock().unwrap() = taken;
+        Some(verdict)
+    }
+
+    fn accept(&self, meta: &SampleMeta) {
+        self.accepted.lock().unwrap().push((meta.seq, self.copied.lock().unwrap().take()));
+    }
+}
+
+fn copied() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Arc::new(Copies::default());
+    let subscription = dds.subscribe(&spec("/copied", FIXED), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/copied", true, false);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    for bytes in [b"1...".as_slice(), b"2 is too long...", b"3......."] {
+        write(&writer, bytes);
+    }
+    until("all", || sink.accepted.lock().unwrap().len() == 3);
+    let accepted = sink.accepted.lock().unwrap();
+    assert_eq!(*accepted, [(1, Some(b"1...".to_vec())), (2, None), (3, Some(b"3.......".to_vec()))]);
+}
+
+struct PanicsInCopy;
+
+impl Sink for PanicsInCopy {
+    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
+        unreachable!("it copies")
+    }
+
+    fn copy(&self, _: &[u8]) -> Option<Verdict> {
+        panic!("this sink was meant to panic")
+    }
+}
+
+fn panics_in_copy() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let (first, second) = (Kept::new(), Kept::new());
+    let bad = dds.subscribe(&spec("/both", FIXED), Arc::new(PanicsInCopy)).unwrap();
+    let good = dds.subscribe(&spec("/both", FIXED), first.clone()).unwrap();
+    dds.subscribe(&spec("/other", FIXED), second.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let (writer, other) = (peer.writer("/both", true, false), peer.writer("/other", true, false));
+    connected(&dds, bad, 1);
+    connected(&dds, good, 1);
+    // The first is also what tells that RustDDS goes on: both read it under the lock of the same topic.
+    first.mark(&writer, b"1...");
+    second.mark(&other, b"2...");
+    until("death", || dds.health().dead.is_some());
+    let dead = dds.health().dead.unwrap();
+    assert_eq!(dead, "the sink of topic `/both` panicked: this sink was meant to panic");
+    first.mark(&writer, b"3...");
+}
+
+fn byte_order() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/big", FIXED), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let policies = policies(true, false);
+    let writer = peer.writer_of::<Big>(&peer.topic("rt/big", "std_msgs::msg::dds_::String_", &policies), &policies);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    write(&writer, &[0, 0, 0, 1]);
+    let (meta, bytes) = &sink.wait(1)[0];
+    assert_eq!((meta.endian, bytes.as_slice()), (Endian::Big, [0, 0, 0, 1].as_slice()));
+}
+
+fn malformed() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/odd", FIXED), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let policies = policies(true, false);
+    let odd = peer.writer_of::<Parameters>(&peer.topic("rt/odd", "std_msgs::msg::dds_::String_", &policies), &policies);
+    let good = peer.writer("/odd", true, false);
+    connected(&dds, subscription, 2);
+    matched(&odd);
+    matched(&good);
+    for _ in 0..3 {
+        write(&odd, b"what is this");
+    }
+    until("malformed samples", || dds.status(subscription).malformed == 3);
+    write(&good, b"good");
+    assert_eq!(sink.bytes(1), [b"good"]);
+    assert_eq!(dds.health().dead, None);
+}
+
+fn two_subscriptions() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let (first, second) = (Kept::new(), Kept::new());
+    let subscription = dds.subscribe(&spec("/both", FIXED), first.clone()).unwrap();
+    let peer = Peer::join(domain);
+    let writer = peer.writer("/both", true, false);
+    connected(&dds, subscription, 1);
+    matched(&writer);
+    write(&writer, b"before..");
+    first.wait(1);
+    let later = dds.subscribe(&spec("/both", FIXED), second.clone()).unwrap();
+    connected(&dds, later, 1);
+    matched(&writer);
+    (0..20_u8).for_each(|n| write(&writer, &[n; 4]));
+    assert_eq!(first.bytes(21).len(), 21);
+    let expected: Vec<Vec<u8>> = (0..20).map(|n| vec![n; 4]).collect();
+    assert_eq!(second.bytes(20), expected, "what came before the subscription is not its business");
+}
+
+fn bad_names() {
+    let mut dds = open(domain());
+    for (topic, type_name) in [("no_slash", "a/msg/B"), ("/a b", "a/msg/B"), ("/a", "B"), ("/a", "a/msg/B\n")] {
+        let names = TopicSpec { topic: topic.to_owned(), type_name: type_name.to_owned(), ..spec("/a", FIXED) };
+        assert!(dds.subscribe(&names, Kept::new()).is_err(), "{topic} {type_name:?}");
+        assert!(dds.writer(topic, type_name, 1).is_err(), "{topic} {type_name:?}");
+    }
+}
+
+fn anew() {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = Kept::new();
+    let subscription = dds.subscribe(&spec("/again", Qos::Auto), sink.clone()).unwrap();
+    let peer = Peer::join(domain);
+    for round in 0..100_u8 {
+        let writer = peer.writer("/again", round % 2 == 0, false);
+        connected(&dds, subscription, 1);
+        sink.mark(&writer, &[round; 4]);
+        drop(writer);
+        connected(&dds, subscription, 0);
+    }
+}

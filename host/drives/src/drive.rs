@@ -1,0 +1,393 @@
+//! The merge: all files of a drive as one sequence of messages.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::collections::binary_heap::PeekMut;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use super::catalog::Catalog;
+use super::chunk::{OpenSegment, Opener};
+use super::damage::Damage;
+use super::error::ReplayError;
+use super::inflate::Inflate;
+use super::options::{Limits, Options, Span};
+use super::step::{Progress, Step};
+use super::storage;
+use super::track::{Routed, Track, nanoseconds};
+use gleaner_messages::Definitions;
+use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict};
+
+/// A drive: one or more files and rosbag2 directories, replayed as one.
+///
+/// Messages come in log-time order; equal times come in the order of the files, then of the channel
+/// ids, then as they lie in the file; in a database, as they are numbered. A message with several
+/// subscriptions is delivered to each in a step of its own.
+///
+/// # Damage
+///
+/// Chunks are delivered whole or not at all: a chunk whose checksum, compression or records are
+/// wrong is damage as a whole. A damaged file ends the drive, for all files, with one
+/// [`ReplayError::Damaged`] from [`Replay::step`] or [`Replay::peek_at_ns`]; from then on there is
+/// nothing more. Before it:
+///
+/// - In a finished file with a usable summary, a damaged chunk shows when its turn comes. Every
+///   message of every file whose log time is before that chunk's start time was delivered.
+/// - In a file without (cut off, never finished, summary damaged), opening finds the damage, and
+///   the readable part ends where it begins. Every message in that part was delivered, in log-time
+///   order, and every message of the other files up to the last log time in it.
+/// - A message that is not CDR is damage where it stands: everything before it in the order of
+///   delivery was delivered.
+///
+/// A file that is readable to its end but has no footer, or a damaged summary, or another number of
+/// messages of a subscribed topic than the summary counts, is replayed whole and then reported as
+/// damaged; so is one whose index says other times of a chunk than the chunk itself, which is read as one without.
+/// Messages outside chunks have no checksum of their own; if the one of the whole data
+/// section is wrong, that too is reported after them. A writer may leave out any checksum; then
+/// only what contradicts itself is noticed.
+///
+/// A database has no checksums: what its pages contradict is noticed when its turn comes, and every
+/// message before was delivered. So it is with a packed file that cannot be unpacked to its end.
+pub struct Replay {
+    tracks: Vec<Track>,
+    catalog: Catalog,
+    sinks: Vec<Arc<dyn Sink>>,
+    opener: Opener,
+    /// What takes apart messages that are packed one by one.
+    inflate: Inflate,
+    limits: Limits,
+    /// The times that are replayed.
+    span: Span,
+    /// The next message of every open segment, earliest on top.
+    heads: BinaryHeap<Reverse<Head>>,
+    open: Vec<OpenSegment>,
+    /// Places in `open` that hold no segment.
+    free: Vec<usize>,
+    open_bytes: u64,
+    /// Which track opens its next segment first, and from which log time on that is due.
+    next_open: Option<(u64, usize)>,
+    /// What ends the drive, and the log time before which all is still delivered.
+    damage: Option<(u64, ReplayError)>,
+    started: bool,
+    ended: bool,
+    /// How many subscriptions the top message was delivered to already.
+    fan: usize,
+    last_at_ns: i64,
+    out_of_order: u64,
+    progress: Progress,
+}
+
+/// The next message of an open segment. The order of the fields is the order of delivery.
+#[derive(Copy, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Head {
+    log_time: u64,
+    track: usize,
+    channel: u16,
+    /// Where the segment lies in its file.
+    offset: u64,
+    slot: usize,
+}
+
+impl Replay {
+    /// Opens the files of a drive and finds out what is in them.
+    ///
+    /// A directory is one that rosbag2 wrote: all files that its metadata name, or if it has none, those of its
+    /// name that we read. A file with a summary, and a database, cost a few reads; a file without a summary is read through
+    /// once, and a packed one is unpacked.
+    ///
+    /// # Errors
+    ///
+    /// [`ReplayError`] if there is no file, one cannot be opened, is nothing that we read or given twice, or
+    /// if they disagree on a topic's type. Damage further inside is reported by [`Replay::step`].
+    pub fn open(paths: &[PathBuf]) -> Result<Self, ReplayError> {
+        Self::open_as(paths, &Options::default())
+    }
+
+    /// As [`Replay::open`], with other limits.
+    ///
+    /// # Errors
+    ///
+    /// As [`Replay::open`].
+    pub fn open_with(paths: &[PathBuf], limits: Limits) -> Result<Self, ReplayError> {
+        Self::open_as(paths, &Options { limits, ..Options::default() })
+    }
+
+    /// As [`Replay::open`], in every way that it can be done.
+    ///
+    /// # Errors
+    ///
+    /// As [`Replay::open`].
+    pub fn open_as(paths: &[PathBuf], options: &Options) -> Result<Self, ReplayError> {
+        if paths.is_empty() {
+            return Err(ReplayError::NoFiles);
+        }
+        let mut opener = Opener::new(options.limits);
+        let tracks = storage::open(paths, options, &mut opener)?;
+        let files: Vec<_> = tracks.iter().map(Track::path_and_contents).collect();
+        let catalog = Catalog::build(&files, options.sources.clone())?;
+        Ok(Self {
+            tracks,
+            catalog,
+            sinks: Vec::new(),
+            opener,
+            inflate: Inflate::new(options.limits.chunk_bytes),
+            limits: options.limits,
+            span: Span::ALL,
+            heads: BinaryHeap::new(),
+            open: Vec::new(),
+            free: Vec::new(),
+            open_bytes: 0,
+            next_open: None,
+            damage: None,
+            started: false,
+            ended: false,
+            fan: 0,
+            last_at_ns: i64::MIN,
+            out_of_order: 0,
+            progress: Progress { done: 0, total: Some(0) },
+        })
+    }
+
+    /// Replays only messages with a log time from `from_ns` on and before `to_ns`; to be called before the first step.
+    ///
+    /// Damage that shows behind all of them is not reported: it costs none.
+    pub fn restrict(&mut self, from_ns: i64, to_ns: i64) {
+        self.span = Span::between(from_ns, to_ns);
+        self.progress.total = None;
+    }
+
+    /// Delivers the next message of a subscribed topic to its sink; `None` at the end of the drive.
+    ///
+    /// # Errors
+    ///
+    /// [`ReplayError::Damaged`] or [`ReplayError::Read`], once; see [`Replay`] for what was
+    /// delivered before. Every later call returns `None`.
+    pub fn step(&mut self) -> Result<Option<Step>, ReplayError> {
+        if !self.advance_to_head()? {
+            return Ok(None);
+        }
+        let Some(Reverse(head)) = self.heads.peek().copied() else {
+            return Ok(None);
+        };
+        let segment = &self.open[head.slot];
+        let track = &mut self.tracks[head.track];
+        let routed = segment
+            .head()
+            .ok_or(Damage::Malformed("a chunk lost its place"))
+            .and_then(|entry| track.route(segment.body(entry), self.fan, &mut self.inflate));
+        let Routed { subscription, is_last, meta, is_too_big, cdr } = match routed {
+            Ok(routed) => routed,
+            Err(what) => {
+                let error = track.damaged(head.offset, what);
+                return Err(self.end(error));
+            }
+        };
+        let sink = &self.sinks[subscription.0];
+        let verdict = if is_too_big {
+            sink.too_big(&meta, cdr.len());
+            Verdict::TooBig
+        } else {
+            sink.deliver(&meta, cdr)
+        };
+        let step = Step { at_ns: meta.at_ns, subscription, verdict, meta, bytes: cdr.len() };
+        if meta.at_ns < self.last_at_ns {
+            self.out_of_order += u64::from(self.fan == 0);
+        }
+        self.last_at_ns = self.last_at_ns.max(meta.at_ns);
+        self.progress.done += 1;
+        if is_last {
+            self.fan = 0;
+            self.pop();
+        } else {
+            self.fan += 1;
+        }
+        Ok(Some(step))
+    }
+
+    /// Log time of the message that the next [`Replay::step`] delivers, in ns; `None` at the end.
+    ///
+    /// # Errors
+    ///
+    /// As [`Replay::step`]: an error reported here is not reported again.
+    pub fn peek_at_ns(&mut self) -> Result<Option<i64>, ReplayError> {
+        if !self.advance_to_head()? {
+            return Ok(None);
+        }
+        Ok(self.heads.peek().map(|Reverse(head)| nanoseconds(head.log_time)))
+    }
+
+    /// Log time of the first message of any topic, in ns; `None` if there is none.
+    pub fn start_ns(&self) -> Option<i64> {
+        let starts = self.tracks.iter().filter_map(|track| track.times().map(|times| times.0));
+        starts.min().map(nanoseconds)
+    }
+
+    /// Log time of the last message of any topic, in ns; `None` if there is none, or if nobody knows: of a database that was
+    /// cut off.
+    pub fn end_ns(&self) -> Option<i64> {
+        if self.tracks.iter().any(Track::is_end_unknown) {
+            return None;
+        }
+        let ends = self.tracks.iter().filter_map(|track| track.times().map(|times| times.1));
+        ends.max().map(nanoseconds)
+    }
+
+    /// Whether a topic can be subscribed so.
+    ///
+    /// # Errors
+    ///
+    /// That of [`Transport::subscribe`].
+    pub fn can_subscribe(&self, spec: &TopicSpec) -> Result<(), TransportError> {
+        self.catalog.select(spec).map(drop)
+    }
+
+    /// How far the replay has come.
+    pub fn progress(&self) -> Progress {
+        self.progress
+    }
+
+    /// Messages delivered after one with a later log time. 0 unless [`Limits::open_bytes`] was reached.
+    pub fn out_of_order(&self) -> u64 {
+        self.out_of_order
+    }
+
+    /// Opens what has to be open for the top of `heads` to be the next message; false at the end.
+    fn advance_to_head(&mut self) -> Result<bool, ReplayError> {
+        if self.ended {
+            return Ok(false);
+        }
+        // Between two deliveries of one message nothing may take its place.
+        if self.fan > 0 {
+            return Ok(true);
+        }
+        if !self.started {
+            self.start();
+        }
+        while let Some((start, track)) = self.next_open {
+            let top = self.heads.peek().map(|Reverse(head)| head.log_time);
+            let is_full = top.is_some() && self.open_bytes >= self.limits.open_bytes;
+            let is_past_damage = self.damage.as_ref().is_some_and(|(before, _)| *before <= start);
+            if top.is_some_and(|top| top < start) || is_full || is_past_damage {
+                break;
+            }
+            self.open_next(start, track)?;
+        }
+        let top = self.heads.peek().map(|Reverse(head)| head.log_time);
+        if let Some((before, error)) = self.damage.take() {
+            if top.is_none_or(|top| top >= before) {
+                return Err(self.end(error));
+            }
+            self.damage = Some((before, error));
+        }
+        if top.is_none() {
+            let missing = if self.span == Span::ALL { self.tracks.iter().find_map(Track::missing) } else { None };
+            if let Some(error) = missing {
+                return Err(self.end(error));
+            }
+            self.ended = true;
+        }
+        Ok(top.is_some())
+    }
+
+    fn start(&mut self) {
+        self.started = true;
+        for track in &mut self.tracks {
+            if let Some((before, error)) = track.start(self.span)
+                && !self.span.ends_before(before)
+            {
+                keep_earlier(&mut self.damage, before, error);
+            }
+        }
+        self.find_next_open();
+    }
+
+    fn open_next(&mut self, start: u64, index: usize) -> Result<(), ReplayError> {
+        let slot = self.free.pop().unwrap_or_else(|| {
+            self.open.push(OpenSegment::default());
+            self.open.len() - 1
+        });
+        let track = &mut self.tracks[index];
+        let into = &mut self.open[slot];
+        let opened = track.open_next(&mut self.opener, into);
+        match (opened, into.head()) {
+            (Ok(offset), Some(entry)) => {
+                self.open_bytes += into.len() as u64;
+                let (log_time, channel) = (entry.log_time, entry.channel);
+                self.heads.push(Reverse(Head { log_time, track: index, channel, offset, slot }));
+            }
+            (Ok(_), None) => self.free.push(slot),
+            (Err(error @ ReplayError::Damaged { .. }), _) => {
+                self.free.push(slot);
+                keep_earlier(&mut self.damage, start, error);
+            }
+            (Err(error), _) => return Err(self.end(error)),
+        }
+        self.find_next_open();
+        Ok(())
+    }
+
+    fn find_next_open(&mut self) {
+        let starts = self.tracks.iter().enumerate();
+        self.next_open = starts.filter_map(|(index, track)| Some((track.next_start()?, index))).min();
+    }
+
+    /// Moves on from the top message.
+    fn pop(&mut self) {
+        let Some(mut top) = self.heads.peek_mut() else {
+            return;
+        };
+        let Reverse(head) = &mut *top;
+        let segment = &mut self.open[head.slot];
+        segment.advance();
+        match segment.head() {
+            Some(entry) => {
+                head.log_time = entry.log_time;
+                head.channel = entry.channel;
+            }
+            None => {
+                self.open_bytes -= segment.len() as u64;
+                self.free.push(head.slot);
+                PeekMut::pop(top);
+            }
+        }
+    }
+
+    fn end(&mut self, error: ReplayError) -> ReplayError {
+        self.ended = true;
+        self.heads.clear();
+        self.open = Vec::new();
+        self.next_open = None;
+        error
+    }
+}
+
+impl Transport for Replay {
+    fn topics(&self) -> Vec<DiscoveredTopic> {
+        self.catalog.topics()
+    }
+
+    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+        if self.started {
+            return Err(TransportError::AlreadyStarted { topic: spec.topic.clone() });
+        }
+        let selected = self.catalog.select(spec)?;
+        let subscription = Subscription(self.sinks.len());
+        for (track, channel) in selected.channels {
+            self.tracks[*track].subscribe(*channel, subscription, spec.max_bytes);
+        }
+        let expected = self.progress.total.zip(selected.messages);
+        self.progress.total = expected.map(|(total, messages)| total.saturating_add(messages));
+        self.sinks.push(sink);
+        Ok(subscription)
+    }
+
+    fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
+        self.catalog.definitions(topic)
+    }
+}
+
+fn keep_earlier(damage: &mut Option<(u64, ReplayError)>, before: u64, error: ReplayError) {
+    if damage.as_ref().is_none_or(|(known, _)| before < *known) {
+        *damage = Some((before, error));
+    }
+}

@@ -1,0 +1,257 @@
+//! What one file contains: its channels, and where its messages lie.
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use tracing::warn;
+
+use super::chunk::Segment;
+use super::damage::Damage;
+use super::records::{Channel, Schema, op};
+use gleaner_transport::Guid;
+
+/// A channel of a file.
+pub(super) struct ChannelInfo {
+    pub(super) topic: String,
+    /// Empty if the channel has no schema.
+    pub(super) type_name: String,
+    pub(super) message_encoding: String,
+    pub(super) schema_encoding: String,
+    pub(super) definitions_text: Option<Arc<str>>,
+    pub(super) offered_qos: Option<String>,
+    /// Who wrote its messages, if the file says so. Clips do.
+    pub(super) writer: Option<Guid>,
+}
+
+#[cfg(feature = "bags")]
+impl ChannelInfo {
+    /// What its texts take, without the definitions, which channels share.
+    pub(super) fn bytes(&self) -> usize {
+        let texts = [&self.topic, &self.type_name, &self.message_encoding, &self.schema_encoding];
+        texts.into_iter().chain(&self.offered_qos).map(|text| text.len()).sum()
+    }
+}
+
+struct SchemaInfo {
+    name: String,
+    encoding: String,
+    text: Option<Arc<str>>,
+}
+
+/// The channels of a file, as far as they are known.
+#[derive(Default)]
+pub(super) struct Channels {
+    schemas: HashMap<u16, SchemaInfo>,
+    by_id: HashMap<u16, ChannelInfo>,
+    /// Bytes of the schemas and channels that were kept.
+    bytes: usize,
+}
+
+/// What all schemas and channels of a file may take; a drive with a hundred topics has some 100 KiB.
+const KNOWN_BYTES: usize = 64 << 20;
+/// The longest description of offered qualities of service that is kept; a usual one has 200 bytes.
+const QOS_BYTES: usize = 64 << 10;
+/// How much of a name of the file stands in an error.
+const SHOWN_CHARS: usize = 100;
+const TOO_MUCH: Damage = Damage::Malformed("its schemas and channels take more than 64 MiB");
+
+impl Channels {
+    pub(super) fn len(&self) -> usize {
+        self.by_id.len()
+    }
+
+    pub(super) fn get(&self, id: u16) -> Option<&ChannelInfo> {
+        self.by_id.get(&id)
+    }
+
+    /// All channels by id, so that everything derived from them has one order.
+    pub(super) fn iter(&self) -> impl Iterator<Item = (u16, &ChannelInfo)> {
+        let mut all: Vec<_> = self.by_id.iter().map(|(id, info)| (*id, info)).collect();
+        all.sort_unstable_by_key(|(id, _)| *id);
+        all.into_iter()
+    }
+
+    /// Adds a channel that a database calls a topic.
+    #[cfg(feature = "bags")]
+    pub(super) fn add(&mut self, id: u16, info: ChannelInfo) -> Result<(), Damage> {
+        self.make_room(info.bytes() + info.definitions_text.as_ref().map_or(0, |text| text.len()))?;
+        self.by_id.insert(id, info);
+        Ok(())
+    }
+
+    pub(super) fn make_room(&mut self, bytes: usize) -> Result<(), Damage> {
+        self.bytes = self.bytes.saturating_add(bytes);
+        if self.bytes > KNOWN_BYTES { Err(TOO_MUCH) } else { Ok(()) }
+    }
+
+    /// Learns from a record; other records are skipped. Writers repeat schemas and channels, always with the same content:
+    /// a repetition that differs is damage, since messages would change their topic or their type.
+    pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
+        match opcode {
+            op::SCHEMA => {
+                let schema = schema_of(body)?;
+                if let Some(known) = self.schemas.get(&schema.id) {
+                    return known.check(&schema);
+                }
+                self.make_room(body.len())?;
+                self.schemas.insert(schema.id, SchemaInfo::of(&schema));
+            }
+            op::CHANNEL => {
+                let channel = channel_of(body)?;
+                if let Some(known) = self.by_id.get(&channel.id) {
+                    return self.check_channel(known, &channel);
+                }
+                self.make_room(body.len())?;
+                let schema = self.schema_of_channel(&channel)?;
+                let of = |field: fn(&SchemaInfo) -> &String| schema.map(field).cloned();
+                let info = ChannelInfo {
+                    topic: channel.topic.to_owned(),
+                    type_name: of(|schema| &schema.name).unwrap_or_default(),
+                    message_encoding: channel.encoding.to_owned(),
+                    schema_encoding: of(|schema| &schema.encoding).unwrap_or_default(),
+                    definitions_text: schema.and_then(|schema| schema.text.clone()),
+                    offered_qos: offered_qos(channel.topic, channel.metadata.get("offered_qos_profiles")),
+                    writer: channel.metadata.get("gleaner.writer").and_then(Guid::from_hex),
+                };
+                self.by_id.insert(channel.id, info);
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Compares a record with what is known; other records, and what is not known, are skipped.
+    pub(super) fn check(&self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
+        match opcode {
+            op::SCHEMA => {
+                let schema = schema_of(body)?;
+                self.schemas.get(&schema.id).map_or(Ok(()), |known| known.check(&schema))
+            }
+            op::CHANNEL => {
+                let channel = channel_of(body)?;
+                self.by_id.get(&channel.id).map_or(Ok(()), |known| self.check_channel(known, &channel))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn check_channel(&self, known: &ChannelInfo, again: &Channel<'_>) -> Result<(), Damage> {
+        let redefined = |field, first, second| redefined("channel", again.id, field, Some((first, second)));
+        if known.topic != again.topic {
+            return redefined("topic", &known.topic, again.topic);
+        }
+        if known.message_encoding != again.encoding {
+            return redefined("message encoding", &known.message_encoding, again.encoding);
+        }
+        let (type_name, encoding, text) = match self.schema_of_channel(again)? {
+            Some(schema) => (schema.name.as_str(), schema.encoding.as_str(), schema.text.as_ref()),
+            None => ("", "", None),
+        };
+        if known.type_name != type_name {
+            return redefined("type", &known.type_name, type_name);
+        }
+        if known.schema_encoding != encoding {
+            return redefined("schema encoding", &known.schema_encoding, encoding);
+        }
+        match known.definitions_text.as_ref() == text {
+            true => Ok(()),
+            false => self::redefined("channel", again.id, "definition of its type", None),
+        }
+    }
+
+    /// The schema that a channel names; number 0 stands for none.
+    fn schema_of_channel(&self, channel: &Channel<'_>) -> Result<Option<&SchemaInfo>, Damage> {
+        match self.schemas.get(&channel.schema) {
+            None if channel.schema != 0 => Err(Damage::Malformed("a channel names a schema that is not defined")),
+            schema => Ok(schema),
+        }
+    }
+}
+
+impl SchemaInfo {
+    fn of(schema: &Schema<'_>) -> Self {
+        let text = definitions(schema);
+        let (name, encoding) = (schema.name.to_owned(), schema.encoding.to_owned());
+        Self { name, encoding, text: Some(text.trim()).filter(|text| !text.is_empty()).map(Arc::from) }
+    }
+
+    fn check(&self, again: &Schema<'_>) -> Result<(), Damage> {
+        let redefined = |field, values| redefined("schema", again.id, field, values);
+        if self.name != again.name {
+            return redefined("name", Some((&self.name, again.name)));
+        }
+        if self.encoding != again.encoding {
+            return redefined("encoding", Some((&self.encoding, again.encoding)));
+        }
+        match self.text.as_deref().unwrap_or_default() == definitions(again).trim() {
+            true => Ok(()),
+            false => redefined("text", None),
+        }
+    }
+}
+
+/// The text of a schema. Comments in other encodings than UTF-8 are common and harmless.
+fn definitions<'a>(schema: &Schema<'a>) -> Cow<'a, str> {
+    String::from_utf8_lossy(schema.data)
+}
+
+fn schema_of(body: &[u8]) -> Result<Schema<'_>, Damage> {
+    Schema::parse(body).ok_or(Damage::Malformed("a schema record is malformed"))
+}
+
+fn channel_of(body: &[u8]) -> Result<Channel<'_>, Damage> {
+    Channel::parse(body).ok_or(Damage::Malformed("a channel record is malformed"))
+}
+
+fn redefined(what: &'static str, id: u16, field: &'static str, values: Option<(&str, &str)>) -> Result<(), Damage> {
+    let shown = |text: &str| text.chars().take(SHOWN_CHARS).collect();
+    Err(Damage::Redefined {
+        what,
+        id,
+        field,
+        values: values.map(|(first, second)| Box::new([shown(first), shown(second)])),
+    })
+}
+
+/// What rosbag2 notes of a topic's writers; it is nothing to fail over if it cannot be kept.
+pub(super) fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
+    let found = found.filter(|text| !text.is_empty())?;
+    if found.len() > QOS_BYTES {
+        warn!(topic, bytes = found.len(), "offered_qos_profiles is longer than 64 KiB, passed over");
+        return None;
+    }
+    Some(found.to_owned())
+}
+
+/// Everything a scan found out about a file.
+#[derive(Default)]
+pub(super) struct Contents {
+    pub(super) channels: Channels,
+    /// In file order.
+    pub(super) segments: Vec<Segment>,
+    /// Messages per channel: from the summary, or counted.
+    pub(super) messages: HashMap<u16, u64>,
+    /// Whether nobody counted them.
+    pub(super) uncounted: bool,
+    /// Whether `messages` is a claim of the summary, to be checked against what is delivered.
+    pub(super) claimed: bool,
+    /// Where the file is damaged and how; everything in `segments` lies before.
+    pub(super) damage: Option<(u64, Damage)>,
+    /// First and last log time, in ns, if they are not those of `segments`.
+    pub(super) times: Option<(u64, u64)>,
+    /// Whether the second of `times` is not the last: that is lost.
+    pub(super) is_end_unknown: bool,
+}
+
+impl Contents {
+    /// First and last log time, in ns.
+    pub(super) fn span(&self) -> Option<(u64, u64)> {
+        if self.times.is_some() {
+            return self.times;
+        }
+        // A chunk without messages has no times; writers put 0 in both.
+        let segments = self.segments.iter().filter(|s| (s.start_time, s.end_time) != (0, 0));
+        segments.map(|segment| (segment.start_time, segment.end_time)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+    }
+}

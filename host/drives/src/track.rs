@@ -1,0 +1,280 @@
+//! One file during a replay: which of its channels go where, and which segment comes next.
+
+use std::path::Path;
+
+use super::chunk::{OpenSegment, Opener, Segment, message_head};
+use super::damage::Damage;
+use super::error::ReplayError;
+use super::file::Contents;
+use super::inflate::{Inflate, ZSTD};
+use super::options::Span;
+use super::records::MESSAGE_HEAD;
+#[cfg(feature = "bags")]
+use super::rows::Rows;
+use super::source::Source;
+use super::writers::{Writer, Writers};
+use gleaner_messages::Endian;
+use gleaner_transport::{SampleMeta, Subscription};
+
+/// Bytes in front of the CDR of a message.
+const ENCAPSULATION: usize = 4;
+
+/// Where the messages of a file are.
+pub(super) enum Store {
+    /// In segments that were found when it was opened.
+    Mcap(Source),
+    /// In a database, which makes segments as they are asked for.
+    #[cfg(feature = "bags")]
+    Rows(Box<Rows>),
+}
+
+impl Store {
+    fn path(&self) -> &Path {
+        match self {
+            Self::Mcap(source) => source.path(),
+            #[cfg(feature = "bags")]
+            Self::Rows(rows) => rows.path(),
+        }
+    }
+
+    fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
+        match self {
+            Self::Mcap(source) => source.damaged(offset, what),
+            #[cfg(feature = "bags")]
+            Self::Rows(rows) => rows.damaged(what),
+        }
+    }
+}
+
+/// A file of a drive.
+pub(super) struct Track {
+    store: Store,
+    contents: Contents,
+    times: Option<(u64, u64)>,
+    /// What is replayed of it.
+    span: Span,
+    /// By channel id. Most files have a few channels with small ids, so a table beats a map.
+    routes: Vec<Channel>,
+    /// The segments still to open, the next one last.
+    queue: Vec<Segment>,
+}
+
+/// What a replay knows of one channel id.
+#[derive(Default)]
+struct Channel {
+    /// `None` if the file does not define the channel.
+    writer: Option<Writer>,
+    subscriptions: Vec<Wanted>,
+    /// The largest message that one of them takes, in bytes of CDR.
+    most: usize,
+    seen: u64,
+}
+
+/// Who wants the messages of a channel.
+#[derive(Copy, Clone)]
+struct Wanted {
+    by: Subscription,
+    /// The largest that is taken, in bytes of CDR.
+    most: usize,
+}
+
+/// A message on its way to a sink.
+pub(super) struct Routed<'a> {
+    pub(super) subscription: Subscription,
+    /// Whether no further subscription wants the message.
+    pub(super) is_last: bool,
+    pub(super) meta: SampleMeta,
+    /// Whether it is packed and larger than the subscription takes. Then `cdr` may be its beginning only.
+    pub(super) is_too_big: bool,
+    pub(super) cdr: &'a [u8],
+}
+
+impl Track {
+    pub(super) fn new(store: Store, contents: Contents, writers: &mut Writers) -> Self {
+        let mut routes = Vec::new();
+        for (id, writer) in writers.of_next_file(store.path(), &contents.channels) {
+            // Ids come in order, and are 16 bits wide.
+            routes.resize_with(usize::from(id) + 1, Channel::default);
+            routes[usize::from(id)].writer = Some(writer);
+        }
+        Self { times: contents.span(), span: Span::ALL, store, contents, routes, queue: Vec::new() }
+    }
+
+    pub(super) fn path_and_contents(&self) -> (&Path, &Contents) {
+        (self.store.path(), &self.contents)
+    }
+
+    /// First and last log time of any message.
+    pub(super) fn times(&self) -> Option<(u64, u64)> {
+        self.times
+    }
+
+    /// Whether the last of [`Track::times`] is lost.
+    pub(super) fn is_end_unknown(&self) -> bool {
+        self.contents.is_end_unknown
+    }
+
+    pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
+        self.store.damaged(offset, what)
+    }
+
+    /// `most` is the largest message that is wanted, in bytes of CDR.
+    pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription, most: usize) {
+        if let Some(channel) = self.routes.get_mut(usize::from(channel)) {
+            channel.subscriptions.push(Wanted { by: subscription, most });
+            channel.most = channel.most.max(most);
+        }
+    }
+
+    /// Lines up the segments that hold subscribed messages of `span`. Returns the damage that the scan found,
+    /// if any, and the log time before which everything still counts.
+    pub(super) fn start(&mut self, span: Span) -> Option<(u64, ReplayError)> {
+        self.span = span;
+        #[cfg(feature = "bags")]
+        if let Store::Rows(rows) = &mut self.store {
+            let routes = &self.routes;
+            // It reports by itself what ends it.
+            rows.start(span, self.contents.damage.take().map(|(_, what)| what), |id| wanted(routes, id) == Some(true));
+            return None;
+        }
+        let last = self.contents.segments.iter().map(|segment| segment.end_time).max();
+        self.queue = std::mem::take(&mut self.contents.segments);
+        let routes = &self.routes;
+        self.queue.retain(|segment| {
+            let is_wanted = segment.channels.as_ref().is_none_or(|channels| {
+                // An undefined channel is damage; the segment has to be opened to report it.
+                channels.iter().any(|id| wanted(routes, *id) != Some(false))
+            });
+            is_wanted && span.meets(segment.start_time, segment.end_time)
+        });
+        self.queue.sort_by_key(|segment| std::cmp::Reverse((segment.start_time, segment.offset)));
+        let (offset, what) = self.contents.damage.take()?;
+        let before = last.map_or(0, |last| last.saturating_add(1));
+        Some((before, self.store.damaged(offset, what)))
+    }
+
+    /// The log time at which the next segment has to be open.
+    pub(super) fn next_start(&self) -> Option<u64> {
+        match &self.store {
+            Store::Mcap(_) => self.queue.last().map(|segment| segment.start_time),
+            #[cfg(feature = "bags")]
+            Store::Rows(rows) => rows.next_start(),
+        }
+    }
+
+    /// Opens the next segment and returns where it lies, or of a database, its number. After an error there are no more.
+    pub(super) fn open_next(&mut self, opener: &mut Opener, into: &mut OpenSegment) -> Result<u64, ReplayError> {
+        let source = match &mut self.store {
+            Store::Mcap(source) => source,
+            #[cfg(feature = "bags")]
+            Store::Rows(rows) => return rows.open_next(into),
+        };
+        let Some(segment) = self.queue.pop() else {
+            return Ok(0);
+        };
+        let routes = &self.routes;
+        let opened = opener.open(source, &segment, &self.contents.channels, self.span, |id| wanted(routes, id), into);
+        match opened {
+            Ok(()) => Ok(segment.offset),
+            Err(error) => {
+                self.queue.clear();
+                Err(error)
+            }
+        }
+    }
+
+    /// Takes apart the message record in `body`; `fan` says how many subscriptions already have it. What is packed goes
+    /// through `inflate`, where it stays until the next that is.
+    #[inline]
+    pub(super) fn route<'a>(
+        &mut self,
+        body: &'a [u8],
+        fan: usize,
+        inflate: &'a mut Inflate,
+    ) -> Result<Routed<'a>, Damage> {
+        let head = message_head(body)?;
+        let channel = self.routes.get_mut(usize::from(head.channel)).ok_or(Damage::UnknownChannel(head.channel))?;
+        let &wanted = channel.subscriptions.get(fan).ok_or(Damage::UnknownChannel(head.channel))?;
+        let writer = channel.writer.as_ref().ok_or(Damage::UnknownChannel(head.channel))?;
+        let mut message = &body[MESSAGE_HEAD..];
+        let is_packed = message.starts_with(&ZSTD);
+        if is_packed {
+            if fan == 0 {
+                let topic = || topic_of(&self.contents, head.channel);
+                let unpacked = inflate.unpack(message, channel.most.saturating_add(ENCAPSULATION + 1));
+                unpacked.map_err(|source| Damage::Unpack { topic: topic(), source })?;
+                if inflate.is_full() {
+                    return Err(Damage::MessageTooLarge { topic: topic(), allowed: inflate.allowed() });
+                }
+            }
+            message = inflate.bytes();
+        }
+        let (endian, options, cdr) = match message {
+            &[0, 0, a, b, ref cdr @ ..] => (Endian::Big, [a, b], cdr),
+            &[0, 1, a, b, ref cdr @ ..] => (Endian::Little, [a, b], cdr),
+            other => {
+                let topic = topic_of(&self.contents, head.channel);
+                return Err(Damage::Encapsulation { topic, found: other[..other.len().min(4)].to_vec() });
+            }
+        };
+        if fan == 0 {
+            writer.count(head.sequence);
+            channel.seen += 1;
+        }
+        Ok(Routed {
+            subscription: wanted.by,
+            is_last: fan + 1 == channel.subscriptions.len(),
+            meta: SampleMeta {
+                at_ns: nanoseconds(head.log_time),
+                publish_ns: nanoseconds(head.publish_time),
+                writer: writer.guid(),
+                seq: writer.last_seq(),
+                endian,
+                options,
+            },
+            is_too_big: is_packed && cdr.len() > wanted.most,
+            cdr,
+        })
+    }
+
+    /// At the end: the first subscribed channel that did not hold what the summary claims.
+    pub(super) fn missing(&self) -> Option<ReplayError> {
+        if !self.contents.claimed {
+            return None;
+        }
+        self.contents.channels.iter().find_map(|(id, info)| {
+            let channel = self.routes.get(usize::from(id))?;
+            let expected = self.contents.messages.get(&id).copied().unwrap_or(0);
+            if channel.subscriptions.is_empty() || channel.seen == expected {
+                return None;
+            }
+            let (topic, found) = (info.topic.clone(), channel.seen);
+            match &self.store {
+                Store::Mcap(source) => Some(source.damaged(source.len(), Damage::Missing { topic, expected, found })),
+                // rosbag2 also counts what it could not write in time: its recorder lost that, not this file.
+                #[cfg(feature = "bags")]
+                Store::Rows(rows) => {
+                    let path = rows.path().display();
+                    tracing::warn!(%path, topic, expected, found, "metadata.yaml counts another number of messages");
+                    None
+                }
+            }
+        })
+    }
+}
+
+fn topic_of(contents: &Contents, channel: u16) -> String {
+    contents.channels.get(channel).map(|info| info.topic.clone()).unwrap_or_default()
+}
+
+/// A time of a file, where times are unsigned. Log times of messages fit; what an index says, and when a message was published,
+/// may be beyond the year 2262, and then reads as the end of time.
+pub(super) fn nanoseconds(log_time: u64) -> i64 {
+    i64::try_from(log_time).unwrap_or(i64::MAX)
+}
+
+/// Whether a channel is subscribed; `None` if the file does not define it.
+fn wanted(routes: &[Channel], id: u16) -> Option<bool> {
+    let channel = routes.get(usize::from(id)).filter(|channel| channel.writer.is_some())?;
+    Some(!channel.subscriptions.is_empty())
+}

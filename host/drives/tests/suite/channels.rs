@@ -1,0 +1,200 @@
+//! What channels say of themselves: who wrote their messages, and the quality of service they offered.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Cursor;
+use std::path::PathBuf;
+
+use gleaner_drives::{Damage, Replay, ReplayError, Step};
+use gleaner_transport::{Guid, Transport};
+use mcap::records::MessageHeader;
+
+use crate::support::{TEXT, TYPE, Written, file, listen, record, run, small_chunks, write};
+
+const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
+const CLAIM: &str = "00112233445566778899aabbccddeeff";
+
+/// A channel to write: its topic, and one pair of metadata.
+type Channel<'a> = (&'static str, &'a str, &'a str);
+
+/// A drive with two messages on each of `channels`, in turn, which all number them 1 and 2.
+fn drive_of(channels: &[Channel<'_>], first: u64) -> PathBuf {
+    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
+    let ids: Vec<u16> = channels
+        .iter()
+        .enumerate()
+        .map(|(n, (topic, key, value))| {
+            // The writer under the tests joins equal channels; ours are to differ.
+            let metadata = [("n".to_owned(), n.to_string()), (key.to_string(), value.to_string())].into();
+            writer.add_channel(schema, topic, "cdr", &metadata).unwrap()
+        })
+        .collect();
+    for sequence in [1, 2] {
+        for (n, (id, (topic, ..))) in ids.iter().zip(channels).enumerate() {
+            let at = first + u64::from(sequence) * 1000 + n as u64;
+            write(&mut writer, *id, &Written { topic, at, sequence, value: n as i64 });
+        }
+    }
+    writer.finish().unwrap();
+    file(&writer.into_inner().into_inner())
+}
+
+fn steps(paths: &[PathBuf], topics: &[&str]) -> Vec<Step> {
+    let mut replay = Replay::open(paths).unwrap();
+    listen(&mut replay, topics);
+    let (steps, error) = run(&mut replay);
+    assert!(error.is_none(), "{error:?}");
+    steps
+}
+
+/// The writers in the order of their first message, once it is sure that each of them counts up.
+fn writers(steps: &[Step]) -> Vec<String> {
+    let mut last = BTreeMap::new();
+    let mut order = Vec::new();
+    for step in steps {
+        let seq = last.insert((step.subscription, step.meta.writer), step.meta.seq);
+        assert!(seq.unwrap_or(0) < step.meta.seq, "{} fell back", step.meta.writer);
+        let name = step.meta.writer.to_string();
+        if !order.contains(&name) {
+            order.push(name);
+        }
+    }
+    order
+}
+
+fn made_up(file: u32, channel: u32) -> String {
+    format!("6d636170{file:08x}{channel:08x}00000000")
+}
+
+#[test]
+fn a_message_keeps_the_options_of_its_encapsulation() {
+    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
+    let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+    for (endian, log_time) in [(0, 1), (1, 2)] {
+        let header = MessageHeader { channel_id, sequence: 0, log_time, publish_time: 0 };
+        writer.write_to_known_channel(&header, &[0, endian, 7, 9, 0, 0, 0, 0, 0, 0, 0, 0]).unwrap();
+    }
+    writer.finish().unwrap();
+    let steps = steps(&[file(&writer.into_inner().into_inner())], &["/a"]);
+    assert!(steps.iter().map(|step| step.meta.options).eq([[7, 9]; 2]));
+}
+
+#[test]
+fn a_channel_names_the_writer_of_its_messages() {
+    let other = CLAIM.replace('0', "7");
+    let key = "gleaner.writer";
+    let path = drive_of(&[("/a", key, CLAIM), ("/a", key, &other), ("/a", "writer", CLAIM), ("/b", key, CLAIM)], 0);
+    let steps = steps(&[path], &["/a", "/b"]);
+    assert_eq!(writers(&steps), [CLAIM, &other, &made_up(0, 3)]);
+    assert_eq!(Guid::from_hex(CLAIM), Some(steps[0].meta.writer));
+    // The writer of two topics counts for each of them.
+    assert!(steps.iter().map(|step| step.meta.seq).eq([1, 1, 1, 1, 2, 2, 2, 2]));
+}
+
+#[test]
+fn a_name_that_is_not_32_lower_case_hex_digits_is_ignored() {
+    let upper = CLAIM.to_uppercase();
+    for name in ["", "0x112233", &CLAIM[1..], &format!("{CLAIM}0"), &format!(" {}", &CLAIM[1..]), &upper] {
+        let path = drive_of(&[("/a", "gleaner.writer", name)], 0);
+        assert_eq!(writers(&steps(&[path], &["/a"])), [made_up(0, 1)], "{name}");
+    }
+}
+
+#[test]
+fn the_second_channel_of_a_topic_that_claims_a_writer_does_not_get_it() {
+    let claim = ("/a", "gleaner.writer", CLAIM);
+    let steps = steps(&[drive_of(&[claim, claim, claim], 0)], &["/a"]);
+    assert_eq!(writers(&steps), [CLAIM.to_owned(), made_up(0, 2), made_up(0, 3)]);
+    assert!(steps.iter().map(|step| step.meta.seq).eq([1, 1, 1, 2, 2, 2]));
+}
+
+#[test]
+fn no_writer_is_made_up_that_another_channel_claims() {
+    // What clips of drives hold that named no writers.
+    let (one, two) = (made_up(0, 1), made_up(0, 2));
+    let key = "gleaner.writer";
+    let path = drive_of(&[("/a", "", ""), ("/a", key, &one), ("/a", key, &two), ("/a", key, &two)], 0);
+    let found = writers(&steps(&[path], &["/a"]));
+    assert_eq!(found.iter().collect::<BTreeSet<_>>().len(), 4);
+    assert_eq!(found[1..3], [one.clone(), two]);
+    assert_eq!(found[0], one.replace("100000000", "100000001"));
+}
+
+#[test]
+fn a_writer_counts_on_from_one_file_to_the_next() {
+    let claim = ("/a", "gleaner.writer", CLAIM);
+    let (first, second) = (drive_of(&[claim], 0), drive_of(&[claim], 500));
+    // The times of the two are interleaved.
+    let steps = steps(&[first, second], &["/a"]);
+    assert_eq!(writers(&steps), [CLAIM]);
+    assert!(steps.iter().map(|step| step.meta.seq).eq([1, 2, 3, 4]));
+}
+
+#[test]
+fn a_topic_has_the_quality_of_service_of_its_first_channel_that_names_one() {
+    let qos = |paths: &[PathBuf]| {
+        let topics = Replay::open(paths).unwrap().topics();
+        topics.into_iter().map(|topic| topic.offered_qos).collect::<Vec<_>>()
+    };
+    let key = "offered_qos_profiles";
+    let long = "x".repeat(65 << 10);
+    let fits = "y".repeat(64 << 10);
+    let first = drive_of(&[("/a", "", ""), ("/a", key, ""), ("/a", key, &long), ("/b", key, "- depth: 1\n")], 0);
+    let second = drive_of(&[("/a", key, &fits), ("/a", key, "z"), ("/b", key, "z"), ("/c", "", "")], 0);
+    assert_eq!(qos(std::slice::from_ref(&first)), [None, Some("- depth: 1\n".to_owned())]);
+    assert_eq!(qos(&[first, second]), [Some(fits), Some("- depth: 1\n".to_owned()), None]);
+}
+
+fn text(text: &str) -> Vec<u8> {
+    [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+/// How a file ends that defines one channel whose record has `metadata` at its end.
+fn ending(metadata: &[u8]) -> (Damage, Vec<gleaner_transport::DiscoveredTopic>) {
+    let schema = [&1u16.to_le_bytes()[..], &text(TYPE), &text("ros2msg"), &text(TEXT)].concat();
+    let channel = [&1u16.to_le_bytes()[..], &1u16.to_le_bytes(), &text("/a"), &text("cdr"), metadata].concat();
+    let bytes = [&MAGIC[..], &record(3, &schema), &record(4, &channel)].concat();
+    let mut replay = Replay::open(&[file(&bytes)]).unwrap();
+    let topics = replay.topics();
+    match run(&mut replay).1 {
+        Some(ReplayError::Damaged { what, .. }) => (what, topics),
+        other => panic!("expected damage, got {other:?}"),
+    }
+}
+
+#[test]
+fn a_channel_whose_metadata_is_malformed_is_damage() {
+    let pair = [text("key"), text("value")].concat();
+    let map = |bytes: &[u8]| [&(bytes.len() as u32).to_le_bytes()[..], bytes].concat();
+    for bad in [
+        vec![0; 3],
+        u32::MAX.to_le_bytes().to_vec(),
+        map(&pair)[..10].to_vec(),
+        map(&pair[..pair.len() - 1]),
+        map(&text("key")),
+        map(&[text("key"), vec![0xff; 4]].concat()),
+    ] {
+        let (what, topics) = ending(&bad);
+        assert!(matches!(what, Damage::Malformed("a channel record is malformed")), "{bad:?}: {what}");
+        assert!(topics.is_empty());
+    }
+}
+
+#[test]
+fn metadata_that_nobody_needs_is_passed_over() {
+    let qos = [text("offered_qos_profiles"), text("- depth: 1")].concat();
+    let foreign = [&[2, 0, 0, 0, 0xff, 0xfe][..], &text("value")].concat();
+    let map = |bytes: &[u8]| [&(bytes.len() as u32).to_le_bytes()[..], bytes].concat();
+    for (metadata, expected) in [
+        (Vec::new(), None),
+        (map(&[]), None),
+        (map(&[foreign.clone(), qos.clone()].concat()), Some("- depth: 1")),
+        ([map(&qos), vec![1, 2, 3]].concat(), Some("- depth: 1")),
+        (map(&[qos, text("offered_qos_profiles"), text("second")].concat()), Some("- depth: 1")),
+    ] {
+        let (what, topics) = ending(&metadata);
+        assert!(matches!(what, Damage::NoFooter), "{what}");
+        assert_eq!(topics[0].offered_qos.as_deref(), expected);
+    }
+}

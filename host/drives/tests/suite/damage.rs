@@ -1,0 +1,207 @@
+//! Damaged drives: all that is promised comes first, then one error that says where and what.
+
+use gleaner_drives::{Damage, Limits, Place, Replay, ReplayError};
+use mcap::WriteOptions;
+use mcap::records::ChunkIndex;
+
+use crate::support::{Written, drive, expected, file, listen, replayed, run, small_chunks, ticking};
+
+const TOPICS: [&str; 2] = ["/a", "/b"];
+
+fn messages() -> Vec<Written> {
+    ticking(&TOPICS, 300, 1000)
+}
+
+/// The chunks of a drive in file order, each with the number of messages in it.
+fn chunks(bytes: &[u8]) -> Vec<(ChunkIndex, usize)> {
+    let summary = mcap::Summary::read(bytes).unwrap().unwrap();
+    let mut indexes = summary.chunk_indexes.clone();
+    indexes.sort_by_key(|index| index.chunk_start_offset);
+    let count = |index: &ChunkIndex| summary.stream_chunk(bytes, index).unwrap().count();
+    indexes.into_iter().map(|index| (index.clone(), count(&index))).collect()
+}
+
+fn damage(error: Option<ReplayError>) -> (u64, Damage) {
+    match error {
+        Some(ReplayError::Damaged { at: Place::Byte(offset), what, .. }) => (offset, what),
+        other => panic!("expected damage, got {other:?}"),
+    }
+}
+
+#[test]
+fn a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut() {
+    for options in [small_chunks(), small_chunks().compression(None)] {
+        let bytes = drive(options, &messages());
+        let chunks = chunks(&bytes);
+        for part in 1..50 {
+            let cut = bytes.len() * part / 50;
+            let (all, error) = match Replay::open(&[file(&bytes[..cut])]) {
+                // Cut before the first channel: there is no topic to subscribe.
+                Ok(replay) if gleaner_transport::Transport::topics(&replay).len() < 2 => continue,
+                Ok(_) => replayed(&[file(&bytes[..cut])], &TOPICS),
+                Err(error) => panic!("cut at {cut}: {error}"),
+            };
+            let end = |index: &ChunkIndex| index.chunk_start_offset + index.chunk_length;
+            let whole = chunks.iter().filter(|(index, _)| end(index) <= cut as u64);
+            let count: usize = whole.map(|(_, count)| count).sum();
+            assert_eq!(all, expected(&messages())[..count], "cut at {cut}");
+            damage(error);
+        }
+    }
+}
+
+#[test]
+fn a_file_without_chunks_gives_every_whole_message_before_the_cut() {
+    let bytes = drive(small_chunks().use_chunks(false), &messages());
+    let mut most = 0;
+    for cut in (200..bytes.len()).step_by(97) {
+        let replay = Replay::open(&[file(&bytes[..cut])]).unwrap();
+        if gleaner_transport::Transport::topics(&replay).len() < 2 {
+            continue;
+        }
+        let (all, error) = replayed(&[file(&bytes[..cut])], &TOPICS);
+        assert_eq!(all, expected(&messages())[..all.len()], "cut at {cut}");
+        assert!(all.len() >= most);
+        most = all.len();
+        damage(error);
+    }
+    assert_eq!(most, 300);
+}
+
+#[test]
+fn whole_data_without_a_footer_is_replayed_and_then_reported() {
+    let bytes = drive(small_chunks(), &messages());
+    // The data section ends where the last message index ends.
+    let (last, _) = chunks(&bytes).pop().unwrap();
+    let end = last.chunk_start_offset + last.chunk_length + last.message_index_length;
+    let (all, error) = replayed(&[file(&bytes[..end as usize])], &TOPICS);
+    assert_eq!(all, expected(&messages()));
+    let (offset, what) = damage(error);
+    assert_eq!(offset, end);
+    assert!(matches!(what, Damage::NoFooter));
+}
+
+#[test]
+fn a_flipped_byte_in_a_chunk_ends_the_drive_before_that_chunk() {
+    for options in [small_chunks(), small_chunks().compression(None)] {
+        let bytes = drive(options, &messages());
+        for (bad, _) in chunks(&bytes).iter().step_by(3) {
+            let mut bytes = bytes.clone();
+            bytes[(bad.chunk_start_offset + bad.chunk_length) as usize - 20] ^= 0x10;
+            let (all, error) = replayed(&[file(&bytes)], &TOPICS);
+            let before: Vec<_> =
+                expected(&messages()).into_iter().filter(|(at, _)| *at < bad.message_start_time as i64).collect();
+            assert_eq!(all, before);
+            let (offset, what) = damage(error);
+            assert_eq!(offset, bad.chunk_start_offset);
+            assert!(matches!(what, Damage::ChunkCrc { .. } | Damage::Inflate(_)), "{what:?}");
+        }
+    }
+}
+
+#[test]
+fn a_flipped_byte_in_a_file_without_summary_ends_the_readable_part() {
+    let indexed = drive(small_chunks(), &messages());
+    let options = small_chunks().emit_summary_records(false).emit_summary_offsets(false);
+    let mut bytes = drive(options, &messages());
+    let (bad, _) = &chunks(&indexed)[5];
+    bytes[(bad.chunk_start_offset + bad.chunk_length) as usize - 20] ^= 0x10;
+    let (all, error) = replayed(&[file(&bytes)], &TOPICS);
+    let count: usize = chunks(&indexed)[..5].iter().map(|(_, count)| count).sum();
+    assert_eq!(all, expected(&messages())[..count]);
+    assert_eq!(damage(error).0, bad.chunk_start_offset);
+}
+
+#[test]
+fn damage_in_one_file_ends_the_drive_for_all() {
+    let first = drive(small_chunks(), &messages());
+    let cut = &first[..first.len() / 2];
+    let mut second = ticking(&["/c"], 300, 1005);
+    second.iter_mut().for_each(|message| message.value += 1000);
+    let paths = [file(cut), file(&drive(small_chunks(), &second))];
+    let (all, error) = replayed(&paths, &["/a", "/b", "/c"]);
+    damage(error);
+    let last = all.iter().filter(|(_, value)| *value < 1000).map(|(at, _)| *at).max().unwrap();
+    let both: Vec<_> = messages().into_iter().chain(second).collect();
+    let until: Vec<_> = expected(&both).into_iter().filter(|(at, _)| *at <= last).collect();
+    assert_eq!(all, until);
+}
+
+#[test]
+fn a_damaged_summary_costs_no_message() {
+    let mut bytes = drive(small_chunks(), &messages());
+    let at = bytes.len() - 60;
+    bytes[at] ^= 0xff;
+    let (all, error) = replayed(&[file(&bytes)], &TOPICS);
+    assert_eq!(all, expected(&messages()));
+    assert!(matches!(damage(error).1, Damage::Summary(_)));
+}
+
+#[test]
+fn messages_outside_chunks_are_covered_by_the_checksum_of_the_data_section() {
+    let mut bytes = drive(small_chunks().use_chunks(false), &messages());
+    // A value: nothing else notices.
+    let needle = 150i64.to_le_bytes();
+    let at = bytes.windows(8).position(|window| window == needle).unwrap();
+    bytes[at] ^= 1;
+    let (all, error) = replayed(&[file(&bytes)], &TOPICS);
+    assert_eq!(all.len(), 300);
+    assert!(matches!(damage(error).1, Damage::DataCrc { .. }));
+}
+
+#[test]
+fn fewer_messages_than_the_summary_counts_are_noticed_at_the_end() {
+    let mut bytes = drive(small_chunks().calculate_summary_section_crc(false), &messages());
+    // The last entry of the statistics: channel 1 has 150 messages.
+    let mut needle = 1u16.to_le_bytes().to_vec();
+    needle.extend(150u64.to_le_bytes());
+    let at = bytes.windows(10).rposition(|window| window == needle).unwrap();
+    bytes[at + 2] = 151;
+    let (all, error) = replayed(&[file(&bytes)], &TOPICS);
+    assert_eq!(all.len(), 300);
+    let (_, what) = damage(error);
+    assert_eq!(what.to_string(), "topic `/a` should have 151 messages; 150 were found");
+}
+
+#[test]
+fn messages_that_are_not_cdr_end_the_drive_where_they_stand() {
+    use std::collections::BTreeMap;
+    use std::io::Cursor;
+    for bad in [&[0u8, 7, 0, 0, 1][..], &[0, 1, 0], &[]] {
+        let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+        let schema = writer.add_schema(crate::support::TYPE, "ros2msg", b"int64 value").unwrap();
+        let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+        for message in ticking(&["/a"], 5, 10) {
+            crate::support::write(&mut writer, channel_id, &message);
+        }
+        let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time: 1000, publish_time: 0 };
+        writer.write_to_known_channel(&header, bad).unwrap();
+        writer.finish().unwrap();
+        let (all, error) = replayed(&[file(&writer.into_inner().into_inner())], &["/a"]);
+        assert_eq!(all.len(), 5);
+        assert!(matches!(damage(error).1, Damage::Encapsulation { .. }));
+    }
+}
+
+#[test]
+fn a_chunk_beyond_the_limit_is_refused() {
+    let bytes = drive(WriteOptions::new(), &messages());
+    let limits = Limits { chunk_bytes: 10_000, ..Limits::default() };
+    let mut replay = Replay::open_with(&[file(&bytes)], limits).unwrap();
+    listen(&mut replay, &TOPICS);
+    let (steps, error) = run(&mut replay);
+    assert!(steps.is_empty());
+    let what = damage(error).1;
+    assert!(matches!(what, Damage::ChunkTooLarge { claimed: 10_001.., allowed: 10_000 }), "{what}");
+}
+
+#[test]
+fn after_the_error_there_is_nothing_more() {
+    let bytes = drive(small_chunks(), &messages());
+    let mut replay = Replay::open(&[file(&bytes[..bytes.len() / 2])]).unwrap();
+    listen(&mut replay, &TOPICS);
+    let (_, error) = run(&mut replay);
+    damage(error);
+    assert!(replay.step().unwrap().is_none());
+    assert!(replay.peek_at_ns().unwrap().is_none());
+}

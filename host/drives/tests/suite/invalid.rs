@@ -1,0 +1,202 @@
+//! Files that contradict themselves without any byte being lost: each is damage, named with its place.
+
+use gleaner_drives::{Damage, Place, Replay, ReplayError};
+use mcap::WriteOptions;
+use mcap::records::ChunkIndex;
+
+use crate::support::{
+    TEXT, TYPE, Written, drive, expected, file, listen, record, replayed, run, small_chunks, ticking,
+};
+
+const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
+const TOPICS: [&str; 2] = ["/a", "/b"];
+
+fn damage(error: Option<ReplayError>) -> (u64, Damage) {
+    match error {
+        Some(ReplayError::Damaged { at: Place::Byte(offset), what, .. }) => (offset, what),
+        other => panic!("expected damage, got {other:?}"),
+    }
+}
+
+fn text(text: &str) -> Vec<u8> {
+    [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+fn schema(id: u16, name: &str, encoding: &str, definitions: &str) -> Vec<u8> {
+    record(3, &[&id.to_le_bytes()[..], &text(name), &text(encoding), &text(definitions)].concat())
+}
+
+fn channel(id: u16, schema: u16, topic: &str, encoding: &str) -> Vec<u8> {
+    record(4, &[&id.to_le_bytes()[..], &schema.to_le_bytes(), &text(topic), &text(encoding), &[0; 4]].concat())
+}
+
+fn message(channel: u16, at: u64) -> Vec<u8> {
+    let head = [&channel.to_le_bytes()[..], &[0; 4], &at.to_le_bytes(), &at.to_le_bytes()].concat();
+    record(5, &[head, vec![0, 1, 0, 0], (at as i64).to_le_bytes().to_vec()].concat())
+}
+
+/// A finished file of these records, without a summary.
+fn finished(records: &[Vec<u8>]) -> Vec<u8> {
+    let end = [record(15, &[0; 4]), record(2, &[0; 20]), MAGIC.to_vec()].concat();
+    [MAGIC.to_vec(), records.concat(), end].concat()
+}
+
+/// The records in one chunk, which is not packed.
+fn chunk(records: &[Vec<u8>], first: u64, last: u64) -> Vec<u8> {
+    let bytes = records.concat();
+    let len = (bytes.len() as u64).to_le_bytes();
+    record(6, &[&first.to_le_bytes()[..], &last.to_le_bytes(), &len, &[0; 4], &text(""), &len, &bytes].concat())
+}
+
+#[test]
+fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
+    let (number, a) = (schema(1, TYPE, "ros2msg", TEXT), channel(1, 1, "/a", "cdr"));
+    for (again, said) in [
+        (vec![channel(1, 1, "/b", "cdr")], "channel 1 is defined again with another topic: first `/a`, then `/b`"),
+        (
+            vec![schema(2, "std_msgs/msg/String", "ros2msg", "string data"), channel(1, 2, "/a", "cdr")],
+            "channel 1 is defined again with another type: first `test_msgs/msg/Number`, then `std_msgs/msg/String`",
+        ),
+        (
+            vec![channel(1, 1, "/a", "json")],
+            "channel 1 is defined again with another message encoding: first `cdr`, then `json`",
+        ),
+        (
+            vec![schema(2, TYPE, "ros2msg", "int64 other"), channel(1, 2, "/a", "cdr")],
+            "channel 1 is defined again with another definition of its type",
+        ),
+        (vec![channel(1, 7, "/a", "cdr")], "a channel names a schema that is not defined"),
+        (
+            vec![schema(1, "test_msgs/msg/Other", "ros2msg", TEXT)],
+            "schema 1 is defined again with another name: first `test_msgs/msg/Number`, then `test_msgs/msg/Other`",
+        ),
+        (
+            vec![schema(1, TYPE, "ros2idl", TEXT)],
+            "schema 1 is defined again with another encoding: first `ros2msg`, then `ros2idl`",
+        ),
+        (vec![schema(1, TYPE, "ros2msg", "int64 other")], "schema 1 is defined again with another text"),
+    ] {
+        let before = [number.clone(), a.clone(), message(1, 10), message(1, 20)];
+        let behind = [again, vec![message(1, 30), message(1, 40)]].concat();
+        let runs = finished(&[&before[..], &behind].concat());
+        let at = MAGIC.len() + before.concat().len();
+        let in_run = behind[..behind.len() - 3].concat().len();
+        let chunks = finished(&[chunk(&before, 10, 20), chunk(&behind, 30, 40)]);
+        let second = MAGIC.len() + chunk(&before, 10, 20).len();
+        for (bytes, at) in [(runs, at + in_run), (chunks, second)] {
+            let (all, error) = replayed(&[file(&bytes)], &["/a"]);
+            assert_eq!(all, [(10, 10), (20, 20)], "{said}");
+            let (offset, what) = damage(error);
+            assert_eq!((offset, what.to_string().as_str()), (at as u64, said));
+        }
+    }
+}
+
+#[test]
+fn a_channel_that_a_chunk_defines_other_than_the_index_is_damage() {
+    let options = small_chunks().compression(None).calculate_chunk_crcs(false).calculate_data_section_crc(false);
+    let mut bytes = drive(options, &ticking(&TOPICS, 300, 1000));
+    // The first of the two stands in the first chunk, the second in the summary.
+    let needle = channel(2, 1, "/b", "cdr");
+    let at = bytes.windows(needle.len()).position(|window| window == needle).unwrap();
+    bytes[at + 9] = 1;
+    let (all, error) = replayed(&[file(&bytes)], &TOPICS);
+    assert_eq!(all, []);
+    assert_eq!(damage(error).1.to_string(), "channel 1 is defined again with another topic: first `/a`, then `/b`");
+}
+
+#[test]
+fn channels_and_schemas_that_are_repeated_are_none() {
+    let definitions = [schema(1, TYPE, "ros2msg", TEXT), channel(1, 1, "/a", "cdr")];
+    let one = |at| [definitions.to_vec(), vec![message(1, at)]].concat();
+    for bytes in [finished(&[one(10), one(20)].concat()), finished(&[chunk(&one(10), 10, 10), chunk(&one(20), 20, 20)])]
+    {
+        let (all, error) = replayed(&[file(&bytes)], &["/a"]);
+        assert!(error.is_none(), "{error:?}");
+        assert_eq!(all, [(10, 10), (20, 20)]);
+    }
+}
+
+#[test]
+fn a_stamp_that_no_clock_can_show_is_damage_and_no_other_stamp() {
+    for late in [i64::MAX as u64 + 1, u64::MAX] {
+        let mut messages = ticking(&["/a"], 300, 1000);
+        messages[200].at = late;
+        for (options, whole) in [(small_chunks(), 190), (small_chunks().use_chunks(false), 200)] {
+            let (all, error) = replayed(&[file(&drive(options, &messages))], &["/a"]);
+            assert!((whole..=200).contains(&all.len()), "{}", all.len());
+            assert_eq!(all, expected(&messages[..200])[..all.len()]);
+            let what = damage(error).1.to_string();
+            assert_eq!(what, format!("a message has log time {late} ns, which is after the year 2262"));
+        }
+    }
+    let messages = [Written { topic: "/a", at: i64::MAX as u64, sequence: 1, value: 7 }];
+    let (all, error) = replayed(&[file(&drive(small_chunks(), &messages))], &["/a"]);
+    assert!(error.is_none(), "{error:?}");
+    assert_eq!(all, [(i64::MAX, 7)]);
+}
+
+/// A drive whose index says other times of some chunks than these have; and where the first of those lies.
+fn lying(
+    options: WriteOptions,
+    messages: &[Written],
+    lies: impl Fn(usize, &ChunkIndex) -> (u64, u64),
+) -> (Vec<u8>, u64) {
+    let mut bytes = drive(options.calculate_summary_section_crc(false), messages);
+    let mut chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+    chunks.sort_by_key(|chunk| chunk.chunk_start_offset);
+    let mut first = None;
+    for (n, chunk) in chunks.iter().enumerate() {
+        let words = |start: u64, end: u64| [start, end, chunk.chunk_start_offset].map(u64::to_le_bytes).concat();
+        let needle = words(chunk.message_start_time, chunk.message_end_time);
+        let (start, end) = lies(n, chunk);
+        let lie = words(start, end);
+        if lie != needle {
+            let at = bytes.windows(needle.len()).rposition(|window| window == needle).unwrap();
+            bytes[at..at + lie.len()].copy_from_slice(&lie);
+            first.get_or_insert(chunk.chunk_start_offset);
+        }
+    }
+    (bytes, first.unwrap())
+}
+
+#[test]
+fn an_index_of_wrong_times_is_not_believed_and_costs_no_message() {
+    let messages = ticking(&TOPICS, 300, 1000);
+    type Lie = fn(usize, &ChunkIndex) -> (u64, u64);
+    let lies: [Lie; 4] = [
+        |_, chunk| (chunk.message_start_time + 1_000_000, chunk.message_end_time + 1_000_000),
+        |n, chunk| if n == 0 { (7, 7) } else { (chunk.message_start_time, chunk.message_end_time) },
+        |n, chunk| if n == 9 { (1000, 1000) } else { (chunk.message_start_time, chunk.message_end_time) },
+        |n, chunk| if n == 9 { (0, u64::MAX) } else { (chunk.message_start_time, chunk.message_end_time) },
+    ];
+    for lie in lies {
+        let (bytes, _) = lying(small_chunks(), &messages, lie);
+        let path = file(&bytes);
+        let (all, error) = replayed(std::slice::from_ref(&path), &TOPICS);
+        assert_eq!(all, expected(&messages));
+        assert!(damage(error).1.to_string().contains("it gives a chunk other times than the chunk itself"));
+        let mut part = Replay::open(&[path]).unwrap();
+        assert_eq!((part.start_ns(), part.end_ns()), (Some(1000), Some(3990)));
+        part.restrict(1500, 2500);
+        let memory = listen(&mut part, &TOPICS);
+        assert!(run(&mut part).1.is_none());
+        assert_eq!(memory.values(), expected(&messages[50..150]));
+    }
+}
+
+#[test]
+fn a_message_outside_of_the_times_of_its_chunk_is_damage() {
+    // So many chunks that not all are compared with the index before they are read.
+    let messages = ticking(&TOPICS, 3000, 1000);
+    let (bytes, at) = lying(small_chunks(), &messages, |n, chunk| {
+        (chunk.message_start_time + 20 * u64::from(n == 101), chunk.message_end_time)
+    });
+    let (all, error) = replayed(&[file(&bytes)], &TOPICS);
+    let (offset, what) = damage(error);
+    assert_eq!(offset, at);
+    let Damage::OutsideChunk { found, first, .. } = what else { panic!("{what}") };
+    assert_eq!(found + 20, first);
+    assert_eq!(all, expected(&messages[..all.len()]));
+    assert!(all.len() > 1000 && all.last().unwrap().0 < found as i64, "{}", all.len());
+}

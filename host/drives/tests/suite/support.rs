@@ -1,0 +1,220 @@
+//! What the tests share: a CDR writer, drives made on the spot, and a sink that remembers.
+// Each test program uses its own part.
+#![allow(dead_code)]
+
+use std::collections::BTreeMap;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+use gleaner_drives::{Replay, ReplayError, Step};
+use gleaner_messages::Endian;
+use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use mcap::records::MessageHeader;
+use mcap::{WriteOptions, Writer};
+
+/// Writes CDR the way a ROS 2 node does, worked out apart from the reader under test.
+pub struct Cdr {
+    pub bytes: Vec<u8>,
+    endian: Endian,
+}
+
+impl Cdr {
+    pub fn new(endian: Endian) -> Self {
+        Self { bytes: Vec::new(), endian }
+    }
+
+    fn put<const N: usize>(mut self, mut little: [u8; N]) -> Self {
+        while !self.bytes.len().is_multiple_of(N) {
+            self.bytes.push(0xAA);
+        }
+        if self.endian == Endian::Big {
+            little.reverse();
+        }
+        self.bytes.extend(little);
+        self
+    }
+
+    pub fn u8(self, value: u8) -> Self {
+        self.put([value])
+    }
+
+    pub fn i16(self, value: i16) -> Self {
+        self.put(value.to_le_bytes())
+    }
+
+    pub fn u16(self, value: u16) -> Self {
+        self.put(value.to_le_bytes())
+    }
+
+    pub fn i32(self, value: i32) -> Self {
+        self.put(value.to_le_bytes())
+    }
+
+    pub fn u32(self, value: u32) -> Self {
+        self.put(value.to_le_bytes())
+    }
+
+    pub fn i64(self, value: i64) -> Self {
+        self.put(value.to_le_bytes())
+    }
+
+    pub fn f32(self, value: f32) -> Self {
+        self.put(value.to_le_bytes())
+    }
+
+    pub fn f64(self, value: f64) -> Self {
+        self.put(value.to_le_bytes())
+    }
+
+    pub fn text(self, value: &str) -> Self {
+        let mut cdr = self.u32(value.len() as u32 + 1);
+        cdr.bytes.extend(value.as_bytes());
+        cdr.bytes.push(0);
+        cdr
+    }
+
+    pub fn blob(self, value: &[u8]) -> Self {
+        let mut cdr = self.u32(value.len() as u32);
+        cdr.bytes.extend(value);
+        cdr
+    }
+}
+
+/// The sample drive that comes with the project.
+pub fn sample_drive() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/highway_drive.mcap")
+}
+
+/// A message to write into a drive.
+#[derive(Clone, Debug)]
+pub struct Written {
+    pub topic: &'static str,
+    pub at: u64,
+    pub sequence: u32,
+    pub value: i64,
+}
+
+pub const TYPE: &str = "test_msgs/msg/Number";
+pub const TEXT: &str = "int64 value\n";
+
+/// Messages on `topics` in turn, one per 10 ns from `first` on.
+pub fn ticking(topics: &[&'static str], count: usize, first: u64) -> Vec<Written> {
+    (0..count)
+        .map(|n| Written {
+            topic: topics[n % topics.len()],
+            at: first + 10 * n as u64,
+            sequence: n as u32 + 1,
+            value: n as i64,
+        })
+        .collect()
+}
+
+/// Chunks of about ten messages, so that small drives have many.
+pub fn small_chunks() -> WriteOptions {
+    WriteOptions::new().profile("ros2").chunk_size(Some(450))
+}
+
+/// The bytes of a drive with `messages` in file order.
+pub fn drive(options: WriteOptions, messages: &[Written]) -> Vec<u8> {
+    let mut writer = options.create(Cursor::new(Vec::new())).unwrap();
+    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
+    let mut channels = BTreeMap::new();
+    for message in messages {
+        let channel = *channels
+            .entry(message.topic)
+            .or_insert_with(|| writer.add_channel(schema, message.topic, "cdr", &BTreeMap::new()).unwrap());
+        write(&mut writer, channel, message);
+    }
+    writer.finish().unwrap();
+    writer.into_inner().into_inner()
+}
+
+pub fn write(writer: &mut Writer<Cursor<Vec<u8>>>, channel_id: u16, message: &Written) {
+    let header = MessageHeader {
+        channel_id,
+        sequence: message.sequence,
+        log_time: message.at,
+        publish_time: message.at.saturating_add(1),
+    };
+    let mut data = vec![0, 1, 0, 0];
+    data.extend(message.value.to_le_bytes());
+    writer.write_to_known_channel(&header, &data).unwrap();
+}
+
+/// A record as it stands in a file, for those that no sound writer writes.
+pub fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
+    [&[opcode][..], &(body.len() as u64).to_le_bytes(), body].concat()
+}
+
+/// Writes `bytes` to a new file.
+pub fn file(bytes: &[u8]) -> PathBuf {
+    static NEXT: AtomicUsize = AtomicUsize::new(0);
+    let name = format!("{}-{}.mcap", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+/// Remembers what it was given.
+#[derive(Default)]
+pub struct Memory(pub Mutex<Vec<(SampleMeta, Vec<u8>)>>);
+
+impl Sink for Memory {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+        self.0.lock().unwrap().push((*meta, cdr.to_vec()));
+        Verdict::Taken
+    }
+}
+
+impl Memory {
+    /// (log time, value) of each message, as drives of [`drive`] hold them.
+    pub fn values(&self) -> Vec<(i64, i64)> {
+        let taken = self.0.lock().unwrap();
+        let value = |cdr: &[u8]| i64::from_le_bytes(cdr.try_into().unwrap());
+        taken.iter().map(|(meta, cdr)| (meta.at_ns, value(cdr))).collect()
+    }
+}
+
+pub fn spec(topic: &str) -> TopicSpec {
+    let (topic, type_name) = (topic.to_owned(), TYPE.to_owned());
+    TopicSpec { topic, type_name, queue: 1, max_bytes: 1 << 20, qos: Default::default() }
+}
+
+/// Subscribes one memory to `topics`, in that order.
+pub fn listen(replay: &mut Replay, topics: &[&str]) -> Arc<Memory> {
+    let memory = Arc::new(Memory::default());
+    for topic in topics {
+        replay.subscribe(&spec(topic), memory.clone()).unwrap();
+    }
+    memory
+}
+
+/// Steps to the end, or to the error.
+pub fn run(replay: &mut Replay) -> (Vec<Step>, Option<ReplayError>) {
+    let mut steps = Vec::new();
+    loop {
+        match replay.step() {
+            Ok(Some(step)) => steps.push(step),
+            Ok(None) => return (steps, None),
+            Err(error) => return (steps, Some(error)),
+        }
+    }
+}
+
+/// Replays drives made by [`drive`]: the (log time, value) pairs delivered, and how it ended.
+pub fn replayed(paths: &[PathBuf], topics: &[&str]) -> (Vec<(i64, i64)>, Option<ReplayError>) {
+    let mut replay = Replay::open(paths).unwrap();
+    let memory = listen(&mut replay, topics);
+    let (_, error) = run(&mut replay);
+    assert_eq!(replay.out_of_order(), 0);
+    (memory.values(), error)
+}
+
+/// What a faithful replay of `messages` delivers.
+pub fn expected(messages: &[Written]) -> Vec<(i64, i64)> {
+    let mut all: Vec<_> = messages.iter().map(|m| (m.at as i64, m.value)).collect();
+    all.sort_by_key(|(at, _)| *at);
+    all
+}

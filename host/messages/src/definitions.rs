@@ -1,0 +1,350 @@
+//! A message type and everything it refers to, resolved and measured.
+
+use std::collections::{HashMap, HashSet};
+
+use super::layout::{Layout, Table};
+use super::parse::{self, Count, Element, Field, Primitive};
+
+/// How deep types may nest. ROS 2's own deepest (diagnostics, visualization) stay below 10.
+const MAX_DEPTH: usize = 32;
+/// How many fields a type may have once every nested type is written out. Nesting doubles cheaply,
+/// so a text of one page could otherwise ask for billions.
+const MAX_FIELDS: usize = 20_000;
+
+/// A message type with all types it refers to, ready for [`super::FieldPath::compile`].
+#[derive(Debug)]
+pub struct Definitions {
+    type_name: String,
+    /// Every reachable type; the root is the last.
+    structs: Vec<Struct>,
+}
+
+#[derive(Debug)]
+pub(super) struct Struct {
+    /// `pkg/Type`.
+    pub(super) name: String,
+    pub(super) fields: Vec<Field<usize>>,
+    pub(super) layout: Layout,
+    /// The fewest bytes a value takes, without padding; at least 1.
+    pub(super) least: usize,
+    /// Fields with all nested ones written out.
+    weight: usize,
+}
+
+/// Why a definition text cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum MessageError {
+    /// A line is not ros2msg.
+    #[error("line {line}: expected {wanted}, found `{text}`")]
+    Syntax {
+        /// Line number, from 1.
+        line: usize,
+        /// The line, cut at 80 characters.
+        text: String,
+        /// What was expected.
+        wanted: &'static str,
+    },
+    /// A field has a type whose definition is not in the text.
+    #[error("field `{field}` of type `{type_name}` has type `{missing}`, which is not defined")]
+    Undefined {
+        /// The type with the field.
+        type_name: String,
+        /// The field.
+        field: String,
+        /// The type that is missing.
+        missing: String,
+    },
+    /// Two parts define the same type, differently.
+    #[error("type `{type_name}` is defined twice, differently")]
+    Conflict {
+        /// The type.
+        type_name: String,
+    },
+    /// A type has two fields of one name.
+    #[error("type `{type_name}` has two fields `{field}`")]
+    DuplicateField {
+        /// The type.
+        type_name: String,
+        /// The field.
+        field: String,
+    },
+    /// A type contains itself, which has no finite size.
+    #[error("type `{type_name}` contains itself")]
+    Recursive {
+        /// The type.
+        type_name: String,
+    },
+    /// Types nest deeper than any sensible message.
+    #[error("type `{type_name}` nests deeper than {MAX_DEPTH} levels")]
+    TooDeep {
+        /// The type at which the limit was reached.
+        type_name: String,
+    },
+    /// A type is larger than any sensible message.
+    #[error("type `{type_name}` has more than {MAX_FIELDS} fields or 4 GiB")]
+    TooLarge {
+        /// The type.
+        type_name: String,
+    },
+}
+
+impl Definitions {
+    /// Parses the ros2msg text of `type_name` (`pkg/msg/Type` or `pkg/Type`): the fields of that
+    /// type, then, each behind a line of `=` and a line `MSG: pkg/Type`, those of the types it
+    /// refers to. `builtin_interfaces/Time` and `Duration` are known if the text leaves them out.
+    ///
+    /// # Errors
+    ///
+    /// [`MessageError`] for malformed lines, missing or contradictory definitions, types that
+    /// contain themselves, and absurd depth or size.
+    pub fn parse(type_name: &str, text: &str) -> Result<Self, MessageError> {
+        let root = short_name(type_name);
+        let mut parts: HashMap<String, Vec<Field<String>>> = HashMap::new();
+        for part in parse::parts(text)? {
+            let name = part.name.map_or_else(|| root.clone(), short_name);
+            match parts.get(&name) {
+                Some(known) if *known != part.fields => {
+                    return Err(MessageError::Conflict { type_name: name });
+                }
+                Some(_) => {}
+                None => {
+                    parts.insert(name, part.fields);
+                }
+            }
+        }
+        for builtin in ["builtin_interfaces/Time", "builtin_interfaces/Duration"] {
+            parts.entry(builtin.to_owned()).or_insert_with(seconds_and_nanoseconds);
+        }
+        let mut resolver = Resolver { parts, structs: Vec::new(), known: HashMap::new(), open: Vec::new() };
+        resolver.resolve(&root)?;
+        Ok(Self { type_name: full_name(&root), structs: resolver.structs })
+    }
+
+    /// The type's full name, `pkg/msg/Type`.
+    pub fn type_name(&self) -> &str {
+        &self.type_name
+    }
+
+    /// The names of the type's own fields, in wire order.
+    pub fn fields(&self) -> impl Iterator<Item = &str> {
+        self.root().fields.iter().map(|field| field.name.as_str())
+    }
+
+    /// Whether both say the same of every message.
+    pub(super) fn says_as(&self, other: &Self) -> bool {
+        let all = |definitions: &Self| -> Vec<(String, Vec<Field<usize>>)> {
+            definitions.structs.iter().map(|one| (one.name.clone(), one.fields.clone())).collect()
+        };
+        // Both list a type before those that contain it, in the order of the fields.
+        all(self) == all(other)
+    }
+
+    pub(super) fn root(&self) -> &Struct {
+        self.structs.last().expect("parse resolves the root or fails, and pushes it last")
+    }
+
+    /// The type that a resolved field refers to.
+    pub(super) fn get(&self, index: usize) -> &Struct {
+        &self.structs[index]
+    }
+}
+
+/// `pkg/msg/Type` as `pkg/Type`; anything else unchanged.
+pub fn short_name(type_name: &str) -> String {
+    match type_name.split_once("/msg/") {
+        Some((package, name)) => format!("{package}/{name}"),
+        None => type_name.to_owned(),
+    }
+}
+
+/// `pkg/Type` as `pkg/msg/Type`, the spelling of manifests and messages to people.
+pub(super) fn full_name(short_name: &str) -> String {
+    match short_name.split_once('/') {
+        Some((package, name)) => format!("{package}/msg/{name}"),
+        None => short_name.to_owned(),
+    }
+}
+
+fn seconds_and_nanoseconds() -> Vec<Field<String>> {
+    [("sec", Primitive::I32), ("nanosec", Primitive::U32)]
+        .map(|(name, primitive)| Field {
+            name: name.to_owned(),
+            element: Element::Primitive(primitive),
+            count: Count::One,
+        })
+        .into()
+}
+
+/// Turns names into indices, innermost types first.
+struct Resolver {
+    parts: HashMap<String, Vec<Field<String>>>,
+    structs: Vec<Struct>,
+    known: HashMap<String, usize>,
+    /// The types being resolved, outermost first.
+    open: Vec<String>,
+}
+
+impl Resolver {
+    fn resolve(&mut self, name: &str) -> Result<usize, MessageError> {
+        if let Some(&index) = self.known.get(name) {
+            return Ok(index);
+        }
+        let type_name = name.to_owned();
+        if self.open.contains(&type_name) {
+            return Err(MessageError::Recursive { type_name });
+        }
+        if self.open.len() >= MAX_DEPTH {
+            return Err(MessageError::TooDeep { type_name });
+        }
+        self.open.push(type_name);
+        let mut fields = Vec::new();
+        let mut names = HashSet::new();
+        for field in self.parts.get(name).cloned().unwrap_or_default() {
+            if !names.insert(field.name.clone()) {
+                let type_name = name.to_owned();
+                return Err(MessageError::DuplicateField { type_name, field: field.name });
+            }
+            fields.push(self.field(name, field)?);
+        }
+        // rosidl gives a type without fields this one byte, since C has no empty structs.
+        if fields.is_empty() {
+            fields.push(Field {
+                name: "structure_needs_at_least_one_member".to_owned(),
+                element: Element::Primitive(Primitive::U8),
+                count: Count::One,
+            });
+        }
+        let measured = self.measure(name, fields)?;
+        self.open.pop();
+        self.structs.push(measured);
+        let index = self.structs.len() - 1;
+        self.known.insert(name.to_owned(), index);
+        Ok(index)
+    }
+
+    fn field(&mut self, owner: &str, field: Field<String>) -> Result<Field<usize>, MessageError> {
+        let Field { name, element, count } = field;
+        let element = match element {
+            Element::Primitive(primitive) => Element::Primitive(primitive),
+            Element::Text => Element::Text,
+            Element::WideText => Element::WideText,
+            Element::Struct(wanted) => {
+                let found = self.lookup(owner, &wanted).ok_or_else(|| MessageError::Undefined {
+                    type_name: owner.to_owned(),
+                    field: name.clone(),
+                    missing: wanted,
+                })?;
+                Element::Struct(self.resolve(&found)?)
+            }
+        };
+        Ok(Field { name, element, count })
+    }
+
+    /// A bare name means the owner's package, or the `Header` that ROS 1 habits left behind.
+    fn lookup(&self, owner: &str, wanted: &str) -> Option<String> {
+        let wanted = short_name(wanted);
+        let candidates = match (wanted.contains('/'), owner.split_once('/')) {
+            (true, _) => vec![wanted],
+            (false, Some((package, _))) => {
+                vec![format!("{package}/{wanted}"), format!("std_msgs/{wanted}")]
+            }
+            (false, None) => vec![wanted],
+        };
+        candidates.into_iter().find(|name| self.parts.contains_key(name))
+    }
+
+    fn measure(&self, name: &str, fields: Vec<Field<usize>>) -> Result<Struct, MessageError> {
+        let too_large = || MessageError::TooLarge { type_name: name.to_owned() };
+        let mut layout = Some(Table::EMPTY);
+        let (mut least, mut weight) = (0usize, 0usize);
+        for field in &fields {
+            let (element, element_least, element_weight) = match &field.element {
+                Element::Primitive(p) => (Layout::Fixed(Table::primitive(*p)), p.size(), 1),
+                Element::Text | Element::WideText => (Layout::Variable, 4, 1),
+                Element::Struct(index) => {
+                    let inner = &self.structs[*index];
+                    (inner.layout, inner.least, inner.weight.saturating_add(1))
+                }
+            };
+            let (table, field_least) = match (field.count, element) {
+                (Count::One, Layout::Fixed(table)) => (Some(table), element_least),
+                (Count::One, Layout::Variable) => (None, element_least),
+                (Count::Fixed(n), Layout::Fixed(table)) => {
+                    let table = table.times(n).ok_or_else(too_large)?;
+                    (Some(table), element_least.saturating_mul(n))
+                }
+                (Count::Fixed(n), Layout::Variable) => (None, element_least.saturating_mul(n)),
+                (Count::Sequence, _) => (None, 4),
+            };
+            layout = match (layout, table) {
+                (Some(before), Some(table)) => Some(before.then(&table).ok_or_else(too_large)?),
+                _ => None,
+            };
+            least = least.saturating_add(field_least);
+            weight = weight.saturating_add(element_weight);
+        }
+        if weight > MAX_FIELDS || least > u32::MAX as usize {
+            return Err(too_large());
+        }
+        let layout = layout.map_or(Layout::Variable, Layout::Fixed);
+        Ok(Struct { name: name.to_owned(), fields, layout, least, weight })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nested_types_resolve_by_full_name_and_within_the_package() {
+        let text = "Inner a\nother/msg/Far b\n===\nMSG: pkg/Inner\nint8 x\n===\nMSG: other/Far\nint8 y\n";
+        let definitions = Definitions::parse("pkg/msg/Outer", text).unwrap();
+        assert_eq!(definitions.type_name(), "pkg/msg/Outer");
+        assert_eq!(definitions.fields().collect::<Vec<_>>(), ["a", "b"]);
+    }
+
+    #[test]
+    fn time_is_known_without_its_definition() {
+        assert!(Definitions::parse("p/T", "builtin_interfaces/Time stamp").is_ok());
+    }
+
+    #[test]
+    fn a_type_that_contains_itself_is_refused() {
+        let text = "p/A a\n===\nMSG: p/A\np/B[] b\n===\nMSG: p/B\np/A a\n";
+        let refused = Definitions::parse("p/T", text).unwrap_err();
+        assert_eq!(refused, MessageError::Recursive { type_name: "p/A".to_owned() });
+    }
+
+    #[test]
+    fn endless_nesting_is_refused() {
+        let mut deep = "p/T0 x\n".to_owned();
+        for level in 0..40 {
+            deep += &format!("===\nMSG: p/T{level}\np/T{} x\n", level + 1);
+        }
+        assert!(matches!(Definitions::parse("p/T", &deep), Err(MessageError::TooDeep { .. })));
+    }
+
+    #[test]
+    fn a_page_that_unfolds_to_billions_is_refused() {
+        let mut text = "p/T0 x\n".to_owned();
+        for level in 0..25 {
+            text += &format!("===\nMSG: p/T{level}\np/T{0} a\np/T{0} b\n", level + 1);
+        }
+        text += "===\nMSG: p/T25\nstring s\n";
+        assert!(matches!(Definitions::parse("p/T", &text), Err(MessageError::TooLarge { .. })));
+    }
+
+    #[test]
+    fn a_missing_type_is_named() {
+        let refused = Definitions::parse("p/T", "q/Gone[] x").unwrap_err();
+        assert_eq!(refused.to_string(), "field `x` of type `p/T` has type `q/Gone`, which is not defined");
+    }
+
+    #[test]
+    fn contradictory_and_duplicate_definitions_are_refused() {
+        let text = "p/A a\n===\nMSG: p/A\nint8 x\n===\nMSG: p/A\nint16 x\n";
+        assert!(matches!(Definitions::parse("p/T", text), Err(MessageError::Conflict { .. })));
+        let twice = Definitions::parse("p/T", "int8 x\nint8 x");
+        assert!(matches!(twice, Err(MessageError::DuplicateField { .. })));
+    }
+}

@@ -1,0 +1,351 @@
+//! Field paths: `a.b[3].c` to a skip program, with errors that say what would have been right.
+
+use super::cdr::{CdrError, Cursor, Endian};
+use super::definitions::{Definitions, Struct, full_name};
+use super::layout::{Layout, Table};
+use super::parse::{Count, Element, Field};
+use super::program::{Leaf, Op, walk};
+use super::value::{Kind, Value};
+use gleaner_base::words::{hint, nearest};
+
+/// One field of one message type, compiled.
+#[derive(Debug)]
+pub struct FieldPath {
+    path: String,
+    type_name: String,
+    ops: Box<[Op]>,
+    leaf: Leaf,
+}
+
+/// Why a path names no readable field.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PathError {
+    /// The path is not of the form `a.b[3].c`.
+    #[error("path `{path}` is malformed at `{rest}`; write it like `a.b[3].c`")]
+    Syntax {
+        /// The path.
+        path: String,
+        /// From where on it makes no sense.
+        rest: String,
+    },
+    /// A type has no field of that name.
+    #[error("type `{type_name}` has no field `{field}`{}; it has: {}", hint(nearest), fields.join(", "))]
+    NoSuchField {
+        /// The type.
+        type_name: String,
+        /// The field asked for.
+        field: String,
+        /// The fields there are, in wire order.
+        fields: Vec<String>,
+        /// The closest of them, if one is close.
+        nearest: Option<String>,
+    },
+    /// The path ends at a message instead of a value.
+    #[error("`{path}` is a whole `{type_name}`; name one of its fields: {}", fields.join(", "))]
+    WholeStruct {
+        /// The path.
+        path: String,
+        /// The type it leads to.
+        type_name: String,
+        /// That type's fields.
+        fields: Vec<String>,
+    },
+    /// The path passes through an array without saying which element.
+    #[error("field `{field}` of `{path}` is an array; write `{field}[0]` and so on")]
+    NeedsIndex {
+        /// The path.
+        path: String,
+        /// The array.
+        field: String,
+    },
+    /// The path goes on behind a value, or indexes something that is no array.
+    #[error("field `{field}` of `{path}` is a single value with nothing inside")]
+    NothingInside {
+        /// The path.
+        path: String,
+        /// The value.
+        field: String,
+    },
+    /// The index is beyond an array of fixed length.
+    #[error("field `{field}` of `{path}` has {len} elements, counted from 0")]
+    OutOfRange {
+        /// The path.
+        path: String,
+        /// The array.
+        field: String,
+        /// Its length.
+        len: usize,
+    },
+    /// A `wstring` is in the way. ROS 2's implementations disagree on the width of its characters,
+    /// so neither it nor anything behind it can be found with certainty.
+    #[error("`{path}` is or lies behind the wstring `{field}`, whose size on the wire is not defined")]
+    WideText {
+        /// The path.
+        path: String,
+        /// The wstring.
+        field: String,
+    },
+}
+
+impl FieldPath {
+    /// Compiles `path`, such as `linear_acceleration.x`, `cov[3]` or `fields[2].name`.
+    ///
+    /// # Errors
+    ///
+    /// [`PathError`], naming the type and what it has instead.
+    pub fn compile(definitions: &Definitions, path: &str) -> Result<Self, PathError> {
+        let segments = segments(path)?;
+        let mut compiler = Compiler { definitions, path, ops: Vec::new() };
+        let leaf = compiler.enter_struct(definitions.root(), &segments)?;
+        Ok(Self {
+            path: path.to_owned(),
+            type_name: definitions.type_name().to_owned(),
+            ops: compiler.ops.into(),
+            leaf,
+        })
+    }
+
+    /// Whether reading it may walk over much of a message, because elements of varying size lie before the field.
+    pub fn walks(&self) -> bool {
+        self.ops.iter().any(|op| matches!(op, Op::Each { .. } | Op::Times { .. }))
+    }
+
+    /// The path as it was written.
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    /// The message type it was compiled for, `pkg/msg/Type`.
+    pub fn type_name(&self) -> &str {
+        &self.type_name
+    }
+
+    /// What kind of value [`FieldPath::read`] returns.
+    pub fn kind(&self) -> Kind {
+        self.leaf.kind()
+    }
+
+    /// Reads the field from `cdr`, a message of the path's type without encapsulation.
+    ///
+    /// # Errors
+    ///
+    /// [`CdrError`] if the bytes are no such message up to and including the field; what lies
+    /// behind it is not looked at.
+    pub fn read<'a>(&self, cdr: &'a [u8], endian: Endian) -> Result<Value<'a>, CdrError> {
+        let mut cursor = Cursor::new(cdr, endian);
+        walk(&self.ops, &mut cursor)?;
+        self.leaf.read(&mut cursor)
+    }
+
+    /// Reads a boolean (0 or 1), an integer (rounded beyond 2^53) or a floating-point number.
+    ///
+    /// # Errors
+    ///
+    /// As [`FieldPath::read`], and [`CdrError::NotANumber`] if [`Kind::is_number`] is false.
+    pub fn number(&self, cdr: &[u8], endian: Endian) -> Result<f64, CdrError> {
+        let mut cursor = Cursor::new(cdr, endian);
+        walk(&self.ops, &mut cursor)?;
+        self.leaf.number(&mut cursor)
+    }
+}
+
+/// One step of a written path.
+#[derive(Debug, PartialEq, Eq)]
+enum Segment<'p> {
+    Name(&'p str),
+    Index(usize),
+}
+
+fn segments(path: &str) -> Result<Vec<Segment<'_>>, PathError> {
+    let malformed = |rest: &str| PathError::Syntax { path: path.to_owned(), rest: rest.to_owned() };
+    let mut segments = Vec::new();
+    let mut rest = path;
+    loop {
+        let is_part = |c: char| c.is_ascii_alphanumeric() || c == '_';
+        let end = rest.find(|c| !is_part(c)).unwrap_or(rest.len());
+        let (name, mut tail) = rest.split_at(end);
+        if name.is_empty() {
+            return Err(malformed(rest));
+        }
+        segments.push(Segment::Name(name));
+        while let Some(inside) = tail.strip_prefix('[') {
+            let (digits, behind) = inside.split_once(']').ok_or_else(|| malformed(tail))?;
+            let is_number = digits.bytes().all(|byte| byte.is_ascii_digit());
+            let index = digits.parse().ok().filter(|_| is_number);
+            segments.push(Segment::Index(index.ok_or_else(|| malformed(tail))?));
+            tail = behind;
+        }
+        if tail.is_empty() {
+            return Ok(segments);
+        }
+        rest = tail.strip_prefix('.').ok_or_else(|| malformed(tail))?;
+    }
+}
+
+struct Compiler<'d> {
+    definitions: &'d Definitions,
+    path: &'d str,
+    ops: Vec<Op>,
+}
+
+impl Compiler<'_> {
+    /// Emits the steps from the start of `owner` to the field that `segments` name.
+    fn enter_struct(&mut self, owner: &Struct, segments: &[Segment<'_>]) -> Result<Leaf, PathError> {
+        let Some((Segment::Name(name), rest)) = segments.split_first() else {
+            // `a[0][1]`: an array of structs is indexed twice.
+            return Err(self.whole(owner));
+        };
+        let position = owner.fields.iter().position(|field| field.name == *name);
+        let Some(position) = position else {
+            let names = owner.fields.iter().map(|field| field.name.as_str());
+            return Err(PathError::NoSuchField {
+                type_name: full_name(&owner.name),
+                field: (*name).to_owned(),
+                fields: names.clone().map(str::to_owned).collect(),
+                nearest: nearest(name, names).map(str::to_owned),
+            });
+        };
+        for field in &owner.fields[..position] {
+            self.skip(field)?;
+        }
+        let field = &owner.fields[position];
+        match (field.count, rest) {
+            (Count::One, rest) => self.enter_element(field, rest),
+            (count, []) => match &field.element {
+                Element::Primitive(primitive) => Ok(Leaf::Array(*primitive, count)),
+                Element::Text => Ok(Leaf::Texts(count)),
+                Element::WideText => Err(self.wide(field)),
+                Element::Struct(_) => Err(self.needs_index(field)),
+            },
+            (count, [Segment::Index(index), rest @ ..]) => {
+                self.skip_to_element(field, count, *index)?;
+                self.enter_element(field, rest)
+            }
+            (_, [Segment::Name(_), ..]) => Err(self.needs_index(field)),
+        }
+    }
+
+    /// Emits the steps into one element of `field`, which starts here.
+    fn enter_element(&mut self, field: &Field<usize>, rest: &[Segment<'_>]) -> Result<Leaf, PathError> {
+        match (&field.element, rest) {
+            (Element::Struct(index), []) => Err(self.whole(self.definitions.get(*index))),
+            (Element::Struct(index), rest) => self.enter_struct(self.definitions.get(*index), rest),
+            (Element::WideText, _) => Err(self.wide(field)),
+            (Element::Primitive(primitive), []) => Ok(Leaf::Scalar(*primitive)),
+            (Element::Text, []) => Ok(Leaf::Text),
+            _ => Err(PathError::NothingInside { path: self.path.to_owned(), field: field.name.clone() }),
+        }
+    }
+
+    fn skip_to_element(&mut self, field: &Field<usize>, count: Count, index: usize) -> Result<(), PathError> {
+        let beyond = |len| PathError::OutOfRange { path: self.path.to_owned(), field: field.name.clone(), len };
+        match count {
+            Count::Fixed(n) if index >= n => return Err(beyond(n)),
+            Count::Sequence if u32::try_from(index).is_err() => {
+                return Err(beyond(u32::MAX as usize));
+            }
+            Count::Sequence => self.ops.push(Op::Enter { index, least: self.least(field) }),
+            _ => {}
+        }
+        match self.layout(field) {
+            Layout::Fixed(table) => match table.times(index) {
+                Some(table) => self.fixed(&table),
+                // No message is that long: the element cannot exist.
+                None => return Err(beyond(u32::MAX as usize)),
+            },
+            Layout::Variable => {
+                let body = self.element_body(field)?;
+                self.ops.push(Op::Times { body, n: index });
+            }
+        }
+        Ok(())
+    }
+
+    /// Emits the steps over a whole field.
+    fn skip(&mut self, field: &Field<usize>) -> Result<(), PathError> {
+        let least = self.least(field);
+        match (field.count, self.layout(field)) {
+            (Count::One, Layout::Fixed(table)) => self.fixed(&table),
+            (Count::One, Layout::Variable) => {
+                let body = self.element_body(field)?;
+                self.ops.extend(body);
+            }
+            (Count::Fixed(n), Layout::Fixed(table)) => {
+                let table = table.times(n).expect("measured when the definitions were parsed");
+                self.fixed(&table);
+            }
+            (Count::Fixed(n), Layout::Variable) => {
+                let body = self.element_body(field)?;
+                self.ops.push(Op::Times { body, n });
+            }
+            (Count::Sequence, Layout::Fixed(table)) => self.ops.push(match &field.element {
+                Element::Primitive(primitive) => Op::Primitives(primitive.size()),
+                _ => Op::Structs { table, least },
+            }),
+            (Count::Sequence, Layout::Variable) => {
+                let body = self.element_body(field)?;
+                self.ops.push(Op::Each { body, least });
+            }
+        }
+        Ok(())
+    }
+
+    /// The steps over one element of `field`, which is of variable size.
+    fn element_body(&self, field: &Field<usize>) -> Result<Box<[Op]>, PathError> {
+        let mut inner = Compiler { definitions: self.definitions, path: self.path, ops: Vec::new() };
+        match &field.element {
+            Element::Primitive(_) => {}
+            Element::Text => inner.ops.push(Op::Text),
+            Element::WideText => return Err(self.wide(field)),
+            Element::Struct(index) => {
+                for field in &self.definitions.get(*index).fields {
+                    inner.skip(field)?;
+                }
+            }
+        }
+        Ok(inner.ops.into())
+    }
+
+    /// Emits a run of fixed size, joined to the run before it if there is one.
+    fn fixed(&mut self, table: &Table) {
+        if let Some(Op::Fixed(before)) = self.ops.last_mut()
+            && let Some(joined) = before.then(table)
+        {
+            *before = joined;
+            return;
+        }
+        self.ops.push(Op::Fixed(*table));
+    }
+
+    fn layout(&self, field: &Field<usize>) -> Layout {
+        match &field.element {
+            Element::Primitive(primitive) => Layout::Fixed(Table::primitive(*primitive)),
+            Element::Text | Element::WideText => Layout::Variable,
+            Element::Struct(index) => self.definitions.get(*index).layout,
+        }
+    }
+
+    fn least(&self, field: &Field<usize>) -> usize {
+        match &field.element {
+            Element::Primitive(primitive) => primitive.size(),
+            Element::Text | Element::WideText => 4,
+            Element::Struct(index) => self.definitions.get(*index).least,
+        }
+    }
+
+    fn whole(&self, owner: &Struct) -> PathError {
+        PathError::WholeStruct {
+            path: self.path.to_owned(),
+            type_name: full_name(&owner.name),
+            fields: owner.fields.iter().map(|field| field.name.clone()).collect(),
+        }
+    }
+
+    fn needs_index(&self, field: &Field<usize>) -> PathError {
+        PathError::NeedsIndex { path: self.path.to_owned(), field: field.name.clone() }
+    }
+
+    fn wide(&self, field: &Field<usize>) -> PathError {
+        PathError::WideText { path: self.path.to_owned(), field: field.name.clone() }
+    }
+}

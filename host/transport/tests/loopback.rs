@@ -1,0 +1,44 @@
+//! The in-process transport.
+
+#[path = "../../drives/tests/suite/support.rs"]
+mod support;
+
+use std::sync::Arc;
+
+use gleaner_messages::Endian;
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Guid, SampleMeta, Subscription, Transport, TransportError, Verdict};
+
+use support::{Memory, TEXT, TYPE, spec};
+
+fn meta(at_ns: i64) -> SampleMeta {
+    SampleMeta { at_ns, publish_ns: 0, writer: Guid([7; 16]), seq: 1, endian: Endian::Little, options: [0; 2] }
+}
+
+#[test]
+fn what_is_published_reaches_every_subscription() {
+    let mut loopback = Loopback::new();
+    loopback.add_topic("/a", TYPE, TEXT);
+    assert_eq!(loopback.publish("/a", &meta(0), &[0; 8]).unwrap(), None);
+    let memory = Arc::new(Memory::default());
+    assert_eq!(loopback.subscribe(&spec("/a"), memory.clone()).unwrap(), Subscription(0));
+    assert_eq!(loopback.subscribe(&spec("/a"), memory.clone()).unwrap(), Subscription(1));
+    let verdict = loopback.publish("/a", &meta(5), &9i64.to_le_bytes()).unwrap();
+    assert_eq!(verdict, Some(Verdict::Taken));
+    assert_eq!(memory.values(), [(5, 9), (5, 9)]);
+    assert_eq!(loopback.topics()[0].messages, Some(2));
+    assert_eq!(loopback.definitions("/a").unwrap().type_name(), TYPE);
+}
+
+#[test]
+fn refusals_name_what_was_wrong() {
+    let mut loopback = Loopback::new();
+    loopback.add_topic("/a", "other/Type", "");
+    let memory = Arc::new(Memory::default());
+    let wrong = loopback.subscribe(&spec("/a"), memory.clone()).unwrap_err();
+    assert!(matches!(wrong, TransportError::WrongType { .. }));
+    let absent = loopback.subscribe(&spec("/b"), memory).unwrap_err();
+    assert!(matches!(absent, TransportError::NoSuchTopic { .. }));
+    let bare = loopback.definitions("/a").unwrap_err();
+    assert!(matches!(bare, TransportError::NoDefinitions { .. }));
+}

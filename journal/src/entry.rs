@@ -1,0 +1,171 @@
+use serde_json::Value;
+
+use super::header::{Difference, JournalInput};
+use super::{FAULTS, fault_code};
+use gleaner_base::words::{excerpt, hex};
+use gleaner_lambda::{Fault, Trigger};
+
+/// One wake: what the lambda saw, and what it decided.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Entry {
+    /// Stamp of the sample or tick, in ns.
+    pub at_ns: i64,
+    /// What woke the lambda.
+    pub cause: Woken,
+    /// What had arrived: one for each input, in the order of the header.
+    pub seen: Vec<Seen>,
+    /// What the lambda caused, in the order in which it did.
+    pub triggers: Vec<Trigger>,
+    /// Why the wake ended early, if it did.
+    pub fault: Option<Fault>,
+    /// Fuel that the wake burnt; `None` for Python, which has none.
+    pub fuel: Option<u64>,
+    /// What it wrote to its log.
+    pub log: Said,
+}
+
+/// What woke a lambda.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Woken {
+    /// A sample of the input that its schedule names.
+    Sample {
+        /// GUID of the sample's writer.
+        writer: [u8; 16],
+        /// Its number among those of its writer.
+        seq: u64,
+    },
+    /// The clock.
+    Tick {
+        /// Ticks that passed since the wake before without one of their own.
+        missed: u64,
+    },
+}
+
+/// What a lambda could see of one input in a wake, and what of it it looked at.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Seen {
+    /// Samples that arrived since the wake before, those included that found no room in the ring.
+    pub new: u64,
+    /// Wrapping sum of the digests of those that entered the ring, see `docs/journal.md`; 0 if there are none.
+    pub digest: u32,
+    /// Writer and number of the newest sample in the ring.
+    pub newest: Option<([u8; 16], u64)>,
+    /// How many samples, the newest included, the lambda looked back; 0 if it did not look.
+    pub reach: u64,
+}
+
+/// What a lambda wrote to its log in one wake.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Said {
+    /// How many lines.
+    pub lines: u32,
+    /// CRC-32 over them; 0 if there are none.
+    pub digest: u32,
+}
+
+impl Entry {
+    /// The first difference between the wake in the journal and the same wake made again `now`; `None` if the lambda saw
+    /// the same and decided the same, bit for bit.
+    ///
+    /// `inputs` are those of the header. A clip keeps neither all writers nor more than 32 bits of a number: without
+    /// `writers`, samples are compared as far as a clip keeps them.
+    pub fn differs_from(&self, now: &Entry, inputs: &[JournalInput], writers: bool) -> Option<Difference> {
+        // The usual case, without a word. Equal scores may still differ in their bits, and equal maps in their order.
+        if self.triggers.is_empty() && self == now {
+            return None;
+        }
+        Difference::of("stamp of the wake, in ns", self.at_ns, now.at_ns)
+            .or_else(|| {
+                Difference::of("what woke the lambda", self.cause_in_words(writers), now.cause_in_words(writers))
+            })
+            .or_else(|| Difference::of("number of inputs", self.seen.len(), now.seen.len()))
+            .or_else(|| {
+                let mut pairs = self.seen.iter().zip(&now.seen).enumerate();
+                pairs.find_map(|(index, (journal, now))| seen_differs(journal, now, &in_words(inputs, index), writers))
+            })
+            .or_else(|| Difference::of("number of triggers", self.triggers.len(), now.triggers.len()))
+            .or_else(|| {
+                let mut pairs = self.triggers.iter().zip(&now.triggers).enumerate();
+                pairs.find_map(|(index, (journal, now))| triggers_differ(journal, now, index + 1))
+            })
+            .or_else(|| Difference::of("fault", fault_in_words(&self.fault), fault_in_words(&now.fault)))
+            .or_else(|| Difference::of("fuel", number(self.fuel), number(now.fuel)))
+            .or_else(|| Difference::of("number of log lines", self.log.lines, now.log.lines))
+            .or_else(|| Difference::of("text of the log lines", digest(self.log.digest), digest(now.log.digest)))
+    }
+
+    fn cause_in_words(&self, writers: bool) -> String {
+        match self.cause {
+            Woken::Sample { writer, seq } => format!("sample {}", identity((writer, seq), writers)),
+            Woken::Tick { missed: 0 } => "a tick".to_owned(),
+            Woken::Tick { missed } => format!("a tick after {missed} missed ones"),
+        }
+    }
+}
+
+fn in_words(inputs: &[JournalInput], index: usize) -> String {
+    match inputs.get(index) {
+        Some(input) => format!("input `{}` ({})", excerpt(&input.name), excerpt(&input.wire_topic)),
+        None => format!("input {}", index + 1),
+    }
+}
+
+fn seen_differs(journal: &Seen, now: &Seen, input: &str, writers: bool) -> Option<Difference> {
+    // In every wake, for every input: nothing is put into words unless it differs.
+    if journal == now {
+        return None;
+    }
+    let newest = |seen: &Seen| seen.newest.map_or("none".to_owned(), |newest| identity(newest, writers));
+    Difference::of(format!("number of new samples of {input}"), journal.new, now.new)
+        .or_else(|| Difference::of(format!("newest sample of {input}"), newest(journal), newest(now)))
+        .or_else(|| Difference::of(format!("samples of {input}"), digest(journal.digest), digest(now.digest)))
+        .or_else(|| {
+            let what = format!("how many samples of {input} the lambda looked back");
+            Difference::of(what, journal.reach, now.reach)
+        })
+}
+
+fn identity((writer, seq): ([u8; 16], u64), writers: bool) -> String {
+    if !writers {
+        return (seq & u64::from(u32::MAX)).to_string();
+    }
+    format!("{seq} of writer {}", hex(&writer))
+}
+
+fn digest(digest: u32) -> String {
+    format!("digest {digest:08x}")
+}
+
+fn number(number: Option<u64>) -> String {
+    number.map_or("none".to_owned(), |number| number.to_string())
+}
+
+fn fault_in_words(fault: &Option<Fault>) -> String {
+    let Some(Fault { kind, message, used, allowed }) = fault else { return "none".to_owned() };
+    let (_, word) = FAULTS[fault_code(*kind)];
+    format!("{word}, `{message}`, used {}, allowed {}", number(*used), number(*allowed))
+}
+
+/// As for twins, but bit for bit, and the attributes too: it is the same lambda.
+fn triggers_differ(journal: &Trigger, now: &Trigger, place: usize) -> Option<Difference> {
+    let what = |part: &str| format!("trigger {place}: {part}");
+    let score = |trigger: &Trigger| trigger.score.map_or("none".to_owned(), |score| score.to_string());
+    let label = |trigger: &Trigger| format!("`{}`", trigger.label);
+    let attribute = |value: Option<&Value>| value.map_or("none".to_owned(), Value::to_string);
+    let keys = |trigger: &Trigger| trigger.attributes.keys().cloned().collect::<Vec<_>>().join(", ");
+    Difference::of(what("kind"), journal.kind.as_str(), now.kind.as_str())
+        .or_else(|| Difference::of(what("label"), label(journal), label(now)))
+        .or_else(|| match journal.score.map(f64::to_bits) == now.score.map(f64::to_bits) {
+            true => None,
+            false => Some(Difference { what: what("score"), journal: score(journal), now: score(now) }),
+        })
+        .or_else(|| {
+            let (journal, now) = (&journal.attributes, &now.attributes);
+            let mut all = journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
+            all.find_map(|key| {
+                let what = what(&format!("attribute `{}`", excerpt(key)));
+                Difference::of(what, attribute(journal.get(key)), attribute(now.get(key)))
+            })
+        })
+        .or_else(|| Difference::of(what("order of its attributes"), keys(journal), keys(now)))
+}

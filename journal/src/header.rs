@@ -1,0 +1,232 @@
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use gleaner_base::words::{excerpt, visible};
+use gleaner_lambda::manifest::{Kind, Limits};
+
+/// What made the decisions of a journal: its first block, as JSON.
+///
+/// A newer writer may add keys; a reader ignores those that it does not know.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Header {
+    /// Version of gleaner that wrote it.
+    pub gleaner: String,
+    /// What the lambda ran on, for example `wasmtime 48.0.8` or `Python 3.12.3, numpy 2.1.0`.
+    pub engine: String,
+    /// The machine's architecture, for example `x86_64`.
+    pub machine: String,
+    /// Name of the lambda.
+    pub lambda: String,
+    /// Version of the lambda.
+    pub version: String,
+    /// What kind of lambda it is.
+    pub kind: Kind,
+    /// The files of its build folder, by path.
+    pub files: Vec<FileDigest>,
+    /// Its models.
+    pub models: Vec<FileDigest>,
+    /// SHA-256 of what its manifest says that a decision can depend on, in hexadecimal digits: not of `[record]`, nor of
+    /// descriptions, so that a clip stays provable when its preroll is tuned; and not of `[limits]`, which are here as they were.
+    pub manifest: String,
+    /// What it was allowed: the limits of its manifest, as a vehicle may have tightened them.
+    #[serde(default)]
+    pub limits: Limits,
+    /// Its inputs, in the order of the manifest.
+    pub inputs: Vec<JournalInput>,
+    /// Which of `inputs` wakes it; `None` if the clock does.
+    pub event_input: Option<usize>,
+    /// Its config as it got it, in the order of the manifest.
+    pub config: Map<String, Value>,
+    /// Other names for topics of the manifest, from and to.
+    pub remaps: Vec<(String, String)>,
+    /// What the times are, for example `log time of the drive`.
+    pub clock: String,
+    /// What was replayed of the drive.
+    #[serde(default, skip_serializing_if = "Part::is_all")]
+    pub part: Part,
+    /// Wakes that came before the first in here: 0, unless this is the part of a journal that a clip holds.
+    pub wakes_before: u64,
+}
+
+/// The samples of a drive between two times, by their log time in ns since 1970.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Part {
+    /// The first time that belongs to it; `None` for the start of the drive.
+    pub from_ns: Option<i64>,
+    /// The first time that does not belong to it any more; `None` for the end of the drive.
+    pub to_ns: Option<i64>,
+}
+
+impl Part {
+    /// Whether it is the whole drive.
+    pub fn is_all(&self) -> bool {
+        *self == Part::default()
+    }
+
+    fn in_words(self) -> String {
+        let time = |ns: Option<i64>, all: &str| ns.map_or_else(|| all.to_owned(), |ns| format!("{ns} ns"));
+        format!("from {} to {}", time(self.from_ns, "its start"), time(self.to_ns, "its end"))
+    }
+}
+
+/// A file, by its content.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct FileDigest {
+    /// Where it lies, relative to what it is a part of.
+    pub path: String,
+    /// Its length.
+    pub bytes: u64,
+    /// Its SHA-256, in hexadecimal digits.
+    pub sha256: String,
+}
+
+/// An input of the lambda.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct JournalInput {
+    /// The lambda's word for it.
+    pub name: String,
+    /// The topic, as the manifest names it.
+    pub topic: String,
+    /// The topic after remapping.
+    pub wire_topic: String,
+    /// The message type.
+    pub type_name: String,
+}
+
+/// The last block of a journal whose writer came to its end, as JSON.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct End {
+    /// How often the lambda ran.
+    pub wakes: u64,
+    /// Samples that arrived in all, for each input.
+    pub samples: Vec<u64>,
+    /// The drives that were replayed.
+    pub drives: Vec<DriveDigest>,
+}
+
+/// A drive, by its content. A checksum is enough to notice that it is not the file that it was, and costs a replay of it
+/// 1 or 2 %; a SHA-256 would cost 15 %.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct DriveDigest {
+    /// Name of the file, without its folder.
+    pub name: String,
+    /// Its length.
+    pub bytes: u64,
+    /// CRC-32 of the whole file.
+    pub crc32: u32,
+}
+
+/// Something that should be equal, and is not.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    /// What it is, for example ``build file `main.py` ``.
+    pub what: String,
+    /// What the journal has.
+    pub journal: String,
+    /// What there is now.
+    pub now: String,
+}
+
+impl Difference {
+    /// `what`, if the two sides are not the same text.
+    pub(super) fn of(what: impl Into<String>, journal: impl ToString, now: impl ToString) -> Option<Difference> {
+        let (journal, now) = (journal.to_string(), now.to_string());
+        (journal != now).then(|| Difference { what: what.into(), journal: visible(&journal), now: visible(&now) })
+    }
+}
+
+impl Header {
+    /// The most telling difference between what wrote this journal and what would run `now`; `None` if a decision that
+    /// differs is then the fault of neither build, config nor inputs.
+    ///
+    /// `gleaner`, `engine`, `machine` and `wakes_before` are not compared: a decision should not depend on them.
+    pub fn differs_from(&self, now: &Header) -> Option<Difference> {
+        Difference::of("lambda", &self.lambda, &now.lambda)
+            .or_else(|| Difference::of("version of the lambda", &self.version, &now.version))
+            .or_else(|| Difference::of("kind of the lambda", self.kind.as_str(), now.kind.as_str()))
+            .or_else(|| files_differ("build file", &self.files, &now.files))
+            .or_else(|| {
+                Difference::of("manifest lambda.toml, less [record] and [limits]", &self.manifest, &now.manifest)
+            })
+            .or_else(|| limits_differ(&self.limits, &now.limits))
+            .or_else(|| files_differ("model", &self.models, &now.models))
+            .or_else(|| config_differs(&self.config, &now.config))
+            .or_else(|| inputs_differ(&self.inputs, &now.inputs))
+            .or_else(|| Difference::of("what wakes the lambda", self.woken_by(), now.woken_by()))
+            .or_else(|| Difference::of("remapped topics", self.remaps_in_words(), now.remaps_in_words()))
+            .or_else(|| Difference::of("clock", &self.clock, &now.clock))
+            .or_else(|| Difference::of("part of the drive", self.part.in_words(), now.part.in_words()))
+    }
+
+    fn woken_by(&self) -> String {
+        match self.event_input {
+            None => "the clock".to_owned(),
+            Some(index) => {
+                let name = self.inputs.get(index).map_or("none", |input| &input.name);
+                format!("samples of input `{name}`")
+            }
+        }
+    }
+
+    fn remaps_in_words(&self) -> String {
+        let remaps: Vec<_> = self.remaps.iter().map(|(from, to)| format!("{from} is {to}")).collect();
+        if remaps.is_empty() { "none".to_owned() } else { remaps.join(", ") }
+    }
+}
+
+const NOT_THERE: &str = "not there";
+
+fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Option<Difference> {
+    let by_path = |files: &'_ [FileDigest]| -> BTreeMap<String, String> {
+        files.iter().map(|file| (file.path.clone(), file.sha256.clone())).collect()
+    };
+    let (journal, now) = (by_path(journal), by_path(now));
+    // What counts of the manifest has a digest of its own.
+    let mut paths: Vec<_> = journal.keys().chain(now.keys()).filter(|path| *path != "lambda.toml").collect();
+    paths.sort();
+    paths.into_iter().find_map(|path| {
+        let (journal, now) = (journal.get(path), now.get(path));
+        if journal == now {
+            return None;
+        }
+        // Sixteen digits are enough to see it, unless somebody made them equal.
+        let start = |digest: Option<&String>| digest.and_then(|digest| digest.get(..16)).map(str::to_owned);
+        let cut = start(journal) != start(now);
+        let side = |digest: Option<&String>| match digest {
+            None => NOT_THERE.to_owned(),
+            Some(digest) if cut && digest.len() > 16 => {
+                format!("sha256 {}…", start(Some(digest)).unwrap_or_else(|| digest.clone()))
+            }
+            Some(digest) => format!("sha256 {digest}"),
+        };
+        Difference::of(format!("{what} `{}`", excerpt(path)), side(journal), side(now))
+    })
+}
+
+fn limits_differ(journal: &Limits, now: &Limits) -> Option<Difference> {
+    let mut pairs = journal.in_words().into_iter().zip(now.in_words());
+    pairs.find_map(|((key, journal), (_, now))| Difference::of(format!("limit `{key}`"), journal, now))
+}
+
+/// Values are compared as they are written, so that `-0.0` is not `0.0`, and 1 is not 1.0.
+fn config_differs(journal: &Map<String, Value>, now: &Map<String, Value>) -> Option<Difference> {
+    let text = |value: Option<&Value>| value.map_or_else(|| NOT_THERE.to_owned(), Value::to_string);
+    let keys = journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
+    let mut differences = keys.filter_map(|key| {
+        Difference::of(format!("config `{}`", excerpt(key)), text(journal.get(key)), text(now.get(key)))
+    });
+    differences.next()
+}
+
+fn inputs_differ(journal: &[JournalInput], now: &[JournalInput]) -> Option<Difference> {
+    let side = |input: &JournalInput| {
+        let JournalInput { name, topic, wire_topic, type_name } = input;
+        let from = if wire_topic == topic { String::new() } else { format!(", from {wire_topic}") };
+        format!("`{name}`: {topic}{from}, {type_name}")
+    };
+    let mut pairs = journal.iter().zip(now);
+    Difference::of("number of inputs", journal.len(), now.len())
+        .or_else(|| pairs.find_map(|(journal, now)| Difference::of("input", side(journal), side(now))))
+}

@@ -1,0 +1,158 @@
+//! Wakes as bytes: they read back, relative to each other and alone, and are small.
+
+use super::*;
+
+#[test]
+fn any_wake_reads_back_as_it_was_written_relative_to_any_other() {
+    let mut random = Random(1);
+    for inputs in [0, 1, 2, 7] {
+        let entries: Vec<_> = (0..2000).map(|_| any_entry(&mut random, inputs)).collect();
+        let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
+        entries.iter().for_each(|entry| encoder.encode(entry, &mut bytes));
+        let (mut decoder, mut rest) = (Decoder::new(inputs), bytes.as_slice());
+        for entry in &entries {
+            let read = decoder.decode(&mut rest).unwrap();
+            assert_eq!(read, *entry);
+            assert_eq!(read.differs_from(entry, &[], true), None);
+        }
+        assert!(rest.is_empty());
+    }
+}
+
+#[test]
+fn after_a_reset_a_wake_stands_alone() {
+    let mut random = Random(2);
+    let mut encoder = Encoder::new(2);
+    for _ in 0..500 {
+        let entry = any_entry(&mut random, 2);
+        let (mut alone, mut reset) = (Vec::new(), Vec::new());
+        Encoder::new(2).encode(&entry, &mut alone);
+        encoder.reset();
+        encoder.encode(&entry, &mut reset);
+        assert_eq!(alone, reset);
+        assert_eq!(Decoder::new(2).decode(&mut reset.as_slice()), Ok(entry));
+    }
+}
+
+#[test]
+fn a_usual_wake_takes_few_bytes() {
+    for (inputs, most) in [(1, 14), (2, 20)] {
+        let entries = usual_entries(inputs, 1000);
+        let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
+        let mut longest = 0;
+        for (index, entry) in entries.iter().enumerate() {
+            let before = bytes.len();
+            encoder.encode(entry, &mut bytes);
+            // The first one is written whole, and the second has no rate to go by.
+            longest = if index < 2 { 0 } else { longest.max(bytes.len() - before) };
+        }
+        assert!(longest <= most, "{longest} bytes for a wake with {inputs} inputs");
+        let file = journal(&header(inputs), &entries, usize::MAX).len();
+        let without = journal(&header(inputs), &[], usize::MAX).len();
+        assert!(file - without <= most * entries.len(), "{} bytes of wakes", file - without);
+    }
+}
+
+#[test]
+fn a_tick_without_new_samples_takes_a_byte_for_itself_one_for_its_time_and_one_for_each_input() {
+    let tick = |at_ns| Entry {
+        at_ns,
+        cause: Woken::Tick { missed: 0 },
+        seen: vec![Seen { newest: Some(([1; 16], 5)), ..Seen::default() }; 3],
+        triggers: Vec::new(),
+        fault: None,
+        fuel: None,
+        log: Said::default(),
+    };
+    let (mut encoder, mut bytes) = (Encoder::new(3), Vec::new());
+    for n in 0..2 {
+        encoder.encode(&tick(n * 100_000_000), &mut bytes);
+    }
+    bytes.clear();
+    encoder.encode(&tick(200_000_000), &mut bytes);
+    assert_eq!(bytes, [1, 0, 0, 0, 0]);
+}
+
+#[test]
+fn a_wake_is_laid_out_as_the_documentation_says() {
+    let entry = Entry {
+        at_ns: 5,
+        cause: Woken::Sample { writer: [0xaa; 16], seq: 3 },
+        seen: vec![Seen { new: 40, digest: 0x0403_0201, newest: Some(([0xbb; 16], 300)), reach: 2 }],
+        triggers: vec![Trigger {
+            kind: TriggerKind::Stop,
+            label: "x".to_owned(),
+            score: Some(1.0),
+            attributes: Map::from_iter([("a".to_owned(), json!(1))]),
+        }],
+        fault: Some(Fault {
+            kind: gleaner_lambda::FaultKind::Trap,
+            message: "m".to_owned(),
+            used: None,
+            allowed: Some(9),
+        }),
+        fuel: Some(64),
+        log: Said { lines: 2, digest: 0x0807_0605 },
+    };
+    let mut expected = vec![0b0111_1110, 10];
+    expected.extend([0xaa; 16]);
+    expected.extend([6, 0x80, 0x01]);
+    expected.extend([0b1111_1111, 9, 1, 2, 3, 4, 2]);
+    expected.extend([0xbb; 16]);
+    expected.extend([0xac, 0x02, 2]);
+    expected.extend([1, 0b110, 1, b'x']);
+    expected.extend(1.0_f64.to_le_bytes());
+    expected.extend(b"\x07{\"a\":1}");
+    expected.extend([0b1_0100, 1, b'm', 9]);
+    expected.extend([2, 5, 6, 7, 8]);
+    let mut bytes = Vec::new();
+    Encoder::new(1).encode(&entry, &mut bytes);
+    assert_eq!(bytes, expected);
+}
+
+#[test]
+fn numbers_at_the_ends_of_their_range_do_not_overflow() {
+    let entry = |at_ns, number| Entry {
+        at_ns,
+        cause: Woken::Sample { writer: [0; 16], seq: number },
+        seen: vec![Seen { new: number, digest: 1, newest: Some(([0; 16], number)), reach: number }],
+        triggers: Vec::new(),
+        fault: None,
+        fuel: Some(number),
+        log: Said { lines: u32::MAX, digest: 0 },
+    };
+    let ends = [(i64::MIN, 0), (i64::MAX, u64::MAX), (i64::MIN, u64::MAX), (i64::MAX, 1), (-1, 1 << 63)];
+    let (mut encoder, mut bytes) = (Encoder::new(1), Vec::new());
+    ends.iter().for_each(|&(at_ns, number)| encoder.encode(&entry(at_ns, number), &mut bytes));
+    let (mut decoder, mut rest) = (Decoder::new(1), bytes.as_slice());
+    for (at_ns, number) in ends {
+        assert_eq!(decoder.decode(&mut rest), Ok(entry(at_ns, number)));
+    }
+}
+
+#[test]
+fn a_fraction_keeps_its_last_bit() {
+    let mut random = Random(3);
+    for _ in 0..2000 {
+        let value = f64::from_bits(random.next());
+        if !value.is_finite() {
+            continue;
+        }
+        let mut entry = any_entry(&mut random, 0);
+        let mut trigger = any_trigger(&mut random);
+        trigger.score = Some(-0.0);
+        trigger.attributes.insert("value".to_owned(), json!(value));
+        entry.triggers = vec![trigger];
+        let mut bytes = Vec::new();
+        Encoder::new(0).encode(&entry, &mut bytes);
+        let read = Decoder::new(0).decode(&mut bytes.as_slice()).unwrap();
+        // Needs the feature `float_roundtrip` of serde_json: without it, a value read may be its neighbour.
+        assert_eq!(read.differs_from(&entry, &[], true), None);
+    }
+}
+
+#[test]
+#[should_panic(expected = "a wake of another lambda")]
+fn a_wake_with_other_inputs_is_no_wake_of_this_journal() {
+    Encoder::new(1).encode(&any_entry(&mut Random(4), 2), &mut Vec::new());
+}

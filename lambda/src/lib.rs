@@ -1,0 +1,28 @@
+//! What a lambda and its results are: the manifest with its limits, the build folder, decisions, clips, log lines, and the files of
+//! a run.
+//!
+//! Nothing here runs a lambda.
+
+mod clip;
+mod decision;
+pub mod layout;
+mod log_line;
+pub mod manifest;
+mod output;
+pub mod results;
+#[cfg(test)]
+#[path = "../../base/src/scratch.rs"]
+mod scratch;
+pub mod signals;
+mod sources;
+mod vehicle;
+
+pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
+pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ};
+pub use layout::{BuildDir, LayoutError};
+pub use log_line::{LogLevel, LogLine};
+pub use manifest::{Manifest, ManifestError};
+pub use output::{LOCK, Output, OutputError, RESULTS};
+pub use results::PAGE_BYTES;
+pub use sources::{SOURCE_MAX, Sources};
+pub use vehicle::Vehicle;

@@ -1,0 +1,92 @@
+//! `lambda.toml`: read once, and turned into types that cannot be wrong, so that no later code has to check again.
+//!
+//! `table` and `value` walk the document, `read` says what each key is, `error` what a user sees when one is refused: the
+//! file, the line, the key, the cause and the way out. Nothing here looks at the file system except to read the
+//! manifest itself: whether `entry` exists is the business of [`layout`](crate::layout).
+
+pub mod bounds;
+mod config;
+mod error;
+mod limits;
+mod names;
+mod read;
+mod read_config;
+mod read_limits;
+mod reference;
+mod syntax;
+mod table;
+#[cfg(test)]
+mod tests;
+mod types;
+mod value;
+
+pub use config::{ConfigError, ConfigItem, ConfigSet, ConfigValue};
+pub use error::{InputMemory, ManifestError, Place};
+use gleaner_base::{ByteSize, UnitError, format_duration, parse_duration};
+pub use limits::{Limits, Tightened};
+pub use names::{ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version};
+pub use reference::reference;
+pub use types::{Backlog, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store};
+
+use std::io;
+use std::path::Path;
+
+use gleaner_base::{NotPlain, PlainFile};
+
+/// Name of the file.
+const FILE: &str = "lambda.toml";
+
+impl Manifest {
+    /// The manifest that `text` holds. `file` is its name in messages, usually `lambda.toml`.
+    ///
+    /// # Errors
+    ///
+    /// The first problem that is found; the text is read table by table.
+    pub fn parse(text: &str, file: impl AsRef<Path>) -> Result<Manifest, ManifestError> {
+        let file = file.as_ref().display().to_string();
+        read::manifest(&table::Document { text, file: &file })
+    }
+
+    /// The manifest in the folder `dir`: a lambda's own, or that of its build folder.
+    ///
+    /// # Errors
+    ///
+    /// As [`parse`](Self::parse) and [`read`](Self::read).
+    pub fn load(dir: impl AsRef<Path>) -> Result<Manifest, ManifestError> {
+        let dir = dir.as_ref();
+        Manifest::parse(&Manifest::read(dir)?, dir.join(FILE))
+    }
+
+    /// The text of the manifest in the folder `dir`, for whoever needs its bytes as well.
+    ///
+    /// # Errors
+    ///
+    /// If `dir/lambda.toml` cannot be read, is no file of that folder, is longer than [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no
+    /// UTF-8.
+    pub fn read(dir: impl AsRef<Path>) -> Result<String, ManifestError> {
+        let dir = dir.as_ref();
+        text(&dir.join(FILE), PlainFile::inside(dir, Path::new(FILE), bounds::MANIFEST_MAX))
+    }
+}
+
+/// The limits that `text` has for a vehicle; those that it does not name are at their maximum.
+pub(crate) fn vehicle_limits(text: &str, file: &str) -> Result<Limits, ManifestError> {
+    read_limits::vehicle(&table::Document { text, file })
+}
+
+/// The text of what is written as a manifest is, in a file that a user has named.
+pub(crate) fn read_text(path: &Path) -> Result<String, ManifestError> {
+    text(path, PlainFile::named(path, bounds::MANIFEST_MAX))
+}
+
+fn text(path: &Path, opened: io::Result<PlainFile>) -> Result<String, ManifestError> {
+    let path = || path.to_owned();
+    let bytes = opened.and_then(PlainFile::read_whole).map_err(|source| match NotPlain::of(&source) {
+        Some(NotPlain::TooLong { most, .. }) => ManifestError::TooLong { path: path(), limit: *most },
+        _ => ManifestError::Read { path: path(), source },
+    })?;
+    String::from_utf8(bytes).map_err(|error| {
+        let source = io::Error::new(io::ErrorKind::InvalidData, error.utf8_error());
+        ManifestError::Read { path: path(), source }
+    })
+}

@@ -1,0 +1,324 @@
+//! Names that were checked once. Each is a text of one form, so that a path, a topic or a version in hand is a good one.
+
+use std::fmt;
+use std::path::Path;
+use std::str::FromStr;
+
+use serde::{Serialize, Serializer};
+
+use gleaner_base::{Exit, Explain};
+
+/// Why a text is no name of the wanted sort.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{text}` is no {what}")]
+pub struct NameError {
+    /// The text that was refused.
+    pub text: String,
+    /// What it should have been, for example `topic name`.
+    pub what: &'static str,
+    /// What such a name looks like, for the help line.
+    pub rule: &'static str,
+}
+
+impl Explain for NameError {
+    fn help(&self) -> Option<String> {
+        Some(self.rule.to_owned())
+    }
+
+    fn exit(&self) -> Exit {
+        Exit::Usage
+    }
+}
+
+macro_rules! checked_text {
+    ($(#[$doc:meta])* $name:ident, $what:literal, $rule:literal, $check:path) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub struct $name(String);
+
+        impl $name {
+            /// The text itself.
+            pub fn as_str(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = NameError;
+
+            fn from_str(text: &str) -> Result<Self, NameError> {
+                if $check(text) {
+                    Ok(Self(text.to_owned()))
+                } else {
+                    Err(NameError { text: text.to_owned(), what: $what, rule: $rule })
+                }
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(&self.0)
+            }
+        }
+
+        impl AsRef<str> for $name {
+            fn as_ref(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl PartialEq<str> for $name {
+            fn eq(&self, other: &str) -> bool {
+                self.0 == other
+            }
+        }
+
+        impl PartialEq<&str> for $name {
+            fn eq(&self, other: &&str) -> bool {
+                self.0 == *other
+            }
+        }
+
+        impl Serialize for $name {
+            fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                serializer.serialize_str(&self.0)
+            }
+        }
+    };
+}
+
+checked_text! {
+    /// Name of a lambda: 1 to 63 lower-case letters, digits and hyphens, the first a letter. It becomes part of file
+    /// names, host labels and URLs, hence the length of a DNS label.
+    LambdaName, "lambda name",
+    "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a letter, for example `brake-dark`",
+    is_lambda_name
+}
+
+checked_text! {
+    /// Name of an input, a model or a config item: 1 to 63 lower-case letters, digits, `_` and `-`, the first a letter.
+    ItemName, "name",
+    "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, for example `front_camera`",
+    is_item_name
+}
+
+checked_text! {
+    /// An absolute ROS 2 topic name, for example `/camera/front/compressed`.
+    ///
+    /// Source: the topic and service names page of the ROS 2 design; the length is rmw's
+    /// `RMW_TOPIC_MAX_NAME_LENGTH`, the 255 bytes of DDS less 8 for prefixes.
+    TopicName, "topic name",
+    "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a digit, for example `/camera/front`",
+    is_topic_name
+}
+
+checked_text! {
+    /// A ROS 2 message type, for example `sensor_msgs/msg/Imu`.
+    TypeName, "message type",
+    "a ROS 2 type has three parts, `package/msg/Type`, for example `sensor_msgs/msg/Imu`",
+    is_type_name
+}
+
+checked_text! {
+    /// `major.minor.patch`, with an optional `-pre.release` part, as in semantic versioning.
+    Version, "version",
+    "a version is `major.minor.patch`, for example `0.1.0` or `1.0.0-rc.1`",
+    is_version
+}
+
+checked_text! {
+    /// A path below the lambda's folder: relative, with `/` between its parts, and never leading out of it.
+    RelativePath, "path inside the lambda's folder",
+    "give a path relative to the lambda's folder, without `..`, for example `models/detector.onnx`",
+    is_relative_path
+}
+
+checked_text! {
+    /// A sha256 as 64 lower-case hexadecimal digits.
+    Sha256, "sha256",
+    "a sha256 has 64 lower-case hexadecimal digits: the first column that `sha256sum FILE` prints",
+    is_sha256
+}
+
+impl RelativePath {
+    /// The path, to be joined to the folder it is relative to.
+    pub fn as_path(&self) -> &Path {
+        Path::new(&self.0)
+    }
+}
+
+impl TypeName {
+    /// `sensor_msgs/msg/CompressedImage`: a frame that is decoded when its pixels are first wanted.
+    pub fn is_compressed_image(&self) -> bool {
+        self.0 == "sensor_msgs/msg/CompressedImage"
+    }
+
+    /// Whether samples of this type are seen as frames: `sensor_msgs/msg/Image` and `CompressedImage`.
+    pub fn is_frame(&self) -> bool {
+        self.0 == "sensor_msgs/msg/Image" || self.is_compressed_image()
+    }
+
+    /// Whether samples of this type are large, so that few of them are kept: frames and point clouds.
+    pub fn is_large(&self) -> bool {
+        self.0 == "sensor_msgs/msg/PointCloud2" || self.is_frame()
+    }
+}
+
+/// Longest topic name that rmw accepts, in bytes.
+const TOPIC_NAME_MAX: usize = 247;
+
+/// 1 to 63 characters, first a lower-case letter, then those, digits and `extra`.
+fn is_name(text: &str, extra: &[u8]) -> bool {
+    let rest = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
+    text.len() <= 63 && text.bytes().next().is_some_and(|first| first.is_ascii_lowercase()) && text.bytes().all(rest)
+}
+
+fn is_lambda_name(text: &str) -> bool {
+    is_name(text, b"-")
+}
+
+fn is_item_name(text: &str) -> bool {
+    is_name(text, b"_-")
+}
+
+fn is_topic_name(text: &str) -> bool {
+    let token = |part: &str| {
+        part.bytes().next().is_some_and(|first| !first.is_ascii_digit())
+            && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+    };
+    text.len() <= TOPIC_NAME_MAX && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
+}
+
+fn is_type_name(text: &str) -> bool {
+    let mut parts = text.split('/');
+    let (Some(package), Some("msg"), Some(name), None) = (parts.next(), parts.next(), parts.next(), parts.next())
+    else {
+        return false;
+    };
+    text.len() <= 255
+        && package.bytes().next().is_some_and(|first| first.is_ascii_alphabetic())
+        && package.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+        && name.bytes().next().is_some_and(|first| first.is_ascii_uppercase())
+        && name.bytes().all(|byte| byte.is_ascii_alphanumeric())
+}
+
+fn is_version(text: &str) -> bool {
+    let (core, pre) = match text.split_once('-') {
+        Some((core, pre)) => (core, Some(pre)),
+        None => (text, None),
+    };
+    // A leading zero would make two texts of one version.
+    let number = |part: &str| part.parse::<u32>().is_ok_and(|n| n.to_string() == part);
+    let identifier =
+        |part: &str| !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-');
+    text.len() <= 63
+        && core.split('.').count() == 3
+        && core.split('.').all(number)
+        && pre.is_none_or(|pre| pre.split('.').all(identifier))
+}
+
+fn is_relative_path(text: &str) -> bool {
+    // Checked as text, not by `Path::components`, which quietly drops `.` and doubled separators: one file, one text.
+    let part = |part: &str| !part.is_empty() && part != "." && part != "..";
+    text.len() <= 255 && text.split('/').all(part) && !text.contains(|c: char| c == '\\' || c.is_control())
+}
+
+fn is_sha256(text: &str) -> bool {
+    text.len() == 64 && text.bytes().all(|byte| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[track_caller]
+    fn accepts<T: FromStr<Err = NameError> + fmt::Display>(texts: &[&str]) {
+        for text in texts {
+            assert_eq!(text.parse::<T>().map(|name| name.to_string()), Ok((*text).to_owned()));
+        }
+    }
+
+    #[track_caller]
+    fn refuses<T: FromStr<Err = NameError> + fmt::Debug>(texts: &[&str]) {
+        for text in texts {
+            assert!(text.parse::<T>().is_err(), "`{text}` was accepted");
+        }
+    }
+
+    #[test]
+    fn a_lambda_name_is_a_lower_case_label() {
+        accepts::<LambdaName>(&["a", "brake-dark", "x1", &"a".repeat(63)]);
+        refuses::<LambdaName>(&["", "1x", "-x", "Brake", "a_b", "a b", "ä", "a/b", &"a".repeat(64)]);
+    }
+
+    #[test]
+    fn an_item_name_may_have_underscores() {
+        accepts::<ItemName>(&["camera", "front_camera", "imu-2"]);
+        refuses::<ItemName>(&["", "_x", "2x", "Camera", "a.b", "a=b"]);
+    }
+
+    #[test]
+    fn a_topic_name_is_absolute_and_has_no_empty_part() {
+        accepts::<TopicName>(&["/a", "/imu/data", "/_x/y_2", "/Camera"]);
+        refuses::<TopicName>(&[
+            "", "/", "imu", "/imu/", "//imu", "/a//b", "/2a", "/a/2b", "/a b", "/a-b", "/~x", "/{x}",
+        ]);
+        refuses::<TopicName>(&[&format!("/{}", "a".repeat(247))]);
+        accepts::<TopicName>(&[&format!("/{}", "a".repeat(246))]);
+    }
+
+    #[test]
+    fn a_message_type_has_three_parts() {
+        accepts::<TypeName>(&["sensor_msgs/msg/Imu", "my_msgs2/msg/X1"]);
+        refuses::<TypeName>(&[
+            "sensor_msgs/Imu",
+            "sensor_msgs/srv/Imu",
+            "a/msg/b",
+            "/msg/B",
+            "a/msg/B/c",
+            "a/msg/",
+            "a/msg/B ",
+        ]);
+    }
+
+    #[test]
+    fn a_version_has_three_numbers_and_perhaps_a_pre_release() {
+        accepts::<Version>(&["0.1.0", "1.0.0-rc.1", "1.2.3-a-b"]);
+        refuses::<Version>(&[
+            "1",
+            "1.0",
+            "1.0.0.0",
+            "v1.0.0",
+            "01.0.0",
+            "1.0.0-",
+            "1.0.0-a..b",
+            "+1.0.0",
+            "1.0.0 ",
+            "9999999999.0.0",
+        ]);
+    }
+
+    #[test]
+    fn a_relative_path_never_leaves_its_folder() {
+        accepts::<RelativePath>(&["main.py", "models/a.onnx", "..hidden"]);
+        refuses::<RelativePath>(&[
+            "",
+            "/etc/passwd",
+            "..",
+            "../x",
+            "a/../../x",
+            "a/..",
+            "./a",
+            "a//b",
+            "a/",
+            "a\\b",
+            "a\0b",
+        ]);
+    }
+
+    #[test]
+    fn a_sha256_has_64_lower_case_digits() {
+        accepts::<Sha256>(&[&"0123456789abcdef".repeat(4)]);
+        refuses::<Sha256>(&["", "abc", &"0123456789ABCDEF".repeat(4), &"g".repeat(64), &"a".repeat(65)]);
+    }
+}

@@ -1,0 +1,266 @@
+//! What each key of `lambda.toml` is: one function per table, one line per key.
+
+use toml::de::DeTable;
+
+use super::bounds;
+use super::error::{InputMemory, ManifestError};
+use super::read_config;
+use super::read_limits::{self, Missing};
+use super::syntax;
+use super::table::{Document, Table};
+use super::value::Value;
+use super::{
+    Backlog, ByteSize, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store,
+    TopicName, TypeName,
+};
+use gleaner_base::words::{excerpt, nearest};
+
+type Result<T> = std::result::Result<T, ManifestError>;
+
+/// The manifest that `document` holds.
+pub(super) fn manifest(document: &Document) -> Result<Manifest> {
+    let entries = DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
+    let known = &["lambda", "schedule", "input", "model", "record", "limits", "config"];
+    let root = Table::root(document, entries.get_ref(), known)?;
+    let needed = |table: &'static str, example: &'static str| {
+        root.get(table).ok_or_else(|| ManifestError::MissingTable { file: document.file.to_owned(), table, example })
+    };
+
+    let lambda = lambda(&needed("lambda", "[lambda] with name, version, kind and entry")?)?;
+    let inputs = inputs(document, &root)?;
+    let schedule =
+        schedule(&needed("schedule", "[schedule] with event = \"<an input's name>\" or period = \"100ms\"")?, &inputs)?;
+    Ok(Manifest {
+        lambda,
+        schedule,
+        inputs,
+        models: models(document, &root)?,
+        record: root.get("record").map(|value| record(document, &value)).transpose()?,
+        limits: read_limits::limits(root.get("limits").as_ref(), Missing::Default)?,
+        config: root.get("config").map_or(Ok(Vec::new()), |value| read_config::items(&value))?,
+    })
+}
+
+fn lambda(value: &Value) -> Result<Lambda> {
+    let table = value.table("[lambda]", &["name", "version", "kind", "entry", "description", "deterministic"])?;
+    let lambda = Lambda {
+        name: table.need("name", "name = \"brake-dark\"")?.parse()?,
+        version: table.need("version", "version = \"0.1.0\"")?.parse()?,
+        kind: table
+            .need("kind", "kind = \"wasm\" or kind = \"python\"")?
+            .choice(&[("wasm", Kind::Wasm), ("python", Kind::Python)])?,
+        entry: table.need("entry", "entry = \"brake_dark.wasm\", or entry = \"main.py\" for Python")?.parse()?,
+        description: table.optional_text("description")?,
+        deterministic: table.flag("deterministic")?,
+    };
+    match table.get("deterministic") {
+        Some(value) if lambda.kind == Kind::Python => Err(value.misplaced(
+            "has no meaning with kind = \"python\"",
+            "remove it: Python's numbers are those of the machine",
+        )),
+        _ => Ok(lambda),
+    }
+}
+
+fn schedule(value: &Value, inputs: &[Input]) -> Result<Schedule> {
+    let table = value.table("[schedule]", &["event", "period", "backlog"])?;
+    match (table.get("event"), table.get("period")) {
+        (Some(event), None) => {
+            let input = event_input(&event, inputs)?;
+            let default = if input.type_name.is_large() { Backlog::Latest } else { Backlog::Each };
+            let backlog = table.choice("backlog", &[("each", Backlog::Each), ("latest", Backlog::Latest)], default)?;
+            Ok(Schedule::Event { input: input.name.clone(), backlog })
+        }
+        (None, Some(period)) => {
+            match table.get("backlog") {
+                Some(backlog) => Err(backlog
+                    .misplaced("has no meaning with `period`", "remove it: missed ticks are counted, never queued")),
+                None => Ok(Schedule::Periodic { period: period.duration(&bounds::PERIOD)? }),
+            }
+        }
+        (Some(event), Some(period)) => {
+            let (_, second) = if event.offset < period.offset { (event, period) } else { (period, event) };
+            Err(second.misplaced(
+                "stands beside the other kind of schedule",
+                "keep `event` or `period`: a lambda runs on one input or on the clock",
+            ))
+        }
+        (None, None) => Err(value
+            .misplaced("has neither `event` nor `period`", "add event = \"<an input's name>\" or period = \"100ms\"")),
+    }
+}
+
+fn event_input<'i>(event: &Value, inputs: &'i [Input]) -> Result<&'i Input> {
+    let name = event.text()?;
+    inputs.iter().find(|input| input.name == name).ok_or_else(|| {
+        let names = || inputs.iter().map(|input| input.name.as_str());
+        ManifestError::NoSuchInput {
+            at: event.place(),
+            name: excerpt(name),
+            near: nearest(name, names()).map(str::to_owned),
+            inputs: names().map(str::to_owned).collect(),
+        }
+    })
+}
+
+fn inputs(document: &Document, root: &Table) -> Result<Vec<Input>> {
+    let known = &["name", "topic", "type", "depth", "max_size", "decoded_size", "hold", "qos"];
+    let mut names = Unique::new(document, "input", "give each [[input]] a name of its own");
+    let mut topics = Unique::new(document, "topic", "keep one [[input]] entry per topic");
+    let mut inputs = Vec::new();
+    let mut memory = Vec::new();
+    for table in root.tables("input", known)? {
+        let name = table.need("name", "name = \"camera\"")?;
+        let topic = table.need("topic", "topic = \"/camera/front/compressed\"")?;
+        let input = input(&table, &name, &topic)?;
+        names.add(input.name.as_str(), &name)?;
+        topics.add(input.topic.as_str(), &topic)?;
+        memory.push(InputMemory { name: input.name.to_string(), line: table.line(), asked: input.memory() });
+        inputs.push(input);
+    }
+    let total = memory.iter().fold(0, |sum: u64, input| sum.saturating_add(input.asked.bytes()));
+    if total > bounds::INPUTS_MEMORY_MAX.bytes() {
+        let (file, total) = (document.file.to_owned(), ByteSize::new(total));
+        return Err(ManifestError::TooMuchMemory { file, total, inputs: memory });
+    }
+    Ok(inputs)
+}
+
+fn input(table: &Table, name: &Value, topic: &Value) -> Result<Input> {
+    let type_name: TypeName = table.need("type", "type = \"sensor_msgs/msg/Imu\"")?.parse()?;
+    let (depth, hold, max_size) = if type_name.is_large() {
+        (bounds::DEPTH_LARGE, bounds::HOLD_LARGE, bounds::MAX_SIZE_LARGE)
+    } else {
+        (bounds::DEPTH_SMALL, bounds::HOLD_SMALL, bounds::MAX_SIZE_SMALL)
+    };
+    let decoded_size = match table.get("decoded_size") {
+        Some(value) if !type_name.is_compressed_image() => {
+            let why = format!("has no meaning for {type_name}");
+            return Err(value.misplaced(why, "remove it: only sensor_msgs/msg/CompressedImage is decoded"));
+        }
+        _ if type_name.is_compressed_image() => Some(table.size("decoded_size", &bounds::DECODED_SIZE)?),
+        _ => None,
+    };
+    Ok(Input {
+        name: name.parse()?,
+        topic: topic.parse()?,
+        depth: count(table.integer("depth", &depth)?),
+        hold: count(table.integer("hold", &hold)?),
+        max_size: table.size("max_size", &max_size)?,
+        decoded_size,
+        qos: table.get("qos").map_or(Ok(Qos::Auto), |value| qos(&value))?,
+        type_name,
+    })
+}
+
+fn qos(value: &Value) -> Result<Qos> {
+    let wanted = "\"auto\", or a table such as { reliability = \"reliable\", durability = \"volatile\", depth = 10 }";
+    if value.raw().is_str() {
+        return value.choice(&[("auto", Qos::Auto)]);
+    }
+    if !value.raw().is_table() {
+        return Err(value.wrong_type(wanted));
+    }
+    let table = value.table("`input.qos`", &["reliability", "durability", "depth"])?;
+    Ok(Qos::Fixed {
+        reliability: table.choice(
+            "reliability",
+            &[("reliable", Reliability::Reliable), ("best_effort", Reliability::BestEffort)],
+            Reliability::Reliable,
+        )?,
+        durability: table.choice(
+            "durability",
+            &[("volatile", Durability::Volatile), ("transient_local", Durability::TransientLocal)],
+            Durability::Volatile,
+        )?,
+        depth: count(table.integer("depth", &bounds::QOS_DEPTH)?),
+    })
+}
+
+fn models(document: &Document, root: &Table) -> Result<Vec<Model>> {
+    let mut names = Unique::new(document, "model", "give each [[model]] a name of its own");
+    let mut models = Vec::new();
+    for table in root.tables("model", &["name", "file", "sha256", "layout", "providers", "threads"])? {
+        let name = table.need("name", "name = \"detector\"")?;
+        let model = Model {
+            name: name.parse()?,
+            file: table.need("file", "file = \"models/detector.onnx\"")?.parse()?,
+            sha256: table.need("sha256", "sha256 = \"<what sha256sum prints for the file>\"")?.parse()?,
+            layout: table.optional_text("layout")?,
+            providers: table.get("providers").map_or(Ok(Vec::new()), |value| providers(&value))?,
+            threads: table.get("threads").map(|value| value.integer(&bounds::THREADS).map(count)).transpose()?,
+        };
+        names.add(model.name.as_str(), &name)?;
+        models.push(model);
+    }
+    Ok(models)
+}
+
+fn providers(value: &Value) -> Result<Vec<String>> {
+    let items = value.items("an array of texts, for example [\"cuda\", \"cpu\"]")?;
+    items.iter().map(|item| item.text().map(str::to_owned)).collect()
+}
+
+fn record(document: &Document, value: &Value) -> Result<Record> {
+    let known = &["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
+    let table = value.table("[record]", known)?;
+    let list = table.need("topics", "topics = [\"/imu/data\"]: what a clip holds")?;
+    let mut unique = Unique::new(document, "topic", "list each topic of [record] once");
+    let mut topics = Vec::new();
+    for item in list.items("an array of topics, for example [\"/imu/data\"]")? {
+        let topic: TopicName = item.parse()?;
+        unique.add(topic.as_str(), &item)?;
+        topics.push(topic);
+    }
+    if topics.is_empty() {
+        return Err(list.misplaced("is empty", "list what a clip holds, or remove [record]"));
+    }
+    let store = table.choice("store", &[("ram", Store::Ram), ("disk", Store::Disk)], Store::Ram)?;
+    let preroll_size = match store {
+        Store::Ram => bounds::PREROLL_SIZE_RAM,
+        Store::Disk => bounds::PREROLL_SIZE_DISK,
+    };
+    Ok(Record {
+        topics,
+        preroll: table.duration("preroll", &bounds::ROLL)?,
+        postroll: table.duration("postroll", &bounds::ROLL)?,
+        store,
+        preroll_size: table.size("preroll_size", &preroll_size)?,
+        cooldown: table.duration("cooldown", &bounds::COOLDOWN)?,
+        max_length: table.duration("max_length", &bounds::MAX_LENGTH)?,
+    })
+}
+
+/// Counts in a manifest end far below the 32 bits that every address has.
+fn count(n: u64) -> usize {
+    usize::try_from(n).unwrap_or(usize::MAX)
+}
+
+/// Names of which each may come once.
+struct Unique<'a> {
+    document: &'a Document<'a>,
+    what: &'static str,
+    way_out: &'static str,
+    seen: Vec<(String, usize)>,
+}
+
+impl<'a> Unique<'a> {
+    fn new(document: &'a Document<'a>, what: &'static str, way_out: &'static str) -> Unique<'a> {
+        Unique { document, what, way_out, seen: Vec::new() }
+    }
+
+    fn add(&mut self, name: &str, value: &Value) -> Result<()> {
+        if let Some((_, first)) = self.seen.iter().find(|(seen, _)| seen == name) {
+            return Err(ManifestError::Twice {
+                what: self.what,
+                name: name.to_owned(),
+                file: self.document.file.to_owned(),
+                first: self.document.line(*first),
+                second: value.line(),
+                way_out: self.way_out,
+            });
+        }
+        self.seen.push((name.to_owned(), value.offset));
+        Ok(())
+    }
+}

@@ -1,0 +1,260 @@
+//! `docs/manifest.md`: every key of a `lambda.toml`. Meanings are the comments of the types that hold the values, rules are those that a
+//! name is refused by, and numbers the bounds that it is checked against; so nothing is said twice, and nothing can go stale.
+
+use std::fmt::{Display, Write};
+use std::ops::RangeInclusive;
+use std::str::FromStr;
+use std::time::Duration;
+
+use super::bounds::{self, Bounds};
+use super::{
+    ByteSize, ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version, format_duration,
+};
+use gleaner_base::grouped;
+
+/// Where the types are that a manifest becomes.
+const SOURCES: [&str; 3] = [include_str!("types.rs"), include_str!("limits.rs"), include_str!("config.rs")];
+
+const BEGIN: &str = "\
+# The manifest
+
+Every key of `lambda.toml`, made of the types that it is read into: `cargo xtask bless` writes this page, and a test compares it. Unknown keys are
+refused with their line and the nearest known one, numbers out of their range with the range. [limits.md](limits.md) says what
+happens beyond a limit; [errors.md](errors.md) what a refusal looks like.
+
+A *size* is a whole number and its unit, as in `\"2 MiB\"`: B, KiB, MiB, GiB. A *duration* is a number and its unit, as in `\"50ms\"` or
+`\"1.5s\"`: us, ms, s, min, h. *Images and clouds* are inputs of `sensor_msgs/msg/Image`, `CompressedImage` and `PointCloud2`.
+";
+
+/// A table of the manifest.
+pub(super) struct Section {
+    /// As it is written, such as `[lambda]`.
+    pub(super) title: &'static str,
+    note: String,
+    pub(super) keys: Vec<Key>,
+}
+
+/// A key in a table.
+pub(super) struct Key {
+    pub(super) name: &'static str,
+    form: String,
+    default: String,
+    range: String,
+    meaning: String,
+}
+
+impl Key {
+    /// The key `name` that becomes `field` of the type `of`.
+    fn new(name: &'static str, of: &str, field: &str, form: impl Into<String>) -> Key {
+        let meaning = meaning(of, field).unwrap_or_else(|| panic!("`{field}` of `{of}` has a comment"));
+        Key { name, form: form.into(), default: "none".to_owned(), range: String::new(), meaning }
+    }
+
+    fn needed(self) -> Key {
+        self.default("*needed*")
+    }
+
+    fn default(mut self, default: &str) -> Key {
+        default.clone_into(&mut self.default);
+        self
+    }
+
+    fn within<T: Copy>(mut self, range: RangeInclusive<T>, show: impl Fn(T) -> String) -> Key {
+        self.range = format!("{} to {}", show(*range.start()), show(*range.end()));
+        self
+    }
+
+    fn bounded<T: Copy>(self, bounds: &Bounds<T>, show: impl Fn(T) -> String) -> Key {
+        let default = show(bounds.default);
+        self.default(&default).within(bounds.range(), show)
+    }
+
+    /// With other bounds for images and clouds.
+    fn or_large<T: Copy + PartialEq>(mut self, large: &Bounds<T>, show: impl Fn(T) -> String) -> Key {
+        let _ = write!(self.default, "; of images and clouds {}", show(large.default));
+        self
+    }
+}
+
+/// All tables, in the order of the page.
+pub(super) fn sections() -> Vec<Section> {
+    vec![lambda(), schedule(), input(), qos(), record(), limits(), config(), model()]
+}
+
+/// The page `docs/manifest.md`.
+///
+/// # Panics
+///
+/// If a field that holds a key has no comment.
+pub fn reference() -> String {
+    let mut page = BEGIN.to_owned();
+    for section in sections() {
+        let _ = write!(page, "\n## {}\n\n{}\n\n", section.title, section.note);
+        page += "| key | value | default | range | meaning |\n|---|---|---|---|---|\n";
+        for Key { name, form, default, range, meaning } in section.keys {
+            let _ = writeln!(page, "| `{name}` | {form} | {default} | {range} | {meaning} |");
+        }
+    }
+    page
+}
+
+fn lambda() -> Section {
+    let keys = vec![
+        Key::new("name", "Lambda", "name", rule::<LambdaName>()).needed(),
+        Key::new("version", "Lambda", "version", rule::<Version>()).needed(),
+        Key::new("kind", "Lambda", "kind", "`\"wasm\"`, `\"python\"`").needed(),
+        Key::new("entry", "Lambda", "entry", rule::<RelativePath>()).needed(),
+        Key::new("description", "Lambda", "description", "text"),
+        Key::new("deterministic", "Lambda", "deterministic", "`true`, `false`").default("`false`"),
+    ];
+    Section { title: "[lambda]", note: "What it is. Needed.".to_owned(), keys }
+}
+
+fn schedule() -> Section {
+    let keys = vec![
+        Key::new("event", "Schedule", "input", "name of an input"),
+        Key::new("period", "Schedule", "period", "duration").within(bounds::PERIOD, duration),
+        Key::new("backlog", "Schedule", "backlog", "`\"each\"`, `\"latest\"`")
+            .default("`\"each\"`; of images and clouds `\"latest\"`"),
+    ];
+    let note = "When it runs. Needed, with either `event` or `period`; `backlog` belongs to `event`. *Each* sample wakes the lambda in order, as far \
+                as the ring reaches; or the *latest* does, and the others are counted as skipped.";
+    Section { title: "[schedule]", note: note.to_owned(), keys }
+}
+
+fn input() -> Section {
+    let keys = vec![
+        Key::new("name", "Input", "name", rule::<ItemName>()).needed(),
+        Key::new("topic", "Input", "topic", rule::<TopicName>()).needed(),
+        Key::new("type", "Input", "type_name", rule::<TypeName>()).needed(),
+        Key::new("depth", "Input", "depth", "number")
+            .bounded(&bounds::DEPTH_SMALL, number)
+            .or_large(&bounds::DEPTH_LARGE, number),
+        Key::new("max_size", "Input", "max_size", "size")
+            .bounded(&bounds::MAX_SIZE_SMALL, size)
+            .or_large(&bounds::MAX_SIZE_LARGE, size),
+        Key::new("decoded_size", "Input", "decoded_size", "size").bounded(&bounds::DECODED_SIZE, size),
+        Key::new("hold", "Input", "hold", "number")
+            .bounded(&bounds::HOLD_SMALL, number)
+            .or_large(&bounds::HOLD_LARGE, number),
+        Key::new("qos", "Input", "qos", "`\"auto\"`, or the table below").default("`\"auto\"`"),
+    ];
+    let note = format!(
+        "A topic that the lambda sees; any number of them, each with a name and a topic of its own. Their memory is taken before the first sample, {} \
+         at most for all: (`depth` + `hold` + 1) × `max_size`, and of compressed images (`hold` + 1) × `decoded_size`.",
+        bounds::INPUTS_MEMORY_MAX
+    );
+    Section { title: "[[input]]", note, keys }
+}
+
+fn qos() -> Section {
+    let keys = vec![
+        Key::new("reliability", "Qos", "reliability", "`\"reliable\"`, `\"best_effort\"`").default("`\"reliable\"`"),
+        Key::new("durability", "Qos", "durability", "`\"volatile\"`, `\"transient_local\"`").default("`\"volatile\"`"),
+        Key::new("depth", "Qos", "depth", "number").bounded(&bounds::QOS_DEPTH, number),
+    ];
+    let note = "`qos = { ... }` of an input, for live topics: exactly this is asked for.";
+    Section { title: "qos", note: note.to_owned(), keys }
+}
+
+fn record() -> Section {
+    let key = |name, form: &str| Key::new(name, "Record", name, form);
+    let mut preroll_size = key("preroll_size", "size").bounded(&bounds::PREROLL_SIZE_RAM, size);
+    let disk = bounds::PREROLL_SIZE_DISK;
+    let _ = write!(preroll_size.default, "; on disk {}", size(disk.default));
+    let _ = write!(preroll_size.range, "; on disk {} to {}", size(disk.min), size(disk.max));
+    let keys = vec![
+        key("topics", "list of topics").needed(),
+        key("preroll", "duration").bounded(&bounds::ROLL, duration),
+        key("postroll", "duration").bounded(&bounds::ROLL, duration),
+        key("cooldown", "duration").bounded(&bounds::COOLDOWN, duration),
+        key("max_length", "duration").bounded(&bounds::MAX_LENGTH, duration),
+        key("store", "`\"ram\"`, `\"disk\"`").default("`\"ram\"`"),
+        preroll_size,
+    ];
+    let note = "What a clip holds, which a trigger cuts ([clips.md](clips.md)). Without it there are none.";
+    Section { title: "[record]", note: note.to_owned(), keys }
+}
+
+fn limits() -> Section {
+    let key = |name, form: &str| Key::new(name, "Limits", name, form);
+    let keys = vec![
+        key("fuel", "number").bounded(&bounds::FUEL, number),
+        key("init_fuel", "number").bounded(&bounds::INIT_FUEL, number),
+        key("deadline", "duration").bounded(&bounds::DEADLINE, duration),
+        key("init_deadline", "duration").bounded(&bounds::INIT_DEADLINE, duration),
+        key("memory", "size").bounded(&bounds::MEMORY, size),
+        key("tables", "number").bounded(&bounds::TABLES, number),
+        key("stack", "size").bounded(&bounds::STACK, size),
+        key("handles", "number").bounded(&bounds::HANDLES, number),
+        key("frames", "number").bounded(&bounds::FRAMES, number),
+        key("call_bytes", "size").bounded(&bounds::CALL_BYTES, size),
+        key("call_items", "number").bounded(&bounds::CALL_ITEMS, number),
+        key("scratch", "size").bounded(&bounds::SCRATCH, size),
+        key("log_lines", "number").bounded(&bounds::LOG_LINES, number),
+        key("log_bytes", "size").bounded(&bounds::LOG_BYTES, size),
+        key("events_per_minute", "number").bounded(&bounds::EVENTS_PER_MINUTE, number),
+    ];
+    Section { title: "[limits]", note: "What it may use. A vehicle can make each smaller.".to_owned(), keys }
+}
+
+fn config() -> Section {
+    let keys = vec![
+        Key::new("default", "ConfigItem", "default", "`true`, `false`, number or text").needed(),
+        Key::new("min", "ConfigItem", "min", "number"),
+        Key::new("max", "ConfigItem", "max", "number"),
+        Key::new("unit", "ConfigItem", "unit", "text"),
+        Key::new("description", "ConfigItem", "description", "text"),
+    ];
+    let note = "Values that the lambda asks for by name, and that `--set` changes: `key = value`, or `key = { ... }` with what follows. Names are those of the \
+                author.";
+    Section { title: "[config]", note: note.to_owned(), keys }
+}
+
+fn model() -> Section {
+    let keys = vec![
+        Key::new("name", "Model", "name", rule::<ItemName>()).needed(),
+        Key::new("file", "Model", "file", rule::<RelativePath>()).needed(),
+        Key::new("sha256", "Model", "sha256", rule::<Sha256>()).needed(),
+        Key::new("layout", "Model", "layout", "text"),
+        Key::new("providers", "Model", "providers", "list of texts").default("empty"),
+        Key::new("threads", "Model", "threads", "number").within(bounds::THREADS, number),
+    ];
+    Section { title: "[[model]]", note: "Read and checked now, used once there are models.".to_owned(), keys }
+}
+
+/// The rule that a name is refused by; no name is empty.
+fn rule<T: FromStr<Err = NameError>>() -> &'static str {
+    "".parse::<T>().err().map_or("a name", |refused| refused.rule)
+}
+
+fn number(number: impl Display) -> String {
+    grouped(number)
+}
+
+fn size(size: ByteSize) -> String {
+    format!("`\"{size}\"`")
+}
+
+fn duration(duration: Duration) -> String {
+    format!("`\"{}\"`", format_duration(duration))
+}
+
+/// The comment of a field, in one line; `of` is the struct or enum that has it.
+fn meaning(of: &str, field: &str) -> Option<String> {
+    let body = SOURCES.iter().find_map(|source| {
+        let at = ["struct", "enum"].iter().find_map(|kind| source.find(&format!("pub {kind} {of} {{")))?;
+        source[at..].split("\n}").next()
+    })?;
+    let mut comment = String::new();
+    for line in body.lines().map(str::trim) {
+        if let Some(text) = line.strip_prefix("///") {
+            comment += text;
+        } else if line.trim_start_matches("pub ").starts_with(&format!("{field}:")) && !comment.is_empty() {
+            return Some(comment.trim().replace('|', "\\|"));
+        } else if !line.starts_with("#[") {
+            comment.clear();
+        }
+    }
+    None
+}

@@ -1,0 +1,44 @@
+use toml::de::Error as TomlError;
+
+use super::error::ManifestError;
+use super::table::Document;
+use gleaner_base::words::excerpt;
+
+/// What a user should see of an error of the TOML parser.
+pub(super) fn explain(document: &Document, error: &TomlError) -> ManifestError {
+    let end = document.text.len();
+    let span = error.span().unwrap_or(end..end);
+    let line = document.line(span.start);
+    let file = document.file.to_owned();
+    let key = document.text.get(span).filter(|_| error.message().starts_with("duplicate key"));
+    if let Some(key) = key
+        && let Some((what, first)) = earlier(document.text, key, line)
+    {
+        let way_out = "keep one of the two";
+        return ManifestError::Twice { what, name: excerpt(key), file, first, second: line, way_out };
+    }
+    ManifestError::Syntax { file, line, message: excerpt(error.message()) }
+}
+
+/// Where `key`, refused as a duplicate in `line`, stood first. The parser knows but does not tell, so its text is
+/// looked for: as the name of a table, or as a key above it in the same table.
+fn earlier(text: &str, key: &str, line: usize) -> Option<(&'static str, usize)> {
+    let above: Vec<&str> = text.lines().take(line).map(str::trim_start).collect();
+    let (second, above) = above.split_last()?;
+    let is_table = second.starts_with('[');
+    for (index, candidate) in above.iter().enumerate().rev() {
+        let name = candidate.trim_start_matches('[').trim_start();
+        let after = name.strip_prefix(key).map(str::trim_start);
+        match (is_table, candidate.starts_with('[')) {
+            (true, true) if after.is_some_and(|after| after.starts_with(']')) => {
+                return Some(("table", index + 1));
+            }
+            (false, false) if after.is_some_and(|after| after.starts_with('=')) => {
+                return Some(("key", index + 1));
+            }
+            (false, true) => return None,
+            _ => {}
+        }
+    }
+    None
+}

@@ -1,0 +1,195 @@
+//! One value of a TOML document, read as what it should be, with its place for the refusal if it is not.
+
+use std::ops::RangeInclusive;
+use std::str::FromStr;
+use std::time::Duration;
+
+use toml::Spanned;
+use toml::de::DeValue;
+
+use super::bounds::ITEMS_MAX;
+use super::error::{ManifestError, Place};
+use super::table::{Document, Table};
+use super::{ByteSize, NameError, UnitError, format_duration, parse_duration};
+use gleaner_base::words::{excerpt, nearest};
+
+type Result<T> = std::result::Result<T, ManifestError>;
+
+/// A value and the key it belongs to.
+#[derive(Clone)]
+pub(super) struct Value<'a> {
+    pub(super) document: &'a Document<'a>,
+    /// The last part of its path, as it is in the file.
+    pub(super) name: &'a str,
+    pub(super) path: String,
+    pub(super) offset: usize,
+    pub(super) value: &'a DeValue<'a>,
+}
+
+impl<'a> Value<'a> {
+    pub(super) fn line(&self) -> usize {
+        self.document.line(self.offset)
+    }
+
+    pub(super) fn place(&self) -> Box<Place> {
+        Box::new(Place { file: self.document.file.to_owned(), line: self.line(), key: self.path.clone() })
+    }
+
+    pub(super) fn raw(&self) -> &'a DeValue<'a> {
+        self.value
+    }
+
+    /// The error for a value of another type; `wanted` is what to give instead.
+    pub(super) fn wrong_type(&self, wanted: &str) -> ManifestError {
+        let found = match self.value {
+            DeValue::String(_) => "a text",
+            DeValue::Integer(_) => "a whole number",
+            DeValue::Float(_) => "a number with a fraction",
+            DeValue::Boolean(_) => "true or false",
+            DeValue::Datetime(_) => "a date or time",
+            DeValue::Array(_) => "an array",
+            DeValue::Table(_) => "a table",
+        };
+        ManifestError::WrongType { at: self.place(), found, wanted: wanted.to_owned() }
+    }
+
+    /// The error for a text that should be a `what`; `rule` is what such a text looks like.
+    pub(super) fn wrong_form(&self, text: &str, what: &'static str, rule: &'static str) -> ManifestError {
+        ManifestError::WrongForm { at: self.place(), text: excerpt(text), what, rule }
+    }
+
+    /// The error for a value that does not fit its surroundings.
+    pub(super) fn misplaced(&self, why: impl Into<String>, way_out: impl Into<String>) -> ManifestError {
+        ManifestError::Misplaced { at: self.place(), why: why.into(), way_out: way_out.into() }
+    }
+
+    /// The table that this is. `title` is how it is written.
+    pub(super) fn table(&self, title: &str, known: &'static [&'static str]) -> Result<Table<'a>> {
+        self.open_table(title)?.knowing(known)
+    }
+
+    /// A table whose keys the author chooses.
+    pub(super) fn open_table(&self, title: &str) -> Result<Table<'a>> {
+        let DeValue::Table(entries) = self.value else {
+            return Err(self.wrong_type("a table"));
+        };
+        let title = title.to_owned();
+        Ok(Table { document: self.document, path: self.path.clone(), title, offset: self.offset, entries })
+    }
+
+    /// The elements of an array, each with its own line.
+    pub(super) fn items(&self, wanted: &str) -> Result<Vec<Value<'a>>> {
+        let DeValue::Array(items) = self.value else {
+            return Err(self.wrong_type(wanted));
+        };
+        if items.len() > ITEMS_MAX {
+            let why = format!("has {} entries, above the maximum of {ITEMS_MAX}", items.len());
+            return Err(self.misplaced(why, format!("keep {ITEMS_MAX} or fewer")));
+        }
+        let item =
+            |item: &'a Spanned<DeValue<'a>>| Value { offset: item.span().start, value: item.get_ref(), ..self.clone() };
+        Ok(items.iter().map(item).collect())
+    }
+
+    pub(super) fn text(&self) -> Result<&'a str> {
+        self.value.as_str().ok_or_else(|| self.wrong_type("a text in quotes"))
+    }
+
+    pub(super) fn boolean(&self) -> Result<bool> {
+        match self.value {
+            DeValue::Boolean(truth) => Ok(*truth),
+            _ => Err(self.wrong_type("true or false")),
+        }
+    }
+
+    /// A text of a checked form.
+    pub(super) fn parse<T: FromStr<Err = NameError>>(&self) -> Result<T> {
+        let text = self.text()?;
+        text.parse().map_err(|NameError { what, rule, .. }| self.wrong_form(text, what, rule))
+    }
+
+    /// The key itself, where its form matters because the author chose it.
+    pub(super) fn parse_key<T: FromStr<Err = NameError>>(&self) -> Result<T> {
+        self.name.parse().map_err(|NameError { what, rule, .. }| self.wrong_form(self.name, what, rule))
+    }
+
+    /// One of a few words.
+    pub(super) fn choice<T: Copy>(&self, choices: &[(&'static str, T)]) -> Result<T> {
+        let text = self.text()?;
+        if let Some((_, choice)) = choices.iter().find(|(word, _)| *word == text) {
+            return Ok(*choice);
+        }
+        let words: Vec<_> = choices.iter().map(|(word, _)| *word).collect();
+        let near = nearest(text, words.iter().copied());
+        Err(ManifestError::NoChoice { at: self.place(), text: excerpt(text), choices: words, near })
+    }
+
+    pub(super) fn integer(&self, range: &RangeInclusive<u64>) -> Result<u64> {
+        let Some(number) = self.whole_number() else {
+            return Err(self.wrong_type("a whole number"));
+        };
+        let (min, max) = (i128::from(*range.start()), i128::from(*range.end()));
+        self.within(&number, Some(&min), Some(&max), i128::to_string)?;
+        // It lies within a range of 64 bits, so that nothing is replaced here.
+        Ok(u64::try_from(number).unwrap_or(*range.end()))
+    }
+
+    pub(super) fn size(&self, range: &RangeInclusive<ByteSize>) -> Result<ByteSize> {
+        if let Some(text) = self.value.as_str() {
+            let size = text.parse().map_err(|UnitError { what, rule, .. }| self.wrong_form(text, what, rule))?;
+            self.within(&size, Some(range.start()), Some(range.end()), ByteSize::to_string)?;
+            return Ok(size);
+        }
+        let Some(number) = self.whole_number() else {
+            return Err(self.wrong_type("a size in quotes, for example \"2 MiB\", or a whole number of bytes"));
+        };
+        // As whole numbers, since the one at hand may be negative or beyond 64 bits.
+        let (min, max) = (i128::from(range.start().bytes()), i128::from(range.end().bytes()));
+        let show = |number: &i128| u64::try_from(*number).map_or(number.to_string(), |n| ByteSize::new(n).to_string());
+        self.within(&number, Some(&min), Some(&max), show)?;
+        Ok(u64::try_from(number).map_or(*range.end(), ByteSize::new))
+    }
+
+    pub(super) fn duration(&self, range: &RangeInclusive<Duration>) -> Result<Duration> {
+        let Some(text) = self.value.as_str() else {
+            return Err(self.wrong_type("a duration in quotes, for example \"50ms\""));
+        };
+        let duration =
+            parse_duration(text).map_err(|UnitError { what, rule, .. }| self.wrong_form(text, what, rule))?;
+        let show = |duration: &Duration| format_duration(*duration);
+        self.within(&duration, Some(range.start()), Some(range.end()), show)?;
+        Ok(duration)
+    }
+
+    /// Refuses `value` outside of the limits that there are.
+    pub(super) fn within<T: PartialOrd>(
+        &self,
+        value: &T,
+        min: Option<&T>,
+        max: Option<&T>,
+        show: impl Fn(&T) -> String,
+    ) -> Result<()> {
+        match (min, max) {
+            (Some(least), _) if value < least => Err(ManifestError::TooSmall {
+                at: self.place(),
+                value: show(value),
+                min: show(least),
+                max: max.map(show),
+            }),
+            (_, Some(most)) if value > most => Err(ManifestError::TooLarge {
+                at: self.place(),
+                value: show(value),
+                min: min.map(&show),
+                max: show(most),
+            }),
+            _ => Ok(()),
+        }
+    }
+
+    /// The whole number that this is; one beyond 128 bits is as good as the largest.
+    pub(super) fn whole_number(&self) -> Option<i128> {
+        let number = self.value.as_integer()?;
+        let huge = if number.as_str().starts_with('-') { i128::MIN } else { i128::MAX };
+        Some(i128::from_str_radix(number.as_str(), number.radix()).unwrap_or(huge))
+    }
+}

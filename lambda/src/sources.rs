@@ -1,0 +1,209 @@
+use std::collections::BTreeSet;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use crate::manifest::Kind;
+use crate::{LayoutError, Manifest};
+use gleaner_base::ByteSize;
+use gleaner_base::NotPlain;
+
+/// Folders beside the manifest that hold no Python of the lambda: what tools made, and its tests.
+const LEFT_OUT: [&str; 4] = ["build", "out", "target", "tests"];
+
+/// Longest Python file or message definition that a build takes. The longest of the standard library has 700 KiB.
+pub const SOURCE_MAX: ByteSize = ByteSize::mib(16);
+
+/// What a build is made of besides `lambda.toml`: the one rule for whoever builds, and for whoever asks whether a build
+/// is still good.
+///
+/// Paths are relative to the lambda's folder. What the manifest names is listed whether it exists or not; the rest is
+/// found in the folder. Hidden files and folders, `__pycache__/` and virtual environments (what holds a `pyvenv.cfg`) are left
+/// out, and links to folders are not followed: they may lead in circles.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Sources {
+    /// What lies in the build under the same name: models, message definitions (`msg/**/*.msg`), and of a Python lambda
+    /// its entry and every `.py` file that is not in `build/`, `out/`, `target/` or `tests/` beside the manifest.
+    pub copied: BTreeSet<PathBuf>,
+    /// What is compiled into the entry of a Rust lambda: `Cargo.toml`, `build.rs`, and everything in `src/`.
+    pub compiled: BTreeSet<PathBuf>,
+}
+
+impl Sources {
+    /// The sources of the lambda in `lambda_dir` that `manifest` declares.
+    ///
+    /// # Errors
+    ///
+    /// [`LayoutError::Read`] if a folder cannot be listed, or is a link that leads out of the lambda's folder.
+    pub fn of(lambda_dir: impl AsRef<Path>, manifest: &Manifest) -> Result<Sources, LayoutError> {
+        let dir = lambda_dir.as_ref();
+        let models = manifest.models.iter().map(|model| model.file.as_path().to_owned());
+        let mut sources = Sources { copied: models.collect(), compiled: BTreeSet::new() };
+        sources.copied.extend(files(dir, "msg", |_| true, |file| has_extension(file, "msg"))?);
+        match manifest.lambda.kind {
+            Kind::Python => {
+                sources.copied.insert(manifest.lambda.entry.as_path().to_owned());
+                let is_of_the_lambda = |folder: &Path| !LEFT_OUT.iter().any(|left_out| folder == Path::new(left_out));
+                sources.copied.extend(files(dir, "", is_of_the_lambda, |file| has_extension(file, "py"))?);
+            }
+            Kind::Wasm => {
+                sources.compiled.extend(["Cargo.toml", "build.rs"].map(PathBuf::from));
+                sources.compiled.extend(files(dir, "src", |_| true, |_| true)?);
+            }
+        }
+        Ok(sources)
+    }
+
+    /// All of them.
+    pub fn iter(&self) -> impl Iterator<Item = &Path> {
+        self.copied.iter().chain(&self.compiled).map(PathBuf::as_path)
+    }
+}
+
+/// The files in the folder `start` of `dir`, which need not exist, and in the folders below that `enters` allows.
+fn files(
+    dir: &Path,
+    start: &str,
+    enters: impl Fn(&Path) -> bool,
+    takes: impl Fn(&Path) -> bool,
+) -> Result<Vec<PathBuf>, LayoutError> {
+    lies_in(dir, start)?;
+    let mut found = Vec::new();
+    let mut folders = vec![PathBuf::from(start)];
+    while let Some(folder) = folders.pop() {
+        let path = dir.join(&folder);
+        let failed = |source| LayoutError::Read { path: path.clone(), source };
+        let entries = match fs::read_dir(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            entries => entries.map_err(failed)?,
+        };
+        for entry in entries {
+            let entry = entry.map_err(failed)?;
+            let (name, relative) = (entry.file_name(), folder.join(entry.file_name()));
+            if name.as_encoded_bytes().starts_with(b".") || name == "__pycache__" {
+                continue;
+            }
+            // Of the entry itself, not of what a link leads to.
+            if entry.file_type().map_err(failed)?.is_dir() {
+                if enters(&relative) && !entry.path().join("pyvenv.cfg").is_file() {
+                    folders.push(relative);
+                }
+            } else if takes(&relative) && entry.path().is_file() {
+                found.push(relative);
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Refuses the folder `start` of `dir` if it is a link that leads elsewhere: anything could be listed there.
+fn lies_in(dir: &Path, start: &str) -> Result<(), LayoutError> {
+    let path = dir.join(start);
+    let (Ok(target), Ok(folder)) = (path.canonicalize(), dir.canonicalize()) else { return Ok(()) };
+    if target.starts_with(&folder) {
+        return Ok(());
+    }
+    Err(LayoutError::Read { path, source: io::Error::other(NotPlain::Outside { target, folder }) })
+}
+
+fn has_extension(file: &Path, wanted: &str) -> bool {
+    file.extension().is_some_and(|extension| extension == wanted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scratch::Scratch;
+
+    fn sources(dir: &Scratch, kind: &str, entry: &str) -> [Vec<String>; 2] {
+        let manifest = format!(
+            "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\nschedule.period = '1s'\n\
+             [[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n",
+            "0".repeat(64)
+        );
+        let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
+        let Sources { copied, compiled } = Sources::of(dir.root(), &manifest).unwrap();
+        [copied, compiled].map(|files| files.iter().map(|file| file.display().to_string()).collect())
+    }
+
+    /// A folder that could belong to a lambda of either kind.
+    fn folder() -> Scratch {
+        let dir = Scratch::new();
+        for file in [
+            ".hidden.py",
+            ".venv/lib/y.py",
+            "Cargo.toml",
+            "README.md",
+            "build/lambda.toml",
+            "build/main.py",
+            "msg/README.md",
+            "msg/a/msg/B.msg",
+            "other.py",
+            "out/x.py",
+            "part/__pycache__/z.py",
+            "part/build/deep.py",
+            "src/.lib.rs.swp",
+            "src/data.bin",
+            "src/inner/mod.rs",
+            "target/t.py",
+            "tests/test.py",
+            "venv/lib/python3.11/site-packages/y.py",
+            "venv/pyvenv.cfg",
+        ] {
+            dir.write(file, "");
+        }
+        dir
+    }
+
+    #[test]
+    fn python_is_copied_but_for_what_tools_made_and_tests() {
+        let [copied, compiled] = sources(&folder(), "python", "main.py");
+        assert_eq!(copied, ["main.py", "models/m.onnx", "msg/a/msg/B.msg", "other.py", "part/build/deep.py"]);
+        assert!(compiled.is_empty());
+    }
+
+    #[test]
+    fn an_entry_is_a_source_wherever_it_lies() {
+        let [copied, _] = sources(&folder(), "python", "tests/test.py");
+        assert!(copied.contains(&"tests/test.py".to_owned()), "{copied:?}");
+    }
+
+    #[test]
+    fn rust_is_compiled_with_its_build_script_and_whatever_lies_in_src() {
+        let [copied, compiled] = sources(&folder(), "wasm", "x.wasm");
+        assert_eq!(copied, ["models/m.onnx", "msg/a/msg/B.msg"]);
+        assert_eq!(compiled, ["Cargo.toml", "build.rs", "src/data.bin", "src/inner/mod.rs"]);
+    }
+
+    #[test]
+    fn a_folder_of_sources_that_leads_elsewhere_is_refused_by_name() {
+        let (dir, elsewhere) = (Scratch::new(), folder());
+        for (name, kind) in [("msg", "python"), ("src", "wasm")] {
+            std::os::unix::fs::symlink(elsewhere.root(), dir.path(name)).unwrap();
+            let manifest = format!(
+                "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = 'x' }}\nschedule.period = '1s'\n"
+            );
+            let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
+            let error = gleaner_failure(Sources::of(dir.root(), &manifest).unwrap_err());
+            assert!(
+                error.contains(&format!("{name}`\n  cause: it is a link to `{}`", elsewhere.root().display())),
+                "{error}"
+            );
+            std::fs::remove_file(dir.path(name)).unwrap();
+        }
+    }
+
+    fn gleaner_failure(error: LayoutError) -> String {
+        gleaner_base::Failure::from(error).to_string()
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_back_into_the_folder_makes_no_circle() {
+        let dir = folder();
+        std::os::unix::fs::symlink(dir.root(), dir.path("again")).unwrap();
+        std::os::unix::fs::symlink(dir.root(), dir.path("src/again")).unwrap();
+        assert_eq!(sources(&dir, "python", "main.py"), sources(&folder(), "python", "main.py"));
+        assert_eq!(sources(&dir, "wasm", "x.wasm"), sources(&folder(), "wasm", "x.wasm"));
+    }
+}
