@@ -108,7 +108,7 @@ impl Job {
 /// The lambda's topics, on which nothing comes; and notes on those whose type is not known here.
 fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>), Failure> {
     let sources = Sources::new(&[asked.build.path().join("msg")], &definitions());
-    let (mut topics, mut notes) = (Loopback::new(), Vec::new());
+    let (topics, mut notes) = (Loopback::new(), Vec::new());
     for input in &manifest.inputs {
         let type_name = input.type_name.as_str();
         let text = sources.find(type_name).map_err(|error| {

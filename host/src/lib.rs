@@ -12,7 +12,6 @@ pub mod input;
 pub mod isolation;
 pub mod journal;
 pub mod judge;
-#[cfg(feature = "dds")]
 pub mod live;
 pub mod memory;
 #[cfg(feature = "dds")]

@@ -14,12 +14,12 @@ pub const UNSAFE_FILES: &[&str] = &[
     "host/buffers/src/pool.rs",
     "host/buffers/src/region.rs",
     "host/buffers/src/ring.rs",
+    "host/dds/src/joins.rs",
     "host/jail/src/enter.rs",
     "host/python/src/array.rs",
     "host/python/src/memory.rs",
     "host/src/guest/wasm/load.rs",
     "host/src/memory.rs",
-    "host/dds/src/joins.rs",
     "host/vitals/src/handed_on.rs",
     "host/vitals/src/pulse.rs",
     "player/src/cyclone.rs",
@@ -32,7 +32,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-buffers", &[]),
     ("gleaner-cli", &["gleaner-base", "gleaner-journal", "gleaner-lambda", "gleaner-parts", "gleaner-protocol"]),
     ("gleaner-compile", &["gleaner-base", "gleaner-jail", "gleaner-lambda"]),
-    ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
+    ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-drives", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
     (
         "gleaner-host",
@@ -86,7 +86,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ),
     ("gleaner-sdk", &[]),
     ("gleaner-shim", &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"]),
-    ("gleaner-transport", &["gleaner-base", "gleaner-messages"]),
+    ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];
 

@@ -4,10 +4,10 @@ use std::fmt;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use gleaner_dds::Clock;
 use gleaner_protocol::Live;
 use gleaner_tests::live::{Started, run};
 use gleaner_tests::{Copy, Folder};
+use gleaner_transport::Clock;
 
 use super::blocks::{BLOCK_MS, Course};
 use crate::measure::{Figure, Kind, stay_on};

@@ -8,8 +8,9 @@ mod blocks;
 mod start;
 mod victim;
 
-use gleaner_dds::{Clock, Dds, Options};
+use gleaner_dds::{Dds, Options};
 use gleaner_tests::live::play;
+use gleaner_transport::{Clock, LiveSource};
 
 use self::attacker::{ATTACKS, Attacker};
 use self::blocks::Course;

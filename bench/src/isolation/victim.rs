@@ -3,9 +3,10 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use gleaner_dds::{Clock, Dds};
+use gleaner_dds::Dds;
 use gleaner_tests::Folder;
 use gleaner_tests::live::{PATIENCE, Started, run};
+use gleaner_transport::Clock;
 
 use super::RATE_HZ;
 use super::attacker::Attack;

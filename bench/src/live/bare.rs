@@ -7,8 +7,8 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use bytes::Bytes;
-use gleaner_dds::Clock;
 use gleaner_messages::CdrWriter;
+use gleaner_transport::Clock;
 use mio::{Events, Interest, Poll, Token};
 use rustdds::policy::{Durability, History, Reliability, ResourceLimits};
 use rustdds::{DomainParticipant, QosPolicyBuilder, RepresentationIdentifier, Topic, TopicKind, no_key};

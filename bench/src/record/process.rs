@@ -4,20 +4,18 @@ use std::fs::{self, File};
 use std::io::{BufRead, BufReader, PipeReader};
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::hex;
-use gleaner_dds::Clock;
 use gleaner_journal::{FileDigest, Header};
-use gleaner_messages::Definitions;
 use gleaner_protocol::link::{Add, Control, RecorderLink, RecorderReport, RecorderStatus, Said};
-use gleaner_recorder::program::{Feed, Options, Pulse, run};
+use gleaner_recorder::program::{Options, run};
 use gleaner_tests::Folder;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError};
+use gleaner_transport::{Clock, LiveSource};
 use sha2::{Digest, Sha256};
 
 use super::{FRAMES_PER_S, TYPE, Traffic, header, wake};
@@ -47,30 +45,6 @@ pub struct Live {
     pub lost: u64,
 }
 
-/// A loopback that one thread feeds while the program listens.
-#[derive(Clone, Default)]
-struct Network(Arc<Mutex<Loopback>>);
-
-impl Transport for Network {
-    fn topics(&self) -> Vec<DiscoveredTopic> {
-        self.0.lock().expect("no thread panics").topics()
-    }
-
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
-        self.0.lock().expect("no thread panics").subscribe(spec, sink)
-    }
-
-    fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
-        self.0.lock().expect("no thread panics").definitions(topic)
-    }
-}
-
-impl Feed for Network {
-    fn pulse(&mut self) -> Pulse {
-        Pulse::default()
-    }
-}
-
 /// Records for `seconds`, with bursts of triggers. On all cores: a vehicle has several, and here are sender and receiver in one.
 pub fn record_live(seconds: u64) -> Live {
     let measured = thread::spawn(move || {
@@ -84,9 +58,9 @@ pub fn record_live(seconds: u64) -> Live {
 }
 
 fn on_these_cores(seconds: u64) -> Live {
-    let (out, network, clock, traffic) = (Folder::new(), Network::default(), Clock::of_today(), Traffic::new());
+    let (out, network, clock, traffic) = (Folder::new(), Loopback::new(), Clock::of_today(), Traffic::new());
     for name in traffic.topics() {
-        network.0.lock().expect("no thread panics").add_topic(name, TYPE, "");
+        network.add_topic(name, TYPE, "");
     }
     let (folder, header) = lambda(out.path(), &traffic);
     let options = Options {
@@ -102,7 +76,7 @@ fn on_these_cores(seconds: u64) -> Live {
     let (reports, to) = std::io::pipe().expect("a pipe");
     let feed = network.clone();
     let program = thread::spawn(move || {
-        let feed = || Ok(Box::new(feed) as Box<dyn Feed>);
+        let feed = || Ok(Box::new(feed) as Box<dyn LiveSource>);
         run(options, feed, stdin, File::from(OwnedFd::from(to)), Arc::default()).expect("nothing fails");
     });
     let reports = thread::spawn(move || last(reports));
@@ -165,7 +139,7 @@ fn decide(link: &mut RecorderLink, clock: Clock, seconds: u64) -> (Vec<f64>, Vec
 }
 
 /// The sensors, until they are to stop. Returns the longest time in which a sample was taken, in ms.
-fn publish(network: &Network, traffic: &Traffic, clock: Clock, stop: &AtomicBool) -> f64 {
+fn publish(network: &Loopback, traffic: &Traffic, clock: Clock, stop: &AtomicBool) -> f64 {
     let (started, mut longest) = (Instant::now(), Duration::ZERO);
     for n in 0.. {
         if stop.load(Ordering::Relaxed) {
@@ -176,9 +150,8 @@ fn publish(network: &Network, traffic: &Traffic, clock: Clock, stop: &AtomicBool
             thread::sleep(early);
         }
         traffic.frame(n, clock.now(), |name, meta, cdr| {
-            let mut loopback = network.0.lock().expect("no thread panics");
             let taken = Instant::now();
-            loopback.publish(name, meta, cdr).expect("the topic is there");
+            network.publish(name, meta, cdr).expect("the topic is there");
             longest = longest.max(taken.elapsed());
         });
     }

@@ -11,12 +11,12 @@ use rustdds::dds::ReadError;
 use rustdds::{DomainParticipant, GUID, RTPSEntity, Timestamp, TopicKind};
 use tracing::{info, warn};
 
-use super::Clock;
 use super::names::{dds_topic, dds_type, ros_type, visible};
 use super::offers::{Offer, Request, in_words};
 use super::raw::{CopyInto, CopyOrSay, Held, PassOver, Raw, RawReader};
 use super::state::{Once, State, Told, lock, panic_text};
 use super::types::Types;
+use gleaner_transport::Clock;
 use gleaner_transport::Gaps;
 use gleaner_transport::{Guid, Qos, SampleMeta, Sink, TopicSpec};
 

@@ -18,7 +18,7 @@
 
 mod ask;
 mod bpf;
-mod clock;
+mod day;
 mod feed;
 mod filter;
 mod graph;
@@ -49,7 +49,6 @@ use std::time::{Duration, Instant};
 use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 use tracing::{info, warn};
 
-pub use clock::Clock;
 pub use options::{DdsError, Distro, Options};
 pub use wire::TopicOnWire;
 pub use writer::Writer;
@@ -57,7 +56,11 @@ pub use writer::Writer;
 use feed::Feed;
 use gleaner_base::words::nearest;
 use gleaner_messages::{Definitions, Sources};
-use gleaner_transport::{DiscoveredTopic, Sink, Status, Subscription, TopicSpec, Transport, TransportError};
+use gleaner_protocol::Network;
+use gleaner_transport::{
+    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Status, Subscription, TopicSpec, Transport,
+    TransportError,
+};
 use guard::Guard;
 use joins::NoJoin;
 use known::Known;
@@ -88,33 +91,11 @@ pub struct Dds {
     line: Line,
     thread: Option<JoinHandle<()>>,
     watch: Mutex<Watch>,
+    domain: u16,
     buffer: (usize, usize),
     /// Topic, type and status of each subscription.
     subscriptions: Vec<(TopicSpec, Arc<Told>)>,
     known: Mutex<Known>,
-}
-
-/// Whether a participant is alive, and what it was granted.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Health {
-    /// Bytes of socket buffer that were asked for.
-    pub buffer_asked: usize,
-    /// Bytes that the kernel granted; 0 if it does not tell.
-    pub buffer_granted: usize,
-    /// Datagrams that the kernel dropped because a buffer was full. The kernel counts those for all programs of the network
-    /// together, so if buffers of others were full as well, some that count here were filtered.
-    pub socket_drops: u64,
-    /// Datagrams that were not let pass: with fragments that claim more memory than anybody subscribed to, or that come
-    /// from a participant that is not known, or not yet; or that speak of more numbers of samples than there can be.
-    pub filtered: u64,
-    /// Why such datagrams are let pass, if they are.
-    pub unfiltered: Option<String>,
-    /// Participants that are known, without this one.
-    pub participants: usize,
-    /// Why nothing, or nothing of a topic, is handled any more; `None` while all is well.
-    pub dead: Option<String>,
-    /// How others see us in the graph of ROS 2, in words.
-    pub graph: String,
 }
 
 impl Dds {
@@ -154,6 +135,7 @@ impl Dds {
             line,
             thread: Some(thread),
             watch: Mutex::new(Watch::new(sockets, threads)),
+            domain: options.domain,
             buffer: (asked, granted(asked, needed)),
             subscriptions: Vec::new(),
             known: Mutex::new(Known::new(Sources::new(&options.messages, &options.prefixes))),
@@ -169,22 +151,9 @@ impl Dds {
         Writer::new(&self.participant, &self.state, &self.line, topic, type_name, depth)
     }
 
-    /// How it is. Cheap enough for once a second, which is how often it is to be called: what is dead is known after ten
-    /// calls.
-    pub fn health(&self) -> Health {
-        let topics: Vec<String> = self.subscriptions.iter().map(|(spec, _)| spec.topic.clone()).collect();
-        let (queues, dead) = lock(&self.watch).look(&self.state, &topics);
-        let ended = self.thread.as_ref().is_none_or(JoinHandle::is_finished);
-        Health {
-            buffer_asked: self.buffer.0,
-            buffer_granted: self.buffer.1,
-            socket_drops: queues.drops,
-            filtered: queues.filtered,
-            unfiltered: self.state.unfiltered(),
-            participants: self.state.peers().participants(),
-            dead: dead.or_else(|| ended.then(|| "the receive thread has ended".to_owned())),
-            graph: self.state.graph().0,
-        }
+    /// Returns how others see this participant in the graph of ROS 2, in words.
+    pub fn graph(&self) -> String {
+        self.state.graph().0
     }
 
     /// The topics of ROS 2 that others write or read, sorted by name; at most 4096.
@@ -264,6 +233,39 @@ impl Transport for Dds {
 
     fn status(&self, subscription: Subscription) -> Status {
         self.subscriptions.get(subscription.0).map(|(_, told)| told.status(&self.state)).unwrap_or_default()
+    }
+}
+
+impl LiveSource for Dds {
+    /// What is dead is known after ten calls.
+    fn health(&self) -> Health {
+        let topics: Vec<String> = self.subscriptions.iter().map(|(spec, _)| spec.topic.clone()).collect();
+        let (queues, dead) = lock(&self.watch).look(&self.state, &topics);
+        let ended = self.thread.as_ref().is_none_or(JoinHandle::is_finished);
+        let network = Network {
+            domain: self.domain,
+            participants: self.state.peers().participants(),
+            buffer_asked: self.buffer.0,
+            buffer_granted: self.buffer.1,
+            // The kernel counts those for all programs of the network together, so if buffers of others were full as well, some
+            // that count here were filtered.
+            socket_drops: queues.drops,
+            filtered: queues.filtered,
+            unfiltered: self.state.unfiltered(),
+        };
+        let dead = dead.or_else(|| ended.then(|| "the receive thread has ended".to_owned()));
+        Health { network: Some(network), dead }
+    }
+
+    fn publisher(&self, topic: &str, type_name: &str, depth: usize) -> Result<Box<dyn Publisher>, PublishError> {
+        let writer = self.writer(topic, type_name, depth).map_err(|error| PublishError(error.into()))?;
+        Ok(Box::new(writer))
+    }
+}
+
+impl Publisher for Writer {
+    fn publish(&self, cdr: &[u8]) -> Result<(), PublishError> {
+        self.write(cdr).map_err(|error| PublishError(error.into()))
     }
 }
 

@@ -4,8 +4,8 @@ use std::error::Error;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
-use super::Clock;
-use super::clock::time_of_day;
+use gleaner_transport::Clock;
+use gleaner_transport::clock::time_of_day;
 
 /// The highest domain whose ports exist.
 const LAST_DOMAIN: u16 = 232;

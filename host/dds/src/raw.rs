@@ -7,9 +7,9 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use bytes::Bytes;
 use rustdds::{RepresentationIdentifier, no_key};
 
-use super::Clock;
 use super::state::panic_text;
 use gleaner_messages::Endian;
+use gleaner_transport::Clock;
 use gleaner_transport::Sink;
 
 /// A reader of any type.

@@ -13,13 +13,14 @@ use mio::{Events, Interest, Poll, Token, Waker};
 use rustdds::{DomainParticipant, DomainParticipantStatusListener, GUID, StatusEvented};
 
 use super::ask::{Ask, Asker};
-use super::clock::Day;
+use super::day::Day;
 use super::feed::{self, Around, Feed};
 use super::guard::Guard;
 use super::offers::Offer;
 use super::presence::Presence;
 use super::state::{State, panic_text};
-use super::{Clock, DdsError, Options, wire};
+use super::{DdsError, Options, wire};
+use gleaner_transport::Clock;
 
 const WAKE: Token = Token(0);
 const STATUS: Token = Token(1);

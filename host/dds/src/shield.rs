@@ -3,7 +3,7 @@
 //!
 //! It takes less than a handler to interrupt one: SIGCHLD, which is ignored, goes to some other thread while the first one is about
 //! to start a process, and ends the wait there. What stops a whole process (SIGSTOP, a debugger, a frozen container, suspend)
-//! cannot be kept away; [`Health::dead`](super::Health::dead) tells.
+//! cannot be kept away; [`Health::dead`](gleaner_transport::Health::dead) tells.
 
 use nix::sys::signal::{SigSet, SigmaskHow, Signal};
 

@@ -11,12 +11,12 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_dds::Clock;
 use gleaner_lambda::Clip;
 use gleaner_lambda::TriggerKind::Event;
 use gleaner_protocol::link::{Control, RecorderLink, RecorderReport};
 use gleaner_recorder::Folder;
-use gleaner_recorder::program::{Feed, run};
+use gleaner_recorder::program::run;
+use gleaner_transport::{Clock, LiveSource};
 use running::*;
 use support::*;
 
@@ -35,7 +35,7 @@ fn child() {
     let (feed, options) = (network.clone(), options(&scratch.0, clock));
     // What is in a file was written, whenever the kill comes.
     let reports = File::create(scratch.0.join("reports.jsonl")).unwrap();
-    thread::spawn(move || run(options, || Ok(Box::new(feed) as Box<dyn Feed>), stdin, reports, Arc::default()));
+    thread::spawn(move || run(options, || Ok(Box::new(feed) as Box<dyn LiveSource>), stdin, reports, Arc::default()));
     let (folder, header) = lambda(&scratch, "first", (300, 1500));
     let mut link = RecorderLink::new(control.add(&add(&folder)).unwrap());
     link.hello(&header, PATIENCE).unwrap();

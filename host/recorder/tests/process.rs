@@ -11,10 +11,10 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::Clock;
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
-use gleaner_recorder::program::{Feed, Options, run};
+use gleaner_recorder::program::{Options, run};
+use gleaner_transport::{Clock, LiveSource};
 use running::*;
 use support::*;
 
@@ -228,7 +228,7 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     received(&mut running, 10);
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
     running.status(|status| status.recording);
-    network.dead.store(true, Ordering::Relaxed);
+    network.loopback.die("its thread is gone");
     running.clip();
     let failure = running.ended().1.unwrap_err();
     assert_eq!((failure.exit, failure.causes), (Exit::Internal, vec!["its thread is gone".to_owned()]));
@@ -308,7 +308,7 @@ fn a_preroll_that_no_memory_holds_is_an_error_in_words() {
         let options = Options { preroll_bytes: Some(bytes), ..options(&scratch.0, Clock::of_today()) };
         let (_control, stdin) = Control::pair().unwrap();
         let (_reader, writer) = std::io::pipe().unwrap();
-        let never = || -> Result<Box<dyn Feed>, Failure> { panic!("the network is joined later") };
+        let never = || -> Result<Box<dyn LiveSource>, Failure> { panic!("the network is joined later") };
         let failure = run(options, never, stdin, File::from(OwnedFd::from(writer)), Arc::default()).unwrap_err();
         assert_eq!(failure.exit, Exit::Usage);
         let said = failure.to_string();

@@ -291,7 +291,6 @@ impl Topic {
 }
 
 /// What only matters while time passes.
-#[cfg(feature = "dds")]
 impl Topic {
     /// From now on the lambda sees the samples received until `at_ns`, and `woken_by` at most: what arrives while it runs belongs to
     /// the next wake, as in a replay.

@@ -4,8 +4,8 @@
 //! `{"lambda": "hello", "decision": {...}}`.
 
 use gleaner_base::Failure;
-use gleaner_dds::Dds;
 use gleaner_lambda::Decision;
+use gleaner_transport::LiveSource;
 use serde::Serialize;
 
 use super::speaker::Speaker;
@@ -27,8 +27,8 @@ struct Announced<'a> {
 
 impl Announcer {
     /// Publishes decisions of `lambda` on `topic`.
-    pub(super) fn open(dds: &Dds, topic: &str, lambda: &str) -> Result<Self, Failure> {
-        Ok(Self { speaker: Speaker::open(dds, topic, TYPE, DEPTH)?, lambda: lambda.to_owned() })
+    pub(super) fn open(source: &dyn LiveSource, topic: &str, lambda: &str) -> Result<Self, Failure> {
+        Ok(Self { speaker: Speaker::open(source, topic, TYPE, DEPTH)?, lambda: lambda.to_owned() })
     }
 
     /// Decisions that were not sent.

@@ -6,8 +6,8 @@ use std::thread;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::{Clock, Dds};
 use gleaner_protocol::Report;
+use gleaner_transport::{Clock, LiveSource};
 use gleaner_vitals::Pulse;
 
 use super::announce::Announcer;
@@ -36,7 +36,7 @@ pub(super) struct Course {
     pub(super) round_trip: Option<RoundTrip>,
     pub(super) announcer: Option<Announcer>,
     pub(super) watch: Watch,
-    pub(super) dds: Dds,
+    pub(super) source: Box<dyn LiveSource>,
     pub(super) clock: Clock,
     pub(super) pulse: Pulse,
 }
@@ -115,14 +115,14 @@ impl Course {
         if !self.watch.is_due(now) {
             return Ok(());
         }
-        let health = self.dds.health();
+        let health = self.source.health();
         if let Some(why) = &health.dead {
             let mut failure = Failure::new(Exit::Unreachable, "nothing of the network is handled any more");
             failure.causes = vec![why.clone()];
             return Err(failure.with_help("start again; where it happens often, report it with these words"));
         }
         let live = self.watch.report(&Around {
-            dds: &self.dds,
+            source: &*self.source,
             health: &health,
             inputs: &self.inputs,
             schedule: &self.schedule,

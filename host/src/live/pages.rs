@@ -21,7 +21,7 @@ const WAITING: usize = 2 * PAGE_BYTES;
 const FULL: usize = 32 << 10;
 
 /// The pipe to the shim.
-pub(super) struct Pages {
+pub struct Pages {
     pipe: File,
     /// Lines that the pipe has not taken; of the first one it may have a part.
     waiting: VecDeque<u8>,
@@ -33,12 +33,12 @@ pub(super) struct Pages {
 }
 
 impl Pages {
-    /// The pipe that the shim has made.
+    /// The pipe that the shim has made: [`RESULTS_ENV`].
     ///
     /// # Errors
     ///
     /// A failure if this process was started without one.
-    pub(super) fn open(pulse: Pulse) -> Result<Self, Failure> {
+    pub fn open(pulse: Pulse) -> Result<Self, Failure> {
         let cannot = |error: &io::Error| Failure::caused_by(Exit::Internal, "cannot hand on results", error);
         let pipe = inherited(RESULTS_ENV).map_err(|error| cannot(&error))?.ok_or_else(|| {
             Failure::new(Exit::Usage, "no process writes the results of this one")
@@ -51,7 +51,8 @@ impl Pages {
         Ok(Self::over(pipe.into(), pulse))
     }
 
-    fn over(pipe: File, pulse: Pulse) -> Self {
+    /// Results go into `pipe`, which does not block; `pulse` shows what of them could not be written.
+    pub fn over(pipe: File, pulse: Pulse) -> Self {
         let waiting = VecDeque::with_capacity(WAITING);
         Self { pipe, waiting, line: Vec::new(), unwritten: 0, pulse }
     }

@@ -6,8 +6,8 @@
 //! message's is, as with `gleaner play --stamp monotonic`.
 
 use gleaner_base::Failure;
-use gleaner_dds::{Clock, Dds};
 use gleaner_lambda::Decision;
+use gleaner_transport::{Clock, LiveSource};
 
 use super::speaker::Speaker;
 use crate::api::data::Wake;
@@ -25,8 +25,8 @@ pub(super) struct RoundTrip {
 
 impl RoundTrip {
     /// Answers of `lambda` on `topic`.
-    pub(super) fn open(dds: &Dds, topic: &str, clock: Clock, lambda: &str) -> Result<Self, Failure> {
-        Ok(Self { speaker: Speaker::open(dds, topic, TYPE, DEPTH)?, clock, lambda: lambda.to_owned(), wakes: 0 })
+    pub(super) fn open(source: &dyn LiveSource, topic: &str, clock: Clock, lambda: &str) -> Result<Self, Failure> {
+        Ok(Self { speaker: Speaker::open(source, topic, TYPE, DEPTH)?, clock, lambda: lambda.to_owned(), wakes: 0 })
     }
 
     /// The stamp of what woke the lambda, in ns.

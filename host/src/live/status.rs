@@ -3,11 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use gleaner_dds::{Clock, Dds, Health};
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::{Live, LiveTopic, Network, Spread, ToRecorder};
-use gleaner_transport::{Subscription, Transport};
+use gleaner_transport::{Clock, Health, LiveSource, Subscription};
 use gleaner_vitals::{Spreads, usage};
 
 use crate::api::Session;
@@ -32,7 +31,7 @@ pub(super) struct Times {
 
 /// What else a report tells of.
 pub(super) struct Around<'a> {
-    pub(super) dds: &'a Dds,
+    pub(super) source: &'a dyn LiveSource,
     pub(super) health: &'a Health,
     pub(super) inputs: &'a [Arc<Topic>],
     pub(super) schedule: &'a Schedule,
@@ -61,14 +60,7 @@ pub(super) struct Watch {
 }
 
 impl Watch {
-    pub(super) fn new(
-        manifest: &Manifest,
-        remaps: &[Remap],
-        out: PathBuf,
-        restarts: u32,
-        domain: u16,
-        clock: Clock,
-    ) -> Self {
+    pub(super) fn new(manifest: &Manifest, remaps: &[Remap], out: PathBuf, restarts: u32, clock: Clock) -> Self {
         let now = clock.now();
         let base = Live {
             lambda: manifest.lambda.name.to_string(),
@@ -92,7 +84,7 @@ impl Watch {
             run: None,
             hand_out: None,
             topics: Vec::new(),
-            network: Network { domain, ..Network::default() },
+            network: Network::default(),
             recorder: None,
             rss_bytes: 0,
             cpu_s: 0.0,
@@ -147,14 +139,14 @@ impl Watch {
     }
 
     fn as_of_now(&mut self, around: &Around, [wake_up, run, hand_out]: [Option<Spread>; 3]) -> Live {
-        let Around { dds, health, inputs, schedule, session, unwritten, unsent, recorder } = *around;
+        let Around { source, health, inputs, schedule, session, unwritten, unsent, recorder } = *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
         self.reported = now;
         let mut topics = Vec::with_capacity(inputs.len());
         for (index, topic) in inputs.iter().enumerate() {
             // The inputs were the first subscriptions of this transport, in their order.
-            let status = dds.status(Subscription(index));
+            let status = source.status(Subscription(index));
             if let Some(lost) = status.lost {
                 topic.set_lost(lost);
             }
@@ -192,15 +184,7 @@ impl Watch {
             run,
             hand_out,
             topics,
-            network: Network {
-                participants: health.participants,
-                buffer_asked: health.buffer_asked,
-                buffer_granted: health.buffer_granted,
-                socket_drops: health.socket_drops,
-                filtered: health.filtered,
-                unfiltered: health.unfiltered.clone(),
-                ..self.base.network
-            },
+            network: health.network.clone().unwrap_or_default(),
             rss_bytes: usage::resident(),
             cpu_s: usage::cpu_seconds(),
             ..self.base.clone()

@@ -3,19 +3,27 @@
 //! For tests and benches. It keeps nothing: a sample published before a subscription is gone.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, OnceLock};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
-use crate::transport::{
-    DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict, same_type,
-};
 use gleaner_base::words::nearest;
-use gleaner_messages::Definitions;
+use gleaner_messages::{Definitions, Endian};
 
-/// The in-process transport.
+use crate::clock::Clock;
+use crate::live::{Health, LiveSource, PublishError, Publisher};
+use crate::transport::{
+    DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict, same_type,
+};
+
+/// The in-process transport. Clones are the same transport: one publishes, another one is subscribed.
+#[derive(Clone, Default)]
+pub struct Loopback(Arc<Mutex<Topics>>);
+
 #[derive(Default)]
-pub struct Loopback {
+struct Topics {
     topics: BTreeMap<String, Topic>,
     subscriptions: usize,
+    dead: Option<String>,
 }
 
 struct Topic {
@@ -34,7 +42,7 @@ impl Loopback {
 
     /// Adds a topic; an empty `definitions_text` means that there is none. Replaces a topic of the
     /// same name, with its subscriptions.
-    pub fn add_topic(&mut self, topic: &str, type_name: &str, definitions_text: &str) {
+    pub fn add_topic(&self, topic: &str, type_name: &str, definitions_text: &str) {
         let added = Topic {
             type_name: type_name.to_owned(),
             text: (!definitions_text.trim().is_empty()).then(|| definitions_text.into()),
@@ -42,7 +50,7 @@ impl Loopback {
             messages: 0,
             definitions: OnceLock::new(),
         };
-        self.topics.insert(topic.to_owned(), added);
+        self.lock().topics.insert(topic.to_owned(), added);
     }
 
     /// Delivers one sample to every subscription of `topic`, in the order of subscribing, and
@@ -51,19 +59,36 @@ impl Loopback {
     /// # Errors
     ///
     /// [`TransportError::NoSuchTopic`] if the topic was never added.
-    pub fn publish(&mut self, topic: &str, meta: &SampleMeta, cdr: &[u8]) -> Result<Option<Verdict>, TransportError> {
-        let found = match self.topics.get_mut(topic) {
-            Some(found) => found,
-            None => return Err(self.no_such(topic)),
+    pub fn publish(&self, topic: &str, meta: &SampleMeta, cdr: &[u8]) -> Result<Option<Verdict>, TransportError> {
+        // Not held while samples are delivered: a sink may publish in turn.
+        let sinks = {
+            let mut topics = self.lock();
+            match topics.topics.get_mut(topic) {
+                Some(found) => {
+                    found.messages += 1;
+                    found.sinks.clone()
+                }
+                None => return Err(topics.no_such(topic)),
+            }
         };
-        found.messages += 1;
         let mut verdict = None;
-        for sink in &found.sinks {
+        for sink in sinks {
             verdict = Some(sink.deliver(meta, cdr));
         }
         Ok(verdict)
     }
 
+    /// From now on [`LiveSource::health`] says that nothing is handled any more, because of `why`.
+    pub fn die(&self, why: &str) {
+        self.lock().dead = Some(why.to_owned());
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Topics> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Topics {
     fn get(&self, topic: &str) -> Result<&Topic, TransportError> {
         self.topics.get(topic).ok_or_else(|| self.no_such(topic))
     }
@@ -86,11 +111,12 @@ impl Transport for Loopback {
             messages: Some(topic.messages),
             offered_qos: None,
         };
-        self.topics.iter().map(discovered).collect()
+        self.lock().topics.iter().map(discovered).collect()
     }
 
     fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
-        let found = self.get(&spec.topic)?;
+        let mut topics = self.lock();
+        let found = topics.get(&spec.topic)?;
         if !same_type(&found.type_name, &spec.type_name) {
             return Err(TransportError::WrongType {
                 topic: spec.topic.clone(),
@@ -98,16 +124,17 @@ impl Transport for Loopback {
                 found: found.type_name.clone(),
             });
         }
-        if let Some(found) = self.topics.get_mut(&spec.topic) {
+        if let Some(found) = topics.topics.get_mut(&spec.topic) {
             found.sinks.push(sink);
         }
-        let subscription = Subscription(self.subscriptions);
-        self.subscriptions += 1;
+        let subscription = Subscription(topics.subscriptions);
+        topics.subscriptions += 1;
         Ok(subscription)
     }
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
-        let found = self.get(topic)?;
+        let topics = self.lock();
+        let found = topics.get(topic)?;
         if let Some(known) = found.definitions.get() {
             return Ok(known.clone());
         }
@@ -118,5 +145,41 @@ impl Transport for Loopback {
         let parsed = Definitions::parse(&found.type_name, text)
             .map_err(|source| TransportError::BadDefinitions { topic: topic.to_owned(), source })?;
         Ok(found.definitions.get_or_init(|| Arc::new(parsed)).clone())
+    }
+}
+
+/// What it publishes is stamped by the clock of the day, and numbered from 1.
+impl LiveSource for Loopback {
+    fn health(&self) -> Health {
+        Health { network: None, dead: self.lock().dead.clone() }
+    }
+
+    fn publisher(&self, topic: &str, _type_name: &str, _depth: usize) -> Result<Box<dyn Publisher>, PublishError> {
+        self.lock().get(topic).map_err(|error| PublishError(error.into()))?;
+        let published = Published {
+            loopback: self.clone(),
+            topic: topic.to_owned(),
+            clock: Clock::of_today(),
+            messages: AtomicU64::new(0),
+        };
+        Ok(Box::new(published))
+    }
+}
+
+/// A topic of a loopback that is published.
+struct Published {
+    loopback: Loopback,
+    topic: String,
+    clock: Clock,
+    messages: AtomicU64,
+}
+
+impl Publisher for Published {
+    fn publish(&self, cdr: &[u8]) -> Result<(), PublishError> {
+        let at_ns = self.clock.now();
+        let seq = self.messages.fetch_add(1, Ordering::Relaxed) + 1;
+        let writer = Guid(*b"gleaner loopback");
+        let meta = SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian: Endian::Little, options: [0; 2] };
+        self.loopback.publish(&self.topic, &meta, cdr).map(drop).map_err(|error| PublishError(error.into()))
     }
 }

@@ -7,7 +7,7 @@ use std::process::Command;
 use gleaner_dds::Dds;
 use gleaner_tests::peers::message::Type;
 use gleaner_tests::peers::{Kind, PATIENCE, Peer};
-use gleaner_transport::{Qos, Transport};
+use gleaner_transport::{LiveSource, Qos, Transport};
 use gleaner_vitals::usage;
 use libtest_mimic::Failed;
 

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use gleaner_dds::{Dds, Options};
 use gleaner_messages::FieldPath;
-use gleaner_transport::{Transport, TransportError};
+use gleaner_transport::{LiveSource, Transport, TransportError};
 use ros2_client::qos::{Durability, History, WhenFull};
 use ros2_client::{Context, Message, MessageTypeName, Name, Node, NodeName, NodeOptions, QosProfile, ServiceTypeName};
 use ros2_client::{Server, ServiceMapping};

@@ -1,7 +1,7 @@
 //! Our node in the graph of ROS 2, read by a parser that knows nothing of ours.
 
 use gleaner_dds::{Dds, Distro, Options};
-use gleaner_transport::Transport;
+use gleaner_transport::{LiveSource, Transport};
 use rustdds::RTPSEntity;
 
 use super::Test;
@@ -88,10 +88,10 @@ fn silent() {
     let dds = open(domain, None);
     let peer = Peer::join(domain);
     let reader = peer.reader(TOPIC, TYPE, &policies(true, true));
-    until("the other participant", || dds.health().participants == 1);
+    until("the other participant", || dds.health().network.unwrap().participants == 1);
     let _other = peer.writer("/other", true, false);
     until("the other's topic", || !dds.discovered().is_empty());
-    assert_eq!(dds.health().graph, "not listed: no node of ROS 2 was heard yet");
+    assert_eq!(dds.graph(), "not listed: no node of ROS 2 was heard yet");
     assert_eq!(take(&reader), None);
 }
 
@@ -129,7 +129,7 @@ fn listed(distro: Distro) {
     assert_eq!(said.participant[..12], guid.to_bytes()[..12]);
     assert_eq!(said.participant[12..16], [0, 0, 1, 0xc1]);
     assert!(writers[0][16..].iter().chain(&said.participant[16..]).all(|byte| *byte == 0));
-    assert!(dds.health().graph.starts_with("listed as `/gleaner/test`"));
+    assert!(dds.graph().starts_with("listed as `/gleaner/test`"));
 
     // An endpoint that goes is taken back, and with the participant the node.
     drop(out);
@@ -149,9 +149,9 @@ fn both() {
     let (old, new) = (Peer::join(domain), Peer::join(domain));
     let reader = old.reader(TOPIC, TYPE, &policies(true, true));
     let _old = announce(&old, 24);
-    until("being listed", || dds.health().graph.starts_with("listed"));
+    until("being listed", || dds.graph().starts_with("listed"));
     let _new = announce(&new, 16);
-    until("staying out", || dds.health().graph.contains("Humble and nodes of newer"));
+    until("staying out", || dds.graph().contains("Humble and nodes of newer"));
     until("taking it back", || {
         take(&reader).is_some_and(|said| understand(&said, 24).is_some_and(|said| said.nodes.is_empty()))
     });
@@ -167,9 +167,9 @@ fn told_wrong() {
     for (told, gid) in [(Distro::Humble, 16), (Distro::Newer, 24)] {
         let domain = domain();
         let dds = open(domain, Some(told));
-        until("being listed", || dds.health().graph.starts_with("listed"));
+        until("being listed", || dds.graph().starts_with("listed"));
         let peer = Peer::join(domain);
         let _node = announce(&peer, gid);
-        until("staying out", || dds.health().graph.starts_with("not listed: ROS_DISTRO says"));
+        until("staying out", || dds.graph().starts_with("not listed: ROS_DISTRO says"));
     }
 }

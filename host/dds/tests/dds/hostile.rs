@@ -3,7 +3,7 @@
 use std::net::UdpSocket;
 
 use gleaner_dds::Dds;
-use gleaner_transport::{Qos, Transport};
+use gleaner_transport::{LiveSource, Qos, Transport};
 use rustdds::{GUID, RTPSEntity};
 
 use super::Test;
@@ -76,8 +76,8 @@ fn most_memory() -> u64 {
 
 /// Datagrams that did not come through.
 fn counted(dds: &Dds) -> u64 {
-    let health = dds.health();
-    health.filtered + health.socket_drops
+    let network = dds.health().network.unwrap();
+    network.filtered + network.socket_drops
 }
 
 /// The port at which the first participant of a domain hears data.
@@ -191,7 +191,7 @@ fn claims() {
     let peer = Peer::join(domain);
     let writer = peer.writer("/claims", true, false);
     connected(&dds, subscription, 1);
-    assert_eq!(dds.health().unfiltered, None);
+    assert_eq!(dds.health().network.unwrap().unfiltered, None);
     let before = most_memory();
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     let send = |bytes: &[u8]| assert!(wire.send_to(bytes, ("127.0.0.1", port(domain))).is_ok());
@@ -223,7 +223,7 @@ fn numbers() {
     let writer = peer.writer("/numbers", true, false);
     connected(&dds, subscription, 1);
     sink.mark(&writer, b"before..");
-    assert_eq!(dds.health().unfiltered, None);
+    assert_eq!(dds.health().network.unwrap().unfiltered, None);
     // The writer of announcements: everybody's reader of them listens to it.
     let mut announcer = writer.guid().to_bytes();
     announcer[12..].copy_from_slice(&[0, 0, 3, 0xc2]);

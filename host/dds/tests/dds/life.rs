@@ -8,7 +8,9 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use gleaner_dds::{Clock, Dds, Health, Options};
+use gleaner_dds::{Dds, Options};
+use gleaner_protocol::Network;
+use gleaner_transport::{Clock, LiveSource};
 use gleaner_transport::{Qos, SampleMeta, Sink, Transport, Verdict};
 
 use super::Test;
@@ -48,7 +50,7 @@ fn set_back() {
 fn buffer() {
     for (largest, asked) in [(1, 8 << 20), (4 << 20, 16 << 20), (usize::MAX, 64 << 20)] {
         let dds = Dds::open(Options { largest, ..options(domain()) }).unwrap();
-        let Health { buffer_asked, buffer_granted, .. } = dds.health();
+        let Network { buffer_asked, buffer_granted, .. } = dds.health().network.unwrap();
         let limit = std::fs::read_to_string("/proc/sys/net/core/rmem_max").unwrap().trim().parse::<usize>().unwrap();
         assert_eq!((buffer_asked, buffer_granted), (asked, asked.min(limit)));
     }

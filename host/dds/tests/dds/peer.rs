@@ -7,7 +7,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use gleaner_dds::{Clock, Dds, Options};
+use gleaner_dds::{Dds, Options};
+use gleaner_transport::Clock;
 use gleaner_transport::{Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
 use rustdds::no_key::{DataWriter, Decode, DeserializerAdapter, SerializerAdapter, SimpleDataReader};
 use rustdds::policy::{Durability, History, Reliability};

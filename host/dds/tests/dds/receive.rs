@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
 use gleaner_messages::Endian;
-use gleaner_transport::{Guid, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Guid, LiveSource, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
 use rustdds::{RTPSEntity, Timestamp};
 
 use super::Test;

@@ -27,7 +27,7 @@ fn listed() {
     assert_eq!((any.topic.as_str(), any.type_name.as_str(), any.writers, any.readers), ("/any", "Shape", 1, 0));
     assert_eq!(any.qos, ["best effort, transient local"]);
     assert_eq!((chatter.type_name.as_str(), chatter.writers, chatter.readers), ("std_msgs/msg/String", 1, 1));
-    until("our part in the graph", || dds.health().graph.starts_with("listed"));
+    until("our part in the graph", || dds.graph().starts_with("listed"));
     let topics = dds.topics();
     assert_eq!((topics[0].definitions_text.as_deref(), topics[0].messages), (None, None));
     assert!(topics[1].definitions_text.as_deref().unwrap().contains("string data"));

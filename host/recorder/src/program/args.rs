@@ -6,10 +6,11 @@ use std::path::PathBuf;
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_dds as dds;
-use gleaner_dds::{Clock, Dds};
+use gleaner_dds::Dds;
 use gleaner_lambda::manifest::TopicName;
+use gleaner_transport::{Clock, LiveSource};
 
-use super::{Feed, Options};
+use super::Options;
 
 /// Records for lambdas from live topics of ROS 2. Lambdas come over standard input, which is a socket of the starter; reports, a
 /// JSON object a line, go to standard output.
@@ -76,10 +77,9 @@ impl Args {
 }
 
 impl Network {
-    pub(super) fn open(self) -> Result<Box<dyn Feed>, Failure> {
-        let domain = self.0.domain;
+    pub(super) fn open(self) -> Result<Box<dyn LiveSource>, Failure> {
         let dds = Dds::open(self.0)
             .map_err(|error| Failure::caused_by(Exit::Unreachable, "cannot join the network", &error))?;
-        Ok(Box::new(super::watch::Live { dds, domain }))
+        Ok(Box::new(dds))
     }
 }

@@ -11,9 +11,9 @@ use std::thread::{self, Builder};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::Clock;
 use gleaner_lambda::manifest::Store;
 use gleaner_protocol::link::RecorderReport;
+use gleaner_transport::{Clock, LiveSource};
 use gleaner_vitals::Spreads;
 use tracing::{error, warn};
 
@@ -24,7 +24,7 @@ use super::lambdas::Lambda;
 use super::say::Say;
 use super::staging::{Block, Lane, Staging};
 use super::telling::Said;
-use super::watch::{Beat, Feed, Seen, Want, Wanted, Watch};
+use super::watch::{Beat, Seen, Want, Wanted, Watch};
 use crate::recorder::counted;
 use crate::{Folder, Recorder, Settings, TopicId, Work};
 
@@ -54,7 +54,7 @@ const SLACK: u64 = 64 << 20;
 /// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead: whoever started this starts it again.
 pub fn run(
     options: Options,
-    feed: impl FnOnce() -> Result<Box<dyn Feed>, Failure>,
+    source: impl FnOnce() -> Result<Box<dyn LiveSource>, Failure>,
     control: OwnedFd,
     reports: File,
     stop: Arc<AtomicBool>,
@@ -81,7 +81,7 @@ pub fn run(
     let (wants, wanted) = sync_channel(EVENTS);
     let reader = thread::current();
     let watch = Watch {
-        feed: feed()?,
+        source: source()?,
         wants: wanted,
         events: events.clone(),
         reader: reader.clone(),
@@ -191,7 +191,7 @@ impl Course {
             is_busy |= self.samples(SAMPLES_TURN)? == Came::More;
             let work = self.recorder.work()?;
             self.tell(false)?;
-            if let Some(why) = self.beat.pulse.dead.take() {
+            if let Some(why) = self.beat.health.dead.take() {
                 self.finish()?;
                 return Err(Failure { causes: vec![why], ..Failure::new(Exit::Internal, "the network is dead") });
             }

@@ -33,12 +33,11 @@ use std::{fs::File, io};
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::Clock;
+use gleaner_transport::Clock;
 use rustix::process::{Signal, set_parent_process_death_signal};
 
 use args::Args;
 pub use course::run;
-pub use watch::{Feed, Pulse};
 
 /// How the process records.
 #[derive(Clone, Debug)]

@@ -98,7 +98,7 @@ impl Course {
             trigger_to_open: None,
             commands: self.commands.as_ref().map(|commands| commands.status(self.beat.commands.as_ref())),
             topics: self.topics.iter().map(topic).collect(),
-            network: self.beat.pulse.network.clone(),
+            network: self.beat.health.network.clone(),
             disk_free: self.beat.disk_free,
             rss_bytes: self.beat.rss_bytes,
             cpu_s: self.beat.cpu_s,

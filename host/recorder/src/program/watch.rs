@@ -8,10 +8,9 @@ use std::thread::Thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
-use gleaner_dds::Dds;
-use gleaner_messages::Definitions;
-use gleaner_protocol::Network;
-use gleaner_transport::{DiscoveredTopic, Qos, Sink, Status, Subscription, TopicSpec, Transport, TransportError};
+use gleaner_transport::{
+    DiscoveredTopic, Health, LiveSource, Qos, Sink, Status, Subscription, TopicSpec, TransportError,
+};
 use gleaner_vitals::usage;
 use tracing::{error, warn};
 
@@ -25,65 +24,6 @@ const LOOK: Duration = Duration::from_millis(100);
 const PULSE: Duration = Duration::from_secs(1);
 /// Looks until a topic that could not be subscribed is tried again.
 const AGAIN: u32 = 100;
-
-/// Where samples come from.
-pub trait Feed: Transport + Send {
-    /// How the network is.
-    fn pulse(&mut self) -> Pulse;
-}
-
-/// How a network is.
-#[derive(Clone, Debug, Default)]
-pub struct Pulse {
-    /// What is known of it; `None` where there is none.
-    pub network: Option<Network>,
-    /// Why nothing comes any more.
-    pub dead: Option<String>,
-}
-
-/// ROS 2.
-pub(super) struct Live {
-    pub(super) dds: Dds,
-    pub(super) domain: u16,
-}
-
-impl Feed for Live {
-    fn pulse(&mut self) -> Pulse {
-        let health = self.dds.health();
-        let network = Network {
-            domain: self.domain,
-            participants: health.participants,
-            buffer_asked: health.buffer_asked,
-            buffer_granted: health.buffer_granted,
-            socket_drops: health.socket_drops,
-            filtered: health.filtered,
-            unfiltered: health.unfiltered,
-        };
-        Pulse { network: Some(network), dead: health.dead }
-    }
-}
-
-impl Transport for Live {
-    fn topics(&self) -> Vec<DiscoveredTopic> {
-        self.dds.topics()
-    }
-
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
-        self.dds.subscribe(spec, sink)
-    }
-
-    fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
-        self.dds.definitions(topic)
-    }
-
-    fn definitions_may_come(&self, topic: &str) -> bool {
-        self.dds.definitions_may_come(topic)
-    }
-
-    fn status(&self, subscription: Subscription) -> Status {
-        self.dds.status(subscription)
-    }
-}
 
 /// A topic that is to be heard.
 pub(super) struct Want {
@@ -146,7 +86,7 @@ pub(super) enum Seen {
 /// How everything outside is.
 #[derive(Default)]
 pub(super) struct Beat {
-    pub(super) pulse: Pulse,
+    pub(super) health: Health,
     pub(super) topics: Vec<(TopicId, Status)>,
     pub(super) commands: Option<Status>,
     pub(super) disk_free: Option<u64>,
@@ -199,7 +139,7 @@ fn add(wanted: &mut Vec<(Want, u32)>, heard: &[Heard], want: Want) {
 
 /// The thread's own.
 pub(super) struct Watch {
-    pub(super) feed: Box<dyn Feed>,
+    pub(super) source: Box<dyn LiveSource>,
     pub(super) wants: Receiver<Want>,
     pub(super) events: SyncSender<Event>,
     pub(super) reader: Thread,
@@ -226,7 +166,7 @@ impl Watch {
                 Err(RecvTimeoutError::Disconnected) => return,
             }
             if !wanted.is_empty() {
-                let topics = self.feed.topics();
+                let topics = self.source.topics();
                 wanted.retain_mut(|(want, wait)| {
                     *wait = wait.saturating_sub(1);
                     let found = choose(&topics, want, &mut odd);
@@ -236,7 +176,7 @@ impl Watch {
                         (Wanted::Recorded { .. }, Some(found))
                             if found.definitions_text.is_none()
                                 && asking.entry(want.name.clone()).or_insert_with(Instant::now).elapsed() < ASKING
-                                && self.feed.definitions_may_come(&want.name) =>
+                                && self.source.definitions_may_come(&want.name) =>
                         {
                             return true;
                         }
@@ -257,11 +197,11 @@ impl Watch {
             }
             if beat_at.elapsed() >= PULSE {
                 beat_at = Instant::now();
-                let topics = heard.iter().map(|of| (of.topic, self.feed.status(of.subscription))).collect();
+                let topics = heard.iter().map(|of| (of.topic, self.source.status(of.subscription))).collect();
                 let (rss_bytes, cpu_s) = (usage::resident(), usage::cpu_seconds());
                 let disk_free = free(&self.out);
-                let commands = commands.map(|of| self.feed.status(of));
-                let beat = Beat { pulse: self.feed.pulse(), topics, commands, disk_free, rss_bytes, cpu_s };
+                let commands = commands.map(|of| self.source.status(of));
+                let beat = Beat { health: self.source.health(), topics, commands, disk_free, rss_bytes, cpu_s };
                 match self.events.try_send(Event::Seen(Seen::Pulse(Box::new(beat)))) {
                     Ok(()) => self.reader.unpark(),
                     // The next one comes soon.
@@ -293,7 +233,7 @@ impl Watch {
         };
         // Before its first sample.
         self.events.send(Event::Seen(Seen::Found { topic, of })).ok()?;
-        match self.feed.subscribe(&spec, Arc::clone(&want.sink)) {
+        match self.source.subscribe(&spec, Arc::clone(&want.sink)) {
             Ok(subscription) => Some(Heard { topic, subscription, type_name: spec.type_name, max_bytes }),
             Err(why) => {
                 error!(topic = %visible(&want.name), error = &why as &dyn std::error::Error, "cannot record a topic");
@@ -312,7 +252,7 @@ impl Watch {
             // Not those from before: they are obeyed already, or nobody wants them any more.
             qos: Qos::Fixed { reliable: true, transient_local: false, depth: commands::QUEUE },
         };
-        self.feed.subscribe(&spec, Arc::clone(&want.sink)).map_err(|why| match why {
+        self.source.subscribe(&spec, Arc::clone(&want.sink)).map_err(|why| match why {
             TransportError::NoSuchTopic { .. } => 1,
             why => {
                 error!(topic = %visible(&want.name), error = &why as &dyn std::error::Error, "cannot hear commands");

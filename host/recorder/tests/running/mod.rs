@@ -12,14 +12,17 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use gleaner_base::{Failure, hex};
-use gleaner_dds::Clock;
 use gleaner_journal::{FileDigest, Header};
 use gleaner_lambda::Clip;
 use gleaner_messages::Definitions;
 use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
-use gleaner_recorder::program::{Feed, Options, Pulse, run};
+use gleaner_recorder::program::{Options, run};
+use gleaner_transport::Clock;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict};
+use gleaner_transport::{
+    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Subscription, TopicSpec, Transport,
+    TransportError, Verdict,
+};
 use sha2::{Digest, Sha256};
 
 use crate::support::{Scratch, member, meta};
@@ -29,8 +32,7 @@ pub const PATIENCE: Duration = Duration::from_secs(60);
 /// A loopback that the test feeds while the process listens.
 #[derive(Clone, Default)]
 pub struct Network {
-    loopback: Arc<Mutex<Loopback>>,
-    pub dead: Arc<AtomicBool>,
+    pub loopback: Loopback,
     /// What was subscribed.
     pub specs: Arc<Mutex<Vec<TopicSpec>>>,
     /// Types under which a topic is written as well, by others.
@@ -39,7 +41,7 @@ pub struct Network {
 
 impl Network {
     pub fn add(&self, topic: &str) {
-        self.loopback.lock().unwrap().add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
+        self.loopback.add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
     }
 
     /// Somebody else writes the topic as another type, and is named first.
@@ -51,40 +53,43 @@ impl Network {
     }
 
     pub fn add_texts(&self, topic: &str) {
-        self.loopback.lock().unwrap().add_topic(topic, "std_msgs/msg/String", "string data\n");
+        self.loopback.add_topic(topic, "std_msgs/msg/String", "string data\n");
     }
 
     /// Whether anybody takes what is published.
     pub fn publish_text(&self, topic: &str, at_ns: i64, text: &[u8]) -> Option<Verdict> {
-        self.loopback.lock().unwrap().publish(topic, &meta(at_ns, 1), &cdr(text)).unwrap()
+        self.loopback.publish(topic, &meta(at_ns, 1), &cdr(text)).unwrap()
     }
 
     pub fn publish(&self, topic: &str, at_ns: i64, seq: u64, cdr: &[u8]) {
-        self.loopback.lock().unwrap().publish(topic, &meta(at_ns, seq), cdr).unwrap();
+        self.loopback.publish(topic, &meta(at_ns, seq), cdr).unwrap();
     }
 }
 
 impl Transport for Network {
     fn topics(&self) -> Vec<DiscoveredTopic> {
         let mut topics = self.others.lock().unwrap().clone();
-        topics.extend(self.loopback.lock().unwrap().topics());
+        topics.extend(self.loopback.topics());
         topics
     }
 
     fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
         self.specs.lock().unwrap().push(spec.clone());
-        self.loopback.lock().unwrap().subscribe(spec, sink)
+        self.loopback.subscribe(spec, sink)
     }
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
-        self.loopback.lock().unwrap().definitions(topic)
+        self.loopback.definitions(topic)
     }
 }
 
-impl Feed for Network {
-    fn pulse(&mut self) -> Pulse {
-        let dead = self.dead.load(Ordering::Relaxed).then(|| "its thread is gone".to_owned());
-        Pulse { network: None, dead }
+impl LiveSource for Network {
+    fn health(&self) -> Health {
+        self.loopback.health()
+    }
+
+    fn publisher(&self, topic: &str, type_name: &str, depth: usize) -> Result<Box<dyn Publisher>, PublishError> {
+        self.loopback.publisher(topic, type_name, depth)
     }
 }
 
@@ -120,7 +125,7 @@ impl Running {
         let for_thread = Arc::clone(&stop);
         let thread = thread::spawn(move || {
             let reports = File::from(OwnedFd::from(writer));
-            run(options, || Ok(Box::new(network) as Box<dyn Feed>), stdin, reports, for_thread)
+            run(options, || Ok(Box::new(network) as Box<dyn LiveSource>), stdin, reports, for_thread)
         });
         let mut running = Running { control, reports: BufReader::new(reader), thread, stop, clock };
         running.until(|report| matches!(report, RecorderReport::Ready).then_some(()));

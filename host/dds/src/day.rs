@@ -1,43 +1,6 @@
-//! The clock that orders everything on a vehicle.
+//! Notices that the time of day was set back: RustDDS depends on it.
 
-/// `CLOCK_MONOTONIC`, set to the time of day once. It never goes back, and its stamps can be read as dates.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Clock {
-    offset_ns: i64,
-}
-
-impl Clock {
-    /// A clock that is `offset_ns` ahead of `CLOCK_MONOTONIC`. All processes of a vehicle use the same.
-    pub fn new(offset_ns: i64) -> Self {
-        Self { offset_ns }
-    }
-
-    /// A clock that shows the time of day now.
-    pub fn of_today() -> Self {
-        Self::new(time_of_day().saturating_sub(monotonic()))
-    }
-
-    /// How far it is ahead of `CLOCK_MONOTONIC`, in ns.
-    pub fn offset_ns(&self) -> i64 {
-        self.offset_ns
-    }
-
-    /// Now, in ns.
-    pub fn now(&self) -> i64 {
-        self.offset_ns.saturating_add(monotonic())
-    }
-
-    /// What `CLOCK_MONOTONIC` shows when this clock shows `at_ns`.
-    pub fn monotonic(&self, at_ns: i64) -> i64 {
-        at_ns.saturating_sub(self.offset_ns)
-    }
-}
-
-/// The time of day, in ns since 1970.
-pub(super) fn time_of_day() -> i64 {
-    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(now.as_nanos()).unwrap_or(0)
-}
+use gleaner_transport::clock::monotonic;
 
 /// Notices that the time of day was set back.
 ///
@@ -74,11 +37,6 @@ impl Day {
     }
 }
 
-fn monotonic() -> i64 {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec)
-}
-
 #[cfg(test)]
 mod tests {
     use std::cell::Cell;
@@ -101,10 +59,10 @@ mod tests {
             // A thread that is stopped between two looks does not know, and looks again.
             (0..3).filter_map(|_| day.set_back()).map(|back| (back + 500_000_000) / 1_000_000_000).collect::<Vec<_>>()
         };
-        assert_eq!(looks(1000), []);
-        assert_eq!(looks(5000), [], "forward");
+        assert!(looks(1000).is_empty());
+        assert!(looks(5000).is_empty(), "forward");
         assert_eq!(looks(4000), [1000]);
-        assert_eq!(looks(4000), []);
+        assert!(looks(4000).is_empty());
         assert_eq!(looks(-10_000), [14_000]);
     }
 

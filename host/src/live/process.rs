@@ -1,21 +1,24 @@
-//! What to run live: the arguments as typed, and what they mean once checked against the build.
+//! The process of a live run: its arguments, the network that it joins, its socket to the recorder, its signals.
 
-use std::io;
+use std::io::{self, Write};
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_dds as dds;
-use gleaner_dds::Clock;
+use gleaner_dds::{Dds, Options};
 use gleaner_jail::Paths;
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_transport::Clock;
 
+use super::{Pages, Run, Settings};
 use crate::input::unfinished_bytes;
-use crate::isolation::definitions;
-use crate::network::NetworkArgs;
-use crate::stage::{Asked, AskedArgs};
+use crate::isolation::{Isolation, definitions};
+use crate::network::{NetworkArgs, NetworkError};
+use crate::stage::{Asked, AskedArgs, Load};
 
 /// Arguments of `run`.
 #[derive(Args, Clone, Debug)]
@@ -49,24 +52,15 @@ pub struct RunArgs {
     pub restarts: u32,
 }
 
-/// How to run.
-pub(super) struct Wanted {
-    pub(super) out: PathBuf,
-    pub(super) all: bool,
-    pub(super) recorder: bool,
-    pub(super) dds: dds::Options,
-    pub(super) restarts: u32,
-    pub(super) round_trip: Option<String>,
-    pub(super) announce: Option<String>,
-}
-
 /// A lambda to run live.
 pub struct Job {
     /// Which lambda.
     pub asked: Asked,
     /// Its manifest.
     pub manifest: Manifest,
-    pub(super) wanted: Wanted,
+    settings: Settings,
+    has_recorder: bool,
+    dds: Options,
 }
 
 impl Job {
@@ -99,25 +93,61 @@ impl Job {
         dds.clock = args.clock_offset.map_or_else(Clock::of_today, Clock::new);
         dds.largest = manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
         dds.messages = messages;
-        let wanted = Wanted {
+        let settings = Settings {
             out: args.out,
             all: args.all,
-            recorder: args.recorder,
-            dds,
             restarts: args.restarts,
+            clock: dds.clock,
             round_trip: args.rtt,
             announce: args.decisions,
         };
-        Ok(Self { asked, manifest, wanted })
+        Ok(Self { asked, manifest, settings, has_recorder: args.recorder, dds })
+    }
+
+    /// Joins the network and runs the lambda until SIGTERM, with reports to `reports`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Run::run`], and a failure if the network cannot be joined.
+    pub fn run(
+        self,
+        load: Load<'_>,
+        isolation: &Isolation,
+        reports: impl Write + Send + 'static,
+    ) -> Result<Exit, Failure> {
+        let Self { asked, manifest, settings, has_recorder, dds } = self;
+        let stop = stop_flag()?;
+        let source = Dds::open(dds).map_err(NetworkError::failure)?;
+        let pulse = isolation.pulse().clone();
+        let run = Run {
+            asked,
+            manifest,
+            settings,
+            source: Box::new(source),
+            recorder: has_recorder.then(take_stdin).transpose()?,
+            results: Pages::open(pulse.clone())?,
+            pulse,
+            close: &mut || isolation.close().map(<[_]>::to_vec),
+            stop: &stop,
+        };
+        run.run(load, reports)
     }
 }
 
 /// Takes the socket that standard input is, and leaves nothing there: a lambda may read its standard input.
-pub(super) fn take_stdin() -> Result<OwnedFd, Failure> {
+fn take_stdin() -> Result<OwnedFd, Failure> {
     let failed =
         |error: io::Error| Failure::caused_by(Exit::Internal, "cannot take the socket to the recorder", &error);
     let socket = rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;
     let nothing = std::fs::File::open("/dev/null").map_err(failed)?;
     rustix::stdio::dup2_stdin(&nothing).map_err(io::Error::from).map_err(failed)?;
     Ok(socket)
+}
+
+/// Returns a flag that SIGTERM raises. SIGINT is for whoever started us, who then sends the other.
+fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
+    let stop = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGTERM, Arc::clone(&stop))
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error))?;
+    Ok(stop)
 }
