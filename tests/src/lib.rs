@@ -3,7 +3,6 @@
 pub mod bag;
 pub mod drive;
 pub mod given;
-pub mod greedy;
 pub mod live;
 pub mod markdown;
 pub mod namespace;

@@ -1,9 +1,6 @@
 //! The process is killed while it records, at any moment: what it has reported is there, and what it was writing is saved.
 #![cfg(feature = "program")]
 
-mod running;
-mod support;
-
 use std::fs::{self, File};
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -11,14 +8,14 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use crate::running::*;
+use crate::support::*;
 use gleaner_protocol::Clip;
 use gleaner_protocol::TriggerKind::Event;
 use gleaner_protocol::link::{Control, RecorderLink, RecorderReport};
 use gleaner_recorder::Folder;
 use gleaner_recorder::program::{Feed, run};
 use gleaner_transport::dds::Clock;
-use running::*;
-use support::*;
 
 /// Kills if `GLEANER_KILLS` does not say how many.
 const KILLS: u64 = 20;

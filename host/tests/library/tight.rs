@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use crate::greedy::{Room, component, limits, publish, subscribed};
 use gleaner_host::api::data::{DataError, Topic};
 use gleaner_host::guest::Guest;
 use gleaner_protocol::manifest::bounds::{FUEL, STACK};
 use gleaner_protocol::manifest::{ByteSize, Limits, Manifest};
 use gleaner_protocol::{Fault, FaultKind};
 use gleaner_tests::drive::Cdr;
-use gleaner_tests::greedy::{Room, component, limits, publish, subscribed};
 
 /// The limits of the suite, with a change.
 fn with(change: impl FnOnce(&mut Limits)) -> Limits {

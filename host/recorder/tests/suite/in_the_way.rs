@@ -1,18 +1,16 @@
 //! What others have put where a recorder's files belong: nothing is written to where it leads, and nobody waits for it.
 
-mod support;
-
 use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::support::*;
 use gleaner_protocol::TriggerKind::{Event, Start};
 use gleaner_protocol::link::Loss;
 use gleaner_protocol::manifest::Store;
 use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{Folder, RecordError};
-use support::*;
 
 const PRECIOUS: &str = "precious, and without a newline at its end";
 

@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitCode, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -15,12 +15,12 @@ use gleaner_recorder::Folder as Clips;
 use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive};
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
-use libtest_mimic::{Arguments, Failed, Trial};
+use libtest_mimic::{Failed, Trial};
 
 /// Events all along the drive, so that clips begin and end at many moments.
 const EVENTS: &str = "event_s=2,8,14,20,26,32,38";
 
-fn main() -> ExitCode {
+pub fn trials() -> Vec<Trial> {
     let mut trials = vec![
         Trial::test("a_recorder_killed_at_any_moment_leaves_nothing_broken", || killed("ram")),
         Trial::test("a_recorder_with_its_preroll_on_disk_killed_at_any_moment_leaves_nothing_broken", || {
@@ -35,7 +35,7 @@ fn main() -> ExitCode {
     } else {
         Trial::test(format!("{name} [no file system can be mounted here]"), || Ok(())).with_ignored_flag(true)
     });
-    libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+    trials
 }
 
 /// `alarm`, with short windows, so that there are several clips.
