@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_protocol::Clip;
 use gleaner_recorder::Folder as Clips;
-use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive};
+use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive, times};
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
 use libtest_mimic::{Failed, Trial};
@@ -66,7 +66,7 @@ fn killed(store: &str) -> Result<(), Failed> {
         replay(lambda.path(), out.path()).status()?;
         duration = duration.min(started.elapsed());
     }
-    let kills: u32 = std::env::var("GLEANER_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(25);
+    let kills = times("GLEANER_KILLS", 25);
     let mut seen = [0_u32; 3];
     let mut out = Folder::new();
     let mut random = 0x9e37_79b9_7f4a_7c15_u64;

@@ -110,7 +110,7 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     let mut lints = player::cargo(checkout)?;
     lints.args(["clippy", "--release", "-p", "gleaner-player", "--all-targets", "--", "-D", "warnings"]);
     let mut tests = player::cargo(checkout)?;
-    tests.args(["test", "--release", "-p", "gleaner-player"]);
+    tests.args(["test", "--release", "--workspace", "--bin", "gleaner-player", "--test", "program"]);
     Ok(vec![
         suite("lints: player", How::Run(lints, Speech::None)),
         suite("cargo test: player", How::Run(tests, Speech::Libtest)),
