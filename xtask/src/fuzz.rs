@@ -97,7 +97,7 @@ impl Asked {
 }
 
 /// Builds the lambda of [`CALLS`], and compiles it for this machine: the target has no compiler in it.
-fn driver(checkout: &Checkout) -> Result<(), Failure> {
+pub(crate) fn driver(checkout: &Checkout) -> Result<(), Failure> {
     setup::target(checkout, setup::TARGET)?;
     // Of all that is built by default, as there, so that nothing is built twice.
     let mut build = checkout.cargo();
