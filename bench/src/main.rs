@@ -55,7 +55,7 @@ fn main() -> ExitCode {
             }
         };
     }
-    let rounds = if quick { 2 } else { 9 };
+    let rounds = if quick { 1 } else { 9 };
     if let Err(error) = measure::stay_on_one_core() {
         eprintln!("cannot stay on one core, figures are of all: {error}");
     }
@@ -113,7 +113,7 @@ fn main() -> ExitCode {
     }
 
     for (name, store) in [("memory", Store::Ram), ("disk", Store::Disk)] {
-        let load = record::record(if quick { 3 } else { 60 }, store);
+        let load = record::record(if quick { 2 } else { 60 }, store);
         let mut tell = |what: &str, unit, value| {
             figures.push(Figure::told(&format!("recorder at 20 MB/s, preroll in {name}: {what}"), unit, &[value]));
         };

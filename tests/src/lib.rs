@@ -3,7 +3,6 @@
 pub mod bag;
 pub mod drive;
 pub mod given;
-pub mod greedy;
 pub mod live;
 pub mod markdown;
 pub mod namespace;
@@ -53,13 +52,15 @@ pub fn program(name: &str) -> PathBuf {
     path
 }
 
-/// How often a test is to do what it does: what the variable `name` says, else `usual`.
+/// How often a test is to do what it does: what the variable `name` says, else `usual`, which is
+/// short, or twenty times that with `GLEANER_LONG=1`. ARCHITECTURE.md ("Tests") lists the variables.
 ///
 /// # Panics
 ///
 /// If the variable is set to anything but a whole number above 0: a test that does nothing would pass.
 pub fn times(name: &str, usual: u32) -> u32 {
-    let Some(said) = std::env::var_os(name) else { return usual };
+    let is_long = std::env::var_os("GLEANER_LONG").is_some_and(|said| said == "1");
+    let Some(said) = std::env::var_os(name) else { return if is_long { 20 * usual } else { usual } };
     let times = said.to_str().and_then(|said| said.parse().ok()).filter(|times| *times > 0);
     times.unwrap_or_else(|| panic!("{name} is {said:?}; set it to a whole number above 0, or not at all"))
 }

@@ -97,7 +97,7 @@ impl Asked {
 }
 
 /// Builds the lambda of [`CALLS`], and compiles it for this machine: the target has no compiler in it.
-fn driver(checkout: &Checkout) -> Result<(), Failure> {
+pub(crate) fn driver(checkout: &Checkout) -> Result<(), Failure> {
     setup::target(checkout, setup::TARGET)?;
     // Of all that is built by default, as there, so that nothing is built twice.
     let mut build = checkout.cargo();
@@ -132,9 +132,7 @@ impl Fuzz<'_> {
         for name in names {
             build.args(["--bin", &format!("fuzz-{name}")]);
         }
-        if names.contains(&CALLS) {
-            build.args(["--features", CALLS]);
-        }
+        build.args(["--features", if names.contains(&CALLS) { "programs,calls" } else { "programs" }]);
         build.env("CARGO_TARGET_DIR", &self.build).env("RUSTFLAGS", FLAGS).env_remove("CARGO_ENCODED_RUSTFLAGS");
         steps::run(&mut build, "if a C++ compiler is missing, install one (`c++`); else see the first error above")?;
         Ok(self.build.join(machine).join("release"))
@@ -142,7 +140,8 @@ impl Fuzz<'_> {
 
     fn seeds(&self) -> Result<(), Failure> {
         let mut build = self.checkout.cargo();
-        build.args(["build", "--release", "-p", "gleaner-fuzz", "--bin", "fuzz-seeds"]);
+        // With the features of all that is built by default, as there, so that nothing is built twice.
+        build.args(["build", "--release", "--workspace", "--exclude", "gleaner-player", "--bin", "fuzz-seeds"]);
         steps::run(&mut build, "see the first error above")?;
         let mut seeds = self.checkout.command(self.checkout.program("fuzz-seeds"));
         steps::run(seeds.arg(self.build.join("seeds")), "see the error above")

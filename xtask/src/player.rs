@@ -19,7 +19,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin("cmake and libclang");
     let mut build = cargo(checkout)?;
     steps.begin("gleaner-player with Cyclone DDS (the first time this takes minutes)");
-    build.args(["build", "--release", "-p", "gleaner-player"]);
+    // With the features of the whole workspace, so that what it shares is built once.
+    build.args(["build", "--release", "--workspace", "--bin", "gleaner-player"]);
     let help = "if a C compiler is missing, install one (`cc`); else see the first error above";
     steps::run(&mut build, help)?;
     println!("built {}", checkout.program("gleaner-player").display());

@@ -30,7 +30,7 @@ pub fn figures(quick: bool) -> Result<Vec<Figure>, String> {
     let cores = cores().map_err(|error| format!("the system does not tell which cores may be used: {error}"))?;
     let [ours, theirs, ..] = cores[..] else { return Err("victim and attacker need a core each".to_owned()) };
     let mut figures = Vec::new();
-    start::figures(if quick { 3 } else { STARTS }, &mut figures);
+    start::figures(if quick { 1 } else { STARTS }, &mut figures);
     stay_on(ours).map_err(|error| format!("cannot stay on one core: {error}"))?;
     attacks(quick, theirs, &mut figures);
     Ok(figures)
@@ -49,7 +49,7 @@ fn attacks(quick: bool, theirs: usize, figures: &mut Vec<Figure>) {
         let mut dds = Dds::open(Options::new("/gleaner_bench/answers")).expect("a private network can be joined");
         let mut attacker = Attacker::start(attack, theirs);
         victims.iter_mut().for_each(|victim| victim.hear(&mut dds));
-        let course = Course::after(clock.now(), if quick { 2 } else { PAIRS });
+        let course = Course::after(clock.now(), if quick { 1 } else { PAIRS });
         let course = &course;
         std::thread::scope(|scope| {
             for victim in &mut victims {

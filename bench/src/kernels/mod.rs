@@ -41,7 +41,7 @@ const MEASURED_S: f64 = 0.005;
 
 /// Measures everything; `quick` shows that it runs.
 pub fn figures(quick: bool) -> Vec<Figure> {
-    let rounds = if quick { 2 } else { 31 };
+    let rounds = if quick { 1 } else { 31 };
     let mut figures = Vec::new();
     let components = ENGINES.map(bare::compiled);
     for (kernel, goal) in KERNELS {

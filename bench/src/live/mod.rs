@@ -49,7 +49,7 @@ fn again() -> Result<bool, String> {
 
 /// All figures.
 pub fn figures(quick: bool) -> Vec<Figure> {
-    let seconds = |long: u32| if quick { 4 } else { long };
+    let seconds = |long: u32| if quick { 2 } else { long };
     let mut figures = Vec::new();
     const FULL_HD: &str = "1920x1080@30";
     for (name, lambdas, players, long) in [

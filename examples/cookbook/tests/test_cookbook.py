@@ -1,6 +1,6 @@
 """The recipes in Python at the desk, without any runtime. `pip install ./guest-sdk-python pytest`, then `pytest examples/cookbook`.
 
-`tests/tests/cookbook.rs` runs all ten recipes in the real host."""
+`tests/tests/programs/cookbook.rs` runs all ten recipes in the real host."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ mod preroll;
 pub mod program;
 mod recorder;
 #[cfg(test)]
-#[path = "../tests/support/mod.rs"]
+#[path = "../tests/suite/support/mod.rs"]
 mod support;
 mod thumbnail;
 mod window;

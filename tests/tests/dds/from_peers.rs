@@ -87,7 +87,7 @@ fn mixed() -> Result<(), Failed> {
 }
 
 fn restarts() -> Result<(), Failed> {
-    let times = gleaner_tests::times("GLEANER_RESTARTS", 10);
+    let times = gleaner_tests::times("GLEANER_RESTARTS", 5);
     let mut dds = join(None)?;
     let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
     let mut known = BTreeSet::new();

@@ -2,7 +2,7 @@
 //! restarts, losses nor hostile packets keep it from doing so.
 //!
 //! Each case is this program once more, in a network of its own (`gleaner_tests::namespace`). `GLEANER_RESTARTS` says how often a
-//! publisher is killed; 10 times if it does not.
+//! publisher is killed; 5 times if it does not.
 
 mod faults;
 mod from_peers;

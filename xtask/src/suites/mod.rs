@@ -14,6 +14,7 @@ use std::time::Instant;
 use gleaner_base::{Exit, Failure};
 
 use crate::checkout::{Checkout, FAMILIES};
+use crate::fuzz;
 use crate::player;
 use crate::setup;
 use crate::steps::{Steps, succeeds};
@@ -37,6 +38,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     suites.extend(player_suites(checkout)?);
     let mut steps = Steps::of(setup::STEPS + 1 + suites.len());
     setup::run(checkout, &mut steps, &FAMILIES)?;
+    fuzz::driver(checkout)?;
     steps.begin("pytest, and what runs notebooks");
     venv::set_up_for_tests(checkout)?;
     let mut total = Tally::new(Speech::None);
@@ -64,6 +66,11 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
     let mut tests = checkout.cargo();
     tests.args(["test", "--release", "--no-fail-fast"]);
 
+    // Of the fuzz targets, with the features of all that is built by default, so that nothing is built twice.
+    let mut seeds = checkout.cargo();
+    seeds.args(["test", "--release", "--workspace", "--exclude", "gleaner-player", "--features", "gleaner-fuzz/calls"]);
+    seeds.args(["--test", "seeds"]);
+
     // In target folders of their own: their flags would have everything else compiled anew.
     let mut loom = checkout.cargo();
     loom.args(["test", "--release", "-p", "gleaner-buffers", "--test", "loom"])
@@ -85,6 +92,7 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
 
     let mut suites = vec![
         suite("cargo test", tests, Speech::Libtest),
+        suite("cargo test: seeds of the fuzz targets", seeds, Speech::Libtest),
         suite("loom: orders of threads in gleaner-buffers", loom, Speech::Libtest),
         Suite { name: "miri: memory in gleaner-buffers".to_owned(), how: miri(checkout) },
         suite("unittest: Python SDK", unittest, Speech::Unittest),
@@ -110,7 +118,7 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     let mut lints = player::cargo(checkout)?;
     lints.args(["clippy", "--release", "-p", "gleaner-player", "--all-targets", "--", "-D", "warnings"]);
     let mut tests = player::cargo(checkout)?;
-    tests.args(["test", "--release", "-p", "gleaner-player"]);
+    tests.args(["test", "--release", "--workspace", "--bin", "gleaner-player", "--test", "program"]);
     Ok(vec![
         suite("lints: player", How::Run(lints, Speech::None)),
         suite("cargo test: player", How::Run(tests, Speech::Libtest)),

@@ -3,14 +3,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_base::ByteSize;
+use crate::greedy::{Room, component, limits, publish, subscribed};
 use gleaner_host::api::data::{DataError, Topic};
 use gleaner_host::guest::Guest;
 use gleaner_lambda::manifest::bounds::{FUEL, STACK};
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{Fault, FaultKind};
 use gleaner_tests::drive::Cdr;
-use gleaner_tests::greedy::{Room, component, limits, publish, subscribed};
 
 /// The limits of the suite, with a change.
 fn with(change: impl FnOnce(&mut Limits)) -> Limits {

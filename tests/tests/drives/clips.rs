@@ -3,16 +3,16 @@
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitCode};
+use std::process::Command;
 
 use gleaner_lambda::Clip;
 use gleaner_tests::drive::corrupted;
 use gleaner_tests::{Copy, Folder, Run, replay_to, root, sample_drive, shared_drive};
-use libtest_mimic::{Arguments, Failed, Trial};
+use libtest_mimic::{Failed, Trial};
 
 const TOPICS: [&str; 3] = ["/camera/front/compressed", "/imu/data", "/vehicle/speed"];
 
-fn main() -> ExitCode {
+pub fn trials() -> Vec<Trial> {
     let mut trials = vec![
         Trial::test("two_triggers_4_s_apart_give_one_clip", || windows("10,14", &[(5.0, 19.0, 2)])),
         Trial::test("two_triggers_8_s_apart_overlap_too", || windows("10,18", &[(5.0, 23.0, 2)])),
@@ -49,7 +49,7 @@ fn main() -> ExitCode {
         shared_drive("rec_brake_dark.mcap"),
         &["--set", "event_s=5,9,35"],
     );
-    libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+    trials
 }
 
 /// The Python that `cargo xtask test` sets up, if it has the readers.

@@ -1,13 +1,11 @@
 //! A recorder, clip by clip: what is in it, and what it says of itself.
 
-mod support;
-
 use std::time::Duration;
 
-use gleaner_base::Explain;
-use gleaner_lambda::TriggerKind::{Event, Start, Stop};
+use crate::support::*;
+use gleaner_protocol::Explain;
+use gleaner_protocol::TriggerKind::{Event, Start, Stop};
 use gleaner_recorder::{Folder, RecordError, TOPICS_MAX};
-use support::*;
 
 const EVENT: &[gleaner_lambda::TriggerKind] = &[Event];
 

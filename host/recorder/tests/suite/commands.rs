@@ -1,17 +1,13 @@
 //! Commands over a topic: what they record, and what is refused.
 #![cfg(feature = "program")]
 
-mod running;
-mod support;
-
 use std::time::Instant;
 
-use gleaner_lambda::TriggerKind::{Event, Start};
-use gleaner_lambda::{Clip, TriggerKind};
+use crate::running::*;
+use crate::support::*;
+use gleaner_protocol::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{CommandStatus, RecorderLink};
 use gleaner_transport::Verdict;
-use running::*;
-use support::*;
 
 const TOPIC: &str = "/gleaner/commands";
 /// The writer that `meta` names, in hexadecimal digits.

@@ -4,11 +4,10 @@
 //! that reason.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use gleaner_lambda::twins_differ;
 use gleaner_tests::{Run, replay, root, sample_drive, shared_drive};
-use libtest_mimic::{Arguments, Failed, Trial};
+use libtest_mimic::{Failed, Trial};
 
 const KINDS: [&str; 2] = ["rust", "python"];
 
@@ -16,7 +15,7 @@ const KINDS: [&str; 2] = ["rust", "python"];
 const EXAMPLES: [(&str, &[&str]); 3] =
     [("hello", &["--set", "brake_mps2=-1.4"]), ("brake-dark", &["--set", "brake_mps2=-1.4"]), ("imu-fft", &[])];
 
-fn main() -> ExitCode {
+pub fn trials() -> Vec<Trial> {
     let mut trials = Vec::new();
     for (example, set) in EXAMPLES {
         for kind in KINDS {
@@ -46,7 +45,7 @@ fn main() -> ExitCode {
     trials.push(shared("the_twins_of_pixels_agree".to_owned(), "rec_raw_image_bgr8_320x180.mcap", |drive| {
         twins("tests/lambdas/pixels", &drive, &["--all"])
     }));
-    libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+    trials
 }
 
 /// A test on a drive beside the checkout; ignored, with the reason in its name, where that is missing.

@@ -1,13 +1,11 @@
 //! A recorder that is fed live, and hears of wakes later than of samples.
 
-mod support;
-
 use std::time::Duration;
 
-use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
-use gleaner_lambda::manifest::Store;
+use crate::support::*;
+use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
+use gleaner_protocol::manifest::Store;
 use gleaner_recorder::{Folder, LambdaId, Recorder, Settings, TopicId};
-use support::*;
 
 /// With one topic and a lambda that keeps nothing from before a trigger, so that nothing waits for longer than it must.
 fn recorder(scratch: &Scratch, postroll_ms: i64, max_length_ms: u64) -> (Recorder, TopicId, LambdaId) {

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use gleaner_base::ByteSize;
+use crate::alone::ran_elsewhere;
+use crate::greedy::{Room, component, limits};
 use gleaner_host::guest::Guest;
-use gleaner_lambda::FaultKind;
-use gleaner_lambda::manifest::Limits;
-use gleaner_tests::greedy::{Room, component, limits};
+use gleaner_protocol::FaultKind;
+use gleaner_protocol::manifest::{ByteSize, Limits};
 use gleaner_tests::times;
 use gleaner_vitals::usage;
 
@@ -35,6 +35,9 @@ fn descriptors() -> usize {
 /// In one test, since memory is counted for the whole program.
 #[test]
 fn faults_in_a_row_leave_memory_slots_and_handles_where_they_were() {
+    if ran_elsewhere("faults::faults_in_a_row_leave_memory_slots_and_handles_where_they_were") {
+        return;
+    }
     let faults = times("GLEANER_FAULTS", 2000);
     let greedy = |behaviour: &str| Room::within(behaviour, 0, &small());
     // Memory costs fuel by the byte.

@@ -1,9 +1,6 @@
 //! The process is killed while it records, at any moment: what it has reported is there, and what it was writing is saved.
 #![cfg(feature = "program")]
 
-mod running;
-mod support;
-
 use std::fs::{self, File};
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -11,17 +8,18 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_lambda::Clip;
-use gleaner_lambda::TriggerKind::Event;
+use crate::running::*;
+use crate::support::*;
+use gleaner_protocol::Clip;
+use gleaner_protocol::TriggerKind::Event;
 use gleaner_protocol::link::{Control, RecorderLink, RecorderReport};
 use gleaner_recorder::Folder;
-use gleaner_recorder::program::run;
-use gleaner_transport::{Clock, LiveSource};
-use running::*;
-use support::*;
+use gleaner_recorder::program::{Feed, run};
+use gleaner_transport::dds::Clock;
 
-/// Kills if `GLEANER_KILLS` does not say how many.
-const KILLS: u64 = 20;
+/// Kills if `GLEANER_KILLS` does not say how many, each after a second and a half; twenty times as
+/// many with `GLEANER_LONG=1`.
+const KILLS: u64 = 10;
 
 /// Not a test by itself: the process that the next one kills.
 #[test]
@@ -79,13 +77,14 @@ fn follow_each_other(numbers: &[u32]) -> bool {
 
 #[test]
 fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
-    let kills = std::env::var("GLEANER_KILLS").map_or(KILLS, |kills| kills.parse().unwrap());
+    let usual = if std::env::var("GLEANER_LONG").is_ok_and(|said| said == "1") { 20 * KILLS } else { KILLS };
+    let kills = std::env::var("GLEANER_KILLS").map_or(usual, |kills| kills.parse().unwrap());
     let mut random = Random(5);
     let (mut reported, mut saved, mut saved_messages) = (0, 0, 0);
     for kill in 0..kills {
         let scratch = Scratch::new();
         let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "child", "--ignored"])
+            .args(["--exact", "kills::child", "--ignored"])
             .env("GLEANER_TEST_OUT", &scratch.0)
             .stdout(Stdio::null())
             .spawn()

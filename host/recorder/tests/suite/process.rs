@@ -1,22 +1,19 @@
 //! The process, fed by the loopback transport: from sockets and samples to clips and reports.
 #![cfg(feature = "program")]
 
-mod running;
-mod support;
-
 use std::fs::{self, File};
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use gleaner_base::{Exit, Failure};
-use gleaner_lambda::TriggerKind::{Event, Start};
+use crate::running::*;
+use crate::support::*;
+use gleaner_protocol::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
-use gleaner_recorder::program::{Options, run};
-use gleaner_transport::{Clock, LiveSource};
-use running::*;
-use support::*;
+use gleaner_protocol::{Exit, Failure};
+use gleaner_recorder::program::{Feed, Options, run};
+use gleaner_transport::dds::Clock;
 
 #[test]
 fn two_lambdas_record_and_neither_speaks_for_the_other() {

@@ -1,13 +1,11 @@
 //! Random drives: each clip holds exactly what a look at all windows at once says.
 
-mod support;
-
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
-use gleaner_lambda::manifest::Store;
-use support::*;
+use crate::support::*;
+use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
+use gleaner_protocol::manifest::Store;
 
 /// A drive and what is done with it, all in ms.
 struct Plan {

@@ -2,13 +2,13 @@
 
 use std::sync::Arc;
 
+use crate::greedy::{FUEL, MEMORY, PICTURE, Room, component, publish, subscribed};
 use gleaner_host::api::data::{DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD, Topic};
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::manifest::bounds::{CALL_BYTES, CALL_ITEMS, HANDLES};
 use gleaner_tests::drive::{Cdr, IMAGE, image};
-use gleaner_tests::greedy::{FUEL, MEMORY, PICTURE, Room, component, publish, subscribed};
 use gleaner_vitals::usage;
 
 /// What one call gives at most.

@@ -16,8 +16,8 @@ use gleaner_messages::Endian;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
 
-use crate::drive::{IMAGE, image};
-use crate::{Folder, root};
+use gleaner_tests::drive::{IMAGE, image};
+use gleaner_tests::{Folder, root};
 
 /// Fuel of a wake.
 pub const FUEL: u64 = 5_000_000;

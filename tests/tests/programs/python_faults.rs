@@ -1,4 +1,4 @@
-//! As `faults.rs`, of a process that is an interpreter. How often its lambda faults is `GLEANER_FAULTS`, and some more.
+//! As `host/tests/library/faults.rs`, of a process that is an interpreter. How often its lambda faults is `GLEANER_FAULTS`, and some more.
 
 use gleaner_base::Exit;
 use gleaner_lambda::{Decision, FaultKind};

@@ -1,4 +1,4 @@
-//! What pages show of commands is what these print. `GLEANER_BLESS=1 cargo test --release -p gleaner-tests --test transcripts` writes what
+//! What pages show of commands is what these print. `GLEANER_BLESS=1 cargo test --release -p gleaner-tests --test programs transcripts` writes what
 //! they print today into the pages.
 
 use std::fs;

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use gleaner_base::ByteSize;
+use crate::greedy::{FUEL, Room, component, limits};
 use gleaner_host::guest::Guest;
-use gleaner_lambda::FaultKind;
-use gleaner_tests::greedy::{FUEL, Room, component, limits};
+use gleaner_protocol::FaultKind;
+use gleaner_protocol::manifest::ByteSize;
 
 /// A component with these imports of WASI, of which `functions` are known to its module by name; `fill` writes a number there as often
 /// as it is told, from 16 on, where the host reads, and `read` gives what is so far behind that.

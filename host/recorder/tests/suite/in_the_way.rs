@@ -1,19 +1,14 @@
 //! What others have put where a recorder's files belong: nothing is written to where it leads, and nobody waits for it.
 
-mod support;
-
 use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_base::{Exit, Failure};
-use gleaner_lambda::Clip;
-use gleaner_lambda::TriggerKind::{Event, Start};
-use gleaner_lambda::manifest::Store;
+use crate::support::*;
+use gleaner_protocol::TriggerKind::{Event, Start};
 use gleaner_protocol::link::Loss;
 use gleaner_recorder::{Folder, RecordError};
-use support::*;
 
 const PRECIOUS: &str = "precious, and without a newline at its end";
 

@@ -1,14 +1,12 @@
 //! A recorder that is fed live makes the clips that one makes which is told the same of a drive.
 
-mod support;
-
 use std::time::Duration;
 
-use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
-use gleaner_lambda::manifest::Store;
+use crate::support::*;
+use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
+use gleaner_protocol::manifest::Store;
 use gleaner_recorder::{Folder, Recorder, Settings, Work};
 use gleaner_transport::{Guid, SampleMeta};
-use support::*;
 
 const EVENT: &[TriggerKind] = &[Event];
 

@@ -1,14 +1,12 @@
 //! The preroll, seen from clips: what did not fit is counted, in the clip whose window reaches over it.
 
-mod support;
-
 use std::fs;
 
-use gleaner_lambda::TriggerKind::Event;
-use gleaner_lambda::manifest::Store;
-use gleaner_lambda::{Clip, TriggerKind};
+use crate::support::*;
+use gleaner_protocol::TriggerKind::Event;
+use gleaner_protocol::manifest::Store;
+use gleaner_protocol::{Clip, TriggerKind};
 use gleaner_recorder::{RecordError, Recorder};
-use support::*;
 
 const EVENT: &[TriggerKind] = &[Event];
 

@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitCode, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -13,14 +13,15 @@ use std::time::{Duration, Instant};
 use gleaner_drives::Replay;
 use gleaner_lambda::Clip;
 use gleaner_recorder::Folder as Clips;
-use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive};
+use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive, times};
+use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
-use libtest_mimic::{Arguments, Failed, Trial};
+use libtest_mimic::{Failed, Trial};
 
 /// Events all along the drive, so that clips begin and end at many moments.
 const EVENTS: &str = "event_s=2,8,14,20,26,32,38";
 
-fn main() -> ExitCode {
+pub fn trials() -> Vec<Trial> {
     let mut trials = vec![
         Trial::test("a_recorder_killed_at_any_moment_leaves_nothing_broken", || killed("ram")),
         Trial::test("a_recorder_with_its_preroll_on_disk_killed_at_any_moment_leaves_nothing_broken", || {
@@ -35,7 +36,7 @@ fn main() -> ExitCode {
     } else {
         Trial::test(format!("{name} [no file system can be mounted here]"), || Ok(())).with_ignored_flag(true)
     });
-    libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+    trials
 }
 
 /// `alarm`, with short windows, so that there are several clips.
@@ -66,7 +67,7 @@ fn killed(store: &str) -> Result<(), Failed> {
         replay(lambda.path(), out.path()).status()?;
         duration = duration.min(started.elapsed());
     }
-    let kills: u32 = std::env::var("GLEANER_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(25);
+    let kills = times("GLEANER_KILLS", 25);
     let mut seen = [0_u32; 3];
     let mut out = Folder::new();
     let mut random = 0x9e37_79b9_7f4a_7c15_u64;

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use crate::greedy::{publish, subscribed};
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{DataError, Topic};
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_tests::drive::{IMAGE, image};
-use gleaner_tests::greedy::{publish, subscribed};
 
 const WIDTH: u32 = 701;
 const HEIGHT: u32 = 900;

@@ -1,0 +1,5 @@
+//! The house is in order, and its pages are true.
+
+mod docs;
+mod rooms;
+mod wit;

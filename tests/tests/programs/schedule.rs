@@ -1,0 +1,76 @@
+//! When a lambda runs over a drive: ticks of its twins. `host/tests/library/schedule.rs` has what samples wake.
+
+use std::path::PathBuf;
+
+use gleaner_protocol::{Cause, Decision, twins_differ};
+use gleaner_tests::drive::{Cdr, one_topic};
+use gleaner_tests::{Folder, Run, replay, root, sample_drive};
+
+const MS: i64 = 1_000_000;
+const PERIOD: i64 = 100 * MS;
+
+/// As much of `sensor_msgs/msg/Imu` as `ticker` reads.
+const IMU: &str = "std_msgs/Header header\ngeometry_msgs/Vector3 linear_acceleration\n\
+================================================================================\n\
+MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n\
+================================================================================\n\
+MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
+================================================================================\n\
+MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+
+/// Both twins of `ticker` over one drive; they must agree, also in what they say beside the score.
+fn tick(drive: PathBuf) -> Run {
+    let [rust, python] = ["rust", "python"].map(|kind| {
+        let lambda = root().join("tests/lambdas/ticker").join(kind);
+        replay(&lambda, std::slice::from_ref(&drive), &["--all"])
+    });
+    assert_eq!(rust.must_exit(0).decisions.len(), python.must_exit(0).decisions.len());
+    for (a, b) in rust.decisions.iter().zip(&python.decisions) {
+        assert_eq!(twins_differ(a, b), None);
+        assert_eq!(a.triggers[0].attributes, b.triggers[0].attributes);
+    }
+    rust
+}
+
+fn said(decision: &Decision, attribute: &str) -> i64 {
+    decision.triggers[0].attributes[attribute].as_i64().unwrap()
+}
+
+#[test]
+fn the_twins_tick_every_100_ms_of_the_drive() {
+    let run = tick(sample_drive());
+    assert_eq!(run.decisions.len(), 399);
+    for decision in &run.decisions {
+        assert_eq!((decision.cause, decision.triggers.len()), (Cause::Tick, 1));
+        assert_eq!((&decision.input, &decision.topic, decision.seq), (&None, &None, None));
+        assert_eq!((said(decision, "at"), said(decision, "missed")), (decision.at_ns, 0));
+    }
+    assert!(run.decisions.windows(2).all(|pair| pair[1].at_ns - pair[0].at_ns == PERIOD));
+    // What a tick sees is the drive: the car brakes.
+    assert!(run.decisions.iter().any(|decision| decision.triggers[0].score.unwrap() < -1.0));
+}
+
+#[test]
+fn ticks_of_a_gap_that_is_too_long_to_catch_up_are_missed_and_counted_to_the_last() {
+    let folder = Folder::new();
+    // Eight hours of nothing, and 50 ms.
+    let [before, after] = [1_000 * MS, 30_000_050 * MS];
+    let messages = [0, before, after, after + 1_000 * MS].map(|at_ns| {
+        // The header, and three numbers from the next multiple of 8.
+        let mut cdr = Cdr::header().done();
+        cdr.resize(cdr.len().next_multiple_of(8), 0);
+        cdr.extend([0.5_f64, 0.0, 9.8].iter().flat_map(|value| value.to_le_bytes()));
+        (at_ns as u64, cdr)
+    });
+    let run = tick(one_topic(&folder, "/imu/data", "sensor_msgs/msg/Imu", IMU, &messages));
+    let summary = run.summary.as_ref().unwrap();
+    // From the one at 1.0 s to the one at 30,000.0 s.
+    let missed = (after - before) / PERIOD + 1;
+    assert_eq!(missed, 299_991);
+    assert_eq!(summary.missed_ticks, missed as u64);
+    let told: Vec<_> = run.decisions.iter().map(|decision| said(decision, "missed")).filter(|n| *n != 0).collect();
+    assert_eq!(told, [missed]);
+    let (early, late): (Vec<_>, Vec<_>) = run.decisions.iter().partition(|decision| decision.at_ns < before);
+    assert_eq!((early.len(), late.len()), (9, 10));
+    assert!(said(late[0], "missed") == missed && late[0].at_ns > after);
+}
