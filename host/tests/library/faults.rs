@@ -4,9 +4,10 @@ use std::sync::Arc;
 
 use crate::alone::ran_elsewhere;
 use crate::greedy::{Room, component, limits};
+use gleaner_base::ByteSize;
 use gleaner_host::guest::Guest;
-use gleaner_protocol::FaultKind;
-use gleaner_protocol::manifest::{ByteSize, Limits};
+use gleaner_lambda::FaultKind;
+use gleaner_lambda::manifest::Limits;
 use gleaner_tests::times;
 use gleaner_vitals::usage;
 

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use crate::greedy::{FUEL, Room, component, limits};
+use gleaner_base::ByteSize;
 use gleaner_host::guest::Guest;
-use gleaner_protocol::FaultKind;
-use gleaner_protocol::manifest::ByteSize;
+use gleaner_lambda::FaultKind;
 
 /// A component with these imports of WASI, of which `functions` are known to its module by name; `fill` writes a number there as often
 /// as it is told, from 16 on, where the host reads, and `read` gives what is so far behind that.

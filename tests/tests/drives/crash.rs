@@ -14,7 +14,6 @@ use gleaner_drives::Replay;
 use gleaner_lambda::Clip;
 use gleaner_recorder::Folder as Clips;
 use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive, times};
-use gleaner_transport::replay::Replay;
 use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
 use libtest_mimic::{Failed, Trial};
 

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use gleaner_protocol::{Cause, Decision, twins_differ};
+use gleaner_lambda::{Cause, Decision, twins_differ};
 use gleaner_tests::drive::{Cdr, one_topic};
 use gleaner_tests::{Folder, Run, replay, root, sample_drive};
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::support::*;
-use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::Loss;
 use gleaner_recorder::{Folder, RecordError};
 

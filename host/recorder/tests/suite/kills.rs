@@ -10,12 +10,12 @@ use std::time::{Duration, Instant};
 
 use crate::running::*;
 use crate::support::*;
-use gleaner_protocol::Clip;
-use gleaner_protocol::TriggerKind::Event;
+use gleaner_lambda::Clip;
+use gleaner_lambda::TriggerKind::Event;
 use gleaner_protocol::link::{Control, RecorderLink, RecorderReport};
 use gleaner_recorder::Folder;
 use gleaner_recorder::program::{Feed, run};
-use gleaner_transport::dds::Clock;
+use gleaner_transport::Clock;
 
 /// Kills if `GLEANER_KILLS` does not say how many, each after a second and a half; twenty times as
 /// many with `GLEANER_LONG=1`.

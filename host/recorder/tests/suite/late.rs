@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use crate::support::*;
-use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
-use gleaner_protocol::manifest::Store;
+use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
+use gleaner_lambda::manifest::Store;
 use gleaner_recorder::{Folder, LambdaId, Recorder, Settings, TopicId};
 
 /// With one topic and a lambda that keeps nothing from before a trigger, so that nothing waits for longer than it must.

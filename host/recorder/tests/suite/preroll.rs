@@ -3,9 +3,9 @@
 use std::fs;
 
 use crate::support::*;
-use gleaner_protocol::TriggerKind::Event;
-use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Clip, TriggerKind};
+use gleaner_lambda::TriggerKind::Event;
+use gleaner_lambda::manifest::Store;
+use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_recorder::{RecordError, Recorder};
 
 const EVENT: &[TriggerKind] = &[Event];

@@ -9,11 +9,11 @@ use std::time::Instant;
 
 use crate::running::*;
 use crate::support::*;
-use gleaner_protocol::TriggerKind::{Event, Start};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
-use gleaner_protocol::{Exit, Failure};
 use gleaner_recorder::program::{Feed, Options, run};
-use gleaner_transport::dds::Clock;
+use gleaner_transport::Clock;
 
 #[test]
 fn two_lambdas_record_and_neither_speaks_for_the_other() {

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use crate::support::*;
-use gleaner_protocol::Explain;
-use gleaner_protocol::TriggerKind::{Event, Start, Stop};
+use gleaner_base::Explain;
+use gleaner_lambda::TriggerKind::{Event, Start, Stop};
 use gleaner_recorder::{Folder, RecordError, TOPICS_MAX};
 
 const EVENT: &[gleaner_lambda::TriggerKind] = &[Event];

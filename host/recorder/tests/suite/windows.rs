@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::support::*;
-use gleaner_protocol::TriggerKind::{self, Event, Start, Stop};
-use gleaner_protocol::manifest::Store;
+use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
+use gleaner_lambda::manifest::Store;
 
 /// A drive and what is done with it, all in ms.
 struct Plan {
