@@ -8,6 +8,7 @@ use gleaner_host::api::data::{Sample, Topic, Wake};
 use gleaner_host::input::open_inputs;
 use gleaner_host::schedule::Schedule;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_messages::Endian;
 use gleaner_tests::root;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::greedy::{Room, component, limits, publish, subscribed};
+use gleaner_base::ByteSize;
 use gleaner_host::api::data::{DataError, Topic};
 use gleaner_host::guest::Guest;
 use gleaner_lambda::manifest::bounds::{FUEL, STACK};
