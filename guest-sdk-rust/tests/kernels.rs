@@ -1,6 +1,6 @@
 //! Kernels against the host's operations on frames: equal, bit for bit, for every layout of the pixels.
 
-use gleaner_image::{Encoding as HostEncoding, Roi as HostRoi, View, ops};
+use gleaner_rules::pixels::{Encoding as HostEncoding, Roi as HostRoi, View, ops};
 use gleaner_sdk::data::{Encoding, Roi};
 use gleaner_sdk::kernels::{Image, downscale, histogram, luma, mean};
 

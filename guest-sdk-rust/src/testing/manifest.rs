@@ -2,9 +2,11 @@
 
 use std::collections::BTreeSet;
 
+use gleaner_rules::clamps::PerCall;
+use gleaner_rules::text::quoted;
 use toml::Value;
 
-use super::error::{Error, nearest, quoted};
+use super::error::{Error, nearest};
 use super::table::{Bounds, Table};
 use crate::bindings::{ConfigEntry, ConfigValue};
 
@@ -38,8 +40,7 @@ pub(super) struct Limits {
     pub(super) memory: usize,
     pub(super) handles: u64,
     pub(super) frames: usize,
-    pub(super) call_bytes: usize,
-    pub(super) call_items: usize,
+    pub(super) per_call: PerCall,
     pub(super) scratch: u64,
     pub(super) log_lines: u64,
     pub(super) log_bytes: u64,
@@ -187,8 +188,10 @@ fn limits(root: &Table) -> Result<Limits> {
         memory: table.size("memory", (MIB, 64 * MIB, 1024 * MIB))? as usize,
         handles: table.integer("handles", (16, 4096, 65_536))?,
         frames: table.integer("frames", (1, 256, 4096))? as usize,
-        call_bytes: table.size("call_bytes", (64 * KIB, MIB, MIB))? as usize,
-        call_items: table.integer("call_items", (16, 65_536, 65_536))? as usize,
+        per_call: PerCall {
+            bytes: table.size("call_bytes", (64 * KIB, MIB, MIB))? as usize,
+            items: table.integer("call_items", (16, 65_536, 65_536))? as usize,
+        },
         scratch: table.size("scratch", (0, 0, 256 * MIB))?,
         log_lines: table.integer("log_lines", (1, 100, 10_000))?,
         log_bytes: table.size("log_bytes", (4 * KIB, 400 * KIB, 16 * MIB))?,
