@@ -6,6 +6,7 @@ import json
 import unittest
 from types import SimpleNamespace
 from typing import Any, Callable, Dict, Iterator, List, Tuple
+from unittest.mock import Mock
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def refusal(call: Callable[[], Any]) -> Any:
         return [error.kind, str(error)]
 
 
-def refused(call: Callable[[], Any]) -> Any:
+def refused(call: Callable[[], object]) -> Any:
     """The text of a refusal, if it is one."""
     try:
         call()
@@ -158,9 +159,14 @@ class Cases(unittest.TestCase):
     def test_scratch(self) -> None:
         def start(given: Dict[str, Any]) -> Calls:
             scratch = Scratch({"scratch": given["granted"], "call_bytes": given["call_bytes"]})
+
+            def fill(entries: int) -> None:
+                for n in range(entries):
+                    scratch.put(str(n), b"")
+
             return {
                 "put": lambda name, kept: refusal(lambda: scratch.put(name, kept.encode())),
-                "fill": lambda entries: [scratch.put(str(n), b"") for n in range(entries)] and None,
+                "fill": fill,
                 "append": lambda name, kept: refusal(lambda: scratch.append(name, kept.encode())),
                 "get": lambda name, offset, len: refusal(lambda: scratch.get(name, offset, len).decode()),
                 "remove": lambda name: refusal(lambda: scratch.remove(name)),
@@ -180,13 +186,16 @@ class Cases(unittest.TestCase):
                     held[position] = cell.lease()
                 return cell is not None
 
+            def let_go(position: int) -> None:
+                held.pop(position, None)
+
             def shows(most: int) -> List[int]:
                 return [cell.position for cell in ring.newest_while(most, lambda _: True)]
 
             return {
                 "push": lambda size: ring.push(arrival(ring.head, size)),
                 "hold": hold,
-                "let go": lambda position: held.pop(position, None) and None,
+                "let go": let_go,
                 "shows": shows,
                 "since": lambda at: [it.position for it in ring.newest_while(99, lambda found: found.at_ns > at)],
                 "counts": lambda: [ring.head, ring.overwritten, ring.no_slot, ring.too_big],
@@ -197,13 +206,13 @@ class Cases(unittest.TestCase):
     def test_clamps(self) -> None:
         def start(given: Dict[str, Any]) -> Calls:
             limits = {"call_bytes": given["bytes"], "call_items": given["items"]}
-            values = {"text": "x", "bytes": b"x", "texts": ["x"]}
+            values: Dict[str, Any] = {"text": "x", "bytes": b"x", "texts": ["x"]}
 
             def samples(asked: int) -> int:
-                most: List[int] = []
-                ring = SimpleNamespace(newest_while=lambda n, _: most.append(n) or [])
+                ring = Mock(newest_while=Mock(return_value=[]))
                 Topic(SimpleNamespace(ring=ring, limits=limits)).last(asked)  # type: ignore[arg-type]
-                return most[0]
+                most: int = ring.newest_while.call_args.args[0]
+                return most
 
             def value(path: str, sort: str, size: int) -> Any:
                 found = np.zeros(size) if sort == "numbers" else 1 if sort == "one" else values[sort] * size
@@ -260,12 +269,18 @@ class Cases(unittest.TestCase):
 
     def test_frames(self) -> None:
         def start(given: Dict[str, Any]) -> Calls:
-            budget, taken = Budget({**LIMITS, **given}), []
+            budget, taken = Budget({**LIMITS, **given}), list[Any]()
 
             def take(size: int) -> Any:
-                return refused(lambda: taken.append(budget.take(size)))
+                def one_more() -> None:
+                    taken.append(budget.take(size))
 
-            return {"take": take, "give back": lambda at: taken.pop(at) and None}
+                return refused(one_more)
+
+            def give_back(at: int) -> None:
+                del taken[at]
+
+            return {"take": take, "give back": give_back}
 
         self.replay("frames", start)
 

@@ -1,4 +1,5 @@
-//! Each rule answers the calls in `cases/*.json` as they say. The Python SDK, where the rules stand a second time, answers the same.
+//! Each rule answers the calls in `cases/*.json` as they say: a call is a list of its name, what it is given, and its answer. The
+//! Python SDK, where the rules stand a second time, answers the same; but for cases that say why they are `not in Python`.
 
 mod cases {
     pub mod causing;
