@@ -13,7 +13,7 @@ import numpy as np
 import home
 from gleaner.data import DataError, Guid
 from gleaner.scratch import ScratchError
-from gleaner.testing import _pixels, _replay, _units
+from gleaner.testing import _manifest, _pixels, _replay, _units
 from gleaner.testing._data import Field, Fields, Sample, Source, Topic
 from gleaner.testing._frame import Budget
 from gleaner.testing._path import Missing, NotANumber, Path, _segments
@@ -266,6 +266,15 @@ class Cases(unittest.TestCase):
             "duration": lambda written: read(_units.duration, written),
         }
         self.replay("units", lambda _: calls)
+
+    def test_names(self) -> None:
+        calls: Calls = {
+            "lambda": lambda name: bool(_manifest.LAMBDA_NAME.fullmatch(name)) and len(name) <= 63,
+            "item": lambda name: bool(_manifest.ITEM_NAME.fullmatch(name)) and len(name) <= 63,
+            "topic": lambda name: bool(_manifest.TOPIC.fullmatch(name)) and len(name) <= 247,
+            "type": lambda name: bool(_manifest.TYPE.fullmatch(name)) and len(name) <= 255,
+        }
+        self.replay("names", lambda _: calls)
 
     def test_frames(self) -> None:
         def start(given: Dict[str, Any]) -> Calls:

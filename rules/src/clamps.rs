@@ -60,7 +60,8 @@ impl PerCall {
         Err(WrongField::new(path, format!("has {len} items, one call hands out {most}; read it with `cdr`")))
     }
 
-    /// The place of `len` bytes from `offset` in a `whole` of so many, clamped to what it has and to what one call hands out.
+    /// The place of `len` bytes from `offset` in a `whole` of so many, clamped to what it has and
+    /// to what one call hands out.
     pub fn piece(self, whole: usize, offset: u64, len: u32) -> Range<usize> {
         piece(whole, offset, self.bytes.min(len as usize))
     }

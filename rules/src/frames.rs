@@ -1,4 +1,5 @@
-//! How many frames a lambda may hold at a time, and how many bytes those that it makes may take together.
+//! How many frames a lambda may hold at a time, and how many bytes those that it makes may take
+//! together.
 
 use std::fmt;
 use std::sync::Arc;

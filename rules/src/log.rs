@@ -42,7 +42,8 @@ impl Rate {
         true
     }
 
-    /// Returns whether the host says this now: each text once in a second, beside what the lambda may write.
+    /// Returns whether the host says this now: each text once in a second, beside what the lambda
+    /// may write.
     pub fn notes(&mut self, at_ns: i64, text: &'static str) -> bool {
         let second = at_ns.div_euclid(SECOND_NS);
         if self.notes.0 != second {

@@ -1,4 +1,5 @@
-//! Paths of fields, such as `a.b[3].c`: their syntax. Which fields there are, definitions or messages say.
+//! Paths of fields, such as `a.b[3].c`: their syntax. Which fields there are, definitions or
+//! messages say.
 
 use std::fmt;
 

@@ -20,6 +20,11 @@ pub fn no_image_type(topic: &str, type_name: &str) -> String {
     format!("a sample of `{topic}` is no image: its type is `{type_name}`")
 }
 
+/// More objects of the host than `handles` of `[limits]` allow.
+pub fn too_many_handles(allowed: u64) -> String {
+    format!("the lambda holds {allowed} handles; drop samples, frames, fields and topics that are not needed")
+}
+
 /// An image that contradicts itself, or of which nothing can be computed.
 pub fn not_a_frame(topic: &str, why: impl Display) -> String {
     format!("a sample of `{topic}` is no image that can be read: {why}")

@@ -1,6 +1,8 @@
-//! The newest samples of one input, within a number of cells: what the lambda holds stays, and may cost others their place.
+//! The newest samples of one input, within a number of cells: what the lambda holds stays, and may
+//! cost others their place.
 //!
-//! This is what a ring shows, said plainly and for one thread. The host's ring, in `host/buffers`, shows the same without a lock.
+//! This is what a ring shows, said plainly and for one thread. The host's ring, in `host/buffers`,
+//! shows the same without a lock.
 
 use std::collections::VecDeque;
 use std::sync::Arc;

@@ -1,9 +1,10 @@
 //! When a lambda runs: for each new sample of one input, or every so often.
 //!
-//! A schedule only looks at rings and times; it never runs anything, and it counts what it passes over.
+//! A schedule only looks at rings and times; it never runs anything, and it counts what it passes
+//! over.
 
-/// Ticks made up for in one gap between two samples. A longer gap (a clock that jumped, two drives far apart) is counted as
-/// missed, so that a bad stamp cannot keep a replay busy for years.
+/// Ticks made up for in one gap between two samples. A longer gap (a clock that jumped, two drives
+/// far apart) is counted as missed, so that a bad stamp cannot keep a replay busy for years.
 const CATCH_UP_TICKS: u64 = 100_000;
 
 /// What a schedule sees of the ring of one input.
@@ -76,7 +77,8 @@ impl<R: Ring> Schedule<R> {
         Self::Event(Event { ring, backlog, next: 0 })
     }
 
-    /// Wakes every `period_ns`, from 1. Time begins with [`Schedule::begin`], or else at the first look for a tick.
+    /// Wakes every `period_ns`, from 1. Time begins with [`Schedule::begin`], or else at the first
+    /// look for a tick.
     pub fn periodic(period_ns: i64) -> Self {
         let period_ns = period_ns.max(1);
         Self::Periodic(Periodic { period_ns, live: false, due_ns: None, missed: 0, missed_total: 0 })
@@ -154,7 +156,8 @@ impl<R: Ring> Event<R> {
             }
             Backlog::Latest => ring.newest(),
         };
-        // While the newest sample is being replaced, a reader may find an older one: what was judged is not judged again.
+        // While the newest sample is being replaced, a reader may find an older one: what was
+        // judged is not judged again.
         let Some((position, sample)) = found.filter(|(position, _)| *position >= self.next) else {
             ring.skip(head - self.next);
             self.next = head;

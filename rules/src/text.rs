@@ -25,13 +25,14 @@ pub fn visible(text: &str) -> String {
     shown
 }
 
-/// Whether it makes a terminal show text in another order than it is written: the bidirectional controls of Unicode.
+/// Whether it makes a terminal show text in another order than it is written: the bidirectional
+/// controls of Unicode.
 fn turns_text(character: char) -> bool {
     matches!(character, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
-/// A number of bytes for people: exact below 1 MiB, then in tenths of a MiB. What is needed rounds up
-/// and what is allowed rounds down, so that a message never says "8 MiB, and 8 MiB is allowed".
+/// A number of bytes for people: exact below 1 MiB, then in tenths of a MiB. What is needed rounds
+/// up and what is allowed rounds down, so that a message never says "8 MiB, and 8 MiB is allowed".
 #[derive(Clone, Copy, Debug)]
 pub struct Rounded {
     bytes: u64,

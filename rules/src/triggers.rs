@@ -123,7 +123,8 @@ impl<T> Triggers<T> {
         self.wake.take().unwrap_or_default()
     }
 
-    /// Something begins that may come in the middle of a wake but is no part of it, such as an `init`: it can cause nothing.
+    /// Something begins that may come in the middle of a wake but is no part of it, such as an
+    /// `init`: it can cause nothing.
     pub fn suspend(&mut self) -> Option<Vec<T>> {
         self.wake.take()
     }

@@ -1,5 +1,6 @@
-//! Each rule answers the calls in `cases/*.json` as they say: a call is a list of its name, what it is given, and its answer. The
-//! Python SDK, where the rules stand a second time, answers the same; but for cases that say why they are `not in Python`.
+//! Each rule answers the calls in `cases/*.json` as they say: a call is a list of its name, what it
+//! is given, and its answer. The Python SDK, where the rules stand a second time, answers the same;
+//! but for cases that say why they are `not in Python`.
 
 mod cases {
     pub mod causing;
@@ -10,7 +11,8 @@ mod cases {
 
 use serde_json::{Value, json};
 
-/// What answers the calls of one case, one after the other: the name of a call, and what it is given.
+/// What answers the calls of one case, one after the other: the name of a call, and what it is
+/// given.
 type Answers<'a> = Box<dyn FnMut(&str, &[Value]) -> Value + 'a>;
 
 /// Replays all cases of a file; `start` is given what a case is about.

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use gleaner_rules::frames::{Budget, NoRoom, Taken};
+use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 use gleaner_rules::pixels::{self as rules, Bayer, PixelError, View, ops};
 use gleaner_rules::refused;
 
@@ -88,8 +89,8 @@ impl Frame {
         let source = Arc::clone(&sample.source);
         let Input { topic, type_name, .. } = &source.declared;
         let is_compressed = match type_name.as_str() {
-            "sensor_msgs/msg/Image" => false,
-            "sensor_msgs/msg/CompressedImage" => true,
+            IMAGE => false,
+            COMPRESSED_IMAGE => true,
             _ => {
                 return Err(DataError::NotAFrame(refused::no_image_type(topic, type_name)));
             }

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use gleaner_rules::frames::Budget;
+use gleaner_rules::names::IMAGE;
 use gleaner_rules::schedule::Backlog;
 use gleaner_rules::text::quoted;
 
 use super::data::Source;
 use super::error::Error;
 use super::frame::Images;
-use super::manifest::{self, IMAGE, Manifest, When};
+use super::manifest::{self, Manifest, When};
 use super::message::Message;
 use super::run::Run;
 use super::schedule::{Input, Schedule};

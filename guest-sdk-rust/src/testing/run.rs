@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use gleaner_rules::faults::Faults;
+use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 use gleaner_rules::text::quoted;
 
 use super::data::{Source, Tick};
 use super::decision::{Cause, Decision, Fault, Trigger};
 use super::error::Error;
 use super::log::Line;
-use super::manifest::{COMPRESSED_IMAGE, IMAGE};
 use super::message::{ENCAPSULATION, Message};
 use super::path::known;
 use super::ring::{Arrival, Cell};

@@ -9,7 +9,8 @@ use super::ring::Cell;
 
 pub(super) type Schedule = rules::Schedule<Input>;
 
-/// The input whose messages wake the lambda. They wait for it, so that `latest` and `each` are the same here.
+/// The input whose messages wake the lambda. They wait for it, so that `latest` and `each` are the
+/// same here.
 pub(super) struct Input(pub(super) Arc<Source>);
 
 impl Ring for Input {

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_rules::log::line;
+use gleaner_rules::refused;
 use gleaner_rules::scratch::Scratch;
 use gleaner_rules::triggers::Triggers;
 use gleaner_rules::units::size_in_words;
@@ -139,8 +140,7 @@ impl Handles {
         let handle = Handle(Arc::clone(self));
         let allowed = self.allowed;
         if held >= allowed {
-            let way_out = "drop samples, frames, fields and topics that are not needed";
-            let message = format!("the lambda holds {allowed} handles; {way_out}");
+            let message = refused::too_many_handles(allowed);
             drop(handle);
             end(Fault { kind: FaultKind::HostCall, message, used: Some(allowed + 1), allowed: Some(allowed) });
         }

@@ -1,4 +1,5 @@
-//! What a ring shows, by the calls and answers of `rules/cases`: this ring gives them without a lock.
+//! What a ring shows, by the calls and answers of `rules/cases`: this ring gives them without a
+//! lock.
 #![cfg(not(loom))]
 
 use std::collections::BTreeMap;

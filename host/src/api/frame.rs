@@ -12,6 +12,7 @@ use super::piece::Piece;
 use gleaner_image::{self as image, Encoding, ImageError, Pace, PixelError, Roi, View, ops};
 pub use gleaner_rules::frames::Budget;
 use gleaner_rules::frames::Taken;
+use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 
 /// Bytes of pixels that the fastest machine decodes in a microsecond: four times what was measured (0.5 GB/s on an x86-64 server).
 const FASTEST_DECODE: u64 = 2_000;
@@ -67,8 +68,8 @@ impl<'a> Picture<'a> {
     /// None if the type is no image.
     pub(super) fn of(type_name: &str, cdr: &'a [u8], endian: Endian) -> Result<Option<Self>, CdrError> {
         Ok(match type_name {
-            "sensor_msgs/msg/Image" => Some(Self::Raw(ImageView::read(cdr, endian)?)),
-            "sensor_msgs/msg/CompressedImage" => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
+            IMAGE => Some(Self::Raw(ImageView::read(cdr, endian)?)),
+            COMPRESSED_IMAGE => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
             _ => None,
         })
     }

@@ -129,7 +129,7 @@ impl Session {
         let state = self.lock();
         let found = state.inputs.iter().find(|topic| topic.name() == name);
         found.cloned().ok_or_else(|| DataError::NoSuchInput {
-            asked: name.chars().take(64).collect(),
+            asked: name.to_owned(),
             known: state.inputs.iter().map(|topic| topic.name().to_owned()).collect(),
         })
     }

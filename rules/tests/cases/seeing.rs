@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use gleaner_rules::clamps::{self, Length, PerCall, WrongField};
 use gleaner_rules::path::{Segment, segments};
 use gleaner_rules::ring::{Counts, Ring};
-use gleaner_rules::units;
+use gleaner_rules::{names, units};
 use serde_json::{Value, json};
 
 use crate::{ns, refused, replay, text, whole};
@@ -86,6 +86,21 @@ fn paths() {
                 segments(text(&given[0])).unwrap().iter().map(plain).collect()
             }
             _ => refused(segments(text(&given[0]))),
+        })
+    });
+}
+
+#[test]
+fn names() {
+    replay("names", include_str!("../../cases/names.json"), |_| {
+        Box::new(|call, given| {
+            let is_right = match call {
+                "lambda" => names::is_lambda,
+                "item" => names::is_item,
+                "topic" => names::is_topic,
+                _ => names::is_type,
+            };
+            json!(is_right(text(&given[0])))
         })
     });
 }
