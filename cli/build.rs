@@ -17,6 +17,7 @@ const PACKED: &[&str] = &[
     "guest-sdk-python/gleaner",
     "guest-sdk-python/pyproject.toml",
     "guest-sdk-rust/src",
+    "rules/src",
     "wit",
 ];
 const EXTENSIONS: &[&str] = &["py", "pyi", "rs", "typed", "wit"];

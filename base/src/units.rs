@@ -4,6 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
 
+use gleaner_rules::units::{self, SIZE_RULE, TIME_RULE};
 use serde::{Deserialize, Serialize};
 
 use crate::{Exit, Explain};
@@ -66,46 +67,21 @@ impl ByteSize {
     }
 }
 
-/// Largest first, so that the first that divides a size is the one to show it in.
-const SIZE_UNITS: [(&str, u64); 4] = [("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10), ("B", 1)];
-
-/// Largest first; a duration is written in any, and shown in the first that divides it.
-const TIME_UNITS: [(&str, u64); 6] = [
-    ("h", 3_600_000_000_000),
-    ("min", 60_000_000_000),
-    ("s", 1_000_000_000),
-    ("ms", 1_000_000),
-    ("us", 1_000),
-    ("ns", 1),
-];
-
-const SIZE_RULE: &str = "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"";
-const TIME_RULE: &str = "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"";
-
-/// The number and the unit of `2 MiB` or `2MiB`; without a unit the second is empty.
-fn split(text: &str) -> (&str, &str) {
-    let end = text.find(|c: char| !c.is_ascii_digit() && c != '.' && c != '_').unwrap_or(text.len());
-    let (number, unit) = text.split_at(end);
-    (number, unit.strip_prefix(' ').unwrap_or(unit))
-}
-
 impl FromStr for ByteSize {
     type Err = UnitError;
 
     fn from_str(text: &str) -> Result<ByteSize, UnitError> {
-        let (number, unit) = split(text.trim());
-        let unit = if unit.is_empty() { "B" } else { unit };
-        let bytes = SIZE_UNITS
-            .iter()
-            .find(|(name, _)| *name == unit)
-            .and_then(|(_, factor)| number.parse::<u64>().ok().and_then(|number| number.checked_mul(*factor)));
-        bytes.map(ByteSize).ok_or_else(|| UnitError { text: text.to_owned(), what: "size", rule: SIZE_RULE })
+        units::size(text).map(ByteSize).ok_or_else(|| UnitError {
+            text: text.to_owned(),
+            what: "size",
+            rule: SIZE_RULE,
+        })
     }
 }
 
 impl fmt::Display for ByteSize {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write_in_largest_unit(f, self.0, &SIZE_UNITS, " ")
+        f.write_str(&units::size_in_words(self.0))
     }
 }
 
@@ -115,47 +91,16 @@ impl fmt::Display for ByteSize {
 ///
 /// [`UnitError`] for a text without a unit, of another form, with parts of a nanosecond, or beyond 584 years.
 pub fn parse_duration(text: &str) -> Result<Duration, UnitError> {
-    let nanoseconds = || {
-        let (number, unit) = split(text.trim());
-        let (_, factor) = TIME_UNITS.iter().find(|(name, _)| *name == unit)?;
-        let (whole, fraction) = number.split_once('.').unwrap_or((number, "0"));
-        let whole = digits(whole)?.checked_mul(*factor)?;
-        let scale = 10_u64.checked_pow(u32::try_from(fraction.len()).ok()?)?;
-        let fraction = u128::from(digits(fraction)?) * u128::from(*factor);
-        let scale = u128::from(scale);
-        let fraction = (fraction % scale == 0).then_some(fraction / scale)?;
-        whole.checked_add(u64::try_from(fraction).ok()?)
-    };
-    nanoseconds().map(Duration::from_nanos).ok_or_else(|| UnitError {
+    units::duration(text).map(Duration::from_nanos).ok_or_else(|| UnitError {
         text: text.to_owned(),
         what: "duration",
         rule: TIME_RULE,
     })
 }
 
-/// Digits and nothing else: `u64::from_str` also takes a sign.
-fn digits(text: &str) -> Option<u64> {
-    if text.bytes().all(|byte| byte.is_ascii_digit()) { text.parse().ok() } else { None }
-}
-
 /// `duration` as [`parse_duration`] reads it, in the largest unit that keeps it whole: `1500ms`, `5s`, `2min`.
 pub fn format_duration(duration: Duration) -> String {
-    struct Shown(u64);
-    impl fmt::Display for Shown {
-        fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            match self.0 {
-                0 => f.write_str("0s"),
-                n => write_in_largest_unit(f, n, &TIME_UNITS, ""),
-            }
-        }
-    }
-    Shown(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)).to_string()
-}
-
-fn write_in_largest_unit(f: &mut fmt::Formatter<'_>, n: u64, units: &[(&str, u64)], gap: &str) -> fmt::Result {
-    let (unit, factor) =
-        units.iter().find(|(_, factor)| n != 0 && n.is_multiple_of(*factor)).unwrap_or(&units[units.len() - 1]);
-    write!(f, "{}{gap}{unit}", n / factor)
+    units::duration_in_words(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX))
 }
 
 #[cfg(test)]

@@ -3,6 +3,8 @@
 use std::fmt::Display;
 use std::path::Path;
 
+pub use gleaner_rules::text::visible;
+
 /// The one of `known` that `word` was most likely meant to be.
 pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     // The distance takes time in proportion to both lengths, and nobody misspells a key with a page of text.
@@ -51,26 +53,9 @@ pub fn shell_word(path: &Path) -> String {
     }
 }
 
-/// `text` with its control characters written out, so that none acts on a terminal.
-pub fn visible(text: &str) -> String {
-    let mut shown = String::with_capacity(text.len());
-    for character in text.chars() {
-        match character.is_control() || turns_text(character) {
-            true => shown.extend(character.escape_default()),
-            false => shown.push(character),
-        }
-    }
-    shown
-}
-
 /// `bytes` in hexadecimal digits, as digests are written.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// Whether it makes a terminal show text in another order than it is written: the bidirectional controls of Unicode.
-fn turns_text(character: char) -> bool {
-    matches!(character, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
 /// A whole number with a comma between thousands.

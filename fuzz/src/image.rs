@@ -2,7 +2,7 @@
 //!
 //! An input is a byte for the mode, and then either a JPEG or PNG file, or the fields of an image and its pixels.
 
-use gleaner_image::{Encoding, ImageError, MAX_SIDE, Roi, View, decode_rgb8, ops, probe};
+use gleaner_image::{Encoding, ImageError, MAX_SIDE, PixelError, Roi, View, decode_rgb8, ops, probe};
 
 use crate::budget;
 use crate::input::Input;
@@ -72,7 +72,10 @@ fn file(data: &[u8]) -> bool {
         (first, second) => panic!("{header}: {:?}, then {:?}", first.err(), second.err()),
     }
     let mut short = vec![0; len - 1];
-    assert!(matches!(decode_rgb8(data, &header, DECODED_MAX, &mut short), Err(ImageError::Output { .. })));
+    assert!(matches!(
+        decode_rgb8(data, &header, DECODED_MAX, &mut short),
+        Err(ImageError::Pixels(PixelError::Output { .. }))
+    ));
     sound
 }
 

@@ -1,8 +1,8 @@
 //! Kernels against the host's operations on frames: equal, bit for bit, for every layout of the pixels.
 
-use gleaner_image::{Encoding as HostEncoding, Roi as HostRoi, View, ops};
+use gleaner_rules::pixels::{self, Encoding as HostEncoding, Roi as HostRoi, View, ops};
 use gleaner_sdk::data::{Encoding, Roi};
-use gleaner_sdk::kernels::{Image, downscale, histogram, luma, mean};
+use gleaner_sdk::kernels::{self, Image, downscale, histogram, luma, mean};
 
 const ENCODINGS: [(Encoding, &str); 3] =
     [(Encoding::Rgb8, "rgb8"), (Encoding::Bgr8, "bgr8"), (Encoding::Mono8, "mono8")];
@@ -114,4 +114,9 @@ fn smaller_images_are_those_of_the_host() {
             assert_eq!(ours, theirs, "{what} to {to_width}x{to_height}");
         });
     }
+}
+
+#[test]
+fn an_image_is_as_large_as_one_of_the_host() {
+    assert_eq!(kernels::MAX_SIDE, pixels::MAX_SIDE);
 }

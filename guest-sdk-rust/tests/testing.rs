@@ -1,5 +1,4 @@
-//! The fake host keeps the host's rules. That it keeps all of them as the host does is tested on both, in `gleaner-tests`; here is
-//! what those lambdas do not reach.
+//! The fake host keeps the host's rules. What these are is tested in `gleaner-rules`; here is what a lambda's author sees of them.
 
 mod testing {
     pub mod frames;

@@ -3,29 +3,11 @@
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::{Cause, Decision, Fault};
+use gleaner_rules::faults::Faults;
 
 use crate::api::Session;
 use crate::api::data::Wake;
 use crate::guest::{Guest, Totals};
-
-/// Faults in a row that are taken for bad luck, or for one bad second of a sensor. From then on the lambda rests.
-pub const FAULTS_IN_A_ROW: u32 = 8;
-
-/// The first rest; each further fault doubles it. It counts from the time of the wake: one that runs for longer than its rest, as a
-/// long `init` does, has none.
-const SHORTEST_REST_NS: i64 = 100_000_000;
-
-/// The longest rest: so long it takes at most until a lambda runs again whose cause of faults is gone. A lambda that always takes all
-/// of a deadline of 100 ms then has a hundredth of the time.
-const LONGEST_REST_NS: i64 = 10_000_000_000;
-
-/// What the log says when a wake finds a fresh lambda.
-pub const MADE_ANEW: &str = "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone \
-                             (in Python, all but the globals of its module)";
-
-/// What the log says when a lambda begins to rest.
-pub const RESTS: &str = "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and twice as \
-                         long after each further fault, 10 s at most, until a wake ends well";
 
 /// Runs one lambda and writes down what it decides.
 pub struct Judge {
@@ -33,31 +15,6 @@ pub struct Judge {
     guest: Box<dyn Guest>,
     run: Duration,
     faults: Faults,
-}
-
-/// Faults without a good wake between them. Time is that of the lambda, so that a replay rests as the vehicle did.
-#[derive(Default)]
-struct Faults {
-    in_a_row: u32,
-    rest_ns: i64,
-    /// From the wake that faulted last until the first that may run, without the latter.
-    rest: Option<(i64, i64)>,
-}
-
-impl Faults {
-    fn add(&mut self, at_ns: i64) {
-        self.in_a_row = self.in_a_row.saturating_add(1);
-        if self.in_a_row < FAULTS_IN_A_ROW {
-            return;
-        }
-        self.rest_ns = (2 * self.rest_ns).clamp(SHORTEST_REST_NS, LONGEST_REST_NS);
-        self.rest = Some((at_ns, at_ns.saturating_add(self.rest_ns)));
-    }
-
-    /// A clock that went back is no reason to rest for long.
-    fn rests(&self, at_ns: i64) -> bool {
-        self.rest.is_some_and(|(from, until)| (from..until).contains(&at_ns))
-    }
 }
 
 impl Judge {
@@ -81,8 +38,8 @@ impl Judge {
     pub fn judge(&mut self, wake: Wake) -> Decision {
         let mut decision = cause(&wake);
         self.session.begin(decision.at_ns);
-        if self.faults.in_a_row > 0 {
-            self.session.note(MADE_ANEW);
+        if let Some(note) = self.faults.begin() {
+            self.session.note(note);
         }
         let started = Instant::now();
         let outcome = self.guest.wake(wake);
@@ -92,13 +49,8 @@ impl Judge {
         decision.fuel = outcome.fuel;
         decision.triggers = self.session.end();
         decision.fault = outcome.result.err();
-        if decision.fault.is_none() {
-            self.faults = Faults::default();
-        } else {
-            self.faults.add(decision.at_ns);
-            if self.faults.in_a_row == FAULTS_IN_A_ROW {
-                self.session.note(RESTS);
-            }
+        if let Some(note) = self.faults.end(decision.at_ns, decision.fault.is_some()) {
+            self.session.note(note);
         }
         decision
     }
@@ -151,6 +103,7 @@ fn cause(wake: &Wake) -> Decision {
 mod tests {
     use gleaner_lambda::manifest::Limits;
     use gleaner_lambda::{Fault, FaultKind};
+    use gleaner_rules::faults::{MADE_ANEW, RESTS};
 
     use super::*;
     use crate::api::data::Tick;
@@ -211,21 +164,6 @@ mod tests {
         assert_eq!(session.passed_over(), 200 - 12);
         // The longest rest is 10 s.
         assert_eq!(runs(&mut judge, 2000, 60_000), [3170, 6370, 12_770, 22_770, 32_770, 42_770, 52_770]);
-    }
-
-    #[test]
-    fn a_good_wake_ends_the_rest_and_the_count() {
-        let (mut judge, session) = room(100 * MS);
-        assert_eq!(runs(&mut judge, 0, 250), [0, 10, 20, 30, 40, 50, 60, 70, 170, 180, 190, 200, 210, 220, 230, 240]);
-        assert_eq!(session.passed_over(), 9);
-    }
-
-    #[test]
-    fn a_clock_that_went_back_ends_a_rest() {
-        let (mut judge, _) = room(i64::MAX);
-        runs(&mut judge, 1000, 1080);
-        assert!(judge.passes_over(&tick(1100 * MS)));
-        assert!(!judge.passes_over(&tick(900 * MS)));
     }
 
     #[test]

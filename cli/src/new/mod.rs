@@ -20,6 +20,11 @@ const PACKED: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/packed.rs")
 
 /// Where the SDK is.
 const SDK: &str = ".gleaner";
+/// What takes the place of a `Cargo.toml` of the repository in it.
+const PACKAGES: [(&str, &str); 2] = [
+    ("guest-sdk-rust/Cargo.toml", include_str!("files/sdk.toml")),
+    ("rules/Cargo.toml", include_str!("files/rules.toml")),
+];
 /// Names that mean something to cargo or to Rust: keywords, and crates that are there already.
 const NO_CRATES: &[&str] = &[
     "abstract",
@@ -44,6 +49,7 @@ const NO_CRATES: &[&str] = &[
     "fn",
     "for",
     "gen",
+    "gleaner-rules",
     "gleaner-sdk",
     "if",
     "impl",
@@ -215,17 +221,19 @@ fn update(dir: &Path) -> Result<(), Failure> {
 }
 
 fn unpack_sdk(to: &Path, kind: Kind) -> Result<(), NewError> {
-    let (parts, package): (&[&str], _) = match kind {
-        Kind::Wasm => (&["guest-sdk-rust", "wit"], Some(include_str!("files/sdk.toml").replace("VERSION", VERSION))),
-        Kind::Python => (&["guest-sdk-python", "wit"], None),
+    let (parts, packages): (&[&str], &[(&str, &str)]) = match kind {
+        Kind::Wasm => (&["guest-sdk-rust", "rules", "wit"], &PACKAGES),
+        Kind::Python => (&["guest-sdk-python", "wit"], &[]),
     };
     for part in parts {
         for (path, bytes) in below(part) {
             write(to, &Path::new(part).join(path), bytes)?;
         }
     }
-    copy("LICENSE", to)?;
-    package.map_or(Ok(()), |package| write(to, Path::new("guest-sdk-rust/Cargo.toml"), package.as_bytes()))
+    for (path, text) in packages {
+        write(to, Path::new(path), text.replace("VERSION", VERSION).as_bytes())?;
+    }
+    copy("LICENSE", to)
 }
 
 /// A packed file, into a folder.

@@ -92,7 +92,7 @@ fn a_folder_needs_a_name_that_a_lambda_can_have() {
     }
     assert_eq!(name_of(Path::new("some/where/pot-hole/")).unwrap().as_str(), "pot-hole");
     let scratch = Scratch::new("names");
-    for name in ["test", "gleaner-sdk", "type"] {
+    for name in ["test", "gleaner-rules", "gleaner-sdk", "type"] {
         let made = make(&scratch.0.join(name), &name.parse().unwrap(), Kind::Wasm);
         assert!(matches!(made, Err(NewError::CrateName { .. })), "{name}");
     }
@@ -110,7 +110,7 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
     let targets = |table: &Table| table["target"].as_table().unwrap().keys().cloned().collect::<Vec<_>>();
     assert_eq!((targets(&packed), targets(&packed).len()), (targets(&ours), 2));
     let dependencies = |table: &Table| {
-        let mut all = table["dependencies"].as_table().unwrap().clone();
+        let mut all = table.get("dependencies").and_then(Value::as_table).cloned().unwrap_or_default();
         for target in table.get("target").and_then(Value::as_table).into_iter().flat_map(Table::values) {
             all.extend(target["dependencies"].as_table().unwrap().clone());
         }
@@ -118,12 +118,15 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
     };
     let names = |table: &Table| dependencies(table).keys().cloned().collect::<Vec<_>>();
     assert_eq!(names(&packed), names(&ours));
-    assert_eq!(names(&packed), ["rustfft", "toml", "wit-bindgen"]);
+    assert_eq!(names(&packed), ["gleaner-rules", "rustfft", "toml", "wit-bindgen"]);
     for name in names(&packed) {
         let plain = |table: &Table| {
             let mut value = dependencies(table)[&name].clone();
             if let Some(table) = value.as_table_mut() {
                 table.remove("optional");
+                // The folder lies beside that of the SDK, as it does here.
+                let path = table.get("path").and_then(Value::as_str).map(|path| path.trim_start_matches("../").into());
+                path.map(|path| table.insert("path".to_owned(), path));
             }
             value
         };
@@ -134,7 +137,9 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
     for key in ["edition", "rust-version"] {
         assert_eq!(lambda["package"][key], package[key], "{key}");
     }
+    let rules = include_str!("files/rules.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
     for key in ["version", "edition", "rust-version", "license"] {
-        assert_eq!(packed["package"][key], package[key], "{key}");
+        assert_eq!((&packed["package"][key], &rules["package"][key]), (&package[key], &package[key]), "{key}");
     }
+    assert_eq!(names(&rules), names(&read("rules/Cargo.toml")));
 }

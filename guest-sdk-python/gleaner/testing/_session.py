@@ -159,7 +159,7 @@ class Scratch:
     def _there(self, name: str) -> bytes:
         _must_be_text(name)
         if name not in self._entries:
-            raise ScratchError(f"scratch has no `{name}`; it is empty when the lambda's process starts", "no-such-entry")
+            raise ScratchError(f"scratch has no `{_visible(name[:NAME_BYTES])}`; it is empty when the lambda's process starts", "no-such-entry")
         return self._entries[name]
 
     def entries(self) -> List[Entry]:

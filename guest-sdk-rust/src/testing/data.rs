@@ -2,31 +2,20 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use gleaner_rules::clamps::{self, Length, WrongField};
+pub use gleaner_rules::schedule::Tick;
+use gleaner_rules::{refused, ring};
+
 pub(crate) use super::frame::Frame;
 use super::frame::Images;
-use super::log::cut;
 use super::manifest::{Input, Limits};
 use super::message::{ENCAPSULATION, Message};
 use super::path::{Found, Missing, Path, known};
-use super::piece;
 use super::ring::{Cell, Ring};
 use super::session::{Handle, Handles, current};
 use super::types::{Column, Counts, DataError, Identity, Stamps, Value};
 
-const SAMPLES_PER_CALL: usize = 256;
-const TEXTS_PER_FIELD: usize = 4096;
-const PATH_BYTES: usize = 1024;
-
 type Answer<T> = Result<T, DataError>;
-
-/// A periodic wake.
-#[derive(Clone, Copy, Debug)]
-pub struct Tick {
-    /// When it was due.
-    pub at_ns: i64,
-    /// Ticks that were due since the previous wake and did not happen.
-    pub missed: u64,
-}
 
 /// Why the lambda runs.
 pub enum Wake {
@@ -41,9 +30,8 @@ pub(crate) fn input(name: &str) -> Answer<Topic> {
     session.passed(name.len());
     let found = session.inputs.iter().find(|source| source.declared.name == name);
     let source = found.cloned().ok_or_else(|| {
-        let asked = name.chars().take(64).collect::<String>();
         let names = session.inputs.iter().map(|source| source.declared.name.as_str());
-        DataError::NoSuchInput(format!("no input `{asked}`; the manifest has {}", super::error::quoted(names)))
+        DataError::NoSuchInput(refused::no_such_input(name, names))
     })?;
     let handle = source.handles.hand_out();
     Ok(Topic { source, _handle: handle })
@@ -83,7 +71,7 @@ impl Source {
         images: Images,
         blank: Option<Message>,
     ) -> Arc<Self> {
-        let ring = Ring::new(declared.depth, declared.hold);
+        let ring = Ring::new(declared.depth, declared.hold, declared.max_size);
         let state = Mutex::new(Arrived { ring, skipped: 0, seq: 0 });
         Arc::new(Self { declared, limits, handles, images, blank, state })
     }
@@ -93,8 +81,8 @@ impl Source {
     }
 
     pub(super) fn counts(&self) -> Counts {
-        let Arrived { ring, skipped, .. } = &*self.lock();
-        let (received, overwritten, no_slot, too_big) = (ring.head, ring.overwritten, ring.no_slot, ring.too_big);
+        let Arrived { ring: arrived, skipped, .. } = &*self.lock();
+        let ring::Counts { received, overwritten, no_slot, too_big } = arrived.counts();
         Counts { received, lost: None, overwritten, no_slot, too_big, skipped: *skipped }
     }
 
@@ -103,8 +91,7 @@ impl Source {
     }
 
     fn malformed(&self, why: &str) -> DataError {
-        let Input { topic, type_name, .. } = &self.declared;
-        DataError::Malformed(format!("a sample of `{topic}` contradicts its type `{type_name}`: {why}"))
+        DataError::Malformed(refused::malformed(&self.declared.topic, &self.declared.type_name, why))
     }
 
     fn find<'a>(&self, path: &Path, message: &'a Message) -> Answer<Found<'a>> {
@@ -120,18 +107,16 @@ impl Source {
     }
 
     fn number(&self, path: &Path, cell: &Cell) -> Answer<f64> {
-        let found = self.find(path, &cell.arrival.message)?;
-        found.number().ok_or_else(|| {
-            DataError::WrongField(format!("field `{}` of `{}` is no number", path.text, self.declared.type_name))
-        })
+        let found = self.find(path, &cell.sample.message)?;
+        found.number().ok_or_else(|| WrongField::no_number(&path.text, &self.declared.type_name).into())
     }
 
     pub(super) fn identity(&self, cell: &Cell) -> Identity {
-        Identity { topic: self.declared.topic.clone(), writer: cell.arrival.writer, seq: cell.arrival.seq }
+        Identity { topic: self.declared.topic.clone(), writer: cell.sample.writer, seq: cell.sample.seq }
     }
 
     pub(super) fn stamps(&self, cell: &Cell) -> Stamps {
-        let arrival = &cell.arrival;
+        let arrival = &cell.sample;
         Stamps { at_ns: arrival.at_ns, publish_ns: arrival.publish_ns, header_ns: arrival.message.header_ns() }
     }
 }
@@ -183,7 +168,7 @@ impl Topic {
     }
 
     fn samples(&self, most: usize, since_ns: i64, all: bool) -> Vec<Sample> {
-        let most = most.min(self.source.limits.call_items).min(SAMPLES_PER_CALL);
+        let most = most.min(self.source.limits.per_call.samples());
         let cells = self.source.lock().ring.newest_while(most, |arrival| all || arrival.at_ns > since_ns);
         cells.into_iter().map(|cell| self.source.sample(cell)).collect()
     }
@@ -193,11 +178,8 @@ impl Topic {
     }
 
     pub(crate) fn field(&self, path: &str) -> Answer<Field> {
-        if path.len() > PATH_BYTES {
-            let why = format!("has {} bytes; a path has {PATH_BYTES} at most", path.len());
-            return Err(DataError::WrongField(format!("field `{}` {why}", cut(path, 64))));
-        }
-        let path = Path::new(path).map_err(DataError::NoSuchField)?;
+        clamps::path(path)?;
+        let path = Path::new(path).map_err(|malformed| DataError::NoSuchField(malformed.to_string()))?;
         if let Some(blank) = &self.source.blank
             && let Err(Missing::Field(known)) = path.find(&blank.fields)
         {
@@ -219,9 +201,10 @@ impl Topic {
     fn read_column(&self, field: &Field, most: usize, keep: impl Fn(i64) -> bool) -> Answer<Column> {
         let source = &self.source;
         let path = field.of(source)?;
-        let cells = source.lock().ring.newest_while(most.min(source.limits.call_items), |arrival| keep(arrival.at_ns));
+        let most = most.min(source.limits.per_call.items);
+        let cells = source.lock().ring.newest_while(most, |arrival| keep(arrival.at_ns));
         let values = cells.iter().map(|cell| source.number(path, cell)).collect::<Answer<_>>()?;
-        Ok(Column { at_ns: cells.iter().map(|cell| cell.arrival.at_ns).collect(), values })
+        Ok(Column { at_ns: cells.iter().map(|cell| cell.sample.at_ns).collect(), values })
     }
 }
 
@@ -234,9 +217,7 @@ impl Field {
         if Arc::ptr_eq(&self.source, source) {
             return Ok(&self.path);
         }
-        let (belongs, asked) = (&self.source.declared.name, &source.declared.name);
-        let path = &self.path.text;
-        Err(DataError::WrongField(format!("field `{path}` belongs to input `{belongs}`, not to `{asked}`")))
+        Err(WrongField::elsewhere(&self.path.text, &self.source.declared.name, &source.declared.name).into())
     }
 }
 
@@ -251,19 +232,15 @@ impl Sample {
 
     pub(crate) fn get(&self, field: &Field) -> Answer<Value> {
         let path = field.of(&self.source)?;
-        let found = self.source.find(path, &self.cell.arrival.message)?;
-        let limits = &self.source.limits;
-        let (len, most) = match found.value() {
-            Value::Text(text) => (text.len(), limits.call_bytes),
-            Value::Bytes(bytes) => (bytes.len(), limits.call_bytes),
-            Value::Numbers(numbers) => (numbers.len(), limits.call_items),
-            Value::Texts(texts) => (texts.len(), limits.call_items.min(TEXTS_PER_FIELD)),
-            Value::Boolean(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => (0, 0),
+        let found = self.source.find(path, &self.cell.sample.message)?;
+        let length = match found.value() {
+            Value::Text(text) => Length::Text(text.len()),
+            Value::Bytes(bytes) => Length::Bytes(bytes.len()),
+            Value::Numbers(numbers) => Length::Numbers(numbers.len()),
+            Value::Texts(texts) => Length::Texts(texts.len()),
+            Value::Boolean(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => Length::One,
         };
-        if len > most {
-            let why = format!("has {len} items, one call hands out {most}; read it with `cdr`");
-            return Err(DataError::WrongField(format!("field `{}` {why}", path.text)));
-        }
+        self.source.limits.per_call.value(&path.text, length)?;
         Ok(found.value().clone())
     }
 
@@ -280,7 +257,8 @@ impl Sample {
     }
 
     pub(crate) fn cdr(&self, offset: u64, len: u32) -> Vec<u8> {
-        piece(self.bytes(), offset, (len as usize).min(self.source.limits.call_bytes)).to_vec()
+        let bytes = self.bytes();
+        bytes[self.source.limits.per_call.piece(bytes.len(), offset, len)].to_vec()
     }
 
     pub(crate) fn as_frame(&self) -> Answer<Frame> {
@@ -297,7 +275,7 @@ impl Sample {
     ///
     /// If the test gave none: there is no honest answer, and no refusal in the interface.
     fn encapsulated(&self) -> &[u8] {
-        self.cell.arrival.message.cdr.as_deref().unwrap_or_else(|| {
+        self.cell.sample.message.cdr.as_deref().unwrap_or_else(|| {
             let topic = &self.source.declared.topic;
             panic!("a message that the test gave to `{topic}` has no bytes; give them with `Message::cdr`")
         })
@@ -305,7 +283,7 @@ impl Sample {
 
     /// A field of an image.
     pub(super) fn need<'a>(&'a self, path: &str) -> Answer<&'a Value> {
-        let fields = &self.cell.arrival.message.fields;
+        let fields = &self.cell.sample.message.fields;
         let why = || format!("it has no `{path}`{}; make it with `Message::image`", known(path, fields));
         fields.get(path).ok_or_else(|| self.source.malformed(&why()))
     }

@@ -1,6 +1,6 @@
 //! What came of a wake.
 
-pub use super::trigger::AttributeValue;
+pub use gleaner_rules::triggers::{AttributeValue, Kind as TriggerKind};
 
 /// The outcome of one wake: what a line of `decisions.jsonl` says of it, but for the digits of the writer, fuel and time.
 #[derive(Clone, Debug, PartialEq)]
@@ -50,17 +50,6 @@ impl Trigger {
     pub fn attribute(&self, key: &str) -> Option<&AttributeValue> {
         self.attributes.iter().find(|(given, _)| given == key).map(|(_, value)| value)
     }
-}
-
-/// What a trigger asks of the recorder.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TriggerKind {
-    /// Keep the time around this wake.
-    Event,
-    /// Begin a recording that lasts until `Stop`.
-    Start,
-    /// End the recording that `Start` began.
-    Stop,
 }
 
 /// Why a wake ended early.

@@ -38,12 +38,6 @@ impl fmt::Debug for Error {
 
 impl std::error::Error for Error {}
 
-/// A list for a message.
-pub(super) fn quoted<'a>(names: impl IntoIterator<Item = &'a str>) -> String {
-    let listed = names.into_iter().map(|name| format!("`{name}`")).collect::<Vec<_>>();
-    if listed.is_empty() { "none".to_owned() } else { listed.join(", ") }
-}
-
 /// The one of `known` that `word` was most likely meant to be.
 pub(super) fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     // The distance takes time in proportion to both lengths, and nobody misspells a name with a page of text.

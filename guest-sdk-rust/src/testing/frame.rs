@@ -2,61 +2,24 @@
 
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
+use gleaner_rules::frames::{Budget, NoRoom, Taken};
+use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
+use gleaner_rules::pixels::{self as rules, Bayer, PixelError, View, ops};
+use gleaner_rules::refused;
+
 use super::data::{Sample, Source};
-use super::manifest::{Input, Limits};
+use super::manifest::Input;
 use super::message::Picture;
-use super::piece;
-use super::pixels::{PixelError, View, encoding_of};
 use super::ring::Cell;
 use super::session::Handle;
 use super::types::{DataError, Encoding, FrameInfo, Identity, Roi, Stamps, Value};
-use crate::data::bytes_per_pixel;
+use crate::data::{bytes_per_pixel, encoding_name};
 
 type Answer<T> = Result<T, DataError>;
 
-/// Frames that a lambda may hold at a time, of all inputs, and bytes of those that it made.
-pub(super) struct Budget {
-    frames_allowed: usize,
-    left: Mutex<(usize, usize)>,
-}
-
-/// A frame that is held, and what it takes; given back when it is dropped.
-struct Taken {
-    budget: Arc<Budget>,
-    bytes: usize,
-}
-
-impl Budget {
-    pub(super) fn new(limits: &Limits) -> Arc<Self> {
-        Arc::new(Self { frames_allowed: limits.frames, left: Mutex::new((limits.frames, limits.memory)) })
-    }
-
-    fn take(self: &Arc<Self>, bytes: usize) -> Answer<Taken> {
-        let (frames, left) = &mut *self.left.lock().unwrap_or_else(PoisonError::into_inner);
-        let way_out = |limit: &str| format!("drop frames that are not needed, or raise `{limit}` in [limits]");
-        if *frames == 0 {
-            let held = self.frames_allowed;
-            return Err(DataError::NoRoom(format!("the lambda holds {held} frames; {}", way_out("frames"))));
-        }
-        if bytes > *left {
-            let why = format!("{bytes} bytes for a new frame, {left} are left; {}", way_out("memory"));
-            return Err(DataError::NoRoom(why));
-        }
-        (*frames, *left) = (*frames - 1, *left - bytes);
-        Ok(Taken { budget: Arc::clone(self), bytes })
-    }
-}
-
-impl Drop for Taken {
-    fn drop(&mut self) {
-        let (frames, left) = &mut *self.budget.left.lock().unwrap_or_else(PoisonError::into_inner);
-        (*frames, *left) = (*frames + 1, *left + self.bytes);
-    }
-}
-
 /// Room for the images of one input.
 pub(super) struct Images {
-    budget: Arc<Budget>,
+    budget: Budget,
     slots: usize,
     slot_bytes: u64,
     decoded: Mutex<Decoded>,
@@ -73,7 +36,7 @@ struct Decoded {
 struct Slot(Arc<[u8]>);
 
 impl Images {
-    pub(super) fn new(declared: &Input, budget: Arc<Budget>) -> Self {
+    pub(super) fn new(declared: &Input, budget: Budget) -> Self {
         let (slots, slot_bytes) = (declared.hold + 1, declared.decoded_size);
         Self { budget, slots, slot_bytes, decoded: Mutex::default() }
     }
@@ -89,15 +52,12 @@ impl Images {
         let needed = 3 * u64::from(width) * u64::from(height);
         if needed > self.slot_bytes {
             let allowed = self.slot_bytes;
-            return Err(DataError::NoRoom(format!(
-                "an image of `{topic}` is too large: image says it is {width}x{height} ({needed} bytes as rgb8); this input's \
-                 decoded_size is {allowed} bytes"
-            )));
+            let why = refused::too_many_pixels((width, height), needed, allowed);
+            return Err(DataError::NoRoom(refused::too_large(topic, why)));
         }
         decoded.held.retain(|slot| slot.strong_count() > 0);
         if decoded.held.len() >= self.slots {
-            let way_out = format!("drop frames that are not needed, or raise `hold` of input `{}`", declared.name);
-            return Err(DataError::NoRoom(format!("every slot for decoded images of `{topic}` is held; {way_out}")));
+            return Err(DataError::NoRoom(refused::no_slot(topic, &declared.name)));
         }
         let slot = Arc::new(Slot(Arc::clone(&picture.data)));
         decoded.held.push(Arc::downgrade(&slot));
@@ -129,11 +89,10 @@ impl Frame {
         let source = Arc::clone(&sample.source);
         let Input { topic, type_name, .. } = &source.declared;
         let is_compressed = match type_name.as_str() {
-            "sensor_msgs/msg/Image" => false,
-            "sensor_msgs/msg/CompressedImage" => true,
+            IMAGE => false,
+            COMPRESSED_IMAGE => true,
             _ => {
-                let why = format!("a sample of `{topic}` is no image: its type is `{type_name}`");
-                return Err(DataError::NotAFrame(why));
+                return Err(DataError::NotAFrame(refused::no_image_type(topic, type_name)));
             }
         };
         let taken = source.images.budget.take(0)?;
@@ -167,47 +126,50 @@ impl Frame {
     }
 
     pub(crate) fn mean_luma(&self, roi: Option<Roi>) -> Answer<f64> {
-        self.view()?.mean_luma(roi).map_err(|error| self.refused(error))
+        ops::mean_luma(&self.view()?, roi.map(region)).map_err(|error| self.refused(error))
     }
 
     pub(crate) fn histogram(&self, roi: Option<Roi>) -> Answer<Vec<u32>> {
-        self.view()?.histogram(roi).map_err(|error| self.refused(error))
+        ops::histogram(&self.view()?, roi.map(region)).map(Vec::from).map_err(|error| self.refused(error))
     }
 
     pub(crate) fn resize(&self, width: u32, height: u32) -> Answer<Self> {
         let view = self.view()?;
-        let encoding = view.resized(width, height).map_err(|error| self.refused(error))?;
-        self.made((width, height), encoding, || view.resize(width, height))
+        let (encoding, _) = ops::resized(&view, width, height).map_err(|error| self.refused(error))?;
+        self.made((width, height), encoding, |out| ops::resize(&view, width, height, out).map(drop))
     }
 
     pub(crate) fn to_gray(&self) -> Answer<Self> {
         let view = self.view()?;
-        self.made((self.info.width, self.info.height), Encoding::Mono8, || view.to_gray())
+        self.made((self.info.width, self.info.height), rules::Encoding::Mono8, |out| ops::to_gray(&view, out))
     }
 
     /// Room is taken before anything is made.
     fn made(
         &self,
         (width, height): (u32, u32),
-        encoding: Encoding,
-        make: impl FnOnce() -> Result<Vec<u8>, PixelError>,
+        encoding: rules::Encoding,
+        fill: impl FnOnce(&mut [u8]) -> Result<(), PixelError>,
     ) -> Answer<Self> {
-        let info = tight(width, height, encoding);
+        let info = tight(width, height, of_rules(encoding));
         let taken = self.source.images.budget.take(info.size as usize)?;
-        let pixels = Pixels::Made(make().map_err(|error| self.refused(error))?);
+        let mut pixels = vec![0; info.size as usize];
+        fill(&mut pixels).map_err(|error| self.refused(error))?;
+        let pixels = Pixels::Made(pixels);
         let about = (Arc::clone(&self.source), self.identity(), self.stamps);
         Ok(Self::new(about, info, pixels, taken))
     }
 
     pub(crate) fn read(&self, offset: u64, len: u32) -> Vec<u8> {
-        piece(self.bytes(), offset, (len as usize).min(self.source.limits.call_bytes)).to_vec()
+        let bytes = self.bytes();
+        bytes[self.source.limits.per_call.piece(bytes.len(), offset, len)].to_vec()
     }
 
     fn bytes(&self) -> &[u8] {
         let whole: &[u8] = match &self.pixels {
             Pixels::Made(bytes) => bytes,
             Pixels::Decoded(slot) => &slot.0,
-            Pixels::Message(cell) => match cell.arrival.message.fields.get("data") {
+            Pixels::Message(cell) => match cell.sample.message.fields.get("data") {
                 Some(Value::Bytes(bytes)) => bytes,
                 _ => &[],
             },
@@ -217,20 +179,54 @@ impl Frame {
 
     fn view(&self) -> Answer<View<'_>> {
         let FrameInfo { width, height, encoding, step, big_endian, .. } = self.info;
-        View::new((width, height), encoding, step, big_endian, self.bytes()).map_err(|error| self.refused(error))
+        View::new(width, height, step, by_rules(encoding), big_endian, self.bytes())
+            .map_err(|error| self.refused(error))
     }
 
     fn refused(&self, error: PixelError) -> DataError {
-        refused(&self.identity.topic, error)
+        refuse(&self.identity.topic, error)
     }
 }
 
-fn refused(topic: &str, error: PixelError) -> DataError {
-    match error {
-        PixelError::OutOfRange(why) => DataError::OutOfRange(why),
-        PixelError::NotAFrame(why) => {
-            DataError::NotAFrame(format!("a sample of `{topic}` is no image that can be read: {why}"))
-        }
+fn refuse(topic: &str, error: PixelError) -> DataError {
+    match error.is_out_of_range() {
+        true => DataError::OutOfRange(error.to_string()),
+        false => DataError::NotAFrame(refused::not_a_frame(topic, error)),
+    }
+}
+
+impl From<NoRoom> for DataError {
+    fn from(no_room: NoRoom) -> Self {
+        Self::NoRoom(no_room.to_string())
+    }
+}
+
+fn region(Roi { x, y, width, height }: Roi) -> rules::Roi {
+    rules::Roi { x, y, width, height }
+}
+
+fn by_rules(encoding: Encoding) -> rules::Encoding {
+    rules::Encoding::from_ros(encoding_name(encoding)).expect("ROS has each of these names")
+}
+
+fn of_rules(encoding: rules::Encoding) -> Encoding {
+    match encoding {
+        rules::Encoding::Rgb8 => Encoding::Rgb8,
+        rules::Encoding::Bgr8 => Encoding::Bgr8,
+        rules::Encoding::Rgba8 => Encoding::Rgba8,
+        rules::Encoding::Bgra8 => Encoding::Bgra8,
+        rules::Encoding::Mono8 => Encoding::Mono8,
+        rules::Encoding::Mono16 => Encoding::Mono16,
+        rules::Encoding::Yuv422Uyvy => Encoding::Yuv422,
+        rules::Encoding::Yuv422Yuyv => Encoding::Yuv422Yuy2,
+        rules::Encoding::Bayer8(Bayer::Rggb) => Encoding::BayerRggb8,
+        rules::Encoding::Bayer8(Bayer::Bggr) => Encoding::BayerBggr8,
+        rules::Encoding::Bayer8(Bayer::Gbrg) => Encoding::BayerGbrg8,
+        rules::Encoding::Bayer8(Bayer::Grbg) => Encoding::BayerGrbg8,
+        rules::Encoding::Bayer16(Bayer::Rggb) => Encoding::BayerRggb16,
+        rules::Encoding::Bayer16(Bayer::Bggr) => Encoding::BayerBggr16,
+        rules::Encoding::Bayer16(Bayer::Gbrg) => Encoding::BayerGbrg16,
+        rules::Encoding::Bayer16(Bayer::Grbg) => Encoding::BayerGrbg16,
     }
 }
 
@@ -253,20 +249,21 @@ fn raw(sample: &Sample) -> Answer<FrameInfo> {
     };
     let Value::Text(encoding) = sample.need("encoding")? else { return Err(sample.wrong_sort("encoding")) };
     let Value::Bytes(data) = sample.need("data")? else { return Err(sample.wrong_sort("data")) };
-    let (size, step, big_endian) =
-        ((number("width")?, number("height")?), number("step")?, number("is_bigendian")? != 0);
-    let view = encoding_of(encoding).and_then(|encoding| View::new(size, encoding, step, big_endian, data));
-    let view = view.map_err(|error| refused(&sample.source.declared.topic, error))?;
-    let (width, height, encoding, size) = (view.width, view.height, view.encoding, view.data.len() as u64);
+    let (width, height) = (number("width")?, number("height")?);
+    let (step, big_endian) = (number("step")?, number("is_bigendian")? != 0);
+    let view = rules::Encoding::from_ros(encoding)
+        .and_then(|encoding| View::new(width, height, step, encoding, big_endian, data))
+        .map_err(|error| refuse(&sample.source.declared.topic, error))?;
+    let (encoding, size) = (of_rules(view.encoding()), view.bytes().len() as u64);
     Ok(FrameInfo { width, height, encoding, step, big_endian, size })
 }
 
 /// The pixels that stand for a JPEG or PNG.
 fn decoded(sample: &Sample) -> Answer<(FrameInfo, Pixels)> {
     let source = &sample.source;
-    let Some(picture) = &sample.cell.arrival.message.picture else {
-        let why = "nobody here decodes JPEG or PNG; make the message with `Message::image`, of the pixels".to_owned();
-        return Err(refused(&source.declared.topic, PixelError::NotAFrame(why)));
+    let Some(picture) = &sample.cell.sample.message.picture else {
+        let why = "nobody here decodes JPEG or PNG; make the message with `Message::image`, of the pixels";
+        return Err(DataError::NotAFrame(refused::not_a_frame(&source.declared.topic, why)));
     };
     let slot = source.images.slot(&source.declared, sample.cell.position, picture)?;
     Ok((tight(picture.width, picture.height, picture.encoding), Pixels::Decoded(slot)))

@@ -2,13 +2,18 @@
 
 use std::sync::Arc;
 
+use gleaner_rules::frames::Budget;
+use gleaner_rules::names::IMAGE;
+use gleaner_rules::schedule::Backlog;
+use gleaner_rules::text::quoted;
+
 use super::data::Source;
-use super::error::{Error, quoted};
-use super::frame::{Budget, Images};
-use super::manifest::{self, IMAGE, Manifest, When};
+use super::error::Error;
+use super::frame::Images;
+use super::manifest::{self, Manifest, When};
 use super::message::Message;
 use super::run::Run;
-use super::schedule::{Periodic, Schedule};
+use super::schedule::{Input, Schedule};
 use super::session::{Handles, Session};
 use crate::bindings::ConfigValue;
 use crate::{Config, Lambda};
@@ -55,10 +60,10 @@ impl Host {
         let inputs = self.inputs(&manifest, &handles)?;
         let session = Session::new(manifest.limits, inputs);
         let schedule = match &manifest.schedule {
-            When::Period(period_ns) => Schedule::Periodic(Periodic::new(*period_ns)),
+            When::Period(period_ns) => Schedule::periodic(*period_ns),
             When::Event(name) => {
                 let woken_by = session.inputs.iter().find(|source| source.declared.name == *name);
-                Schedule::Event { source: Arc::clone(woken_by.expect("the manifest was checked")), next: 0 }
+                Schedule::event(Input(Arc::clone(woken_by.expect("the manifest was checked"))), Backlog::Each)
             }
         };
         Run::start(&manifest.name, config, session, schedule)
@@ -70,7 +75,7 @@ impl Host {
             let help = format!("the manifest has {}", quoted(names()));
             return Err(Error::new(format!("no input `{asked}` for a blank message"), "", help));
         }
-        let budget = Budget::new(&manifest.limits);
+        let budget = Budget::new(manifest.limits.frames, manifest.limits.memory);
         let source = |declared: &manifest::Input| {
             let blank = self.blanks.iter().rev().find(|(name, _)| *name == declared.name);
             let blank = blank.map(|(_, message)| {
@@ -80,7 +85,7 @@ impl Host {
                 }
                 message
             });
-            let images = Images::new(declared, Arc::clone(&budget));
+            let images = Images::new(declared, budget.clone());
             Source::new(declared.clone(), manifest.limits, Arc::clone(handles), images, blank)
         };
         Ok(manifest.inputs.iter().map(source).collect())

@@ -2,9 +2,12 @@
 
 use std::collections::BTreeSet;
 
+use gleaner_rules::clamps::PerCall;
+use gleaner_rules::names::{self, COMPRESSED_IMAGE};
+use gleaner_rules::text::quoted;
 use toml::Value;
 
-use super::error::{Error, nearest, quoted};
+use super::error::{Error, nearest};
 use super::table::{Bounds, Table};
 use crate::bindings::{ConfigEntry, ConfigValue};
 
@@ -14,9 +17,6 @@ const KIB: u64 = 1 << 10;
 const MIB: u64 = 1 << 20;
 const MS: u64 = 1_000_000;
 const SECOND: u64 = 1_000_000_000;
-
-pub(super) const IMAGE: &str = "sensor_msgs/msg/Image";
-pub(super) const COMPRESSED_IMAGE: &str = "sensor_msgs/msg/CompressedImage";
 
 /// One `[[input]]`.
 #[derive(Clone, Debug)]
@@ -38,8 +38,7 @@ pub(super) struct Limits {
     pub(super) memory: usize,
     pub(super) handles: u64,
     pub(super) frames: usize,
-    pub(super) call_bytes: usize,
-    pub(super) call_items: usize,
+    pub(super) per_call: PerCall,
     pub(super) scratch: u64,
     pub(super) log_lines: u64,
     pub(super) log_bytes: u64,
@@ -95,7 +94,7 @@ pub(super) fn read(text: &str) -> Result<Manifest> {
         Table::new("[record]", value, &known)?;
     }
     Ok(Manifest {
-        name: lambda.text("name", "name = \"brake-dark\"", |text| is_name(text, b"-"))?,
+        name: lambda.text("name", "name = \"brake-dark\"", names::is_lambda)?,
         schedule: schedule(&root, &inputs)?,
         inputs,
         limits: limits(&root)?,
@@ -136,17 +135,16 @@ fn schedule(root: &Table, inputs: &[Input]) -> Result<When> {
 fn input(value: &Value) -> Result<Input> {
     let known = ["name", "topic", "type", "depth", "max_size", "decoded_size", "hold", "qos"];
     let table = Table::new("[[input]]", value, &known)?;
-    let type_name = table.text("type", "type = \"sensor_msgs/msg/Imu\"", is_type)?;
+    let type_name = table.text("type", "type = \"sensor_msgs/msg/Imu\"", names::is_type)?;
     let is_compressed = type_name == COMPRESSED_IMAGE;
-    let large = is_compressed || type_name == IMAGE || type_name == "sensor_msgs/msg/PointCloud2";
-    let (depth, hold, size) = if large { (4, 2, 8 * MIB) } else { (64, 8, 4 * KIB) };
+    let (depth, hold, size) = if names::is_large(&type_name) { (4, 2, 8 * MIB) } else { (64, 8, 4 * KIB) };
     if table.get("decoded_size").is_some() && !is_compressed {
         return Err(table.refusal(&format!("has a `decoded_size`, and {type_name} is not decoded"), "remove it"));
     }
     let decoded_size = table.size("decoded_size", (1, 8 * MIB, 256 * MIB))?;
     Ok(Input {
-        name: table.text("name", "name = \"camera\"", |text| is_name(text, b"_-"))?,
-        topic: table.text("topic", "topic = \"/camera/front\"", is_topic)?,
+        name: table.text("name", "name = \"camera\"", names::is_item)?,
+        topic: table.text("topic", "topic = \"/camera/front\"", names::is_topic)?,
         depth: table.integer("depth", (1, depth, 65_536))? as usize,
         hold: table.integer("hold", (1, hold, 1024))? as usize,
         max_size: table.size("max_size", (1, size, 256 * MIB))? as usize,
@@ -187,8 +185,10 @@ fn limits(root: &Table) -> Result<Limits> {
         memory: table.size("memory", (MIB, 64 * MIB, 1024 * MIB))? as usize,
         handles: table.integer("handles", (16, 4096, 65_536))?,
         frames: table.integer("frames", (1, 256, 4096))? as usize,
-        call_bytes: table.size("call_bytes", (64 * KIB, MIB, MIB))? as usize,
-        call_items: table.integer("call_items", (16, 65_536, 65_536))? as usize,
+        per_call: PerCall {
+            bytes: table.size("call_bytes", (64 * KIB, MIB, MIB))? as usize,
+            items: table.integer("call_items", (16, 65_536, 65_536))? as usize,
+        },
         scratch: table.size("scratch", (0, 0, 256 * MIB))?,
         log_lines: table.integer("log_lines", (1, 100, 10_000))?,
         log_bytes: table.size("log_bytes", (4 * KIB, 400 * KIB, 16 * MIB))?,
@@ -282,27 +282,4 @@ impl Manifest {
         };
         self.items.iter().map(|item| Ok(ConfigEntry { key: item.name.clone(), value: value(item)? })).collect()
     }
-}
-
-/// 1 to 63 characters, first a lower-case letter, then those, digits and `extra`.
-fn is_name(text: &str, extra: &[u8]) -> bool {
-    let rest = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
-    text.len() <= 63 && text.starts_with(|first: char| first.is_ascii_lowercase()) && text.bytes().all(rest)
-}
-
-fn is_topic(text: &str) -> bool {
-    let word = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'_';
-    let token = |part: &str| part.starts_with(|first: char| !first.is_ascii_digit()) && part.bytes().all(word);
-    text.len() <= 247 && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
-}
-
-fn is_type(text: &str) -> bool {
-    let word = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'_';
-    text.len() <= 255
-        && text.split_once("/msg/").is_some_and(|(package, name)| {
-            package.starts_with(|first: char| first.is_ascii_alphabetic())
-                && package.bytes().all(word)
-                && name.starts_with(|first: char| first.is_ascii_uppercase())
-                && name.bytes().all(|byte| byte.is_ascii_alphanumeric())
-        })
 }

@@ -44,8 +44,8 @@
 //!
 //! The lambda is the same source; only what it calls is another. The rules are those of the host: rings with `depth` and `hold`,
 //! schedules, columns, what is clamped and refused and in which words, operations on pixels to the last bit, limits of triggers,
-//! log, scratch, frames, handles and bytes of a call, faults and the lambda made anew after one, rests. This is the third writing of
-//! `host/src/api`, after the host's own and the one in Python; tests run one lambda on this and on the host.
+//! log, scratch, frames, handles and bytes of a call, faults and the lambda made anew after one, rests. Most of them are the host's
+//! own code, in `gleaner-rules`.
 //!
 //! Not here: fuel, time and memory, but for pixels of frames that are made; decoders of JPEG and PNG; definitions of messages, so
 //! that a message has the fields that the test gives; clips; models. `docs/rust.md` says what follows from that.
@@ -64,7 +64,6 @@ pub(crate) mod log;
 mod manifest;
 mod message;
 mod path;
-mod pixels;
 mod ring;
 mod run;
 mod schedule;
@@ -73,7 +72,6 @@ mod session;
 mod table;
 pub(crate) mod trigger;
 pub(crate) mod types;
-mod units;
 
 pub use decision::{AttributeValue, Cause, Decision, Fault, FaultKind, Trigger, TriggerKind};
 pub use error::Error;
@@ -81,9 +79,3 @@ pub use host::{Host, Setting};
 pub use log::Line;
 pub use message::{FieldValue, Message};
 pub use run::Run;
-
-/// `len` bytes of `whole` from `offset`, clamped to what there is.
-fn piece(whole: &[u8], offset: u64, len: usize) -> &[u8] {
-    let from = usize::try_from(offset).unwrap_or(usize::MAX).min(whole.len());
-    &whole[from..from + len.min(whole.len() - from)]
-}

@@ -2,11 +2,14 @@
 
 use std::sync::Arc;
 
+use gleaner_rules::faults::Faults;
+use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
+use gleaner_rules::text::quoted;
+
 use super::data::{Source, Tick};
 use super::decision::{Cause, Decision, Fault, Trigger};
-use super::error::{Error, quoted};
+use super::error::Error;
 use super::log::Line;
-use super::manifest::{COMPRESSED_IMAGE, IMAGE};
 use super::message::{ENCAPSULATION, Message};
 use super::path::known;
 use super::ring::{Arrival, Cell};
@@ -15,15 +18,6 @@ use super::session::{Session, attempt};
 use super::types::{Counts, Encoding, Guid, Value};
 use crate::data::Sample;
 use crate::{Config, Lambda};
-
-const FAULTS_IN_A_ROW: u32 = 8;
-const SHORTEST_REST_NS: i64 = 100_000_000;
-const LONGEST_REST_NS: i64 = 10_000_000_000;
-
-const MADE_ANEW: &str = "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone \
-                         (in Python, all but the globals of its module)";
-const RESTS: &str = "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and twice as \
-                     long after each further fault, 10 s at most, until a wake ends well";
 
 /// A lambda that was loaded, and all that came of it so far.
 ///
@@ -36,15 +30,7 @@ pub struct Run<L: Lambda> {
     lambda: Option<L>,
     now_ns: Option<i64>,
     decisions: Vec<Decision>,
-    faults: FaultsInARow,
-}
-
-#[derive(Default)]
-struct FaultsInARow {
-    count: u32,
-    rest_ns: i64,
-    /// From the wake that faulted last until the first that may run, without the latter.
-    rest: Option<(i64, i64)>,
+    faults: Faults,
 }
 
 /// Why the lambda runs.
@@ -55,7 +41,7 @@ enum Due {
 
 impl<L: Lambda> Run<L> {
     pub(super) fn start(name: &str, config: Config, session: Arc<Session>, schedule: Schedule) -> Result<Self, Error> {
-        let (lambda, now_ns, decisions, faults) = (None, None, Vec::new(), FaultsInARow::default());
+        let (lambda, now_ns, decisions, faults) = (None, None, Vec::new(), Faults::default());
         let mut run = Self { config, session, schedule, lambda, now_ns, decisions, faults };
         match run.init() {
             Ok(()) => Ok(run),
@@ -100,16 +86,12 @@ impl<L: Lambda> Run<L> {
         {
             let arrived = &mut *source.lock();
             arrived.seq = seq;
-            if message.bytes_at_least() > source.declared.max_size {
-                arrived.ring.too_big += 1;
-            } else {
-                let writer = Guid { high: u64::from(u32::from_be_bytes(*b"desk")) << 32, low: (number as u64) << 32 };
-                let publish_ns = message.publish_ns.unwrap_or(at_ns);
-                arrived.ring.push(Arrival { at_ns, publish_ns, writer, seq, message });
-            }
+            let writer = Guid { high: u64::from(u32::from_be_bytes(*b"desk")) << 32, low: (number as u64) << 32 };
+            let (publish_ns, bytes) = (message.publish_ns.unwrap_or(at_ns), message.bytes_at_least());
+            arrived.ring.push(Arrival { at_ns, publish_ns, writer, seq, message }, bytes);
         }
         while let Some((source, cell)) = self.schedule.next_event() {
-            self.wake(cell.arrival.at_ns, Due::Event(source, cell));
+            self.wake(cell.sample.at_ns, Due::Event(source, cell));
         }
         Ok(&self.decisions[decided..])
     }
@@ -162,12 +144,12 @@ impl<L: Lambda> Run<L> {
 
     /// Log lines dropped by the limits of a second.
     pub fn log_dropped(&self) -> u64 {
-        self.session.lock().log.dropped
+        self.session.lock().log.dropped()
     }
 
     /// Triggers refused by `events_per_minute`.
     pub fn triggers_refused(&self) -> u64 {
-        self.session.lock().rate.refused
+        self.session.lock().triggers.refused()
     }
 
     /// Wakes passed over since the lambda had faulted again and again.
@@ -208,21 +190,24 @@ impl<L: Lambda> Run<L> {
 
     /// From cause to decision. What a lambda triggers before it faults still counts.
     fn wake(&mut self, at_ns: i64, due: Due) {
-        if self.faults.rest.is_some_and(|(from, until)| (from..until).contains(&at_ns)) {
+        if self.faults.rests(at_ns) {
             self.session.lock().passed_over += 1;
             return;
         }
         let mut decision = cause(at_ns, &due);
         {
             let state = &mut *self.session.lock();
-            (state.now_ns, state.triggers) = (at_ns, Some(Vec::new()));
-            if self.faults.count > 0 {
-                state.log.note(at_ns, MADE_ANEW);
+            state.now_ns = at_ns;
+            state.triggers.begin();
+            if let Some(note) = self.faults.begin() {
+                state.log.note(at_ns, note);
             }
         }
         decision.fault = self.run(due).err();
-        decision.triggers = self.session.lock().triggers.take().unwrap_or_default();
-        self.count(at_ns, decision.fault.is_some());
+        decision.triggers = self.session.lock().triggers.end();
+        if let Some(note) = self.faults.end(at_ns, decision.fault.is_some()) {
+            self.session.lock().log.note(at_ns, note);
+        }
         self.decisions.push(decision);
     }
 
@@ -242,23 +227,6 @@ impl<L: Lambda> Run<L> {
             let _ = session.aside(|| dropped(&session, lambda));
         }
         ran
-    }
-
-    /// After so many faults in a row the lambda rests, for twice as long after each further one.
-    fn count(&mut self, at_ns: i64, faulted: bool) {
-        if !faulted {
-            self.faults = FaultsInARow::default();
-            return;
-        }
-        let faults = &mut self.faults;
-        faults.count = faults.count.saturating_add(1);
-        if faults.count >= FAULTS_IN_A_ROW {
-            faults.rest_ns = (2 * faults.rest_ns).clamp(SHORTEST_REST_NS, LONGEST_REST_NS);
-            faults.rest = Some((at_ns, at_ns.saturating_add(faults.rest_ns)));
-        }
-        if faults.count == FAULTS_IN_A_ROW {
-            self.session.lock().log.note(at_ns, RESTS);
-        }
     }
 }
 
@@ -286,7 +254,7 @@ fn cause(at_ns: i64, due: &Due) -> Decision {
             cause: Cause::Event,
             input: Some(source.declared.name.clone()),
             topic: Some(source.declared.topic.clone()),
-            seq: Some(cell.arrival.seq),
+            seq: Some(cell.sample.seq),
             triggers,
             fault,
         },

@@ -6,13 +6,16 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use gleaner_rules::log::line;
+use gleaner_rules::refused;
+use gleaner_rules::scratch::Scratch;
+use gleaner_rules::triggers::Triggers;
+use gleaner_rules::units::size_in_words;
+
 use super::data::Source;
 use super::decision::{Fault, FaultKind, Trigger};
-use super::log::{LINE_BYTES, Log, cut};
+use super::log::Log;
 use super::manifest::Limits;
-use super::scratch::Scratch;
-use super::trigger::Rate;
-use super::units::size_in_words;
 
 /// The session of a run: a lambda that is made anew finds it as it was.
 pub(crate) struct Session {
@@ -23,9 +26,7 @@ pub(crate) struct Session {
 
 pub(super) struct State {
     pub(super) now_ns: i64,
-    /// What the wake has caused; none outside of a wake, where nothing can be caused.
-    pub(super) triggers: Option<Vec<Trigger>>,
-    pub(super) rate: Rate,
+    pub(super) triggers: Triggers<Trigger>,
     pub(super) log: Log,
     pub(super) scratch: Scratch,
     pub(super) passed_over: u64,
@@ -33,8 +34,9 @@ pub(super) struct State {
 
 impl Session {
     pub(super) fn new(limits: Limits, inputs: Vec<Arc<Source>>) -> Arc<Self> {
-        let (rate, log, scratch) = (Rate::new(&limits), Log::new(&limits), Scratch::new(&limits));
-        let state = Mutex::new(State { now_ns: 0, triggers: None, rate, log, scratch, passed_over: 0 });
+        let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(&limits));
+        let scratch = Scratch::new(limits.scratch, limits.per_call.bytes);
+        let state = Mutex::new(State { now_ns: 0, triggers, log, scratch, passed_over: 0 });
         Arc::new(Self { limits, inputs, state })
     }
 
@@ -43,13 +45,9 @@ impl Session {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn limits(&self) -> &Limits {
-        &self.limits
-    }
-
     /// The lambda passes so many bytes in one call. More than `call_bytes` of `[limits]` end it, as they end a component.
     pub(super) fn passed(&self, bytes: usize) {
-        let allowed = self.limits.call_bytes;
+        let allowed = self.limits.per_call.bytes;
         if bytes > allowed {
             let what = "too much data is being copied between the host and the guest";
             let message = format!("{what}: at most {} in one call", size_in_words(allowed as u64));
@@ -59,9 +57,9 @@ impl Session {
 
     /// Runs an `init`, or drops a lambda: in the middle of a wake maybe, but no part of it. It can cause nothing.
     pub(super) fn aside<R>(&self, run: impl FnOnce() -> R) -> R {
-        let triggers = self.lock().triggers.take();
+        let triggers = self.lock().triggers.suspend();
         let result = run();
-        self.lock().triggers = triggers;
+        self.lock().triggers.resume(triggers);
         result
     }
 }
@@ -99,7 +97,7 @@ pub(super) fn attempt<R>(
     }
     let _back = Back(CURRENT.replace(Some(Arc::clone(session))));
     let plain = |kind, message: &str| {
-        let message = format!("{when}{}", cut(message, LINE_BYTES));
+        let message = format!("{when}{}", line(message));
         Fault { kind, message, used: None, allowed: None }
     };
     match catch_unwind(AssertUnwindSafe(call)) {
@@ -142,8 +140,7 @@ impl Handles {
         let handle = Handle(Arc::clone(self));
         let allowed = self.allowed;
         if held >= allowed {
-            let way_out = "drop samples, frames, fields and topics that are not needed";
-            let message = format!("the lambda holds {allowed} handles; {way_out}");
+            let message = refused::too_many_handles(allowed);
             drop(handle);
             end(Fault { kind: FaultKind::HostCall, message, used: Some(allowed + 1), allowed: Some(allowed) });
         }

@@ -1,9 +1,10 @@
 //! One table of a `lambda.toml`, whose keys are known: each is read as what it should be, or refused by its name.
 
+use gleaner_rules::text::quoted;
+use gleaner_rules::units;
 use toml::{Table as Entries, Value};
 
-use super::error::{Error, nearest, quoted};
-use super::units;
+use super::error::{Error, nearest};
 
 type Result<T> = std::result::Result<T, Error>;
 

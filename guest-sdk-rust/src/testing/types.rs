@@ -179,3 +179,9 @@ macro_rules! refusal {
 pub(super) use refusal;
 
 refusal!(DataError);
+
+impl From<gleaner_rules::clamps::WrongField> for DataError {
+    fn from(wrong: gleaner_rules::clamps::WrongField) -> Self {
+        Self::WrongField(wrong.to_string())
+    }
+}

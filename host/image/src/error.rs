@@ -1,103 +1,18 @@
 //! Why an image cannot be read, in the words that a user sees.
 
-use std::fmt;
+use gleaner_rules::pixels::PixelError;
+use gleaner_rules::refused;
+use gleaner_rules::text::Rounded;
 
-use super::{Encoding, Format, Header, Roi};
+use super::{Format, Header};
 
 /// An image, or a request about one, that makes no sense or costs too much.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ImageError {
-    /// A name that is no encoding which we read.
-    #[error("encoding `{name}` is not supported; supported are {supported}")]
-    UnknownEncoding {
-        /// What the message says, at most 40 characters of it.
-        name: String,
-        /// The names that are understood.
-        supported: String,
-    },
-    /// Nothing to see, or more than any camera delivers.
-    #[error("image says it is {width}x{height}; each side must be 1 to {max}", max = super::MAX_SIDE)]
-    Size {
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-    },
-    /// The rows overlap.
-    #[error("image of {width}x{height} {} says a row has {step} bytes; it needs {needed}", encoding.name())]
-    Step {
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-        /// What a pixel is.
-        encoding: Encoding,
-        /// Bytes from a row to the next, as the message says.
-        step: u32,
-        /// Bytes that the pixels of a row fill.
-        needed: usize,
-    },
-    /// Fewer bytes than the size asks for.
-    #[error("image of {width}x{height} {} with {step} bytes per row needs {needed} bytes; it has {found}", encoding.name())]
-    Data {
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-        /// What a pixel is.
-        encoding: Encoding,
-        /// Bytes from a row to the next.
-        step: u32,
-        /// Bytes up to the end of the last row.
-        needed: usize,
-        /// Bytes that are there.
-        found: usize,
-    },
-    /// A pixel without the neighbour that holds the other half of its colour.
-    #[error("image of {} is {width} pixels wide; two pixels share a colour, so the width must be even", encoding.name())]
-    OddWidth {
-        /// Pixels per row.
-        width: u32,
-        /// What a pixel is.
-        encoding: Encoding,
-    },
-    /// A region without a pixel.
-    #[error("region {}x{} at ({}, {}) has no pixel in the image of {width}x{height}", roi.width, roi.height, roi.x, roi.y)]
-    Roi {
-        /// The region.
-        roi: Roi,
-        /// Pixels per row of the image.
-        width: u32,
-        /// Rows of the image.
-        height: u32,
-    },
-    /// An operation on colours, asked of an image that has none yet.
-    #[error("{operation} of a raw image ({}): its pixels have no colour until it is debayered", encoding.name())]
-    Raw {
-        /// What was asked.
-        operation: &'static str,
-        /// What a pixel is.
-        encoding: Encoding,
-    },
-    /// A result of no size, or of an absurd one.
-    #[error("resize to {width}x{height}: each side must be 1 to {max}", max = super::ops::MAX_RESIZED_SIDE)]
-    ResizeTo {
-        /// Pixels per row that were asked for.
-        width: u32,
-        /// Rows that were asked for.
-        height: u32,
-    },
-    /// The caller's memory does not fit the result.
-    #[error("{operation} makes {needed} bytes; the place for them has {found}")]
-    Output {
-        /// What was asked.
-        operation: &'static str,
-        /// Bytes of the result.
-        needed: usize,
-        /// Bytes of the caller's slice.
-        found: usize,
-    },
+    /// Pixels that are no image, an operation on them without a result, or one that the caller ended.
+    #[error(transparent)]
+    Pixels(#[from] PixelError),
     /// Bytes that are no image file.
     #[error("data is neither JPEG nor PNG: its {len} bytes start with {start:02x?}")]
     NotAnImage {
@@ -107,7 +22,7 @@ pub enum ImageError {
         start: Vec<u8>,
     },
     /// A file which is small, of an image which is not.
-    #[error("image says it is {width}x{height} ({} as rgb8); this input's decoded_size is {}", Rounded::up(*needed), Rounded::down(*allowed))]
+    #[error("{}", refused::too_many_pixels((*width, *height), *needed, *allowed as u64))]
     Bomb {
         /// Pixels per row.
         width: u32,
@@ -119,7 +34,7 @@ pub enum ImageError {
         allowed: usize,
     },
     /// A file whose decoder would need far more memory than its pixels.
-    #[error("{format} of {width}x{height} needs {} to decode, besides its pixels; {} is allowed", Rounded::up(*needed), Rounded::down(*allowed))]
+    #[error("{format} of {width}x{height} needs {} to decode, besides its pixels; {} is allowed", Rounded::up(*needed), Rounded::down(*allowed as u64))]
     WorkingMemory {
         /// What the file is.
         format: Format,
@@ -166,9 +81,6 @@ pub enum ImageError {
         /// What is wrong.
         what: &'static str,
     },
-    /// The caller's [`Pace`](super::Pace) ended an operation.
-    #[error("stopped by the caller before the end")]
-    Stopped,
     /// The JPEG decoder gave up.
     #[error("cannot decode the JPEG of {width}x{height}")]
     Jpeg {
@@ -189,60 +101,4 @@ pub enum ImageError {
         /// Why.
         source: png::DecodingError,
     },
-}
-
-/// `name` for a message: a hostile one must not fill the log.
-pub(super) fn shortened(name: &str) -> String {
-    const LONGEST: usize = 40;
-    match name.char_indices().nth(LONGEST) {
-        None => name.to_owned(),
-        Some((end, _)) => format!("{}…", &name[..end]),
-    }
-}
-
-/// A number of bytes for people: exact below 1 MiB, then in tenths of a MiB. What is needed rounds up
-/// and what is allowed rounds down, so that a message never says "8 MiB, and 8 MiB is allowed".
-struct Rounded {
-    bytes: u64,
-    tenths: u64,
-}
-
-const MIB: u64 = 1 << 20;
-
-impl Rounded {
-    fn up(bytes: u64) -> Self {
-        let tenths = (bytes / MIB * 10).saturating_add((bytes % MIB * 10).div_ceil(MIB));
-        Self { bytes, tenths }
-    }
-
-    fn down(bytes: usize) -> Self {
-        let bytes = bytes as u64;
-        let tenths = (bytes / MIB * 10).saturating_add(bytes % MIB * 10 / MIB);
-        Self { bytes, tenths }
-    }
-}
-
-impl fmt::Display for Rounded {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match (self.bytes, self.tenths) {
-            (bytes, _) if bytes < MIB => write!(f, "{bytes} bytes"),
-            (_, tenths) if tenths % 10 == 0 => write!(f, "{} MiB", tenths / 10),
-            (_, tenths) => write!(f, "{}.{} MiB", tenths / 10, tenths % 10),
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_are_rounded_against_the_one_who_asks() {
-        assert_eq!(Rounded::down(8 << 20).to_string(), "8 MiB");
-        assert_eq!(Rounded::up((8 << 20) + 1).to_string(), "8.1 MiB");
-        assert_eq!(Rounded::down((8 << 20) - 1).to_string(), "7.9 MiB");
-        assert_eq!(Rounded::up(12_870_750_000).to_string(), "12274.6 MiB");
-        assert_eq!(Rounded::up(768).to_string(), "768 bytes");
-        assert_eq!(Rounded::up(u64::MAX).to_string(), "17592186044416 MiB");
-    }
 }

@@ -1,5 +1,7 @@
 //! Field paths: `a.b[3].c` to a skip program, with errors that say what would have been right.
 
+use gleaner_rules::path::{Malformed, Segment, segments};
+
 use super::cdr::{CdrError, Cursor, Endian};
 use super::definitions::{Definitions, Struct, full_name};
 use super::layout::{Layout, Table};
@@ -21,13 +23,8 @@ pub struct FieldPath {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PathError {
     /// The path is not of the form `a.b[3].c`.
-    #[error("path `{path}` is malformed at `{rest}`; write it like `a.b[3].c`")]
-    Syntax {
-        /// The path.
-        path: String,
-        /// From where on it makes no sense.
-        rest: String,
-    },
+    #[error(transparent)]
+    Syntax(#[from] Malformed),
     /// A type has no field of that name.
     #[error("type `{type_name}` has no field `{field}`{}; it has: {}", hint(nearest), fields.join(", "))]
     NoSuchField {
@@ -146,39 +143,6 @@ impl FieldPath {
         let mut cursor = Cursor::new(cdr, endian);
         walk(&self.ops, &mut cursor)?;
         self.leaf.number(&mut cursor)
-    }
-}
-
-/// One step of a written path.
-#[derive(Debug, PartialEq, Eq)]
-enum Segment<'p> {
-    Name(&'p str),
-    Index(usize),
-}
-
-fn segments(path: &str) -> Result<Vec<Segment<'_>>, PathError> {
-    let malformed = |rest: &str| PathError::Syntax { path: path.to_owned(), rest: rest.to_owned() };
-    let mut segments = Vec::new();
-    let mut rest = path;
-    loop {
-        let is_part = |c: char| c.is_ascii_alphanumeric() || c == '_';
-        let end = rest.find(|c| !is_part(c)).unwrap_or(rest.len());
-        let (name, mut tail) = rest.split_at(end);
-        if name.is_empty() {
-            return Err(malformed(rest));
-        }
-        segments.push(Segment::Name(name));
-        while let Some(inside) = tail.strip_prefix('[') {
-            let (digits, behind) = inside.split_once(']').ok_or_else(|| malformed(tail))?;
-            let is_number = digits.bytes().all(|byte| byte.is_ascii_digit());
-            let index = digits.parse().ok().filter(|_| is_number);
-            segments.push(Segment::Index(index.ok_or_else(|| malformed(tail))?));
-            tail = behind;
-        }
-        if tail.is_empty() {
-            return Ok(segments);
-        }
-        rest = tail.strip_prefix('.').ok_or_else(|| malformed(tail))?;
     }
 }
 

@@ -250,11 +250,9 @@ pub(crate) fn refused(py: Python<'_>, error: DataError) -> PyErr {
         DataError::WrongField { .. } => "wrong-field",
         DataError::Malformed { .. } => "malformed",
         DataError::NoImageType { .. } | DataError::NotAFrame { .. } => "not-a-frame",
-        DataError::TooLarge { .. }
-        | DataError::NoSlot { .. }
-        | DataError::NoMemory { .. }
-        | DataError::TooManyFrames { .. }
-        | DataError::OutOfTime => "no-room",
+        DataError::TooLarge { .. } | DataError::NoSlot { .. } | DataError::NoRoom(_) | DataError::OutOfTime => {
+            "no-room"
+        }
         DataError::OutOfRange(_) => "out-of-range",
     };
     DATA_ERROR.error(py, error.to_string(), kind)

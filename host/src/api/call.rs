@@ -5,13 +5,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::manifest::Limits;
+use gleaner_rules::clamps;
 
 use super::error::DataError;
-
-/// Most samples that one call hands out.
-pub const SAMPLES_PER_CALL: usize = 256;
-/// Longest list of strings in one field.
-pub const TEXTS_PER_FIELD: usize = 4096;
 
 /// What one call may take, for all inputs of a lambda.
 #[derive(Clone)]
@@ -31,12 +27,9 @@ impl PerCall {
         Self { bytes: limits.call_bytes.as_usize(), items, due: Due::default() }
     }
 
-    pub(super) fn samples(&self) -> usize {
-        self.items.min(SAMPLES_PER_CALL)
-    }
-
-    pub(super) fn texts(&self) -> usize {
-        self.items.min(TEXTS_PER_FIELD)
+    /// What it hands out at most.
+    pub(super) fn clamps(&self) -> clamps::PerCall {
+        clamps::PerCall { bytes: self.bytes, items: self.items }
     }
 }
 

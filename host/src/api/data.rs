@@ -7,21 +7,20 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use gleaner_buffers::{Lease, RingCounts, RingReader};
 use gleaner_messages::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
+use gleaner_rules::clamps::{self, WrongField};
+pub use gleaner_rules::clamps::{PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
 use gleaner_transport::SampleMeta;
 
-pub use super::call::{Due, PerCall, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
+pub use super::call::{Due, PerCall};
 use super::curves::{Curves, Pen};
 pub use super::error::DataError;
 use super::frame::Images;
-use super::log::cut;
 pub use super::sample::Sample;
 use super::trace::{Arrivals, Looked};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
 /// What reading a field at a fixed place costs, in bytes: the walk to it, and its value.
 pub const FIELD_BYTES: usize = 64;
-/// Longest path of a field, in bytes.
-pub const PATH_BYTES: usize = 1024;
 /// Samples of a column between two looks at the time, and bytes of those that are walked over.
 const SAMPLES_PER_LOOK: usize = 1024;
 const BYTES_PER_LOOK: usize = 1 << 20;
@@ -121,7 +120,7 @@ impl Topic {
     /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and what `[limits]` allows.
     pub fn last(self: &Arc<Self>, n: usize) -> Vec<Sample> {
         let mut leases = Vec::new();
-        self.reader.last_before(self.until(), n.min(self.per_call.samples()).min(self.depth), &mut leases);
+        self.reader.last_before(self.until(), n.min(self.per_call.clamps().samples()).min(self.depth), &mut leases);
         self.looked.at(leases.first());
         leases.into_iter().map(|lease| self.sample(lease)).collect()
     }
@@ -132,7 +131,7 @@ impl Topic {
         let until = self.until();
         self.reader.newest_while_before(
             until,
-            self.per_call.samples().min(self.depth),
+            self.per_call.clamps().samples().min(self.depth),
             |meta| meta.at_ns > since_ns,
             &mut leases,
         );
@@ -154,13 +153,10 @@ impl Topic {
     ///
     /// [`DataError::NoSuchField`] names the nearest field.
     pub fn field(self: &Arc<Self>, path: &str) -> Result<Field, DataError> {
-        if path.len() > PATH_BYTES {
-            let why = format!("has {} bytes; a path has {PATH_BYTES} at most", path.len());
-            return Err(DataError::WrongField { path: cut(path, 64).to_owned(), why });
-        }
+        clamps::path(path)?;
         let Some(definitions) = &self.definitions else {
             let why = format!("cannot be found: nobody here has message definitions of `{}`", self.type_name);
-            return Err(DataError::WrongField { path: path.to_owned(), why });
+            return Err(WrongField::new(path, why).into());
         };
         let path = FieldPath::compile(definitions, path).map_err(DataError::NoSuchField)?;
         Ok(Field { topic: Arc::clone(self), pen: self.pen(|| path.path().to_owned()), path })
@@ -237,10 +233,7 @@ impl Topic {
 
     pub(super) fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {
         match error {
-            CdrError::NotANumber => DataError::WrongField {
-                path: path.path().to_owned(),
-                why: format!("of `{}` is no number", self.type_name),
-            },
+            CdrError::NotANumber => WrongField::no_number(path.path(), &self.type_name).into(),
             source => DataError::Malformed { topic: self.topic.clone(), type_name: self.type_name.clone(), source },
         }
     }
@@ -345,8 +338,7 @@ impl Field {
         if Arc::ptr_eq(&self.topic, topic) {
             return Ok(());
         }
-        let why = format!("belongs to input `{}`, not to `{}`", self.topic.input, topic.input);
-        Err(DataError::WrongField { path: self.path().to_owned(), why })
+        Err(WrongField::elsewhere(self.path(), &self.topic.input, &topic.input).into())
     }
 }
 

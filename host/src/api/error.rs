@@ -1,43 +1,35 @@
 //! Why a read of data failed, in words for the lambda's author.
 
+use gleaner_image::{ImageError, PixelError};
 use gleaner_messages::{CdrError, PathError};
-
-use gleaner_image::ImageError;
+use gleaner_rules::clamps::WrongField;
+use gleaner_rules::frames::NoRoom;
+use gleaner_rules::refused;
 
 /// Why a read of data failed.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum DataError {
-    #[error("no input `{asked}`; the manifest has {}", list(known))]
+    #[error("{}", refused::no_such_input(asked, known))]
     NoSuchInput { asked: String, known: Vec<String> },
     #[error("{0}")]
     NoSuchField(PathError),
-    #[error("field `{path}` {why}")]
-    WrongField { path: String, why: String },
-    #[error("a sample of `{topic}` contradicts its type `{type_name}`: {source}")]
+    #[error(transparent)]
+    WrongField(#[from] WrongField),
+    #[error("{}", refused::malformed(topic, type_name, source))]
     Malformed { topic: String, type_name: String, source: CdrError },
-    #[error("a sample of `{topic}` is no image: its type is `{type_name}`")]
+    #[error("{}", refused::no_image_type(topic, type_name))]
     NoImageType { topic: String, type_name: String },
-    #[error("a sample of `{topic}` is no image that can be read: {source}")]
+    #[error("{}", refused::not_a_frame(topic, source))]
     NotAFrame { topic: String, source: ImageError },
-    #[error("an image of `{topic}` is too large: {source}")]
+    #[error("{}", refused::too_large(topic, source))]
     TooLarge { topic: String, source: ImageError },
-    #[error(
-        "every slot for decoded images of `{topic}` is held; drop frames that are not needed, or raise `hold` of input `{input}`"
-    )]
+    #[error("{}", refused::no_slot(topic, input))]
     NoSlot { topic: String, input: String },
-    #[error(
-        "{asked} bytes for a new frame, {left} are left; drop frames that are not needed, or raise `memory` in [limits]"
-    )]
-    NoMemory { asked: usize, left: usize },
-    #[error("the lambda holds {allowed} frames; drop frames that are not needed, or raise `frames` in [limits]")]
-    TooManyFrames { allowed: usize },
+    #[error(transparent)]
+    NoRoom(#[from] NoRoom),
     #[error("{0}")]
-    OutOfRange(ImageError),
+    OutOfRange(PixelError),
     #[error("the deadline is over")]
     OutOfTime,
-}
-
-fn list(names: &[String]) -> String {
-    if names.is_empty() { "none".to_owned() } else { format!("`{}`", names.join("`, `")) }
 }

@@ -1,6 +1,6 @@
 //! A sample seen as an image: raw pixels in place, JPEG and PNG decoded lazily into slots of their own.
 
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
@@ -9,7 +9,10 @@ use gleaner_messages::{CdrError, CompressedView, Endian, ImageView};
 
 use super::data::{DataError, Identity, Sample, Stamps};
 use super::piece::Piece;
-use gleaner_image::{self as image, Encoding, ImageError, Pace, Roi, View, ops};
+use gleaner_image::{self as image, Encoding, ImageError, Pace, PixelError, Roi, View, ops};
+pub use gleaner_rules::frames::Budget;
+use gleaner_rules::frames::Taken;
+use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 
 /// Bytes of pixels that the fastest machine decodes in a microsecond: four times what was measured (0.5 GB/s on an x86-64 server).
 const FASTEST_DECODE: u64 = 2_000;
@@ -65,8 +68,8 @@ impl<'a> Picture<'a> {
     /// None if the type is no image.
     pub(super) fn of(type_name: &str, cdr: &'a [u8], endian: Endian) -> Result<Option<Self>, CdrError> {
         Ok(match type_name {
-            "sensor_msgs/msg/Image" => Some(Self::Raw(ImageView::read(cdr, endian)?)),
-            "sensor_msgs/msg/CompressedImage" => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
+            IMAGE => Some(Self::Raw(ImageView::read(cdr, endian)?)),
+            COMPRESSED_IMAGE => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
             _ => None,
         })
     }
@@ -105,54 +108,6 @@ impl Images {
     }
 }
 
-/// Frames that a lambda may hold at a time, and the bytes that those made by `resize` and `to_gray` may take together.
-#[derive(Clone)]
-pub struct Budget(Arc<Left>);
-
-struct Left {
-    frames: AtomicUsize,
-    frames_allowed: usize,
-    bytes: AtomicUsize,
-}
-
-/// A frame that is held, and what it takes; given back when it is dropped.
-struct Taken {
-    budget: Budget,
-    bytes: usize,
-}
-
-impl Budget {
-    /// A budget of that many frames and bytes.
-    pub fn new(frames: usize, bytes: usize) -> Self {
-        let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
-        Self(Arc::new(Left { frames: left, frames_allowed: frames, bytes }))
-    }
-
-    fn has(&self, bytes: usize) -> bool {
-        bytes <= self.0.bytes.load(Ordering::Relaxed)
-    }
-
-    fn take(&self, bytes: usize) -> Result<Taken, DataError> {
-        let take = |from: &AtomicUsize, n: usize| {
-            from.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(n))
-        };
-        let allowed = self.0.frames_allowed;
-        take(&self.0.frames, 1).map_err(|_| DataError::TooManyFrames { allowed })?;
-        // From here on the frame is given back, whatever comes.
-        let mut taken = Taken { budget: self.clone(), bytes: 0 };
-        take(&self.0.bytes, bytes).map_err(|left| DataError::NoMemory { asked: bytes, left })?;
-        taken.bytes = bytes;
-        Ok(taken)
-    }
-}
-
-impl Drop for Taken {
-    fn drop(&mut self) {
-        self.budget.0.bytes.fetch_add(self.bytes, Ordering::Relaxed);
-        self.budget.0.frames.fetch_add(1, Ordering::Relaxed);
-    }
-}
-
 /// A sample seen as an image. Holds its pixels until dropped.
 pub struct Frame {
     source: Source,
@@ -185,10 +140,9 @@ impl Frame {
         let info =
             Info { width: raw.width, height: raw.height, encoding, step: raw.step, big_endian: raw.is_bigendian };
         let view = info.view(raw.data).map_err(|error| source.not_a_frame(error))?;
-        let len = view.step() * (view.height() as usize - 1) + view.width() as usize * encoding.bytes_per_pixel();
         // The pixels were borrowed from the message, so they lie within it.
         let start = raw.data.as_ptr().addr() - sample.bytes().as_ptr().addr();
-        let pixels = Piece::of_message(sample.lease()).part(start as u64, len);
+        let pixels = Piece::of_message(sample.lease()).part(start as u64, view.bytes().len());
         Ok(Self { source, info, pixels, _taken: taken })
     }
 
@@ -285,7 +239,7 @@ impl Frame {
     }
 
     /// Works on the pixels until the call is due.
-    fn paced<T>(&self, work: impl FnOnce(&View<'_>) -> Result<T, ImageError>) -> Result<T, DataError> {
+    fn paced<T>(&self, work: impl FnOnce(&View<'_>) -> Result<T, PixelError>) -> Result<T, DataError> {
         let in_time = || self.source.topic.per_call.due.check().is_ok();
         work(&self.view()?.paced(&Pace::new(&in_time))).map_err(|error| self.source.refused(error))
     }
@@ -294,7 +248,7 @@ impl Frame {
     ///
     /// # Errors
     ///
-    /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`]; [`DataError::NoMemory`]; as [`Frame::mean_luma`].
+    /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`]; [`DataError::NoRoom`]; as [`Frame::mean_luma`].
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
         let (encoding, _) = ops::resized(&self.view()?, width, height).map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
@@ -305,7 +259,7 @@ impl Frame {
     ///
     /// # Errors
     ///
-    /// [`DataError::NoMemory`]; as [`Frame::mean_luma`].
+    /// [`DataError::NoRoom`]; as [`Frame::mean_luma`].
     pub fn to_gray(&self) -> Result<Self, DataError> {
         let info = Info::tight(self.info.width, self.info.height, Encoding::Mono8);
         self.make(info, ops::to_gray)
@@ -314,7 +268,7 @@ impl Frame {
     fn make(
         &self,
         info: Info,
-        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), ImageError>,
+        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), PixelError>,
     ) -> Result<Self, DataError> {
         let len = info.step as usize * info.height as usize;
         let taken = self.source.topic.images.made.take(len)?;
@@ -329,7 +283,7 @@ impl Frame {
 }
 
 impl Info {
-    fn view<'a>(&self, data: &'a [u8]) -> Result<View<'a>, ImageError> {
+    fn view<'a>(&self, data: &'a [u8]) -> Result<View<'a>, PixelError> {
         View::new(self.width, self.height, self.step, self.encoding, self.big_endian, data)
     }
 }
@@ -345,14 +299,14 @@ impl Source {
         }
     }
 
-    fn not_a_frame(&self, source: ImageError) -> DataError {
-        DataError::NotAFrame { topic: self.identity.topic.clone(), source }
+    fn not_a_frame(&self, source: impl Into<ImageError>) -> DataError {
+        DataError::NotAFrame { topic: self.identity.topic.clone(), source: source.into() }
     }
 
-    fn refused(&self, error: ImageError) -> DataError {
-        match error {
-            ImageError::Roi { .. } | ImageError::ResizeTo { .. } => DataError::OutOfRange(error),
-            ImageError::Stopped => DataError::OutOfTime,
+    fn refused(&self, error: impl Into<ImageError>) -> DataError {
+        match error.into() {
+            ImageError::Pixels(error) if error.is_out_of_range() => DataError::OutOfRange(error),
+            ImageError::Pixels(PixelError::Stopped) => DataError::OutOfTime,
             error => self.not_a_frame(error),
         }
     }

@@ -3,45 +3,24 @@
 use gleaner_journal::Said;
 use gleaner_lambda::manifest::Limits;
 pub use gleaner_lambda::{LogLevel as Level, LogLine as Line};
+pub use gleaner_rules::log::LINE_BYTES;
+use gleaner_rules::log::{Rate, line};
+pub use gleaner_rules::text::cut;
 
 use super::Session;
 
-/// Longest line in bytes; the rest is cut at a character boundary.
-pub const LINE_BYTES: usize = 4096;
-
 pub(super) struct Log {
     lines: Vec<Line>,
-    dropped: u64,
-    /// What may be written in one second of the lambda's time.
-    lines_per_second: u64,
-    bytes_per_second: u64,
-    window: Window,
-    /// What the host noted in this second.
-    notes: (i64, Vec<&'static str>),
+    rate: Rate,
     /// Lines since the last call of `take`, those included that were dropped, and the CRC-32 over them: how many the rate limit
     /// lets pass depends on wakes before.
     said: Said,
 }
 
-/// What was written in a second.
-#[derive(Default)]
-struct Window {
-    second: i64,
-    lines: u64,
-    bytes: u64,
-}
-
 impl Log {
     pub(super) fn new(limits: &Limits) -> Self {
-        Self {
-            lines: Vec::new(),
-            dropped: 0,
-            lines_per_second: limits.log_lines,
-            bytes_per_second: limits.log_bytes.bytes(),
-            window: Window::default(),
-            notes: (0, Vec::new()),
-            said: Said::default(),
-        }
+        let rate = Rate::new(limits.log_lines, limits.log_bytes.bytes());
+        Self { lines: Vec::new(), rate, said: Said::default() }
     }
 
     pub(super) fn take(&mut self) -> (Vec<Line>, Said) {
@@ -49,7 +28,7 @@ impl Log {
     }
 
     pub(super) fn dropped(&self) -> u64 {
-        self.dropped
+        self.rate.dropped()
     }
 
     /// The lines behind the first `n`, which stay, and what a journal notes of all.
@@ -60,45 +39,27 @@ impl Log {
     /// Adds what was counted in another process, where the lines were written.
     pub(super) fn relay(&mut self, said: Said, dropped: u64) {
         self.said = said;
-        self.dropped = self.dropped.saturating_add(dropped);
+        self.rate.add_dropped(dropped);
     }
 
     fn write(&mut self, at_ns: i64, level: Level, message: &str) {
-        let message = cut(message, LINE_BYTES);
+        let message = line(message);
         let mut digest = crc32fast::Hasher::new_with_initial(self.said.digest);
         digest.update(&[level as u8]);
         digest.update(&(message.len() as u64).to_le_bytes());
         digest.update(message.as_bytes());
         self.said = Said { lines: self.said.lines.saturating_add(1), digest: digest.finalize() };
-        let second = second(at_ns);
-        if self.window.second != second {
-            self.window = Window { second, ..Window::default() };
+        if self.rate.keeps(at_ns, message) {
+            self.lines.push(Line { at_ns, level, message: message.to_owned() });
         }
-        let Window { lines, bytes, .. } = &mut self.window;
-        let with_it = bytes.saturating_add(message.len() as u64);
-        if *lines >= self.lines_per_second || with_it > self.bytes_per_second {
-            self.dropped += 1;
-            return;
-        }
-        (*lines, *bytes) = (*lines + 1, with_it);
-        self.lines.push(Line { at_ns, level, message: message.to_owned() });
     }
 
     /// Each text once in a second, beside what the lambda may write, and no part of what it said.
     fn note(&mut self, at_ns: i64, text: &'static str) {
-        let second = second(at_ns);
-        if self.notes.0 != second {
-            self.notes = (second, Vec::new());
-        }
-        if !self.notes.1.contains(&text) {
-            self.notes.1.push(text);
+        if self.rate.notes(at_ns, text) {
             self.lines.push(Line { at_ns, level: Level::Warn, message: text.to_owned() });
         }
     }
-}
-
-fn second(at_ns: i64) -> i64 {
-    at_ns.div_euclid(1_000_000_000)
 }
 
 impl Session {
@@ -117,38 +78,9 @@ impl Session {
     }
 }
 
-/// The longest start of `text` that fits into `bytes` and ends at a character boundary.
-pub fn cut(text: &str, bytes: usize) -> &str {
-    &text[..text.floor_char_boundary(bytes)]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_flood_is_dropped_and_counted_until_the_next_second() {
-        let mut log = Log::new(&Limits::default());
-        for _ in 0..250 {
-            log.write(10, Level::Info, "x");
-        }
-        log.write(1_000_000_000, Level::Info, "y");
-        assert_eq!(log.dropped(), 150);
-        assert_eq!(log.take().0.len(), 101);
-    }
-
-    #[test]
-    fn bytes_are_limited_beside_lines() {
-        let mut limits = Limits::default();
-        limits.log_bytes = gleaner_base::ByteSize::kib(4);
-        let mut log = Log::new(&limits);
-        for _ in 0..5 {
-            log.write(10, Level::Info, &"x".repeat(1000));
-        }
-        // A short one still has room.
-        log.write(10, Level::Info, "y");
-        assert_eq!((log.dropped(), log.take().0.len()), (1, 5));
-    }
 
     #[test]
     fn what_the_host_notes_comes_once_in_a_second_and_is_nothing_that_the_lambda_said() {
@@ -159,12 +91,5 @@ mod tests {
         }
         let (lines, said) = log.take();
         assert_eq!((lines.len(), said), (4, Said::default()));
-    }
-
-    #[test]
-    fn a_long_line_is_cut_between_characters() {
-        assert_eq!(cut("aé", 2), "a");
-        assert_eq!(cut("aé", 3), "aé");
-        assert_eq!(cut("", 3), "");
     }
 }

@@ -27,7 +27,7 @@ use gleaner_lambda::manifest::{ConfigValue, Limits};
 use data::{DataError, Due, Topic};
 use log::{Line, Log};
 use scratch::Scratch;
-use trigger::{Rate, Triggers};
+use trigger::Triggers;
 
 /// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call, by one thread.
 #[derive(Clone)]
@@ -37,9 +37,7 @@ struct State {
     inputs: Vec<Arc<Topic>>,
     config: Vec<(String, ConfigValue)>,
     now_ns: i64,
-    /// What the wake has caused; none outside of a wake, where nothing can be caused.
-    triggers: Option<Triggers>,
-    rate: Rate,
+    triggers: Triggers<Trigger>,
     log: Log,
     scratch: Scratch,
     due: Option<Due>,
@@ -51,8 +49,9 @@ impl Session {
     pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>, limits: &Limits) -> Self {
         // All inputs of a lambda have the same.
         let due = inputs.first().map(|topic| topic.due());
-        let (rate, log, scratch) = (Rate::new(limits), Log::new(limits), Scratch::new(limits));
-        let state = State { inputs, config, now_ns: 0, triggers: None, rate, log, scratch, due, passed_over: 0 };
+        let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(limits));
+        let scratch = Scratch::new(limits.scratch.bytes(), limits.call_bytes.as_usize());
+        let state = State { inputs, config, now_ns: 0, triggers, log, scratch, due, passed_over: 0 };
         Self(Arc::new(Mutex::new(state)))
     }
 
@@ -60,19 +59,19 @@ impl Session {
     pub fn begin(&self, now_ns: i64) {
         let mut state = self.lock();
         state.now_ns = now_ns;
-        state.triggers = Some(Triggers::default());
+        state.triggers.begin();
     }
 
     /// Ends a wake and takes what it caused, in the order of the calls.
     pub fn end(&self) -> Vec<Trigger> {
-        self.lock().triggers.take().map(Triggers::into_list).unwrap_or_default()
+        self.lock().triggers.end()
     }
 
     /// Runs an `init`, which may come in the middle of a wake but is no part of it: it can cause nothing.
     pub fn during_init<R>(&self, init: impl FnOnce() -> R) -> R {
-        let triggers = self.lock().triggers.take();
+        let triggers = self.lock().triggers.suspend();
         let result = init();
-        self.lock().triggers = triggers;
+        self.lock().triggers.resume(triggers);
         result
     }
 
@@ -88,7 +87,7 @@ impl Session {
 
     /// Triggers refused by the rate limit, since the start.
     pub fn triggers_refused(&self) -> u64 {
-        self.lock().rate.refused()
+        self.lock().triggers.refused()
     }
 
     /// Counts a wake that did not happen, because the lambda had faulted again and again.
@@ -130,7 +129,7 @@ impl Session {
         let state = self.lock();
         let found = state.inputs.iter().find(|topic| topic.name() == name);
         found.cloned().ok_or_else(|| DataError::NoSuchInput {
-            asked: name.chars().take(64).collect(),
+            asked: name.to_owned(),
             known: state.inputs.iter().map(|topic| topic.name().to_owned()).collect(),
         })
     }

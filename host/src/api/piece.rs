@@ -4,6 +4,7 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use gleaner_buffers::Lease;
+use gleaner_rules::clamps;
 use gleaner_transport::SampleMeta;
 
 use super::frame::Info;
@@ -44,9 +45,8 @@ impl Piece {
 
     /// `len` bytes of it from `offset`, clamped to what it has.
     pub(super) fn part(&self, offset: u64, len: usize) -> Self {
-        let offset = usize::try_from(offset).unwrap_or(usize::MAX).min(self.len);
-        let len = len.min(self.len - offset);
-        Self { held: self.held.clone(), start: self.start + offset, len }
+        let place = clamps::piece(self.len, offset, len);
+        Self { held: self.held.clone(), start: self.start + place.start, len: place.len() }
     }
 }
 

@@ -12,7 +12,7 @@ use super::trigger::{Attribute, AttributeValue, TriggerError};
 impl Session {
     /// Triggers of this wake so far.
     pub fn triggers(&self) -> Vec<Trigger> {
-        self.lock().triggers.as_ref().map(|triggers| triggers.list().to_vec()).unwrap_or_default()
+        self.lock().triggers.list().to_vec()
     }
 
     /// Log lines that wait to be taken.
@@ -55,7 +55,7 @@ impl Session {
     pub fn relay_counts(&self, said: Said, log_dropped: u64, triggers_refused: u64) {
         let mut state = self.lock();
         state.log.relay(said, log_dropped);
-        state.rate.relay(triggers_refused);
+        state.triggers.add_refused(triggers_refused);
     }
 }
 

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use gleaner_buffers::Lease;
 use gleaner_messages::{Endian, Value};
+use gleaner_rules::clamps::Length;
 use gleaner_transport::SampleMeta;
 
 use super::data::{DataError, Field, Topic};
@@ -49,21 +50,17 @@ impl Sample {
             .path
             .read(&self.lease, self.lease.meta().endian)
             .map_err(|error| self.topic.unreadable(&field.path, error))?;
-        let per_call = &self.topic.per_call;
         if let Some(number) = number(&value) {
             field.draw(self.lease.meta().at_ns, number);
         }
-        let (len, max) = match &value {
-            Value::Text(text) => (text.len(), per_call.bytes),
-            Value::Bytes(bytes) => (bytes.len(), per_call.bytes),
-            Value::Numbers(numbers) => (numbers.len(), per_call.items),
-            Value::Texts(texts) => (texts.len(), per_call.texts()),
-            Value::Bool(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => (0, 0),
+        let length = match &value {
+            Value::Text(text) => Length::Text(text.len()),
+            Value::Bytes(bytes) => Length::Bytes(bytes.len()),
+            Value::Numbers(numbers) => Length::Numbers(numbers.len()),
+            Value::Texts(texts) => Length::Texts(texts.len()),
+            Value::Bool(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => Length::One,
         };
-        if len > max {
-            let why = format!("has {len} items, one call hands out {max}; read it with `cdr`");
-            return Err(DataError::WrongField { path: field.path().to_owned(), why });
-        }
+        self.topic.per_call.clamps().value(field.path(), length)?;
         Ok(value)
     }
 
@@ -109,7 +106,7 @@ impl Sample {
     /// # Errors
     ///
     /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`], [`DataError::NoSlot`],
-    /// [`DataError::TooManyFrames`].
+    /// [`DataError::NoRoom`].
     pub fn as_frame(&self) -> Result<Frame, DataError> {
         Frame::of(self)
     }

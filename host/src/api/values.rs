@@ -1,5 +1,6 @@
 //! Plain values that a lambda is given: they hold nothing and ask nobody.
 
+pub use gleaner_rules::schedule::Tick;
 use gleaner_transport::Guid;
 use serde::{Deserialize, Serialize};
 
@@ -55,13 +56,4 @@ impl Column {
     pub(super) fn with_capacity(len: usize) -> Self {
         Self { at_ns: Vec::with_capacity(len), values: Vec::with_capacity(len) }
     }
-}
-
-/// A periodic wake.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Tick {
-    /// When it was due, in nanoseconds.
-    pub at_ns: i64,
-    /// Ticks that were due since the previous wake and did not happen.
-    pub missed: u64,
 }

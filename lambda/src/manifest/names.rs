@@ -4,6 +4,7 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
+use gleaner_rules::names;
 use serde::{Serialize, Serializer};
 
 use gleaner_base::{Exit, Explain};
@@ -92,14 +93,14 @@ checked_text! {
     /// names, host labels and URLs, hence the length of a DNS label.
     LambdaName, "lambda name",
     "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a letter, for example `brake-dark`",
-    is_lambda_name
+    names::is_lambda
 }
 
 checked_text! {
     /// Name of an input, a model or a config item: 1 to 63 lower-case letters, digits, `_` and `-`, the first a letter.
     ItemName, "name",
     "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, for example `front_camera`",
-    is_item_name
+    names::is_item
 }
 
 checked_text! {
@@ -109,14 +110,14 @@ checked_text! {
     /// `RMW_TOPIC_MAX_NAME_LENGTH`, the 255 bytes of DDS less 8 for prefixes.
     TopicName, "topic name",
     "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a digit, for example `/camera/front`",
-    is_topic_name
+    names::is_topic
 }
 
 checked_text! {
     /// A ROS 2 message type, for example `sensor_msgs/msg/Imu`.
     TypeName, "message type",
     "a ROS 2 type has three parts, `package/msg/Type`, for example `sensor_msgs/msg/Imu`",
-    is_type_name
+    names::is_type
 }
 
 checked_text! {
@@ -150,56 +151,18 @@ impl RelativePath {
 impl TypeName {
     /// `sensor_msgs/msg/CompressedImage`: a frame that is decoded when its pixels are first wanted.
     pub fn is_compressed_image(&self) -> bool {
-        self.0 == "sensor_msgs/msg/CompressedImage"
+        self.0 == names::COMPRESSED_IMAGE
     }
 
     /// Whether samples of this type are seen as frames: `sensor_msgs/msg/Image` and `CompressedImage`.
     pub fn is_frame(&self) -> bool {
-        self.0 == "sensor_msgs/msg/Image" || self.is_compressed_image()
+        names::is_frame(&self.0)
     }
 
     /// Whether samples of this type are large, so that few of them are kept: frames and point clouds.
     pub fn is_large(&self) -> bool {
-        self.0 == "sensor_msgs/msg/PointCloud2" || self.is_frame()
+        names::is_large(&self.0)
     }
-}
-
-/// Longest topic name that rmw accepts, in bytes.
-const TOPIC_NAME_MAX: usize = 247;
-
-/// 1 to 63 characters, first a lower-case letter, then those, digits and `extra`.
-fn is_name(text: &str, extra: &[u8]) -> bool {
-    let rest = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
-    text.len() <= 63 && text.bytes().next().is_some_and(|first| first.is_ascii_lowercase()) && text.bytes().all(rest)
-}
-
-fn is_lambda_name(text: &str) -> bool {
-    is_name(text, b"-")
-}
-
-fn is_item_name(text: &str) -> bool {
-    is_name(text, b"_-")
-}
-
-fn is_topic_name(text: &str) -> bool {
-    let token = |part: &str| {
-        part.bytes().next().is_some_and(|first| !first.is_ascii_digit())
-            && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
-    };
-    text.len() <= TOPIC_NAME_MAX && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
-}
-
-fn is_type_name(text: &str) -> bool {
-    let mut parts = text.split('/');
-    let (Some(package), Some("msg"), Some(name), None) = (parts.next(), parts.next(), parts.next(), parts.next())
-    else {
-        return false;
-    };
-    text.len() <= 255
-        && package.bytes().next().is_some_and(|first| first.is_ascii_alphabetic())
-        && package.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
-        && name.bytes().next().is_some_and(|first| first.is_ascii_uppercase())
-        && name.bytes().all(|byte| byte.is_ascii_alphanumeric())
 }
 
 fn is_version(text: &str) -> bool {

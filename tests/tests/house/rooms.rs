@@ -71,6 +71,13 @@ fn buffers_depend_on_nothing_but_the_standard_library() {
     assert_eq!(always, 0, "loom is for `cfg(loom)` only");
 }
 
+/// They travel with the SDK into the folder of every new lambda, and into its component.
+#[test]
+fn rules_depend_on_nothing_but_the_standard_library() {
+    let manifest = toml_of("rules/Cargo.toml");
+    assert_eq!(dependencies(&manifest), BTreeSet::new());
+}
+
 #[test]
 fn crates_do_without_what_they_should_not_link() {
     let mut problems = Vec::new();

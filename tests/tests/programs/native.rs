@@ -1,15 +1,13 @@
 //! One lambda natively, in the fake host of the SDK, and as a component in the host: every decision is equal, to the last bit of its
-//! scores, and so are the log and what is counted.
+//! scores, and so are the log and what is counted. Both have the same rules, of `gleaner-rules`; here is what lies around them.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use gleaner_base::Exit;
 use gleaner_sdk::Lambda;
-use gleaner_sdk::data::Encoding;
-use gleaner_sdk::testing::{self, AttributeValue, FaultKind, Host, Message, Run, Setting};
-use gleaner_tests::drive::{IMAGE, image, one_topic};
+use gleaner_sdk::testing::{self, AttributeValue, FaultKind, Host, Run, Setting};
 use gleaner_tests::given::{Given, STAMP, Wanted, messages};
-use gleaner_tests::{Copy, Folder, replay, root, sample_drive};
+use gleaner_tests::{replay, root, sample_drive};
 
 const IMU: Wanted = (
     "imu",
@@ -34,13 +32,10 @@ struct Both {
 }
 
 impl Both {
-    fn of(lambda: &str, drive: PathBuf, wanted: &[Wanted]) -> Self {
+    fn on_sample_drive(lambda: &str, wanted: &[Wanted]) -> Self {
+        let drive = sample_drive();
         let given = messages(&drive, wanted);
         Self { folder: root().join(lambda), drive, given, set: Vec::new() }
-    }
-
-    fn on_sample_drive(lambda: &str, wanted: &[Wanted]) -> Self {
-        Self::of(lambda, sample_drive(), wanted)
     }
 
     fn set<T: Into<Setting> + ToString>(mut self, key: &'static str, value: T) -> Self {
@@ -111,9 +106,6 @@ impl Both {
     }
 }
 
-/// Among what is unlike: the last bits of scores. A spectrum is computed by other instructions natively; nothing of the host is.
-const LAST_BITS: &str = "the last bits";
-
 /// Asserts that a decision is the same, but for attributes that are `unlike`.
 #[track_caller]
 fn same(ours: &testing::Decision, theirs: &gleaner_lambda::Decision, unlike: &[&str], which: &str) {
@@ -127,12 +119,7 @@ fn same(ours: &testing::Decision, theirs: &gleaner_lambda::Decision, unlike: &[&
     for (ours, theirs) in ours.triggers.iter().zip(&theirs.triggers) {
         let kind = format!("{:?}", ours.kind).to_lowercase();
         assert_eq!((kind.as_str(), &ours.label), (theirs.kind.as_str(), &theirs.label), "{which}");
-        match (ours.score, theirs.score) {
-            (Some(ours), Some(theirs)) if unlike.contains(&LAST_BITS) => {
-                assert!((ours - theirs).abs() <= 1e-12 * theirs.abs(), "{which}: {ours} and {theirs}");
-            }
-            (ours, theirs) => assert_eq!(ours.map(f64::to_bits), theirs.map(f64::to_bits), "{which}"),
-        }
+        assert_eq!(ours.score.map(f64::to_bits), theirs.score.map(f64::to_bits), "{which}");
         let plain = |(key, value): &(String, AttributeValue)| {
             let value = match value {
                 AttributeValue::Boolean(value) => serde_json::Value::from(*value),
@@ -173,20 +160,6 @@ fn hello_finds_the_brakings_of_the_sample_drive() {
 }
 
 #[test]
-fn imu_fft_finds_the_same_rough_roads() {
-    let both = Both::on_sample_drive("examples/imu-fft/rust", &[IMU]).set("rough", 0.02);
-    assert!(both.agree::<imu_fft::ImuFft>(&[LAST_BITS]).triggers().count() > 50);
-}
-
-#[test]
-fn brake_dark_sees_the_pixels_that_the_host_decodes() {
-    let both = Both::on_sample_drive("examples/brake-dark/rust", &[CAMERA, IMU]);
-    let run = both.set("brake_mps2", -1.4).set("dark_luma", 255.0).agree::<brake_dark::BrakeDark>(&[]);
-    assert!(run.triggers().count() > 0);
-    assert!(run.triggers().all(|trigger| trigger.attribute("luma").is_some()));
-}
-
-#[test]
 fn every_function_of_the_interface_answers_alike() {
     // The writer is made up from the drive by the one, and by the other from nothing.
     let run = Both::on_sample_drive("tests/lambdas/probe/rust", &[CAMERA, IMU]).agree::<probe::Probe>(&["writer"]);
@@ -201,27 +174,17 @@ fn ticks_come_at_the_same_times_and_see_the_same() {
 }
 
 #[test]
-fn what_is_kept_outlives_faults_and_its_bound_is_the_same() {
-    let run = Both::on_sample_drive("tests/lambdas/keeper/rust", &[IMU]).agree::<keeper::Keeper>(&[]);
-    assert_eq!((run.decisions().len(), run.faults().count()), (399, 133));
-    assert!(run.triggers().any(|trigger| trigger.label == "full"));
-}
-
-#[test]
 fn misbehaviour_has_the_same_consequences() {
     let misbehave = |behaviour| {
         let both = Both::on_sample_drive("tests/lambdas/misbehave/rust", &[IMU]).set("behaviour", behaviour);
         both.agree::<misbehave::Misbehave>(&[])
     };
-    for behaviour in ["error", "panic", "not_a_frame", "huge_label", "too_many_triggers", "nan_score", "none of these"]
-    {
+    for behaviour in ["error", "panic", "huge_label"] {
         let run = misbehave(behaviour);
         assert!(run.faults().count() >= 8 && run.passed_over() > 0, "{behaviour}");
     }
-    for behaviour in ["event_then_error", "event_then_panic"] {
-        let run = misbehave(behaviour);
-        assert_eq!(run.triggers().count(), run.faults().count(), "{behaviour}");
-    }
+    let run = misbehave("event_then_panic");
+    assert_eq!(run.triggers().count(), run.faults().count());
     assert!(misbehave("hold").counts("imu").unwrap().no_slot > 0);
     assert!(misbehave("log_flood").log_dropped() > 0);
     assert_eq!(misbehave("ok").faults().next(), None);
@@ -244,48 +207,5 @@ fn a_lambda_that_does_not_start_says_why_in_the_same_words() {
             assert!(said.contains("cannot start lambda `misbehave`") && said.contains("in init: "), "{said}");
             assert!(said.contains(wanted), "{said}");
         }
-    }
-}
-
-/// A drive of pictures, and the same for the fake.
-fn pictures(folder: &Folder, lambda: &Path) -> Both {
-    let (width, height) = (40, 30);
-    let pixels = |n: u32| (0..width * height * 3).map(|at| (at * 7 + n * 31) as u8).collect::<Vec<_>>();
-    let cdr = |n| image(width, height, "rgb8", 3 * width, &pixels(n));
-    let drive = (1..=12).map(|n| (u64::from(n) * 100_000_000, cdr(n))).collect::<Vec<_>>();
-    let drive = one_topic(folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &drive);
-    let given = (1..=12).map(|n| {
-        let bytes = [&[0, 1, 0, 0], cdr(n).as_slice()].concat();
-        let message = Message::image(width, height, Encoding::Rgb8, pixels(n)).cdr(bytes).stamped(0);
-        Given { input: "camera", at_ns: i64::from(n) * 100_000_000, message }
-    });
-    Both { folder: lambda.to_owned(), drive, given: given.collect(), set: Vec::new() }
-}
-
-#[test]
-fn greed_meets_the_same_limits() {
-    let folder = Folder::new();
-    for (behaviour, bytes) in [
-        ("topics", 0),
-        ("fields", 0),
-        ("read_cdr", 5000),
-        ("read_frame", 5000),
-        ("mean_luma", 0),
-        ("long_label", 1000),
-        ("long_label", 2 << 20),
-        ("frames", 0),
-        ("resized", 0),
-        ("huge", 0),
-        ("events", 17),
-        ("log", 5000),
-        ("ok", 0),
-    ] {
-        // What is written here fuel is not to end.
-        let lambda =
-            Copy::of("tests/lambdas/greedy/rust", |toml| toml.replace("fuel = 5_000_000", "fuel = 1_000_000_000"));
-        let both = pictures(&folder, lambda.path()).set("behaviour", behaviour).set("bytes", bytes);
-        let run = both.agree::<greedy::Greedy>(&[]);
-        let good = ["read_cdr", "read_frame", "mean_luma", "log", "ok"].contains(&behaviour);
-        assert_eq!(run.faults().next().is_none(), good, "{behaviour}");
     }
 }

@@ -13,6 +13,7 @@
 
 use std::cell::Cell;
 
+use gleaner_rules::pixels::{Pace, PixelError, check_size};
 use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
@@ -20,8 +21,6 @@ use zune_jpeg::JpegDecoder;
 use super::paced::Paced;
 use super::{Format, Header};
 use crate::error::ImageError;
-use crate::pace::Pace;
-use crate::view::check_size;
 
 /// Start of image, and the start of the marker that must follow.
 pub(super) const MAGIC: [u8; 3] = [0xff, 0xd8, 0xff];
@@ -51,7 +50,7 @@ pub(super) fn decode(
     check_structure(data)?;
     let stopped = Cell::new(false);
     let refused = |source| match stopped.get() {
-        true => ImageError::Stopped,
+        true => PixelError::Stopped.into(),
         false => ImageError::Jpeg { width, height, source },
     };
     let options = DecoderOptions::default()
@@ -68,7 +67,7 @@ pub(super) fn decode(
     }
     decoder.decode_into(out).map_err(refused)?;
     // It makes up the end of some files whose bytes end early.
-    if stopped.get() { Err(ImageError::Stopped) } else { Ok(()) }
+    if stopped.get() { Err(PixelError::Stopped.into()) } else { Ok(()) }
 }
 
 /// What the frame header (SOF) says.

@@ -17,7 +17,7 @@ mod tests;
 
 use std::fmt;
 
-use super::{ImageError, Pace};
+use super::{ImageError, Pace, PixelError};
 
 /// What the bytes of a file are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,7 +65,7 @@ impl fmt::Display for Header {
 ///
 /// # Errors
 ///
-/// [`ImageError::NotAnImage`] for other bytes, [`ImageError::Size`] for an image without pixels,
+/// [`ImageError::NotAnImage`] for other bytes, [`PixelError::Size`] for an image without pixels,
 /// [`ImageError::Unsupported`] for a kind of JPEG that cameras do not send, and
 /// [`ImageError::CutOff`] or [`ImageError::Damaged`] if there is no readable header.
 pub fn probe(data: &[u8]) -> Result<Header, ImageError> {
@@ -90,7 +90,7 @@ pub fn probe(data: &[u8]) -> Result<Header, ImageError> {
 /// # Errors
 ///
 /// [`ImageError::Bomb`] if the image is larger than `max_bytes`, before any memory is touched;
-/// [`ImageError::WorkingMemory`] if the decoder would need too much; [`ImageError::Output`] if `out`
+/// [`ImageError::WorkingMemory`] if the decoder would need too much; [`PixelError::Output`] if `out`
 /// has another length; [`ImageError::OtherImage`] if `header` is not that of `data`;
 /// [`ImageError::CutOff`], [`ImageError::Damaged`], [`ImageError::Unsupported`],
 /// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken, or not of a kind that we read.
@@ -103,7 +103,7 @@ pub fn decode_rgb8(data: &[u8], header: &Header, max_bytes: usize, out: &mut [u8
 ///
 /// # Errors
 ///
-/// As [`decode_rgb8`], and [`ImageError::Stopped`].
+/// As [`decode_rgb8`], and [`PixelError::Stopped`].
 pub fn decode_rgb8_paced(
     data: &[u8],
     header: &Header,
@@ -124,7 +124,7 @@ pub fn decode_rgb8_paced(
         }
     };
     if out.len() != needed {
-        return Err(ImageError::Output { operation: "decoding", needed, found: out.len() });
+        return Err(PixelError::Output { operation: "decoding", needed, found: out.len() }.into());
     }
     let allowed = max_bytes.saturating_mul(4).saturating_add(4 << 20);
     // What a broken file leaves unwritten is black, not a piece of whatever was here before.

@@ -2,9 +2,8 @@
 
 use std::cell::Cell;
 
+use gleaner_rules::pixels::Pace;
 use zune_core::bytestream::{ZByteIoError, ZByteReaderTrait, ZCursor, ZSeekFrom};
-
-use crate::pace::Pace;
 
 /// Work on a byte of a JPEG, in bytes of other work: it becomes a dozen bytes of pixels or more, each of which takes some time.
 const WEIGHT: usize = 64;

@@ -2,12 +2,11 @@
 
 use std::io::{Cursor, ErrorKind};
 
+use gleaner_rules::pixels::{Pace, check_size};
 use png::{ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformations};
 
 use super::{Format, Header};
 use crate::error::ImageError;
-use crate::pace::Pace;
-use crate::view::check_size;
 
 /// The signature of PNG.
 pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
@@ -106,6 +105,8 @@ fn damaged(at: usize, what: &'static str) -> ImageError {
 #[cfg(test)]
 mod tests {
     use png::{BitDepth, Encoder};
+
+    use gleaner_rules::pixels::PixelError;
 
     use super::*;
     use crate::decode::samples::{self, HEIGHT, WIDTH, colour};
@@ -222,7 +223,7 @@ mod tests {
         let error = decode_rgb8(&bomb, &header, 1 << 20, &mut []).unwrap_err();
         assert!(matches!(error, ImageError::Bomb { needed: 12_884_508_675, .. }), "{error}");
         bomb[16] = 0x80;
-        assert!(matches!(probe(&bomb), Err(ImageError::Size { .. })));
+        assert!(matches!(probe(&bomb), Err(ImageError::Pixels(PixelError::Size { .. }))));
         bomb[12] = b'X';
         assert!(matches!(probe(&bomb), Err(ImageError::Damaged { .. })));
     }

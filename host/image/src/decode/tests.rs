@@ -32,7 +32,7 @@ fn decoding_stops_when_its_caller_wants_that() {
             decode_rgb8_paced(file, &header, 1 << 20, &mut out, &Pace::new(may_go_on)).map(|()| out.clone())
         };
         let stopped = decode(&|| false);
-        assert!(matches!(stopped, Err(ImageError::Stopped)), "{header}: {stopped:?}");
+        assert!(matches!(stopped, Err(ImageError::Pixels(PixelError::Stopped))), "{header}: {stopped:?}");
         assert_eq!(decode(&|| true).unwrap(), decoded(file).unwrap(), "{header}");
     }
 }
@@ -154,7 +154,7 @@ fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
     let twelve = patched(&samples::BASELINE, 0xc0, &[0, 17, 12]);
     assert!(matches!(probe(&twelve), Err(ImageError::Unsupported { .. })));
     let no_height = patched(&samples::BASELINE, 0xc0, &[0, 17, 8, 0, 0]);
-    assert!(matches!(probe(&no_height), Err(ImageError::Size { width: 24, height: 0 })));
+    assert!(matches!(probe(&no_height), Err(ImageError::Pixels(PixelError::Size { width: 24, height: 0 }))));
 }
 
 #[test]

@@ -6,6 +6,7 @@ use std::time::Instant;
 use crate::running::*;
 use crate::support::*;
 use gleaner_lambda::TriggerKind::{Event, Start};
+use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_protocol::link::{CommandStatus, RecorderLink};
 use gleaner_transport::Verdict;
 

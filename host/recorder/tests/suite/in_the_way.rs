@@ -6,7 +6,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::support::*;
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::Clip;
 use gleaner_lambda::TriggerKind::{Event, Start};
+use gleaner_lambda::manifest::Store;
 use gleaner_protocol::link::Loss;
 use gleaner_recorder::{Folder, RecordError};
 

@@ -14,8 +14,8 @@ use gleaner_lambda::Clip;
 use gleaner_lambda::TriggerKind::Event;
 use gleaner_protocol::link::{Control, RecorderLink, RecorderReport};
 use gleaner_recorder::Folder;
-use gleaner_recorder::program::{Feed, run};
-use gleaner_transport::Clock;
+use gleaner_recorder::program::run;
+use gleaner_transport::{Clock, LiveSource};
 
 /// Kills if `GLEANER_KILLS` does not say how many, each after a second and a half; twenty times as
 /// many with `GLEANER_LONG=1`.

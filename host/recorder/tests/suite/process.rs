@@ -12,8 +12,8 @@ use crate::support::*;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
-use gleaner_recorder::program::{Feed, Options, run};
-use gleaner_transport::Clock;
+use gleaner_recorder::program::{Options, run};
+use gleaner_transport::{Clock, LiveSource};
 
 #[test]
 fn two_lambdas_record_and_neither_speaks_for_the_other() {

@@ -325,8 +325,7 @@ fn refused(error: data::DataError) -> DataError {
         data::DataError::NoImageType { .. } | data::DataError::NotAFrame { .. } => DataError::NotAFrame(message),
         data::DataError::TooLarge { .. }
         | data::DataError::NoSlot { .. }
-        | data::DataError::NoMemory { .. }
-        | data::DataError::TooManyFrames { .. }
+        | data::DataError::NoRoom(_)
         | data::DataError::OutOfTime => DataError::NoRoom(message),
         data::DataError::OutOfRange(_) => DataError::OutOfRange(message),
     }

@@ -58,8 +58,7 @@ pub(super) fn from_error(
     }
     if let Some(ResourceTableError::Full) = error.downcast_ref() {
         let allowed = hosted.allowed.handles;
-        let message =
-            format!("the lambda holds {allowed} handles; drop samples, frames, fields and topics that are not needed");
+        let message = gleaner_rules::refused::too_many_handles(allowed);
         return Fault { kind: FaultKind::HostCall, message, used: Some(allowed + 1), allowed: Some(allowed) };
     }
     if error.root_cause().to_string().starts_with(TOO_MUCH_DATA) {

@@ -1,6 +1,6 @@
 //! What the bytes of a pixel mean: the encodings of `sensor_msgs/msg/Image` that we read.
 
-use super::error::{ImageError, shortened};
+use super::error::{PixelError, shortened};
 
 /// Arrangement of the colour filter in front of a raw sensor: the first two pixels of the first row,
 /// then of the second.
@@ -75,10 +75,10 @@ impl Encoding {
     ///
     /// # Errors
     ///
-    /// [`ImageError::UnknownEncoding`] with the list of names that are understood.
-    pub fn from_ros(name: &str) -> Result<Self, ImageError> {
+    /// [`PixelError::UnknownEncoding`] with the list of names that are understood.
+    pub fn from_ros(name: &str) -> Result<Self, PixelError> {
         NAMES.iter().find(|(known, _)| *known == name).map(|(_, encoding)| *encoding).ok_or_else(|| {
-            ImageError::UnknownEncoding { name: shortened(name), supported: NAMES.map(|(known, _)| known).join(", ") }
+            PixelError::UnknownEncoding { name: shortened(name), supported: NAMES.map(|(known, _)| known).join(", ") }
         })
     }
 

@@ -1,6 +1,6 @@
 //! How a pixel of each encoding is read as grey or as red, green and blue.
 
-use crate::{Encoding, ImageError, View};
+use crate::pixels::{Encoding, PixelError, View};
 
 /// The pixels of an image that are not raw: every encoding that has a grey level.
 #[derive(Debug, Clone, Copy)]
@@ -20,7 +20,7 @@ pub(super) enum Pixels {
 
 impl Pixels {
     /// The pixels of `view`, or why `operation` cannot read them.
-    pub(super) fn of(view: &View<'_>, operation: &'static str) -> Result<Self, ImageError> {
+    pub(super) fn of(view: &View<'_>, operation: &'static str) -> Result<Self, PixelError> {
         Ok(match view.encoding() {
             Encoding::Mono8 => Self::Grey8,
             Encoding::Mono16 => Self::Grey16 { high: usize::from(!view.big_endian()) },
@@ -31,7 +31,7 @@ impl Pixels {
             Encoding::Yuv422Uyvy => Self::Uyvy,
             Encoding::Yuv422Yuyv => Self::Yuyv,
             encoding @ (Encoding::Bayer8(_) | Encoding::Bayer16(_)) => {
-                return Err(ImageError::Raw { operation, encoding });
+                return Err(PixelError::Raw { operation, encoding });
             }
         })
     }

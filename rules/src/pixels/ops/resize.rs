@@ -14,7 +14,7 @@
 
 use super::pixels::Pixels;
 use super::rounded::Rounded;
-use crate::{Encoding, ImageError, View};
+use crate::pixels::{Encoding, PixelError, View};
 
 /// Largest width and height of a resized image, in pixels.
 pub const MAX_RESIZED_SIDE: u32 = 16_384;
@@ -24,13 +24,13 @@ pub const MAX_RESIZED_SIDE: u32 = 16_384;
 ///
 /// # Errors
 ///
-/// [`ImageError::ResizeTo`] if a side is 0 or above [`MAX_RESIZED_SIDE`], [`ImageError::Raw`] for a
+/// [`PixelError::ResizeTo`] if a side is 0 or above [`MAX_RESIZED_SIDE`], [`PixelError::Raw`] for a
 /// Bayer image.
-pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, usize), ImageError> {
+pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, usize), PixelError> {
     Pixels::of(view, "resize")?;
     let fits = |side| (1..=MAX_RESIZED_SIDE).contains(&side);
     if !fits(width) || !fits(height) {
-        return Err(ImageError::ResizeTo { width, height });
+        return Err(PixelError::ResizeTo { width, height });
     }
     let encoding = if view.encoding().is_grey() { Encoding::Mono8 } else { Encoding::Rgb8 };
     // At most 3 * 2^28.
@@ -43,7 +43,7 @@ pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, us
 /// # Errors
 ///
 /// As for [`resized`].
-pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, ImageError> {
+pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, PixelError> {
     let (encoding, out) = resized(view, width, height)?;
     let old_row = u64::from(view.width()) * encoding.bytes_per_pixel() as u64;
     let sums = if height > view.height() { 0 } else { u64::from(height) * old_row };
@@ -61,12 +61,12 @@ pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, Imag
 ///
 /// # Errors
 ///
-/// As for [`resized`], [`ImageError::Output`] if `out` has another length, [`ImageError::Stopped`].
-pub fn resize(view: &View<'_>, width: u32, height: u32, out: &mut [u8]) -> Result<Encoding, ImageError> {
+/// As for [`resized`], [`PixelError::Output`] if `out` has another length, [`PixelError::Stopped`].
+pub fn resize(view: &View<'_>, width: u32, height: u32, out: &mut [u8]) -> Result<Encoding, PixelError> {
     let pixels = Pixels::of(view, "resize")?;
     let (encoding, needed) = resized(view, width, height)?;
     if out.len() != needed {
-        return Err(ImageError::Output { operation: "resize", needed, found: out.len() });
+        return Err(PixelError::Output { operation: "resize", needed, found: out.len() });
     }
     let across = Axis { from: view.width(), to: width };
     let down = Axis { from: view.height(), to: height };
@@ -95,12 +95,12 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
         Self { pixels, down, across: (0..across.to).map(|x| across.taps(x)).collect(), rounded, row }
     }
 
-    fn fill(self, view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
+    fn fill(self, view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
         if self.down.to > self.down.from { self.grow_down(view, out) } else { self.shrink_down(view, out) }
     }
 
     /// Adds up the old rows of each new one, then blends the sums across.
-    fn shrink_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
+    fn shrink_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
         let mut columns = vec![0_u32; self.row.len()];
         for (y, line) in (0..).zip(out.chunks_exact_mut(self.across.len() * CHANNELS)) {
             view.go_on(line.len())?;
@@ -123,7 +123,7 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
     }
 
     /// Blends each old row across, then two of them into each new row.
-    fn grow_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
+    fn grow_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
         let width = self.across.len() * CHANNELS;
         // The two rows that were blended last, the upper one first.
         let mut blended = [vec![0_u32; width], vec![0_u32; width]];
@@ -370,7 +370,7 @@ mod tests {
         );
         let bayer = Encoding::from_ros("bayer_bggr8").unwrap();
         let raw = View::new(2, 2, 2, bayer, false, &[0; 4]).unwrap();
-        assert!(matches!(resize(&raw, 1, 1, &mut [0; 3]), Err(ImageError::Raw { .. })));
+        assert!(matches!(resize(&raw, 1, 1, &mut [0; 3]), Err(PixelError::Raw { .. })));
     }
 
     #[test]

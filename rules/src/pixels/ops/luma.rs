@@ -1,7 +1,7 @@
 //! How bright an image is.
 
 use super::pixels::Pixels;
-use crate::{ImageError, Roi, View};
+use crate::pixels::{PixelError, Roi, View};
 
 /// Byte positions that are summed side by side. 48 bytes are whole pixels of 1, 2, 3 and 4 bytes and
 /// whole vector registers of 16 bytes, so that one loop serves every encoding and vectorises.
@@ -18,10 +18,10 @@ const GROUPS: usize = 257;
 ///
 /// # Errors
 ///
-/// [`ImageError::Roi`] if no pixel is in `roi`, [`ImageError::Raw`] for a Bayer image, [`ImageError::Stopped`].
+/// [`PixelError::Roi`] if no pixel is in `roi`, [`PixelError::Raw`] for a Bayer image, [`PixelError::Stopped`].
 ///
 /// Source: luma weights of ITU-R BT.601.
-pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, ImageError> {
+pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, PixelError> {
     let pixels = Pixels::of(view, "mean luma")?;
     let roi = view.clip(roi)?;
     let mut lanes = [0; LANES];
@@ -71,8 +71,8 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
 ///
 /// # Errors
 ///
-/// [`ImageError::Roi`] if no pixel is in `roi`, [`ImageError::Raw`] for a Bayer image, [`ImageError::Stopped`].
-pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], ImageError> {
+/// [`PixelError::Roi`] if no pixel is in `roi`, [`PixelError::Raw`] for a Bayer image, [`PixelError::Stopped`].
+pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], PixelError> {
     let pixels = Pixels::of(view, "histogram")?;
     let roi = view.clip(roi)?;
     // 65,535^2 pixels of one level still fit a `u32`.
@@ -99,14 +99,14 @@ pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], ImageE
 ///
 /// # Errors
 ///
-/// [`ImageError::Output`] if `out` has another length, [`ImageError::Raw`] for a Bayer image, [`ImageError::Stopped`].
-pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
+/// [`PixelError::Output`] if `out` has another length, [`PixelError::Raw`] for a Bayer image, [`PixelError::Stopped`].
+pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
     let pixels = Pixels::of(view, "grey image")?;
     let width = view.width() as usize;
     // The view has at least one byte for each pixel, so their number is a `usize`.
     let needed = width * view.height() as usize;
     if out.len() != needed {
-        return Err(ImageError::Output { operation: "grey image", needed, found: out.len() });
+        return Err(PixelError::Output { operation: "grey image", needed, found: out.len() });
     }
     for (y, levels) in (0..view.height()).zip(out.chunks_exact_mut(width)) {
         let row = view.row(y);
@@ -119,8 +119,8 @@ pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), ImageError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Encoding;
-    use crate::ops::work;
+    use crate::pixels::Encoding;
+    use crate::pixels::ops::work;
 
     const WHOLE: Option<Roi> = None;
 
@@ -275,7 +275,7 @@ mod tests {
     fn a_region_outside_is_refused() {
         let view = View::new(2, 2, 2, Encoding::Mono8, false, &[0; 4]).unwrap();
         let outside = Some(Roi { x: 2, y: 0, width: 1, height: 1 });
-        assert!(matches!(mean_luma(&view, outside), Err(ImageError::Roi { .. })));
-        assert!(matches!(histogram(&view, outside), Err(ImageError::Roi { .. })));
+        assert!(matches!(mean_luma(&view, outside), Err(PixelError::Roi { .. })));
+        assert!(matches!(histogram(&view, outside), Err(PixelError::Roi { .. })));
     }
 }

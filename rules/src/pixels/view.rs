@@ -1,6 +1,6 @@
 //! An image as it lies in memory, once its size has been checked.
 
-use super::{Encoding, ImageError, Pace};
+use super::{Encoding, Pace, PixelError};
 
 /// Largest width and height of an image, in pixels.
 pub const MAX_SIDE: u32 = 65_535;
@@ -27,8 +27,8 @@ impl<'a> View<'a> {
     ///
     /// # Errors
     ///
-    /// [`ImageError::Size`], [`ImageError::Step`], [`ImageError::Data`] or
-    /// [`ImageError::OddWidth`], with the numbers that do not fit.
+    /// [`PixelError::Size`], [`PixelError::Step`], [`PixelError::Data`] or
+    /// [`PixelError::OddWidth`], with the numbers that do not fit.
     pub fn new(
         width: u32,
         height: u32,
@@ -36,16 +36,16 @@ impl<'a> View<'a> {
         encoding: Encoding,
         big_endian: bool,
         data: &'a [u8],
-    ) -> Result<Self, ImageError> {
+    ) -> Result<Self, PixelError> {
         check_size(width, height)?;
         if encoding.is_paired() && !width.is_multiple_of(2) {
-            return Err(ImageError::OddWidth { width, encoding });
+            return Err(PixelError::OddWidth { width, encoding });
         }
         // At most 65,535 * 4: fits even where a `usize` has 32 bits.
         let row = width as usize * encoding.bytes_per_pixel();
         if (step as usize) < row {
             let needed = row;
-            return Err(ImageError::Step { width, height, encoding, step, needed });
+            return Err(PixelError::Step { width, height, encoding, step, needed });
         }
         let needed = (step as usize)
             .checked_mul(height as usize - 1)
@@ -53,7 +53,7 @@ impl<'a> View<'a> {
             .unwrap_or(usize::MAX);
         if data.len() < needed {
             let found = data.len();
-            return Err(ImageError::Data { width, height, encoding, step, needed, found });
+            return Err(PixelError::Data { width, height, encoding, step, needed, found });
         }
         let data = &data[..needed];
         Ok(Self { width, height, step: step as usize, encoding, big_endian, data, pace: None })
@@ -66,7 +66,7 @@ impl<'a> View<'a> {
     }
 
     /// Asks whether an operation may go on to the next so many bytes.
-    pub(super) fn go_on(&self, bytes: usize) -> Result<(), ImageError> {
+    pub(super) fn go_on(&self, bytes: usize) -> Result<(), PixelError> {
         self.pace.map_or(Ok(()), |pace| pace.go_on(bytes))
     }
 
@@ -83,6 +83,11 @@ impl<'a> View<'a> {
     /// Bytes from the start of a row to the start of the next.
     pub const fn step(&self) -> usize {
         self.step
+    }
+
+    /// All rows; the last one without padding.
+    pub const fn bytes(&self) -> &'a [u8] {
+        self.data
     }
 
     /// What a pixel is.
@@ -106,14 +111,14 @@ impl<'a> View<'a> {
     ///
     /// # Errors
     ///
-    /// [`ImageError::Roi`] if no pixel of the image is in the region.
-    pub fn clip(&self, roi: Option<Roi>) -> Result<Roi, ImageError> {
+    /// [`PixelError::Roi`] if no pixel of the image is in the region.
+    pub fn clip(&self, roi: Option<Roi>) -> Result<Roi, PixelError> {
         let (width, height) = (self.width, self.height);
         let Some(roi) = roi else {
             return Ok(Roi { x: 0, y: 0, width, height });
         };
         if roi.x >= width || roi.y >= height || roi.width == 0 || roi.height == 0 {
-            return Err(ImageError::Roi { roi, width, height });
+            return Err(PixelError::Roi { roi, width, height });
         }
         Ok(Roi { width: roi.width.min(width - roi.x), height: roi.height.min(height - roi.y), ..roi })
     }
@@ -128,9 +133,9 @@ impl<'a> View<'a> {
 }
 
 /// Refuses an image without pixels and one with absurdly many.
-pub(super) fn check_size(width: u32, height: u32) -> Result<(), ImageError> {
+pub fn check_size(width: u32, height: u32) -> Result<(), PixelError> {
     let fits = |side| (1..=MAX_SIDE).contains(&side);
-    if fits(width) && fits(height) { Ok(()) } else { Err(ImageError::Size { width, height }) }
+    if fits(width) && fits(height) { Ok(()) } else { Err(PixelError::Size { width, height }) }
 }
 
 /// A rectangle of pixels; its corner (`x`, `y`) counts from the top left of the image.

@@ -15,14 +15,14 @@ mod rounded;
 pub use luma::{histogram, mean_luma, to_gray};
 pub use resize::{MAX_RESIZED_SIDE, resize, resize_work, resized};
 
-use super::{ImageError, Roi, View};
+use super::{PixelError, Roi, View};
 
 /// Bytes that [`mean_luma`], [`histogram`] or [`to_gray`] reads, the measure of its cost.
 ///
 /// # Errors
 ///
-/// [`ImageError::Roi`] if no pixel of the image is in `roi`.
-pub fn work(view: &View<'_>, roi: Option<Roi>) -> Result<u64, ImageError> {
+/// [`PixelError::Roi`] if no pixel of the image is in `roi`.
+pub fn work(view: &View<'_>, roi: Option<Roi>) -> Result<u64, PixelError> {
     let roi = view.clip(roi)?;
     Ok(u64::from(roi.width) * u64::from(roi.height) * view.encoding().bytes_per_pixel() as u64)
 }
@@ -30,7 +30,7 @@ pub fn work(view: &View<'_>, roi: Option<Roi>) -> Result<u64, ImageError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Encoding;
+    use crate::pixels::Encoding;
 
     #[test]
     fn work_is_the_bytes_of_the_pixels_without_padding() {

@@ -2,6 +2,8 @@
 
 /// Largest first, so that the first that divides a size is the one to show it in.
 const SIZES: [(&str, u64); 4] = [("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10), ("B", 1)];
+
+/// Largest first; a duration is written in any, and shown in the first that divides it.
 const TIMES: [(&str, u64); 6] = [
     ("h", 3_600_000_000_000),
     ("min", 60_000_000_000),
@@ -10,8 +12,11 @@ const TIMES: [(&str, u64); 6] = [
     ("us", 1_000),
     ("ns", 1),
 ];
-pub(super) const SIZE_RULE: &str = "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"";
-pub(super) const TIME_RULE: &str = "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"";
+
+/// How a size is written.
+pub const SIZE_RULE: &str = "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"";
+/// How a duration is written.
+pub const TIME_RULE: &str = "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"";
 
 /// The number and the unit of `2 MiB` or `2MiB`; without a unit the second is empty.
 fn split(text: &str) -> (&str, &str) {
@@ -25,15 +30,15 @@ fn factor(units: &[(&str, u64)], unit: &str) -> Option<u64> {
     units.iter().find(|(name, _)| *name == unit).map(|(_, factor)| *factor)
 }
 
-/// Bytes.
-pub(super) fn size(text: &str) -> Option<u64> {
+/// The bytes that `text` stands for; without a unit it is a number of bytes.
+pub fn size(text: &str) -> Option<u64> {
     let (number, unit) = split(text);
     let factor = if unit.is_empty() { 1 } else { factor(&SIZES, unit)? };
     number.parse::<u64>().ok()?.checked_mul(factor)
 }
 
-/// Nanoseconds, which must be whole.
-pub(super) fn duration(text: &str) -> Option<u64> {
+/// The nanoseconds that `text` stands for: exact, so it has no parts of one.
+pub fn duration(text: &str) -> Option<u64> {
     let (number, unit) = split(text);
     let factor = factor(&TIMES, unit)?;
     let (whole, fraction) = number.split_once('.').unwrap_or((number, "0"));
@@ -44,29 +49,23 @@ pub(super) fn duration(text: &str) -> Option<u64> {
     whole.checked_add(u64::try_from(part).ok()?)
 }
 
+/// Digits and nothing else: `u64::from_str` also takes a sign.
 fn digits(text: &str) -> Option<u64> {
     if text.bytes().all(|byte| byte.is_ascii_digit()) { text.parse().ok() } else { None }
 }
 
-/// In the largest unit that keeps it whole.
-pub(super) fn size_in_words(bytes: u64) -> String {
-    let fits = |(_, factor): &&(&str, u64)| bytes != 0 && bytes.is_multiple_of(*factor);
-    let (unit, factor) = SIZES.iter().find(fits).unwrap_or(&SIZES[SIZES.len() - 1]);
-    format!("{} {unit}", bytes / factor)
+/// A size in the largest unit that keeps it whole: `2 MiB`, `1536 B`.
+pub fn size_in_words(bytes: u64) -> String {
+    in_largest(bytes, &SIZES, " ")
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+/// A duration in the largest unit that keeps it whole: `1500ms`, `5s`, `2min`.
+pub fn duration_in_words(ns: u64) -> String {
+    if ns == 0 { "0s".to_owned() } else { in_largest(ns, &TIMES, "") }
+}
 
-    #[test]
-    fn sizes_and_durations_are_read_exactly_or_not_at_all() {
-        assert_eq!(
-            ["2 MiB", "512KiB", "17", "1.5 MiB", "2 MB"].map(size),
-            [Some(2 << 20), Some(512 << 10), Some(17), None, None]
-        );
-        let times = ["1.5s", "100us", "0.000000001s", "5", "0.0000000001s"].map(duration);
-        assert_eq!(times, [Some(1_500_000_000), Some(100_000), Some(1), None, None]);
-        assert_eq!([0, 1 << 20, 1536].map(size_in_words), ["0 B", "1 MiB", "1536 B"]);
-    }
+fn in_largest(n: u64, units: &[(&str, u64)], gap: &str) -> String {
+    let fits = |(_, factor): &&(&str, u64)| n != 0 && n.is_multiple_of(*factor);
+    let (unit, factor) = units.iter().find(fits).unwrap_or(&units[units.len() - 1]);
+    format!("{}{gap}{unit}", n / factor)
 }

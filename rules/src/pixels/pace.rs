@@ -3,7 +3,7 @@
 use std::cell::Cell;
 use std::fmt;
 
-use super::ImageError;
+use super::PixelError;
 
 /// Bytes that are worked on between two questions: below a tenth of a millisecond, and long enough for a look at a clock to be cheap.
 const STRIDE: usize = 64 << 10;
@@ -22,13 +22,13 @@ impl<'a> Pace<'a> {
     }
 
     /// Asks, if it is time to, before so many bytes are worked on.
-    pub(super) fn go_on(&self, bytes: usize) -> Result<(), ImageError> {
+    pub fn go_on(&self, bytes: usize) -> Result<(), PixelError> {
         if let Some(left) = self.left.get().checked_sub(bytes) {
             self.left.set(left);
             return Ok(());
         }
         self.left.set(STRIDE);
-        if (self.may_go_on)() { Ok(()) } else { Err(ImageError::Stopped) }
+        if (self.may_go_on)() { Ok(()) } else { Err(PixelError::Stopped) }
     }
 }
 
@@ -41,10 +41,10 @@ impl fmt::Debug for Pace<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Encoding, View, ops};
+    use crate::pixels::{Encoding, View, ops};
 
     /// How many rows of a picture of 1024 columns an operation reached that is stopped at its `asked`th question.
-    fn rows_reached(asked: u32, operation: impl Fn(&View<'_>) -> Result<(), ImageError>) -> Result<(), ImageError> {
+    fn rows_reached(asked: u32, operation: impl Fn(&View<'_>) -> Result<(), PixelError>) -> Result<(), PixelError> {
         let data = vec![200; 1024 * 3 * 1024];
         let questions = Cell::new(0);
         let may_go_on = || {
@@ -60,7 +60,7 @@ mod tests {
 
     #[test]
     fn every_operation_stops_between_rows() {
-        let stopped = |result| assert!(matches!(result, Err(ImageError::Stopped)), "{result:?}");
+        let stopped = |result| assert!(matches!(result, Err(PixelError::Stopped)), "{result:?}");
         for asked in [1, 2, 5] {
             stopped(rows_reached(asked, |view| ops::mean_luma(view, None).map(drop)));
             stopped(rows_reached(asked, |view| ops::histogram(view, None).map(drop)));

@@ -1,0 +1,50 @@
+//! What a ring shows, by the calls and answers of `rules/cases`: this ring gives them without a
+//! lock.
+#![cfg(not(loom))]
+
+use std::collections::BTreeMap;
+
+use gleaner_buffers::{HeapRegion, Pool, RingCounts, ring};
+use serde_json::{Value, json};
+
+#[test]
+fn a_ring_answers_as_the_rules_have_it() {
+    let cases: Vec<Value> = serde_json::from_str(include_str!("../../../rules/cases/ring.json")).unwrap();
+    for case in &cases {
+        let [depth, hold, max_size] =
+            ["depth", "hold", "max_size"].map(|key| case["given"][key].as_u64().unwrap() as usize);
+        let slots = depth + hold + 1;
+        let region = HeapRegion::zeroed(Pool::<i64>::bytes_needed(slots, max_size).unwrap()).unwrap();
+        let (mut writer, reader) = ring(Pool::new(region, slots, max_size).unwrap(), depth).unwrap();
+        let (mut held, mut found) = (BTreeMap::new(), Vec::new());
+        for (n, call) in case["calls"].as_array().unwrap().iter().enumerate() {
+            let given = call[1].as_u64().unwrap_or_default();
+            let answer = match call[0].as_str().unwrap() {
+                "push" => {
+                    if let Ok(draft) = writer.draft(given as usize) {
+                        // A sample is its own time.
+                        writer.publish(draft, reader.head() as i64).unwrap();
+                    }
+                    Value::Null
+                }
+                "hold" => json!(reader.get(given).map(|lease| held.insert(given, lease)).is_some()),
+                "let go" => {
+                    held.remove(&given);
+                    Value::Null
+                }
+                "counts" => {
+                    let RingCounts { received, overwritten, no_slot, too_big } = reader.counts();
+                    json!([received, overwritten, no_slot, too_big])
+                }
+                asked => {
+                    let since = if asked == "since" { call[1].as_i64().unwrap() } else { i64::MIN };
+                    let most = if asked == "since" { 99 } else { given as usize };
+                    reader.newest_while(most, |at_ns| *at_ns > since, &mut found);
+                    found.drain(..).map(|lease| json!(lease.position())).collect()
+                }
+            };
+            let wanted = call.as_array().unwrap().last().unwrap();
+            assert_eq!(&answer, wanted, "{}: call {n}, {call}", case["name"]);
+        }
+    }
+}

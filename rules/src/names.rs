@@ -1,0 +1,58 @@
+//! Names in a manifest: of lambdas and inputs, of topics, and of message types.
+
+/// Longest topic name that rmw accepts, in bytes.
+const TOPIC_NAME_MAX: usize = 247;
+
+/// The type of raw images.
+pub const IMAGE: &str = "sensor_msgs/msg/Image";
+/// The type of images that are decoded.
+pub const COMPRESSED_IMAGE: &str = "sensor_msgs/msg/CompressedImage";
+
+/// 1 to 63 characters, first a lower-case letter, then those, digits and `extra`.
+fn is_name(text: &str, extra: &[u8]) -> bool {
+    let rest = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
+    text.len() <= 63 && text.bytes().next().is_some_and(|first| first.is_ascii_lowercase()) && text.bytes().all(rest)
+}
+
+/// Whether a lambda can have this name.
+pub fn is_lambda(text: &str) -> bool {
+    is_name(text, b"-")
+}
+
+/// Whether an input, a model or a value of `[config]` can have this name.
+pub fn is_item(text: &str) -> bool {
+    is_name(text, b"_-")
+}
+
+/// Whether a ROS topic can have this name, which is absolute.
+pub fn is_topic(text: &str) -> bool {
+    let token = |part: &str| {
+        part.bytes().next().is_some_and(|first| !first.is_ascii_digit())
+            && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+    };
+    text.len() <= TOPIC_NAME_MAX && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
+}
+
+/// Whether a ROS message type can have this name, such as `sensor_msgs/msg/Imu`.
+pub fn is_type(text: &str) -> bool {
+    let mut parts = text.split('/');
+    let (Some(package), Some("msg"), Some(name), None) = (parts.next(), parts.next(), parts.next(), parts.next())
+    else {
+        return false;
+    };
+    text.len() <= 255
+        && package.bytes().next().is_some_and(|first| first.is_ascii_alphabetic())
+        && package.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+        && name.bytes().next().is_some_and(|first| first.is_ascii_uppercase())
+        && name.bytes().all(|byte| byte.is_ascii_alphanumeric())
+}
+
+/// Whether samples of this type are seen as frames.
+pub fn is_frame(type_name: &str) -> bool {
+    type_name == IMAGE || type_name == COMPRESSED_IMAGE
+}
+
+/// Whether samples of this type are large, so that few of them are kept: frames and point clouds.
+pub fn is_large(type_name: &str) -> bool {
+    type_name == "sensor_msgs/msg/PointCloud2" || is_frame(type_name)
+}

@@ -1,0 +1,61 @@
+//! Paths of fields, such as `a.b[3].c`: their syntax. Which fields there are, definitions or
+//! messages say.
+
+use std::fmt;
+
+/// One step of a written path.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Segment<'p> {
+    /// A field of a message.
+    Name(&'p str),
+    /// An element of an array.
+    Index(usize),
+}
+
+/// A text that is no path.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Malformed {
+    /// The text.
+    pub path: String,
+    /// From where on it makes no sense.
+    pub rest: String,
+}
+
+impl fmt::Display for Malformed {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "path `{}` is malformed at `{}`; write it like `a.b[3].c`", self.path, self.rest)
+    }
+}
+
+impl std::error::Error for Malformed {}
+
+/// The steps of `path`, at least one; the first is a name, and so is each behind a point.
+///
+/// # Errors
+///
+/// [`Malformed`] says from where on it makes no sense.
+pub fn segments(path: &str) -> Result<Vec<Segment<'_>>, Malformed> {
+    let malformed = |rest: &str| Malformed { path: path.to_owned(), rest: rest.to_owned() };
+    let mut segments = Vec::new();
+    let mut rest = path;
+    loop {
+        let is_part = |c: char| c.is_ascii_alphanumeric() || c == '_';
+        let end = rest.find(|c| !is_part(c)).unwrap_or(rest.len());
+        let (name, mut tail) = rest.split_at(end);
+        if name.is_empty() {
+            return Err(malformed(rest));
+        }
+        segments.push(Segment::Name(name));
+        while let Some(inside) = tail.strip_prefix('[') {
+            let (digits, behind) = inside.split_once(']').ok_or_else(|| malformed(tail))?;
+            let is_number = digits.bytes().all(|byte| byte.is_ascii_digit());
+            let index = digits.parse().ok().filter(|_| is_number);
+            segments.push(Segment::Index(index.ok_or_else(|| malformed(tail))?));
+            tail = behind;
+        }
+        if tail.is_empty() {
+            return Ok(segments);
+        }
+        rest = tail.strip_prefix('.').ok_or_else(|| malformed(tail))?;
+    }
+}

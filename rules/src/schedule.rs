@@ -1,0 +1,254 @@
+//! When a lambda runs: for each new sample of one input, or every so often.
+//!
+//! A schedule only looks at rings and times; it never runs anything, and it counts what it passes
+//! over.
+
+/// Ticks made up for in one gap between two samples. A longer gap (a clock that jumped, two drives
+/// far apart) is counted as missed, so that a bad stamp cannot keep a replay busy for years.
+const CATCH_UP_TICKS: u64 = 100_000;
+
+/// What a schedule sees of the ring of one input.
+pub trait Ring {
+    /// One sample in the ring.
+    type Sample;
+
+    /// Number of samples that entered so far: the position that the next one will have.
+    fn head(&self) -> u64;
+    /// How many samples the lambda sees at most.
+    fn depth(&self) -> usize;
+    /// The sample at a position, if it is still there.
+    fn get(&self, position: u64) -> Option<Self::Sample>;
+    /// The newest sample, and its position.
+    fn newest(&self) -> Option<(u64, Self::Sample)>;
+    /// Counts samples that should have woken the lambda and did not.
+    fn skip(&self, samples: u64);
+}
+
+/// Which samples wake a lambda that was busy.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Backlog {
+    /// Each that is still in the ring.
+    Each,
+    /// The newest one.
+    Latest,
+}
+
+/// A periodic wake.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tick {
+    /// When it was due, in nanoseconds.
+    pub at_ns: i64,
+    /// Ticks that were due since the previous wake and did not happen.
+    pub missed: u64,
+}
+
+/// The schedule of one lambda.
+#[derive(Debug)]
+pub enum Schedule<R> {
+    /// One wake for each sample, or for the newest one.
+    Event(Event<R>),
+    /// One wake for each period.
+    Periodic(Periodic),
+}
+
+/// Wakes on new samples of one input.
+#[derive(Debug)]
+pub struct Event<R> {
+    ring: R,
+    backlog: Backlog,
+    /// Position in the ring of the first sample that has not been considered.
+    next: u64,
+}
+
+/// Wakes on a period, counted from the start of the drive, or live of the run.
+#[derive(Debug)]
+pub struct Periodic {
+    period_ns: i64,
+    /// Live, a tick whose successor is due as well is missed: nobody waits for what is late.
+    live: bool,
+    due_ns: Option<i64>,
+    missed: u64,
+    missed_total: u64,
+}
+
+impl<R: Ring> Schedule<R> {
+    /// Wakes on samples of `ring`.
+    pub fn event(ring: R, backlog: Backlog) -> Self {
+        Self::Event(Event { ring, backlog, next: 0 })
+    }
+
+    /// Wakes every `period_ns`, from 1. Time begins with [`Schedule::begin`], or else at the first
+    /// look for a tick.
+    pub fn periodic(period_ns: i64) -> Self {
+        let period_ns = period_ns.max(1);
+        Self::Periodic(Periodic { period_ns, live: false, due_ns: None, missed: 0, missed_total: 0 })
+    }
+
+    /// Time begins, in a replay: the first tick comes a period later.
+    pub fn begin(&mut self, at_ns: i64) {
+        if let Self::Periodic(periodic) = self {
+            periodic.due_ns = Some(at_ns.saturating_add(periodic.period_ns));
+        }
+    }
+
+    /// Time begins where it does not wait.
+    pub fn begin_live(&mut self, now_ns: i64) {
+        self.begin(now_ns);
+        if let Self::Periodic(periodic) = self {
+            periodic.live = true;
+        }
+    }
+
+    /// When the next tick is due, if time causes any.
+    pub fn next_due(&self) -> Option<i64> {
+        match self {
+            Self::Event(_) => None,
+            Self::Periodic(periodic) => periodic.due_ns,
+        }
+    }
+
+    /// The next sample that has arrived and wakes the lambda.
+    pub fn next_event(&mut self) -> Option<R::Sample> {
+        match self {
+            Self::Event(event) => event.next(),
+            Self::Periodic(_) => None,
+        }
+    }
+
+    /// The next tick that is due before `now_ns`, or live by then; call again until there is none.
+    pub fn next_tick(&mut self, now_ns: i64) -> Option<Tick> {
+        match self {
+            Self::Event(_) => None,
+            Self::Periodic(periodic) => periodic.next(now_ns),
+        }
+    }
+
+    /// At the end: what has arrived and woken nobody was skipped.
+    pub fn finish(&mut self) {
+        if let Self::Event(event) = self {
+            let head = event.ring.head();
+            event.ring.skip(head - event.next.min(head));
+            event.next = head;
+        }
+    }
+
+    /// Ticks that were due and did not happen.
+    pub fn missed(&self) -> u64 {
+        match self {
+            Self::Event(_) => 0,
+            Self::Periodic(periodic) => periodic.missed_total,
+        }
+    }
+}
+
+impl<R: Ring> Event<R> {
+    fn next(&mut self) -> Option<R::Sample> {
+        let ring = &self.ring;
+        let head = ring.head();
+        if self.next >= head {
+            return None;
+        }
+        let found = match self.backlog {
+            Backlog::Each => {
+                // What left the ring before this schedule came to it cannot wake any more.
+                let oldest = head.saturating_sub(ring.depth() as u64).max(self.next);
+                (oldest..head).find_map(|position| Some((position, ring.get(position)?)))
+            }
+            Backlog::Latest => ring.newest(),
+        };
+        // While the newest sample is being replaced, a reader may find an older one: what was
+        // judged is not judged again.
+        let Some((position, sample)) = found.filter(|(position, _)| *position >= self.next) else {
+            ring.skip(head - self.next);
+            self.next = head;
+            return None;
+        };
+        ring.skip(position.saturating_sub(self.next));
+        self.next = position + 1;
+        Some(sample)
+    }
+}
+
+impl Periodic {
+    fn next(&mut self, now_ns: i64) -> Option<Tick> {
+        let Some(due_ns) = self.due_ns else {
+            self.due_ns = Some(now_ns.saturating_add(self.period_ns));
+            return None;
+        };
+        if self.live {
+            return self.newest_due(due_ns, now_ns);
+        }
+        // Strictly before: a tick sees all samples of its own instant.
+        if due_ns >= now_ns {
+            return None;
+        }
+        let behind = (now_ns.abs_diff(due_ns) - 1) / self.period_ns as u64 + 1;
+        if behind > CATCH_UP_TICKS {
+            self.missed += behind;
+            self.missed_total += behind;
+            // In step with the ticks before; the next one is due at `now_ns` or later.
+            self.due_ns = Some(self.later(due_ns, behind));
+            return None;
+        }
+        self.due_ns = Some(due_ns.saturating_add(self.period_ns));
+        Some(Tick { at_ns: due_ns, missed: std::mem::take(&mut self.missed) })
+    }
+
+    /// The newest of the ticks that are due by now.
+    fn newest_due(&mut self, due_ns: i64, now_ns: i64) -> Option<Tick> {
+        if due_ns > now_ns {
+            return None;
+        }
+        let missed = now_ns.abs_diff(due_ns) / self.period_ns as u64;
+        self.missed_total += missed;
+        let at_ns = self.later(due_ns, missed);
+        self.due_ns = Some(at_ns.saturating_add(self.period_ns));
+        Some(Tick { at_ns, missed })
+    }
+
+    fn later(&self, at_ns: i64, periods: u64) -> i64 {
+        at_ns.saturating_add(i64::try_from(periods).unwrap_or(i64::MAX).saturating_mul(self.period_ns))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A ring into which nothing comes.
+    #[derive(Debug)]
+    struct Empty;
+
+    impl Ring for Empty {
+        type Sample = ();
+
+        fn head(&self) -> u64 {
+            0
+        }
+
+        fn depth(&self) -> usize {
+            1
+        }
+
+        fn get(&self, _: u64) -> Option<()> {
+            None
+        }
+
+        fn newest(&self) -> Option<(u64, ())> {
+            None
+        }
+
+        fn skip(&self, _: u64) {}
+    }
+
+    #[test]
+    fn a_jump_of_the_clock_counts_missed_ticks_instead_of_running_them() {
+        let mut schedule = Schedule::<Empty>::periodic(1);
+        assert_eq!(schedule.next_tick(0), None);
+        assert_eq!(schedule.next_tick(i64::MAX - 10), None);
+        // Due at 1, 2, and so on up to, not including, `i64::MAX - 10`.
+        let missed = i64::MAX as u64 - 11;
+        assert_eq!(schedule.missed(), missed);
+        assert_eq!(schedule.next_tick(i64::MAX), Some(Tick { at_ns: i64::MAX - 10, missed }));
+    }
+}

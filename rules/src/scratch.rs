@@ -1,0 +1,259 @@
+//! What the host keeps for a lambda, by name, within `scratch` of `[limits]`.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use crate::text::visible;
+
+/// Longest name, in bytes.
+const NAME_BYTES: usize = 128;
+/// Most entries.
+const ENTRIES: usize = 1024;
+/// What an entry takes beside its name and its bytes: about what it costs the host.
+const ENTRY_BYTES: u64 = 64;
+/// Bytes are kept in pieces of so many, so that no call moves more than that.
+const PIECE_BYTES: usize = 1 << 20;
+
+/// Why something was not kept or not found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ScratchError {
+    /// It would take more than is granted.
+    NoRoom {
+        /// What was to be kept.
+        name: String,
+        /// Bytes that it would take in addition.
+        needed: u64,
+        /// Bytes that are free.
+        free: u64,
+    },
+    /// There are as many entries as there can be.
+    TooMany(String),
+    /// Nothing has that name.
+    NoSuchEntry(String),
+    /// A name that cannot be one.
+    WrongName(String),
+}
+
+impl fmt::Display for ScratchError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoRoom { name, needed, free } => {
+                write!(f, "`{name}` needs {needed} bytes of scratch and {free} are free; ")?;
+                write!(f, "remove entries, or ask for more by `scratch` in [limits]")
+            }
+            Self::TooMany(name) => {
+                write!(f, "there is no room for `{name}` beside {ENTRIES} entries; ")?;
+                write!(f, "remove some, or append to one of them")
+            }
+            Self::NoSuchEntry(name) => {
+                write!(f, "scratch has no `{name}`; it is empty when the lambda's process starts")
+            }
+            Self::WrongName(name) => {
+                write!(f, "`{name}` is no name for scratch; give 1 to 128 bytes without control characters")
+            }
+        }
+    }
+}
+
+impl std::error::Error for ScratchError {}
+
+/// Something that is kept.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Entry {
+    /// Its name.
+    pub name: String,
+    /// Its length in bytes.
+    pub bytes: u64,
+}
+
+/// Entries by name, and what they take.
+pub struct Scratch {
+    granted: u64,
+    most_given: usize,
+    used: u64,
+    entries: BTreeMap<String, Pieces>,
+}
+
+impl Scratch {
+    /// Room for `granted` bytes, of which one call gives `most_given` at most.
+    pub fn new(granted: u64, most_given: usize) -> Self {
+        Self { granted, most_given, used: 0, entries: BTreeMap::new() }
+    }
+
+    /// Bytes for which there is room.
+    pub fn free(&self) -> u64 {
+        self.granted - self.used
+    }
+
+    /// Everything that is kept, in the order of the names' bytes.
+    pub fn entries(&self) -> Vec<Entry> {
+        self.entries.iter().map(|(name, pieces)| Entry { name: name.clone(), bytes: pieces.len() }).collect()
+    }
+
+    /// Keeps `bytes` under a name, in place of what was there.
+    ///
+    /// # Errors
+    ///
+    /// [`ScratchError`]; nothing has changed then.
+    pub fn put(&mut self, name: &str, bytes: &[u8]) -> Result<(), ScratchError> {
+        self.keep(name, bytes, true)
+    }
+
+    /// Keeps `bytes` behind what is there already under that name.
+    ///
+    /// # Errors
+    ///
+    /// As [`Scratch::put`].
+    pub fn append(&mut self, name: &str, bytes: &[u8]) -> Result<(), ScratchError> {
+        self.keep(name, bytes, false)
+    }
+
+    /// Keeps `bytes` behind what is there, or in place of it.
+    fn keep(&mut self, name: &str, bytes: &[u8], in_place: bool) -> Result<(), ScratchError> {
+        if name.is_empty() || name.len() > NAME_BYTES || name.chars().any(char::is_control) {
+            return Err(ScratchError::WrongName(shown(name)));
+        }
+        let there = self.entries.get(name).map(Pieces::len);
+        if there.is_none() && self.entries.len() >= ENTRIES {
+            return Err(ScratchError::TooMany(shown(name)));
+        }
+        let given_back = if in_place { there.unwrap_or(0) } else { 0 };
+        let new = there.map_or(ENTRY_BYTES + name.len() as u64, |_| 0) + bytes.len() as u64;
+        let no_room = |free| ScratchError::NoRoom { name: shown(name), needed: new.saturating_sub(given_back), free };
+        if new > self.free() + given_back {
+            return Err(no_room(self.free()));
+        }
+        // What was there stays until all of the new is made.
+        let made = match self.entries.get_mut(name).filter(|_| !in_place) {
+            Some(pieces) => pieces.append(bytes),
+            None => {
+                let mut pieces = Pieces::default();
+                let made = pieces.append(bytes);
+                if made {
+                    self.entries.insert(name.to_owned(), pieces);
+                }
+                made
+            }
+        };
+        if !made {
+            // The process may not have what it was granted.
+            return Err(no_room(0));
+        }
+        self.used = self.used + new - given_back;
+        Ok(())
+    }
+
+    /// Bytes from `offset`, `len` at most; clamped to what is there, and to what one call gives.
+    ///
+    /// # Errors
+    ///
+    /// [`ScratchError::NoSuchEntry`].
+    pub fn get(&self, name: &str, offset: u64, len: u64) -> Result<Vec<u8>, ScratchError> {
+        let pieces = self.entries.get(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
+        let from = offset.min(pieces.len());
+        let len = len.min(pieces.len() - from).min(self.most_given as u64);
+        Ok(pieces.read(from as usize, len as usize))
+    }
+
+    /// Forgets what is kept under a name.
+    ///
+    /// # Errors
+    ///
+    /// [`ScratchError::NoSuchEntry`].
+    pub fn remove(&mut self, name: &str) -> Result<(), ScratchError> {
+        let pieces = self.entries.remove(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
+        self.used -= ENTRY_BYTES + name.len() as u64 + pieces.len();
+        Ok(())
+    }
+}
+
+/// A name in a message, which may be none that can be.
+fn shown(name: &str) -> String {
+    visible(&name.chars().take(NAME_BYTES).collect::<String>())
+}
+
+/// Bytes in pieces, of which all but the last are full.
+#[derive(Default)]
+struct Pieces(Vec<Vec<u8>>);
+
+impl Pieces {
+    fn len(&self) -> u64 {
+        let full = self.0.len().saturating_sub(1) * PIECE_BYTES;
+        (full + self.0.last().map_or(0, Vec::len)) as u64
+    }
+
+    /// Adds `bytes`; false if there is no memory for them, and nothing was added.
+    fn append(&mut self, mut bytes: &[u8]) -> bool {
+        let before = self.len();
+        while !bytes.is_empty() {
+            if self.0.last().is_none_or(|piece| piece.len() == PIECE_BYTES) {
+                self.0.push(Vec::new());
+            }
+            let piece = self.0.last_mut().expect("one was there, or was made");
+            let (now, later) = bytes.split_at(bytes.len().min(PIECE_BYTES - piece.len()));
+            if piece.capacity() - piece.len() < now.len() {
+                // Twice as much each time, and never beyond a piece.
+                let more = now.len().max(piece.len().min(PIECE_BYTES - piece.len()));
+                if piece.try_reserve_exact(more).is_err() {
+                    self.cut(before);
+                    return false;
+                }
+            }
+            piece.extend_from_slice(now);
+            bytes = later;
+        }
+        true
+    }
+
+    fn cut(&mut self, len: u64) {
+        let len = len as usize;
+        self.0.truncate(len.div_ceil(PIECE_BYTES));
+        if let Some(last) = self.0.last_mut() {
+            last.truncate(len - (len - 1) / PIECE_BYTES * PIECE_BYTES);
+        }
+    }
+
+    /// `len` bytes from `from`, all of which are there.
+    fn read(&self, mut from: usize, len: usize) -> Vec<u8> {
+        let mut read = Vec::with_capacity(len);
+        while read.len() < len {
+            let piece = &self.0[from / PIECE_BYTES][from % PIECE_BYTES..];
+            let some = &piece[..piece.len().min(len - read.len())];
+            read.extend_from_slice(some);
+            from += some.len();
+        }
+        read
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_go_on_from_piece_to_piece_and_a_call_gives_no_more_than_its_limit() {
+        let mut scratch = Scratch::new(8 << 20, 1 << 20);
+        let bytes: Vec<u8> = (0..3_000_000_u32).map(|n| (n % 251) as u8).collect();
+        for part in bytes.chunks(700_001) {
+            scratch.append("long", part).unwrap();
+        }
+        let at = PIECE_BYTES - 3;
+        assert_eq!(scratch.get("long", at as u64, 7).unwrap(), bytes[at..at + 7]);
+        assert_eq!(scratch.get("long", 0, u64::MAX).unwrap(), bytes[..1 << 20]);
+        let read: Vec<u8> =
+            (0..).step_by(1 << 20).map(|from| scratch.get("long", from, 1 << 20).unwrap()).take(3).flatten().collect();
+        assert!(read == bytes);
+    }
+
+    #[test]
+    fn what_is_cut_back_is_what_was_there() {
+        for len in [0, 1, PIECE_BYTES - 1, PIECE_BYTES, PIECE_BYTES + 1, 2 * PIECE_BYTES] {
+            let mut pieces = Pieces::default();
+            let bytes: Vec<u8> = (0..len).map(|n| n as u8).collect();
+            assert!(pieces.append(&bytes) && pieces.append(&vec![9; PIECE_BYTES + 5]));
+            pieces.cut(len as u64);
+            assert_eq!(pieces.len(), len as u64);
+            assert!(pieces.read(0, len) == bytes);
+        }
+    }
+}
