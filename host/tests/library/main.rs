@@ -9,5 +9,6 @@ mod guest_room;
 mod host_calls;
 mod host_time;
 mod limits;
+mod live;
 mod schedule;
 mod tight;

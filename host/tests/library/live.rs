@@ -1,0 +1,225 @@
+//! A whole live run over a loopback: time, results, reports and what is published, without DDS, a shim or a sandbox.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, PipeReader, Read, pipe};
+use std::os::fd::OwnedFd;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use gleaner_base::{Exit, Failure};
+use gleaner_host::api::Session;
+use gleaner_host::api::data::Wake;
+use gleaner_host::guest::{Guest, Outcome};
+use gleaner_host::live::{Pages, Run, Settings};
+use gleaner_host::stage::Asked;
+use gleaner_lambda::manifest::Manifest;
+use gleaner_lambda::{BuildDir, Fault, FaultKind};
+use gleaner_messages::Endian;
+use gleaner_protocol::{Page, Report};
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Clock, Guid, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_vitals::Pulse;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+const NUMBERS: &str = "/numbers";
+const DECISIONS: &str = "/decisions";
+
+/// Triggers with the number of each sample; a negative one is a fault.
+struct Numbers(Session);
+
+impl Guest for Numbers {
+    fn init(&mut self) -> Result<(), Fault> {
+        Ok(())
+    }
+
+    fn wake(&mut self, wake: Wake) -> Outcome {
+        let Wake::Event(sample) = wake else { panic!("samples wake this lambda") };
+        let value = sample.number(&sample.topic().field("value").unwrap()).unwrap();
+        self.0.event("number", value, Vec::new()).unwrap();
+        let fault = Fault { kind: FaultKind::Exception, message: "negative".to_owned(), used: None, allowed: None };
+        Outcome { result: if value < 0.0 { Err(fault) } else { Ok(()) }, fuel: None, run_ns: None }
+    }
+
+    fn engine(&self) -> String {
+        "a test".to_owned()
+    }
+}
+
+/// A run in a thread of its own.
+struct Running {
+    loopback: Loopback,
+    clock: Clock,
+    stop: Arc<AtomicBool>,
+    reports: BufReader<PipeReader>,
+    results: PipeReader,
+    run: JoinHandle<Result<Exit, Failure>>,
+    sent: u64,
+}
+
+impl Running {
+    /// Starts a run and waits until it is ready.
+    fn start(announce: Option<&str>) -> Self {
+        let manifest = "[lambda]\nname = \"numbers\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"numbers.wasm\"\n\
+                        [schedule]\nevent = \"numbers\"\n\
+                        [[input]]\nname = \"numbers\"\ntopic = \"/numbers\"\ntype = \"test_msgs/msg/Number\"\n";
+        let manifest = Manifest::parse(manifest, "lambda.toml").unwrap();
+        let (loopback, clock, stop) = (Loopback::new(), Clock::of_today(), Arc::<AtomicBool>::default());
+        loopback.add_topic(NUMBERS, "test_msgs/msg/Number", "int64 value\n");
+        loopback.add_topic(DECISIONS, "std_msgs/msg/String", "string data\n");
+        let (reports, to_reports) = pipe().unwrap();
+        let (results, to_results) = pipe().unwrap();
+        let (source, stopped, announce) = (loopback.clone(), Arc::clone(&stop), announce.map(str::to_owned));
+        let run = thread::spawn(move || {
+            let pulse = Pulse::make().unwrap().0;
+            let folder = PathBuf::from("numbers");
+            let run = Run {
+                asked: Asked {
+                    build: BuildDir::of(&folder),
+                    lambda: folder.clone(),
+                    config: Vec::new(),
+                    remaps: Vec::new(),
+                    vehicle: None,
+                },
+                manifest,
+                settings: Settings { out: folder, all: false, restarts: 0, clock, round_trip: None, announce },
+                source: Box::new(source),
+                recorder: None,
+                results: Pages::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
+                pulse,
+                close: &mut || Ok(Vec::new()),
+                stop: &stopped,
+            };
+            let mut load =
+                |_: &Asked, _: &Manifest, session: Session, _| Ok(Box::new(Numbers(session)) as Box<dyn Guest>);
+            run.run(&mut load, File::from(OwnedFd::from(to_reports)))
+        });
+        let mut running = Self { loopback, clock, stop, reports: BufReader::new(reports), results, run, sent: 0 };
+        running.until(|report| matches!(report, Report::Ready).then_some(()));
+        running
+    }
+
+    fn publish(&mut self, value: i64) {
+        self.sent += 1;
+        let (at_ns, seq) = (self.clock.now(), self.sent);
+        let meta = SampleMeta {
+            at_ns,
+            publish_ns: at_ns,
+            writer: Guid([7; 16]),
+            seq,
+            endian: Endian::Little,
+            options: [0; 2],
+        };
+        self.loopback.publish(NUMBERS, &meta, &value.to_le_bytes()).unwrap();
+    }
+
+    /// Reads reports until one is what is looked for.
+    fn until<T>(&mut self, mut looked_for: impl FnMut(Report) -> Option<T>) -> T {
+        loop {
+            let mut line = String::new();
+            assert!(self.reports.read_line(&mut line).unwrap() > 0, "the reports end");
+            if let Some(found) = looked_for(serde_json::from_str(&line).unwrap()) {
+                return found;
+            }
+        }
+    }
+
+    /// Waits for the decision of the next wake with a trigger, and returns its score.
+    fn decided(&mut self) -> f64 {
+        self.until(|report| if let Report::Decision(decision) = report { decision.triggers[0].score } else { None })
+    }
+
+    /// Stops the run; returns its end, and its results.
+    fn stop(mut self) -> (Result<Exit, Failure>, Vec<Page>) {
+        self.stop.store(true, Ordering::Relaxed);
+        let ended = self.run.join().unwrap();
+        let mut text = String::new();
+        self.results.read_to_string(&mut text).unwrap();
+        (ended, text.lines().map(|line| serde_json::from_str(line).unwrap()).collect())
+    }
+}
+
+#[test]
+fn each_sample_wakes_the_lambda_and_each_decision_is_a_report_and_a_result() {
+    let mut running = Running::start(None);
+    for value in [3, 1, 2] {
+        running.publish(value);
+        assert_eq!(running.decided(), value as f64);
+    }
+    let (ended, pages) = running.stop();
+    assert_eq!(ended.unwrap(), Exit::Ok);
+    let [Page::Woken(woken_by), Page::Decision(_), Page::Decision(_), Page::Decision(_), Page::Last(last)] = &pages[..]
+    else {
+        panic!("{pages:?}");
+    };
+    assert_eq!(woken_by.topic.as_deref(), Some(NUMBERS));
+    assert_eq!((last.wakes, last.triggers, last.faults, last.topics[0].received), (3, 3, 0, 3));
+    assert_eq!(last.network, gleaner_protocol::Network::default(), "a loopback has none");
+}
+
+#[test]
+fn a_fault_is_a_decision_the_run_goes_on_and_its_exit_says_so() {
+    let mut running = Running::start(None);
+    running.publish(-1);
+    assert_eq!(running.decided(), -1.0, "what it triggered before counts");
+    running.publish(5);
+    assert_eq!(running.decided(), 5.0);
+    let (ended, pages) = running.stop();
+    assert_eq!(ended.unwrap(), Exit::LambdaFaulted);
+    let faults = pages.iter().filter(|page| matches!(page, Page::Decision(decision) if decision.fault.is_some()));
+    assert_eq!(faults.count(), 1);
+}
+
+#[test]
+fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_whole() {
+    let mut running = Running::start(None);
+    running.publish(4);
+    assert_eq!(running.decided(), 4.0);
+    running.loopback.die("the cable is cut");
+    running.until(|report| matches!(report, Report::Ended(_)).then_some(()));
+    let (ended, pages) = running.stop();
+    let failure = ended.unwrap_err();
+    assert_eq!((failure.exit, failure.causes), (Exit::Unreachable, vec!["the cable is cut".to_owned()]));
+    assert!(matches!(pages.last(), Some(Page::Last(last)) if last.wakes == 1), "{pages:?}");
+}
+
+/// Sends the messages of a topic on.
+struct Heard(Mutex<SyncSender<Vec<u8>>>);
+
+impl Sink for Heard {
+    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Verdict {
+        self.0.lock().unwrap().send(cdr.to_vec()).unwrap();
+        Verdict::Taken
+    }
+}
+
+fn heard(loopback: &Loopback, topic: &str) -> Receiver<Vec<u8>> {
+    let (sender, receiver) = sync_channel(64);
+    let spec = TopicSpec {
+        topic: topic.to_owned(),
+        type_name: "std_msgs/msg/String".to_owned(),
+        queue: 8,
+        max_bytes: 1 << 20,
+        qos: Qos::Auto,
+    };
+    loopback.clone().subscribe(&spec, Arc::new(Heard(Mutex::new(sender)))).unwrap();
+    receiver
+}
+
+#[test]
+fn decisions_are_published_on_the_topic_that_was_asked_for() {
+    let mut running = Running::start(Some(DECISIONS));
+    let decisions = heard(&running.loopback, DECISIONS);
+    running.publish(6);
+    let message = decisions.recv_timeout(PATIENCE).unwrap();
+    // A string in CDR: its length with the zero at its end, and that zero.
+    let text = std::str::from_utf8(&message[4..message.len() - 1]).unwrap();
+    let announced: serde_json::Value = serde_json::from_str(text).unwrap();
+    assert_eq!(announced["lambda"], "numbers");
+    assert_eq!(announced["decision"]["triggers"][0]["score"], 6.0);
+    let (ended, _) = running.stop();
+    assert_eq!(ended.unwrap(), Exit::Ok);
+}
