@@ -8,7 +8,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::{env, process};
 
-use rustix::fs::statvfs;
+use rustix::fs::{StatVfsMountFlags, statvfs};
 
 const SHARED_MEMORY: &str = "/dev/shm";
 /// A test fills 4 GiB, and others run beside it.
@@ -22,8 +22,11 @@ pub(super) struct Folder(PathBuf);
 impl Folder {
     /// A new folder; `None` where memory is scarce, or the user has named a folder for temporary files.
     pub(super) fn new() -> Option<Folder> {
-        let room = statvfs(SHARED_MEMORY).ok().map(|found| found.f_bavail * found.f_frsize)?;
-        if env::var_os("TMPDIR").is_some() || room < ROOM_BYTES || available()? < ROOM_BYTES + LEFT_BYTES {
+        let found = statvfs(SHARED_MEMORY).ok()?;
+        let is_roomy = found.f_bavail * found.f_frsize >= ROOM_BYTES && available()? >= ROOM_BYTES + LEFT_BYTES;
+        // Tests start programs that they have built there.
+        let runs_programs = !found.f_flag.contains(StatVfsMountFlags::NOEXEC);
+        if env::var_os("TMPDIR").is_some() || !is_roomy || !runs_programs {
             return None;
         }
         let path = Path::new(SHARED_MEMORY).join(format!("gleaner-tests-{}", process::id()));
