@@ -179,10 +179,11 @@ impl<R: Read> Reader<R> {
                 self.decoder.reset();
             }
             Next::Block(kind::END, payload) => {
-                self.end = Some(json(&payload)?);
+                let end = json(&payload)?;
                 if self.source.fill(&mut [0])? > 0 {
                     return Err(Stop::Damage(Damage::AfterEnd));
                 }
+                self.end = Some(end);
                 self.state = State::Ended;
             }
             Next::Block(..) => self.unknown_blocks += 1,

@@ -113,6 +113,14 @@ fn blocks_that_no_writer_writes_are_refused_though_their_checksums_are_right() {
 }
 
 #[test]
+fn a_journal_that_goes_on_behind_its_end_has_none() {
+    let end = (kind::END, serde_json::to_vec(&end(0)).unwrap());
+    let bytes = journal_of(&[header_block(&header(1)), end.clone(), end]);
+    let mut reader = Reader::open(bytes.as_slice()).unwrap();
+    assert!(reader.next().is_err() && reader.end().is_none());
+}
+
+#[test]
 fn a_block_of_an_unknown_kind_is_stepped_over_and_counted() {
     let mut payload = vec![1];
     let entry = usual_entries(1, 1).remove(0);

@@ -1,0 +1,54 @@
+//! Where tests make their folders: in memory, if the machine has plenty of it.
+//!
+//! What is tested syncs files to the disk for cars that lose power. A test cannot cut the power: it
+//! kills processes, which is the same in memory, and would wait for the disk most of its time.
+
+use std::fs::{self, DirBuilder};
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::{env, process};
+
+use rustix::fs::{StatVfsMountFlags, statvfs};
+
+const SHARED_MEMORY: &str = "/dev/shm";
+/// A test fills 4 GiB, and others run beside it.
+const ROOM_BYTES: u64 = 8 << 30;
+/// What is left for programs if that room is used.
+const LEFT_BYTES: u64 = 4 << 30;
+
+/// A folder in memory, removed with this.
+pub(super) struct Folder(PathBuf);
+
+impl Folder {
+    /// A new folder; `None` where memory is scarce, or the user has named a folder for temporary files.
+    pub(super) fn new() -> Option<Folder> {
+        let found = statvfs(SHARED_MEMORY).ok()?;
+        let is_roomy = found.f_bavail * found.f_frsize >= ROOM_BYTES && available()? >= ROOM_BYTES + LEFT_BYTES;
+        // Tests start programs that they have built there.
+        let runs_programs = !found.f_flag.contains(StatVfsMountFlags::NOEXEC);
+        if env::var_os("TMPDIR").is_some() || !is_roomy || !runs_programs {
+            return None;
+        }
+        let path = Path::new(SHARED_MEMORY).join(format!("gleaner-tests-{}", process::id()));
+        DirBuilder::new().mode(0o700).create(&path).ok()?;
+        Some(Folder(path))
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Bytes of memory that programs may still take.
+fn available() -> Option<u64> {
+    let text = fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let kib: u64 = line.trim().strip_suffix(" kB")?.trim().parse().ok()?;
+    Some(kib << 10)
+}
