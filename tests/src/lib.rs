@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use gleaner_cli::results::{seconds, trigger_lines};
 use gleaner_protocol::{Clip, Decision, Report, Summary, Verified};
+use gleaner_report::words::{seconds, trigger_lines};
 
 /// The checkout.
 pub fn root() -> PathBuf {

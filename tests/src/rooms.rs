@@ -27,7 +27,7 @@ pub const UNSAFE_FILES: &[&str] = &[
 /// and lambdas stand outside of the house.
 pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-buffers", &[]),
-    ("gleaner-cli", &["gleaner-protocol"]),
+    ("gleaner-cli", &["gleaner-protocol", "gleaner-report"]),
     ("gleaner-compile", &["gleaner-jail", "gleaner-protocol"]),
     (
         "gleaner-host",
@@ -48,6 +48,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-protocol", &[]),
     ("gleaner-python", &["gleaner-host", "gleaner-image", "gleaner-protocol", "gleaner-transport", "gleaner-vitals"]),
     ("gleaner-recorder", &["gleaner-image", "gleaner-protocol", "gleaner-transport", "gleaner-vitals"]),
+    ("gleaner-report", &["gleaner-protocol"]),
     ("gleaner-sdk", &[]),
     ("gleaner-shim", &["gleaner-jail", "gleaner-protocol", "gleaner-vitals"]),
     ("gleaner-transport", &[]),
@@ -55,8 +56,12 @@ pub const CRATES: &[(&str, &[&str])] = &[
 ];
 
 /// Crates that a program must not contain, whatever the features: a program, and what it does without.
-pub const WITHOUT: &[(&str, &[&str])] =
-    &[("gleaner-cli", &["wasmtime", "pyo3", "rustdds"]), ("gleaner-host", &["pyo3"]), ("gleaner-transport", &["pyo3"])];
+pub const WITHOUT: &[(&str, &[&str])] = &[
+    ("gleaner-cli", &["wasmtime", "pyo3", "rustdds"]),
+    ("gleaner-host", &["pyo3"]),
+    ("gleaner-report", &["clap", "indicatif"]),
+    ("gleaner-transport", &["pyo3"]),
+];
 
 /// Inside of `host/src`: a room, and the rooms that it must not name.
 pub const ROOMS: &[(&str, &[&str])] = &[

@@ -4,8 +4,8 @@
 use std::fs;
 use std::path::Path;
 
-use gleaner_cli::results::trigger_lines;
 use gleaner_protocol::{Exit, Failure};
+use gleaner_report::words::trigger_lines;
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Recipe, Replayed, difference};

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_cli::results::{clip_contents, clip_span, grouped, seconds};
 use gleaner_protocol::{Decision, Exit, Failure, visible};
+use gleaner_report::words::{clip_contents, clip_span, grouped, seconds};
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example, Replayed, difference};

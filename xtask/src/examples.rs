@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use gleaner_cli::results::{Decisions, ResultsError, clips};
 use gleaner_protocol::{Clip, Decision, Exit, Failure, Summary, Verified, twins_differ};
+use gleaner_report::{Decisions, ResultsError, clips};
 
 use crate::checkout::Checkout;
 use crate::steps;

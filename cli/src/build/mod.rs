@@ -16,11 +16,11 @@ use std::time::SystemTime;
 use gleaner_protocol::layout::FILE_MAX;
 use gleaner_protocol::manifest::{ByteSize, Kind};
 use gleaner_protocol::{BuildDir, Exit, Failure, LayoutError, Manifest, PlainFile, SOURCE_MAX, Sources};
+use gleaner_report::words::size;
 
 use error::BuildError;
 use folder::{Built, Partial};
 
-use crate::results::size;
 use crate::say::say;
 
 /// Builds the lambda in `dir` and says so. If it is `sandboxed`, code of its author runs in a jail meanwhile.

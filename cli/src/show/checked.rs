@@ -1,9 +1,9 @@
 use std::fmt::{self, Write};
 
 use gleaner_protocol::{Checked, Need, Place, visible};
+use gleaner_report::words::size;
 
 use super::Paint;
-use crate::results::size;
 
 /// What was found out about a lambda, for a person.
 pub(crate) fn checked(checked: &Checked, paint: Paint) -> String {
