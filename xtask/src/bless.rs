@@ -16,7 +16,7 @@ use crate::steps::Steps;
 /// the command; and the page on the manifest. Twins that differ write nothing.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps, &["examples"])?;
+    setup::run(checkout, &mut steps, &checkout.lambdas(&["examples"]))?;
     steps.begin(&format!("expected decisions on {DRIVE}"));
     for example in &EXAMPLES {
         let twins = example.replay(checkout)?;
