@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use gleaner_protocol::{Exit, Failure, Report};
+use gleaner_protocol::{Exit, Failure, Report, nanoseconds};
 use gleaner_transport::dds::{Clock, Dds};
 use gleaner_vitals::Pulse;
 
@@ -133,8 +133,4 @@ impl Course {
         self.ledger.report(Report::Live(Box::new(live)));
         Ok(())
     }
-}
-
-fn nanoseconds(duration: Duration) -> i64 {
-    i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
 }

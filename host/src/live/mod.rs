@@ -16,8 +16,6 @@ mod status;
 pub use options::{Job, RunArgs};
 
 use std::io::Write;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use gleaner_protocol::journal::Part;
 use gleaner_protocol::manifest::Schedule as Declared;
@@ -55,7 +53,8 @@ impl Job {
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
         let Self { asked, manifest, wanted } = self;
-        let stop = stop_flag()?;
+        let stop = gleaner_vitals::start::stop_flag()
+            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error))?;
         let clock = wanted.dds.clock;
         let domain = wanted.dds.domain;
         let mut dds = Dds::open(wanted.dds).map_err(NetworkError::failure)?;
@@ -135,12 +134,4 @@ impl Job {
         ended?;
         Ok(if faults > 0 { Exit::LambdaFaulted } else { Exit::Ok })
     }
-}
-
-/// Raised by SIGTERM. SIGINT is for whoever started us, who then sends the other.
-fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
-    signal_hook::flag::register(signal_hook::consts::SIGTERM, Arc::clone(&stop))
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error))?;
-    Ok(stop)
 }

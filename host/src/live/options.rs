@@ -8,11 +8,11 @@ use clap::Args;
 use gleaner_jail::Paths;
 use gleaner_protocol::manifest::Manifest;
 use gleaner_protocol::{BuildDir, Exit, Failure};
-use gleaner_transport::dds::{self, Clock};
+use gleaner_transport::dds::{self, Clock, NetworkArgs};
 
 use crate::input::unfinished_bytes;
 use crate::isolation::definitions;
-use crate::network::NetworkArgs;
+use crate::network::NetworkError;
 use crate::stage::{Asked, AskedArgs};
 
 /// Arguments of `run`.
@@ -93,7 +93,7 @@ impl Job {
         let asked = Asked::new(args.asked, build, &mut manifest)?;
         let name: String =
             manifest.lambda.name.as_str().chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
-        let mut dds = args.network.options(&format!("/gleaner/{name}"))?;
+        let mut dds = args.network.options(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
         dds.clock = args.clock_offset.map_or_else(Clock::of_today, Clock::new);
         dds.largest = manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
         dds.messages = messages;

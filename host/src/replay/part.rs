@@ -1,7 +1,7 @@
 //! Which part of a drive is replayed.
 
 use gleaner_protocol::journal::Part;
-use gleaner_protocol::{DriveTime, Exit, Failure};
+use gleaner_protocol::{DriveTime, Exit, Failure, nanoseconds};
 use gleaner_transport::replay::Replay;
 
 /// The part that is asked for; it means something once a drive is open.
@@ -29,9 +29,7 @@ impl Wanted {
         // Of a database that was cut off, nobody knows it.
         let end_ns = drive.end_ns();
         let ns = |time: DriveTime| match time {
-            DriveTime::After(duration) => {
-                start_ns.saturating_add(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX))
-            }
+            DriveTime::After(duration) => start_ns.saturating_add(nanoseconds(duration)),
             DriveTime::At(ns) => ns,
         };
         let part = Part { from_ns: self.from.map(ns), to_ns: self.to.map(ns) };

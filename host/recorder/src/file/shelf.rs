@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_protocol::link::Loss;
-use gleaner_protocol::{Clip, Failure};
+use gleaner_protocol::{Clip, Failure, nanoseconds};
 use tracing::{error, warn};
 
 use super::durable;
@@ -133,5 +133,5 @@ impl Kept {
 
 fn now() -> i64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(now.as_nanos()).unwrap_or(i64::MAX)
+    nanoseconds(now)
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use gleaner_protocol::link::Loss;
 use gleaner_protocol::manifest::Store;
-use gleaner_protocol::{Clip, Moment, Trigger};
+use gleaner_protocol::{Clip, Moment, Trigger, nanoseconds};
 use gleaner_transport::SampleMeta;
 
 use super::finished::KEPT;
@@ -14,7 +14,7 @@ use super::walk::Budget;
 use super::{Commanded, LambdaId, Recorder, Settings, TopicId, Work};
 use crate::RecordError;
 use crate::file::{Folder, Topic};
-use crate::window::{Heard, nanoseconds};
+use crate::window::Heard;
 
 /// How much later than its stamp a wake may come: a lambda's process sends them together, see
 /// [`gleaner_protocol::link::RecorderLink::wake`]. Clips wait for them.

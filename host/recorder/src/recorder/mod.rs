@@ -17,12 +17,12 @@ mod walk;
 use std::sync::Arc;
 
 use gleaner_protocol::journal::{Encoder, Entry};
-use gleaner_protocol::{Clip, Moment, TriggerKind};
+use gleaner_protocol::{Clip, Moment, TriggerKind, nanoseconds};
 use gleaner_transport::{Gaps, SampleMeta};
 
 use crate::file::{Folder, Topic};
 use crate::preroll::{Held, Losses, Preroll, Walked};
-use crate::window::{Heard, Rules, Windows, nanoseconds};
+use crate::window::{Heard, Rules, Windows};
 use crate::{LAMBDAS_MAX, RecordError};
 use draft::Draft;
 use finished::Finished;
