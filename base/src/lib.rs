@@ -6,16 +6,20 @@
 mod exit;
 mod failure;
 pub mod own_file;
+mod pieces;
 mod plain_file;
 #[cfg(test)]
 mod scratch;
+mod time;
 pub mod units;
 mod whole;
 pub mod words;
 
 pub use exit::Exit;
 pub use failure::{Explain, Failure, chain};
+pub use pieces::{Piece, each_piece};
 pub use plain_file::{NotPlain, PlainFile};
+pub use time::nanoseconds;
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};
 pub use whole::write_whole;
 pub use words::{excerpt, grouped, hex, visible};

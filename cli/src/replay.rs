@@ -2,15 +2,15 @@
 
 use std::ffi::OsString;
 use std::fs;
-use std::io::{self, IsTerminal};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::Summary;
+use gleaner_report::{Decisions, clips};
 
 use crate::args::{ReplayArgs, VerifyArgs};
 use crate::report;
-use crate::results::{Decisions, clips};
 use crate::runtime::{self, Heard};
 use crate::say::say;
 use crate::show::{self, Digest, Paint};
@@ -35,7 +35,7 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     show_result((heard, exit), args.json)?;
     match report {
         Ok(Some(path)) if !args.json => {
-            say(&format!("  {}\n", paint().dim(&format!("report: {}", path.display()))))?;
+            say(&format!("  {}\n", Paint::of_stdout().dim(&format!("report: {}", path.display()))))?;
         }
         Ok(_) => {}
         // The results are whole without it.
@@ -75,9 +75,9 @@ pub(crate) fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> R
         Some(Heard::Summary(summary)) if json => show::json_line(&summary),
         Some(Heard::Verified(verified)) if json => show::json_line(&verified),
         Some(Heard::Checked(checked)) if json => show::json_line(&checked),
-        Some(Heard::Checked(checked)) => show::checked(&checked, paint()),
+        Some(Heard::Checked(checked)) => show::checked(&checked, Paint::of_stdout()),
         Some(Heard::Summary(summary)) => summary_text(&summary)?,
-        Some(Heard::Verified(verified)) => show::verified(&verified, paint()),
+        Some(Heard::Verified(verified)) => show::verified(&verified, Paint::of_stdout()),
     };
     say(&text)?;
     Ok(exit)
@@ -86,11 +86,7 @@ pub(crate) fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> R
 fn summary_text(summary: &Summary) -> Result<String, Failure> {
     let digest = Digest::of(Decisions::open(&summary.out)?, summary.start_ns)?;
     let clips = if summary.clips > 0 { clips(&summary.out)? } else { Vec::new() };
-    Ok(show::summary(summary, &digest, &clips, paint()))
-}
-
-fn paint() -> Paint {
-    Paint::new(io::stdout().is_terminal())
+    Ok(show::summary(summary, &digest, &clips, Paint::of_stdout()))
 }
 
 /// The runtime's arguments: ours, less what only concerns showing.

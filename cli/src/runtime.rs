@@ -7,6 +7,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use gleaner_base::each_piece;
 use gleaner_base::{Exit, Explain, Failure, visible};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::{Kind, Manifest};
@@ -157,22 +158,14 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
     Ok(None)
 }
 
-/// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed. A line is cut into
-/// pieces rather than held whole, however long it is.
+/// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed.
 pub(crate) fn pass_on(says: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
-    const PIECE: u64 = 8192;
-    let mut says = BufReader::new(says);
-    let mut line = Vec::new();
-    let mut at_start = true;
-    while matches!((&mut says).take(PIECE).read_until(b'\n', &mut line), Ok(1..)) {
-        // As a `Failure` begins; a lambda and its libraries write here too.
-        if at_start && line.starts_with(b"error: ") {
+    each_piece(says, |piece| {
+        if piece.is_failure() {
             explained.store(true, Ordering::Relaxed);
         }
-        show(fit_to_print(&line).as_bytes());
-        at_start = line.ends_with(b"\n");
-        line.clear();
-    }
+        show(fit_to_print(piece.bytes).as_bytes());
+    });
 }
 
 /// With what a terminal would act on written out.

@@ -8,7 +8,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 use gleaner_protocol::Report;
 
-use crate::args::{InspectArgs, NetworkArgs, TopicsArgs};
+use crate::args::{InspectArgs, TopicsArgs};
 use crate::say::say;
 use crate::show;
 
@@ -27,7 +27,7 @@ pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
 /// Asks `gleaner-runtime` for the live topics.
 pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["topics".into()];
-    line.extend(network(&args.network));
+    line.extend(args.network.to_args());
     line.extend(args.wait.map(|wait| format!("--wait={wait}").into()));
     let text = match report(&line)? {
         Err(exit) => return Ok(exit),
@@ -72,11 +72,4 @@ fn report(line: &[OsString]) -> Result<Result<Report, Exit>, Failure> {
     }
     let report = serde_json::from_slice(&output.stdout);
     report.map(Ok).map_err(|error| failed("cannot understand what gleaner-runtime reports", &error))
-}
-
-/// The network, as our programs take it.
-pub(crate) fn network(args: &NetworkArgs) -> Vec<OsString> {
-    let domain = args.domain.map(|domain| format!("--domain={domain}"));
-    let interfaces = args.interface.iter().map(|address| format!("--interface={address}"));
-    domain.into_iter().chain(interfaces).map(OsString::from).collect()
 }

@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::fs::File;
-use std::io::{self, Write};
+use std::io::Write;
 use std::process::ExitCode;
 use std::sync::Arc;
 
@@ -318,14 +318,10 @@ fn watched<'a>(
     }
 }
 
-/// What was standard output. What a library writes there by itself goes to standard error; what a lambda prints is in its log.
+/// See [`gleaner_vitals::start::reports`].
 fn reports() -> Result<File, Failure> {
-    let internal = |error: io::Error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error);
-    let reports = io::stdout();
-    // Not for processes that a lambda starts: whoever reads the reports waits for their end.
-    let reports = rustix::io::fcntl_dupfd_cloexec(&reports, 3).map_err(io::Error::from).map_err(internal)?;
-    rustix::stdio::dup2_stdout(io::stderr()).map_err(io::Error::from).map_err(internal)?;
-    Ok(File::from(reports))
+    gleaner_vitals::start::reports()
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error))
 }
 
 #[cfg(feature = "wasm")]

@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::Dds;
+use gleaner_dds::{Dds, NetworkArgs};
 use gleaner_protocol::{Report, TopicSeen};
 
-use crate::network::{NetworkArgs, NetworkError};
+use crate::network::NetworkError;
 
 /// How long to listen if nothing else is said: announcements of participants come every few seconds, and those who are there
 /// answer a new one at once.
@@ -29,7 +29,7 @@ pub struct TopicsArgs {
 pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Failure> {
     let wait = Duration::try_from_secs_f64(args.wait).ok().filter(|wait| *wait <= WAIT_MAX);
     let wait = wait.ok_or_else(|| Failure::new(Exit::Usage, format!("--wait {}: use 0 to 3600 s", args.wait)))?;
-    let mut options = args.network.options("/gleaner/topics")?;
+    let mut options = args.network.options("/gleaner/topics").map_err(NetworkError::failure)?;
     // No samples are received.
     options.largest = 0;
     let dds = Dds::open(options).map_err(NetworkError::failure)?;

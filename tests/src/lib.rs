@@ -17,9 +17,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use gleaner_cli::results::{seconds, trigger_lines};
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::{Report, Summary, Verified};
+use gleaner_report::words::{seconds, trigger_lines};
 
 /// The checkout.
 pub fn root() -> PathBuf {

@@ -30,7 +30,10 @@ pub const UNSAFE_FILES: &[&str] = &[
 pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-base", &["gleaner-rules"]),
     ("gleaner-buffers", &[]),
-    ("gleaner-cli", &["gleaner-base", "gleaner-journal", "gleaner-lambda", "gleaner-parts", "gleaner-protocol"]),
+    (
+        "gleaner-cli",
+        &["gleaner-base", "gleaner-journal", "gleaner-lambda", "gleaner-parts", "gleaner-protocol", "gleaner-report"],
+    ),
     ("gleaner-compile", &["gleaner-base", "gleaner-jail", "gleaner-lambda"]),
     ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-drives", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
@@ -102,6 +105,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-vitals",
         ],
     ),
+    ("gleaner-report", &["gleaner-base", "gleaner-journal", "gleaner-lambda", "gleaner-protocol"]),
     ("gleaner-rules", &[]),
     ("gleaner-sdk", &["gleaner-rules"]),
     ("gleaner-shim", &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"]),

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_cli::results::trigger_lines;
+use gleaner_report::words::trigger_lines;
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Recipe, Replayed, difference};
@@ -16,7 +16,7 @@ use crate::steps::Steps;
 /// the command; and the page on the manifest. Twins that differ write nothing.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps, &["examples"])?;
+    setup::run(checkout, &mut steps, &checkout.lambdas(&["examples"]))?;
     steps.begin(&format!("expected decisions on {DRIVE}"));
     for example in &EXAMPLES {
         let twins = example.replay(checkout)?;

@@ -26,7 +26,7 @@ impl Checkout {
         let package = env::var_os("CARGO_MANIFEST_DIR").ok_or_else(|| lost("cannot tell where the checkout is"))?;
         let root = Path::new(&package).parent().ok_or_else(|| lost("cannot tell where the checkout is"))?.to_owned();
         let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        // TARGET/release/xtask: so every other cargo builds where this one did, whatever the user configured.
+        // TARGET/xtask/xtask: so every other cargo builds where this one did, whatever the user configured.
         let exe = env::current_exe().ok().filter(|exe| exe.is_absolute());
         let target = exe.as_deref().and_then(|exe| exe.ancestors().nth(2));
         let target = target.ok_or_else(|| lost("cannot tell where cargo builds"))?.to_owned();

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use gleaner_base::{Exit, Failure, visible};
-use gleaner_cli::results::{clip_contents, clip_span, grouped, seconds};
 use gleaner_lambda::Decision;
+use gleaner_report::words::{clip_contents, clip_span, grouped, seconds};
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example, Replayed, difference};
@@ -15,7 +15,7 @@ use crate::steps::Steps;
 /// the journal, and from the clips alone.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps, &["examples"])?;
+    setup::run(checkout, &mut steps, &EXAMPLES.iter().flat_map(Example::lambdas).collect::<Vec<_>>())?;
     steps.begin(&format!("replay of {DRIVE}"));
     let mut rows = vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
     let (mut verdicts, mut proofs, mut clips) = (Vec::new(), Vec::new(), Vec::new());

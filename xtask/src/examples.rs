@@ -4,9 +4,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_cli::results::{Decisions, ResultsError, clips};
 use gleaner_lambda::{Clip, Decision, twins_differ};
 use gleaner_protocol::{Summary, Verified};
+use gleaner_report::{Decisions, ResultsError, clips};
 
 use crate::checkout::Checkout;
 use crate::steps;
@@ -51,9 +51,18 @@ impl Example {
         Ok([self.replay_twin(checkout, "rust")?, self.replay_twin(checkout, "python")?])
     }
 
+    /// The folders of both, relative to the checkout.
+    pub(crate) fn lambdas(&self) -> [PathBuf; 2] {
+        ["rust", "python"].map(|language| self.lambda(language))
+    }
+
+    fn lambda(&self, language: &str) -> PathBuf {
+        Path::new("examples").join(self.name).join(language)
+    }
+
     fn replay_twin(&self, checkout: &Checkout, language: &str) -> Result<Replayed, Failure> {
         let kind = if language == "rust" { "wasm" } else { language };
-        let lambda = Path::new("examples").join(self.name).join(language);
+        let lambda = self.lambda(language);
         let settings = self.set.iter().flat_map(|set| ["--set".to_owned(), (*set).to_owned()]);
         replay(checkout, &format!("{}-{kind}", self.name), lambda, settings.collect())
     }

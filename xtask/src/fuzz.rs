@@ -106,7 +106,7 @@ pub(crate) fn driver(checkout: &Checkout) -> Result<(), Failure> {
         &mut build,
         "if a linker or a C compiler is missing, install one (`cc`); else see the first error above",
     )?;
-    setup::lambdas(checkout, &[PathBuf::from(DRIVER)])?;
+    setup::build_lambdas(checkout, &[PathBuf::from(DRIVER)])?;
     let mut compile = checkout.command(checkout.program("gleaner-compile"));
     let code = checkout.path(DRIVER).join("build/driver.wasm");
     steps::run(compile.arg(code).arg("--cache").arg(checkout.path(CACHE)), "see the error above")

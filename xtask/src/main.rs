@@ -67,14 +67,20 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "peers" => peers::build(&checkout, rest),
         "player" => player::run(&checkout),
         "aarch64" => aarch64::run(&checkout),
-        "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS), &FAMILIES).map(|()| Exit::Ok),
+        "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS), &checkout.lambdas(&FAMILIES)).map(|()| Exit::Ok),
         _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
     }
 }
 
 fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps, &FAMILIES)?;
+    let mut steps = Steps::of(setup::STEPS + 3);
+    setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
+    steps.begin("readers of drives, to compare with");
+    venv::set_up_for_tests(checkout)?;
+    steps.begin("gleaner-bench");
+    let mut build = checkout.cargo();
+    // By its name alone: cargo chooses features by the packages that are named, and none of it is to compile twice.
+    steps::run(build.args(["build", "--release", "--bin", "gleaner-bench"]), "see the first error above")?;
     steps.begin("measurements");
     let mut bench = checkout.command(checkout.program("gleaner-bench"));
     bench.args(arguments);

@@ -14,16 +14,20 @@ pub(crate) const STEPS: usize = 4;
 /// What lambdas in Rust are compiled for.
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
-/// Sets up: the wasm target, `.venv`, all programs, the lambdas in `families`.
-pub(crate) fn run(checkout: &Checkout, steps: &mut Steps, families: &[&str]) -> Result<(), Failure> {
+/// The packages with what is installed, and nothing else: no benches, no tests, no lambda for this machine.
+const PROGRAMS: [&str; 6] =
+    ["gleaner-cli", "gleaner-compile", "gleaner-host", "gleaner-python", "gleaner-recorder", "gleaner-shim"];
+
+/// Sets up: the wasm target, `.venv`, the programs, and these lambdas.
+pub(crate) fn run(checkout: &Checkout, steps: &mut Steps, lambdas: &[PathBuf]) -> Result<(), Failure> {
     steps.begin(&format!("compilation target {TARGET}"));
     target(checkout, TARGET)?;
-    steps.begin("Python environment .venv with numpy, mypy and readers of MCAP");
+    steps.begin("Python environment .venv with numpy");
     venv::set_up(checkout)?;
     steps.begin("programs (the first time this takes minutes)");
     programs(checkout)?;
-    steps.begin(&format!("lambdas in {}", families.join(", ")));
-    lambdas(checkout, &checkout.lambdas(families))
+    steps.begin(&format!("{} lambdas", lambdas.len()));
+    build_lambdas(checkout, lambdas)
 }
 
 /// Adds the libraries of Rust for `target`.
@@ -43,20 +47,51 @@ pub(crate) fn target(checkout: &Checkout, target: &str) -> Result<(), Failure> {
     steps::run(&mut add, &help)
 }
 
-/// All in one call, as each test run needs them: features of shared crates are then the same everywhere, and nothing
-/// heavy compiles twice.
+/// All in one call, those too that a command needs not: features of shared crates are then those of `cargo test`, and nothing heavy
+/// compiles twice.
 pub(crate) fn programs(checkout: &Checkout) -> Result<(), Failure> {
     let mut build = checkout.cargo();
-    build.args(["build", "--release"]);
+    build.args(["build", "--release"]).args(PROGRAMS.iter().flat_map(|package| ["--package", package]));
     steps::run(&mut build, "if a linker or a C compiler is missing, install one (`cc`); else see the first error above")
 }
 
 /// Builds the lambdas in these folders.
-pub(crate) fn lambdas(checkout: &Checkout, folders: &[PathBuf]) -> Result<(), Failure> {
+pub(crate) fn build_lambdas(checkout: &Checkout, folders: &[PathBuf]) -> Result<(), Failure> {
     for lambda in folders {
         let mut build = checkout.command(checkout.program("gleaner"));
         build.arg("build").arg(lambda);
         steps::run(&mut build, "see the error above")?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::env;
+    use std::process::Command;
+
+    use super::*;
+
+    /// Each package that cargo builds for `selected`, with its features; `edges` are the kinds of dependencies that count.
+    fn packages(edges: &str, selected: &[&str]) -> BTreeSet<String> {
+        let cargo = env::var_os("CARGO").expect("cargo runs the tests");
+        let mut tree = Command::new(cargo);
+        tree.current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(".."));
+        tree.args(["tree", "--locked", "--edges", edges, "--prefix", "none", "--format", "{p} {f}"]);
+        tree.args(selected.iter().flat_map(|package| ["--package", package]));
+        let output = tree.output().expect("cargo starts");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let lines = String::from_utf8(output.stdout).expect("names are text");
+        lines.lines().map(|line| line.trim_end_matches(" (*)").to_owned()).collect()
+    }
+
+    #[test]
+    fn what_is_built_of_programs_is_not_built_again_for_tests() {
+        let (programs, all) = (packages("normal,build", &PROGRAMS), packages("normal,build,dev", &[]));
+        assert!(programs.len() > 100, "{}", programs.len());
+        // As cargo chooses features by what it builds, a feature that only a test enables is one more build of all that uses it.
+        let again: Vec<_> = programs.difference(&all).collect();
+        assert!(again.is_empty(), "with other features in `cargo test`: {again:#?}");
+    }
 }

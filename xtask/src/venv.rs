@@ -1,5 +1,5 @@
-//! `.venv`: Python with numpy, for Python lambdas; mypy, for the check of the SDK's types; and the readers of others, by which
-//! tests read our clips. No version is pinned: the newest that this Python takes, so that a user's environment is the one that
+//! `.venv`: Python with numpy, for Python lambdas; and for tests and benches mypy, which checks the SDK's types, and the readers of
+//! others, by which tests read our clips. No version is pinned: the newest that this Python takes, so that a user's environment is the one that
 //! is tested. But for mypy, of which the newest may find new faults in old code: it has an upper bound.
 
 use std::fs;
@@ -11,17 +11,15 @@ use gleaner_parts::Parts;
 use crate::checkout::Checkout;
 use crate::steps::{run, succeeds};
 
-/// What pip calls each, and what Python does.
-const PACKAGES: [(&str, &str); 5] = [
-    ("numpy", "numpy"),
+/// What lambdas need: what pip calls it, and what Python does.
+const PACKAGES: [(&str, &str); 1] = [("numpy", "numpy")];
+
+/// What tests and benches need, too: types, readers, `gleaner.testing` on pictures, tests of lambdas, and notebooks.
+const FOR_TESTS: [(&str, &str); 9] = [
     ("mypy<2.5", "mypy"),
     ("mcap", "mcap"),
     ("mcap-ros2-support", "mcap_ros2"),
     ("rosbags", "rosbags"),
-];
-
-/// What only tests need: `gleaner.testing` on pictures, tests of lambdas, and notebooks.
-const FOR_TESTS: [(&str, &str); 5] = [
     ("pillow", "PIL"),
     ("pytest", "pytest"),
     ("nbclient", "nbclient"),
@@ -52,7 +50,7 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
     fetch(checkout, &PACKAGES)
 }
 
-/// Adds what tests need to the environment.
+/// Adds what tests and benches need to the environment.
 pub(crate) fn set_up_for_tests(checkout: &Checkout) -> Result<(), Failure> {
     if has(checkout, &FOR_TESTS) { Ok(()) } else { fetch(checkout, &FOR_TESTS) }
 }

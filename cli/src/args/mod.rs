@@ -119,6 +119,15 @@ pub struct NetworkArgs {
     pub interface: Vec<IpAddr>,
 }
 
+impl NetworkArgs {
+    /// The same, as our programs take it.
+    pub(crate) fn to_args(&self) -> impl Iterator<Item = OsString> {
+        let domain = self.domain.map(|domain| format!("--domain={domain}"));
+        let interfaces = self.interface.iter().map(|address| format!("--interface={address}"));
+        domain.into_iter().chain(interfaces).map(OsString::from)
+    }
+}
+
 /// Arguments of `gleaner run`.
 #[derive(Args, Debug)]
 pub struct RunArgs {

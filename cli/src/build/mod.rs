@@ -18,11 +18,11 @@ use gleaner_base::{Exit, Failure, PlainFile};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::Kind;
 use gleaner_lambda::{BuildDir, LayoutError, Manifest, SOURCE_MAX, Sources};
+use gleaner_report::words::size;
 
 use error::BuildError;
 use folder::{Built, Partial};
 
-use crate::results::size;
 use crate::say::say;
 
 /// Builds the lambda in `dir` and says so. If it is `sandboxed`, code of its author runs in a jail meanwhile.

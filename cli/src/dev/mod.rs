@@ -11,10 +11,12 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use gleaner_base::ByteSize;
 use gleaner_base::{Exit, Failure, PlainFile, own_file, visible};
+use gleaner_report::Diff;
 
 use crate::args::{AskedArgs, ReplayArgs};
 use crate::say::say;
-use crate::{build, diff, replay};
+use crate::show::{self, Paint};
+use crate::{build, replay};
 
 use watch::Seen;
 
@@ -85,10 +87,10 @@ fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
 }
 
 fn compare(before: &Path, out: &Path) -> Result<(), Failure> {
-    let mut changes = diff::between(before, out)?;
+    let mut changes = Diff::between(before, out)?;
     changes.a.out = "before".to_owned();
     changes.b.out = "now".to_owned();
-    say(&format!("\n{}", changes.text()))
+    say(&format!("\n{}", show::diff(&changes, Paint::of_stdout())))
 }
 
 /// Copies what a later replay is compared with; false if there is nothing whole.

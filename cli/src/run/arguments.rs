@@ -4,7 +4,7 @@ use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
 use crate::args::RunArgs;
-use crate::sibling::{network, starter};
+use crate::sibling::starter;
 
 /// The runtime's arguments.
 pub(super) fn runtime(args: &RunArgs, has_recorder: bool, offset_ns: i64, restarts: u32) -> Vec<OsString> {
@@ -24,7 +24,7 @@ pub(super) fn runtime(args: &RunArgs, has_recorder: bool, offset_ns: i64, restar
             line.push(flag.into());
         }
     }
-    line.extend(network(&args.network));
+    line.extend(args.network.to_args());
     line.extend(["--".into(), args.asked.lambda.clone().into()]);
     line
 }
@@ -49,7 +49,7 @@ pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsSt
             line.push(format!("--{flag}={bound}").into());
         }
     }
-    line.extend(network(&args.network));
+    line.extend(args.network.to_args());
     line
 }
 

@@ -1,7 +1,7 @@
 //! What is shown while a lambda runs: lines that stay, and below them how it is doing.
 
 use std::collections::HashSet;
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, Write};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision};
@@ -36,7 +36,7 @@ impl Screen {
         Self {
             stats,
             json,
-            paint: Paint::new(io::stdout().is_terminal()),
+            paint: Paint::of_stdout(),
             waited: HashSet::new(),
             recorder: String::new(),
             below: below.with_style(style),

@@ -2,9 +2,9 @@ use std::fmt::{self, Write};
 
 use gleaner_base::visible;
 use gleaner_protocol::{Checked, Need, Place};
+use gleaner_report::words::size;
 
 use super::Paint;
-use crate::results::size;
 
 /// What was found out about a lambda, for a person.
 pub(crate) fn checked(checked: &Checked, paint: Paint) -> String {

@@ -5,9 +5,9 @@ use std::fmt::{self, Write};
 use gleaner_base::visible;
 use gleaner_lambda::Clip;
 use gleaner_protocol::Summary;
+use gleaner_report::words::{clip_contents, clip_span, counted, seconds};
 
-use super::{Paint, SHOWN, counted, more};
-use crate::results::{clip_contents, clip_span, seconds};
+use super::{Paint, SHOWN, more};
 
 /// A block for each clip: when it is, what is in it, and what is missing.
 pub(super) fn write(text: &mut String, clips: &[Clip], summary: &Summary, paint: Paint) -> fmt::Result {

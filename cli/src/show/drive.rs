@@ -5,9 +5,9 @@ use std::fmt::Write;
 
 use gleaner_base::visible;
 use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen};
+use gleaner_report::words::{counted, grouped, seconds, size};
 
 use super::live::table;
-use crate::results::{grouped, seconds, size};
 
 /// Parts of a topic's name that say nothing of what is measured.
 const EMPTY_WORDS: [&str; 7] = ["data", "raw", "image", "image_raw", "image_color", "compressed", "msg"];
@@ -30,13 +30,13 @@ pub(crate) fn drive(drive: &DriveSeen) -> String {
         let _ = writeln!(text, "damaged: {}", visible(damaged));
     }
     if drive.out_of_order > 0 {
-        let _ = writeln!(text, "{} out of order by log time", super::counted(drive.out_of_order, "message"));
+        let _ = writeln!(text, "{} out of order by log time", counted(drive.out_of_order, "message"));
     }
     let head = ["topic", "type", "messages", "Hz", "longest gap", "at", "missing", "largest", ""].map(str::to_owned);
     let rows = drive.topics.iter().map(|topic| row(topic, start));
     text += &table(std::iter::once(head).chain(rows).collect(), &[2, 3, 4, 5, 6, 7]);
     if drive.skipped > 0 {
-        let _ = writeln!(text, "and {}, not looked at", super::counted(drive.skipped, "more topic"));
+        let _ = writeln!(text, "and {}, not looked at", counted(drive.skipped, "more topic"));
     }
     text + &inputs(&drive.topics)
 }

@@ -6,9 +6,9 @@ use gleaner_base::visible;
 use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
 use gleaner_protocol::{Live, LiveTopic, Network, Spread, TopicSeen};
+use gleaner_report::words::{clip_span, counted, fault_kind, grouped, three_digits};
 
-use super::{Paint, counted, grouped, mib, word};
-use crate::results::{clip_span, three_digits};
+use super::{Paint, mib};
 
 /// How it is doing, in some lines.
 pub(crate) fn live(live: &Live, paint: Paint) -> String {
@@ -64,7 +64,7 @@ pub(crate) fn decision(decision: &gleaner_lambda::Decision, paint: Paint) -> Str
         text += &format!("{}\n", paint.green(line.trim_end()));
     }
     if let Some(fault) = &decision.fault {
-        let line = format!("{time}  {}: {}", word(fault.kind), super::shown(super::gist(&fault.message)));
+        let line = format!("{time}  {}: {}", fault_kind(fault.kind), super::shown(super::gist(&fault.message)));
         text += &format!("{}\n", paint.red(&line));
     }
     text

@@ -1,20 +1,23 @@
 //! What a person sees after a replay. Text in, text out: nothing is read or printed here.
 
 use std::fmt::{self, Write};
+use std::io::{self, IsTerminal};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision, Fault, FaultKind, Trigger, TriggerKind};
 use gleaner_protocol::{Summary, TopicReport, Verified};
-
-use crate::results::{ResultsError, grouped, seconds, three_digits};
+use gleaner_report::ResultsError;
+use gleaner_report::words::{counted, fault_kind, gist, grouped, seconds, three_digits};
 
 mod checked;
 mod clips;
+mod diff;
 mod drive;
 mod isolation;
 mod live;
 
 pub(crate) use checked::checked;
+pub(crate) use diff::diff;
 pub(crate) use drive::drive;
 pub(crate) use isolation::isolation;
 pub(crate) use live::{clip_line, decision, live, recorder, topics};
@@ -137,14 +140,6 @@ impl Burst {
     }
 }
 
-/// The line of a fault's message that says most: the first, but the last of a Python traceback.
-pub(crate) fn gist(message: &str) -> &str {
-    let mut lines = message.lines().map(str::trim).filter(|line| !line.is_empty());
-    let traceback = message.contains("Traceback (most recent call last)");
-    let line = if traceback { lines.next_back() } else { lines.next() };
-    line.unwrap_or_default()
-}
-
 /// A fault's message, fit to print and no longer than a few lines of a terminal.
 pub(crate) fn shown(message: &str) -> String {
     // What is written out takes more room than it did.
@@ -215,7 +210,7 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
     if summary.faults > 0 {
         writeln!(text, "  {}", paint.red(&counted(summary.faults, "fault")))?;
         for cause in &digest.causes {
-            let kind = word(cause.kind);
+            let kind = fault_kind(cause.kind);
             writeln!(text, "{:>10.3} s  {}x {kind}: {}", cause.first_seconds, grouped(cause.count), cause.message)?;
         }
         more(text, digest.other_faults)?;
@@ -301,17 +296,6 @@ fn losses(summary: &Summary) -> Vec<String> {
     all.filter(|(count, _)| *count > 0).map(|(_, loss)| loss).collect()
 }
 
-/// The word of `decisions.jsonl`.
-pub(crate) fn word(kind: FaultKind) -> String {
-    let word = serde_json::to_value(kind).ok();
-    word.as_ref().and_then(|word| word.as_str()).unwrap_or("fault").to_owned()
-}
-
-/// `1 wake`, `2,000 wakes`.
-pub(crate) fn counted(count: u64, thing: &str) -> String {
-    format!("{} {thing}{}", grouped(count), if count == 1 { "" } else { "s" })
-}
-
 fn mib(bytes: u64) -> f64 {
     bytes as f64 / (1024.0 * 1024.0)
 }
@@ -328,6 +312,11 @@ impl Paint {
     /// Source: no-color.org, by which `NO_COLOR` counts if it is not empty.
     pub(crate) fn new(terminal: bool) -> Paint {
         Paint { on: terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()) }
+    }
+
+    /// Colours if standard output is a terminal.
+    pub(crate) fn of_stdout() -> Paint {
+        Paint::new(io::stdout().is_terminal())
     }
 
     pub(crate) fn bold(self, text: &str) -> String {

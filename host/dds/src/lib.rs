@@ -16,6 +16,8 @@
 //!
 //! [`Qos::Auto`]: gleaner_transport::Qos::Auto
 
+#[cfg(feature = "clap")]
+mod arguments;
 mod ask;
 mod bpf;
 mod day;
@@ -49,6 +51,8 @@ use std::time::{Duration, Instant};
 use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 use tracing::{info, warn};
 
+#[cfg(feature = "clap")]
+pub use arguments::NetworkArgs;
 pub use options::{DdsError, Distro, Options};
 pub use wire::TopicOnWire;
 pub use writer::Writer;

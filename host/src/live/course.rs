@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, nanoseconds};
 use gleaner_protocol::Report;
 use gleaner_transport::{Clock, LiveSource};
 use gleaner_vitals::Pulse;
@@ -134,8 +134,4 @@ impl Course {
         self.ledger.report(Report::Live(Box::new(live)));
         Ok(())
     }
-}
-
-fn nanoseconds(duration: Duration) -> i64 {
-    i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
 }

@@ -3,21 +3,20 @@
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::{Dds, Options};
+use gleaner_dds::{Dds, NetworkArgs, Options};
 use gleaner_jail::Paths;
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_transport::Clock;
+use gleaner_vitals::start::stop_flag;
 
 use super::{Pages, Run, Settings};
 use crate::input::unfinished_bytes;
 use crate::isolation::{Isolation, definitions};
-use crate::network::{NetworkArgs, NetworkError};
+use crate::network::NetworkError;
 use crate::stage::{Asked, AskedArgs, Load};
 
 /// Arguments of `run`.
@@ -89,7 +88,7 @@ impl Job {
         let asked = Asked::new(args.asked, build, &mut manifest)?;
         let name: String =
             manifest.lambda.name.as_str().chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
-        let mut dds = args.network.options(&format!("/gleaner/{name}"))?;
+        let mut dds = args.network.options(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
         dds.clock = args.clock_offset.map_or_else(Clock::of_today, Clock::new);
         dds.largest = manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
         dds.messages = messages;
@@ -116,7 +115,8 @@ impl Job {
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
         let Self { asked, manifest, settings, has_recorder, dds } = self;
-        let stop = stop_flag()?;
+        let stop =
+            stop_flag().map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error))?;
         let source = Dds::open(dds).map_err(NetworkError::failure)?;
         let pulse = isolation.pulse().clone();
         let run = Run {
@@ -142,12 +142,4 @@ fn take_stdin() -> Result<OwnedFd, Failure> {
     let nothing = std::fs::File::open("/dev/null").map_err(failed)?;
     rustix::stdio::dup2_stdin(&nothing).map_err(io::Error::from).map_err(failed)?;
     Ok(socket)
-}
-
-/// Returns a flag that SIGTERM raises. SIGINT is for whoever started us, who then sends the other.
-fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
-    signal_hook::flag::register(signal_hook::consts::SIGTERM, Arc::clone(&stop))
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error))?;
-    Ok(stop)
 }

@@ -1,5 +1,6 @@
 //! Which part of a drive is replayed.
 
+use gleaner_base::nanoseconds;
 use gleaner_base::{Exit, Failure};
 use gleaner_drives::Replay;
 use gleaner_journal::Part;
@@ -30,9 +31,7 @@ impl Wanted {
         // Of a database that was cut off, nobody knows it.
         let end_ns = drive.end_ns();
         let ns = |time: DriveTime| match time {
-            DriveTime::After(duration) => {
-                start_ns.saturating_add(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX))
-            }
+            DriveTime::After(duration) => start_ns.saturating_add(nanoseconds(duration)),
             DriveTime::At(ns) => ns,
         };
         let part = Part { from_ns: self.from.map(ns), to_ns: self.to.map(ns) };

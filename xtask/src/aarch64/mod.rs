@@ -41,7 +41,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin("programs and lambdas for this machine (the first time this takes minutes)");
     setup::target(checkout, setup::TARGET)?;
     setup::programs(checkout)?;
-    setup::lambdas(checkout, &cases::lambdas())?;
+    setup::build_lambdas(checkout, &cases::lambdas())?;
     steps.begin(&format!("programs for {TARGET} (the first time this takes minutes)"));
     let emulated = build(checkout, &tools)?;
     println!("built {}", checkout.target().join(TARGET).join("release").display());

@@ -38,9 +38,9 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut suites = suites(checkout);
     suites.extend(player_suites(checkout)?);
     let mut steps = Steps::of(setup::STEPS + 1 + suites.len());
-    setup::run(checkout, &mut steps, &FAMILIES)?;
+    setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
     fuzz::driver(checkout)?;
-    steps.begin("pytest, and what runs notebooks");
+    steps.begin("mypy, pytest, readers of drives, and what runs notebooks");
     venv::set_up_for_tests(checkout)?;
     let mut total = Tally::new(Speech::None);
     let mut table = format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::Failure;
+use gleaner_base::nanoseconds;
 use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 use tracing::{error, warn};
@@ -134,5 +135,5 @@ impl Kept {
 
 fn now() -> i64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(now.as_nanos()).unwrap_or(i64::MAX)
+    nanoseconds(now)
 }

@@ -1,12 +1,11 @@
 //! The command line.
 
-use std::net::IpAddr;
 use std::path::PathBuf;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_dds as dds;
-use gleaner_dds::Dds;
+use gleaner_dds::{Dds, NetworkArgs};
 use gleaner_lambda::manifest::TopicName;
 use gleaner_transport::{Clock, LiveSource};
 
@@ -20,12 +19,8 @@ pub(super) struct Args {
     /// Folder of the clips: `clips.jsonl`, `clips/`.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
-    /// Domain of DDS; without it that of `ROS_DOMAIN_ID`.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(..=232))]
-    domain: Option<u16>,
-    /// Address of an interface to use; all without it.
-    #[arg(long, value_name = "ADDRESS")]
-    interface: Vec<IpAddr>,
+    #[command(flatten)]
+    network: NetworkArgs,
     /// How far the clock of samples is ahead of CLOCK_MONOTONIC, in ns; without it, it shows the time of day.
     #[arg(long, value_name = "NS", allow_negative_numbers = true)]
     clock_offset: Option<i64>,
@@ -58,8 +53,7 @@ pub(super) struct Network(dds::Options);
 impl Args {
     pub(super) fn read(self) -> Result<(Options, Network), Failure> {
         let usage = |error: &dds::DdsError| Failure::caused_by(Exit::Usage, "cannot use the network", error);
-        let mut network = dds::Options::from_env("/gleaner/recorder").map_err(|error| usage(&error))?;
-        network = network.narrowed(self.domain, self.interface);
+        let mut network = self.network.options("/gleaner/recorder").map_err(|error| usage(&error))?;
         network.largest = self.largest.unwrap_or(network.largest);
         network.messages = self.messages;
         network.clock = self.clock_offset.map_or(network.clock, Clock::new);

@@ -24,16 +24,16 @@ mod staging;
 mod telling;
 mod watch;
 
+use std::io;
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
-use std::{fs::File, io};
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_transport::Clock;
+use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
 
 use args::Args;
@@ -76,9 +76,7 @@ fn start(args: Args) -> Result<(), Failure> {
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
         .map_err(internal("cannot be told of the starter's death"))?;
-    let stop = Arc::new(AtomicBool::new(false));
-    signal_hook::flag::register(signal_hook::consts::SIGTERM, Arc::clone(&stop))
-        .map_err(internal("cannot handle SIGTERM"))?;
+    let stop = stop_flag().map_err(internal("cannot handle SIGTERM"))?;
     // Ctrl-C in a terminal reaches all processes; the starter says when this one ends.
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::default())
         .map_err(internal("cannot handle SIGINT"))?;
@@ -96,11 +94,4 @@ fn control() -> Result<OwnedFd, Failure> {
         Failure::new(Exit::Usage, "standard input is not the socket of a starter")
             .with_help("start it with `gleaner run LAMBDA`")
     })
-}
-
-/// What was standard output. What a library writes there by itself goes to standard error.
-fn reports() -> io::Result<File> {
-    let reports = rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdout(), 3)?;
-    rustix::stdio::dup2_stdout(io::stderr())?;
-    Ok(File::from(reports))
 }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use gleaner_base::nanoseconds;
 use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Clip, Moment, Trigger};
 use gleaner_protocol::link::Loss;
@@ -14,7 +15,7 @@ use super::walk::Budget;
 use super::{Commanded, LambdaId, Recorder, Settings, TopicId, Work};
 use crate::RecordError;
 use crate::file::{Folder, Topic};
-use crate::window::{Heard, nanoseconds};
+use crate::window::Heard;
 
 /// How much later than its stamp a wake may come: a lambda's process sends them together, see
 /// [`gleaner_protocol::link::RecorderLink::wake`]. Clips wait for them.

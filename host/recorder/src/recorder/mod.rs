@@ -16,13 +16,14 @@ mod walk;
 
 use std::sync::Arc;
 
+use gleaner_base::nanoseconds;
 use gleaner_journal::{Encoder, Entry};
 use gleaner_lambda::{Clip, Moment, TriggerKind};
 use gleaner_transport::{Gaps, SampleMeta};
 
 use crate::file::{Folder, Topic};
 use crate::preroll::{Held, Losses, Preroll, Walked};
-use crate::window::{Heard, Rules, Windows, nanoseconds};
+use crate::window::{Heard, Rules, Windows};
 use crate::{LAMBDAS_MAX, RecordError};
 use draft::Draft;
 use finished::Finished;

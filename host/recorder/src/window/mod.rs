@@ -14,8 +14,6 @@ mod group;
 mod intervals;
 mod machine;
 
-use std::time::Duration;
-
 pub use group::Group;
 #[cfg(test)]
 use machine::STARTED_MAX;
@@ -51,11 +49,6 @@ impl Window {
     fn touches(&self, other: &Window) -> bool {
         other.to.is_none_or(|to| self.from <= to) && self.to.is_none_or(|to| other.from <= to)
     }
-}
-
-/// `duration` in ns; no duration in a manifest comes near to the largest one.
-pub fn nanoseconds(duration: Duration) -> i64 {
-    i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_base::each_piece;
 use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 use gleaner_protocol::ExitRecord;
@@ -21,8 +22,6 @@ pub const WORKER: &str = "--worker";
 
 /// How long a worker may take to end once that was requested. What it wrote to standard error may take as long.
 const UNTIL_KILLED: Duration = Duration::from_secs(2);
-/// Longest piece of a line of standard error that is passed on at once.
-const PIECE: u64 = 8192;
 /// Bytes of standard error that are held while it is not known whether they come from the lambda.
 const HELD: usize = 4 << 20;
 
@@ -210,16 +209,14 @@ fn pass_on(mut from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>)
         }
     };
     let mark = if is_ready == Ok(true) { "lambda: " } else { "" };
-    let mut from = BufReader::new(io::Cursor::new(held).chain(from));
-    let (mut piece, mut begins_line, mut is_explained) = (Vec::new(), true, false);
-    while matches!((&mut from).take(PIECE).read_until(b'\n', &mut piece), Ok(1..)) {
-        is_explained |= begins_line && mark.is_empty() && piece.starts_with(b"error: ");
-        let mut text = if begins_line { mark.as_bytes().to_vec() } else { Vec::new() };
-        text.append(&mut piece);
-        begins_line = text.ends_with(b"\n");
+    let mut is_explained = false;
+    let is_whole = each_piece(io::Cursor::new(held).chain(from), |piece| {
+        is_explained |= mark.is_empty() && piece.is_failure();
+        // In one write, so that no other line of this process comes between.
+        let text = [if piece.begins_line { mark.as_bytes() } else { b"" }, piece.bytes].concat();
         let _ = io::stderr().write_all(&text);
-    }
-    if !begins_line {
+    });
+    if !is_whole {
         // Else the next line of this process would be a part of it.
         let _ = io::stderr().write_all(b"\n");
     }

@@ -10,11 +10,12 @@ use gleaner_lambda::{Clip, Decision};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
-use super::marks::{Marks, Room, cut};
+use super::marks::{Marks, Room};
 use super::model::{ClipShown, CurveShown, Fact, LogShown, Run, SpreadShown, Totals};
 use super::pictures::Pictures;
-use super::told::{TellError, Told, in_words, shown_config, signals};
-use crate::results::{JsonLines, ResultsError, clip_contents, clip_span, grouped, seconds, size};
+use crate::results::{JsonLines, ResultsError};
+use crate::run_summary::{OutputError, RunSummary, in_words, shown_config, signals};
+use crate::words::{clip_contents, clip_span, counted, cut, grouped, seconds, size};
 
 /// Most clips and lines of the log on a page.
 const CLIPS_MAX: usize = 1_000;
@@ -35,13 +36,13 @@ struct Line {
 
 /// What the page shows of `out`, which shares it with others: it has one part of `shares`. Times count from `from_ns`; of a run
 /// that is alone, from its own start.
-pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<Run, TellError> {
+pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<Run, OutputError> {
     let mut notes = Vec::new();
-    let told = Told::bounded(out, &mut notes)?;
+    let told = RunSummary::bounded(out, &mut notes)?;
     let signals = signals(out, &mut notes)?;
     let begin_ns = match &told {
-        Told::Replay(summary) => summary.start_ns,
-        Told::Live(_) => first_ns(out).unwrap_or(0),
+        RunSummary::Replay(summary) => summary.start_ns,
+        RunSummary::Live(_) => first_ns(out).unwrap_or(0),
     };
     let start_ns = from_ns.unwrap_or(begin_ns);
 
@@ -91,7 +92,7 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
         lambda: name.to_owned(),
         version: version.to_owned(),
         kind,
-        is_live: matches!(told, Told::Live(_)),
+        is_live: matches!(told, RunSummary::Live(_)),
         drive: Vec::new(),
         start_ns,
         start_ms: start_ns as f64 / 1e6,
@@ -141,8 +142,8 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
 }
 
 /// Which drive it was, and what of it.
-fn place(run: &mut Run, told: &Told) {
-    let Told::Replay(summary) = told else { return };
+fn place(run: &mut Run, told: &RunSummary) {
+    let RunSummary::Replay(summary) = told else { return };
     run.drive = summary.drive.iter().map(|path| path.display().to_string()).collect();
     let part = summary.part;
     let from_ns = part.from_ns.unwrap_or(summary.start_ns).max(summary.start_ns);
@@ -197,7 +198,7 @@ fn each<T: DeserializeOwned>(
         }
     }
     if bad > 0 {
-        notes.push(format!("{} of `{name}` left out; the first: {first}", crate::show::counted(bad, "line")));
+        notes.push(format!("{} of `{name}` left out; the first: {first}", counted(bad, "line")));
     }
     Ok(())
 }
@@ -255,7 +256,7 @@ fn nine_digits(value: f64) -> f64 {
     format!("{value:.8e}").parse().unwrap_or(value)
 }
 
-fn spreads(told: &Told, signals: Option<&Signals>) -> Vec<SpreadShown> {
+fn spreads(told: &RunSummary, signals: Option<&Signals>) -> Vec<SpreadShown> {
     let kept = |what, unit, spread: &Spread| SpreadShown {
         what,
         unit,
@@ -267,7 +268,7 @@ fn spreads(told: &Told, signals: Option<&Signals>) -> Vec<SpreadShown> {
         let fuel = signals.fuel.iter().map(|fuel| kept("fuel", "fuel", fuel));
         return std::iter::once(kept("time in the lambda", "ns", &signals.run_ns)).chain(fuel).collect();
     }
-    let Told::Live(live) = told else { return Vec::new() };
+    let RunSummary::Live(live) = told else { return Vec::new() };
     let spreads = [("wake-up", live.wake_up), ("time in the lambda", live.run), ("decision handed out", live.hand_out)];
     let shown = spreads.into_iter().filter_map(|(what, spread)| Some((what, spread?)));
     let shown = shown.map(|(what, spread)| SpreadShown {
@@ -280,10 +281,10 @@ fn spreads(told: &Told, signals: Option<&Signals>) -> Vec<SpreadShown> {
     shown.collect()
 }
 
-fn facts(told: &Told) -> Vec<Fact> {
+fn facts(told: &RunSummary) -> Vec<Fact> {
     let fact = |what, text: String| Fact { what, text };
     match told {
-        Told::Replay(told) => {
+        RunSummary::Replay(told) => {
             let percent = 100.0 * told.decode_s / told.run_s.max(told.decode_s).max(f64::MIN_POSITIVE);
             let decoding = if told.decode_s > 0.0 { format!(", {percent:.0} % decoding") } else { String::new() };
             vec![
@@ -293,7 +294,7 @@ fn facts(told: &Told) -> Vec<Fact> {
                 fact("memory, at most", size(told.peak_rss_bytes)),
             ]
         }
-        Told::Live(told) => {
+        RunSummary::Live(told) => {
             let trouble = told.topics.iter().flat_map(|topic| &topic.trouble);
             let facts = [
                 fact("up", format!("{:.1} s", told.up_s)),

@@ -10,10 +10,9 @@ use gleaner_lambda::results::PICTURE_MAX;
 use gleaner_lambda::signals::Picture;
 
 use super::gather::{named, places};
-use super::marks::cut;
+use super::html::jpeg_address;
 use super::model::{ClipShown, Mark, PictureShown};
-use super::page::jpeg_address;
-use crate::results::seconds;
+use crate::words::{cut, seconds};
 
 /// Most bytes of all pictures on a page.
 const ALL_BYTES: usize = 2 << 20;

@@ -4,8 +4,7 @@ use gleaner_lambda::{Decision, Fault, SCORE_TOLERANCE, Trigger, TriggerKind};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-use crate::report::cut;
-use crate::results::{score, seconds, three_digits};
+use crate::words::{cut, fault_kind, gist, score, seconds};
 
 /// Most characters of what is said of one difference.
 const CHARS: usize = 300;
@@ -13,35 +12,42 @@ const CHARS: usize = 300;
 /// What a difference is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Of {
+pub enum Of {
+    /// A trigger.
     Trigger,
+    /// A fault.
     Fault,
 }
 
 /// What became of it in the second run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Is {
+pub enum Is {
+    /// Only the first run has it.
     Gone,
+    /// Only the second run has it.
     New,
+    /// Both have it, not alike.
     Changed,
 }
 
 /// A trigger or a fault that both runs do not have alike.
 #[derive(Debug, PartialEq, Serialize)]
-pub(crate) struct Difference {
+pub struct Difference {
     /// Time of the wake, in ns since the epoch of the drive.
-    pub(crate) at_ns: i64,
+    pub at_ns: i64,
     /// The same, in s after the start of the first run's drive.
-    pub(crate) t: f64,
-    pub(crate) of: Of,
-    pub(crate) is: Is,
+    pub t: f64,
+    /// A trigger or a fault.
+    pub of: Of,
+    /// What became of it.
+    pub is: Is,
     /// The topic of the sample that woke it; `None` for a tick.
-    pub(crate) topic: Option<String>,
+    pub topic: Option<String>,
     /// Its label; of a fault, its kind.
-    pub(crate) label: String,
+    pub label: String,
     /// Score or message; of what changed, before and after.
-    pub(crate) detail: String,
+    pub detail: String,
 }
 
 /// What is alike and what is not, in one wake.
@@ -176,19 +182,14 @@ fn exact(trigger: &Trigger) -> String {
 }
 
 fn kind(fault: &Fault) -> String {
-    crate::show::word(fault.kind)
+    fault_kind(fault.kind)
 }
 
 fn first_line(fault: &Fault) -> String {
-    crate::show::gist(&fault.message).to_owned()
+    gist(&fault.message).to_owned()
 }
 
 /// `text`, or its begin.
 pub(super) fn short(text: &str) -> String {
     cut(text, CHARS)
-}
-
-/// `b / a` in words.
-pub(super) fn ratio(ratio: f64) -> String {
-    format!("x{}", three_digits(ratio))
 }

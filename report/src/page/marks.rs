@@ -5,9 +5,9 @@ use std::collections::HashMap;
 use gleaner_lambda::{Decision, Fault, FaultKind, Trigger};
 
 use super::density::Density;
+use super::html;
 use super::model::{Amounts, FaultCause, FaultMark, Mark};
-use super::page;
-use crate::results::{grouped, seconds, size};
+use crate::words::{cut, grouped, seconds, size};
 
 /// Most triggers with all that is known of them, most faults, and most lines of the table of faults.
 pub(super) const TRIGGERS_MAX: usize = 5_000;
@@ -35,7 +35,7 @@ impl Room {
 
     /// Whether `value` found room.
     pub(super) fn take(&mut self, value: &impl serde::Serialize) -> bool {
-        let bytes = page::json(value).len();
+        let bytes = html::json(value).len();
         match self.0.checked_sub(bytes) {
             Some(left) => {
                 self.0 = left;
@@ -107,7 +107,7 @@ impl Marks {
         if self.triggers.len() == TRIGGERS_MAX || self.trigger_room.is_full() {
             return;
         }
-        let attributes_cut = page::json(&trigger.attributes).len() > ATTRIBUTE_BYTES;
+        let attributes_cut = html::json(&trigger.attributes).len() > ATTRIBUTE_BYTES;
         let shown = |(name, value): (&String, &serde_json::Value)| {
             // A script would round large whole numbers.
             (name.clone(), value.as_str().map_or_else(|| value.to_string(), str::to_owned))
@@ -191,12 +191,4 @@ fn amounts(fault: &Fault) -> Amounts {
         _ => grouped(amount),
     };
     Amounts { used: fault.used.map(words), allowed: fault.allowed.map(words) }
-}
-
-/// The first `chars` characters of `text`.
-pub(crate) fn cut(text: &str, chars: usize) -> String {
-    match text.char_indices().nth(chars) {
-        Some((end, _)) => format!("{}…", &text[..end]),
-        None => text.to_owned(),
-    }
 }

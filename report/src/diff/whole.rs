@@ -10,8 +10,9 @@ use gleaner_protocol::Live;
 
 use super::compare::short;
 use super::{Change, Cost, Diff, DiffError, Side, Tally};
-use crate::report::{Losses, Told, signals};
-use crate::results::{JsonLines, grouped, size};
+use crate::results::JsonLines;
+use crate::run_summary::{Losses, RunSummary, signals};
+use crate::words::{grouped, size};
 
 /// Most values of a config that are listed.
 const CHANGES_MAX: usize = 200;
@@ -19,7 +20,7 @@ const CHANGES_MAX: usize = 200;
 /// All that can be said without looking at a decision.
 pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     let mut notes = Vec::new();
-    let (told_a, told_b) = (Told::bounded(a, &mut notes)?, Told::bounded(b, &mut notes)?);
+    let (told_a, told_b) = (RunSummary::bounded(a, &mut notes)?, RunSummary::bounded(b, &mut notes)?);
     apart(&told_a, &told_b, &mut notes);
     let (read_a, read_b) = (signals(a, &mut notes)?, signals(b, &mut notes)?);
     let clips = [clips(a)?, clips(b)?];
@@ -38,20 +39,20 @@ pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     })
 }
 
-fn side(out: &Path, told: &Told) -> Side {
+fn side(out: &Path, told: &RunSummary) -> Side {
     let (lambda, version, kind) = told.lambda();
     let (drive, start_ns) = match told {
-        Told::Replay(summary) => {
+        RunSummary::Replay(summary) => {
             (summary.drive.iter().map(|path| path.display().to_string()).collect(), Some(summary.start_ns))
         }
-        Told::Live(_) => (Vec::new(), None),
+        RunSummary::Live(_) => (Vec::new(), None),
     };
     let (lambda, version) = (lambda.to_owned(), version.to_owned());
     Side { out: out.display().to_string(), lambda, version, kind, drive, start_ns }
 }
 
 /// What makes a comparison doubtful: it is said before all else.
-fn apart(a: &Told, b: &Told, notes: &mut Vec<String>) {
+fn apart(a: &RunSummary, b: &RunSummary, notes: &mut Vec<String>) {
     let [(name_a, version_a, kind_a), (name_b, version_b, kind_b)] = [a.lambda(), b.lambda()];
     if name_a != name_b {
         notes.push(format!("different lambdas: `{name_a}` and `{name_b}`"));
@@ -62,8 +63,10 @@ fn apart(a: &Told, b: &Told, notes: &mut Vec<String>) {
         notes.push(format!("different kinds: {} and {}", kind_a.as_str(), kind_b.as_str()));
     }
     let (a, b) = match (a, b) {
-        (Told::Replay(a), Told::Replay(b)) => (a, b),
-        (Told::Live(_), Told::Live(_)) => return notes.push("both ran live, each on what it received".to_owned()),
+        (RunSummary::Replay(a), RunSummary::Replay(b)) => (a, b),
+        (RunSummary::Live(_), RunSummary::Live(_)) => {
+            return notes.push("both ran live, each on what it received".to_owned());
+        }
         _ => return notes.push("one is a replay, the other ran live".to_owned()),
     };
     if (a.start_ns, a.end_ns) != (b.start_ns, b.end_ns) {
@@ -119,7 +122,7 @@ fn clips(out: &Path) -> Result<[u64; 2], DiffError> {
     Ok(found)
 }
 
-fn counts(a: &Told, b: &Told, clips: [[u64; 2]; 2]) -> Vec<Change> {
+fn counts(a: &RunSummary, b: &RunSummary, clips: [[u64; 2]; 2]) -> Vec<Change> {
     let mut changes = Vec::new();
     let mut add = |what: String, a: Option<String>, b: Option<String>| {
         if a != b {
@@ -127,7 +130,7 @@ fn counts(a: &Told, b: &Told, clips: [[u64; 2]; 2]) -> Vec<Change> {
         }
     };
     // The same things in the same order, first those that both have.
-    let numbers = |told: &Told| told.wakes().into_iter().chain(told.missed()).collect::<Vec<_>>();
+    let numbers = |told: &RunSummary| told.wakes().into_iter().chain(told.missed()).collect::<Vec<_>>();
     let (of_a, of_b) = (numbers(a), numbers(b));
     let find = |list: &[(&'static str, u64)], what: &str| {
         list.iter().find(|(name, _)| *name == what).map(|(_, count)| grouped(*count))
@@ -166,13 +169,13 @@ fn counts(a: &Told, b: &Told, clips: [[u64; 2]; 2]) -> Vec<Change> {
 }
 
 /// Of a run without `signals.json`, what its summary tells.
-fn cost(a: (&Told, Option<&Signals>), b: (&Told, Option<&Signals>)) -> Vec<Cost> {
-    let time = |(told, signals): (&Told, Option<&Signals>)| match (signals, told) {
+fn cost(a: (&RunSummary, Option<&Signals>), b: (&RunSummary, Option<&Signals>)) -> Vec<Cost> {
+    let time = |(told, signals): (&RunSummary, Option<&Signals>)| match (signals, told) {
         (Some(signals), _) => Some(signals.run_ns.p50).filter(|_| signals.run_ns.count > 0),
-        (None, Told::Live(live)) => run(live),
-        (None, Told::Replay(_)) => None,
+        (None, RunSummary::Live(live)) => run(live),
+        (None, RunSummary::Replay(_)) => None,
     };
-    let fuel = |(_, signals): (&Told, Option<&Signals>)| {
+    let fuel = |(_, signals): (&RunSummary, Option<&Signals>)| {
         signals.and_then(|signals| signals.fuel.as_ref()).filter(|fuel| fuel.count > 0).map(|fuel| fuel.p50)
     };
     let cost = |what, unit, a: Option<u64>, b: Option<u64>| {

@@ -6,8 +6,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use serde_json::{Value, json};
 
-use super::{Page, gather, page, write, write_both};
-use crate::diff::between;
+use gleaner_base::{Exit, Failure};
+
+use super::{Page, gather};
+use crate::diff::Diff;
 
 /// A folder of results, removed when the test ends. It is also what the tests of `diff` compare.
 pub(crate) struct Out(PathBuf);
@@ -169,9 +171,8 @@ fn two_runs_count_from_the_start_of_the_first() {
     a.decisions(&both);
     b.decisions(&[&both[..], &[wake(20_000, json!([trigger("brake", 1.5)]), Value::Null)]].concat());
     for (first, second, new_s, [from_a, from_b]) in [(&a, &b, 20.0, [0.0, 12.0]), (&b, &a, 10.0, [2.0, -10.0])] {
-        let path = first.path().join("both.html");
-        write_both(first.path(), second.path(), between(first.path(), second.path()).unwrap(), &path).unwrap();
-        let html = fs::read_to_string(&path).unwrap();
+        let diff = Diff::between(first.path(), second.path()).unwrap();
+        let html = Page::of_both(first.path(), second.path(), diff).unwrap().to_html();
         let (_, data) = html.split_once("application/json\">").unwrap();
         let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
         let run = |n: usize| &data["runs"][n];
@@ -200,8 +201,7 @@ fn hostile_texts_stay_texts() {
     decision["triggers"][0]["attributes"] = json!({hostile: hostile});
     out.decisions(&[decision]);
     out.write("log.jsonl", format!("{}\n", json!({"at_ns": START_NS, "level": hostile, "message": hostile})));
-    let path = write(out.path()).unwrap();
-    let html = fs::read_to_string(path).unwrap();
+    let html = Page::of(out.path()).unwrap().to_html();
     assert!(!html.contains("<script>alert") && !html.contains('\u{2028}'));
     let (_, data) = html.split_once("application/json\">").unwrap();
     let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
@@ -269,11 +269,7 @@ fn a_page_has_bounds_and_says_what_is_beyond_them() {
     let dense = |key: &str| run[key].as_array().unwrap().iter().map(|bin| bin["count"].as_u64().unwrap()).sum::<u64>();
     assert_eq!((dense("trigger_density"), dense("fault_density")), (6000, 6000));
     assert!(length("log") < 2000 && run["totals"]["log"] == 3000, "each line is cut, and all of them share a room");
-    let html = page::html(&Page {
-        made_by: String::new(),
-        runs: vec![gather::gather(out.path(), 1, None).unwrap()],
-        diff: None,
-    });
+    let html = Page::of(out.path()).unwrap().to_html();
     assert!(html.len() < 10 << 20, "{}", html.len());
 }
 
@@ -302,11 +298,9 @@ fn names_values_and_lists_have_bounds_too() {
     }
     signals["config"] = json!({});
     other.write("signals.json", signals.to_string());
-    let path = out.path().join("both.html");
-    let diff = between(out.path(), other.path()).unwrap();
+    let diff = Diff::between(out.path(), other.path()).unwrap();
     assert!(diff.notes.iter().any(|note| note == "50 more config values differ"), "{:?}", diff.notes);
-    write_both(out.path(), other.path(), diff, &path).unwrap();
-    let bytes = fs::metadata(path).unwrap().len();
+    let bytes = Page::of_both(out.path(), other.path(), diff).unwrap().to_html().len();
     assert!(bytes < 8 << 20, "{bytes}");
 }
 
@@ -344,13 +338,12 @@ fn a_folder_without_results_is_refused_with_a_way_out() {
     let out = Out::new();
     out.write("hello/summary.json", summary().to_string());
     fs::remove_file(out.path().join("summary.json")).unwrap();
-    let failure = write(out.path()).unwrap_err();
-    assert_eq!(failure.exit, gleaner_base::Exit::Usage);
+    let failure = Failure::from(Page::of(out.path()).unwrap_err());
+    assert_eq!(failure.exit, Exit::Usage);
     assert!(failure.help.as_ref().unwrap().contains("hello`"), "{failure}");
     out.write("summary.json", "{}");
-    let failure = write(out.path()).unwrap_err();
+    let failure = Failure::from(Page::of(out.path()).unwrap_err());
     assert!(failure.to_string().contains("missing field `lambda`"), "{failure}");
-    assert!(!out.path().join("report.html").exists());
 }
 
 #[test]

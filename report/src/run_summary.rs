@@ -13,8 +13,8 @@ use gleaner_lambda::signals::{Curve, Signals};
 use gleaner_protocol::{Live, Summary};
 use serde::de::DeserializeOwned;
 
-use super::marks::cut;
 use crate::results::ResultsError;
+use crate::words::cut;
 
 /// Most topics of a summary, and drives of it: a lambda has fewer, but the file may be by others. Most characters of their names, and of
 /// what else a summary says in a word.
@@ -28,11 +28,25 @@ const WHY_CHARS: usize = 2_000;
 
 /// Why a folder is no output.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum TellError {
+pub enum OutputError {
+    /// It has no `summary.json`.
     #[error("`{}` holds no results", out.display())]
-    None { out: PathBuf, inside: Vec<PathBuf>, source: FileError },
+    None {
+        /// The folder.
+        out: PathBuf,
+        /// Folders in it that hold results.
+        inside: Vec<PathBuf>,
+        /// Why not.
+        source: FileError,
+    },
+    /// Its `summary.json` or `signals.json` is none of ours.
     #[error("`{}` is not what gleaner writes", path.display())]
-    Summary { path: PathBuf, source: FileError },
+    Summary {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: FileError,
+    },
     /// A file of lines that no run of ours has left so.
     #[error(transparent)]
     Lines(#[from] ResultsError),
@@ -40,11 +54,23 @@ pub(crate) enum TellError {
 
 /// Why a file of an output cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum FileError {
+pub enum FileError {
+    /// It cannot be opened or read.
     #[error("cannot read `{name}`")]
-    Read { name: &'static str, source: io::Error },
+    Read {
+        /// Its name in the folder.
+        name: &'static str,
+        /// Why not.
+        source: io::Error,
+    },
+    /// It is no JSON, or other JSON than ours.
     #[error("`{name}` cannot be understood")]
-    Json { name: &'static str, source: serde_json::Error },
+    Json {
+        /// Its name in the folder.
+        name: &'static str,
+        /// Why not.
+        source: serde_json::Error,
+    },
 }
 
 impl FileError {
@@ -58,7 +84,7 @@ impl FileError {
     }
 }
 
-impl Explain for TellError {
+impl Explain for OutputError {
     fn help(&self) -> Option<String> {
         Some(match self {
             Self::None { inside, .. } if !inside.is_empty() => {
@@ -81,7 +107,7 @@ impl Explain for TellError {
 
 /// What a run did as a whole.
 #[derive(Debug)]
-pub(crate) enum Told {
+pub(crate) enum RunSummary {
     /// It was a replay.
     Replay(Box<Summary>),
     /// It was live.
@@ -105,28 +131,28 @@ pub(crate) struct Losses {
     pub(crate) overwritten: u64,
 }
 
-impl Told {
+impl RunSummary {
     /// Reads `out/summary.json`.
-    fn of(out: &Path) -> Result<Self, TellError> {
+    fn of(out: &Path) -> Result<Self, OutputError> {
         let text = match bounded(out, "summary.json", SUMMARY_MAX) {
             Ok(text) => text,
             Err(source) if source.is_absent() => {
-                return Err(TellError::None { out: out.to_owned(), inside: outputs_in(out), source });
+                return Err(OutputError::None { out: out.to_owned(), inside: outputs_in(out), source });
             }
-            Err(source) => return Err(TellError::Summary { path: out.join("summary.json"), source }),
+            Err(source) => return Err(OutputError::Summary { path: out.join("summary.json"), source }),
         };
-        // Told apart by a key that only one of them has, so that what is wrong with a summary is said of the right one.
+        // RunSummary apart by a key that only one of them has, so that what is wrong with a summary is said of the right one.
         let is_live = serde_json::from_slice::<serde_json::Value>(&text).is_ok_and(|value| value.get("up_s").is_some());
         let told = if is_live {
             parsed("summary.json", &text).map(Self::Live)
         } else {
             parsed("summary.json", &text).map(Self::Replay)
         };
-        told.map_err(|source| TellError::Summary { path: out.join("summary.json"), source })
+        told.map_err(|source| OutputError::Summary { path: out.join("summary.json"), source })
     }
 
     /// As `of`, within what a page has room for. What is left out is said in `notes`.
-    pub(crate) fn bounded(out: &Path, notes: &mut Vec<String>) -> Result<Self, TellError> {
+    pub(crate) fn bounded(out: &Path, notes: &mut Vec<String>) -> Result<Self, OutputError> {
         let mut told = Self::of(out)?;
         let mut left_out = |what: &str, found: usize, most: usize| {
             if found > most {
@@ -266,13 +292,13 @@ impl From<&gleaner_protocol::LiveTopic> for Losses {
 /// # Errors
 ///
 /// If the file is a link, or something else that no run leaves.
-pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Result<Option<Signals>, TellError> {
+pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Result<Option<Signals>, OutputError> {
     let read = bounded(out, "signals.json", SIGNALS_MAX).and_then(|text| parsed::<Signals>("signals.json", &text));
     let mut signals = match read {
         Ok(signals) => signals,
         Err(error) if error.is_absent() => return Ok(None),
         Err(source) if source.is_no_result() => {
-            return Err(TellError::Summary { path: out.join("signals.json"), source });
+            return Err(OutputError::Summary { path: out.join("signals.json"), source });
         }
         Err(error) => {
             // It may quote what was found there.

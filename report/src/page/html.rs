@@ -7,28 +7,28 @@ use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use super::model::Page;
+use super::Page;
 
-const PAGE: &str = include_str!("../../assets/report/page.html");
-const STYLE: [&str; 2] = [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/report/page.css")];
+const PAGE: &str = include_str!("../../assets/page/page.html");
+const STYLE: [&str; 2] = [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/page/page.css")];
 /// The plots, which others made.
 const PLOTS: &str = include_str!("../../assets/uPlot.iife.min.js");
 const PLOTS_LICENSE: &str = include_str!("../../assets/uPlot.LICENSE");
 /// In the order in which they use each other.
 const SCRIPTS: &[&str] = &[
-    include_str!("../../assets/report/elements.js"),
-    include_str!("../../assets/report/words.js"),
-    include_str!("../../assets/report/colours.js"),
-    include_str!("../../assets/report/timeline.js"),
-    include_str!("../../assets/report/lanes.js"),
-    include_str!("../../assets/report/curves.js"),
-    include_str!("../../assets/report/details.js"),
-    include_str!("../../assets/report/head.js"),
-    include_str!("../../assets/report/spreads.js"),
-    include_str!("../../assets/report/tables.js"),
-    include_str!("../../assets/report/gallery.js"),
-    include_str!("../../assets/report/differences.js"),
-    include_str!("../../assets/report/main.js"),
+    include_str!("../../assets/page/elements.js"),
+    include_str!("../../assets/page/words.js"),
+    include_str!("../../assets/page/colours.js"),
+    include_str!("../../assets/page/timeline.js"),
+    include_str!("../../assets/page/lanes.js"),
+    include_str!("../../assets/page/curves.js"),
+    include_str!("../../assets/page/details.js"),
+    include_str!("../../assets/page/head.js"),
+    include_str!("../../assets/page/spreads.js"),
+    include_str!("../../assets/page/tables.js"),
+    include_str!("../../assets/page/gallery.js"),
+    include_str!("../../assets/page/differences.js"),
+    include_str!("../../assets/page/main.js"),
 ];
 
 /// The page for `page`.

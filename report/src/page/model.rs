@@ -7,18 +7,7 @@ use gleaner_lambda::{Cause, FaultKind};
 use serde::Serialize;
 
 use super::density::Dense;
-use super::told::Losses;
-use crate::diff::Diff;
-
-/// All of it.
-#[derive(Debug, Serialize)]
-pub(crate) struct Page {
-    /// Which gleaner made it.
-    pub(crate) made_by: String,
-    /// One, or two that are compared.
-    pub(crate) runs: Vec<Run>,
-    pub(crate) diff: Option<Diff>,
-}
+use crate::run_summary::Losses;
 
 /// What one output holds.
 #[derive(Debug, Serialize)]
