@@ -14,7 +14,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{BuildDir, Exit, Failure, Manifest};
+use gleaner_protocol::manifest::Limits;
+use gleaner_protocol::{BuildDir, Exit, Failure, Manifest, Vehicle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::party::{Ended, Party};
@@ -38,6 +39,8 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     // Recorded topics need not be inputs; what is known of the largest message is what the inputs say.
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes());
     let largest = (manifest.record.is_some() && !args.no_record).then(|| sizes.max().unwrap_or(0));
+    // Its runtime reads the same file, and says what it made smaller.
+    let most = args.asked.vehicle.as_ref().map_or(Ok(Limits::MOST), |file| Vehicle::load(file).map(|it| it.limits))?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
     let offset_ns = clock_offset();
@@ -50,10 +53,10 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     loop {
         let left = args.last.map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let begun = Instant::now();
-        let mut party = Party::start(args, largest, offset_ns, left, restarts)?;
+        let mut party = Party::start(args, most, largest, offset_ns, left, restarts)?;
         match party.attend(&mut screen, &stop)? {
             Ended::Well(exit) => {
-                earlier.complete(party.last(), &arguments::out(args))?;
+                earlier.complete(party.last(), party.recorded(), &arguments::out(args))?;
                 return broken.end(exit);
             }
             // It has said why. What ran before may run again: a network may be down for a while.
@@ -61,7 +64,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             Ended::Never(exit) => broken.add("it could not start".to_owned(), exit == Exit::LambdaFaulted),
             Ended::Broken { why, faulted } => broken.add(why, faulted),
         }
-        earlier.add(party.last(), party.has_lost_wake());
+        earlier.add(party.last(), party.recorded(), party.has_lost_wake());
         restarts += 1;
         pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
         let why = broken.why.as_deref().unwrap_or_default();
@@ -72,7 +75,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             thread::sleep(LOOK);
         }
         if ends() {
-            earlier.complete(None, &arguments::out(args))?;
+            earlier.complete(None, None, &arguments::out(args))?;
             return broken.end(Exit::Ok);
         }
         pause = (pause * 2).min(PAUSE_MAX);

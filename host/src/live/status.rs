@@ -93,6 +93,7 @@ impl Watch {
             topics: Vec::new(),
             network: Network { domain, ..Network::default() },
             recorder: None,
+            recording: None,
             rss_bytes: 0,
             cpu_s: 0.0,
         };

@@ -7,7 +7,7 @@ use gleaner_protocol::journal::{Entry, Header};
 use gleaner_protocol::manifest::{Manifest, Record};
 use gleaner_protocol::{Clip, Exit, Failure};
 use gleaner_recorder::{
-    Counts, Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image, lambda_digest,
+    Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image, lambda_digest,
 };
 use gleaner_transport::replay::Replay;
 use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, Transport, Verdict};
@@ -25,14 +25,6 @@ pub(super) struct Recording {
     /// What an earlier replay left, and what of it was recovered only now; until it is replaced.
     earlier: Option<(Earlier, Vec<Clip>)>,
     lambda: Option<LambdaId>,
-}
-
-/// What a recording did, beside its clips.
-#[derive(Default)]
-pub(super) struct Recorded {
-    pub(super) clips: u64,
-    pub(super) in_cooldown: u64,
-    pub(super) ignored: u64,
 }
 
 struct Shared {
@@ -204,11 +196,10 @@ impl Recording {
     }
 
     /// At the end of the drive: closes what is open.
-    pub(super) fn finish(&self, end_ns: i64) -> Result<Recorded, Failure> {
+    pub(super) fn finish(&self, end_ns: i64) -> Result<gleaner_protocol::Recording, Failure> {
         self.with(|recorder| {
             recorder.finish(end_ns)?;
-            let Counts { clips, in_cooldown, ignored, .. } = recorder.counts();
-            Ok(Recorded { clips, in_cooldown, ignored })
+            Ok(recorder.counts().recording)
         })
     }
 

@@ -24,6 +24,7 @@ pub mod own_file;
 mod page;
 pub mod parts;
 mod plain_file;
+mod recording;
 mod report;
 pub mod results;
 #[cfg(test)]
@@ -52,6 +53,7 @@ pub use output::{LOCK, Output, OutputError, RESULTS};
 pub use page::{PAGE_BYTES, Page, RESULTS_ENV, WokenBy};
 pub use parts::{Looked, Parts, PartsError};
 pub use plain_file::{NotPlain, PlainFile};
+pub use recording::{Counted, Outcome, Recording};
 pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
 pub use sources::{SOURCE_MAX, Sources};
 pub use vehicle::Vehicle;

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use gleaner_protocol::journal::{FileDigest, Header};
 use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
+use gleaner_protocol::manifest::Limits;
 use gleaner_protocol::{Clip, Failure, hex};
 use gleaner_recorder::program::{Feed, Options, Pulse, run};
 use gleaner_transport::dds::Clock;
@@ -182,7 +183,7 @@ pub fn cdr(text: &[u8]) -> Vec<u8> {
 }
 
 pub fn add(folder: &Path) -> Add {
-    Add { lambda: folder.to_owned(), remaps: Vec::new() }
+    Add { lambda: folder.to_owned(), remaps: Vec::new(), most: Limits::MOST }
 }
 
 pub fn monotonic(clock: Clock) -> i64 {
