@@ -85,7 +85,7 @@ pub(crate) fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> R
 
 fn summary_text(summary: &Summary) -> Result<String, Failure> {
     let digest = Digest::of(Decisions::open(&summary.out)?, summary.start_ns)?;
-    let clips = if summary.clips > 0 { clips(&summary.out)? } else { Vec::new() };
+    let clips = if summary.recording.clips > 0 { clips(&summary.out)? } else { Vec::new() };
     Ok(show::summary(summary, &digest, &clips, Paint::of_stdout()))
 }
 

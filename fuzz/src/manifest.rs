@@ -51,7 +51,10 @@ fn accepted(manifest: &Manifest) {
         assert!(!record.topics.is_empty() && record.topics.len() <= bounds::ITEMS_MAX);
         assert!([record.preroll, record.postroll, record.cooldown, record.max_length].into_iter().all(reads_back));
     }
-    assert!(bounds::FUEL.range().contains(&manifest.limits.fuel) && reads_back(manifest.limits.deadline));
+    assert!(
+        (Limits::LEAST.fuel..=Limits::MOST.fuel).contains(&manifest.limits.fuel)
+            && reads_back(manifest.limits.deadline)
+    );
     config(manifest);
     let json = manifest.to_json();
     assert_eq!(json["input"].as_array().map(Vec::len), Some(manifest.inputs.len()));

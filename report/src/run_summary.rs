@@ -10,7 +10,8 @@ use gleaner_base::{Exit, Explain, NotPlain, PlainFile};
 use gleaner_lambda::manifest::{ConfigValue, Kind};
 use gleaner_lambda::results::{SIGNALS_MAX, SUMMARY_MAX};
 use gleaner_lambda::signals::{Curve, Signals};
-use gleaner_protocol::{Live, Summary};
+use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
+use gleaner_protocol::{Live, Recording, Summary};
 use serde::de::DeserializeOwned;
 
 use crate::results::ResultsError;
@@ -218,8 +219,7 @@ impl RunSummary {
                 let mut counts =
                     shared(told.skipped, told.missed_ticks, told.log_dropped, told.triggers_refused, told.passed_over);
                 counts.push(("messages out of order in the drive", told.out_of_order));
-                counts.push(("triggers within the cooldown of another", told.in_cooldown));
-                counts.push(("starts of what ran, stops of what did not", told.ignored));
+                counts.extend(by_cause(&told.recording));
                 counts
             }
             Self::Live(told) => {
@@ -235,6 +235,7 @@ impl RunSummary {
                         ("triggers not told to the recorder", recorder.triggers_lost),
                     ]
                 }));
+                counts.extend(told.recording.iter().flat_map(|status| recorded(status)));
                 counts
             }
         }
@@ -247,6 +248,28 @@ impl RunSummary {
             Self::Live(live) => live.topics.iter().map(Losses::from).collect(),
         }
     }
+}
+
+/// What a recorder did not record.
+fn by_cause(recording: &Recording) -> impl Iterator<Item = (&'static str, u64)> {
+    recording.by_cause().into_iter().map(|counted| (counted.label, counted.count))
+}
+
+/// The same live, where there is more on the way to it.
+fn recorded(status: &RecorderStatus) -> Vec<(&'static str, u64)> {
+    let sum = |count: fn(&RecordedTopic) -> u64| status.topics.iter().map(count).fold(0, u64::saturating_add);
+    let (network, commands) = (status.network.as_ref(), status.commands.as_ref());
+    let mut counts: Vec<_> = by_cause(&status.recording).collect();
+    counts.extend([
+        ("samples to be recorded, lost before they reached the recorder", sum(|topic| topic.lost.unwrap_or(0))),
+        ("samples to be recorded, without room as the recorder was busy", sum(|topic| topic.no_slot)),
+        ("samples to be recorded, larger than the recorder can take", sum(|topic| topic.too_big)),
+        ("samples to be recorded, malformed", sum(|topic| topic.malformed)),
+        ("commands refused", commands.map_or(0, |commands| commands.refused)),
+        ("datagrams dropped by full sockets of the recorder", network.map_or(0, |network| network.socket_drops)),
+        ("hostile datagrams dropped by the recorder", network.map_or(0, |network| network.filtered)),
+    ]);
+    counts
 }
 
 fn shorten<'a>(texts: impl Iterator<Item = &'a mut String>) {

@@ -233,7 +233,7 @@ fn ctrl_c() {
     // The night brake is at 10.8 s.
     let player = play(&[path, "--wait", "1", "--start", "8"]);
     started.until("a window", |line| match line {
-        Line::Recorder(RecorderReport::Status(status)) if status.recording => Some(()),
+        Line::Recorder(RecorderReport::Status(status)) if status.is_recording => Some(()),
         _ => None,
     });
     started.signal("INT");
@@ -260,7 +260,7 @@ fn killed(name: &str) {
     started.until("a window", |line| {
         match line {
             Line::Lambda(Report::Decision(decision)) => told.extend(about(std::slice::from_ref(&decision))),
-            Line::Recorder(RecorderReport::Status(status)) => is_recording = status.recording,
+            Line::Recorder(RecorderReport::Status(status)) => is_recording = status.is_recording,
             _ => {}
         }
         (is_recording && !told.is_empty()).then_some(())

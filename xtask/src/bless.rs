@@ -5,6 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use gleaner_base::{Exit, Failure};
+use gleaner_lambda::manifest::GENERATED;
 use gleaner_report::words::trigger_lines;
 
 use crate::checkout::Checkout;
@@ -13,8 +14,16 @@ use crate::setup;
 use crate::steps::Steps;
 
 /// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin, and `examples/cookbook/*/expected.txt`, where the first line is
-/// the command; and the page on the manifest. Twins that differ write nothing.
+/// the command; before these, what is made of the manifest's types: a page, and the numbers of the limits in three other files. Of twins
+/// that differ nothing is written.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
+    for file in GENERATED {
+        let path = checkout.path(Path::new(file.path));
+        // One that is not there yet is made whole.
+        let now = fs::read_to_string(&path).unwrap_or_default();
+        let text = file.text(&now).map_err(|why| Failure::new(Exit::Usage, why))?;
+        write(checkout, Path::new(file.path), text)?;
+    }
     let mut steps = Steps::of(setup::STEPS + 1);
     setup::run(checkout, &mut steps, &checkout.lambdas(&["examples"]))?;
     steps.begin(&format!("expected decisions on {DRIVE}"));
@@ -28,7 +37,6 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let [rust, _] = &twins;
         write(checkout, &Path::new("examples").join(example.name).join("expected.txt"), rows(rust))?;
     }
-    write(checkout, Path::new("docs/manifest.md"), gleaner_lambda::manifest::reference())?;
     for recipe in Recipe::all(checkout)? {
         let rows = rows(&recipe.replay(checkout)?);
         write(checkout, &recipe.expected(), format!("{}\n{rows}", recipe.command))?;

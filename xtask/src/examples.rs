@@ -118,7 +118,7 @@ fn replay(checkout: &Checkout, name: &str, lambda: PathBuf, settings: Vec<String
     replay.arg("--journal").arg(out.join(JOURNAL));
     let summary: Summary = report(&mut replay)?;
     let folder = checkout.path(&out);
-    let clips = if summary.clips > 0 { clips(&folder)? } else { Vec::new() };
+    let clips = if summary.recording.clips > 0 { clips(&folder)? } else { Vec::new() };
     Ok(Replayed { decisions: decisions(&folder)?, clips, summary, lambda, out })
 }
 

@@ -29,7 +29,7 @@ use steps::Steps;
 const USAGE: &str = "usage: cargo xtask COMMAND
   demo   run both twins of every example over the sample drive, and show what they decided
   test   run all tests; the last line is `N passed, M failed, K skipped`
-  bless  write what the examples decide on the sample drive to expected.txt, and the page on the manifest
+  bless  write what the examples decide on the sample drive to expected.txt, and what is made of the manifest's types
   docs   fetch mdBook and build the pages as a book, in target/book
   bench  measure what is promised; what follows goes to gleaner-bench
   peers  build programs on other DDS for the tests of live topics; --install fetches their packages first

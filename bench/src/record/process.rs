@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::hex;
 use gleaner_journal::{FileDigest, Header};
+use gleaner_lambda::manifest::Limits;
 use gleaner_protocol::link::{Add, Control, RecorderLink, RecorderReport, RecorderStatus, Said};
 use gleaner_recorder::program::{Options, run};
 use gleaner_tests::Folder;
@@ -80,7 +81,7 @@ fn on_these_cores(seconds: u64) -> Live {
         run(options, feed, stdin, File::from(OwnedFd::from(to)), Arc::default()).expect("nothing fails");
     });
     let reports = thread::spawn(move || last(reports));
-    let socket = control.add(&Add { lambda: folder, remaps: Vec::new() }).expect("it is there");
+    let socket = control.add(&Add { lambda: folder, remaps: Vec::new(), most: Limits::MOST }).expect("it is there");
     let mut link = RecorderLink::new(socket);
     link.hello(&header, PATIENCE).expect("it is the lambda that was announced");
     let stop = Arc::<AtomicBool>::default();
@@ -95,7 +96,7 @@ fn on_these_cores(seconds: u64) -> Live {
     control.stop().expect("it is there");
     program.join().expect("nothing fails");
     let last = reports.join().expect("nothing fails").expect("the program says how it ended");
-    let lost = last.topics.iter().map(|topic| topic.no_slot + topic.too_big).sum::<u64>() + last.pushed_out;
+    let lost = last.topics.iter().map(|topic| topic.no_slot + topic.too_big).sum::<u64>() + last.recording.pushed_out;
     Live { opened_ms, longest_ms, told_us, lost }
 }
 

@@ -5,7 +5,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::FaultKind;
-use gleaner_protocol::link::{Loss, RecorderReport};
+use gleaner_protocol::link::{Loss, RecorderReport, RecorderStatus};
 use gleaner_protocol::{Live, Report};
 
 use super::screen::Screen;
@@ -36,11 +36,21 @@ pub(super) struct Ear {
     pub(super) has_ended: bool,
     /// What it counted, as it said last.
     pub(super) last: Option<Live>,
+    /// What the recorder counted, as it said last.
+    pub(super) recorded: Option<Box<RecorderStatus>>,
 }
 
 impl Ear {
     pub(super) fn new(heard: Receiver<Heard>) -> Self {
-        Self { heard, is_ready: false, has_faulted: false, has_lost_wake: false, has_ended: false, last: None }
+        Self {
+            heard,
+            is_ready: false,
+            has_faulted: false,
+            has_lost_wake: false,
+            has_ended: false,
+            last: None,
+            recorded: None,
+        }
     }
 
     /// Shows what is heard for so long, or until all streams are closed.
@@ -79,7 +89,7 @@ impl Ear {
             }
             Heard::Recorder(report) => {
                 screen.report(&report);
-                show_recorder(report, screen);
+                self.show_recorder(report, screen);
             }
         }
     }
@@ -111,27 +121,35 @@ impl Ear {
             _ => {}
         }
     }
-}
 
-fn show_recorder(report: RecorderReport, screen: &mut Screen) {
-    match report {
-        RecorderReport::Clip(clip) => screen.clip(&clip),
-        RecorderReport::Recovered(clip) => {
-            screen.warn("recovered a clip of an earlier recorder, which did not end well");
-            screen.clip(&clip);
+    fn show_recorder(&mut self, report: RecorderReport, screen: &mut Screen) {
+        match report {
+            RecorderReport::Clip(clip) => screen.clip(&clip),
+            RecorderReport::Recovered(clip) => {
+                screen.warn("recovered a clip of an earlier recorder, which did not end well");
+                screen.clip(&clip);
+            }
+            RecorderReport::Loss(Loss::Deleted { file, why, .. }) => {
+                screen.warn(&format!("deleted `{}`, which nobody had fetched: {why}", file.display()));
+            }
+            RecorderReport::Loss(Loss::NotDeleted { file, why, .. }) => {
+                screen.warn(&format!("cannot delete `{}` to make room: {why}", file.display()));
+            }
+            RecorderReport::Loss(Loss::Failed { why, .. }) => {
+                screen.warn(&format!("a clip could not be written: {why}"))
+            }
+            RecorderReport::Loss(Loss::HeldBack { triggers, why, .. }) => {
+                screen.warn(&format!("{triggers} triggers opened no window: {why}"));
+            }
+            RecorderReport::Status(status) => {
+                screen.recorder(&status);
+                self.recorded = Some(status);
+            }
+            RecorderReport::Ended(status) => {
+                screen.recorder_ended(&status);
+                self.recorded = Some(status);
+            }
+            RecorderReport::Ready => {}
         }
-        RecorderReport::Loss(Loss::Deleted { file, why, .. }) => {
-            screen.warn(&format!("deleted `{}`, which nobody had fetched: {why}", file.display()));
-        }
-        RecorderReport::Loss(Loss::NotDeleted { file, why, .. }) => {
-            screen.warn(&format!("cannot delete `{}` to make room: {why}", file.display()));
-        }
-        RecorderReport::Loss(Loss::Failed { why, .. }) => screen.warn(&format!("a clip could not be written: {why}")),
-        RecorderReport::Loss(Loss::HeldBack { triggers, why, .. }) => {
-            screen.warn(&format!("{triggers} triggers opened no window: {why}"));
-        }
-        RecorderReport::Status(status) => screen.recorder(&status),
-        RecorderReport::Ended(status) => screen.recorder_ended(&status),
-        RecorderReport::Ready => {}
     }
 }

@@ -15,7 +15,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_lambda::{BuildDir, Manifest};
+use gleaner_lambda::manifest::Limits;
+use gleaner_lambda::{BuildDir, Manifest, Vehicle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::party::{Ended, Party};
@@ -39,6 +40,8 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     // Recorded topics need not be inputs; what is known of the largest message is what the inputs say.
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes());
     let largest = (manifest.record.is_some() && !args.no_record).then(|| sizes.max().unwrap_or(0));
+    // Its runtime reads the same file, and says what it made smaller.
+    let most = args.asked.vehicle.as_ref().map_or(Ok(Limits::MOST), |file| Vehicle::load(file).map(|it| it.limits))?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
     let offset_ns = clock_offset();
@@ -51,10 +54,10 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     loop {
         let left = args.last.map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let begun = Instant::now();
-        let mut party = Party::start(args, largest, offset_ns, left, restarts)?;
+        let mut party = Party::start(args, most, largest, offset_ns, left, restarts)?;
         match party.attend(&mut screen, &stop)? {
             Ended::Well(exit) => {
-                earlier.complete(party.last(), &arguments::out(args))?;
+                earlier.complete(party.last(), party.recorded(), &arguments::out(args))?;
                 return broken.end(exit);
             }
             // It has said why. What ran before may run again: a network may be down for a while.
@@ -62,7 +65,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             Ended::Never(exit) => broken.add("it could not start".to_owned(), exit == Exit::LambdaFaulted),
             Ended::Broken { why, faulted } => broken.add(why, faulted),
         }
-        earlier.add(party.last(), party.has_lost_wake());
+        earlier.add(party.last(), party.recorded(), party.has_lost_wake());
         restarts += 1;
         pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
         let why = broken.why.as_deref().unwrap_or_default();
@@ -73,7 +76,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             thread::sleep(LOOK);
         }
         if ends() {
-            earlier.complete(None, &arguments::out(args))?;
+            earlier.complete(None, None, &arguments::out(args))?;
             return broken.end(Exit::Ok);
         }
         pause = (pause * 2).min(PAUSE_MAX);

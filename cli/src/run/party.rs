@@ -7,8 +7,9 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, own_file};
+use gleaner_lambda::manifest::Limits;
 use gleaner_parts::Parts;
-use gleaner_protocol::link::{Add, Control};
+use gleaner_protocol::link::{Add, Control, RecorderStatus};
 use gleaner_protocol::{ExitRecord, Live};
 
 use super::ear::{Ear, Heard};
@@ -49,9 +50,10 @@ pub(super) struct Party {
 }
 
 impl Party {
-    /// Starts them. `largest` is the largest sample that is recorded, in bytes; none if nothing is.
+    /// Starts them. `most` are the limits of this vehicle; `largest` is the largest sample that is recorded, in bytes; none if nothing is.
     pub(super) fn start(
         args: &RunArgs,
+        most: Limits,
         largest: Option<u64>,
         offset_ns: i64,
         left: Option<Duration>,
@@ -70,7 +72,7 @@ impl Party {
             let (mut control, stdin) = Control::pair().map_err(|error| failed(&error))?;
             let line = arguments::recorder(args, largest, offset_ns);
             let process = Process::start(&parts, "gleaner-recorder", line, Some(stdin), None, Heard::Recorder, &say)?;
-            let add = Add { lambda: args.asked.lambda.clone(), remaps: arguments::remaps(args) };
+            let add = Add { lambda: args.asked.lambda.clone(), remaps: arguments::remaps(args), most };
             socket = Some(control.add(&add).map_err(|error| failed(&error))?);
             recorder = Some((process, control));
         }
@@ -84,6 +86,11 @@ impl Party {
     /// What the lambda's process counted, as it said last.
     pub(super) fn last(&mut self) -> Option<Live> {
         self.ear.last.take()
+    }
+
+    /// What the recorder counted, as it said last.
+    pub(super) fn recorded(&mut self) -> Option<Box<RecorderStatus>> {
+        self.ear.recorded.take()
     }
 
     /// Whether a wake ended with the lambda's process.

@@ -156,9 +156,9 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
         text,
         "{}: {}, {}{}; preroll {:.1} of {:.1} MiB{}",
         paint.bold("recorder"),
-        counted(status.clips, "clip"),
-        counted(status.windows, "window"),
-        if status.recording { ", recording" } else { "" },
+        counted(status.recording.clips, "clip"),
+        counted(status.recording.windows, "window"),
+        if status.is_recording { ", recording" } else { "" },
         mib(status.preroll_bytes),
         mib(status.preroll_bound),
         opened.unwrap_or_default(),
@@ -180,27 +180,7 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
     for trouble in status.topics.iter().flat_map(|topic| &topic.trouble) {
         writeln!(text, "  {}", paint.yellow(&visible(trouble)))?;
     }
-    let losses = [
-        (status.failed, "clip", "could not be written"),
-        (status.deleted, "clip", "deleted before anybody fetched it"),
-        (status.lambdas_refused, "lambda", "not recorded for: the recorder has said why"),
-        (status.held_back, "trigger", "opened no window: the disk is too full"),
-        (status.wakes_lost, "wake", "not in any journal"),
-        (status.pushed_out, "sample", "pushed out of the preroll too early: preroll_size"),
-        (status.too_big, "sample", "larger than the preroll: preroll_size"),
-        (status.refused, "sample", "stamped before 1970, or of a topic not yet known"),
-    ];
-    for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
-        writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
-    }
-    if status.not_deleted > 0 {
-        let clips = counted(status.not_deleted, "clip");
-        writeln!(
-            text,
-            "  {}",
-            paint.yellow(&format!("{clips} could not be deleted to make room: losses.jsonl says why"))
-        )?;
-    }
+    super::write_counted(text, &status.recording, paint)?;
     match &status.network {
         Some(network) => write_network(text, network, (status.rss_bytes, status.cpu_s), paint),
         None => Ok(()),

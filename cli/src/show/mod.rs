@@ -5,7 +5,7 @@ use std::io::{self, IsTerminal};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision, Fault, FaultKind, Trigger, TriggerKind};
-use gleaner_protocol::{Summary, TopicReport, Verified};
+use gleaner_protocol::{Outcome, Recording, Summary, TopicReport, Verified};
 use gleaner_report::ResultsError;
 use gleaner_report::words::{counted, fault_kind, gist, grouped, seconds, three_digits};
 
@@ -216,13 +216,10 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
         more(text, digest.other_faults)?;
     }
     clips::write(text, clips, summary, paint)?;
-    let quiet = [
-        (summary.in_cooldown, "no window", "trigger", ", within the cooldown"),
-        (summary.ignored, "no window", "start or stop", ", of a recording that ran already or did not run"),
-        (summary.clips_replaced, "replaced", "clip", " of an earlier replay"),
-    ];
-    for (count, what, thing, why) in quiet.into_iter().filter(|(count, ..)| *count > 0) {
-        writeln!(text, "  {}", paint.dim(&format!("{what}: {}{why}", counted(count, thing))))?;
+    write_counted(text, &summary.recording, paint)?;
+    if summary.clips_replaced > 0 {
+        let clips = counted(summary.clips_replaced, "clip");
+        writeln!(text, "  {}", paint.dim(&format!("replaced: {clips} of an earlier replay")))?;
     }
     for loss in losses(summary) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {loss}")))?;
@@ -262,6 +259,19 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
     let clips = if clips.is_empty() { "" } else { ", clips.jsonl, clips/" };
     let files = format!("{}: decisions.jsonl, log.jsonl, summary.json{clips}", visible(&summary.out.to_string_lossy()));
     writeln!(text, "  {}", paint.dim(&files))
+}
+
+/// What a recorder did not record, by cause.
+fn write_counted(text: &mut String, recording: &Recording, paint: Paint) -> fmt::Result {
+    for counted in recording.by_cause().into_iter().filter(|counted| counted.count > 0) {
+        let line = counted.in_words();
+        writeln!(
+            text,
+            "  {}",
+            if counted.outcome == Outcome::NoWindow { paint.dim(&line) } else { paint.yellow(&line) }
+        )?;
+    }
+    Ok(())
 }
 
 fn more(text: &mut String, count: u64) -> fmt::Result {

@@ -42,10 +42,8 @@ fn replay() -> Summary {
             no_slot: 0,
             too_big: 0,
         }],
-        clips: 0,
+        recording: Recording::default(),
         clips_replaced: 0,
-        in_cooldown: 0,
-        ignored: 0,
         damaged: None,
         stopped: None,
     }
@@ -236,7 +234,12 @@ fn clip() -> Clip {
 
 #[test]
 fn a_clip_is_shown_with_its_length_topics_thumbnail_and_what_is_missing() {
-    let text = summary(&Summary { clips: 1, ..replay() }, &digest(Vec::new()), &[clip()], PLAIN);
+    let text = summary(
+        &Summary { recording: Recording { clips: 1, ..Recording::default() }, ..replay() },
+        &digest(Vec::new()),
+        &[clip()],
+        PLAIN,
+    );
     let shown = "  1 clip\n     \
                     5.801 to 9.000 s  clips/x.mcap\n              \
                     3.2 s, 1.0 MiB: messages /imu/data 1,646; clips/x.jpg\n              \
@@ -251,13 +254,15 @@ fn starts_and_stops_are_told_from_events_and_what_made_no_clip_is_counted() {
     let mut decisions = vec![decision(1000, Some("turn"), None), decision(1100, Some("turn"), None)];
     decisions[0].triggers[0].kind = TriggerKind::Start;
     decisions[1].triggers[0].kind = TriggerKind::Stop;
-    let quiet = Summary { in_cooldown: 2, ignored: 1, clips_replaced: 5, ..replay() };
+    let recording = Recording { in_cooldown: 2, ignored: 1, pushed_out: 3, ..Recording::default() };
+    let quiet = Summary { recording, clips_replaced: 5, ..replay() };
     let text = summary(&quiet, &digest(decisions), &[], PLAIN);
     for line in [
         "  turn, start  1.46\n",
         "  turn, stop  1.46\n",
-        "  no window: 2 triggers, within the cooldown\n",
+        "  no window: 2 triggers, within the cooldown of another\n",
         "  no window: 1 start or stop, of a recording that ran already or did not run\n",
+        "  lost: 3 samples, pushed out of the preroll too early: preroll_size\n",
         "  replaced: 5 clips of an earlier replay\n",
     ] {
         assert!(text.contains(line), "no `{line}` in {text}");

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Tuple, Union
 
 from ._error import ReplayError, nearest, quoted
+from ._limits import LIMITS
 from ._table import Table
 
 ConfigValue = Union[bool, int, float, str]
@@ -24,25 +25,6 @@ LAMBDA_NAME = re.compile(r"[a-z][a-z0-9-]*")
 ITEM_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
-
-# Minimum, default and maximum. Those of a manifest, in `bounds.rs`.
-LIMITS: Dict[str, Tuple[int, int, int]] = {
-    "fuel": (1_000, 50_000_000, 10**12),
-    "init_fuel": (1_000, 10**9, 10**12),
-    "memory": (MIB, 64 * MIB, 1024 * MIB),
-    "tables": (1, 20_000, 1_000_000),
-    "stack": (16 * KIB, 512 * KIB, 512 * KIB),
-    "handles": (16, 4096, 65_536),
-    "frames": (1, 256, 4096),
-    "call_bytes": (64 * KIB, MIB, MIB),
-    "call_items": (16, 65_536, 65_536),
-    "scratch": (0, 0, 256 * MIB),
-    "log_lines": (1, 100, 10_000),
-    "log_bytes": (4 * KIB, 400 * KIB, 16 * MIB),
-    "events_per_minute": (1, 12_000, 60_000),
-}
-SIZES = ("memory", "stack", "call_bytes", "scratch", "log_bytes")
-DEADLINES = {"deadline": (10**6, 50 * 10**6, 60 * SECOND), "init_deadline": (10**6, 10 * SECOND, 300 * SECOND)}
 
 
 @dataclass(frozen=True)
@@ -190,11 +172,9 @@ def _record(root: Table) -> Optional[Record]:
 
 
 def _limits(root: Table) -> Dict[str, int]:
-    table = Table(root.file, "[limits]", root.entries.get("limits", {}), [*LIMITS, *DEADLINES])
-    limits = {
-        key: table.size(key, bounds) if key in SIZES else table.integer(key, bounds) for key, bounds in LIMITS.items()
-    }
-    return {**limits, **{key: table.duration(key, bounds) for key, bounds in DEADLINES.items()}}
+    table = Table(root.file, "[limits]", root.entries.get("limits", {}), [key for key, _, _ in LIMITS])
+    read = {"number": table.integer, "size": table.size, "duration": table.duration}
+    return {key: read[unit](key, bounds) for key, unit, bounds in LIMITS}
 
 
 def _config(root: Table, overrides: Mapping[str, Any]) -> Dict[str, ConfigValue]:

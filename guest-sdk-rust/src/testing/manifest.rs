@@ -1,6 +1,6 @@
 //! `lambda.toml`, as far as the fake host needs it. `gleaner build` reads all of it, and is stricter in places.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use gleaner_rules::clamps::PerCall;
 use gleaner_rules::names::{self, COMPRESSED_IMAGE};
@@ -8,6 +8,7 @@ use gleaner_rules::text::quoted;
 use toml::Value;
 
 use super::error::{Error, nearest};
+use super::limits::LIMITS;
 use super::table::{Bounds, Table};
 use crate::bindings::{ConfigEntry, ConfigValue};
 
@@ -154,45 +155,28 @@ fn input(value: &Value) -> Result<Input> {
 }
 
 fn limits(root: &Table) -> Result<Limits> {
-    const FUEL: Bounds = (1_000, 50_000_000, 1_000_000_000_000);
-    let known = [
-        "fuel",
-        "init_fuel",
-        "deadline",
-        "init_deadline",
-        "memory",
-        "tables",
-        "stack",
-        "handles",
-        "frames",
-        "call_bytes",
-        "call_items",
-        "scratch",
-        "log_lines",
-        "log_bytes",
-        "events_per_minute",
-    ];
+    let known: Vec<&str> = LIMITS.iter().map(|(key, ..)| *key).collect();
     let empty = Value::Table(toml::Table::new());
     let table = Table::new("[limits]", root.get("limits").unwrap_or(&empty), &known)?;
-    // These have no meaning here, and are still checked.
-    table.integer("fuel", FUEL)?;
-    table.integer("init_fuel", FUEL)?;
-    table.duration("deadline", (MS, 50 * MS, 60 * SECOND))?;
-    table.duration("init_deadline", (MS, 10 * SECOND, 300 * SECOND))?;
-    table.integer("tables", (1, 20_000, 1_000_000))?;
-    table.size("stack", (16 * KIB, 512 * KIB, 512 * KIB))?;
+    // Those without meaning here are checked nevertheless.
+    let read = |&(key, unit, bounds): &(&'static str, &str, Bounds)| {
+        let value = match unit {
+            "size" => table.size(key, bounds),
+            "duration" => table.duration(key, bounds),
+            _ => table.integer(key, bounds),
+        };
+        Ok((key, value?))
+    };
+    let all = LIMITS.iter().map(read).collect::<Result<BTreeMap<_, _>>>()?;
     Ok(Limits {
-        memory: table.size("memory", (MIB, 64 * MIB, 1024 * MIB))? as usize,
-        handles: table.integer("handles", (16, 4096, 65_536))?,
-        frames: table.integer("frames", (1, 256, 4096))? as usize,
-        per_call: PerCall {
-            bytes: table.size("call_bytes", (64 * KIB, MIB, MIB))? as usize,
-            items: table.integer("call_items", (16, 65_536, 65_536))? as usize,
-        },
-        scratch: table.size("scratch", (0, 0, 256 * MIB))?,
-        log_lines: table.integer("log_lines", (1, 100, 10_000))?,
-        log_bytes: table.size("log_bytes", (4 * KIB, 400 * KIB, 16 * MIB))?,
-        events_per_minute: table.integer("events_per_minute", (1, 12_000, 60_000))?,
+        memory: all["memory"] as usize,
+        handles: all["handles"],
+        frames: all["frames"] as usize,
+        per_call: PerCall { bytes: all["call_bytes"] as usize, items: all["call_items"] as usize },
+        scratch: all["scratch"],
+        log_lines: all["log_lines"],
+        log_bytes: all["log_bytes"],
+        events_per_minute: all["events_per_minute"],
     })
 }
 

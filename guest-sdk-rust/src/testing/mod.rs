@@ -60,6 +60,7 @@ mod error;
 mod frame;
 mod host;
 pub(crate) mod inference;
+mod limits;
 pub(crate) mod log;
 mod manifest;
 mod message;

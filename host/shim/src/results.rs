@@ -169,6 +169,8 @@ impl Writer {
         let unwritten = self.unwritten();
         let finished = match (self.output, self.last.filter(|_| is_complete)) {
             (Some(output), Some(mut last)) => {
+                // What a recorder counted is not the lambda's to say.
+                last.recording = None;
                 last.unwritten = last.unwritten.saturating_add(unwritten);
                 output.finish(&last)
             }

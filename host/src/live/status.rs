@@ -86,6 +86,7 @@ impl Watch {
             topics: Vec::new(),
             network: Network::default(),
             recorder: None,
+            recording: None,
             rss_bytes: 0,
             cpu_s: 0.0,
         };

@@ -9,7 +9,7 @@ use gleaner_journal::{Entry, Header};
 use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::{Manifest, Record};
 use gleaner_recorder::{
-    Counts, Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image, lambda_digest,
+    Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image, lambda_digest,
 };
 use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, Transport, Verdict};
 
@@ -26,14 +26,6 @@ pub(super) struct Recording {
     /// What an earlier replay left, and what of it was recovered only now; until it is replaced.
     earlier: Option<(Earlier, Vec<Clip>)>,
     lambda: Option<LambdaId>,
-}
-
-/// What a recording did, beside its clips.
-#[derive(Default)]
-pub(super) struct Recorded {
-    pub(super) clips: u64,
-    pub(super) in_cooldown: u64,
-    pub(super) ignored: u64,
 }
 
 struct Shared {
@@ -205,11 +197,10 @@ impl Recording {
     }
 
     /// At the end of the drive: closes what is open.
-    pub(super) fn finish(&self, end_ns: i64) -> Result<Recorded, Failure> {
+    pub(super) fn finish(&self, end_ns: i64) -> Result<gleaner_protocol::Recording, Failure> {
         self.with(|recorder| {
             recorder.finish(end_ns)?;
-            let Counts { clips, in_cooldown, ignored, .. } = recorder.counts();
-            Ok(Recorded { clips, in_cooldown, ignored })
+            Ok(recorder.counts().recording)
         })
     }
 

@@ -18,7 +18,7 @@ use super::digests::Digests;
 use super::journal_file::JournalFile;
 use super::open::{DriveError, open_drives};
 use super::options::Results;
-use super::record::{Recorded, Recording, remove_clips};
+use super::record::{Recording, remove_clips};
 use super::signals::Gathered;
 use super::{CLOCK, Options, report as send};
 use crate::api::Session;
@@ -138,13 +138,13 @@ impl Pass<'_> {
     }
 
     /// Goes through the drive, and closes what is recorded.
-    fn run(&mut self, drive: &mut Replay) -> Result<(Reached, Recorded), Failure> {
+    fn run(&mut self, drive: &mut Replay) -> Result<(Reached, gleaner_protocol::Recording), Failure> {
         let span = Span::of(drive, self.part);
         let reached = course::take(drive, span, self)?;
         // Of a damaged drive nobody knows what came after the last sample.
         let is_whole = reached.broken.is_none() && !reached.stopped;
         let end_ns = span.end_ns.filter(|_| is_whole).unwrap_or(reached.at_ns);
-        let recorded = self.recording.as_ref().map_or(Ok(Recorded::default()), |recording| recording.finish(end_ns))?;
+        let recorded = self.recording.as_ref().map_or(Ok(Default::default()), |recording| recording.finish(end_ns))?;
         Ok((reached, recorded))
     }
 }
@@ -261,10 +261,8 @@ pub(super) fn replay(
         wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
         peak_rss_bytes: pass.judge.most_resident_bytes(),
         topics: inputs.iter().zip(&totals.counts).map(topic_report).collect(),
-        clips: recorded.clips,
+        recording: recorded,
         clips_replaced,
-        in_cooldown: recorded.in_cooldown,
-        ignored: recorded.ignored,
         damaged: broken.as_ref().map(|error| {
             let mut failure = Failure::because("the drive could not be read to its end", error);
             failure.causes.push(read_so_far(&drive, reached.at_ns));

@@ -6,14 +6,13 @@ use crate::greedy::{FUEL, MEMORY, PICTURE, Room, component, publish, subscribed}
 use gleaner_host::api::data::{DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD, Topic};
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
-use gleaner_lambda::manifest::Manifest;
-use gleaner_lambda::manifest::bounds::{CALL_BYTES, CALL_ITEMS, HANDLES};
+use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_tests::drive::{Cdr, IMAGE, image};
 use gleaner_vitals::usage;
 
 /// What one call gives at most.
-const BYTES_PER_CALL: usize = CALL_BYTES.max.bytes() as usize;
-const COLUMN_LEN: usize = CALL_ITEMS.max as usize;
+const BYTES_PER_CALL: usize = Limits::MOST.call_bytes.bytes() as usize;
+const COLUMN_LEN: usize = Limits::MOST.call_items as usize;
 const PAGE: u64 = 64 << 10;
 
 #[test]
@@ -24,7 +23,7 @@ fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
         let owners = Arc::strong_count(&room.topic);
         let first = room.fault();
         assert_eq!(first.kind, FaultKind::HostCall, "{behaviour}: {first:?}");
-        let allowed = HANDLES.default;
+        let allowed = Limits::DEFAULT.handles;
         assert!(first.message.contains(&format!("{allowed} handles")), "{behaviour}: {}", first.message);
         assert_eq!((first.used, first.allowed), (Some(allowed + 1), Some(allowed)), "{behaviour}");
         // What the guest held went with it, so the second one comes as far as the first.

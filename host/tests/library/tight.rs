@@ -7,7 +7,6 @@ use crate::greedy::{Room, component, limits, publish, subscribed};
 use gleaner_base::ByteSize;
 use gleaner_host::api::data::{DataError, Topic};
 use gleaner_host::guest::Guest;
-use gleaner_lambda::manifest::bounds::{FUEL, STACK};
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{Fault, FaultKind};
 use gleaner_tests::drive::Cdr;
@@ -37,7 +36,7 @@ fn the_deadline_of_a_wake_and_of_init_are_two_limits() {
     let ms = Duration::from_millis;
     for [wake, init] in [[20, 10_000], [10_000, 20]] {
         let limits = with(|limits| {
-            (limits.fuel, limits.init_fuel) = (FUEL.max, FUEL.max);
+            (limits.fuel, limits.init_fuel) = (Limits::MOST.fuel, Limits::MOST.fuel);
             (limits.deadline, limits.init_deadline) = (ms(wake), ms(init));
         });
         let behaviour = if wake < init { "endless" } else { "endless_init" };
@@ -52,7 +51,7 @@ fn the_deadline_of_a_wake_and_of_init_are_two_limits() {
 fn a_call_that_does_not_end_in_time_ends_between_two_rows() {
     // 800 MB of pixels, for which no machine takes less than 150 ms; a limit that was computed once would let it begin.
     let limits = with(|limits| {
-        (limits.fuel, limits.memory) = (FUEL.max, ByteSize::mib(1024));
+        (limits.fuel, limits.memory) = (Limits::MOST.fuel, ByteSize::mib(1024));
         limits.deadline = Duration::from_millis(150);
     });
     Room::timed("mean_luma", 0, &limits).wake().result.unwrap();
@@ -102,7 +101,7 @@ fn a_smaller_stack_is_full_earlier() {
         };
         (0..24).map(|power| 64 << power).find(fuel_lasts).expect("some fuel lasts until the stack is full")
     };
-    let (least, most) = (deep(STACK.min), deep(STACK.max));
+    let (least, most) = (deep(Limits::LEAST.stack), deep(Limits::MOST.stack));
     assert!((16..=64).contains(&(most / least)), "{least} and {most}");
 }
 

@@ -1,4 +1,4 @@
-//! The default, minimum and maximum of every number in a manifest, and why.
+//! The default, minimum and maximum of every number in a manifest, and why. Those of `[limits]` stand in its table, `limits.rs`.
 
 use std::ops::RangeInclusive;
 use std::time::Duration;
@@ -75,62 +75,6 @@ pub const PREROLL_SIZE_DISK: Bounds<ByteSize> =
 /// leaves files that can be moved and opened.
 pub const MAX_LENGTH: Bounds<Duration> =
     Bounds { min: Duration::from_secs(1), default: Duration::from_secs(600), max: Duration::from_secs(3600) };
-
-/// `limits.fuel`: about one unit per WebAssembly instruction, so that the default is some 20 ms.
-pub const FUEL: Bounds<u64> = Bounds { min: 1_000, default: 50_000_000, max: 1_000_000_000_000 };
-
-/// `limits.init_fuel`: `init` builds its tables once, and may take as much as twenty wakes by default.
-pub const INIT_FUEL: Bounds<u64> = Bounds { default: 1_000_000_000, ..FUEL };
-
-/// `limits.deadline`.
-pub const DEADLINE: Bounds<Duration> =
-    Bounds { min: Duration::from_millis(1), default: Duration::from_millis(50), max: Duration::from_secs(60) };
-
-/// `limits.init_deadline`: importing numpy and loading a model take seconds; nobody waits for five minutes.
-pub const INIT_DEADLINE: Bounds<Duration> =
-    Bounds { min: Duration::from_millis(1), default: Duration::from_secs(10), max: Duration::from_secs(300) };
-
-/// `limits.memory`: what the lambda itself may allocate, beyond the rings.
-pub const MEMORY: Bounds<ByteSize> =
-    Bounds { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) };
-
-/// `limits.tables`: elements of all tables together. A lambda built from Rust has some hundred, for its function pointers. The host
-/// keeps 8 bytes for each, beside `memory`: 8 MB at most.
-pub const TABLES: Bounds<u64> = Bounds { min: 1, default: 20_000, max: 1_000_000 };
-
-/// `limits.stack`: what calls within the component may take. The thread that runs it has 8 MiB, of which the host needs some for its
-/// own calls below the guest's; half a mebibyte is a recursion some thousand deep.
-pub const STACK: Bounds<ByteSize> =
-    Bounds { min: ByteSize::kib(16), default: ByteSize::kib(512), max: ByteSize::kib(512) };
-
-/// `limits.handles`: samples, frames, fields, topics and what WASI hands out. The host keeps some 200 bytes for each: 13 MB at most.
-pub const HANDLES: Bounds<u64> = Bounds { min: 16, default: 4096, max: 65_536 };
-
-/// `limits.frames`: frames of all inputs, however they were made. Their pixels are bounded by `hold`, `decoded_size` and `memory`.
-pub const FRAMES: Bounds<u64> = Bounds { min: 1, default: 256, max: 4096 };
-
-/// `limits.call_bytes`: what one call takes from a lambda or gives to it. A call is the shortest thing that a deadline can end, and
-/// a mebibyte takes 0.1 ms. The SDK reads frames in pieces of 64 KiB.
-pub const CALL_BYTES: Bounds<ByteSize> =
-    Bounds { min: ByteSize::kib(64), default: ByteSize::mib(1), max: ByteSize::mib(1) };
-
-/// `limits.call_items`: samples, values or texts that one call gives. As many as the deepest ring has.
-pub const CALL_ITEMS: Bounds<u64> = Bounds { min: 16, default: 65_536, max: 65_536 };
-
-/// `limits.scratch`: what the host keeps for a lambda. It is memory, so nobody has some who does not ask for it.
-pub const SCRATCH: Bounds<ByteSize> =
-    Bounds { min: ByteSize::kib(0), default: ByteSize::kib(0), max: ByteSize::mib(256) };
-
-/// `limits.log_lines`: for each second of the lambda's time. Nobody reads more, and a disk should last.
-pub const LOG_LINES: Bounds<u64> = Bounds { min: 1, default: 100, max: 10_000 };
-
-/// `limits.log_bytes`: likewise. The default is a hundred of the longest lines.
-pub const LOG_BYTES: Bounds<ByteSize> =
-    Bounds { min: ByteSize::kib(4), default: ByteSize::kib(400), max: ByteSize::mib(16) };
-
-/// `limits.events_per_minute`: triggers of all kinds. The default is 200 a second, which is what a recorder takes for long from one
-/// lambda; the maximum one for each wake of the shortest period.
-pub const EVENTS_PER_MINUTE: Bounds<u64> = Bounds { min: 1, default: 12_000, max: 60_000 };
 
 /// `model.threads`; without it the vehicle chooses.
 pub const THREADS: RangeInclusive<u64> = 1..=64;

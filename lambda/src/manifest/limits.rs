@@ -1,52 +1,138 @@
 //! `[limits]`: what a lambda may use, and how a vehicle tightens it.
+//!
+//! A limit is one entry of the table below: its meaning, the reason for its numbers, key, unit, and bounds. The struct, its reader, its
+//! words and its JSON are made of the table here; the page on the manifest, two columns of `docs/limits.md` and the numbers of both
+//! SDKs' fake hosts by `cargo xtask bless` (`generated.rs`).
 
 use std::fmt;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::read_limits::{Missing, all};
-use super::{ByteSize, format_duration};
+use super::bounds::Bounds;
+use super::limit::{Limit, Unit, plain};
+use super::table::Table;
+use super::{ByteSize, ManifestError};
 
-/// What a lambda may use. `docs/limits.md` says what happens where it wants more.
-///
-/// As JSON it has the file's keys; durations are `_ns`, sizes are in bytes. What is missing there has its default.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
-#[non_exhaustive]
-pub struct Limits {
+/// Makes all of the table. `as` gives the key that a limit has in JSON, where it is another one than in the file.
+macro_rules! limits {
+    ($($(#[doc = $meaning:literal])+ $key:ident $(as $json:literal)?: $unit:ty { $($bounds:tt)+ })+) => {
+        /// What a lambda may use. `docs/limits.md` says what happens where it wants more.
+        ///
+        /// As JSON it has the file's keys; durations are `_ns`, sizes are in bytes. What is missing there has its default.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+        #[serde(default)]
+        #[non_exhaustive]
+        pub struct Limits {
+            $($(#[doc = $meaning])+ $(#[serde(rename = $json)])? #[serde(with = "plain")] pub $key: $unit,)+
+        }
+
+        impl Limits {
+            /// Every limit at its minimum.
+            pub const LEAST: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.min),+ };
+            /// Every limit as it is where a manifest does not name it.
+            pub const DEFAULT: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.default),+ };
+            /// Every limit at its maximum.
+            pub const MOST: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.max),+ };
+
+            /// The keys, in the order of the table.
+            pub(super) const KEYS: &[&str] = &[$(stringify!($key)),+];
+
+            /// The table itself.
+            pub(super) fn table() -> [Limit; Limits::KEYS.len()] {
+                [$(Limit::new(stringify!($key), concat!($($meaning),+), Bounds::<$unit> { $($bounds)+ })),+]
+            }
+
+            /// The limits that `table` names; the others are those of `missing`.
+            pub(super) fn read(table: &Table, missing: Limits) -> Result<Limits, ManifestError> {
+                let (min, max) = (Limits::LEAST, Limits::MOST);
+                Ok(Limits {
+                    $($key: Unit::read(
+                        table,
+                        stringify!($key),
+                        &Bounds { min: min.$key, default: missing.$key, max: max.$key },
+                    )?),+
+                })
+            }
+
+            fn smaller(&self, most: &Limits) -> Limits {
+                Limits { $($key: self.$key.min(most.$key)),+ }
+            }
+
+            /// Each key with its value, as it would be written in the file.
+            pub fn in_words(&self) -> [(&'static str, String); Limits::KEYS.len()] {
+                [$((stringify!($key), self.$key.in_words())),+]
+            }
+        }
+    };
+}
+
+limits! {
     /// Fuel units for each wake; without meaning for Python.
-    pub fuel: u64,
+    // About one unit per WebAssembly instruction, so that the default is some 20 ms.
+    fuel: u64 { min: 1_000, default: 50_000_000, max: 1_000_000_000_000 }
+
     /// Fuel units for `init`, likewise.
-    pub init_fuel: u64,
+    // `init` builds its tables once, and may take as much as twenty wakes by default.
+    init_fuel: u64 { min: 1_000, default: 1_000_000_000, max: 1_000_000_000_000 }
+
     /// Time until a wake ends with a fault. Live only: in a replay it would make decisions depend on the machine.
-    #[serde(rename = "deadline_ns", with = "nanoseconds")]
-    pub deadline: Duration,
+    deadline as "deadline_ns": Duration {
+        min: Duration::from_millis(1), default: Duration::from_millis(50), max: Duration::from_secs(60)
+    }
+
     /// Time until `init` does, likewise.
-    #[serde(rename = "init_deadline_ns", with = "nanoseconds")]
-    pub init_deadline: Duration,
+    // Importing numpy and loading a model take seconds; nobody waits for five minutes.
+    init_deadline as "init_deadline_ns": Duration {
+        min: Duration::from_millis(1), default: Duration::from_secs(10), max: Duration::from_secs(300)
+    }
+
     /// Memory that the lambda itself may allocate, and once more the pixels of the frames that it makes.
-    pub memory: ByteSize,
+    // The rings are beside it.
+    memory: ByteSize { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) }
+
     /// Elements of all tables of a component together.
-    pub tables: u64,
+    // A lambda built from Rust has some hundred, for its function pointers. The host keeps 8 bytes for each, beside `memory`: 8 MB at
+    // most.
+    tables: u64 { min: 1, default: 20_000, max: 1_000_000 }
+
     /// Stack of a component.
-    pub stack: ByteSize,
+    // The thread that runs it has 8 MiB, of which the host needs some for its own calls below the guest's; half a mebibyte is a
+    // recursion some thousand deep.
+    stack: ByteSize { min: ByteSize::kib(16), default: ByteSize::kib(512), max: ByteSize::kib(512) }
+
     /// Handles that a component holds at a time, of all kinds.
-    pub handles: u64,
+    // Samples, frames, fields, topics and what WASI hands out. The host keeps some 200 bytes for each: 13 MB at most.
+    handles: u64 { min: 16, default: 4096, max: 65_536 }
+
     /// Frames that the lambda holds at a time, of all inputs.
-    pub frames: u64,
+    // However they were made. Their pixels are bounded by `hold`, `decoded_size` and `memory`.
+    frames: u64 { min: 1, default: 256, max: 4096 }
+
     /// Bytes that one call takes or gives.
-    pub call_bytes: ByteSize,
+    // A call is the shortest thing that a deadline can end, and a mebibyte takes 0.1 ms. The SDK reads frames in pieces of 64 KiB.
+    call_bytes: ByteSize { min: ByteSize::kib(64), default: ByteSize::mib(1), max: ByteSize::mib(1) }
+
     /// Samples, values or texts that one call gives.
-    pub call_items: u64,
+    // As many as the deepest ring has.
+    call_items: u64 { min: 16, default: 65_536, max: 65_536 }
+
     /// Bytes that the host keeps for the lambda, by name.
-    pub scratch: ByteSize,
+    // It is memory, so nobody has some who does not ask for it.
+    scratch: ByteSize { min: ByteSize::kib(0), default: ByteSize::kib(0), max: ByteSize::mib(256) }
+
     /// Log lines for each second of the lambda's time.
-    pub log_lines: u64,
+    // Nobody reads more, and a disk should last.
+    log_lines: u64 { min: 1, default: 100, max: 10_000 }
+
     /// Bytes of log lines, likewise.
-    pub log_bytes: ByteSize,
+    // The default is a hundred of the longest lines.
+    log_bytes: ByteSize { min: ByteSize::kib(4), default: ByteSize::kib(400), max: ByteSize::mib(16) }
+
     /// Triggers for each minute of the lambda's time.
-    pub events_per_minute: u64,
+    // Of all kinds. The default is 200 a second, which is what a recorder takes for long from one lambda; the maximum one for each
+    // wake of the shortest period.
+    events_per_minute: u64 { min: 1, default: 12_000, max: 60_000 }
 }
 
 /// A limit that a vehicle made smaller.
@@ -67,91 +153,28 @@ impl fmt::Display for Tightened {
 }
 
 impl Limits {
-    /// Every limit at its maximum.
-    pub fn most() -> Limits {
-        all(None, Missing::Most).expect("nothing is read")
-    }
-
     /// The smaller one of each pair, and where that is smaller than before.
     pub fn tightened_by(&self, most: &Limits) -> (Limits, Vec<Tightened>) {
-        let tight = Limits {
-            fuel: self.fuel.min(most.fuel),
-            init_fuel: self.init_fuel.min(most.init_fuel),
-            deadline: self.deadline.min(most.deadline),
-            init_deadline: self.init_deadline.min(most.init_deadline),
-            memory: self.memory.min(most.memory),
-            tables: self.tables.min(most.tables),
-            stack: self.stack.min(most.stack),
-            handles: self.handles.min(most.handles),
-            frames: self.frames.min(most.frames),
-            call_bytes: self.call_bytes.min(most.call_bytes),
-            call_items: self.call_items.min(most.call_items),
-            scratch: self.scratch.min(most.scratch),
-            log_lines: self.log_lines.min(most.log_lines),
-            log_bytes: self.log_bytes.min(most.log_bytes),
-            events_per_minute: self.events_per_minute.min(most.events_per_minute),
-        };
+        let tight = self.smaller(most);
         let pairs = self.in_words().into_iter().zip(tight.in_words());
         let tightened = pairs.filter(|(before, after)| before != after);
         (tight, tightened.map(|((key, from), (_, to))| Tightened { key, from, to }).collect())
-    }
-
-    /// Each key with its value, as it would be written in the file.
-    pub fn in_words(&self) -> [(&'static str, String); 15] {
-        [
-            ("fuel", self.fuel.to_string()),
-            ("init_fuel", self.init_fuel.to_string()),
-            ("deadline", format_duration(self.deadline)),
-            ("init_deadline", format_duration(self.init_deadline)),
-            ("memory", self.memory.to_string()),
-            ("tables", self.tables.to_string()),
-            ("stack", self.stack.to_string()),
-            ("handles", self.handles.to_string()),
-            ("frames", self.frames.to_string()),
-            ("call_bytes", self.call_bytes.to_string()),
-            ("call_items", self.call_items.to_string()),
-            ("scratch", self.scratch.to_string()),
-            ("log_lines", self.log_lines.to_string()),
-            ("log_bytes", self.log_bytes.to_string()),
-            ("events_per_minute", self.events_per_minute.to_string()),
-        ]
     }
 }
 
 impl Default for Limits {
     fn default() -> Limits {
-        all(None, Missing::Default).expect("nothing is read")
-    }
-}
-
-/// Durations as JSON. None of them exceeds an hour, so that their nanoseconds fit.
-mod nanoseconds {
-    use std::time::Duration;
-
-    use serde::{Deserialize, Deserializer, Serializer};
-
-    pub(super) fn serialize<S: Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_u64(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX))
-    }
-
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
-        u64::deserialize(deserializer).map(Duration::from_nanos)
+        Limits::DEFAULT
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::read_limits::KEYS;
     use super::*;
 
     #[test]
-    fn every_key_of_the_file_has_its_words() {
-        assert_eq!(Limits::default().in_words().map(|(key, _)| key), *KEYS);
-    }
-
-    #[test]
     fn a_vehicle_makes_limits_smaller_and_never_larger() {
-        let mut vehicle = Limits::most();
+        let mut vehicle = Limits::MOST;
         (vehicle.fuel, vehicle.deadline) = (10_000_000, Duration::from_millis(20));
         vehicle.memory = ByteSize::gib(1);
         let (limits, tightened) = Limits::default().tightened_by(&vehicle);
@@ -159,17 +182,17 @@ mod tests {
         assert_eq!(limits, expected);
         let said: Vec<_> = tightened.iter().map(Tightened::to_string).collect();
         assert_eq!(said, ["fuel 50000000 -> 10000000", "deadline 50ms -> 20ms"]);
-        assert_eq!(limits.tightened_by(&Limits::most()), (limits, Vec::new()));
+        assert_eq!(limits.tightened_by(&Limits::MOST), (limits, Vec::new()));
     }
 
     #[test]
     fn every_limit_can_be_tightened_by_itself() {
-        let smallest = serde_json::to_value(all(None, Missing::Least).unwrap()).unwrap();
+        let smallest = serde_json::to_value(Limits::LEAST).unwrap();
         for (key, least) in smallest.as_object().unwrap() {
-            let mut vehicle = serde_json::to_value(Limits::most()).unwrap();
+            let mut vehicle = serde_json::to_value(Limits::MOST).unwrap();
             vehicle[key] = least.clone();
             let vehicle: Limits = serde_json::from_value(vehicle).unwrap();
-            let (tight, tightened) = Limits::most().tightened_by(&vehicle);
+            let (tight, tightened) = Limits::MOST.tightened_by(&vehicle);
             assert_eq!(serde_json::to_value(tight).unwrap()[key], *least, "{key}");
             assert_eq!(tightened.len(), 1, "{key}");
         }
@@ -179,7 +202,7 @@ mod tests {
     fn what_is_missing_in_json_has_its_default_and_what_is_there_reads_back() {
         let limits: Limits = serde_json::from_str(r#"{"fuel":5000,"of a newer version":1}"#).unwrap();
         assert_eq!(limits, Limits { fuel: 5000, ..Limits::default() });
-        let again: Limits = serde_json::from_value(serde_json::to_value(Limits::most()).unwrap()).unwrap();
-        assert_eq!(again, Limits::most());
+        let again: Limits = serde_json::from_value(serde_json::to_value(Limits::MOST).unwrap()).unwrap();
+        assert_eq!(again, Limits::MOST);
     }
 }

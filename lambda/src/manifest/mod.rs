@@ -7,6 +7,8 @@
 pub mod bounds;
 mod config;
 mod error;
+mod generated;
+mod limit;
 mod limits;
 mod names;
 mod read;
@@ -22,6 +24,7 @@ mod value;
 
 pub use config::{ConfigError, ConfigItem, ConfigSet, ConfigValue};
 pub use error::{InputMemory, ManifestError, Place};
+pub use generated::{GENERATED, Generated};
 use gleaner_base::{ByteSize, UnitError, format_duration, parse_duration};
 pub use limits::{Limits, Tightened};
 pub use names::{ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version};

@@ -5,13 +5,13 @@ use toml::de::DeTable;
 use super::bounds;
 use super::error::{InputMemory, ManifestError};
 use super::read_config;
-use super::read_limits::{self, Missing};
+use super::read_limits;
 use super::syntax;
 use super::table::{Document, Table};
 use super::value::Value;
 use super::{
-    Backlog, ByteSize, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store,
-    TopicName, TypeName,
+    Backlog, ByteSize, Durability, Input, Kind, Lambda, Limits, Manifest, Model, Qos, Record, Reliability, Schedule,
+    Store, TopicName, TypeName,
 };
 use gleaner_base::words::{excerpt, nearest};
 
@@ -36,7 +36,7 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
         inputs,
         models: models(document, &root)?,
         record: root.get("record").map(|value| record(document, &value)).transpose()?,
-        limits: read_limits::limits(root.get("limits").as_ref(), Missing::Default)?,
+        limits: read_limits::limits(root.get("limits").as_ref(), Limits::DEFAULT)?,
         config: root.get("config").map_or(Ok(Vec::new()), |value| read_config::items(&value))?,
     })
 }

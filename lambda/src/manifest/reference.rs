@@ -7,13 +7,15 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use super::bounds::{self, Bounds};
+use super::limit::Limit;
 use super::{
-    ByteSize, ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version, format_duration,
+    ByteSize, ItemName, LambdaName, Limits, NameError, RelativePath, Sha256, TopicName, TypeName, Version,
+    format_duration,
 };
 use gleaner_base::grouped;
 
 /// Where the types are that a manifest becomes.
-const SOURCES: [&str; 3] = [include_str!("types.rs"), include_str!("limits.rs"), include_str!("config.rs")];
+const SOURCES: [&str; 2] = [include_str!("types.rs"), include_str!("config.rs")];
 
 const BEGIN: &str = "\
 # The manifest
@@ -177,24 +179,12 @@ fn record() -> Section {
 }
 
 fn limits() -> Section {
-    let key = |name, form: &str| Key::new(name, "Limits", name, form);
-    let keys = vec![
-        key("fuel", "number").bounded(&bounds::FUEL, number),
-        key("init_fuel", "number").bounded(&bounds::INIT_FUEL, number),
-        key("deadline", "duration").bounded(&bounds::DEADLINE, duration),
-        key("init_deadline", "duration").bounded(&bounds::INIT_DEADLINE, duration),
-        key("memory", "size").bounded(&bounds::MEMORY, size),
-        key("tables", "number").bounded(&bounds::TABLES, number),
-        key("stack", "size").bounded(&bounds::STACK, size),
-        key("handles", "number").bounded(&bounds::HANDLES, number),
-        key("frames", "number").bounded(&bounds::FRAMES, number),
-        key("call_bytes", "size").bounded(&bounds::CALL_BYTES, size),
-        key("call_items", "number").bounded(&bounds::CALL_ITEMS, number),
-        key("scratch", "size").bounded(&bounds::SCRATCH, size),
-        key("log_lines", "number").bounded(&bounds::LOG_LINES, number),
-        key("log_bytes", "size").bounded(&bounds::LOG_BYTES, size),
-        key("events_per_minute", "number").bounded(&bounds::EVENTS_PER_MINUTE, number),
-    ];
+    let key = |limit: Limit| {
+        let [min, default, max] = limit.typed();
+        let (form, meaning) = (limit.unit.to_owned(), limit.meaning.trim().to_owned());
+        Key { name: limit.key, form, default, range: format!("{min} to {max}"), meaning }
+    };
+    let keys = Limits::table().into_iter().map(key).collect();
     Section { title: "[limits]", note: "What it may use. A vehicle can make each smaller.".to_owned(), keys }
 }
 

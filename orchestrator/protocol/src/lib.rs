@@ -10,6 +10,7 @@ mod isolation;
 pub mod link;
 mod live;
 mod page;
+mod recording;
 mod report;
 #[cfg(test)]
 #[path = "../../../base/src/scratch.rs"]
@@ -23,4 +24,5 @@ pub use exit_record::{Doing, ExitRecord, Killed, UNTIL_KILLED, Why};
 pub use isolation::{Holds, LAYERS_ENV, Layer};
 pub use live::{Live, LiveTopic, Network, Spread, ToRecorder};
 pub use page::{Page, RESULTS_ENV, WokenBy};
+pub use recording::{Counted, Outcome, Recording};
 pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};

@@ -2,6 +2,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::link::RecorderStatus;
 use gleaner_lambda::manifest::Kind;
 
 /// How a lambda is doing on live topics. Counts are since its start; spreads are since the report before, and in the last report
@@ -56,6 +57,9 @@ pub struct Live {
     pub network: Network,
     /// What became of the wakes on their way to the recorder; `None` without one.
     pub recorder: Option<ToRecorder>,
+    /// What the recorders of the run counted, in `summary.json` only: whoever starts them adds it. `None` without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recording: Option<Box<RecorderStatus>>,
     /// Resident memory, in bytes.
     pub rss_bytes: u64,
     /// CPU time of the process, in s.
@@ -105,7 +109,7 @@ impl Live {
     }
 }
 
-fn add<const N: usize>(counts: [(&mut u64, u64); N]) {
+pub(crate) fn add<const N: usize>(counts: [(&mut u64, u64); N]) {
     counts.into_iter().for_each(|(count, before)| *count = count.saturating_add(before));
 }
 
@@ -234,6 +238,7 @@ mod tests {
             topics: vec![topic],
             network: Network { socket_drops: count, filtered: count, participants: 3, ..Network::default() },
             recorder: Some(ToRecorder { wakes_dropped: count, triggers_lost: count }),
+            recording: None,
             rss_bytes: count,
             cpu_s: count as f64,
         }

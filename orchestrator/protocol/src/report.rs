@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Checked, DriveSeen, Layer, Live};
+use crate::{Checked, DriveSeen, Layer, Live, Recording};
 use gleaner_journal::Part;
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Kind;
@@ -157,14 +157,11 @@ pub struct Summary {
     pub peak_rss_bytes: u64,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<TopicReport>,
-    /// Clips made; `clips.jsonl` has a line for each, and for those that were recovered.
-    pub clips: u64,
+    /// What was recorded, and what was not; `clips.jsonl` has a line for each clip, and for those that were recovered.
+    #[serde(flatten)]
+    pub recording: Recording,
     /// Clips of an earlier replay that were deleted from the same folder.
     pub clips_replaced: u64,
-    /// Triggers that opened no window, as they came within the cooldown of another.
-    pub in_cooldown: u64,
-    /// Starts of a recording that was running, and stops of none.
-    pub ignored: u64,
     /// What is wrong with the drive, if it is damaged; the results end there.
     pub damaged: Option<String>,
     /// Why the lambda's process could not go on to the end of the drive; the results end there.
@@ -251,10 +248,8 @@ mod tests {
             wakes_per_s: 200.0,
             peak_rss_bytes: 1 << 20,
             topics: vec![topic],
-            clips: 2,
+            recording: Recording { clips: 2, in_cooldown: 3, ..Recording::default() },
             clips_replaced: 1,
-            in_cooldown: 3,
-            ignored: 0,
             damaged: None,
             stopped: None,
         };
@@ -266,7 +261,10 @@ mod tests {
                 r#""log_dropped":0,"triggers_refused":5,"passed_over":6,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
                 r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,
-                r#""clips":2,"clips_replaced":1,"in_cooldown":3,"ignored":0,"damaged":null}"#
+                r#""clips":2,"windows":0,"in_cooldown":3,"ignored":0,"too_many_started":0,"too_many_waiting":0,"held_back":0,"#,
+                r#""triggers_over_rate":0,"triggers_misstamped":0,"wakes_lost":0,"wakes_over_rate":0,"wakes_misstamped":0,"failed":0,"#,
+                r#""deleted":0,"not_deleted":0,"pushed_out":0,"too_big":0,"before_1970":0,"topic_unknown":0,"lambdas_refused":0,"#,
+                r#""clips_replaced":1,"damaged":null}"#
             ),
         );
     }

@@ -4,6 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use gleaner_protocol::Recording;
+use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
 use serde_json::{Value, json};
 
 use gleaner_base::{Exit, Failure};
@@ -351,11 +353,17 @@ fn a_live_run_has_a_report_that_begins_with_what_it_saw_first() {
     let out = Out::new();
     let topic = json!({"name": "imu", "topic": "/imu", "type_name": "sensor_msgs/msg/Imu", "writers": 1, "rate_hz": 100.0, "received": 7,
         "lost": 2, "malformed": 1, "overwritten": 0, "no_slot": 0, "too_big": 0, "skipped": 0, "age_ns": null, "qos": null, "trouble": ["it is far"]});
+    let recorded = RecordedTopic { no_slot: 8, ..RecordedTopic::default() };
+    let recording = RecorderStatus {
+        recording: Recording { held_back: 6, ..Recording::default() },
+        topics: vec![recorded],
+        ..RecorderStatus::default()
+    };
     let live = json!({"lambda": "hello", "version": "0.1.0", "kind": "python", "out": "x", "restarts": 1, "up_s": 3.0, "wakes": 7, "triggers": 1,
         "faults": 0, "skipped": 0, "missed_ticks": 0, "log_lines": 0, "log_dropped": 0, "triggers_refused": 0, "passed_over": 0,
         "unwritten": 4, "unsent": 0, "wake_up": null, "run": {"n": 7, "p50_ns": 10, "p99_ns": 20, "max_ns": 30}, "hand_out": null,
         "topics": [topic], "network": {"domain": 0, "participants": 1, "buffer_asked": 1, "buffer_granted": 1, "socket_drops": 5},
-        "recorder": null, "rss_bytes": 1, "cpu_s": 0.5});
+        "recorder": null, "recording": recording, "rss_bytes": 1, "cpu_s": 0.5});
     out.write("summary.json", live.to_string());
     out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
     let run = out.data();
@@ -365,6 +373,12 @@ fn a_live_run_has_a_report_that_begins_with_what_it_saw_first() {
     );
     assert_eq!(run["spreads"][0]["marks"], json!([["half", 10], ["99 %", 20], ["most", 30]]));
     assert_eq!((&run["topics"][0]["lost"], &run["topics"][0]["malformed"]), (&json!(2), &json!(1)));
-    assert!(run["missed"].as_array().unwrap().contains(&json!(["decisions and log lines not written", 4])));
+    for missed in [
+        json!(["decisions and log lines not written", 4]),
+        json!(["triggers without a window: the disk was too full", 6]),
+        json!(["samples to be recorded, without room as the recorder was busy", 8]),
+    ] {
+        assert!(run["missed"].as_array().unwrap().contains(&missed), "{missed}: {}", run["missed"]);
+    }
     assert!(run["facts"].as_array().unwrap().iter().any(|fact| fact["text"] == "it is far"));
 }

@@ -4,6 +4,7 @@
 //! Each case is this program once more, in a network of its own (`gleaner_tests::namespace`). `GLEANER_RESTARTS` says how often a
 //! publisher is killed; 5 times if it does not.
 
+mod counted;
 mod faults;
 mod from_peers;
 mod graph;
@@ -38,8 +39,8 @@ struct Case {
 const CASE: &str = "GLEANER_DDS_CASE";
 
 fn main() -> ExitCode {
-    let cases =
-        || [from_peers::CASES, to_peers::CASES, graph::CASES, faults::CASES, together::CASES].into_iter().flatten();
+    let suites = [from_peers::CASES, to_peers::CASES, graph::CASES, faults::CASES, together::CASES, counted::CASES];
+    let cases = || suites.into_iter().flatten();
     if let Ok(name) = std::env::var(CASE) {
         let case = cases().find(|case| case.name == name).expect("this program gives itself the names of its cases");
         return match (case.run)() {

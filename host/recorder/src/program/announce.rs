@@ -27,7 +27,7 @@ impl Course {
         if self.lambdas.len() == LAMBDAS {
             warn!(lambda = %name, most = LAMBDAS, "too many lambdas at a time: not recorded for");
             answers.refused(&format!("it hears at most {LAMBDAS} lambdas at a time"));
-            self.lambdas_refused += 1;
+            self.counted.lambdas_refused += 1;
             return Ok(());
         }
         let mut topics = Vec::new();
@@ -45,7 +45,7 @@ impl Course {
                     let why = error.to_string();
                     warn!(lambda = %name, topic = %wanted, %why, "a lambda cannot be recorded for");
                     answers.refused(&why);
-                    self.lambdas_refused += 1;
+                    self.counted.lambdas_refused += 1;
                     return Ok(());
                 }
             }
@@ -62,7 +62,7 @@ impl Course {
             let why = Failure::from(error).to_string();
             warn!(lambda = %name, %why, "a lambda cannot be recorded for");
             answers.refused(&why);
-            self.lambdas_refused += 1;
+            self.counted.lambdas_refused += 1;
             return Ok(());
         }
         self.recorder.grow_length(rules.max_length);

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::Store;
+use gleaner_protocol::Recording;
 use gleaner_protocol::link::RecorderReport;
 use gleaner_transport::{Clock, LiveSource};
 use gleaner_vitals::Spreads;
@@ -95,6 +96,7 @@ pub fn run(
         commands
     });
     say.say(RecorderReport::Ready);
+    let (gone, stuck) = counted(&deleted);
     let mut course = Course {
         recorder,
         clock: options.clock,
@@ -111,10 +113,7 @@ pub fn run(
         said: Said::default(),
         beat: Beat::default(),
         spreads: Spreads::new(),
-        lambdas_refused: 0,
-        wakes_lost: 0,
-        triggers_refused: 0,
-        deleted_before: counted(&deleted),
+        counted: Recording { deleted: gone, not_deleted: stuck, ..Recording::default() },
         is_ending: false,
         options,
         stop,
@@ -168,12 +167,9 @@ pub(super) struct Course {
     pub(super) said: Said,
     pub(super) beat: Beat,
     pub(super) spreads: Spreads,
-    /// Lambdas that are not recorded for.
-    pub(super) lambdas_refused: u64,
-    pub(super) wakes_lost: u64,
-    pub(super) triggers_refused: u64,
-    /// Clips that were deleted before anything was recorded, and that could not be.
-    pub(super) deleted_before: (u64, u64),
+    /// What is counted here: lambdas and wakes that are refused, and clips that were deleted before anything was recorded. The
+    /// recorder counts the rest.
+    pub(super) counted: Recording,
     is_ending: bool,
     pub(super) options: Options,
     stop: Arc<AtomicBool>,
@@ -211,7 +207,7 @@ impl Course {
             heard = true;
             match event {
                 Event::Announced(announced) => self.announce(*announced)?,
-                Event::Refused => self.lambdas_refused += 1,
+                Event::Refused => self.counted.lambdas_refused += 1,
                 Event::Stop => self.is_ending = true,
                 Event::Seen(Seen::Found { topic, of }) => {
                     let type_name = of.type_name.clone();
@@ -258,9 +254,8 @@ impl Course {
             let monotonic = || clock.monotonic(clock.now());
             let listened = self.lambdas[index].listen(&mut self.recorder, now, monotonic, &mut self.spreads)?;
             heard |= listened.heard;
-            self.lambdas_refused += u64::from(listened.is_refused);
-            self.wakes_lost += listened.wakes_lost;
-            self.triggers_refused += listened.triggers_refused;
+            self.counted.lambdas_refused += u64::from(listened.is_refused);
+            self.counted.add(&listened.counted);
             if let (Some(commands), Some(id)) = (&mut self.commands, listened.is_new) {
                 commands.add(&self.lambdas[index].name, id);
             }

@@ -2,7 +2,6 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{Builder, Thread};
 
@@ -87,7 +86,7 @@ fn announced(add: Add, socket: OwnedFd, reader: &Thread) -> Option<Announced> {
             return None;
         }
     };
-    let (manifest, digest) = match load(&add.lambda) {
+    let (manifest, digest) = match load(&add) {
         Ok(loaded) => loaded,
         Err(failure) => {
             warn!(%lambda, %failure, "a lambda cannot be recorded for");
@@ -156,17 +155,24 @@ impl Expected {
                 let is_other = header.remaps != self.remaps;
                 is_other.then(|| "its topics are remapped in another way than the recorder was told".to_owned())
             })
+            .or_else(|| {
+                let limits = header.limits.in_words().into_iter().zip(self.manifest.limits.in_words());
+                limits
+                    .into_iter()
+                    .find_map(|((key, found), (_, wanted))| text(&format!("limit `{key}`"), &wanted, &found))
+            })
     }
 }
 
-/// The manifest of a build, and its digest: of the same bytes.
-fn load(lambda: &Path) -> Result<(Manifest, String), Failure> {
-    let build = BuildDir::of(lambda);
+/// The manifest of a build with the limits that it gets on this vehicle, and its digest: of the same bytes.
+fn load(add: &Add) -> Result<(Manifest, String), Failure> {
+    let build = BuildDir::of(&add.lambda);
     let text = Manifest::read(build.path())?;
-    let manifest = Manifest::parse(&text, build.manifest_path())?;
+    let mut manifest = Manifest::parse(&text, build.manifest_path())?;
     if manifest.record.is_none() {
         let message = format!("lambda `{}` has no [record]", manifest.lambda.name);
         return Err(Failure::new(Exit::Usage, message));
     }
+    manifest.limits = manifest.limits.tightened_by(&add.most).0;
     Ok((manifest, hex(&Sha256::digest(text))))
 }

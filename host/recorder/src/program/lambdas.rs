@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use gleaner_journal::Entry;
 use gleaner_lambda::manifest::Record;
+use gleaner_protocol::Recording;
 use gleaner_protocol::link::Answers;
 use gleaner_vitals::Spreads;
 use tracing::warn;
@@ -51,8 +52,7 @@ pub(super) struct Listened {
     /// Nothing more is heard of it.
     pub(super) is_gone: bool,
     /// Wakes that are not recorded, and triggers of such.
-    pub(super) wakes_lost: u64,
-    pub(super) triggers_refused: u64,
+    pub(super) counted: Recording,
 }
 
 impl Lambda {
@@ -109,12 +109,11 @@ impl Lambda {
                     let Some(id) = self.id else { continue };
                     if missing > 0 {
                         recorder.lost_wakes(id, entry.at_ns, missing.into());
-                        listened.wakes_lost += u64::from(missing);
+                        listened.counted.wakes_lost += u64::from(missing);
                     }
-                    if !self.may(&entry, bytes, now_ns) {
+                    if let Some(refused) = self.refused(&entry, bytes, now_ns) {
                         recorder.lost_wakes(id, entry.at_ns.clamp(0, now_ns.max(0)), 1);
-                        listened.wakes_lost += 1;
-                        listened.triggers_refused += entry.triggers.len() as u64;
+                        listened.counted.add(&refused);
                         continue;
                     }
                     recorder.wake(id, &entry)?;
@@ -143,16 +142,21 @@ impl Lambda {
         Ok(listened)
     }
 
-    /// Whether a wake is one that an honest host may send: a lambda cannot fill what all share.
-    fn may(&mut self, entry: &Entry, bytes: usize, now_ns: i64) -> bool {
+    /// Counts a wake that an honest host would not send, and its triggers: a lambda cannot fill what all share.
+    fn refused(&mut self, entry: &Entry, bytes: usize, now_ns: i64) -> Option<Recording> {
         let now = Instant::now();
         let is_now = (now_ns.saturating_sub(BEHIND_NS)..=now_ns.saturating_add(AHEAD_NS)).contains(&entry.at_ns);
-        let triggers = entry.triggers.len() as f64;
-        let may = is_now && self.bytes.take(bytes as f64, now) && self.triggers.take(triggers, now);
-        if !may && !self.is_warned {
+        let triggers = entry.triggers.len() as u64;
+        if is_now && self.bytes.take(bytes as f64, now) && self.triggers.take(triggers as f64, now) {
+            return None;
+        }
+        if !self.is_warned {
             self.is_warned = true;
             warn!(lambda = %self.name, is_now, "wakes of a lambda are not recorded: too many, or of another time");
         }
-        may
+        Some(match is_now {
+            true => Recording { wakes_over_rate: 1, triggers_over_rate: triggers, ..Recording::default() },
+            false => Recording { wakes_misstamped: 1, triggers_misstamped: triggers, ..Recording::default() },
+        })
     }
 }

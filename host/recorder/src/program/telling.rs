@@ -22,12 +22,12 @@ impl Course {
     /// Tells what is new.
     pub(super) fn tell(&mut self, is_last: bool) -> Result<(), Failure> {
         let counts = self.recorder.counts();
-        let new = usize::try_from(counts.clips - self.said.clips).unwrap_or(usize::MAX);
+        let new = usize::try_from(counts.recording.clips - self.said.clips).unwrap_or(usize::MAX);
         let clips = self.recorder.clips();
         for clip in &clips[clips.len().saturating_sub(new)..] {
             self.say.say(RecorderReport::Clip(Box::new(clip.clone())));
         }
-        self.said.clips = counts.clips;
+        self.said.clips = counts.recording.clips;
         for clip in self.recorder.take_recovered() {
             warn!(clip = %clip.file.display(), "recovered a clip of an earlier recorder, which did not end well");
             self.say.say(RecorderReport::Recovered(Box::new(clip)));
@@ -46,9 +46,9 @@ impl Course {
             return Ok(());
         }
         self.said.at = Some(Instant::now());
-        let held_back = counts.held_back - self.said.held_back;
+        let held_back = counts.recording.held_back - self.said.held_back;
         if held_back > 0 {
-            self.said.held_back = counts.held_back;
+            self.said.held_back = counts.recording.held_back;
             let why = "the disk had too little room".to_owned();
             self.say.say(RecorderReport::Loss(Loss::HeldBack { at_ns, triggers: held_back, why }));
         }
@@ -76,24 +76,14 @@ impl Course {
                 trouble: status.trouble,
             }
         };
+        let mut recording = counts.recording;
+        recording.add(&self.counted);
         RecorderStatus {
             lambdas: self.lambdas.len(),
-            lambdas_refused: self.lambdas_refused,
-            clips: counts.clips,
-            failed: counts.failed,
-            deleted: counts.deleted + self.deleted_before.0,
-            not_deleted: counts.not_deleted + self.deleted_before.1,
-            windows: counts.windows,
-            recording: self.recorder.is_recording(),
-            in_cooldown: counts.in_cooldown,
-            ignored: counts.ignored + self.triggers_refused,
-            held_back: counts.held_back,
-            wakes_lost: self.wakes_lost,
+            recording,
+            is_recording: self.recorder.is_recording(),
             preroll_bytes: counts.preroll_bytes,
             preroll_bound: counts.preroll_bound,
-            pushed_out: counts.pushed_out,
-            too_big: counts.too_big,
-            refused: counts.refused,
             in_flight: counts.in_flight,
             trigger_to_open: None,
             commands: self.commands.as_ref().map(|commands| commands.status(self.beat.commands.as_ref())),

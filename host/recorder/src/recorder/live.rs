@@ -123,16 +123,18 @@ impl Recorder {
         source: String,
     ) -> Result<Commanded, RecordError> {
         if self.held.is_some() {
-            self.counts.held_back += 1;
+            self.counts.recording.held_back += 1;
             return Ok(Commanded::HeldBack);
         }
         let commanded = match self.windows.command(lambda.0, trigger.kind, &trigger.label, at_ns) {
             Heard::Opened => {
-                self.counts.windows += 1;
+                self.counts.recording.windows += 1;
                 Commanded::Opened
             }
             Heard::Stopped => Commanded::Stopped,
-            Heard::InCooldown | Heard::Ignored => return Ok(Commanded::Ignored),
+            Heard::InCooldown | Heard::Ignored | Heard::TooManyStarted | Heard::TooManyWaiting => {
+                return Ok(Commanded::Ignored);
+            }
         };
         let moment = Moment { source: Some(source), ..Moment::of(self.name_of(lambda), trigger, at_ns) };
         self.await_clip(lambda, moment);
@@ -233,8 +235,8 @@ impl Recorder {
 
     fn note_deleted(&mut self, deleted: Vec<Loss>) {
         let (gone, stuck) = counted(&deleted);
-        self.counts.deleted += gone;
-        self.counts.not_deleted += stuck;
+        self.counts.recording.deleted += gone;
+        self.counts.recording.not_deleted += stuck;
         self.finished.deleted.extend(deleted);
         self.finished.deleted.truncate(KEPT);
     }
@@ -251,7 +253,7 @@ impl Recorder {
                     self.note_deleted(deleted);
                 }
                 Outcome::Failed(error) => {
-                    self.counts.failed += 1;
+                    self.counts.recording.failed += 1;
                     self.finished.fail(error);
                 }
             }

@@ -19,6 +19,7 @@ use std::sync::Arc;
 use gleaner_base::nanoseconds;
 use gleaner_journal::{Encoder, Entry};
 use gleaner_lambda::{Clip, Moment, TriggerKind};
+use gleaner_protocol::Recording;
 use gleaner_transport::{Gaps, SampleMeta};
 
 use crate::file::{Folder, Topic};
@@ -203,8 +204,12 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn sample(&mut self, topic: TopicId, meta: &SampleMeta, cdr: &[u8]) -> Result<(), RecordError> {
-        if meta.at_ns < 0 || self.stock.desk.lanes[topic.0].is_missing {
-            self.counts.refused += 1;
+        if meta.at_ns < 0 {
+            self.counts.recording.before_1970 += 1;
+            return Ok(());
+        }
+        if self.stock.desk.lanes[topic.0].is_missing {
+            self.counts.recording.topic_unknown += 1;
             return Ok(());
         }
         self.counts.out_of_order += u64::from(self.now.is_some_and(|now| meta.at_ns < now));
@@ -215,7 +220,7 @@ impl Recorder {
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
         let in_group = self.write(topic.0, &meta, cdr)?;
-        let Counts { pushed_out, too_big, .. } = &mut self.counts;
+        let Recording { pushed_out, too_big, .. } = &mut self.counts.recording;
         self.stock.keep(Held::sample(topic.0, &meta, in_group), cdr, pushed_out, too_big)
     }
 
@@ -253,7 +258,7 @@ impl Recorder {
         let number = crew.wakes;
         crew.wakes += 1;
         if entry.at_ns < 0 {
-            self.counts.refused += 1;
+            self.counts.recording.before_1970 += 1;
             return Ok(());
         }
         self.encoded.clear();
@@ -269,21 +274,23 @@ impl Recorder {
             draft.wake(lambda.0, number, &self.encoded);
             in_group = draft.group;
         }
-        let Counts { pushed_out, too_big, .. } = &mut self.counts;
+        let Recording { pushed_out, too_big, .. } = &mut self.counts.recording;
         self.stock.keep(Held::wake(lambda.0, number, entry.at_ns, in_group), &self.encoded, pushed_out, too_big)?;
         if entry.triggers.is_empty() {
             return Ok(());
         }
         if self.held.is_some() {
-            self.counts.held_back +=
+            self.counts.recording.held_back +=
                 entry.triggers.iter().filter(|trigger| trigger.kind != TriggerKind::Stop).count() as u64;
             return Ok(());
         }
         for trigger in &entry.triggers {
             match self.windows.trigger(lambda.0, trigger.kind, &trigger.label, entry.at_ns) {
-                Heard::Opened => self.counts.windows += 1,
-                Heard::InCooldown => self.counts.in_cooldown += 1,
-                Heard::Ignored => self.counts.ignored += 1,
+                Heard::Opened => self.counts.recording.windows += 1,
+                Heard::InCooldown => self.counts.recording.in_cooldown += 1,
+                Heard::Ignored => self.counts.recording.ignored += 1,
+                Heard::TooManyStarted => self.counts.recording.too_many_started += 1,
+                Heard::TooManyWaiting => self.counts.recording.too_many_waiting += 1,
                 Heard::Stopped => {}
             }
             self.await_clip(lambda, Moment::of(self.name_of(lambda), trigger, entry.at_ns));
@@ -328,7 +335,7 @@ impl Recorder {
     pub fn counts(&self) -> Counts {
         let preroll = &self.stock.preroll;
         Counts {
-            clips: self.finished.count,
+            recording: Recording { clips: self.finished.count, ..self.counts.recording },
             preroll_bytes: preroll.bytes_held(),
             preroll_highest: preroll.bytes_highest(),
             in_flight: self.stock.desk.pen.in_flight() as u64,

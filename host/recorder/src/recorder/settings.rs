@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use gleaner_lambda::manifest::Store;
+use gleaner_protocol::Recording;
 
 /// How a recorder works.
 #[derive(Clone, Debug)]
@@ -33,31 +34,8 @@ pub struct LambdaId(pub(super) usize);
 /// What a recorder has done so far.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Clips that are finished.
-    pub clips: u64,
-    /// Clips that could not be written, or recovered. What there is of them is recovered when the folder is opened again.
-    pub failed: u64,
-    /// Clips that were deleted to make room, and that nobody had fetched.
-    pub deleted: u64,
-    /// Clips that should have been deleted to make room, and could not be.
-    pub not_deleted: u64,
-    /// Windows that triggers and commands opened.
-    pub windows: u64,
-    /// Triggers that opened none, because they came within the cooldown of another.
-    pub in_cooldown: u64,
-    /// Starts while one of the same label was open or 64 of the lambda were, stops while none was, and what came while too many
-    /// windows waited for their clip.
-    pub ignored: u64,
-    /// Triggers but for stops, and commands, that came while nothing was recorded, and windows that waited for their clip then:
-    /// [`Recorder::hold`](super::Recorder::hold).
-    pub held_back: u64,
-    /// Samples that left the preroll for want of bytes before they were too old for any window.
-    pub pushed_out: u64,
-    /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless, unless they are larger
-    /// than any message of a clip, which is somewhat below 1 GiB.
-    pub too_big: u64,
-    /// Samples and wakes with a stamp before 1970, and samples of missing topics: they are not recorded.
-    pub refused: u64,
+    /// What is reported.
+    pub recording: Recording,
     /// Samples older than one that came before them. They are recorded where windows cover them.
     pub out_of_order: u64,
     /// Bytes that the preroll holds.

@@ -134,7 +134,7 @@ fn a_message_that_no_clip_can_hold_is_counted_by_the_clip_that_wants_it() {
     let clip = &recorder.clips()[0];
     let topic = &clip.topics[0];
     assert_eq!((topic.messages, topic.received, topic.too_big), (2, Some(4), Some(2)));
-    assert_eq!(recorder.counts().too_big, 3);
+    assert_eq!(recorder.counts().recording.too_big, 3);
     let said = "1 sample of /a larger than 0 MiB: no clip holds such";
     assert!(clip.short.iter().any(|short| short == said), "{:?}", clip.short);
 }

@@ -15,9 +15,12 @@ pub enum Heard {
     Stopped,
     /// It came too soon after the last one that opened a window.
     InCooldown,
-    /// A start while one of its label is open, or [`STARTED_MAX`] are; a stop while none of its label is; or too many windows
-    /// wait.
+    /// A start while one of its label is open; a stop while none of its label is.
     Ignored,
+    /// A start while [`STARTED_MAX`] are open.
+    TooManyStarted,
+    /// Too many windows wait.
+    TooManyWaiting,
 }
 
 /// Who triggers in the name of a lambda.
@@ -161,9 +164,8 @@ impl Windows {
         let Some(state) = self.lambdas.get_mut(lambda) else { return Heard::Ignored };
         let (rules, label) = (state.rules, (by, label.to_owned()));
         match kind {
-            TriggerKind::Start if state.started.contains(&label) || state.started_by(by) >= STARTED_MAX => {
-                return Heard::Ignored;
-            }
+            TriggerKind::Start if state.started.contains(&label) => return Heard::Ignored,
+            TriggerKind::Start if state.started_by(by) >= STARTED_MAX => return Heard::TooManyStarted,
             TriggerKind::Stop if !state.started.remove(&label) => return Heard::Ignored,
             TriggerKind::Stop => {
                 if state.started.is_empty() {
@@ -171,7 +173,9 @@ impl Windows {
                 }
                 return Heard::Stopped;
             }
-            TriggerKind::Event | TriggerKind::Start if self.pending.len() >= WAITING_MAX => return Heard::Ignored,
+            TriggerKind::Event | TriggerKind::Start if self.pending.len() >= WAITING_MAX => {
+                return Heard::TooManyWaiting;
+            }
             TriggerKind::Event | TriggerKind::Start => {}
         }
         if by == By::Lambda {

@@ -301,7 +301,16 @@ fn a_lambda_that_starts_ever_new_recordings_is_heard_up_to_a_bound() {
     windows.add(Rules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
     let heard = (0..STARTED_MAX + 1).map(|n| windows.trigger(0, Start, &n.to_string(), 100)).collect::<Vec<_>>();
     assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
-    assert_eq!(heard.last(), Some(&Heard::Ignored));
+    assert_eq!(heard.last(), Some(&Heard::TooManyStarted));
+}
+
+#[test]
+fn more_windows_than_may_wait_are_refused_as_that() {
+    let mut windows = machine(LONG, &[rules(0, 0, 0)]);
+    let heard: Vec<_> = (0..4097).map(|n| windows.trigger(0, Event, "x", 10 * n)).collect();
+    assert!(heard[..4096].iter().all(|heard| *heard == Heard::Opened));
+    assert_eq!((heard[4096], windows.trigger(0, Start, "y", 100_000)), (Heard::TooManyWaiting, Heard::TooManyWaiting));
+    assert_eq!(windows.forget_waiting(), 4096);
 }
 
 #[test]

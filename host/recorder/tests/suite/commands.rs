@@ -7,6 +7,7 @@ use crate::running::*;
 use crate::support::*;
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_lambda::{Clip, TriggerKind};
+use gleaner_protocol::Recording;
 use gleaner_protocol::link::{CommandStatus, RecorderLink};
 use gleaner_transport::Verdict;
 
@@ -109,7 +110,7 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
     let second = commanded.join(&scratch, "second", (0, 0));
     received(&mut commanded.running, 50);
     first.wake(&entry(commanded.running.clock.now(), &[Start]), 0).unwrap();
-    commanded.running.status(|status| status.windows == 1);
+    commanded.running.status(|status| status.recording.windows == 1);
     // The lambda's own is not ended, whoever asks.
     commanded.say(r#"{"command": "stop", "label": "here", "lambda": "first"}"#);
     commanded.accepted_and_refused(0, 1);
@@ -119,7 +120,7 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
     second.bye(PATIENCE);
     first.bye(PATIENCE);
     let status = commanded.running.status(|status| status.lambdas == 0);
-    assert!(status.recording);
+    assert!(status.is_recording);
     commanded.say(r#"{"command": "stop", "label": "here"}"#);
     commanded.accepted_and_refused(1, 2);
     let (stopped, _) = commanded.say(r#"{"command": "stop", "label": "here", "lambda": "second"}"#);
@@ -159,7 +160,7 @@ fn too_many_too_long_and_senseless_commands_are_counted_and_do_nothing() {
         commanded.running.control.stop().unwrap();
         commanded.running.ended().0
     };
-    assert_eq!((last.windows, last.clips, last.ignored), (0, 0, 0));
+    assert_eq!(last.recording, Recording::default());
 }
 
 #[test]

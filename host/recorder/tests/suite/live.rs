@@ -233,7 +233,7 @@ fn while_nothing_may_be_recorded_triggers_are_counted_and_the_open_clip_ends() {
         (every(50, 300, 1), &["the disk is full".to_owned()][..])
     );
     assert_eq!((stamps(&scratch, whole, "/a"), whole.short.len()), (every(950, 1500, 1), 0));
-    assert_eq!(recorder.counts().held_back, 1);
+    assert_eq!(recorder.counts().recording.held_back, 1);
 }
 
 #[test]
@@ -270,7 +270,7 @@ fn a_clip_that_cannot_be_written_is_told_and_the_next_one_can() {
             90 => std::fs::rename(&clips, scratch.0.join("away")).unwrap(),
             100 | 1000 => recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap(),
             500 => {
-                while recorder.counts().failed == 0 {
+                while recorder.counts().recording.failed == 0 {
                     recorder.work().unwrap();
                 }
                 assert_eq!(recorder.take_failures().len(), 1);
@@ -283,7 +283,7 @@ fn a_clip_that_cannot_be_written_is_told_and_the_next_one_can() {
     recorder.finish(T0 + 2 * S).unwrap();
     let [clip] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
     assert_eq!(stamps(&scratch, clip, "/a"), every(1000, 1050, 1));
-    assert_eq!(recorder.counts().failed, 1);
+    assert_eq!(recorder.counts().recording.failed, 1);
 }
 
 #[test]
@@ -342,7 +342,7 @@ fn the_oldest_clips_make_room_and_each_is_named() {
     for (line, clip) in losses.lines().zip(recorder.clips().to_vec()) {
         assert!(line.contains(&format!(r#""file":"{}""#, clip.file.display())), "{line}");
     }
-    assert_eq!((recorder.counts().deleted, recorder.take_deleted().len()), (3, 3));
+    assert_eq!((recorder.counts().recording.deleted, recorder.take_deleted().len()), (3, 3));
 }
 
 #[test]
@@ -382,5 +382,5 @@ fn a_clip_that_was_fetched_leaves_its_room_to_others() {
     recorder.sample(a, &meta(at, 1), b"x").unwrap();
     recorder.wake(lambda, &entry(at, EVENT)).unwrap();
     recorder.finish(at + S).unwrap();
-    assert!(oldest.exists() && recorder.clips().len() == 1 && recorder.counts().deleted == 0);
+    assert!(oldest.exists() && recorder.clips().len() == 1 && recorder.counts().recording.deleted == 0);
 }

@@ -25,7 +25,7 @@ fn cut(store: Store, bytes: u64) -> (Scratch, Clip, u64) {
     }
     recorder.finish(T0 + S * 4).unwrap();
     assert_eq!(recorder.clips().len(), 1);
-    let (clip, pushed_out) = (recorder.clips()[0].clone(), recorder.counts().pushed_out);
+    let (clip, pushed_out) = (recorder.clips()[0].clone(), recorder.counts().recording.pushed_out);
     (scratch, clip, pushed_out)
 }
 
@@ -86,7 +86,7 @@ fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
         assert_eq!(stamps(&scratch, clip, "/a"), [0, 200, 300]);
         assert_eq!((clip.topics[0].too_big, clip.topics[0].received), (Some(1), Some(4)));
         assert_eq!(clip.short, ["1 sample of /a did not fit into the preroll: preroll_size"]);
-        assert_eq!(recorder.counts().too_big, 2);
+        assert_eq!(recorder.counts().recording.too_big, 2);
     }
 }
 

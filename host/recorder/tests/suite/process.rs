@@ -57,11 +57,11 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     assert_eq!(two.bye(PATIENCE), one.bye(PATIENCE));
     // One that was never built.
     let _unbuilt = running.control.add(&add(&scratch.0.join("third"))).unwrap();
-    running.status(|status| status.lambdas == 0 && status.lambdas_refused == 2);
+    running.status(|status| status.lambdas == 0 && status.recording.lambdas_refused == 2);
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!(ended, Ok(()));
-    assert_eq!((last.clips, last.windows, last.trigger_to_open.unwrap().n), (1, 1, 1));
+    assert_eq!((last.recording.clips, last.recording.windows, last.trigger_to_open.unwrap().n), (1, 1, 1));
     drop(sensor);
 }
 
@@ -79,7 +79,7 @@ fn a_recording_that_is_stopped_keeps_what_it_has() {
         let _sensor = Sensor::start(&network, running.clock);
         received(&mut running, 10);
         link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
-        running.status(|status| status.recording);
+        running.status(|status| status.is_recording);
         match how {
             "stop" => running.control.stop().unwrap(),
             "SIGTERM" => running.stop.store(true, Ordering::Relaxed),
@@ -121,7 +121,9 @@ fn what_a_hostile_lambda_says_costs_nobody_else() {
         noisy.wake(&entry(clock.now(), &[Event]), monotonic(clock)).unwrap();
     }
     noisy.bye(PATIENCE);
-    running.status(|status| status.wakes_lost > 4 && status.ignored > 10_000);
+    let status = running.status(|status| status.recording.triggers_over_rate > 10_000);
+    assert_eq!((status.recording.wakes_misstamped, status.recording.triggers_misstamped), (4, 8));
+    assert_eq!((status.recording.wakes_over_rate, status.recording.ignored), (status.recording.triggers_over_rate, 0));
     let anchor = clock.now();
     honest.wake(&entry(anchor, &[Event]), monotonic(clock)).unwrap();
     let clip = running.until(|report| match report {
@@ -132,6 +134,27 @@ fn what_a_hostile_lambda_says_costs_nobody_else() {
     assert_eq!(clip.topics[0].overwritten, Some(0));
     running.control.stop().unwrap();
     assert_eq!(running.ended().1, Ok(()));
+}
+
+#[test]
+fn the_limits_of_a_vehicle_hold_for_what_the_recorder_reads_of_a_manifest() {
+    let scratch = Scratch::new();
+    let network = Network::default();
+    let mut running = Running::start(&scratch, &network, |_| {});
+    let (folder, as_in_manifest) = lambda(&scratch, "first", (10, 10));
+    let mut on_vehicle = as_in_manifest.clone();
+    on_vehicle.limits.fuel = 10_000;
+    let mut announced = add(&folder);
+    announced.most.fuel = 10_000;
+    // A process with more than the vehicle gives is not the one that was announced.
+    let refused = RecorderLink::new(running.control.add(&announced).unwrap()).hello(&as_in_manifest, PATIENCE);
+    let limit = "its limit `fuel` is `50000000`; the recorder was told of `10000`";
+    assert!(matches!(&refused, Err(LinkError::Refused { why }) if why.contains(limit)), "{refused:?}");
+    let mut link = RecorderLink::new(running.control.add(&announced).unwrap());
+    link.hello(&on_vehicle, PATIENCE).unwrap();
+    running.control.stop().unwrap();
+    let (last, ended) = running.ended();
+    assert_eq!((last.recording.lambdas_refused, ended), (1, Ok(())));
 }
 
 #[test]
@@ -153,7 +176,7 @@ fn a_full_disk_is_said_and_no_clip_is_begun() {
     assert_eq!(triggers, 1);
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
-    assert_eq!((last.held_back, last.clips, ended), (1, 0, Ok(())));
+    assert_eq!((last.recording.held_back, last.recording.clips, ended), (1, 0, Ok(())));
     assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains(r#""loss":"held_back""#));
 }
 
@@ -195,7 +218,7 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
     assert!(!scratch.messages(&running.clip()).is_empty());
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
-    assert_eq!((last.clips, last.failed, ended), (1, 1, Ok(())));
+    assert_eq!((last.recording.clips, last.recording.failed, ended), (1, 1, Ok(())));
     assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains("cannot recover"));
     assert_eq!(fs::read(part).unwrap(), left);
     // The way is free; and a recorder that is stopped at once has some seconds for it.
@@ -208,7 +231,7 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
     });
     assert!(recovered.recovered.is_some() && recovered.lambdas[0].name == "dead");
     let (last, ended) = running.ended();
-    assert_eq!((last.clips, last.failed, last.deleted, ended), (0, 0, 1, Ok(())));
+    assert_eq!((last.recording.clips, last.recording.failed, last.recording.deleted, ended), (0, 0, 1, Ok(())));
     assert_eq!(find(".mcap"), [scratch.0.join(&recovered.file)]);
 }
 
@@ -224,7 +247,7 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
-    running.status(|status| status.recording);
+    running.status(|status| status.is_recording);
     network.loopback.die("its thread is gone");
     running.clip();
     let failure = running.ended().1.unwrap_err();
@@ -289,7 +312,7 @@ fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
     let mut last = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
     let refused = last.hello(&header, PATIENCE).unwrap_err();
     assert_eq!(refused.to_string(), "the recorder refuses the lambda: it hears at most 256 lambdas at a time");
-    running.status(|status| (status.lambdas, status.lambdas_refused) == (256, 1));
+    running.status(|status| (status.lambdas, status.recording.lambdas_refused) == (256, 1));
     let mut links = sockets.into_iter().map(RecorderLink::new);
     links.next_back().unwrap().hello(&header, PATIENCE).unwrap();
     // Where one goes, there is room for another.

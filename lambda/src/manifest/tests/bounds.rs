@@ -1,5 +1,6 @@
 //! Every number has a minimum and a maximum, and every list an end.
 
+use super::super::limit::Limit;
 use super::*;
 
 /// The value in line `line` is refused as out of its bounds.
@@ -29,26 +30,24 @@ fn every_limit_has_a_minimum_and_a_maximum() {
 }
 
 #[test]
-fn every_further_limit_has_a_minimum_and_a_maximum() {
-    for (key, below, above, min, max) in [
-        ("init_fuel", "999", "1000000000001", "1000", "1000000000000"),
-        ("init_deadline", "\"999us\"", "\"301s\"", "1ms", "5min"),
-        ("tables", "0", "1000001", "1", "1000000"),
-        ("stack", "\"15 KiB\"", "\"513 KiB\"", "16 KiB", "512 KiB"),
-        ("handles", "15", "65537", "16", "65536"),
-        ("frames", "0", "4097", "1", "4096"),
-        ("call_bytes", "\"63 KiB\"", "\"1025 KiB\"", "64 KiB", "1 MiB"),
-        ("call_items", "15", "65537", "16", "65536"),
-        ("scratch", "-1", "\"257 MiB\"", "0 B", "256 MiB"),
-        ("log_lines", "0", "10001", "1", "10000"),
-        ("log_bytes", "\"3 KiB\"", "\"17 MiB\"", "4 KiB", "16 MiB"),
-        ("events_per_minute", "0", "60001", "1", "60000"),
-    ] {
-        let help = format!("give a value from {min} to {max}");
-        for (value, side) in
-            [(below, format!("below the minimum of {min}")), (above, format!("above the maximum of {max}"))]
-        {
-            let problem = format!("`limits.{key}` is {}, {side}", value.trim_matches('"'));
+fn every_limit_is_refused_just_outside_of_its_bounds() {
+    for Limit { key, unit, plain: [min, _, max], .. } in Limits::table() {
+        let shown = |plain: u64| match unit {
+            "number" => plain.to_string(),
+            "size" => ByteSize::new(plain).to_string(),
+            _ => format_duration(Duration::from_nanos(plain)),
+        };
+        let written = |plain: u64| match unit {
+            "duration" => format!("\"{}\"", shown(plain)),
+            _ => plain.to_string(),
+        };
+        let help = format!("give a value from {} to {}", shown(min), shown(max));
+        let below = min.checked_sub(1).map_or(("-1".to_owned(), "-1".to_owned()), |less| (written(less), shown(less)));
+        for ((value, value_shown), side) in [
+            (below, format!("below the minimum of {}", shown(min))),
+            ((written(max + 1), shown(max + 1)), format!("above the maximum of {}", shown(max))),
+        ] {
+            let problem = format!("`limits.{key}` is {value_shown}, {side}");
             out_of_bounds(&format!("[limits]\n{key} = {value}"), 9, &problem, &help);
         }
     }

@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use super::LinkError;
 use super::frame::{self, tag};
+use gleaner_lambda::manifest::Limits;
 
 const STARTER: &str = "the starter";
 const RECORDER: &str = "the recorder";
@@ -30,6 +31,8 @@ pub struct Add {
     pub lambda: PathBuf,
     /// Other names for topics of the manifest, from and to.
     pub remaps: Vec<(String, String)>,
+    /// The most that a lambda gets on this vehicle: the limits of its manifest count as far as they are smaller.
+    pub most: Limits,
 }
 
 /// The starter's end.

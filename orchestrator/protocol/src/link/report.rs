@@ -2,7 +2,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Network, Spread};
+use crate::live::add;
+use crate::{Network, Recording, Spread};
 use gleaner_lambda::Clip;
 
 /// One line of JSON that `gleaner-recorder` writes on its standard output for the program that started it.
@@ -76,42 +77,16 @@ pub enum Loss {
 pub struct RecorderStatus {
     /// Lambdas that it hears.
     pub lambdas: usize,
-    /// Lambdas that it was told of and does not record for; the log says why.
-    #[serde(default)]
-    pub lambdas_refused: u64,
-    /// Clips that are finished.
-    pub clips: u64,
-    /// Clips that could not be written.
-    pub failed: u64,
-    /// Clips that were deleted to make room, and that nobody had fetched.
-    pub deleted: u64,
-    /// Clips that should have been deleted to make room, and could not be.
-    #[serde(default)]
-    pub not_deleted: u64,
-    /// Windows that triggers and commands opened.
-    pub windows: u64,
+    /// What it counted.
+    #[serde(flatten)]
+    pub recording: Recording,
     /// Whether a clip is open.
-    pub recording: bool,
-    /// Triggers that opened no window, as they came within the cooldown of another.
-    pub in_cooldown: u64,
-    /// Starts of a recording that was running, stops of none, and triggers beyond what one lambda may cause.
-    pub ignored: u64,
-    /// Triggers that opened no window, as the disk had too little room.
-    pub held_back: u64,
-    /// Wakes that did not reach the recorder, or that it refused: the journals of clips lack them.
-    pub wakes_lost: u64,
+    #[serde(rename = "recording")]
+    pub is_recording: bool,
     /// Bytes that the preroll holds.
     pub preroll_bytes: u64,
     /// The most that it may hold.
     pub preroll_bound: u64,
-    /// Samples that it gave up too early, for want of bytes.
-    pub pushed_out: u64,
-    /// Samples that are larger than the preroll: they are in a clip only if it was open when they came.
-    #[serde(default)]
-    pub too_big: u64,
-    /// Samples and wakes that were not taken, as their stamps were before 1970, or their topic was not known yet.
-    #[serde(default)]
-    pub refused: u64,
     /// Bytes on their way to the disk.
     pub in_flight: u64,
     /// From a decision with triggers to the opening of its windows. `None` without such.
@@ -129,6 +104,36 @@ pub struct RecorderStatus {
     pub rss_bytes: u64,
     /// CPU time of the process, in s.
     pub cpu_s: f64,
+}
+
+impl RecorderStatus {
+    /// With what was counted of `before`, an earlier recorder of the same run. Spreads, and what is true of an instant, stay those
+    /// of this one.
+    #[must_use]
+    pub fn after(mut self, before: &RecorderStatus) -> RecorderStatus {
+        self.recording.add(&before.recording);
+        self.cpu_s += before.cpu_s;
+        if let (Some(now), Some(before)) = (&mut self.commands, &before.commands) {
+            add([(&mut now.accepted, before.accepted), (&mut now.refused, before.refused)]);
+        }
+        for topic in &mut self.topics {
+            let Some(before) = before.topics.iter().find(|before| before.topic == topic.topic) else { continue };
+            // Unknown in one of them is unknown in both.
+            topic.lost = topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
+            add([
+                (&mut topic.received, before.received),
+                (&mut topic.no_slot, before.no_slot),
+                (&mut topic.too_big, before.too_big),
+                (&mut topic.malformed, before.malformed),
+            ]);
+        }
+        let known: Vec<_> = self.topics.iter().map(|topic| topic.topic.clone()).collect();
+        self.topics.extend(before.topics.iter().filter(|before| !known.contains(&before.topic)).cloned());
+        if let (Some(now), Some(before)) = (&mut self.network, &before.network) {
+            add([(&mut now.socket_drops, before.socket_drops), (&mut now.filtered, before.filtered)]);
+        }
+        self
+    }
 }
 
 /// What came of commands.
@@ -169,4 +174,49 @@ pub struct RecordedTopic {
     pub qos: Option<String>,
     /// What keeps writers from being heard, in whole sentences.
     pub trouble: Vec<String>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn status(count: u64, topics: &[&str], lost: Option<u64>) -> RecorderStatus {
+        let topic = |name: &&str| RecordedTopic {
+            topic: (*name).to_owned(),
+            received: count,
+            lost,
+            no_slot: count,
+            too_big: count,
+            malformed: count,
+            ..RecordedTopic::default()
+        };
+        RecorderStatus {
+            recording: Recording { clips: count, held_back: count, ..Recording::default() },
+            commands: Some(CommandStatus { accepted: count, refused: count, ..CommandStatus::default() }),
+            topics: topics.iter().map(topic).collect(),
+            network: Some(Network { socket_drops: count, filtered: count, ..Network::default() }),
+            ..RecorderStatus::default()
+        }
+    }
+
+    #[test]
+    fn counts_are_those_of_both_recorders() {
+        let both = status(2, &["/a"], Some(3)).after(&status(40, &["/a", "/b"], Some(50)));
+        let mut expected = status(42, &["/a"], Some(53));
+        expected.topics.extend(status(40, &["/b"], Some(50)).topics);
+        assert_eq!(both, expected);
+        assert_eq!(
+            status(2, &["/a"], Some(3)).after(&status(4, &["/a"], None)).topics[0].lost,
+            None,
+            "unknown is never 0"
+        );
+    }
+
+    #[test]
+    fn a_status_reads_back_and_is_flat() {
+        let status = RecorderStatus { is_recording: true, ..status(2, &["/a"], None) };
+        let json = serde_json::to_value(&status).unwrap();
+        assert_eq!((&json["held_back"], &json["recording"]), (&2.into(), &true.into()));
+        assert_eq!(serde_json::from_value::<RecorderStatus>(json).unwrap(), status);
+    }
 }

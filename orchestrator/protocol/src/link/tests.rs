@@ -9,7 +9,7 @@ use std::time::Duration;
 use super::frame::{self, tag};
 use super::*;
 use gleaner_journal::{Entry, Header, JournalInput, Said as Lines, Seen, Woken};
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::{Kind, Limits};
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -68,7 +68,7 @@ fn connected() -> (RecorderLink, LambdaLink, Answers) {
 }
 
 fn add(lambda: &str) -> Add {
-    Add { lambda: lambda.into(), remaps: vec![("/imu".to_owned(), "/imu/data".to_owned())] }
+    Add { lambda: lambda.into(), remaps: vec![("/imu".to_owned(), "/imu/data".to_owned())], most: Limits::DEFAULT }
 }
 
 #[test]
@@ -353,7 +353,7 @@ fn a_recorder_that_talks_nonsense_is_refused_by_name() {
 #[test]
 fn an_order_that_no_frame_holds_is_not_sent() {
     let (mut control, stdin) = Control::pair().unwrap();
-    let long = Add { lambda: "x".repeat(FRAME_MAX).into(), remaps: Vec::new() };
+    let long = Add { lambda: "x".repeat(FRAME_MAX).into(), remaps: Vec::new(), most: Limits::MOST };
     let refused = control.add(&long).unwrap_err();
     assert!(
         matches!(refused, LinkError::TooLong { who: "the starter", frame: "add", bytes } if bytes > FRAME_MAX as u64),

@@ -14,6 +14,7 @@ use std::time::Duration;
 use gleaner_base::{Failure, hex};
 use gleaner_journal::{FileDigest, Header};
 use gleaner_lambda::Clip;
+use gleaner_lambda::manifest::Limits;
 use gleaner_messages::Definitions;
 use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
 use gleaner_recorder::program::{Options, run};
@@ -188,7 +189,7 @@ pub fn cdr(text: &[u8]) -> Vec<u8> {
 }
 
 pub fn add(folder: &Path) -> Add {
-    Add { lambda: folder.to_owned(), remaps: Vec::new() }
+    Add { lambda: folder.to_owned(), remaps: Vec::new(), most: Limits::MOST }
 }
 
 pub fn monotonic(clock: Clock) -> i64 {

@@ -1,0 +1,132 @@
+//! One limit of the table in `limits.rs`: how its unit is read, written and shown.
+
+use std::time::Duration;
+
+use super::bounds::Bounds;
+use super::table::Table;
+use super::{ByteSize, ManifestError, format_duration};
+use gleaner_base::grouped;
+
+/// A type that a limit may have.
+pub(super) trait Unit: Copy + Ord {
+    /// The name of the unit on the page about the manifest.
+    const NAME: &'static str;
+
+    /// Reads the value of `key`, which is its default where the table does not have the key.
+    fn read(table: &Table, key: &str, bounds: &Bounds<Self>) -> Result<Self, ManifestError>;
+
+    /// Returns the value as it would be written in the file, without quotes.
+    fn in_words(self) -> String;
+
+    /// Returns the value as JSON and the SDKs have it: a number, bytes, or nanoseconds.
+    fn plain(self) -> u64;
+
+    /// The value that [`plain`](Self::plain) is that of.
+    fn of_plain(plain: u64) -> Self;
+}
+
+impl Unit for u64 {
+    const NAME: &'static str = "number";
+
+    fn read(table: &Table, key: &str, bounds: &Bounds<u64>) -> Result<u64, ManifestError> {
+        table.integer(key, bounds)
+    }
+
+    fn in_words(self) -> String {
+        self.to_string()
+    }
+
+    fn plain(self) -> u64 {
+        self
+    }
+
+    fn of_plain(plain: u64) -> u64 {
+        plain
+    }
+}
+
+impl Unit for ByteSize {
+    const NAME: &'static str = "size";
+
+    fn read(table: &Table, key: &str, bounds: &Bounds<ByteSize>) -> Result<ByteSize, ManifestError> {
+        table.size(key, bounds)
+    }
+
+    fn in_words(self) -> String {
+        self.to_string()
+    }
+
+    fn plain(self) -> u64 {
+        self.bytes()
+    }
+
+    fn of_plain(plain: u64) -> ByteSize {
+        ByteSize::new(plain)
+    }
+}
+
+impl Unit for Duration {
+    const NAME: &'static str = "duration";
+
+    fn read(table: &Table, key: &str, bounds: &Bounds<Duration>) -> Result<Duration, ManifestError> {
+        table.duration(key, bounds)
+    }
+
+    fn in_words(self) -> String {
+        format_duration(self)
+    }
+
+    fn plain(self) -> u64 {
+        // None of them exceeds an hour, so that their nanoseconds fit.
+        u64::try_from(self.as_nanos()).unwrap_or(u64::MAX)
+    }
+
+    fn of_plain(plain: u64) -> Duration {
+        Duration::from_nanos(plain)
+    }
+}
+
+/// A limit, for pages and for files of other languages.
+pub(super) struct Limit {
+    pub(super) key: &'static str,
+    pub(super) unit: &'static str,
+    /// The comment of the table, which begins with a space.
+    pub(super) meaning: &'static str,
+    /// Minimum, default and maximum, plain.
+    pub(super) plain: [u64; 3],
+    /// The same, as they are written in the file; large numbers are grouped.
+    pub(super) words: [String; 3],
+}
+
+impl Limit {
+    pub(super) fn new<T: Unit>(key: &'static str, meaning: &'static str, bounds: Bounds<T>) -> Limit {
+        let Bounds { min, default, max } = bounds;
+        let word = |value: T| match T::NAME {
+            "number" => grouped(value.plain()),
+            _ => value.in_words(),
+        };
+        let values = [min, default, max];
+        Limit { key, unit: T::NAME, meaning, plain: values.map(T::plain), words: values.map(word) }
+    }
+
+    /// The three, as they are typed.
+    pub(super) fn typed(&self) -> [String; 3] {
+        let quoted = self.unit != "number";
+        self.words.clone().map(|word| if quoted { format!("`\"{word}\"`") } else { word })
+    }
+}
+
+/// Limits as JSON.
+pub(super) mod plain {
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    use super::Unit;
+
+    pub(in super::super) fn serialize<T: Unit, S: Serializer>(value: &T, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_u64(value.plain())
+    }
+
+    pub(in super::super) fn deserialize<'de, T: Unit, D: Deserializer<'de>>(deserializer: D) -> Result<T, D::Error> {
+        u64::deserialize(deserializer).map(T::of_plain)
+    }
+}
