@@ -1,6 +1,6 @@
 use std::cell::RefCell;
 
-use gleaner_image::{Encoding as HostEncoding, ImageError, Roi as HostRoi, View, ops};
+use gleaner_image::{Encoding as HostEncoding, ImageError, ImageErrorKind, Roi as HostRoi, View, ops};
 use gleaner_sdk::data::{Encoding, Roi, bytes_per_pixel, encoding_name};
 use gleaner_sdk::testing::Message;
 use gleaner_sdk::{Error, Frame, Result, Sample};
@@ -86,9 +86,10 @@ thread_local! {
 
 /// A result of the host as a lambda gets it: of refusals, the kind.
 fn told<T>(result: std::result::Result<T, ImageError>) -> std::result::Result<T, &'static str> {
-    result.map_err(|error| match error {
-        ImageError::Roi { .. } | ImageError::ResizeTo { .. } => "out-of-range",
-        _ => "not-a-frame",
+    result.map_err(|error| match error.kind() {
+        ImageErrorKind::OutOfRange => "out-of-range",
+        ImageErrorKind::Unreadable => "not-a-frame",
+        ImageErrorKind::Stopped => unreachable!("nobody stops it"),
     })
 }
 

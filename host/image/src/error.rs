@@ -191,6 +191,43 @@ pub enum ImageError {
     },
 }
 
+/// What kind of refusal an [`ImageError`] is, to a caller that answers for others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ImageErrorKind {
+    /// The image, or the operation on such an image, makes no sense or costs too much.
+    Unreadable,
+    /// The region or the size that was asked for.
+    OutOfRange,
+    /// The caller ended it.
+    Stopped,
+}
+
+impl ImageError {
+    /// The kind: each error has to say which it is.
+    pub fn kind(&self) -> ImageErrorKind {
+        match self {
+            Self::Roi { .. } | Self::ResizeTo { .. } => ImageErrorKind::OutOfRange,
+            Self::Stopped => ImageErrorKind::Stopped,
+            Self::UnknownEncoding { .. }
+            | Self::Size { .. }
+            | Self::Step { .. }
+            | Self::Data { .. }
+            | Self::OddWidth { .. }
+            | Self::Raw { .. }
+            | Self::Output { .. }
+            | Self::NotAnImage { .. }
+            | Self::Bomb { .. }
+            | Self::WorkingMemory { .. }
+            | Self::OtherImage { .. }
+            | Self::CutOff { .. }
+            | Self::Unsupported { .. }
+            | Self::Damaged { .. }
+            | Self::Jpeg { .. }
+            | Self::Png { .. } => ImageErrorKind::Unreadable,
+        }
+    }
+}
+
 /// `name` for a message: a hostile one must not fill the log.
 pub(super) fn shortened(name: &str) -> String {
     const LONGEST: usize = 40;

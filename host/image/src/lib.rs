@@ -18,6 +18,6 @@ mod view;
 
 pub use decode::{Format, Header, decode_rgb8, decode_rgb8_paced, probe};
 pub use encoding::{Bayer, Encoding};
-pub use error::ImageError;
+pub use error::{ImageError, ImageErrorKind};
 pub use pace::Pace;
 pub use view::{MAX_SIDE, Roi, View};

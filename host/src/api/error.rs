@@ -4,6 +4,8 @@ use gleaner_transport::message::{CdrError, PathError};
 
 use gleaner_image::ImageError;
 
+use super::fuel::OutOfFuel;
+
 /// Why a read of data failed.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
@@ -36,6 +38,55 @@ pub enum DataError {
     OutOfRange(ImageError),
     #[error("the deadline is over")]
     OutOfTime,
+    #[error(transparent)]
+    OutOfFuel(#[from] OutOfFuel),
+}
+
+/// Which of the refusals of `wit/types.wit` a lambda gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum DataErrorKind {
+    NoSuchInput,
+    NoSuchField,
+    WrongField,
+    Malformed,
+    NotAFrame,
+    NoRoom,
+    OutOfRange,
+}
+
+impl DataErrorKind {
+    /// The name in the WIT.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::NoSuchInput => "no-such-input",
+            Self::NoSuchField => "no-such-field",
+            Self::WrongField => "wrong-field",
+            Self::Malformed => "malformed",
+            Self::NotAFrame => "not-a-frame",
+            Self::NoRoom => "no-room",
+            Self::OutOfRange => "out-of-range",
+        }
+    }
+}
+
+impl DataError {
+    /// The refusal that a lambda gets.
+    pub fn kind(&self) -> DataErrorKind {
+        match self {
+            Self::NoSuchInput { .. } => DataErrorKind::NoSuchInput,
+            Self::NoSuchField(_) => DataErrorKind::NoSuchField,
+            Self::WrongField { .. } => DataErrorKind::WrongField,
+            Self::Malformed { .. } => DataErrorKind::Malformed,
+            Self::NoImageType { .. } | Self::NotAFrame { .. } => DataErrorKind::NotAFrame,
+            Self::TooLarge { .. } | Self::NoSlot { .. } | Self::NoMemory { .. } | Self::TooManyFrames { .. } => {
+                DataErrorKind::NoRoom
+            }
+            Self::OutOfRange(_) => DataErrorKind::OutOfRange,
+            // Whoever can end a guest ends it instead.
+            Self::OutOfTime | Self::OutOfFuel(_) => DataErrorKind::NoRoom,
+        }
+    }
 }
 
 fn list(names: &[String]) -> String {

@@ -1,35 +1,33 @@
 //! A sample seen as an image: raw pixels in place, JPEG and PNG decoded lazily into slots of their own.
 
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, PoisonError};
 use std::time::Instant;
 
 use gleaner_buffers::{Lease, Pool, Refusal};
 use gleaner_transport::message::{CdrError, CompressedView, Endian, ImageView};
 
-use super::data::{DataError, Identity, Sample, Stamps};
+use super::data::{DataError, Identity, OutOfFuel, Sample, Stamps};
+use super::images::Taken;
+pub use super::images::{Budget, Images};
 use super::piece::Piece;
-use gleaner_image::{self as image, Encoding, ImageError, Pace, Roi, View, ops};
+use gleaner_image::{self as image, Encoding, ImageError, ImageErrorKind, Pace, Roi, View, ops};
 
 /// Bytes of pixels that the fastest machine decodes in a microsecond: four times what was measured (0.5 GB/s on an x86-64 server).
 const FASTEST_DECODE: u64 = 2_000;
 
 /// Bytes that are copied while one is worked on, if a copy makes 22 GB/s: then 8 bytes of it take as long as a unit of fuel. Measured on
-/// an x86-64 server: 2.7, 4.3 to 41, and 0.5 GB/s.
+/// an x86-64 server: 2.7 and 4.3 to 41 GB/s, and 0.5 GB/s for decoding, which costs `images::DECODE`.
 const HISTOGRAM: u64 = 8;
 const GRAY: u64 = 4;
-const DECODE: usize = 40;
 
-/// An operation on the pixels of a frame.
-#[derive(Clone, Copy, Debug)]
-pub enum Operation {
-    /// [`Frame::mean_luma`].
+/// An operation on the pixels of a frame. [`Frame::work`] has the price of each.
+#[derive(Clone, Copy)]
+enum Operation {
     MeanLuma(Option<Roi>),
-    /// [`Frame::histogram`].
     Histogram(Option<Roi>),
-    /// [`Frame::to_gray`].
     ToGray,
-    /// [`Frame::resize`], to width and height.
+    /// To width and height.
     Resize(u32, u32),
 }
 
@@ -69,87 +67,6 @@ impl<'a> Picture<'a> {
             "sensor_msgs/msg/CompressedImage" => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
             _ => None,
         })
-    }
-}
-
-/// Room for the images of one input, beyond the ring: decoded ones in slots, made ones out of a budget.
-pub struct Images {
-    decoded: Option<Pool<Info>>,
-    made: Budget,
-    /// The newest decoded image, so that each is decoded once.
-    newest: Mutex<Option<(u64, Lease<Info>)>>,
-    decode_ns: AtomicU64,
-}
-
-impl Images {
-    /// `decoded` holds what JPEG and PNG become (none for raw images); `made` is shared by all inputs of a lambda.
-    pub fn new(decoded: Option<Pool<Info>>, made: Budget) -> Self {
-        Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
-    }
-
-    /// Work of decoding `data`, by its header, as [`Frame::work`]; none if it is the newest decoded image already.
-    pub(super) fn decode_work(&self, position: Option<u64>, data: &[u8]) -> usize {
-        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
-        if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {
-            return 0;
-        }
-        let room = self.decoded.as_ref().map_or(0, Pool::slot_bytes);
-        image::probe(data)
-            .ok()
-            .and_then(|header| header.rgb8_len())
-            .map_or(0, |len| len.min(room).saturating_mul(DECODE))
-    }
-
-    pub(super) fn decode_ns(&self) -> u64 {
-        self.decode_ns.load(Ordering::Relaxed)
-    }
-}
-
-/// Frames that a lambda may hold at a time, and the bytes that those made by `resize` and `to_gray` may take together.
-#[derive(Clone)]
-pub struct Budget(Arc<Left>);
-
-struct Left {
-    frames: AtomicUsize,
-    frames_allowed: usize,
-    bytes: AtomicUsize,
-}
-
-/// A frame that is held, and what it takes; given back when it is dropped.
-struct Taken {
-    budget: Budget,
-    bytes: usize,
-}
-
-impl Budget {
-    /// A budget of that many frames and bytes.
-    pub fn new(frames: usize, bytes: usize) -> Self {
-        let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
-        Self(Arc::new(Left { frames: left, frames_allowed: frames, bytes }))
-    }
-
-    fn has(&self, bytes: usize) -> bool {
-        bytes <= self.0.bytes.load(Ordering::Relaxed)
-    }
-
-    fn take(&self, bytes: usize) -> Result<Taken, DataError> {
-        let take = |from: &AtomicUsize, n: usize| {
-            from.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(n))
-        };
-        let allowed = self.0.frames_allowed;
-        take(&self.0.frames, 1).map_err(|_| DataError::TooManyFrames { allowed })?;
-        // From here on the frame is given back, whatever comes.
-        let mut taken = Taken { budget: self.clone(), bytes: 0 };
-        take(&self.0.bytes, bytes).map_err(|left| DataError::NoMemory { asked: bytes, left })?;
-        taken.bytes = bytes;
-        Ok(taken)
-    }
-}
-
-impl Drop for Taken {
-    fn drop(&mut self) {
-        self.budget.0.bytes.fetch_add(self.bytes, Ordering::Relaxed);
-        self.budget.0.frames.fetch_add(1, Ordering::Relaxed);
     }
 }
 
@@ -236,7 +153,7 @@ impl Frame {
     }
 
     /// Work of an operation, in bytes that are copied in the same time: the price of a call, on whatever machine.
-    pub fn work(&self, operation: Operation) -> usize {
+    fn work(&self, operation: Operation) -> usize {
         let work = self.view().and_then(|view| {
             let work = match operation {
                 Operation::MeanLuma(roi) => ops::work(&view, roi),
@@ -259,8 +176,15 @@ impl Frame {
     }
 
     /// Bytes from `offset`, `len` at most, clamped to the frame and to `call_bytes` of `[limits]`.
-    pub fn read(&self, offset: u64, len: u32) -> Piece {
-        self.pixels.part(offset, self.source.topic.per_call.bytes.min(len as usize))
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn read(&self, offset: u64, len: u32) -> Result<Piece, OutOfFuel> {
+        let per_call = &self.source.topic.per_call;
+        let piece = self.pixels.part(offset, per_call.bytes.min(len as usize));
+        per_call.charge(|| piece.len())?;
+        Ok(piece)
     }
 
     /// Mean BT.601 luma, 0 to 255, computed in integers.
@@ -270,7 +194,7 @@ impl Frame {
     /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer encodings;
     /// [`DataError::OutOfTime`].
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
-        let luma = self.paced(|view| ops::mean_luma(view, roi))?;
+        let luma = self.begin(Operation::MeanLuma(roi))?.work(|view| ops::mean_luma(view, roi))?;
         self.source.draw_luma(roi, luma);
         Ok(luma)
     }
@@ -281,13 +205,13 @@ impl Frame {
     ///
     /// As [`Frame::mean_luma`].
     pub fn histogram(&self, roi: Option<Roi>) -> Result<[u32; 256], DataError> {
-        self.paced(|view| ops::histogram(view, roi))
+        self.begin(Operation::Histogram(roi))?.work(|view| ops::histogram(view, roi))
     }
 
-    /// Works on the pixels until the call is due.
-    fn paced<T>(&self, work: impl FnOnce(&View<'_>) -> Result<T, ImageError>) -> Result<T, DataError> {
-        let in_time = || self.source.topic.per_call.due.check().is_ok();
-        work(&self.view()?.paced(&Pace::new(&in_time))).map_err(|error| self.source.refused(error))
+    /// Charges an operation. What it returns is the way to the pixels.
+    fn begin(&self, operation: Operation) -> Result<Paid<'_>, DataError> {
+        self.source.topic.per_call.charge(|| self.work(operation))?;
+        Ok(Paid(self))
     }
 
     /// A new frame of that size: rgb8, or mono8 for grey encodings.
@@ -296,9 +220,10 @@ impl Frame {
     ///
     /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`]; [`DataError::NoMemory`]; as [`Frame::mean_luma`].
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
+        let paid = self.begin(Operation::Resize(width, height))?;
         let (encoding, _) = ops::resized(&self.view()?, width, height).map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
-        self.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
+        paid.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
     }
 
     /// A new mono8 frame of the same size.
@@ -307,24 +232,38 @@ impl Frame {
     ///
     /// [`DataError::NoMemory`]; as [`Frame::mean_luma`].
     pub fn to_gray(&self) -> Result<Self, DataError> {
-        let info = Info::tight(self.info.width, self.info.height, Encoding::Mono8);
-        self.make(info, ops::to_gray)
-    }
-
-    fn make(
-        &self,
-        info: Info,
-        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), ImageError>,
-    ) -> Result<Self, DataError> {
-        let len = info.step as usize * info.height as usize;
-        let taken = self.source.topic.images.made.take(len)?;
-        let mut bytes = vec![0; len].into_boxed_slice();
-        self.paced(|view| fill(view, &mut bytes))?;
-        Ok(Self { source: self.source.clone(), info, pixels: Piece::made(bytes), _taken: taken })
+        let paid = self.begin(Operation::ToGray)?;
+        paid.make(Info::tight(self.info.width, self.info.height, Encoding::Mono8), ops::to_gray)
     }
 
     fn view(&self) -> Result<View<'_>, DataError> {
         self.info.view(self.bytes()).map_err(|error| self.source.not_a_frame(error))
+    }
+}
+
+/// A frame whose pixels may be worked on, since the operation is paid for.
+struct Paid<'a>(&'a Frame);
+
+impl Paid<'_> {
+    /// Works on the pixels until the call is due.
+    fn work<T>(self, work: impl FnOnce(&View<'_>) -> Result<T, ImageError>) -> Result<T, DataError> {
+        let source = &self.0.source;
+        let in_time = || source.topic.per_call.due.check().is_ok();
+        work(&self.0.view()?.paced(&Pace::new(&in_time))).map_err(|error| source.refused(error))
+    }
+
+    /// Makes a new frame.
+    fn make(
+        self,
+        info: Info,
+        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), ImageError>,
+    ) -> Result<Frame, DataError> {
+        let source = self.0.source.clone();
+        let len = info.step as usize * info.height as usize;
+        let taken = source.topic.images.made.take(len)?;
+        let mut bytes = vec![0; len].into_boxed_slice();
+        self.work(|view| fill(view, &mut bytes))?;
+        Ok(Frame { source, info, pixels: Piece::made(bytes), _taken: taken })
     }
 }
 
@@ -350,10 +289,10 @@ impl Source {
     }
 
     fn refused(&self, error: ImageError) -> DataError {
-        match error {
-            ImageError::Roi { .. } | ImageError::ResizeTo { .. } => DataError::OutOfRange(error),
-            ImageError::Stopped => DataError::OutOfTime,
-            error => self.not_a_frame(error),
+        match error.kind() {
+            ImageErrorKind::OutOfRange => DataError::OutOfRange(error),
+            ImageErrorKind::Stopped => DataError::OutOfTime,
+            ImageErrorKind::Unreadable => self.not_a_frame(error),
         }
     }
 }

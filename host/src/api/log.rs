@@ -5,6 +5,7 @@ use gleaner_protocol::manifest::Limits;
 pub use gleaner_protocol::{LogLevel as Level, LogLine as Line};
 
 use super::Session;
+use super::fuel::OutOfFuel;
 
 /// Longest line in bytes; the rest is cut at a character boundary.
 pub const LINE_BYTES: usize = 4096;
@@ -103,7 +104,18 @@ fn second(at_ns: i64) -> i64 {
 
 impl Session {
     /// Writes one line at the time of this wake.
-    pub fn log(&self, level: Level, message: &str) {
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn log(&self, level: Level, message: &str) -> Result<(), OutOfFuel> {
+        self.fuel.charge(|| message.len())?;
+        self.write(level, message);
+        Ok(())
+    }
+
+    /// Writes one line that the lambda has paid for otherwise.
+    pub(crate) fn write(&self, level: Level, message: &str) {
         let mut state = self.lock();
         let at_ns = state.now_ns;
         state.log.write(at_ns, level, message);

@@ -9,6 +9,7 @@ use gleaner_protocol::manifest::Limits;
 use gleaner_protocol::visible;
 
 use super::Session;
+use super::fuel::OutOfFuel;
 
 /// Longest name, in bytes.
 const NAME_BYTES: usize = 128;
@@ -16,6 +17,8 @@ const NAME_BYTES: usize = 128;
 const ENTRIES: usize = 1024;
 /// What an entry takes beside its name and its bytes: about what it costs the host.
 const ENTRY_BYTES: u64 = 64;
+/// What an entry of the list costs besides its name.
+const LISTED_BYTES: usize = 64;
 /// Bytes are kept in pieces of so many, so that no call moves more than that.
 const PIECE_BYTES: usize = 1 << 20;
 
@@ -43,6 +46,41 @@ pub enum ScratchError {
     /// A name that cannot be one.
     #[error("`{0}` is no name for scratch; give 1 to 128 bytes without control characters")]
     WrongName(String),
+    /// The lambda cannot pay for the call.
+    #[error(transparent)]
+    OutOfFuel(#[from] OutOfFuel),
+}
+
+/// Which of the refusals of `wit/scratch.wit` a lambda gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum ScratchErrorKind {
+    NoRoom,
+    NoSuchEntry,
+    WrongName,
+}
+
+impl ScratchErrorKind {
+    /// The name in the WIT.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::NoRoom => "no-room",
+            Self::NoSuchEntry => "no-such-entry",
+            Self::WrongName => "wrong-name",
+        }
+    }
+}
+
+impl ScratchError {
+    /// The refusal that a lambda gets.
+    pub fn kind(&self) -> ScratchErrorKind {
+        match self {
+            // Whoever can end a guest for want of fuel ends it instead.
+            Self::NoRoom { .. } | Self::TooMany(_) | Self::OutOfFuel(_) => ScratchErrorKind::NoRoom,
+            Self::NoSuchEntry(_) => ScratchErrorKind::NoSuchEntry,
+            Self::WrongName(_) => ScratchErrorKind::WrongName,
+        }
+    }
 }
 
 /// Something that is kept.
@@ -187,6 +225,7 @@ impl Session {
     ///
     /// [`ScratchError`]; nothing has changed then.
     pub fn put(&self, name: &str, bytes: &[u8]) -> Result<(), ScratchError> {
+        self.fuel.charge(|| name.len() + bytes.len())?;
         self.lock().scratch.keep(name, bytes, true)
     }
 
@@ -196,6 +235,7 @@ impl Session {
     ///
     /// As [`Session::put`].
     pub fn append(&self, name: &str, bytes: &[u8]) -> Result<(), ScratchError> {
+        self.fuel.charge(|| name.len() + bytes.len())?;
         self.lock().scratch.keep(name, bytes, false)
     }
 
@@ -205,7 +245,9 @@ impl Session {
     ///
     /// [`ScratchError::NoSuchEntry`].
     pub fn get(&self, name: &str, offset: u64, len: u64) -> Result<Vec<u8>, ScratchError> {
-        self.lock().scratch.get(name, offset, len)
+        let got = self.lock().scratch.get(name, offset, len);
+        self.fuel.charge(|| name.len() + got.as_ref().map_or(0, Vec::len))?;
+        got
     }
 
     /// Forgets what is kept under a name.
@@ -214,14 +256,20 @@ impl Session {
     ///
     /// [`ScratchError::NoSuchEntry`].
     pub fn remove(&self, name: &str) -> Result<(), ScratchError> {
+        self.fuel.charge(|| name.len())?;
         self.lock().scratch.remove(name)
     }
 
     /// Everything that is kept, in the order of the names' bytes.
-    pub fn entries(&self) -> Vec<Entry> {
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn entries(&self) -> Result<Vec<Entry>, OutOfFuel> {
         let state = self.lock();
-        let entries = state.scratch.entries.iter();
-        entries.map(|(name, pieces)| Entry { name: name.clone(), bytes: pieces.len() }).collect()
+        let entries = &state.scratch.entries;
+        self.fuel.charge(|| entries.keys().map(|name| LISTED_BYTES + name.len()).sum())?;
+        Ok(entries.iter().map(|(name, pieces)| Entry { name: name.clone(), bytes: pieces.len() }).collect())
     }
 
     /// Bytes for which there is room.
@@ -252,9 +300,9 @@ mod tests {
         assert_eq!(session.get("b", 5, 2).unwrap(), b"tw");
         assert_eq!(session.get("b", 1 << 40, 2).unwrap(), b"");
         let entry = |name: &str, bytes| Entry { name: name.to_owned(), bytes };
-        assert_eq!(session.entries(), [entry("a", 3), entry("b", 8)]);
+        assert_eq!(session.entries().unwrap(), [entry("a", 3), entry("b", 8)]);
         session.put("b", b"").unwrap();
-        assert_eq!(session.entries(), [entry("a", 3), entry("b", 0)]);
+        assert_eq!(session.entries().unwrap(), [entry("a", 3), entry("b", 0)]);
         session.remove("b").unwrap();
         assert_eq!(session.remove("b"), Err(ScratchError::NoSuchEntry("b".to_owned())));
         assert_eq!(session.get("b", 0, 1), Err(ScratchError::NoSuchEntry("b".to_owned())));

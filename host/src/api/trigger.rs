@@ -5,6 +5,7 @@ use gleaner_protocol::{Trigger, TriggerKind};
 use serde_json::{Map, Value};
 
 use super::Session;
+use super::fuel::OutOfFuel;
 
 /// Triggers that one wake may cause.
 pub const PER_WAKE: usize = 16;
@@ -38,6 +39,19 @@ pub enum AttributeValue {
     Text(String),
 }
 
+impl Attribute {
+    /// What it costs besides its texts: it was made for the host before it could be refused.
+    const BYTES: usize = 64;
+
+    fn work(&self) -> usize {
+        let text = match &self.value {
+            AttributeValue::Text(text) => text.len(),
+            AttributeValue::Boolean(_) | AttributeValue::Signed(_) | AttributeValue::Real(_) => 8,
+        };
+        Self::BYTES + self.key.len() + text
+    }
+}
+
 /// A refused call; it had no effect.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[allow(missing_docs)]
@@ -60,6 +74,42 @@ pub enum TriggerError {
         "the lambda has caused {allowed} triggers in this minute already, `events_per_minute` in [limits]; further ones are refused"
     )]
     TooOften { allowed: u64 },
+    #[error(transparent)]
+    OutOfFuel(#[from] OutOfFuel),
+}
+
+/// Which of the refusals of `wit/trigger.wit` a lambda gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum TriggerErrorKind {
+    Invalid,
+    TooMany,
+}
+
+impl TriggerErrorKind {
+    /// The name in the WIT.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Invalid => "invalid",
+            Self::TooMany => "too-many",
+        }
+    }
+}
+
+impl TriggerError {
+    /// The refusal that a lambda gets.
+    pub fn kind(&self) -> TriggerErrorKind {
+        match self {
+            Self::NoLabel
+            | Self::LongLabel { .. }
+            | Self::Score { .. }
+            | Self::Attributes { .. }
+            | Self::Attribute { .. }
+            | Self::NoWake => TriggerErrorKind::Invalid,
+            // Whoever can end a guest for want of fuel ends it instead.
+            Self::TooMany | Self::TooOften { .. } | Self::OutOfFuel(_) => TriggerErrorKind::TooMany,
+        }
+    }
 }
 
 const MINUTE_NS: i64 = 60_000_000_000;
@@ -204,6 +254,7 @@ impl Session {
         score: Option<f64>,
         attributes: Vec<Attribute>,
     ) -> Result<(), TriggerError> {
+        self.fuel.charge(|| label.len() + attributes.iter().map(Attribute::work).sum::<usize>())?;
         let state = &mut *self.lock();
         let triggers = state.triggers.as_mut().ok_or(TriggerError::NoWake)?;
         // Who has used up the minute may still end what was begun.
