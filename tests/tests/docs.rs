@@ -225,6 +225,30 @@ fn every_recipe_is_in_the_book_with_what_it_finds() {
 }
 
 #[test]
+fn every_file_that_a_recipe_for_changes_names_exists() {
+    let page = fs::read_to_string(root().join("CONTRIBUTING.md")).expect("CONTRIBUTING.md");
+    let (mut seen, mut problems) = (0, Vec::new());
+    for (index, line) in page.lines().enumerate() {
+        // Between two marks is code.
+        for word in line.split('`').skip(1).step_by(2) {
+            let is_file = Path::new(word).extension().is_some_and(|end| end.to_str().is_some_and(is_a_file_ending));
+            if is_file || word.contains('/') && !word.contains(' ') {
+                seen += 1;
+                if !root().join(word).exists() {
+                    problems.push(format!("CONTRIBUTING.md:{}: there is no `{word}`", index + 1));
+                }
+            }
+        }
+    }
+    assert!(seen > 60, "{seen} files were found");
+    none(problems);
+}
+
+fn is_a_file_ending(end: &str) -> bool {
+    ["css", "js", "md", "py", "rs", "sh", "toml", "txt", "wit"].contains(&end)
+}
+
+#[test]
 fn the_manifest_reference_is_that_of_the_types() {
     let page = fs::read_to_string(root().join("docs/manifest.md")).expect("docs/manifest.md");
     assert!(page == gleaner_protocol::manifest::reference(), "run `cargo xtask bless`, which writes docs/manifest.md");

@@ -1,5 +1,6 @@
-//! Calls through the WIT in every order, with whatever arguments, from the lambda `driver`: the host stays whole, gives back what it
-//! lent, and decides the same again. Programs are made up by a generator of numbers that always begins with the same one.
+//! Calls through the WIT, from the lambda `driver`. Each is paid for. In every order, with whatever arguments: the host stays whole,
+//! gives back what it lent, and decides the same again. Programs are made up by a generator of numbers that always begins with the
+//! same one.
 //!
 //! `GLEANER_HOST_CALLS` says how many programs; 10,000 take half a minute, a million an hour.
 
@@ -12,6 +13,7 @@ use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::Guest;
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
+use gleaner_operations::{MESSAGE, Operation, Step, setup};
 use gleaner_protocol::manifest::{Limits, Manifest};
 use gleaner_protocol::{Fault, Trigger};
 use gleaner_tests::drive::{COMPRESSED, Cdr, IMAGE, compressed, image};
@@ -128,6 +130,38 @@ fn pictures() -> Vec<(Vec<u8>, Vec<u8>)> {
     let raw = [("rgb8", 192), ("mono16", 128), ("yuv422", 128), ("bayer_rggb8", 64)];
     raw.map(|(encoding, step)| (image(64, 48, encoding, step, &noise[..48 * step as usize]), compressed(&jpeg)))
         .to_vec()
+}
+
+/// What the host did for each of some calls behind [`setup`], in units of fuel.
+fn paid(operation: Operation, arguments: &[u8]) -> u64 {
+    let (raw, coded) = &pictures()[0];
+    assert_eq!(raw.len() as u64, MESSAGE, "the list counts on the length of this message");
+    let used = |program: &[u8]| {
+        let mut driver = Driver::new(false);
+        let mut used = 0;
+        // Until the rings are full, and the memory of the guest has grown to what it needs.
+        for _ in 0..6 {
+            let (result, _, _) = driver.run(raw, coded, program);
+            assert_eq!(result, Ok(()), "{}", operation.name());
+            used = driver.session.fuel().used();
+        }
+        used
+    };
+    let call = Step::Call(operation).with(arguments);
+    used(&[setup(), call].concat()) - used(&setup())
+}
+
+#[test]
+fn every_call_costs_what_the_list_says() {
+    for operation in Operation::ALL {
+        let name = operation.name();
+        match operation.price().calls() {
+            Some(calls) => calls.into_iter().for_each(|(arguments, price)| {
+                assert_eq!(paid(*operation, arguments), price, "{name} {arguments:?}");
+            }),
+            None => assert_eq!(paid(*operation, &[0, 0]), 0, "`{name}` can be called now: what does it cost?"),
+        }
+    }
 }
 
 #[test]
