@@ -29,7 +29,7 @@ fn pixels() -> Vec<u8> {
     noise.take((STEP * HEIGHT) as usize).collect()
 }
 
-/// What calls work on: a large raw picture, and a coded one that nobody has decoded yet.
+/// What calls work on: a large raw picture, a coded one that nobody has decoded yet, and many small samples.
 struct Seen {
     session: Session,
     topic: Arc<Topic>,
@@ -37,6 +37,8 @@ struct Seen {
     sample: Sample,
     coded: Sample,
     frame: Frame,
+    many: Arc<Topic>,
+    x: Field,
 }
 
 impl Seen {
@@ -47,10 +49,11 @@ impl Seen {
             )
         };
         let lambda = "[lambda]\nname = \"x\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"x.wasm\"\n[schedule]\nevent = \"raw\"\n";
-        let manifest = [lambda, &input("raw", "Image"), &input("coded", "CompressedImage")].concat();
+        let many = "[[input]]\nname = \"many\"\ntopic = \"/many\"\ntype = \"test_msgs/msg/Only\"\ndepth = 1024\nmax_size = \"16 B\"\n";
+        let manifest = [lambda, &input("raw", "Image"), &input("coded", "CompressedImage"), many].concat();
         let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
         let mut transport = Loopback::new();
-        for (input, definition) in manifest.inputs.iter().zip([IMAGE, COMPRESSED]) {
+        for (input, definition) in manifest.inputs.iter().zip([IMAGE, COMPRESSED, "uint8 x\n"]) {
             transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
         }
         let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
@@ -60,19 +63,19 @@ impl Seen {
             .unwrap();
         publish(&mut transport, "/raw", 1, raw);
         publish(&mut transport, "/coded", 1, &compressed(&jpeg));
+        (1..=1024).for_each(|seq| publish(&mut transport, "/many", seq, &[7]));
         let session = Session::new(inputs.clone(), Vec::new(), &Limits::default());
         session.begin(1);
-        let [topic, coded] = [&inputs[0], &inputs[1]].map(Arc::clone);
-        // A text of any length lies before it.
-        let field = topic.field("width").unwrap();
+        let [topic, coded, many] = [0, 1, 2].map(|input| Arc::clone(&inputs[input]));
+        let (field, x) = (topic.field("width").unwrap(), many.field("x").unwrap());
         let (sample, coded) = (topic.newest().unwrap(), coded.newest().unwrap());
         let frame = sample.as_frame().unwrap();
-        Self { session, topic, field, sample, coded, frame }
+        Self { session, topic, field, sample, coded, frame, many, x }
     }
 
     /// Calls an operation, and says what of its answer the deadline can change.
     fn call(&self, operation: Operation) -> Result<(), DataError> {
-        let Self { session, topic, field, sample, coded, frame } = self;
+        let Self { session, topic, field, sample, coded, frame, many, x } = self;
         match operation {
             Operation::Input => session.input("raw").map(drop),
             Operation::Inputs => session.input_names().map(drop).map_err(DataError::from),
@@ -85,8 +88,8 @@ impl Seen {
             Operation::Last => topic.last(9).map(drop).map_err(DataError::from),
             Operation::Since => topic.since(0).map(drop).map_err(DataError::from),
             Operation::Field => topic.field("encoding").map(drop),
-            Operation::Column => topic.column(field, 9).map(drop),
-            Operation::ColumnSince => topic.column_since(field, 0).map(drop),
+            Operation::Column => many.column(x, usize::MAX).map(drop),
+            Operation::ColumnSince => many.column_since(x, 0).map(drop),
             Operation::FieldPath => answered(field.path()),
             Operation::SampleIdentity => answered(sample.identity()),
             Operation::SampleStamps => answered(sample.stamps()),

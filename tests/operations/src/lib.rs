@@ -13,7 +13,7 @@ pub use step::{Extra, Step};
 /// Bytes of the pixels of the picture that [`SETUP`] looks at: 64 by 48, rgb8. The coded one has as many.
 pub const PIXELS: u64 = 64 * 48 * 3;
 /// Bytes of the message that it stands in, as `gleaner_tests::drive::image` makes it.
-pub const MESSAGE: u64 = 60 + PIXELS;
+pub const MESSAGE: u64 = 44 + PIXELS;
 
 /// How a call meets the deadline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,7 +61,7 @@ impl Price {
 }
 
 /// A program for `driver` with which calls begin: all topics, by number the program's, the raw camera's and the coded one's; of the
-/// raw one a field at a fixed place and one behind a text; the newest sample of both; the raw one as a frame; `b` in scratch.
+/// raw one the seconds of its stamp and its width; the newest sample of both; the raw one as a frame; `b` in scratch.
 pub fn setup() -> Vec<u8> {
     use Operation::{AsFrame, Field, Input, Newest, ScratchPut};
     let steps = [

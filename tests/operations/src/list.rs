@@ -51,9 +51,9 @@ operations! {
     Field "data.topic.field" Short Bytes([call(&[1, 1, 1, b'x'], 1), call(&[1, 1, 255, 232, 3, 0, 0], 1000)]);
     Last "data.topic.last" Short Bytes([call(&[1, 0, 0, 0, 0], 0), call(&[1, 4, 0, 0, 0], 4 * 64)]);
     Since "data.topic.since" Short Bytes([call(&[1, 0, 0, 0, 0, 0, 0, 0, 127], 0), call(&[1], 4 * 64)]);
-    Column "data.topic.column" Looked Bytes([call(&[1, 0, 1, 0, 0, 0], 64), call(&[1, 1, 4, 0, 0, 0], 4 * MESSAGE)]);
+    Column "data.topic.column" Looked Bytes([call(&[1, 0, 1, 0, 0, 0], 64), call(&[1, 0, 4, 0, 0, 0], 4 * 64)]);
     ColumnSince "data.topic.column-since" Looked
-        Bytes([call(&[1, 0, 0, 0, 0, 0, 0, 0, 0, 127], 0), call(&[1, 1], 4 * MESSAGE)]);
+        Bytes([call(&[1, 0, 0, 0, 0, 0, 0, 0, 0, 127], 0), call(&[1, 0], 4 * 64)]);
     Name "data.topic.name" Short each(&[1], 0);
     RosTopic "data.topic.ros-topic" Short each(&[1], 0);
     TypeName "data.topic.type-name" Short each(&[1], 0);
@@ -65,7 +65,7 @@ operations! {
     MeanLuma "data.frame.mean-luma" Looked Bytes([call(&[0, 2, 2, 3, 8, 1], 24), call(&[0, 0], PIXELS)]);
     BigEndian "data.sample.big-endian" Short each(&[0], 0);
     Get "data.sample.get" Short each(&[0, 0], MESSAGE);
-    Number "data.sample.number" Short Bytes([call(&[0, 0], 64), call(&[0, 1], MESSAGE)]);
+    Number "data.sample.number" Short each(&[0, 0], 64);
     Cdr "data.sample.cdr" Short
         Bytes([call(&[0], 0), call(&[0, 0, 0, 0, 0, 0, 0, 0, 0, 64, 31, 0, 0], 8000)]);
     Info "data.frame.info" Short each(&[0], 0);
