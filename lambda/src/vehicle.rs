@@ -42,7 +42,7 @@ mod tests {
     #[test]
     fn what_a_vehicle_does_not_name_is_at_its_maximum() {
         let vehicle = Vehicle::parse("[limits]\nfuel = 10_000_000\nmemory = \"32 MiB\"", "vehicle.toml").unwrap();
-        assert_eq!((vehicle.limits.fuel, vehicle.limits.memory), (10_000_000, manifest::ByteSize::mib(32)));
+        assert_eq!((vehicle.limits.fuel, vehicle.limits.memory), (10_000_000, gleaner_base::ByteSize::mib(32)));
         assert_eq!(vehicle.limits.deadline, Limits::MOST.deadline);
         assert_eq!(Vehicle::parse("", "vehicle.toml").unwrap().limits, Limits::MOST);
     }

@@ -16,11 +16,12 @@ use gleaner_journal::{Decoder, Encoder, Entry, Woken};
 use gleaner_lambda::Manifest;
 use gleaner_messages::Endian;
 use gleaner_messages::Sources;
+use gleaner_operations::Operation::{AsFrame, Column, Field, Input as Topics, MeanLuma, Newest, Resize, ToGray};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
 
-use super::picture;
 use super::pictures::{coded, raw};
+use super::{picture, program};
 use crate::input::Input;
 
 /// What the host may allocate for an input: the pictures that a lambda makes, 4 MiB by the manifest, and as much for all else. Samples and
@@ -35,17 +36,20 @@ const DECODED: ByteSize = ByteSize::kib(32);
 const MESSAGE_BYTES: usize = LINE_BYTES + 256;
 
 /// Calls that take all frames there are, and one more. How much fuel they burn tells whether any is missing.
-const KNOWN: [&[u8]; 3] = [
-    // The cameras, a field of each, their newest samples, and the pictures of these.
-    &[0, 1, 0, 2, 9, 0, 2, 9, 1, 4, 5, 0, 5, 1, 17, 1, 17, 2],
-    // Their light, and a column.
-    &[21, 0, 0, 21, 1, 0, 10, 0, 0, 1, 0, 0, 0],
-    // Four in another size, and eleven in grey.
-    &[
-        24, 0, 16, 16, 24, 0, 16, 16, 24, 1, 16, 16, 24, 1, 16, 16, 25, 2, 25, 2, 25, 2, 25, 2, 25, 2, 25, 2, 25, 2,
-        25, 2, 25, 2, 25, 2, 25, 2,
-    ],
-];
+fn known_calls() -> Vec<u8> {
+    let (small, gray) = ([(Resize, &[0, 0, 16, 16][..]), (Resize, &[1, 0, 16, 16])], [(ToGray, &[2][..])]);
+    [
+        // The cameras, a field of each, their newest samples, and the pictures of these.
+        program(&[(Topics, &[1]), (Topics, &[2]), (Field, &[0, 0, 2]), (Field, &[1, 0, 4])]),
+        program(&[(Newest, &[0]), (Newest, &[1]), (AsFrame, &[1]), (AsFrame, &[2])]),
+        // Their light, and a column.
+        program(&[(MeanLuma, &[0, 0]), (MeanLuma, &[1, 0]), (Column, &[0, 0, 1, 0, 0, 0])]),
+        // Four in another size, and eleven in grey.
+        program(&small).repeat(2),
+        program(&gray).repeat(11),
+    ]
+    .concat()
+}
 
 /// One wake, as a journal has it.
 #[derive(Debug, PartialEq)]
@@ -199,7 +203,7 @@ impl Driver {
         let Common { raw, coded, .. } = common();
         self.publish("/camera/raw", &raw[0], Endian::Little);
         self.publish("/camera/coded", &coded[0], Endian::Little);
-        let woke = self.run(&KNOWN.concat());
+        let woke = self.run(&known_calls());
         assert!(woke.ran && woke.entry.fault.is_none(), "{woke:?}");
         woke.entry.fuel
     }

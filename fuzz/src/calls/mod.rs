@@ -8,6 +8,8 @@ mod driver;
 #[cfg(feature = "calls")]
 mod pictures;
 
+use gleaner_operations::{Operation, Step};
+
 /// What stands between two wakes.
 pub const WAKE: &[u8] = b"WAKE";
 
@@ -23,6 +25,11 @@ pub mod picture {
     pub const CHANGES: u8 = 0x70;
     /// It is what follows: a length in a byte, and so many bytes.
     pub const OWN: u8 = 0x80;
+}
+
+/// Calls with their arguments, as a program for `driver`.
+pub fn program(calls: &[(Operation, &[u8])]) -> Vec<u8> {
+    calls.iter().flat_map(|(operation, arguments)| Step::Call(*operation).with(arguments)).collect()
 }
 
 /// Makes the calls twice, and then some that are known by another instance. Whether each wake of it could run.

@@ -1,8 +1,14 @@
 //! Programs of `driver`: one for each of its calls, and some that go on for longer.
 
-use crate::calls::WAKE;
+use gleaner_operations::Operation::{Append, ScratchGet, ScratchPut, Start};
+use gleaner_operations::Operation::{
+    AsFrame, Event, Field, Histogram, Input, Last, Log, MeanLuma, Newest, Resize, ToGray,
+};
+use gleaner_operations::{Extra, Operation, Step, setup};
 
-/// Words of programs: calls that need others before them, paths, and names of inputs.
+use crate::calls::{WAKE, program};
+
+/// Words of programs: paths, names of inputs, and arguments. What calls need others before them, seeds have.
 pub const WORDS: &[&str] = &[
     "WAKE",
     "program",
@@ -12,44 +18,48 @@ pub const WORDS: &[&str] = &[
     "width",
     "header.frame_id",
     "header.stamp.sec",
-    // Both cameras.
-    "\0\u{1}\0\u{2}",
-    // The newest sample of an input, and its picture.
-    "\u{5}\u{1}\u{11}\u{1}",
-    "\u{5}\u{2}\u{11}\u{2}",
     // All samples of an input.
-    "\u{6}\u{1}\u{7f}\u{7f}\0\0",
-    // Fields, and a column.
-    "\t\u{1}\u{2}",
-    "\t\u{2}\u{4}",
-    "\n\0\0\u{4}\0\0\0",
-    // A picture in another size, and in grey.
-    "\u{18}\0 \u{10}",
-    "\u{19}\0",
+    "\u{1}\u{7f}\u{7f}\0\0",
+    // A picture in another size.
+    "\0\0 \u{10}",
     // Too much memory, and as much as may be said.
-    ",\0\0\u{7f}\0",
-    "0\0\0\0\u{4}\0",
+    "\0\0\u{7f}\0",
+    "\0\0\0\u{4}\0",
 ];
-
-/// Both cameras, a field of each, their newest samples, and their pictures. What comes first is the program itself.
-const LOOKED: &[u8] = &[0, 0, 0, 1, 0, 2, 9, 0, 0, 9, 1, 2, 9, 2, 4, 5, 1, 5, 2, 17, 1, 17, 2];
-
-const CALLS: u8 = 54;
 
 /// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
-    let mut seeds: Vec<_> = (0..CALLS).map(|call| wake(&[LOOKED, &arguments(call)].concat())).collect();
-    let each: Vec<_> = (0..CALLS).filter(|call| !(39..=47).contains(call)).flat_map(arguments).collect();
-    let frames: Vec<u8> = [LOOKED, &[24, 0, 60, 50, 24, 1, 9, 9, 25, 0].repeat(9), &[42, 3, 42, 0, 23, 1]].concat();
-    let scratch = [[48, 0, 0, 0, 2, 0], [48, 1, 0, 0, 2, 0], [49, 2, 255, 255, 52, 0], [51, 1, 1, 0, 0, 0]].concat();
-    let triggers: Vec<u8> = (0..20).flat_map(|n| [27, 1, b'a' + n, 0, 0, 0, 0, 0, 0, 240, 63]).collect();
-    let texts = [[32, 1, 255, 0, 0, 31, 0], [33, 255, 0, 0, 31, 0, 53], [28, 255, 0, 0, 31, 0, 3]].concat();
-    let (panic, exit, memory) = ([46, 0xba, 3, b'n', b'o', b'!'], [47, 0xba, 3], [44, 255, 255, 127, 0]);
-    let fuel = [LOOKED, &[22, 0, 0, 6, 1, 4, 0, 0, 0].repeat(70)].concat();
+    let operations = || Operation::ALL.iter().map(|operation| Step::Call(*operation).with(arguments(*operation)));
+    let extras = Extra::ALL.map(|extra| Step::Extra(extra).with(taken(extra)));
+    let looked = looked();
+    let mut seeds: Vec<_> = operations().chain(extras).map(|step| wake(&[&looked[..], &step].concat())).collect();
+    let each: Vec<_> = operations().flatten().collect();
+    let made = program(&[(Resize, &[0, 0, 60, 50]), (Resize, &[1, 0, 9, 9]), (ToGray, &[0])]).repeat(9);
+    let forget = |frame| Step::Extra(Extra::ForgetFrame).with(&[frame]);
+    let last = program(&[(Resize, &[1, 0, 0, 0])]);
+    let frames = [&looked[..], &made, &forget(3), &forget(0), &last].concat();
+    let scratch = program(&[
+        (ScratchPut, &[0, 0, 0, 2, 0]),
+        (ScratchPut, &[1, 0, 0, 2, 0]),
+        (Append, &[2, 255, 255]),
+        (ScratchGet, &[1, 1, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0]),
+    ]);
+    let trigger = |n| Step::Call(Event).with(&[1, b'a' + n, 0, 0, 0, 0, 0, 0, 240, 63]);
+    let triggers: Vec<u8> = (0..20).flat_map(trigger).collect();
+    let long = [255, 0, 0, 31, 0];
+    let said = [Step::Call(Log).with(&[1]), Step::Extra(Extra::Print).with(&[]), Step::Call(Start).with(&[])];
+    let texts = said.map(|step| [&step[..], &long].concat()).concat();
+    let panic = Step::Extra(Extra::Panic).with(&[0xba, 3, b'n', b'o', b'!']);
+    let exit = Step::Extra(Extra::Exit).with(&[0xba, 3]);
+    let memory = Step::Extra(Extra::Allocate).with(&[255, 255, 127, 0]);
+    let much = program(&[(Histogram, &[0, 0]), (Last, &[1, 4, 0, 0, 0])]).repeat(70);
+    let fuel = [&looked[..], &much].concat();
     let others = [0x12_u8, 0x51, 2, 3, 4, 0x88, 4, 9, 9, 9, 9];
-    let kept = [wake(&frames), wake(&[17, 0, 21, 2, 0]), wake(&panic), wake(LOOKED)].join(WAKE);
+    let glance = program(&[(AsFrame, &[0]), (MeanLuma, &[2, 0])]);
+    let kept = [wake(&frames), wake(&glance), wake(&panic), wake(&looked)].join(WAKE);
     let changed = [vec![1, 0x12, 200, 0, 3], vec![0x5e, 30, 1, 8, 0, 255, 40, 0, 9, 3, 0, 1], vec![0x83, 1, 2, 3, 2]];
-    seeds.extend(changed.map(|pictures| [&pictures[..], LOOKED, &[22, 0, 0]].concat()));
+    let light = Step::Call(Histogram).with(&[0, 0]);
+    seeds.extend(changed.map(|pictures| [&pictures[..], &looked, &light].concat()));
     for program in [&each[..], &frames, &scratch, &triggers, &texts, &panic, &exit, &memory, &fuel, &others] {
         seeds.push(wake(program));
     }
@@ -58,29 +68,31 @@ pub fn all() -> Vec<Vec<u8>> {
     seeds
 }
 
+/// [`setup`], and what of the coded camera it leaves out: a field, and the picture.
+fn looked() -> Vec<u8> {
+    [setup(), program(&[(Field, &[2, 0, 5]), (AsFrame, &[1])])].concat()
+}
+
 /// A wake with the first picture of each kind.
 fn wake(program: &[u8]) -> Vec<u8> {
     [&[0, 0], program].concat()
 }
 
-/// A call, with arguments that name what [`LOOKED`] made.
-fn arguments(call: u8) -> Vec<u8> {
-    let text = |text: &str| [&[call, text.len() as u8][..], text.as_bytes()].concat();
-    match call {
-        1 => text("coded"),
-        8 => [&[call, 1][..], &text("header.stamp.sec")[1..]].concat(),
-        // The topic and its field.
-        10 | 11 => vec![call, 1, 1, 3, 0, 0, 0, 0, 0, 0, 0],
-        // The sample and its field.
-        14 | 15 => vec![call, 1, 1],
-        // A part of the picture.
-        21 | 22 => vec![call, 0, 2, 3, 4, 9, 9],
-        27 => [&text("dark")[..], &0.5_f64.to_le_bytes()].concat(),
-        28 => [&text("k")[..], &0.5_f64.to_le_bytes(), &text("t")[1..], &text("text")[1..]].concat(),
-        30 | 31 | 33 | 34 | 35 | 50 => text("word"),
-        32 => [&[call, 1][..], &text("word")[1..]].concat(),
-        37 => vec![call, 0, 8, 0, 0, 0, 8, 0, 0, 0, 100],
-        46 | 47 => vec![call, 0],
-        _ => vec![call, 1, 4, 0, 0, 0, 2, 0, 0, 0, 1, 0, 0, 0],
+/// Of the expensive call of an operation, and where nothing can be called, of any.
+fn arguments(operation: Operation) -> &'static [u8] {
+    operation.price().calls().map_or(&[0, 0, 8, 0, 0, 0], |[_, (arguments, _)]| arguments)
+}
+
+/// What a step that is no call takes.
+fn taken(extra: Extra) -> &'static [u8] {
+    match extra {
+        Extra::Reset | Extra::Wasi => &[],
+        Extra::ForgetTopic | Extra::ForgetField | Extra::ForgetSample | Extra::ForgetFrame => &[1],
+        Extra::EventWithTexts => &[1, b'k', 0, 0, 0, 0, 0, 0, 224, 63, 1, b't', 4, b't', b'e', b'x', b't'],
+        Extra::EventWithMany => &[9],
+        Extra::ColumnAtOnce => &[1, 2],
+        Extra::ScratchPutText | Extra::Print | Extra::PrintError => &[4, b'w', b'o', b'r', b'd'],
+        Extra::Allocate => &[1, 4, 0, 0],
+        Extra::Panic | Extra::Exit => &[0],
     }
 }

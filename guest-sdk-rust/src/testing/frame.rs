@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use gleaner_rules::frames::{Budget, NoRoom, Taken};
 use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
-use gleaner_rules::pixels::{self as rules, Bayer, PixelError, View, ops};
+use gleaner_rules::pixels::{self as rules, Bayer, PixelError, PixelErrorKind, View, ops};
 use gleaner_rules::refused;
 
 use super::data::{Sample, Source};
@@ -189,7 +189,7 @@ impl Frame {
 }
 
 fn refuse(topic: &str, error: PixelError) -> DataError {
-    match error.is_out_of_range() {
+    match error.kind() == PixelErrorKind::OutOfRange {
         true => DataError::OutOfRange(error.to_string()),
         false => DataError::NotAFrame(refused::not_a_frame(topic, error)),
     }

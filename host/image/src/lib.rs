@@ -13,4 +13,4 @@ mod error;
 
 pub use decode::{Format, Header, decode_rgb8, decode_rgb8_paced, probe};
 pub use error::ImageError;
-pub use gleaner_rules::pixels::{Bayer, Encoding, MAX_SIDE, Pace, PixelError, Roi, View, ops};
+pub use gleaner_rules::pixels::{Bayer, Encoding, MAX_SIDE, Pace, PixelError, PixelErrorKind, Roi, View, ops};

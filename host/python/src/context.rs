@@ -84,8 +84,8 @@ impl Context {
         self.topic(py, &topic).cloned()
     }
 
-    fn inputs(&self) -> Vec<String> {
-        self.session.inputs().iter().map(|topic| topic.name().to_owned()).collect()
+    fn inputs(&self, py: Python<'_>) -> PyResult<Vec<String>> {
+        self.session.input_names().map_err(|error| refused(py, error.into()))
     }
 
     fn now_ns(&self) -> i64 {
@@ -115,8 +115,7 @@ impl Context {
         self.session.stop(&label).map_err(|error| trigger::refused(py, &error))
     }
 
-    fn log(&self, level: Cow<'_, str>, message: Cow<'_, str>) -> PyResult<()> {
-        self.session.log(log::level(&level)?, &message);
-        Ok(())
+    fn log(&self, py: Python<'_>, level: Cow<'_, str>, message: Cow<'_, str>) -> PyResult<()> {
+        self.session.log(log::level(&level)?, &message).map_err(|error| refused(py, error.into()))
     }
 }

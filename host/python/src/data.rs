@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use gleaner_host::api::data::{self, DataError};
+use gleaner_host::api::data::{self, DataError, OutOfFuel};
 use gleaner_messages::Value;
 use numpy::PyArray1;
 use pyo3::IntoPyObjectExt;
@@ -56,8 +56,9 @@ impl Topic {
         Sample { inner, fields: self.fields.clone_ref(py) }
     }
 
-    fn samples(&self, py: Python<'_>, samples: Vec<data::Sample>) -> Vec<Sample> {
-        samples.into_iter().map(|sample| self.sample(py, sample)).collect()
+    fn samples(&self, py: Python<'_>, samples: Result<Vec<data::Sample>, OutOfFuel>) -> PyResult<Vec<Sample>> {
+        let samples = samples.map_err(|error| refused(py, error.into()))?;
+        Ok(samples.into_iter().map(|sample| self.sample(py, sample)).collect())
     }
 }
 
@@ -82,11 +83,11 @@ impl Topic {
         self.inner.newest().map(|sample| self.sample(py, sample))
     }
 
-    fn last(&self, py: Python<'_>, n: usize) -> Vec<Sample> {
+    fn last(&self, py: Python<'_>, n: usize) -> PyResult<Vec<Sample>> {
         self.samples(py, self.inner.last(n))
     }
 
-    fn since(&self, py: Python<'_>, since_ns: i64) -> Vec<Sample> {
+    fn since(&self, py: Python<'_>, since_ns: i64) -> PyResult<Vec<Sample>> {
         self.samples(py, self.inner.since(since_ns))
     }
 
@@ -164,8 +165,9 @@ impl Sample {
     }
 
     #[pyo3(signature = (offset = 0, len = None))]
-    fn cdr<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> Bound<'py, PyBytes> {
-        PyBytes::new(py, &self.inner.cdr(offset, len.unwrap_or(u32::MAX)))
+    fn cdr<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self.inner.cdr(offset, len.unwrap_or(u32::MAX)).map_err(|error| refused(py, error.into()))?;
+        Ok(PyBytes::new(py, &bytes))
     }
 
     fn as_frame(&self, py: Python<'_>) -> PyResult<Frame> {
@@ -244,16 +246,5 @@ pub(crate) fn stamps(py: Python<'_>, stamps: data::Stamps) -> PyResult<Bound<'_,
 }
 
 pub(crate) fn refused(py: Python<'_>, error: DataError) -> PyErr {
-    let kind = match &error {
-        DataError::NoSuchInput { .. } => "no-such-input",
-        DataError::NoSuchField(_) => "no-such-field",
-        DataError::WrongField { .. } => "wrong-field",
-        DataError::Malformed { .. } => "malformed",
-        DataError::NoImageType { .. } | DataError::NotAFrame { .. } => "not-a-frame",
-        DataError::TooLarge { .. } | DataError::NoSlot { .. } | DataError::NoRoom(_) | DataError::OutOfTime => {
-            "no-room"
-        }
-        DataError::OutOfRange(_) => "out-of-range",
-    };
-    DATA_ERROR.error(py, error.to_string(), kind)
+    DATA_ERROR.error(py, error.to_string(), error.kind().name())
 }

@@ -71,8 +71,9 @@ impl Frame {
     }
 
     #[pyo3(signature = (offset = 0, len = None))]
-    fn read<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> Bound<'py, PyBytes> {
-        PyBytes::new(py, &self.0.read(offset, len.unwrap_or(u32::MAX)))
+    fn read<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self.0.read(offset, len.unwrap_or(u32::MAX)).map_err(|error| refused(py, error.into()))?;
+        Ok(PyBytes::new(py, &bytes))
     }
 
     fn array<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {

@@ -4,6 +4,7 @@
 
 use std::borrow::Cow;
 
+use gleaner_host::api::fuel::Fuel;
 use gleaner_host::api::inference::{self, InferenceError};
 use pyo3::prelude::*;
 
@@ -20,10 +21,7 @@ pub(crate) struct Tensor(inference::Tensor);
 pub(crate) struct Model(inference::Model);
 
 fn refused(py: Python<'_>, error: &InferenceError) -> PyErr {
-    let kind = match error {
-        InferenceError::NoRuntime => "no-runtime",
-    };
-    INFERENCE_ERROR.error(py, error.to_string(), kind)
+    INFERENCE_ERROR.error(py, error.to_string(), error.kind().name())
 }
 
 #[pymethods]
@@ -31,13 +29,13 @@ impl Tensor {
     #[staticmethod]
     #[expect(unused_variables)]
     fn from_values(py: Python<'_>, shape: &Bound<'_, PyAny>, values: &Bound<'_, PyAny>) -> PyResult<Self> {
-        inference::Tensor::new().map(Self).map_err(|error| refused(py, &error))
+        inference::Tensor::from_values(0, &Fuel::default()).map(Self).map_err(|error| refused(py, &error))
     }
 
     #[staticmethod]
     #[expect(unused_variables)]
     fn from_frame(py: Python<'_>, frame: &Bound<'_, PyAny>, how: &Bound<'_, PyAny>) -> PyResult<Self> {
-        inference::Tensor::new().map(Self).map_err(|error| refused(py, &error))
+        inference::Tensor::from_frame(&Fuel::default()).map(Self).map_err(|error| refused(py, &error))
     }
 
     #[getter]
@@ -56,7 +54,7 @@ impl Tensor {
 impl Model {
     #[staticmethod]
     fn open(py: Python<'_>, name: Cow<'_, str>) -> PyResult<Self> {
-        inference::Model::open(&name).map(Self).map_err(|error| refused(py, &error))
+        inference::Model::open(&name, &Fuel::default()).map(Self).map_err(|error| refused(py, &error))
     }
 
     #[expect(unused_variables)]

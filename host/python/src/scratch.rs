@@ -13,12 +13,7 @@ static SCRATCH_ERROR: SdkClass = SdkClass::new("gleaner.scratch", "ScratchError"
 static ENTRY: SdkClass = SdkClass::new("gleaner.scratch", "Entry");
 
 fn refused(py: Python<'_>, error: &ScratchError) -> PyErr {
-    let kind = match error {
-        ScratchError::NoRoom { .. } | ScratchError::TooMany(_) => "no-room",
-        ScratchError::NoSuchEntry(_) => "no-such-entry",
-        ScratchError::WrongName(_) => "wrong-name",
-    };
-    SCRATCH_ERROR.error(py, error.to_string(), kind)
+    SCRATCH_ERROR.error(py, error.to_string(), error.kind().name())
 }
 
 /// What the host keeps for the lambda, by name.
@@ -58,7 +53,8 @@ impl Scratch {
     }
 
     fn entries<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyAny>>> {
-        self.0.entries().into_iter().map(|Entry { name, bytes }| ENTRY.make(py, (name, bytes))).collect()
+        let entries = self.0.entries().map_err(|error| refused(py, &error.into()))?;
+        entries.into_iter().map(|Entry { name, bytes }| ENTRY.make(py, (name, bytes))).collect()
     }
 
     fn free(&self) -> u64 {

@@ -10,11 +10,7 @@ use crate::sdk::SdkClass;
 static TRIGGER_ERROR: SdkClass = SdkClass::new("gleaner.trigger", "TriggerError");
 
 pub(crate) fn refused(py: Python<'_>, error: &TriggerError) -> PyErr {
-    let kind = match error {
-        TriggerError::TooMany | TriggerError::TooOften { .. } => "too-many",
-        _ => "invalid",
-    };
-    TRIGGER_ERROR.error(py, error.to_string(), kind)
+    TRIGGER_ERROR.error(py, error.to_string(), error.kind().name())
 }
 
 /// Keyword arguments as attributes of `label`, in the order in which they were written.

@@ -1,4 +1,4 @@
-//! What one call of a lambda may take: bytes, items and time. Neither fuel nor a deadline ends a call from outside.
+//! What one call of a lambda may take: bytes, items, fuel and time. Neither fuel nor a deadline ends a call from outside.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -8,6 +8,7 @@ use gleaner_lambda::manifest::Limits;
 use gleaner_rules::clamps;
 
 use super::error::DataError;
+use super::fuel::{Fuel, OutOfFuel};
 
 /// What one call may take, for all inputs of a lambda.
 #[derive(Clone)]
@@ -18,13 +19,20 @@ pub struct PerCall {
     pub(super) items: usize,
     /// When it has to end.
     pub(super) due: Due,
+    /// What all of them have cost in this wake.
+    pub(super) fuel: Fuel,
 }
 
 impl PerCall {
-    /// By these limits, and without end.
+    /// By these limits, without end and without a price.
     pub fn new(limits: &Limits) -> Self {
         let items = usize::try_from(limits.call_items).unwrap_or(usize::MAX);
-        Self { bytes: limits.call_bytes.as_usize(), items, due: Due::default() }
+        Self { bytes: limits.call_bytes.as_usize(), items, due: Due::default(), fuel: Fuel::default() }
+    }
+
+    /// Charges a call that touches so many bytes. Each call of a lambda is charged once, before its work.
+    pub(super) fn charge(&self, bytes: impl FnOnce() -> usize) -> Result<(), OutOfFuel> {
+        self.fuel.charge(bytes)
     }
 
     /// What it hands out at most.

@@ -13,14 +13,16 @@ use gleaner_transport::SampleMeta;
 
 pub use super::call::{Due, PerCall};
 use super::curves::{Curves, Pen};
-pub use super::error::DataError;
+pub use super::error::{DataError, DataErrorKind};
+use super::field::FIELD_BYTES;
+pub use super::field::Field;
 use super::frame::Images;
+use super::fuel::Fuel;
+pub use super::fuel::OutOfFuel;
 pub use super::sample::Sample;
 use super::trace::{Arrivals, Looked};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
-/// What reading a field at a fixed place costs, in bytes: the walk to it, and its value.
-pub const FIELD_BYTES: usize = 64;
 /// Samples of a column between two looks at the time, and bytes of those that are walked over.
 const SAMPLES_PER_LOOK: usize = 1024;
 const BYTES_PER_LOOK: usize = 1 << 20;
@@ -54,13 +56,6 @@ pub struct Topic {
     scratch: Mutex<Vec<Lease<SampleMeta>>>,
     /// Where what is read is drawn, if anybody asked for that.
     curves: OnceLock<Arc<Curves>>,
-}
-
-/// A compiled path into the messages of one topic.
-pub struct Field {
-    topic: Arc<Topic>,
-    pub(super) path: FieldPath,
-    pen: Option<Arc<Pen>>,
 }
 
 impl Topic {
@@ -118,15 +113,22 @@ impl Topic {
     }
 
     /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and what `[limits]` allows.
-    pub fn last(self: &Arc<Self>, n: usize) -> Vec<Sample> {
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn last(self: &Arc<Self>, n: usize) -> Result<Vec<Sample>, OutOfFuel> {
         let mut leases = Vec::new();
         self.reader.last_before(self.until(), n.min(self.per_call.clamps().samples()).min(self.depth), &mut leases);
-        self.looked.at(leases.first());
-        leases.into_iter().map(|lease| self.sample(lease)).collect()
+        self.hand_out(leases)
     }
 
     /// Samples received later than `since_ns`, oldest first; as many of the newest as [`Topic::last`] gives at most.
-    pub fn since(self: &Arc<Self>, since_ns: i64) -> Vec<Sample> {
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn since(self: &Arc<Self>, since_ns: i64) -> Result<Vec<Sample>, OutOfFuel> {
         let mut leases = Vec::new();
         let until = self.until();
         self.reader.newest_while_before(
@@ -135,8 +137,13 @@ impl Topic {
             |meta| meta.at_ns > since_ns,
             &mut leases,
         );
+        self.hand_out(leases)
+    }
+
+    fn hand_out(self: &Arc<Self>, leases: Vec<Lease<SampleMeta>>) -> Result<Vec<Sample>, OutOfFuel> {
         self.looked.at(leases.first());
-        leases.into_iter().map(|lease| self.sample(lease)).collect()
+        self.per_call.charge(|| leases.len() * FIELD_BYTES)?;
+        Ok(leases.into_iter().map(|lease| self.sample(lease)).collect())
     }
 
     /// What became of the samples.
@@ -153,6 +160,7 @@ impl Topic {
     ///
     /// [`DataError::NoSuchField`] names the nearest field.
     pub fn field(self: &Arc<Self>, path: &str) -> Result<Field, DataError> {
+        self.per_call.charge(|| path.len())?;
         clamps::path(path)?;
         let Some(definitions) = &self.definitions else {
             let why = format!("cannot be found: nobody here has message definitions of `{}`", self.type_name);
@@ -169,6 +177,7 @@ impl Topic {
     /// [`DataError::WrongField`] if the field is no number or belongs to another topic; [`DataError::Malformed`];
     /// [`DataError::OutOfTime`].
     pub fn column(self: &Arc<Self>, field: &Field, n: usize) -> Result<Column, DataError> {
+        self.per_call.charge(|| self.column_work(field, n))?;
         let until = self.until();
         self.read_column(field, |reader, out| {
             reader.last_before(until, n.min(self.per_call.items).min(self.depth), out)
@@ -181,11 +190,21 @@ impl Topic {
     ///
     /// As [`Topic::column`].
     pub fn column_since(self: &Arc<Self>, field: &Field, since_ns: i64) -> Result<Column, DataError> {
+        // How many samples it is shows only on the way. At fixed places they cost little, and are charged afterwards.
+        let whole_ring = || self.column_work(field, usize::MAX);
+        if field.walks() {
+            self.per_call.charge(whole_ring)?;
+        }
         let until = self.until();
         let is_since = |meta: &SampleMeta| meta.at_ns > since_ns;
-        self.read_column(field, |reader, out| {
+        let column = self.read_column(field, |reader, out| {
             reader.newest_while_before(until, self.per_call.items.min(self.depth), is_since, out)
-        })
+        });
+        if !field.walks() {
+            let read = |column: &Column| column.values.len() * FIELD_BYTES;
+            self.per_call.charge(|| column.as_ref().map_or_else(|_| whole_ring(), read))?;
+        }
+        column
     }
 
     fn read_column(
@@ -240,7 +259,7 @@ impl Topic {
 
     /// Bytes that a column of `field` over `n` samples may touch, judged by the newest sample; the ring holds no more than
     /// its depth.
-    pub fn column_work(&self, field: &Field, n: usize) -> usize {
+    fn column_work(&self, field: &Field, n: usize) -> usize {
         let held = usize::try_from(self.reader.head()).unwrap_or(usize::MAX).min(self.depth);
         let message_bytes = self.reader.newest_before(self.until()).map_or(0, |lease| lease.len());
         n.min(held).min(self.per_call.items).saturating_mul(field.work(message_bytes))
@@ -258,6 +277,11 @@ impl Topic {
     /// When a call has to end, for all inputs of the lambda.
     pub(super) fn due(&self) -> Due {
         self.per_call.due.clone()
+    }
+
+    /// What calls cost, for all inputs of the lambda.
+    pub(super) fn fuel(&self) -> Fuel {
+        self.per_call.fuel.clone()
     }
 
     /// How many samples the lambda sees at most.
@@ -308,37 +332,6 @@ impl Topic {
     /// Notes how many samples were lost before they reached this process.
     pub(crate) fn set_lost(&self, lost: u64) {
         self.lost.store(lost, Ordering::Relaxed);
-    }
-}
-
-impl Field {
-    /// Whether elements of varying size lie before it, so that reading it walks over much of a message.
-    pub fn walks(&self) -> bool {
-        self.path.walks()
-    }
-
-    /// Bytes that reading it from a message of `message_bytes` may touch: all of them if elements of varying size lie before it.
-    pub fn work(&self, message_bytes: usize) -> usize {
-        if self.walks() { message_bytes.max(FIELD_BYTES) } else { FIELD_BYTES }
-    }
-
-    /// The path as it was written.
-    pub fn path(&self) -> &str {
-        self.path.path()
-    }
-
-    /// Notes what was read of the sample of `at_ns`.
-    pub(super) fn draw(&self, at_ns: i64, value: f64) {
-        if let Some(pen) = &self.pen {
-            pen.number(at_ns, value);
-        }
-    }
-
-    pub(super) fn must_belong_to(&self, topic: &Arc<Topic>) -> Result<(), DataError> {
-        if Arc::ptr_eq(&self.topic, topic) {
-            return Ok(());
-        }
-        Err(WrongField::elsewhere(self.path(), &self.topic.input, &topic.input).into())
     }
 }
 

@@ -6,6 +6,8 @@ use gleaner_rules::clamps::WrongField;
 use gleaner_rules::frames::NoRoom;
 use gleaner_rules::refused;
 
+use super::fuel::OutOfFuel;
+
 /// Why a read of data failed.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
@@ -32,4 +34,51 @@ pub enum DataError {
     OutOfRange(PixelError),
     #[error("the deadline is over")]
     OutOfTime,
+    #[error(transparent)]
+    OutOfFuel(#[from] OutOfFuel),
+}
+
+/// Which of the refusals of `wit/types.wit` a lambda gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum DataErrorKind {
+    NoSuchInput,
+    NoSuchField,
+    WrongField,
+    Malformed,
+    NotAFrame,
+    NoRoom,
+    OutOfRange,
+}
+
+impl DataErrorKind {
+    /// The name in the WIT.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::NoSuchInput => "no-such-input",
+            Self::NoSuchField => "no-such-field",
+            Self::WrongField => "wrong-field",
+            Self::Malformed => "malformed",
+            Self::NotAFrame => "not-a-frame",
+            Self::NoRoom => "no-room",
+            Self::OutOfRange => "out-of-range",
+        }
+    }
+}
+
+impl DataError {
+    /// The refusal that a lambda gets.
+    pub fn kind(&self) -> DataErrorKind {
+        match self {
+            Self::NoSuchInput { .. } => DataErrorKind::NoSuchInput,
+            Self::NoSuchField(_) => DataErrorKind::NoSuchField,
+            Self::WrongField { .. } => DataErrorKind::WrongField,
+            Self::Malformed { .. } => DataErrorKind::Malformed,
+            Self::NoImageType { .. } | Self::NotAFrame { .. } => DataErrorKind::NotAFrame,
+            Self::TooLarge { .. } | Self::NoSlot { .. } | Self::NoRoom(_) => DataErrorKind::NoRoom,
+            Self::OutOfRange(_) => DataErrorKind::OutOfRange,
+            // Whoever can end a guest ends it instead.
+            Self::OutOfTime | Self::OutOfFuel(_) => DataErrorKind::NoRoom,
+        }
+    }
 }

@@ -1,15 +1,16 @@
 //! A sample seen as an image: raw pixels in place, JPEG and PNG decoded lazily into slots of their own.
 
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, PoisonError};
 use std::time::Instant;
 
 use gleaner_buffers::{Lease, Pool, Refusal};
 use gleaner_messages::{CdrError, CompressedView, Endian, ImageView};
 
-use super::data::{DataError, Identity, Sample, Stamps};
+use super::data::{DataError, Identity, OutOfFuel, Sample, Stamps};
+pub use super::images::Images;
 use super::piece::Piece;
-use gleaner_image::{self as image, Encoding, ImageError, Pace, PixelError, Roi, View, ops};
+use gleaner_image::{self as image, Encoding, ImageError, Pace, PixelError, PixelErrorKind, Roi, View, ops};
 pub use gleaner_rules::frames::Budget;
 use gleaner_rules::frames::Taken;
 use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
@@ -18,21 +19,17 @@ use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 const FASTEST_DECODE: u64 = 2_000;
 
 /// Bytes that are copied while one is worked on, if a copy makes 22 GB/s: then 8 bytes of it take as long as a unit of fuel. Measured on
-/// an x86-64 server: 2.7, 4.3 to 41, and 0.5 GB/s.
+/// an x86-64 server: 2.7 and 4.3 to 41 GB/s, and 0.5 GB/s for decoding, which costs `images::DECODE`.
 const HISTOGRAM: u64 = 8;
 const GRAY: u64 = 4;
-const DECODE: usize = 40;
 
-/// An operation on the pixels of a frame.
-#[derive(Clone, Copy, Debug)]
-pub enum Operation {
-    /// [`Frame::mean_luma`].
+/// An operation on the pixels of a frame. [`Frame::work`] has the price of each.
+#[derive(Clone, Copy)]
+enum Operation {
     MeanLuma(Option<Roi>),
-    /// [`Frame::histogram`].
     Histogram(Option<Roi>),
-    /// [`Frame::to_gray`].
     ToGray,
-    /// [`Frame::resize`], to width and height.
+    /// To width and height.
     Resize(u32, u32),
 }
 
@@ -72,39 +69,6 @@ impl<'a> Picture<'a> {
             COMPRESSED_IMAGE => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
             _ => None,
         })
-    }
-}
-
-/// Room for the images of one input, beyond the ring: decoded ones in slots, made ones out of a budget.
-pub struct Images {
-    decoded: Option<Pool<Info>>,
-    made: Budget,
-    /// The newest decoded image, so that each is decoded once.
-    newest: Mutex<Option<(u64, Lease<Info>)>>,
-    decode_ns: AtomicU64,
-}
-
-impl Images {
-    /// `decoded` holds what JPEG and PNG become (none for raw images); `made` is shared by all inputs of a lambda.
-    pub fn new(decoded: Option<Pool<Info>>, made: Budget) -> Self {
-        Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
-    }
-
-    /// Work of decoding `data`, by its header, as [`Frame::work`]; none if it is the newest decoded image already.
-    pub(super) fn decode_work(&self, position: Option<u64>, data: &[u8]) -> usize {
-        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
-        if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {
-            return 0;
-        }
-        let room = self.decoded.as_ref().map_or(0, Pool::slot_bytes);
-        image::probe(data)
-            .ok()
-            .and_then(|header| header.rgb8_len())
-            .map_or(0, |len| len.min(room).saturating_mul(DECODE))
-    }
-
-    pub(super) fn decode_ns(&self) -> u64 {
-        self.decode_ns.load(Ordering::Relaxed)
     }
 }
 
@@ -190,7 +154,7 @@ impl Frame {
     }
 
     /// Work of an operation, in bytes that are copied in the same time: the price of a call, on whatever machine.
-    pub fn work(&self, operation: Operation) -> usize {
+    fn work(&self, operation: Operation) -> usize {
         let work = self.view().and_then(|view| {
             let work = match operation {
                 Operation::MeanLuma(roi) => ops::work(&view, roi),
@@ -213,8 +177,15 @@ impl Frame {
     }
 
     /// Bytes from `offset`, `len` at most, clamped to the frame and to `call_bytes` of `[limits]`.
-    pub fn read(&self, offset: u64, len: u32) -> Piece {
-        self.pixels.part(offset, self.source.topic.per_call.bytes.min(len as usize))
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn read(&self, offset: u64, len: u32) -> Result<Piece, OutOfFuel> {
+        let per_call = &self.source.topic.per_call;
+        let piece = self.pixels.part(offset, per_call.bytes.min(len as usize));
+        per_call.charge(|| piece.len())?;
+        Ok(piece)
     }
 
     /// Mean BT.601 luma, 0 to 255, computed in integers.
@@ -224,7 +195,7 @@ impl Frame {
     /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer encodings;
     /// [`DataError::OutOfTime`].
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
-        let luma = self.paced(|view| ops::mean_luma(view, roi))?;
+        let luma = self.begin(Operation::MeanLuma(roi))?.work(|view| ops::mean_luma(view, roi))?;
         self.source.draw_luma(roi, luma);
         Ok(luma)
     }
@@ -235,13 +206,13 @@ impl Frame {
     ///
     /// As [`Frame::mean_luma`].
     pub fn histogram(&self, roi: Option<Roi>) -> Result<[u32; 256], DataError> {
-        self.paced(|view| ops::histogram(view, roi))
+        self.begin(Operation::Histogram(roi))?.work(|view| ops::histogram(view, roi))
     }
 
-    /// Works on the pixels until the call is due.
-    fn paced<T>(&self, work: impl FnOnce(&View<'_>) -> Result<T, PixelError>) -> Result<T, DataError> {
-        let in_time = || self.source.topic.per_call.due.check().is_ok();
-        work(&self.view()?.paced(&Pace::new(&in_time))).map_err(|error| self.source.refused(error))
+    /// Charges an operation. What it returns is the way to the pixels.
+    fn begin(&self, operation: Operation) -> Result<Paid<'_>, DataError> {
+        self.source.topic.per_call.charge(|| self.work(operation))?;
+        Ok(Paid(self))
     }
 
     /// A new frame of that size: rgb8, or mono8 for grey encodings.
@@ -250,9 +221,10 @@ impl Frame {
     ///
     /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`]; [`DataError::NoRoom`]; as [`Frame::mean_luma`].
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
+        let paid = self.begin(Operation::Resize(width, height))?;
         let (encoding, _) = ops::resized(&self.view()?, width, height).map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
-        self.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
+        paid.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
     }
 
     /// A new mono8 frame of the same size.
@@ -261,24 +233,38 @@ impl Frame {
     ///
     /// [`DataError::NoRoom`]; as [`Frame::mean_luma`].
     pub fn to_gray(&self) -> Result<Self, DataError> {
-        let info = Info::tight(self.info.width, self.info.height, Encoding::Mono8);
-        self.make(info, ops::to_gray)
-    }
-
-    fn make(
-        &self,
-        info: Info,
-        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), PixelError>,
-    ) -> Result<Self, DataError> {
-        let len = info.step as usize * info.height as usize;
-        let taken = self.source.topic.images.made.take(len)?;
-        let mut bytes = vec![0; len].into_boxed_slice();
-        self.paced(|view| fill(view, &mut bytes))?;
-        Ok(Self { source: self.source.clone(), info, pixels: Piece::made(bytes), _taken: taken })
+        let paid = self.begin(Operation::ToGray)?;
+        paid.make(Info::tight(self.info.width, self.info.height, Encoding::Mono8), ops::to_gray)
     }
 
     fn view(&self) -> Result<View<'_>, DataError> {
         self.info.view(self.bytes()).map_err(|error| self.source.not_a_frame(error))
+    }
+}
+
+/// A frame whose pixels may be worked on, since the operation is paid for.
+struct Paid<'a>(&'a Frame);
+
+impl Paid<'_> {
+    /// Works on the pixels until the call is due.
+    fn work<T>(self, work: impl FnOnce(&View<'_>) -> Result<T, PixelError>) -> Result<T, DataError> {
+        let source = &self.0.source;
+        let in_time = || source.topic.per_call.due.check().is_ok();
+        work(&self.0.view()?.paced(&Pace::new(&in_time))).map_err(|error| source.refused(error))
+    }
+
+    /// Makes a new frame.
+    fn make(
+        self,
+        info: Info,
+        fill: impl FnOnce(&View<'_>, &mut [u8]) -> Result<(), PixelError>,
+    ) -> Result<Frame, DataError> {
+        let source = self.0.source.clone();
+        let len = info.step as usize * info.height as usize;
+        let taken = source.topic.images.made.take(len)?;
+        let mut bytes = vec![0; len].into_boxed_slice();
+        self.work(|view| fill(view, &mut bytes))?;
+        Ok(Frame { source, info, pixels: Piece::made(bytes), _taken: taken })
     }
 }
 
@@ -305,8 +291,11 @@ impl Source {
 
     fn refused(&self, error: impl Into<ImageError>) -> DataError {
         match error.into() {
-            ImageError::Pixels(error) if error.is_out_of_range() => DataError::OutOfRange(error),
-            ImageError::Pixels(PixelError::Stopped) => DataError::OutOfTime,
+            ImageError::Pixels(error) => match error.kind() {
+                PixelErrorKind::OutOfRange => DataError::OutOfRange(error),
+                PixelErrorKind::Stopped => DataError::OutOfTime,
+                PixelErrorKind::Unreadable => self.not_a_frame(error),
+            },
             error => self.not_a_frame(error),
         }
     }

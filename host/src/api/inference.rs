@@ -1,11 +1,42 @@
 //! Models that run on the host. This build has no model runtime: every call says so.
 
+use super::fuel::{Fuel, OutOfFuel};
+
 /// Why a model could not be opened or run.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InferenceError {
     /// The host was built without a model runtime.
     #[error("no model runtime in this build")]
     NoRuntime,
+    /// The lambda cannot pay for the call.
+    #[error(transparent)]
+    OutOfFuel(#[from] OutOfFuel),
+}
+
+/// Which of the refusals of `wit/inference.wit` a lambda gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum InferenceErrorKind {
+    NoRuntime,
+}
+
+impl InferenceErrorKind {
+    /// The name in the WIT.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::NoRuntime => "no-runtime",
+        }
+    }
+}
+
+impl InferenceError {
+    /// The refusal that a lambda gets.
+    pub fn kind(&self) -> InferenceErrorKind {
+        match self {
+            // Whoever can end a guest for want of fuel ends it instead.
+            Self::NoRuntime | Self::OutOfFuel(_) => InferenceErrorKind::NoRuntime,
+        }
+    }
 }
 
 /// Numbers on the host. Cannot be made in this build.
@@ -17,12 +48,27 @@ pub enum Tensor {}
 pub enum Model {}
 
 impl Tensor {
-    /// Makes a tensor of `shape` from `values`, or from a frame.
+    /// Makes a tensor from numbers that take so many bytes with its shape.
     ///
     /// # Errors
     ///
-    /// [`InferenceError::NoRuntime`], always.
-    pub fn new() -> Result<Self, InferenceError> {
+    /// [`InferenceError::NoRuntime`]; [`InferenceError::OutOfFuel`].
+    pub fn from_values(bytes: usize, fuel: &Fuel) -> Result<Self, InferenceError> {
+        fuel.charge(|| bytes)?;
+        Self::new(fuel)
+    }
+
+    /// Makes a tensor from a frame.
+    ///
+    /// # Errors
+    ///
+    /// As [`Tensor::from_values`].
+    pub fn from_frame(fuel: &Fuel) -> Result<Self, InferenceError> {
+        Self::new(fuel)
+    }
+
+    fn new(fuel: &Fuel) -> Result<Self, InferenceError> {
+        fuel.charge_call()?;
         Err(InferenceError::NoRuntime)
     }
 }
@@ -32,8 +78,10 @@ impl Model {
     ///
     /// # Errors
     ///
-    /// [`InferenceError::NoRuntime`], always.
-    pub fn open(_name: &str) -> Result<Self, InferenceError> {
+    /// [`InferenceError::NoRuntime`]; [`InferenceError::OutOfFuel`].
+    pub fn open(name: &str, fuel: &Fuel) -> Result<Self, InferenceError> {
+        fuel.charge(|| name.len())?;
+        fuel.charge_call()?;
         Err(InferenceError::NoRuntime)
     }
 }

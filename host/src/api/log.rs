@@ -8,6 +8,7 @@ use gleaner_rules::log::{Rate, line};
 pub use gleaner_rules::text::cut;
 
 use super::Session;
+use super::fuel::OutOfFuel;
 
 pub(super) struct Log {
     lines: Vec<Line>,
@@ -64,7 +65,18 @@ impl Log {
 
 impl Session {
     /// Writes one line at the time of this wake.
-    pub fn log(&self, level: Level, message: &str) {
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn log(&self, level: Level, message: &str) -> Result<(), OutOfFuel> {
+        self.fuel.charge(|| message.len())?;
+        self.write(level, message);
+        Ok(())
+    }
+
+    /// Writes one line that the lambda has paid for otherwise.
+    pub(crate) fn write(&self, level: Level, message: &str) {
         let mut state = self.lock();
         let at_ns = state.now_ns;
         state.log.write(at_ns, level, message);

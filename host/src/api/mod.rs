@@ -2,12 +2,19 @@
 //!
 //! Five of the files beside this one carry the names of the five WIT interfaces. WebAssembly (`guest::wasm`) and Python
 //! (`host/python`) are thin skins over them: they convert arguments and errors, and decide nothing. What is here knows neither.
+//!
+//! So each call does three things here: it is charged ([`fuel`]), before its work wherever that is known; what takes long looks
+//! at the deadline as it goes (`call`); and a refusal says which one of the WIT it is (`kind`). A call that only looks at a
+//! value costs what any call costs, which a skin charges where it looks up what a handle stands for.
 
 mod call;
 pub mod curves;
 pub mod data;
 mod error;
+mod field;
 pub mod frame;
+pub mod fuel;
+mod images;
 pub mod inference;
 pub mod log;
 mod piece;
@@ -25,13 +32,18 @@ use gleaner_lambda::Trigger;
 use gleaner_lambda::manifest::{ConfigValue, Limits};
 
 use data::{DataError, Due, Topic};
+use field::FIELD_BYTES;
+use fuel::{Fuel, OutOfFuel};
 use log::{Line, Log};
 use scratch::Scratch;
 use trigger::Triggers;
 
 /// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call, by one thread.
 #[derive(Clone)]
-pub struct Session(Arc<Mutex<State>>);
+pub struct Session {
+    state: Arc<Mutex<State>>,
+    fuel: Fuel,
+}
 
 struct State {
     inputs: Vec<Arc<Topic>>,
@@ -49,10 +61,11 @@ impl Session {
     pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>, limits: &Limits) -> Self {
         // All inputs of a lambda have the same.
         let due = inputs.first().map(|topic| topic.due());
+        let fuel = inputs.first().map(|topic| topic.fuel()).unwrap_or_default();
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(limits));
         let scratch = Scratch::new(limits.scratch.bytes(), limits.call_bytes.as_usize());
         let state = State { inputs, config, now_ns: 0, triggers, log, scratch, due, passed_over: 0 };
-        Self(Arc::new(Mutex::new(state)))
+        Self { state: Arc::new(Mutex::new(state)), fuel }
     }
 
     /// Begins a wake at `now_ns`: what an earlier wake left behind is dropped.
@@ -105,6 +118,11 @@ impl Session {
         self.lock().due.clone()
     }
 
+    /// What calls of the lambda cost. Nothing, unless its guest begins an allowance.
+    pub fn fuel(&self) -> &Fuel {
+        &self.fuel
+    }
+
     /// Time of this wake, in nanoseconds.
     pub fn now_ns(&self) -> i64 {
         self.lock().now_ns
@@ -120,12 +138,24 @@ impl Session {
         self.lock().inputs.clone()
     }
 
+    /// Names of all inputs, in the manifest's order.
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn input_names(&self) -> Result<Vec<String>, OutOfFuel> {
+        let state = self.lock();
+        self.fuel.charge(|| state.inputs.len() * FIELD_BYTES)?;
+        Ok(state.inputs.iter().map(|topic| topic.name().to_owned()).collect())
+    }
+
     /// The input of that name.
     ///
     /// # Errors
     ///
-    /// [`DataError::NoSuchInput`] names those that exist.
+    /// [`DataError::NoSuchInput`] names those that exist; [`DataError::OutOfFuel`].
     pub fn input(&self, name: &str) -> Result<Arc<Topic>, DataError> {
+        self.fuel.charge(|| name.len())?;
         let state = self.lock();
         let found = state.inputs.iter().find(|topic| topic.name() == name);
         found.cloned().ok_or_else(|| DataError::NoSuchInput {
@@ -136,6 +166,6 @@ impl Session {
 
     fn lock(&self) -> MutexGuard<'_, State> {
         // No call leaves the state half changed, so a poisoned lock holds nothing worse than a shorter list.
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -2,6 +2,7 @@
 
 use gleaner_journal::Said;
 use gleaner_lambda::{Trigger, TriggerKind};
+use gleaner_rules::triggers::TriggerError as Refusal;
 use serde_json::Value;
 
 use super::Session;
@@ -34,15 +35,15 @@ impl Session {
     /// [`TriggerError`] if no call could have caused it.
     pub fn relay_trigger(&self, trigger: Trigger) -> Result<(), TriggerError> {
         let Trigger { kind, label, score, attributes } = trigger;
-        let wrong = |key: &str, why| TriggerError::Attribute { label: label.clone(), key: key.to_owned(), why };
+        let wrong = |key: &str, why| Refusal::Attribute { label: label.clone(), key: key.to_owned(), why };
         if score.is_some() != (kind == TriggerKind::Event) {
-            return Err(wrong("score", "an event has a score, and nothing else has one"));
+            return Err(wrong("score", "an event has a score, and nothing else has one").into());
         }
         let attributes = attributes.into_iter().map(|(key, value)| match attribute(value) {
             Some(value) => Ok(Attribute { key, value }),
             None => Err(wrong(&key, "the value must be a truth value, a number or a text")),
         });
-        let attributes = attributes.collect::<Result<_, _>>()?;
+        let attributes = attributes.collect::<Result<_, Refusal>>()?;
         match (kind, score) {
             (TriggerKind::Event, score) => self.event(&label, score.unwrap_or_default(), attributes),
             (TriggerKind::Start, _) => self.start(&label, attributes),

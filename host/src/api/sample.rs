@@ -7,7 +7,7 @@ use gleaner_messages::{Endian, Value};
 use gleaner_rules::clamps::Length;
 use gleaner_transport::SampleMeta;
 
-use super::data::{DataError, Field, Topic};
+use super::data::{DataError, Field, OutOfFuel, Topic};
 use super::frame::{Frame, Picture};
 use super::piece::Piece;
 use super::values::{Identity, Stamps};
@@ -45,6 +45,8 @@ impl Sample {
     /// [`DataError::WrongField`] if the field belongs to another topic or is longer than one call hands out;
     /// [`DataError::Malformed`].
     pub fn get(&self, field: &Field) -> Result<Value<'_>, DataError> {
+        // A path may walk over the whole message, and the value may be most of it.
+        self.topic.per_call.charge(|| self.lease.len())?;
         field.must_belong_to(&self.topic)?;
         let value = field
             .path
@@ -70,6 +72,7 @@ impl Sample {
     ///
     /// As [`Topic::column`].
     pub fn number(&self, field: &Field) -> Result<f64, DataError> {
+        self.topic.per_call.charge(|| field.work(self.lease.len()))?;
         field.must_belong_to(&self.topic)?;
         let number = self.topic.number(&field.path, &self.lease)?;
         field.draw(self.lease.meta().at_ns, number);
@@ -87,12 +90,19 @@ impl Sample {
     }
 
     /// Bytes from `offset`, `len` at most, clamped to the message and to `call_bytes` of `[limits]`.
-    pub fn cdr(&self, offset: u64, len: u32) -> Piece {
-        Piece::of_message(&self.lease).part(offset, self.topic.per_call.bytes.min(len as usize))
+    ///
+    /// # Errors
+    ///
+    /// [`OutOfFuel`].
+    pub fn cdr(&self, offset: u64, len: u32) -> Result<Piece, OutOfFuel> {
+        let per_call = &self.topic.per_call;
+        let piece = Piece::of_message(&self.lease).part(offset, per_call.bytes.min(len as usize));
+        per_call.charge(|| piece.len())?;
+        Ok(piece)
     }
 
-    /// Work of [`Sample::as_frame`], by the header of what it has to decode, as [`Frame::work`]; none if that is done already.
-    pub fn decode_work(&self) -> usize {
+    /// Work of [`Sample::as_frame`], by the header of what it has to decode, in bytes; none if that is done already.
+    fn decode_work(&self) -> usize {
         match self.picture() {
             Ok(Picture::Compressed(compressed)) => {
                 self.topic.images.decode_work(self.lease.position(), compressed.data)
@@ -108,6 +118,7 @@ impl Sample {
     /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`], [`DataError::NoSlot`],
     /// [`DataError::NoRoom`].
     pub fn as_frame(&self) -> Result<Frame, DataError> {
+        self.topic.per_call.charge(|| self.decode_work())?;
         Frame::of(self)
     }
 

@@ -2,11 +2,63 @@
 
 use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_rules::triggers::Kind;
+use gleaner_rules::triggers::TriggerError as Refusal;
 pub(super) use gleaner_rules::triggers::Triggers;
-pub use gleaner_rules::triggers::{ATTRIBUTES, Attribute, AttributeValue, LABEL_BYTES, PER_WAKE, TriggerError};
+pub use gleaner_rules::triggers::{ATTRIBUTES, Attribute, AttributeValue, LABEL_BYTES, PER_WAKE};
 use serde_json::Value;
 
 use super::Session;
+use super::fuel::OutOfFuel;
+
+/// A refused call; it had no effect.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error(transparent)]
+pub enum TriggerError {
+    /// A rule of triggers refuses it.
+    Refused(#[from] Refusal),
+    /// The lambda cannot pay for it.
+    OutOfFuel(#[from] OutOfFuel),
+}
+
+/// Which of the refusals of `wit/trigger.wit` a lambda gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum TriggerErrorKind {
+    Invalid,
+    TooMany,
+}
+
+impl TriggerErrorKind {
+    /// The name in the WIT.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Invalid => "invalid",
+            Self::TooMany => "too-many",
+        }
+    }
+}
+
+impl TriggerError {
+    /// The refusal that a lambda gets.
+    pub fn kind(&self) -> TriggerErrorKind {
+        match self {
+            Self::Refused(refusal) if !refusal.is_too_many() => TriggerErrorKind::Invalid,
+            // Whoever can end a guest for want of fuel ends it instead.
+            Self::Refused(_) | Self::OutOfFuel(_) => TriggerErrorKind::TooMany,
+        }
+    }
+}
+
+/// What an attribute costs, in bytes, besides its texts: it was made for the host before it could be refused.
+const ATTRIBUTE_BYTES: usize = 64;
+
+fn work(attribute: &Attribute) -> usize {
+    let text = match &attribute.value {
+        AttributeValue::Text(text) => text.len(),
+        AttributeValue::Boolean(_) | AttributeValue::Signed(_) | AttributeValue::Real(_) => 8,
+    };
+    ATTRIBUTE_BYTES + attribute.key.len() + text
+}
 
 impl Session {
     /// Something worth keeping happened. `score` says how strongly, in the lambda's own unit.
@@ -43,11 +95,13 @@ impl Session {
         score: Option<f64>,
         attributes: Vec<Attribute>,
     ) -> Result<(), TriggerError> {
+        self.fuel.charge(|| label.len() + attributes.iter().map(work).sum::<usize>())?;
         let state = &mut *self.lock();
-        state.triggers.cause(state.now_ns, as_asked(kind), (label, score), attributes, |attributes| {
+        let caused = state.triggers.cause(state.now_ns, as_asked(kind), (label, score), attributes, |attributes| {
             let attributes = attributes.into_iter().map(|Attribute { key, value }| (key, json(value))).collect();
             Trigger { kind, label: label.to_owned(), score, attributes }
-        })
+        });
+        Ok(caused?)
     }
 }
 
@@ -102,7 +156,7 @@ mod tests {
         for _ in 0..PER_WAKE {
             session.event("x", 1.0, Vec::new()).unwrap();
         }
-        assert_eq!(session.event("x", 1.0, Vec::new()), Err(TriggerError::TooMany));
+        assert_eq!(session.event("x", 1.0, Vec::new()), Err(Refusal::TooMany.into()));
         session.begin(1);
         assert_eq!(session.event("x", 1.0, Vec::new()), Ok(()));
     }
@@ -111,9 +165,9 @@ mod tests {
     fn outside_of_a_wake_nothing_can_be_caused() {
         let session = session();
         session.event("before", 1.0, Vec::new()).unwrap();
-        assert_eq!(session.during_init(|| session.event("init", 1.0, Vec::new())), Err(TriggerError::NoWake));
+        assert_eq!(session.during_init(|| session.event("init", 1.0, Vec::new())), Err(Refusal::NoWake.into()));
         session.event("after", 1.0, Vec::new()).unwrap();
         assert_eq!(session.end().len(), 2);
-        assert_eq!(session.stop("late"), Err(TriggerError::NoWake));
+        assert_eq!(session.stop("late"), Err(Refusal::NoWake.into()));
     }
 }

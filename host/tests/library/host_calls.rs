@@ -1,5 +1,6 @@
-//! Calls through the WIT in every order, with whatever arguments, from the lambda `driver`: the host stays whole, gives back what it
-//! lent, and decides the same again. Programs are made up by a generator of numbers that always begins with the same one.
+//! Calls through the WIT, from the lambda `driver`. Each is paid for. In every order, with whatever arguments: the host stays whole,
+//! gives back what it lent, and decides the same again. Programs are made up by a generator of numbers that always begins with the
+//! same one.
 //!
 //! `GLEANER_HOST_CALLS` says how many programs; 10,000 take half a minute, a million an hour.
 
@@ -15,6 +16,7 @@ use gleaner_host::input::open_inputs;
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{Fault, Trigger};
 use gleaner_messages::Endian;
+use gleaner_operations::{MESSAGE, Operation, Step, setup};
 use gleaner_tests::drive::{COMPRESSED, Cdr, IMAGE, compressed, image};
 use gleaner_tests::{root, times};
 use gleaner_transport::loopback::Loopback;
@@ -105,7 +107,7 @@ impl Driver {
     fn publish(&mut self, topic: &str, cdr: &[u8]) {
         self.sent += 1;
         let (at_ns, seq) = (self.sent as i64 * 1_000_000, self.sent);
-        let endian = if cdr.len() % 7 == 6 { Endian::Big } else { Endian::Little };
+        let endian = if cdr.len() % 7 == 5 { Endian::Big } else { Endian::Little };
         let meta = SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian, options: [0; 2] };
         self.transport.publish(topic, &meta, cdr).unwrap();
     }
@@ -131,6 +133,45 @@ fn pictures() -> Vec<(Vec<u8>, Vec<u8>)> {
     let raw = [("rgb8", 192), ("mono16", 128), ("yuv422", 128), ("bayer_rggb8", 64)];
     raw.map(|(encoding, step)| (image(64, 48, encoding, step, &noise[..48 * step as usize]), compressed(&jpeg)))
         .to_vec()
+}
+
+/// What the host did for each of some calls behind [`setup`], in units of fuel.
+fn paid(operation: Operation, arguments: &[u8]) -> u64 {
+    let (raw, coded) = &pictures()[0];
+    assert_eq!(raw.len() as u64, MESSAGE, "the list counts on the length of this message");
+    let used = |program: &[u8]| {
+        let mut driver = Driver::new(false);
+        let mut used = 0;
+        // Until the rings are full, and the memory of the guest has grown to what it needs.
+        for _ in 0..6 {
+            let (result, _, _) = driver.run(raw, coded, program);
+            assert_eq!(result, Ok(()), "{}", operation.name());
+            used = driver.session.fuel().used();
+        }
+        // It reads its program by a call, too.
+        used - program.len() as u64 / 8
+    };
+    let call = Step::Call(operation).with(arguments);
+    used(&[setup(), call].concat()) - used(&setup())
+}
+
+#[test]
+fn every_call_costs_what_the_list_says() {
+    let mut problems = Vec::new();
+    for operation in Operation::ALL {
+        let name = operation.name();
+        let Some(calls) = operation.price().calls() else {
+            assert_eq!(paid(*operation, &[]), 0, "`{name}` can be called now: what does it cost?");
+            continue;
+        };
+        for (arguments, price) in calls {
+            let paid = paid(*operation, arguments);
+            if paid != price {
+                problems.push(format!("`{name}` {arguments:?} cost {paid} units of fuel; the list says {price}"));
+            }
+        }
+    }
+    assert!(problems.is_empty(), "\n{}", problems.join("\n"));
 }
 
 #[test]

@@ -164,7 +164,7 @@ fn what_one_call_gives_is_limited() {
     let bytes = vec![7; 100_000];
     let topic = topic("uint8[] x\n", "call_bytes = \"64 KiB\"", 1, &Cdr::default().bytes(&bytes).done());
     let sample = topic.newest().unwrap();
-    assert_eq!(sample.cdr(0, u32::MAX).len(), 64 << 10);
+    assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), 64 << 10);
     let error = sample.get(&topic.field("x").unwrap()).map(drop).unwrap_err();
     assert!(error.to_string().contains("has 100000 items, one call hands out 65536"), "{error}");
 }
@@ -174,7 +174,7 @@ fn how_many_items_one_call_gives_is_limited() {
     let few = "call_items = 20";
     let one = topic("uint8 x\n", few, 100, &[7]);
     let field = one.field("x").unwrap();
-    let lists = [one.last(usize::MAX).len(), one.since(0).len()];
+    let lists = [one.last(usize::MAX).unwrap().len(), one.since(0).unwrap().len()];
     let columns = [one.column(&field, usize::MAX).unwrap(), one.column_since(&field, 0).unwrap()];
     assert_eq!((lists, columns.map(|column| column.values.len())), ([20; 2], [20; 2]));
     let texts = |n: usize| (0..n).fold(Cdr::default().u32(n as u32), |cdr, _| cdr.text("x")).done();

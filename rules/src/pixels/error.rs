@@ -94,10 +94,31 @@ pub enum PixelError {
     Stopped,
 }
 
+/// What kind of refusal a [`PixelError`] is, to a caller that answers for others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PixelErrorKind {
+    /// The image, or the operation on such an image, makes no sense or costs too much.
+    Unreadable,
+    /// The region or the size that was asked for.
+    OutOfRange,
+    /// The caller ended it.
+    Stopped,
+}
+
 impl PixelError {
-    /// Whether a region or a size does not fit the image, rather than the image its own fields.
-    pub const fn is_out_of_range(&self) -> bool {
-        matches!(self, Self::Roi { .. } | Self::ResizeTo { .. })
+    /// Returns the kind. Each error has to say which it is.
+    pub const fn kind(&self) -> PixelErrorKind {
+        match self {
+            Self::Roi { .. } | Self::ResizeTo { .. } => PixelErrorKind::OutOfRange,
+            Self::Stopped => PixelErrorKind::Stopped,
+            Self::UnknownEncoding { .. }
+            | Self::Size { .. }
+            | Self::Step { .. }
+            | Self::Data { .. }
+            | Self::OddWidth { .. }
+            | Self::Raw { .. }
+            | Self::Output { .. } => PixelErrorKind::Unreadable,
+        }
     }
 }
 

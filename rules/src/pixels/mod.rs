@@ -14,6 +14,6 @@ mod pace;
 mod view;
 
 pub use encoding::{Bayer, Encoding};
-pub use error::PixelError;
+pub use error::{PixelError, PixelErrorKind};
 pub use pace::Pace;
 pub use view::{MAX_SIDE, Roi, View, check_size};

@@ -1,6 +1,6 @@
 //! What frames are, and what is computed on them.
 
-use gleaner_rules::pixels::{Encoding, PixelError, Roi, View, ops};
+use gleaner_rules::pixels::{Encoding, PixelError, PixelErrorKind, Roi, View, ops};
 use serde_json::{Value, json};
 
 use crate::{replay, text};
@@ -26,7 +26,7 @@ fn roi(given: &Value) -> Option<Roi> {
 /// What a lambda is told of it.
 fn told(result: Result<Value, PixelError>) -> Value {
     result.unwrap_or_else(|error| {
-        let kind = if error.is_out_of_range() { "out-of-range" } else { "not-a-frame" };
+        let kind = if error.kind() == PixelErrorKind::OutOfRange { "out-of-range" } else { "not-a-frame" };
         let message = error.to_string();
         // Which encodings there are, each side lists in its own order.
         json!([kind, message.split("; supported are").next()])

@@ -236,6 +236,30 @@ fn what_is_made_of_the_manifests_types_is_not_stale() {
 }
 
 #[test]
+fn every_file_that_a_recipe_for_changes_names_exists() {
+    let page = fs::read_to_string(root().join("CONTRIBUTING.md")).expect("CONTRIBUTING.md");
+    let (mut seen, mut problems) = (0, Vec::new());
+    for (index, line) in page.lines().enumerate() {
+        // Between two marks is code.
+        for word in line.split('`').skip(1).step_by(2) {
+            let is_file = Path::new(word).extension().is_some_and(|end| end.to_str().is_some_and(is_a_file_ending));
+            if is_file || word.contains('/') && !word.contains(' ') {
+                seen += 1;
+                if !root().join(word).exists() {
+                    problems.push(format!("CONTRIBUTING.md:{}: there is no `{word}`", index + 1));
+                }
+            }
+        }
+    }
+    assert!(seen > 60, "{seen} files were found");
+    none(problems);
+}
+
+fn is_a_file_ending(end: &str) -> bool {
+    ["css", "js", "md", "py", "rs", "sh", "toml", "txt", "wit"].contains(&end)
+}
+
+#[test]
 fn the_book_does_not_leave_the_checkout() {
     let book = fs::read_to_string(root().join("docs/book.toml")).expect("docs/book.toml");
     let book: toml::Table = book.parse().expect("TOML");

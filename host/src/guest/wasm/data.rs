@@ -9,7 +9,7 @@ use super::bindings::gleaner::lambda::types::{
     self, Column, Counts, DataError, Encoding, FrameInfo, Guid, Identity, Roi, Stamps, Value,
 };
 use super::bindings::handles::{Field, Frame, Sample, Topic};
-use crate::api::frame::Operation;
+use crate::api::data::DataErrorKind as Kind;
 use crate::api::{data, frame};
 use gleaner_image as image;
 
@@ -22,85 +22,66 @@ impl types::Host for Hosted {}
 
 impl Host for Hosted {
     fn input(&mut self, name: String) -> Answer<Resource<Topic>> {
-        self.meter.charge(name.len())?;
         let input = self.session.input(&name);
         self.hand_out(input)
     }
 
     fn inputs(&mut self) -> wasmtime::Result<Vec<String>> {
-        let inputs = self.session.inputs();
-        self.meter.charge(inputs.len() * data::FIELD_BYTES)?;
-        Ok(inputs.iter().map(|topic| topic.name().to_owned()).collect())
+        Ok(self.session.input_names()?)
     }
 
     fn now_ns(&mut self) -> wasmtime::Result<i64> {
-        self.meter.charge(0)?;
+        self.session.fuel().charge_call()?;
         Ok(self.session.now_ns())
     }
 }
 
 impl HostTopic for Hosted {
     fn name(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
-        self.text(&topic, |topic| topic.name())
+        Ok(self.look(&topic)?.name().to_owned())
     }
 
     fn ros_topic(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
-        self.text(&topic, |topic| topic.ros_topic())
+        Ok(self.look(&topic)?.ros_topic().to_owned())
     }
 
     fn type_name(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
-        self.text(&topic, |topic| topic.type_name())
+        Ok(self.look(&topic)?.type_name().to_owned())
     }
 
     fn newest(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Option<Resource<Sample>>> {
-        self.meter.charge(0)?;
-        let newest = self.handles.get(&topic)?.newest();
+        let newest = self.look(&topic)?.newest();
         newest.map(|sample| Ok(self.handles.push(sample)?)).transpose()
     }
 
     fn last(&mut self, topic: Resource<Topic>, n: u32) -> wasmtime::Result<Vec<Resource<Sample>>> {
-        let samples = self.handles.get(&topic)?.last(n as usize);
+        let samples = self.handles.get(&topic)?.last(n as usize)?;
         self.hand_out_all(samples)
     }
 
     fn since(&mut self, topic: Resource<Topic>, since_ns: i64) -> wasmtime::Result<Vec<Resource<Sample>>> {
-        let samples = self.handles.get(&topic)?.since(since_ns);
+        let samples = self.handles.get(&topic)?.since(since_ns)?;
         self.hand_out_all(samples)
     }
 
     fn counts(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Counts> {
-        self.meter.charge(0)?;
-        let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } =
-            self.handles.get(&topic)?.counts();
+        let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } = self.look(&topic)?.counts();
         Ok(Counts { received, lost, overwritten, no_slot, too_big, skipped })
     }
 
     fn field(&mut self, topic: Resource<Topic>, path: String) -> Answer<Resource<Field>> {
-        self.meter.charge(path.len())?;
         let field = self.handles.get(&topic)?.field(&path);
         self.hand_out(field)
     }
 
     fn column(&mut self, topic: Resource<Topic>, field: Resource<Field>, n: u32) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        self.meter.charge(topic.column_work(field, n as usize))?;
         answer(topic.column(field, n as usize).map(column_out))
     }
 
     fn column_since(&mut self, topic: Resource<Topic>, field: Resource<Field>, since_ns: i64) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        // How many samples it is shows only on the way. At fixed places they cost little, and are charged afterwards.
-        let whole_ring = || topic.column_work(field, usize::MAX);
-        let column = if field.walks() {
-            self.meter.charge(whole_ring())?;
-            topic.column_since(field, since_ns)
-        } else {
-            let column = topic.column_since(field, since_ns);
-            let read = column.as_ref().map_or_else(|_| whole_ring(), |column| column.values.len() * data::FIELD_BYTES);
-            self.meter.charge(read)?;
-            column
-        };
-        answer(column.map(column_out))
+        answer(topic.column_since(field, since_ns).map(column_out))
     }
 
     fn drop(&mut self, topic: Resource<Topic>) -> wasmtime::Result<()> {
@@ -111,7 +92,7 @@ impl HostTopic for Hosted {
 
 impl HostField for Hosted {
     fn path(&mut self, field: Resource<Field>) -> wasmtime::Result<String> {
-        self.text(&field, |field| field.path())
+        Ok(self.look(&field)?.path().to_owned())
     }
 
     fn drop(&mut self, field: Resource<Field>) -> wasmtime::Result<()> {
@@ -122,36 +103,29 @@ impl HostField for Hosted {
 
 impl HostSample for Hosted {
     fn identity(&mut self, sample: Resource<Sample>) -> wasmtime::Result<Identity> {
-        self.meter.charge(0)?;
-        Ok(identity(&self.handles.get(&sample)?.identity()))
+        Ok(identity(&self.look(&sample)?.identity()))
     }
 
     fn stamps(&mut self, sample: Resource<Sample>) -> wasmtime::Result<Stamps> {
-        self.meter.charge(0)?;
-        Ok(stamps(self.handles.get(&sample)?.stamps()))
+        Ok(stamps(self.look(&sample)?.stamps()))
     }
 
     fn get(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<Value> {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
-        // A path may walk over the whole message, and the value may be most of it.
-        self.meter.charge(sample.bytes().len())?;
         answer(sample.get(field).map(value))
     }
 
     fn number(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<f64> {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
-        self.meter.charge(field.work(sample.bytes().len()))?;
         answer(sample.number(field))
     }
 
     fn size(&mut self, sample: Resource<Sample>) -> wasmtime::Result<u64> {
-        self.meter.charge(0)?;
-        Ok(self.handles.get(&sample)?.bytes().len() as u64)
+        Ok(self.look(&sample)?.bytes().len() as u64)
     }
 
     fn big_endian(&mut self, sample: Resource<Sample>) -> wasmtime::Result<bool> {
-        self.meter.charge(0)?;
-        Ok(self.handles.get(&sample)?.big_endian())
+        Ok(self.look(&sample)?.big_endian())
     }
 
     /// Never called: see [`add_reads_to_linker`].
@@ -160,9 +134,7 @@ impl HostSample for Hosted {
     }
 
     fn as_frame(&mut self, sample: Resource<Sample>) -> Answer<Resource<Frame>> {
-        let sample = self.handles.get(&sample)?;
-        self.meter.charge(sample.decode_work())?;
-        let frame = sample.as_frame();
+        let frame = self.handles.get(&sample)?.as_frame();
         self.hand_out(frame)
     }
 
@@ -174,46 +146,35 @@ impl HostSample for Hosted {
 
 impl HostFrame for Hosted {
     fn info(&mut self, frame: Resource<Frame>) -> wasmtime::Result<FrameInfo> {
-        self.meter.charge(0)?;
-        let frame = self.handles.get(&frame)?;
+        let frame = self.look(&frame)?;
         let frame::Info { width, height, encoding, step, big_endian } = frame.info();
         let size = frame.bytes().len() as u64;
         Ok(FrameInfo { width, height, encoding: encoding_out(encoding), step, big_endian, size })
     }
 
     fn identity(&mut self, frame: Resource<Frame>) -> wasmtime::Result<Identity> {
-        self.meter.charge(0)?;
-        Ok(identity(self.handles.get(&frame)?.identity()))
+        Ok(identity(self.look(&frame)?.identity()))
     }
 
     fn stamps(&mut self, frame: Resource<Frame>) -> wasmtime::Result<Stamps> {
-        self.meter.charge(0)?;
-        Ok(stamps(self.handles.get(&frame)?.stamps()))
+        Ok(stamps(self.look(&frame)?.stamps()))
     }
 
     fn mean_luma(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<f64> {
-        let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
-        self.meter.charge(frame.work(Operation::MeanLuma(roi)))?;
-        answer(frame.mean_luma(roi))
+        answer(self.handles.get(&frame)?.mean_luma(roi.map(roi_in)))
     }
 
     fn histogram(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<Vec<u32>> {
-        let (frame, roi) = (self.handles.get(&frame)?, roi.map(roi_in));
-        self.meter.charge(frame.work(Operation::Histogram(roi)))?;
-        answer(frame.histogram(roi).map(Vec::from))
+        answer(self.handles.get(&frame)?.histogram(roi.map(roi_in)).map(Vec::from))
     }
 
     fn resize(&mut self, frame: Resource<Frame>, width: u32, height: u32) -> Answer<Resource<Frame>> {
-        let frame = self.handles.get(&frame)?;
-        self.meter.charge(frame.work(Operation::Resize(width, height)))?;
-        let resized = frame.resize(width, height);
+        let resized = self.handles.get(&frame)?.resize(width, height);
         self.hand_out(resized)
     }
 
     fn to_gray(&mut self, frame: Resource<Frame>) -> Answer<Resource<Frame>> {
-        let frame = self.handles.get(&frame)?;
-        self.meter.charge(frame.work(Operation::ToGray))?;
-        let gray = frame.to_gray();
+        let gray = self.handles.get(&frame)?.to_gray();
         self.hand_out(gray)
     }
 
@@ -245,15 +206,11 @@ pub(super) fn add_reads_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Resu
 
 impl Hosted {
     fn sample_cdr(&mut self, sample: &Resource<Sample>, offset: u64, len: u32) -> wasmtime::Result<Bytes> {
-        let bytes = self.handles.get(sample)?.cdr(offset, len);
-        self.meter.charge(bytes.len())?;
-        Ok(Bytes::from_owner(bytes))
+        Ok(Bytes::from_owner(self.handles.get(sample)?.cdr(offset, len)?))
     }
 
     fn frame_read(&mut self, frame: &Resource<Frame>, offset: u64, len: u32) -> wasmtime::Result<Bytes> {
-        let bytes = self.handles.get(frame)?.read(offset, len);
-        self.meter.charge(bytes.len())?;
-        Ok(Bytes::from_owner(bytes))
+        Ok(Bytes::from_owner(self.handles.get(frame)?.read(offset, len)?))
     }
 
     fn hand_out<T: Send + 'static>(&mut self, made: Result<T, data::DataError>) -> Answer<Resource<T>> {
@@ -264,20 +221,21 @@ impl Hosted {
     }
 
     fn hand_out_all(&mut self, samples: Vec<Sample>) -> wasmtime::Result<Vec<Resource<Sample>>> {
-        self.meter.charge(samples.len() * data::FIELD_BYTES)?;
         samples.into_iter().map(|sample| Ok(self.handles.push(sample)?)).collect()
     }
 
-    fn text<T: 'static>(&mut self, handle: &Resource<T>, text: impl FnOnce(&T) -> &str) -> wasmtime::Result<String> {
-        self.meter.charge(0)?;
-        Ok(text(self.handles.get(handle)?).to_owned())
+    /// What a handle stands for, for a call that only looks at it: one that is charged nowhere else.
+    fn look<T: 'static>(&self, handle: &Resource<T>) -> wasmtime::Result<&T> {
+        self.session.fuel().charge_call()?;
+        Ok(self.handles.get(handle)?)
     }
 }
 
-/// What a guest is answered; what could not end in time ends it.
+/// What a guest is answered; what it could not pay for, or could not end in time, ends it.
 fn answer<T>(made: Result<T, data::DataError>) -> Answer<T> {
     match made {
         Ok(value) => Ok(Ok(value)),
+        Err(data::DataError::OutOfFuel(error)) => Err(error.into()),
         Err(error @ data::DataError::OutOfTime) => Err(error.into()),
         Err(error) => Ok(Err(refused(error))),
     }
@@ -317,17 +275,14 @@ fn value(value: gleaner_messages::Value<'_>) -> Value {
 
 fn refused(error: data::DataError) -> DataError {
     let message = error.to_string();
-    match error {
-        data::DataError::NoSuchInput { .. } => DataError::NoSuchInput(message),
-        data::DataError::NoSuchField(_) => DataError::NoSuchField(message),
-        data::DataError::WrongField { .. } => DataError::WrongField(message),
-        data::DataError::Malformed { .. } => DataError::Malformed(message),
-        data::DataError::NoImageType { .. } | data::DataError::NotAFrame { .. } => DataError::NotAFrame(message),
-        data::DataError::TooLarge { .. }
-        | data::DataError::NoSlot { .. }
-        | data::DataError::NoRoom(_)
-        | data::DataError::OutOfTime => DataError::NoRoom(message),
-        data::DataError::OutOfRange(_) => DataError::OutOfRange(message),
+    match error.kind() {
+        Kind::NoSuchInput => DataError::NoSuchInput(message),
+        Kind::NoSuchField => DataError::NoSuchField(message),
+        Kind::WrongField => DataError::WrongField(message),
+        Kind::Malformed => DataError::Malformed(message),
+        Kind::NotAFrame => DataError::NotAFrame(message),
+        Kind::NoRoom => DataError::NoRoom(message),
+        Kind::OutOfRange => DataError::OutOfRange(message),
     }
 }
 

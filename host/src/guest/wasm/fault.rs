@@ -6,9 +6,10 @@ use wasmtime::{Trap, WasmBacktrace};
 use wasmtime_wasi::I32Exit;
 
 use super::Hosted;
-use super::limits::{OutOfFuel, Refused};
+use super::limits::Refused;
 use super::wasi::Asleep;
 use crate::api::data::DataError;
+use crate::api::fuel::OutOfFuel;
 
 /// How wasmtime begins to say that a lambda passed more than `call_bytes`.
 const TOO_MUCH_DATA: &str = "too much data is being copied between the host and the guest";

@@ -7,7 +7,7 @@ use super::bindings::gleaner::lambda::inference::{
     DetectOptions, Detection, Host, HostModel, HostTensor, InferenceError, Preprocess,
 };
 use crate::api::frame::Frame;
-use crate::api::inference::{self, Model, Tensor};
+use crate::api::inference::{self, InferenceErrorKind, Model, Tensor};
 
 type Answer<T> = wasmtime::Result<Result<T, InferenceError>>;
 
@@ -15,12 +15,13 @@ impl Host for Hosted {}
 
 impl HostTensor for Hosted {
     fn from_values(&mut self, shape: Vec<u32>, values: Vec<f32>) -> Answer<Resource<Tensor>> {
-        self.meter.charge(size_of_val(&*shape) + size_of_val(&*values))?;
-        self.answer(Tensor::new())
+        let made = Tensor::from_values(size_of_val(&*shape) + size_of_val(&*values), self.session.fuel());
+        self.answer(made)
     }
 
     fn from_frame(&mut self, _frame: Resource<Frame>, _how: Preprocess) -> Answer<Resource<Tensor>> {
-        self.answer(Tensor::new())
+        let made = Tensor::from_frame(self.session.fuel());
+        self.answer(made)
     }
 
     fn shape(&mut self, tensor: Resource<Tensor>) -> wasmtime::Result<Vec<u32>> {
@@ -38,8 +39,8 @@ impl HostTensor for Hosted {
 
 impl HostModel for Hosted {
     fn open(&mut self, name: String) -> Answer<Resource<Model>> {
-        self.meter.charge(name.len())?;
-        self.answer(Model::open(&name))
+        let opened = Model::open(&name, self.session.fuel());
+        self.answer(opened)
     }
 
     fn run(&mut self, model: Resource<Model>, _inputs: Vec<Resource<Tensor>>) -> Answer<Vec<Resource<Tensor>>> {
@@ -62,10 +63,13 @@ impl HostModel for Hosted {
 
 impl Hosted {
     fn answer<T: Send + 'static>(&mut self, made: Result<T, inference::InferenceError>) -> Answer<Resource<T>> {
-        self.meter.charge(0)?;
-        Ok(match made {
-            Ok(value) => Ok(self.handles.push(value)?),
-            Err(error @ inference::InferenceError::NoRuntime) => Err(InferenceError::NoRuntime(error.to_string())),
-        })
+        let error = match made {
+            Ok(value) => return Ok(Ok(self.handles.push(value)?)),
+            Err(inference::InferenceError::OutOfFuel(error)) => return Err(error.into()),
+            Err(error) => error,
+        };
+        Ok(Err(match error.kind() {
+            InferenceErrorKind::NoRuntime => InferenceError::NoRuntime(error.to_string()),
+        }))
     }
 }

@@ -1,17 +1,12 @@
-//! What a store refuses: memory beyond the cap, and host work beyond the fuel.
-
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+//! What a store refuses: memory and tables beyond the cap.
 
 use gleaner_lambda::manifest::Limits;
 use wasmtime::ResourceLimiter;
 
-/// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in the same time.
-const BYTES_PER_FUEL: u64 = 8;
+use crate::api::fuel::Fuel;
+
 /// Bytes of a page of linear memory.
 const PAGE: usize = 64 << 10;
-/// Fuel for the call itself.
-const FUEL_PER_CALL: u64 = 20;
 
 /// Caps memory and tables, and remembers what it refused, since a guest only traps afterwards.
 pub(super) struct Caps {
@@ -22,7 +17,7 @@ pub(super) struct Caps {
     /// Of all tables together.
     table_elements: usize,
     refused: Option<Refused>,
-    meter: Meter,
+    fuel: Fuel,
 }
 
 /// What was asked for beyond a cap.
@@ -35,11 +30,11 @@ pub(super) struct Refused {
 }
 
 impl Caps {
-    /// The caps in `limits`; what grows is charged to `meter`.
-    pub(super) fn new(limits: &Limits, meter: Meter) -> Self {
+    /// The caps in `limits`; what grows is charged to `fuel`.
+    pub(super) fn new(limits: &Limits, fuel: Fuel) -> Self {
         let tables_allowed = usize::try_from(limits.tables).unwrap_or(usize::MAX);
         let memory_allowed = limits.memory.as_usize();
-        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None, meter }
+        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None, fuel }
     }
 
     pub(super) fn forget_refusal(&mut self) {
@@ -62,7 +57,7 @@ impl ResourceLimiter for Caps {
         // One instruction has the kernel clear all these pages, and a loop of refusals takes time, too. A memory's first bytes belong to
         // its instance, which is no work of a loop.
         if now > 0 {
-            self.meter.charge(if grows { more } else { PAGE })?;
+            self.fuel.charge(|| if grows { more } else { PAGE })?;
         }
         if !fits {
             let (asked, allowed) = (total as u64, self.memory_allowed as u64);
@@ -102,61 +97,10 @@ impl ResourceLimiter for Caps {
     }
 }
 
-/// Counts the work of host calls as fuel. The guest's own instructions are counted by the store. Clones count together: output and
-/// random numbers of WASI do not see the store. One thread uses them.
-#[derive(Clone, Default)]
-pub(super) struct Meter(Arc<Account>);
-
-#[derive(Default)]
-struct Account {
-    used: AtomicU64,
-    allowed: AtomicU64,
-}
-
-/// The host has done as much for a guest as its fuel allows.
-#[derive(Debug, thiserror::Error)]
-#[error("host calls used all fuel")]
-pub(super) struct OutOfFuel;
-
-impl Meter {
-    /// A new call into the guest, in which the host may do as much.
-    pub(super) fn begin(&self, allowed: u64) {
-        self.0.used.store(0, Ordering::Relaxed);
-        self.0.allowed.store(allowed, Ordering::Relaxed);
-    }
-
-    pub(super) fn used(&self) -> u64 {
-        self.0.used.load(Ordering::Relaxed)
-    }
-
-    /// Charges one call that touches `bytes`, before it is done.
-    pub(super) fn charge(&self, bytes: usize) -> Result<(), OutOfFuel> {
-        self.charge_fuel(bytes as u64 / BYTES_PER_FUEL)
-    }
-
-    /// Charges one call that takes as long as so many instructions.
-    pub(super) fn charge_fuel(&self, fuel: u64) -> Result<(), OutOfFuel> {
-        let used = self.used().saturating_add(FUEL_PER_CALL).saturating_add(fuel);
-        self.0.used.store(used, Ordering::Relaxed);
-        if used > self.0.allowed.load(Ordering::Relaxed) { Err(OutOfFuel) } else { Ok(()) }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn work_is_refused_once_the_fuel_is_used() {
-        let meter = Meter::default();
-        meter.begin(1000);
-        let other = meter.clone();
-        assert!(meter.charge(4000).is_ok());
-        assert!(other.charge(4000).is_err());
-        assert_eq!(meter.used(), 1040);
-        meter.begin(100);
-        assert!(meter.charge_fuel(80).is_ok() && meter.charge_fuel(u64::MAX).is_err());
-    }
+    use crate::api::fuel::OutOfFuel;
 
     #[test]
     fn a_refused_growth_is_remembered() {
@@ -172,27 +116,29 @@ mod tests {
     }
 
     const MIB: usize = 1 << 20;
+    /// Of the call that grows something.
+    const FUEL_PER_CALL: u64 = 20;
 
     /// Of a mebibyte and 100 elements.
     fn caps() -> Caps {
         let mut limits = Limits::default();
         (limits.memory, limits.tables) = (gleaner_base::ByteSize::mib(1), 100);
-        let meter = Meter::default();
-        meter.begin(1_000_000);
-        Caps::new(&limits, meter)
+        let fuel = Fuel::default();
+        fuel.begin(1_000_000);
+        Caps::new(&limits, fuel)
     }
 
     #[test]
     fn growing_costs_fuel_by_the_byte_and_a_refusal_as_much_as_a_page() {
         let mut caps = caps();
         let (grown, refused) = ((MIB / 2) as u64 / 8 + FUEL_PER_CALL, PAGE as u64 / 8 + FUEL_PER_CALL);
-        caps.meter.begin(grown + 2 * refused - 1);
+        caps.fuel.begin(grown + 2 * refused - 1);
         assert!(caps.memory_growing(0, MIB / 2, None).unwrap());
-        assert_eq!(caps.meter.used(), 0);
+        assert_eq!(caps.fuel.used(), 0);
         assert!(caps.memory_growing(MIB / 2, MIB, None).unwrap());
-        assert_eq!(caps.meter.used(), grown);
+        assert_eq!(caps.fuel.used(), grown);
         assert!(!caps.memory_growing(MIB, 2 * MIB, None).unwrap());
-        assert_eq!(caps.meter.used(), grown + refused);
+        assert_eq!(caps.fuel.used(), grown + refused);
         let error = caps.memory_growing(MIB, 2 * MIB, None).unwrap_err();
         assert!(error.downcast_ref::<OutOfFuel>().is_some());
     }

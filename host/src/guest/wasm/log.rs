@@ -6,7 +6,6 @@ use crate::api::log;
 
 impl Host for Hosted {
     fn log(&mut self, level: Level, message: String) -> wasmtime::Result<()> {
-        self.meter.charge(message.len())?;
         let level = match level {
             Level::Error => log::Level::Error,
             Level::Warn => log::Level::Warn,
@@ -14,7 +13,6 @@ impl Host for Hosted {
             Level::Debug => log::Level::Debug,
             Level::Trace => log::Level::Trace,
         };
-        self.session.log(level, &message);
-        Ok(())
+        Ok(self.session.log(level, &message)?)
     }
 }

@@ -1,7 +1,7 @@
 //! WebAssembly components: one store on one thread, fuel and a memory cap always on, a deadline where the clock is real.
 //!
-//! The five files named as the WIT interfaces are thin: they convert, charge fuel for the bytes that the host touches, and
-//! leave everything else to `api`. A trap ends the store; the next wake gets a new one. Nothing here compiles code.
+//! The five files named as the WIT interfaces are thin: they convert, and leave everything else to `api`, prices too. A trap
+//! ends the store; the next wake gets a new one. Nothing here compiles code.
 
 mod bindings;
 mod data;
@@ -29,7 +29,7 @@ use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
 
 use self::bindings::gleaner::lambda::data as wit;
 use self::bindings::{ConfigEntry, ConfigValue as WitConfigValue, Lambda};
-use self::limits::{Caps, Meter};
+use self::limits::Caps;
 use self::wasi::Printed;
 use super::{Guest, Outcome};
 use crate::api::Session;
@@ -59,7 +59,6 @@ struct Hosted {
     printed: Printed,
     allowed: Limits,
     caps: Caps,
-    meter: Meter,
     /// When the call that runs has to end, where there is a deadline.
     due: Option<Instant>,
 }
@@ -97,16 +96,14 @@ impl WasmGuest {
     }
 
     fn new_store(&self) -> Store<Hosted> {
-        let meter = Meter::default();
-        let printed = Printed::new(&self.session, &meter);
+        let printed = Printed::new(&self.session);
         let hosted = Hosted {
             session: self.session.clone(),
             handles: handle_table(&self.limits),
             wasi: wasi::context(&self.session, &printed, self.loaded.seed()),
             printed,
             allowed: self.limits,
-            caps: Caps::new(&self.limits, meter.clone()),
-            meter,
+            caps: Caps::new(&self.limits, self.session.fuel().clone()),
             due: None,
         };
         let mut store = Store::new(self.loaded.engine(), hosted);
@@ -174,7 +171,7 @@ impl<'a> Call<'a> {
     fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<(&'a Deadline, Duration)>) -> Self {
         store.set_fuel(fuel).expect("the engine counts fuel");
         let hosted = store.data_mut();
-        hosted.meter.begin(fuel);
+        hosted.session.fuel().begin(fuel);
         hosted.caps.forget_refusal();
         hosted.printed.begin();
         let armed = deadline.map(|(deadline, allowed)| deadline.arm(store, allowed));
@@ -205,7 +202,7 @@ impl<'a> Call<'a> {
         drop(self.armed);
         self.store.data().printed.end();
         let left = self.store.get_fuel().unwrap_or(0);
-        let used = (self.fuel - left.min(self.fuel)).saturating_add(self.store.data().meter.used());
+        let used = (self.fuel - left.min(self.fuel)).saturating_add(self.store.data().session.fuel().used());
         let time = taken.map(deadline::Taken::elapsed_and_allowed);
         let result = match result {
             // Guest and host each kept within the allowance; together they must as well.

@@ -2,52 +2,48 @@
 
 use super::Hosted;
 use super::bindings::gleaner::lambda::scratch::{Entry, Host, ScratchError};
-use crate::api::scratch;
+use crate::api::scratch::{self, ScratchErrorKind};
 
 type Answer<T> = wasmtime::Result<Result<T, ScratchError>>;
 
-/// What an entry of the list costs besides its name.
-const ENTRY_BYTES: usize = 64;
-
 impl Host for Hosted {
     fn put(&mut self, name: String, bytes: Vec<u8>) -> Answer<()> {
-        self.meter.charge(name.len() + bytes.len())?;
-        Ok(self.session.put(&name, &bytes).map_err(refused))
+        answer(self.session.put(&name, &bytes))
     }
 
     fn append(&mut self, name: String, bytes: Vec<u8>) -> Answer<()> {
-        self.meter.charge(name.len() + bytes.len())?;
-        Ok(self.session.append(&name, &bytes).map_err(refused))
+        answer(self.session.append(&name, &bytes))
     }
 
     fn get(&mut self, name: String, offset: u64, len: u32) -> Answer<Vec<u8>> {
-        let answer = self.session.get(&name, offset, u64::from(len));
-        self.meter.charge(name.len() + answer.as_ref().map_or(0, Vec::len))?;
-        Ok(answer.map_err(refused))
+        answer(self.session.get(&name, offset, u64::from(len)))
     }
 
     fn remove(&mut self, name: String) -> Answer<()> {
-        self.meter.charge(name.len())?;
-        Ok(self.session.remove(&name).map_err(refused))
+        answer(self.session.remove(&name))
     }
 
     fn entries(&mut self) -> wasmtime::Result<Vec<Entry>> {
-        let entries = self.session.entries();
-        self.meter.charge(entries.iter().map(|entry| ENTRY_BYTES + entry.name.len()).sum())?;
+        let entries = self.session.entries()?;
         Ok(entries.into_iter().map(|scratch::Entry { name, bytes }| Entry { name, bytes }).collect())
     }
 
     fn free(&mut self) -> wasmtime::Result<u64> {
-        self.meter.charge(0)?;
+        self.session.fuel().charge_call()?;
         Ok(self.session.free())
     }
 }
 
-fn refused(error: scratch::ScratchError) -> ScratchError {
+fn answer<T>(made: Result<T, scratch::ScratchError>) -> Answer<T> {
+    let error = match made {
+        Ok(value) => return Ok(Ok(value)),
+        Err(scratch::ScratchError::OutOfFuel(error)) => return Err(error.into()),
+        Err(error) => error,
+    };
     let message = error.to_string();
-    match error {
-        scratch::ScratchError::NoRoom { .. } | scratch::ScratchError::TooMany(_) => ScratchError::NoRoom(message),
-        scratch::ScratchError::NoSuchEntry(_) => ScratchError::NoSuchEntry(message),
-        scratch::ScratchError::WrongName(_) => ScratchError::WrongName(message),
-    }
+    Ok(Err(match error.kind() {
+        ScratchErrorKind::NoRoom => ScratchError::NoRoom(message),
+        ScratchErrorKind::NoSuchEntry => ScratchError::NoSuchEntry(message),
+        ScratchErrorKind::WrongName => ScratchError::WrongName(message),
+    }))
 }

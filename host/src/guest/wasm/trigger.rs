@@ -2,36 +2,22 @@
 
 use super::Hosted;
 use super::bindings::gleaner::lambda::trigger::{Attribute, AttributeValue, Host, TriggerError};
-use crate::api::trigger;
+use crate::api::trigger::{self, TriggerErrorKind};
 
 type Answer = wasmtime::Result<Result<(), TriggerError>>;
 
 impl Host for Hosted {
     fn event(&mut self, label: String, score: f64, attributes: Vec<Attribute>) -> Answer {
-        self.meter.charge(label.len() + bytes(&attributes))?;
-        Ok(self.session.event(&label, score, attributes.into_iter().map(attribute).collect()).map_err(refused))
+        answer(self.session.event(&label, score, attributes.into_iter().map(attribute).collect()))
     }
 
     fn start(&mut self, label: String, attributes: Vec<Attribute>) -> Answer {
-        self.meter.charge(label.len() + bytes(&attributes))?;
-        Ok(self.session.start(&label, attributes.into_iter().map(attribute).collect()).map_err(refused))
+        answer(self.session.start(&label, attributes.into_iter().map(attribute).collect()))
     }
 
     fn stop(&mut self, label: String) -> Answer {
-        self.meter.charge(label.len())?;
-        Ok(self.session.stop(&label).map_err(refused))
+        answer(self.session.stop(&label))
     }
-}
-
-/// What an attribute costs besides its texts: it was lifted out of the guest before it could be refused.
-const ATTRIBUTE_BYTES: usize = 64;
-
-fn bytes(attributes: &[Attribute]) -> usize {
-    let text = |value: &AttributeValue| match value {
-        AttributeValue::Text(text) => text.len(),
-        AttributeValue::Boolean(_) | AttributeValue::Signed(_) | AttributeValue::Real(_) => 8,
-    };
-    attributes.iter().map(|attribute| ATTRIBUTE_BYTES + attribute.key.len() + text(&attribute.value)).sum()
 }
 
 fn attribute(Attribute { key, value }: Attribute) -> trigger::Attribute {
@@ -44,11 +30,14 @@ fn attribute(Attribute { key, value }: Attribute) -> trigger::Attribute {
     trigger::Attribute { key, value }
 }
 
-fn refused(error: trigger::TriggerError) -> TriggerError {
-    match error {
-        trigger::TriggerError::TooMany | trigger::TriggerError::TooOften { .. } => {
-            TriggerError::TooMany(error.to_string())
-        }
-        error => TriggerError::Invalid(error.to_string()),
+fn answer(made: Result<(), trigger::TriggerError>) -> Answer {
+    let Err(error) = made else { return Ok(Ok(())) };
+    if let trigger::TriggerError::OutOfFuel(error) = error {
+        return Err(error.into());
     }
+    let message = error.to_string();
+    Ok(Err(match error.kind() {
+        TriggerErrorKind::Invalid => TriggerError::Invalid(message),
+        TriggerErrorKind::TooMany => TriggerError::TooMany(message),
+    }))
 }

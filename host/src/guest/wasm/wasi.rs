@@ -21,8 +21,8 @@ use wasmtime_wasi::random::WasiRandomCtx;
 use wasmtime_wasi::{HostWallClock, WasiCtx, WasiCtxView, WasiView};
 
 use super::Hosted;
-use super::limits::{Meter, OutOfFuel};
 use crate::api::Session;
+use crate::api::fuel::OutOfFuel;
 use crate::api::log::{LINE_BYTES, Level, cut};
 
 /// How the standard library begins to tell a panic, behind the name of the thread.
@@ -62,7 +62,7 @@ fn refuse_names(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
         |store,
          (network, name): (Resource<Network>, String)|
          -> wasmtime::Result<(Result<Resource<Addresses>, ErrorCode>,)> {
-            store.data().meter.charge(name.len())?;
+            store.data().session.fuel().charge(|| name.len())?;
             store.data().handles.get(&network)?;
             Ok((Err(ErrorCode::PermanentResolverFailure),))
         },
@@ -134,7 +134,7 @@ impl Hosted {
 
     fn charge_random(&self, bytes: u64) -> Result<(), OutOfFuel> {
         // More is refused, without being drawn.
-        self.meter.charge_fuel(bytes.min(RANDOM_BYTES) * FUEL_PER_RANDOM_BYTE)
+        self.session.fuel().charge_units(bytes.min(RANDOM_BYTES) * FUEL_PER_RANDOM_BYTE)
     }
 }
 
@@ -165,19 +165,19 @@ impl insecure::Host for Hosted {
 /// Output is all that can be waited for, and always ready.
 impl poll::Host for Hosted {
     fn poll(&mut self, these: Vec<Resource<DynPollable>>) -> wasmtime::Result<Vec<u32>> {
-        self.meter.charge_fuel(FUEL_PER_POLLABLE.saturating_mul(these.len() as u64))?;
+        self.session.fuel().charge_units(FUEL_PER_POLLABLE.saturating_mul(these.len() as u64))?;
         poll::Host::poll(&mut self.handles, these)
     }
 }
 
 impl poll::HostPollable for Hosted {
     fn ready(&mut self, this: Resource<DynPollable>) -> wasmtime::Result<bool> {
-        self.meter.charge_fuel(FUEL_PER_POLLABLE)?;
+        self.session.fuel().charge_units(FUEL_PER_POLLABLE)?;
         poll::HostPollable::ready(&mut self.handles, this)
     }
 
     fn block(&mut self, this: Resource<DynPollable>) -> wasmtime::Result<()> {
-        self.meter.charge_fuel(FUEL_PER_POLLABLE)?;
+        self.session.fuel().charge_units(FUEL_PER_POLLABLE)?;
         poll::HostPollable::block(&mut self.handles, this)
     }
 
@@ -193,8 +193,8 @@ pub(super) struct Printed {
 }
 
 impl Printed {
-    pub(super) fn new(session: &Session, meter: &Meter) -> Self {
-        Self { stdout: Lines::new(session, meter, Level::Info), stderr: Lines::new(session, meter, Level::Warn) }
+    pub(super) fn new(session: &Session) -> Self {
+        Self { stdout: Lines::new(session, Level::Info), stderr: Lines::new(session, Level::Warn) }
     }
 
     /// Forgets what an earlier call said on standard error.
@@ -229,7 +229,6 @@ impl Printed {
 #[derive(Clone)]
 struct Lines {
     session: Session,
-    meter: Meter,
     level: Level,
     state: Arc<Mutex<Unfinished>>,
 }
@@ -245,8 +244,8 @@ struct Unfinished {
 }
 
 impl Lines {
-    fn new(session: &Session, meter: &Meter, level: Level) -> Self {
-        Self { session: session.clone(), meter: meter.clone(), level, state: Arc::default() }
+    fn new(session: &Session, level: Level) -> Self {
+        Self { session: session.clone(), level, state: Arc::default() }
     }
 
     fn lock(&self) -> MutexGuard<'_, Unfinished> {
@@ -273,7 +272,7 @@ impl Unfinished {
         // A panic is told by the fault; in the log it would only take the room of other lines.
         self.panicking |= line.contains(PANICKED);
         if !line.is_empty() && !self.panicking {
-            session.log(level, line);
+            session.write(level, line);
         }
     }
 }
@@ -300,7 +299,7 @@ impl OutputStream for Lines {
         if bytes.len() > LINE_BYTES {
             return Err(StreamError::trap("a lambda wrote more than its stream had said to take"));
         }
-        self.meter.charge(bytes.len()).map_err(|error| StreamError::Trap(error.into()))?;
+        self.session.fuel().charge(|| bytes.len()).map_err(|error| StreamError::Trap(error.into()))?;
         self.lock().write(&bytes, &self.session, self.level);
         Ok(())
     }

@@ -115,7 +115,7 @@ impl Remote {
     fn call<T>(&mut self, wanted: impl Fn(Message) -> Option<T>) -> Result<T, Fault> {
         self.read()?;
         let Some(Read { log, message }) = self.read.take() else { return Err(self.killed(None)) };
-        log.iter().for_each(|(level, message)| self.session.log(*level, message));
+        log.iter().for_each(|(level, message)| self.session.write(*level, message));
         wanted(message).ok_or_else(|| self.killed(Some("a message that is not due")))
     }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Callable
 
 import numpy as np
-from gleaner import Context, Error, Model, Roi, Sample
+from gleaner import Context, Error, Model, Preprocess, Roi, Sample, Tensor
 
 
 class Lambda:
@@ -113,6 +113,8 @@ class Lambda:
             label=kind(lambda: ctx.event("", 0.0)),
             score=kind(lambda: ctx.event("x", float("inf"))),
             model=kind(lambda: Model.open("nothing")),
+            values=kind(lambda: Tensor.from_values([1], [0.5])),
+            tensor=kind(lambda: Tensor.from_frame(frame, Preprocess(8, 8))),
         )
 
     def newest(self) -> Sample:

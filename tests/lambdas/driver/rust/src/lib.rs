@@ -1,11 +1,12 @@
 //! A lambda that makes the calls which the bytes of a sample say, with whatever arguments: the host must stay whole.
 //!
-//! A program is a list of steps: a byte for the call, then what it takes. What a call gives is kept, and later steps take from it by
+//! A program is a list of steps (`tests/operations`): a byte for the call, then what it takes. What a call gives is kept, and later steps take from it by
 //! number, so that they come in every order. What is missing at the end of the bytes is 0. Refusals are expected; a step that says so
 //! ends in a panic instead.
 
+use gleaner_operations::{Extra, Operation, Step};
 use gleaner_sdk::data::{Frame, Roi};
-use gleaner_sdk::inference::{Model, Preprocess, Tensor};
+use gleaner_sdk::inference::{DetectOptions, Model, Preprocess, Tensor};
 use gleaner_sdk::log::{error, trace, warn};
 use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, inputs, now_ns, scratch, start, stop};
 
@@ -20,6 +21,8 @@ struct Kept {
     fields: Vec<Field>,
     samples: Vec<Sample>,
     frames: Vec<Frame>,
+    tensors: Vec<Tensor>,
+    models: Vec<Model>,
 }
 
 struct Driver {
@@ -47,67 +50,121 @@ impl Lambda for Driver {
 
 impl Kept {
     fn step(&mut self, bytes: &mut Bytes) {
-        match bytes.u8() % 54 {
-            0 => self.topics.extend(input(["program", "raw", "coded"][usize::from(bytes.u8() % 3)])),
-            1 => self.topics.extend(input(&bytes.text())),
-            2 => drop(inputs()),
-            3 => drop(now_ns()),
-            4 => drop(of(&self.topics, bytes).map(|it| (it.name(), it.ros_topic(), it.type_name(), it.counts()))),
-            5 => self.samples.extend(of(&self.topics, bytes).and_then(Topic::newest)),
-            6 => keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.last(bytes.u32()))),
-            7 => keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.since(bytes.i64()))),
-            8 => self.fields.extend(of(&self.topics, bytes).and_then(|it| it.field(&bytes.text()).ok())),
-            9 => self.fields.extend(of(&self.topics, bytes).and_then(|it| it.field(bytes.path()).ok())),
-            10 => drop(self.both(bytes).map(|(topic, field)| topic.column(field, bytes.u32()))),
-            11 => drop(self.both(bytes).map(|(topic, field)| topic.column_since(field, bytes.i64()))),
-            12 => drop(of(&self.fields, bytes).map(Field::path)),
-            13 => drop(of(&self.samples, bytes).map(|it| (it.identity(), it.stamps(), it.size(), it.big_endian()))),
-            14 => drop(self.reading(bytes).map(|(sample, field)| sample.get(field))),
-            15 => drop(self.reading(bytes).map(|(sample, field)| sample.number(field))),
-            16 => drop(of(&self.samples, bytes).map(|it| it.cdr(bytes.u64(), bytes.u32()))),
-            17..=19 => self.frames.extend(of(&self.samples, bytes).and_then(|it| it.as_frame().ok())),
-            20 => drop(of(&self.frames, bytes).map(|it| (it.info(), it.identity(), it.stamps()))),
-            21 => drop(of(&self.frames, bytes).map(|it| it.mean_luma(bytes.roi()))),
-            22 => drop(of(&self.frames, bytes).map(|it| it.histogram(bytes.roi()))),
-            23 => self.frames.extend(of(&self.frames, bytes).and_then(|it| it.resize(bytes.u32(), bytes.u32()).ok())),
-            24 => {
-                let side = |bytes: &mut Bytes| u32::from(bytes.u8());
-                self.frames.extend(of(&self.frames, bytes).and_then(|it| it.resize(side(bytes), side(bytes)).ok()));
+        match Step::of(bytes.u8()) {
+            Step::Call(operation) => self.call(operation, bytes),
+            Step::Extra(extra) => self.extra(extra, bytes),
+        }
+    }
+
+    fn call(&mut self, operation: Operation, bytes: &mut Bytes) {
+        match operation {
+            Operation::Input => self.topics.extend(match bytes.u8() % 4 {
+                3 => input(&bytes.text()),
+                known => input(["program", "raw", "coded"][usize::from(known)]),
+            }),
+            Operation::Inputs => drop(inputs()),
+            Operation::NowNs => drop(now_ns()),
+            Operation::Name => drop(of(&self.topics, bytes).map(Topic::name)),
+            Operation::RosTopic => drop(of(&self.topics, bytes).map(Topic::ros_topic)),
+            Operation::TypeName => drop(of(&self.topics, bytes).map(Topic::type_name)),
+            Operation::TopicCounts => drop(of(&self.topics, bytes).map(Topic::counts)),
+            Operation::Newest => self.samples.extend(of(&self.topics, bytes).and_then(Topic::newest)),
+            Operation::Last => keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.last(bytes.u32()))),
+            Operation::Since => keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.since(bytes.i64()))),
+            Operation::Field => self.fields.extend(of(&self.topics, bytes).and_then(|it| {
+                match bytes.u8() % 2 {
+                    0 => it.field(bytes.path()),
+                    _ => it.field(&bytes.text()),
+                }
+                .ok()
+            })),
+            Operation::Column => drop(self.both(bytes).map(|(topic, field)| topic.column(field, bytes.u32()))),
+            Operation::ColumnSince => {
+                drop(self.both(bytes).map(|(topic, field)| topic.column_since(field, bytes.i64())));
             }
-            25 => self.frames.extend(of(&self.frames, bytes).and_then(|it| it.to_gray().ok())),
-            26 => drop(of(&self.frames, bytes).map(|it| it.read(bytes.u64(), bytes.u32()))),
-            27 => drop(event(&bytes.text(), bytes.f64()).send()),
-            28 => drop(event("e", 0.5).with(&bytes.text(), bytes.f64()).with(&bytes.text(), &*bytes.text()).send()),
-            29 => {
+            Operation::FieldPath => drop(of(&self.fields, bytes).map(Field::path)),
+            Operation::SampleIdentity => drop(of(&self.samples, bytes).map(Sample::identity)),
+            Operation::SampleStamps => drop(of(&self.samples, bytes).map(Sample::stamps)),
+            Operation::Size => drop(of(&self.samples, bytes).map(Sample::size)),
+            Operation::BigEndian => drop(of(&self.samples, bytes).map(Sample::big_endian)),
+            Operation::Get => drop(self.reading(bytes).map(|(sample, field)| sample.get(field))),
+            Operation::Number => drop(self.reading(bytes).map(|(sample, field)| sample.number(field))),
+            Operation::Cdr => drop(of(&self.samples, bytes).map(|it| it.cdr(bytes.u64(), bytes.u32()))),
+            Operation::AsFrame => self.frames.extend(of(&self.samples, bytes).and_then(|it| it.as_frame().ok())),
+            Operation::Info => drop(of(&self.frames, bytes).map(Frame::info)),
+            Operation::FrameIdentity => drop(of(&self.frames, bytes).map(Frame::identity)),
+            Operation::FrameStamps => drop(of(&self.frames, bytes).map(Frame::stamps)),
+            Operation::MeanLuma => drop(of(&self.frames, bytes).map(|it| it.mean_luma(bytes.roi()))),
+            Operation::Histogram => drop(of(&self.frames, bytes).map(|it| it.histogram(bytes.roi()))),
+            Operation::Resize => self.frames.extend(of(&self.frames, bytes).and_then(|it| {
+                let [width, height] = match bytes.u8() % 2 {
+                    0 => [bytes.u8().into(), bytes.u8().into()],
+                    _ => [bytes.u32(), bytes.u32()],
+                };
+                it.resize(width, height).ok()
+            })),
+            Operation::ToGray => self.frames.extend(of(&self.frames, bytes).and_then(|it| it.to_gray().ok())),
+            Operation::Read => drop(of(&self.frames, bytes).map(|it| it.read(bytes.u64(), bytes.u32()))),
+            Operation::Event => drop(event(&bytes.text(), bytes.f64()).send()),
+            Operation::Start => drop(start(&bytes.text()).with("k", bytes.u8() > 0).send()),
+            Operation::Stop => drop(stop(&bytes.text())),
+            Operation::Log => [error, warn, trace][usize::from(bytes.u8() % 3)](&bytes.text()),
+            Operation::FromValues => {
+                let shape = [bytes.u32(), bytes.u32()];
+                self.tensors.extend(Tensor::from_values(&shape, &vec![0.5; usize::from(bytes.u16())]));
+            }
+            Operation::FromFrame => {
+                let made = of(&self.frames, bytes).map(|it| Tensor::from_frame(it, bytes.preprocess()));
+                self.tensors.extend(made.and_then(Result::ok));
+            }
+            Operation::Shape => drop(of(&self.tensors, bytes).map(Tensor::shape)),
+            Operation::TensorRead => drop(of(&self.tensors, bytes).map(|it| it.read(bytes.u64(), bytes.u32()))),
+            Operation::Open => self.models.extend(Model::open(&bytes.text())),
+            Operation::Run => {
+                let tensors: Vec<_> = of(&self.tensors, bytes).into_iter().collect();
+                drop(of(&self.models, bytes).map(|it| it.run(&tensors)));
+            }
+            Operation::Detect => {
+                let frame = of(&self.frames, bytes);
+                let (min_score, max_iou, max_count) = (0.0, f32::NAN, bytes.u32());
+                let options = DetectOptions { classes: Vec::new(), min_score, max_iou, max_count };
+                drop(of(&self.models, bytes).zip(frame).map(|(it, frame)| it.detect(frame, &options)));
+            }
+            Operation::ScratchPut => drop(scratch::put(bytes.name(), &vec![1; bytes.u32() as usize % TEXT])),
+            Operation::Append => drop(scratch::append(bytes.name(), &vec![2; usize::from(bytes.u16())])),
+            Operation::ScratchGet => drop(scratch::get(bytes.name(), bytes.u64(), bytes.u32())),
+            Operation::Remove => drop(scratch::remove(bytes.name())),
+            Operation::Entries => drop(scratch::entries()),
+            Operation::Free => drop(scratch::free()),
+        }
+    }
+
+    fn extra(&mut self, extra: Extra, bytes: &mut Bytes) {
+        match extra {
+            Extra::Reset => *self = Self::default(),
+            Extra::ForgetTopic => forget(&mut self.topics, bytes),
+            Extra::ForgetField => forget(&mut self.fields, bytes),
+            Extra::ForgetSample => forget(&mut self.samples, bytes),
+            Extra::ForgetFrame => forget(&mut self.frames, bytes),
+            Extra::EventWithTexts => {
+                drop(event("e", 0.5).with(&bytes.text(), bytes.f64()).with(&bytes.text(), &*bytes.text()).send());
+            }
+            Extra::EventWithMany => {
                 let many =
                     (0..bytes.u8()).fold(event("many", 1.0), |event, key| event.with(&key.to_string(), i64::MIN));
                 drop(many.send());
             }
-            30 => drop(start(&bytes.text()).with("k", bytes.u8() > 0).send()),
-            31 => drop(stop(&bytes.text())),
-            32 => [error, warn, trace][usize::from(bytes.u8() % 3)](&bytes.text()),
-            33 => println!("{}", bytes.text()),
-            34 => eprint!("{}", bytes.text()),
-            35 => drop(Model::open(&bytes.text())),
-            36 => drop(Tensor::from_values(&[bytes.u32(), bytes.u32()], &vec![0.5; usize::from(bytes.u16())])),
-            37 => drop(of(&self.frames, bytes).map(|it| Tensor::from_frame(it, bytes.preprocess()))),
-            38 => drop(of(&self.topics, bytes).map(|it| it.column(&it.field(bytes.path())?, u32::MAX))),
-            39 => forget(&mut self.topics, bytes),
-            40 => forget(&mut self.fields, bytes),
-            41 => forget(&mut self.samples, bytes),
-            42 => forget(&mut self.frames, bytes),
-            43 => *self = Self::default(),
-            44 => drop(std::hint::black_box(vec![0_u8; bytes.u32() as usize % (8 << 20)])),
-            45 => drop((std::fs::read("/"), std::time::SystemTime::now(), std::time::Instant::now())),
-            46 if bytes.u8() == 0xba => panic!("{}", bytes.text()),
-            47 if bytes.u8() == 0xba => std::process::exit(i32::from(bytes.u8())),
-            48 => drop(scratch::put(bytes.name(), &vec![1; bytes.u32() as usize % TEXT])),
-            49 => drop(scratch::append(bytes.name(), &vec![2; usize::from(bytes.u16())])),
-            50 => drop(scratch::put(&bytes.text(), b"")),
-            51 => drop(scratch::get(bytes.name(), bytes.u64(), bytes.u32())),
-            52 => drop(scratch::remove(bytes.name())),
-            53 => drop((scratch::entries(), scratch::free(), scratch::get(bytes.name(), u64::from(bytes.u16()), 9))),
-            _ => {}
+            Extra::ColumnAtOnce => {
+                drop(of(&self.topics, bytes).map(|it| it.column(&it.field(bytes.path())?, u32::MAX)));
+            }
+            Extra::ScratchPutText => drop(scratch::put(&bytes.text(), b"")),
+            Extra::Print => println!("{}", bytes.text()),
+            Extra::PrintError => eprint!("{}", bytes.text()),
+            Extra::Allocate => drop(std::hint::black_box(vec![0_u8; bytes.u32() as usize % (8 << 20)])),
+            Extra::Wasi => drop((std::fs::read("/"), std::time::SystemTime::now(), std::time::Instant::now())),
+            Extra::Panic if bytes.u8() == 0xba => panic!("{}", bytes.text()),
+            Extra::Exit if bytes.u8() == 0xba => std::process::exit(i32::from(bytes.u8())),
+            Extra::Panic | Extra::Exit => {}
         }
     }
 

@@ -1,7 +1,7 @@
 //! Calls every function of the interface and says what it answers. Its twin must be answered the same.
 
 use gleaner_sdk::data::{Roi, Value, encoding_name};
-use gleaner_sdk::inference::Model;
+use gleaner_sdk::inference::{Model, Preprocess, Tensor};
 use gleaner_sdk::{
     Config, Error, Field, Lambda, Result, Sample, Topic, event, input, inputs, log, now_ns, start, stop,
 };
@@ -123,6 +123,8 @@ impl Probe {
 
     fn refusals(&self, sample: &Sample) -> Result<()> {
         let frame = sample.as_frame()?;
+        let (mean, scale) = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0));
+        let how = Preprocess { width: 8, height: 8, letterbox: false, fill: 114, bgr: false, mean, scale };
         event("refusals", 0.0)
             .with("input", kind(input("nothing")))
             .with("field", kind(self.imu.field("nothing")))
@@ -135,6 +137,8 @@ impl Probe {
             .with("label", kind(event("", 0.0).send()))
             .with("score", kind(event("x", f64::INFINITY).send()))
             .with("model", kind(Model::open("nothing")))
+            .with("values", kind(Tensor::from_values(&[1], &[0.5])))
+            .with("tensor", kind(Tensor::from_frame(&frame, how)))
             .send()
     }
 }

@@ -1,0 +1,46 @@
+//! Room for images: slots for decoded ones, and a budget for those that a lambda makes.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use gleaner_buffers::{Lease, Pool};
+use gleaner_image as image;
+use gleaner_rules::frames::Budget;
+
+use super::frame::Info;
+
+/// Bytes that are copied in the time in which one is decoded; see `HISTOGRAM` in `frame`.
+const DECODE: usize = 40;
+
+/// Room for the images of one input, beyond the ring: decoded ones in slots, made ones out of a budget.
+pub struct Images {
+    pub(super) decoded: Option<Pool<Info>>,
+    pub(super) made: Budget,
+    /// The newest decoded image, so that each is decoded once.
+    pub(super) newest: Mutex<Option<(u64, Lease<Info>)>>,
+    pub(super) decode_ns: AtomicU64,
+}
+
+impl Images {
+    /// `decoded` holds what JPEG and PNG become (none for raw images); `made` is shared by all inputs of a lambda.
+    pub fn new(decoded: Option<Pool<Info>>, made: Budget) -> Self {
+        Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
+    }
+
+    /// Work of decoding `data`, by its header, in bytes; none if it is the newest decoded image already.
+    pub(super) fn decode_work(&self, position: Option<u64>, data: &[u8]) -> usize {
+        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {
+            return 0;
+        }
+        let room = self.decoded.as_ref().map_or(0, Pool::slot_bytes);
+        image::probe(data)
+            .ok()
+            .and_then(|header| header.rgb8_len())
+            .map_or(0, |len| len.min(room).saturating_mul(DECODE))
+    }
+
+    pub(super) fn decode_ns(&self) -> u64 {
+        self.decode_ns.load(Ordering::Relaxed)
+    }
+}
