@@ -67,7 +67,7 @@ recording! {
     triggers_misstamped => Lost "trigger", "triggers", "of another time than the recorder's";
 
     /// Wakes that did not reach the recorder: the journals of clips lack them, and the ones below.
-    wakes_lost => Lost "wake", "wakes", "not in any journal: not told to the recorder";
+    wakes_lost => Lost "wake", "wakes", "not in any journal: they did not reach the recorder";
 
     /// Wakes that were refused, as the lambda causes more triggers or bytes than the recorder takes of one.
     wakes_over_rate => Lost "wake", "wakes", "not in any journal: beyond what the recorder takes of one lambda";

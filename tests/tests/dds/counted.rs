@@ -21,8 +21,8 @@ fn held_back() -> Result<(), Failed> {
     let out = Folder::new();
     let floor = u64::MAX.to_string();
     let (last, summary) = recorded(out.path(), "", &["--disk-floor", &floor], |status| status.recording.held_back > 2)?;
-    // The process went on until it was stopped.
-    if summary.recording.held_back < last.recording.held_back || summary.recording.clips > 0 {
+    // The lambda went on until it was stopped.
+    if summary.recording.held_back < last.recording.held_back {
         return Err(format!("{:?}, and before {:?}", summary.recording, last.recording).into());
     }
     let reported = Command::new(program("gleaner")).arg("report").arg(out.path()).output()?;
