@@ -7,7 +7,8 @@ use gleaner_fuzz::{TARGETS, Target};
 /// with `GLEANER_LONG=1`.
 fn inputs(target: &Target) -> u32 {
     match target.name {
-        "bag" | "calls" => 1_000,
+        "bag" => 1_000,
+        "calls" => 8_000,
         "drive" => 5_000,
         _ => 20_000,
     }

@@ -117,7 +117,8 @@ fn main() -> ExitCode {
         Trial::test(name, move || namespace::case(CASE, &case)).with_ignored_flag(missing.is_some())
     };
     let mut arguments = Arguments::from_args();
-    arguments.test_threads = arguments.test_threads.or(Some(2));
+    // They wait for most of their time: for a start, a deadline, a status each half a second.
+    arguments.test_threads.get_or_insert(4);
     let trials = cases.map(trial).collect();
     libtest_mimic::run(&arguments, trials).exit_code()
 }

@@ -14,6 +14,7 @@ mod to_peers;
 mod together;
 
 use std::process::{ExitCode, Stdio};
+use std::sync::{PoisonError, RwLock};
 
 use gleaner_tests::namespace;
 use gleaner_tests::peers::Kind;
@@ -52,16 +53,26 @@ fn main() -> ExitCode {
         };
     }
     let mut arguments = Arguments::from_args();
-    // Two that move images at the same time would show how small this machine is.
-    arguments.test_threads.get_or_insert(1);
+    // They wait for most of their time, and each is in a network of its own.
+    arguments.test_threads.get_or_insert(3);
     let trials = cases().map(|case| {
-        let run = || namespace::case(CASE, case.name);
+        let run = || run(case);
         match unavailable(case) {
             None => Trial::test(case.name, run),
             Some(why) => Trial::test(format!("{} [{why}]", case.name), run).with_ignored_flag(true),
         }
     });
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
+}
+
+/// Runs a case in a process of its own; one that moves images or point clouds while no other runs: two of them at the same time would
+/// show how small this machine is.
+fn run(case: &Case) -> Result<(), Failed> {
+    static RUNNING: RwLock<()> = RwLock::new(());
+    let is_large = ["images", "point_clouds"].iter().any(|large| case.name.contains(large));
+    let _alone = is_large.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
+    let _beside_others = (!is_large).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
+    namespace::case(CASE, case.name)
 }
 
 fn unavailable(case: &Case) -> Option<&'static str> {
