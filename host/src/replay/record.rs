@@ -18,7 +18,7 @@ use super::pictures::Camera;
 use super::{CLOCK, Options};
 
 /// A recorder over one lambda's `[record]`.
-pub(super) struct RecordedReplay {
+pub(super) struct ReplayRecorder {
     shared: Arc<Mutex<Shared>>,
     /// One for each topic, with what the recorder calls it.
     lanes: Vec<Arc<Lane>>,
@@ -78,7 +78,7 @@ pub(super) fn remove_clips(out: &Path) -> Result<u64, Failure> {
     Ok(folder.replace(&recovered)?)
 }
 
-impl RecordedReplay {
+impl ReplayRecorder {
     /// Subscribes the topics of `[record]`; none if the manifest has no such table.
     ///
     /// A topic that the drive does not have is no error: a vehicle's sensors differ from drive to drive. Its clips say so.
@@ -143,7 +143,7 @@ impl RecordedReplay {
     }
 
     /// Makes the recorder, which takes hold of the clips in `out`. What a killed replay left there is recovered, kept
-    /// until the next, and said; what an earlier one left stays until [`RecordedReplay::replace`].
+    /// until the next, and said; what an earlier one left stays until [`ReplayRecorder::replace`].
     pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
         let (folder, recovered) = Folder::open(out)?;
         for clip in &recovered {

@@ -18,7 +18,7 @@ use super::digests::Digests;
 use super::journal_file::JournalFile;
 use super::open::{DriveError, open_drives};
 use super::options::Results;
-use super::record::{RecordedReplay, remove_clips};
+use super::record::{ReplayRecorder, remove_clips};
 use super::signals::Gathered;
 use super::{CLOCK, Options, report as send};
 use crate::api::Session;
@@ -45,7 +45,7 @@ struct Pass<'a> {
     /// Fills in what the journal and the clips say of a wake; none where there is neither.
     scribe: Option<Scribe>,
     journal: Option<JournalFile>,
-    recording: Option<RecordedReplay>,
+    recording: Option<ReplayRecorder>,
     gathered: Gathered,
     part: Part,
     wakes: u64,
@@ -168,7 +168,7 @@ pub(super) fn replay(
 ) -> Result<Ended, Failure> {
     let name = manifest.lambda.name.as_str();
     let (mut drive, part) = open_drives(options)?;
-    let mut recording = if results.record { RecordedReplay::subscribe(manifest, options, &mut drive)? } else { None };
+    let mut recording = if results.record { ReplayRecorder::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { inputs, session, mut guest } =
         Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
     let started = Instant::now();
@@ -183,7 +183,7 @@ pub(super) fn replay(
         recording.start(&results.out, header)?;
     }
     let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.files.clone()));
-    let gathered = Gathered::of(&inputs, recording.as_ref().and_then(RecordedReplay::camera));
+    let gathered = Gathered::of(&inputs, recording.as_ref().and_then(ReplayRecorder::camera));
     let layers = guest.layers()?;
     if is_first {
         send(reports, &Report::Isolation { layers });

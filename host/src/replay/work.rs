@@ -7,7 +7,7 @@ use gleaner_lambda::manifest::Manifest;
 use super::Options;
 use super::course::{self, Course, Span};
 use super::open::open_drives;
-use super::record::RecordedReplay;
+use super::record::ReplayRecorder;
 use crate::api::Session;
 use crate::api::curves::Curves;
 use crate::api::data::Wake;
@@ -27,7 +27,7 @@ pub(super) fn work(
 ) -> Result<(), Failure> {
     let (mut drive, part) = open_drives(options)?;
     // The steps of a drive are those of all topics that are read, recorded ones included, and ticks may be counted between them.
-    let _recorded = if is_recorded { RecordedReplay::subscribe(manifest, options, &mut drive)? } else { None };
+    let _recorded = if is_recorded { ReplayRecorder::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { inputs, session, mut guest } =
         Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
     let curves = Curves::of(&inputs);
