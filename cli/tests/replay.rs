@@ -92,7 +92,7 @@ fn json_is_the_summary_alone() {
     let line = text(&output.stdout);
     assert!(line.ends_with("}\n") && line.lines().count() == 1, "{line}");
     // Counts that an older runtime does not have are 0.
-    assert_eq!(serde_json::from_str::<Summary>(&line).unwrap(), serde_json::from_str::<Summary>(&expected).unwrap());
+    assert_eq!(serde_json::from_str::<Summary>(line).unwrap(), serde_json::from_str::<Summary>(&expected).unwrap());
 }
 
 #[test]
