@@ -1,7 +1,7 @@
 //! Manifests. An input is the text of one.
 
 use gleaner_protocol::manifest::{
-    ByteSize, ConfigSet, ConfigValue, Manifest, Schedule, bounds, format_duration, parse_duration,
+    ByteSize, ConfigSet, ConfigValue, Limits, Manifest, Schedule, bounds, format_duration, parse_duration,
 };
 use gleaner_protocol::{Explain, Failure};
 
