@@ -2,7 +2,7 @@
 
 use gleaner_base::{ByteSize, format_duration, parse_duration};
 use gleaner_base::{Explain, Failure};
-use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Schedule, bounds};
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Limits, Manifest, Schedule, bounds};
 
 use crate::budget;
 

@@ -253,19 +253,21 @@ mod tests {
             damaged: None,
             stopped: None,
         };
+        // Flat, whatever a recorder counts.
+        let counts = serde_json::to_string(&summary.recording).unwrap();
+        assert!(counts.starts_with(r#"{"clips":2,"windows":0,"in_cooldown":3,"ignored":0,"#), "{counts}");
         reads_back(
             &Report::Summary(Box::new(summary)),
-            concat!(
+            &concat!(
                 r#"{"report":"summary","lambda":"brake-dark","version":"0.1.0","kind":"wasm","drive":["a.mcap","b"],"#,
                 r#""out":"out","wakes":50,"triggers":2,"faults":0,"skipped":0,"missed_ticks":0,"out_of_order":4,"log_lines":3,"#,
                 r#""log_dropped":0,"triggers_refused":5,"passed_over":6,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
                 r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,
-                r#""clips":2,"windows":0,"in_cooldown":3,"ignored":0,"too_many_started":0,"too_many_waiting":0,"held_back":0,"#,
-                r#""triggers_over_rate":0,"triggers_misstamped":0,"wakes_lost":0,"wakes_over_rate":0,"wakes_misstamped":0,"failed":0,"#,
-                r#""deleted":0,"not_deleted":0,"pushed_out":0,"too_big":0,"before_1970":0,"topic_unknown":0,"lambdas_refused":0,"#,
+                "COUNTS,",
                 r#""clips_replaced":1,"damaged":null}"#
-            ),
+            )
+            .replace("COUNTS", counts.trim_matches(['{', '}'])),
         );
     }
 }
