@@ -121,6 +121,8 @@ pub const WITHOUT: &[(&str, &[&str])] = &[
     // Native code is loaded by the runtime and made by `gleaner-compile` alone.
     ("gleaner-host", &["cranelift-codegen", "pyo3"]),
     ("gleaner-player", &["pyo3", "rustdds"]),
+    // The cloud's page can use it.
+    ("gleaner-report", &["clap", "indicatif"]),
 ];
 
 /// Inside of `host/src`: a room, and the rooms that it must not name.

@@ -1,6 +1,6 @@
 //! Why an image cannot be read, in the words that a user sees.
 
-use gleaner_rules::pixels::PixelError;
+use gleaner_rules::pixels::{PixelError, PixelErrorKind};
 use gleaner_rules::refused;
 use gleaner_rules::text::Rounded;
 
@@ -101,4 +101,22 @@ pub enum ImageError {
         /// Why.
         source: png::DecodingError,
     },
+}
+
+impl ImageError {
+    /// The kind: each error has to say which it is.
+    pub fn kind(&self) -> PixelErrorKind {
+        match self {
+            Self::Pixels(error) => error.kind(),
+            Self::NotAnImage { .. }
+            | Self::Bomb { .. }
+            | Self::WorkingMemory { .. }
+            | Self::OtherImage { .. }
+            | Self::CutOff { .. }
+            | Self::Unsupported { .. }
+            | Self::Damaged { .. }
+            | Self::Jpeg { .. }
+            | Self::Png { .. } => PixelErrorKind::Unreadable,
+        }
+    }
 }

@@ -1,6 +1,6 @@
 //! Why a read of data failed, in words for the lambda's author.
 
-use gleaner_image::{ImageError, PixelError};
+use gleaner_image::ImageError;
 use gleaner_messages::{CdrError, PathError};
 use gleaner_rules::clamps::WrongField;
 use gleaner_rules::frames::NoRoom;
@@ -31,7 +31,7 @@ pub enum DataError {
     #[error(transparent)]
     NoRoom(#[from] NoRoom),
     #[error("{0}")]
-    OutOfRange(PixelError),
+    OutOfRange(ImageError),
     #[error("the deadline is over")]
     OutOfTime,
     #[error(transparent)]

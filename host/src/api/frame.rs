@@ -290,13 +290,11 @@ impl Source {
     }
 
     fn refused(&self, error: impl Into<ImageError>) -> DataError {
-        match error.into() {
-            ImageError::Pixels(error) => match error.kind() {
-                PixelErrorKind::OutOfRange => DataError::OutOfRange(error),
-                PixelErrorKind::Stopped => DataError::OutOfTime,
-                PixelErrorKind::Unreadable => self.not_a_frame(error),
-            },
-            error => self.not_a_frame(error),
+        let error = error.into();
+        match error.kind() {
+            PixelErrorKind::OutOfRange => DataError::OutOfRange(error),
+            PixelErrorKind::Stopped => DataError::OutOfTime,
+            PixelErrorKind::Unreadable => self.not_a_frame(error),
         }
     }
 }

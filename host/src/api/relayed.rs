@@ -52,7 +52,7 @@ impl Session {
     }
 
     /// Takes over what another process counted in a call: all lines that the lambda logged, of which those that passed the rate
-    /// limit were taken over by [`Session::log`], and what was dropped and refused.
+    /// limit were taken over by `Session::write`, and what was dropped and refused.
     pub fn relay_counts(&self, said: Said, log_dropped: u64, triggers_refused: u64) {
         let mut state = self.lock();
         state.log.relay(said, log_dropped);

@@ -26,7 +26,11 @@ fn roi(given: &Value) -> Option<Roi> {
 /// What a lambda is told of it.
 fn told(result: Result<Value, PixelError>) -> Value {
     result.unwrap_or_else(|error| {
-        let kind = if error.kind() == PixelErrorKind::OutOfRange { "out-of-range" } else { "not-a-frame" };
+        let kind = match error.kind() {
+            PixelErrorKind::OutOfRange => "out-of-range",
+            PixelErrorKind::Unreadable => "not-a-frame",
+            PixelErrorKind::Stopped => unreachable!("nobody stops it"),
+        };
         let message = error.to_string();
         // Which encodings there are, each side lists in its own order.
         json!([kind, message.split("; supported are").next()])

@@ -1,8 +1,8 @@
 //! What of the host a lambda can call: one line for each function and method of `wit/`, with what it costs.
 //!
 //! Tests, the lambda `driver` and the fuzzer of calls go through this list, so that a call which is missing in one of them does
-//! not compile or fails. `tests/tests/wit.rs` holds it against `wit/`, `tests/tests/host_calls.rs` holds the prices against what
-//! the host charges, and `tests/tests/calls.rs` tries the deadlines. It names nothing of ours, since `driver` is a component.
+//! not compile or fails. `tests/tests/house/wit.rs` holds it against `wit/`, `host/tests/library/host_calls.rs` holds the prices against what
+//! the host charges, and `host/tests/library/calls.rs` tries the deadlines. It names nothing of ours, since `driver` is a component.
 
 mod list;
 mod step;
