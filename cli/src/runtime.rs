@@ -7,8 +7,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use gleaner_base::each_piece;
-use gleaner_base::{Exit, Explain, Failure, visible};
+use gleaner_base::{Exit, Explain, Failure, each_piece, visible};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::{Kind, Manifest};
 use gleaner_parts::Parts;

@@ -1,7 +1,6 @@
 //! Manifests. An input is the text of one.
 
-use gleaner_base::{ByteSize, format_duration, parse_duration};
-use gleaner_base::{Explain, Failure};
+use gleaner_base::{ByteSize, Explain, Failure, format_duration, parse_duration};
 use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Limits, Manifest, Schedule, bounds};
 
 use crate::budget;

@@ -6,9 +6,8 @@
 use std::collections::VecDeque;
 use std::sync::OnceLock;
 
-use gleaner_messages::Endian;
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, FieldPath, ImageView, Kind, PathError, Sources, Value, header_stamp,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Sources, Value, header_stamp,
 };
 
 use crate::budget;

@@ -10,9 +10,8 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use crate::{Manifest, ManifestError, Sources};
-use gleaner_base::ByteSize;
 use gleaner_base::words::shell_word;
-use gleaner_base::{Exit, Explain, NotPlain, PlainFile};
+use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile};
 
 /// Longest file of a build. No model is longer: ONNX is protobuf, whose messages end at 2 GiB.
 pub const FILE_MAX: ByteSize = ByteSize::gib(2);

@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::manifest::Kind;
 use crate::{LayoutError, Manifest};
-use gleaner_base::ByteSize;
-use gleaner_base::NotPlain;
+use gleaner_base::{ByteSize, NotPlain};
 
 /// Folders beside the manifest that hold no Python of the lambda: what tools made, and its tests.
 const LEFT_OUT: [&str; 4] = ["build", "out", "target", "tests"];

@@ -1,7 +1,6 @@
 //! Messages as they go over the wire: four bytes of encapsulation, then CDR, then zeros up to a multiple of four.
 
-use gleaner_messages::CdrWriter;
-use gleaner_messages::Endian;
+use gleaner_messages::{CdrWriter, Endian};
 
 /// Bytes in front of the CDR, from which its alignment does not count.
 pub(crate) const ENCAPSULATION: usize = 4;

@@ -1,9 +1,7 @@
 //! `header.stamp`: what it becomes when a message is sent.
 
 use clap::ValueEnum;
-use gleaner_messages::Definitions;
-use gleaner_messages::Endian;
-use gleaner_messages::header_stamp;
+use gleaner_messages::{Definitions, Endian, header_stamp};
 use rustix::time::{ClockId, clock_gettime};
 
 use crate::cdr::ENCAPSULATION;

@@ -5,8 +5,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::ByteSize;
-use gleaner_base::{Exit, Explain, NotPlain, PlainFile};
+use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile};
 use gleaner_lambda::manifest::{ConfigValue, Kind};
 use gleaner_lambda::results::{SIGNALS_MAX, SUMMARY_MAX};
 use gleaner_lambda::signals::{Curve, Signals};

@@ -9,8 +9,6 @@ use clap_complete::Shell;
 use gleaner_lambda::manifest::Kind;
 use gleaner_protocol::DriveTime;
 
-use crate::dev::DevArgs;
-
 /// Small functions next to the sensors, that keep the data worth keeping.
 #[derive(Parser, Debug)]
 #[command(name = "gleaner", version, propagate_version = true)]
@@ -330,6 +328,29 @@ pub struct DiffArgs {
     /// Write a page with both runs, their differences marked
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
+}
+
+/// Arguments of `gleaner dev`.
+#[derive(Args, Debug)]
+pub struct DevArgs {
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub asked: AskedArgs,
+    /// MCAP files, .db3 files and directories of rosbag2; several are merged by time
+    #[arg(value_name = "DRIVE", required = true)]
+    pub drives: Vec<PathBuf>,
+    /// Replay from this time on, as in `gleaner replay`
+    #[arg(long, value_name = "TIME", value_parser = drive_time)]
+    pub from: Option<String>,
+    /// Replay until before this time
+    #[arg(long, value_name = "TIME", value_parser = drive_time)]
+    pub to: Option<String>,
+    /// Where the results go [default: DIR/out]
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// Leave out the clips that the table `record` of the manifest asks for: a replay is faster without
+    #[arg(long)]
+    pub no_record: bool,
 }
 
 /// Arguments of `gleaner verify`.

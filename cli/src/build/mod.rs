@@ -13,8 +13,7 @@ use std::fs::File;
 use std::path::Path;
 use std::time::SystemTime;
 
-use gleaner_base::ByteSize;
-use gleaner_base::{Exit, Failure, PlainFile};
+use gleaner_base::{ByteSize, Exit, Failure, PlainFile};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::Kind;
 use gleaner_lambda::{BuildDir, LayoutError, Manifest, SOURCE_MAX, Sources};

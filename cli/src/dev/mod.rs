@@ -6,42 +6,17 @@ mod watch;
 
 use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use clap::Args;
-use gleaner_base::ByteSize;
-use gleaner_base::{Exit, Failure, PlainFile, own_file, visible};
+use gleaner_base::{ByteSize, Exit, Failure, PlainFile, own_file, visible};
 use gleaner_report::Diff;
 
-use crate::args::{AskedArgs, ReplayArgs};
+use crate::args::{DevArgs, ReplayArgs};
 use crate::say::say;
 use crate::show::{self, Paint};
 use crate::{build, replay};
 
 use watch::Seen;
-
-/// Arguments of `gleaner dev`.
-#[derive(Args, Debug)]
-pub struct DevArgs {
-    #[command(flatten)]
-    #[allow(missing_docs)]
-    pub asked: AskedArgs,
-    /// MCAP files, .db3 files and directories of rosbag2; several are merged by time
-    #[arg(value_name = "DRIVE", required = true)]
-    pub drives: Vec<PathBuf>,
-    /// Replay from this time on, as in `gleaner replay`
-    #[arg(long, value_name = "TIME", value_parser = crate::args::drive_time)]
-    pub from: Option<String>,
-    /// Replay until before this time
-    #[arg(long, value_name = "TIME", value_parser = crate::args::drive_time)]
-    pub to: Option<String>,
-    /// Where the results go [default: DIR/out]
-    #[arg(long)]
-    pub out: Option<PathBuf>,
-    /// Leave out the clips that the table `record` of the manifest asks for: a replay is faster without
-    #[arg(long)]
-    pub no_record: bool,
-}
 
 /// Where what a replay is compared with is kept, below its results: `gleaner diff` finds it there, too.
 const BEFORE: &str = ".before";

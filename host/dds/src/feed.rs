@@ -16,9 +16,7 @@ use super::offers::{Offer, Request, in_words};
 use super::raw::{CopyInto, CopyOrSay, Held, PassOver, Raw, RawReader};
 use super::state::{Once, State, Told, lock, panic_text};
 use super::types::Types;
-use gleaner_transport::Clock;
-use gleaner_transport::Gaps;
-use gleaner_transport::{Guid, Qos, SampleMeta, Sink, TopicSpec};
+use gleaner_transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
 
 /// What RustDDS may keep of a topic: it frees a sample when newer ones have taken its place, not when it was taken.
 const KEPT_BYTES: usize = 64 << 20;

@@ -9,8 +9,7 @@ use rustdds::{RepresentationIdentifier, no_key};
 
 use super::state::panic_text;
 use gleaner_messages::Endian;
-use gleaner_transport::Clock;
-use gleaner_transport::Sink;
+use gleaner_transport::{Clock, Sink};
 
 /// A reader of any type.
 pub(super) type RawReader = no_key::SimpleDataReader<Raw, RawAdapter>;

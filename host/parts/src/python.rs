@@ -3,9 +3,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use super::{Looked, PartsError};
-use gleaner_base::ByteSize;
 use gleaner_base::words::excerpt;
-use gleaner_base::{NotPlain, PlainFile};
+use gleaner_base::{ByteSize, NotPlain, PlainFile};
 
 /// Prints the version and the path of the interpreter itself: `python3` is often a script that chooses one, and would
 /// choose again at every start. Fails where the system's Python comes in pieces and lacks the two modules. They are looked for and

@@ -4,8 +4,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use gleaner_host::api::Session;
-use gleaner_host::api::data;
+use gleaner_host::api::{Session, data};
 use gleaner_lambda::manifest::ConfigValue;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;

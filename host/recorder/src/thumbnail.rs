@@ -1,8 +1,7 @@
 //! A small JPEG of an image message, for lists of clips.
 
 use gleaner_image::{self as image, Encoding, View, ops};
-use gleaner_messages::Endian;
-use gleaner_messages::{CompressedView, ImageView};
+use gleaner_messages::{CompressedView, Endian, ImageView};
 use jpeg_encoder::{ColorType, Encoder};
 
 /// Most pixels in a row of a thumbnail.

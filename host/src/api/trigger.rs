@@ -1,10 +1,9 @@
 //! What a lambda causes: events, and the start and stop of recordings.
 
 use gleaner_lambda::{Trigger, TriggerKind};
-use gleaner_rules::triggers::Kind;
-use gleaner_rules::triggers::TriggerError as Refusal;
 pub(super) use gleaner_rules::triggers::Triggers;
 pub use gleaner_rules::triggers::{ATTRIBUTES, Attribute, AttributeValue, LABEL_BYTES, PER_WAKE};
+use gleaner_rules::triggers::{Kind, TriggerError as Refusal};
 use serde_json::Value;
 
 use super::Session;

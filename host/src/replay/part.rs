@@ -1,7 +1,6 @@
 //! Which part of a drive is replayed.
 
-use gleaner_base::nanoseconds;
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, nanoseconds};
 use gleaner_drives::Replay;
 use gleaner_journal::Part;
 use gleaner_protocol::DriveTime;

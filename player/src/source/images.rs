@@ -1,8 +1,9 @@
 //! Compressed images become raw ones, in another size if asked for.
 
 use gleaner_image::{ImageError, decode_rgb8, probe};
-use gleaner_messages::Endian;
-use gleaner_messages::{CdrError, CompressedView, Definitions, FieldPath, HeaderStamp, Sources, Value, header_stamp};
+use gleaner_messages::{
+    CdrError, CompressedView, Definitions, Endian, FieldPath, HeaderStamp, Sources, Value, header_stamp,
+};
 
 use crate::args::Size;
 use crate::buffer::{Buffer, Pool};

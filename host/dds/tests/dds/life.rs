@@ -10,8 +10,7 @@ use std::time::Duration;
 
 use gleaner_dds::{Dds, Options};
 use gleaner_protocol::Network;
-use gleaner_transport::{Clock, LiveSource};
-use gleaner_transport::{Qos, SampleMeta, Sink, Transport, Verdict};
+use gleaner_transport::{Clock, LiveSource, Qos, SampleMeta, Sink, Transport, Verdict};
 
 use super::Test;
 use super::peer::{Kept, Peer, connected, domain, matched, open, options, spec, until, write};

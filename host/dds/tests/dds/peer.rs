@@ -8,8 +8,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use gleaner_dds::{Dds, Options};
-use gleaner_transport::Clock;
-use gleaner_transport::{Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Clock, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
 use rustdds::no_key::{DataWriter, Decode, DeserializerAdapter, SerializerAdapter, SimpleDataReader};
 use rustdds::policy::{Durability, History, Reliability};
 use rustdds::{

@@ -5,8 +5,7 @@ use std::io::Cursor;
 use std::sync::Arc;
 
 use gleaner_drives::{Limits, Progress, Replay, ReplayError};
-use gleaner_messages::Endian;
-use gleaner_messages::{CompressedView, FieldPath, header_stamp};
+use gleaner_messages::{CompressedView, Endian, FieldPath, header_stamp};
 use gleaner_transport::{Subscription, TopicSpec, Transport, TransportError};
 use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions};

@@ -3,9 +3,8 @@
 use std::sync::Arc;
 
 use gleaner_drives::Replay;
-use gleaner_messages::Endian;
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, FieldPath, ImageView, Kind, PathError, Value, header_stamp,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Value, header_stamp,
 };
 use gleaner_transport::Transport;
 

@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use gleaner_base::Failure;
-use gleaner_base::nanoseconds;
+use gleaner_base::{Failure, nanoseconds};
 use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 use tracing::{error, warn};

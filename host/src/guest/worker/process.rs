@@ -7,8 +7,7 @@ use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_base::each_piece;
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, each_piece};
 use gleaner_parts::Parts;
 use gleaner_protocol::ExitRecord;
 use rustix::event::{PollFd, PollFlags, poll};

@@ -18,10 +18,9 @@ use gleaner_lambda::manifest::Limits;
 use gleaner_messages::Definitions;
 use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
 use gleaner_recorder::program::{Options, run};
-use gleaner_transport::Clock;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{
-    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Subscription, TopicSpec, Transport,
+    Clock, DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Subscription, TopicSpec, Transport,
     TransportError, Verdict,
 };
 use sha2::{Digest, Sha256};
