@@ -1,9 +1,7 @@
 //! Programs of `driver`: one for each of its calls, and some that go on for longer.
 
 use gleaner_operations::Operation::{Append, ScratchGet, ScratchPut, Start};
-use gleaner_operations::Operation::{
-    AsFrame, Event, Field, Histogram, Input, Last, Log, MeanLuma, Newest, Resize, ToGray,
-};
+use gleaner_operations::Operation::{AsFrame, Event, Field, Histogram, Last, Log, MeanLuma, Resize, ToGray};
 use gleaner_operations::{Extra, Operation, Step, setup};
 
 use crate::calls::{WAKE, program};
