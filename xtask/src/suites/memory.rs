@@ -11,6 +11,8 @@ use std::{env, process};
 use rustix::fs::{StatVfsMountFlags, statvfs};
 
 const SHARED_MEMORY: &str = "/dev/shm";
+/// How the name of such a folder begins; the number of its process follows.
+const NAME: &str = "gleaner-tests-";
 /// A test fills 4 GiB, and others run beside it.
 const ROOM_BYTES: u64 = 8 << 30;
 /// What is left for programs if that room is used.
@@ -22,6 +24,7 @@ pub(super) struct Folder(PathBuf);
 impl Folder {
     /// A new folder; `None` where memory is scarce, or the user has named a folder for temporary files.
     pub(super) fn new() -> Option<Folder> {
+        remove_left();
         let found = statvfs(SHARED_MEMORY).ok()?;
         let is_roomy = found.f_bavail * found.f_frsize >= ROOM_BYTES && available()? >= ROOM_BYTES + LEFT_BYTES;
         // Tests start programs that they have built there.
@@ -29,7 +32,7 @@ impl Folder {
         if env::var_os("TMPDIR").is_some() || !is_roomy || !runs_programs {
             return None;
         }
-        let path = Path::new(SHARED_MEMORY).join(format!("gleaner-tests-{}", process::id()));
+        let path = Path::new(SHARED_MEMORY).join(format!("{NAME}{}", process::id()));
         DirBuilder::new().mode(0o700).create(&path).ok()?;
         Some(Folder(path))
     }
@@ -42,6 +45,18 @@ impl Folder {
 impl Drop for Folder {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Removes the folders of processes that were killed: nothing else would give their memory back.
+fn remove_left() {
+    for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let process = name.to_str().and_then(|name| name.strip_prefix(NAME)?.parse::<u32>().ok());
+        if process.is_some_and(|process| !Path::new("/proc").join(process.to_string()).exists()) {
+            // Those of other users stay.
+            let _ = fs::remove_dir_all(entry.path());
+        }
     }
 }
 
