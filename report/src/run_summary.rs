@@ -141,7 +141,7 @@ impl RunSummary {
             }
             Err(source) => return Err(OutputError::Summary { path: out.join("summary.json"), source }),
         };
-        // RunSummary apart by a key that only one of them has, so that what is wrong with a summary is said of the right one.
+        // The two are told apart by a key that only one of them has, so that what is wrong with a summary is said of the right one.
         let is_live = serde_json::from_slice::<serde_json::Value>(&text).is_ok_and(|value| value.get("up_s").is_some());
         let told = if is_live {
             parsed("summary.json", &text).map(Self::Live)

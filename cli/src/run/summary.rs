@@ -64,6 +64,10 @@ impl Earlier {
         let sum = Live { faults: sum.faults.saturating_add(lost_wakes), recording: recorded, ..sum };
         let mut text = serde_json::to_vec_pretty(&sum).expect("counts are plain data");
         text.push(b'\n');
+        if text.len() as u64 > SUMMARY_MAX.bytes() {
+            let failure = Failure::new(Exit::Internal, format!("`{}` lacks what the recorder counted", path.display()));
+            return Err(failure.with_help("give fewer topics to one lambda: a summary has 4 MiB at most"));
+        }
         write_whole(&path, &text)
             .map_err(|error| Failure::caused_by(Exit::Internal, format!("cannot write `{}`", path.display()), &error))
     }

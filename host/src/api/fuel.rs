@@ -29,7 +29,7 @@ struct Account {
 pub struct OutOfFuel;
 
 impl Default for Fuel {
-    /// Without an allowance: nothing is counted, and nothing is refused.
+    /// Without an allowance: nothing is refused.
     fn default() -> Self {
         Self(Arc::new(Account { used: AtomicU64::new(0), allowed: AtomicU64::new(ENDLESS) }))
     }

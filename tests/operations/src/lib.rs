@@ -10,7 +10,7 @@ mod step;
 pub use list::Operation;
 pub use step::{Extra, Step};
 
-/// Bytes of the pixels of the picture that [`SETUP`] looks at: 64 by 48, rgb8. The coded one has as many.
+/// Bytes of the pixels of the picture that [`setup`] looks at: 64 by 48, rgb8. The coded one has as many.
 pub const PIXELS: u64 = 64 * 48 * 3;
 /// Bytes of the message that it stands in, as `gleaner_tests::drive::image` makes it.
 pub const MESSAGE: u64 = 44 + PIXELS;

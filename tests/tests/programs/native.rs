@@ -1,13 +1,15 @@
 //! One lambda natively, in the fake host of the SDK, and as a component in the host: every decision is equal, to the last bit of its
 //! scores, and so are the log and what is counted. Both have the same rules, of `gleaner-rules`; here is what lies around them.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use gleaner_base::Exit;
 use gleaner_sdk::Lambda;
-use gleaner_sdk::testing::{self, AttributeValue, FaultKind, Host, Run, Setting};
+use gleaner_sdk::data::Encoding;
+use gleaner_sdk::testing::{self, AttributeValue, FaultKind, Host, Message, Run, Setting};
+use gleaner_tests::drive::{IMAGE, image, one_topic};
 use gleaner_tests::given::{Given, STAMP, Wanted, messages};
-use gleaner_tests::{replay, root, sample_drive};
+use gleaner_tests::{Copy, Folder, replay, root, sample_drive};
 
 const IMU: Wanted = (
     "imu",
@@ -160,6 +162,14 @@ fn hello_finds_the_brakings_of_the_sample_drive() {
 }
 
 #[test]
+fn brake_dark_sees_the_pixels_that_the_host_decodes() {
+    let both = Both::on_sample_drive("examples/brake-dark/rust", &[CAMERA, IMU]);
+    let run = both.set("brake_mps2", -1.4).set("dark_luma", 255.0).agree::<brake_dark::BrakeDark>(&[]);
+    assert!(run.triggers().count() > 0);
+    assert!(run.triggers().all(|trigger| trigger.attribute("luma").is_some()));
+}
+
+#[test]
 fn every_function_of_the_interface_answers_alike() {
     // The writer is made up from the drive by the one, and by the other from nothing.
     let run = Both::on_sample_drive("tests/lambdas/probe/rust", &[CAMERA, IMU]).agree::<probe::Probe>(&["writer"]);
@@ -179,7 +189,7 @@ fn misbehaviour_has_the_same_consequences() {
         let both = Both::on_sample_drive("tests/lambdas/misbehave/rust", &[IMU]).set("behaviour", behaviour);
         both.agree::<misbehave::Misbehave>(&[])
     };
-    for behaviour in ["error", "panic", "huge_label"] {
+    for behaviour in ["error", "panic", "not_a_frame", "huge_label", "too_many_triggers", "nan_score"] {
         let run = misbehave(behaviour);
         assert!(run.faults().count() >= 8 && run.passed_over() > 0, "{behaviour}");
     }
@@ -207,5 +217,42 @@ fn a_lambda_that_does_not_start_says_why_in_the_same_words() {
             assert!(said.contains("cannot start lambda `misbehave`") && said.contains("in init: "), "{said}");
             assert!(said.contains(wanted), "{said}");
         }
+    }
+}
+
+/// A drive of pictures, and the same for the fake.
+fn pictures(folder: &Folder, lambda: &Path) -> Both {
+    let (width, height) = (40, 30);
+    let pixels = |n: u32| (0..width * height * 3).map(|at| (at * 7 + n * 31) as u8).collect::<Vec<_>>();
+    let cdr = |n| image(width, height, "rgb8", 3 * width, &pixels(n));
+    let drive = (1..=12).map(|n| (u64::from(n) * 100_000_000, cdr(n))).collect::<Vec<_>>();
+    let drive = one_topic(folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &drive);
+    let given = (1..=12).map(|n| {
+        let bytes = [&[0, 1, 0, 0], cdr(n).as_slice()].concat();
+        let message = Message::image(width, height, Encoding::Rgb8, pixels(n)).cdr(bytes).stamped(0);
+        Given { input: "camera", at_ns: i64::from(n) * 100_000_000, message }
+    });
+    Both { folder: lambda.to_owned(), drive, given: given.collect(), set: Vec::new() }
+}
+
+#[test]
+fn greed_meets_the_same_limits() {
+    let folder = Folder::new();
+    for (behaviour, bytes) in [
+        ("topics", 0),
+        ("read_cdr", 5000),
+        ("read_frame", 5000),
+        ("mean_luma", 0),
+        ("long_label", 2 << 20),
+        ("frames", 0),
+        ("ok", 0),
+    ] {
+        // What is written here fuel is not to end.
+        let lambda =
+            Copy::of("tests/lambdas/greedy/rust", |toml| toml.replace("fuel = 5_000_000", "fuel = 1_000_000_000"));
+        let both = pictures(&folder, lambda.path()).set("behaviour", behaviour).set("bytes", bytes);
+        let run = both.agree::<greedy::Greedy>(&[]);
+        let good = ["read_cdr", "read_frame", "mean_luma", "ok"].contains(&behaviour);
+        assert_eq!(run.faults().next().is_none(), good, "{behaviour}");
     }
 }

@@ -28,12 +28,15 @@ pub(super) struct Folder {
 impl Folder {
     /// A new folder; `None` where memory is scarce, or the user has named a folder for temporary files.
     pub(super) fn new() -> Option<Folder> {
+        if env::var_os("TMPDIR").is_some() {
+            return None;
+        }
         remove_left();
         let found = statvfs(SHARED_MEMORY).ok()?;
         let is_roomy = found.f_bavail * found.f_frsize >= ROOM_BYTES && available()? >= ROOM_BYTES + LEFT_BYTES;
         // Tests start programs that they have built there.
         let runs_programs = !found.f_flag.contains(StatVfsMountFlags::NOEXEC);
-        if env::var_os("TMPDIR").is_some() || !is_roomy || !runs_programs {
+        if !is_roomy || !runs_programs {
             return None;
         }
         let path = Path::new(SHARED_MEMORY).join(format!("{NAME}{}", process::id()));
