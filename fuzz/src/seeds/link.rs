@@ -1,6 +1,8 @@
 //! Conversations with the recorder, frame by frame.
 
 use gleaner_journal::Encoder;
+use gleaner_lambda::manifest::Limits;
+use gleaner_protocol::link::Add;
 
 use super::journal::{entries, header};
 use crate::link::mode;
@@ -14,7 +16,9 @@ pub fn all() -> Vec<Vec<u8>> {
         (17, payload)
     });
     let lambda = [(16, hello)].into_iter().chain(wakes).chain([(18, Vec::new())]).collect();
-    let add = br#"{"lambda":"/lambdas/brake","remaps":[["/imu","/car/imu"]]}"#.to_vec();
+    let remaps = vec![("/imu".to_owned(), "/car/imu".to_owned())];
+    let add = Add { lambda: "/lambdas/brake".into(), remaps, most: Limits::MOST };
+    let add = serde_json::to_vec(&add).expect("it is JSON");
     let starter = vec![(1, add), (2, Vec::new())];
     let recorder = vec![(32, Vec::new()), (34, 5_u64.to_le_bytes().to_vec()), (33, b"not today".to_vec())];
     let all = [(mode::LAMBDA, lambda), (mode::STARTER, starter), (mode::RECORDER, recorder)];
