@@ -100,7 +100,7 @@ fn every_answer() -> Result<(), Failed> {
 
 /// What `probe` triggers at each wake, and which refusals it provokes, in its order.
 const PROBED: [&str; 6] = ["topic", "sample", "frame", "refusals", "recording", "recording"];
-const REFUSALS: [&str; 11] = [
+const REFUSALS: [&str; 13] = [
     "no-such-input",
     "no-such-field",
     "wrong-field",
@@ -111,6 +111,8 @@ const REFUSALS: [&str; 11] = [
     "no-room",
     "invalid",
     "invalid",
+    "no-runtime",
+    "no-runtime",
     "no-runtime",
 ];
 
