@@ -169,7 +169,8 @@ impl Output {
     }
 }
 
-/// A file of lines. It grows by whole lines only, so that it can be read whenever this process ends.
+/// A file of lines. It grows by whole lines, so that it can be read whenever this process ends. Only a kill in the middle of a write
+/// leaves a part of one, which whoever goes on cuts off.
 struct Lines {
     path: PathBuf,
     file: File,
