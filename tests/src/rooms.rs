@@ -66,28 +66,12 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-parts", &["gleaner-base"]),
     (
         "gleaner-player",
-        &[
-            "gleaner-base",
-            "gleaner-drives",
-            "gleaner-image",
-            "gleaner-lambda",
-            "gleaner-messages",
-            "gleaner-rules",
-            "gleaner-transport",
-        ],
+        &["gleaner-base", "gleaner-drives", "gleaner-image", "gleaner-lambda", "gleaner-messages", "gleaner-transport"],
     ),
     ("gleaner-protocol", &["gleaner-base", "gleaner-journal", "gleaner-lambda"]),
     (
         "gleaner-python",
-        &[
-            "gleaner-host",
-            "gleaner-image",
-            "gleaner-lambda",
-            "gleaner-messages",
-            "gleaner-rules",
-            "gleaner-transport",
-            "gleaner-vitals",
-        ],
+        &["gleaner-host", "gleaner-image", "gleaner-lambda", "gleaner-messages", "gleaner-transport", "gleaner-vitals"],
     ),
     (
         "gleaner-recorder",
@@ -100,17 +84,16 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-lambda",
             "gleaner-messages",
             "gleaner-protocol",
-            "gleaner-rules",
             "gleaner-transport",
             "gleaner-vitals",
         ],
     ),
-    ("gleaner-report", &["gleaner-base", "gleaner-journal", "gleaner-lambda", "gleaner-protocol"]),
+    ("gleaner-report", &["gleaner-base", "gleaner-lambda", "gleaner-protocol"]),
     ("gleaner-rules", &[]),
     ("gleaner-sdk", &["gleaner-rules"]),
     ("gleaner-shim", &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"]),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
-    ("gleaner-vitals", &["gleaner-base", "gleaner-protocol"]),
+    ("gleaner-vitals", &["gleaner-protocol"]),
 ];
 
 /// Crates that are not linked into a crate of ours, whatever its features.

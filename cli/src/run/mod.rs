@@ -40,6 +40,9 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     // Recorded topics need not be inputs; what is known of the largest message is what the inputs say.
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes());
     let largest = (manifest.record.is_some() && !args.no_record).then(|| sizes.max().unwrap_or(0));
+    let vehicle = args.asked.vehicle.as_ref();
+    let allowed = || vehicle.map_or(Ok(Limits::MOST), |file| Vehicle::load(file).map(|vehicle| vehicle.limits));
+    let mut most = allowed()?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
     let offset_ns = clock_offset();
@@ -52,9 +55,8 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     loop {
         let left = args.last.map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let begun = Instant::now();
-        // Its runtime reads the same file now, and says what it made smaller.
-        let vehicle = args.asked.vehicle.as_ref();
-        let most = vehicle.map_or(Ok(Limits::MOST), |file| Vehicle::load(file).map(|it| it.limits))?;
+        // The runtime reads the same file at each start, and reports one that cannot be used: that is no reason to end a run.
+        most = allowed().unwrap_or(most);
         let mut party = Party::start(args, most, largest, offset_ns, left, restarts)?;
         match party.attend(&mut screen, &stop)? {
             Ended::Well(exit) => {

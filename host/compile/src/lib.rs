@@ -9,7 +9,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{Exit, Explain, NotPlain, PlainFile};
+use gleaner_base::{Exit, Explain, NotPlain, PlainFile, chain};
 use gleaner_lambda::layout::COMPONENT_MAX;
 use wasmtime::{Config, Engine};
 
@@ -106,8 +106,8 @@ impl NoComponent {
 
 /// Whether the compiler refused something of WebAssembly that [`settings`] do not have.
 fn asks_for_a_proposal(error: &(dyn std::error::Error + 'static)) -> bool {
-    let chain = std::iter::successors(Some(error), |error| error.source());
-    chain.map(ToString::to_string).any(|text| text.contains("must be enabled") || text.contains("not enabled"))
+    let text = chain(error);
+    text.contains("must be enabled") || text.contains("not enabled")
 }
 
 impl Explain for CompileError {
