@@ -1,4 +1,5 @@
-//! Puts what a new lambda needs into `gleaner`: the SDKs, the WIT, and the example that it begins with.
+//! Puts what a new lambda needs into `gleaner`: the SDKs, the WIT, and the example that it begins
+//! with.
 
 use std::env;
 use std::fmt::Write as _;
@@ -7,7 +8,8 @@ use std::path::{Path, PathBuf};
 
 /// Files of the repository, and folders of which all files with one of the extensions are packed.
 const PACKED: &[&str] = &[
-    // With it, a new lambda is built of the very versions that Gleaner was tested with; cargo takes out what it does not need.
+    // With it, a new lambda is built of the very versions that Gleaner was tested with; cargo takes
+    // out what it does not need.
     "Cargo.lock",
     "LICENSE",
     "examples/hello/python/lambda.toml",
@@ -38,13 +40,18 @@ fn add(root: &Path, path: &Path, list: &mut String) {
     let full = root.join(path);
     if full.is_dir() {
         let entries = fs::read_dir(&full).expect("a folder of the repository");
-        let mut inside: Vec<_> = entries.map(|entry| entry.expect("the same").file_name()).collect();
+        let mut inside: Vec<_> =
+            entries.map(|entry| entry.expect("the same").file_name()).collect();
         inside.sort();
         // Hidden is what tools leave.
-        let inside = inside.iter().filter(|name| *name != "__pycache__" && !name.as_encoded_bytes().starts_with(b"."));
+        let inside = inside
+            .iter()
+            .filter(|name| *name != "__pycache__" && !name.as_encoded_bytes().starts_with(b"."));
         inside.for_each(|name| add(root, &path.join(name), list));
     } else if PACKED.iter().any(|packed| Path::new(packed) == path)
-        || path.extension().is_some_and(|found| EXTENSIONS.iter().any(|extension| found == *extension))
+        || path
+            .extension()
+            .is_some_and(|found| EXTENSIONS.iter().any(|extension| found == *extension))
     {
         let full = full.canonicalize().expect("a file of the repository");
         let _ = writeln!(list, "    ({:?}, include_bytes!({:?})),", path, full);

@@ -4,9 +4,11 @@ use std::fmt;
 use crate::Exit;
 use crate::words::visible;
 
-/// An error that knows the way out of it. The error enum of a room implements this next to its messages.
+/// An error that knows the way out of it. The error enum of a room implements this next to its
+/// messages.
 pub trait Explain: Error {
-    /// What the user can do about it, as a lower-case fragment; `None` if there is nothing but the cause.
+    /// What the user can do about it, as a lower-case fragment; `None` if there is nothing but the
+    /// cause.
     fn help(&self) -> Option<String> {
         None
     }
@@ -49,7 +51,8 @@ impl Failure {
         Failure { help: error.help(), ..Failure::caused_by(error.exit(), action, error) }
     }
 
-    /// As [`because`](Self::because), for an error from elsewhere that knows neither a way out nor an exit code.
+    /// As [`because`](Self::because), for an error from elsewhere that knows neither a way out nor
+    /// an exit code.
     pub fn caused_by(exit: Exit, action: impl Into<String>, error: &dyn Error) -> Failure {
         let mut failure = Failure::new(exit, action);
         failure.add_cause(error.to_string());
@@ -64,7 +67,8 @@ impl Failure {
         self
     }
 
-    /// Reads what another program of ours printed as a failure, and ended with `exit`; `None` if `text` is none.
+    /// Reads what another program of ours printed as a failure, and ended with `exit`; `None` if
+    /// `text` is none.
     pub fn parse(text: &str, exit: Exit) -> Option<Failure> {
         let mut lines = text.lines();
         let mut failure = Failure::new(exit, lines.next()?.strip_prefix(ERROR)?);
@@ -107,7 +111,8 @@ const HELP: &str = "  help:  ";
 /// The error's own message is what failed; its sources are the causes.
 impl<E: Explain> From<E> for Failure {
     fn from(error: E) -> Failure {
-        let mut failure = Failure { help: error.help(), ..Failure::new(error.exit(), error.to_string()) };
+        let mut failure =
+            Failure { help: error.help(), ..Failure::new(error.exit(), error.to_string()) };
         failure.add_sources(&error);
         failure
     }
@@ -128,8 +133,8 @@ impl fmt::Display for Failure {
     }
 }
 
-/// `text` behind `label`, with further lines of it below its first. Control characters, which a file or a lambda may
-/// have put there, are shown and not sent to the terminal.
+/// `text` behind `label`, with further lines of it below its first. Control characters, which a
+/// file or a lambda may have put there, are shown and not sent to the terminal.
 fn write_labelled(f: &mut fmt::Formatter<'_>, label: &str, text: &str) -> fmt::Result {
     f.write_str(label)?;
     for (index, line) in text.trim_end().lines().enumerate() {
@@ -169,7 +174,8 @@ mod tests {
 
     impl Explain for StartError {
         fn help(&self) -> Option<String> {
-            matches!(self, StartError::Manifest(..)).then(|| "keep one [[input]] entry per topic".to_owned())
+            matches!(self, StartError::Manifest(..))
+                .then(|| "keep one [[input]] entry per topic".to_owned())
         }
 
         fn exit(&self) -> Exit {
@@ -219,7 +225,10 @@ mod tests {
         for _ in 0..2 {
             for help in [None, Some("rm 'x'\nor wait".to_owned())] {
                 failure.help = help;
-                assert_eq!(Failure::parse(&failure.to_string(), Exit::Denied), Some(failure.clone()));
+                assert_eq!(
+                    Failure::parse(&failure.to_string(), Exit::Denied),
+                    Some(failure.clone())
+                );
             }
             failure.causes = vec!["one".to_owned(), "two\nof two lines".to_owned()];
         }

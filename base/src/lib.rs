@@ -1,5 +1,6 @@
-//! What every program of Gleaner needs, and nothing of what it does: exit codes, errors as people read them, files that are safe to
-//! open and written whole, sizes and durations, words in messages.
+//! What every program of Gleaner needs, and nothing of what it does: exit codes, errors as people
+//! read them, files that are safe to open and written whole, sizes and durations, words in
+//! messages.
 //!
 //! Nothing here knows what a lambda is.
 

@@ -1,7 +1,8 @@
-//! Files and folders of ours, where others may write as well: whoever made a lambda may have put links, pipes or devices into the
-//! folder of its results.
+//! Files and folders of ours, where others may write as well: whoever made a lambda may have put
+//! links, pipes or devices into the folder of its results.
 //!
-//! What is opened here is what it seems to be. Nothing waits, and nothing is written to where a link leads.
+//! What is opened here is what it seems to be. Nothing waits, and nothing is written to where a
+//! link leads.
 
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
@@ -12,7 +13,8 @@ use rustix::fs::OFlags;
 
 use crate::{Exit, Failure};
 
-/// Why something that has the name of a file or folder of ours is none. It is the cause in an [`io::Error`].
+/// Why something that has the name of a file or folder of ours is none. It is the cause in an
+/// [`io::Error`].
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InTheWay {
     /// A symbolic link.
@@ -66,14 +68,17 @@ pub fn edit(path: &Path) -> io::Result<File> {
     own(path, File::options().read(true).write(true))
 }
 
-/// Begins a new file `path`. What had the name loses it, and nothing else: a link goes, and not where it leads.
+/// Begins a new file `path`. What had the name loses it, and nothing else: a link goes, and not
+/// where it leads.
 ///
 /// # Errors
 ///
 /// [`InTheWay`] if it is a folder; those of the file system.
 pub fn anew(path: &Path) -> io::Result<File> {
     match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(in_the_way(path, error)),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            return Err(in_the_way(path, error));
+        }
         _ => {}
     }
     own(path, File::options().write(true).create_new(true))
@@ -97,7 +102,8 @@ pub fn read_named(path: &Path) -> io::Result<File> {
     open(path, File::options().read(true), OFlags::empty()).map(|(file, _)| file)
 }
 
-/// Makes sure that `path` is a folder, and no link to one; it is made if there is none, with those that it is in. These may be links.
+/// Makes sure that `path` is a folder, and no link to one; it is made if there is none, with those
+/// that it is in. These may be links.
 ///
 /// # Errors
 ///
@@ -118,13 +124,15 @@ pub fn folder(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Refuses `folder`, of results, if it lies in the folder `lambda` by way of a link: whoever made the lambda may have put it there.
+/// Refuses `folder`, of results, if it lies in the folder `lambda` by way of a link: whoever made
+/// the lambda may have put it there.
 ///
 /// # Errors
 ///
 /// A failure that names the link.
 pub fn real_place(folder: &Path, lambda: &Path) -> Result<(), Failure> {
-    let within = folder.ancestors().take_while(|path| folder.starts_with(lambda) && *path != lambda);
+    let within =
+        folder.ancestors().take_while(|path| folder.starts_with(lambda) && *path != lambda);
     let Some(link) = within.filter(|path| path.is_symlink()).last() else { return Ok(()) };
     let message = format!("`{}` is a link in the lambda's own folder", link.display());
     Err(Failure::new(Exit::Usage, message).with_help("remove it, or name the folder: --out DIR"))

@@ -15,14 +15,15 @@ pub struct Piece<'a> {
 }
 
 impl Piece<'_> {
-    /// Whether it begins as a [`Failure`](crate::Failure) does. A lambda and its libraries may write that, too.
+    /// Whether it begins as a [`Failure`](crate::Failure) does. A lambda and its libraries may
+    /// write that, too.
     pub fn is_failure(&self) -> bool {
         self.begins_line && self.bytes.starts_with(b"error: ")
     }
 }
 
-/// Gives `take` all that `from` has, to its end. A line is cut into pieces rather than held whole, however long it is. Returns whether
-/// the last line has its end.
+/// Gives `take` all that `from` has, to its end. A line is cut into pieces rather than held whole,
+/// however long it is. Returns whether the last line has its end.
 pub fn each_piece(from: impl Read, mut take: impl FnMut(Piece<'_>)) -> bool {
     let mut from = BufReader::new(from);
     let (mut bytes, mut begins_line) = (Vec::new(), true);
@@ -51,8 +52,14 @@ mod tests {
                 && each_piece(&b""[..], |_| {})
                 && each_piece(&b"error: x\n"[..], |piece| assert!(piece.is_failure()))
         );
-        assert_eq!(pieces.iter().flat_map(|(bytes, _)| bytes).copied().collect::<Vec<_>>(), text.as_bytes());
-        assert_eq!(pieces.iter().map(|(_, begins)| *begins).collect::<Vec<_>>(), [true, true, false, false, true]);
+        assert_eq!(
+            pieces.iter().flat_map(|(bytes, _)| bytes).copied().collect::<Vec<_>>(),
+            text.as_bytes()
+        );
+        assert_eq!(
+            pieces.iter().map(|(_, begins)| *begins).collect::<Vec<_>>(),
+            [true, true, false, false, true]
+        );
         assert!(pieces.iter().all(|(bytes, _)| bytes.len() as u64 <= PIECE_MAX));
     }
 }

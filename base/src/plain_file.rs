@@ -1,8 +1,10 @@
-//! Opens files that a user or another program provided: a lambda's folder and build, its environment, results.
+//! Opens files that a user or another program provided: a lambda's folder and build, its
+//! environment, results.
 //!
-//! What is opened here is a regular file of a bounded length. A pipe is not waited for, a device is not opened, and a file that is
-//! too long, such as a sparse one, is refused before its first byte. Of a lambda's folder only what lies in it is opened, wherever
-//! links lead. What is checked is what was opened, so that a file which is replaced meanwhile makes no difference.
+//! What is opened here is a regular file of a bounded length. A pipe is not waited for, a device is
+//! not opened, and a file that is too long, such as a sparse one, is refused before its first byte.
+//! Of a lambda's folder only what lies in it is opened, wherever links lead. What is checked is
+//! what was opened, so that a file which is replaced meanwhile makes no difference.
 
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
@@ -86,7 +88,8 @@ impl PlainFile {
         Self::opened(Place::of(path, OFlags::NOFOLLOW)?, most)
     }
 
-    /// Opens the file `path` of the folder `folder`. Links may lead to files in that folder, and to no others.
+    /// Opens the file `path` of the folder `folder`. Links may lead to files in that folder, and to
+    /// no others.
     ///
     /// # Errors
     ///
@@ -100,7 +103,11 @@ impl PlainFile {
     fn opened(place: Place, most: ByteSize) -> io::Result<Self> {
         let found = place.0.metadata()?;
         if !found.is_file() {
-            return Err(io::Error::other(if found.is_symlink() { NotPlain::Link } else { NotPlain::NoFile }));
+            return Err(io::Error::other(if found.is_symlink() {
+                NotPlain::Link
+            } else {
+                NotPlain::NoFile
+            }));
         }
         if found.len() > most.bytes() {
             return Err(io::Error::other(NotPlain::TooLong { bytes: found.len(), most }));
@@ -218,7 +225,11 @@ mod tests {
         let scratch = Scratch::new();
         let (folder, secret) = (scratch.path("lambda"), scratch.write("secret", "secret"));
         scratch.write("lambda/part/a.py", "a");
-        let links = [("short.py", "part/a.py".into()), ("long.py", folder.join("part/a.py")), ("same", ".".into())];
+        let links = [
+            ("short.py", "part/a.py".into()),
+            ("long.py", folder.join("part/a.py")),
+            ("same", ".".into()),
+        ];
         for (link, target) in links {
             symlink(target, folder.join(link)).unwrap();
         }
@@ -248,7 +259,8 @@ mod tests {
     #[test]
     fn what_is_no_file_is_neither_waited_for_nor_opened() {
         let scratch = Scratch::new();
-        let (pipe, socket, folder) = (scratch.path("pipe"), scratch.path("socket"), scratch.path("folder"));
+        let (pipe, socket, folder) =
+            (scratch.path("pipe"), scratch.path("socket"), scratch.path("folder"));
         mknodat(CWD, &pipe, FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
         let _listener = UnixListener::bind(&socket).unwrap();
         fs::create_dir(&folder).unwrap();
@@ -256,11 +268,16 @@ mod tests {
             assert_eq!(why(PlainFile::named(path, MOST)), NotPlain::NoFile, "{}", path.display());
             assert_eq!(why(PlainFile::result(path, MOST)), NotPlain::NoFile, "{}", path.display());
         }
-        assert_eq!(why(PlainFile::inside(scratch.root(), Path::new("pipe"), MOST)), NotPlain::NoFile);
+        assert_eq!(
+            why(PlainFile::inside(scratch.root(), Path::new("pipe"), MOST)),
+            NotPlain::NoFile
+        );
         symlink("/dev/zero", scratch.path("device")).unwrap();
         assert_eq!(why(PlainFile::named(&scratch.path("device"), MOST)), NotPlain::NoFile);
         let outside = why(PlainFile::inside(scratch.root(), Path::new("device"), MOST));
-        assert!(matches!(outside, NotPlain::Outside { target, .. } if target == Path::new("/dev/zero")));
+        assert!(
+            matches!(outside, NotPlain::Outside { target, .. } if target == Path::new("/dev/zero"))
+        );
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! A folder for one test, removed with everything in it when the test ends. Several crates include this file.
+//! A folder for one test, removed with everything in it when the test ends. Several crates include
+//! this file.
 // Each uses its own part.
 #![allow(dead_code)]
 
@@ -13,7 +14,11 @@ pub(crate) struct Scratch {
 impl Scratch {
     pub(crate) fn new() -> Scratch {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!("gleaner-test-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let name = format!(
+            "gleaner-test-{}-{}",
+            std::process::id(),
+            COUNT.fetch_add(1, Ordering::Relaxed)
+        );
         let root = std::env::temp_dir().join(name);
         fs::create_dir(&root).unwrap();
         // Without links, so that it compares equal to what programs find out about themselves.

@@ -61,7 +61,8 @@ impl ByteSize {
         self.0
     }
 
-    /// The number of bytes as a length in memory. No size of memory in a manifest exceeds 2 GiB, so that none saturates.
+    /// The number of bytes as a length in memory. No size of memory in a manifest exceeds 2 GiB, so
+    /// that none saturates.
     pub fn as_usize(self) -> usize {
         usize::try_from(self.0).unwrap_or(usize::MAX)
     }
@@ -85,11 +86,13 @@ impl fmt::Display for ByteSize {
     }
 }
 
-/// The duration that a text such as `5s`, `50ms`, `1.5s`, `2min` or `100us` stands for, exact to the nanosecond.
+/// The duration that a text such as `5s`, `50ms`, `1.5s`, `2min` or `100us` stands for, exact to
+/// the nanosecond.
 ///
 /// # Errors
 ///
-/// [`UnitError`] for a text without a unit, of another form, with parts of a nanosecond, or beyond 584 years.
+/// [`UnitError`] for a text without a unit, of another form, with parts of a nanosecond, or beyond
+/// 584 years.
 pub fn parse_duration(text: &str) -> Result<Duration, UnitError> {
     units::duration(text).map(Duration::from_nanos).ok_or_else(|| UnitError {
         text: text.to_owned(),
@@ -98,7 +101,8 @@ pub fn parse_duration(text: &str) -> Result<Duration, UnitError> {
     })
 }
 
-/// `duration` as [`parse_duration`] reads it, in the largest unit that keeps it whole: `1500ms`, `5s`, `2min`.
+/// `duration` as [`parse_duration`] reads it, in the largest unit that keeps it whole: `1500ms`,
+/// `5s`, `2min`.
 pub fn format_duration(duration: Duration) -> String {
     units::duration_in_words(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX))
 }
@@ -124,9 +128,19 @@ mod tests {
 
     #[test]
     fn sizes_of_another_form_are_refused() {
-        for text in
-            ["", "MiB", "2 MB", "2 mib", "1.5 MiB", "-1 B", "+1 B", "2  MiB", "2 MiB x", "99999999999 GiB", "1_000 B"]
-        {
+        for text in [
+            "",
+            "MiB",
+            "2 MB",
+            "2 mib",
+            "1.5 MiB",
+            "-1 B",
+            "+1 B",
+            "2  MiB",
+            "2 MiB x",
+            "99999999999 GiB",
+            "1_000 B",
+        ] {
             assert_eq!(
                 text.parse::<ByteSize>(),
                 Err(UnitError { text: text.to_owned(), what: "size", rule: SIZE_RULE }),
@@ -192,9 +206,13 @@ mod tests {
             assert_eq!(ByteSize::new(size).to_string(), text);
             assert_eq!(text.parse(), Ok(ByteSize::new(size)));
         }
-        for (ns, text) in
-            [(0, "0s"), (1_500_000_000, "1500ms"), (120_000_000_000, "2min"), (1, "1ns"), (50_000_000, "50ms")]
-        {
+        for (ns, text) in [
+            (0, "0s"),
+            (1_500_000_000, "1500ms"),
+            (120_000_000_000, "2min"),
+            (1, "1ns"),
+            (50_000_000, "50ms"),
+        ] {
             assert_eq!(format_duration(Duration::from_nanos(ns)), text);
             assert_eq!(parse_duration(text), Ok(Duration::from_nanos(ns)));
         }

@@ -4,8 +4,9 @@ use std::path::Path;
 
 use crate::own_file;
 
-/// Writes `content` to the file `path` by way of one beside it, so that whatever happens there is the former file or this one, whole.
-/// After an error, the one beside it is removed: on a full disk, its room is needed.
+/// Writes `content` to the file `path` by way of one beside it, so that whatever happens there is
+/// the former file or this one, whole. After an error, the one beside it is removed: on a full
+/// disk, its room is needed.
 ///
 /// # Errors
 ///
@@ -15,7 +16,10 @@ pub fn write_whole(path: &Path, content: &[u8]) -> io::Result<()> {
     part.push(".part");
     let part = Path::new(&part);
     let mut file = own_file::anew(part)?;
-    let written = file.write_all(content).and_then(|()| file.sync_all()).and_then(|()| fs::rename(part, path));
+    let written = file
+        .write_all(content)
+        .and_then(|()| file.sync_all())
+        .and_then(|()| fs::rename(part, path));
     if let Err(error) = written {
         let _ = fs::remove_file(part);
         return Err(error);

@@ -1,4 +1,5 @@
-//! Words in messages: lists of them, the nearest to a misspelt one, numbers, and foreign text made fit to print.
+//! Words in messages: lists of them, the nearest to a misspelt one, numbers, and foreign text made
+//! fit to print.
 
 use std::fmt::Display;
 use std::path::Path;
@@ -7,7 +8,8 @@ pub use gleaner_rules::text::visible;
 
 /// The one of `known` that `word` was most likely meant to be.
 pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
-    // The distance takes time in proportion to both lengths, and nobody misspells a key with a page of text.
+    // The distance takes time in proportion to both lengths, and nobody misspells a key with a page
+    // of text.
     if word.len() > 64 {
         return None;
     }
@@ -34,7 +36,8 @@ pub fn list<W: AsRef<str>>(words: &[W], last: &str) -> String {
     }
 }
 
-/// A text from a file, short enough for a message and without characters that would act on a terminal.
+/// A text from a file, short enough for a message and without characters that would act on a
+/// terminal.
 pub fn excerpt(text: &str) -> String {
     const SHOWN: usize = 80;
     match text.char_indices().nth(SHOWN) {

@@ -21,10 +21,13 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     let directory = bag::directory(&folder, rounds);
     let short = hello(&sample_drive(), "rust").peak_rss_bytes;
     let mut figures = against_rosbags(quick);
-    for (name, drive, file) in [("MCAP", &mcap, &mcap), ("sqlite3", &directory, &directory.join("drive_0.db3"))] {
+    for (name, drive, file) in
+        [("MCAP", &mcap, &mcap), ("sqlite3", &directory, &directory.join("drive_0.db3"))]
+    {
         let bytes = std::fs::metadata(file).expect("it was written").len();
-        let mut tell =
-            |what: &str, unit, value: f64| figures.push(Figure::told(&format!("{name}: {what}"), unit, &[value]));
+        let mut tell = |what: &str, unit, value: f64| {
+            figures.push(Figure::told(&format!("{name}: {what}"), unit, &[value]))
+        };
         tell("size", "GB", bytes as f64 / 1e9);
         let summary = hello(drive, "rust");
         assert_eq!(summary.wakes, rounds * 4170, "every IMU sample wakes");
@@ -39,8 +42,8 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     figures
 }
 
-/// The same judgement over the same drive of 200 MB, by lambdas and in a script on rosbags, in turns: wakes for each second from the
-/// first message to the last.
+/// The same judgement over the same drive of 200 MB, by lambdas and in a script on rosbags, in
+/// turns: wakes for each second from the first message to the last.
 fn against_rosbags(quick: bool) -> Vec<Figure> {
     let folder = Folder::new();
     let drive = folder.path().join("drive.mcap");
@@ -57,9 +60,12 @@ fn against_rosbags(quick: bool) -> Vec<Figure> {
         rates[2].push(messages as f64 / seconds);
     }
     let names = ["hello in wasm", "hello in Python", "the same function in a script on rosbags"];
-    let told =
-        names.iter().zip(&rates).map(|(name, rates)| Figure::told(&format!("MCAP, 0.2 GB: {name}"), "wakes/s", rates));
-    let factor = rates[1].iter().zip(&rates[2]).map(|(ours, theirs)| ours / theirs).collect::<Vec<_>>();
+    let told = names
+        .iter()
+        .zip(&rates)
+        .map(|(name, rates)| Figure::told(&format!("MCAP, 0.2 GB: {name}"), "wakes/s", rates));
+    let factor =
+        rates[1].iter().zip(&rates[2]).map(|(ours, theirs)| ours / theirs).collect::<Vec<_>>();
     told.chain([Figure::told("replay in Python against rosbags", "x", &factor)]).collect()
 }
 
@@ -92,8 +98,11 @@ fn hello(drive: &Path, kind: &str) -> Summary {
 /// How long `gleaner inspect` takes, the start of its two programs included.
 fn inspect_ms(drive: &Path) -> f64 {
     let started = Instant::now();
-    let output =
-        Command::new(program("gleaner")).args(["inspect", "--json"]).arg(drive).output().expect("gleaner starts");
+    let output = Command::new(program("gleaner"))
+        .args(["inspect", "--json"])
+        .arg(drive)
+        .output()
+        .expect("gleaner starts");
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let seen: DriveSeen = serde_json::from_slice(&output.stdout).expect("topics of a drive");
     assert_eq!(seen.topics.len(), 3);

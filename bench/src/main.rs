@@ -1,6 +1,8 @@
-//! Measures what Gleaner promises, with the programs that users run. `cargo xtask bench` builds what it needs first.
+//! Measures what Gleaner promises, with the programs that users run. `cargo xtask bench` builds
+//! what it needs first.
 //!
-//! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the spread of its runs.
+//! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the
+//! spread of its runs.
 
 mod answers;
 mod drives;
@@ -25,14 +27,15 @@ struct Args {
     /// Live topics instead of drives, in a private network; needs gleaner-player.
     #[arg(long)]
     live: bool,
-    /// Arithmetic in lambdas against the same natively, and calls between lambda and host, instead of drives.
+    /// Arithmetic in lambdas against the same natively, and calls between lambda and host, instead
+    /// of drives.
     #[arg(long, conflicts_with = "live")]
     kernels: bool,
     /// Drives of 2 GB in each storage, instead of short ones; takes 5 GB of disk.
     #[arg(long, conflicts_with_all = ["live", "kernels", "isolation"])]
     drives: bool,
-    /// What a lambda feels of another one that misbehaves, in a private network, and what a process costs, instead of drives; needs
-    /// gleaner-player.
+    /// What a lambda feels of another one that misbehaves, in a private network, and what a process
+    /// costs, instead of drives; needs gleaner-player.
     #[arg(long, conflicts_with_all = ["live", "kernels"])]
     isolation: bool,
 }
@@ -80,19 +83,34 @@ fn main() -> ExitCode {
         shares.push(100.0 * summary.decode_s / summary.wall_s);
         summary.wakes_per_s
     });
-    figures.push(Figure::told("replay, 640x360 JPEG, every frame decoded, wasm", "frames/s", &camera[0].1));
-    figures.push(Figure::told("replay, 640x360 JPEG, every frame decoded, Python", "frames/s", &camera[1].1));
+    figures.push(Figure::told(
+        "replay, 640x360 JPEG, every frame decoded, wasm",
+        "frames/s",
+        &camera[0].1,
+    ));
+    figures.push(Figure::told(
+        "replay, 640x360 JPEG, every frame decoded, Python",
+        "frames/s",
+        &camera[1].1,
+    ));
     figures.push(Figure::told("share of JPEG decoding in these", "%", &shares));
 
     for example in ["hello", "brake-dark"] {
         for kind in [Kind::Rust, Kind::Python] {
             let growth = (0..rounds.min(3)).map(|_| setting.growth_from_2nd_to_10th(example, kind));
-            let name = format!("memory after the 10th replay of {example} in one process against the 2nd, {kind}");
+            let name = format!(
+                "memory after the 10th replay of {example} in one process against the 2nd, {kind}"
+            );
             figures.push(Figure::at_most(&name, "%", 2.0, &growth.collect::<Vec<_>>()));
         }
     }
     let arrays = (0..rounds.min(5)).flat_map(|_| setting.array_ns()).collect::<Vec<_>>();
-    figures.push(Figure::at_most("slot to ndarray, 1920x1080 bgr8 (6.2 MB)", "ns", 1000.0, &arrays));
+    figures.push(Figure::at_most(
+        "slot to ndarray, 1920x1080 bgr8 (6.2 MB)",
+        "ns",
+        1000.0,
+        &arrays,
+    ));
 
     let what = || [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
     let [imu, sample] = [
@@ -103,19 +121,41 @@ fn main() -> ExitCode {
         let pairs = replays[0].1.iter().zip(&replays[with].1);
         pairs.map(|(a, b)| 100.0 * (a / b - 1.0)).collect::<Vec<_>>()
     };
-    figures.push(Figure::at_most("replay slower by a journal, 200 s of IMU, wasm", "%", 5.0, &slower(&imu, 1)));
-    figures.push(Figure::told("replay slower by a journal, sample drive with camera, wasm", "%", &slower(&sample, 1)));
-    figures.push(Figure::told("replay slower by clips, sample drive with camera, wasm", "%", &slower(&sample, 2)));
+    figures.push(Figure::at_most(
+        "replay slower by a journal, 200 s of IMU, wasm",
+        "%",
+        5.0,
+        &slower(&imu, 1),
+    ));
+    figures.push(Figure::told(
+        "replay slower by a journal, sample drive with camera, wasm",
+        "%",
+        &slower(&sample, 1),
+    ));
+    figures.push(Figure::told(
+        "replay slower by clips, sample drive with camera, wasm",
+        "%",
+        &slower(&sample, 2),
+    ));
     let sizes = [("hello", 14.0), ("brake-dark", 20.0)];
     for (example, goal) in sizes {
         let name = format!("journal of {example}");
-        figures.push(Figure::at_most(&name, "bytes/wake", goal, &[setting.journal_bytes_per_wake(example)]));
+        figures.push(Figure::at_most(
+            &name,
+            "bytes/wake",
+            goal,
+            &[setting.journal_bytes_per_wake(example)],
+        ));
     }
 
     for (name, store) in [("memory", Store::Ram), ("disk", Store::Disk)] {
         let load = record::record(if quick { 2 } else { 60 }, store);
         let mut tell = |what: &str, unit, value| {
-            figures.push(Figure::told(&format!("recorder at 20 MB/s, preroll in {name}: {what}"), unit, &[value]));
+            figures.push(Figure::told(
+                &format!("recorder at 20 MB/s, preroll in {name}: {what}"),
+                unit,
+                &[value],
+            ));
         };
         tell("arrived", "MB/s", load.megabytes_per_s);
         tell("part of the time in clips", "%", load.recorded_percent);
@@ -131,15 +171,33 @@ fn main() -> ExitCode {
     let live = record::record_live(if quick { 4 } else { 60 });
     let opened = |share| quantile(&live.opened_ms, share);
     figures.push(Figure::told("trigger to window open, at 20 MB/s: median", "ms", &[opened(0.5)]));
-    figures.push(Figure::at_most("trigger to window open, at 20 MB/s: 99 %", "ms", 1.0, &[opened(0.99)]));
+    figures.push(Figure::at_most(
+        "trigger to window open, at 20 MB/s: 99 %",
+        "ms",
+        1.0,
+        &[opened(0.99)],
+    ));
     figures.push(Figure::told(
         "trigger to window open, at 20 MB/s: longest",
         "ms",
         &live.opened_ms[live.opened_ms.len().max(1) - 1..],
     ));
-    figures.push(Figure::told("live recorder at 20 MB/s: longest time to take a sample", "ms", &[live.longest_ms]));
-    figures.push(Figure::told("live recorder: time to tell it of a wake", "us", &[quantile(&live.told_us, 0.5)]));
-    figures.push(Figure::at_most("live recorder at 20 MB/s: samples lost", "samples", 0.0, &[live.lost as f64]));
+    figures.push(Figure::told(
+        "live recorder at 20 MB/s: longest time to take a sample",
+        "ms",
+        &[live.longest_ms],
+    ));
+    figures.push(Figure::told(
+        "live recorder: time to tell it of a wake",
+        "us",
+        &[quantile(&live.told_us, 0.5)],
+    ));
+    figures.push(Figure::at_most(
+        "live recorder at 20 MB/s: samples lost",
+        "samples",
+        0.0,
+        &[live.lost as f64],
+    ));
 
     tell(&figures, quick)
 }
@@ -153,7 +211,8 @@ fn tell(figures: &[Figure], quick: bool) -> ExitCode {
     if quick || figures.iter().all(Figure::is_met) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Runs `measure` for each of `series` in turn, `rounds` times, so that a change of the machine's mood meets all alike.
+/// Runs `measure` for each of `series` in turn, `rounds` times, so that a change of the machine's
+/// mood meets all alike.
 fn alternate<K: Copy, const N: usize>(
     rounds: usize,
     mut series: [(K, Vec<f64>); N],

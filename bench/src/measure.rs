@@ -68,8 +68,11 @@ impl Setting {
     pub fn new() -> Self {
         let folder = Folder::new();
         let pixels = vec![99; 1920 * 1080 * 3];
-        let frames = (0..4).map(|i| (i * 100_000_000, image(1920, 1080, "bgr8", 5760, &pixels))).collect::<Vec<_>>();
-        let frames = one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &frames);
+        let frames = (0..4)
+            .map(|i| (i * 100_000_000, image(1920, 1080, "bgr8", 5760, &pixels)))
+            .collect::<Vec<_>>();
+        let frames =
+            one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &frames);
         let imu_folder = Folder::new();
         let imu = imu_only(&imu_folder, 5);
         Self { sample: sample_drive(), frames, imu, _folders: [folder, imu_folder] }
@@ -82,28 +85,39 @@ impl Setting {
 
     /// `brake-dark` over the sample drive, brought to look at each of its 400 pictures.
     pub fn every_frame_decoded(&self, kind: Kind) -> Summary {
-        self.run(&kind.example("brake-dark"), &["--set", "brake_mps2=1000", "--set", "dark_luma=0", "--no-record"])
+        self.run(
+            &kind.example("brake-dark"),
+            &["--set", "brake_mps2=1000", "--set", "dark_luma=0", "--no-record"],
+        )
     }
 
     fn run(&self, lambda: &Path, args: &[&str]) -> Summary {
-        replay(lambda, std::slice::from_ref(&self.sample), args).must_exit(0).summary.clone().expect("a summary")
+        replay(lambda, std::slice::from_ref(&self.sample), args)
+            .must_exit(0)
+            .summary
+            .clone()
+            .expect("a summary")
     }
 
-    /// By how many per cent memory after the 10th replay of `example` in one process exceeds that after the 2nd.
+    /// By how many per cent memory after the 10th replay of `example` in one process exceeds that
+    /// after the 2nd.
     pub fn growth_from_2nd_to_10th(&self, example: &str, kind: Kind) -> f64 {
         let args = ["--set", "brake_mps2=-1.4", "--repeat", "10"];
         let rounds = self.rounds(&kind.example(example), &self.sample, &args);
         100.0 * (rounds[9].rss_bytes as f64 / rounds[1].rss_bytes as f64 - 1.0)
     }
 
-    /// Wakes per second of `hello` in wasm over `drive` that judges alone, or writes a `journal`, or makes `clips`: the median of
-    /// so many passes in one process that a pass of 20 ms is no matter of luck.
+    /// Wakes per second of `hello` in wasm over `drive` that judges alone, or writes a `journal`,
+    /// or makes `clips`: the median of so many passes in one process that a pass of 20 ms is no
+    /// matter of luck.
     fn hello_rounds(&self, drive: &Path, what: &str) -> f64 {
         let folder = Folder::new();
         let journal = folder.path().join("wakes.journal");
         let mut args = vec!["--set", "brake_mps2=-1.4", "--repeat", "20"];
         match what {
-            "journal" => args.extend(["--no-record", "--journal", journal.to_str().expect("a plain name")]),
+            "journal" => {
+                args.extend(["--no-record", "--journal", journal.to_str().expect("a plain name")])
+            }
             "clips" => {}
             _ => args.push("--no-record"),
         }
@@ -113,7 +127,8 @@ impl Setting {
         rates[rates.len() / 2]
     }
 
-    /// As [`Setting::hello_rounds`] over the sample drive, most of which is pictures that the lambda does not read.
+    /// As [`Setting::hello_rounds`] over the sample drive, most of which is pictures that the
+    /// lambda does not read.
     pub fn sample_rounds(&self, what: &str) -> f64 {
         self.hello_rounds(&self.sample, what)
     }
@@ -127,7 +142,13 @@ impl Setting {
     pub fn journal_bytes_per_wake(&self, example: &str) -> f64 {
         let folder = Folder::new();
         let journal = folder.path().join("wakes.journal");
-        let args = ["--set", "brake_mps2=-1.4", "--no-record", "--journal", journal.to_str().expect("a plain name")];
+        let args = [
+            "--set",
+            "brake_mps2=-1.4",
+            "--no-record",
+            "--journal",
+            journal.to_str().expect("a plain name"),
+        ];
         let summary = self.run(&Kind::Rust.example(example), &args);
         std::fs::metadata(&journal).expect("a journal").len() as f64 / summary.wakes as f64
     }
@@ -154,7 +175,8 @@ impl Setting {
         rounds
     }
 
-    /// Nanoseconds for one array over a frame of 6.2 MB, one figure for each frame, as the lambda measures it.
+    /// Nanoseconds for one array over a frame of 6.2 MB, one figure for each frame, as the lambda
+    /// measures it.
     pub fn array_ns(&self) -> Vec<f64> {
         let lambda = root().join("bench/lambdas/ndarray/python");
         let run = replay(&lambda, std::slice::from_ref(&self.frames), &[]);

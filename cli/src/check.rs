@@ -1,4 +1,5 @@
-//! `gleaner check DIR`: a built lambda is loaded as on a vehicle and its `init` run, without any sample.
+//! `gleaner check DIR`: a built lambda is loaded as on a vehicle and its `init` run, without any
+//! sample.
 
 use std::ffi::OsString;
 

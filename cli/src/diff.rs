@@ -1,4 +1,5 @@
-//! `gleaner diff OUT1 OUT2`: shows what differs between two runs. What is compared, and how, is decided in `gleaner-report`.
+//! `gleaner diff OUT1 OUT2`: shows what differs between two runs. What is compared, and how, is
+//! decided in `gleaner-report`.
 
 use gleaner_base::{Exit, Failure};
 use gleaner_report::Diff;

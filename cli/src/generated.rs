@@ -1,4 +1,5 @@
-//! What is made from the definition of the command line alone: completions for shells, and man pages.
+//! What is made from the definition of the command line alone: completions for shells, and man
+//! pages.
 
 use std::path::Path;
 
@@ -19,10 +20,14 @@ pub(crate) fn completions(shell: Shell) -> Result<Exit, Failure> {
 
 /// Writes a man page for each command into `folder`.
 pub(crate) fn man(folder: &Path) -> Result<Exit, Failure> {
-    let written = std::fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(Cli::command(), folder));
+    let written = std::fs::create_dir_all(folder)
+        .and_then(|()| clap_mangen::generate_to(Cli::command(), folder));
     written.map_err(|error| {
-        let failure =
-            Failure::caused_by(Exit::Usage, format!("cannot write man pages into `{}`", folder.display()), &error);
+        let failure = Failure::caused_by(
+            Exit::Usage,
+            format!("cannot write man pages into `{}`", folder.display()),
+            &error,
+        );
         failure.with_help("name a folder that you may write to, such as ~/.local/share/man/man1")
     })?;
     say(&format!(
@@ -41,10 +46,14 @@ mod tests {
     fn every_command_has_a_man_page() {
         let folder = tempfile::tempdir().unwrap();
         man(folder.path()).unwrap();
-        let names = Cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect::<Vec<_>>();
+        let names = Cli::command()
+            .get_subcommands()
+            .map(|command| command.get_name().to_owned())
+            .collect::<Vec<_>>();
         assert!(names.len() > 10, "{names:?}");
         for name in names {
-            let page = std::fs::read_to_string(folder.path().join(format!("gleaner-{name}.1"))).unwrap();
+            let page =
+                std::fs::read_to_string(folder.path().join(format!("gleaner-{name}.1"))).unwrap();
             assert!(page.contains(".SH SYNOPSIS"), "{name}");
         }
     }
@@ -55,7 +64,10 @@ mod tests {
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut Cli::command(), "gleaner", &mut script);
             let script = String::from_utf8(script).unwrap();
-            assert!(["replay", "no-record", "disk-floor"].iter().all(|word| script.contains(word)), "{shell}");
+            assert!(
+                ["replay", "no-record", "disk-floor"].iter().all(|word| script.contains(word)),
+                "{shell}"
+            );
         }
     }
 }

@@ -1,10 +1,12 @@
-//! The command `gleaner`: `new` makes a lambda's folder, `build` its build folder, `runtime` starts `gleaner-runtime` for `check`, `replay` and
-//! `verify`, `run` keeps it and the recorder going live, `show` is what people see of results, `report` writes the page about them, `diff` shows
-//! what differs between two runs, `dev` does all of it again whenever a source is saved, and `generated` is what is made from the command line's
-//! definition.
+//! The command `gleaner`: `new` makes a lambda's folder, `build` its build folder, `runtime` starts
+//! `gleaner-runtime` for `check`, `replay` and `verify`, `run` keeps it and the recorder going
+//! live, `show` is what people see of results, `report` writes the page about them, `diff` shows
+//! what differs between two runs, `dev` does all of it again whenever a source is saved, and
+//! `generated` is what is made from the command line's definition.
 //!
-//! It is thin. No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts its
-//! sibling programs and speaks to them through `gleaner-protocol`. What is known of results is in `gleaner-report`.
+//! It is thin. No lambda runs in this process, and it links neither a WebAssembly engine nor
+//! Python: it starts its sibling programs and speaks to them through `gleaner-protocol`. What is
+//! known of results is in `gleaner-report`.
 
 pub mod args;
 mod build;

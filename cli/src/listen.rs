@@ -1,18 +1,21 @@
-//! Hearing out a program without depending on it to close its streams: what it left running may hold them open.
+//! Hearing out a program without depending on it to close its streams: what it left running may
+//! hold them open.
 
 use std::process::Child;
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
 use std::thread;
 use std::time::Duration;
 
-/// How long after a program's end its streams may still bring something. What it wrote lies in a pipe of some kilobytes
-/// by then: this is ample for them, and short for a person who waits because another process holds the pipe.
+/// How long after a program's end its streams may still bring something. What it wrote lies in a
+/// pipe of some kilobytes by then: this is ample for them, and short for a person who waits because
+/// another process holds the pipe.
 const REST: Duration = Duration::from_secs(2);
 
 /// How often to ask whether the program still runs, while nothing else tells.
 const ASK: Duration = Duration::from_millis(50);
 
-/// Work on a thread of its own that ends with a stream, or before. The thread of one that is given up is left behind.
+/// Work on a thread of its own that ends with a stream, or before. The thread of one that is given
+/// up is left behind.
 pub(crate) struct Listener<T> {
     heard: Receiver<T>,
 }
@@ -26,20 +29,24 @@ impl<T: Send + 'static> Listener<T> {
         Listener { heard }
     }
 
-    /// What was heard, as soon as it was heard; `None` if `child` ended meanwhile and a moment later it was not.
+    /// What was heard, as soon as it was heard; `None` if `child` ended meanwhile and a moment
+    /// later it was not.
     pub(crate) fn until_the_end_of(self, child: &mut Child) -> Option<T> {
         loop {
             match self.heard.recv_timeout(ASK) {
                 Ok(heard) => return Some(heard),
                 Err(RecvTimeoutError::Disconnected) => return None,
                 // One that cannot be asked will not be waited for.
-                Err(RecvTimeoutError::Timeout) if !matches!(child.try_wait(), Ok(None)) => return self.rest(),
+                Err(RecvTimeoutError::Timeout) if !matches!(child.try_wait(), Ok(None)) => {
+                    return self.rest();
+                }
                 Err(RecvTimeoutError::Timeout) => {}
             }
         }
     }
 
-    /// What was heard of a program that has ended; `None` if a moment later the stream is still open.
+    /// What was heard of a program that has ended; `None` if a moment later the stream is still
+    /// open.
     pub(crate) fn rest(self) -> Option<T> {
         self.heard.recv_timeout(REST).ok()
     }

@@ -1,4 +1,5 @@
-//! `gleaner replay DIR DRIVE...` and `gleaner verify CLIP`: what the runtime is asked for, and what people see of its result.
+//! `gleaner replay DIR DRIVE...` and `gleaner verify CLIP`: what the runtime is asked for, and what
+//! people see of its result.
 
 use std::ffi::OsString;
 use std::fs;
@@ -20,7 +21,8 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     results(args).map(|(exit, _)| exit)
 }
 
-/// Replays. How the runtime ended, and whether there are results of this replay: a lambda that could not start leaves those of before.
+/// Replays. How the runtime ended, and whether there are results of this replay: a lambda that
+/// could not start leaves those of before.
 pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     let (mut heard, exit) = runtime::run(&args.asked.lambda, arguments(args))?;
     let has_results = heard.is_some();
@@ -35,7 +37,10 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     show_result((heard, exit), args.json)?;
     match report {
         Ok(Some(path)) if !args.json => {
-            say(&format!("  {}\n", Paint::of_stdout().dim(&format!("report: {}", path.display()))))?;
+            say(&format!(
+                "  {}\n",
+                Paint::of_stdout().dim(&format!("report: {}", path.display()))
+            ))?;
         }
         Ok(_) => {}
         // The results are whole without it.
@@ -47,14 +52,18 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     Ok((exit, has_results))
 }
 
-/// Writes the report of `out`, unless it was declined. That of an earlier replay goes in any case: it is about other results.
+/// Writes the report of `out`, unless it was declined. That of an earlier replay goes in any case:
+/// it is about other results.
 fn report_of(out: &Path, is_declined: bool) -> Result<Option<PathBuf>, Failure> {
     let path = out.join(report::NAME);
     if let Err(error) = fs::remove_file(&path)
         && error.kind() != io::ErrorKind::NotFound
     {
-        let failure =
-            Failure::caused_by(Exit::Internal, format!("cannot write the report `{}`", path.display()), &error);
+        let failure = Failure::caused_by(
+            Exit::Internal,
+            format!("cannot write the report `{}`", path.display()),
+            &error,
+        );
         return Err(failure.with_help("remove what is there: it is not about this replay"));
     }
     if is_declined { Ok(None) } else { report::write(out).map(Some) }
@@ -69,7 +78,10 @@ pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
 }
 
 /// Shows what the runtime reported last, and ends as it ended.
-pub(crate) fn show_result((heard, exit): (Option<Heard>, Exit), json: bool) -> Result<Exit, Failure> {
+pub(crate) fn show_result(
+    (heard, exit): (Option<Heard>, Exit),
+    json: bool,
+) -> Result<Exit, Failure> {
     let text = match heard {
         None => return Ok(exit),
         Some(Heard::Summary(summary)) if json => show::json_line(&summary),
@@ -93,7 +105,9 @@ fn summary_text(summary: &Summary) -> Result<String, Failure> {
 fn arguments(args: &ReplayArgs) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["replay".into()];
     line.extend(args.asked.settings());
-    for (flag, file) in [("--out", &args.out), ("--journal", &args.journal), ("--verify", &args.verify)] {
+    for (flag, file) in
+        [("--out", &args.out), ("--journal", &args.journal), ("--verify", &args.verify)]
+    {
         if let Some(file) = file {
             line.extend([flag.into(), file.into()]);
         }
@@ -101,7 +115,9 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
     for (flag, time) in [("--from", &args.from), ("--to", &args.to)] {
         line.extend(time.iter().flat_map(|time| [OsString::from(flag), time.into()]));
     }
-    line.extend(args.topics.iter().flat_map(|pattern| [OsString::from("--topics"), pattern.into()]));
+    line.extend(
+        args.topics.iter().flat_map(|pattern| [OsString::from("--topics"), pattern.into()]),
+    );
     for (flag, wanted) in [("--all", args.all), ("--no-record", args.no_record)] {
         if wanted {
             line.push(flag.into());

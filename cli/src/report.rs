@@ -1,4 +1,5 @@
-//! `gleaner report OUT`: writes the page about a run to `OUT/report.html`. What is on it is decided in `gleaner-report`.
+//! `gleaner report OUT`: writes the page about a run to `OUT/report.html`. What is on it is decided
+//! in `gleaner-report`.
 
 use std::path::{Path, PathBuf};
 
@@ -32,8 +33,11 @@ fn save(page: &Page, path: PathBuf) -> Result<PathBuf, Failure> {
     match write_whole(&path, page.to_html().as_bytes()) {
         Ok(()) => Ok(path),
         Err(error) => {
-            let failure =
-                Failure::caused_by(Exit::Internal, format!("cannot write the report `{}`", path.display()), &error);
+            let failure = Failure::caused_by(
+                Exit::Internal,
+                format!("cannot write the report `{}`", path.display()),
+                &error,
+            );
             Err(failure.with_help("make room, or choose a folder that you may write to"))
         }
     }

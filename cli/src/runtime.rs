@@ -17,7 +17,8 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use crate::listen::Listener;
 use crate::sibling::starter;
 
-/// Longest report, as of one trigger with all its attributes or a clip with all that it lists, with much room.
+/// Longest report, as of one trigger with all its attributes or a clip with all that it lists, with
+/// much room.
 const REPORT_BYTES: u64 = 16 << 20;
 
 /// Why the runtime did not do what it was asked for, where it could not say so itself.
@@ -59,20 +60,24 @@ pub(crate) enum Heard {
     Checked(Box<Checked>),
 }
 
-/// Runs the runtime on `lambda` with these arguments to its end. Returns its result and how it ended; no result if it has printed
-/// why there is none.
-pub(crate) fn run(lambda: &Path, arguments: Vec<OsString>) -> Result<(Option<Heard>, Exit), Failure> {
+/// Runs the runtime on `lambda` with these arguments to its end. Returns its result and how it
+/// ended; no result if it has printed why there is none.
+pub(crate) fn run(
+    lambda: &Path,
+    arguments: Vec<OsString>,
+) -> Result<(Option<Heard>, Exit), Failure> {
     let parts = Parts::find()?;
     let runtime = parts.program("gleaner-runtime")?;
     let shim = if has_worker(lambda) { None } else { Some(parts.program("gleaner-shim")?) };
     let bar = progress_bar();
     let mut child = start(shim, runtime, arguments)?;
-    // Both streams are heard on threads of their own: a lambda may leave processes behind that hold them open for ever.
+    // Both streams are heard on threads of their own: a lambda may leave processes behind that hold
+    // them open for ever.
     let explained = Arc::new(AtomicBool::new(false));
     let says = child.stderr.take().map(|says| {
         let (bar, explained) = (bar.clone(), explained.clone());
-        // While a bar is drawn, what the runtime says has to be put above it. Nobody is left to tell if standard error
-        // is gone.
+        // While a bar is drawn, what the runtime says has to be put above it. Nobody is left to
+        // tell if standard error is gone.
         let show = move |piece: &[u8]| drop(bar.suspend(|| io::stderr().write_all(piece)));
         Listener::start(move || pass_on(says, &explained, show))
     });
@@ -95,19 +100,27 @@ pub(crate) fn run(lambda: &Path, arguments: Vec<OsString>) -> Result<(Option<Hea
         (Some(result), Some(exit)) => Ok((Some(result), exit)),
         (Some(_), None) => Err(RuntimeError::Code { status }.into()),
         // An exit code alone is not trusted: a lambda can end the process with any.
-        (None, Some(exit)) if exit != Exit::Ok && explained.load(Ordering::Relaxed) => Ok((None, exit)),
+        (None, Some(exit)) if exit != Exit::Ok && explained.load(Ordering::Relaxed) => {
+            Ok((None, exit))
+        }
         (None, _) => Err(RuntimeError::NoResult { status }.into()),
     }
 }
 
-/// Whether nothing of the lambda runs in the process of `gleaner-runtime`, which starts a worker for it, below a shim: so it is
-/// for Python. Of a lambda that cannot be read, the runtime reports why.
+/// Whether nothing of the lambda runs in the process of `gleaner-runtime`, which starts a worker
+/// for it, below a shim: so it is for Python. Of a lambda that cannot be read, the runtime reports
+/// why.
 fn has_worker(lambda: &Path) -> bool {
-    Manifest::load(BuildDir::of(lambda).path()).is_ok_and(|manifest| manifest.lambda.kind == Kind::Python)
+    Manifest::load(BuildDir::of(lambda).path())
+        .is_ok_and(|manifest| manifest.lambda.kind == Kind::Python)
 }
 
 /// Starts the runtime, below `shim` if the lambda runs in its process.
-fn start(shim: Option<PathBuf>, runtime: PathBuf, arguments: Vec<OsString>) -> Result<Child, RuntimeError> {
+fn start(
+    shim: Option<PathBuf>,
+    runtime: PathBuf,
+    arguments: Vec<OsString>,
+) -> Result<Child, RuntimeError> {
     let mut command = Command::new(shim.as_ref().unwrap_or(&runtime));
     if shim.is_some() {
         command.args([starter(), "--".into()]).arg(&runtime);
@@ -122,8 +135,8 @@ fn start(shim: Option<PathBuf>, runtime: PathBuf, arguments: Vec<OsString>) -> R
         .map_err(|source| RuntimeError::Start { program, source })
 }
 
-/// Reads the next report into `line`; `false` if there is none. What is longer than a report can be comes in pieces, which are none:
-/// a lambda's process writes here, too.
+/// Reads the next report into `line`; `false` if there is none. What is longer than a report can be
+/// comes in pieces, which are none: a lambda's process writes here, too.
 pub(crate) fn next_report(reports: &mut impl BufRead, line: &mut Vec<u8>) -> io::Result<bool> {
     line.clear();
     Ok(reports.take(REPORT_BYTES).read_until(b'\n', line)? > 0)
@@ -178,7 +191,9 @@ fn progress_bar() -> ProgressBar {
     // Hidden by itself where standard error is no terminal.
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
     let style = "{bar:30} {percent:>3} %  {human_pos} of {human_len} messages, {eta} left";
-    bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
+    bar.with_style(
+        ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()),
+    )
 }
 
 #[cfg(unix)]
@@ -252,9 +267,13 @@ mod tests {
     #[test]
     fn only_a_line_that_begins_as_a_failure_explains_an_exit_code() {
         let inside = format!("{}error: x", "y".repeat(8192));
-        for (text, expected) in
-            [("error: x", true), ("a\nerror: x\n", true), ("an error: x\n", false), (&inside, false), ("", false)]
-        {
+        for (text, expected) in [
+            ("error: x", true),
+            ("a\nerror: x\n", true),
+            ("an error: x\n", false),
+            (&inside, false),
+            ("", false),
+        ] {
             let explained = AtomicBool::new(false);
             pass_on(text.as_bytes(), &explained, |_| {});
             assert_eq!(explained.into_inner(), expected);

@@ -33,7 +33,12 @@ pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
         Err(exit) => return Ok(exit),
         Ok(Report::Topics { topics }) if args.json => show::json_line(&topics),
         Ok(Report::Topics { topics }) => show::topics(&topics),
-        Ok(_) => return Err(Failure::new(Exit::Internal, "gleaner-runtime reported something else than topics")),
+        Ok(_) => {
+            return Err(Failure::new(
+                Exit::Internal,
+                "gleaner-runtime reported something else than topics",
+            ));
+        }
     };
     say(&text)?;
     Ok(Exit::Ok)
@@ -48,7 +53,12 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
     let drive = match report(&line)? {
         Err(exit) => return Ok(exit),
         Ok(Report::Drive(drive)) => drive,
-        Ok(_) => return Err(Failure::new(Exit::Internal, "gleaner-runtime reported something else than a drive")),
+        Ok(_) => {
+            return Err(Failure::new(
+                Exit::Internal,
+                "gleaner-runtime reported something else than a drive",
+            ));
+        }
     };
     say(&if args.json { show::json_line(&drive) } else { show::drive(&drive) })?;
     Ok(if drive.damaged.is_some() { Exit::DriveDamaged } else { Exit::Ok })
@@ -57,17 +67,22 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
 /// The one report of a `gleaner-runtime` that is given this command line, or how it ended without.
 fn report(line: &[OsString]) -> Result<Result<Report, Exit>, Failure> {
     let program = Parts::find()?.program("gleaner-runtime")?;
-    let failed = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
+    let failed =
+        |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
     let mut runtime = Command::new(&program);
     runtime.args(line);
     // It says itself why it cannot.
     let output = runtime.stderr(std::process::Stdio::inherit()).output();
-    let output = output.map_err(|error| failed(&format!("cannot start `{}`", program.display()), &error))?;
+    let output =
+        output.map_err(|error| failed(&format!("cannot start `{}`", program.display()), &error))?;
     match output.status.code().and_then(Exit::from_code) {
         Some(Exit::Ok) => {}
         Some(exit) => return Ok(Err(exit)),
         None => {
-            return Err(Failure::new(Exit::Internal, format!("gleaner-runtime did not end well ({})", output.status)));
+            return Err(Failure::new(
+                Exit::Internal,
+                format!("gleaner-runtime did not end well ({})", output.status),
+            ));
         }
     }
     let report = serde_json::from_slice(&output.stdout);

@@ -19,8 +19,8 @@ const DECISION: &str = concat!(
     r#""triggers":[{"kind":"event","label":"seen","score":0.5,"attributes":{}}],"fault":null,"fuel":1,"run_ns":2}"#
 );
 
-/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another test is about to start. Who
-/// writes a program, and who starts one, takes turns.
+/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another
+/// test is about to start. Who writes a program, and who starts one, takes turns.
 static TURN: Mutex<()> = Mutex::new(());
 
 /// A folder with `gleaner-runtime`, removed when the test ends.
@@ -31,7 +31,9 @@ impl Installation {
         let folder = std::env::temp_dir().join(format!("gleaner-replay-{}-{test}", process::id()));
         fs::create_dir(&folder).unwrap();
         let program = folder.join("gleaner-runtime");
-        let report = SUMMARY.replacen('{', r#"{"report":"summary","#, 1).replace("OUT", folder.to_str().unwrap());
+        let report = SUMMARY
+            .replacen('{', r#"{"report":"summary","#, 1)
+            .replace("OUT", folder.to_str().unwrap());
         fs::write(folder.join("report"), report + "\n").unwrap();
         fs::write(folder.join("summary.json"), SUMMARY).unwrap();
         fs::write(folder.join("log.jsonl"), "").unwrap();
@@ -45,7 +47,11 @@ impl Installation {
     fn command(&self, arguments: &[&str]) -> Command {
         let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
         // What a runtime reports says what happened, and not where.
-        gleaner.args(["replay", "dir", "a.mcap", "--out"]).arg(&self.0).args(arguments).env("GLEANER_HOME", &self.0);
+        gleaner
+            .args(["replay", "dir", "a.mcap", "--out"])
+            .arg(&self.0)
+            .args(arguments)
+            .env("GLEANER_HOME", &self.0);
         gleaner
     }
 
@@ -76,10 +82,9 @@ fn a_replay_ends_with_a_summary_and_without_colours_in_a_pipe() {
     let runtime = r#"echo '{"report":"progress","done":1,"total":2,"at_ns":5}'; cat report"#;
     let output = Installation::new("summary", runtime).replay(&[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
-    assert!(
-        text(&output.stdout)
-            .starts_with("x 0.1.0 (wasm): 1 trigger in 2 wakes, 3.0 s of drive\n     1.500 s  seen  0.5\n")
-    );
+    assert!(text(&output.stdout).starts_with(
+        "x 0.1.0 (wasm): 1 trigger in 2 wakes, 3.0 s of drive\n     1.500 s  seen  0.5\n"
+    ));
     assert!(!text(&output.stdout).contains('\u{1b}'));
     assert_eq!(text(&output.stderr), "");
 }
@@ -92,7 +97,10 @@ fn json_is_the_summary_alone() {
     let line = text(&output.stdout);
     assert!(line.ends_with("}\n") && line.lines().count() == 1, "{line}");
     // Counts that an older runtime does not have are 0.
-    assert_eq!(serde_json::from_str::<Summary>(line).unwrap(), serde_json::from_str::<Summary>(&expected).unwrap());
+    assert_eq!(
+        serde_json::from_str::<Summary>(line).unwrap(),
+        serde_json::from_str::<Summary>(&expected).unwrap()
+    );
 }
 
 #[test]
@@ -100,7 +108,11 @@ fn a_replay_leaves_a_report_and_says_where() {
     let installation = Installation::new("page", "cat report");
     let page = installation.0.join("report.html");
     let output = installation.replay(&[]);
-    assert!(text(&output.stdout).ends_with(&format!("  report: {}\n", page.display())), "{}", text(&output.stdout));
+    assert!(
+        text(&output.stdout).ends_with(&format!("  report: {}\n", page.display())),
+        "{}",
+        text(&output.stdout)
+    );
     assert!(fs::read_to_string(&page).unwrap().contains(r#""labels":["seen"]"#));
     fs::remove_file(&page).unwrap();
     installation.replay(&["--json"]);
@@ -117,7 +129,10 @@ fn a_report_that_cannot_be_written_is_an_error_beside_the_results() {
     let output = installation.replay(&[]);
     assert_eq!(output.status.code(), Some(6), "the replay's own");
     let said = text(&output.stderr);
-    assert!(said.starts_with("error: cannot write the report") && said.contains("  help:  "), "{said}");
+    assert!(
+        said.starts_with("error: cannot write the report") && said.contains("  help:  "),
+        "{said}"
+    );
     assert!(text(&output.stdout).contains("seen") && !text(&output.stdout).contains("  report: "));
 }
 
@@ -136,14 +151,15 @@ fn a_runtime_that_is_killed_has_a_cause_of_its_own() {
     let output = Installation::new("killed", "kill -9 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
     let said = text(&output.stderr);
-    assert!(said.starts_with("error: gleaner-runtime ended without a result (signal: 9 (SIGKILL))\n  help:  the "));
+    assert!(said.starts_with(
+        "error: gleaner-runtime ended without a result (signal: 9 (SIGKILL))\n  help:  the "
+    ));
     assert!(said.contains("dmesg"), "{said}");
 }
 
-/// What a lambda may leave running: it holds the stream of reports, notes if it lived to its end, and ends early once
-/// the test has removed the folder.
-const ORPHAN: &str =
-    "(n=0; while [ -e report ] && [ $n -lt 300 ]; do sleep 0.1; n=$((n+1)); done; touch waited) 2>/dev/null &";
+/// What a lambda may leave running: it holds the stream of reports, notes if it lived to its end,
+/// and ends early once the test has removed the folder.
+const ORPHAN: &str = "(n=0; while [ -e report ] && [ $n -lt 300 ]; do sleep 0.1; n=$((n+1)); done; touch waited) 2>/dev/null &";
 
 #[test]
 fn what_a_lambda_leaves_running_does_not_hold_up_the_summary() {
@@ -156,7 +172,8 @@ fn what_a_lambda_leaves_running_does_not_hold_up_the_summary() {
 
 #[test]
 fn what_a_lambda_leaves_running_does_not_hold_up_a_failure() {
-    let installation = Installation::new("orphan-fails", &format!("{ORPHAN} echo error: no >&2; exit 5"));
+    let installation =
+        Installation::new("orphan-fails", &format!("{ORPHAN} echo error: no >&2; exit 5"));
     assert_eq!(installation.replay(&[]).status.code(), Some(5));
     assert!(!installation.0.join("waited").exists());
 }
@@ -164,7 +181,8 @@ fn what_a_lambda_leaves_running_does_not_hold_up_a_failure() {
 #[test]
 fn a_runtime_of_another_version_is_stopped() {
     // It would go on for ever.
-    let output = Installation::new("version", r#"while echo '{"report":"weather"}'; do :; done"#).replay(&[]);
+    let output = Installation::new("version", r#"while echo '{"report":"weather"}'; do :; done"#)
+        .replay(&[]);
     assert_eq!(output.status.code(), Some(1));
     assert!(text(&output.stderr).contains("install gleaner and gleaner-runtime of one version"));
 }
@@ -172,14 +190,21 @@ fn a_runtime_of_another_version_is_stopped() {
 #[test]
 fn an_exit_code_that_nothing_explains_is_not_trusted() {
     // As `os._exit` of a lambda ends the process, whatever the lambda wrote before.
-    for (code, said) in [(0, ""), (3, ""), (6, ""), (3, "warning: an error: is near\n"), (101, "error: x\n")] {
+    for (code, said) in
+        [(0, ""), (3, ""), (6, ""), (3, "warning: an error: is near\n"), (101, "error: x\n")]
+    {
         let test = format!("unexplained-{code}-{}", said.len());
-        let output = Installation::new(&test, &format!("printf '{said}' >&2; exit {code}")).replay(&[]);
+        let output =
+            Installation::new(&test, &format!("printf '{said}' >&2; exit {code}")).replay(&[]);
         assert_eq!(output.status.code(), Some(1));
         let ended = format!(
             "error: gleaner-runtime ended without a result (exit status: {code})\n  help:  no code of a lambda "
         );
-        assert!(text(&output.stderr).starts_with(&format!("{said}{ended}")), "{}", text(&output.stderr));
+        assert!(
+            text(&output.stderr).starts_with(&format!("{said}{ended}")),
+            "{}",
+            text(&output.stderr)
+        );
     }
 }
 
@@ -187,22 +212,36 @@ fn an_exit_code_that_nothing_explains_is_not_trusted() {
 fn a_crash_names_its_signal() {
     let output = Installation::new("crash", "kill -11 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(text(&output.stderr).contains("without a result (signal: 11 (SIGSEGV)"), "{}", text(&output.stderr));
+    assert!(
+        text(&output.stderr).contains("without a result (signal: 11 (SIGSEGV)"),
+        "{}",
+        text(&output.stderr)
+    );
 }
 
 /// Runs `gleaner` with arguments that name the folder of `installation` as OUT.
 fn with_out(installation: &Installation, arguments: &[&str]) -> Output {
     let out = installation.0.to_str().unwrap();
-    let arguments = arguments.iter().map(|argument| if *argument == "OUT" { out } else { *argument });
+    let arguments =
+        arguments.iter().map(|argument| if *argument == "OUT" { out } else { *argument });
     // Seconds after which it counts as one that waits for ever; it takes some milliseconds.
     let mut gleaner = Command::new("timeout");
-    output(gleaner.arg("120").arg(env!("CARGO_BIN_EXE_gleaner")).args(arguments).stdout(Stdio::piped()))
+    output(
+        gleaner
+            .arg("120")
+            .arg(env!("CARGO_BIN_EXE_gleaner"))
+            .args(arguments)
+            .stdout(Stdio::piped()),
+    )
 }
 
 #[test]
 fn results_without_an_end_are_refused_with_their_name_and_bound() {
-    let commands: [&[&str]; 3] =
-        [&["report", "OUT"], &["diff", "OUT", "OUT"], &["diff", "OUT", "OUT", "--report", "/dev/null"]];
+    let commands: [&[&str]; 3] = [
+        &["report", "OUT"],
+        &["diff", "OUT", "OUT"],
+        &["diff", "OUT", "OUT", "--report", "/dev/null"],
+    ];
     for (name, bound, refusing) in [
         ("decisions.jsonl", "32 GiB", &commands[..]),
         ("clips.jsonl", "32 GiB", &commands),
@@ -210,7 +249,10 @@ fn results_without_an_end_are_refused_with_their_name_and_bound() {
         ("summary.json", "4 MiB", &commands),
         ("signals.json", "32 MiB", &commands),
     ] {
-        let installation = Installation::new(&format!("sparse-{name}"), &format!("truncate -s 1T {name}; cat report"));
+        let installation = Installation::new(
+            &format!("sparse-{name}"),
+            &format!("truncate -s 1T {name}; cat report"),
+        );
         let refused = format!("cause: it has 1099511627776 bytes; at most {bound} are read");
         let shown = installation.replay(&[]);
         let said = text(&shown.stderr);
@@ -221,7 +263,10 @@ fn results_without_an_end_are_refused_with_their_name_and_bound() {
             let output = with_out(&installation, arguments);
             let said = text(&output.stderr);
             assert_eq!(output.status.code(), Some(2), "{arguments:?}: {said}");
-            assert!(said.contains(name) && said.contains(&refused) && said.contains("help:"), "{arguments:?}: {said}");
+            assert!(
+                said.contains(name) && said.contains(&refused) && said.contains("help:"),
+                "{arguments:?}: {said}"
+            );
         }
     }
 }
@@ -239,7 +284,10 @@ fn results_of_others_are_not_shown_as_those_of_a_run() {
         let output = with_out(&installation, &["report", "OUT"]);
         let said = text(&output.stderr);
         assert_eq!(output.status.code(), Some(2), "{said}");
-        assert!(said.contains(name) && said.contains("cause: it is a link") && !said.contains(other), "{said}");
+        assert!(
+            said.contains(name) && said.contains("cause: it is a link") && !said.contains(other),
+            "{said}"
+        );
         assert!(!page.exists(), "{name}");
     }
 }
@@ -252,7 +300,10 @@ fn an_output_that_takes_nothing_is_a_failure() {
         let full = fs::File::options().write(true).open("/dev/full").unwrap();
         let output = output(installation.command(arguments).stdout(full));
         assert_eq!(output.status.code(), Some(1));
-        assert!(text(&output.stderr).starts_with("error: cannot write to standard output\n  cause: No space left"));
+        assert!(
+            text(&output.stderr)
+                .starts_with("error: cannot write to standard output\n  cause: No space left")
+        );
     }
 }
 

@@ -1,4 +1,5 @@
-//! What stands in a rosbag2 directory: an input that begins like a database is one, every other is its `metadata.yaml`.
+//! What stands in a rosbag2 directory: an input that begins like a database is one, every other is
+//! its `metadata.yaml`.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -10,7 +11,8 @@ use gleaner_drives::{ReplayError, files_of};
 use crate::budget;
 use crate::drive::{MEMORY, replay};
 
-/// Reads a directory with the input in it. Whether that is sound: metadata that name files, or a database with messages.
+/// Reads a directory with the input in it. Whether that is sound: metadata that name files, or a
+/// database with messages.
 pub fn check(data: &[u8]) -> bool {
     if data.starts_with(b"SQLite format 3\0") { database(data) } else { metadata(data) }
 }
@@ -29,7 +31,11 @@ fn metadata(text: &[u8]) -> bool {
             }
             !files.is_empty()
         }
-        Err(error @ (ReplayError::Metadata { .. } | ReplayError::NoSuchFile { .. } | ReplayError::Outside { .. })) => {
+        Err(
+            error @ (ReplayError::Metadata { .. }
+            | ReplayError::NoSuchFile { .. }
+            | ReplayError::Outside { .. }),
+        ) => {
             assert!(error.help().is_some(), "{error} has no way out");
             false
         }

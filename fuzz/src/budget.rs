@@ -1,5 +1,6 @@
-//! Memory that a reading may take. Every allocation of these programs is counted; one beyond the budget fails, which ends
-//! the program, and so is a finding, however short the memory would have been used.
+//! Memory that a reading may take. Every allocation of these programs is counted; one beyond the
+//! budget fails, which ends the program, and so is a finding, however short the memory would have
+//! been used.
 
 use std::alloc::System;
 use std::panic;
@@ -22,7 +23,8 @@ pub fn within<T>(bytes: usize, read: impl FnOnce() -> T) -> T {
     value
 }
 
-/// Saying where a panic comes from takes memory, too; without it the program would wait for itself instead.
+/// Saying where a panic comes from takes memory, too; without it the program would wait for itself
+/// instead.
 fn no_limit_for_panics() {
     let tell = panic::take_hook();
     panic::set_hook(Box::new(move |what| {

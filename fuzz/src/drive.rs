@@ -13,15 +13,18 @@ use rustix::fs::{MemfdFlags, SeekFrom, ftruncate, memfd_create, seek};
 use crate::budget;
 
 /// So that a few KB can reach them.
-const LIMITS: Limits = Limits { chunk_bytes: 256 << 10, open_bytes: 512 << 10, unpacked_bytes: 1 << 20 };
+const LIMITS: Limits =
+    Limits { chunk_bytes: 256 << 10, open_bytes: 512 << 10, unpacked_bytes: 1 << 20 };
 
-/// What a replay may take: the open chunks and the one that is being opened, and what the file itself says of channels.
+/// What a replay may take: the open chunks and the one that is being opened, and what the file
+/// itself says of channels.
 pub(crate) const MEMORY: usize = 16 << 20;
 
 /// What metadata and attachments may take, and what they cost besides.
 const EXTRAS: u64 = 32 << 10;
 
-/// More steps than the limits on chunks and files allow honest drives; one that goes on has left the loop.
+/// More steps than the limits on chunks and files allow honest drives; one that goes on has left
+/// the loop.
 const STEPS_MAX: usize = 200_000;
 
 /// Replays one file twice, and reads its extras. Whether it is whole, and holds messages.
@@ -35,9 +38,14 @@ pub fn check(data: &[u8]) -> bool {
     let extras = budget::within(MEMORY, || read_extras(path, EXTRAS));
     if let Ok(extras) = &extras {
         let pair = |(key, value): (&String, &String)| 128 + key.len() + value.len();
-        let metadata =
-            extras.metadata.iter().map(|(name, pairs)| 128 + name.len() + pairs.iter().map(pair).sum::<usize>());
-        let attachments = extras.attachments.iter().map(|one| one.name.len() + one.media_type.len() + one.data.len());
+        let metadata = extras
+            .metadata
+            .iter()
+            .map(|(name, pairs)| 128 + name.len() + pairs.iter().map(pair).sum::<usize>());
+        let attachments = extras
+            .attachments
+            .iter()
+            .map(|one| one.name.len() + one.media_type.len() + one.data.len());
         let taken = metadata.sum::<usize>() + attachments.sum::<usize>();
         assert!(taken as u64 <= EXTRAS, "{taken} bytes of metadata and attachments");
     }
@@ -48,7 +56,8 @@ pub fn check(data: &[u8]) -> bool {
 fn file() -> &'static (OwnedFd, PathBuf) {
     static FILE: OnceLock<(OwnedFd, PathBuf)> = OnceLock::new();
     FILE.get_or_init(|| {
-        let file = memfd_create("drive.mcap", MemfdFlags::CLOEXEC).expect("the system has files in memory");
+        let file = memfd_create("drive.mcap", MemfdFlags::CLOEXEC)
+            .expect("the system has files in memory");
         let path = PathBuf::from(format!("/proc/self/fd/{}", file.as_raw_fd()));
         (file, path)
     })
@@ -135,7 +144,10 @@ impl Order {
         assert_eq!(step.at_ns, step.meta.at_ns);
         self.late += u64::from(self.newest_ns.is_some_and(|newest| step.at_ns < newest));
         self.newest_ns = self.newest_ns.max(Some(step.at_ns));
-        let before = self.numbers.insert((step.subscription, step.meta.writer.0), step.meta.seq).unwrap_or(0);
+        let before = self
+            .numbers
+            .insert((step.subscription, step.meta.writer.0), step.meta.seq)
+            .unwrap_or(0);
         assert!(step.meta.seq > before, "number {} after {before}", step.meta.seq);
     }
 }
@@ -159,7 +171,8 @@ impl Memory {
 
 impl Sink for Memory {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        *self.meta.lock().expect("nothing panics while it is held") = (Some(*meta), crc32fast::hash(cdr).into());
+        *self.meta.lock().expect("nothing panics while it is held") =
+            (Some(*meta), crc32fast::hash(cdr).into());
         self.bytes.store(cdr.len() as u64, Ordering::Relaxed);
         Verdict::Taken
     }

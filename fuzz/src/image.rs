@@ -1,8 +1,11 @@
 //! Images: files to be decoded, and raw pixels to be worked on.
 //!
-//! An input is a byte for the mode, and then either a JPEG or PNG file, or the fields of an image and its pixels.
+//! An input is a byte for the mode, and then either a JPEG or PNG file, or the fields of an image
+//! and its pixels.
 
-use gleaner_image::{Encoding, ImageError, MAX_SIDE, PixelError, Roi, View, decode_rgb8, ops, probe};
+use gleaner_image::{
+    Encoding, ImageError, MAX_SIDE, PixelError, Roi, View, decode_rgb8, ops, probe,
+};
 
 use crate::budget;
 use crate::input::Input;
@@ -67,7 +70,9 @@ fn file(data: &[u8]) -> bool {
     let (first, second) = (decode(0xaa), decode(0x55));
     let sound = first.is_ok();
     match (first, second) {
-        (Ok(first), Ok(second)) => assert!(first == second, "{header}: pixels of an earlier image are left"),
+        (Ok(first), Ok(second)) => {
+            assert!(first == second, "{header}: pixels of an earlier image are left")
+        }
         (Err(_), Err(_)) => {}
         (first, second) => panic!("{header}: {:?}, then {:?}", first.err(), second.err()),
     }
@@ -90,7 +95,10 @@ fn raw(input: &mut Input) -> bool {
     let view = View::new(width.into(), height.into(), step.into(), encoding, big_endian, input.0);
     let Ok(view) = view else { return false };
     let rows = (0..view.height()).map(|y| view.row(y).len());
-    assert_eq!(rows.sum::<usize>(), usize::from(width) * usize::from(height) * encoding.bytes_per_pixel());
+    assert_eq!(
+        rows.sum::<usize>(),
+        usize::from(width) * usize::from(height) * encoding.bytes_per_pixel()
+    );
     assert!(view.row(view.height()).is_empty());
     if encoding.is_raw() {
         assert!(ops::mean_luma(&view, None).is_err() && ops::resized(&view, 1, 1).is_err());
@@ -116,25 +124,39 @@ fn grey(view: &View, roi: Option<Roi>) {
     let mut grey = vec![0; view.width() as usize * view.height() as usize];
     ops::to_gray(view, &mut grey).expect("the place is as large as the image");
     let mut expected = [0_u32; 256];
-    let rows = grey.chunks_exact(view.width() as usize).skip(inside.y as usize).take(inside.height as usize);
+    let rows = grey
+        .chunks_exact(view.width() as usize)
+        .skip(inside.y as usize)
+        .take(inside.height as usize);
     for level in rows.flat_map(|row| &row[inside.x as usize..][..inside.width as usize]) {
         expected[usize::from(*level)] += 1;
     }
     assert_eq!(counts, expected, "histogram and grey image of {inside:?}");
     let luma = ops::mean_luma(view, roi).expect("the region has pixels");
-    let sum: f64 = counts.iter().zip(0_u32..).map(|(count, level)| f64::from(*count) * f64::from(level)).sum();
+    let sum: f64 =
+        counts.iter().zip(0_u32..).map(|(count, level)| f64::from(*count) * f64::from(level)).sum();
     let pixels = f64::from(inside.width) * f64::from(inside.height);
     // A level of the grey image is rounded, by at most one in each pixel.
-    assert!((0.0..=255.0).contains(&luma) && (luma - sum / pixels).abs() <= 1.0, "{luma}, not {}", sum / pixels);
+    assert!(
+        (0.0..=255.0).contains(&luma) && (luma - sum / pixels).abs() <= 1.0,
+        "{luma}, not {}",
+        sum / pixels
+    );
 }
 
 fn resize(view: &View, (width, height): (u32, u32)) {
     let Ok((encoding, len)) = ops::resized(view, width, height) else { return };
     assert_eq!(len, width as usize * height as usize * encoding.bytes_per_pixel());
     let mut out = vec![0; len];
-    assert_eq!(ops::resize(view, width, height, &mut out).expect("size and place are right"), encoding);
+    assert_eq!(
+        ops::resize(view, width, height, &mut out).expect("size and place are right"),
+        encoding
+    );
     let unchanged = view.encoding() == encoding && (width, height) == (view.width(), view.height());
     if unchanged {
-        assert!((0..height).flat_map(|y| view.row(y)).eq(&out), "an image of the same size has other pixels");
+        assert!(
+            (0..height).flat_map(|y| view.row(y)).eq(&out),
+            "an image of the same size has other pixels"
+        );
     }
 }

@@ -1,9 +1,11 @@
 //! Journals: as files, and as the wakes in them.
 //!
-//! An input is a byte for the mode, and what that says. Checksums would keep a fuzzer from all that lies behind them, so that in
-//! one mode they are made right.
+//! An input is a byte for the mode, and what that says. Checksums would keep a fuzzer from all that
+//! lies behind them, so that in one mode they are made right.
 
-use gleaner_journal::{ATTRIBUTES_MAX, Decoder, Encoder, End, Entry, Reader, TRIGGERS_MAX, VERSION, Writer};
+use gleaner_journal::{
+    ATTRIBUTES_MAX, Decoder, Encoder, End, Entry, Reader, TRIGGERS_MAX, VERSION, Writer,
+};
 
 use crate::budget;
 use crate::input::Input;
@@ -77,7 +79,8 @@ fn file(bytes: &[u8]) -> bool {
     assert!(failed.is_none() || !reader.cut_off() && reader.end().is_none());
     assert!(failed.is_some() || reader.cut_off() != reader.end().is_some());
     assert!(reader.torn_bytes() <= bytes.len() as u64);
-    let end = reader.end().cloned().unwrap_or(End { wakes: entries.len() as u64, ..End::default() });
+    let end =
+        reader.end().cloned().unwrap_or(End { wakes: entries.len() as u64, ..End::default() });
     let mut writer = Writer::begin(Vec::new(), &header).expect("the header was read");
     entries.retain(fits);
     entries.iter().for_each(|entry| writer.wake(entry).expect("the wake was read"));
@@ -92,9 +95,12 @@ fn file(bytes: &[u8]) -> bool {
     failed.is_none() && !entries.is_empty()
 }
 
-/// Numbers in attributes may be longer when they are written again: `1e15` is 1000000000000000.0 then.
+/// Numbers in attributes may be longer when they are written again: `1e15` is 1000000000000000.0
+/// then.
 fn fits(entry: &Entry) -> bool {
-    let long = |attributes| serde_json::to_string(attributes).is_ok_and(|json| json.len() > ATTRIBUTES_MAX);
+    let long = |attributes| {
+        serde_json::to_string(attributes).is_ok_and(|json| json.len() > ATTRIBUTES_MAX)
+    };
     !entry.triggers.iter().any(|trigger| long(&trigger.attributes))
 }
 

@@ -1,8 +1,11 @@
-//! What reads foreign bytes, fed with bytes that a fuzzer makes up; and the calls of a lambda. `docs/fuzzing.md` says how.
+//! What reads foreign bytes, fed with bytes that a fuzzer makes up; and the calls of a lambda.
+//! `docs/fuzzing.md` says how.
 //!
-//! Each module is a target: its `check` reads bytes in every way that we offer, panics if what comes out contradicts
-//! what is promised, and returns whether the input was sound, so that there was something to check. Most promises are such that two readings must agree. `budget` bounds the memory of a reading,
-//! `seeds` are the sound inputs that a fuzzer begins with. In `targets/` is a program for each.
+//! Each module is a target: its `check` reads bytes in every way that we offer, panics if what
+//! comes out contradicts what is promised, and returns whether the input was sound, so that there
+//! was something to check. Most promises are such that two readings must agree. `budget` bounds the
+//! memory of a reading, `seeds` are the sound inputs that a fuzzer begins with. In `targets/` is a
+//! program for each.
 //!
 //! What never happens here: a promise that only holds for what our own writers write.
 
@@ -22,7 +25,8 @@ pub mod seeds;
 pub struct Target {
     /// Its name; its program is `fuzz-<name>`.
     pub name: &'static str,
-    /// Panics if a promise is broken. Returns whether the input was sound, as seeds are. None where this was built without it.
+    /// Panics if a promise is broken. Returns whether the input was sound, as seeds are. None where
+    /// this was built without it.
     pub check: Option<fn(&[u8]) -> bool>,
     /// Length up to which inputs make sense, in bytes: a longer one is cut off there.
     pub longest: usize,
@@ -48,7 +52,13 @@ pub const TARGETS: [Target; 8] = [
         seeds: seeds::drive::all,
         words: seeds::drive::WORDS,
     },
-    Target { name: "bag", check: Some(bag::check), longest: 8 << 10, seeds: seeds::bag::all, words: seeds::bag::WORDS },
+    Target {
+        name: "bag",
+        check: Some(bag::check),
+        longest: 8 << 10,
+        seeds: seeds::bag::all,
+        words: seeds::bag::WORDS,
+    },
     Target {
         name: "image",
         check: Some(image::check),

@@ -1,8 +1,10 @@
-//! What a lambda's process and a starter say to the recorder, and the recorder to a lambda's process, over sockets.
+//! What a lambda's process and a starter say to the recorder, and the recorder to a lambda's
+//! process, over sockets.
 //!
 //! A starter sends one socket, with the first byte.
 //!
-//! An input is a byte for the mode, and then either bytes as they go over the socket, or frames: tag, length in two bytes, payload.
+//! An input is a byte for the mode, and then either bytes as they go over the socket, or frames:
+//! tag, length in two bytes, payload.
 
 use std::io::{IoSlice, Write};
 use std::mem::MaybeUninit;
@@ -67,7 +69,8 @@ fn with_socket(to: &UnixStream, bytes: &[u8]) {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
     let mut with = SendAncillaryBuffer::new(&mut space);
     with.push(SendAncillaryMessage::ScmRights(&fds));
-    sendmsg(to, &[IoSlice::new(bytes)], &mut with, SendFlags::NOSIGNAL).expect("a socket takes this much at once");
+    sendmsg(to, &[IoSlice::new(bytes)], &mut with, SendFlags::NOSIGNAL)
+        .expect("a socket takes this much at once");
 }
 
 fn framed(mut input: Input) -> Vec<u8> {

@@ -11,7 +11,8 @@ const MEMORY: usize = 32 << 20;
 /// The longest message about a manifest: a few lists of names, each name cut to 80 characters.
 const MESSAGE_MAX: usize = 64 << 10;
 
-/// Parses it. What is accepted is within all bounds, and what is refused is refused in words that can be shown.
+/// Parses it. What is accepted is within all bounds, and what is refused is refused in words that
+/// can be shown.
 pub fn check(data: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(data) else { return false };
     match budget::within(MEMORY, || Manifest::parse(text, "lambda.toml")) {
@@ -32,13 +33,19 @@ pub fn check(data: &[u8]) -> bool {
 }
 
 fn accepted(manifest: &Manifest) {
-    assert!(manifest.inputs.len() <= bounds::ITEMS_MAX && manifest.models.len() <= bounds::ITEMS_MAX);
+    assert!(
+        manifest.inputs.len() <= bounds::ITEMS_MAX && manifest.models.len() <= bounds::ITEMS_MAX
+    );
     assert!(manifest.config.len() <= bounds::ITEMS_MAX);
     let memory = manifest.inputs.iter().map(|input| input.memory().bytes()).sum::<u64>();
     assert!(memory <= bounds::INPUTS_MEMORY_MAX.bytes(), "{memory} bytes of inputs");
     match &manifest.schedule {
-        Schedule::Event { .. } => assert!(manifest.event_input().is_some(), "woken by an input that is not there"),
-        Schedule::Periodic { period } => assert!(bounds::PERIOD.contains(period) && reads_back(*period)),
+        Schedule::Event { .. } => {
+            assert!(manifest.event_input().is_some(), "woken by an input that is not there")
+        }
+        Schedule::Periodic { period } => {
+            assert!(bounds::PERIOD.contains(period) && reads_back(*period))
+        }
     }
     for input in &manifest.inputs {
         assert!(manifest.input(input.name.as_str()) == Some(input), "two inputs of one name");
@@ -48,7 +55,11 @@ fn accepted(manifest: &Manifest) {
     }
     if let Some(record) = &manifest.record {
         assert!(!record.topics.is_empty() && record.topics.len() <= bounds::ITEMS_MAX);
-        assert!([record.preroll, record.postroll, record.cooldown, record.max_length].into_iter().all(reads_back));
+        assert!(
+            [record.preroll, record.postroll, record.cooldown, record.max_length]
+                .into_iter()
+                .all(reads_back)
+        );
     }
     assert!(
         (Limits::LEAST.fuel..=Limits::MOST.fuel).contains(&manifest.limits.fuel)

@@ -1,13 +1,15 @@
 //! Messages as CDR, of the bundled types and of types that the input defines.
 //!
-//! An input is a byte for the mode, one for the order of bytes, the type (its place in [`TYPES`], or its definition, up to a
-//! byte 0), a path up to a byte 0, and the message. Besides that path, all fields of the type are read.
+//! An input is a byte for the mode, one for the order of bytes, the type (its place in [`TYPES`],
+//! or its definition, up to a byte 0), a path up to a byte 0, and the message. Besides that path,
+//! all fields of the type are read.
 
 use std::collections::VecDeque;
 use std::sync::OnceLock;
 
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Sources, Value, header_stamp,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Sources,
+    Value, header_stamp,
 };
 
 use crate::budget;
@@ -55,7 +57,8 @@ pub fn check(data: &[u8]) -> bool {
     if mode == mode::DEFINED {
         let Ok(text) = std::str::from_utf8(input.until_zero()) else { return false };
         let path = input.until_zero();
-        let parsed = budget::within(DEFINITIONS_MEMORY, || Definitions::parse("pkg/msg/Type", text));
+        let parsed =
+            budget::within(DEFINITIONS_MEMORY, || Definitions::parse("pkg/msg/Type", text));
         let Ok(definitions) = parsed else { return false };
         assert!(definitions.fields().next().is_some(), "a type without fields");
         let paths = budget::within(DEFINITIONS_MEMORY * 4, || all_paths(&definitions));
@@ -78,7 +81,10 @@ fn bundled() -> &'static [(Definitions, Vec<FieldPath>)] {
     static BUNDLED: OnceLock<Vec<(Definitions, Vec<FieldPath>)>> = OnceLock::new();
     BUNDLED.get_or_init(|| {
         let definitions = TYPES.map(|name| {
-            let text = Sources::default().find(name).expect("a bundled type is whole").expect("the type is bundled");
+            let text = Sources::default()
+                .find(name)
+                .expect("a bundled type is whole")
+                .expect("the type is bundled");
             Definitions::parse(name, &text).expect("a bundled type parses")
         });
         definitions
@@ -91,20 +97,26 @@ fn bundled() -> &'static [(Definitions, Vec<FieldPath>)] {
     })
 }
 
-/// The first [`PATHS_MAX`] fields of a type. Of an array of structs, the first and the third element.
+/// The first [`PATHS_MAX`] fields of a type. Of an array of structs, the first and the third
+/// element.
 fn all_paths(definitions: &Definitions) -> Vec<FieldPath> {
     let mut open: VecDeque<String> = definitions.fields().map(str::to_owned).collect();
     let mut paths = Vec::new();
     while let Some(path) = open.pop_front().filter(|_| paths.len() < PATHS_MAX) {
         match FieldPath::compile(definitions, &path) {
             Ok(compiled) => {
-                assert_eq!((compiled.path(), compiled.type_name()), (path.as_str(), definitions.type_name()));
+                assert_eq!(
+                    (compiled.path(), compiled.type_name()),
+                    (path.as_str(), definitions.type_name())
+                );
                 paths.push(compiled);
             }
             Err(PathError::WholeStruct { fields, .. }) => {
                 open.extend(fields.iter().take(PATHS_MAX).map(|field| format!("{path}.{field}")));
             }
-            Err(PathError::NeedsIndex { .. }) => open.extend([0, 2].map(|index| format!("{path}[{index}]"))),
+            Err(PathError::NeedsIndex { .. }) => {
+                open.extend([0, 2].map(|index| format!("{path}[{index}]")))
+            }
             // An array of fixed length may be shorter.
             Err(PathError::WideText { .. } | PathError::OutOfRange { .. }) => {}
             Err(error) => panic!("`{path}` is a field: {error}"),
@@ -115,19 +127,28 @@ fn all_paths(definitions: &Definitions) -> Vec<FieldPath> {
     paths
 }
 
-fn of_type(definitions: &Definitions, paths: &[FieldPath], path: &[u8], cdr: &[u8], endian: Endian) -> bool {
+fn of_type(
+    definitions: &Definitions,
+    paths: &[FieldPath],
+    path: &[u8],
+    cdr: &[u8],
+    endian: Endian,
+) -> bool {
     let written = std::str::from_utf8(path).ok().filter(|path| !path.is_empty());
-    let written =
-        written.and_then(|path| budget::within(DEFINITIONS_MEMORY, || FieldPath::compile(definitions, path)).ok());
+    let written = written.and_then(|path| {
+        budget::within(DEFINITIONS_MEMORY, || FieldPath::compile(definitions, path)).ok()
+    });
     let longer = [cdr, &[0xa5; 9]].concat();
     stamp(definitions, cdr, endian);
     let read = paths.iter().chain(&written).filter(|path| field(path, cdr, &longer, endian));
     read.count() > 0
 }
 
-/// One field is the same whichever way it is read, and does not depend on what stands behind it. Whether it could be read.
+/// One field is the same whichever way it is read, and does not depend on what stands behind it.
+/// Whether it could be read.
 fn field(path: &FieldPath, cdr: &[u8], longer: &[u8], endian: Endian) -> bool {
-    // A number takes at least a byte there and eight here, a text four and sixteen; a vector grows by doubling.
+    // A number takes at least a byte there and eight here, a text four and sixteen; a vector grows
+    // by doubling.
     let memory = (64 << 10) + 32 * cdr.len();
     let read = budget::within(memory, || path.read(cdr, endian));
     let number = budget::within(4096, || path.number(cdr, endian));
@@ -136,10 +157,17 @@ fn field(path: &FieldPath, cdr: &[u8], longer: &[u8], endian: Endian) -> bool {
         assert!(number.is_err(), "{}: a number where nothing can be read", path.path());
         return false;
     };
-    assert!(again.is_ok_and(|again| same(&value, &again)), "{}: more bytes behind the message change it", path.path());
+    assert!(
+        again.is_ok_and(|again| same(&value, &again)),
+        "{}: more bytes behind the message change it",
+        path.path()
+    );
     let inside = |bytes: &[u8]| {
         let (all, part) = (cdr.as_ptr_range(), bytes.as_ptr_range());
-        assert!(bytes.is_empty() || all.start <= part.start && part.end <= all.end, "bytes from elsewhere");
+        assert!(
+            bytes.is_empty() || all.start <= part.start && part.end <= all.end,
+            "bytes from elsewhere"
+        );
     };
     let (kind, expected) = match &value {
         Value::Bool(truth) => (Kind::Bool, Some(f64::from(u8::from(*truth)))),
@@ -164,9 +192,16 @@ fn field(path: &FieldPath, cdr: &[u8], longer: &[u8], endian: Endian) -> bool {
             (Kind::Texts, None)
         }
     };
-    assert_eq!((path.kind(), path.kind().is_number()), (kind, expected.is_some()), "{}", path.path());
+    assert_eq!(
+        (path.kind(), path.kind().is_number()),
+        (kind, expected.is_some()),
+        "{}",
+        path.path()
+    );
     match (expected, number) {
-        (Some(expected), Ok(number)) => assert_eq!(expected.to_bits(), number.to_bits(), "{}", path.path()),
+        (Some(expected), Ok(number)) => {
+            assert_eq!(expected.to_bits(), number.to_bits(), "{}", path.path())
+        }
         (None, Err(CdrError::NotANumber)) => {}
         (_, number) => panic!("{}: {value:?} as a number is {number:?}", path.path()),
     }
@@ -198,9 +233,15 @@ fn stamp(definitions: &Definitions, cdr: &[u8], endian: Endian) {
             _ => None,
         })
     };
-    let slow =
-        part("sec").zip(part("nanosec")).map(|(sec, nanosec)| i128::from(sec) * 1_000_000_000 + i128::from(nanosec));
-    assert_eq!(quick.read(cdr, endian).ok().map(i128::from), slow, "the stamp of {}", definitions.type_name());
+    let slow = part("sec")
+        .zip(part("nanosec"))
+        .map(|(sec, nanosec)| i128::from(sec) * 1_000_000_000 + i128::from(nanosec));
+    assert_eq!(
+        quick.read(cdr, endian).ok().map(i128::from),
+        slow,
+        "the stamp of {}",
+        definitions.type_name()
+    );
 }
 
 fn image_agrees(paths: &[FieldPath], cdr: &[u8], endian: Endian) {
@@ -217,7 +258,12 @@ fn image_agrees(paths: &[FieldPath], cdr: &[u8], endian: Endian) {
 
 fn compressed_agrees(paths: &[FieldPath], cdr: &[u8], endian: Endian) {
     let Ok(view) = budget::within(4096, || CompressedView::read(cdr, endian)) else { return };
-    paths_agree(paths, cdr, endian, &[("format", Value::Text(view.format)), ("data", Value::Bytes(view.data))]);
+    paths_agree(
+        paths,
+        cdr,
+        endian,
+        &[("format", Value::Text(view.format)), ("data", Value::Bytes(view.data))],
+    );
 }
 
 fn paths_agree(paths: &[FieldPath], cdr: &[u8], endian: Endian, expected: &[(&str, Value)]) {

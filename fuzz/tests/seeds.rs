@@ -1,5 +1,5 @@
-//! Seeds are sound and keep the promises of their targets, also when they are changed by chance. In one test, as memory is counted
-//! for the whole program.
+//! Seeds are sound and keep the promises of their targets, also when they are changed by chance. In
+//! one test, as memory is counted for the whole program.
 
 use gleaner_fuzz::{TARGETS, Target};
 
@@ -57,7 +57,12 @@ fn all_seeds_keep_all_promises_also_when_they_are_cut_off_or_changed() {
         assert!(seeds.len() >= 3, "{}", target.name);
         for (number, seed) in seeds.iter().enumerate() {
             // libFuzzer would cut it off.
-            assert!(seed.len() <= target.longest, "seed {number} for {} has {} bytes", target.name, seed.len());
+            assert!(
+                seed.len() <= target.longest,
+                "seed {number} for {} has {} bytes",
+                target.name,
+                seed.len()
+            );
             assert!(check(seed), "seed {number} for {} is not sound", target.name);
             for part in 0..8 {
                 check(&seed[..seed.len() * part / 8]);
@@ -72,6 +77,10 @@ fn changed(target: &Target, check: fn(&[u8]) -> bool, seeds: &[Vec<u8>], times: 
     let mut random = Random(0x9e37_79b9_7f4a_7c15);
     let started = std::time::Instant::now();
     let sound = (0..inputs).filter(|_| check(&random.changed(seeds, target.longest))).count();
-    println!("{}: {sound} of {inputs} changed seeds are sound, in {:?}", target.name, started.elapsed());
+    println!(
+        "{}: {sound} of {inputs} changed seeds are sound, in {:?}",
+        target.name,
+        started.elapsed()
+    );
     assert!(sound > 0, "{}: nothing was checked", target.name);
 }

@@ -78,7 +78,10 @@ impl Topic {
     }
 
     /// Samples received later than `since_ns`, oldest first; the newest 256 at most.
-    pub fn since(&self, since_ns: i64) -> impl DoubleEndedIterator<Item = Sample> + ExactSizeIterator {
+    pub fn since(
+        &self,
+        since_ns: i64,
+    ) -> impl DoubleEndedIterator<Item = Sample> + ExactSizeIterator {
         self.0.since(since_ns).into_iter().map(Sample)
     }
 
@@ -87,7 +90,8 @@ impl Topic {
         self.0.counts()
     }
 
-    /// Compiles the path of a field, such as `linear_acceleration.x` or `cov[3]`. Do this in `init`.
+    /// Compiles the path of a field, such as `linear_acceleration.x` or `cov[3]`. Do this in
+    /// `init`.
     ///
     /// # Errors
     ///
@@ -241,7 +245,10 @@ impl Frame {
     pub fn copy_to(&self, out: &mut [u8]) -> Result<()> {
         let size = self.info().size;
         if out.len() as u64 != size {
-            return Err(Error::new(format!("the frame has {size} bytes, the buffer {}", out.len())));
+            return Err(Error::new(format!(
+                "the frame has {size} bytes, the buffer {}",
+                out.len()
+            )));
         }
         let mut offset = 0;
         for piece in out.chunks_mut(PIECE) {
@@ -291,9 +298,11 @@ pub fn bytes_per_pixel(encoding: Encoding) -> u32 {
     match encoding {
         Encoding::Rgb8 | Encoding::Bgr8 => 3,
         Encoding::Rgba8 | Encoding::Bgra8 => 4,
-        Encoding::Mono8 | Encoding::BayerRggb8 | Encoding::BayerBggr8 | Encoding::BayerGbrg8 | Encoding::BayerGrbg8 => {
-            1
-        }
+        Encoding::Mono8
+        | Encoding::BayerRggb8
+        | Encoding::BayerBggr8
+        | Encoding::BayerGbrg8
+        | Encoding::BayerGrbg8 => 1,
         Encoding::Mono16
         | Encoding::Yuv422
         | Encoding::Yuv422Yuy2

@@ -23,7 +23,8 @@ impl Error {
         Self { kind: None, message: message.into() }
     }
 
-    /// Which refusal of the host it was, as the WIT names it, such as `no-room`; none for other errors.
+    /// Which refusal of the host it was, as the WIT names it, such as `no-room`; none for other
+    /// errors.
     pub fn kind(&self) -> Option<&'static str> {
         self.kind
     }
@@ -35,7 +36,8 @@ impl fmt::Display for Error {
     }
 }
 
-/// Any error of Rust becomes one with `?`, its causes behind it. (`Error` itself is none, or this would overlap.)
+/// Any error of Rust becomes one with `?`, its causes behind it. (`Error` itself is none, or this
+/// would overlap.)
 impl<E: std::error::Error> From<E> for Error {
     fn from(error: E) -> Self {
         let mut message = error.to_string();
@@ -53,7 +55,8 @@ pub(crate) trait Refusal {
     fn said(self) -> (&'static str, String);
 }
 
-/// An answer of the host as a result of this crate. What wit-bindgen makes of a refusal prints as code, not as words.
+/// An answer of the host as a result of this crate. What wit-bindgen makes of a refusal prints as
+/// code, not as words.
 pub(crate) fn answer<T>(answer: std::result::Result<T, impl Refusal>) -> Result<T> {
     answer.map_err(|refusal| {
         let (kind, message) = refusal.said();
@@ -112,13 +115,19 @@ mod tests {
     #[test]
     fn a_refusal_keeps_its_kind_and_its_words() {
         let error = answer::<()>(Err(DataError::NoRoom("no slot is free".to_owned()))).unwrap_err();
-        assert_eq!((error.kind(), error.to_string()), (Some("no-room"), "no slot is free".to_owned()));
+        assert_eq!(
+            (error.kind(), error.to_string()),
+            (Some("no-room"), "no slot is free".to_owned())
+        );
     }
 
     #[test]
     fn any_error_of_rust_becomes_one() {
         let parse = || -> Result<i32> { Ok("x".parse::<i32>()?) };
         let error = parse().unwrap_err();
-        assert_eq!((error.kind(), error.to_string()), (None, "invalid digit found in string".to_owned()));
+        assert_eq!(
+            (error.kind(), error.to_string()),
+            (None, "invalid digit found in string".to_owned())
+        );
     }
 }

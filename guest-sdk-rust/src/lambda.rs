@@ -9,10 +9,11 @@ use crate::{Config, Error, Result};
 
 /// A lambda. The methods are called by the host, one at a time.
 ///
-/// An `Err` or a panic is a fault of that wake: it stands in the decision, and the lambda starts afresh with
-/// [`Lambda::init`] at the next wake.
+/// An `Err` or a panic is a fault of that wake: it stands in the decision, and the lambda starts
+/// afresh with [`Lambda::init`] at the next wake.
 pub trait Lambda: Sized + 'static {
-    /// Makes the lambda. Find inputs and compile fields here: it is called once, and wakes are many.
+    /// Makes the lambda. Find inputs and compile fields here: it is called once, and wakes are
+    /// many.
     ///
     /// # Errors
     ///

@@ -1,6 +1,7 @@
 //! Write Gleaner lambdas in Rust.
 //!
-//! A lambda is a type that implements [`Lambda`], exported once with [`lambda!`], in a crate of type `cdylib`:
+//! A lambda is a type that implements [`Lambda`], exported once with [`lambda!`], in a crate of
+//! type `cdylib`:
 //!
 //! ```
 //! use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input};
@@ -30,13 +31,14 @@
 //! gleaner_sdk::lambda!(Dip);
 //! ```
 //!
-//! The functions of this crate reach the host on the vehicle and in replay. Natively, in `cargo test`, [`testing`] has a fake host that
-//! keeps the same rules; called outside of it they panic. Judgement in plain functions over plain numbers needs neither, and is
-//! tested as any Rust code.
+//! The functions of this crate reach the host on the vehicle and in replay. Natively, in `cargo
+//! test`, [`testing`] has a fake host that keeps the same rules; called outside of it they panic.
+//! Judgement in plain functions over plain numbers needs neither, and is tested as any Rust code.
 //!
 //! [`kernels`] are such functions, for pixels and signals.
 //!
-//! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same five names as the modules here.
+//! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same
+//! five names as the modules here.
 
 #[cfg(target_family = "wasm")]
 #[doc(hidden)]

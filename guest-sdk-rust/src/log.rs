@@ -1,4 +1,5 @@
-//! Lines for people: `gleaner:lambda/log`. At most 100 in one second; the rest is dropped and counted.
+//! Lines for people: `gleaner:lambda/log`. At most 100 in one second; the rest is dropped and
+//! counted.
 
 use crate::bindings::gleaner::lambda::log as wit;
 pub use crate::bindings::gleaner::lambda::log::Level;

@@ -9,7 +9,8 @@ use crate::error::answer;
 ///
 /// # Errors
 ///
-/// `no-room` beyond `scratch` of `[limits]` or 1,024 entries; `wrong-name`. Nothing has changed then.
+/// `no-room` beyond `scratch` of `[limits]` or 1,024 entries; `wrong-name`. Nothing has changed
+/// then.
 pub fn put(name: &str, bytes: &[u8]) -> Result<()> {
     answer(wit::put(name, bytes))
 }
@@ -23,7 +24,8 @@ pub fn append(name: &str, bytes: &[u8]) -> Result<()> {
     answer(wit::append(name, bytes))
 }
 
-/// Bytes from `offset`, `len` at most; clamped to what is there, and to `call_bytes` of `[limits]`, 1 MiB by default.
+/// Bytes from `offset`, `len` at most; clamped to what is there, and to `call_bytes` of `[limits]`,
+/// 1 MiB by default.
 ///
 /// # Errors
 ///

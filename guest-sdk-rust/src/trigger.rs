@@ -5,7 +5,8 @@ use crate::bindings::gleaner::lambda::trigger as wit;
 pub use crate::bindings::gleaner::lambda::trigger::TriggerError;
 use crate::error::answer;
 
-/// Something worth keeping happened. `score` says how strongly, in a unit that the lambda documents.
+/// Something worth keeping happened. `score` says how strongly, in a unit that the lambda
+/// documents.
 ///
 /// Nothing happens before [`Event::send`].
 #[must_use = "an event counts once it is sent"]
@@ -48,8 +49,8 @@ impl Event<'_> {
     ///
     /// # Errors
     ///
-    /// If the label is empty or over 128 bytes, a number is not finite, a key is given twice, this wake has caused 16 triggers,
-    /// or there is no wake, as in `init`. Nothing is caused then.
+    /// If the label is empty or over 128 bytes, a number is not finite, a key is given twice, this
+    /// wake has caused 16 triggers, or there is no wake, as in `init`. Nothing is caused then.
     pub fn send(self) -> Result<()> {
         answer(wit::event(self.label, self.score, &self.attributes))
     }

@@ -1,4 +1,5 @@
-//! Kernels against the host's operations on frames: equal, bit for bit, for every layout of the pixels.
+//! Kernels against the host's operations on frames: equal, bit for bit, for every layout of the
+//! pixels.
 
 use gleaner_rules::pixels::{self, Encoding as HostEncoding, Roi as HostRoi, View, ops};
 use gleaner_sdk::data::{Encoding, Roi};
@@ -12,7 +13,8 @@ struct Noise(u64);
 
 impl Noise {
     fn next(&mut self) -> u32 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.0 =
+            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 33) as u32
     }
 
@@ -34,7 +36,10 @@ impl Pixels {
     fn new(noise: &mut Noise, width: u32, height: u32) -> Self {
         let step = 3 * width + [0, noise.next() % 9][noise.next() as usize % 2];
         // Of few levels sometimes, of one side sometimes: sums that are large, counts that are.
-        let (mask, floor) = ([0xff, 0xff, 0x81, 0x00][noise.next() as usize % 4], [0, 0xfe][noise.next() as usize % 2]);
+        let (mask, floor) = (
+            [0xff, 0xff, 0x81, 0x00][noise.next() as usize % 4],
+            [0, 0xfe][noise.next() as usize % 2],
+        );
         let data = (0..step * height).map(|_| noise.next() as u8 & mask | floor).collect();
         Self { width, height, step, data }
     }
@@ -43,7 +48,15 @@ impl Pixels {
         let Self { width, height, step, data } = self;
         for (encoding, name) in ENCODINGS {
             let image = Image::new(*width, *height, *step, encoding, data).unwrap();
-            let view = View::new(*width, *height, *step, HostEncoding::from_ros(name).unwrap(), false, data).unwrap();
+            let view = View::new(
+                *width,
+                *height,
+                *step,
+                HostEncoding::from_ros(name).unwrap(),
+                false,
+                data,
+            )
+            .unwrap();
             check(image, view, &format!("{width}x{height}, step {step}, {name}"));
         }
     }
@@ -64,7 +77,11 @@ fn means_histograms_and_grey_images_are_those_of_the_host() {
         let [across, down] = [width, height].map(|side| noise.up_to(side));
         pixels.each(|image, view, what| {
             assert_eq!(luma::mean_luma(&image), ops::mean_luma(&view, None).unwrap(), "{what}");
-            assert_eq!(histogram::histogram(&image), ops::histogram(&view, None).unwrap(), "{what}");
+            assert_eq!(
+                histogram::histogram(&image),
+                ops::histogram(&view, None).unwrap(),
+                "{what}"
+            );
             let mut ours = vec![0; (width * height) as usize];
             let mut theirs = ours.clone();
             luma::to_gray(&image, &mut ours).unwrap();
@@ -73,8 +90,16 @@ fn means_histograms_and_grey_images_are_those_of_the_host() {
 
             let part = image.part(Roi { x, y, width: across, height: down }).unwrap();
             let roi = Some(HostRoi { x, y, width: across, height: down });
-            assert_eq!(luma::mean_luma(&part), ops::mean_luma(&view, roi).unwrap(), "{what}, {roi:?}");
-            assert_eq!(histogram::histogram(&part), ops::histogram(&view, roi).unwrap(), "{what}, {roi:?}");
+            assert_eq!(
+                luma::mean_luma(&part),
+                ops::mean_luma(&view, roi).unwrap(),
+                "{what}, {roi:?}"
+            );
+            assert_eq!(
+                histogram::histogram(&part),
+                ops::histogram(&view, roi).unwrap(),
+                "{what}, {roi:?}"
+            );
         });
     }
 }

@@ -1,4 +1,5 @@
-//! The fake host keeps the host's rules. What these are is tested in `gleaner-rules`; here is what a lambda's author sees of them.
+//! The fake host keeps the host's rules. What these are is tested in `gleaner-rules`; here is what
+//! a lambda's author sees of them.
 
 mod testing {
     pub mod frames;

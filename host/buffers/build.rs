@@ -1,4 +1,5 @@
-//! Tells rustc that `--cfg loom` is known here: `[lints] workspace = true` leaves no room for it in Cargo.toml.
+//! Tells rustc that `--cfg loom` is known here: `[lints] workspace = true` leaves no room for it in
+//! Cargo.toml.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");

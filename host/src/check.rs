@@ -1,7 +1,9 @@
-//! `gleaner-runtime check`: a lambda without any sample. It is loaded as on a vehicle, its rings are made, and its `init` is run,
-//! which finds inputs that the manifest lacks and fields that their types lack.
+//! `gleaner-runtime check`: a lambda without any sample. It is loaded as on a vehicle, its rings
+//! are made, and its `init` is run, which finds inputs that the manifest lacks and fields that
+//! their types lack.
 //!
-//! What the types are is said by the definitions that lie with the lambda, on this machine, or in this program.
+//! What the types are is said by the definitions that lie with the lambda, on this machine, or in
+//! this program.
 
 use std::io::Write;
 use std::time::Instant;
@@ -22,7 +24,8 @@ use crate::input::{Live, Remap, live_slots, unfinished_bytes};
 use crate::isolation::{code, definitions};
 use crate::stage::{Asked, AskedArgs, Bounds, Load, Stage, not_started};
 
-/// What the recorder may take beside the preroll: two staging areas, and what is on its way to the disk.
+/// What the recorder may take beside the preroll: two staging areas, and what is on its way to the
+/// disk.
 const RECORDER: u64 = (2 * 256 + 16) << 20;
 
 /// Arguments of `check`.
@@ -71,7 +74,8 @@ impl Job {
         let Self { asked, manifest } = self;
         let (mut topics, notes) = topics(&asked, &manifest)?;
         let bounds = Bounds::Live(manifest.limits.deadline);
-        let mut stage = Stage::set(&mut topics, &asked, &manifest, bounds, Some(&Live { bell: None }), load)?;
+        let mut stage =
+            Stage::set(&mut topics, &asked, &manifest, bounds, Some(&Live { bell: None }), load)?;
         // Without its type, a field that is there would be missing.
         let mut log = Vec::new();
         let mut started = |outcome: Result<(), Fault>| {
@@ -112,7 +116,11 @@ fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>),
     for input in &manifest.inputs {
         let type_name = input.type_name.as_str();
         let text = sources.find(type_name).map_err(|error| {
-            Failure::caused_by(Exit::Usage, format!("the definition of `{type_name}` makes no sense"), &error)
+            Failure::caused_by(
+                Exit::Usage,
+                format!("the definition of `{type_name}` makes no sense"),
+                &error,
+            )
         })?;
         if text.is_none() {
             notes.push(format!(
@@ -121,16 +129,23 @@ fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>),
                 input.name
             ));
         }
-        topics.add_topic(Remap::apply(&asked.remaps, input.topic.as_str()), type_name, text.as_deref().unwrap_or(""));
+        topics.add_topic(
+            Remap::apply(&asked.remaps, input.topic.as_str()),
+            type_name,
+            text.as_deref().unwrap_or(""),
+        );
     }
     Ok((topics, notes))
 }
 
-/// Those of the lambda's own process in the order of the manifest, then those of the recorder, then the disk.
+/// Those of the lambda's own process in the order of the manifest, then those of the recorder, then
+/// the disk.
 fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
     let limits = &manifest.limits;
     let mut needs = Vec::new();
-    let mut need = |place, at_once, purpose: String, bytes| needs.push(Need { purpose, bytes, place, at_once });
+    let mut need = |place, at_once, purpose: String, bytes| {
+        needs.push(Need { purpose, bytes, place, at_once })
+    };
     for input in &manifest.inputs {
         let (name, slots) = (&input.name, live_slots(input));
         let bytes = Pool::<SampleMeta>::bytes_needed(slots, input.max_size.as_usize());
@@ -143,7 +158,12 @@ fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
             need(Place::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
         }
     }
-    need(Place::Memory, false, "the lambda itself (`memory`)".to_owned(), Some(limits.memory.bytes()));
+    need(
+        Place::Memory,
+        false,
+        "the lambda itself (`memory`)".to_owned(),
+        Some(limits.memory.bytes()),
+    );
     if manifest.inputs.iter().any(|input| input.type_name.is_frame()) {
         need(
             Place::Memory,
@@ -154,7 +174,12 @@ fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
     }
     if limits.scratch.bytes() > 0 {
         let bytes = limits.scratch.bytes().saturating_mul(2);
-        need(Place::Memory, false, "what it keeps (`scratch`, twice while an entry grows)".to_owned(), Some(bytes));
+        need(
+            Place::Memory,
+            false,
+            "what it keeps (`scratch`, twice while an entry grows)".to_owned(),
+            Some(bytes),
+        );
     }
     let unfinished = Some(unfinished_bytes(manifest));
     need(
@@ -175,11 +200,21 @@ fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
             "recorder: messages on their way, and clips being written".to_owned(),
             Some(RECORDER),
         );
-        need(Place::Disk, false, "clips; `gleaner run --clips-max --bytes-max` bounds them".to_owned(), None);
+        need(
+            Place::Disk,
+            false,
+            "clips; `gleaner run --clips-max --bytes-max` bounds them".to_owned(),
+            None,
+        );
     }
     for model in &manifest.models {
         let file = asked.build.path().join(model.file.as_path());
-        need(Place::Disk, true, format!("model `{}`", model.name), file.metadata().ok().map(|data| data.len()));
+        need(
+            Place::Disk,
+            true,
+            format!("model `{}`", model.name),
+            file.metadata().ok().map(|data| data.len()),
+        );
     }
     need(Place::Disk, false, "decisions.jsonl and log.jsonl".to_owned(), None);
     needs

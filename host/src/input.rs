@@ -1,6 +1,8 @@
-//! Where samples are held: one ring for each input of the manifest, filled from the transport's thread.
+//! Where samples are held: one ring for each input of the manifest, filled from the transport's
+//! thread.
 //!
-//! All memory is taken and touched here, before the first sample. Delivering copies a sample once and never waits for a lambda.
+//! All memory is taken and touched here, before the first sample. Delivering copies a sample once
+//! and never waits for a lambda.
 
 use std::io;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -67,22 +69,25 @@ const SMALL_BYTES: u64 = 64 << 10;
 /// As many large samples may arrive during a wake without one leaving that it may see.
 const SPARE_LARGE: usize = 2;
 
-/// How much deeper a ring is than the lambda sees, so that what it may see does not leave while it runs.
+/// How much deeper a ring is than the lambda sees, so that what it may see does not leave while it
+/// runs.
 fn spare(input: &Input) -> usize {
     if input.max_size.bytes() <= SMALL_BYTES { input.depth } else { input.depth.min(SPARE_LARGE) }
 }
 
-/// Bytes beside the rings that a process takes on a vehicle at most: decisions that wait to be written, and messages that the network puts
-/// together.
+/// Bytes beside the rings that a process takes on a vehicle at most: decisions that wait to be
+/// written, and messages that the network puts together.
 pub fn unfinished_bytes(manifest: &Manifest) -> u64 {
     const LINES: u64 = 48 << 20;
-    // So many unfinished messages does RustDDS keep of a writer, and where memory is refused to it, it ends the process.
+    // So many unfinished messages does RustDDS keep of a writer, and where memory is refused to it,
+    // it ends the process.
     const MESSAGES: u64 = 130;
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes().saturating_mul(MESSAGES));
     sizes.fold(LINES, u64::saturating_add)
 }
 
-/// Slots for the samples of an input on a vehicle: one more is for the newest of those that a wake sees, which is held while it runs.
+/// Slots for the samples of an input on a vehicle: one more is for the newest of those that a wake
+/// sees, which is held while it runs.
 pub fn live_slots(input: &Input) -> usize {
     input.slots() + spare(input) + 1
 }
@@ -105,7 +110,11 @@ pub fn open_inputs(
         per_call: PerCall::new(limits),
         ask_until: Instant::now() + ASK_ALL,
     };
-    manifest.inputs.iter().map(|input| open_input(input, remaps, transport, live, &shared)).collect()
+    manifest
+        .inputs
+        .iter()
+        .map(|input| open_input(input, remaps, transport, live, &shared))
+        .collect()
 }
 
 /// What all inputs of a lambda have together.
@@ -152,14 +161,17 @@ fn open_input(
         input: input.name.to_string(),
         topic: spec.topic.clone(),
         refused: Default::default(),
-        bell: live.and_then(|live| live.bell.clone()).filter(|bell| bell.input == input.name.as_str()),
+        bell: live
+            .and_then(|live| live.bell.clone())
+            .filter(|bell| bell.input == input.name.as_str()),
     });
     transport.subscribe(&spec, ingest).map_err(subscribe)?;
     // Whoever writes a topic that is there already can say what it is, if nobody here can.
     let found = loop {
         match transport.definitions(&spec.topic) {
             Err(TransportError::NoDefinitions { .. })
-                if Instant::now() < shared.ask_until && transport.definitions_may_come(&spec.topic) =>
+                if Instant::now() < shared.ask_until
+                    && transport.definitions_may_come(&spec.topic) =>
             {
                 std::thread::sleep(ASK_EVERY);
             }
@@ -174,7 +186,15 @@ fn open_input(
         }
         Err(error) => return Err(subscribe(error)),
     };
-    Ok(Topic::new(input.name.as_str(), topic, &spec.type_name, (reader, input.depth), arrivals, definitions, images))
+    Ok(Topic::new(
+        input.name.as_str(),
+        topic,
+        &spec.type_name,
+        (reader, input.depth),
+        arrivals,
+        definitions,
+        images,
+    ))
 }
 
 fn qos(qos: manifest::Qos) -> Qos {
@@ -195,9 +215,14 @@ fn pool<M: Copy + Send + Sync + 'static>(
 ) -> Result<Pool<M>, InputError> {
     let name = || input.name.to_string();
     let layout = |source| InputError::Layout { input: name(), source };
-    let bytes = Pool::<M>::bytes_needed(slots, slot_bytes).ok_or(PoolError::TooLarge { slots, slot_bytes });
+    let bytes =
+        Pool::<M>::bytes_needed(slots, slot_bytes).ok_or(PoolError::TooLarge { slots, slot_bytes });
     let bytes = bytes.map_err(layout)?;
-    let region = Mapping::populated(bytes).map_err(|source| InputError::Memory { input: name(), bytes, source })?;
+    let region = Mapping::populated(bytes).map_err(|source| InputError::Memory {
+        input: name(),
+        bytes,
+        source,
+    })?;
     Pool::new(region, slots, slot_bytes).map_err(layout)
 }
 
@@ -205,7 +230,8 @@ fn pool<M: Copy + Send + Sync + 'static>(
 const ASK_ALL: Duration = Duration::from_secs(6);
 /// How often it is looked whether definitions have come.
 const ASK_EVERY: Duration = Duration::from_millis(20);
-/// How often a refusal is said again, with how many there were: what a lambda can cause in a loop must not fill a log.
+/// How often a refusal is said again, with how many there were: what a lambda can cause in a loop
+/// must not fill a log.
 const SAY_EVERY: Duration = Duration::from_secs(10);
 
 /// The transport's end of a ring. The lock is only ever taken by the transport's own thread.
@@ -302,7 +328,9 @@ impl Ingest {
             Refusal::NoSlot => &self.refused[0],
             Refusal::TooBig { .. } => &self.refused[1],
         };
-        let Some(samples) = refused.lock().unwrap_or_else(PoisonError::into_inner).due() else { return };
+        let Some(samples) = refused.lock().unwrap_or_else(PoisonError::into_inner).due() else {
+            return;
+        };
         match refusal {
             Refusal::NoSlot => {
                 warn!(input = %self.input, topic = %self.topic, samples, "samples dropped: the lambda holds all slots");
@@ -337,7 +365,9 @@ mod tests {
 
     fn ingest() -> (Ingest, RingReader<SampleMeta>) {
         let (slots, slot_bytes) = (3, 8);
-        let region = HeapRegion::zeroed(Pool::<SampleMeta>::bytes_needed(slots, slot_bytes).unwrap()).unwrap();
+        let region =
+            HeapRegion::zeroed(Pool::<SampleMeta>::bytes_needed(slots, slot_bytes).unwrap())
+                .unwrap();
         let (ring, reader) = ring(Pool::new(region, slots, slot_bytes).unwrap(), 2).unwrap();
         let (end, arrivals) = (Mutex::new(End { ring, copied: None }), Arc::new(Arrivals::new(2)));
         let (input, topic) = ("camera".to_owned(), "/camera".to_owned());
@@ -371,7 +401,10 @@ mod tests {
         ingest.accept(&meta(1));
         assert_eq!(&*reader.newest().unwrap(), b"mine");
         let counts = reader.counts();
-        assert_eq!((counts.received, counts.overwritten, counts.no_slot, counts.too_big), (1, 0, 0, 0));
+        assert_eq!(
+            (counts.received, counts.overwritten, counts.no_slot, counts.too_big),
+            (1, 0, 0, 0)
+        );
     }
 
     #[test]

@@ -23,8 +23,8 @@ impl Judge {
         Self { session, guest, run: Duration::ZERO, faults: Faults::default() }
     }
 
-    /// Returns whether to skip this wake. A lambda that rests after faults skips it, and it is counted. So does a worker that had no
-    /// room for the sample, which the worker counts.
+    /// Returns whether to skip this wake. A lambda that rests after faults skips it, and it is
+    /// counted. So does a worker that had no room for the sample, which the worker counts.
     pub fn passes_over(&mut self, wake: &Wake) -> bool {
         let rests = self.faults.rests(wake.at_ns());
         if rests {
@@ -33,8 +33,9 @@ impl Judge {
         rests || !self.guest.expects(wake)
     }
 
-    /// Runs the lambda once. A fault becomes part of the decision; what the lambda triggered before it still counts, since a
-    /// moment that it found worth keeping must not be lost to a mistake made afterwards.
+    /// Runs the lambda once. A fault becomes part of the decision; what the lambda triggered before
+    /// it still counts, since a moment that it found worth keeping must not be lost to a mistake
+    /// made afterwards.
     pub fn judge(&mut self, wake: Wake) -> Decision {
         let mut decision = cause(&wake);
         self.session.begin(decision.at_ns);
@@ -120,7 +121,8 @@ mod tests {
         }
 
         fn wake(&mut self, wake: Wake) -> Outcome {
-            let fault = Fault { kind: FaultKind::Trap, message: String::new(), used: None, allowed: None };
+            let fault =
+                Fault { kind: FaultKind::Trap, message: String::new(), used: None, allowed: None };
             let result = if wake.at_ns() < self.until_ns { Err(fault) } else { Ok(()) };
             Outcome { result, fuel: None, run_ns: None }
         }
@@ -163,7 +165,10 @@ mod tests {
         assert_eq!(first, [0, 10, 20, 30, 40, 50, 60, 70, 170, 370, 770, 1570]);
         assert_eq!(session.passed_over(), 200 - 12);
         // The longest rest is 10 s.
-        assert_eq!(runs(&mut judge, 2000, 60_000), [3170, 6370, 12_770, 22_770, 32_770, 42_770, 52_770]);
+        assert_eq!(
+            runs(&mut judge, 2000, 60_000),
+            [3170, 6370, 12_770, 22_770, 32_770, 42_770, 52_770]
+        );
     }
 
     #[test]
@@ -171,7 +176,10 @@ mod tests {
         let (mut judge, session) = room(i64::MAX);
         runs(&mut judge, 0, 1000);
         let (lines, said) = session.take_log();
-        assert_eq!(lines.iter().map(|line| line.message.as_str()).collect::<Vec<_>>(), [MADE_ANEW, RESTS]);
+        assert_eq!(
+            lines.iter().map(|line| line.message.as_str()).collect::<Vec<_>>(),
+            [MADE_ANEW, RESTS]
+        );
         assert_eq!((lines[0].at_ns, lines[1].at_ns, said.lines), (10 * MS, 70 * MS, 0));
         // Again in the next second: state was lost again.
         runs(&mut judge, 1000, 2000);

@@ -1,4 +1,5 @@
-//! `gleaner-runtime`: the process that hosts one lambda. `gleaner` starts it; see `gleaner-runtime --help`.
+//! `gleaner-runtime`: the process that hosts one lambda. `gleaner` starts it; see `gleaner-runtime
+//! --help`.
 
 use std::process::ExitCode;
 

@@ -1,7 +1,9 @@
-//! Memory for samples: mapped from the kernel, touched before the first sample, and given back whole.
+//! Memory for samples: mapped from the kernel, touched before the first sample, and given back
+//! whole.
 //!
-//! Not from the allocator. glibc's learns from each large block that is freed to keep the next one: a process that replayed
-//! ten times grew from 8.6 to 13.1 MB in WebAssembly, and from 52 to 61 MB in Python.
+//! Not from the allocator. glibc's learns from each large block that is freed to keep the next one:
+//! a process that replayed ten times grew from 8.6 to 13.1 MB in WebAssembly, and from 52 to 61 MB
+//! in Python.
 #![allow(unsafe_code)]
 
 use std::io;
@@ -12,12 +14,12 @@ use gleaner_buffers::Region;
 use gleaner_vitals::own::LARGE_BYTES;
 use rustix::mm::{MapFlags, ProtFlags, mmap_anonymous, munmap};
 
-/// Keeps the allocator from holding on to large blocks: it maps each and gives it back when it is freed, as it does before it learns
-/// otherwise. Call it once, at the start of a program.
+/// Keeps the allocator from holding on to large blocks: it maps each and gives it back when it is
+/// freed, as it does before it learns otherwise. Call it once, at the start of a program.
 pub fn give_large_blocks_back() {
     #[cfg(target_env = "gnu")]
-    // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only for a parameter it does not know,
-    // and then nothing has changed.
+    // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only for a
+    // parameter it does not know, and then nothing has changed.
     unsafe {
         libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BYTES as libc::c_int);
     }
@@ -26,7 +28,8 @@ pub fn give_large_blocks_back() {
 /// Gives back to the system what the allocator keeps of memory that was freed.
 pub fn give_freed_back() {
     #[cfg(target_env = "gnu")]
-    // SAFETY: `malloc_trim` takes a number by value, and locks what it gives back, which nothing uses.
+    // SAFETY: `malloc_trim` takes a number by value, and locks what it gives back, which nothing
+    // uses.
     unsafe {
         libc::malloc_trim(0);
     }
@@ -48,7 +51,9 @@ impl Mapping {
         let len = len.max(1);
         let flags = MapFlags::PRIVATE | MapFlags::POPULATE;
         // SAFETY: a null hint lets the kernel choose addresses that nothing else uses.
-        let base = unsafe { mmap_anonymous(ptr::null_mut(), len, ProtFlags::READ | ProtFlags::WRITE, flags) }?;
+        let base = unsafe {
+            mmap_anonymous(ptr::null_mut(), len, ProtFlags::READ | ProtFlags::WRITE, flags)
+        }?;
         let base = NonNull::new(base.cast()).ok_or(io::ErrorKind::OutOfMemory)?;
         Ok(Self { base, len })
     }
@@ -56,14 +61,14 @@ impl Mapping {
 
 impl Drop for Mapping {
     fn drop(&mut self) {
-        // SAFETY: `populated` mapped exactly these bytes, and a pool drops its region after the last lease.
-        // It can only fail for arguments that no mapping has.
+        // SAFETY: `populated` mapped exactly these bytes, and a pool drops its region after the
+        // last lease. It can only fail for arguments that no mapping has.
         let _ = unsafe { munmap(self.base.as_ptr().cast(), self.len) };
     }
 }
 
-// SAFETY: the mapping is owned, at a fixed place, readable and writable for `len` bytes until it is dropped, and reached only
-// through the pool that it is given to.
+// SAFETY: the mapping is owned, at a fixed place, readable and writable for `len` bytes until it is
+// dropped, and reached only through the pool that it is given to.
 unsafe impl Region for Mapping {
     fn base(&self) -> NonNull<u8> {
         self.base
@@ -74,7 +79,8 @@ unsafe impl Region for Mapping {
     }
 }
 
-// SAFETY: bytes have no thread of their own; the pool that owns the mapping decides who touches them.
+// SAFETY: bytes have no thread of their own; the pool that owns the mapping decides who touches
+// them.
 unsafe impl Send for Mapping {}
 // SAFETY: as above; a shared `Mapping` gives out no more than its address and length.
 unsafe impl Sync for Mapping {}

@@ -18,7 +18,9 @@ impl NetworkError {
 impl Explain for NetworkError {
     fn help(&self) -> Option<String> {
         match &self.0 {
-            DdsError::Join { .. } => Some("`gleaner doctor` looks at the network of this machine".to_owned()),
+            DdsError::Join { .. } => {
+                Some("`gleaner doctor` looks at the network of this machine".to_owned())
+            }
             _ => None,
         }
     }

@@ -1,4 +1,5 @@
-//! The program `gleaner-runtime`: reads its arguments, chooses the guest by the manifest's kind, ends with an exit code.
+//! The program `gleaner-runtime`: reads its arguments, chooses the guest by the manifest's kind,
+//! ends with an exit code.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -41,7 +42,8 @@ use crate::topics::TopicsArgs;
 #[derive(Parser)]
 #[command(name = "gleaner-runtime", version)]
 struct Cli {
-    /// Runs the lambda of a replay, sends each outcome to the process that started this one, and writes nothing.
+    /// Runs the lambda of a replay, sends each outcome to the process that started this one, and
+    /// writes nothing.
     #[arg(long, hide = true)]
     worker: bool,
     #[command(flatten)]
@@ -87,7 +89,8 @@ impl Job {
         }
     }
 
-    /// What a process needs from its start: the place of its results, which is made, and memory for itself and its rings.
+    /// What a process needs from its start: the place of its results, which is made, and memory for
+    /// itself and its rings.
     fn around(&self, is_worker: bool) -> Result<Inside, Failure> {
         let results = match self {
             _ if is_worker => None,
@@ -124,7 +127,9 @@ impl Job {
         let kept = 2 * manifest.limits.scratch.bytes();
         let memory = manifest.limits.memory.bytes().saturating_add(kept).saturating_add(ours);
         // Frames that a lambda makes may take `memory` once more.
-        let all = memory.saturating_add(manifest.limits.memory.bytes()).saturating_add(at_start(manifest));
+        let all = memory
+            .saturating_add(manifest.limits.memory.bytes())
+            .saturating_add(at_start(manifest));
         Inside { paths, memory: (manifest.lambda.kind == Kind::Python).then_some(memory), all }
     }
 
@@ -163,8 +168,9 @@ fn no_worker() -> Failure {
     Failure::new(Exit::Usage, "a live run has no worker").with_help("leave `--worker` out")
 }
 
-/// Memory that a process takes before the lambda is in it, at most: an interpreter with numpy and our own part take some 100 MB,
-/// and numpy's threads more where a user asks for many; and the rings.
+/// Memory that a process takes before the lambda is in it, at most: an interpreter with numpy and
+/// our own part take some 100 MB, and numpy's threads more where a user asks for many; and the
+/// rings.
 fn at_start(manifest: &Manifest) -> u64 {
     const INTERPRETER: u64 = 1 << 30;
     let rings = manifest.inputs.iter().flat_map(|input| {
@@ -211,8 +217,8 @@ pub fn main() -> ExitCode {
     end(cli.job().and_then(|job| job.map_or_else(Ok, |job| run_any(job, worker))))
 }
 
-/// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was given: their job, with the guest
-/// that `load` makes. Returns the exit code.
+/// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was
+/// given: their job, with the guest that `load` makes. Returns the exit code.
 pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
     prepare();
     let cli = match Cli::try_parse_from(args) {
@@ -223,7 +229,9 @@ pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
         }
     };
     let worker = cli.worker;
-    code(cli.job().and_then(|job| job.map_or_else(Ok, |job| if worker { work(job, load) } else { run(job, load) })))
+    code(cli.job().and_then(|job| {
+        job.map_or_else(Ok, |job| if worker { work(job, load) } else { run(job, load) })
+    }))
 }
 
 fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
@@ -285,8 +293,9 @@ fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
     }
 }
 
-/// Does the part of `job` that is the worker's. Once the lambda may have run, what goes wrong is no longer printed: the process
-/// that reads the outcomes finds it too, and nothing here is to be taken for its words.
+/// Does the part of `job` that is the worker's. Once the lambda may have run, what goes wrong is no
+/// longer printed: the process that reads the outcomes finds it too, and nothing here is to be
+/// taken for its words.
 fn work(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
     let isolation = Arc::new(Isolation::of_this_process(job.inside(true))?);
     let reports = Reports::to(reports()?);
@@ -320,8 +329,9 @@ fn watched<'a>(
 
 /// See [`gleaner_vitals::start::reports`].
 fn reports() -> Result<File, Failure> {
-    gleaner_vitals::start::reports()
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error))
+    gleaner_vitals::start::reports().map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error)
+    })
 }
 
 #[cfg(feature = "wasm")]
@@ -341,19 +351,24 @@ mod wasm {
         session: Session,
         bounds: Bounds,
     ) -> Result<Box<dyn Guest>, Failure> {
-        let cannot =
-            |error: &WasmError| Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error);
+        let cannot = |error: &WasmError| {
+            Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error)
+        };
         let cache = gleaner_parts::cache_dir().map_err(|error| cannot(&error.into()))?;
         let limits = &manifest.limits;
         let nans = if manifest.lambda.deterministic { Nans::Canonical } else { Nans::AsMade };
-        let loaded = Loaded::open(&asked.build.entry_path(manifest), &cache, limits.stack.as_usize(), nans)
-            .map_err(|error| cannot(&error))?;
-        let failed = |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot make a guest", &error);
+        let loaded =
+            Loaded::open(&asked.build.entry_path(manifest), &cache, limits.stack.as_usize(), nans)
+                .map_err(|error| cannot(&error))?;
+        let failed = |error: std::io::Error| {
+            Failure::caused_by(Exit::Internal, "cannot make a guest", &error)
+        };
         let deadline = match bounds {
             Bounds::Replay => None,
-            Bounds::Live(allowed) => {
-                Some(Deadline::new(loaded.engine(), allowed.min(limits.init_deadline)).map_err(failed)?)
-            }
+            Bounds::Live(allowed) => Some(
+                Deadline::new(loaded.engine(), allowed.min(limits.init_deadline))
+                    .map_err(failed)?,
+            ),
         };
         let guest = WasmGuest::new(loaded, session, limits, deadline).map_err(failed)?;
         Ok(Box::new(guest))

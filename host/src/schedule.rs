@@ -48,7 +48,10 @@ impl Schedule {
                     DeclaredBacklog::Each => Backlog::Each,
                     DeclaredBacklog::Latest => Backlog::Latest,
                 };
-                rules::Schedule::event(Input(Arc::clone(topic.expect("the manifest was checked"))), backlog)
+                rules::Schedule::event(
+                    Input(Arc::clone(topic.expect("the manifest was checked"))),
+                    backlog,
+                )
             }
             Declared::Periodic { period } => {
                 rules::Schedule::periodic(i64::try_from(period.as_nanos()).unwrap_or(i64::MAX))

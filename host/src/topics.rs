@@ -10,8 +10,8 @@ use gleaner_protocol::{Report, TopicSeen};
 
 use crate::network::NetworkError;
 
-/// How long to listen if nothing else is said: announcements of participants come every few seconds, and those who are there
-/// answer a new one at once.
+/// How long to listen if nothing else is said: announcements of participants come every few
+/// seconds, and those who are there answer a new one at once.
 const WAIT_S: f64 = 2.0;
 const WAIT_MAX: Duration = Duration::from_secs(3600);
 
@@ -28,7 +28,9 @@ pub struct TopicsArgs {
 /// Listens for a while, and reports what there was.
 pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Failure> {
     let wait = Duration::try_from_secs_f64(args.wait).ok().filter(|wait| *wait <= WAIT_MAX);
-    let wait = wait.ok_or_else(|| Failure::new(Exit::Usage, format!("--wait {}: use 0 to 3600 s", args.wait)))?;
+    let wait = wait.ok_or_else(|| {
+        Failure::new(Exit::Usage, format!("--wait {}: use 0 to 3600 s", args.wait))
+    })?;
     let mut options = args.network.options("/gleaner/topics").map_err(NetworkError::failure)?;
     // No samples are received.
     options.largest = 0;

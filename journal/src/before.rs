@@ -1,4 +1,5 @@
-//! What a wake is written relative to: the wake before it. Writer and reader follow the same rules, which stand here.
+//! What a wake is written relative to: the wake before it. Writer and reader follow the same rules,
+//! which stand here.
 
 use super::entry::{Entry, Woken};
 
@@ -6,7 +7,8 @@ use super::entry::{Entry, Woken};
 pub(super) struct Before {
     /// Stamp of the wake before; `None` at the begin of a block.
     pub(super) at_ns: Option<i64>,
-    /// Time between the two wakes before, 0 if there were none: lambdas are woken at a fairly even rate.
+    /// Time between the two wakes before, 0 if there were none: lambdas are woken at a fairly even
+    /// rate.
     pub(super) step_ns: i64,
     /// Writer and number of the sample that caused a wake last.
     pub(super) woken_by: ([u8; 16], u64),
@@ -47,7 +49,8 @@ impl Before {
         self.at_ns.unwrap_or(0).wrapping_add(self.step_ns)
     }
 
-    /// The number of the next sample that causes a wake: the one after the last, or 0 if it is of another writer.
+    /// The number of the next sample that causes a wake: the one after the last, or 0 if it is of
+    /// another writer.
     pub(super) fn expected_seq(&self, same_writer: bool) -> u64 {
         if same_writer { self.woken_by.1.wrapping_add(1) } else { 0 }
     }

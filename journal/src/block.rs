@@ -1,6 +1,7 @@
 //! The blocks of a journal: a head that vouches for itself and its payload, then the payload.
 
-/// First bytes of a journal. Bytes that a transfer as text would change tell such a transfer from damage.
+/// First bytes of a journal. Bytes that a transfer as text would change tell such a transfer from
+/// damage.
 pub(super) const MAGIC: [u8; 8] = *b"\x89GLJRN\r\n";
 
 /// Magic, version, and six bytes that are 0.
@@ -9,7 +10,8 @@ pub(super) const PREAMBLE_LEN: usize = 16;
 /// Kind, length, checksum of the payload, checksum of the head.
 pub(super) const HEAD_LEN: usize = 13;
 
-/// Longest payload. It holds the header of a build with 10,000 files, and the largest wake that the host allows.
+/// Longest payload. It holds the header of a build with 10,000 files, and the largest wake that the
+/// host allows.
 pub(super) const PAYLOAD_MAX: usize = 2 << 20;
 
 /// What is in a block. Blocks of other kinds are stepped over: a newer writer may have more to say.
@@ -43,13 +45,20 @@ impl Head {
 
     /// The head of block number `index`; `None` if its checksum is of another one.
     pub(super) fn from_bytes(bytes: &[u8; HEAD_LEN], index: u64) -> Option<Head> {
-        let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
-        (word(9) == head_crc(bytes, index)).then(|| Head { kind: bytes[0], len: word(1), payload_crc: word(5) })
+        let word = |at: usize| {
+            u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
+        };
+        (word(9) == head_crc(bytes, index)).then(|| Head {
+            kind: bytes[0],
+            len: word(1),
+            payload_crc: word(5),
+        })
     }
 }
 
-/// The head has a checksum of its own, so that a flipped length is damage and does not look like a file that was cut off.
-/// The number of the block is in it, so that a block that is missing or stands elsewhere is found.
+/// The head has a checksum of its own, so that a flipped length is damage and does not look like a
+/// file that was cut off. The number of the block is in it, so that a block that is missing or
+/// stands elsewhere is found.
 fn head_crc(bytes: &[u8; HEAD_LEN], index: u64) -> u32 {
     let mut crc = crc32fast::Hasher::new();
     crc.update(&index.to_le_bytes());

@@ -1,6 +1,8 @@
 use serde_json::{Map, Value};
 
-use super::before::{Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen};
+use super::before::{
+    Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen,
+};
 use super::entry::{Entry, Said, Seen, Woken};
 use super::number::{take, unfold};
 use super::{ATTRIBUTES_MAX, FAULTS, TRIGGERS_MAX};
@@ -48,8 +50,8 @@ pub enum Malformed {
 
 type Result<T> = std::result::Result<T, Malformed>;
 
-/// Reads what an [`Encoder`](super::Encoder) wrote. Its input may be anything: no memory is taken for a number before the
-/// bytes that it counts were seen.
+/// Reads what an [`Encoder`](super::Encoder) wrote. Its input may be anything: no memory is taken
+/// for a number before the bytes that it counts were seen.
 pub struct Decoder {
     before: Before,
 }
@@ -69,8 +71,8 @@ impl Decoder {
     ///
     /// # Errors
     ///
-    /// [`Malformed`]; what is left of `bytes` then has no meaning, and neither have wakes that were written relative to
-    /// this one.
+    /// [`Malformed`]; what is left of `bytes` then has no meaning, and neither have wakes that were
+    /// written relative to this one.
     pub fn decode(&mut self, bytes: &mut &[u8]) -> Result<Entry> {
         let before = &self.before;
         let [flags] = array(bytes)?;
@@ -87,7 +89,8 @@ impl Decoder {
         if bytes.len() < before.inputs.len() {
             return Err(Malformed::Short);
         }
-        let seen = before.inputs.iter().map(|before| input(before, bytes)).collect::<Result<_>>()?;
+        let seen =
+            before.inputs.iter().map(|before| input(before, bytes)).collect::<Result<_>>()?;
         let triggers = if flags & flag::TRIGGERS != 0 { triggers(bytes)? } else { Vec::new() };
         let fault = if flags & flag::FAULT != 0 { Some(fault(bytes)?) } else { None };
         let log = if flags & flag::LOG != 0 { said(bytes)? } else { Said::default() };
@@ -137,7 +140,10 @@ fn cause(flags: u8, before: &Before, bytes: &mut &[u8]) -> Result<Woken> {
     }
     let writer = if writer_follows { array(bytes)? } else { before.woken_by.0 };
     let expected = before.expected_seq(!writer_follows);
-    Ok(Woken::Sample { writer, seq: if number_follows { difference(bytes, expected)? } else { expected } })
+    Ok(Woken::Sample {
+        writer,
+        seq: if number_follows { difference(bytes, expected)? } else { expected },
+    })
 }
 
 fn input(before: &InputBefore, bytes: &mut &[u8]) -> Result<Seen> {
@@ -152,9 +158,13 @@ fn input(before: &InputBefore, bytes: &mut &[u8]) -> Result<Seen> {
         false => expected,
         true => match (array(bytes)?, expected) {
             ([newest::NONE], _) => None,
-            ([newest::SAME_WRITER], Some((writer, expected))) => Some((writer, difference(bytes, expected)?)),
+            ([newest::SAME_WRITER], Some((writer, expected))) => {
+                Some((writer, difference(bytes, expected)?))
+            }
             ([newest::OTHER_WRITER], _) => Some((array(bytes)?, number(bytes)?)),
-            ([value], _) => return Err(Malformed::Unknown { what: "form of a newest sample", value }),
+            ([value], _) => {
+                return Err(Malformed::Unknown { what: "form of a newest sample", value });
+            }
         },
     };
     let reach = if set & seen::REACH != 0 { number(bytes)? } else { before.reach };

@@ -1,4 +1,6 @@
-use super::before::{Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen};
+use super::before::{
+    Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen,
+};
 use super::entry::{Entry, Seen, Woken};
 use super::fault_code;
 use super::number::{fold, put};
@@ -143,7 +145,8 @@ fn trigger(trigger: &Trigger, json: &mut Vec<u8>, out: &mut Vec<u8>) {
     }
     json.clear();
     if !trigger.attributes.is_empty() {
-        serde_json::to_writer(&mut *json, &trigger.attributes).expect("a map with texts as keys is JSON");
+        serde_json::to_writer(&mut *json, &trigger.attributes)
+            .expect("a map with texts as keys is JSON");
     }
     put(json.len() as u64, out);
     out.extend_from_slice(json);

@@ -46,7 +46,8 @@ pub enum Woken {
 pub struct Seen {
     /// Samples that arrived since the wake before, those included that found no room in the ring.
     pub new: u64,
-    /// Wrapping sum of the digests of those that entered the ring, see `docs/journal.md`; 0 if there are none.
+    /// Wrapping sum of the digests of those that entered the ring, see `docs/journal.md`; 0 if
+    /// there are none.
     pub digest: u32,
     /// Writer and number of the newest sample in the ring.
     pub newest: Option<([u8; 16], u64)>,
@@ -64,34 +65,56 @@ pub struct Said {
 }
 
 impl Entry {
-    /// The first difference between the wake in the journal and the same wake made again `now`; `None` if the lambda saw
-    /// the same and decided the same, bit for bit.
+    /// The first difference between the wake in the journal and the same wake made again `now`;
+    /// `None` if the lambda saw the same and decided the same, bit for bit.
     ///
-    /// `inputs` are those of the header. A clip keeps neither all writers nor more than 32 bits of a number: without
-    /// `writers`, samples are compared as far as a clip keeps them.
-    pub fn differs_from(&self, now: &Entry, inputs: &[JournalInput], writers: bool) -> Option<Difference> {
-        // The usual case, without a word. Equal scores may still differ in their bits, and equal maps in their order.
+    /// `inputs` are those of the header. A clip keeps neither all writers nor more than 32 bits of
+    /// a number: without `writers`, samples are compared as far as a clip keeps them.
+    pub fn differs_from(
+        &self,
+        now: &Entry,
+        inputs: &[JournalInput],
+        writers: bool,
+    ) -> Option<Difference> {
+        // The usual case, without a word. Equal scores may still differ in their bits, and equal
+        // maps in their order.
         if self.triggers.is_empty() && self == now {
             return None;
         }
         Difference::of("stamp of the wake, in ns", self.at_ns, now.at_ns)
             .or_else(|| {
-                Difference::of("what woke the lambda", self.cause_in_words(writers), now.cause_in_words(writers))
+                Difference::of(
+                    "what woke the lambda",
+                    self.cause_in_words(writers),
+                    now.cause_in_words(writers),
+                )
             })
             .or_else(|| Difference::of("number of inputs", self.seen.len(), now.seen.len()))
             .or_else(|| {
                 let mut pairs = self.seen.iter().zip(&now.seen).enumerate();
-                pairs.find_map(|(index, (journal, now))| seen_differs(journal, now, &in_words(inputs, index), writers))
+                pairs.find_map(|(index, (journal, now))| {
+                    seen_differs(journal, now, &in_words(inputs, index), writers)
+                })
             })
-            .or_else(|| Difference::of("number of triggers", self.triggers.len(), now.triggers.len()))
+            .or_else(|| {
+                Difference::of("number of triggers", self.triggers.len(), now.triggers.len())
+            })
             .or_else(|| {
                 let mut pairs = self.triggers.iter().zip(&now.triggers).enumerate();
                 pairs.find_map(|(index, (journal, now))| triggers_differ(journal, now, index + 1))
             })
-            .or_else(|| Difference::of("fault", fault_in_words(&self.fault), fault_in_words(&now.fault)))
+            .or_else(|| {
+                Difference::of("fault", fault_in_words(&self.fault), fault_in_words(&now.fault))
+            })
             .or_else(|| Difference::of("fuel", number(self.fuel), number(now.fuel)))
             .or_else(|| Difference::of("number of log lines", self.log.lines, now.log.lines))
-            .or_else(|| Difference::of("text of the log lines", digest(self.log.digest), digest(now.log.digest)))
+            .or_else(|| {
+                Difference::of(
+                    "text of the log lines",
+                    digest(self.log.digest),
+                    digest(now.log.digest),
+                )
+            })
     }
 
     fn cause_in_words(&self, writers: bool) -> String {
@@ -115,10 +138,19 @@ fn seen_differs(journal: &Seen, now: &Seen, input: &str, writers: bool) -> Optio
     if journal == now {
         return None;
     }
-    let newest = |seen: &Seen| seen.newest.map_or("none".to_owned(), |newest| identity(newest, writers));
+    let newest =
+        |seen: &Seen| seen.newest.map_or("none".to_owned(), |newest| identity(newest, writers));
     Difference::of(format!("number of new samples of {input}"), journal.new, now.new)
-        .or_else(|| Difference::of(format!("newest sample of {input}"), newest(journal), newest(now)))
-        .or_else(|| Difference::of(format!("samples of {input}"), digest(journal.digest), digest(now.digest)))
+        .or_else(|| {
+            Difference::of(format!("newest sample of {input}"), newest(journal), newest(now))
+        })
+        .or_else(|| {
+            Difference::of(
+                format!("samples of {input}"),
+                digest(journal.digest),
+                digest(now.digest),
+            )
+        })
         .or_else(|| {
             let what = format!("how many samples of {input} the lambda looked back");
             Difference::of(what, journal.reach, now.reach)
@@ -149,19 +181,24 @@ fn fault_in_words(fault: &Option<Fault>) -> String {
 /// As for twins, but bit for bit, and the attributes too: it is the same lambda.
 fn triggers_differ(journal: &Trigger, now: &Trigger, place: usize) -> Option<Difference> {
     let what = |part: &str| format!("trigger {place}: {part}");
-    let score = |trigger: &Trigger| trigger.score.map_or("none".to_owned(), |score| score.to_string());
+    let score =
+        |trigger: &Trigger| trigger.score.map_or("none".to_owned(), |score| score.to_string());
     let label = |trigger: &Trigger| format!("`{}`", trigger.label);
     let attribute = |value: Option<&Value>| value.map_or("none".to_owned(), Value::to_string);
-    let keys = |trigger: &Trigger| trigger.attributes.keys().cloned().collect::<Vec<_>>().join(", ");
+    let keys =
+        |trigger: &Trigger| trigger.attributes.keys().cloned().collect::<Vec<_>>().join(", ");
     Difference::of(what("kind"), journal.kind.as_str(), now.kind.as_str())
         .or_else(|| Difference::of(what("label"), label(journal), label(now)))
         .or_else(|| match journal.score.map(f64::to_bits) == now.score.map(f64::to_bits) {
             true => None,
-            false => Some(Difference { what: what("score"), journal: score(journal), now: score(now) }),
+            false => {
+                Some(Difference { what: what("score"), journal: score(journal), now: score(now) })
+            }
         })
         .or_else(|| {
             let (journal, now) = (&journal.attributes, &now.attributes);
-            let mut all = journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
+            let mut all =
+                journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
             all.find_map(|key| {
                 let what = what(&format!("attribute `{}`", excerpt(key)));
                 Difference::of(what, attribute(journal.get(key)), attribute(now.get(key)))

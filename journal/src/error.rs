@@ -100,8 +100,12 @@ impl Explain for JournalError {
                 "name the file that `gleaner replay --journal FILE` wrote, or a clip".to_owned()
             }
             JournalError::NoHeader { .. } => "its writer died at once: write a new one".to_owned(),
-            JournalError::Version { found } if *found > VERSION => "use the gleaner that wrote it".to_owned(),
-            JournalError::Version { .. } => "use the gleaner that wrote it, or write a new one".to_owned(),
+            JournalError::Version { found } if *found > VERSION => {
+                "use the gleaner that wrote it".to_owned()
+            }
+            JournalError::Version { .. } => {
+                "use the gleaner that wrote it, or write a new one".to_owned()
+            }
             JournalError::Read { .. } => return None,
             JournalError::Damaged { .. } => {
                 "it was changed after it was written: copy it again, or write a new one".to_owned()

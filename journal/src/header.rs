@@ -27,8 +27,9 @@ pub struct Header {
     pub files: Vec<FileDigest>,
     /// Its models.
     pub models: Vec<FileDigest>,
-    /// SHA-256 of what its manifest says that a decision can depend on, in hexadecimal digits: not of `[record]`, nor of
-    /// descriptions, so that a clip stays provable when its preroll is tuned; and not of `[limits]`, which are here as they were.
+    /// SHA-256 of what its manifest says that a decision can depend on, in hexadecimal digits: not
+    /// of `[record]`, nor of descriptions, so that a clip stays provable when its preroll is tuned;
+    /// and not of `[limits]`, which are here as they were.
     pub manifest: String,
     /// What it was allowed: the limits of its manifest, as a vehicle may have tightened them.
     #[serde(default)]
@@ -46,7 +47,8 @@ pub struct Header {
     /// What was replayed of the drive.
     #[serde(default, skip_serializing_if = "Part::is_all")]
     pub part: Part,
-    /// Wakes that came before the first in here: 0, unless this is the part of a journal that a clip holds.
+    /// Wakes that came before the first in here: 0, unless this is the part of a journal that a
+    /// clip holds.
     pub wakes_before: u64,
 }
 
@@ -66,7 +68,8 @@ impl Part {
     }
 
     fn in_words(self) -> String {
-        let time = |ns: Option<i64>, all: &str| ns.map_or_else(|| all.to_owned(), |ns| format!("{ns} ns"));
+        let time =
+            |ns: Option<i64>, all: &str| ns.map_or_else(|| all.to_owned(), |ns| format!("{ns} ns"));
         format!("from {} to {}", time(self.from_ns, "its start"), time(self.to_ns, "its end"))
     }
 }
@@ -106,8 +109,8 @@ pub struct End {
     pub drives: Vec<DriveDigest>,
 }
 
-/// A drive, by its content. A checksum is enough to notice that it is not the file that it was, and costs a replay of it
-/// 1 or 2 %; a SHA-256 would cost 15 %.
+/// A drive, by its content. A checksum is enough to notice that it is not the file that it was, and
+/// costs a replay of it 1 or 2 %; a SHA-256 would cost 15 %.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct DriveDigest {
     /// Name of the file, without its folder.
@@ -131,33 +134,50 @@ pub struct Difference {
 
 impl Difference {
     /// `what`, if the two sides are not the same text.
-    pub(super) fn of(what: impl Into<String>, journal: impl ToString, now: impl ToString) -> Option<Difference> {
+    pub(super) fn of(
+        what: impl Into<String>,
+        journal: impl ToString,
+        now: impl ToString,
+    ) -> Option<Difference> {
         let (journal, now) = (journal.to_string(), now.to_string());
-        (journal != now).then(|| Difference { what: what.into(), journal: visible(&journal), now: visible(&now) })
+        (journal != now).then(|| Difference {
+            what: what.into(),
+            journal: visible(&journal),
+            now: visible(&now),
+        })
     }
 }
 
 impl Header {
-    /// The most telling difference between what wrote this journal and what would run `now`; `None` if a decision that
-    /// differs is then the fault of neither build, config nor inputs.
+    /// The most telling difference between what wrote this journal and what would run `now`; `None`
+    /// if a decision that differs is then the fault of neither build, config nor inputs.
     ///
-    /// `gleaner`, `engine`, `machine` and `wakes_before` are not compared: a decision should not depend on them.
+    /// `gleaner`, `engine`, `machine` and `wakes_before` are not compared: a decision should not
+    /// depend on them.
     pub fn differs_from(&self, now: &Header) -> Option<Difference> {
         Difference::of("lambda", &self.lambda, &now.lambda)
             .or_else(|| Difference::of("version of the lambda", &self.version, &now.version))
             .or_else(|| Difference::of("kind of the lambda", self.kind.as_str(), now.kind.as_str()))
             .or_else(|| files_differ("build file", &self.files, &now.files))
             .or_else(|| {
-                Difference::of("manifest lambda.toml, less [record] and [limits]", &self.manifest, &now.manifest)
+                Difference::of(
+                    "manifest lambda.toml, less [record] and [limits]",
+                    &self.manifest,
+                    &now.manifest,
+                )
             })
             .or_else(|| limits_differ(&self.limits, &now.limits))
             .or_else(|| files_differ("model", &self.models, &now.models))
             .or_else(|| config_differs(&self.config, &now.config))
             .or_else(|| inputs_differ(&self.inputs, &now.inputs))
             .or_else(|| Difference::of("what wakes the lambda", self.woken_by(), now.woken_by()))
-            .or_else(|| Difference::of("remapped topics", self.remaps_in_words(), now.remaps_in_words()))
+            .or_else(|| {
+                Difference::of("remapped topics", self.remaps_in_words(), now.remaps_in_words())
+            })
             .or_else(|| Difference::of("clock", &self.clock, &now.clock))
-            .or_else(|| Difference::of("part of the drive", self.part.in_words(), now.part.in_words()))
+            .or_else(|| {
+                Difference::of("part of the drive", self.part.in_words(), now.part.in_words())
+            })
     }
 
     fn woken_by(&self) -> String {
@@ -171,7 +191,8 @@ impl Header {
     }
 
     fn remaps_in_words(&self) -> String {
-        let remaps: Vec<_> = self.remaps.iter().map(|(from, to)| format!("{from} is {to}")).collect();
+        let remaps: Vec<_> =
+            self.remaps.iter().map(|(from, to)| format!("{from} is {to}")).collect();
         if remaps.is_empty() { "none".to_owned() } else { remaps.join(", ") }
     }
 }
@@ -184,7 +205,8 @@ fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Optio
     };
     let (journal, now) = (by_path(journal), by_path(now));
     // What counts of the manifest has a digest of its own.
-    let mut paths: Vec<_> = journal.keys().chain(now.keys()).filter(|path| *path != "lambda.toml").collect();
+    let mut paths: Vec<_> =
+        journal.keys().chain(now.keys()).filter(|path| *path != "lambda.toml").collect();
     paths.sort();
     paths.into_iter().find_map(|path| {
         let (journal, now) = (journal.get(path), now.get(path));
@@ -192,7 +214,8 @@ fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Optio
             return None;
         }
         // Sixteen digits are enough to see it, unless somebody made them equal.
-        let start = |digest: Option<&String>| digest.and_then(|digest| digest.get(..16)).map(str::to_owned);
+        let start =
+            |digest: Option<&String>| digest.and_then(|digest| digest.get(..16)).map(str::to_owned);
         let cut = start(journal) != start(now);
         let side = |digest: Option<&String>| match digest {
             None => NOT_THERE.to_owned(),
@@ -207,7 +230,9 @@ fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Optio
 
 fn limits_differ(journal: &Limits, now: &Limits) -> Option<Difference> {
     let mut pairs = journal.in_words().into_iter().zip(now.in_words());
-    pairs.find_map(|((key, journal), (_, now))| Difference::of(format!("limit `{key}`"), journal, now))
+    pairs.find_map(|((key, journal), (_, now))| {
+        Difference::of(format!("limit `{key}`"), journal, now)
+    })
 }
 
 /// Values are compared as they are written, so that `-0.0` is not `0.0`, and 1 is not 1.0.
@@ -215,7 +240,11 @@ fn config_differs(journal: &Map<String, Value>, now: &Map<String, Value>) -> Opt
     let text = |value: Option<&Value>| value.map_or_else(|| NOT_THERE.to_owned(), Value::to_string);
     let keys = journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
     let mut differences = keys.filter_map(|key| {
-        Difference::of(format!("config `{}`", excerpt(key)), text(journal.get(key)), text(now.get(key)))
+        Difference::of(
+            format!("config `{}`", excerpt(key)),
+            text(journal.get(key)),
+            text(now.get(key)),
+        )
     });
     differences.next()
 }
@@ -227,6 +256,7 @@ fn inputs_differ(journal: &[JournalInput], now: &[JournalInput]) -> Option<Diffe
         format!("`{name}`: {topic}{from}, {type_name}")
     };
     let mut pairs = journal.iter().zip(now);
-    Difference::of("number of inputs", journal.len(), now.len())
-        .or_else(|| pairs.find_map(|(journal, now)| Difference::of("input", side(journal), side(now))))
+    Difference::of("number of inputs", journal.len(), now.len()).or_else(|| {
+        pairs.find_map(|(journal, now)| Difference::of("input", side(journal), side(now)))
+    })
 }

@@ -1,10 +1,11 @@
-//! Journals: of every wake of a lambda, what it saw and what it decided, so that a replay can make each decision again
-//! and compare it.
+//! Journals: of every wake of a lambda, what it saw and what it decided, so that a replay can make
+//! each decision again and compare it.
 //!
-//! A journal is compact, is only ever appended to, can be read after a crash, and a flipped byte in it is found and named.
-//! `header` and `entry` are what is kept, and what counts as a difference; `encode` and `decode` turn a wake into some
-//! 15 bytes and back; `block`, `write` and `read` are the file. `docs/journal.md` describes the bytes for readers in other
-//! languages. Nothing here knows where a journal lies, or runs a lambda.
+//! A journal is compact, is only ever appended to, can be read after a crash, and a flipped byte in
+//! it is found and named. `header` and `entry` are what is kept, and what counts as a difference;
+//! `encode` and `decode` turn a wake into some 15 bytes and back; `block`, `write` and `read` are
+//! the file. `docs/journal.md` describes the bytes for readers in other languages. Nothing here
+//! knows where a journal lies, or runs a lambda.
 
 mod before;
 mod block;
@@ -35,13 +36,16 @@ pub const VERSION: u16 = 1;
 /// Most inputs of a journal: as many as a manifest may have.
 pub const INPUTS_MAX: usize = gleaner_lambda::manifest::bounds::ITEMS_MAX;
 
-/// Most triggers of one wake. The host allows fewer; a reader of files needs a limit that outlasts the host's.
+/// Most triggers of one wake. The host allows fewer; a reader of files needs a limit that outlasts
+/// the host's.
 pub const TRIGGERS_MAX: usize = 64;
 
-/// Most bytes of one trigger's attributes as JSON: above what the host allows, with every character escaped.
+/// Most bytes of one trigger's attributes as JSON: above what the host allows, with every character
+/// escaped.
 pub const ATTRIBUTES_MAX: usize = 128 << 10;
 
-/// The bytes that stand for each kind of fault, which is its place here, and the word of `decisions.jsonl`.
+/// The bytes that stand for each kind of fault, which is its place here, and the word of
+/// `decisions.jsonl`.
 const FAULTS: [(FaultKind, &str); 8] = [
     (FaultKind::Fuel, "fuel"),
     (FaultKind::Deadline, "deadline"),

@@ -1,4 +1,5 @@
-//! Whole numbers in as few bytes as they need: seven bits in each, the lowest first; the eighth bit says that more follow.
+//! Whole numbers in as few bytes as they need: seven bits in each, the lowest first; the eighth bit
+//! says that more follow.
 
 /// Most bytes that a number takes.
 pub(super) const NUMBER_MAX: usize = 10;
@@ -12,7 +13,8 @@ pub(super) fn put(mut number: u64, out: &mut Vec<u8>) {
     out.push(number as u8);
 }
 
-/// The number at the begin of `bytes`, which is taken off; `None` if it has no end or more than 64 bits.
+/// The number at the begin of `bytes`, which is taken off; `None` if it has no end or more than 64
+/// bits.
 pub(super) fn take(bytes: &mut &[u8]) -> Option<u64> {
     let mut number = 0;
     for (index, byte) in bytes.iter().take(NUMBER_MAX).enumerate() {
@@ -30,7 +32,8 @@ pub(super) fn take(bytes: &mut &[u8]) -> Option<u64> {
     None
 }
 
-/// `difference` of two numbers as one that is small if they are close, whichever is larger: 0, -1, 1, -2 become 0, 1, 2, 3.
+/// `difference` of two numbers as one that is small if they are close, whichever is larger: 0, -1,
+/// 1, -2 become 0, 1, 2, 3.
 pub(super) fn fold(difference: u64) -> u64 {
     (difference << 1) ^ (((difference as i64) >> 63) as u64)
 }
@@ -61,7 +64,8 @@ mod tests {
 
     #[test]
     fn numbers_that_are_close_fold_to_small_ones() {
-        let folded = [0_i64, -1, 1, -2, 2, i64::MAX, i64::MIN].map(|difference| fold(difference as u64));
+        let folded =
+            [0_i64, -1, 1, -2, 2, i64::MAX, i64::MIN].map(|difference| fold(difference as u64));
         assert_eq!(folded, [0, 1, 2, 3, 4, u64::MAX - 1, u64::MAX]);
     }
 

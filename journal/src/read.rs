@@ -66,7 +66,9 @@ impl<R: Read> Reader<R> {
         let at = Place { offset: source.offset, ..Place::default() };
         let (kind, payload) = match source.block().map_err(|stop| stop.into_error(at))? {
             Next::Block(kind, payload) => (kind, payload),
-            Next::Nothing | Next::Torn(_) => return Err(JournalError::NoHeader { bytes: source.offset }),
+            Next::Nothing | Next::Torn(_) => {
+                return Err(JournalError::NoHeader { bytes: source.offset });
+            }
         };
         if kind != kind::HEADER {
             return Err(at.damaged(Damage::NotAHeader { kind }));
@@ -99,8 +101,8 @@ impl<R: Read> Reader<R> {
         &self.header
     }
 
-    /// The next wake; `None` after the last one that is whole. Then [`end`](Self::end) and [`cut_off`](Self::cut_off)
-    /// tell whether the writer came to its end.
+    /// The next wake; `None` after the last one that is whole. Then [`end`](Self::end) and
+    /// [`cut_off`](Self::cut_off) tell whether the writer came to its end.
     ///
     /// # Errors
     ///
@@ -113,10 +115,16 @@ impl<R: Read> Reader<R> {
                 State::Ended | State::CutOff { .. } => return Ok(None),
                 State::Failed(Some((at, why))) => return Err(at.damaged(why.clone())),
                 State::Failed(None) => {
-                    return Err(JournalError::Read { source: io::Error::other("an earlier read failed") });
+                    return Err(JournalError::Read {
+                        source: io::Error::other("an earlier read failed"),
+                    });
                 }
             }
-            let step = if self.left > 0 { self.decode().map(Some) } else { self.open_block().map(|()| None) };
+            let step = if self.left > 0 {
+                self.decode().map(Some)
+            } else {
+                self.open_block().map(|()| None)
+            };
             match step {
                 Ok(None) => {}
                 Ok(entry) => return Ok(entry),
@@ -303,7 +311,8 @@ impl<R: Read> Source<R> {
         Ok(Next::Block(kind, payload))
     }
 
-    /// After a loss of power, a file may have its new length and zeros for what was not written yet: it is torn.
+    /// After a loss of power, a file may have its new length and zeros for what was not written
+    /// yet: it is torn.
     fn zeros(&mut self, head: &[u8; HEAD_LEN]) -> Result<Next, Stop> {
         let mut torn_bytes = HEAD_LEN as u64;
         let mut zeros = head.iter().all(|byte| *byte == 0);

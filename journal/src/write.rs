@@ -12,8 +12,9 @@ use super::{ATTRIBUTES_MAX, INPUTS_MAX, TRIGGERS_MAX, VERSION};
 /// A block of wakes is written when it is as long: small enough that its checksum names a place.
 const CLOSE_AT: usize = 32 << 10;
 
-/// A block is written when it has as many wakes: a writer that dies loses fewer. Where a block ends depends on what is in it and
-/// on nothing else, so that the journals of equal runs are equal. Of 4 KB, its head and its first wake take some 60 bytes.
+/// A block is written when it has as many wakes: a writer that dies loses fewer. Where a block ends
+/// depends on what is in it and on nothing else, so that the journals of equal runs are equal. Of 4
+/// KB, its head and its first wake take some 60 bytes.
 const CLOSE_AT_WAKES: u64 = 256;
 
 /// Room for what comes before the wakes of a block, and is known when it is full.
@@ -21,8 +22,8 @@ const ROOM: usize = HEAD_LEN + NUMBER_MAX;
 
 /// Writes a journal.
 ///
-/// Wakes wait in a block until it is full or [`flush`](Self::flush) is called. A writer that is dropped without
-/// [`finish`](Self::finish) loses those, and leaves a journal that is cut off.
+/// Wakes wait in a block until it is full or [`flush`](Self::flush) is called. A writer that is
+/// dropped without [`finish`](Self::finish) loses those, and leaves a journal that is cut off.
 pub struct Writer<W: Write> {
     out: W,
     encoder: Encoder,
@@ -44,7 +45,9 @@ impl<W: Write> Writer<W> {
     pub fn begin(out: W, header: &Header) -> io::Result<Writer<W>> {
         let inputs = header.inputs.len();
         if inputs > INPUTS_MAX || header.event_input.is_some_and(|event| event >= inputs) {
-            return Err(refused("a header names more inputs than there may be, or one that is not there"));
+            return Err(refused(
+                "a header names more inputs than there may be, or one that is not there",
+            ));
         }
         let mut block = Vec::with_capacity(ROOM + 2 * CLOSE_AT);
         block.resize(ROOM, 0);
@@ -63,7 +66,8 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Those of `out`; after one, every further call fails, since the last block may be torn.
-    /// [`io::ErrorKind::InvalidInput`] for a wake that no reader would take: it is left out, and the next one may follow.
+    /// [`io::ErrorKind::InvalidInput`] for a wake that no reader would take: it is left out, and
+    /// the next one may follow.
     pub fn wake(&mut self, entry: &Entry) -> io::Result<()> {
         self.usable()?;
         self.fits(entry)?;
@@ -76,7 +80,11 @@ impl<W: Write> Writer<W> {
             return Err(refused("a wake is larger than a block of a journal"));
         }
         self.wakes += 1;
-        if payload >= CLOSE_AT || self.wakes >= CLOSE_AT_WAKES { self.write_wakes() } else { Ok(()) }
+        if payload >= CLOSE_AT || self.wakes >= CLOSE_AT_WAKES {
+            self.write_wakes()
+        } else {
+            Ok(())
+        }
     }
 
     /// Writes the wakes that wait, and flushes `out`.
@@ -126,7 +134,10 @@ impl<W: Write> Writer<W> {
             return Err(refused("a wake has more triggers than a journal takes"));
         }
         for trigger in &entry.triggers {
-            let long = || serde_json::to_string(&trigger.attributes).map_or(true, |json| json.len() > ATTRIBUTES_MAX);
+            let long = || {
+                serde_json::to_string(&trigger.attributes)
+                    .map_or(true, |json| json.len() > ATTRIBUTES_MAX)
+            };
             if !trigger.attributes.is_empty() && long() {
                 return Err(refused("a trigger has longer attributes than a journal takes"));
             }
@@ -156,7 +167,12 @@ impl<W: Write> Writer<W> {
     }
 
     /// Writes `value` in a block of its own, behind `bytes`, all at once.
-    fn write_json(&mut self, kind: u8, value: &impl Serialize, mut bytes: Vec<u8>) -> io::Result<()> {
+    fn write_json(
+        &mut self,
+        kind: u8,
+        value: &impl Serialize,
+        mut bytes: Vec<u8>,
+    ) -> io::Result<()> {
         let json = serde_json::to_vec(value)?;
         if json.len() > PAYLOAD_MAX {
             return Err(refused("the header or the end is larger than a block of a journal"));

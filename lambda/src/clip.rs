@@ -8,7 +8,8 @@ use crate::{Trigger, TriggerKind};
 
 /// One clip that was written: one line of `clips.jsonl`.
 ///
-/// The order of the fields is the order of the keys in the file. A number that nobody knows is `null`, never 0.
+/// The order of the fields is the order of the keys in the file. A number that nobody knows is
+/// `null`, never 0.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Clip {
     /// The file, relative to the folder that holds `clips.jsonl`, for example
@@ -18,7 +19,8 @@ pub struct Clip {
     pub thumbnail: Option<PathBuf>,
     /// Length of the file.
     pub bytes: u64,
-    /// Begin of what was asked for: of the earliest of its windows, in ns since the epoch of the drive.
+    /// Begin of what was asked for: of the earliest of its windows, in ns since the epoch of the
+    /// drive.
     pub from_ns: i64,
     /// End of what was asked for: of the latest of its windows, inclusive.
     pub to_ns: i64,
@@ -30,7 +32,8 @@ pub struct Clip {
     pub lambdas: Vec<ClipLambda>,
     /// Triggers of these lambdas, and commands in their name, within it.
     pub triggers: u64,
-    /// The first [`MOMENTS_MAX`](Self::MOMENTS_MAX) of the triggers; the file itself has more of them.
+    /// The first [`MOMENTS_MAX`](Self::MOMENTS_MAX) of the triggers; the file itself has more of
+    /// them.
     pub moments: Vec<Moment>,
     /// What was recorded, and what of it is missing.
     pub topics: Vec<ClipTopic>,
@@ -41,7 +44,8 @@ pub struct Clip {
 }
 
 impl Clip {
-    /// Most moments in one line, so that a lambda that triggers in every wake leaves a line that people can read.
+    /// Most moments in one line, so that a lambda that triggers in every wake leaves a line that
+    /// people can read.
     pub const MOMENTS_MAX: usize = 100;
 }
 
@@ -71,8 +75,8 @@ pub struct Moment {
     pub label: String,
     /// How sure or how strong; always finite.
     pub score: Option<f64>,
-    /// What else the lambda said of it; `None` where that takes more than [`Moment::ATTRIBUTE_BYTES`], and only the journal has
-    /// it.
+    /// What else the lambda said of it; `None` where that takes more than
+    /// [`Moment::ATTRIBUTE_BYTES`], and only the journal has it.
     pub attributes: Option<Map<String, Value>>,
     /// Stamp of the wake, in ns since the epoch of the drive.
     pub at_ns: i64,
@@ -100,11 +104,14 @@ impl Moment {
 }
 
 impl Moment {
-    /// The first key whose value is another in `other`, with both values as JSON; values are compared as they are written, so that
-    /// `-0.0` is not `0.0`.
+    /// The first key whose value is another in `other`, with both values as JSON; values are
+    /// compared as they are written, so that `-0.0` is not `0.0`.
     pub fn differs_from(&self, other: &Moment) -> Option<(String, [String; 2])> {
-        let values = [self, other].map(|moment| serde_json::to_value(moment).expect("a moment is plain data"));
-        let text = |side: usize, key: &str| values[side].get(key).map_or_else(|| "none".to_owned(), Value::to_string);
+        let values = [self, other]
+            .map(|moment| serde_json::to_value(moment).expect("a moment is plain data"));
+        let text = |side: usize, key: &str| {
+            values[side].get(key).map_or_else(|| "none".to_owned(), Value::to_string)
+        };
         let keys = values.iter().filter_map(Value::as_object).flat_map(Map::keys);
         let mut both = keys.map(|key| (key, [text(0, key), text(1, key)]));
         both.find(|(_, [one, other])| one != other).map(|(key, both)| (key.clone(), both))
@@ -205,9 +212,14 @@ mod tests {
 
     #[test]
     fn a_moment_that_no_lambda_caused_says_whence_it_came() {
-        let trigger =
-            Trigger { kind: TriggerKind::Stop, label: "x".to_owned(), score: None, attributes: serde_json::Map::new() };
-        let moment = Moment { source: Some("command on /c".to_owned()), ..Moment::of("l", &trigger, 1) };
+        let trigger = Trigger {
+            kind: TriggerKind::Stop,
+            label: "x".to_owned(),
+            score: None,
+            attributes: serde_json::Map::new(),
+        };
+        let moment =
+            Moment { source: Some("command on /c".to_owned()), ..Moment::of("l", &trigger, 1) };
         let line = serde_json::to_string(&moment).unwrap();
         assert!(line.ends_with(r#""at_ns":1,"source":"command on /c"}"#), "{line}");
         assert_eq!(serde_json::from_str::<Moment>(&line).unwrap(), moment);
@@ -219,7 +231,10 @@ mod tests {
         assert_eq!(moment.differs_from(moment), None);
         let zero = Moment { score: Some(0.0), ..moment.clone() };
         let other = Moment { score: Some(-0.0), at_ns: 7, ..moment.clone() };
-        assert_eq!(zero.differs_from(&other), Some(("score".to_owned(), ["0.0", "-0.0"].map(str::to_owned))));
+        assert_eq!(
+            zero.differs_from(&other),
+            Some(("score".to_owned(), ["0.0", "-0.0"].map(str::to_owned)))
+        );
         let command = Moment { source: Some("command on /c".to_owned()), ..moment.clone() };
         assert_eq!(
             moment.differs_from(&command).map(|(key, [one, _])| (key, one)),
@@ -245,7 +260,10 @@ mod tests {
         let topic = &mut unknown.topics[0];
         (topic.received, topic.lost, topic.overwritten, topic.too_big) = (None, None, None, None);
         let line = serde_json::to_string(&unknown).unwrap();
-        assert!(line.contains(r#""received":null,"lost":null,"overwritten":null,"too_big":null"#), "{line}");
+        assert!(
+            line.contains(r#""received":null,"lost":null,"overwritten":null,"too_big":null"#),
+            "{line}"
+        );
         assert_eq!(serde_json::from_str::<Clip>(&line).unwrap(), unknown);
     }
 }

@@ -2,9 +2,9 @@ use serde::{Deserialize, Serialize};
 
 /// The outcome of one wake of a lambda: one line of `decisions.jsonl`.
 ///
-/// The order of the fields is the order of the keys in the file. JSON has no number for infinities and NaN: whoever
-/// makes a decision refuses such scores and attributes first (a trigger with one is a fault of the lambda), because
-/// a line with one would carry `null` in its place.
+/// The order of the fields is the order of the keys in the file. JSON has no number for infinities
+/// and NaN: whoever makes a decision refuses such scores and attributes first (a trigger with one
+/// is a fault of the lambda), because a line with one would carry `null` in its place.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Decision {
     /// Log time of the sample or tick that woke the lambda, in ns since the epoch of the drive.
@@ -15,7 +15,8 @@ pub struct Decision {
     pub input: Option<String>,
     /// Topic of the waking sample; `None` for a tick.
     pub topic: Option<String>,
-    /// GUID of the sample's writer, 32 hexadecimal digits; `None` for a tick, or if the drive does not know it.
+    /// GUID of the sample's writer, 32 hexadecimal digits; `None` for a tick, or if the drive does
+    /// not know it.
     pub writer: Option<String>,
     /// Sequence number of the waking sample among those of its writer.
     pub seq: Option<u64>,
@@ -23,8 +24,8 @@ pub struct Decision {
     pub triggers: Vec<Trigger>,
     /// Why the wake ended early, if it did. Triggers that came before the fault still count.
     pub fault: Option<Fault>,
-    /// Fuel that the wake burnt; `None` for Python, which has none, and after [`FaultKind::Stack`]: how much it is until a stack is
-    /// full depends on the processor.
+    /// Fuel that the wake burnt; `None` for Python, which has none, and after [`FaultKind::Stack`]:
+    /// how much it is until a stack is full depends on the processor.
     pub fuel: Option<u64>,
     /// Time in the lambda, in ns. It differs from run to run, so twins are not compared by it.
     pub run_ns: u64,
@@ -83,7 +84,8 @@ pub struct Fault {
     pub kind: FaultKind,
     /// The cause, for people.
     pub message: String,
-    /// What the lambda used, in the unit of the limit: fuel units, ns for a deadline, bytes for memory.
+    /// What the lambda used, in the unit of the limit: fuel units, ns for a deadline, bytes for
+    /// memory.
     pub used: Option<u64>,
     /// What it was allowed, in the same unit.
     pub allowed: Option<u64>,
@@ -114,16 +116,20 @@ pub enum FaultKind {
 /// How far apart the scores of twins may be, relative to the larger magnitude of the two.
 pub const SCORE_TOLERANCE: f64 = 1e-5;
 
-/// What differs between the decisions of two twins on the same wake, for a person; `None` if they agree.
+/// What differs between the decisions of two twins on the same wake, for a person; `None` if they
+/// agree.
 ///
-/// Twins agree when `at_ns`, `topic`, `seq`, and the kinds and labels of the triggers are equal and scores are within
-/// [`SCORE_TOLERANCE`] of the larger one. Fuel, time and attributes may differ: they belong to the language.
+/// Twins agree when `at_ns`, `topic`, `seq`, and the kinds and labels of the triggers are equal and
+/// scores are within [`SCORE_TOLERANCE`] of the larger one. Fuel, time and attributes may differ:
+/// they belong to the language.
 pub fn twins_differ(a: &Decision, b: &Decision) -> Option<String> {
     if a.at_ns != b.at_ns {
         return Some(format!("at_ns is {} and {}", a.at_ns, b.at_ns));
     }
     if a.topic != b.topic {
-        let name = |topic: &Option<String>| topic.as_ref().map_or("none".to_owned(), |topic| format!("`{topic}`"));
+        let name = |topic: &Option<String>| {
+            topic.as_ref().map_or("none".to_owned(), |topic| format!("`{topic}`"))
+        };
         return Some(format!("topic is {} and {}", name(&a.topic), name(&b.topic)));
     }
     if a.seq != b.seq {
@@ -131,7 +137,11 @@ pub fn twins_differ(a: &Decision, b: &Decision) -> Option<String> {
         return Some(format!("seq is {} and {}", number(a.seq), number(b.seq)));
     }
     if a.triggers.len() != b.triggers.len() {
-        return Some(format!("the number of triggers is {} and {}", a.triggers.len(), b.triggers.len()));
+        return Some(format!(
+            "the number of triggers is {} and {}",
+            a.triggers.len(),
+            b.triggers.len()
+        ));
     }
     let mut pairs = a.triggers.iter().zip(&b.triggers).enumerate();
     pairs.find_map(|(index, (a, b))| {
@@ -223,7 +233,9 @@ mod tests {
             ..decision()
         };
         let line = serde_json::to_string(&tick).unwrap();
-        assert!(line.contains(r#""cause":"tick","input":null,"topic":null,"writer":null,"seq":null,"triggers":[]"#));
+        assert!(line.contains(
+            r#""cause":"tick","input":null,"topic":null,"writer":null,"seq":null,"triggers":[]"#
+        ));
         assert!(line.contains(
             r#""fault":{"kind":"host_call","message":"offset 9 is beyond the frame","used":null,"allowed":8}"#
         ));
@@ -261,7 +273,10 @@ mod tests {
             (|twin| twin.seq = Some(8), "seq is 7 and 8"),
             (|twin| twin.triggers.clear(), "the number of triggers is 1 and 0"),
             (|twin| twin.triggers[0].kind = TriggerKind::Stop, "trigger 1: kind is event and stop"),
-            (|twin| twin.triggers[0].label = "x".to_owned(), "trigger 1: label is `hard-brake` and `x`"),
+            (
+                |twin| twin.triggers[0].label = "x".to_owned(),
+                "trigger 1: label is `hard-brake` and `x`",
+            ),
         ];
         for (change, difference) in cases {
             assert_eq!(changed(change).as_deref(), Some(difference));

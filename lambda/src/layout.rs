@@ -1,8 +1,10 @@
-//! The build folder of a lambda, `DIR/build/`: what `gleaner build DIR` leaves and every other command uses.
+//! The build folder of a lambda, `DIR/build/`: what `gleaner build DIR` leaves and every other
+//! command uses.
 //!
-//! It is complete: manifest, entry, models, and the message definitions in `msg/`, for when a transport cannot tell
-//! them. Nothing here builds, and no reader of a build folder writes into it. Whoever made the folder may have put anything there, so
-//! that its files are checked before one of them is used.
+//! It is complete: manifest, entry, models, and the message definitions in `msg/`, for when a
+//! transport cannot tell them. Nothing here builds, and no reader of a build folder writes into it.
+//! Whoever made the folder may have put anything there, so that its files are checked before one of
+//! them is used.
 
 use std::fs;
 use std::io;
@@ -19,7 +21,8 @@ pub const FILE_MAX: ByteSize = ByteSize::gib(2);
 /// Most bytes of all files of a build together.
 pub const BUILD_MAX: ByteSize = ByteSize::gib(4);
 
-/// Most files of a build: more than any has, by far. With names of 255 bytes they fit into the header of a journal.
+/// Most files of a build: more than any has, by far. With names of 255 bytes they fit into the
+/// header of a journal.
 pub const FILES_MAX: usize = 4_000;
 
 /// Longest component that is compiled.
@@ -39,20 +42,26 @@ impl BuildDir {
 
     /// The build folder of the lambda in `lambda_dir`, if it is there and no source is newer.
     ///
-    /// The age of a build is that of its `lambda.toml`, which whoever builds writes last. What its sources are,
-    /// [`Sources`] says; one that is gone since makes no build old.
+    /// The age of a build is that of its `lambda.toml`, which whoever builds writes last. What its
+    /// sources are, [`Sources`] says; one that is gone since makes no build old.
     ///
     /// # Errors
     ///
-    /// [`LayoutError::NoFolder`], [`LayoutError::File`] or [`LayoutError::IsBuild`] if `lambda_dir` is no lambda's
-    /// folder, [`LayoutError::Missing`], [`LayoutError::Older`], [`LayoutError::Manifest`] if the build's manifest is
-    /// refused, or [`LayoutError::Read`], [`LayoutError::TooMany`] and [`LayoutError::TooLarge`] as for [`files`](Self::files).
+    /// [`LayoutError::NoFolder`], [`LayoutError::File`] or [`LayoutError::IsBuild`] if `lambda_dir`
+    /// is no lambda's folder, [`LayoutError::Missing`], [`LayoutError::Older`],
+    /// [`LayoutError::Manifest`] if the build's manifest is refused, or [`LayoutError::Read`],
+    /// [`LayoutError::TooMany`] and [`LayoutError::TooLarge`] as for [`files`](Self::files).
     pub fn check_fresh(lambda_dir: impl AsRef<Path>) -> Result<BuildDir, LayoutError> {
         let dir = lambda_dir.as_ref();
         let build = BuildDir::of(dir);
         let built = match modified(&build.manifest_path()) {
             Ok(time) => time,
-            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+            Err(error)
+                if matches!(
+                    error.kind(),
+                    io::ErrorKind::NotFound | io::ErrorKind::NotADirectory
+                ) =>
+            {
                 return Err(missing(dir));
             }
             Err(source) => {
@@ -63,8 +72,12 @@ impl BuildDir {
         let text = Manifest::read(build.path())?;
         // An editor may have removed a file meanwhile: then it is no source.
         let age = |source: &Path| modified(&dir.join(source)).ok().filter(|age| *age > built);
-        let older = |source: &Path| LayoutError::Older { dir: dir.to_owned(), source_file: source.to_owned() };
-        // Before what it says: a newer manifest may name other sources, and the old one need not suit this Gleaner.
+        let older = |source: &Path| LayoutError::Older {
+            dir: dir.to_owned(),
+            source_file: source.to_owned(),
+        };
+        // Before what it says: a newer manifest may name other sources, and the old one need not
+        // suit this Gleaner.
         let manifest = Path::new("lambda.toml");
         if age(manifest).is_some() {
             return Err(older(manifest));
@@ -72,17 +85,19 @@ impl BuildDir {
         let sources = Sources::of(dir, &Manifest::parse(&text, build.manifest_path())?)?;
         match sources.iter().filter_map(|source| age(source).map(|age| (age, source))).max() {
             Some((_, source)) => Err(older(source)),
-            // The interpreter would wait for a pipe, and a digest of a file without an end would not end.
+            // The interpreter would wait for a pipe, and a digest of a file without an end would
+            // not end.
             None => build.files().map(|_| build),
         }
     }
 
-    /// The paths of its files in it, in order. All of them are regular files that lie in it, wherever links lead, and they are no more
-    /// and no longer than those of a build may be.
+    /// The paths of its files in it, in order. All of them are regular files that lie in it,
+    /// wherever links lead, and they are no more and no longer than those of a build may be.
     ///
     /// # Errors
     ///
-    /// [`LayoutError::Read`] if a folder cannot be listed or one of them is something else, [`LayoutError::TooMany`], [`LayoutError::TooLarge`].
+    /// [`LayoutError::Read`] if a folder cannot be listed or one of them is something else,
+    /// [`LayoutError::TooMany`], [`LayoutError::TooLarge`].
     pub fn files(&self) -> Result<Vec<PathBuf>, LayoutError> {
         let (mut files, mut bytes, mut folders) = (Vec::new(), 0_u64, vec![PathBuf::new()]);
         while let Some(folder) = folders.pop() {
@@ -199,9 +214,9 @@ impl Explain for LayoutError {
                 Some(format!("run `gleaner build {}`", shell_word(dir)))
             }
             LayoutError::Manifest(error) => error.help(),
-            LayoutError::TooMany { .. } | LayoutError::TooLarge { .. } => {
-                Some("keep in the lambda's folder what belongs to it, and build it again".to_owned())
-            }
+            LayoutError::TooMany { .. } | LayoutError::TooLarge { .. } => Some(
+                "keep in the lambda's folder what belongs to it, and build it again".to_owned(),
+            ),
             LayoutError::Read { source, .. } => NotPlain::of(source).map(NotPlain::help),
         }
     }
@@ -262,13 +277,19 @@ mod tests {
     fn is_older_than(dir: &Scratch, source: &str) {
         let error = BuildDir::check_fresh(dir.root()).unwrap_err();
         let shown = dir.root().display();
-        assert_eq!(error.to_string(), format!("the build of lambda `{shown}` is older than its source `{source}`"));
+        assert_eq!(
+            error.to_string(),
+            format!("the build of lambda `{shown}` is older than its source `{source}`")
+        );
         assert_eq!(error.help(), Some(format!("run `gleaner build {shown}`")));
     }
 
     #[test]
     fn a_build_newer_than_every_source_is_used() {
-        let dir = lambda("wasm", &["lambda.toml", "Cargo.toml", "src/lib.rs", "msg/a/msg/B.msg", "build/lambda.toml"]);
+        let dir = lambda(
+            "wasm",
+            &["lambda.toml", "Cargo.toml", "src/lib.rs", "msg/a/msg/B.msg", "build/lambda.toml"],
+        );
         let build = BuildDir::check_fresh(dir.root()).unwrap();
         assert_eq!(build.path(), dir.path("build"));
         assert_eq!(build.manifest_path(), dir.path("build/lambda.toml"));
@@ -276,8 +297,7 @@ mod tests {
 
     #[test]
     fn the_entry_lies_in_the_build_folder() {
-        let text =
-            "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'";
+        let text = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'";
         let manifest = Manifest::parse(text, "lambda.toml").unwrap();
         assert_eq!(BuildDir::of("x").entry_path(&manifest), Path::new("x/build/main.py"));
     }
@@ -299,7 +319,11 @@ mod tests {
         for (name, message, help) in [
             ("nowhere", format!("there is no folder `{root}/nowhere`"), folder_first.clone()),
             ("lambda.toml", format!("`{root}/lambda.toml` is no folder"), folder_first),
-            ("build", format!("`{root}/build` is the build folder of a lambda"), format!("did you mean `{root}`?")),
+            (
+                "build",
+                format!("`{root}/build` is the build folder of a lambda"),
+                format!("did you mean `{root}`?"),
+            ),
         ] {
             let error = BuildDir::check_fresh(dir.path(name)).unwrap_err();
             assert_eq!((error.to_string(), error.help()), (message, Some(help)));
@@ -315,17 +339,33 @@ mod tests {
 
     #[test]
     fn a_build_older_than_a_source_is_refused_and_names_the_newest() {
-        for source in ["lambda.toml", "Cargo.toml", "build.rs", "src/a/b.rs", "msg/a/msg/B.msg", "models/m.onnx"] {
+        for source in [
+            "lambda.toml",
+            "Cargo.toml",
+            "build.rs",
+            "src/a/b.rs",
+            "msg/a/msg/B.msg",
+            "models/m.onnx",
+        ] {
             is_older_than(&lambda("wasm", &["build/lambda.toml", "src/lib.rs", source]), source);
         }
-        for source in ["lambda.toml", "main.py", "package/part.py", "msg/a/msg/B.msg", "models/m.onnx"] {
+        for source in
+            ["lambda.toml", "main.py", "package/part.py", "msg/a/msg/B.msg", "models/m.onnx"]
+        {
             is_older_than(&lambda("python", &["build/lambda.toml", "other.py", source]), source);
         }
     }
 
     #[test]
     fn what_is_not_built_in_may_be_newer() {
-        for file in ["README.md", "tests/test_main.py", "out/x.py", ".venv/x.py", "build/main.py", "Cargo.toml"] {
+        for file in [
+            "README.md",
+            "tests/test_main.py",
+            "out/x.py",
+            ".venv/x.py",
+            "build/main.py",
+            "Cargo.toml",
+        ] {
             let dir = lambda("python", &["lambda.toml", "main.py", "build/lambda.toml", file]);
             assert!(BuildDir::check_fresh(dir.root()).is_ok(), "{file}");
         }
@@ -337,7 +377,10 @@ mod tests {
 
     #[test]
     fn a_build_holds_files_of_its_own_of_a_bounded_number_and_length() {
-        let dir = lambda("python", &["lambda.toml", "build/main.py", "build/msg/a/msg/B.msg", "build/lambda.toml"]);
+        let dir = lambda(
+            "python",
+            &["lambda.toml", "build/main.py", "build/msg/a/msg/B.msg", "build/lambda.toml"],
+        );
         let refused = |said: &str| {
             let error = BuildDir::check_fresh(dir.root()).unwrap_err();
             assert_eq!(error.exit(), Exit::Usage);
@@ -345,7 +388,10 @@ mod tests {
             assert!(text.contains(said) && text.contains("help:"), "{text}");
         };
         let build = BuildDir::check_fresh(dir.root()).unwrap();
-        assert_eq!(build.files().unwrap(), ["lambda.toml", "main.py", "msg/a/msg/B.msg"].map(PathBuf::from));
+        assert_eq!(
+            build.files().unwrap(),
+            ["lambda.toml", "main.py", "msg/a/msg/B.msg"].map(PathBuf::from)
+        );
 
         let outside = dir.write("secret", "secret");
         std::os::unix::fs::symlink(&outside, dir.path("build/x")).unwrap();
@@ -380,7 +426,12 @@ mod tests {
         assert!(matches!(error, LayoutError::Manifest(_)), "{error}");
         assert!(error.help().is_some());
         let later = SystemTime::now() + Duration::from_secs(60);
-        File::options().write(true).open(dir.path("lambda.toml")).unwrap().set_modified(later).unwrap();
+        File::options()
+            .write(true)
+            .open(dir.path("lambda.toml"))
+            .unwrap()
+            .set_modified(later)
+            .unwrap();
         is_older_than(&dir, "lambda.toml");
     }
 }

@@ -1,5 +1,5 @@
-//! What a lambda and its results are: the manifest with its limits, the build folder, decisions, clips, log lines, and the files of
-//! a run.
+//! What a lambda and its results are: the manifest with its limits, the build folder, decisions,
+//! clips, log lines, and the files of a run.
 //!
 //! Nothing here runs a lambda.
 
@@ -18,7 +18,9 @@ mod sources;
 mod vehicle;
 
 pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
-pub use decision::{Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ};
+pub use decision::{
+    Cause, Decision, Fault, FaultKind, SCORE_TOLERANCE, Trigger, TriggerKind, twins_differ,
+};
 pub use layout::{BuildDir, LayoutError};
 pub use log_line::{LogLevel, LogLine};
 pub use manifest::{Manifest, ManifestError};

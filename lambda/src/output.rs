@@ -1,4 +1,5 @@
-//! The files of a run: `decisions.jsonl`, `log.jsonl`, `summary.json`. Live, `gleaner-shim` writes them; in a replay, the runtime.
+//! The files of a run: `decisions.jsonl`, `log.jsonl`, `summary.json`. Live, `gleaner-shim` writes
+//! them; in a replay, the runtime.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -49,7 +50,10 @@ impl Explain for OutputError {
             (Some(_), _) => InTheWay::HELP.to_owned(),
             // A folder of results is created; that of a journal is not.
             (None, Some(folder)) if self.source.kind() == io::ErrorKind::NotFound => {
-                format!("there is no folder `{}`: create it first, or name a file in another", folder.display())
+                format!(
+                    "there is no folder `{}`: create it first, or name a file in another",
+                    folder.display()
+                )
             }
             _ => "make room or choose another folder: --out DIR".to_owned(),
         })
@@ -69,7 +73,8 @@ pub struct Output {
 }
 
 impl Output {
-    /// Makes `folder` and starts its files anew. With `all`, decisions without trigger and fault are written too.
+    /// Makes `folder` and starts its files anew. With `all`, decisions without trigger and fault
+    /// are written too.
     ///
     /// # Errors
     ///
@@ -84,15 +89,21 @@ impl Output {
     ///
     /// [`OutputError`] names the file.
     pub fn begin(folder: &Path, all: bool, again: bool) -> Result<Self, OutputError> {
-        fs::create_dir_all(folder).map_err(|source| OutputError { path: folder.to_owned(), source })?;
-        // A summary says that the files beside it are whole; what was read earlier, and a page about it, would be taken for this run's.
+        fs::create_dir_all(folder)
+            .map_err(|source| OutputError { path: folder.to_owned(), source })?;
+        // A summary says that the files beside it are whole; what was read earlier, and a page
+        // about it, would be taken for this run's.
         let replaced = [SUMMARY, SIGNALS, REPORT];
-        // A writer that was killed left its part: it takes room, and the next one may not come so far.
-        let of_earlier = replaced.iter().flat_map(|name| [(*name).to_owned(), format!("{name}.part")]);
+        // A writer that was killed left its part: it takes room, and the next one may not come so
+        // far.
+        let of_earlier =
+            replaced.iter().flat_map(|name| [(*name).to_owned(), format!("{name}.part")]);
         for name in of_earlier.chain((!again).then(|| LOG_BEFORE.to_owned())) {
             let path = folder.join(name);
             match fs::remove_file(&path) {
-                Err(source) if source.kind() != io::ErrorKind::NotFound => return Err(OutputError { path, source }),
+                Err(source) if source.kind() != io::ErrorKind::NotFound => {
+                    return Err(OutputError { path, source });
+                }
                 _ => {}
             }
         }
@@ -101,7 +112,8 @@ impl Output {
         Ok(Self { folder: folder.to_owned(), decisions, log, all })
     }
 
-    /// Keeps the log from growing for ever: beyond `bytes` it goes on in a new file, and of the earlier ones only the last is kept.
+    /// Keeps the log from growing for ever: beyond `bytes` it goes on in a new file, and of the
+    /// earlier ones only the last is kept.
     #[must_use]
     pub fn with_log_of(mut self, bytes: u64) -> Self {
         self.log.most = Some((bytes, self.folder.join(LOG_BEFORE)));
@@ -169,8 +181,8 @@ impl Output {
     }
 }
 
-/// A file of lines. It grows by whole lines, so that it can be read whenever this process ends. Only a kill in the middle of a write
-/// leaves a part of one, which whoever goes on cuts off.
+/// A file of lines. It grows by whole lines, so that it can be read whenever this process ends.
+/// Only a kill in the middle of a write leaves a part of one, which whoever goes on cuts off.
 struct Lines {
     path: PathBuf,
     file: File,
@@ -188,10 +200,13 @@ const PENDING_BYTES: usize = 64 << 10;
 
 impl Lines {
     fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
-        let begun = if again { end_in_a_whole_line(&path) } else { own_file::anew(&path).map(drop) };
+        let begun =
+            if again { end_in_a_whole_line(&path) } else { own_file::anew(&path).map(drop) };
         let opened = begun.and_then(|()| own_file::append(&path));
         match opened {
-            Ok(file) => Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None }),
+            Ok(file) => {
+                Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None })
+            }
             Err(source) => Err(OutputError { path, source }),
         }
     }
@@ -210,8 +225,11 @@ impl Lines {
         }
         let renewed = self.renew();
         let before = self.file.metadata().map(|metadata| metadata.len());
-        let is_full = before.as_ref().is_ok_and(|before| before + self.pending.len() as u64 > LINES_MAX.bytes());
-        let bounded = renewed.and_then(|()| if is_full { Err(io::ErrorKind::FileTooLarge.into()) } else { Ok(()) });
+        let is_full = before
+            .as_ref()
+            .is_ok_and(|before| before + self.pending.len() as u64 > LINES_MAX.bytes());
+        let bounded = renewed
+            .and_then(|()| if is_full { Err(io::ErrorKind::FileTooLarge.into()) } else { Ok(()) });
         let written = bounded.and_then(|()| self.file.write_all(&self.pending));
         let waited = std::mem::take(&mut self.waiting);
         self.pending.clear();
@@ -268,7 +286,9 @@ mod tests {
     fn said(folder: &Path, name: &str) -> Vec<i64> {
         let text = fs::read_to_string(folder.join(name)).unwrap_or_default();
         text.lines()
-            .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["at_ns"].as_i64().unwrap())
+            .map(|line| {
+                serde_json::from_str::<serde_json::Value>(line).unwrap()["at_ns"].as_i64().unwrap()
+            })
             .collect()
     }
 
@@ -280,11 +300,17 @@ mod tests {
             (|precious, path| symlink(precious, path).unwrap(), "it is a link"),
             (|precious, path| fs::hard_link(precious, path).unwrap(), "the file has other names"),
             (
-                |_, path| assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success()),
+                |_, path| {
+                    assert!(
+                        std::process::Command::new("mkfifo").arg(path).status().unwrap().success()
+                    )
+                },
                 "it is no file",
             ),
         ];
-        let cases = ["decisions.jsonl", "log.jsonl"].into_iter().flat_map(|name| put.map(|put| (name, put)));
+        let cases = ["decisions.jsonl", "log.jsonl"]
+            .into_iter()
+            .flat_map(|name| put.map(|put| (name, put)));
         for (name, (put, why)) in cases {
             let folder = Scratch::new();
             let (precious, path) = (folder.path("precious"), folder.path(name));
@@ -293,7 +319,10 @@ mod tests {
             let error = Output::begin(folder.root(), true, true).err().unwrap();
             assert_eq!(error.help().unwrap(), "remove it, or choose another folder: --out DIR");
             let text = gleaner_base::Failure::from(error).to_string();
-            assert!(text.contains(&format!("`{}`", path.display())) && text.contains(why), "{text}");
+            assert!(
+                text.contains(&format!("`{}`", path.display())) && text.contains(why),
+                "{text}"
+            );
             // What begins anew takes its place.
             Output::begin(folder.root(), true, false).unwrap();
             assert!(said(folder.root(), name).is_empty());
@@ -303,7 +332,9 @@ mod tests {
 
     #[test]
     fn a_folder_that_is_missing_is_named_and_a_full_disk_wants_room() {
-        let help = |path: &str, kind: io::ErrorKind| OutputError { path: path.into(), source: kind.into() }.help();
+        let help = |path: &str, kind: io::ErrorKind| {
+            OutputError { path: path.into(), source: kind.into() }.help()
+        };
         let missing = help("o/wakes.journal", io::ErrorKind::NotFound).unwrap();
         assert_eq!(missing, "there is no folder `o`: create it first, or name a file in another");
         let full = help("o/wakes.journal", io::ErrorKind::StorageFull).unwrap();
@@ -316,7 +347,9 @@ mod tests {
         let mut output = Output::create(folder.root(), true).unwrap();
         let log = File::options().write(true).open(folder.path("log.jsonl")).unwrap();
         log.set_len(LINES_MAX.bytes() - 10).unwrap();
-        output.log(&[LogLine { at_ns: 1, level: LogLevel::Info, message: "x".to_owned() }]).unwrap();
+        output
+            .log(&[LogLine { at_ns: 1, level: LogLevel::Info, message: "x".to_owned() }])
+            .unwrap();
         assert_eq!(output.flush().unwrap_err().source.kind(), io::ErrorKind::FileTooLarge);
         assert_eq!((output.lost(), log.metadata().unwrap().len()), (1, LINES_MAX.bytes() - 10));
     }
@@ -373,7 +406,11 @@ mod tests {
             }
             drop(Output::begin(folder.root(), true, true).unwrap());
             for name in ["decisions.jsonl", "log.jsonl"] {
-                assert!(fs::read_to_string(folder.path(name)).unwrap() == after, "{name} of {} bytes", before.len());
+                assert!(
+                    fs::read_to_string(folder.path(name)).unwrap() == after,
+                    "{name} of {} bytes",
+                    before.len()
+                );
             }
         }
     }

@@ -7,9 +7,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::manifest::ConfigValue;
 
-/// What a replayed lambda read, and what its wakes cost: the file `signals.json`, from which a report is drawn.
+/// What a replayed lambda read, and what its wakes cost: the file `signals.json`, from which a
+/// report is drawn.
 ///
-/// Its size is bounded: a curve has [`Signals::POINTS_MAX`] points, a lambda [`Signals::CURVES_MAX`] curves.
+/// Its size is bounded: a curve has [`Signals::POINTS_MAX`] points, a lambda
+/// [`Signals::CURVES_MAX`] curves.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Signals {
     /// The configuration that held, by key.
@@ -22,7 +24,8 @@ pub struct Signals {
     pub run_ns: Spread,
     /// Fuel of each wake; none in Python, which has no fuel.
     pub fuel: Option<Spread>,
-    /// What a camera saw at wakes that triggered: [`Signals::PICTURES_MAX`] at most, spread over all of them.
+    /// What a camera saw at wakes that triggered: [`Signals::PICTURES_MAX`] at most, spread over
+    /// all of them.
     pub pictures: Vec<Picture>,
     /// Wakes that triggered and have no picture, since there were more of them, or no image.
     pub pictures_left_out: u64,
@@ -44,9 +47,11 @@ pub struct Curve {
     pub input: String,
     /// Its topic, after remapping.
     pub topic: String,
-    /// The path of the field, such as `linear_acceleration.x`, or what the host worked out of a picture: `mean luma`.
+    /// The path of the field, such as `linear_acceleration.x`, or what the host worked out of a
+    /// picture: `mean luma`.
     pub path: String,
-    /// Samples that it was read of, with stamps that rise: of equal ones the first. Those between them were not looked at.
+    /// Samples that it was read of, with stamps that rise: of equal ones the first. Those between
+    /// them were not looked at.
     pub samples: u64,
     /// Samples in which it was NaN or infinite: these are in no point.
     pub not_finite: u64,
@@ -99,6 +104,7 @@ pub struct Picture {
     pub topic: String,
     /// Stamp of the image: the newest that had arrived.
     pub image_ns: i64,
-    /// A small JPEG, relative to the folder that holds `signals.json`, for example `pictures/trigger-000000.jpg`.
+    /// A small JPEG, relative to the folder that holds `signals.json`, for example
+    /// `pictures/trigger-000000.jpg`.
     pub file: PathBuf,
 }

@@ -10,21 +10,25 @@ use gleaner_base::{ByteSize, NotPlain};
 /// Folders beside the manifest that hold no Python of the lambda: what tools made, and its tests.
 const LEFT_OUT: [&str; 4] = ["build", "out", "target", "tests"];
 
-/// Longest Python file or message definition that a build takes. The longest of the standard library has 700 KiB.
+/// Longest Python file or message definition that a build takes. The longest of the standard
+/// library has 700 KiB.
 pub const SOURCE_MAX: ByteSize = ByteSize::mib(16);
 
-/// What a build is made of besides `lambda.toml`: the one rule for whoever builds, and for whoever asks whether a build
-/// is still good.
+/// What a build is made of besides `lambda.toml`: the one rule for whoever builds, and for whoever
+/// asks whether a build is still good.
 ///
-/// Paths are relative to the lambda's folder. What the manifest names is listed whether it exists or not; the rest is
-/// found in the folder. Hidden files and folders, `__pycache__/` and virtual environments (what holds a `pyvenv.cfg`) are left
-/// out, and links to folders are not followed: they may lead in circles.
+/// Paths are relative to the lambda's folder. What the manifest names is listed whether it exists
+/// or not; the rest is found in the folder. Hidden files and folders, `__pycache__/` and virtual
+/// environments (what holds a `pyvenv.cfg`) are left out, and links to folders are not followed:
+/// they may lead in circles.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sources {
-    /// What lies in the build under the same name: models, message definitions (`msg/**/*.msg`), and of a Python lambda
-    /// its entry and every `.py` file that is not in `build/`, `out/`, `target/` or `tests/` beside the manifest.
+    /// What lies in the build under the same name: models, message definitions (`msg/**/*.msg`),
+    /// and of a Python lambda its entry and every `.py` file that is not in `build/`, `out/`,
+    /// `target/` or `tests/` beside the manifest.
     pub copied: BTreeSet<PathBuf>,
-    /// What is compiled into the entry of a Rust lambda: `Cargo.toml`, `build.rs`, and everything in `src/`.
+    /// What is compiled into the entry of a Rust lambda: `Cargo.toml`, `build.rs`, and everything
+    /// in `src/`.
     pub compiled: BTreeSet<PathBuf>,
 }
 
@@ -33,7 +37,8 @@ impl Sources {
     ///
     /// # Errors
     ///
-    /// [`LayoutError::Read`] if a folder cannot be listed, or is a link that leads out of the lambda's folder.
+    /// [`LayoutError::Read`] if a folder cannot be listed, or is a link that leads out of the
+    /// lambda's folder.
     pub fn of(lambda_dir: impl AsRef<Path>, manifest: &Manifest) -> Result<Sources, LayoutError> {
         let dir = lambda_dir.as_ref();
         let models = manifest.models.iter().map(|model| model.file.as_path().to_owned());
@@ -42,8 +47,11 @@ impl Sources {
         match manifest.lambda.kind {
             Kind::Python => {
                 sources.copied.insert(manifest.lambda.entry.as_path().to_owned());
-                let is_of_the_lambda = |folder: &Path| !LEFT_OUT.iter().any(|left_out| folder == Path::new(left_out));
-                sources.copied.extend(files(dir, "", is_of_the_lambda, |file| has_extension(file, "py"))?);
+                let is_of_the_lambda =
+                    |folder: &Path| !LEFT_OUT.iter().any(|left_out| folder == Path::new(left_out));
+                sources
+                    .copied
+                    .extend(files(dir, "", is_of_the_lambda, |file| has_extension(file, "py"))?);
             }
             Kind::Wasm => {
                 sources.compiled.extend(["Cargo.toml", "build.rs"].map(PathBuf::from));
@@ -59,7 +67,8 @@ impl Sources {
     }
 }
 
-/// The files in the folder `start` of `dir`, which need not exist, and in the folders below that `enters` allows.
+/// The files in the folder `start` of `dir`, which need not exist, and in the folders below that
+/// `enters` allows.
 fn files(
     dir: &Path,
     start: &str,
@@ -95,7 +104,8 @@ fn files(
     Ok(found)
 }
 
-/// Refuses the folder `start` of `dir` if it is a link that leads elsewhere: anything could be listed there.
+/// Refuses the folder `start` of `dir` if it is a link that leads elsewhere: anything could be
+/// listed there.
 fn lies_in(dir: &Path, start: &str) -> Result<(), LayoutError> {
     let path = dir.join(start);
     let (Ok(target), Ok(folder)) = (path.canonicalize(), dir.canonicalize()) else { return Ok(()) };
@@ -122,7 +132,8 @@ mod tests {
         );
         let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
         let Sources { copied, compiled } = Sources::of(dir.root(), &manifest).unwrap();
-        [copied, compiled].map(|files| files.iter().map(|file| file.display().to_string()).collect())
+        [copied, compiled]
+            .map(|files| files.iter().map(|file| file.display().to_string()).collect())
     }
 
     /// A folder that could belong to a lambda of either kind.
@@ -157,7 +168,10 @@ mod tests {
     #[test]
     fn python_is_copied_but_for_what_tools_made_and_tests() {
         let [copied, compiled] = sources(&folder(), "python", "main.py");
-        assert_eq!(copied, ["main.py", "models/m.onnx", "msg/a/msg/B.msg", "other.py", "part/build/deep.py"]);
+        assert_eq!(
+            copied,
+            ["main.py", "models/m.onnx", "msg/a/msg/B.msg", "other.py", "part/build/deep.py"]
+        );
         assert!(compiled.is_empty());
     }
 
@@ -185,7 +199,10 @@ mod tests {
             let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
             let error = gleaner_failure(Sources::of(dir.root(), &manifest).unwrap_err());
             assert!(
-                error.contains(&format!("{name}`\n  cause: it is a link to `{}`", elsewhere.root().display())),
+                error.contains(&format!(
+                    "{name}`\n  cause: it is a link to `{}`",
+                    elsewhere.root().display()
+                )),
                 "{error}"
             );
             std::fs::remove_file(dir.path(name)).unwrap();

@@ -1,4 +1,5 @@
-//! `vehicle.toml`: what the owner of a vehicle says about all lambdas on it. Read as a manifest is, and refused in the same words.
+//! `vehicle.toml`: what the owner of a vehicle says about all lambdas on it. Read as a manifest is,
+//! and refused in the same words.
 
 use std::path::Path;
 
@@ -8,7 +9,8 @@ use crate::manifest::{self, Limits, ManifestError};
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Vehicle {
-    /// `[limits]`: the most that a lambda gets here. What the file does not name is at the maximum that any lambda may ask for.
+    /// `[limits]`: the most that a lambda gets here. What the file does not name is at the maximum
+    /// that any lambda may ask for.
     pub limits: Limits,
 }
 
@@ -17,7 +19,8 @@ impl Vehicle {
     ///
     /// # Errors
     ///
-    /// The first problem that is found, with its line: an unknown key, or a value that no lambda could ask for.
+    /// The first problem that is found, with its line: an unknown key, or a value that no lambda
+    /// could ask for.
     pub fn parse(text: &str, file: impl AsRef<Path>) -> Result<Vehicle, ManifestError> {
         let file = file.as_ref().display().to_string();
         Ok(Vehicle { limits: manifest::vehicle_limits(text, &file)? })
@@ -41,8 +44,13 @@ mod tests {
 
     #[test]
     fn what_a_vehicle_does_not_name_is_at_its_maximum() {
-        let vehicle = Vehicle::parse("[limits]\nfuel = 10_000_000\nmemory = \"32 MiB\"", "vehicle.toml").unwrap();
-        assert_eq!((vehicle.limits.fuel, vehicle.limits.memory), (10_000_000, gleaner_base::ByteSize::mib(32)));
+        let vehicle =
+            Vehicle::parse("[limits]\nfuel = 10_000_000\nmemory = \"32 MiB\"", "vehicle.toml")
+                .unwrap();
+        assert_eq!(
+            (vehicle.limits.fuel, vehicle.limits.memory),
+            (10_000_000, gleaner_base::ByteSize::mib(32))
+        );
         assert_eq!(vehicle.limits.deadline, Limits::MOST.deadline);
         assert_eq!(Vehicle::parse("", "vehicle.toml").unwrap().limits, Limits::MOST);
     }
@@ -50,8 +58,16 @@ mod tests {
     #[test]
     fn what_nobody_knows_or_could_ask_for_is_refused_with_its_line() {
         for (text, problem, help) in [
-            ("\n[limits]\nfule = 1", "vehicle.toml, line 3: unknown key `fule` in [limits]", "did you mean `fuel`?"),
-            ("[limit]", "vehicle.toml, line 1: unknown key `limit` at the top level", "did you mean `limits`?"),
+            (
+                "\n[limits]\nfule = 1",
+                "vehicle.toml, line 3: unknown key `fule` in [limits]",
+                "did you mean `fuel`?",
+            ),
+            (
+                "[limit]",
+                "vehicle.toml, line 1: unknown key `limit` at the top level",
+                "did you mean `limits`?",
+            ),
             (
                 "[limits]\nframes = 0",
                 "vehicle.toml, line 2: `limits.frames` is 0, below the minimum of 1",
@@ -59,7 +75,10 @@ mod tests {
             ),
         ] {
             let error = Vehicle::parse(text, "vehicle.toml").unwrap_err();
-            assert_eq!((error.to_string().as_str(), error.help().as_deref()), (problem, Some(help)));
+            assert_eq!(
+                (error.to_string().as_str(), error.help().as_deref()),
+                (problem, Some(help))
+            );
         }
     }
 

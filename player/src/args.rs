@@ -14,8 +14,9 @@ use crate::stamp::Stamp;
 
 /// Play recorded drives as live topics of ROS 2, through Cyclone DDS
 ///
-/// Topics keep their names, types and offered quality of service, so that nodes cannot tell a drive from a vehicle. Plays in
-/// the domain of --domain, else of ROS_DOMAIN_ID, else 0. Ctrl-C ends it in order, with a summary.
+/// Topics keep their names, types and offered quality of service, so that nodes cannot tell a drive
+/// from a vehicle. Plays in the domain of --domain, else of ROS_DOMAIN_ID, else 0. Ctrl-C ends it
+/// in order, with a summary.
 #[derive(Parser, Debug)]
 #[command(name = "gleaner-player", bin_name = "gleaner play", version)]
 #[command(group = ArgGroup::new("what").required(true).multiple(true).args(["drives", "synthetic", "imu"]))]
@@ -29,7 +30,8 @@ pub(crate) struct Args {
     /// Begin again at the end, until ctrl-C
     #[arg(long = "loop")]
     pub(crate) looped: bool,
-    /// What header.stamp becomes: the wall clock at sending, what was recorded, or the monotonic clock at sending
+    /// What header.stamp becomes: the wall clock at sending, what was recorded, or the monotonic
+    /// clock at sending
     #[arg(long, value_enum, default_value = "now")]
     pub(crate) stamp: Stamp,
     /// Play only these topics of the drive
@@ -100,10 +102,13 @@ impl FromStr for Size {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Size, String> {
-        let sides = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+        let sides = text
+            .split_once('x')
+            .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
         match sides {
             Some((width, height))
-                if (1..=Size::LARGEST.width).contains(&width) && (1..=Size::LARGEST.height).contains(&height) =>
+                if (1..=Size::LARGEST.width).contains(&width)
+                    && (1..=Size::LARGEST.height).contains(&height) =>
             {
                 Ok(Size { width, height })
             }
@@ -123,21 +128,30 @@ impl FromStr for Camera {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Camera, String> {
-        let (size, rate) = text.split_once('@').ok_or("write WIDTHxHEIGHT@HZ, as in 1920x1080@30")?;
+        let (size, rate) =
+            text.split_once('@').ok_or("write WIDTHxHEIGHT@HZ, as in 1920x1080@30")?;
         Ok(Camera { size: size.parse()?, hertz: hertz(rate)? })
     }
 }
 
 impl Args {
-    /// The domain to play in: what was asked for, else what `environment`, the content of `ROS_DOMAIN_ID`, says.
+    /// The domain to play in: what was asked for, else what `environment`, the content of
+    /// `ROS_DOMAIN_ID`, says.
     pub(crate) fn domain(&self, environment: Option<&str>) -> Result<u32, Failure> {
         match (self.domain, environment.map(str::trim)) {
             (Some(domain), _) => Ok(domain),
             (None, None | Some("")) => Ok(0),
-            (None, Some(text)) => text.parse().ok().filter(|domain| *domain <= LAST_DOMAIN).ok_or_else(|| {
-                Failure::new(Exit::Usage, format!("ROS_DOMAIN_ID is `{text}`, which is no domain"))
-                    .with_help(format!("set it to a number from 0 to {LAST_DOMAIN}, or give --domain"))
-            }),
+            (None, Some(text)) => {
+                text.parse().ok().filter(|domain| *domain <= LAST_DOMAIN).ok_or_else(|| {
+                    Failure::new(
+                        Exit::Usage,
+                        format!("ROS_DOMAIN_ID is `{text}`, which is no domain"),
+                    )
+                    .with_help(format!(
+                        "set it to a number from 0 to {LAST_DOMAIN}, or give --domain"
+                    ))
+                })
+            }
         }
     }
 }
@@ -156,11 +170,14 @@ fn remap(text: &str) -> Result<(String, String), String> {
 /// Seconds as nanoseconds; a year at most, so that no sum of them overflows.
 fn seconds(text: &str) -> Result<i64, String> {
     let seconds = text.parse::<f64>().ok().filter(|seconds| (0.0..=31_536_000.0).contains(seconds));
-    seconds.map(|seconds| (seconds * 1e9) as i64).ok_or_else(|| "write seconds, as in 12.5, at most a year".to_owned())
+    seconds
+        .map(|seconds| (seconds * 1e9) as i64)
+        .ok_or_else(|| "write seconds, as in 12.5, at most a year".to_owned())
 }
 
 fn some_seconds(text: &str) -> Result<i64, String> {
-    seconds(text).and_then(|ns| if ns > 0 { Ok(ns) } else { Err("nothing would be played".to_owned()) })
+    seconds(text)
+        .and_then(|ns| if ns > 0 { Ok(ns) } else { Err("nothing would be played".to_owned()) })
 }
 
 fn hertz(text: &str) -> Result<f64, String> {
@@ -173,7 +190,8 @@ mod tests {
     use super::*;
 
     fn parse(arguments: &[&str]) -> Result<Args, String> {
-        Args::try_parse_from(["gleaner-player"].iter().chain(arguments)).map_err(|error| error.to_string())
+        Args::try_parse_from(["gleaner-player"].iter().chain(arguments))
+            .map_err(|error| error.to_string())
     }
 
     #[test]
@@ -186,13 +204,17 @@ mod tests {
     fn a_drive_is_played_as_recorded_with_stamps_of_now_unless_told_otherwise() {
         let args = parse(&["a.mcap", "b.mcap"]).unwrap();
         assert_eq!(args.drives.len(), 2);
-        assert_eq!((args.rate, args.stamp, args.start, args.wait), (Rate::Times(1.0), Stamp::Now, 0, 0));
+        assert_eq!(
+            (args.rate, args.stamp, args.start, args.wait),
+            (Rate::Times(1.0), Stamp::Now, 0, 0)
+        );
         assert!(args.duration.is_none() && !args.looped && !args.raw_images && !args.json);
     }
 
     #[test]
     fn made_up_sensors_need_no_drive_and_exclude_one() {
-        let args = parse(&["--synthetic", "1920x1080@30", "--imu", "100", "--duration", "2.5"]).unwrap();
+        let args =
+            parse(&["--synthetic", "1920x1080@30", "--imu", "100", "--duration", "2.5"]).unwrap();
         let size = Size { width: 1920, height: 1080 };
         assert_eq!((args.synthetic, args.imu), (Some(Camera { size, hertz: 30.0 }), Some(100.0)));
         assert_eq!(args.duration, Some(2_500_000_000));
@@ -221,7 +243,9 @@ mod tests {
             let error = parse(&["a.mcap", &arguments.join("=")]).unwrap_err();
             assert!(error.contains(said), "{arguments:?}: {error}");
         }
-        for camera in ["1920x1080", "0x10@1", "3849x10@1", "10x2169@1", "10x10@0", "10x10@inf", "x@"] {
+        for camera in
+            ["1920x1080", "0x10@1", "3849x10@1", "10x2169@1", "10x10@0", "10x10@inf", "x@"]
+        {
             assert!(parse(&["--synthetic", camera]).is_err(), "{camera}");
         }
     }
@@ -234,7 +258,9 @@ mod tests {
         assert_eq!(of(&["a"], Some("")), Ok(0));
         assert_eq!(of(&["a"], None), Ok(0));
         // The page by which all programs of ours are tested.
-        for line in include_str!("../../tests/domains.txt").lines().filter(|line| line.starts_with('|')) {
+        for line in
+            include_str!("../../tests/domains.txt").lines().filter(|line| line.starts_with('|'))
+        {
             let (content, domain) = line[1..].split_once('|').unwrap();
             assert_eq!(of(&["a"], Some(content)).ok(), domain.trim().parse().ok(), "{line}");
         }

@@ -4,8 +4,8 @@ use std::mem;
 use std::ops::{Deref, DerefMut};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Bytes that a pool keeps for later at most. A frame of 25 MB is mapped and cleared by the kernel each time it is
-/// allocated; with a depth of ten, this much comes back at once.
+/// Bytes that a pool keeps for later at most. A frame of 25 MB is mapped and cleared by the kernel
+/// each time it is allocated; with a depth of ten, this much comes back at once.
 const KEPT_BYTES: usize = 256 << 20;
 
 /// The bytes of one message. They return to their pool when dropped, on whatever thread that is.
@@ -48,7 +48,8 @@ impl Drop for Buffer {
 pub(crate) struct Pool(Arc<Mutex<Vec<Vec<u8>>>>);
 
 impl Pool {
-    /// A buffer with room for `len` bytes: one that was used before, with its old content, or an empty one.
+    /// A buffer with room for `len` bytes: one that was used before, with its old content, or an
+    /// empty one.
     pub(crate) fn take(&self, len: usize) -> Buffer {
         let mut kept = self.kept();
         let fits = |bytes: &Vec<u8>| bytes.capacity() >= len && bytes.capacity() / 2 <= len;
@@ -60,7 +61,9 @@ impl Pool {
     fn put(&self, bytes: Vec<u8>) {
         let mut kept = self.kept();
         // Those of another size, of which no more come, make room for this one.
-        while kept.iter().map(Vec::capacity).sum::<usize>() + bytes.capacity() > KEPT_BYTES && !kept.is_empty() {
+        while kept.iter().map(Vec::capacity).sum::<usize>() + bytes.capacity() > KEPT_BYTES
+            && !kept.is_empty()
+        {
             kept.remove(0);
         }
         if bytes.capacity() <= KEPT_BYTES {

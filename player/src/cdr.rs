@@ -1,4 +1,5 @@
-//! Messages as they go over the wire: four bytes of encapsulation, then CDR, then zeros up to a multiple of four.
+//! Messages as they go over the wire: four bytes of encapsulation, then CDR, then zeros up to a
+//! multiple of four.
 
 use gleaner_messages::{CdrWriter, Endian};
 
@@ -11,7 +12,8 @@ pub(crate) fn encapsulation(endian: Endian, options: [u8; 2]) -> [u8; ENCAPSULAT
     [0, u8::from(endian == Endian::Little), a, b]
 }
 
-/// Fills `bytes` up to a multiple of four, which is how DDS sends them: Cyclone DDS may read that far.
+/// Fills `bytes` up to a multiple of four, which is how DDS sends them: Cyclone DDS may read that
+/// far.
 pub(crate) fn pad(bytes: &mut Vec<u8>) {
     bytes.resize(bytes.len().next_multiple_of(4), 0);
 }
@@ -30,7 +32,8 @@ pub(crate) fn sealed(cdr: &CdrWriter) -> Vec<u8> {
     message
 }
 
-/// All of a `sensor_msgs/msg/Image` in bgr8 that comes before its pixels, of which there are `3 * width * height`.
+/// All of a `sensor_msgs/msg/Image` in bgr8 that comes before its pixels, of which there are `3 *
+/// width * height`.
 pub(crate) fn image_head(stamp_ns: i64, frame_id: &str, width: u32, height: u32) -> Vec<u8> {
     let mut cdr = with_header(stamp_ns, frame_id);
     cdr.u32(height).u32(width).string("bgr8").u8(0).u32(3 * width).u32(3 * width * height);

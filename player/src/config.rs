@@ -4,13 +4,16 @@ use std::net::IpAddr;
 
 /// The configuration of Cyclone DDS as its own XML.
 ///
-/// With its defaults a frame of 25 MB is 18,600 fragments of 1344 bytes, of which a reader with an ordinary socket buffer
-/// loses many; with these, 400. A writer waits when more than `WhcHigh` was not acknowledged: ten frames of 25 MB are
-/// below it. A sample that is larger than `MaxQueuedRexmitBytes` could never be repaired, and one that is larger than
-/// `MaxRexmit` is repaired in several rounds, each as long as the reader waits before it asks.
+/// With its defaults a frame of 25 MB is 18,600 fragments of 1344 bytes, of which a reader with an
+/// ordinary socket buffer loses many; with these, 400. A writer waits when more than `WhcHigh` was
+/// not acknowledged: ten frames of 25 MB are below it. A sample that is larger than
+/// `MaxQueuedRexmitBytes` could never be repaired, and one that is larger than `MaxRexmit` is
+/// repaired in several rounds, each as long as the reader waits before it asks.
 pub(crate) fn xml(interface: Option<IpAddr>) -> String {
     let interfaces = match interface {
-        Some(address) => format!("<Interfaces><NetworkInterface address=\"{address}\"/></Interfaces>"),
+        Some(address) => {
+            format!("<Interfaces><NetworkInterface address=\"{address}\"/></Interfaces>")
+        }
         None => String::new(),
     };
     format!(
@@ -37,14 +40,18 @@ mod tests {
     #[test]
     fn an_interface_is_named_only_if_asked_for() {
         assert!(!xml(None).contains("Interface"));
-        assert!(xml(Some("127.0.0.1".parse().unwrap())).contains("<NetworkInterface address=\"127.0.0.1\"/>"));
+        assert!(
+            xml(Some("127.0.0.1".parse().unwrap()))
+                .contains("<NetworkInterface address=\"127.0.0.1\"/>")
+        );
         assert!(xml(Some("fe80::1".parse().unwrap())).contains("\"fe80::1\""));
     }
 
     #[test]
     fn people_who_configure_cyclone_dds_themselves_are_told_the_same() {
         let page = include_str!("../../docs/play.md");
-        let told = page.split_once("```xml\n").and_then(|(_, rest)| rest.split_once("```")).unwrap().0;
+        let told =
+            page.split_once("```xml\n").and_then(|(_, rest)| rest.split_once("```")).unwrap().0;
         assert_eq!(told.lines().map(str::trim).collect::<String>(), xml(None));
     }
 }

@@ -16,8 +16,8 @@ pub(crate) struct Counts {
     pub(crate) writes: Durations,
 }
 
-/// From which delay on a message counts as late. Waking up takes a tenth of a millisecond on a machine that has time, and
-/// several on one that has not.
+/// From which delay on a message counts as late. Waking up takes a tenth of a millisecond on a
+/// machine that has time, and several on one that has not.
 pub(crate) const LATE_NS: i64 = 5_000_000;
 
 /// Durations in buckets that are an eighth of a power of two wide: 12 % of a value, in 4 KiB.
@@ -46,7 +46,8 @@ impl Durations {
         self.longest_ns = self.longest_ns.max(ns);
     }
 
-    /// The median, rounded up to the end of its bucket, but not beyond the longest. 0 if there is none.
+    /// The median, rounded up to the end of its bucket, but not beyond the longest. 0 if there is
+    /// none.
     pub(crate) fn median_ns(&self) -> u64 {
         let mut before = 0;
         let at = self.buckets.iter().position(|bucket| {
@@ -74,7 +75,10 @@ mod tests {
             let mut durations = Durations::default();
             (1..=1001).for_each(|n| durations.add(n * scale));
             let (true_median, found) = (501 * scale, durations.median_ns());
-            assert!((true_median..=true_median + true_median / 8).contains(&found), "{true_median} {found}");
+            assert!(
+                (true_median..=true_median + true_median / 8).contains(&found),
+                "{true_median} {found}"
+            );
             assert_eq!(durations.longest_ns(), 1001 * scale);
         }
     }

@@ -1,8 +1,10 @@
-//! Cyclone DDS: a participant, and writers of any type, that are handed whole CDR messages without copying them.
+//! Cyclone DDS: a participant, and writers of any type, that are handed whole CDR messages without
+//! copying them.
 //!
-//! A topic of Cyclone DDS is usually made from a C type. `cyclors` also makes one from names alone, whose samples are opaque
-//! bytes; for those we bring our own operations on samples, so that Cyclone DDS refers to our buffers, and drops them
-//! when the last reader has acknowledged them. There are no readers here, so nothing is ever made from received bytes.
+//! A topic of Cyclone DDS is usually made from a C type. `cyclors` also makes one from names alone,
+//! whose samples are opaque bytes; for those we bring our own operations on samples, so that
+//! Cyclone DDS refers to our buffers, and drops them when the last reader has acknowledged them.
+//! There are no readers here, so nothing is ever made from received bytes.
 #![allow(unsafe_code)]
 
 use std::ffi::{CStr, CString, c_char, c_void};
@@ -11,8 +13,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use cyclors::{
-    DDS_DATA_REPRESENTATION_XCDR1, DDS_RETCODE_TIMEOUT, dds_entity_t, ddsi_keyhash, ddsi_serdata, ddsi_serdata_ops,
-    ddsi_sertype, ddsrt_iovec_t,
+    DDS_DATA_REPRESENTATION_XCDR1, DDS_RETCODE_TIMEOUT, dds_entity_t, ddsi_keyhash, ddsi_serdata,
+    ddsi_serdata_ops, ddsi_sertype, ddsrt_iovec_t,
 };
 use gleaner_base::{Exit, Explain};
 
@@ -46,7 +48,8 @@ impl Explain for CycloneError {
     }
 }
 
-/// How long a write waits for readers that lag behind. ROS 2 waits forever; then a stopped reader stops the player.
+/// How long a write waits for readers that lag behind. ROS 2 waits forever; then a stopped reader
+/// stops the player.
 const MAX_BLOCKING: Duration = Duration::from_secs(1);
 
 /// More than any message of ROS 2, and what Cyclone DDS sends at most.
@@ -67,15 +70,22 @@ impl Participant {
             created(unsafe { cyclors::dds_create_domain(domain, config.as_ptr()) }, what)?;
         }
         // SAFETY: null stands for the default quality of service and for no listener.
-        let participant = unsafe { cyclors::dds_create_participant(domain, ptr::null(), ptr::null()) };
+        let participant =
+            unsafe { cyclors::dds_create_participant(domain, ptr::null(), ptr::null()) };
         created(participant, what).map(|participant| Participant { participant })
     }
 
     /// Offers a topic by the names that DDS has for it and for its type.
-    pub(crate) fn writer(&self, topic: &str, type_name: &str, offer: Offer) -> Result<Writer<'_>, CycloneError> {
+    pub(crate) fn writer(
+        &self,
+        topic: &str,
+        type_name: &str,
+        offer: Offer,
+    ) -> Result<Writer<'_>, CycloneError> {
         let what = || format!("a writer of `{topic}` with type `{type_name}`");
         let (topic_name, type_name) = (c_string(topic), c_string(type_name));
-        // SAFETY: both texts are terminated and outlive the call, which copies them and does not write to them.
+        // SAFETY: both texts are terminated and outlive the call, which copies them and does not
+        // write to them.
         let topic = unsafe {
             cyclors::cdds_create_blob_topic(
                 self.participant,
@@ -89,8 +99,8 @@ impl Participant {
         // SAFETY: the topic is ours, and the place for the answer is valid.
         let answer = unsafe { cyclors::dds_get_entity_sertype(topic, &mut sertype) };
         created(answer, what)?;
-        // SAFETY: a fresh set of policies, filled by the calls below, copied by dds_create_writer, deleted once; the array
-        // of representations is as long as it says.
+        // SAFETY: a fresh set of policies, filled by the calls below, copied by dds_create_writer,
+        // deleted once; the array of representations is as long as it says.
         let writer = unsafe {
             let qos = cyclors::dds_create_qos();
             let (reliability, durability) = kinds(offer);
@@ -134,18 +144,25 @@ unsafe impl Send for Writer<'_> {}
 unsafe impl Sync for Writer<'_> {}
 
 impl Writer<'_> {
-    /// Sends `message`: encapsulation, CDR, and zeros up to a multiple of four. Returns when the kernel has it; waits at most
-    /// [`MAX_BLOCKING`] for readers that lag behind.
+    /// Sends `message`: encapsulation, CDR, and zeros up to a multiple of four. Returns when the
+    /// kernel has it; waits at most [`MAX_BLOCKING`] for readers that lag behind.
     pub(crate) fn write(&self, message: Buffer) -> Result<(), CycloneError> {
         let len = message.len();
         if len > MAX_MESSAGE || !len.is_multiple_of(4) || len < 4 {
-            return Err(CycloneError::Write { len, said: "it has no length that a message can have".to_owned() });
+            return Err(CycloneError::Write {
+                len,
+                said: "it has no length that a message can have".to_owned(),
+            });
         }
-        // SAFETY: all of `ddsi_serdata` is numbers and pointers, for which zeros are valid; `ddsi_serdata_init` fills it with
-        // one reference, which dds_writecdr takes over.
+        // SAFETY: all of `ddsi_serdata` is numbers and pointers, for which zeros are valid;
+        // `ddsi_serdata_init` fills it with one reference, which dds_writecdr takes over.
         let code = unsafe {
             let mut sample = Box::new(Sample { base: std::mem::zeroed(), message });
-            cyclors::ddsi_serdata_init(&mut sample.base, self.sertype, cyclors::ddsi_serdata_kind_SDK_DATA);
+            cyclors::ddsi_serdata_init(
+                &mut sample.base,
+                self.sertype,
+                cyclors::ddsi_serdata_kind_SDK_DATA,
+            );
             sample.base.ops = &OPERATIONS;
             cyclors::dds_writecdr(self.writer, Box::into_raw(sample).cast())
         };
@@ -159,7 +176,8 @@ impl Writer<'_> {
     /// Readers that match now.
     pub(crate) fn readers(&self) -> usize {
         // SAFETY: with room for no handle, none is written, and the answer is their number.
-        let count = unsafe { cyclors::dds_get_matched_subscriptions(self.writer, ptr::null_mut(), 0) };
+        let count =
+            unsafe { cyclors::dds_get_matched_subscriptions(self.writer, ptr::null_mut(), 0) };
         usize::try_from(count).unwrap_or(0)
     }
 
@@ -187,7 +205,11 @@ fn c_string(text: &str) -> CString {
 }
 
 fn created(answer: i32, what: impl FnOnce() -> String) -> Result<dds_entity_t, CycloneError> {
-    if answer >= 0 { Ok(answer) } else { Err(CycloneError::Create { what: what(), said: said(answer) }) }
+    if answer >= 0 {
+        Ok(answer)
+    } else {
+        Err(CycloneError::Create { what: what(), said: said(answer) })
+    }
 }
 
 fn said(code: i32) -> String {
@@ -229,13 +251,19 @@ unsafe extern "C" fn eqkey(_: *const ddsi_serdata, _: *const ddsi_serdata) -> bo
 }
 
 unsafe extern "C" fn get_size(sample: *const ddsi_serdata) -> u32 {
-    // SAFETY: Cyclone DDS calls these operations only with samples that `write` or `to_untyped` made, and that live.
+    // SAFETY: Cyclone DDS calls these operations only with samples that `write` or `to_untyped`
+    // made, and that live.
     let message = unsafe { &(*sample.cast::<Sample>()).message };
     // At most MAX_MESSAGE.
     message.len() as u32
 }
 
-unsafe extern "C" fn to_ser(sample: *const ddsi_serdata, from: usize, len: usize, into: *mut c_void) {
+unsafe extern "C" fn to_ser(
+    sample: *const ddsi_serdata,
+    from: usize,
+    len: usize,
+    into: *mut c_void,
+) {
     // SAFETY: as in `get_size`; `into` has room for `len` bytes, and is not ours.
     unsafe {
         let message = &(*sample.cast::<Sample>()).message;
@@ -243,15 +271,16 @@ unsafe extern "C" fn to_ser(sample: *const ddsi_serdata, from: usize, len: usize
     }
 }
 
-/// Lends a part of the message. It counts as a reference, so that the part stays where it is until [`to_ser_unref`].
+/// Lends a part of the message. It counts as a reference, so that the part stays where it is until
+/// [`to_ser_unref`].
 unsafe extern "C" fn to_ser_ref(
     sample: *const ddsi_serdata,
     from: usize,
     len: usize,
     part: *mut ddsrt_iovec_t,
 ) -> *mut ddsi_serdata {
-    // SAFETY: as in `get_size`; `part` is valid. The count is only ever changed atomically, by Cyclone DDS and here. What is
-    // lent is only read.
+    // SAFETY: as in `get_size`; `part` is valid. The count is only ever changed atomically, by
+    // Cyclone DDS and here. What is lent is only read.
     unsafe {
         let lent = &(&(*sample.cast::<Sample>()).message)[from..from + len];
         (*part).iov_base = lent.as_ptr().cast_mut().cast();
@@ -269,10 +298,15 @@ unsafe extern "C" fn to_ser_unref(sample: *mut ddsi_serdata, _: *const ddsrt_iov
 
 /// The key of a sample, which is nothing.
 unsafe extern "C" fn to_untyped(sample: *const ddsi_serdata) -> *mut ddsi_serdata {
-    // SAFETY: as in `write`; the type is that of a live sample, and a key is not to refer to it afterwards.
+    // SAFETY: as in `write`; the type is that of a live sample, and a key is not to refer to it
+    // afterwards.
     unsafe {
         let mut key = Box::new(Sample { base: std::mem::zeroed(), message: Buffer::default() });
-        cyclors::ddsi_serdata_init(&mut key.base, (*sample).type_, cyclors::ddsi_serdata_kind_SDK_KEY);
+        cyclors::ddsi_serdata_init(
+            &mut key.base,
+            (*sample).type_,
+            cyclors::ddsi_serdata_kind_SDK_KEY,
+        );
         key.base.ops = &OPERATIONS;
         key.base.type_ = ptr::null();
         Box::into_raw(key).cast()
@@ -280,12 +314,18 @@ unsafe extern "C" fn to_untyped(sample: *const ddsi_serdata) -> *mut ddsi_serdat
 }
 
 unsafe extern "C" fn free(sample: *mut ddsi_serdata) {
-    // SAFETY: as in `get_size`; this was the last reference, and the box was given away when the first was.
+    // SAFETY: as in `get_size`; this was the last reference, and the box was given away when the
+    // first was.
     drop(unsafe { Box::from_raw(sample.cast::<Sample>()) });
 }
 
 /// What a trace of Cyclone DDS shows of a sample: nothing.
-unsafe extern "C" fn print(_: *const ddsi_sertype, _: *const ddsi_serdata, into: *mut c_char, len: usize) -> usize {
+unsafe extern "C" fn print(
+    _: *const ddsi_sertype,
+    _: *const ddsi_serdata,
+    into: *mut c_char,
+    len: usize,
+) -> usize {
     if len > 0 {
         // SAFETY: there is room for `len` bytes.
         unsafe { *into = 0 };
@@ -293,7 +333,11 @@ unsafe extern "C" fn print(_: *const ddsi_sertype, _: *const ddsi_serdata, into:
     0
 }
 
-unsafe extern "C" fn get_keyhash(_: *const ddsi_serdata, into: *mut ddsi_keyhash, _force_md5: bool) {
+unsafe extern "C" fn get_keyhash(
+    _: *const ddsi_serdata,
+    into: *mut ddsi_keyhash,
+    _force_md5: bool,
+) {
     // SAFETY: Cyclone DDS brings the place for the answer.
     unsafe { (*into).value = [0; 16] };
 }

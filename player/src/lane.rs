@@ -23,8 +23,8 @@ pub(crate) struct Outlet<'p> {
 /// From which delay on people are told at once that the player falls behind.
 const BEHIND_NS: i64 = 100_000_000;
 
-/// Sends what comes through `lane` of `queue`, until the queue is closed and empty or the player stops. Returns the counts
-/// of all topics; those of other lanes are zero.
+/// Sends what comes through `lane` of `queue`, until the queue is closed and empty or the player
+/// stops. Returns the counts of all topics; those of other lanes are zero.
 pub(crate) fn run(
     queue: &Queue<'_>,
     lane: usize,
@@ -48,7 +48,9 @@ pub(crate) fn run(
             ));
         }
         counts.latest_ns = counts.latest_ns.max(late_ns);
-        if outlet.is_stamped && !stamp::write(&mut message.bytes, message.endian, stamp, message.rounds_ns) {
+        if outlet.is_stamped
+            && !stamp::write(&mut message.bytes, message.endian, stamp, message.rounds_ns)
+        {
             counts.unstamped += 1;
         }
         let len = message.bytes.len();
@@ -62,7 +64,10 @@ pub(crate) fn run(
             }
             Err(error) => {
                 if counts.refused == 0 {
-                    warn(&format!("a message of `{}` was not sent: {error}; the summary counts them", outlet.topic));
+                    warn(&format!(
+                        "a message of `{}` was not sent: {error}; the summary counts them",
+                        outlet.topic
+                    ));
                 }
                 counts.refused += 1;
             }

@@ -1,8 +1,10 @@
-//! `gleaner-player`: plays drives as live topics of ROS 2. `gleaner play` starts it; see `gleaner play --help`.
+//! `gleaner-player`: plays drives as live topics of ROS 2. `gleaner play` starts it; see `gleaner
+//! play --help`.
 //!
-//! A `source` (a drive, or made-up sensors) is read ahead by one thread into a bounded `queue`; lanes, which are threads,
-//! take messages from it, wait until each is due by the `pace`, and write it through `cyclone`, the one room that knows
-//! Cyclone DDS. No message is copied after it was put into the queue, until the kernel sends it.
+//! A `source` (a drive, or made-up sensors) is read ahead by one thread into a bounded `queue`;
+//! lanes, which are threads, take messages from it, wait until each is due by the `pace`, and write
+//! it through `cyclone`, the one room that knows Cyclone DDS. No message is copied after it was put
+//! into the queue, until the kernel sends it.
 
 mod args;
 mod buffer;

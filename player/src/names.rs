@@ -7,7 +7,8 @@ pub(crate) fn dds_topic(topic: &str) -> Option<String> {
     topic.parse::<TopicName>().ok().map(|topic| format!("rt{topic}"))
 }
 
-/// The DDS name of a type: `sensor_msgs::msg::dds_::Imu_` of `sensor_msgs/msg/Imu`; `None` if it is no type of ROS 2.
+/// The DDS name of a type: `sensor_msgs::msg::dds_::Imu_` of `sensor_msgs/msg/Imu`; `None` if it is
+/// no type of ROS 2.
 pub(crate) fn dds_type(type_name: &str) -> Option<String> {
     let parts: Vec<&str> = type_name.split('/').collect();
     let (package, kind, name) = match parts[..] {
@@ -44,7 +45,18 @@ mod tests {
 
     #[test]
     fn what_ros_2_does_not_take_has_no_name() {
-        for topic in ["imu", "", "/", "/a//b", "/a/", "/1a", "/a b", "/a\0", "/ä", &format!("/{}", "a".repeat(300))] {
+        for topic in [
+            "imu",
+            "",
+            "/",
+            "/a//b",
+            "/a/",
+            "/1a",
+            "/a b",
+            "/a\0",
+            "/ä",
+            &format!("/{}", "a".repeat(300)),
+        ] {
             assert_eq!(dds_topic(topic), None, "{topic}");
         }
         for type_name in ["Imu", "", "a/b/c/d", "a//b", "a/msg/", "foxglove.Image", "a/msg/b\0"] {

@@ -25,7 +25,9 @@ impl FromStr for Rate {
             return Ok(Rate::Max);
         }
         let times = text.parse::<f64>().ok().filter(|times| (0.000_1..=10_000.0).contains(times));
-        times.map(Rate::Times).ok_or_else(|| "write a number greater than 0, at most 10000, or max".to_owned())
+        times
+            .map(Rate::Times)
+            .ok_or_else(|| "write a number greater than 0, at most 10000, or max".to_owned())
     }
 }
 
@@ -41,7 +43,8 @@ pub(crate) struct Pace {
 const SLICE_NS: i64 = 100_000_000;
 
 impl Pace {
-    /// When a message `at_ns` after the begin of the drive is due, by the monotonic clock; `None` if at once.
+    /// When a message `at_ns` after the begin of the drive is due, by the monotonic clock; `None`
+    /// if at once.
     pub(crate) fn due_ns(&self, at_ns: i64) -> Option<i64> {
         match self.rate {
             // A double holds the nanoseconds of a hundred days.
@@ -50,7 +53,8 @@ impl Pace {
         }
     }
 
-    /// Waits until a message is due. Returns by how many ns it is late, or `None` if the player is to stop.
+    /// Waits until a message is due. Returns by how many ns it is late, or `None` if the player is
+    /// to stop.
     pub(crate) fn wait(&self, at_ns: i64, stop: &AtomicBool) -> Option<i64> {
         loop {
             if stop.load(Ordering::Relaxed) {
@@ -62,8 +66,10 @@ impl Pace {
                 return Some(now_ns - due_ns);
             }
             let until_ns = due_ns.min(now_ns + SLICE_NS);
-            let until =
-                Timespec { tv_sec: until_ns.div_euclid(1_000_000_000), tv_nsec: until_ns.rem_euclid(1_000_000_000) };
+            let until = Timespec {
+                tv_sec: until_ns.div_euclid(1_000_000_000),
+                tv_nsec: until_ns.rem_euclid(1_000_000_000),
+            };
             // A signal ends it early; the loop looks again.
             let _ = clock_nanosleep_absolute(ClockId::Monotonic, &until);
         }

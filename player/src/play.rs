@@ -41,12 +41,16 @@ pub(crate) fn run(args: &Args) -> Result<Exit, Failure> {
     let topics = source.topics().to_vec();
     let config = configuration(args);
     let participant = Participant::join(domain, config.as_deref())?;
-    let outlets = topics.iter().map(|topic| offer(&participant, topic, args.stamp)).collect::<Result<Vec<_>, _>>()?;
+    let outlets = topics
+        .iter()
+        .map(|topic| offer(&participant, topic, args.stamp))
+        .collect::<Result<Vec<_>, _>>()?;
     line(&format!("playing {} topics in domain {domain}", topics.len()));
     wait_for_readers(&outlets, args.wait, &stop);
 
     let lanes = lanes(&topics, args.rate);
-    let queue = Queue::new(lanes.iter().max().map_or(1, |last| last + 1), source.read_ahead(), &stop);
+    let queue =
+        Queue::new(lanes.iter().max().map_or(1, |last| last + 1), source.read_ahead(), &stop);
     let (ended, counts, readers, seconds) = thread::scope(|scope| {
         let reader = scope.spawn(|| {
             let ended = read_ahead(source.as_mut(), &lanes, &queue);
@@ -57,11 +61,13 @@ pub(crate) fn run(args: &Args) -> Result<Exit, Failure> {
         let begin = Instant::now();
         let pace = Pace { rate: args.rate, begin_ns: now(ClockId::Monotonic) };
         let (queue, outlets, stop) = (&queue, outlets.as_slice(), &*stop);
-        let work = |index| scope.spawn(move || lane::run(queue, index, outlets, &pace, args.stamp, stop));
+        let work =
+            |index| scope.spawn(move || lane::run(queue, index, outlets, &pace, args.stamp, stop));
         let senders: Vec<_> = (0..queue.lanes()).map(work).collect();
         let mut readers = vec![0; outlets.len()];
         watch(outlets, &mut readers, || senders.iter().all(|sender| sender.is_finished()));
-        let counts = senders.into_iter().map(|sender| sender.join().expect("a lane does not panic"));
+        let counts =
+            senders.into_iter().map(|sender| sender.join().expect("a lane does not panic"));
         let counts: Vec<_> = counts.collect();
         let seconds = begin.elapsed().as_secs_f64();
         (reader.join().expect("reading ahead does not panic"), counts, readers, seconds)
@@ -82,9 +88,13 @@ pub(crate) fn run(args: &Args) -> Result<Exit, Failure> {
 fn stop_on_signals() -> Result<Arc<AtomicBool>, Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
-        signal_hook::flag::register_conditional_shutdown(signal, i32::from(Exit::Internal.code()), stop.clone())
-            .and_then(|_| signal_hook::flag::register(signal, stop.clone()))
-            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen to signals", &error))?;
+        signal_hook::flag::register_conditional_shutdown(
+            signal,
+            i32::from(Exit::Internal.code()),
+            stop.clone(),
+        )
+        .and_then(|_| signal_hook::flag::register(signal, stop.clone()))
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen to signals", &error))?;
     }
     Ok(stop)
 }
@@ -103,19 +113,28 @@ fn configuration(args: &Args) -> Option<String> {
     None
 }
 
-fn offer<'p>(participant: &'p Participant, topic: &Topic, stamp: Stamp) -> Result<Outlet<'p>, Failure> {
+fn offer<'p>(
+    participant: &'p Participant,
+    topic: &Topic,
+    stamp: Stamp,
+) -> Result<Outlet<'p>, Failure> {
     let Topic { topic: name, type_name, offer, is_stamped } = topic;
-    let unusable = || Failure::new(Exit::Usage, format!("ROS 2 takes no topic `{name}` of type `{type_name}`"));
+    let unusable = || {
+        Failure::new(Exit::Usage, format!("ROS 2 takes no topic `{name}` of type `{type_name}`"))
+    };
     let dds_topic = names::dds_topic(name).ok_or_else(unusable)?;
     let dds_type = names::dds_type(type_name).ok_or_else(unusable)?;
     let writer = participant.writer(&dds_topic, &dds_type, *offer)?;
     if !is_stamped && stamp != Stamp::Recorded {
-        line(&format!("`{name}` is sent as recorded: its type does not begin with a stamp, as far as the drive tells"));
+        line(&format!(
+            "`{name}` is sent as recorded: its type does not begin with a stamp, as far as the drive tells"
+        ));
     }
     Ok(Outlet { topic: name.clone(), writer, is_stamped: *is_stamped })
 }
 
-/// The lane of each topic. As fast as possible there is one, since nothing else keeps the order of the drive.
+/// The lane of each topic. As fast as possible there is one, since nothing else keeps the order of
+/// the drive.
 fn lanes(topics: &[Topic], rate: Rate) -> Vec<usize> {
     let mut large = 0;
     let lane = |topic: &Topic| {
@@ -164,7 +183,9 @@ fn watch(outlets: &[Outlet<'_>], readers: &mut [usize], is_over: impl Fn() -> bo
         if !is_told && (begin.elapsed() >= LONELY || is_last) {
             is_told = true;
             if readers.iter().all(|readers| *readers == 0) {
-                warn("no reader was found; is it in the same domain, and does it ask for no more than is offered?");
+                warn(
+                    "no reader was found; is it in the same domain, and does it ask for no more than is offered?",
+                );
             }
         }
         if is_last {
@@ -174,7 +195,8 @@ fn watch(outlets: &[Outlet<'_>], readers: &mut [usize], is_over: impl Fn() -> bo
     }
 }
 
-/// Waits until readers have what was sent, so that the end of the process does not take it away from them.
+/// Waits until readers have what was sent, so that the end of the process does not take it away
+/// from them.
 fn flush(outlets: &[Outlet<'_>]) {
     let until = Instant::now() + FLUSH;
     for outlet in outlets {
@@ -185,7 +207,11 @@ fn flush(outlets: &[Outlet<'_>]) {
 }
 
 fn show(lines: &[Line<'_>], seconds: f64, as_json: bool) -> Result<(), Failure> {
-    let text = if as_json { format!("{}\n", summary::json(lines, seconds)) } else { summary::text(lines, seconds) };
+    let text = if as_json {
+        format!("{}\n", summary::json(lines, seconds))
+    } else {
+        summary::text(lines, seconds)
+    };
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {

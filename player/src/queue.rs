@@ -1,4 +1,5 @@
-//! What was read ahead: messages in the order of the drive, sorted into lanes, within one bound of bytes for all.
+//! What was read ahead: messages in the order of the drive, sorted into lanes, within one bound of
+//! bytes for all.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -63,7 +64,8 @@ impl<'s> Queue<'s> {
         self.lock().lanes.len()
     }
 
-    /// Puts a message behind the others of its lane, as soon as there is room. False if the player is to stop.
+    /// Puts a message behind the others of its lane, as soon as there is room. False if the player
+    /// is to stop.
     pub(crate) fn push(&self, lane: usize, message: Message) -> bool {
         let mut inner = self.lock();
         while inner.held > 0 && inner.held + message.cost() > self.budget {
@@ -78,8 +80,8 @@ impl<'s> Queue<'s> {
         !self.is_stopping()
     }
 
-    /// The next message of a lane; `None` if there will be none, or if the player is to stop. It counts until
-    /// [`Self::sent`] is told its length.
+    /// The next message of a lane; `None` if there will be none, or if the player is to stop. It
+    /// counts until [`Self::sent`] is told its length.
     pub(crate) fn pop(&self, lane: usize) -> Option<Message> {
         let mut inner = self.lock();
         loop {
@@ -107,15 +109,20 @@ impl<'s> Queue<'s> {
         self.changed.notify_all();
     }
 
-    /// Waits until so much was read ahead that playing can begin: half of the budget, everything, or what came within a
-    /// second after the first message.
+    /// Waits until so much was read ahead that playing can begin: half of the budget, everything,
+    /// or what came within a second after the first message.
     pub(crate) fn wait_until_filled(&self) {
         let mut inner = self.lock();
         let mut looks = 0;
-        while !inner.is_closed && inner.held <= self.budget / 2 && looks < 10 && !self.is_stopping() {
+        while !inner.is_closed && inner.held <= self.budget / 2 && looks < 10 && !self.is_stopping()
+        {
             looks += u32::from(inner.held > 0);
             let is_filling = |inner: &mut Inner| !inner.is_closed && inner.held <= self.budget / 2;
-            inner = self.changed.wait_timeout_while(inner, LOOK, is_filling).unwrap_or_else(PoisonError::into_inner).0;
+            inner = self
+                .changed
+                .wait_timeout_while(inner, LOOK, is_filling)
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
         }
     }
 
@@ -127,7 +134,8 @@ impl<'s> Queue<'s> {
         self.changed.wait_timeout(inner, LOOK).unwrap_or_else(PoisonError::into_inner).0
     }
 
-    /// Each change of what is inside is a single step, so it is whole even if a thread died holding it.
+    /// Each change of what is inside is a single step, so it is whole even if a thread died holding
+    /// it.
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -138,7 +146,13 @@ mod tests {
     use super::*;
 
     fn message(topic: usize, len: usize) -> Message {
-        Message { topic, at_ns: 0, rounds_ns: 0, endian: Endian::Little, bytes: vec![0; len].into() }
+        Message {
+            topic,
+            at_ns: 0,
+            rounds_ns: 0,
+            endian: Endian::Little,
+            bytes: vec![0; len].into(),
+        }
     }
 
     #[test]
@@ -149,7 +163,9 @@ mod tests {
             assert!(queue.push(lane, message(topic, 10)));
         }
         queue.close();
-        let topics = |lane| std::iter::from_fn(|| queue.pop(lane)).map(|message| message.topic).collect::<Vec<_>>();
+        let topics = |lane| {
+            std::iter::from_fn(|| queue.pop(lane)).map(|message| message.topic).collect::<Vec<_>>()
+        };
         assert_eq!((topics(0), topics(1)), (vec![1, 3], vec![2]));
     }
 

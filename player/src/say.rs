@@ -9,7 +9,8 @@ pub(crate) fn line(text: &str) {
     let _ = writeln!(io::stderr().lock(), "{text}");
 }
 
-/// Says that data or time was lost, or will be. Control characters, which a drive may hold, are shown.
+/// Says that data or time was lost, or will be. Control characters, which a drive may hold, are
+/// shown.
 pub(crate) fn warn(text: &str) {
     line(&format!("warning: {}", visible(text)));
 }

@@ -17,12 +17,14 @@ pub(crate) enum Stamp {
     Monotonic,
 }
 
-/// Whether messages of a type have a stamp that [`write`] reaches: then it stands in their first eight bytes.
+/// Whether messages of a type have a stamp that [`write`] reaches: then it stands in their first
+/// eight bytes.
 pub(crate) fn has_stamp(definitions: &Definitions) -> bool {
     header_stamp(definitions).is_some()
 }
 
-/// Puts the stamp that `stamp` asks for into `message`, which [`has_stamp`]. `later_ns` is how long the rounds before took.
+/// Puts the stamp that `stamp` asks for into `message`, which [`has_stamp`]. `later_ns` is how long
+/// the rounds before took.
 ///
 /// Returns false for a message that is too short to have a stamp.
 pub(crate) fn write(message: &mut [u8], endian: Endian, stamp: Stamp, later_ns: i64) -> bool {
@@ -94,7 +96,9 @@ mod tests {
 
     #[test]
     fn the_clocks_at_sending_replace_the_stamp_and_nothing_else() {
-        for (stamp, clock) in [(Stamp::Now, ClockId::Realtime), (Stamp::Monotonic, ClockId::Monotonic)] {
+        for (stamp, clock) in
+            [(Stamp::Now, ClockId::Realtime), (Stamp::Monotonic, ClockId::Monotonic)]
+        {
             let mut bytes = message(0, [0; 8]);
             let before = now(clock);
             assert!(write(&mut bytes, Endian::Big, stamp, 0));

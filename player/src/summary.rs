@@ -47,7 +47,10 @@ pub(crate) fn text(lines: &[Line<'_>], seconds: f64) -> String {
     let sent: u64 = lines.iter().map(|line| line.counts.sent).sum();
     let bytes: u64 = lines.iter().map(|line| line.counts.bytes).sum();
     let rate = bytes as f64 / 1e6 / seconds.max(1e-9);
-    let mut text = format!("sent {sent} messages, {:.1} MB, in {seconds:.1} s: {rate:.1} MB/s\n", bytes as f64 / 1e6);
+    let mut text = format!(
+        "sent {sent} messages, {:.1} MB, in {seconds:.1} s: {rate:.1} MB/s\n",
+        bytes as f64 / 1e6
+    );
     let width = lines.iter().map(|line| line.topic.topic.len()).max().unwrap_or(0).max(5);
     text += &format!(
         "{:width$}  {:>9} {:>10} {:>7} {:>8} {:>12} {:>10}\n",
@@ -72,7 +75,10 @@ pub(crate) fn text(lines: &[Line<'_>], seconds: f64) -> String {
             (counts.refused, "were not sent: readers were too slow".to_owned()),
             (line.undecodable, "were left out: their pictures cannot be decoded".to_owned()),
             (counts.unstamped, "kept their stamp: they are too short for one".to_owned()),
-            (counts.late, format!("were late, by up to {}", duration(counts.latest_ns.unsigned_abs()))),
+            (
+                counts.late,
+                format!("were late, by up to {}", duration(counts.latest_ns.unsigned_abs())),
+            ),
         ];
         for (count, what) in losses.iter().filter(|(count, _)| *count > 0) {
             text += &format!("{topic}: {count} messages {what}\n");
@@ -126,7 +132,10 @@ mod tests {
         }
         let object = json(&lines, 2.0);
         let line = &object["topics"][0];
-        assert_eq!([&line["sent"], &line["refused"], &line["undecodable"], &line["late"]], [7, 3, 4, 2]);
+        assert_eq!(
+            [&line["sent"], &line["refused"], &line["undecodable"], &line["late"]],
+            [7, 3, 4, 2]
+        );
         assert_eq!((&line["write_max_ns"], &line["unstamped"]), (&json!(1_500_000), &json!(1)));
     }
 }

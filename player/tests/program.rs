@@ -14,7 +14,12 @@ fn what_cannot_be_played_is_refused_with_the_exit_code_that_scripts_expect() {
         (&["no-such-drive.mcap"][..], "", 2, "cannot open drive `no-such-drive.mcap`"),
         (&["--imu", "10"], "seven", 2, "ROS_DOMAIN_ID is `seven`"),
         (&["--imu", "10", "--rate", "0"], "", 2, "greater than 0"),
-        (&["--imu", "10", "--remap", "/imu/data:=/car/imu"], "", 2, "`/imu/data`, which is not played"),
+        (
+            &["--imu", "10", "--remap", "/imu/data:=/car/imu"],
+            "",
+            2,
+            "`/imu/data`, which is not played",
+        ),
         // An address for documentation (RFC 5737), which no interface has.
         (&["--imu", "10", "--interface", "203.0.113.1"], "", 5, "--interface"),
     ] {

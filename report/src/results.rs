@@ -1,6 +1,8 @@
-//! The JSON lines in a folder of results: `decisions.jsonl`, `clips.jsonl` and what else has a line for each thing.
+//! The JSON lines in a folder of results: `decisions.jsonl`, `clips.jsonl` and what else has a line
+//! for each thing.
 //!
-//! Nothing is written here, and no file is held in memory as a whole: `decisions.jsonl` may have a line per wake.
+//! Nothing is written here, and no file is held in memory as a whole: `decisions.jsonl` may have a
+//! line per wake.
 
 use std::io::{self, BufRead, BufReader, Read};
 use std::marker::PhantomData;
@@ -44,7 +46,10 @@ pub enum ResultsError {
 
 impl Explain for ResultsError {
     fn help(&self) -> Option<String> {
-        Some("replay again; nothing else may write into the folder of the results meanwhile".to_owned())
+        Some(
+            "replay again; nothing else may write into the folder of the results meanwhile"
+                .to_owned(),
+        )
     }
 
     fn exit(&self) -> Exit {
@@ -52,8 +57,9 @@ impl Explain for ResultsError {
     }
 }
 
-/// A file of JSON lines, read one by one. After a line that cannot be used the next one follows; after one that is too long none, since a
-/// sparse file is one line without an end; and after a file that cannot be read, none.
+/// A file of JSON lines, read one by one. After a line that cannot be used the next one follows;
+/// after one that is too long none, since a sparse file is one line without an end; and after a
+/// file that cannot be read, none.
 #[derive(Debug)]
 pub struct JsonLines<T> {
     path: PathBuf,
@@ -95,9 +101,13 @@ impl<T> JsonLines<T> {
     /// [`ResultsError::Read`] if the file cannot be opened.
     pub fn read(path: PathBuf) -> Result<Self, ResultsError> {
         match PlainFile::result(&path, LINES_MAX) {
-            Ok(file) => {
-                Ok(Self { path, reader: Some(BufReader::new(file)), text: Vec::new(), line: 0, of: PhantomData })
-            }
+            Ok(file) => Ok(Self {
+                path,
+                reader: Some(BufReader::new(file)),
+                text: Vec::new(),
+                line: 0,
+                of: PhantomData,
+            }),
             Err(source) => Err(ResultsError::Read { path, source }),
         }
     }
@@ -172,7 +182,9 @@ mod tests {
         };
         let text = gleaner_base::Failure::from(sparse(1 << 40).unwrap_err()).to_string();
         assert!(
-            text.contains("decisions.jsonl`\n  cause: it has 1099511627776 bytes; at most 32 GiB are read"),
+            text.contains(
+                "decisions.jsonl`\n  cause: it has 1099511627776 bytes; at most 32 GiB are read"
+            ),
             "{text}"
         );
         let lines: Vec<_> = sparse(LINES_MAX.bytes()).unwrap().collect();
@@ -182,14 +194,16 @@ mod tests {
     #[test]
     fn a_pipe_or_a_link_in_the_place_of_results_is_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let [decisions, clips_list] = ["decisions.jsonl", "clips.jsonl"].map(|name| folder.path().join(name));
+        let [decisions, clips_list] =
+            ["decisions.jsonl", "clips.jsonl"].map(|name| folder.path().join(name));
         assert!(std::process::Command::new("mkfifo").arg(&decisions).status().unwrap().success());
         std::fs::write(folder.path().join("other"), "").unwrap();
         std::os::unix::fs::symlink("other", &clips_list).unwrap();
         let errors = [Decisions::open(folder.path()).err(), clips(folder.path()).err()];
-        for (error, said) in
-            errors.into_iter().zip(["decisions.jsonl`\n  cause: it is no file", "clips.jsonl`\n  cause: it is a link"])
-        {
+        for (error, said) in errors.into_iter().zip([
+            "decisions.jsonl`\n  cause: it is no file",
+            "clips.jsonl`\n  cause: it is a link",
+        ]) {
             let text = gleaner_base::Failure::from(error.unwrap()).to_string();
             assert!(text.contains(said), "{text}");
         }

@@ -1,4 +1,5 @@
-//! What the files of an output tell as a whole: `summary.json` of a replay or of a live run, and `signals.json`.
+//! What the files of an output tell as a whole: `summary.json` of a replay or of a live run, and
+//! `signals.json`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,8 +17,8 @@ use serde::de::DeserializeOwned;
 use crate::results::ResultsError;
 use crate::words::cut;
 
-/// Most topics of a summary, and drives of it: a lambda has fewer, but the file may be by others. Most characters of their names, and of
-/// what else a summary says in a word.
+/// Most topics of a summary, and drives of it: a lambda has fewer, but the file may be by others.
+/// Most characters of their names, and of what else a summary says in a word.
 const TOPICS_MAX: usize = 256;
 const DRIVES_MAX: usize = 50;
 const NAME_CHARS: usize = 300;
@@ -137,12 +138,20 @@ impl RunSummary {
         let text = match bounded(out, "summary.json", SUMMARY_MAX) {
             Ok(text) => text,
             Err(source) if source.is_absent() => {
-                return Err(OutputError::None { out: out.to_owned(), inside: outputs_in(out), source });
+                return Err(OutputError::None {
+                    out: out.to_owned(),
+                    inside: outputs_in(out),
+                    source,
+                });
             }
-            Err(source) => return Err(OutputError::Summary { path: out.join("summary.json"), source }),
+            Err(source) => {
+                return Err(OutputError::Summary { path: out.join("summary.json"), source });
+            }
         };
-        // The two are told apart by a key that only one of them has, so that what is wrong with a summary is said of the right one.
-        let is_live = serde_json::from_slice::<serde_json::Value>(&text).is_ok_and(|value| value.get("up_s").is_some());
+        // The two are told apart by a key that only one of them has, so that what is wrong with a
+        // summary is said of the right one.
+        let is_live = serde_json::from_slice::<serde_json::Value>(&text)
+            .is_ok_and(|value| value.get("up_s").is_some());
         let told = if is_live {
             parsed("summary.json", &text).map(Self::Live)
         } else {
@@ -164,12 +173,16 @@ impl RunSummary {
                 left_out("drives", summary.drive.len(), DRIVES_MAX);
                 left_out("topics", summary.topics.len(), TOPICS_MAX);
                 summary.drive.truncate(DRIVES_MAX);
-                summary.drive.iter_mut().for_each(|drive| *drive = cut(&drive.to_string_lossy(), NAME_CHARS).into());
+                summary
+                    .drive
+                    .iter_mut()
+                    .for_each(|drive| *drive = cut(&drive.to_string_lossy(), NAME_CHARS).into());
                 summary.damaged = summary.damaged.as_deref().map(|why| cut(why, WHY_CHARS));
                 summary.stopped = summary.stopped.as_deref().map(|why| cut(why, WHY_CHARS));
                 summary.topics.truncate(TOPICS_MAX);
                 let topics = summary.topics.iter_mut();
-                let names = topics.flat_map(|topic| [&mut topic.name, &mut topic.topic, &mut topic.type_name]);
+                let names = topics
+                    .flat_map(|topic| [&mut topic.name, &mut topic.topic, &mut topic.type_name]);
                 shorten(names.chain([&mut summary.lambda, &mut summary.version]));
             }
             Self::Live(live) => {
@@ -177,7 +190,9 @@ impl RunSummary {
                 live.topics.truncate(TOPICS_MAX);
                 let topics = live.topics.iter_mut();
                 let names = topics.flat_map(|topic| {
-                    [&mut topic.name, &mut topic.topic, &mut topic.type_name].into_iter().chain(&mut topic.trouble)
+                    [&mut topic.name, &mut topic.topic, &mut topic.type_name]
+                        .into_iter()
+                        .chain(&mut topic.trouble)
                 });
                 shorten(names.chain([&mut live.lambda, &mut live.version]));
             }
@@ -215,15 +230,25 @@ impl RunSummary {
         };
         match self {
             Self::Replay(told) => {
-                let mut counts =
-                    shared(told.skipped, told.missed_ticks, told.log_dropped, told.triggers_refused, told.passed_over);
+                let mut counts = shared(
+                    told.skipped,
+                    told.missed_ticks,
+                    told.log_dropped,
+                    told.triggers_refused,
+                    told.passed_over,
+                );
                 counts.push(("messages out of order in the drive", told.out_of_order));
                 counts.extend(by_cause(&told.recording));
                 counts
             }
             Self::Live(told) => {
-                let mut counts =
-                    shared(told.skipped, told.missed_ticks, told.log_dropped, told.triggers_refused, told.passed_over);
+                let mut counts = shared(
+                    told.skipped,
+                    told.missed_ticks,
+                    told.log_dropped,
+                    told.triggers_refused,
+                    told.passed_over,
+                );
                 counts.push(("decisions and log lines not written", told.unwritten));
                 counts.push(("messages not sent, of `--rtt` and `--decisions`", told.unsent));
                 counts.push(("datagrams dropped by full sockets", told.network.socket_drops));
@@ -256,17 +281,31 @@ fn by_cause(recording: &Recording) -> impl Iterator<Item = (&'static str, u64)> 
 
 /// The same live, where there is more on the way to it.
 fn recorded(status: &RecorderStatus) -> Vec<(&'static str, u64)> {
-    let sum = |count: fn(&RecordedTopic) -> u64| status.topics.iter().map(count).fold(0, u64::saturating_add);
+    let sum = |count: fn(&RecordedTopic) -> u64| {
+        status.topics.iter().map(count).fold(0, u64::saturating_add)
+    };
     let (network, commands) = (status.network.as_ref(), status.commands.as_ref());
     let mut counts: Vec<_> = by_cause(&status.recording).collect();
     counts.extend([
-        ("samples to be recorded, lost before they reached the recorder", sum(|topic| topic.lost.unwrap_or(0))),
-        ("samples to be recorded, without room as the recorder was busy", sum(|topic| topic.no_slot)),
+        (
+            "samples to be recorded, lost before they reached the recorder",
+            sum(|topic| topic.lost.unwrap_or(0)),
+        ),
+        (
+            "samples to be recorded, without room as the recorder was busy",
+            sum(|topic| topic.no_slot),
+        ),
         ("samples to be recorded, larger than the recorder can take", sum(|topic| topic.too_big)),
         ("samples to be recorded, malformed", sum(|topic| topic.malformed)),
         ("commands refused", commands.map_or(0, |commands| commands.refused)),
-        ("datagrams dropped by full sockets of the recorder", network.map_or(0, |network| network.socket_drops)),
-        ("hostile datagrams dropped by the recorder", network.map_or(0, |network| network.filtered)),
+        (
+            "datagrams dropped by full sockets of the recorder",
+            network.map_or(0, |network| network.socket_drops),
+        ),
+        (
+            "hostile datagrams dropped by the recorder",
+            network.map_or(0, |network| network.filtered),
+        ),
     ]);
     counts
 }
@@ -309,13 +348,15 @@ impl From<&gleaner_protocol::LiveTopic> for Losses {
 
 /// What the lambda read; `None` if the run left no `signals.json`, as a live one does not.
 ///
-/// What is more than it may be is cut, and curves whose numbers do not belong together are left out; `notes` says so.
+/// What is more than it may be is cut, and curves whose numbers do not belong together are left
+/// out; `notes` says so.
 ///
 /// # Errors
 ///
 /// If the file is a link, or something else that no run leaves.
 pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Result<Option<Signals>, OutputError> {
-    let read = bounded(out, "signals.json", SIGNALS_MAX).and_then(|text| parsed::<Signals>("signals.json", &text));
+    let read = bounded(out, "signals.json", SIGNALS_MAX)
+        .and_then(|text| parsed::<Signals>("signals.json", &text));
     let mut signals = match read {
         Ok(signals) => signals,
         Err(error) if error.is_absent() => return Ok(None),
@@ -345,7 +386,11 @@ pub(crate) fn shown_config(
     notes: &mut Vec<String>,
 ) -> BTreeMap<String, ConfigValue> {
     if config.len() > CONFIG_MAX {
-        notes.push(format!("`signals.json`: {} of {} config values left out", config.len() - CONFIG_MAX, config.len()));
+        notes.push(format!(
+            "`signals.json`: {} of {} config values left out",
+            config.len() - CONFIG_MAX,
+            config.len()
+        ));
     }
     let value = |value: &ConfigValue| match value {
         ConfigValue::Text(text) => ConfigValue::Text(cut(text, NAME_CHARS)),
@@ -383,8 +428,11 @@ fn bounded(out: &Path, name: &'static str, most: ByteSize) -> Result<Vec<u8>, Fi
 /// Folders in `out` that hold results: a vehicle has one for each lambda.
 fn outputs_in(out: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(out).into_iter().flatten().flatten();
-    let mut folders: Vec<_> =
-        entries.map(|entry| entry.path()).filter(|path| path.join("summary.json").is_file()).take(8).collect();
+    let mut folders: Vec<_> = entries
+        .map(|entry| entry.path())
+        .filter(|path| path.join("summary.json").is_file())
+        .take(8)
+        .collect();
     folders.sort();
     folders
 }

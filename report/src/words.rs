@@ -5,13 +5,17 @@ use gleaner_lambda::{Clip, Decision, FaultKind, Trigger};
 
 pub use gleaner_base::grouped;
 
-/// A line of `expected.txt` for each trigger of `decision`: `<seconds %.3f> <label> <score %.3g>`; no score is `-`.
+/// A line of `expected.txt` for each trigger of `decision`: `<seconds %.3f> <label> <score %.3g>`;
+/// no score is `-`.
 ///
-/// `start_ns` is [`Summary::start_ns`](gleaner_protocol::Summary::start_ns): seconds count from the first message of
-/// the drive, of whatever topic.
+/// `start_ns` is [`Summary::start_ns`](gleaner_protocol::Summary::start_ns): seconds count from the
+/// first message of the drive, of whatever topic.
 pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item = String> {
     let seconds = seconds(decision.at_ns, start_ns);
-    decision.triggers.iter().map(move |trigger| format!("{seconds:.3} {} {}", visible(&trigger.label), score(trigger)))
+    decision
+        .triggers
+        .iter()
+        .map(move |trigger| format!("{seconds:.3} {} {}", visible(&trigger.label), score(trigger)))
 }
 
 /// The score of `trigger` in three significant digits, `-` if it has none.
@@ -31,8 +35,16 @@ pub fn size(bytes: u64) -> String {
 /// What is in a clip: `9.1 s, 205 KiB: messages /imu/data 950, /vehicle/speed 757`.
 pub fn clip_contents(clip: &Clip) -> String {
     let [from, to] = clip_span(clip);
-    let topics = clip.topics.iter().map(|topic| format!("{} {}", visible(&topic.topic), grouped(topic.messages)));
-    format!("{:.1} s, {}: messages {}", seconds(to, from), size(clip.bytes), topics.collect::<Vec<_>>().join(", "))
+    let topics = clip
+        .topics
+        .iter()
+        .map(|topic| format!("{} {}", visible(&topic.topic), grouped(topic.messages)));
+    format!(
+        "{:.1} s, {}: messages {}",
+        seconds(to, from),
+        size(clip.bytes),
+        topics.collect::<Vec<_>>().join(", ")
+    )
 }
 
 /// Log times of a clip's first and last message; of what was asked for, if it has none.
@@ -45,15 +57,17 @@ pub fn seconds(at_ns: i64, start_ns: i64) -> f64 {
     at_ns.saturating_sub(start_ns) as f64 / 1e9
 }
 
-/// `value` as C's `printf("%.3g")` writes it: three significant digits, without zeros at the end, in scientific
-/// notation from 1000 on and below 0.0001.
+/// `value` as C's `printf("%.3g")` writes it: three significant digits, without zeros at the end,
+/// in scientific notation from 1000 on and below 0.0001.
 ///
-/// Source: ISO C, `fprintf`, conversion `g`: with precision P and exponent X it is `%f` if P > X >= -4, else `%e`.
+/// Source: ISO C, `fprintf`, conversion `g`: with precision P and exponent X it is `%f` if P > X >=
+/// -4, else `%e`.
 pub fn three_digits(value: f64) -> String {
     if !value.is_finite() {
         return value.to_string().to_lowercase();
     }
-    // Rounding may carry into the next power of ten, so the exponent is read from the rounded value.
+    // Rounding may carry into the next power of ten, so the exponent is read from the rounded
+    // value.
     let scientific = format!("{value:.2e}");
     let (digits, exponent) = scientific.split_once('e').unwrap_or((&scientific, "0"));
     let exponent: i32 = exponent.parse().unwrap_or(0);
@@ -63,7 +77,12 @@ pub fn three_digits(value: f64) -> String {
     };
     match exponent {
         -4..=2 => trimmed(&format!("{value:.*}", (2 - exponent) as usize)),
-        _ => format!("{}e{}{:02}", trimmed(digits), if exponent < 0 { '-' } else { '+' }, exponent.abs()),
+        _ => format!(
+            "{}e{}{:02}",
+            trimmed(digits),
+            if exponent < 0 { '-' } else { '+' },
+            exponent.abs()
+        ),
     }
 }
 
@@ -138,7 +157,13 @@ mod tests {
 
     #[test]
     fn thousands_are_grouped() {
-        for (count, text) in [(0, "0"), (999, "999"), (1000, "1,000"), (123_456, "123,456"), (1_234_567, "1,234,567")] {
+        for (count, text) in [
+            (0, "0"),
+            (999, "999"),
+            (1000, "1,000"),
+            (123_456, "123,456"),
+            (1_234_567, "1,234,567"),
+        ] {
             assert_eq!(grouped(count), text);
         }
     }

@@ -57,7 +57,10 @@ impl PerCall {
         if len <= most {
             return Ok(());
         }
-        Err(WrongField::new(path, format!("has {len} items, one call hands out {most}; read it with `cdr`")))
+        Err(WrongField::new(
+            path,
+            format!("has {len} items, one call hands out {most}; read it with `cdr`"),
+        ))
     }
 
     /// The place of `len` bytes from `offset` in a `whole` of so many, clamped to what it has and

@@ -10,8 +10,11 @@ pub const COMPRESSED_IMAGE: &str = "sensor_msgs/msg/CompressedImage";
 
 /// 1 to 63 characters, first a lower-case letter, then those, digits and `extra`.
 fn is_name(text: &str, extra: &[u8]) -> bool {
-    let rest = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
-    text.len() <= 63 && text.bytes().next().is_some_and(|first| first.is_ascii_lowercase()) && text.bytes().all(rest)
+    let rest =
+        |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
+    text.len() <= 63
+        && text.bytes().next().is_some_and(|first| first.is_ascii_lowercase())
+        && text.bytes().all(rest)
 }
 
 /// Whether a lambda can have this name.
@@ -30,13 +33,15 @@ pub fn is_topic(text: &str) -> bool {
         part.bytes().next().is_some_and(|first| !first.is_ascii_digit())
             && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
     };
-    text.len() <= TOPIC_NAME_MAX && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
+    text.len() <= TOPIC_NAME_MAX
+        && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
 }
 
 /// Whether a ROS message type can have this name, such as `sensor_msgs/msg/Imu`.
 pub fn is_type(text: &str) -> bool {
     let mut parts = text.split('/');
-    let (Some(package), Some("msg"), Some(name), None) = (parts.next(), parts.next(), parts.next(), parts.next())
+    let (Some(package), Some("msg"), Some(name), None) =
+        (parts.next(), parts.next(), parts.next(), parts.next())
     else {
         return false;
     };

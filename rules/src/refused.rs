@@ -22,7 +22,9 @@ pub fn no_image_type(topic: &str, type_name: &str) -> String {
 
 /// More objects of the host than `handles` of `[limits]` allow.
 pub fn too_many_handles(allowed: u64) -> String {
-    format!("the lambda holds {allowed} handles; drop samples, frames, fields and topics that are not needed")
+    format!(
+        "the lambda holds {allowed} handles; drop samples, frames, fields and topics that are not needed"
+    )
 }
 
 /// An image that contradicts itself, or of which nothing can be computed.
@@ -45,5 +47,7 @@ pub fn no_slot(topic: &str, input: &str) -> String {
 /// Why a JPEG or PNG is too large: what it needs, and what its input's slots have.
 pub fn too_many_pixels((width, height): (u32, u32), needed: u64, allowed: u64) -> String {
     let (needed, allowed) = (Rounded::up(needed), Rounded::down(allowed));
-    format!("image says it is {width}x{height} ({needed} as rgb8); this input's decoded_size is {allowed}")
+    format!(
+        "image says it is {width}x{height} ({needed} as rgb8); this input's decoded_size is {allowed}"
+    )
 }

@@ -68,7 +68,8 @@ impl<T> Ring<T> {
         self.shown.push_back(Arc::new(Cell { sample, position }));
         self.counts.received += 1;
         let leaves = |cell: &Arc<Cell<T>>| cell.position + self.depth as u64 == position;
-        let leaving = if self.shown.front().is_some_and(leaves) { self.shown.pop_front() } else { None };
+        let leaving =
+            if self.shown.front().is_some_and(leaves) { self.shown.pop_front() } else { None };
         if let Some(cell) = leaving {
             self.counts.overwritten += 1;
             if is_held(&cell) {

@@ -81,7 +81,13 @@ impl<R: Ring> Schedule<R> {
     /// look for a tick.
     pub fn periodic(period_ns: i64) -> Self {
         let period_ns = period_ns.max(1);
-        Self::Periodic(Periodic { period_ns, live: false, due_ns: None, missed: 0, missed_total: 0 })
+        Self::Periodic(Periodic {
+            period_ns,
+            live: false,
+            due_ns: None,
+            missed: 0,
+            missed_total: 0,
+        })
     }
 
     /// Time begins, in a replay: the first tick comes a period later.
@@ -207,7 +213,9 @@ impl Periodic {
     }
 
     fn later(&self, at_ns: i64, periods: u64) -> i64 {
-        at_ns.saturating_add(i64::try_from(periods).unwrap_or(i64::MAX).saturating_mul(self.period_ns))
+        at_ns.saturating_add(
+            i64::try_from(periods).unwrap_or(i64::MAX).saturating_mul(self.period_ns),
+        )
     }
 }
 

@@ -49,7 +49,10 @@ impl fmt::Display for ScratchError {
                 write!(f, "scratch has no `{name}`; it is empty when the lambda's process starts")
             }
             Self::WrongName(name) => {
-                write!(f, "`{name}` is no name for scratch; give 1 to 128 bytes without control characters")
+                write!(
+                    f,
+                    "`{name}` is no name for scratch; give 1 to 128 bytes without control characters"
+                )
             }
         }
     }
@@ -87,7 +90,10 @@ impl Scratch {
 
     /// Everything that is kept, in the order of the names' bytes.
     pub fn entries(&self) -> Vec<Entry> {
-        self.entries.iter().map(|(name, pieces)| Entry { name: name.clone(), bytes: pieces.len() }).collect()
+        self.entries
+            .iter()
+            .map(|(name, pieces)| Entry { name: name.clone(), bytes: pieces.len() })
+            .collect()
     }
 
     /// Keeps `bytes` under a name, in place of what was there.
@@ -119,7 +125,11 @@ impl Scratch {
         }
         let given_back = if in_place { there.unwrap_or(0) } else { 0 };
         let new = there.map_or(ENTRY_BYTES + name.len() as u64, |_| 0) + bytes.len() as u64;
-        let no_room = |free| ScratchError::NoRoom { name: shown(name), needed: new.saturating_sub(given_back), free };
+        let no_room = |free| ScratchError::NoRoom {
+            name: shown(name),
+            needed: new.saturating_sub(given_back),
+            free,
+        };
         if new > self.free() + given_back {
             return Err(no_room(self.free()));
         }
@@ -149,7 +159,8 @@ impl Scratch {
     ///
     /// [`ScratchError::NoSuchEntry`].
     pub fn get(&self, name: &str, offset: u64, len: u64) -> Result<Vec<u8>, ScratchError> {
-        let pieces = self.entries.get(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
+        let pieces =
+            self.entries.get(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
         let from = offset.min(pieces.len());
         let len = len.min(pieces.len() - from).min(self.most_given as u64);
         Ok(pieces.read(from as usize, len as usize))
@@ -161,7 +172,8 @@ impl Scratch {
     ///
     /// [`ScratchError::NoSuchEntry`].
     pub fn remove(&mut self, name: &str) -> Result<(), ScratchError> {
-        let pieces = self.entries.remove(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
+        let pieces =
+            self.entries.remove(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
         self.used -= ENTRY_BYTES + name.len() as u64 + pieces.len();
         Ok(())
     }
@@ -240,8 +252,12 @@ mod tests {
         let at = PIECE_BYTES - 3;
         assert_eq!(scratch.get("long", at as u64, 7).unwrap(), bytes[at..at + 7]);
         assert_eq!(scratch.get("long", 0, u64::MAX).unwrap(), bytes[..1 << 20]);
-        let read: Vec<u8> =
-            (0..).step_by(1 << 20).map(|from| scratch.get("long", from, 1 << 20).unwrap()).take(3).flatten().collect();
+        let read: Vec<u8> = (0..)
+            .step_by(1 << 20)
+            .map(|from| scratch.get("long", from, 1 << 20).unwrap())
+            .take(3)
+            .flatten()
+            .collect();
         assert!(read == bytes);
     }
 

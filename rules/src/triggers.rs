@@ -74,17 +74,29 @@ impl fmt::Display for TriggerError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::NoLabel => write!(f, "the label is empty"),
-            Self::LongLabel { bytes } => write!(f, "the label has {bytes} bytes; at most {LABEL_BYTES} are allowed"),
-            Self::Score { label, score } => write!(f, "the score of `{label}` is {score}; it must be finite"),
+            Self::LongLabel { bytes } => {
+                write!(f, "the label has {bytes} bytes; at most {LABEL_BYTES} are allowed")
+            }
+            Self::Score { label, score } => {
+                write!(f, "the score of `{label}` is {score}; it must be finite")
+            }
             Self::Attributes { label, given } => {
                 write!(f, "`{label}` has {given} attributes; at most {ATTRIBUTES} are allowed")
             }
-            Self::Attribute { label, key, why } => write!(f, "attribute `{key}` of `{label}`: {why}"),
+            Self::Attribute { label, key, why } => {
+                write!(f, "attribute `{key}` of `{label}`: {why}")
+            }
             Self::NoWake => {
-                write!(f, "triggers belong to a wake: in init, and between two wakes, there are none")
+                write!(
+                    f,
+                    "triggers belong to a wake: in init, and between two wakes, there are none"
+                )
             }
             Self::TooMany => {
-                write!(f, "this wake has caused {PER_WAKE} triggers already; further ones are refused")
+                write!(
+                    f,
+                    "this wake has caused {PER_WAKE} triggers already; further ones are refused"
+                )
             }
             Self::TooOften { allowed } => {
                 write!(f, "the lambda has caused {allowed} triggers in this minute already, ")?;
@@ -207,12 +219,20 @@ fn check(label: &str, score: Option<f64>, attributes: &[Attribute]) -> Result<()
         return Err(TriggerError::Attributes { label: label(), given: attributes.len() });
     }
     for (n, Attribute { key, value }) in attributes.iter().enumerate() {
-        let refuse = |why| Err(TriggerError::Attribute { label: label(), key: cut(key, KEY_BYTES).to_owned(), why });
+        let refuse = |why| {
+            Err(TriggerError::Attribute {
+                label: label(),
+                key: cut(key, KEY_BYTES).to_owned(),
+                why,
+            })
+        };
         if key.is_empty() || key.len() > KEY_BYTES {
             return refuse("the key must have 1 to 64 bytes");
         }
         match value {
-            AttributeValue::Real(value) if !value.is_finite() => return refuse("the value must be finite"),
+            AttributeValue::Real(value) if !value.is_finite() => {
+                return refuse("the value must be finite");
+            }
             AttributeValue::Text(text) if text.len() > TEXT_BYTES => {
                 return refuse("the text must have at most 1,024 bytes");
             }

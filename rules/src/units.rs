@@ -14,9 +14,11 @@ const TIMES: [(&str, u64); 6] = [
 ];
 
 /// How a size is written.
-pub const SIZE_RULE: &str = "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"";
+pub const SIZE_RULE: &str =
+    "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"";
 /// How a duration is written.
-pub const TIME_RULE: &str = "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"";
+pub const TIME_RULE: &str =
+    "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"";
 
 /// The number and the unit of `2 MiB` or `2MiB`; without a unit the second is empty.
 fn split(text: &str) -> (&str, &str) {

@@ -28,7 +28,12 @@ fn replay(file: &str, cases: &str, start: impl Fn(&Value) -> Answers<'static>) {
             };
             let arguments = arguments.iter().map(plain).collect::<Vec<_>>();
             let name = name.as_str().unwrap();
-            assert_eq!(&answers(name, &arguments), wanted, "{file}: {}: call {n}, {name}", case["name"]);
+            assert_eq!(
+                &answers(name, &arguments),
+                wanted,
+                "{file}: {}: call {n}, {name}",
+                case["name"]
+            );
         }
     }
 }

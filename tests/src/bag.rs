@@ -35,7 +35,8 @@ fn sample() -> Vec<(String, String, u64, Vec<u8>)> {
     messages
 }
 
-/// Writes the sample drive into the new database `path`, so many times in a row. Gives the number of messages by topic.
+/// Writes the sample drive into the new database `path`, so many times in a row. Gives the number
+/// of messages by topic.
 pub fn database(path: &Path, rounds: u64) -> BTreeMap<String, u64> {
     let db = Connection::open(path).expect("the folder is writable");
     db.execute_batch(TABLES).expect("an empty database");
@@ -62,11 +63,16 @@ pub fn database(path: &Path, rounds: u64) -> BTreeMap<String, u64> {
     counts
 }
 
-/// Writes the sample drive into the new MCAP file `path`, so many times in a row, chunks unpacked as rosbag2 leaves them.
+/// Writes the sample drive into the new MCAP file `path`, so many times in a row, chunks unpacked
+/// as rosbag2 leaves them.
 pub fn mcap(path: &Path, rounds: u64) {
     let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
     let file = BufWriter::new(File::create(path).expect("the folder is writable"));
-    let mut writer = mcap::WriteOptions::new().profile("ros2").compression(None).create(file).expect("a new file");
+    let mut writer = mcap::WriteOptions::new()
+        .profile("ros2")
+        .compression(None)
+        .create(file)
+        .expect("a new file");
     for round in 0..rounds {
         for message in mcap::MessageStream::new(&bytes).expect("a drive") {
             let mut message = message.expect("a whole drive");
@@ -85,7 +91,9 @@ pub fn directory(folder: &Folder, rounds: u64) -> PathBuf {
     let counts = database(&path.join("drive_0.db3"), rounds);
     let topics: String = counts
         .iter()
-        .map(|(topic, count)| format!("    - topic_metadata:\n        name: {topic}\n      message_count: {count}\n"))
+        .map(|(topic, count)| {
+            format!("    - topic_metadata:\n        name: {topic}\n      message_count: {count}\n")
+        })
         .collect();
     let text = format!(
         "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: sqlite3\n  relative_file_paths:\n    - drive_0.db3\n\

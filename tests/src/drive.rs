@@ -23,15 +23,30 @@ MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
 ================================================================================\n\
 MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
-/// Writes a drive of one topic; each message is its log time in nanoseconds and its CDR without encapsulation.
-pub fn one_topic(folder: &Folder, topic: &str, type_name: &str, schema: &str, messages: &[(u64, Vec<u8>)]) -> PathBuf {
+/// Writes a drive of one topic; each message is its log time in nanoseconds and its CDR without
+/// encapsulation.
+pub fn one_topic(
+    folder: &Folder,
+    topic: &str,
+    type_name: &str,
+    schema: &str,
+    messages: &[(u64, Vec<u8>)],
+) -> PathBuf {
     let mut file = Cursor::new(Vec::new());
-    let mut writer =
-        mcap::WriteOptions::new().profile("ros2").compression(None).create(&mut file).expect("a drive in memory");
+    let mut writer = mcap::WriteOptions::new()
+        .profile("ros2")
+        .compression(None)
+        .create(&mut file)
+        .expect("a drive in memory");
     let schema = writer.add_schema(type_name, "ros2msg", schema.as_bytes()).expect("a schema");
     let channel = writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel");
     for (sequence, (log_time, cdr)) in (1..).zip(messages) {
-        let header = MessageHeader { channel_id: channel, sequence, log_time: *log_time, publish_time: *log_time };
+        let header = MessageHeader {
+            channel_id: channel,
+            sequence,
+            log_time: *log_time,
+            publish_time: *log_time,
+        };
         let data = [&[0, 1, 0, 0], cdr.as_slice()].concat();
         writer.write_to_known_channel(&header, &data).expect("a message");
     }
@@ -43,26 +58,36 @@ pub fn one_topic(folder: &Folder, topic: &str, type_name: &str, schema: &str, me
 /// The IMU of the sample drive alone, so many times in a row, 40 s each.
 pub fn imu_only(folder: &Folder, times: u64) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
-    let messages = mcap::MessageStream::new(&bytes).expect("a drive").map(|message| message.expect("a whole drive"));
+    let messages = mcap::MessageStream::new(&bytes)
+        .expect("a drive")
+        .map(|message| message.expect("a whole drive"));
     let imu = messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
     let schema = imu[0].channel.schema.clone().expect("a schema");
     let schema = String::from_utf8_lossy(&schema.data).into_owned();
     let rounds = (0..times).flat_map(|round| {
-        imu.iter().map(move |message| (message.log_time + round * 40_100_000_000, message.data[4..].to_vec()))
+        imu.iter().map(move |message| {
+            (message.log_time + round * 40_100_000_000, message.data[4..].to_vec())
+        })
     });
     one_topic(folder, "/imu/data", "sensor_msgs/msg/Imu", &schema, &rounds.collect::<Vec<_>>())
 }
 
-/// The IMU of the sample drive, with so many topics beside it: `/many/0` and on, each with ten of its messages.
+/// The IMU of the sample drive, with so many topics beside it: `/many/0` and on, each with ten of
+/// its messages.
 pub fn with_topics(folder: &Folder, topics: u16) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
     let mut file = Cursor::new(Vec::new());
-    let mut writer = mcap::WriteOptions::new().profile("ros2").create(&mut file).expect("a drive in memory");
-    let messages = mcap::MessageStream::new(&bytes).expect("a drive").map(|message| message.expect("a whole drive"));
+    let mut writer =
+        mcap::WriteOptions::new().profile("ros2").create(&mut file).expect("a drive in memory");
+    let messages = mcap::MessageStream::new(&bytes)
+        .expect("a drive")
+        .map(|message| message.expect("a whole drive"));
     let imu = messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
     let schema = imu[0].channel.schema.clone().expect("a schema");
     let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data).expect("a schema");
-    let mut add = |topic: &str| writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel");
+    let mut add = |topic: &str| {
+        writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel")
+    };
     let ours = add("/imu/data");
     let others = (0..topics).map(|n| add(&format!("/many/{n}"))).collect::<Vec<_>>();
     let apart = imu.len() / 10;
@@ -70,7 +95,12 @@ pub fn with_topics(folder: &Folder, topics: u16) -> PathBuf {
         let others = if n % apart == 0 { others.as_slice() } else { &[] };
         for channel_id in [ours].iter().chain(others) {
             let (log_time, publish_time) = (message.log_time, message.publish_time);
-            let header = MessageHeader { channel_id: *channel_id, sequence: message.sequence, log_time, publish_time };
+            let header = MessageHeader {
+                channel_id: *channel_id,
+                sequence: message.sequence,
+                log_time,
+                publish_time,
+            };
             writer.write_to_known_channel(&header, &message.data).expect("a message");
         }
     }
@@ -93,9 +123,11 @@ pub struct Changed {
 }
 
 impl Changed {
-    /// Where the first field behind its header lies, for types of 64-bit floats: behind a stamp and the text of `frame_id`.
+    /// Where the first field behind its header lies, for types of 64-bit floats: behind a stamp and
+    /// the text of `frame_id`.
     fn body(&self) -> usize {
-        let length = u32::from_le_bytes(self.data[12..16].try_into().expect("a header has a frame_id"));
+        let length =
+            u32::from_le_bytes(self.data[12..16].try_into().expect("a header has a frame_id"));
         // Alignment counts from behind the 4 bytes of encapsulation.
         (12 + length as usize).next_multiple_of(8) + 4
     }
@@ -113,19 +145,29 @@ impl Changed {
     }
 }
 
-/// The sample drive with each message as `change` leaves it, and without those of which it says `false`.
+/// The sample drive with each message as `change` leaves it, and without those of which it says
+/// `false`.
 pub fn changed(folder: &Folder, mut change: impl FnMut(&mut Changed) -> bool) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
     let mut file = Cursor::new(Vec::new());
-    let mut writer = mcap::WriteOptions::new().profile("ros2").compression(None).create(&mut file).expect("a drive");
+    let mut writer = mcap::WriteOptions::new()
+        .profile("ros2")
+        .compression(None)
+        .create(&mut file)
+        .expect("a drive");
     let mut start = None;
-    for message in mcap::MessageStream::new(&bytes).expect("a drive").map(|message| message.expect("a whole drive")) {
-        let (topic, log_time, data) = (message.channel.topic.clone(), message.log_time, message.data.to_vec());
+    for message in mcap::MessageStream::new(&bytes)
+        .expect("a drive")
+        .map(|message| message.expect("a whole drive"))
+    {
+        let (topic, log_time, data) =
+            (message.channel.topic.clone(), message.log_time, message.data.to_vec());
         let at_s = (log_time - *start.get_or_insert(log_time)) as f64 / 1e9;
         let mut changed = Changed { topic, at_s, log_time, data };
         if change(&mut changed) {
             let (publish_time, data) = (message.publish_time, changed.data.into());
-            let message = mcap::Message { log_time: changed.log_time, publish_time, data, ..message };
+            let message =
+                mcap::Message { log_time: changed.log_time, publish_time, data, ..message };
             writer.write(&message).expect("a message");
         }
     }

@@ -34,12 +34,16 @@ pub fn messages(drive: &Path, wanted: &[Wanted]) -> Vec<Given> {
     let mut given = Vec::new();
     for message in mcap::MessageStream::new(&bytes).expect("a drive") {
         let message = message.expect("a whole drive");
-        let Some(number) = wanted.iter().position(|(_, topic, _)| *topic == message.channel.topic) else { continue };
+        let Some(number) = wanted.iter().position(|(_, topic, _)| *topic == message.channel.topic)
+        else {
+            continue;
+        };
         let (input, _, paths) = wanted[number];
         // As the host numbers messages whose recorder did not.
         let seq = u64::from(message.sequence).max(last_seq[number] + 1);
         last_seq[number] = seq;
-        let as_given = given_of(&message, paths).numbered(seq).published(message.publish_time as i64);
+        let as_given =
+            given_of(&message, paths).numbered(seq).published(message.publish_time as i64);
         given.push(Given { input, at_ns: message.log_time as i64, message: as_given });
     }
     given.sort_by_key(|given| given.at_ns);
@@ -52,19 +56,24 @@ fn given_of(message: &mcap::Message<'_>, paths: &[&str]) -> Message {
     let definitions = Definitions::parse(&schema.name, &text).expect("definitions");
     let endian = if message.data[1] & 1 == 0 { Endian::Big } else { Endian::Little };
     let cdr = &message.data[4..];
-    let read = |path: &str| FieldPath::compile(&definitions, path).expect("a field").read(cdr, endian).map(owned);
+    let read = |path: &str| {
+        FieldPath::compile(&definitions, path).expect("a field").read(cdr, endian).map(owned)
+    };
     let pictured = match schema.name.as_str() {
         "sensor_msgs/msg/CompressedImage" => picture(cdr, &definitions, endian),
         _ => Message::new(),
     };
-    let with = |message: Message, path: &&str| message.with(path, read(path).expect("a whole message"));
+    let with =
+        |message: Message, path: &&str| message.with(path, read(path).expect("a whole message"));
     paths.iter().fold(pictured, with).cdr(message.data.to_vec())
 }
 
 /// What the host makes of a JPEG or PNG.
 fn picture(cdr: &[u8], definitions: &Definitions, endian: Endian) -> Message {
     let data = FieldPath::compile(definitions, "data").expect("a field");
-    let Value::Bytes(data) = data.read(cdr, endian).expect("a whole message") else { panic!("no bytes") };
+    let Value::Bytes(data) = data.read(cdr, endian).expect("a whole message") else {
+        panic!("no bytes")
+    };
     let header = probe(data).expect("an image");
     let mut pixels = vec![0; header.rgb8_len().expect("an image of some size")];
     let room = pixels.len();

@@ -31,7 +31,8 @@ pub fn sample_drive() -> PathBuf {
     root().join("examples/data/highway_drive.mcap")
 }
 
-/// Drives that may not come with the project, in the folder beside the checkout; the reason where there are none.
+/// Drives that may not come with the project, in the folder beside the checkout; the reason where
+/// there are none.
 pub fn shared_drive(name: &str) -> Result<PathBuf, String> {
     let path = root().join("../shared/data").join(name);
     if path.is_file() { Ok(path) } else { Err(format!("no `{name}` in ../shared/data")) }
@@ -53,16 +54,22 @@ pub fn program(name: &str) -> PathBuf {
 }
 
 /// How often a test is to do what it does: what the variable `name` says, else `usual`, which is
-/// short, or twenty times that with `GLEANER_LONG=1`. ARCHITECTURE.md ("Tests") lists the variables.
+/// short, or twenty times that with `GLEANER_LONG=1`. ARCHITECTURE.md ("Tests") lists the
+/// variables.
 ///
 /// # Panics
 ///
-/// If the variable is set to anything but a whole number above 0: a test that does nothing would pass.
+/// If the variable is set to anything but a whole number above 0: a test that does nothing would
+/// pass.
 pub fn times(name: &str, usual: u32) -> u32 {
     let is_long = std::env::var_os("GLEANER_LONG").is_some_and(|said| said == "1");
-    let Some(said) = std::env::var_os(name) else { return if is_long { 20 * usual } else { usual } };
+    let Some(said) = std::env::var_os(name) else {
+        return if is_long { 20 * usual } else { usual };
+    };
     let times = said.to_str().and_then(|said| said.parse().ok()).filter(|times| *times > 0);
-    times.unwrap_or_else(|| panic!("{name} is {said:?}; set it to a whole number above 0, or not at all"))
+    times.unwrap_or_else(|| {
+        panic!("{name} is {said:?}; set it to a whole number above 0, or not at all")
+    })
 }
 
 /// A folder of this test's own, removed with it.
@@ -73,7 +80,11 @@ impl Folder {
     #[allow(clippy::new_without_default)]
     pub fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!("gleaner-test-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let name = format!(
+            "gleaner-test-{}-{}",
+            std::process::id(),
+            COUNT.fetch_add(1, Ordering::Relaxed)
+        );
         let path = std::env::temp_dir().join(name);
         std::fs::create_dir_all(&path).expect("the temporary folder is writable");
         Self(path)
@@ -87,7 +98,8 @@ impl Folder {
     /// Writes a file into it.
     pub fn write(&self, name: &str, content: impl AsRef<[u8]>) -> PathBuf {
         let path = self.0.join(name);
-        std::fs::create_dir_all(path.parent().expect("a file has a folder")).expect("the folder is writable");
+        std::fs::create_dir_all(path.parent().expect("a file has a folder"))
+            .expect("the folder is writable");
         std::fs::write(&path, content).expect("the folder is writable");
         path
     }
@@ -115,7 +127,8 @@ pub struct Run {
     pub summary: Option<Summary>,
 }
 
-/// `gleaner-runtime`, which compiles into the tests' own cache: nothing that a user compiled before is trusted or touched.
+/// `gleaner-runtime`, which compiles into the tests' own cache: nothing that a user compiled before
+/// is trusted or touched.
 pub fn runtime() -> Command {
     let mut runtime = Command::new(program("gleaner-runtime"));
     runtime.env("XDG_CACHE_HOME", root().join("target/test-cache"));
@@ -180,13 +193,17 @@ fn parsed<T: serde::de::DeserializeOwned>(line: &str) -> T {
 impl Run {
     /// A line for each trigger, as in `expected.txt`.
     pub fn rows(&self) -> String {
-        let lines = self.decisions.iter().flat_map(|decision| trigger_lines(decision, self.start_ns()));
+        let lines =
+            self.decisions.iter().flat_map(|decision| trigger_lines(decision, self.start_ns()));
         lines.map(|line| line + "\n").collect()
     }
 
     /// Seconds from the start of the drive of each trigger.
     pub fn seconds(&self) -> Vec<f64> {
-        let causing = self.decisions.iter().flat_map(|decision| decision.triggers.iter().map(|_| decision.at_ns));
+        let causing = self
+            .decisions
+            .iter()
+            .flat_map(|decision| decision.triggers.iter().map(|_| decision.at_ns));
         causing.map(|at_ns| seconds(at_ns, self.start_ns())).collect()
     }
 
@@ -219,7 +236,8 @@ pub struct Copy {
 }
 
 impl Copy {
-    /// Copies the lambda in `lambda`, a folder of the checkout, with `change` applied to its manifest.
+    /// Copies the lambda in `lambda`, a folder of the checkout, with `change` applied to its
+    /// manifest.
     pub fn of(lambda: &str, change: impl Fn(String) -> String) -> Self {
         let folder = Folder::new();
         copy_lambda(lambda, &folder, ".", change);
@@ -237,7 +255,8 @@ impl Copy {
     }
 }
 
-/// Copies the built lambda in `lambda`, a folder of the checkout, to `name` in `folder`, with `change` applied to its manifest.
+/// Copies the built lambda in `lambda`, a folder of the checkout, to `name` in `folder`, with
+/// `change` applied to its manifest.
 pub fn copy_lambda(lambda: &str, folder: &Folder, name: &str, change: impl Fn(String) -> String) {
     let source = root().join(lambda).join("build");
     let files = std::fs::read_dir(&source)
@@ -249,7 +268,8 @@ pub fn copy_lambda(lambda: &str, folder: &Folder, name: &str, change: impl Fn(St
             folder.write(&to, std::fs::read(file.path()).expect("a build can be read"));
         }
     }
-    let manifest = std::fs::read_to_string(source.join("lambda.toml")).expect("a build has a manifest");
+    let manifest =
+        std::fs::read_to_string(source.join("lambda.toml")).expect("a build has a manifest");
     // The build's manifest is written last: it must not be older than any source.
     folder.write(&format!("{name}/lambda.toml"), change(manifest.clone()));
     folder.write(&format!("{name}/build/lambda.toml"), change(manifest));

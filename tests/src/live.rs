@@ -1,4 +1,5 @@
-//! `gleaner run` as a process that a test starts, hears out, and ends; and the player that gives it something to hear.
+//! `gleaner run` as a process that a test starts, hears out, and ends; and the player that gives it
+//! something to hear.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -103,7 +104,9 @@ impl Started {
 
     /// Waits until the lambda has had its `init`.
     pub fn until_ready(&self) {
-        self.until("the lambda to be ready", |line| matches!(line, Line::Lambda(Report::Ready)).then_some(()));
+        self.until("the lambda to be ready", |line| {
+            matches!(line, Line::Lambda(Report::Ready)).then_some(())
+        });
     }
 
     /// Waits for a status of the lambda that is as `wanted`.
@@ -127,13 +130,17 @@ impl Started {
     pub fn finish(mut self) -> Finished {
         let deadline = Instant::now() + PATIENCE;
         let mut lines = Vec::new();
-        while let Ok(line) = self.lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+        while let Ok(line) =
+            self.lines.recv_timeout(deadline.saturating_duration_since(Instant::now()))
+        {
             lines.push(line);
         }
         let status = loop {
             match self.child.try_wait().expect("a child of ours can be waited for") {
                 Some(status) => break status,
-                None if Instant::now() > deadline => panic!("it does not end; it said\n{}", self.said()),
+                None if Instant::now() > deadline => {
+                    panic!("it does not end; it said\n{}", self.said())
+                }
                 None => thread::sleep(Duration::from_millis(10)),
             }
         };
@@ -188,19 +195,26 @@ impl Finished {
 /// If `kill` cannot be run.
 pub fn signal(pid: u32, name: &str) {
     // It may have ended just now.
-    let _ = Command::new("kill").arg(format!("-{name}")).arg(pid.to_string()).stderr(Stdio::null()).status();
+    let _ = Command::new("kill")
+        .arg(format!("-{name}"))
+        .arg(pid.to_string())
+        .stderr(Stdio::null())
+        .status();
 }
 
 /// The processes below `of` whose command line contains `name`.
 pub fn below(of: u32, name: &str) -> Vec<u32> {
-    let text = std::fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
+    let text =
+        std::fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
     let is_called = |pid: u32| {
         let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         // Python, too, has our program's name in its arguments no more; it has `start.py`.
         String::from_utf8_lossy(&line).contains(name)
     };
     let children = text.split_whitespace().filter_map(|pid| pid.parse().ok());
-    children.flat_map(|pid| is_called(pid).then_some(pid).into_iter().chain(below(pid, name))).collect()
+    children
+        .flat_map(|pid| is_called(pid).then_some(pid).into_iter().chain(below(pid, name)))
+        .collect()
 }
 
 /// The decisions in a folder of results.

@@ -25,11 +25,19 @@ pub fn blocks(page: &str) -> Vec<Block> {
             Some((_, _, mark)) if trimmed.trim_end() == *mark => {
                 blocks.extend(open.take().map(|(block, ..)| block));
             }
-            Some((block, indent, _)) => block.lines.push(line.get(*indent..).unwrap_or_default().to_owned()),
+            Some((block, indent, _)) => {
+                block.lines.push(line.get(*indent..).unwrap_or_default().to_owned())
+            }
             None if fence.len() >= 3 => {
-                let file = above.strip_prefix("<!-- file: ").and_then(|rest| rest.strip_suffix(" -->"));
+                let file =
+                    above.strip_prefix("<!-- file: ").and_then(|rest| rest.strip_suffix(" -->"));
                 let language = trimmed[fence.len()..].trim().to_owned();
-                let block = Block { line: index + 1, language, file: file.map(str::to_owned), lines: Vec::new() };
+                let block = Block {
+                    line: index + 1,
+                    language,
+                    file: file.map(str::to_owned),
+                    lines: Vec::new(),
+                };
                 open = Some((block, line.len() - trimmed.len(), fence));
             }
             None => {}

@@ -1,7 +1,7 @@
 //! A private network for one test: only `lo`, with multicast, and nobody else on it.
 //!
-//! Linux gives a process a network of its own, with which what it starts is alone. A DDS peer that is started any other way could
-//! talk to whatever runs on this machine or next to it.
+//! Linux gives a process a network of its own, with which what it starts is alone. A DDS peer that
+//! is started any other way could talk to whatever runs on this machine or next to it.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -10,12 +10,15 @@ use std::sync::OnceLock;
 use libtest_mimic::Failed;
 
 /// What makes a network usable for DDS, then the program in `$0` with its arguments.
-const SET_UP: &str =
-    "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo && exec \"$0\" \"$@\"";
+const SET_UP: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo && exec \"$0\" \"$@\"";
 
 /// Why there can be no private network here; `None` where there can.
 pub fn unavailable() -> Option<&'static str> {
-    if way().is_some() { None } else { Some("no private network can be made here: unshare -n and ip are needed") }
+    if way().is_some() {
+        None
+    } else {
+        Some("no private network can be made here: unshare -n and ip are needed")
+    }
 }
 
 /// `program`, to be run in a private network that ends with it.
@@ -24,12 +27,14 @@ pub fn unavailable() -> Option<&'static str> {
 ///
 /// If there can be none; see [`unavailable`].
 pub fn command(program: &Path) -> Command {
-    let mut command = shell(way().expect("asked before whether there can be a private network"), SET_UP);
+    let mut command =
+        shell(way().expect("asked before whether there can be a private network"), SET_UP);
     command.arg(program);
     command
 }
 
-/// This program once more, in a private network, with the variable `name` set to `value`, so that it knows what it is to do.
+/// This program once more, in a private network, with the variable `name` set to `value`, so that
+/// it knows what it is to do.
 ///
 /// # Panics
 ///
@@ -40,8 +45,8 @@ pub fn again(name: &str, value: &str) -> Command {
     command
 }
 
-/// Runs one case of a suite in a private network: this program once more, with the variable `name` set to the `case`. What it
-/// prints is shown.
+/// Runs one case of a suite in a private network: this program once more, with the variable `name`
+/// set to the `case`. What it prints is shown.
 ///
 /// # Errors
 ///
@@ -59,15 +64,16 @@ pub fn case(name: &str, case: &str) -> Result<(), Failed> {
     Err(format!("{}; it said:\n{}", output.status, String::from_utf8_lossy(&output.stderr)).into())
 }
 
-/// The options of `unshare` that work here: root needs no more than `-n`, others become root of a user namespace, where that is
-/// allowed.
+/// The options of `unshare` that work here: root needs no more than `-n`, others become root of a
+/// user namespace, where that is allowed.
 fn way() -> Option<&'static [&'static str]> {
     static WAY: OnceLock<Option<&[&str]>> = OnceLock::new();
     *WAY.get_or_init(|| {
         let ways: [&[&str]; 2] = [&["-n"], &["-r", "-n"]];
         ways.into_iter().find(|way| {
             let mut probe = shell(way, SET_UP);
-            let probe = probe.arg("true").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+            let probe =
+                probe.arg("true").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
             probe.status().is_ok_and(|status| status.success())
         })
     })

@@ -43,13 +43,19 @@ impl Parts {
     /// Takes the clip `path` apart.
     pub fn of(path: &Path) -> Self {
         let bytes = std::fs::read(path).unwrap();
-        let mut parts = Self { metadata: vec![], channels: vec![], messages: vec![], attachments: vec![] };
+        let mut parts =
+            Self { metadata: vec![], channels: vec![], messages: vec![], attachments: vec![] };
         let (mut schemas, mut indexes) = (BTreeMap::new(), BTreeMap::new());
         for record in mcap::read::ChunkFlattener::new(&bytes).unwrap() {
             match record.unwrap() {
                 Record::Schema { header, data } => {
                     let data = Cow::Owned(data.into_owned());
-                    let schema = mcap::Schema { id: header.id, name: header.name, encoding: header.encoding, data };
+                    let schema = mcap::Schema {
+                        id: header.id,
+                        name: header.name,
+                        encoding: header.encoding,
+                        data,
+                    };
                     schemas.insert(header.id, Arc::new(schema));
                 }
                 // The summary has them again.
@@ -88,15 +94,26 @@ impl Parts {
         for channel in &self.channels {
             let schema = channel.schema.as_ref().unwrap();
             let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data).unwrap();
-            ids.push(writer.add_channel(schema, &channel.topic, &channel.message_encoding, &channel.metadata).unwrap());
+            ids.push(
+                writer
+                    .add_channel(
+                        schema,
+                        &channel.topic,
+                        &channel.message_encoding,
+                        &channel.metadata,
+                    )
+                    .unwrap(),
+            );
         }
         for (channel, header, data) in &self.messages {
             let header = MessageHeader { channel_id: ids[*channel], ..*header };
             writer.write_to_known_channel(&header, data).unwrap();
         }
         for Attached { name, media_type, log_time, data } in &self.attachments {
-            let (name, media_type, data) = (name.clone(), media_type.clone(), Cow::Borrowed(&data[..]));
-            let attachment = Attachment { log_time: *log_time, create_time: *log_time, name, media_type, data };
+            let (name, media_type, data) =
+                (name.clone(), media_type.clone(), Cow::Borrowed(&data[..]));
+            let attachment =
+                Attachment { log_time: *log_time, create_time: *log_time, name, media_type, data };
             writer.attach(&attachment).unwrap();
         }
         writer.finish().unwrap();
@@ -106,13 +123,15 @@ impl Parts {
 
     /// The first record `gleaner.NAME`.
     pub fn record(&mut self, name: &str) -> &mut BTreeMap<String, String> {
-        let found = self.metadata.iter_mut().find(|metadata| metadata.name == format!("gleaner.{name}"));
+        let found =
+            self.metadata.iter_mut().find(|metadata| metadata.name == format!("gleaner.{name}"));
         &mut found.unwrap_or_else(|| panic!("there is no gleaner.{name}")).metadata
     }
 
     /// The record of a topic.
     pub fn topic(&mut self, topic: &str) -> &mut BTreeMap<String, String> {
-        let is_it = |metadata: &&mut Metadata| metadata.metadata.get("topic").is_some_and(|of| of == topic);
+        let is_it =
+            |metadata: &&mut Metadata| metadata.metadata.get("topic").is_some_and(|of| of == topic);
         &mut self.metadata.iter_mut().find(is_it).unwrap().metadata
     }
 
@@ -143,6 +162,9 @@ impl Parts {
 
     /// The part of a journal in it.
     pub fn journal(&mut self) -> &mut Attached {
-        self.attachments.iter_mut().find(|attachment| attachment.name.starts_with("journal/")).unwrap()
+        self.attachments
+            .iter_mut()
+            .find(|attachment| attachment.name.starts_with("journal/"))
+            .unwrap()
     }
 }

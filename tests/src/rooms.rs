@@ -1,4 +1,5 @@
-//! The order of the house: which room may name which, and where unsafe code has its address. See ARCHITECTURE.md.
+//! The order of the house: which room may name which, and where unsafe code has its address. See
+//! ARCHITECTURE.md.
 
 use std::collections::BTreeSet;
 use std::process::Command;
@@ -6,8 +7,8 @@ use std::process::Command;
 use crate::root;
 use crate::tree::File;
 
-/// The files that may hold unsafe code. Each says so below its `//!` lines, and states the fact that makes each block
-/// sound.
+/// The files that may hold unsafe code. Each says so below its `//!` lines, and states the fact
+/// that makes each block sound.
 pub const UNSAFE_FILES: &[&str] = &[
     "guest-sdk-rust/src/bindings.rs",
     "host/buffers/src/lease.rs",
@@ -25,14 +26,21 @@ pub const UNSAFE_FILES: &[&str] = &[
     "player/src/cyclone.rs",
 ];
 
-/// The crates of ours that a crate may depend on. A crate that is not listed may depend on what it likes: tests, benches
-/// and lambdas stand outside of the house.
+/// The crates of ours that a crate may depend on. A crate that is not listed may depend on what it
+/// likes: tests, benches and lambdas stand outside of the house.
 pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-base", &["gleaner-rules"]),
     ("gleaner-buffers", &[]),
     (
         "gleaner-cli",
-        &["gleaner-base", "gleaner-journal", "gleaner-lambda", "gleaner-parts", "gleaner-protocol", "gleaner-report"],
+        &[
+            "gleaner-base",
+            "gleaner-journal",
+            "gleaner-lambda",
+            "gleaner-parts",
+            "gleaner-protocol",
+            "gleaner-report",
+        ],
     ),
     ("gleaner-compile", &["gleaner-base", "gleaner-jail", "gleaner-lambda"]),
     ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-protocol", "gleaner-transport"]),
@@ -66,12 +74,26 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-parts", &["gleaner-base"]),
     (
         "gleaner-player",
-        &["gleaner-base", "gleaner-drives", "gleaner-image", "gleaner-lambda", "gleaner-messages", "gleaner-transport"],
+        &[
+            "gleaner-base",
+            "gleaner-drives",
+            "gleaner-image",
+            "gleaner-lambda",
+            "gleaner-messages",
+            "gleaner-transport",
+        ],
     ),
     ("gleaner-protocol", &["gleaner-base", "gleaner-journal", "gleaner-lambda"]),
     (
         "gleaner-python",
-        &["gleaner-host", "gleaner-image", "gleaner-lambda", "gleaner-messages", "gleaner-transport", "gleaner-vitals"],
+        &[
+            "gleaner-host",
+            "gleaner-image",
+            "gleaner-lambda",
+            "gleaner-messages",
+            "gleaner-transport",
+            "gleaner-vitals",
+        ],
     ),
     (
         "gleaner-recorder",
@@ -91,7 +113,10 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-report", &["gleaner-base", "gleaner-lambda", "gleaner-protocol"]),
     ("gleaner-rules", &[]),
     ("gleaner-sdk", &["gleaner-rules"]),
-    ("gleaner-shim", &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"]),
+    (
+        "gleaner-shim",
+        &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"],
+    ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];
@@ -110,10 +135,19 @@ pub const WITHOUT: &[(&str, &[&str])] = &[
 
 /// Inside of `host/src`: a room, and the rooms that it must not name.
 pub const ROOMS: &[(&str, &[&str])] = &[
-    ("memory", &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
+    (
+        "memory",
+        &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"],
+    ),
     ("api", &["guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
     ("input", &["guest", "judge", "live", "program", "replay", "schedule", "stage"]),
-    ("isolation", &["api", "guest", "input", "journal", "judge", "live", "program", "replay", "schedule", "stage"]),
+    (
+        "isolation",
+        &[
+            "api", "guest", "input", "journal", "judge", "live", "program", "replay", "schedule",
+            "stage",
+        ],
+    ),
     ("journal", &["guest", "judge", "live", "program", "replay", "schedule", "stage"]),
     ("schedule", &["guest", "judge", "live", "program", "replay", "stage"]),
     ("judge", &["live", "program", "replay", "schedule", "stage"]),
@@ -121,13 +155,22 @@ pub const ROOMS: &[(&str, &[&str])] = &[
     ("stage", &["judge", "live", "program", "replay", "schedule"]),
     ("replay", &["live", "program"]),
     ("live", &["program", "replay"]),
-    ("network", &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
-    ("topics", &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"]),
+    (
+        "network",
+        &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"],
+    ),
+    (
+        "topics",
+        &["api", "guest", "input", "judge", "live", "program", "replay", "schedule", "stage"],
+    ),
 ];
 
 /// Whether `file` declares that it holds unsafe code.
 pub fn allows_unsafe(file: &File) -> bool {
-    file.text.lines().map(str::trim).any(|line| line.starts_with('#') && line.contains("allow(unsafe_code"))
+    file.text
+        .lines()
+        .map(str::trim)
+        .any(|line| line.starts_with('#') && line.contains("allow(unsafe_code"))
 }
 
 /// The lines of a Rust file that hold unsafe code, from 1.
@@ -153,12 +196,14 @@ pub fn room_of(path: &str) -> Option<&str> {
     Some(room.strip_suffix(".rs").unwrap_or(room))
 }
 
-/// The rooms of its crate that a Rust file names, as in `crate::api::Session` or `use crate::{api, input::Remap}`.
+/// The rooms of its crate that a Rust file names, as in `crate::api::Session` or `use crate::{api,
+/// input::Remap}`.
 pub fn rooms_named(text: &str) -> BTreeSet<String> {
     let code: String = code(text).flat_map(|line| [line, "\n"]).collect();
     let mut named = BTreeSet::new();
     for (at, start) in code.match_indices("crate::") {
-        let begins_a_word = !code[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == '$');
+        let begins_a_word =
+            !code[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == '$');
         if begins_a_word {
             named.extend(first_words(&code[at + start.len()..]));
         }
@@ -195,11 +240,17 @@ fn first_words(path: &str) -> Vec<String> {
     words
 }
 
-/// The packages that a `Cargo.toml` depends on for what it makes, on any platform; not those of its own tests.
+/// The packages that a `Cargo.toml` depends on for what it makes, on any platform; not those of its
+/// own tests.
 pub fn dependencies(manifest: &toml::Table) -> BTreeSet<String> {
-    let platforms = manifest.get("target").and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::values);
+    let platforms = manifest
+        .get("target")
+        .and_then(toml::Value::as_table)
+        .into_iter()
+        .flat_map(toml::Table::values);
     let sections = platforms.filter_map(toml::Value::as_table).chain([manifest]);
-    let tables = sections.flat_map(|section| ["dependencies", "build-dependencies"].map(|key| section.get(key)));
+    let tables = sections
+        .flat_map(|section| ["dependencies", "build-dependencies"].map(|key| section.get(key)));
     let entries = tables.flatten().filter_map(toml::Value::as_table).flatten();
     // An entry may give the package another name; then the package is what counts.
     let package = |(name, entry): (&String, &toml::Value)| {
@@ -215,7 +266,17 @@ pub fn dependencies(manifest: &toml::Table) -> BTreeSet<String> {
 /// If cargo does not know the package.
 pub fn contents(package: &str) -> BTreeSet<String> {
     let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    cargo.args(["tree", "--offline", "--all-features", "--edges", "normal", "--prefix", "none", "--package", package]);
+    cargo.args([
+        "tree",
+        "--offline",
+        "--all-features",
+        "--edges",
+        "normal",
+        "--prefix",
+        "none",
+        "--package",
+        package,
+    ]);
     let output = cargo.current_dir(root()).output().expect("cargo starts");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8_lossy(&output.stdout);

@@ -17,12 +17,14 @@ pub struct File {
 impl File {
     /// Whether the name ends with one of `extensions`, given without their dots.
     pub fn is_one_of(&self, extensions: &[&str]) -> bool {
-        Path::new(&self.path).extension().is_some_and(|found| extensions.iter().any(|extension| found == *extension))
+        Path::new(&self.path)
+            .extension()
+            .is_some_and(|found| extensions.iter().any(|extension| found == *extension))
     }
 }
 
-/// Every text file of the checkout, in the order of the paths. What tools make is left out: target folders, results,
-/// build folders of lambdas, and hidden folders but those that are ours.
+/// Every text file of the checkout, in the order of the paths. What tools make is left out: target
+/// folders, results, build folders of lambdas, and hidden folders but those that are ours.
 ///
 /// # Panics
 ///
@@ -32,7 +34,9 @@ pub fn files() -> Vec<File> {
     let mut files = Vec::new();
     let mut folders = vec![String::new()];
     while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(root.join(&folder)).expect("a folder of the checkout can be listed") {
+        for entry in
+            fs::read_dir(root.join(&folder)).expect("a folder of the checkout can be listed")
+        {
             let entry = entry.expect("a folder of the checkout can be listed");
             let name = entry.file_name().into_string().expect("names in the checkout are text");
             let path = if folder.is_empty() { name.clone() } else { format!("{folder}/{name}") };

@@ -1,5 +1,5 @@
-//! Lambdas that attack whatever is around them, live, below `gleaner-shim`: what becomes of each attack is a row of the table in
-//! `docs/security.md`, and has to be as it says there.
+//! Lambdas that attack whatever is around them, live, below `gleaner-shim`: what becomes of each
+//! attack is a row of the table in `docs/security.md`, and has to be as it says there.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -26,16 +26,19 @@ enum Fate {
     Cut,
     /// It may go on, and what it wrote in place of results is counted, and changes no others.
     Garbled,
-    /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault of kind `killed`, with these words.
+    /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault
+    /// of kind `killed`, with these words.
     Killed(&'static str),
-    /// The process cannot go on, says why and ends, each time that it is started. Nobody killed it, and the run has not gone well.
+    /// The process cannot go on, says why and ends, each time that it is started. Nobody killed it,
+    /// and the run has not gone well.
     Broken,
 }
 
 use Fate::{Broken, Cut, Fault, Garbled, Killed, Refused};
 use FaultKind::{Deadline, Exception, Fuel, HostCall, Memory, Trap};
 
-/// An attack, and its fate in WebAssembly and in Python; none where the language has no words for it.
+/// An attack, and its fate in WebAssembly and in Python; none where the language has no words for
+/// it.
 const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
     ("endless", Some(Fault(Fuel)), Some(Fault(Deadline))),
     ("host_calls", Some(Fault(Fuel)), Some(Fault(Deadline))),
@@ -96,7 +99,8 @@ const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
 fn main() -> ExitCode {
     if let Ok(case) = std::env::var(CASE) {
         let (attack, language) = case.split_once('/').expect("a case of this suite");
-        let (_, wasm, python) = ATTACKS.iter().find(|(known, ..)| *known == attack).expect("a case of this suite");
+        let (_, wasm, python) =
+            ATTACKS.iter().find(|(known, ..)| *known == attack).expect("a case of this suite");
         let fate = if language == "rust" { wasm } else { python };
         attacked(attack, language, fate.expect("a case of this suite"));
         return ExitCode::SUCCESS;
@@ -128,7 +132,11 @@ struct Bystander(Child);
 
 impl Bystander {
     fn new() -> Self {
-        let child = Command::new("sleep").arg("1000").stdin(Stdio::null()).spawn().expect("there is a `sleep`");
+        let child = Command::new("sleep")
+            .arg("1000")
+            .stdin(Stdio::null())
+            .spawn()
+            .expect("there is a `sleep`");
         Self(child)
     }
 
@@ -175,8 +183,11 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
         }
         Refused(words) => {
             let decision = decision.expect("an event");
-            let event =
-                decision.triggers.iter().find(|it| it.label != "flood").expect("the lambda says what came of it");
+            let event = decision
+                .triggers
+                .iter()
+                .find(|it| it.label != "flood")
+                .expect("the lambda says what came of it");
             assert_eq!(event.label, "refused", "{event:?}");
             let why = event.attributes["why"].as_str().expect("a text");
             assert!(why.contains(words) && !why.contains("unknown attack"), "{why}");
@@ -185,11 +196,14 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
         Cut => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
         Garbled => {
             let written = decisions(out.path());
-            let forged = |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.message == "forged");
+            let forged =
+                |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.message == "forged");
             assert!(written.iter().any(forged), "{written:?}");
             // Its other results are as ever: that it came back from the attack is one of them.
             assert!(
-                written.iter().any(|it| it.triggers.iter().any(|trigger| trigger.label == "escaped")),
+                written
+                    .iter()
+                    .any(|it| it.triggers.iter().any(|trigger| trigger.label == "escaped")),
                 "{written:?}"
             );
             assert_eq!(finished.ended().restarts, 0, "the process lives on");
@@ -199,12 +213,17 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
             assert_eq!(fault.kind, FaultKind::Killed, "{}", fault.message);
             assert!(fault.message.contains(words), "{}", fault.message);
             let written = decisions(out.path());
-            let killed = |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed);
+            let killed = |it: &Decision| {
+                it.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed)
+            };
             assert!(written.iter().any(killed), "{written:?}");
         }
     }
     assert!(bystander.is_alive(), "the process of somebody else was hit");
-    assert!(!Path::new("/tmp/gleaner-escaped").exists(), "a file was written where nobody had allowed it");
+    assert!(
+        !Path::new("/tmp/gleaner-escaped").exists(),
+        "a file was written where nobody had allowed it"
+    );
 }
 
 /// The decision in which the attack shows; none where it is only counted.
@@ -248,7 +267,9 @@ fn until_it_goes_on(started: &Started) -> Live {
 fn in_words(decision: Option<&Decision>) -> String {
     let Some(decision) = decision else { return "counted".to_owned() };
     match (&decision.fault, decision.triggers.first()) {
-        (Some(fault), _) => format!("{:?}: {}", fault.kind, fault.message.lines().last().unwrap_or_default()),
+        (Some(fault), _) => {
+            format!("{:?}: {}", fault.kind, fault.message.lines().last().unwrap_or_default())
+        }
         (None, Some(trigger)) => format!("{}: {:?}", trigger.label, trigger.attributes),
         (None, None) => "nothing".to_owned(),
     }

@@ -1,6 +1,8 @@
-//! Lambdas on live topics: `gleaner run`, with the recorder and the player, each in a private network.
+//! Lambdas on live topics: `gleaner run`, with the recorder and the player, each in a private
+//! network.
 //!
-//! `GLEANER_ROUNDS` says how often a drive is played and compared with its replay; once if it does not.
+//! `GLEANER_ROUNDS` says how often a drive is played and compared with its replay; once if it does
+//! not.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -21,11 +23,20 @@ type Case = (&'static str, fn());
 /// Cases with a player.
 const PLAYED: &[Case] = &[
     ("a_drive_played_live_is_decided_as_in_its_replay", as_in_replay),
-    ("a_lambda_slower_than_its_camera_sees_the_newest_frame_and_skips_are_counted", || slow("sleep")),
-    ("a_lambda_that_keeps_every_frame_does_not_stop_the_reception_and_refusals_are_counted", || slow("keep")),
+    ("a_lambda_slower_than_its_camera_sees_the_newest_frame_and_skips_are_counted", || {
+        slow("sleep")
+    }),
+    (
+        "a_lambda_that_keeps_every_frame_does_not_stop_the_reception_and_refusals_are_counted",
+        || slow("keep"),
+    ),
     ("ctrl_c_ends_in_order_and_clips_that_are_open_are_closed", ctrl_c),
-    ("a_lambda_whose_process_is_killed_is_started_again_and_loses_no_decision", || killed("start.py")),
-    ("a_recorder_that_is_killed_is_started_again_and_its_clip_recovered", || killed("gleaner-recorder")),
+    ("a_lambda_whose_process_is_killed_is_started_again_and_loses_no_decision", || {
+        killed("start.py")
+    }),
+    ("a_recorder_that_is_killed_is_started_again_and_its_clip_recovered", || {
+        killed("gleaner-recorder")
+    }),
 ];
 
 /// Cases with nothing but lambdas.
@@ -40,7 +51,11 @@ const ALONE: &[Case] = &[
 
 fn main() -> ExitCode {
     if let Ok(name) = std::env::var(CASE) {
-        let (_, case) = PLAYED.iter().chain(ALONE).find(|(known, _)| *known == name).expect("a case of this suite");
+        let (_, case) = PLAYED
+            .iter()
+            .chain(ALONE)
+            .find(|(known, _)| *known == name)
+            .expect("a case of this suite");
         case();
         return ExitCode::SUCCESS;
     }
@@ -65,9 +80,12 @@ fn lambda(name: &str, language: &str) -> PathBuf {
     root().join(name).join(language)
 }
 
-/// A copy of a lambda with more time than it needs. A fault would take what it has learned, and nothing here is about time.
+/// A copy of a lambda with more time than it needs. A fault would take what it has learned, and
+/// nothing here is about time.
 fn patient(lambda: &str) -> Copy {
-    let line = |line: &str| if line.starts_with("deadline") { "deadline = \"5s\"" } else { line }.to_owned();
+    let line = |line: &str| {
+        if line.starts_with("deadline") { "deadline = \"5s\"" } else { line }.to_owned()
+    };
     Copy::of(lambda, |manifest| manifest.lines().map(line).collect::<Vec<_>>().join("\n"))
 }
 
@@ -78,29 +96,40 @@ type About = (String, Option<u64>);
 fn about(decisions: &[Decision]) -> Vec<About> {
     let of = |decision: &Decision| {
         let seq = decision.seq;
-        decision.triggers.iter().map(move |trigger| (trigger.label.clone(), seq)).collect::<Vec<_>>()
+        decision
+            .triggers
+            .iter()
+            .map(move |trigger| (trigger.label.clone(), seq))
+            .collect::<Vec<_>>()
     };
     decisions.iter().flat_map(of).collect()
 }
 
 /// The same labels for the same samples of the camera, and for nearly the same of the IMU.
 ///
-/// Both lambdas look at half a second of the IMU by receive stamps. Live, these jitter by a millisecond and more, so that a sample
-/// at the edge is in or out; a threshold may then be passed some samples earlier or later. A frame of the camera is 10 of them.
-/// Where samples were passed over, it is by as many later.
+/// Both lambdas look at half a second of the IMU by receive stamps. Live, these jitter by a
+/// millisecond and more, so that a sample at the edge is in or out; a threshold may then be passed
+/// some samples earlier or later. A frame of the camera is 10 of them. Where samples were passed
+/// over, it is by as many later.
 fn alike(live: &[About], replay: &[About], skipped: u64) -> bool {
     let is_camera = replay.iter().all(|(label, _)| label == "brake-dark");
     let slack = skipped + if is_camera { 0 } else { 10 };
-    let same = |((a, n), (b, m)): (&About, &About)| a == b && n.zip(*m).is_some_and(|(n, m)| n.abs_diff(m) <= slack);
+    let same = |((a, n), (b, m)): (&About, &About)| {
+        a == b && n.zip(*m).is_some_and(|(n, m)| n.abs_diff(m) <= slack)
+    };
     live.len() == replay.len() && live.iter().zip(replay).all(same)
 }
 
 fn lost(ended: &Live) -> u64 {
-    ended.topics.iter().map(|topic| topic.lost.expect("DDS tells") + topic.no_slot + topic.malformed).sum()
+    ended
+        .topics
+        .iter()
+        .map(|topic| topic.lost.expect("DDS tells") + topic.no_slot + topic.malformed)
+        .sum()
 }
 
-/// A machine that is busy with others may stop for longer than a window jitters. What differs then is played once more; what
-/// differs each time is wrong.
+/// A machine that is busy with others may stop for longer than a window jitters. What differs then
+/// is played once more; what differs each time is wrong.
 fn as_in_replay() {
     /// So often each lambda is played to, until it does as in its replay.
     const TRIES: usize = 6;
@@ -131,40 +160,54 @@ fn as_in_replay() {
             }
         }
         println!("round {round}: {} differences {differences:#?}", differences.len());
-        assert!(left.is_empty(), "round {round}: {TRIES} times another than in the replay: {differences:#?}");
+        assert!(
+            left.is_empty(),
+            "round {round}: {TRIES} times another than in the replay: {differences:#?}"
+        );
     }
 }
 
-/// Plays the drive to these lambdas at once; in which way each did something else than in its replay, if it did.
+/// Plays the drive to these lambdas at once; in which way each did something else than in its
+/// replay, if it did.
 fn played(drive: &Path, set: &[&str; 2], lambdas: &[(PathBuf, Vec<About>)]) -> Vec<Option<String>> {
     let args = [set[0], set[1], "--no-record"];
     let outs: Vec<Folder> = lambdas.iter().map(|_| Folder::new()).collect();
-    let runs: Vec<Started> =
-        lambdas.iter().zip(&outs).map(|((lambda, _), out)| run(lambda, out.path(), &args)).collect();
+    let runs: Vec<Started> = lambdas
+        .iter()
+        .zip(&outs)
+        .map(|((lambda, _), out)| run(lambda, out.path(), &args))
+        .collect();
     runs.iter().for_each(Started::until_ready);
     let path = drive.to_str().expect("the checkout has a plain path");
-    let played = play(&[path, "--wait", "2", "--topics", "/imu/data,/camera/front/compressed"]).finish();
+    let played =
+        play(&[path, "--wait", "2", "--topics", "/imu/data,/camera/front/compressed"]).finish();
     assert!(played.status.success(), "{}", played.said);
     // The last sample may still be on its way, and windows are open for some seconds after it.
     for started in &runs {
         started.until_live("the end of the drive", |live| {
-            let is_over = live.topics.iter().all(|topic| topic.writers == Some(0) && topic.received > 0);
+            let is_over =
+                live.topics.iter().all(|topic| topic.writers == Some(0) && topic.received > 0);
             // Each event sample has been considered: one of the topics causes the wakes.
             is_over && live.topics.iter().any(|topic| live.wakes + topic.skipped == topic.received)
         });
         started.signal("INT");
     }
-    let compared = |((started, out), (_, expected)): ((Started, &Folder), &(PathBuf, Vec<About>))| {
-        let finished = started.finish();
-        assert!(finished.status.success(), "{}, {}", finished.status, finished.said);
-        let ended = finished.ended();
-        assert_eq!(ended.faults, 0, "{}", finished.said);
-        let live = about(&decisions(out.path()));
-        if lost(&ended) == 0 && alike(&live, expected, ended.skipped) {
-            return None;
-        }
-        Some(format!("{} skipped, {} lost: {live:?}, in the replay {expected:?}", ended.skipped, lost(&ended)))
-    };
+    let compared =
+        |((started, out), (_, expected)): ((Started, &Folder), &(PathBuf, Vec<About>))| {
+            let finished = started.finish();
+            assert!(finished.status.success(), "{}, {}", finished.status, finished.said);
+            let ended = finished.ended();
+            assert_eq!(ended.faults, 0, "{}", finished.said);
+            let live = about(&decisions(out.path()));
+            if lost(&ended) == 0 && alike(&live, expected, ended.skipped) {
+                return None;
+            }
+            Some(format!(
+                "{} skipped, {} lost: {live:?}, in the replay {expected:?}",
+                ended.skipped,
+                lost(&ended)
+            ))
+        };
     runs.into_iter().zip(&outs).zip(lambdas).map(compared).collect()
 }
 
@@ -172,7 +215,8 @@ fn played(drive: &Path, set: &[&str; 2], lambdas: &[(PathBuf, Vec<About>)]) -> V
 const FRAMES: u64 = 180;
 
 fn slow(behaviour: &str) {
-    // What a busy machine kept from the first frame on, nobody counts: then they are played once more.
+    // What a busy machine kept from the first frame on, nobody counts: then they are played once
+    // more.
     let is_whole = (0..3).any(|_| slowly(behaviour));
     assert!(is_whole, "frames were lost before the first that arrived, each time");
 }
@@ -201,16 +245,24 @@ fn slowly(behaviour: &str) -> bool {
         let finished = started.finish();
         let ended = finished.ended();
         let topic = &ended.topics[0];
-        let stale = decisions(out.path()).iter().filter(|decision| !decision.triggers.is_empty()).count() as u64;
-        // Two may arrive between being chosen and being looked at, on a machine that stops in between.
-        assert!(10 * stale <= ended.wakes + 10, "{stale} of {} wakes were not for the newest frame", ended.wakes);
+        let stale =
+            decisions(out.path()).iter().filter(|decision| !decision.triggers.is_empty()).count()
+                as u64;
+        // Two may arrive between being chosen and being looked at, on a machine that stops in
+        // between.
+        assert!(
+            10 * stale <= ended.wakes + 10,
+            "{stale} of {} wakes were not for the newest frame",
+            ended.wakes
+        );
         assert_eq!(ended.faults, 0, "{}", finished.said);
         assert_eq!(ended.wakes + topic.skipped, topic.received, "{topic:?}");
         if behaviour == "sleep" {
             assert!(topic.skipped > 0 && topic.no_slot == 0, "{topic:?}");
         } else {
             assert!(topic.no_slot > 0, "{topic:?}");
-            let warning = finished.said.lines().find(|line| line.contains("the lambda holds all slots"));
+            let warning =
+                finished.said.lines().find(|line| line.contains("the lambda holds all slots"));
             assert!(warning.is_some_and(|line| line.contains(&topic.topic)), "{}", finished.said);
         }
         // Each sample that was sent is accounted for, once.
@@ -259,7 +311,9 @@ fn killed(name: &str) {
     let (mut told, mut is_recording) = (Vec::new(), false);
     started.until("a window", |line| {
         match line {
-            Line::Lambda(Report::Decision(decision)) => told.extend(about(std::slice::from_ref(&decision))),
+            Line::Lambda(Report::Decision(decision)) => {
+                told.extend(about(std::slice::from_ref(&decision)))
+            }
             Line::Recorder(RecorderReport::Status(status)) => is_recording = status.is_recording,
             _ => {}
         }
@@ -274,7 +328,9 @@ fn killed(name: &str) {
     assert_eq!(victims.len(), 1, "{victims:?}");
     signal(victims[0], "KILL");
     started.until_ready();
-    started.until_live("samples after the restart", |live| live.restarts == 1 && live.topics[0].received > 0);
+    started.until_live("samples after the restart", |live| {
+        live.restarts == 1 && live.topics[0].received > 0
+    });
     started.signal("INT");
     let finished = started.finish();
     drop(player);
@@ -298,13 +354,16 @@ fn outlives(who: Option<&str>) {
     signal(starter, "KILL");
     // A process that has ended has no command line, even where nobody asks how it ended.
     let line = format!("/proc/{}/cmdline", left[0]);
-    wait_for("the end of the lambda's process", || std::fs::read(&line).unwrap_or_default().is_empty());
+    wait_for("the end of the lambda's process", || {
+        std::fs::read(&line).unwrap_or_default().is_empty()
+    });
 }
 
 fn every_wake() {
     for language in ["rust", "python"] {
-        let lambda =
-            Copy::of(&format!("tests/lambdas/attack/{language}"), |manifest| manifest.replace("\"20ms\"", "\"1ms\""));
+        let lambda = Copy::of(&format!("tests/lambdas/attack/{language}"), |manifest| {
+            manifest.replace("\"20ms\"", "\"1ms\"")
+        });
         let out = Folder::new();
         let started = run(lambda.path(), out.path(), &["--no-record", "--all"]);
         started.until_live("some thousand wakes", |live| live.wakes >= 3000);
@@ -313,13 +372,17 @@ fn every_wake() {
         let (ended, written) = (finished.ended(), decisions(out.path()));
         assert_eq!((written.len() as u64, ended.unwritten), (ended.wakes, 0), "{}", finished.said);
         assert!(written.is_sorted_by(|a, b| a.at_ns < b.at_ns));
-        let summary: Live = serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap()).unwrap();
+        let summary: Live =
+            serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap())
+                .unwrap();
         assert_eq!((summary.wakes, summary.unwritten), (ended.wakes, 0));
     }
 }
 
 fn killed_at_once() {
-    let lambda = Copy::of("tests/lambdas/ticker/python", |manifest| manifest.replace("\"100ms\"", "\"1ms\""));
+    let lambda = Copy::of("tests/lambdas/ticker/python", |manifest| {
+        manifest.replace("\"100ms\"", "\"1ms\"")
+    });
     let out = Folder::new();
     let started = run(lambda.path(), out.path(), &["--no-record"]);
     started.until_ready();
@@ -330,32 +393,41 @@ fn killed_at_once() {
         if told.is_empty() {
             signal(process, "KILL");
         }
-        let is_killed = decision.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed);
+        let is_killed =
+            decision.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed);
         told.push(*decision);
         is_killed.then_some(())
     });
     let written = decisions(out.path());
-    assert!(told.len() > 1 && told.iter().all(|decision| written.contains(decision)), "{told:?}, written {written:?}");
+    assert!(
+        told.len() > 1 && told.iter().all(|decision| written.contains(decision)),
+        "{told:?}, written {written:?}"
+    );
     started.until_live("the next process", |live| live.restarts == 1);
     started.signal("INT");
     let finished = started.finish();
     assert!(finished.said.contains("was ended by signal 9"), "{}", finished.said);
     // The process that broke could not count its last wake.
-    let summary: Live = serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap()).unwrap();
+    let summary: Live =
+        serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap()).unwrap();
     assert_eq!(summary.faults, finished.ended().faults + 1);
 }
 
 fn stopped() {
     const TOLD: &str = "/told";
-    let talker = Copy::of("tests/lambdas/ticker/rust", |manifest| manifest.replace("\"100ms\"", "\"1ms\""));
+    let talker =
+        Copy::of("tests/lambdas/ticker/rust", |manifest| manifest.replace("\"100ms\"", "\"1ms\""));
     let listener = Copy::of("bench/lambdas/imu/rust", |manifest| {
-        manifest.replace("/imu/synthetic", TOLD).replace("sensor_msgs/msg/Imu", "std_msgs/msg/String")
+        manifest
+            .replace("/imu/synthetic", TOLD)
+            .replace("sensor_msgs/msg/Imu", "std_msgs/msg/String")
     });
     let (told, heard) = (Folder::new(), Folder::new());
     let talks = run(talker.path(), told.path(), &["--no-record", "--decisions", TOLD]);
     let listens = run(listener.path(), heard.path(), &["--no-record"]);
     listens.until_live("decisions", |live| live.topics[0].received > 0);
-    let stopped = below(listens.pid(), "gleaner-runtime").into_iter().next_back().expect("its runtime");
+    let stopped =
+        below(listens.pid(), "gleaner-runtime").into_iter().next_back().expect("its runtime");
     // Its shim first, which would not stand by.
     let shim = below(listens.pid(), "gleaner-shim")[0];
     [shim, stopped].into_iter().for_each(|pid| signal(pid, "STOP"));
@@ -364,7 +436,11 @@ fn stopped() {
     [stopped, shim].into_iter().for_each(|pid| signal(pid, "CONT"));
     // 1,000 a second are due. Waiting for the reader, it would be 10.
     let rate = (to.wakes - from.wakes) as f64 / (to.up_s - from.up_s);
-    assert!(rate > 50.0 && to.unsent > from.unsent, "{rate} wakes in a second, {} not sent", to.unsent);
+    assert!(
+        rate > 50.0 && to.unsent > from.unsent,
+        "{rate} wakes in a second, {} not sent",
+        to.unsent
+    );
     talks.signal("INT");
     assert!(talks.finish().ended().unsent >= to.unsent);
     listens.signal("INT");
@@ -376,7 +452,11 @@ fn nobody_writes() {
     let started = run(&lambda("examples/hello", "rust"), out.path(), &["--for", "5"]);
     let finished = started.finish();
     assert!(finished.status.success(), "{}", finished.said);
-    assert!(finished.said.contains("nobody writes `/imu/data` (sensor_msgs/msg/Imu) yet"), "{}", finished.said);
+    assert!(
+        finished.said.contains("nobody writes `/imu/data` (sensor_msgs/msg/Imu) yet"),
+        "{}",
+        finished.said
+    );
     assert_eq!(finished.ended().topics[0].received, 0);
 }
 

@@ -1,5 +1,5 @@
-//! `cargo xtask bless`: what the examples decide today becomes what they are expected to decide, and pages that are made of the source
-//! become what it says.
+//! `cargo xtask bless`: what the examples decide today becomes what they are expected to decide,
+//! and pages that are made of the source become what it says.
 
 use std::fs;
 use std::path::Path;
@@ -13,9 +13,10 @@ use crate::examples::{DRIVE, EXAMPLES, Recipe, Replayed, difference};
 use crate::setup;
 use crate::steps::Steps;
 
-/// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin, and `examples/cookbook/*/expected.txt`, where the first line is
-/// the command; before these, what is made of the manifest's types: a page, and the numbers of the limits in three other files. Of twins
-/// that differ nothing is written.
+/// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin, and
+/// `examples/cookbook/*/expected.txt`, where the first line is the command; before these, what is
+/// made of the manifest's types: a page, and the numbers of the limits in three other files. Of
+/// twins that differ nothing is written.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     for file in GENERATED {
         let path = checkout.path(Path::new(file.path));
@@ -30,12 +31,21 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     for example in &EXAMPLES {
         let twins = example.replay(checkout)?;
         if let Some(what) = difference(&twins) {
-            let mut failure = Failure::new(Exit::Differs, format!("the twins of example `{}` differ", example.name));
+            let mut failure = Failure::new(
+                Exit::Differs,
+                format!("the twins of example `{}` differ", example.name),
+            );
             failure.causes = vec![what];
-            return Err(failure.with_help("compare their decisions.jsonl in out/demo, and correct one of the two"));
+            return Err(failure.with_help(
+                "compare their decisions.jsonl in out/demo, and correct one of the two",
+            ));
         }
         let [rust, _] = &twins;
-        write(checkout, &Path::new("examples").join(example.name).join("expected.txt"), rows(rust))?;
+        write(
+            checkout,
+            &Path::new("examples").join(example.name).join("expected.txt"),
+            rows(rust),
+        )?;
     }
     for recipe in Recipe::all(checkout)? {
         let rows = rows(&recipe.replay(checkout)?);
@@ -46,15 +56,17 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
 
 /// A line for each trigger.
 fn rows(run: &Replayed) -> String {
-    let lines = run.decisions.iter().flat_map(|decision| trigger_lines(decision, run.summary.start_ns));
+    let lines =
+        run.decisions.iter().flat_map(|decision| trigger_lines(decision, run.summary.start_ns));
     lines.map(|line| line + "\n").collect()
 }
 
 /// Writes and shows a file of the checkout.
 fn write(checkout: &Checkout, file: &Path, text: String) -> Result<(), Failure> {
     let file_name = file.display();
-    fs::write(checkout.path(file), &text)
-        .map_err(|error| Failure::caused_by(Exit::Internal, format!("cannot write `{file_name}`"), &error))?;
+    fs::write(checkout.path(file), &text).map_err(|error| {
+        Failure::caused_by(Exit::Internal, format!("cannot write `{file_name}`"), &error)
+    })?;
     println!("{file_name}:\n{text}");
     Ok(())
 }

@@ -20,13 +20,20 @@ pub(crate) struct Checkout {
 impl Checkout {
     /// The checkout that this program was built in.
     pub(crate) fn find() -> Result<Checkout, Failure> {
-        let lost =
-            |what| Failure::new(Exit::Usage, what).with_help("start it as `cargo xtask`, inside of the checkout");
+        let lost = |what| {
+            Failure::new(Exit::Usage, what)
+                .with_help("start it as `cargo xtask`, inside of the checkout")
+        };
         // Cargo tells a program that it runs where its package is and which cargo it is.
-        let package = env::var_os("CARGO_MANIFEST_DIR").ok_or_else(|| lost("cannot tell where the checkout is"))?;
-        let root = Path::new(&package).parent().ok_or_else(|| lost("cannot tell where the checkout is"))?.to_owned();
+        let package = env::var_os("CARGO_MANIFEST_DIR")
+            .ok_or_else(|| lost("cannot tell where the checkout is"))?;
+        let root = Path::new(&package)
+            .parent()
+            .ok_or_else(|| lost("cannot tell where the checkout is"))?
+            .to_owned();
         let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        // TARGET/xtask/xtask: so every other cargo builds where this one did, whatever the user configured.
+        // TARGET/xtask/xtask: so every other cargo builds where this one did, whatever the user
+        // configured.
         let exe = env::current_exe().ok().filter(|exe| exe.is_absolute());
         let target = exe.as_deref().and_then(|exe| exe.ancestors().nth(2));
         let target = target.ok_or_else(|| lost("cannot tell where cargo builds"))?.to_owned();
@@ -51,8 +58,9 @@ impl Checkout {
         self.target.join("release").join(name)
     }
 
-    /// `program`, to be run in the checkout; it and what it starts use our cargo, target folder and Python, and the
-    /// checkout's parts even if the target folder lies elsewhere or another Gleaner is installed.
+    /// `program`, to be run in the checkout; it and what it starts use our cargo, target folder and
+    /// Python, and the checkout's parts even if the target folder lies elsewhere or another Gleaner
+    /// is installed.
     pub(crate) fn command(&self, program: impl AsRef<OsStr>) -> Command {
         let mut command = Command::new(program);
         command
@@ -72,13 +80,18 @@ impl Checkout {
     /// The folders of the lambdas in `families`, relative to the checkout: all twins of each.
     pub(crate) fn lambdas(&self, families: &[&str]) -> Vec<PathBuf> {
         let below = |folder: &PathBuf| {
-            let entries = fs::read_dir(self.path(folder)).into_iter().flatten().filter_map(Result::ok);
+            let entries =
+                fs::read_dir(self.path(folder)).into_iter().flatten().filter_map(Result::ok);
             let folder = folder.clone();
             entries.map(move |entry| folder.join(entry.file_name())).collect::<Vec<_>>()
         };
-        let twins =
-            families.iter().map(PathBuf::from).flat_map(|family| below(&family)).flat_map(|lambda| below(&lambda));
-        let mut lambdas: Vec<_> = twins.filter(|twin| self.path(twin).join("lambda.toml").is_file()).collect();
+        let twins = families
+            .iter()
+            .map(PathBuf::from)
+            .flat_map(|family| below(&family))
+            .flat_map(|lambda| below(&lambda));
+        let mut lambdas: Vec<_> =
+            twins.filter(|twin| self.path(twin).join("lambda.toml").is_file()).collect();
         lambdas.sort();
         lambdas
     }

@@ -11,13 +11,18 @@ use crate::examples::{DRIVE, EXAMPLES, Example, Replayed, difference};
 use crate::setup;
 use crate::steps::Steps;
 
-/// Replays the sample drive through both twins of every example, compares them, and makes every decision a second time: from
-/// the journal, and from the clips alone.
+/// Replays the sample drive through both twins of every example, compares them, and makes every
+/// decision a second time: from the journal, and from the clips alone.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(checkout, &mut steps, &EXAMPLES.iter().flat_map(Example::lambdas).collect::<Vec<_>>())?;
+    setup::run(
+        checkout,
+        &mut steps,
+        &EXAMPLES.iter().flat_map(Example::lambdas).collect::<Vec<_>>(),
+    )?;
     steps.begin(&format!("replay of {DRIVE}"));
-    let mut rows = vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
+    let mut rows =
+        vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
     let (mut verdicts, mut proofs, mut clips) = (Vec::new(), Vec::new(), Vec::new());
     let mut agree = true;
     for example in &EXAMPLES {
@@ -33,9 +38,15 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let settings: String = example.set.iter().map(|set| format!(" --set {set}")).collect();
         verdicts.push(match difference {
             None => {
-                format!("{}{with}{settings}: the Rust and the Python lambda decide and keep the same", example.name)
+                format!(
+                    "{}{with}{settings}: the Rust and the Python lambda decide and keep the same",
+                    example.name
+                )
             }
-            Some(what) => format!("{}{with}{settings}: the Rust and the Python lambda DIFFER: {what}", example.name),
+            Some(what) => format!(
+                "{}{with}{settings}: the Rust and the Python lambda DIFFER: {what}",
+                example.name
+            ),
         });
     }
     println!("\n{}", table(&rows));
@@ -55,7 +66,9 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     );
     let gleaner = checkout.program("gleaner");
     let gleaner = gleaner.strip_prefix(checkout.path("")).unwrap_or(&gleaner).display();
-    println!("try next, with another limit: {gleaner} replay examples/hello/rust {DRIVE} --set brake_mps2=-1.2");
+    println!(
+        "try next, with another limit: {gleaner} replay examples/hello/rust {DRIVE} --set brake_mps2=-1.2"
+    );
     Ok(if agree { Exit::Ok } else { Exit::Differs })
 }
 
@@ -63,8 +76,13 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
 fn clip_lines(twin: &Replayed) -> Vec<String> {
     let lines = twin.clips.iter().map(|clip| {
         let [from, to] = clip_span(clip).map(|at_ns| seconds(at_ns, twin.summary.start_ns));
-        let thumbnail = clip.thumbnail.as_ref().map_or("no camera in it".to_owned(), |path| twin.path(path));
-        let short = clip.short.iter().map(|why| format!("\n    short: {}", visible(why))).collect::<String>();
+        let thumbnail =
+            clip.thumbnail.as_ref().map_or("no camera in it".to_owned(), |path| twin.path(path));
+        let short = clip
+            .short
+            .iter()
+            .map(|why| format!("\n    short: {}", visible(why)))
+            .collect::<String>();
         format!(
             "  {}\n    {from:.2} to {to:.2} s: {}\n    thumbnail: {thumbnail}{short}",
             twin.path(&clip.file),
@@ -74,17 +92,25 @@ fn clip_lines(twin: &Replayed) -> Vec<String> {
     lines.collect()
 }
 
-/// Verifies the journal, and every clip that can be alone, and says how many decisions were the same.
+/// Verifies the journal, and every clip that can be alone, and says how many decisions were the
+/// same.
 fn prove(checkout: &Checkout, example: &Example, twin: &Replayed) -> Result<String, Failure> {
     let (name, kind) = (example.name, twin.summary.kind.as_str());
     let whole = twin.verify(checkout)?;
-    let all = format!("  {name}, {kind}: all {} from the journal and the drive", grouped(whole.wakes));
+    let all =
+        format!("  {name}, {kind}: all {} from the journal and the drive", grouped(whole.wakes));
     if !example.forgets {
         return Ok(format!("{all}; not from clips alone, since it remembers what was before them"));
     }
-    let parts = twin.clips.iter().map(|clip| twin.verify_clip(checkout, clip)).collect::<Result<Vec<_>, _>>()?;
-    let (wakes, uncovered) = parts.iter().fold((0, 0), |sum, part| (sum.0 + part.wakes, sum.1 + part.uncovered));
-    let clips = if parts.len() == 1 { "one clip".to_owned() } else { format!("{} clips", parts.len()) };
+    let parts = twin
+        .clips
+        .iter()
+        .map(|clip| twin.verify_clip(checkout, clip))
+        .collect::<Result<Vec<_>, _>>()?;
+    let (wakes, uncovered) =
+        parts.iter().fold((0, 0), |sum, part| (sum.0 + part.wakes, sum.1 + part.uncovered));
+    let clips =
+        if parts.len() == 1 { "one clip".to_owned() } else { format!("{} clips", parts.len()) };
     let further = match uncovered {
         0 => String::new(),
         _ => format!(" (in {} the lambda had looked at samples from before)", grouped(uncovered)),
@@ -112,13 +138,15 @@ fn triggers(decisions: &[Decision], start_ns: i64) -> String {
             times.entry(&trigger.label).or_default().push(time);
         }
     }
-    let labels = times.iter().map(|(label, times)| format!("{} at {} s", visible(label), times.join(", ")));
+    let labels =
+        times.iter().map(|(label, times)| format!("{} at {} s", visible(label), times.join(", ")));
     if times.is_empty() { "none".to_owned() } else { labels.collect::<Vec<_>>().join("; ") }
 }
 
 /// Columns as wide as their widest cell: words to the left, numbers to the right.
 fn table(rows: &[[String; 6]]) -> String {
-    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let width =
+        |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let line = |row: &[String; 6]| {
         let cells = row.iter().enumerate().map(|(column, cell)| match column {
             2..=4 => format!("{cell:>width$}", width = width(column)),
@@ -135,7 +163,10 @@ mod tests {
 
     #[test]
     fn a_table_has_words_to_the_left_and_numbers_to_the_right() {
-        let rows = [["example", "kind", "wakes", "w/s", "MiB", "at"], ["a", "python", "10", "9999", "1.0", "none"]];
+        let rows = [
+            ["example", "kind", "wakes", "w/s", "MiB", "at"],
+            ["a", "python", "10", "9999", "1.0", "none"],
+        ];
         let rows = rows.map(|row| row.map(str::to_owned));
         assert_eq!(
             table(&rows),
@@ -147,12 +178,17 @@ mod tests {
     #[test]
     fn each_label_stands_once_before_its_times() {
         let decision = |at_ns: i64, label: &str| -> Decision {
-            let trigger = format!(r#"{{"kind":"event","label":"{label}","score":null,"attributes":{{}}}}"#);
+            let trigger =
+                format!(r#"{{"kind":"event","label":"{label}","score":null,"attributes":{{}}}}"#);
             let rest = r#""fault":null,"fuel":null,"run_ns":0"#;
             let woken = r#""cause":"tick","input":null,"topic":null,"writer":null,"seq":null"#;
-            serde_json::from_str(&format!(r#"{{"at_ns":{at_ns},{woken},"triggers":[{trigger}],{rest}}}"#)).unwrap()
+            serde_json::from_str(&format!(
+                r#"{{"at_ns":{at_ns},{woken},"triggers":[{trigger}],{rest}}}"#
+            ))
+            .unwrap()
         };
-        let decisions = [(5_136_000_000, "brake"), (6_000_000_000, "dark"), (11_801_000_000, "brake")];
+        let decisions =
+            [(5_136_000_000, "brake"), (6_000_000_000, "dark"), (11_801_000_000, "brake")];
         let decisions = decisions.map(|(at_ns, label)| decision(at_ns, label));
         assert_eq!(triggers(&decisions, 1_000_000_000), "brake at 4.14, 10.80 s; dark at 5.00 s");
         assert_eq!(triggers(&[], 0), "none");

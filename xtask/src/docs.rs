@@ -1,7 +1,9 @@
-//! `cargo xtask docs`: the pages as a book, in `target/book`. Tests do without it: they read the pages themselves.
+//! `cargo xtask docs`: the pages as a book, in `target/book`. Tests do without it: they read the
+//! pages themselves.
 //!
-//! Pages link to files all over the checkout, and mdBook knows those of one folder only. So it gets a folder with the text files of the
-//! checkout at their places, beside which `SUMMARY.md` of `docs` lies, its links as seen from there.
+//! Pages link to files all over the checkout, and mdBook knows those of one folder only. So it gets
+//! a folder with the text files of the checkout at their places, beside which `SUMMARY.md` of
+//! `docs` lies, its links as seen from there.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -31,11 +33,13 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let mut install = checkout.cargo();
         install.args(["install", "mdbook", "--locked", "--version", MDBOOK, "--root"]).arg(&home);
         let help = "see that the network is there; the pages can be read without a book, too";
-        steps::run(&mut install, help).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
+        steps::run(&mut install, help)
+            .map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
     }
     steps.begin("the book");
     let source = checkout.target().join("book-source");
-    stage(checkout, &source).map_err(|error| Failure::caused_by(Exit::Internal, "cannot lay out the book", &error))?;
+    stage(checkout, &source)
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot lay out the book", &error))?;
     let mut build = checkout.command(&mdbook);
     let book = checkout.target().join("book");
     build.arg("build").arg(&source).arg("--dest-dir").arg(&book);
@@ -63,13 +67,19 @@ fn stage(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
                 if !name.starts_with('.') && !LEFT_OUT.contains(&&*name) {
                     folders.push(path);
                 }
-            } else if kind.is_file() && LINKED.contains(&name.rsplit('.').next().unwrap_or_default()) {
+            } else if kind.is_file()
+                && LINKED.contains(&name.rsplit('.').next().unwrap_or_default())
+            {
                 let copy = to.join("src").join(path);
                 fs::create_dir_all(copy.parent().unwrap_or(to))?;
                 if name.ends_with(".md") {
-                    // mdBook calls the page of a README `index.html`, but leaves links to it as they are.
+                    // mdBook calls the page of a README `index.html`, but leaves links to it as
+                    // they are.
                     let page = fs::read_to_string(entry.path())?;
-                    fs::write(copy, page.replace("README.md)", "index.md)").replace("README.md#", "index.md#"))?;
+                    fs::write(
+                        copy,
+                        page.replace("README.md)", "index.md)").replace("README.md#", "index.md#"),
+                    )?;
                 } else {
                     fs::copy(entry.path(), copy)?;
                 }
@@ -93,7 +103,8 @@ mod tests {
     #[test]
     fn chapters_are_named_from_the_root() {
         let summary = "[Gleaner](../README.md)\n\n- [Clips](clips.md)\n    - [X](../examples/hello/README.md)";
-        let moved = "[Gleaner](README.md)\n\n- [Clips](docs/clips.md)\n    - [X](examples/hello/README.md)";
+        let moved =
+            "[Gleaner](README.md)\n\n- [Clips](docs/clips.md)\n    - [X](examples/hello/README.md)";
         assert_eq!(from_the_root(summary), moved);
     }
 }

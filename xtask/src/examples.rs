@@ -1,4 +1,5 @@
-//! The examples and the recipes of the cookbook on the sample drive: what `demo` shows and `bless` writes down.
+//! The examples and the recipes of the cookbook on the sample drive: what `demo` shows and `bless`
+//! writes down.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -23,7 +24,8 @@ const COOKBOOK: &str = "examples/cookbook";
 pub(crate) struct Example {
     pub(crate) name: &'static str,
     pub(crate) set: &'static [&'static str],
-    /// Whether it decides by what it looks at in a wake and shortly before, so that a clip alone tells what it decided.
+    /// Whether it decides by what it looks at in a wake and shortly before, so that a clip alone
+    /// tells what it decided.
     pub(crate) forgets: bool,
 }
 
@@ -46,7 +48,8 @@ pub(crate) struct Replayed {
 }
 
 impl Example {
-    /// Replays the Rust and the Python twin, in this order. Results go to `out/demo/<example>-<kind>/`.
+    /// Replays the Rust and the Python twin, in this order. Results go to
+    /// `out/demo/<example>-<kind>/`.
     pub(crate) fn replay(&self, checkout: &Checkout) -> Result<[Replayed; 2], Failure> {
         Ok([self.replay_twin(checkout, "rust")?, self.replay_twin(checkout, "python")?])
     }
@@ -68,7 +71,8 @@ impl Example {
     }
 }
 
-/// A lambda of the cookbook: in one language, with an `expected.txt` whose first line is the command that finds the others.
+/// A lambda of the cookbook: in one language, with an `expected.txt` whose first line is the
+/// command that finds the others.
 pub(crate) struct Recipe {
     name: String,
     /// That first line.
@@ -78,7 +82,10 @@ pub(crate) struct Recipe {
 impl Recipe {
     /// All of them.
     pub(crate) fn all(checkout: &Checkout) -> Result<Vec<Recipe>, Failure> {
-        let folders = checkout.lambdas(&["examples"]).into_iter().filter(|lambda| lambda.starts_with(COOKBOOK));
+        let folders = checkout
+            .lambdas(&["examples"])
+            .into_iter()
+            .filter(|lambda| lambda.starts_with(COOKBOOK));
         folders.map(|folder| Recipe::read(checkout, &folder)).collect()
     }
 
@@ -89,8 +96,13 @@ impl Recipe {
         let text = fs::read_to_string(checkout.path(&file)).unwrap_or_default();
         match text.lines().next().filter(|line| line.starts_with(&begin)) {
             Some(command) => Ok(Recipe { name, command: command.to_owned() }),
-            None => Err(Failure::new(Exit::Usage, format!("`{}` does not begin with its command", file.display()))
-                .with_help(format!("write into its first line: {begin}, and what else the command needs"))),
+            None => Err(Failure::new(
+                Exit::Usage,
+                format!("`{}` does not begin with its command", file.display()),
+            )
+            .with_help(format!(
+                "write into its first line: {begin}, and what else the command needs"
+            ))),
         }
     }
 
@@ -103,15 +115,32 @@ impl Recipe {
     pub(crate) fn replay(&self, checkout: &Checkout) -> Result<Replayed, Failure> {
         // Behind `gleaner replay DIR DRIVE`.
         let settings = self.command.split_whitespace().skip(4).map(str::to_owned).collect();
-        replay(checkout, &format!("cookbook-{}", self.name), Path::new(COOKBOOK).join(&self.name), settings)
+        replay(
+            checkout,
+            &format!("cookbook-{}", self.name),
+            Path::new(COOKBOOK).join(&self.name),
+            settings,
+        )
     }
 }
 
 /// Replays a lambda with `settings` over the sample drive. Results go to `out/demo/<name>/`.
-fn replay(checkout: &Checkout, name: &str, lambda: PathBuf, settings: Vec<String>) -> Result<Replayed, Failure> {
+fn replay(
+    checkout: &Checkout,
+    name: &str,
+    lambda: PathBuf,
+    settings: Vec<String>,
+) -> Result<Replayed, Failure> {
     let out = Path::new("out/demo").join(name);
     let mut replay = checkout.command(checkout.program("gleaner"));
-    replay.arg("replay").arg(&lambda).arg(DRIVE).args(settings).arg("--out").arg(&out).arg("--json");
+    replay
+        .arg("replay")
+        .arg(&lambda)
+        .arg(DRIVE)
+        .args(settings)
+        .arg("--out")
+        .arg(&out)
+        .arg("--json");
     // The folder may not be there yet, and a journal of an earlier demo is replaced.
     fs::create_dir_all(checkout.path(&out))
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make `out/demo`", &error))?;
@@ -126,14 +155,29 @@ impl Replayed {
     /// Makes every decision of the journal again, from the drive.
     pub(crate) fn verify(&self, checkout: &Checkout) -> Result<Verified, Failure> {
         let mut verify = checkout.command(checkout.program("gleaner"));
-        verify.arg("replay").arg(&self.lambda).arg(DRIVE).arg("--verify").arg(self.out.join(JOURNAL)).arg("--json");
+        verify
+            .arg("replay")
+            .arg(&self.lambda)
+            .arg(DRIVE)
+            .arg("--verify")
+            .arg(self.out.join(JOURNAL))
+            .arg("--json");
         report(&mut verify)
     }
 
     /// Makes the decisions in a clip again, from the clip alone.
-    pub(crate) fn verify_clip(&self, checkout: &Checkout, clip: &Clip) -> Result<Verified, Failure> {
+    pub(crate) fn verify_clip(
+        &self,
+        checkout: &Checkout,
+        clip: &Clip,
+    ) -> Result<Verified, Failure> {
         let mut verify = checkout.command(checkout.program("gleaner"));
-        verify.arg("verify").arg(self.out.join(&clip.file)).arg("--lambda").arg(&self.lambda).arg("--json");
+        verify
+            .arg("verify")
+            .arg(self.out.join(&clip.file))
+            .arg("--lambda")
+            .arg(&self.lambda)
+            .arg("--json");
         report(&mut verify)
     }
 
@@ -144,10 +188,14 @@ impl Replayed {
 }
 
 /// What `gleaner --json` reports.
-fn report<T: serde::de::DeserializeOwned>(gleaner: &mut std::process::Command) -> Result<T, Failure> {
-    let json = steps::output(gleaner, "see the error above; what was decided until then is in out/demo")?;
-    serde_json::from_str(&json)
-        .map_err(|error| Failure::caused_by(Exit::Internal, "`gleaner --json` gave no report", &error))
+fn report<T: serde::de::DeserializeOwned>(
+    gleaner: &mut std::process::Command,
+) -> Result<T, Failure> {
+    let json =
+        steps::output(gleaner, "see the error above; what was decided until then is in out/demo")?;
+    serde_json::from_str(&json).map_err(|error| {
+        Failure::caused_by(Exit::Internal, "`gleaner --json` gave no report", &error)
+    })
 }
 
 fn decisions(out: &Path) -> Result<Vec<Decision>, ResultsError> {
@@ -160,16 +208,19 @@ pub(crate) fn difference([a, b]: &[Replayed; 2]) -> Option<String> {
         return Some(format!("the number of wakes is {} and {}", a.summary.wakes, b.summary.wakes));
     }
     let held = |twin: &Replayed| {
-        twin.clips.iter().map(|clip| (clip.from_ns, clip.to_ns, clip.topics.clone())).collect::<Vec<_>>()
+        twin.clips
+            .iter()
+            .map(|clip| (clip.from_ns, clip.to_ns, clip.topics.clone()))
+            .collect::<Vec<_>>()
     };
     if held(a) != held(b) {
         return Some("the clips do not hold the same".to_owned());
     }
     let (a, b) = (&a.decisions, &b.decisions);
-    let differ = |(index, (a, b))| twins_differ(a, b).map(|what| format!("decision {}: {what}", index + 1));
-    a.iter()
-        .zip(b)
-        .enumerate()
-        .find_map(differ)
-        .or_else(|| (a.len() != b.len()).then(|| format!("the number of decisions is {} and {}", a.len(), b.len())))
+    let differ =
+        |(index, (a, b))| twins_differ(a, b).map(|what| format!("decision {}: {what}", index + 1));
+    a.iter().zip(b).enumerate().find_map(differ).or_else(|| {
+        (a.len() != b.len())
+            .then(|| format!("the number of decisions is {} and {}", a.len(), b.len()))
+    })
 }

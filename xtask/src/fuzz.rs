@@ -1,8 +1,9 @@
-//! `cargo xtask fuzz`: feeds what reads foreign bytes with bytes that libFuzzer makes up, guided by what code they reach.
-//! `docs/fuzzing.md` says what is promised.
+//! `cargo xtask fuzz`: feeds what reads foreign bytes with bytes that libFuzzer makes up, guided by
+//! what code they reach. `docs/fuzzing.md` says what is promised.
 //!
-//! The stable compiler can instrument code for libFuzzer if it is told so in its own words, which is what `cargo fuzz` does
-//! too. All that is made lies in `fuzz/` and `fuzz-artifacts/` of the target folder.
+//! The stable compiler can instrument code for libFuzzer if it is told so in its own words, which
+//! is what `cargo fuzz` does too. All that is made lies in `fuzz/` and `fuzz-artifacts/` of the
+//! target folder.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -18,10 +19,13 @@ use crate::checkout::Checkout;
 use crate::setup;
 use crate::steps::{self, Steps};
 
-/// The targets. The rest about them is known to `gleaner-fuzz`, which would take too long to be built for this.
-const TARGETS: [&str; 8] = ["message", "drive", "bag", "image", "journal", "link", "manifest", CALLS];
+/// The targets. The rest about them is known to `gleaner-fuzz`, which would take too long to be
+/// built for this.
+const TARGETS: [&str; 8] =
+    ["message", "drive", "bag", "image", "journal", "link", "manifest", CALLS];
 
-/// The target that runs a lambda. It needs that lambda compiled, and the host, which takes minutes to be built.
+/// The target that runs a lambda. It needs that lambda compiled, and the host, which takes minutes
+/// to be built.
 const CALLS: &str = "calls";
 /// The lambda of [`CALLS`], and where its native code is kept, as for tests.
 const DRIVER: &str = "tests/lambdas/driver/rust";
@@ -76,14 +80,22 @@ impl Asked {
         let mut words = arguments.iter().map(|argument| argument.to_string_lossy());
         while let Some(word) = words.next() {
             if word == "--seconds" {
-                let seconds = words.next().and_then(|seconds| seconds.parse().ok()).filter(|seconds| *seconds > 0);
-                asked.seconds = seconds.ok_or_else(|| refused("`--seconds` takes a whole number".to_owned()))?;
+                let seconds = words
+                    .next()
+                    .and_then(|seconds| seconds.parse().ok())
+                    .filter(|seconds| *seconds > 0);
+                asked.seconds = seconds
+                    .ok_or_else(|| refused("`--seconds` takes a whole number".to_owned()))?;
             } else if word == "--seed" {
                 let seed = words.next().and_then(|seed| seed.parse().ok()).filter(|seed| *seed > 0);
-                asked.seed = Some(seed.ok_or_else(|| refused("`--seed` takes a whole number above 0".to_owned()))?);
+                asked.seed =
+                    Some(seed.ok_or_else(|| {
+                        refused("`--seed` takes a whole number above 0".to_owned())
+                    })?);
             } else {
                 let target = TARGETS.into_iter().find(|name| *name == word);
-                let target = target.ok_or_else(|| refused(format!("there is no target `{word}`")))?;
+                let target =
+                    target.ok_or_else(|| refused(format!("there is no target `{word}`")))?;
                 if !asked.targets.contains(&target) {
                     asked.targets.push(target);
                 }
@@ -96,7 +108,8 @@ impl Asked {
     }
 }
 
-/// Builds the lambda of [`CALLS`], and compiles it for this machine: the target has no compiler in it.
+/// Builds the lambda of [`CALLS`], and compiles it for this machine: the target has no compiler in
+/// it.
 pub(crate) fn driver(checkout: &Checkout) -> Result<(), Failure> {
     setup::target(checkout, setup::TARGET)?;
     // Of all that is built by default, as there, so that nothing is built twice.
@@ -123,31 +136,53 @@ struct Fuzz<'c> {
 impl Fuzz<'_> {
     /// Builds the programs of these targets; returns where they are.
     fn programs(&self, names: &[&str]) -> Result<PathBuf, Failure> {
-        let mut rustc = self.checkout.command(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
-        let machine = steps::output(rustc.args(["--print", "host-tuple"]), "install Rust with rustup")?;
+        let mut rustc =
+            self.checkout.command(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
+        let machine =
+            steps::output(rustc.args(["--print", "host-tuple"]), "install Rust with rustup")?;
         let machine = machine.trim();
         let mut build = self.checkout.cargo();
-        // With a target named, flags are for it alone, and not for the programs that run while building.
+        // With a target named, flags are for it alone, and not for the programs that run while
+        // building.
         build.args(["build", "--release", "-p", "gleaner-fuzz", "--target", machine]);
         for name in names {
             build.args(["--bin", &format!("fuzz-{name}")]);
         }
-        build.args(["--features", if names.contains(&CALLS) { "programs,calls" } else { "programs" }]);
-        build.env("CARGO_TARGET_DIR", &self.build).env("RUSTFLAGS", FLAGS).env_remove("CARGO_ENCODED_RUSTFLAGS");
-        steps::run(&mut build, "if a C++ compiler is missing, install one (`c++`); else see the first error above")?;
+        build.args([
+            "--features",
+            if names.contains(&CALLS) { "programs,calls" } else { "programs" },
+        ]);
+        build
+            .env("CARGO_TARGET_DIR", &self.build)
+            .env("RUSTFLAGS", FLAGS)
+            .env_remove("CARGO_ENCODED_RUSTFLAGS");
+        steps::run(
+            &mut build,
+            "if a C++ compiler is missing, install one (`c++`); else see the first error above",
+        )?;
         Ok(self.build.join(machine).join("release"))
     }
 
     fn seeds(&self) -> Result<(), Failure> {
         let mut build = self.checkout.cargo();
-        // With the features of all that is built by default, as there, so that nothing is built twice.
-        build.args(["build", "--release", "--workspace", "--exclude", "gleaner-player", "--bin", "fuzz-seeds"]);
+        // With the features of all that is built by default, as there, so that nothing is built
+        // twice.
+        build.args([
+            "build",
+            "--release",
+            "--workspace",
+            "--exclude",
+            "gleaner-player",
+            "--bin",
+            "fuzz-seeds",
+        ]);
         steps::run(&mut build, "see the first error above")?;
         let mut seeds = self.checkout.command(self.checkout.program("fuzz-seeds"));
         steps::run(seeds.arg(self.build.join("seeds")), "see the error above")
     }
 
-    /// Runs these, as many at once as there are cores: each is one thread. How many found something.
+    /// Runs these, as many at once as there are cores: each is one thread. How many found
+    /// something.
     fn targets(&self, programs: &Path, names: &[&str]) -> Result<usize, Failure> {
         let left = Mutex::new(names.iter());
         let next = || left.lock().expect("nobody panics here").next();
@@ -171,11 +206,14 @@ impl Fuzz<'_> {
         let findings = folder(self.findings.join(name))?;
         let log = findings.join("log");
         let longest = self.build.join("seeds").join(format!("{name}.longest"));
-        let longest = fs::read_to_string(&longest).map_err(|error| cannot("read", &longest, &error))?;
+        let longest =
+            fs::read_to_string(&longest).map_err(|error| cannot("read", &longest, &error))?;
         let output = File::create(&log).map_err(|error| cannot("write", &log, &error))?;
         let mut fuzzer = self.checkout.command(&program);
         // What was reached in earlier runs is kept, and is where the next one begins.
-        fuzzer.arg(folder(self.build.join("corpus").join(name))?).arg(self.build.join("seeds").join(name));
+        fuzzer
+            .arg(folder(self.build.join("corpus").join(name))?)
+            .arg(self.build.join("seeds").join(name));
         fuzzer.arg(option("dict", self.build.join("seeds").join(format!("{name}.dict")).display()));
         fuzzer.arg(option("artifact_prefix", format!("{}/", findings.display())));
         fuzzer.args(self.seed.map(|seed| option("seed", seed)));
@@ -188,12 +226,18 @@ impl Fuzz<'_> {
         if !status.success() && input.is_none() {
             // It ended by itself, without having looked for anything.
             let what = format!("`{}` ended with {status}", program.display());
-            return Err(Failure::new(Exit::Internal, what).with_help(format!("see {}", log.display())));
+            return Err(
+                Failure::new(Exit::Internal, what).with_help(format!("see {}", log.display()))
+            );
         }
         let found = if input.is_some() { "A FINDING" } else { "nothing found" };
         println!("{name:<9} {executions:>12} executions {reached:>6} edges reached  {found}");
         if let Some(input) = &input {
-            println!("  input: {input}\n  log:   {}\n  again: {} {input}", log.display(), program.display());
+            println!(
+                "  input: {input}\n  log:   {}\n  again: {} {input}",
+                log.display(),
+                program.display()
+            );
         }
         Ok(input.is_some())
     }
@@ -211,7 +255,9 @@ impl Said {
     fn of(text: &str) -> Said {
         let behind = |sign: &str| {
             let mut lines = text.lines().rev();
-            lines.find_map(|line| Some(line.split_once(sign)?.1.split_whitespace().next()?.to_owned()))
+            lines.find_map(|line| {
+                Some(line.split_once(sign)?.1.split_whitespace().next()?.to_owned())
+            })
         };
         let unknown = || "?".to_owned();
         Said {
@@ -251,15 +297,24 @@ mod tests {
 
     #[test]
     fn targets_a_time_and_a_seed_can_be_asked_for() {
-        let asked = |words: &[&str]| Asked::of(&words.iter().map(OsString::from).collect::<Vec<_>>());
+        let asked =
+            |words: &[&str]| Asked::of(&words.iter().map(OsString::from).collect::<Vec<_>>());
         let all = asked(&[]).unwrap_or_else(|failure| panic!("{failure}"));
         assert_eq!((all.targets.len(), all.seconds), (TARGETS.len(), 60));
         assert_eq!(all.seed, None);
         let some = ["drive", "--seconds", "5", "image", "--seed", "7", "drive"];
         let some = asked(&some).unwrap_or_else(|failure| panic!("{failure}"));
         assert_eq!((some.targets, some.seconds, some.seed), (vec!["drive", "image"], 5, Some(7)));
-        let nonsense = [["--seconds", "0"], ["--seconds", "-1"], ["--seed", "0"], ["--seed", "x"], ["drive", "x"]];
-        for wrong in nonsense.iter().map(|wrong| &wrong[..]).chain([&["x"][..], &["--seconds"], &["--seed"]]) {
+        let nonsense = [
+            ["--seconds", "0"],
+            ["--seconds", "-1"],
+            ["--seed", "0"],
+            ["--seed", "x"],
+            ["drive", "x"],
+        ];
+        for wrong in
+            nonsense.iter().map(|wrong| &wrong[..]).chain([&["x"][..], &["--seconds"], &["--seed"]])
+        {
             assert!(asked(wrong).is_err_and(|failure| failure.exit == Exit::Usage), "{wrong:?}");
         }
     }

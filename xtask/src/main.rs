@@ -1,7 +1,9 @@
-//! `cargo xtask`: everything a fresh machine needs beyond cargo, a C compiler and Python is fetched and built here.
+//! `cargo xtask`: everything a fresh machine needs beyond cargo, a C compiler and Python is fetched
+//! and built here.
 //!
-//! `checkout` knows where things are, `setup` makes what is missing, `examples` replays the sample drive, and each
-//! command is a file that says what it does after that. Nothing here is part of what is installed.
+//! `checkout` knows where things are, `setup` makes what is missing, `examples` replays the sample
+//! drive, and each command is a file that says what it does after that. Nothing here is part of
+//! what is installed.
 
 mod aarch64;
 mod bless;
@@ -54,7 +56,11 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         None => ("", &[][..]),
     };
     if !rest.is_empty() && !["bench", "fuzz", "peers"].contains(&command) {
-        return Err(Failure::new(Exit::Usage, format!("`cargo xtask {command}` takes no arguments")).with_help(USAGE));
+        return Err(Failure::new(
+            Exit::Usage,
+            format!("`cargo xtask {command}` takes no arguments"),
+        )
+        .with_help(USAGE));
     }
     let checkout = Checkout::find()?;
     match command {
@@ -67,7 +73,10 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "peers" => peers::build(&checkout, rest),
         "player" => player::run(&checkout),
         "aarch64" => aarch64::run(&checkout),
-        "build" => setup::run(&checkout, &mut Steps::of(setup::STEPS), &checkout.lambdas(&FAMILIES)).map(|()| Exit::Ok),
+        "build" => {
+            setup::run(&checkout, &mut Steps::of(setup::STEPS), &checkout.lambdas(&FAMILIES))
+                .map(|()| Exit::Ok)
+        }
         _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
     }
 }
@@ -79,8 +88,12 @@ fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     venv::set_up_for_tests(checkout)?;
     steps.begin("gleaner-bench");
     let mut build = checkout.cargo();
-    // By its name alone: cargo chooses features by the packages that are named, and none of it is to compile twice.
-    steps::run(build.args(["build", "--release", "--bin", "gleaner-bench"]), "see the first error above")?;
+    // By its name alone: cargo chooses features by the packages that are named, and none of it is
+    // to compile twice.
+    steps::run(
+        build.args(["build", "--release", "--bin", "gleaner-bench"]),
+        "see the first error above",
+    )?;
     steps.begin("measurements");
     let mut bench = checkout.command(checkout.program("gleaner-bench"));
     bench.args(arguments);

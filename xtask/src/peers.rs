@@ -1,5 +1,6 @@
-//! `cargo xtask peers`: programs on other people's DDS, which the suite `dds` lets us talk to. Those whose packages are there are
-//! built into `peers/` of the target folder; for the others it is said how to get them.
+//! `cargo xtask peers`: programs on other people's DDS, which the suite `dds` lets us talk to.
+//! Those whose packages are there are built into `peers/` of the target folder; for the others it
+//! is said how to get them.
 
 use std::ffi::OsString;
 use std::fs;
@@ -12,7 +13,8 @@ use crate::checkout::Checkout;
 use crate::steps::{Steps, run, succeeds};
 use crate::venv;
 
-/// Debian's and Ubuntu's packages: of the two DDS, and of what private networks for tests are made with.
+/// Debian's and Ubuntu's packages: of the two DDS, and of what private networks for tests are made
+/// with.
 const CYCLONE: [&str; 2] = ["cyclonedds-dev", "cyclonedds-tools"];
 const FAST: [&str; 4] = ["libfastrtps-dev", "libfastcdr-dev", "fastddsgen", "default-jre-headless"];
 const NETWORK: [&str; 2] = ["iproute2", "nftables"];
@@ -27,7 +29,12 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     let install = match arguments {
         [] => false,
         [one] if one == "--install" => true,
-        _ => return Err(Failure::new(Exit::Usage, "`cargo xtask peers` takes `--install` or nothing")),
+        _ => {
+            return Err(Failure::new(
+                Exit::Usage,
+                "`cargo xtask peers` takes `--install` or nothing",
+            ));
+        }
     };
     let peers = Peers { checkout, folder: checkout.target().join("peers") };
     let mut steps = Steps::of(4);
@@ -57,7 +64,8 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     if missing.is_empty() {
         return Ok(Exit::Ok);
     }
-    let help = format!("as root: cargo xtask peers --install, or: apt-get install {}", missing.join(" "));
+    let help =
+        format!("as root: cargo xtask peers --install, or: apt-get install {}", missing.join(" "));
     Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help))
 }
 
@@ -94,8 +102,17 @@ impl Peers<'_> {
 
     fn missing(&self) -> Vec<&'static str> {
         let network = self.has("ip", "-V") && self.has("nft", "-v");
-        let groups = [(self.has_cyclone(), &CYCLONE[..]), (self.has_fast(), &FAST[..]), (network, &NETWORK[..])];
-        groups.into_iter().filter(|(there, _)| !there).flat_map(|(_, packages)| packages).copied().collect()
+        let groups = [
+            (self.has_cyclone(), &CYCLONE[..]),
+            (self.has_fast(), &FAST[..]),
+            (network, &NETWORK[..]),
+        ];
+        groups
+            .into_iter()
+            .filter(|(there, _)| !there)
+            .flat_map(|(_, packages)| packages)
+            .copied()
+            .collect()
     }
 
     fn install(&self, packages: &[&str]) -> Result<(), Failure> {
@@ -109,7 +126,11 @@ impl Peers<'_> {
     fn generated(&self, name: &str) -> Result<PathBuf, Failure> {
         let folder = self.folder.join(name);
         fs::create_dir_all(&folder).map_err(|error| {
-            Failure::caused_by(Exit::Internal, format!("cannot make folder `{}`", folder.display()), &error)
+            Failure::caused_by(
+                Exit::Internal,
+                format!("cannot make folder `{}`", folder.display()),
+                &error,
+            )
         })?;
         Ok(folder)
     }
@@ -121,12 +142,21 @@ impl Peers<'_> {
     fn cyclone(&self) -> Result<(), Failure> {
         let messages = self.generated("cyclone")?;
         self.idlc(&["-o".as_ref(), messages.as_ref(), self.source("messages.idl").as_ref()])?;
-        let sources = [self.source("cyclone/peer.c"), self.source("cyclone/content.c"), messages.join("messages.c")];
+        let sources = [
+            self.source("cyclone/peer.c"),
+            self.source("cyclone/content.c"),
+            messages.join("messages.c"),
+        ];
         self.compile_c(&messages, &sources, "cyclone-peer")?;
         for size in GID_SIZES {
             let graph = self.generated(&format!("graph-{size}"))?;
             let define = format!("-DGID_SIZE={size}");
-            self.idlc(&[define.as_ref(), "-o".as_ref(), graph.as_ref(), self.source("graph.idl").as_ref()])?;
+            self.idlc(&[
+                define.as_ref(),
+                "-o".as_ref(),
+                graph.as_ref(),
+                self.source("graph.idl").as_ref(),
+            ])?;
             let sources = [self.source("cyclone/graph.c"), graph.join("graph.c")];
             self.compile_c(&graph, &sources, &format!("cyclone-graph-{size}"))?;
         }

@@ -1,5 +1,6 @@
-//! `cargo xtask player`: builds `gleaner-player`. It holds Cyclone DDS, which is C: that takes cmake, and libclang to read its
-//! headers. What the system lacks of them is put into `.venv`, which needs no root.
+//! `cargo xtask player`: builds `gleaner-player`. It holds Cyclone DDS, which is C: that takes
+//! cmake, and libclang to read its headers. What the system lacks of them is put into `.venv`,
+//! which needs no root.
 
 use std::env;
 use std::ffi::OsString;
@@ -27,7 +28,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// Cargo that can build the player: with the tools that it takes, which are fetched if the system lacks them.
+/// Cargo that can build the player: with the tools that it takes, which are fetched if the system
+/// lacks them.
 pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
     let lacks_cmake = !steps::succeeds(checkout.command("cmake").arg("--version"));
     let lacks_libclang = env::var_os("LIBCLANG_PATH").is_none() && !has_libclang();
@@ -42,7 +44,8 @@ pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
     if lacks_libclang {
         cargo.env("LIBCLANG_PATH", fetched_libclang(checkout)?);
     }
-    // libclang alone has no stddef.h and the like, and finds those of the C compiler only if told where.
+    // libclang alone has no stddef.h and the like, and finds those of the C compiler only if told
+    // where.
     if env::var_os("BINDGEN_EXTRA_CLANG_ARGS").is_none() {
         cargo.env("BINDGEN_EXTRA_CLANG_ARGS", format!("-I{}", headers(checkout)?));
     }
@@ -51,21 +54,31 @@ pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
 
 /// Whether libclang lies where the crate `clang-sys` looks for it.
 fn has_libclang() -> bool {
-    let folders = ["/usr/lib", "/usr/lib64", "/usr/local/lib", "/usr/local/lib64"].map(PathBuf::from);
+    let folders =
+        ["/usr/lib", "/usr/lib64", "/usr/local/lib", "/usr/local/lib64"].map(PathBuf::from);
     // Below each, distributions have one for their architecture, and one for each version of LLVM.
-    let deeper = folders.iter().flat_map(|folder| entries(folder)).flat_map(|path| [path.join("lib"), path]);
-    deeper.chain(folders.iter().cloned()).any(|folder| entries(&folder).iter().any(|path| is_libclang(path)))
+    let deeper =
+        folders.iter().flat_map(|folder| entries(folder)).flat_map(|path| [path.join("lib"), path]);
+    deeper
+        .chain(folders.iter().cloned())
+        .any(|folder| entries(&folder).iter().any(|path| is_libclang(path)))
 }
 
 fn is_libclang(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     // Another library has the begin of its name: libclang-cpp.
-    let has_version = name.strip_prefix("libclang-").is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()));
+    let has_version = name
+        .strip_prefix("libclang-")
+        .is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()));
     name.starts_with("libclang.so") || has_version && name.contains(".so")
 }
 
 fn entries(folder: &Path) -> Vec<PathBuf> {
-    fs::read_dir(folder).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path())).collect()
+    fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .collect()
 }
 
 /// Puts both into `.venv`; pip does nothing where they are there.
@@ -77,8 +90,9 @@ fn fetch(checkout: &Checkout) -> Result<(), Failure> {
 
 fn path_with(folder: PathBuf) -> Result<OsString, Failure> {
     let path = env::var_os("PATH").unwrap_or_default();
-    env::join_paths(env::split_paths(&path).chain([folder]))
-        .map_err(|error| Failure::caused_by(Exit::Internal, "the checkout's path cannot stand in PATH", &error))
+    env::join_paths(env::split_paths(&path).chain([folder])).map_err(|error| {
+        Failure::caused_by(Exit::Internal, "the checkout's path cannot stand in PATH", &error)
+    })
 }
 
 fn fetched_libclang(checkout: &Checkout) -> Result<PathBuf, Failure> {

@@ -1,4 +1,5 @@
-//! What every command needs first. Each step looks first, and does nothing where nothing is missing.
+//! What every command needs first. Each step looks first, and does nothing where nothing is
+//! missing.
 
 use std::path::{Path, PathBuf};
 
@@ -14,12 +15,23 @@ pub(crate) const STEPS: usize = 4;
 /// What lambdas in Rust are compiled for.
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
-/// The packages with what is installed, and nothing else: no benches, no tests, no lambda for this machine.
-const PROGRAMS: [&str; 6] =
-    ["gleaner-cli", "gleaner-compile", "gleaner-host", "gleaner-python", "gleaner-recorder", "gleaner-shim"];
+/// The packages with what is installed, and nothing else: no benches, no tests, no lambda for this
+/// machine.
+const PROGRAMS: [&str; 6] = [
+    "gleaner-cli",
+    "gleaner-compile",
+    "gleaner-host",
+    "gleaner-python",
+    "gleaner-recorder",
+    "gleaner-shim",
+];
 
 /// Sets up: the wasm target, `.venv`, the programs, and these lambdas.
-pub(crate) fn run(checkout: &Checkout, steps: &mut Steps, lambdas: &[PathBuf]) -> Result<(), Failure> {
+pub(crate) fn run(
+    checkout: &Checkout,
+    steps: &mut Steps,
+    lambdas: &[PathBuf],
+) -> Result<(), Failure> {
     steps.begin(&format!("compilation target {TARGET}"));
     target(checkout, TARGET)?;
     steps.begin("Python environment .venv with numpy");
@@ -42,17 +54,23 @@ pub(crate) fn target(checkout: &Checkout, target: &str) -> Result<(), Failure> {
     }
     let mut add = checkout.command("rustup");
     add.args(["target", "add", target]);
-    let help =
-        format!("install the standard library for {target}: `rustup target add {target}`, or your system's package");
+    let help = format!(
+        "install the standard library for {target}: `rustup target add {target}`, or your system's package"
+    );
     steps::run(&mut add, &help)
 }
 
-/// All in one call, those too that a command needs not: features of shared crates are then those of `cargo test`, and nothing heavy
-/// compiles twice.
+/// All in one call, those too that a command needs not: features of shared crates are then those of
+/// `cargo test`, and nothing heavy compiles twice.
 pub(crate) fn programs(checkout: &Checkout) -> Result<(), Failure> {
     let mut build = checkout.cargo();
-    build.args(["build", "--release"]).args(PROGRAMS.iter().flat_map(|package| ["--package", package]));
-    steps::run(&mut build, "if a linker or a C compiler is missing, install one (`cc`); else see the first error above")
+    build
+        .args(["build", "--release"])
+        .args(PROGRAMS.iter().flat_map(|package| ["--package", package]));
+    steps::run(
+        &mut build,
+        "if a linker or a C compiler is missing, install one (`cc`); else see the first error above",
+    )
 }
 
 /// Builds the lambdas in these folders.
@@ -73,12 +91,15 @@ mod tests {
 
     use super::*;
 
-    /// Each package that cargo builds for `selected`, with its features; `edges` are the kinds of dependencies that count.
+    /// Each package that cargo builds for `selected`, with its features; `edges` are the kinds of
+    /// dependencies that count.
     fn packages(edges: &str, selected: &[&str]) -> BTreeSet<String> {
         let cargo = env::var_os("CARGO").expect("cargo runs the tests");
         let mut tree = Command::new(cargo);
         tree.current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(".."));
-        tree.args(["tree", "--locked", "--edges", edges, "--prefix", "none", "--format", "{p} {f}"]);
+        tree.args([
+            "tree", "--locked", "--edges", edges, "--prefix", "none", "--format", "{p} {f}",
+        ]);
         tree.args(selected.iter().flat_map(|package| ["--package", package]));
         let output = tree.output().expect("cargo starts");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -88,9 +109,11 @@ mod tests {
 
     #[test]
     fn what_is_built_of_programs_is_not_built_again_for_tests() {
-        let (programs, all) = (packages("normal,build", &PROGRAMS), packages("normal,build,dev", &[]));
+        let (programs, all) =
+            (packages("normal,build", &PROGRAMS), packages("normal,build,dev", &[]));
         assert!(programs.len() > 100, "{}", programs.len());
-        // As cargo chooses features by what it builds, a feature that only a test enables is one more build of all that uses it.
+        // As cargo chooses features by what it builds, a feature that only a test enables is one
+        // more build of all that uses it.
         let again: Vec<_> = programs.difference(&all).collect();
         assert!(again.is_empty(), "with other features in `cargo test`: {again:#?}");
     }

@@ -27,14 +27,18 @@ impl Steps {
 
 /// Runs `command` to its end, with its output shown. `help` is what to do if it fails.
 pub(crate) fn run(command: &mut Command, help: &str) -> Result<(), Failure> {
-    let status = command.stdin(Stdio::null()).status().map_err(|error| cannot_start(command, &error, help))?;
+    let status = command
+        .stdin(Stdio::null())
+        .status()
+        .map_err(|error| cannot_start(command, &error, help))?;
     if status.success() { Ok(()) } else { Err(ended(command, &status.to_string(), help)) }
 }
 
 /// Runs `command` to its end and keeps what it writes to standard output; the rest is shown.
 pub(crate) fn output(command: &mut Command, help: &str) -> Result<String, Failure> {
     let command = command.stdin(Stdio::null()).stderr(Stdio::inherit());
-    let Output { status, stdout, .. } = command.output().map_err(|error| cannot_start(command, &error, help))?;
+    let Output { status, stdout, .. } =
+        command.output().map_err(|error| cannot_start(command, &error, help))?;
     if status.success() {
         Ok(String::from_utf8_lossy(&stdout).into_owned())
     } else {
@@ -42,7 +46,8 @@ pub(crate) fn output(command: &mut Command, help: &str) -> Result<String, Failur
     }
 }
 
-/// Runs `command` silently. Whether it succeeded is the answer; a program that is not there did not.
+/// Runs `command` silently. Whether it succeeded is the answer; a program that is not there did
+/// not.
 pub(crate) fn succeeds(command: &mut Command) -> bool {
     let command = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     command.status().is_ok_and(|status| status.success())
@@ -59,7 +64,8 @@ fn ended(command: &Command, status: &str, help: &str) -> Failure {
         line.push(' ');
         line.push_str(&argument.to_string_lossy());
     }
-    let mut failure = Failure::new(Exit::Internal, "a step failed; its messages are above").with_help(help);
+    let mut failure =
+        Failure::new(Exit::Internal, "a step failed; its messages are above").with_help(help);
     failure.causes = vec![format!("`{line}` ended with {status}")];
     failure
 }

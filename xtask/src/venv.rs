@@ -1,6 +1,7 @@
-//! `.venv`: Python with numpy, for Python lambdas; and for tests and benches mypy, which checks the SDK's types, and the readers of
-//! others, by which tests read our clips. No version is pinned: the newest that this Python takes, so that a user's environment is the one that
-//! is tested. But for mypy, of which the newest may find new faults in old code: it has an upper bound.
+//! `.venv`: Python with numpy, for Python lambdas; and for tests and benches mypy, which checks the
+//! SDK's types, and the readers of others, by which tests read our clips. No version is pinned: the
+//! newest that this Python takes, so that a user's environment is the one that is tested. But for
+//! mypy, of which the newest may find new faults in old code: it has an upper bound.
 
 use std::fs;
 use std::process::Command;
@@ -14,7 +15,8 @@ use crate::steps::{run, succeeds};
 /// What lambdas need: what pip calls it, and what Python does.
 const PACKAGES: [(&str, &str); 1] = [("numpy", "numpy")];
 
-/// What tests and benches need, too: types, readers, `gleaner.testing` on pictures, tests of lambdas, and notebooks.
+/// What tests and benches need, too: types, readers, `gleaner.testing` on pictures, tests of
+/// lambdas, and notebooks.
 const FOR_TESTS: [(&str, &str); 9] = [
     ("mypy<2.5", "mypy"),
     ("mcap", "mcap"),
@@ -27,7 +29,8 @@ const FOR_TESTS: [(&str, &str); 9] = [
     ("matplotlib", "matplotlib"),
 ];
 
-/// Makes the environment, or completes it. One whose Python does not run, since the system's Python went, is made anew.
+/// Makes the environment, or completes it. One whose Python does not run, since the system's Python
+/// went, is made anew.
 pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
     if has(checkout, &PACKAGES) {
         return Ok(());
@@ -37,10 +40,15 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
         if folder.exists() {
             println!("making it anew: its Python does not run");
             fs::remove_dir_all(&folder).map_err(|error| {
-                Failure::caused_by(Exit::Internal, format!("cannot remove `{}`", folder.display()), &error)
+                Failure::caused_by(
+                    Exit::Internal,
+                    format!("cannot remove `{}`", folder.display()),
+                    &error,
+                )
             })?;
         }
-        // By the rule by which Python is found for a lambda; what is in `.venv` comes first, and there is nothing.
+        // By the rule by which Python is found for a lambda; what is in `.venv` comes first, and
+        // there is nothing.
         let interpreter = Parts::find()?.python(None)?;
         println!("made by {}", interpreter.display());
         let mut make = checkout.command(interpreter);
@@ -69,7 +77,11 @@ fn has(checkout: &Checkout, packages: &[(&str, &str)]) -> bool {
 
 fn fetch(checkout: &Checkout, packages: &[(&str, &str)]) -> Result<(), Failure> {
     let packages: Vec<_> = packages.iter().map(|(package, _)| *package).collect();
-    pip(checkout.command(checkout.python()), &packages, "see that the network is there, or configure pip for a mirror")
+    pip(
+        checkout.command(checkout.python()),
+        &packages,
+        "see that the network is there, or configure pip for a mirror",
+    )
 }
 
 /// Has the pip of a `python` fetch packages. `help` is what else can be done.

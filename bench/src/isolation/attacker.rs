@@ -1,4 +1,5 @@
-//! The lambda of `tests/lambdas/attack`, with the manifest of somebody who wants as much as he can get.
+//! The lambda of `tests/lambdas/attack`, with the manifest of somebody who wants as much as he can
+//! get.
 
 use std::fmt;
 use std::thread::{self, JoinHandle};
@@ -16,8 +17,8 @@ use crate::measure::{Figure, Kind, stay_on};
 pub(super) struct Attack {
     /// In words.
     name: &'static str,
-    /// By its name in the lambda, and in which language; none for a thread of ours that does nothing but to be busy, which shows what
-    /// the machine itself does not keep apart.
+    /// By its name in the lambda, and in which language; none for a thread of ours that does
+    /// nothing but to be busy, which shows what the machine itself does not keep apart.
     by: Option<(&'static str, Kind)>,
 }
 
@@ -43,8 +44,8 @@ pub(super) const ATTACKS: &[Attack] = &[
     by("sleeping past the deadline", "sleep", Kind::Python),
 ];
 
-/// What the attacker asks for: 200 ms of every wake, a wake each millisecond, more memory than the largest cache has, and all the words
-/// that the host takes.
+/// What the attacker asks for: 200 ms of every wake, a wake each millisecond, more memory than the
+/// largest cache has, and all the words that the host takes.
 const LIMITS: &str = "[limits]
 deadline = \"200ms\"
 fuel = 1_000_000_000_000
@@ -86,10 +87,15 @@ impl Attacker {
     /// Starts it on `core`, and waits until it has had its `init`.
     pub(super) fn start(attack: &Attack, core: usize) -> Self {
         let Some((behaviour, kind)) = attack.by else { return Self::Neighbour { core } };
-        let lambda = Copy::of(&format!("tests/lambdas/attack/{}", kind.folder()), |manifest| hungry(&manifest));
+        let lambda = Copy::of(&format!("tests/lambdas/attack/{}", kind.folder()), |manifest| {
+            hungry(&manifest)
+        });
         let out = Folder::new();
-        let settings =
-            [format!("attack={behaviour}"), format!("every_ms={BLOCK_MS}"), format!("touch_mib={TOUCHED_MIB}")];
+        let settings = [
+            format!("attack={behaviour}"),
+            format!("every_ms={BLOCK_MS}"),
+            format!("touch_mib={TOUCHED_MIB}"),
+        ];
         let start = || {
             // What a thread starts stays on its core.
             stay_on(core).expect("one of the cores that may be used");
@@ -98,7 +104,12 @@ impl Attacker {
         };
         let started = thread::scope(|scope| scope.spawn(start).join().expect("it starts"));
         started.until_ready();
-        Self::Lambda { name: attack.to_string(), started, seen: Vec::new(), _folders: (lambda, out) }
+        Self::Lambda {
+            name: attack.to_string(),
+            started,
+            seen: Vec::new(),
+            _folders: (lambda, out),
+        }
     }
 
     /// Until the end of `course`.
@@ -110,11 +121,14 @@ impl Attacker {
                     seen.push((clock.now(), live));
                 }
             }
-            Self::Neighbour { core } => busy(*core, course.end_ns(), clock).join().expect("it does nothing"),
+            Self::Neighbour { core } => {
+                busy(*core, course.end_ns(), clock).join().expect("it does nothing")
+            }
         }
     }
 
-    /// Ends it, and tells how much it did: a goal is missed if it did not attack in attacked blocks, or did in quiet ones.
+    /// Ends it, and tells how much it did: a goal is missed if it did not attack in attacked
+    /// blocks, or did in quiet ones.
     pub(super) fn end(self, course: &Course, figures: &mut Vec<Figure>) {
         let Self::Lambda { name, started, seen, _folders } = self else { return };
         started.signal("INT");
@@ -128,11 +142,24 @@ impl Attacker {
             up_s[block % 2] += after.up_s - before.up_s;
         }
         let name = format!("{name}: the attacker");
-        figures.push(Figure::told(&format!("{name}: share of its core, quiet"), "%", &[100.0 * cpu_s[0] / up_s[0]]));
-        figures.push(Figure::told(&format!("{name}: share of its core, attacked"), "%", &[100.0 * cpu_s[1] / up_s[1]]));
+        figures.push(Figure::told(
+            &format!("{name}: share of its core, quiet"),
+            "%",
+            &[100.0 * cpu_s[0] / up_s[0]],
+        ));
+        figures.push(Figure::told(
+            &format!("{name}: share of its core, attacked"),
+            "%",
+            &[100.0 * cpu_s[1] / up_s[1]],
+        ));
         let [quiet, attacked] = hindered.map(|count| count as f64);
         // Else nothing was measured.
-        figures.push(Figure::at_most(&format!("{name}: how often it was hindered, quiet"), "times", 0.0, &[quiet]));
+        figures.push(Figure::at_most(
+            &format!("{name}: how often it was hindered, quiet"),
+            "times",
+            0.0,
+            &[quiet],
+        ));
         figures.push(Figure::at_least(
             &format!("{name}: how often it was hindered, attacked"),
             "times",
@@ -140,7 +167,11 @@ impl Attacker {
             &[attacked],
         ));
         let rate = attacked / up_s[1];
-        figures.push(Figure::told(&format!("{name}: faults, and words that were thrown away"), "a second", &[rate]));
+        figures.push(Figure::told(
+            &format!("{name}: faults, and words that were thrown away"),
+            "a second",
+            &[rate],
+        ));
     }
 }
 

@@ -8,7 +8,8 @@ pub(super) const BLOCK_MS: i64 = 2500;
 const SETTLE_NS: i64 = 400_000_000;
 const BLOCK_NS: i64 = BLOCK_MS * 1_000_000;
 
-/// The blocks of one attack: by the time of day, those with an even number are quiet, those with an odd one attacked.
+/// The blocks of one attack: by the time of day, those with an even number are quiet, those with an
+/// odd one attacked.
 pub(super) struct Course {
     first_ns: i64,
     pairs: usize,
@@ -33,7 +34,10 @@ impl Course {
     }
 
     /// The values of each block.
-    pub(super) fn sorted_in(&self, values: impl Iterator<Item = (Option<usize>, f64)>) -> Vec<Vec<f64>> {
+    pub(super) fn sorted_in(
+        &self,
+        values: impl Iterator<Item = (Option<usize>, f64)>,
+    ) -> Vec<Vec<f64>> {
         let mut blocks = vec![Vec::new(); 2 * self.pairs];
         for (block, value) in values {
             if let Some(block) = block {
@@ -49,14 +53,16 @@ impl Course {
     }
 }
 
-/// `what`, of which there is one value in us for each block: attacked against quiet, beside quiet against quiet.
+/// `what`, of which there is one value in us for each block: attacked against quiet, beside quiet
+/// against quiet.
 ///
-/// The goal is how much two quiet blocks differ, as a median: a median over all pairs that is no larger cannot be told from nothing.
-/// It is not `promised` where it is not ours to keep.
+/// The goal is how much two quiet blocks differ, as a median: a median over all pairs that is no
+/// larger cannot be told from nothing. It is not `promised` where it is not ours to keep.
 pub(super) fn compare(what: &str, promised: bool, blocks: &[f64], figures: &mut Vec<Figure>) {
     let quiet = blocks.iter().step_by(2).copied().collect::<Vec<_>>();
     let attacked = blocks.iter().skip(1).step_by(2);
-    let differences = attacked.zip(&quiet).map(|(attacked, quiet)| attacked - quiet).collect::<Vec<_>>();
+    let differences =
+        attacked.zip(&quiet).map(|(attacked, quiet)| attacked - quiet).collect::<Vec<_>>();
     let by_itself = quiet.chunks_exact(2).map(|pair| pair[1] - pair[0]).collect::<Vec<_>>();
     let spread = quantile(&by_itself.iter().map(|us| us.abs()).collect::<Vec<_>>(), 0.5);
     // As it is shown.

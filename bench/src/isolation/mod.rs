@@ -1,7 +1,9 @@
-//! What holds between lambdas: how late a lambda answers while another one misbehaves on another core. And what a process costs.
+//! What holds between lambdas: how late a lambda answers while another one misbehaves on another
+//! core. And what a process costs.
 //!
-//! The victim and the player that feeds it are on one core, with this process; the attacker, with all that reads its reports, is on
-//! another one. All of them run all the time: the attacker looks at the clock, and attacks in every second block of time.
+//! The victim and the player that feeds it are on one core, with this process; the attacker, with
+//! all that reads its reports, is on another one. All of them run all the time: the attacker looks
+//! at the clock, and attacks in every second block of time.
 
 mod attacker;
 mod blocks;
@@ -27,8 +29,11 @@ const RATE: &str = "500";
 
 /// All figures; the reason where there can be none.
 pub fn figures(quick: bool) -> Result<Vec<Figure>, String> {
-    let cores = cores().map_err(|error| format!("the system does not tell which cores may be used: {error}"))?;
-    let [ours, theirs, ..] = cores[..] else { return Err("victim and attacker need a core each".to_owned()) };
+    let cores = cores()
+        .map_err(|error| format!("the system does not tell which cores may be used: {error}"))?;
+    let [ours, theirs, ..] = cores[..] else {
+        return Err("victim and attacker need a core each".to_owned());
+    };
     let mut figures = Vec::new();
     start::figures(if quick { 1 } else { STARTS }, &mut figures);
     stay_on(ours).map_err(|error| format!("cannot stay on one core: {error}"))?;
@@ -42,11 +47,13 @@ fn attacks(quick: bool, theirs: usize, figures: &mut Vec<Figure>) {
     let mut victims = [Kind::Rust, Kind::Python].map(Victim::start);
     let readers = victims.len().to_string();
     // Far longer than this takes: it is told when to stop.
-    let player = play(&["--imu", RATE, "--stamp", "monotonic", "--wait", &readers, "--duration", "36000"]);
+    let player =
+        play(&["--imu", RATE, "--stamp", "monotonic", "--wait", &readers, "--duration", "36000"]);
     victims.iter().for_each(Victim::until_fed);
     for attack in ATTACKS.iter().filter(|attack| !quick || attack.is_quick()) {
         // A new one for each attack, so that one that dies costs no more than that.
-        let mut dds = Dds::open(Options::new("/gleaner_bench/answers")).expect("a private network can be joined");
+        let mut dds = Dds::open(Options::new("/gleaner_bench/answers"))
+            .expect("a private network can be joined");
         let mut attacker = Attacker::start(attack, theirs);
         victims.iter_mut().for_each(|victim| victim.hear(&mut dds));
         let course = Course::after(clock.now(), if quick { 1 } else { PAIRS });

@@ -1,5 +1,5 @@
-//! How long it takes until a lambda is there, without a network: the whole life of a process that replays one message, from its
-//! start to its end. Its `init` has returned before that.
+//! How long it takes until a lambda is there, without a network: the whole life of a process that
+//! replays one message, from its start to its end. Its `init` has returned before that.
 
 use std::process::{Command, Stdio};
 use std::time::Instant;
@@ -46,13 +46,18 @@ pub(super) fn figures(rounds: usize, figures: &mut Vec<Figure>) {
         figures.push(Figure::at_most(&name, "ms", *goal, bare));
         figures.push(Figure::told(&format!("{name}, below gleaner-shim"), "ms", below_shim));
     }
-    let python = std::env::var_os("GLEANER_PYTHON").unwrap_or_else(|| root().join(".venv/bin/python3").into());
+    let python = std::env::var_os("GLEANER_PYTHON")
+        .unwrap_or_else(|| root().join(".venv/bin/python3").into());
     let empty = (0..rounds).map(|_| {
         let mut python = Command::new(&python);
         python.args(["-I", "-c", "pass"]);
         life_ms(python)
     });
-    figures.push(Figure::told("the same of an interpreter alone that does nothing", "ms", &empty.collect::<Vec<_>>()));
+    figures.push(Figure::told(
+        "the same of an interpreter alone that does nothing",
+        "ms",
+        &empty.collect::<Vec<_>>(),
+    ));
 }
 
 /// `runtime`, which has no arguments yet, below its parent.

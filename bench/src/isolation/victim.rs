@@ -25,7 +25,8 @@ pub(super) struct Victim {
     answers: Option<Arc<Answers>>,
     started: Started,
     out: Folder,
-    /// When each status came, and the 99 % of what it took from a sample received to the lambda entered, in us.
+    /// When each status came, and the 99 % of what it took from a sample received to the lambda
+    /// entered, in us.
     entered: Vec<(i64, f64)>,
 }
 
@@ -61,7 +62,13 @@ impl Victim {
     }
 
     /// What the attack did to it. To be asked once for each attack.
-    pub(super) fn figures(&mut self, attack: &Attack, course: &Course, clock: Clock, figures: &mut Vec<Figure>) {
+    pub(super) fn figures(
+        &mut self,
+        attack: &Attack,
+        course: &Course,
+        clock: Clock,
+        figures: &mut Vec<Figure>,
+    ) {
         let answers = self.answers.take().map(|answers| answers.take()).unwrap_or_default();
         // A late answer counts where its sample came.
         let in_us = answers.iter().map(|answer| {
@@ -79,18 +86,28 @@ impl Victim {
             &[100.0 * answered as f64 / (RATE_HZ * course.measured_s())],
         ));
         compare(&format!("{of}: round trip, 99 %"), attack.is_by_a_lambda(), &p99, figures);
-        let entered = self.entered.drain(..).map(|(at_ns, us)| (course.block(at_ns - STATUS_NS, at_ns), us));
+        let entered =
+            self.entered.drain(..).map(|(at_ns, us)| (course.block(at_ns - STATUS_NS, at_ns), us));
         let entered = course.sorted_in(entered);
         let entered = entered.iter().map(|block| quantile(block, 0.5)).collect::<Vec<_>>();
-        compare(&format!("{of}: received to entered, 99 %"), attack.is_by_a_lambda(), &entered, figures);
+        compare(
+            &format!("{of}: received to entered, 99 %"),
+            attack.is_by_a_lambda(),
+            &entered,
+            figures,
+        );
     }
 
     /// Ends it, and tells what it lost all the while.
     pub(super) fn end(self, figures: &mut Vec<Figure>) {
         self.started.signal("INT");
         let live = self.started.finish().ended();
-        let lost = live.topics.iter().map(|topic| topic.lost.unwrap_or(u64::MAX).saturating_add(topic.skipped));
-        let name = format!("empty lambda, {}: samples lost or passed over in all that time", self.kind);
+        let lost = live
+            .topics
+            .iter()
+            .map(|topic| topic.lost.unwrap_or(u64::MAX).saturating_add(topic.skipped));
+        let name =
+            format!("empty lambda, {}: samples lost or passed over in all that time", self.kind);
         figures.push(Figure::at_most(&name, "samples", 0.0, &[lost.sum::<u64>() as f64]));
         drop(self.out);
     }

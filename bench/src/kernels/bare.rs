@@ -28,10 +28,14 @@ pub struct Compiled {
 /// Compiles the component.
 pub fn compiled(checks: Checks) -> Compiled {
     let mut config = gleaner_compile::settings(Nans::AsMade);
-    config.consume_fuel(checks.fuel).epoch_interruption(checks.epochs).cranelift_nan_canonicalization(checks.nans);
+    config
+        .consume_fuel(checks.fuel)
+        .epoch_interruption(checks.epochs)
+        .cranelift_nan_canonicalization(checks.nans);
     let engine = Engine::new(&config).expect("an engine");
     let path = root().join("bench/lambdas/kernels/rust/build/bench_kernels.wasm");
-    let component = Component::from_file(&engine, path).expect("a component; run: cargo xtask bench");
+    let component =
+        Component::from_file(&engine, path).expect("a component; run: cargo xtask bench");
     Compiled { component, checks }
 }
 
@@ -64,7 +68,9 @@ fn refuse_host_calls(linker: &mut Linker<Wasi>, component: &Component) -> wasmti
         for (name, item) in items.exports(engine) {
             match item.ty {
                 ComponentItem::ComponentFunc(_) => {
-                    interface.func_new(name, |_, _, _, _| Err(wasmtime::Error::msg("there is no host here")))?;
+                    interface.func_new(name, |_, _, _, _| {
+                        Err(wasmtime::Error::msg("there is no host here"))
+                    })?;
                 }
                 ComponentItem::Resource(_) => {
                     interface.resource(name, ResourceType::host::<()>(), |_, _| Ok(()))?;
@@ -83,8 +89,10 @@ impl Bare {
         let mut linker = Linker::new(component.engine());
         wasmtime_wasi::p2::add_to_linker_sync(&mut linker).expect("WASI");
         refuse_host_calls(&mut linker, component).expect("imports");
-        let mut store =
-            Store::new(component.engine(), Wasi { ctx: WasiCtx::builder().build(), table: ResourceTable::new() });
+        let mut store = Store::new(
+            component.engine(),
+            Wasi { ctx: WasiCtx::builder().build(), table: ResourceTable::new() },
+        );
         if checks.fuel {
             store.set_fuel(PLENTY).expect("fuel is counted");
         }
@@ -92,10 +100,14 @@ impl Bare {
             store.set_epoch_deadline(PLENTY);
         }
         let instance = linker.instantiate(&mut store, component).expect("an instance");
-        let mut function = |name| instance.get_func(&mut store, name).expect("the world of lambdas");
+        let mut function =
+            |name| instance.get_func(&mut store, name).expect("the world of lambdas");
         let (init, on_wake) = (function("init"), function("on-wake"));
         let entry = |key: &str, value: Val| {
-            Val::Record(vec![("key".to_owned(), Val::String(key.to_owned())), ("value".to_owned(), value)])
+            Val::Record(vec![
+                ("key".to_owned(), Val::String(key.to_owned())),
+                ("value".to_owned(), value),
+            ])
         };
         let variant = |case: &str, value| Val::Variant(case.to_owned(), Some(Box::new(value)));
         let config = Val::List(vec![

@@ -34,10 +34,12 @@ impl Hosted {
     /// The lambda after `init`, told to do `work` so many times in a wake by a frame.
     pub fn new(work: &str, rounds: u64) -> Self {
         let lambda = root().join("bench/lambdas/kernels/rust/build");
-        let manifest = Manifest::load(&lambda).expect("the lambda is built; run: cargo xtask bench");
+        let manifest =
+            Manifest::load(&lambda).expect("the lambda is built; run: cargo xtask bench");
         let mut transport = Loopback::new();
         transport.add_topic(TOPIC, "sensor_msgs/msg/Image", IMAGE);
-        let inputs = open_inputs(&manifest, &[], &mut transport, None).expect("memory for the frame");
+        let inputs =
+            open_inputs(&manifest, &[], &mut transport, None).expect("memory for the frame");
         let topic = Arc::clone(&inputs[0]);
         let meta = SampleMeta {
             at_ns: 1,
@@ -57,7 +59,12 @@ impl Hosted {
         limits.fuel = u64::MAX / 1000;
         let session = Session::new(inputs, config, &limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(&lambda.join("bench_kernels.wasm"), &cache, limits.stack.as_usize(), Nans::AsMade);
+        let loaded = Loaded::open(
+            &lambda.join("bench_kernels.wasm"),
+            &cache,
+            limits.stack.as_usize(),
+            Nans::AsMade,
+        );
         let loaded = loaded.expect("a component");
         let mut guest = WasmGuest::new(loaded, session.clone(), &limits, None).expect("a guest");
         guest.init().expect("init");

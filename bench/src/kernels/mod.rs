@@ -1,7 +1,9 @@
-//! What a lambda's own arithmetic costs: kernels of the SDK in a component against the same source natively, on registers of the
-//! same width; and what fuel, epochs and the canonicalisation of NaNs add to it. Then what passes between lambda and host.
+//! What a lambda's own arithmetic costs: kernels of the SDK in a component against the same source
+//! natively, on registers of the same width; and what fuel, epochs and the canonicalisation of NaNs
+//! add to it. Then what passes between lambda and host.
 //!
-//! In each round every kernel runs natively and on every engine, one after the other, and is compared within the round.
+//! In each round every kernel runs natively and on every engine, one after the other, and is
+//! compared within the round.
 
 mod bare;
 mod hosted;
@@ -28,7 +30,8 @@ const KERNELS: [(&str, Option<f64>); 9] = [
     ("mean", None),
 ];
 
-/// What code is made to check, and what is told of it against code that checks nothing or, for NaNs, as much as ours.
+/// What code is made to check, and what is told of it against code that checks nothing or, for
+/// NaNs, as much as ours.
 const NONE: Checks = Checks { fuel: false, epochs: false, nans: false };
 const FUEL: Checks = Checks { fuel: true, ..NONE };
 const EPOCHS: Checks = Checks { epochs: true, ..NONE };
@@ -45,7 +48,8 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     let mut figures = Vec::new();
     let components = ENGINES.map(bare::compiled);
     for (kernel, goal) in KERNELS {
-        let guests = components.iter().map(|component| Bare::new(component, kernel)).collect::<Vec<_>>();
+        let guests =
+            components.iter().map(|component| Bare::new(component, kernel)).collect::<Vec<_>>();
         figures.extend(compare(kernel, goal, guests, rounds));
     }
     figures.extend(between(rounds));
@@ -68,10 +72,14 @@ fn compare(kernel: &str, goal: Option<f64>, mut guests: Vec<Bare>, rounds: usize
             measured.push(us);
         }
     }
-    let [none, fuel, epochs, ours, nans] = guest_us.as_slice() else { unreachable!("a series for each engine") };
+    let [none, fuel, epochs, ours, nans] = guest_us.as_slice() else {
+        unreachable!("a series for each engine")
+    };
     let ratio = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a / b).collect::<Vec<_>>();
-    let price = |a, b| ratio(a, b).into_iter().map(|ratio| 100.0 * (ratio - 1.0)).collect::<Vec<_>>();
-    let told = |what: &str, unit, values: &[f64]| Figure::told(&format!("{kernel}: {what}"), unit, values);
+    let price =
+        |a, b| ratio(a, b).into_iter().map(|ratio| 100.0 * (ratio - 1.0)).collect::<Vec<_>>();
+    let told =
+        |what: &str, unit, values: &[f64]| Figure::told(&format!("{kernel}: {what}"), unit, values);
     let against = ratio(ours, &native_us);
     let name = format!("{kernel}: component, with fuel and epochs, against native");
     vec![
@@ -100,24 +108,48 @@ fn between(rounds: usize) -> Vec<Figure> {
         let call_ns = 1000.0 * timed(call.rounds(), || call.frame()).0;
         let stream_us = timed(stream.rounds(), || stream.frame()).0;
         let copy_us = timed(copy.rounds(), || copy.frame()).0;
-        let copied = || (0..copy.rounds()).for_each(|_| black_box(&mut place).copy_from_slice(black_box(&source)));
+        let copied = || {
+            (0..copy.rounds())
+                .for_each(|_| black_box(&mut place).copy_from_slice(black_box(&source)))
+        };
         let memcpy_us = timed(copy.rounds(), copied).0;
-        let row = [tick_ns, call_ns, stream_us, copy_us, memcpy_us, stream_us / memcpy_us, copy_us / memcpy_us];
+        let row = [
+            tick_ns,
+            call_ns,
+            stream_us,
+            copy_us,
+            memcpy_us,
+            stream_us / memcpy_us,
+            copy_us / memcpy_us,
+        ];
         series.iter_mut().zip(row).for_each(|(series, value)| series.push(value));
     }
     vec![
-        Figure::told("host calls a lambda that does nothing, with all that surrounds a wake", "ns", &series[0]),
+        Figure::told(
+            "host calls a lambda that does nothing, with all that surrounds a wake",
+            "ns",
+            &series[0],
+        ),
         Figure::told("lambda calls the host for the time", "ns", &series[1]),
         Figure::told("1920x1080 bgr8 (6.2 MB) to a lambda, in pieces of 64 KiB", "us", &series[2]),
         Figure::told("the same, each piece copied to its place in a whole frame", "us", &series[3]),
         Figure::told("the same by memcpy", "us", &series[4]),
-        Figure::at_most("1920x1080 bgr8 in pieces to a lambda, against memcpy", "times", 1.1, &series[5]),
-        Figure::told("1920x1080 bgr8 in pieces to a whole frame of a lambda, against memcpy", "times", &series[6]),
+        Figure::at_most(
+            "1920x1080 bgr8 in pieces to a lambda, against memcpy",
+            "times",
+            1.1,
+            &series[5],
+        ),
+        Figure::told(
+            "1920x1080 bgr8 in pieces to a whole frame of a lambda, against memcpy",
+            "times",
+            &series[6],
+        ),
     ]
 }
 
-/// Microseconds of each of `times` that `work` does, and what it says. It is time of this thread on a core: what else runs there
-/// meanwhile is left out, but for what it does to the caches.
+/// Microseconds of each of `times` that `work` does, and what it says. It is time of this thread on
+/// a core: what else runs there meanwhile is left out, but for what it does to the caches.
 fn timed<T>(times: u64, work: impl FnOnce() -> T) -> (f64, T) {
     let now_us = || {
         let now = clock_gettime(ClockId::ThreadCPUTime);

@@ -1,4 +1,5 @@
-//! What the library alone can do: a reader of an IMU that only stamps each sample and answers it, on one thread.
+//! What the library alone can do: a reader of an IMU that only stamps each sample and answers it,
+//! on one thread.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -11,7 +12,9 @@ use gleaner_messages::CdrWriter;
 use gleaner_transport::Clock;
 use mio::{Events, Interest, Poll, Token};
 use rustdds::policy::{Durability, History, Reliability, ResourceLimits};
-use rustdds::{DomainParticipant, QosPolicyBuilder, RepresentationIdentifier, Topic, TopicKind, no_key};
+use rustdds::{
+    DomainParticipant, QosPolicyBuilder, RepresentationIdentifier, Topic, TopicKind, no_key,
+};
 
 /// A thread that answers until it is told to stop.
 pub(super) struct Bare {
@@ -23,7 +26,8 @@ impl Bare {
     /// Answers the samples of `input` on `output`.
     pub(super) fn start(input: &str, output: &str) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
-        let (raised, input, output) = (Arc::clone(&stop), format!("rt{input}"), format!("rt{output}"));
+        let (raised, input, output) =
+            (Arc::clone(&stop), format!("rt{input}"), format!("rt{output}"));
         let thread = thread::spawn(move || answer(&raised, &input, &output));
         Self { stop, thread }
     }
@@ -37,7 +41,8 @@ impl Bare {
 
 fn answer(stop: &AtomicBool, input: &str, output: &str) -> Vec<f64> {
     let participant = DomainParticipant::new(0).expect("a private network can be joined");
-    let limits = ResourceLimits { max_samples: 1024, max_instances: 1, max_samples_per_instance: 1024 };
+    let limits =
+        ResourceLimits { max_samples: 1024, max_instances: 1, max_samples_per_instance: 1024 };
     let reliable = Reliability::Reliable { max_blocking_time: rustdds::Duration::from_millis(100) };
     let qos = QosPolicyBuilder::new()
         .reliability(reliable)
@@ -46,11 +51,14 @@ fn answer(stop: &AtomicBool, input: &str, output: &str) -> Vec<f64> {
         .resource_limits(limits)
         .build();
     let topic = |name: &str, type_name: &str| -> Topic {
-        let topic = participant.create_topic(name.to_owned(), type_name.to_owned(), &qos, TopicKind::NoKey);
+        let topic =
+            participant.create_topic(name.to_owned(), type_name.to_owned(), &qos, TopicKind::NoKey);
         topic.expect("a topic can be made")
     };
-    let (input, output) =
-        (topic(input, "sensor_msgs::msg::dds_::Imu_"), topic(output, "sensor_msgs::msg::dds_::TimeReference_"));
+    let (input, output) = (
+        topic(input, "sensor_msgs::msg::dds_::Imu_"),
+        topic(output, "sensor_msgs::msg::dds_::TimeReference_"),
+    );
     let subscriber = participant.create_subscriber(&qos).expect("a subscriber can be made");
     let mut reader = subscriber
         .create_simple_datareader_no_key::<i64, Adapter>(&input, Some(qos.clone()))
@@ -59,7 +67,9 @@ fn answer(stop: &AtomicBool, input: &str, output: &str) -> Vec<f64> {
     let writer = publisher.create_datawriter_no_key::<Bytes, Adapter>(&output, Some(qos.clone()));
     let writer = writer.expect("a writer can be made");
     let mut poll = Poll::new().expect("the system has a poll");
-    poll.registry().register(&mut reader, Token(0), Interest::READABLE).expect("a reader can be polled");
+    poll.registry()
+        .register(&mut reader, Token(0), Interest::READABLE)
+        .expect("a reader can be polled");
     let mut events = Events::with_capacity(16);
     let (clock, mut message, mut times) = (Clock::new(0), CdrWriter::new(), Vec::new());
     while !stop.load(Ordering::Relaxed) {
@@ -113,8 +123,11 @@ impl<'de> no_key::Decode<'de, i64> for Stamp {
     type Error = Infallible;
 
     fn decode_bytes(self, cdr: &'de [u8], _: RepresentationIdentifier) -> Result<i64, Infallible> {
-        let number =
-            |at: usize| cdr.get(at..at + 4).and_then(|bytes| bytes.try_into().ok()).map_or(0, u32::from_le_bytes);
+        let number = |at: usize| {
+            cdr.get(at..at + 4)
+                .and_then(|bytes| bytes.try_into().ok())
+                .map_or(0, u32::from_le_bytes)
+        };
         Ok(i64::from(number(0) as i32) * 1_000_000_000 + i64::from(number(4)))
     }
 }

@@ -1,4 +1,5 @@
-//! Live topics: what arrives, how fast it is answered, and what that costs. In a private network, with our player on Cyclone DDS.
+//! Live topics: what arrives, how fast it is answered, and what that costs. In a private network,
+//! with our player on Cyclone DDS.
 
 mod bare;
 mod footprint;
@@ -15,7 +16,8 @@ use crate::measure::{Figure, Kind};
 /// Set in the process that is alone in its network.
 const ALONE: &str = "GLEANER_BENCH_ALONE";
 
-/// Where the system says how large a socket's buffer may be. It counts for all networks, and can be changed in the first only.
+/// Where the system says how large a socket's buffer may be. It counts for all networks, and can be
+/// changed in the first only.
 const BUFFER_LIMIT: &str = "/proc/sys/net/core/rmem_max";
 const BUFFER_BYTES: u64 = 64 << 20;
 
@@ -56,12 +58,21 @@ pub fn figures(quick: bool) -> Vec<Figure> {
         ("1080p bgr8 at 30 Hz", &["camera"][..], &[&["--synthetic", FULL_HD][..]][..], 60),
         ("3848x2168 bgr8 at 10 Hz", &["camera"], &[&["--synthetic", "3848x2168@10"]], 30),
         ("IMU at 1 kHz", &["imu"], &[&["--imu", "1000"]], 60),
-        ("1080p at 30 Hz and an IMU at 1 kHz", &["camera", "imu"], &[&["--synthetic", FULL_HD, "--imu", "1000"]], 60),
-        // One lambda with three inputs. A player has one camera, so the second one has a player of its own.
+        (
+            "1080p at 30 Hz and an IMU at 1 kHz",
+            &["camera", "imu"],
+            &[&["--synthetic", FULL_HD, "--imu", "1000"]],
+            60,
+        ),
+        // One lambda with three inputs. A player has one camera, so the second one has a player of
+        // its own.
         (
             "two cameras of 1080p at 30 Hz and an IMU at 1 kHz at once",
             &["rig"],
-            &[&["--synthetic", FULL_HD, "--imu", "1000"], &["--synthetic", FULL_HD, "--remap", REAR]],
+            &[
+                &["--synthetic", FULL_HD, "--imu", "1000"],
+                &["--synthetic", FULL_HD, "--remap", REAR],
+            ],
             60,
         ),
     ] {
@@ -84,9 +95,13 @@ fn start(lambda: &Path, args: &[&str]) -> (Started, Folder) {
     (started, out)
 }
 
-/// Plays to the end, with a player for each of `players`, and then asks how the lambdas were. The statuses of the first one
-/// meanwhile go to `seen`.
-fn to_the_end(started: Vec<(Started, Folder)>, players: &[Vec<&str>], seen: &mut Vec<Live>) -> Vec<Live> {
+/// Plays to the end, with a player for each of `players`, and then asks how the lambdas were. The
+/// statuses of the first one meanwhile go to `seen`.
+fn to_the_end(
+    started: Vec<(Started, Folder)>,
+    players: &[Vec<&str>],
+    seen: &mut Vec<Live>,
+) -> Vec<Live> {
     played(&started, players, seen);
     ended(started)
 }
@@ -115,11 +130,22 @@ fn played(started: &[(Started, Folder)], players: &[Vec<&str>], seen: &mut Vec<L
 }
 
 /// What the empty `lambdas` receive, each in a process of its own, and what that takes.
-fn receive(name: &str, lambdas: &[&str], players: &[&[&str]], seconds: u32, figures: &mut Vec<Figure>) {
-    let started = lambdas.iter().map(|lambda| start(&self::lambda(lambda, Kind::Rust), &["--no-record"])).collect();
+fn receive(
+    name: &str,
+    lambdas: &[&str],
+    players: &[&[&str]],
+    seconds: u32,
+    figures: &mut Vec<Figure>,
+) {
+    let started = lambdas
+        .iter()
+        .map(|lambda| start(&self::lambda(lambda, Kind::Rust), &["--no-record"]))
+        .collect();
     let duration = seconds.to_string();
-    let players: Vec<_> =
-        players.iter().map(|player| [player, &["--wait", "1", "--duration", &duration][..]].concat()).collect();
+    let players: Vec<_> = players
+        .iter()
+        .map(|player| [player, &["--wait", "1", "--duration", &duration][..]].concat())
+        .collect();
     let mut seen = Vec::new();
     let ended = to_the_end(started, &players, &mut seen);
     let topics: usize = ended.iter().map(|live| live.topics.len()).sum();
@@ -129,7 +155,11 @@ fn receive(name: &str, lambdas: &[&str], players: &[&[&str]], seconds: u32, figu
         for topic in &live.topics {
             let of = if topics > 1 { format!("{name}: {}", topic.name) } else { name.to_owned() };
             let refused = topic.no_slot + topic.too_big + topic.malformed;
-            figures.push(Figure::told(&format!("{of}: received in {seconds} s"), "samples", &[topic.received as f64]));
+            figures.push(Figure::told(
+                &format!("{of}: received in {seconds} s"),
+                "samples",
+                &[topic.received as f64],
+            ));
             let lost = format!(
                 "{of}: lost, with a socket buffer of {buffer:.0} MiB{}",
                 if granted { "" } else { " (not granted)" }
@@ -150,7 +180,11 @@ fn receive(name: &str, lambdas: &[&str], players: &[&[&str]], seconds: u32, figu
         figures.push(Figure::told(&format!("{of}: share of a core"), "%", &[cpu]));
         if let Some(wake_up) = live.wake_up {
             for (what, ns) in [("median", wake_up.p50_ns), ("99 %", wake_up.p99_ns)] {
-                figures.push(Figure::told(&format!("{of}: wake-up, {what}"), "us", &[ns as f64 / 1e3]));
+                figures.push(Figure::told(
+                    &format!("{of}: wake-up, {what}"),
+                    "us",
+                    &[ns as f64 / 1e3],
+                ));
             }
         }
     }
@@ -159,13 +193,19 @@ fn receive(name: &str, lambdas: &[&str], players: &[&[&str]], seconds: u32, figu
     if let (Some(warm), Some(last)) = (seen.get(seen.len() / 4), seen.last()) {
         let growth = 100.0 * (rss(last) / rss(warm) - 1.0);
         figures.push(Figure::told(&format!("{name}: resident memory"), "MiB", &[rss(last)]));
-        figures.push(Figure::at_most(&format!("{name}: its growth after a quarter of the time"), "%", 2.0, &[growth]));
+        figures.push(Figure::at_most(
+            &format!("{name}: its growth after a quarter of the time"),
+            "%",
+            2.0,
+            &[growth],
+        ));
     }
 }
 
 /// So many runtimes on one machine: whether all find the one publisher, and what they take.
 fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
-    let started: Vec<_> = (0..count).map(|_| start(&lambda("imu", Kind::Rust), &["--no-record"])).collect();
+    let started: Vec<_> =
+        (0..count).map(|_| start(&lambda("imu", Kind::Rust), &["--no-record"])).collect();
     let (count, duration) = (count.to_string(), seconds.to_string());
     let player = vec!["--imu", "100", "--wait", &count, "--duration", &duration];
     played(&started, &[player], &mut Vec::new());
@@ -185,7 +225,8 @@ fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
         ended.len() as f64,
         &[whole as f64],
     ));
-    let rss: Vec<f64> = ended.iter().map(|live| live.rss_bytes as f64 / f64::from(1 << 20)).collect();
+    let rss: Vec<f64> =
+        ended.iter().map(|live| live.rss_bytes as f64 / f64::from(1 << 20)).collect();
     figures.push(Figure::told(&format!("{count} runtimes: resident memory of each"), "MiB", &rss));
     figures.push(Figure::told(&format!("{count} runtimes: PSS of each"), "MB", &pss));
     let cpu: Vec<f64> = ended.iter().map(|live| 100.0 * live.cpu_s / live.up_s).collect();

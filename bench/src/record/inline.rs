@@ -37,7 +37,11 @@ struct Lane {
 
 impl Sink for Lane {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        self.recorder.lock().expect("one thread").sample(self.topic, meta, cdr).expect("the disk has room");
+        self.recorder
+            .lock()
+            .expect("one thread")
+            .sample(self.topic, meta, cdr)
+            .expect("the disk has room");
         Verdict::Taken
     }
 }
@@ -59,9 +63,16 @@ pub fn record(seconds: u64, store: Store) -> Load {
     let recorder = Arc::new(Mutex::new(Recorder::new(folder, settings).expect("a recorder")));
     let mut loopback = Loopback::new();
     let traffic = Traffic::new();
-    let topics = traffic.topics().iter().map(|name| subscribe(&mut loopback, &recorder, name)).collect::<Vec<_>>();
+    let topics = traffic
+        .topics()
+        .iter()
+        .map(|name| subscribe(&mut loopback, &recorder, name))
+        .collect::<Vec<_>>();
     let header = header();
-    let rules = Manifest::parse(MANIFEST, "lambda.toml").expect("a manifest").record.expect("with [record]");
+    let rules = Manifest::parse(MANIFEST, "lambda.toml")
+        .expect("a manifest")
+        .record
+        .expect("with [record]");
     let lambda = {
         let mut recorder = recorder.lock().expect("one thread");
         recorder.add_lambda(Member { header, rules, digest: "0".repeat(64), topics })
@@ -92,8 +103,11 @@ pub fn record(seconds: u64, store: Store) -> Load {
     let cpu_s = self::usage::cpu_seconds() - cpu;
     let mut recorder = recorder.lock().expect("one thread");
     recorder.finish((seconds * 1_000_000_000) as i64).expect("the disk has room");
-    let recorded: i64 =
-        recorder.clips().iter().map(|clip| clip.last_ns.unwrap_or(0) - clip.first_ns.unwrap_or(0)).sum();
+    let recorded: i64 = recorder
+        .clips()
+        .iter()
+        .map(|clip| clip.last_ns.unwrap_or(0) - clip.first_ns.unwrap_or(0))
+        .sum();
     Load {
         megabytes_per_s: bytes as f64 / 1e6 / passed,
         cpu_percent: 100.0 * cpu_s / passed,
@@ -120,7 +134,12 @@ postroll = "5s"
 fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &str) -> TopicId {
     let type_name = TYPE;
     loopback.add_topic(name, type_name, "");
-    let topic = Topic { name: name.to_owned(), type_name: type_name.to_owned(), definitions: None, offered_qos: None };
+    let topic = Topic {
+        name: name.to_owned(),
+        type_name: type_name.to_owned(),
+        definitions: None,
+        offered_qos: None,
+    };
     let topic = recorder.lock().expect("one thread").add_topic(topic).expect("few topics");
     let spec = TopicSpec {
         topic: name.to_owned(),
@@ -129,7 +148,9 @@ fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &st
         max_bytes: 1 << 20,
         qos: Default::default(),
     };
-    loopback.subscribe(&spec, Arc::new(Lane { recorder: recorder.clone(), topic })).expect("the topic is there");
+    loopback
+        .subscribe(&spec, Arc::new(Lane { recorder: recorder.clone(), topic }))
+        .expect("the topic is there");
     topic
 }
 

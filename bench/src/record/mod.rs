@@ -1,7 +1,9 @@
-//! The recorder under load: 20 MB/s on ten topics, from the loopback transport, at the pace of a vehicle.
+//! The recorder under load: 20 MB/s on ten topics, from the loopback transport, at the pace of a
+//! vehicle.
 //!
 //! - `inline`: as a replay has it, in one thread.
-//! - `process`: as a vehicle has it: the whole program, but for the network and a process of its own.
+//! - `process`: as a vehicle has it: the whole program, but for the network and a process of its
+//!   own.
 
 mod inline;
 mod process;
@@ -53,11 +55,20 @@ impl Traffic {
     fn frame(&self, n: u64, at_ns: i64, mut publish: impl FnMut(&str, &SampleMeta, &[u8])) {
         let mut publish = |name: &str, at_ns: i64, seq: u64, cdr: &[u8]| {
             let (writer, endian) = (Guid::default(), Endian::Little);
-            publish(name, &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian, options: [0; 2] }, cdr);
+            publish(
+                name,
+                &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian, options: [0; 2] },
+                cdr,
+            );
         };
         publish("/camera", at_ns, n + 1, &self.frame);
         for i in 0..IMU_PER_FRAME {
-            publish("/imu", at_ns + i as i64 * 3_000_000, n * IMU_PER_FRAME + i + 1, &self.frame[..IMU_BYTES]);
+            publish(
+                "/imu",
+                at_ns + i as i64 * 3_000_000,
+                n * IMU_PER_FRAME + i + 1,
+                &self.frame[..IMU_BYTES],
+            );
         }
         for name in &self.names[2..] {
             publish(name, at_ns + 30_000_000, n + 1, &self.status);
@@ -88,8 +99,12 @@ fn header() -> Header {
 }
 
 fn wake(at_ns: i64, triggers: bool) -> Entry {
-    let trigger =
-        Trigger { kind: TriggerKind::Event, label: "load".to_owned(), score: None, attributes: serde_json::Map::new() };
+    let trigger = Trigger {
+        kind: TriggerKind::Event,
+        label: "load".to_owned(),
+        score: None,
+        attributes: serde_json::Map::new(),
+    };
     Entry {
         at_ns,
         cause: Woken::Tick { missed: 0 },

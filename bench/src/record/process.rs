@@ -23,8 +23,8 @@ use super::{FRAMES_PER_S, TYPE, Traffic, header, wake};
 
 /// Time between two wakes.
 const WAKE: Duration = Duration::from_millis(10);
-/// Wakes between two triggers of a burst, triggers of a burst, and wakes from one burst to the next: each finds the clip of the one
-/// before finished, and a full preroll to walk through.
+/// Wakes between two triggers of a burst, triggers of a burst, and wakes from one burst to the
+/// next: each finds the clip of the one before finished, and a full preroll to walk through.
 const APART: u64 = 10;
 const BURST: u64 = 10;
 const AGAIN: u64 = 400;
@@ -46,7 +46,8 @@ pub struct Live {
     pub lost: u64,
 }
 
-/// Records for `seconds`, with bursts of triggers. On all cores: a vehicle has several, and here are sender and receiver in one.
+/// Records for `seconds`, with bursts of triggers. On all cores: a vehicle has several, and here
+/// are sender and receiver in one.
 pub fn record_live(seconds: u64) -> Live {
     let measured = thread::spawn(move || {
         let mut all = rustix::thread::CpuSet::new();
@@ -59,7 +60,8 @@ pub fn record_live(seconds: u64) -> Live {
 }
 
 fn on_these_cores(seconds: u64) -> Live {
-    let (out, network, clock, traffic) = (Folder::new(), Loopback::new(), Clock::of_today(), Traffic::new());
+    let (out, network, clock, traffic) =
+        (Folder::new(), Loopback::new(), Clock::of_today(), Traffic::new());
     for name in traffic.topics() {
         network.add_topic(name, TYPE, "");
     }
@@ -78,10 +80,13 @@ fn on_these_cores(seconds: u64) -> Live {
     let feed = network.clone();
     let program = thread::spawn(move || {
         let feed = || Ok(Box::new(feed) as Box<dyn LiveSource>);
-        run(options, feed, stdin, File::from(OwnedFd::from(to)), Arc::default()).expect("nothing fails");
+        run(options, feed, stdin, File::from(OwnedFd::from(to)), Arc::default())
+            .expect("nothing fails");
     });
     let reports = thread::spawn(move || last(reports));
-    let socket = control.add(&Add { lambda: folder, remaps: Vec::new(), most: Limits::MOST }).expect("it is there");
+    let socket = control
+        .add(&Add { lambda: folder, remaps: Vec::new(), most: Limits::MOST })
+        .expect("it is there");
     let mut link = RecorderLink::new(socket);
     link.hello(&header, PATIENCE).expect("it is the lambda that was announced");
     let stop = Arc::<AtomicBool>::default();
@@ -96,7 +101,8 @@ fn on_these_cores(seconds: u64) -> Live {
     control.stop().expect("it is there");
     program.join().expect("nothing fails");
     let last = reports.join().expect("nothing fails").expect("the program says how it ended");
-    let lost = last.topics.iter().map(|topic| topic.no_slot + topic.too_big).sum::<u64>() + last.recording.pushed_out;
+    let lost = last.topics.iter().map(|topic| topic.no_slot + topic.too_big).sum::<u64>()
+        + last.recording.pushed_out;
     Live { opened_ms, longest_ms, told_us, lost }
 }
 
@@ -117,7 +123,8 @@ fn decide(link: &mut RecorderLink, clock: Clock, seconds: u64) -> (Vec<f64>, Vec
         if let Some(early) = (WAKE * n as u32).checked_sub(started.elapsed()) {
             thread::sleep(early);
         }
-        let in_burst = n.checked_sub(FIRST).map(|n| n % AGAIN).filter(|n| n % APART == 0 && n / APART < BURST);
+        let in_burst =
+            n.checked_sub(FIRST).map(|n| n % AGAIN).filter(|n| n % APART == 0 && n / APART < BURST);
         let at_ns = clock.now();
         let entry = wake(at_ns, in_burst.is_some());
         let before = Instant::now();
@@ -139,7 +146,8 @@ fn decide(link: &mut RecorderLink, clock: Clock, seconds: u64) -> (Vec<f64>, Vec
     (opened, told)
 }
 
-/// The sensors, until they are to stop. Returns the longest time in which a sample was taken, in ms.
+/// The sensors, until they are to stop. Returns the longest time in which a sample was taken, in
+/// ms.
 fn publish(network: &Loopback, traffic: &Traffic, clock: Clock, stop: &AtomicBool) -> f64 {
     let (started, mut longest) = (Instant::now(), Duration::ZERO);
     for n in 0.. {
@@ -161,10 +169,12 @@ fn publish(network: &Loopback, traffic: &Traffic, clock: Clock, stop: &AtomicBoo
 
 /// The last thing that the program says.
 fn last(reports: PipeReader) -> Option<RecorderStatus> {
-    BufReader::new(reports).lines().map_while(Result::ok).find_map(|line| match serde_json::from_str(&line) {
-        Ok(RecorderReport::Ended(last)) => Some(*last),
-        _ => None,
-    })
+    BufReader::new(reports).lines().map_while(Result::ok).find_map(
+        |line| match serde_json::from_str(&line) {
+            Ok(RecorderReport::Ended(last)) => Some(*last),
+            _ => None,
+        },
+    )
 }
 
 /// A build that the program can be told of.

@@ -21,7 +21,8 @@ pub struct Cli {
 /// What `gleaner` can do.
 #[derive(Subcommand, Debug)]
 pub enum Command {
-    /// Show what is in a recorded drive: topics, rates, gaps, sizes, and the inputs to paste into a manifest
+    /// Show what is in a recorded drive: topics, rates, gaps, sizes, and the inputs to paste into a
+    /// manifest
     Inspect(InspectArgs),
     /// Make the folder of a new lambda, with its SDK, a test, and something to begin with
     New(NewArgs),
@@ -33,8 +34,8 @@ pub enum Command {
     Check(CheckArgs),
     /// Run a built lambda over recorded drives
     ///
-    /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json, the clips that the manifest asks for, and OUT/report.html, and
-    /// shows a summary.
+    /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json, the clips that the manifest
+    /// asks for, and OUT/report.html, and shows a summary.
     Replay(ReplayArgs),
     /// Write OUT/report.html, the page about a replay or a live run, from the files in OUT
     Report(ReportArgs),
@@ -42,7 +43,8 @@ pub enum Command {
     ///
     /// Ends with 0 if the decisions are the same, and with 4 if they are not.
     Diff(DiffArgs),
-    /// Build and replay a lambda whenever one of its sources is saved, and show what that changed in its decisions
+    /// Build and replay a lambda whenever one of its sources is saved, and show what that changed
+    /// in its decisions
     Dev(DevArgs),
     /// Make the decisions in a clip again, and compare them with its journal
     ///
@@ -50,7 +52,8 @@ pub enum Command {
     Verify(VerifyArgs),
     /// Run a built lambda on the live topics of this vehicle, until ctrl-C
     ///
-    /// Records the clips that the manifest asks for, and writes OUT/decisions.jsonl, OUT/log.jsonl and OUT/summary.json.
+    /// Records the clips that the manifest asks for, and writes OUT/decisions.jsonl, OUT/log.jsonl
+    /// and OUT/summary.json.
     Run(RunArgs),
     /// Show the live topics that are there
     Topics(TopicsArgs),
@@ -88,7 +91,8 @@ pub struct AskedArgs {
     /// Another name for a topic of the manifest, as in /imu/data:=/car/imu
     #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
     pub remap: Vec<String>,
-    /// The configuration of the vehicle, whose limits hold where they are smaller than those of the manifest; see docs/limits.md
+    /// The configuration of the vehicle, whose limits hold where they are smaller than those of the
+    /// manifest; see docs/limits.md
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
 }
@@ -97,10 +101,13 @@ impl AskedArgs {
     /// The settings, as our programs take them.
     pub(crate) fn settings(&self) -> Vec<OsString> {
         let settings = [("--set", &self.set), ("--remap", &self.remap)];
-        let vehicle = self.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]);
+        let vehicle =
+            self.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]);
         settings
             .iter()
-            .flat_map(|(flag, values)| values.iter().flat_map(move |value| [OsString::from(*flag), value.into()]))
+            .flat_map(|(flag, values)| {
+                values.iter().flat_map(move |value| [OsString::from(*flag), value.into()])
+            })
             .chain(vehicle)
             .collect()
     }
@@ -147,7 +154,8 @@ pub struct RunArgs {
     /// Stop after so many seconds
     #[arg(long = "for", value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..))]
     pub last: Option<u32>,
-    /// Answer each wake on this topic with the stamps of input and decision, as sensor_msgs/msg/TimeReference
+    /// Answer each wake on this topic with the stamps of input and decision, as
+    /// sensor_msgs/msg/TimeReference
     #[arg(long, value_name = "TOPIC")]
     pub rtt: Option<String>,
     /// Publish decisions with a trigger or a fault on this topic, as std_msgs/msg/String with JSON
@@ -165,7 +173,8 @@ pub struct RunArgs {
     /// Most bytes of clips that are kept, likewise
     #[arg(long, value_name = "BYTES")]
     pub bytes_max: Option<u64>,
-    /// Give the lambda's process a control group of its own in this folder of cgroup v2, delegated to this user
+    /// Give the lambda's process a control group of its own in this folder of cgroup v2, delegated
+    /// to this user
     #[arg(long, value_name = "DIR")]
     pub cgroup: Option<PathBuf>,
     /// Print what is reported as JSON, an object a line
@@ -246,7 +255,8 @@ impl From<Language> for Kind {
 /// Arguments of `gleaner build`.
 #[derive(Args, Debug)]
 pub struct BuildArgs {
-    /// Compile a Rust lambda where its build scripts and macros reach no network and no files but its own; see docs/security.md
+    /// Compile a Rust lambda where its build scripts and macros reach no network and no files but
+    /// its own; see docs/security.md
     #[arg(long)]
     pub sandboxed: bool,
     /// The lambda's folder, with its lambda.toml
@@ -271,10 +281,12 @@ pub struct ReplayArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub asked: AskedArgs,
-    /// MCAP files, .db3 files and directories of rosbag2, packed with zstd or not; several are merged by time
+    /// MCAP files, .db3 files and directories of rosbag2, packed with zstd or not; several are
+    /// merged by time
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
-    /// Replay from this time on: seconds after the drive's start, as in 12.5 or 2min, or since 1970, as in @1700000000.5
+    /// Replay from this time on: seconds after the drive's start, as in 12.5 or 2min, or since
+    /// 1970, as in @1700000000.5
     #[arg(long, value_name = "TIME", value_parser = drive_time)]
     pub from: Option<String>,
     /// Replay until before this time, given likewise
@@ -289,13 +301,15 @@ pub struct ReplayArgs {
     /// Leave out the clips that the table `record` of the manifest asks for
     #[arg(long)]
     pub no_record: bool,
-    /// Have clips hold these topics of the drive instead of those of the table `record`, as in '*' or '/camera/*'
+    /// Have clips hold these topics of the drive instead of those of the table `record`, as in '*'
+    /// or '/camera/*'
     #[arg(long, value_name = "PATTERN", conflicts_with_all = ["no_record", "verify"])]
     pub topics: Vec<String>,
     /// Write a journal: of every wake, what the lambda saw and decided
     #[arg(long, value_name = "FILE")]
     pub journal: Option<PathBuf>,
-    /// Make every decision of a journal again and compare, instead of writing results; exit code 4 at the first difference
+    /// Make every decision of a journal again and compare, instead of writing results; exit code 4
+    /// at the first difference
     #[arg(long, value_name = "FILE", conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal"])]
     pub verify: Option<PathBuf>,
     /// Leave out OUT/report.html
@@ -348,7 +362,8 @@ pub struct DevArgs {
     /// Where the results go [default: DIR/out]
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// Leave out the clips that the table `record` of the manifest asks for: a replay is faster without
+    /// Leave out the clips that the table `record` of the manifest asks for: a replay is faster
+    /// without
     #[arg(long)]
     pub no_record: bool,
 }

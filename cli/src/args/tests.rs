@@ -16,7 +16,9 @@ fn the_definition_of_the_command_line_is_sound() {
 
 #[test]
 fn a_value_may_begin_with_a_minus_and_hold_an_equals_sign() {
-    let args = replay(&["dir", "a.mcap", "--set", "brake_mps2=-1.4", "--set", "word=a=b", "b.mcap"]).unwrap();
+    let args =
+        replay(&["dir", "a.mcap", "--set", "brake_mps2=-1.4", "--set", "word=a=b", "b.mcap"])
+            .unwrap();
     assert_eq!(args.asked.set, ["brake_mps2=-1.4", "word=a=b"]);
     assert_eq!(args.drives, [PathBuf::from("a.mcap"), PathBuf::from("b.mcap")]);
 }

@@ -17,8 +17,8 @@ use super::sandbox::Sandbox;
 /// Cargo's own variable for what is left out of a component.
 const STRIP: &str = "CARGO_PROFILE_RELEASE_STRIP";
 
-/// Instructions on 128 bits at a time, which every host runs: kernels of the SDK take several times as long without. Not
-/// `relaxed-simd`, whose results depend on the CPU.
+/// Instructions on 128 bits at a time, which every host runs: kernels of the SDK take several times
+/// as long without. Not `relaxed-simd`, whose results depend on the CPU.
 const SIMD: &str = "-Ctarget-feature=+simd128";
 
 /// A component in cargo's target folder.
@@ -42,11 +42,18 @@ pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildErro
     let program = PathBuf::from(build.get_program());
     let no_cargo = |source| BuildError::NoCargo { program: program.clone(), source };
     if env::var_os(STRIP).is_none() {
-        // The standard library's line tables are most of a component: 2.6 MB with them, a tenth without. Names stay.
+        // The standard library's line tables are most of a component: 2.6 MB with them, a tenth
+        // without. Names stay.
         build.env(STRIP, "debuginfo");
     }
     let mut child = with_simd(&mut build, |variable| env::var_os(variable))
-        .args(["--release", "--target", TARGET, "--message-format=json-render-diagnostics", "--manifest-path"])
+        .args([
+            "--release",
+            "--target",
+            TARGET,
+            "--message-format=json-render-diagnostics",
+            "--manifest-path",
+        ])
         .arg(&package)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -63,7 +70,9 @@ pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildErro
     if !status.success() {
         return Err(match &sandbox {
             // Cargo itself ends with 1 or 101.
-            Some(_) if status.code() == Some(i32::from(Exit::Denied.code())) => BuildError::NoSandbox,
+            Some(_) if status.code() == Some(i32::from(Exit::Denied.code())) => {
+                BuildError::NoSandbox
+            }
             Some(_) => BuildError::CompileSandboxed { status },
             None if target_is_missing() => BuildError::NoTarget,
             None => BuildError::Compile { status },
@@ -84,8 +93,8 @@ fn cargo() -> Command {
     cargo
 }
 
-/// Adds [`SIMD`] to the flags that the compiler gets. Cargo takes those of one place only, and of a variable first; so they are
-/// added where the user has some.
+/// Adds [`SIMD`] to the flags that the compiler gets. Cargo takes those of one place only, and of a
+/// variable first; so they are added where the user has some.
 fn with_simd(cargo: &mut Command, variable: impl Fn(&str) -> Option<OsString>) -> &mut Command {
     for (name, between) in [("CARGO_ENCODED_RUSTFLAGS", "\x1f"), ("RUSTFLAGS", " ")] {
         // Set to nothing it still counts, and hides those of files.
@@ -104,7 +113,8 @@ fn with_simd(cargo: &mut Command, variable: impl Fn(&str) -> Option<OsString>) -
 /// The component that this message of cargo announces, if it does and `package` made it.
 fn component_in(message: &str, package: &Path) -> Option<PathBuf> {
     let message: Value = serde_json::from_str(message).ok()?;
-    let of_package = message["manifest_path"].as_str().is_some_and(|path| Path::new(path) == package);
+    let of_package =
+        message["manifest_path"].as_str().is_some_and(|path| Path::new(path) == package);
     if message["reason"] != "compiler-artifact" || !of_package {
         return None;
     }
@@ -113,14 +123,19 @@ fn component_in(message: &str, package: &Path) -> Option<PathBuf> {
         return None;
     }
     let files = message["filenames"].as_array()?;
-    files.iter().filter_map(Value::as_str).map(PathBuf::from).find(|file| file.extension().is_some_and(|e| e == "wasm"))
+    files
+        .iter()
+        .filter_map(Value::as_str)
+        .map(PathBuf::from)
+        .find(|file| file.extension().is_some_and(|e| e == "wasm"))
 }
 
-/// Whether the compiler lacks the target's libraries. Cargo's own message about it is long, and its way out depends on
-/// how Rust was installed; so this is asked only after a failure.
+/// Whether the compiler lacks the target's libraries. Cargo's own message about it is long, and its
+/// way out depends on how Rust was installed; so this is asked only after a failure.
 fn target_is_missing() -> bool {
-    let output =
-        Command::new(program("RUSTC", "rustc")).args(["--print", "target-libdir", "--target", TARGET]).output();
+    let output = Command::new(program("RUSTC", "rustc"))
+        .args(["--print", "target-libdir", "--target", TARGET])
+        .output();
     output.is_ok_and(|output| {
         let libraries = String::from_utf8_lossy(&output.stdout);
         output.status.success() && !Path::new(libraries.trim()).is_dir()
@@ -150,7 +165,9 @@ mod tests {
         let build = |set: &'static str, flags: &'static str| {
             let mut cargo = Command::new("cargo");
             with_simd(&mut cargo, |name| (name == set).then(|| flags.into()));
-            let told = cargo.get_envs().filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
+            let told = cargo
+                .get_envs()
+                .filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
             let arguments = cargo.get_args().map(ToOwned::to_owned).collect::<Vec<_>>();
             (told.collect::<Vec<_>>(), arguments)
         };
@@ -158,7 +175,10 @@ mod tests {
         assert_eq!(build("", ""), (vec![], vec!["--config".into(), config.into()]));
         let flags = |name: &str, flags: &str| (vec![(name.into(), flags.into())], vec![]);
         assert_eq!(build("RUSTFLAGS", ""), flags("RUSTFLAGS", "-Ctarget-feature=+simd128"));
-        assert_eq!(build("RUSTFLAGS", "-Dwarnings"), flags("RUSTFLAGS", "-Dwarnings -Ctarget-feature=+simd128"));
+        assert_eq!(
+            build("RUSTFLAGS", "-Dwarnings"),
+            flags("RUSTFLAGS", "-Dwarnings -Ctarget-feature=+simd128")
+        );
         assert_eq!(
             build("CARGO_ENCODED_RUSTFLAGS", "-C\x1flto"),
             flags("CARGO_ENCODED_RUSTFLAGS", "-C\x1flto\x1f-Ctarget-feature=+simd128")

@@ -27,7 +27,9 @@ pub(super) enum BuildError {
     CompileSandboxed { status: ExitStatus },
     #[error("cargo is not sandboxed; gleaner-shim says above what is missing")]
     NoSandbox,
-    #[error("what the lambda depends on cannot be fetched: cargo ended with {status}; its messages are above")]
+    #[error(
+        "what the lambda depends on cannot be fetched: cargo ended with {status}; its messages are above"
+    )]
     Fetch { status: ExitStatus },
     #[error("the lambda belongs to the workspace `{}`, and all of that could be read", workspace.display())]
     Workspace { workspace: PathBuf },

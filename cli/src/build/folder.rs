@@ -12,8 +12,8 @@ use gleaner_lambda::{BuildDir, Manifest};
 
 use super::error::BuildError;
 
-/// A build in the making, in a hidden folder beside the old one; hidden, because then no file in it counts as a source
-/// if we are killed. Dropped before [`finish`](Self::finish), it leaves nothing.
+/// A build in the making, in a hidden folder beside the old one; hidden, because then no file in it
+/// counts as a source if we are killed. Dropped before [`finish`](Self::finish), it leaves nothing.
 pub(super) struct Partial {
     dir: PathBuf,
     path: PathBuf,
@@ -37,7 +37,12 @@ impl Partial {
     }
 
     /// Copies the file that was `opened`, of the name `from`, to `to`, relative to the build.
-    pub(super) fn add(&mut self, from: &Path, opened: io::Result<PlainFile>, to: &Path) -> Result<(), BuildError> {
+    pub(super) fn add(
+        &mut self,
+        from: &Path,
+        opened: io::Result<PlainFile>,
+        to: &Path,
+    ) -> Result<(), BuildError> {
         let file = opened.map_err(failed("copy", from))?;
         // Before the disk is full of it.
         self.count(file.length())?;
@@ -53,12 +58,13 @@ impl Partial {
     fn count(&mut self, bytes: u64) -> Result<(), BuildError> {
         self.built.files += 1;
         self.built.bytes = self.built.bytes.saturating_add(bytes);
-        let is_within = self.built.files <= FILES_MAX as u64 && self.built.bytes <= BUILD_MAX.bytes();
+        let is_within =
+            self.built.files <= FILES_MAX as u64 && self.built.bytes <= BUILD_MAX.bytes();
         if is_within { Ok(()) } else { Err(BuildError::TooMuch) }
     }
 
-    /// Adds the manifest, by whose time the age of a build is told, and puts the build into its place. `started` is
-    /// when its first source was read.
+    /// Adds the manifest, by whose time the age of a build is told, and puts the build into its
+    /// place. `started` is when its first source was read.
     pub(super) fn finish(mut self, started: SystemTime) -> Result<Built, BuildError> {
         let text = Manifest::read(&self.dir).map_err(BuildError::Manifest)?;
         self.count(text.len() as u64)?;
@@ -95,14 +101,17 @@ impl Partial {
 
 impl Drop for Partial {
     fn drop(&mut self) {
-        // Gone already after `finish`; after a failure, that failure is what the user has to hear of.
+        // Gone already after `finish`; after a failure, that failure is what the user has to hear
+        // of.
         let _ = fs::remove_dir_all(&self.path);
     }
 }
 
 fn remove(folder: &Path) -> Result<(), BuildError> {
     match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(failed("remove", folder)(error)),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(failed("remove", folder)(error))
+        }
         _ => Ok(()),
     }
 }

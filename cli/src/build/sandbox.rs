@@ -1,8 +1,10 @@
-//! `--sandboxed`: building a Rust lambda runs code of its author, build scripts and macros. Here that code can read the toolchain, fetched
-//! crates and the workspace of the lambda, and write into a folder of its own, and has no sockets.
+//! `--sandboxed`: building a Rust lambda runs code of its author, build scripts and macros. Here
+//! that code can read the toolchain, fetched crates and the workspace of the lambda, and write into
+//! a folder of its own, and has no sockets.
 //!
-//! What it needs from a network is fetched before, which runs none of that code. Cargo is started in the root folder: a configuration or
-//! toolchain file beside the lambda, which could name programs to run, is not read. The jail itself is `gleaner-shim --compiler`.
+//! What it needs from a network is fetched before, which runs none of that code. Cargo is started
+//! in the root folder: a configuration or toolchain file beside the lambda, which could name
+//! programs to run, is not read. The jail itself is `gleaner-shim --compiler`.
 
 use std::env;
 use std::io;
@@ -19,7 +21,8 @@ use super::error::{BuildError, TARGET};
 /// Where cargo is started.
 const ROOT: &str = "/";
 
-/// The target folder of cargo before it is in its jail: nothing can be written there, whatever links the lambda's own has.
+/// The target folder of cargo before it is in its jail: nothing can be written there, whatever
+/// links the lambda's own has.
 const NOWHERE: &str = "/dev/null/target";
 
 /// What is needed of cargo's own folder: crates, and where they come from. Its credentials are not.
@@ -44,7 +47,9 @@ struct Metadata {
 impl Sandbox {
     /// Fetches what `package`, a `Cargo.toml`, depends on.
     pub(super) fn prepare(package: &Path) -> Result<Self, BuildError> {
-        let shim = Parts::find().and_then(|parts| parts.program("gleaner-shim")).map_err(BuildError::Parts)?;
+        let shim = Parts::find()
+            .and_then(|parts| parts.program("gleaner-shim"))
+            .map_err(BuildError::Parts)?;
         let home = env::var_os("HOME").map(PathBuf::from).filter(|home| home.is_absolute());
         let home = home.ok_or(BuildError::NoHome)?;
         let sysroot = sysroot(&home)?;
@@ -55,8 +60,12 @@ impl Sandbox {
         let lock = workspace_root.join("Cargo.lock");
         // Cargo would write to where a link leads, and wait for a pipe.
         match lock.symlink_metadata() {
-            Ok(found) if found.is_symlink() => return Err(file("write", &lock)(io::Error::other(NotPlain::Link))),
-            Ok(found) if !found.is_file() => return Err(file("write", &lock)(io::Error::other(NotPlain::NoFile))),
+            Ok(found) if found.is_symlink() => {
+                return Err(file("write", &lock)(io::Error::other(NotPlain::Link)));
+            }
+            Ok(found) if !found.is_file() => {
+                return Err(file("write", &lock)(io::Error::other(NotPlain::NoFile)));
+            }
             _ => {}
         }
         fetch(&sysroot, package)?;
@@ -69,7 +78,8 @@ impl Sandbox {
             own_file::folder(folder).map_err(file("create", folder))?;
         }
         let target = target.canonicalize().map_err(file("create", &target))?;
-        let cargo_home = env::var_os("CARGO_HOME").map_or_else(|| home.join(".cargo"), PathBuf::from);
+        let cargo_home =
+            env::var_os("CARGO_HOME").map_or_else(|| home.join(".cargo"), PathBuf::from);
         Ok(Self { shim, sysroot, cargo_home, workspace: workspace_root, target })
     }
 
@@ -88,15 +98,20 @@ impl Sandbox {
         }
         command.arg("--").arg(program_of(&self.sysroot, "cargo")).arg("build").arg("--offline");
         command.arg("--target-dir").arg(&self.target);
-        // Not by way of a wrapper, which is a program of the user's, and may want a socket. That of the workspace is left alone: cargo has
-        // it in the names of symbols, be it set to nothing, so that another component would come out.
+        // Not by way of a wrapper, which is a program of the user's, and may want a socket. That of
+        // the workspace is left alone: cargo has it in the names of symbols, be it set to nothing,
+        // so that another component would come out.
         command.env("RUSTC", program_of(&self.sysroot, "rustc")).env("RUSTC_WRAPPER", "");
-        command.env("CARGO_HOME", &self.cargo_home).env("TMPDIR", self.target.join("tmp")).current_dir(ROOT);
+        command
+            .env("CARGO_HOME", &self.cargo_home)
+            .env("TMPDIR", self.target.join("tmp"))
+            .current_dir(ROOT);
         command
     }
 }
 
-/// The folder of the compiler that the user has chosen. A toolchain file may name any folder: only what rustup installed is started.
+/// The folder of the compiler that the user has chosen. A toolchain file may name any folder: only
+/// what rustup installed is started.
 fn sysroot(home: &Path) -> Result<PathBuf, BuildError> {
     let chosen = env::var_os("CARGO").map(PathBuf::from).filter(|cargo| cargo.is_absolute());
     let rustc = match chosen {
@@ -126,7 +141,9 @@ fn program_of(sysroot: &Path, name: &str) -> PathBuf {
 fn metadata(sysroot: &Path, package: &Path) -> Result<Metadata, BuildError> {
     let cargo = program_of(sysroot, "cargo");
     let mut command = Command::new(&cargo);
-    command.args(["metadata", "--no-deps", "--offline", "--format-version", "1", "--manifest-path"]).arg(package);
+    command
+        .args(["metadata", "--no-deps", "--offline", "--format-version", "1", "--manifest-path"])
+        .arg(package);
     let output = command
         .env("CARGO_TARGET_DIR", NOWHERE)
         .current_dir(ROOT)
@@ -145,7 +162,11 @@ fn fetch(sysroot: &Path, package: &Path) -> Result<(), BuildError> {
     let host = answer(Command::new(&rustc).args(["--print", "host-tuple"]).current_dir(ROOT))
         .map_err(|source| BuildError::NoCargo { program: rustc, source })?;
     let mut command = Command::new(&cargo);
-    command.arg("fetch").arg("--manifest-path").arg(package).args(["--target", TARGET, "--target", &host]);
+    command
+        .arg("fetch")
+        .arg("--manifest-path")
+        .arg(package)
+        .args(["--target", TARGET, "--target", &host]);
     command.env("CARGO_TARGET_DIR", NOWHERE);
     let status = command.current_dir(ROOT).stdin(Stdio::null()).status();
     let status = status.map_err(|source| BuildError::NoCargo { program: cargo, source })?;

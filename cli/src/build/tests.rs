@@ -6,8 +6,7 @@ use std::time::Duration;
 
 use super::*;
 
-const PYTHON: &str =
-    "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
+const PYTHON: &str = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
 
 /// A lambda's folder, removed when the test ends.
 struct Lambda(PathBuf);
@@ -15,7 +14,8 @@ struct Lambda(PathBuf);
 impl Lambda {
     fn new(manifest: &str) -> Lambda {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!("gleaner-cli-{}-{}", process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let name =
+            format!("gleaner-cli-{}-{}", process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
         let lambda = Lambda(std::env::temp_dir().join(name));
         lambda.write("lambda.toml", manifest);
         lambda
@@ -42,7 +42,9 @@ impl Lambda {
             for entry in fs::read_dir(folder).unwrap().map(Result::unwrap) {
                 match entry.path().is_dir() {
                     true => walk(root, &entry.path(), found),
-                    false => found.push(entry.path().strip_prefix(root).unwrap().display().to_string()),
+                    false => {
+                        found.push(entry.path().strip_prefix(root).unwrap().display().to_string())
+                    }
                 }
             }
         }
@@ -104,7 +106,10 @@ fn a_build_that_fails_leaves_the_old_one_as_it_was() {
     lambda.build().unwrap();
     fs::remove_file(lambda.0.join("main.py")).unwrap();
     let error = lambda.build().unwrap_err();
-    assert!(matches!(&error, BuildError::Missing { path, .. } if path.ends_with("main.py")), "{error}");
+    assert!(
+        matches!(&error, BuildError::Missing { path, .. } if path.ends_with("main.py")),
+        "{error}"
+    );
     assert_eq!(lambda.files(""), ["build/lambda.toml", "build/main.py", "lambda.toml"]);
 }
 
@@ -160,13 +165,17 @@ fn a_wasm_lambda_without_a_package_is_told_how_to_make_one() {
     use gleaner_base::Explain;
     let lambda = Lambda::new(&PYTHON.replace("python", "wasm").replace("main.py", "x.wasm"));
     let error = lambda.build().unwrap_err();
-    assert_eq!(error.to_string(), format!("there is no `{}`", lambda.0.join("Cargo.toml").display()));
+    assert_eq!(
+        error.to_string(),
+        format!("there is no `{}`", lambda.0.join("Cargo.toml").display())
+    );
     assert!(error.help().unwrap().contains("cargo init --lib"));
 }
 
 #[test]
 fn messages_may_be_absent_but_a_model_that_is_named_may_not() {
-    let model = format!("[[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n", "0".repeat(64));
+    let model =
+        format!("[[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n", "0".repeat(64));
     let lambda = Lambda::new(&format!("{PYTHON}{model}"));
     lambda.write("main.py", "1");
     let error = lambda.build().unwrap_err();

@@ -1,6 +1,8 @@
-//! `gleaner dev DIR DRIVE...`: builds and replays a lambda whenever one of its sources is saved, and shows what that changed.
+//! `gleaner dev DIR DRIVE...`: builds and replays a lambda whenever one of its sources is saved,
+//! and shows what that changed.
 //!
-//! Nothing here is a way of its own to build, to replay or to compare: it does what the three commands do, one after the other.
+//! Nothing here is a way of its own to build, to replay or to compare: it does what the three
+//! commands do, one after the other.
 
 mod watch;
 
@@ -18,7 +20,8 @@ use crate::{build, replay};
 
 use watch::Seen;
 
-/// Where what a replay is compared with is kept, below its results: `gleaner diff` finds it there, too.
+/// Where what a replay is compared with is kept, below its results: `gleaner diff` finds it there,
+/// too.
 const BEFORE: &str = ".before";
 
 /// Files of a replay from which it is compared with the next.
@@ -33,7 +36,8 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
     let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
     let before = out.join(BEFORE);
     let replay = replay_args(args);
-    // Of the one before this started, if its results still lie there, too: somebody comes back from lunch.
+    // Of the one before this started, if its results still lie there, too: somebody comes back from
+    // lunch.
     let mut has_before = keep(&out, &before);
     let mut seen = Seen::of(&dir);
     loop {
@@ -50,12 +54,17 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
         say(&format!("\nwaiting for changes in {} (ctrl-C ends)\n", dir.display()))?;
         let (now, changed) = seen.wait_for_change(&dir);
         seen = now;
-        let changed = changed.iter().map(|path| visible(&path.to_string_lossy())).collect::<Vec<_>>().join(", ");
+        let changed = changed
+            .iter()
+            .map(|path| visible(&path.to_string_lossy()))
+            .collect::<Vec<_>>()
+            .join(", ");
         say(&format!("\n── changed: {changed}\n"))?;
     }
 }
 
-/// Builds and replays; whether there are results, be they of a lambda with faults or of a damaged drive.
+/// Builds and replays; whether there are results, be they of a lambda with faults or of a damaged
+/// drive.
 fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
     build::run(dir, false)?;
     replay::results(args).map(|(_, has_results)| has_results)

@@ -1,7 +1,8 @@
 //! Waiting until somebody saves a source of a lambda.
 //!
-//! The sources are looked at, some times a second, by length and date: that is a handful of calls for what one person writes, and
-//! unlike notices of a kernel it works on shared and mounted folders, and with editors that replace files instead of writing them.
+//! The sources are looked at, some times a second, by length and date: that is a handful of calls
+//! for what one person writes, and unlike notices of a kernel it works on shared and mounted
+//! folders, and with editors that replace files instead of writing them.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -19,9 +20,11 @@ const EVERY: Duration = Duration::from_millis(200);
 pub(super) struct Seen(BTreeMap<PathBuf, Option<(u64, SystemTime)>>);
 
 impl Seen {
-    /// As they are now in `dir`. Of a manifest that cannot be read, only the manifest is a source: nothing else tells.
+    /// As they are now in `dir`. Of a manifest that cannot be read, only the manifest is a source:
+    /// nothing else tells.
     pub(super) fn of(dir: &Path) -> Self {
-        let sources = Manifest::load(dir).ok().and_then(|manifest| Sources::of(dir, &manifest).ok());
+        let sources =
+            Manifest::load(dir).ok().and_then(|manifest| Sources::of(dir, &manifest).ok());
         let sources = sources.iter().flat_map(Sources::iter).chain([Path::new("lambda.toml")]);
         let state = |path: &Path| {
             let metadata = fs::metadata(dir.join(path)).ok()?;
@@ -30,8 +33,8 @@ impl Seen {
         Self(sources.map(|path| (path.to_owned(), state(path))).collect())
     }
 
-    /// Waits until the sources in `dir` differ from these, and nobody is writing them any more. Gives them as they are then, and
-    /// which differ.
+    /// Waits until the sources in `dir` differ from these, and nobody is writing them any more.
+    /// Gives them as they are then, and which differ.
     pub(super) fn wait_for_change(&self, dir: &Path) -> (Self, Vec<PathBuf>) {
         loop {
             thread::sleep(EVERY);

@@ -1,4 +1,5 @@
-//! Which layers of isolation a lambda's process has here: `gleaner-shim` sets each up, and tries it.
+//! Which layers of isolation a lambda's process has here: `gleaner-shim` sets each up, and tries
+//! it.
 
 use std::process::Command;
 
@@ -11,7 +12,9 @@ use super::{Finding, State};
 pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
     match layers(parts) {
         Ok(layers) => layers.iter().map(finding).collect(),
-        Err(why) => vec![Finding::warning("isolation", why, "build it again: cargo build --release")],
+        Err(why) => {
+            vec![Finding::warning("isolation", why, "build it again: cargo build --release")]
+        }
     }
 }
 
@@ -19,9 +22,13 @@ fn layers(parts: &Parts) -> Result<Vec<Layer>, String> {
     let shim = parts.program("gleaner-shim").map_err(|error| error.to_string())?;
     let output = Command::new(&shim).arg("--layers").output().map_err(|error| error.to_string())?;
     if !output.status.success() {
-        return Err(format!("gleaner-shim cannot tell: {}", String::from_utf8_lossy(&output.stderr).trim()));
+        return Err(format!(
+            "gleaner-shim cannot tell: {}",
+            String::from_utf8_lossy(&output.stderr).trim()
+        ));
     }
-    serde_json::from_slice(&output.stdout).map_err(|error| format!("cannot understand gleaner-shim: {error}"))
+    serde_json::from_slice(&output.stdout)
+        .map_err(|error| format!("cannot understand gleaner-shim: {error}"))
 }
 
 fn finding(layer: &Layer) -> Finding {

@@ -1,4 +1,5 @@
-//! `gleaner doctor`: what would keep lambdas from running well on this machine, and what to do about it.
+//! `gleaner doctor`: what would keep lambdas from running well on this machine, and what to do
+//! about it.
 //!
 //! It only looks: nothing is changed, started or sent.
 
@@ -50,7 +51,8 @@ impl Finding {
 /// Looks, and shows what was found. The exit is [`Exit::Internal`] if something is broken.
 pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     let parts = Parts::find()?;
-    let mut findings = vec![program(&parts, "gleaner-runtime"), program(&parts, "gleaner-recorder")];
+    let mut findings =
+        vec![program(&parts, "gleaner-runtime"), program(&parts, "gleaner-recorder")];
     findings.push(program(&parts, "gleaner-shim"));
     findings.push(optional(&parts, "gleaner-player", "`gleaner play` needs it"));
     findings.push(python(&parts));
@@ -76,7 +78,9 @@ fn program(parts: &Parts, name: &'static str) -> Finding {
 fn optional(parts: &Parts, name: &'static str, why: &str) -> Finding {
     let finding = program(parts, name);
     match finding.state {
-        State::Broken => Finding { state: State::Warning, found: format!("not there; {why}"), ..finding },
+        State::Broken => {
+            Finding { state: State::Warning, found: format!("not there; {why}"), ..finding }
+        }
         _ => finding,
     }
 }
@@ -87,7 +91,11 @@ fn python(parts: &Parts) -> Finding {
         Err(error) => {
             let failure = Failure::from(error);
             let help = failure.help.unwrap_or_else(|| "install Python 3.9 or newer".to_owned());
-            Finding::warning("Python", format!("{}; lambdas of kind python need it", failure.message), help)
+            Finding::warning(
+                "Python",
+                format!("{}; lambdas of kind python need it", failure.message),
+                help,
+            )
         }
     }
 }

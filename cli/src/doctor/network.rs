@@ -15,7 +15,8 @@ const MULTICAST: InterfaceFlags = InterfaceFlags::IFF_MULTICAST;
 const BUFFER_BYTES: u64 = 64 << 20;
 /// What a socket filter of ours takes, and some more: see `docs/dds-limits.md`.
 const FILTER_BYTES: u64 = 128 << 10;
-/// Participants on one host that find each other without multicast: RustDDS announces itself to the first twelve by address.
+/// Participants on one host that find each other without multicast: RustDDS announces itself to the
+/// first twelve by address.
 const WITHOUT_MULTICAST: usize = 12;
 
 /// An interface of this machine.
@@ -30,7 +31,8 @@ pub(super) fn findings() -> Vec<Finding> {
     let filters = fs::read_to_string("/proc/sys/net/core/optmem_max");
     let routes = fs::read_to_string("/proc/net/route").unwrap_or_default();
     let localhost_only = std::env::var("ROS_LOCALHOST_ONLY").is_ok_and(|value| value == "1")
-        || std::env::var("ROS_AUTOMATIC_DISCOVERY_RANGE").is_ok_and(|range| range.eq_ignore_ascii_case("localhost"));
+        || std::env::var("ROS_AUTOMATIC_DISCOVERY_RANGE")
+            .is_ok_and(|range| range.eq_ignore_ascii_case("localhost"));
     vec![
         socket_buffer(buffer.ok().and_then(|text| text.trim().parse().ok())),
         socket_filter(filters.ok().and_then(|text| text.trim().parse().ok())),
@@ -41,22 +43,33 @@ pub(super) fn findings() -> Vec<Finding> {
 
 fn socket_buffer(most: Option<u64>) -> Finding {
     const ABOUT: &str = "socket buffer";
-    let help = format!("for images: `sysctl -w net.core.rmem_max={BUFFER_BYTES}`, and the same in /etc/sysctl.d");
+    let help = format!(
+        "for images: `sysctl -w net.core.rmem_max={BUFFER_BYTES}`, and the same in /etc/sysctl.d"
+    );
     match most {
         None => Finding::warning(ABOUT, "the system does not tell its limit", help),
-        Some(most) if most >= BUFFER_BYTES => Finding::fine(ABOUT, format!("up to {} MiB", most >> 20)),
+        Some(most) if most >= BUFFER_BYTES => {
+            Finding::fine(ABOUT, format!("up to {} MiB", most >> 20))
+        }
         Some(most) => {
             let kib = most >> 10;
-            Finding::warning(ABOUT, format!("{kib} KiB at most: bursts of large messages will be lost"), help)
+            Finding::warning(
+                ABOUT,
+                format!("{kib} KiB at most: bursts of large messages will be lost"),
+                help,
+            )
         }
     }
 }
 
 fn socket_filter(most: Option<u64>) -> Finding {
     const ABOUT: &str = "socket filter";
-    let help = format!("`sysctl -w net.core.optmem_max={FILTER_BYTES}`, and the same in /etc/sysctl.d");
+    let help =
+        format!("`sysctl -w net.core.optmem_max={FILTER_BYTES}`, and the same in /etc/sysctl.d");
     match most {
-        Some(most) if most >= FILTER_BYTES => Finding::fine(ABOUT, format!("up to {} KiB", most >> 10)),
+        Some(most) if most >= FILTER_BYTES => {
+            Finding::fine(ABOUT, format!("up to {} KiB", most >> 10))
+        }
         _ => {
             let found = "no room for the one that keeps hostile fragments from taking all memory";
             Finding::warning(ABOUT, found, help)
@@ -71,7 +84,8 @@ fn discovery(interfaces: &[Interface], routes: &str, localhost_only: bool) -> Fi
             && (!localhost_only || interface.name == "lo")
             && has_multicast_route(routes, &interface.name)
     };
-    let by: Vec<&str> = interfaces.iter().filter(usable).map(|interface| interface.name.as_str()).collect();
+    let by: Vec<&str> =
+        interfaces.iter().filter(usable).map(|interface| interface.name.as_str()).collect();
     if !by.is_empty() {
         return Finding::fine(ABOUT, format!("multicast by {}", by.join(", ")));
     }
@@ -84,9 +98,11 @@ fn discovery(interfaces: &[Interface], routes: &str, localhost_only: bool) -> Fi
     Finding::warning(ABOUT, found, help)
 }
 
-/// Whether multicast leaves by this interface: it has a route of its own for it, or the default one.
+/// Whether multicast leaves by this interface: it has a route of its own for it, or the default
+/// one.
 fn has_multicast_route(routes: &str, interface: &str) -> bool {
-    // Interface, destination, gateway, flags, references, use, metric, mask; addresses as the CPU holds them.
+    // Interface, destination, gateway, flags, references, use, metric, mask; addresses as the CPU
+    // holds them.
     routes.lines().skip(1).any(|line| {
         let mut words = line.split_whitespace();
         let (Some(name), Some(destination)) = (words.next(), words.next()) else { return false };
@@ -95,7 +111,9 @@ fn has_multicast_route(routes: &str, interface: &str) -> bool {
             let bits = u32::from_str_radix(word?, 16).ok()?;
             Some(Ipv4Addr::from(bits.to_ne_bytes()))
         };
-        let (Some(destination), Some(mask)) = (address(Some(destination)), address(mask)) else { return false };
+        let (Some(destination), Some(mask)) = (address(Some(destination)), address(mask)) else {
+            return false;
+        };
         // The group that every participant joins.
         let group = Ipv4Addr::new(239, 255, 0, 1);
         name == interface && u32::from(group) & u32::from(mask) == u32::from(destination)
@@ -108,7 +126,11 @@ fn domain(id: Option<&str>) -> Finding {
         None | Some("") => Finding::fine(ABOUT, "not set: domain 0"),
         Some(id) => match id.parse::<u16>() {
             Ok(domain) if domain <= 232 => Finding::fine(ABOUT, format!("domain {domain}")),
-            _ => Finding::warning(ABOUT, format!("`{}` is no domain", gleaner_base::visible(id)), "use 0 to 232"),
+            _ => Finding::warning(
+                ABOUT,
+                format!("`{}` is no domain", gleaner_base::visible(id)),
+                "use 0 to 232",
+            ),
         },
     }
 }
@@ -129,7 +151,8 @@ mod tests {
     use super::super::State;
     use super::*;
 
-    const HEAD: &str = "Iface\tDestination\tGateway\tFlags\tRefCnt\tUse\tMetric\tMask\tMTU\tWindow\tIRTT\n";
+    const HEAD: &str =
+        "Iface\tDestination\tGateway\tFlags\tRefCnt\tUse\tMetric\tMask\tMTU\tWindow\tIRTT\n";
 
     fn interface(name: &str, flags: InterfaceFlags) -> Interface {
         Interface { name: name.to_owned(), flags }
@@ -172,7 +195,10 @@ mod tests {
             let (content, wanted) = line[1..].split_once('|').unwrap();
             let found = domain(Some(content));
             assert_eq!(found.state == State::Fine, wanted.trim() != "none", "{line}");
-            assert!(found.state != State::Fine || found.found.ends_with(&format!("domain{wanted}")), "{line}");
+            assert!(
+                found.state != State::Fine || found.found.ends_with(&format!("domain{wanted}")),
+                "{line}"
+            );
         }
     }
 

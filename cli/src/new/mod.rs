@@ -1,7 +1,8 @@
-//! `gleaner new`: a folder with a lambda in it that builds, passes its test, and finds something in the sample drive.
+//! `gleaner new`: a folder with a lambda in it that builds, passes its test, and finds something in
+//! the sample drive.
 //!
-//! It begins as the example `hello`. With it comes the SDK, in `.gleaner`, so that the folder builds wherever it is taken.
-//! Nothing that is there already is changed.
+//! It begins as the example `hello`. With it comes the SDK, in `.gleaner`, so that the folder
+//! builds wherever it is taken. Nothing that is there already is changed.
 
 use std::fs;
 use std::io;
@@ -108,15 +109,21 @@ enum NewError {
 impl Explain for NewError {
     fn help(&self) -> Option<String> {
         match self {
-            Self::NoName { .. } => {
-                Some("give the folder to make, whose name is the lambda's: gleaner new brake-dark".to_owned())
-            }
+            Self::NoName { .. } => Some(
+                "give the folder to make, whose name is the lambda's: gleaner new brake-dark"
+                    .to_owned(),
+            ),
             Self::Name(error) => error.help(),
-            Self::NotEmpty { .. } => {
-                Some("choose another name; to replace only the SDK in it: gleaner new --update DIR".to_owned())
+            Self::NotEmpty { .. } => Some(
+                "choose another name; to replace only the SDK in it: gleaner new --update DIR"
+                    .to_owned(),
+            ),
+            Self::NoSdk { .. } => {
+                Some("give the folder of a lambda that `gleaner new` made".to_owned())
             }
-            Self::NoSdk { .. } => Some("give the folder of a lambda that `gleaner new` made".to_owned()),
-            Self::CrateName { .. } => Some("it means something to Rust; choose another one".to_owned()),
+            Self::CrateName { .. } => {
+                Some("it means something to Rust; choose another one".to_owned())
+            }
             Self::File { .. } => None,
         }
     }
@@ -134,7 +141,9 @@ pub(crate) fn run(args: &NewArgs) -> Result<Exit, Failure> {
     let (dir, shown) = (&args.path, args.path.display());
     if args.update {
         update(dir)?;
-        say(&format!("{shown}/{SDK} is that of gleaner {VERSION} now; next: gleaner build {shown}\n"))?;
+        say(&format!(
+            "{shown}/{SDK} is that of gleaner {VERSION} now; next: gleaner build {shown}\n"
+        ))?;
         return Ok(Exit::Ok);
     }
     let name = name_of(dir)?;
@@ -167,7 +176,8 @@ fn make(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
     // One of our own: what has that name already is somebody else's.
     let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
     fs::create_dir(&partial).map_err(failed("make", &partial))?;
-    let made = fill(&partial, name, kind).and_then(|()| fs::rename(&partial, dir).map_err(failed("make", dir)));
+    let made = fill(&partial, name, kind)
+        .and_then(|()| fs::rename(&partial, dir).map_err(failed("make", dir)));
     if made.is_err() {
         // What went wrong tells more than what cannot be cleaned up after it.
         let _ = fs::remove_dir_all(&partial);
@@ -194,7 +204,10 @@ fn fill(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
             ("tests/test_main.py", include_str!("files/test_main.py")),
         ],
     };
-    let both = [("README.md", include_str!("files/README.md")), (".gitignore", include_str!("files/gitignore"))];
+    let both = [
+        ("README.md", include_str!("files/README.md")),
+        (".gitignore", include_str!("files/gitignore")),
+    ];
     for (path, text) in own.iter().chain(&both) {
         let text = text.replace("NAME", name.as_str()).replace("VERSION", VERSION);
         let text = text.replace("TEST", test_command(kind)).replace("SOURCE", source(kind));
@@ -238,12 +251,17 @@ fn unpack_sdk(to: &Path, kind: Kind) -> Result<(), NewError> {
 
 /// A packed file, into a folder.
 fn copy(file: &str, to: &Path) -> Result<(), NewError> {
-    PACKED.iter().filter(|(path, _)| *path == file).try_for_each(|(path, bytes)| write(to, Path::new(path), bytes))
+    PACKED
+        .iter()
+        .filter(|(path, _)| *path == file)
+        .try_for_each(|(path, bytes)| write(to, Path::new(path), bytes))
 }
 
 /// What is packed of a folder, by the path in it.
 fn below(folder: &str) -> impl Iterator<Item = (&'static Path, &'static [u8])> {
-    PACKED.iter().filter_map(move |(path, bytes)| Some((Path::new(*path).strip_prefix(folder).ok()?, *bytes)))
+    PACKED.iter().filter_map(move |(path, bytes)| {
+        Some((Path::new(*path).strip_prefix(folder).ok()?, *bytes))
+    })
 }
 
 fn test_command(kind: Kind) -> &'static str {
@@ -274,7 +292,9 @@ fn is_empty(folder: &Path) -> bool {
 
 fn remove(folder: &Path) -> Result<(), NewError> {
     match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(failed("remove", folder)(error)),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(failed("remove", folder)(error))
+        }
         _ => Ok(()),
     }
 }

@@ -7,7 +7,8 @@ struct Scratch(PathBuf);
 
 impl Scratch {
     fn new(name: &str) -> Self {
-        let folder = std::env::temp_dir().join(format!("gleaner-new-{}-{name}", std::process::id()));
+        let folder =
+            std::env::temp_dir().join(format!("gleaner-new-{}-{name}", std::process::id()));
         drop(fs::remove_dir_all(&folder));
         fs::create_dir_all(&folder).unwrap();
         Self(folder)
@@ -85,8 +86,11 @@ fn folders_above_are_made_as_well() {
 
 #[test]
 fn a_folder_needs_a_name_that_a_lambda_can_have() {
-    for (path, wanted) in [("/", "ends with no name"), ("..", "ends with no name"), ("My Lambda", "is no lambda name")]
-    {
+    for (path, wanted) in [
+        ("/", "ends with no name"),
+        ("..", "ends with no name"),
+        ("My Lambda", "is no lambda name"),
+    ] {
         let error = name_of(Path::new(path)).unwrap_err();
         assert!(error.to_string().contains(wanted) && error.help().is_some(), "{error}");
     }
@@ -104,14 +108,19 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let read = |path: &str| fs::read_to_string(root.join(path)).unwrap().parse::<Table>().unwrap();
     let (workspace, ours) = (read("Cargo.toml"), read("guest-sdk-rust/Cargo.toml"));
-    let packed = include_str!("files/sdk.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
+    let packed =
+        include_str!("files/sdk.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
     assert_eq!(packed["features"], ours["features"]);
     // For all targets, for components, and natively.
-    let targets = |table: &Table| table["target"].as_table().unwrap().keys().cloned().collect::<Vec<_>>();
+    let targets =
+        |table: &Table| table["target"].as_table().unwrap().keys().cloned().collect::<Vec<_>>();
     assert_eq!((targets(&packed), targets(&packed).len()), (targets(&ours), 2));
     let dependencies = |table: &Table| {
-        let mut all = table.get("dependencies").and_then(Value::as_table).cloned().unwrap_or_default();
-        for target in table.get("target").and_then(Value::as_table).into_iter().flat_map(Table::values) {
+        let mut all =
+            table.get("dependencies").and_then(Value::as_table).cloned().unwrap_or_default();
+        for target in
+            table.get("target").and_then(Value::as_table).into_iter().flat_map(Table::values)
+        {
             all.extend(target["dependencies"].as_table().unwrap().clone());
         }
         all
@@ -125,7 +134,10 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
             if let Some(table) = value.as_table_mut() {
                 table.remove("optional");
                 // The folder lies beside that of the SDK, as it does here.
-                let path = table.get("path").and_then(Value::as_str).map(|path| path.trim_start_matches("../").into());
+                let path = table
+                    .get("path")
+                    .and_then(Value::as_str)
+                    .map(|path| path.trim_start_matches("../").into());
                 path.map(|path| table.insert("path".to_owned(), path));
             }
             value
@@ -137,9 +149,14 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
     for key in ["edition", "rust-version"] {
         assert_eq!(lambda["package"][key], package[key], "{key}");
     }
-    let rules = include_str!("files/rules.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
+    let rules =
+        include_str!("files/rules.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
     for key in ["version", "edition", "rust-version", "license"] {
-        assert_eq!((&packed["package"][key], &rules["package"][key]), (&package[key], &package[key]), "{key}");
+        assert_eq!(
+            (&packed["package"][key], &rules["package"][key]),
+            (&package[key], &package[key]),
+            "{key}"
+        );
     }
     assert_eq!(names(&rules), names(&read("rules/Cargo.toml")));
 }

@@ -7,7 +7,12 @@ use crate::args::RunArgs;
 use crate::sibling::starter;
 
 /// The runtime's arguments.
-pub(super) fn runtime(args: &RunArgs, has_recorder: bool, offset_ns: i64, restarts: u32) -> Vec<OsString> {
+pub(super) fn runtime(
+    args: &RunArgs,
+    has_recorder: bool,
+    offset_ns: i64,
+    restarts: u32,
+) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["run".into(), format!("--clock-offset={offset_ns}").into()];
     line.extend(args.asked.settings());
     line.push(word("--out", out(args)));
@@ -31,7 +36,8 @@ pub(super) fn runtime(args: &RunArgs, has_recorder: bool, offset_ns: i64, restar
 
 /// The arguments of the runtime's shim.
 pub(super) fn shim(args: &RunArgs, exit_record: &Path, restarts: u32) -> Vec<OsString> {
-    let mut line = vec![word("--exit-record", exit_record), word("--results", out(args)), starter()];
+    let mut line =
+        vec![word("--exit-record", exit_record), word("--results", out(args)), starter()];
     line.extend((restarts > 0).then(|| "--again".into()));
     line.extend(args.cgroup.as_ref().map(|folder| word("--cgroup", folder)));
     line
@@ -39,11 +45,16 @@ pub(super) fn shim(args: &RunArgs, exit_record: &Path, restarts: u32) -> Vec<OsS
 
 /// The recorder's arguments. `largest` is the largest sample that it will see, in bytes.
 pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsString> {
-    let mut line = vec![word("--out", out(args)), word("--messages", args.asked.lambda.join("build/msg"))];
+    let mut line =
+        vec![word("--out", out(args)), word("--messages", args.asked.lambda.join("build/msg"))];
     line.push(format!("--clock-offset={offset_ns}").into());
     line.push(format!("--largest={largest}").into());
     line.extend(args.commands.as_ref().map(|topic| word("--commands", topic)));
-    let bounds = [("disk-floor", args.disk_floor), ("clips-max", args.clips_max), ("bytes-max", args.bytes_max)];
+    let bounds = [
+        ("disk-floor", args.disk_floor),
+        ("clips-max", args.clips_max),
+        ("bytes-max", args.bytes_max),
+    ];
     for (flag, bound) in bounds {
         if let Some(bound) = bound {
             line.push(format!("--{flag}={bound}").into());

@@ -56,12 +56,15 @@ impl Ear {
     /// Shows what is heard for so long, or until all streams are closed.
     pub(super) fn listen(&mut self, screen: &mut Screen, patience: Duration) {
         let until = Instant::now() + patience;
-        while let Ok(heard) = self.heard.recv_timeout(until.saturating_duration_since(Instant::now())) {
+        while let Ok(heard) =
+            self.heard.recv_timeout(until.saturating_duration_since(Instant::now()))
+        {
             self.show(heard, screen);
         }
     }
 
-    /// Shows what is heard, until nothing is there; but not longer than this, or a flood would keep us from all else.
+    /// Shows what is heard, until nothing is there; but not longer than this, or a flood would keep
+    /// us from all else.
     pub(super) fn look(&mut self, screen: &mut Screen, patience: Duration) {
         let until = Instant::now() + patience;
         let mut wait = patience;
@@ -70,7 +73,9 @@ impl Ear {
                 Ok(heard) => self.show(heard, screen),
                 Err(RecvTimeoutError::Timeout) => return,
                 // Whoever asks again and again shall not be busy.
-                Err(RecvTimeoutError::Disconnected) => return thread::sleep(Duration::from_millis(10)),
+                Err(RecvTimeoutError::Disconnected) => {
+                    return thread::sleep(Duration::from_millis(10));
+                }
             }
             if Instant::now() >= until {
                 return;
@@ -82,7 +87,9 @@ impl Ear {
     fn show(&mut self, heard: Heard, screen: &mut Screen) {
         match heard {
             Heard::Said(piece) => screen.err(&piece),
-            Heard::Garbled(line) => screen.warn(&format!("a report that nobody understands: {line}")),
+            Heard::Garbled(line) => {
+                screen.warn(&format!("a report that nobody understands: {line}"))
+            }
             Heard::Runtime(report) => {
                 screen.report(&report);
                 self.show_runtime(report, screen);
@@ -130,7 +137,10 @@ impl Ear {
                 screen.clip(&clip);
             }
             RecorderReport::Loss(Loss::Deleted { file, why, .. }) => {
-                screen.warn(&format!("deleted `{}`, which nobody had fetched: {why}", file.display()));
+                screen.warn(&format!(
+                    "deleted `{}`, which nobody had fetched: {why}",
+                    file.display()
+                ));
             }
             RecorderReport::Loss(Loss::NotDeleted { file, why, .. }) => {
                 screen.warn(&format!("cannot delete `{}` to make room: {why}", file.display()));

@@ -1,6 +1,8 @@
-//! `gleaner run DIR`: keeps a lambda and its recorder going until ctrl-C, and shows what they report.
+//! `gleaner run DIR`: keeps a lambda and its recorder going until ctrl-C, and shows what they
+//! report.
 //!
-//! A process that breaks is started again, a little later each time; one that could not even start is not.
+//! A process that breaks is started again, a little later each time; one that could not even start
+//! is not.
 
 mod arguments;
 mod ear;
@@ -37,11 +39,14 @@ const LOOK: Duration = Duration::from_millis(100);
 pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let build = BuildDir::check_fresh(&args.asked.lambda)?;
     let manifest = Manifest::load(build.path())?;
-    // Recorded topics need not be inputs; what is known of the largest message is what the inputs say.
+    // Recorded topics need not be inputs; what is known of the largest message is what the inputs
+    // say.
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes());
     let largest = (manifest.record.is_some() && !args.no_record).then(|| sizes.max().unwrap_or(0));
     let vehicle = args.asked.vehicle.as_ref();
-    let allowed = || vehicle.map_or(Ok(Limits::MOST), |file| Vehicle::load(file).map(|vehicle| vehicle.limits));
+    let allowed = || {
+        vehicle.map_or(Ok(Limits::MOST), |file| Vehicle::load(file).map(|vehicle| vehicle.limits))
+    };
     let mut most = allowed()?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
@@ -53,9 +58,12 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let mut earlier = Earlier::default();
     let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
     loop {
-        let left = args.last.map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
+        let left = args
+            .last
+            .map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let begun = Instant::now();
-        // The runtime reads the same file at each start, and reports one that cannot be used: that is no reason to end a run.
+        // The runtime reads the same file at each start, and reports one that cannot be used: that
+        // is no reason to end a run.
         most = allowed().unwrap_or(most);
         let mut party = Party::start(args, most, largest, offset_ns, left, restarts)?;
         match party.attend(&mut screen, &stop)? {
@@ -65,14 +73,17 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             }
             // It has said why. What ran before may run again: a network may be down for a while.
             Ended::Never(exit) if restarts == 0 => return Ok(exit),
-            Ended::Never(exit) => broken.add("it could not start".to_owned(), exit == Exit::LambdaFaulted),
+            Ended::Never(exit) => {
+                broken.add("it could not start".to_owned(), exit == Exit::LambdaFaulted)
+            }
             Ended::Broken { why, faulted } => broken.add(why, faulted),
         }
         earlier.add(party.last(), party.recorded(), party.has_lost_wake());
         restarts += 1;
         pause = if begun.elapsed() >= SOUND { PAUSE } else { pause };
         let why = broken.why.as_deref().unwrap_or_default();
-        screen.warn(&format!("{why}; starting again in {} s (restart {restarts})", pause.as_secs()));
+        screen
+            .warn(&format!("{why}; starting again in {} s (restart {restarts})", pause.as_secs()));
         let until = Instant::now() + pause;
         let ends = || stop.load(Ordering::Relaxed) || is_over();
         while Instant::now() < until && !ends() {
@@ -86,7 +97,8 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Processes of a run that broke. Whether the run ends while one works, or in the pause before the next, it did not go well.
+/// Processes of a run that broke. Whether the run ends while one works, or in the pause before the
+/// next, it did not go well.
 #[derive(Default)]
 struct Broken {
     /// Why the last one did.
@@ -110,10 +122,16 @@ impl Broken {
             None => Ok(Exit::Ok),
             Some(_) if self.faulted => Ok(Exit::LambdaFaulted),
             Some(why) => {
-                let times = if self.times == 1 { "once".to_owned() } else { format!("{} times", self.times) };
+                let times = if self.times == 1 {
+                    "once".to_owned()
+                } else {
+                    format!("{} times", self.times)
+                };
                 let mut failure = Failure::new(Exit::Internal, format!("the run broke {times}"));
                 failure.causes = vec![why];
-                Err(failure.with_help("results are whole but for what happened between an end and the next start"))
+                Err(failure.with_help(
+                    "results are whole but for what happened between an end and the next start",
+                ))
             }
         }
     }
@@ -123,13 +141,15 @@ impl Broken {
 fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register(signal, Arc::clone(&stop))
-            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for signals", &error))?;
+        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot listen for signals", &error)
+        })?;
     }
     Ok(stop)
 }
 
-/// How far the vehicle's clock is ahead of CLOCK_MONOTONIC, in ns: it shows the time of day now, and never jumps afterwards.
+/// How far the vehicle's clock is ahead of CLOCK_MONOTONIC, in ns: it shows the time of day now,
+/// and never jumps afterwards.
 fn clock_offset() -> i64 {
     use rustix::time::{ClockId, clock_gettime};
     let ns = |clock| {
@@ -164,6 +184,9 @@ mod tests {
         let mut broken = Broken::default();
         ["a disk", "a network"].into_iter().for_each(|why| broken.add(why.to_owned(), false));
         let failure = broken.end(Exit::Ok).unwrap_err().to_string();
-        assert!(failure.contains("the run broke 2 times") && failure.contains("a network"), "{failure}");
+        assert!(
+            failure.contains("the run broke 2 times") && failure.contains("a network"),
+            "{failure}"
+        );
     }
 }

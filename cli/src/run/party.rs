@@ -18,10 +18,12 @@ use super::screen::Screen;
 use super::{LOOK, arguments};
 use crate::args::RunArgs;
 
-/// How long after the end of all processes their streams may still bring something: what they left running may hold them open.
+/// How long after the end of all processes their streams may still bring something: what they left
+/// running may hold them open.
 const REST: Duration = Duration::from_millis(300);
 
-/// Reports that may wait to be shown. Beyond that they stay in their pipe, and whoever writes them counts what does not go in.
+/// Reports that may wait to be shown. Beyond that they stay in their pipe, and whoever writes them
+/// counts what does not go in.
 const UNHEARD: usize = 16;
 
 /// How a run ended.
@@ -50,7 +52,8 @@ pub(super) struct Party {
 }
 
 impl Party {
-    /// Starts them. `most` are the limits of this vehicle; `largest` is the largest sample that is recorded, in bytes; none if nothing is.
+    /// Starts them. `most` are the limits of this vehicle; `largest` is the largest sample that is
+    /// recorded, in bytes; none if nothing is.
     pub(super) fn start(
         args: &RunArgs,
         most: Limits,
@@ -71,15 +74,25 @@ impl Party {
         if let Some(largest) = largest {
             let (mut control, stdin) = Control::pair().map_err(|error| failed(&error))?;
             let line = arguments::recorder(args, largest, offset_ns);
-            let process = Process::start(&parts, "gleaner-recorder", line, Some(stdin), None, Heard::Recorder, &say)?;
-            let add = Add { lambda: args.asked.lambda.clone(), remaps: arguments::remaps(args), most };
+            let process = Process::start(
+                &parts,
+                "gleaner-recorder",
+                line,
+                Some(stdin),
+                None,
+                Heard::Recorder,
+                &say,
+            )?;
+            let add =
+                Add { lambda: args.asked.lambda.clone(), remaps: arguments::remaps(args), most };
             socket = Some(control.add(&add).map_err(|error| failed(&error))?);
             recorder = Some((process, control));
         }
         let line = arguments::runtime(args, socket.is_some(), offset_ns, restarts);
         let exit_record = arguments::out(args).join(ExitRecord::FILE);
         let shim = Some(arguments::shim(args, &exit_record, restarts));
-        let runtime = Process::start(&parts, "gleaner-runtime", line, socket, shim, Heard::Runtime, &say)?;
+        let runtime =
+            Process::start(&parts, "gleaner-runtime", line, socket, shim, Heard::Runtime, &say)?;
         Ok(Self { runtime, exit_record, recorder, ear: Ear::new(heard), left })
     }
 
@@ -99,7 +112,11 @@ impl Party {
     }
 
     /// Shows what they report until they end, which they do when `stop` is raised.
-    pub(super) fn attend(&mut self, screen: &mut Screen, stop: &AtomicBool) -> Result<Ended, Failure> {
+    pub(super) fn attend(
+        &mut self,
+        screen: &mut Screen,
+        stop: &AtomicBool,
+    ) -> Result<Ended, Failure> {
         let Self { runtime, exit_record, recorder, ear, left } = self;
         let mut ready: Option<Instant> = None;
         let mut asked = false;
@@ -122,7 +139,10 @@ impl Party {
                 return Ok(match status.code().and_then(Exit::from_code) {
                     // It has said why.
                     Some(exit) if !ear.is_ready && exit != Exit::Ok => Ended::Never(exit),
-                    _ => Ended::Broken { why: in_words("the recorder", status), faulted: ear.has_faulted },
+                    _ => Ended::Broken {
+                        why: in_words("the recorder", status),
+                        faulted: ear.has_faulted,
+                    },
                 });
             }
         };
@@ -139,16 +159,20 @@ impl Party {
         }
         ear.listen(screen, REST);
         let record = ExitRecord::read(exit_record).ok();
-        // A lambda can have its own process end as if that had been requested. The shim knows whether it was, and whether in time.
+        // A lambda can have its own process end as if that had been requested. The shim knows
+        // whether it was, and whether in time.
         let asked = record.as_ref().map_or(asked, |record| record.asked);
         Ok(match status.code().and_then(Exit::from_code) {
             // Told to end before it could listen for that.
             None if asked && !ear.is_ready => Ended::Well(Exit::Ok),
-            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if asked && ear.has_ended => Ended::Well(exit),
+            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if asked && ear.has_ended => {
+                Ended::Well(exit)
+            }
             Some(exit) if !ear.is_ready && exit != Exit::Ok => Ended::Never(exit),
             _ => {
                 let why = record.as_ref().and_then(ExitRecord::sentence);
-                let faulted = ear.has_faulted || record.is_some_and(|record| record.is_the_lambdas());
+                let faulted =
+                    ear.has_faulted || record.is_some_and(|record| record.is_the_lambdas());
                 let why = why.map_or_else(
                     || in_words("the lambda's process", status),
                     |why| format!("the lambda's process {why}"),

@@ -22,7 +22,8 @@ use super::ear::{Ear, Heard};
 use super::screen::Screen;
 use crate::runtime::next_report;
 
-/// How long a process may take for its end: a wake that runs, clips that are completed. A shim ends its runtime before.
+/// How long a process may take for its end: a wake that runs, clips that are completed. A shim ends
+/// its runtime before.
 const PATIENCE: Duration = UNTIL_KILLED.saturating_add(Duration::from_secs(10));
 
 /// A program of ours that reports.
@@ -32,7 +33,8 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts it; its reports are `T`, and are heard as `heard` says. With `shim`, arguments of gleaner-shim, it is a runtime.
+    /// Starts it; its reports are `T`, and are heard as `heard` says. With `shim`, arguments of
+    /// gleaner-shim, it is a runtime.
     pub(super) fn start<T: DeserializeOwned + 'static>(
         parts: &Parts,
         name: &'static str,
@@ -52,7 +54,11 @@ impl Process {
             .stderr(Stdio::piped())
             .spawn()
             .map_err(|error| {
-                Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error)
+                Failure::caused_by(
+                    Exit::Internal,
+                    format!("cannot start `{}`", program.display()),
+                    &error,
+                )
             })?;
         if let Some(reports) = child.stdout.take() {
             let say = say.clone();
@@ -68,18 +74,28 @@ impl Process {
 
     /// How it ended, if it has.
     pub(super) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
-        let failed = |error| Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error);
+        let failed = |error| {
+            Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error)
+        };
         self.child.try_wait().map_err(failed)
     }
 
     /// Asks it to end, and waits for that.
-    pub(super) fn end(&mut self, ear: &mut Ear, screen: &mut Screen) -> Result<ExitStatus, Failure> {
+    pub(super) fn end(
+        &mut self,
+        ear: &mut Ear,
+        screen: &mut Screen,
+    ) -> Result<ExitStatus, Failure> {
         self.tell(Signal::TERM);
         self.wait(ear, screen)
     }
 
     /// Waits for its end, and forces it in the end.
-    pub(super) fn wait(&mut self, ear: &mut Ear, screen: &mut Screen) -> Result<ExitStatus, Failure> {
+    pub(super) fn wait(
+        &mut self,
+        ear: &mut Ear,
+        screen: &mut Screen,
+    ) -> Result<ExitStatus, Failure> {
         let mut asked = Instant::now();
         loop {
             ear.look(screen, LOOK);
@@ -87,7 +103,10 @@ impl Process {
                 return Ok(status);
             }
             if asked.elapsed() > PATIENCE {
-                screen.warn(&format!("{} did not end when it was asked to, and is killed", self.name));
+                screen.warn(&format!(
+                    "{} did not end when it was asked to, and is killed",
+                    self.name
+                ));
                 self.tell(Signal::KILL);
                 asked = Instant::now();
             }
@@ -133,8 +152,11 @@ fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &
         if line == b"\n" {
             continue;
         }
-        let garbled =
-            |_| Heard::Garbled(visible(&String::from_utf8_lossy(&line).chars().take(200).collect::<String>()));
+        let garbled = |_| {
+            Heard::Garbled(visible(
+                &String::from_utf8_lossy(&line).chars().take(200).collect::<String>(),
+            ))
+        };
         if say.send(serde_json::from_slice(&line).map_or_else(garbled, heard)).is_err() {
             return;
         }

@@ -30,9 +30,11 @@ pub(super) struct Screen {
 
 impl Screen {
     pub(super) fn new(stats: bool, json: bool) -> Self {
-        let target = if stats { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+        let target =
+            if stats { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let below = ProgressBar::with_draw_target(None, target);
-        let style = ProgressStyle::with_template("{msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
+        let style =
+            ProgressStyle::with_template("{msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
         Self {
             stats,
             json,
@@ -100,7 +102,9 @@ impl Screen {
             if self.waited.insert(topic.topic.clone()) {
                 let name = visible(&topic.topic);
                 let kind = visible(&topic.type_name);
-                self.warn(&format!("nobody writes `{name}` ({kind}) yet; `gleaner topics` shows what is there"));
+                self.warn(&format!(
+                    "nobody writes `{name}` ({kind}) yet; `gleaner topics` shows what is there"
+                ));
             }
         }
     }
@@ -111,7 +115,10 @@ impl Screen {
         self.below.set_message("");
         self.below.tick();
         self.say(&show::live(live, self.paint));
-        self.say(&format!("  {}: decisions.jsonl, log.jsonl, summary.json\n", visible(&live.out.to_string_lossy())));
+        self.say(&format!(
+            "  {}: decisions.jsonl, log.jsonl, summary.json\n",
+            visible(&live.out.to_string_lossy())
+        ));
     }
 
     pub(super) fn warn(&self, text: &str) {
@@ -126,6 +133,8 @@ impl Screen {
 
     fn out(&self, text: &str) {
         // A reader that is gone is no failure: the results are in files.
-        self.below.suspend(|| drop(io::stdout().write_all(text.as_bytes()).and_then(|()| io::stdout().flush())));
+        self.below.suspend(|| {
+            drop(io::stdout().write_all(text.as_bytes()).and_then(|()| io::stdout().flush()))
+        });
     }
 }

@@ -1,5 +1,6 @@
-//! `summary.json` of a run, where `gleaner-shim` cannot write all of it: what the recorder counted, and what the processes of a lambda
-//! that was started again did together. Each counts for itself, and only who started them has seen them all.
+//! `summary.json` of a run, where `gleaner-shim` cannot write all of it: what the recorder counted,
+//! and what the processes of a lambda that was started again did together. Each counts for itself,
+//! and only who started them has seen them all.
 
 use std::path::Path;
 
@@ -18,9 +19,14 @@ pub(super) struct Earlier {
 }
 
 impl Earlier {
-    /// One more of each has ended. `last` and `recorded` are what they said last: of one that broke, up to a second of counts is
-    /// missing.
-    pub(super) fn add(&mut self, last: Option<Live>, recorded: Option<Box<RecorderStatus>>, has_lost_wake: bool) {
+    /// One more of each has ended. `last` and `recorded` are what they said last: of one that
+    /// broke, up to a second of counts is missing.
+    pub(super) fn add(
+        &mut self,
+        last: Option<Live>,
+        recorded: Option<Box<RecorderStatus>>,
+        has_lost_wake: bool,
+    ) {
         self.lost_wakes += u64::from(has_lost_wake);
         self.add_recorded(recorded);
         self.counted = match (last, self.counted.take()) {
@@ -36,8 +42,8 @@ impl Earlier {
         };
     }
 
-    /// There will be no further one. Writes the counts of all, unless there are none but those of `last`, which ended well and for which
-    /// the shim has written its own.
+    /// There will be no further one. Writes the counts of all, unless there are none but those of
+    /// `last`, which ended well and for which the shim has written its own.
     ///
     /// # Errors
     ///
@@ -51,32 +57,45 @@ impl Earlier {
         self.add_recorded(recorded);
         let Self { counted, mut recorded, lost_wakes } = self;
         // Sentences about writers of a thousand topics have no bound, and a summary has one.
-        recorded.iter_mut().flat_map(|status| &mut status.topics).for_each(|topic| topic.trouble.clear());
+        recorded
+            .iter_mut()
+            .flat_map(|status| &mut status.topics)
+            .for_each(|topic| topic.trouble.clear());
         // Not where the report says: it comes from the lambda's process.
         let path = out.join("summary.json");
-        let last = last.map(|last| Live { unwritten: last.unwritten.max(unwritten(&path)), ..last });
+        let last =
+            last.map(|last| Live { unwritten: last.unwritten.max(unwritten(&path)), ..last });
         let sum = match (last, counted) {
             (Some(last), Some(before)) => last.after(&before),
             (None, Some(before)) => before,
             (Some(last), None) if lost_wakes > 0 || recorded.is_some() => last,
             _ => return Ok(()),
         };
-        let sum = Live { faults: sum.faults.saturating_add(lost_wakes), recording: recorded, ..sum };
+        let sum =
+            Live { faults: sum.faults.saturating_add(lost_wakes), recording: recorded, ..sum };
         let mut text = serde_json::to_vec_pretty(&sum).expect("counts are plain data");
         text.push(b'\n');
         if text.len() as u64 > SUMMARY_MAX.bytes() {
-            let failure = Failure::new(Exit::Internal, format!("`{}` lacks what the recorder counted", path.display()));
-            return Err(failure.with_help("give fewer topics to one lambda: a summary has 4 MiB at most"));
+            let failure = Failure::new(
+                Exit::Internal,
+                format!("`{}` lacks what the recorder counted", path.display()),
+            );
+            return Err(
+                failure.with_help("give fewer topics to one lambda: a summary has 4 MiB at most")
+            );
         }
-        write_whole(&path, &text)
-            .map_err(|error| Failure::caused_by(Exit::Internal, format!("cannot write `{}`", path.display()), &error))
+        write_whole(&path, &text).map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot write `{}`", path.display()), &error)
+        })
     }
 }
 
-/// What the shim could not write of the last process: it alone knows what it met after the last report.
+/// What the shim could not write of the last process: it alone knows what it met after the last
+/// report.
 fn unwritten(summary: &Path) -> u64 {
     let text = PlainFile::result(summary, SUMMARY_MAX).and_then(PlainFile::read_whole).ok();
-    text.and_then(|text| serde_json::from_slice::<Live>(&text).ok()).map_or(0, |written| written.unwritten)
+    text.and_then(|text| serde_json::from_slice::<Live>(&text).ok())
+        .map_or(0, |written| written.unwritten)
 }
 
 #[cfg(test)]

@@ -33,12 +33,17 @@ fn write_checked(text: &mut String, checked: &Checked, paint: Paint) -> fmt::Res
             continue;
         }
         let sum = |at_once: bool| {
-            let bytes = needs.iter().filter(|need| need.at_once == at_once).filter_map(|need| need.bytes);
+            let bytes =
+                needs.iter().filter(|need| need.at_once == at_once).filter_map(|need| need.bytes);
             bytes.fold(0, u64::saturating_add)
         };
         let (at_once, later) = (sum(true), sum(false));
         let most = size(at_once.saturating_add(later));
-        let beyond = if needs.iter().any(|need| need.bytes.is_none()) { ", and what has no bound" } else { "" };
+        let beyond = if needs.iter().any(|need| need.bytes.is_none()) {
+            ", and what has no bound"
+        } else {
+            ""
+        };
         writeln!(text, "{word}: {} from the start, {most} at most{beyond}", size(at_once))?;
         for need in needs {
             let bytes = need.bytes.map_or_else(|| "no bound".to_owned(), size);
@@ -46,7 +51,11 @@ fn write_checked(text: &mut String, checked: &Checked, paint: Paint) -> fmt::Res
             writeln!(text, "{bytes:>12}  {}{at_most}", visible(&need.purpose))?;
         }
     }
-    writeln!(text, "its process has {} now, with its rings and before any sample", size(checked.resident_bytes))
+    writeln!(
+        text,
+        "its process has {} now, with its rings and before any sample",
+        size(checked.resident_bytes)
+    )
 }
 
 #[cfg(test)]

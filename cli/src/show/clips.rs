@@ -10,7 +10,12 @@ use gleaner_report::words::{clip_contents, clip_span, counted, seconds};
 use super::{Paint, SHOWN, more};
 
 /// A block for each clip: when it is, what is in it, and what is missing.
-pub(super) fn write(text: &mut String, clips: &[Clip], summary: &Summary, paint: Paint) -> fmt::Result {
+pub(super) fn write(
+    text: &mut String,
+    clips: &[Clip],
+    summary: &Summary,
+    paint: Paint,
+) -> fmt::Result {
     if clips.is_empty() {
         return Ok(());
     }
@@ -26,7 +31,8 @@ pub(super) fn write(text: &mut String, clips: &[Clip], summary: &Summary, paint:
 pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> fmt::Result {
     let file = visible(&clip.file.to_string_lossy());
     writeln!(text, "{}  {file}", paint.green(when))?;
-    let thumbnail = clip.thumbnail.as_ref().map(|path| format!("; {}", visible(&path.to_string_lossy())));
+    let thumbnail =
+        clip.thumbnail.as_ref().map(|path| format!("; {}", visible(&path.to_string_lossy())));
     writeln!(text, "{:>14}{}{}", "", clip_contents(clip), thumbnail.unwrap_or_default())?;
     for why in &clip.short {
         writeln!(text, "{:>14}{}", "", paint.yellow(&format!("short: {}", visible(why))))?;
@@ -35,7 +41,11 @@ pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> f
         writeln!(text, "{:>14}{}", "", paint.yellow(&format!("lost: {loss}")))?;
     }
     if let Some(recovered) = &clip.recovered {
-        let what = format!("recovered: {} ({} lost)", visible(&recovered.what), counted(recovered.lost_bytes, "byte"));
+        let what = format!(
+            "recovered: {} ({} lost)",
+            visible(&recovered.what),
+            counted(recovered.lost_bytes, "byte")
+        );
         writeln!(text, "{:>14}{}", "", paint.yellow(&what))?;
     }
     Ok(())
@@ -43,9 +53,14 @@ pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> f
 
 /// What never came; what the recorder had to give up stands in `short`.
 fn losses(clip: &Clip) -> Vec<String> {
-    let lost = clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));
+    let lost =
+        clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));
     let lines = lost.map(|(topic, lost)| {
-        format!("{} of {}, before they reached the recorder", counted(lost, "message"), visible(&topic.topic))
+        format!(
+            "{} of {}, before they reached the recorder",
+            counted(lost, "message"),
+            visible(&topic.topic)
+        )
     });
     lines.collect()
 }

@@ -38,9 +38,16 @@ fn write(text: &mut String, diff: &Diff, paint: Paint) -> fmt::Result {
     for cost in &diff.cost {
         writeln!(text, "  {}", cost_in_words(cost))?;
     }
-    for (of, thing, tally) in [(Of::Trigger, "trigger", diff.triggers), (Of::Fault, "fault", diff.faults)] {
-        for (is, count) in [(Is::Gone, tally.gone), (Is::New, tally.new), (Is::Changed, tally.changed)] {
-            let listed = diff.differences.iter().filter(|difference| difference.of == of && difference.is == is);
+    for (of, thing, tally) in
+        [(Of::Trigger, "trigger", diff.triggers), (Of::Fault, "fault", diff.faults)]
+    {
+        for (is, count) in
+            [(Is::Gone, tally.gone), (Is::New, tally.new), (Is::Changed, tally.changed)]
+        {
+            let listed = diff
+                .differences
+                .iter()
+                .filter(|difference| difference.of == of && difference.is == is);
             block(text, listed, is, &counted(count, thing), count, paint)?;
         }
     }
@@ -66,8 +73,12 @@ fn block<'a>(
     writeln!(text, "{}", paint.bold(&format!("{title} {word}")))?;
     let mut shown = 0;
     for difference in listed.take(SHOWN) {
-        let line =
-            format!("{sign}{:>10.3} s  {}  {}", difference.t, visible(&difference.label), visible(&difference.detail));
+        let line = format!(
+            "{sign}{:>10.3} s  {}  {}",
+            difference.t,
+            visible(&difference.label),
+            visible(&difference.detail)
+        );
         let line = line.trim_end();
         let line = match is {
             Is::Gone => paint.red(line),
@@ -87,7 +98,13 @@ fn named(side: &Side) -> String {
     let drive: Vec<_> = side.drive.iter().map(|drive| visible(drive)).collect();
     let drive = if drive.is_empty() { "live".to_owned() } else { drive.join(", ") };
     let Side { out, lambda, version, kind, .. } = side;
-    format!("{}: {} {} ({}), {drive}", visible(out), visible(lambda), visible(version), kind.as_str())
+    format!(
+        "{}: {} {} ({}), {drive}",
+        visible(out),
+        visible(lambda),
+        visible(version),
+        kind.as_str()
+    )
 }
 
 fn in_words(Change { what, a, b }: &Change) -> String {
@@ -125,7 +142,14 @@ mod tests {
 
     fn side(out: &str) -> Side {
         let [out, lambda, version] = [out, "hello", "0.1.0"].map(str::to_owned);
-        Side { out, lambda, version, kind: Kind::Wasm, drive: vec!["a.mcap".to_owned()], start_ns: Some(0) }
+        Side {
+            out,
+            lambda,
+            version,
+            kind: Kind::Wasm,
+            drive: vec!["a.mcap".to_owned()],
+            start_ns: Some(0),
+        }
     }
 
     fn alike() -> Diff {
@@ -162,8 +186,17 @@ mod tests {
         let changed = Diff {
             notes: vec!["different lambdas: `hello` and `brake-dark`".to_owned()],
             config: vec![change("brake", Some("-1.4"), "-2.0")],
-            counts: vec![change("wakes", Some("400"), "500"), change("samples of `imu`, lost", None, "4")],
-            cost: vec![Cost { what: "time in the lambda", unit: "ns", a: Some(2000), b: Some(3000), ratio: Some(1.5) }],
+            counts: vec![
+                change("wakes", Some("400"), "500"),
+                change("samples of `imu`, lost", None, "4"),
+            ],
+            cost: vec![Cost {
+                what: "time in the lambda",
+                unit: "ns",
+                a: Some(2000),
+                b: Some(3000),
+                ratio: Some(1.5),
+            }],
             ..alike()
         };
         let text = text(&changed);
@@ -192,7 +225,9 @@ mod tests {
         });
         assert!(text.contains("  triggers: 0 the same, 3,000 gone, 30 new, 0 changed\n"), "{text}");
         assert!(
-            text.contains("and 2,980 more") && text.contains("+     3.000 s  new  1\n") && text.contains("and 10 more"),
+            text.contains("and 2,980 more")
+                && text.contains("+     3.000 s  new  1\n")
+                && text.contains("and 10 more"),
             "{text}"
         );
     }
@@ -200,7 +235,8 @@ mod tests {
     #[test]
     fn hostile_texts_do_not_act_on_a_terminal() {
         let differences = vec![difference(Is::Gone, 0.0, "\u{1b}[2J")];
-        let text = text(&Diff { triggers: Tally { gone: 1, ..Tally::default() }, differences, ..alike() });
+        let text =
+            text(&Diff { triggers: Tally { gone: 1, ..Tally::default() }, differences, ..alike() });
         assert!(!text.contains('\u{1b}') && text.contains("\\u{1b}[2J"), "{text}");
     }
 }

@@ -10,29 +10,34 @@ use gleaner_report::words::{counted, grouped, seconds, size};
 use super::live::table;
 
 /// Parts of a topic's name that say nothing of what is measured.
-const EMPTY_WORDS: [&str; 7] = ["data", "raw", "image", "image_raw", "image_color", "compressed", "msg"];
+const EMPTY_WORDS: [&str; 7] =
+    ["data", "raw", "image", "image_raw", "image_color", "compressed", "msg"];
 
 /// How long the drive is, its topics as a table, and `[[input]]` tables.
 pub(crate) fn drive(drive: &DriveSeen) -> String {
-    let (Some(start), Some(end)) = (drive.start_ns, drive.end_ns) else { return "no messages\n".to_owned() };
+    let (Some(start), Some(end)) = (drive.start_ns, drive.end_ns) else {
+        return "no messages\n".to_owned();
+    };
     let (whole, rest) = (start.div_euclid(1_000_000_000), start.rem_euclid(1_000_000_000));
     let mut text = format!("{:.3} s, from @{whole}.{rest:09} on\n", seconds(end, start));
     if !drive.parts.is_empty() {
-        let parts = drive
-            .parts
-            .iter()
-            .map(|[from, to]| format!("{:.1} to {:.1} s", seconds(*from, start), seconds(*to, start)));
+        let parts = drive.parts.iter().map(|[from, to]| {
+            format!("{:.1} to {:.1} s", seconds(*from, start), seconds(*to, start))
+        });
         let parts = parts.collect::<Vec<_>>().join(", ");
         // Writing to a string cannot fail, here and below.
-        let _ = writeln!(text, "rates, gaps and sizes are those of {parts}; --all reads everything");
+        let _ =
+            writeln!(text, "rates, gaps and sizes are those of {parts}; --all reads everything");
     }
     if let Some(damaged) = &drive.damaged {
         let _ = writeln!(text, "damaged: {}", visible(damaged));
     }
     if drive.out_of_order > 0 {
-        let _ = writeln!(text, "{} out of order by log time", counted(drive.out_of_order, "message"));
+        let _ =
+            writeln!(text, "{} out of order by log time", counted(drive.out_of_order, "message"));
     }
-    let head = ["topic", "type", "messages", "Hz", "longest gap", "at", "missing", "largest", ""].map(str::to_owned);
+    let head = ["topic", "type", "messages", "Hz", "longest gap", "at", "missing", "largest", ""]
+        .map(str::to_owned);
     let rows = drive.topics.iter().map(|topic| row(topic, start));
     text += &table(std::iter::once(head).chain(rows).collect(), &[2, 3, 4, 5, 6, 7]);
     if drive.skipped > 0 {
@@ -53,7 +58,9 @@ fn row(topic: &RecordedTopicSeen, start_ns: i64) -> [String; 9] {
         visible(&topic.type_name),
         topic.messages.map_or_else(unknown, grouped),
         rate_hz(topic).map_or_else(unknown, |hz| format!("{hz:.1}")),
-        topic.interval.map_or_else(unknown, |interval| format!("{:.1} ms", interval.max_ns as f64 / 1e6)),
+        topic
+            .interval
+            .map_or_else(unknown, |interval| format!("{:.1} ms", interval.max_ns as f64 / 1e6)),
         topic.longest_after_ns.map_or_else(unknown, |at| format!("{:.3} s", seconds(at, start_ns))),
         topic.missing.map_or_else(unknown, grouped),
         if topic.read > 0 { size(topic.largest_bytes) } else { unknown() },
@@ -67,16 +74,25 @@ fn in_words(picture: &Picture) -> String {
 
 /// By the median of the intervals: a gap is no other rate.
 fn rate_hz(topic: &RecordedTopicSeen) -> Option<f64> {
-    topic.interval.filter(|interval| interval.p50_ns > 0).map(|interval| 1e9 / interval.p50_ns as f64)
+    topic
+        .interval
+        .filter(|interval| interval.p50_ns > 0)
+        .map(|interval| 1e9 / interval.p50_ns as f64)
 }
 
 /// A table for each topic whose fields can be read.
 fn inputs(topics: &[RecordedTopicSeen]) -> String {
     let (mut text, mut names) = (String::new(), HashSet::new());
-    for topic in topics.iter().filter(|topic| topic.is_defined && topic.unreadable.is_none() && topic.read > 0) {
+    for topic in topics
+        .iter()
+        .filter(|topic| topic.is_defined && topic.unreadable.is_none() && topic.read > 0)
+    {
         let base = name_of(&topic.topic);
         let others = (2..).map(|n| format!("{base}_{n}"));
-        let name = std::iter::once(base.clone()).chain(others).find(|name| !names.contains(name)).unwrap_or_default();
+        let name = std::iter::once(base.clone())
+            .chain(others)
+            .find(|name| !names.contains(name))
+            .unwrap_or_default();
         let _ = write!(
             text,
             "\n[[input]]\nname = \"{name}\"\ntopic = \"{}\"\ntype = \"{}\"\n",
@@ -110,7 +126,11 @@ fn sizes(topic: &RecordedTopicSeen) -> String {
         let _ = writeln!(text, "depth = {depth:<20}# {:.1} s", depth as f64 / hz);
     }
     if topic.largest_bytes > 4096 {
-        let _ = writeln!(text, "max_size = \"{}\"", kib(topic.largest_bytes.saturating_mul(2).next_power_of_two()));
+        let _ = writeln!(
+            text,
+            "max_size = \"{}\"",
+            kib(topic.largest_bytes.saturating_mul(2).next_power_of_two())
+        );
     }
     text
 }
@@ -120,8 +140,13 @@ fn name_of(topic: &str) -> String {
     let words = topic.split('/').filter(|word| !word.is_empty() && !EMPTY_WORDS.contains(word));
     let words = words.map(str::to_ascii_lowercase).collect::<Vec<_>>();
     let name = words[words.len().saturating_sub(2)..].join("_");
-    let name: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '_').take(48).collect();
-    if name.starts_with(|first: char| first.is_ascii_lowercase()) { name } else { format!("input{name}") }
+    let name: String =
+        name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '_').take(48).collect();
+    if name.starts_with(|first: char| first.is_ascii_lowercase()) {
+        name
+    } else {
+        format!("input{name}")
+    }
 }
 
 #[cfg(test)]
@@ -150,7 +175,15 @@ mod tests {
 
     fn seen(topics: Vec<RecordedTopicSeen>) -> DriveSeen {
         let [start_ns, end_ns] = [1_500_000_000_250_000_000, 1_500_000_002_000_000_000].map(Some);
-        DriveSeen { start_ns, end_ns, parts: Vec::new(), out_of_order: 0, damaged: None, topics, skipped: 0 }
+        DriveSeen {
+            start_ns,
+            end_ns,
+            parts: Vec::new(),
+            out_of_order: 0,
+            damaged: None,
+            topics,
+            skipped: 0,
+        }
     }
 
     #[test]
@@ -183,17 +216,26 @@ depth = 128                 # 1.3 s
 
     #[test]
     fn pictures_get_the_room_that_they_need() {
-        let shape = |is_compressed| Picture { encoding: "x".to_owned(), width: 1280, height: 720, is_compressed };
+        let shape = |is_compressed| Picture {
+            encoding: "x".to_owned(),
+            width: 1280,
+            height: 720,
+            is_compressed,
+        };
         let camera = |is_compressed, largest_bytes| RecordedTopicSeen {
             picture: Some(shape(is_compressed)),
             largest_bytes,
             ..topic("/camera/front/compressed")
         };
-        assert_eq!(sizes(&camera(true, 41_000)), "max_size = \"128 KiB\"\ndecoded_size = \"2700 KiB\"\n");
+        assert_eq!(
+            sizes(&camera(true, 41_000)),
+            "max_size = \"128 KiB\"\ndecoded_size = \"2700 KiB\"\n"
+        );
         assert_eq!(sizes(&camera(false, 2_764_900)), "max_size = \"2702 KiB\"\n");
         for is_compressed in [true, false] {
             let picture = Picture { width: u32::MAX, height: u32::MAX, ..shape(is_compressed) };
-            let camera = RecordedTopicSeen { picture: Some(picture), ..camera(is_compressed, 1024) };
+            let camera =
+                RecordedTopicSeen { picture: Some(picture), ..camera(is_compressed, 1024) };
             assert!(sizes(&camera).starts_with("max_size = \"2 KiB\"\n"));
         }
     }
@@ -211,7 +253,10 @@ depth = 128                 # 1.3 s
             assert!(name.parse::<gleaner_lambda::manifest::ItemName>().is_ok());
         }
         let text = inputs(&[topic("/imu/data"), topic("/imu/raw"), topic("/imu")]);
-        assert!(["\"imu\"", "\"imu_2\"", "\"imu_3\""].iter().all(|name| text.contains(name)), "{text}");
+        assert!(
+            ["\"imu\"", "\"imu_2\"", "\"imu_3\""].iter().all(|name| text.contains(name)),
+            "{text}"
+        );
     }
 
     #[test]

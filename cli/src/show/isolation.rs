@@ -4,11 +4,14 @@ use gleaner_protocol::{Holds, Layer};
 /// The layers of isolation in a line: those that hold by name, the others with the reason.
 pub(crate) fn isolation(layers: &[Layer]) -> String {
     let named = |holds| layers.iter().filter(move |layer| layer.holds == holds);
-    let mut parts =
-        vec![format!("{} hold", named(Holds::Yes).map(|layer| visible(&layer.name)).collect::<Vec<_>>().join(", "))];
+    let mut parts = vec![format!(
+        "{} hold",
+        named(Holds::Yes).map(|layer| visible(&layer.name)).collect::<Vec<_>>().join(", ")
+    )];
     for (holds, word) in [(Holds::Partly, "in part"), (Holds::No, "not here")] {
-        let those: Vec<_> =
-            named(holds).map(|layer| format!("{} ({})", visible(&layer.name), visible(&layer.note))).collect();
+        let those: Vec<_> = named(holds)
+            .map(|layer| format!("{} ({})", visible(&layer.name), visible(&layer.note)))
+            .collect();
         if !those.is_empty() {
             parts.push(format!("{word}: {}", those.join(", ")));
         }
@@ -22,8 +25,11 @@ mod tests {
 
     #[test]
     fn what_holds_is_named_and_what_does_not_has_its_reason() {
-        let layers =
-            [Layer::yes("files", "a"), Layer::yes("sockets", "b"), Layer::no("control group", "none was delegated")];
+        let layers = [
+            Layer::yes("files", "a"),
+            Layer::yes("sockets", "b"),
+            Layer::no("control group", "none was delegated"),
+        ];
         assert_eq!(
             isolation(&layers),
             "isolation: files, sockets hold; not here: control group (none was delegated)\n"

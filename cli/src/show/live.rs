@@ -64,7 +64,11 @@ pub(crate) fn decision(decision: &gleaner_lambda::Decision, paint: Paint) -> Str
         text += &format!("{}\n", paint.green(line.trim_end()));
     }
     if let Some(fault) = &decision.fault {
-        let line = format!("{time}  {}: {}", fault_kind(fault.kind), super::shown(super::gist(&fault.message)));
+        let line = format!(
+            "{time}  {}: {}",
+            fault_kind(fault.kind),
+            super::shown(super::gist(&fault.message))
+        );
         text += &format!("{}\n", paint.red(&line));
     }
     text
@@ -80,11 +84,18 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         live.up_s,
         counted(live.wakes, "wake"),
         counted(live.triggers, "trigger"),
-        if live.faults > 0 { paint.red(&counted(live.faults, "fault")) } else { counted(live.faults, "fault") },
+        if live.faults > 0 {
+            paint.red(&counted(live.faults, "fault"))
+        } else {
+            counted(live.faults, "fault")
+        },
     )?;
-    let spreads = [("wake-up", live.wake_up), ("in the lambda", live.run), ("handed out", live.hand_out)];
-    let told: Vec<String> =
-        spreads.iter().filter_map(|(what, spread)| spread.map(|spread| format!("{what} {}", in_ms(&spread)))).collect();
+    let spreads =
+        [("wake-up", live.wake_up), ("in the lambda", live.run), ("handed out", live.hand_out)];
+    let told: Vec<String> = spreads
+        .iter()
+        .filter_map(|(what, spread)| spread.map(|spread| format!("{what} {}", in_ms(&spread))))
+        .collect();
     if !told.is_empty() {
         writeln!(text, "  {} ms (median / 99 % / longest)", told.join(", "))?;
     }
@@ -102,7 +113,8 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         "skipped",
         "newest",
     ];
-    let rows = std::iter::once(head.map(str::to_owned)).chain(live.topics.iter().map(row)).collect();
+    let rows =
+        std::iter::once(head.map(str::to_owned)).chain(live.topics.iter().map(row)).collect();
     for line in table(rows, &[2, 3, 4, 5, 6, 7, 8, 9, 10, 11]).lines() {
         writeln!(text, "  {line}")?;
     }
@@ -118,8 +130,16 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         (live.passed_over, "wake", "passed over after repeated faults"),
         (live.unwritten, "decision or log line", "not written"),
         (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` does not keep up"),
-        (live.recorder.map_or(0, |recorder| recorder.wakes_dropped), "wake", "not told to the recorder"),
-        (live.recorder.map_or(0, |recorder| recorder.triggers_lost), "trigger", "not told to the recorder"),
+        (
+            live.recorder.map_or(0, |recorder| recorder.wakes_dropped),
+            "wake",
+            "not told to the recorder",
+        ),
+        (
+            live.recorder.map_or(0, |recorder| recorder.triggers_lost),
+            "trigger",
+            "not told to the recorder",
+        ),
     ];
     for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
@@ -128,13 +148,22 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
 }
 
 /// What the network lost, and what a process takes: bytes of memory, and seconds of CPU time.
-fn write_network(text: &mut String, network: &Network, (rss_bytes, cpu_s): (u64, f64), paint: Paint) -> fmt::Result {
+fn write_network(
+    text: &mut String,
+    network: &Network,
+    (rss_bytes, cpu_s): (u64, f64),
+    paint: Paint,
+) -> fmt::Result {
     let losses = [
         (network.socket_drops, "dropped by the system: a socket buffer was full"),
         (network.filtered, "dropped: fragments that claim too much, or of nobody known"),
     ];
     for (count, why) in losses.into_iter().filter(|(count, _)| *count > 0) {
-        writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, "datagram"))))?;
+        writeln!(
+            text,
+            "  {}",
+            paint.yellow(&format!("lost: {}, {why}", counted(count, "datagram")))
+        )?;
     }
     if let Some(why) = &network.unfiltered {
         writeln!(text, "  {}", paint.yellow(&visible(why)))?;
@@ -151,7 +180,8 @@ fn write_network(text: &mut String, network: &Network, (rss_bytes, cpu_s): (u64,
 }
 
 fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> fmt::Result {
-    let opened = status.trigger_to_open.map(|spread| format!("; trigger to window {} ms", in_ms(&spread)));
+    let opened =
+        status.trigger_to_open.map(|spread| format!("; trigger to window {} ms", in_ms(&spread)));
     writeln!(
         text,
         "{}: {}, {}{}; preroll {:.1} of {:.1} MiB{}",
@@ -163,7 +193,8 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
         mib(status.preroll_bound),
         opened.unwrap_or_default(),
     )?;
-    let head = ["topic", "writers", "received", "lost", "no slot", "too big", "malformed"].map(str::to_owned);
+    let head = ["topic", "writers", "received", "lost", "no slot", "too big", "malformed"]
+        .map(str::to_owned);
     let rows = std::iter::once(head).chain(status.topics.iter().map(recorded)).collect();
     for line in table(rows, &[1, 2, 3, 4, 5, 6]).lines() {
         writeln!(text, "  {line}")?;
@@ -214,7 +245,9 @@ fn row(topic: &LiveTopic) -> [String; 12] {
         grouped(topic.malformed),
         grouped(topic.overwritten),
         grouped(topic.skipped),
-        topic.age_ns.map_or_else(|| "never".to_owned(), |age| format!("{:.3} s ago", age as f64 / 1e9)),
+        topic
+            .age_ns
+            .map_or_else(|| "never".to_owned(), |age| format!("{:.3} s ago", age as f64 / 1e9)),
     ]
 }
 
@@ -225,13 +258,18 @@ fn in_ms(spread: &Spread) -> String {
 
 /// Columns as wide as their widest cell; those of `numbers` end on the right.
 pub(super) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
-    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let width =
+        |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..N).map(width).collect();
     let mut text = String::new();
     for row in &rows {
         let cells = row.iter().enumerate().map(|(column, cell)| {
             let width = widths[column];
-            if numbers.contains(&column) { format!("{cell:>width$}") } else { format!("{cell:<width$}") }
+            if numbers.contains(&column) {
+                format!("{cell:>width$}")
+            } else {
+                format!("{cell:<width$}")
+            }
         });
         text += cells.collect::<Vec<_>>().join("  ").trim_end();
         text.push('\n');
@@ -280,8 +318,12 @@ mod tests {
             filtered: 1,
             unfiltered: Some("no filter here".to_owned()),
         };
-        let status =
-            RecorderStatus { network: Some(network), rss_bytes: 5 << 20, cpu_s: 1.0, ..RecorderStatus::default() };
+        let status = RecorderStatus {
+            network: Some(network),
+            rss_bytes: 5 << 20,
+            cpu_s: 1.0,
+            ..RecorderStatus::default()
+        };
         let text = recorder(&status, Paint { on: false });
         let lines: Vec<_> = text.lines().rev().take(4).collect();
         assert_eq!(

@@ -33,7 +33,8 @@ const SHOWN: usize = 20;
 /// Characters of a fault's message that are shown; all of it is in `decisions.jsonl`.
 const MESSAGE_CHARS: usize = 200;
 
-/// Triggers of one label that are less than this apart are one burst: most lambdas see an event in several samples.
+/// Triggers of one label that are less than this apart are one burst: most lambdas see an event in
+/// several samples.
 const BURST_GAP_S: f64 = 1.0;
 
 /// The part of the decisions that is shown. It stays small, however many decisions there are.
@@ -98,7 +99,8 @@ impl Digest {
             Some(burst) if burst.label == label && seconds - burst.last_seconds < BURST_GAP_S => {
                 burst.count += 1;
                 burst.last_seconds = seconds;
-                burst.highest_score = burst.highest_score.into_iter().chain(trigger.score).reduce(f64::max);
+                burst.highest_score =
+                    burst.highest_score.into_iter().chain(trigger.score).reduce(f64::max);
             }
             _ if full => self.other_triggers = 1,
             _ => self.triggers.push(Burst {
@@ -113,7 +115,9 @@ impl Digest {
 
     fn count(&mut self, fault: &Fault, first_seconds: f64) {
         let (kind, message) = (fault.kind, shown(gist(&fault.message)));
-        if let Some(cause) = self.causes.iter_mut().find(|cause| cause.kind == kind && cause.message == message) {
+        if let Some(cause) =
+            self.causes.iter_mut().find(|cause| cause.kind == kind && cause.message == message)
+        {
             cause.count += 1;
         } else if self.causes.len() < SHOWN {
             self.causes.push(Cause { kind, message, count: 1, first_seconds });
@@ -125,7 +129,8 @@ impl Digest {
 
 impl Burst {
     fn time(&self) -> String {
-        let [first, last] = [self.first_seconds, self.last_seconds].map(|seconds| format!("{seconds:.3}"));
+        let [first, last] =
+            [self.first_seconds, self.last_seconds].map(|seconds| format!("{seconds:.3}"));
         if first == last { format!("{first:>10} s") } else { format!("{first:>10} to {last} s") }
     }
 
@@ -169,7 +174,8 @@ pub(crate) fn verified(verified: &Verified, paint: Paint) -> String {
 fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::Result {
     let name = visible(&verified.lambda);
     let compared = counted(verified.wakes.saturating_sub(verified.uncovered), "decision");
-    let triggers = counted(verified.triggers.saturating_sub(verified.uncovered_triggers), "trigger");
+    let triggers =
+        counted(verified.triggers.saturating_sub(verified.uncovered_triggers), "trigger");
     let same = format!("{compared} with {triggers} made again, all the same");
     writeln!(text, "{}: {}", paint.bold(&name), paint.green(&same))?;
     if verified.uncovered > 0 {
@@ -188,7 +194,13 @@ fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::
     writeln!(text, "  {:.3} s", verified.wall_s)
 }
 
-fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &[Clip], paint: Paint) -> fmt::Result {
+fn write_summary(
+    text: &mut String,
+    summary: &Summary,
+    digest: &Digest,
+    clips: &[Clip],
+    paint: Paint,
+) -> fmt::Result {
     let name = format!("{} {}", visible(&summary.lambda), visible(&summary.version));
     let from_ns = summary.part.from_ns.unwrap_or(summary.start_ns).max(summary.start_ns);
     let to_ns = summary.part.to_ns.unwrap_or(summary.end_ns).min(summary.end_ns);
@@ -211,7 +223,13 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
         writeln!(text, "  {}", paint.red(&counted(summary.faults, "fault")))?;
         for cause in &digest.causes {
             let kind = fault_kind(cause.kind);
-            writeln!(text, "{:>10.3} s  {}x {kind}: {}", cause.first_seconds, grouped(cause.count), cause.message)?;
+            writeln!(
+                text,
+                "{:>10.3} s  {}x {kind}: {}",
+                cause.first_seconds,
+                grouped(cause.count),
+                cause.message
+            )?;
         }
         more(text, digest.other_faults)?;
     }
@@ -239,13 +257,21 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
         }
     }
     if let Some(why) = &summary.stopped {
-        writeln!(text, "  {}", paint.red("the lambda's process ended before the drive did; the results end there"))?;
+        writeln!(
+            text,
+            "  {}",
+            paint.red("the lambda's process ended before the drive did; the results end there")
+        )?;
         writeln!(text, "    {}", visible(why))?;
     }
 
     if !summary.part.is_all() {
         let [from_s, to_s] = [from_ns, to_ns].map(|ns| seconds(ns, summary.start_ns));
-        writeln!(text, "  {}", paint.dim(&format!("part of the drive: from {from_s:.3} s to {to_s:.3} s")))?;
+        writeln!(
+            text,
+            "  {}",
+            paint.dim(&format!("part of the drive: from {from_s:.3} s to {to_s:.3} s"))
+        )?;
     }
     write!(text, "  {} wakes/s", grouped(summary.wakes_per_s.round() as u64))?;
     if summary.wall_s > 0.0 && span_s > 0.0 {
@@ -253,11 +279,18 @@ fn write_summary(text: &mut String, summary: &Summary, digest: &Digest, clips: &
     }
     write!(text, ", {:.3} s in the lambda", summary.run_s)?;
     if summary.decode_s > 0.0 {
-        write!(text, " ({:.0} % decoding)", 100.0 * summary.decode_s / summary.run_s.max(summary.decode_s))?;
+        write!(
+            text,
+            " ({:.0} % decoding)",
+            100.0 * summary.decode_s / summary.run_s.max(summary.decode_s)
+        )?;
     }
     writeln!(text, ", {:.1} MiB at most", mib(summary.peak_rss_bytes))?;
     let clips = if clips.is_empty() { "" } else { ", clips.jsonl, clips/" };
-    let files = format!("{}: decisions.jsonl, log.jsonl, summary.json{clips}", visible(&summary.out.to_string_lossy()));
+    let files = format!(
+        "{}: decisions.jsonl, log.jsonl, summary.json{clips}",
+        visible(&summary.out.to_string_lossy())
+    );
     writeln!(text, "  {}", paint.dim(&files))
 }
 
@@ -268,7 +301,11 @@ fn write_counted(text: &mut String, recording: &Recording, paint: Paint) -> fmt:
         writeln!(
             text,
             "  {}",
-            if counted.outcome == Outcome::NoWindow { paint.dim(&line) } else { paint.yellow(&line) }
+            if counted.outcome == Outcome::NoWindow {
+                paint.dim(&line)
+            } else {
+                paint.yellow(&line)
+            }
         )?;
     }
     Ok(())
@@ -295,12 +332,21 @@ fn losses(summary: &Summary) -> Vec<String> {
     let overall = [
         (summary.skipped, format!("{}, skipped", counted(summary.skipped, "event sample"))),
         (summary.missed_ticks, format!("{}, missed", counted(summary.missed_ticks, "tick"))),
-        (summary.log_dropped, format!("{}, over the rate limit", counted(summary.log_dropped, "log line"))),
+        (
+            summary.log_dropped,
+            format!("{}, over the rate limit", counted(summary.log_dropped, "log line")),
+        ),
         (
             summary.triggers_refused,
-            format!("{}, refused: over `events_per_minute`", counted(summary.triggers_refused, "trigger")),
+            format!(
+                "{}, refused: over `events_per_minute`",
+                counted(summary.triggers_refused, "trigger")
+            ),
         ),
-        (summary.passed_over, format!("{}, passed over after repeated faults", counted(summary.passed_over, "wake"))),
+        (
+            summary.passed_over,
+            format!("{}, passed over after repeated faults", counted(summary.passed_over, "wake")),
+        ),
     ];
     let all = summary.topics.iter().flat_map(of_topic).chain(overall);
     all.filter(|(count, _)| *count > 0).map(|(_, loss)| loss).collect()

@@ -64,7 +64,12 @@ fn decision(milliseconds: i64, label: Option<&str>, fault: Option<(FaultKind, &s
         writer: None,
         seq: None,
         triggers: label.map(trigger).into_iter().collect(),
-        fault: fault.map(|(kind, message)| Fault { kind, message: message.to_owned(), used: None, allowed: None }),
+        fault: fault.map(|(kind, message)| Fault {
+            kind,
+            message: message.to_owned(),
+            used: None,
+            allowed: None,
+        }),
         fuel: None,
         run_ns: 0,
     }
@@ -76,7 +81,8 @@ fn digest(decisions: Vec<Decision>) -> Digest {
 
 #[test]
 fn a_summary_says_what_was_found_when_how_fast_and_where_the_files_are() {
-    let digest = digest(vec![decision(10_810, Some("brake-dark"), None), decision(11_000, None, None)]);
+    let digest =
+        digest(vec![decision(10_810, Some("brake-dark"), None), decision(11_000, None, None)]);
     assert_eq!(
         summary(&replay(), &digest, &[], PLAIN),
         "brake-dark 0.1.0 (wasm): 1 trigger in 1,200 wakes, 40.0 s of drive\n    \
@@ -131,7 +137,8 @@ fn a_part_of_a_drive_is_shown_with_its_times_and_length() {
 
 #[test]
 fn where_a_panic_was_and_what_it_said_are_both_shown() {
-    let message = "panicked at src/lib.rs:17:9: ouch\nerror while executing at wasm backtrace:\n    0: 0x1";
+    let message =
+        "panicked at src/lib.rs:17:9: ouch\nerror while executing at wasm backtrace:\n    0: 0x1";
     let text = summary(
         &Summary { faults: 1, ..replay() },
         &digest(vec![decision(0, None, Some((FaultKind::Trap, message)))]),
@@ -143,9 +150,12 @@ fn where_a_panic_was_and_what_it_said_are_both_shown() {
 
 #[test]
 fn faults_are_shown_once_per_cause_with_the_line_that_says_most() {
-    let traceback = "Traceback (most recent call last):\n  File \"main.py\", line 3\nValueError: no\n";
-    let faults = [(500, FaultKind::Trap, "unreachable\nat f"), (600, FaultKind::Exception, traceback)];
-    let mut decisions: Vec<_> = faults.map(|(at, kind, message)| decision(at, None, Some((kind, message)))).into();
+    let traceback =
+        "Traceback (most recent call last):\n  File \"main.py\", line 3\nValueError: no\n";
+    let faults =
+        [(500, FaultKind::Trap, "unreachable\nat f"), (600, FaultKind::Exception, traceback)];
+    let mut decisions: Vec<_> =
+        faults.map(|(at, kind, message)| decision(at, None, Some((kind, message)))).into();
     decisions.push(decision(700, None, Some((FaultKind::Trap, "unreachable\nat g"))));
     let text = summary(&Summary { faults: 3, ..replay() }, &digest(decisions), &[], PLAIN);
     assert!(
@@ -157,7 +167,9 @@ fn faults_are_shown_once_per_cause_with_the_line_that_says_most() {
 #[test]
 fn faults_with_ever_new_messages_take_no_more_room() {
     let message = |n: i64| format!("message {n}");
-    let digest = digest((0..50).map(|n| decision(n, None, Some((FaultKind::HostCall, &message(n))))).collect());
+    let digest = digest(
+        (0..50).map(|n| decision(n, None, Some((FaultKind::HostCall, &message(n))))).collect(),
+    );
     assert_eq!((digest.causes.len(), digest.other_faults), (20, 30));
 }
 
@@ -167,14 +179,18 @@ fn a_long_message_of_a_fault_is_cut_where_a_person_reads_it() {
     let fault = decision(500, None, Some((FaultKind::Exception, &long)));
     let text = summary(&Summary { faults: 1, ..replay() }, &digest(vec![fault]), &[], PLAIN);
     let line = text.lines().find(|line| line.contains("exception")).unwrap();
-    assert!(line.contains("\\u{0}\\u{0}") && line.ends_with("m … (all of it is in decisions.jsonl)"), "{line}");
+    assert!(
+        line.contains("\\u{0}\\u{0}") && line.ends_with("m … (all of it is in decisions.jsonl)"),
+        "{line}"
+    );
     assert!(line.chars().count() < 300, "{line}");
 }
 
 #[test]
 fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
     assert!(losses(&replay()).is_empty());
-    let mut lossy = Summary { skipped: 1, log_dropped: 3000, triggers_refused: 1, passed_over: 2, ..replay() };
+    let mut lossy =
+        Summary { skipped: 1, log_dropped: 3000, triggers_refused: 1, passed_over: 2, ..replay() };
     lossy.topics[0].lost = Some(2);
     lossy.topics[0].too_big = 4;
     assert_eq!(
@@ -194,7 +210,10 @@ fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
 fn messages_that_came_out_of_order_are_said_and_are_no_loss() {
     let disordered = Summary { out_of_order: 2, ..replay() };
     let text = summary(&disordered, &digest(Vec::new()), &[], PLAIN);
-    assert!(text.contains("\n  out of order: 2 messages came after one with a later log time\n"), "{text}");
+    assert!(
+        text.contains("\n  out of order: 2 messages came after one with a later log time\n"),
+        "{text}"
+    );
     assert!(losses(&disordered).is_empty());
     assert!(!summary(&replay(), &digest(Vec::new()), &[], PLAIN).contains("order"));
 }
@@ -246,12 +265,16 @@ fn a_clip_is_shown_with_its_length_topics_thumbnail_and_what_is_missing() {
                     short: the drive ended 6.8 s before the window did\n              \
                     lost: 2 messages of /imu/data, before they reached the recorder\n";
     assert!(text.contains(shown), "{text}");
-    assert!(text.ends_with("out/demo: decisions.jsonl, log.jsonl, summary.json, clips.jsonl, clips/\n"), "{text}");
+    assert!(
+        text.ends_with("out/demo: decisions.jsonl, log.jsonl, summary.json, clips.jsonl, clips/\n"),
+        "{text}"
+    );
 }
 
 #[test]
 fn starts_and_stops_are_told_from_events_and_what_made_no_clip_is_counted() {
-    let mut decisions = vec![decision(1000, Some("turn"), None), decision(1100, Some("turn"), None)];
+    let mut decisions =
+        vec![decision(1000, Some("turn"), None), decision(1100, Some("turn"), None)];
     decisions[0].triggers[0].kind = TriggerKind::Start;
     decisions[1].triggers[0].kind = TriggerKind::Stop;
     let recording = Recording { in_cooldown: 2, ignored: 1, pushed_out: 3, ..Recording::default() };
@@ -297,7 +320,9 @@ fn a_verified_journal_says_how_many_decisions_are_the_same_and_what_was_not_comp
     proved.notes = vec!["machine: aarch64 in the journal, x86_64 now".to_owned()];
     let text = verified(&proved, PLAIN);
     assert!(
-        text.starts_with("hello: 4,120 decisions with 2 triggers made again, all the same\n  50 wakes with 1"),
+        text.starts_with(
+            "hello: 4,120 decisions with 2 triggers made again, all the same\n  50 wakes with 1"
+        ),
         "{text}"
     );
     assert!(text.contains("the journal has no end") && text.contains("machine: aarch64"), "{text}");

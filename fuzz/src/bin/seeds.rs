@@ -11,7 +11,10 @@ fn main() -> ExitCode {
     match gleaner_fuzz::seeds::write(Path::new(&folder)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: cannot write to `{}`\n  cause: {error}", Path::new(&folder).display());
+            eprintln!(
+                "error: cannot write to `{}`\n  cause: {error}",
+                Path::new(&folder).display()
+            );
             ExitCode::FAILURE
         }
     }

@@ -15,7 +15,9 @@ use gleaner_host::input::open_inputs;
 use gleaner_journal::{Decoder, Encoder, Entry, Woken};
 use gleaner_lambda::Manifest;
 use gleaner_messages::{Endian, Sources};
-use gleaner_operations::Operation::{AsFrame, Column, Field, Input as Topics, MeanLuma, Newest, Resize, ToGray};
+use gleaner_operations::Operation::{
+    AsFrame, Column, Field, Input as Topics, MeanLuma, Newest, Resize, ToGray,
+};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
 
@@ -23,8 +25,8 @@ use super::pictures::{coded, raw};
 use super::{picture, program};
 use crate::input::Input;
 
-/// What the host may allocate for an input: the pictures that a lambda makes, 4 MiB by the manifest, and as much for all else. Samples and
-/// the memory of the guest are mapped.
+/// What the host may allocate for an input: the pictures that a lambda makes, 4 MiB by the
+/// manifest, and as much for all else. Samples and the memory of the guest are mapped.
 pub(super) const MEMORY: usize = 8 << 20;
 
 /// The largest sample, and what a picture may become; the sound ones have 9 KiB of pixels.
@@ -34,9 +36,11 @@ const DECODED: ByteSize = ByteSize::kib(32);
 /// How long a fault's message is at most: what a panic says is a line of a log.
 const MESSAGE_BYTES: usize = LINE_BYTES + 256;
 
-/// Calls that take all frames there are, and one more. How much fuel they burn tells whether any is missing.
+/// Calls that take all frames there are, and one more. How much fuel they burn tells whether any is
+/// missing.
 fn known_calls() -> Vec<u8> {
-    let (small, gray) = ([(Resize, &[0, 0, 16, 16][..]), (Resize, &[1, 0, 16, 16])], [(ToGray, &[2][..])]);
+    let (small, gray) =
+        ([(Resize, &[0, 0, 16, 16][..]), (Resize, &[1, 0, 16, 16])], [(ToGray, &[2][..])]);
     [
         // The cameras, a field of each, their newest samples, and the pictures of these.
         program(&[(Topics, &[1]), (Topics, &[2]), (Field, &[0, 0, 2]), (Field, &[1, 0, 4])]),
@@ -72,29 +76,40 @@ struct Common {
 fn common() -> &'static Common {
     static COMMON: OnceLock<Common> = OnceLock::new();
     COMMON.get_or_init(|| {
-        let root =
-            Path::new(env!("CARGO_MANIFEST_DIR")).parent().map(PathBuf::from).expect("fuzz/ lies in the checkout");
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .parent()
+            .map(PathBuf::from)
+            .expect("fuzz/ lies in the checkout");
         let lambda = root.join("tests/lambdas/driver/rust/build");
-        let missing = |what: &dyn std::fmt::Display| -> ! { panic!("{what}; run: cargo xtask fuzz calls --seconds 1") };
+        let missing = |what: &dyn std::fmt::Display| -> ! {
+            panic!("{what}; run: cargo xtask fuzz calls --seconds 1")
+        };
         let mut manifest = Manifest::load(&lambda).unwrap_or_else(|error| missing(&error));
-        // All of it is mapped and touched for each input of the fuzzer: a quarter of the time would go there.
+        // All of it is mapped and touched for each input of the fuzzer: a quarter of the time would
+        // go there.
         for input in &mut manifest.inputs {
             input.max_size = SAMPLE;
             input.decoded_size = input.decoded_size.map(|_| DECODED);
         }
         let (code, cache) = (lambda.join("driver.wasm"), root.join("target/test-cache/gleaner"));
         let stack = manifest.limits.stack.as_usize();
-        let loaded = Loaded::open(&code, &cache, stack, Nans::AsMade).unwrap_or_else(|error| missing(&error));
+        let loaded = Loaded::open(&code, &cache, stack, Nans::AsMade)
+            .unwrap_or_else(|error| missing(&error));
         let definition = |name| {
-            let text = Sources::default().find(name).expect("a bundled type is whole").expect("the type is bundled");
+            let text = Sources::default()
+                .find(name)
+                .expect("a bundled type is whole")
+                .expect("the type is bundled");
             (name, text.to_string())
         };
-        let definitions = ["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"].map(definition);
+        let definitions =
+            ["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"].map(definition);
         Common { manifest, loaded, definitions, raw: raw(), coded: coded() }
     })
 }
 
-/// What known calls are answered with, by an instance that is the first on its inputs: the wake's fuel, which tells refusals apart.
+/// What known calls are answered with, by an instance that is the first on its inputs: the wake's
+/// fuel, which tells refusals apart.
 pub(super) fn known() -> Option<u64> {
     static FUEL: OnceLock<Option<u64>> = OnceLock::new();
     *FUEL.get_or_init(|| {
@@ -104,7 +119,8 @@ pub(super) fn known() -> Option<u64> {
     })
 }
 
-/// An instance of `driver` and what it sees. Each input of a fuzzer has one of its own, so that what it does happens again.
+/// An instance of `driver` and what it sees. Each input of a fuzzer has one of its own, so that
+/// what it does happens again.
 pub(super) struct Driver {
     guest: WasmGuest,
     session: Session,
@@ -123,10 +139,11 @@ impl Driver {
         for (topic, (name, text)) in ["/camera/raw", "/camera/coded"].into_iter().zip(definitions) {
             transport.add_topic(topic, name, text);
         }
-        let inputs = open_inputs(manifest, &[], &mut transport, None).expect("the inputs fit into memory");
+        let inputs =
+            open_inputs(manifest, &[], &mut transport, None).expect("the inputs fit into memory");
         let session = Session::new(inputs.clone(), Vec::new(), &manifest.limits);
-        let guest =
-            WasmGuest::new(loaded.clone(), session.clone(), &manifest.limits, None).expect("descriptors are left");
+        let guest = WasmGuest::new(loaded.clone(), session.clone(), &manifest.limits, None)
+            .expect("descriptors are left");
         let unused = inputs.iter().map(Arc::strong_count).collect();
         let mut driver = Self { guest, session, transport, inputs, unused, sent: 0 };
         driver.guest.init().expect("driver does nothing at its start");
@@ -136,7 +153,14 @@ impl Driver {
     fn publish(&mut self, topic: &str, cdr: &[u8], endian: Endian) {
         self.sent += 1;
         let (at_ns, seq) = (self.sent as i64 * 1_000_000, self.sent);
-        let meta = SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian, options: [0; 2] };
+        let meta = SampleMeta {
+            at_ns,
+            publish_ns: at_ns,
+            writer: Guid::default(),
+            seq,
+            endian,
+            options: [0; 2],
+        };
         self.transport.publish(topic, &meta, cdr).expect("the topic was added");
     }
 
@@ -157,14 +181,25 @@ impl Driver {
         self.publish("/program", &cdr, Endian::Little);
         let at_ns = self.sent as i64 * 1_000_000;
         self.session.begin(at_ns);
-        // It keeps what it likes: then there may be no room for the program, and the one before runs again.
+        // It keeps what it likes: then there may be no room for the program, and the one before
+        // runs again.
         let newest = self.inputs[0].newest();
         let ran = newest.as_ref().is_some_and(|sample| sample.identity().seq == self.sent);
         let outcome = newest.map(|sample| self.guest.wake(Wake::Event(sample)));
         let (log, said) = self.session.take_log();
-        let (result, fuel) = outcome.map_or((Ok(()), None), |outcome| (outcome.result, outcome.fuel));
-        let (triggers, cause) = (self.session.end(), Woken::Sample { writer: [0; 16], seq: self.sent });
-        let entry = Entry { at_ns, cause, seen: Vec::new(), triggers, fault: result.err(), fuel, log: said };
+        let (result, fuel) =
+            outcome.map_or((Ok(()), None), |outcome| (outcome.result, outcome.fuel));
+        let (triggers, cause) =
+            (self.session.end(), Woken::Sample { writer: [0; 16], seq: self.sent });
+        let entry = Entry {
+            at_ns,
+            cause,
+            seen: Vec::new(),
+            triggers,
+            fault: result.err(),
+            fuel,
+            log: said,
+        };
         self.hold_to_promises(&entry, &log);
         Woke { ran, entry, log }
     }
@@ -174,14 +209,24 @@ impl Driver {
         match &entry.fault {
             Some(fault) => {
                 let length = fault.message.len();
-                assert!((1..=MESSAGE_BYTES).contains(&length), "a fault with a message of {length} bytes");
+                assert!(
+                    (1..=MESSAGE_BYTES).contains(&length),
+                    "a fault with a message of {length} bytes"
+                );
                 assert_eq!(self.held(), self.unused, "after a fault something of it is still held");
             }
-            None => assert!(entry.fuel.is_none_or(|fuel| fuel <= limits.fuel), "{:?} is more than allowed", entry.fuel),
+            None => assert!(
+                entry.fuel.is_none_or(|fuel| fuel <= limits.fuel),
+                "{:?} is more than allowed",
+                entry.fuel
+            ),
         }
         assert!(entry.triggers.len() <= PER_WAKE);
         for trigger in &entry.triggers {
-            assert!((1..=LABEL_BYTES).contains(&trigger.label.len()) && trigger.attributes.len() <= ATTRIBUTES);
+            assert!(
+                (1..=LABEL_BYTES).contains(&trigger.label.len())
+                    && trigger.attributes.len() <= ATTRIBUTES
+            );
         }
         assert!(log.iter().all(|line| line.message.len() <= LINE_BYTES), "a line that is too long");
         let mut bytes = Vec::new();

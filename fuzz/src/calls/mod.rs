@@ -1,7 +1,8 @@
-//! Calls of a lambda into the host, through the WIT: the component `driver` (`tests/lambdas/driver`) makes those that an input says.
+//! Calls of a lambda into the host, through the WIT: the component `driver`
+//! (`tests/lambdas/driver`) makes those that an input says.
 //!
-//! An input is a list of wakes, with [`WAKE`] between them. A wake is a byte for each of the two pictures, with what it says they
-//! are changed by, and then the program of `driver`.
+//! An input is a list of wakes, with [`WAKE`] between them. A wake is a byte for each of the two
+//! pictures, with what it says they are changed by, and then the program of `driver`.
 
 #[cfg(feature = "calls")]
 mod driver;
@@ -32,7 +33,8 @@ pub fn program(calls: &[(Operation, &[u8])]) -> Vec<u8> {
     calls.iter().flat_map(|(operation, arguments)| Step::Call(*operation).with(arguments)).collect()
 }
 
-/// Makes the calls twice, and then some that are known by another instance. Whether each wake of it could run.
+/// Makes the calls twice, and then some that are known by another instance. Whether each wake of it
+/// could run.
 #[cfg(feature = "calls")]
 pub fn check(data: &[u8]) -> bool {
     use crate::budget;
@@ -58,7 +60,10 @@ pub fn check(data: &[u8]) -> bool {
 fn wakes(data: &[u8]) -> Vec<&[u8]> {
     const WAKES_MAX: usize = 8;
     let (mut wakes, mut rest) = (Vec::new(), data);
-    while let Some(at) = rest.windows(WAKE.len()).position(|word| word == WAKE).filter(|_| wakes.len() < WAKES_MAX - 1)
+    while let Some(at) = rest
+        .windows(WAKE.len())
+        .position(|word| word == WAKE)
+        .filter(|_| wakes.len() < WAKES_MAX - 1)
     {
         wakes.push(&rest[..at]);
         rest = &rest[at + WAKE.len()..];

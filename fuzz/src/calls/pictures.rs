@@ -11,7 +11,13 @@ pub(super) fn raw() -> Vec<Vec<u8>> {
     let image = |(encoding, bytes)| {
         let step = u32::from(WIDTH) * bytes;
         let mut cdr = CdrWriter::new();
-        cdr.time(5_000_000_007).string("camera").u32(HEIGHT.into()).u32(WIDTH.into()).string(encoding).u8(0).u32(step);
+        cdr.time(5_000_000_007)
+            .string("camera")
+            .u32(HEIGHT.into())
+            .u32(WIDTH.into())
+            .string(encoding)
+            .u8(0)
+            .u32(step);
         with_bytes(cdr, &pixels(bytes as usize))
     };
     encodings.map(image).into()
@@ -19,7 +25,12 @@ pub(super) fn raw() -> Vec<Vec<u8>> {
 
 pub(super) fn coded() -> Vec<Vec<u8>> {
     let (rgb, progressive) = (jpeg(ColorType::Rgb, 3, false), jpeg(ColorType::Rgb, 3, true));
-    let files = [("jpeg", rgb), ("jpeg", progressive), ("jpeg", jpeg(ColorType::Luma, 1, false)), ("png", png())];
+    let files = [
+        ("jpeg", rgb),
+        ("jpeg", progressive),
+        ("jpeg", jpeg(ColorType::Luma, 1, false)),
+        ("png", png()),
+    ];
     let image = |(format, file): (&str, Vec<u8>)| {
         let mut cdr = CdrWriter::new();
         cdr.time(5_000_000_007).string("camera").string(format);
@@ -35,14 +46,18 @@ fn with_bytes(mut cdr: CdrWriter, bytes: &[u8]) -> Vec<u8> {
 
 /// Pixels that differ from their neighbours.
 fn pixels(bytes_per_pixel: usize) -> Vec<u8> {
-    (0..usize::from(WIDTH) * usize::from(HEIGHT) * bytes_per_pixel).map(|n| (n * 7 + n / 11) as u8).collect()
+    (0..usize::from(WIDTH) * usize::from(HEIGHT) * bytes_per_pixel)
+        .map(|n| (n * 7 + n / 11) as u8)
+        .collect()
 }
 
 fn jpeg(colour: ColorType, bytes_per_pixel: usize, progressive: bool) -> Vec<u8> {
     let mut file = Vec::new();
     let mut encoder = Encoder::new(&mut file, 80);
     encoder.set_progressive(progressive);
-    encoder.encode(&pixels(bytes_per_pixel), WIDTH, HEIGHT, colour).expect("the pixels are as many as the size says");
+    encoder
+        .encode(&pixels(bytes_per_pixel), WIDTH, HEIGHT, colour)
+        .expect("the pixels are as many as the size says");
     file
 }
 

@@ -48,7 +48,8 @@ pub fn all() -> Vec<Vec<u8>> {
         ),
         "version: 9\n  storage_identifier: mcap\n  files:\n    - path: &a a.mcap\n  custom_data: {x: *a}\n".to_owned(),
     ];
-    let texts = texts.iter().map(|text| format!("rosbag2_bagfile_information:\n  {text}").into_bytes());
+    let texts =
+        texts.iter().map(|text| format!("rosbag2_bagfile_information:\n  {text}").into_bytes());
     let encodings = ["", "ros2msg"];
     texts.chain(encodings.map(database)).collect()
 }
@@ -75,9 +76,11 @@ fn database(encoding: &str) -> Vec<u8> {
         let sql = "INSERT INTO messages (topic_id, timestamp, data) VALUES (?1, ?2, ?3)";
         db.execute(sql, (number % 2 + 1, 1000 + number / 3, data)).expect("the tables are there");
     }
-    let folder = std::env::temp_dir().join(format!("gleaner-seed-{}-{encoding}.db3", std::process::id()));
+    let folder =
+        std::env::temp_dir().join(format!("gleaner-seed-{}-{encoding}.db3", std::process::id()));
     let _ = std::fs::remove_file(&folder);
-    db.execute("VACUUM INTO ?1", [folder.to_str().expect("a temporary folder is text")]).expect("it is writable");
+    db.execute("VACUUM INTO ?1", [folder.to_str().expect("a temporary folder is text")])
+        .expect("it is writable");
     let bytes = std::fs::read(&folder).expect("it was written");
     let _ = std::fs::remove_file(&folder);
     bytes

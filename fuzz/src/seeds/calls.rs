@@ -1,12 +1,15 @@
 //! Programs of `driver`: one for each of its calls, and some that go on for longer.
 
 use gleaner_operations::Operation::{Append, ScratchGet, ScratchPut, Start};
-use gleaner_operations::Operation::{AsFrame, Event, Field, Histogram, Last, Log, MeanLuma, Resize, ToGray};
+use gleaner_operations::Operation::{
+    AsFrame, Event, Field, Histogram, Last, Log, MeanLuma, Resize, ToGray,
+};
 use gleaner_operations::{Extra, Operation, Step, setup};
 
 use crate::calls::{WAKE, program};
 
-/// Words of programs: paths, names of inputs, and arguments. What calls need others before them, seeds have.
+/// Words of programs: paths, names of inputs, and arguments. What calls need others before them,
+/// seeds have.
 pub const WORDS: &[&str] = &[
     "WAKE",
     "program",
@@ -27,12 +30,16 @@ pub const WORDS: &[&str] = &[
 
 /// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
-    let operations = || Operation::ALL.iter().map(|operation| Step::Call(*operation).with(arguments(*operation)));
+    let operations = || {
+        Operation::ALL.iter().map(|operation| Step::Call(*operation).with(arguments(*operation)))
+    };
     let extras = Extra::ALL.map(|extra| Step::Extra(extra).with(taken(extra)));
     let looked = looked();
-    let mut seeds: Vec<_> = operations().chain(extras).map(|step| wake(&[&looked[..], &step].concat())).collect();
+    let mut seeds: Vec<_> =
+        operations().chain(extras).map(|step| wake(&[&looked[..], &step].concat())).collect();
     let each: Vec<_> = operations().flatten().collect();
-    let made = program(&[(Resize, &[0, 0, 60, 50]), (Resize, &[1, 0, 9, 9]), (ToGray, &[0])]).repeat(9);
+    let made =
+        program(&[(Resize, &[0, 0, 60, 50]), (Resize, &[1, 0, 9, 9]), (ToGray, &[0])]).repeat(9);
     let forget = |frame| Step::Extra(Extra::ForgetFrame).with(&[frame]);
     let last = program(&[(Resize, &[1, 0, 0, 0])]);
     let frames = [&looked[..], &made, &forget(3), &forget(0), &last].concat();
@@ -45,7 +52,11 @@ pub fn all() -> Vec<Vec<u8>> {
     let trigger = |n| Step::Call(Event).with(&[1, b'a' + n, 0, 0, 0, 0, 0, 0, 240, 63]);
     let triggers: Vec<u8> = (0..20).flat_map(trigger).collect();
     let long = [255, 0, 0, 31, 0];
-    let said = [Step::Call(Log).with(&[1]), Step::Extra(Extra::Print).with(&[]), Step::Call(Start).with(&[])];
+    let said = [
+        Step::Call(Log).with(&[1]),
+        Step::Extra(Extra::Print).with(&[]),
+        Step::Call(Start).with(&[]),
+    ];
     let texts = said.map(|step| [&step[..], &long].concat()).concat();
     let panic = Step::Extra(Extra::Panic).with(&[0xba, 3, b'n', b'o', b'!']);
     let exit = Step::Extra(Extra::Exit).with(&[0xba, 3]);
@@ -55,14 +66,22 @@ pub fn all() -> Vec<Vec<u8>> {
     let others = [0x12_u8, 0x51, 2, 3, 4, 0x88, 4, 9, 9, 9, 9];
     let glance = program(&[(AsFrame, &[0]), (MeanLuma, &[2, 0])]);
     let kept = [wake(&frames), wake(&glance), wake(&panic), wake(&looked)].join(WAKE);
-    let changed = [vec![1, 0x12, 200, 0, 3], vec![0x5e, 30, 1, 8, 0, 255, 40, 0, 9, 3, 0, 1], vec![0x83, 1, 2, 3, 2]];
+    let changed = [
+        vec![1, 0x12, 200, 0, 3],
+        vec![0x5e, 30, 1, 8, 0, 255, 40, 0, 9, 3, 0, 1],
+        vec![0x83, 1, 2, 3, 2],
+    ];
     let light = Step::Call(Histogram).with(&[0, 0]);
     seeds.extend(changed.map(|pictures| [&pictures[..], &looked, &light].concat()));
-    for program in [&each[..], &frames, &scratch, &triggers, &texts, &panic, &exit, &memory, &fuel, &others] {
+    for program in
+        [&each[..], &frames, &scratch, &triggers, &texts, &panic, &exit, &memory, &fuel, &others]
+    {
         seeds.push(wake(program));
     }
     seeds.push(kept);
-    seeds.push([wake(&scratch), wake(&memory), wake(&scratch), wake(&exit), wake(&triggers)].join(WAKE));
+    seeds.push(
+        [wake(&scratch), wake(&memory), wake(&scratch), wake(&exit), wake(&triggers)].join(WAKE),
+    );
     seeds
 }
 
@@ -86,7 +105,9 @@ fn taken(extra: Extra) -> &'static [u8] {
     match extra {
         Extra::Reset | Extra::Wasi => &[],
         Extra::ForgetTopic | Extra::ForgetField | Extra::ForgetSample | Extra::ForgetFrame => &[1],
-        Extra::EventWithTexts => &[1, b'k', 0, 0, 0, 0, 0, 0, 224, 63, 1, b't', 4, b't', b'e', b'x', b't'],
+        Extra::EventWithTexts => {
+            &[1, b'k', 0, 0, 0, 0, 0, 0, 224, 63, 1, b't', 4, b't', b'e', b'x', b't']
+        }
         Extra::EventWithMany => &[9],
         Extra::ColumnAtOnce => &[1, 2],
         Extra::ScratchPutText | Extra::Print | Extra::PrintError => &[4, b'w', b'o', b'r', b'd'],

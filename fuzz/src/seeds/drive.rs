@@ -1,4 +1,5 @@
-//! Small drives, written in every way that the writer knows; most without checksums, which a fuzzer would not get past.
+//! Small drives, written in every way that the writer knows; most without checksums, which a fuzzer
+//! would not get past.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -43,20 +44,28 @@ pub fn all() -> Vec<Vec<u8>> {
 }
 
 fn drive(options: WriteOptions) -> Vec<u8> {
-    let mut writer = options.create(Cursor::new(Vec::new())).expect("memory takes what is written to it");
-    let schema = writer.add_schema("test_msgs/msg/Number", "ros2msg", b"int64 value\n").expect("a schema");
+    let mut writer =
+        options.create(Cursor::new(Vec::new())).expect("memory takes what is written to it");
+    let schema =
+        writer.add_schema("test_msgs/msg/Number", "ros2msg", b"int64 value\n").expect("a schema");
     let writers = BTreeMap::from([
         ("gleaner.writer".to_owned(), "0123456789abcdef".repeat(2)),
         ("offered_qos_profiles".to_owned(), "- depth: 1".to_owned()),
     ]);
     let channels = [("/a", BTreeMap::new()), ("/b", writers)];
-    let channels =
-        channels.map(|(topic, metadata)| writer.add_channel(schema, topic, "cdr", &metadata).expect("a channel"));
+    let channels = channels.map(|(topic, metadata)| {
+        writer.add_channel(schema, topic, "cdr", &metadata).expect("a channel")
+    });
     for number in 0..8_u64 {
         let channel_id = channels[number as usize % 2];
         // Chunks that overlap in time, so that several are open together.
         let log_time = 1000 + number * 10 - 25 * (number % 3);
-        let header = MessageHeader { channel_id, sequence: number as u32 / 2 + 1, log_time, publish_time: log_time };
+        let header = MessageHeader {
+            channel_id,
+            sequence: number as u32 / 2 + 1,
+            log_time,
+            publish_time: log_time,
+        };
         let data = [&[0, 1, 0, 0][..], &number.to_le_bytes()].concat();
         writer.write_to_known_channel(&header, &data).expect("the channel is known");
     }

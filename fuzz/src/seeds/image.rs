@@ -34,10 +34,15 @@ pub fn all() -> Vec<Vec<u8>> {
     for sampling in [SamplingFactor::F_1_1, SamplingFactor::F_2_1, SamplingFactor::F_2_2] {
         seeds.extend([false, true].map(|progressive| jpeg(ColorType::Rgb, sampling, progressive)));
     }
-    seeds.extend([false, true].map(|progressive| jpeg(ColorType::Luma, SamplingFactor::F_1_1, progressive)));
-    for (colour, channels) in [(Png::Grayscale, 1), (Png::GrayscaleAlpha, 2), (Png::Rgb, 3), (Png::Rgba, 4)] {
+    seeds.extend(
+        [false, true].map(|progressive| jpeg(ColorType::Luma, SamplingFactor::F_1_1, progressive)),
+    );
+    for (colour, channels) in
+        [(Png::Grayscale, 1), (Png::GrayscaleAlpha, 2), (Png::Rgb, 3), (Png::Rgba, 4)]
+    {
         seeds.extend(
-            [(BitDepth::Eight, 1), (BitDepth::Sixteen, 2)].map(|(depth, bytes)| png(colour, depth, channels * bytes)),
+            [(BitDepth::Eight, 1), (BitDepth::Sixteen, 2)]
+                .map(|(depth, bytes)| png(colour, depth, channels * bytes)),
         );
     }
     seeds.push(png(Png::Indexed, BitDepth::Eight, 1));
@@ -56,7 +61,9 @@ fn jpeg(colour: ColorType, sampling: SamplingFactor, progressive: bool) -> Vec<u
     encoder.set_sampling_factor(sampling);
     encoder.set_progressive(progressive);
     let channels = if colour == ColorType::Luma { 1 } else { 3 };
-    encoder.encode(&pixels(channels), SIDE, SIDE, colour).expect("the pixels are as many as the size says");
+    encoder
+        .encode(&pixels(channels), SIDE, SIDE, colour)
+        .expect("the pixels are as many as the size says");
     file
 }
 
@@ -66,10 +73,13 @@ fn png(colour: Png, depth: BitDepth, bytes_per_pixel: usize) -> Vec<u8> {
     encoder.set_color(colour);
     encoder.set_depth(depth);
     if colour == Png::Indexed {
-        encoder.set_palette((0..=255).flat_map(|level| [level, 255 - level, 7]).collect::<Vec<u8>>());
+        encoder
+            .set_palette((0..=255).flat_map(|level| [level, 255 - level, 7]).collect::<Vec<u8>>());
     }
     let mut writer = encoder.write_header().expect("memory takes what is written to it");
-    writer.write_image_data(&pixels(bytes_per_pixel)).expect("the pixels are as many as the size says");
+    writer
+        .write_image_data(&pixels(bytes_per_pixel))
+        .expect("the pixels are as many as the size says");
     writer.finish().expect("memory takes what is written to it");
     file
 }

@@ -104,7 +104,12 @@ pub(super) fn header() -> Header {
 }
 
 pub(super) fn entries() -> Vec<Entry> {
-    let seen = |seq: u64| Seen { new: seq % 40, digest: seq as u32, newest: Some(([7; 16], seq)), reach: 3 };
+    let seen = |seq: u64| Seen {
+        new: seq % 40,
+        digest: seq as u32,
+        newest: Some(([7; 16], seq)),
+        reach: 3,
+    };
     let usual = |seq: u64| Entry {
         at_ns: 1_500_000_000_000_000_000 + 100_000_000 * seq as i64,
         cause: Woken::Sample { writer: [7; 16], seq },
@@ -116,8 +121,18 @@ pub(super) fn entries() -> Vec<Entry> {
     };
     let mut attributes = Map::new();
     attributes.insert("speed".to_owned(), json!([1.5, -0.0, null, "text", { "a": 1e300 }]));
-    let trigger = Trigger { kind: TriggerKind::Event, label: "brake".to_owned(), score: Some(0.5), attributes };
-    let fault = Fault { kind: FaultKind::Fuel, message: "too much".to_owned(), used: Some(9), allowed: Some(8) };
+    let trigger = Trigger {
+        kind: TriggerKind::Event,
+        label: "brake".to_owned(),
+        score: Some(0.5),
+        attributes,
+    };
+    let fault = Fault {
+        kind: FaultKind::Fuel,
+        message: "too much".to_owned(),
+        used: Some(9),
+        allowed: Some(8),
+    };
     vec![
         usual(1),
         Entry { triggers: vec![trigger], ..usual(2) },

@@ -20,9 +20,12 @@ pub fn all() -> Vec<Vec<u8>> {
     let add = Add { lambda: "/lambdas/brake".into(), remaps, most: Limits::MOST };
     let add = serde_json::to_vec(&add).expect("it is JSON");
     let starter = vec![(1, add), (2, Vec::new())];
-    let recorder = vec![(32, Vec::new()), (34, 5_u64.to_le_bytes().to_vec()), (33, b"not today".to_vec())];
+    let recorder =
+        vec![(32, Vec::new()), (34, 5_u64.to_le_bytes().to_vec()), (33, b"not today".to_vec())];
     let all = [(mode::LAMBDA, lambda), (mode::STARTER, starter), (mode::RECORDER, recorder)];
-    all.into_iter().flat_map(|(who, frames)| [as_frames(who, &frames), as_bytes(who, &frames)]).collect()
+    all.into_iter()
+        .flat_map(|(who, frames)| [as_frames(who, &frames), as_bytes(who, &frames)])
+        .collect()
 }
 
 fn as_frames(who: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {

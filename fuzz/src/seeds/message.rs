@@ -57,12 +57,19 @@ pub fn all() -> Vec<Vec<u8>> {
     for (place, order) in (0..TYPES.len()).flat_map(|place| [(place, 0), (place, 1)]) {
         seeds.push([&[mode::BUNDLED, order, place as u8, 0][..], &ones(order)].concat());
     }
-    let defined = |text: &str, body: &[u8]| [&[mode::DEFINED, 0][..], text.as_bytes(), &[0, 0], body].concat();
+    let defined = |text: &str, body: &[u8]| {
+        [&[mode::DEFINED, 0][..], text.as_bytes(), &[0, 0], body].concat()
+    };
     for text in DEFINED {
         seeds.push(defined(text, &ones(0)));
     }
-    for name in ["sensor_msgs/msg/Imu", "diagnostic_msgs/msg/DiagnosticArray", "tf2_msgs/msg/TFMessage"] {
-        let text = Sources::default().find(name).expect("a bundled type is whole").expect("the type is bundled");
+    for name in
+        ["sensor_msgs/msg/Imu", "diagnostic_msgs/msg/DiagnosticArray", "tf2_msgs/msg/TFMessage"]
+    {
+        let text = Sources::default()
+            .find(name)
+            .expect("a bundled type is whole")
+            .expect("the type is bundled");
         seeds.push(defined(&text, &ones(0)));
     }
     seeds.extend([image(), compressed()]);

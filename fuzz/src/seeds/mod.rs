@@ -1,4 +1,5 @@
-//! What a fuzzer begins with: small sound inputs, made anew when they are needed, so that none has to be kept.
+//! What a fuzzer begins with: small sound inputs, made anew when they are needed, so that none has
+//! to be kept.
 
 pub mod bag;
 pub mod calls;
@@ -15,8 +16,8 @@ use std::path::Path;
 
 use crate::TARGETS;
 
-/// Writes the seeds of each target to files in a folder of its name, its words to `<name>.dict`, as libFuzzer reads them, and the
-/// longest input to `<name>.longest`, in bytes.
+/// Writes the seeds of each target to files in a folder of its name, its words to `<name>.dict`, as
+/// libFuzzer reads them, and the longest input to `<name>.longest`, in bytes.
 ///
 /// # Errors
 ///
@@ -38,5 +39,11 @@ pub fn write(folder: &Path) -> io::Result<()> {
 /// libFuzzer knows bytes as hexadecimal digits, and no other escapes that are worth it.
 fn escaped(word: &str) -> String {
     let plain = |byte: u8| (byte.is_ascii_graphic() || byte == b' ') && !b"\"\\".contains(&byte);
-    word.bytes().map(|byte| if plain(byte) { char::from(byte).to_string() } else { format!("\\x{byte:02x}") }).collect()
+    word.bytes()
+        .map(
+            |byte| {
+                if plain(byte) { char::from(byte).to_string() } else { format!("\\x{byte:02x}") }
+            },
+        )
+        .collect()
 }

@@ -1,37 +1,47 @@
 //! An image in fewer pixels.
 //!
-//! Each axis by itself: cut the axis of `from` pixels into `from * to` pieces, then an old pixel is `to` of them and a new one
-//! `from`, and the weight of an old pixel in a new one is the number of pieces that they share. So a result is an exact fraction,
-//! rounded once.
+//! Each axis by itself: cut the axis of `from` pixels into `from * to` pieces, then an old pixel is
+//! `to` of them and a new one `from`, and the weight of an old pixel in a new one is the number of
+//! pieces that they share. So a result is an exact fraction, rounded once.
 
 use super::{Colours, Image, ImageError};
 
 /// Bytes of a row that are weighed in one turn.
 const TURN: usize = 64;
 
-/// Bytes that [`downscale`] of `image` to `width` x `height` writes: three for each pixel of a coloured image, one of a grey one.
+/// Bytes that [`downscale`] of `image` to `width` x `height` writes: three for each pixel of a
+/// coloured image, one of a grey one.
 ///
 /// # Errors
 ///
 /// [`ImageError::ResizeTo`] if a side is 0 or longer than before.
 pub fn downscaled(image: &Image<'_>, width: u32, height: u32) -> Result<usize, ImageError> {
     if !(1..=image.width()).contains(&width) || !(1..=image.height()).contains(&height) {
-        return Err(ImageError::ResizeTo { from: (image.width(), image.height()), to: (width, height) });
+        return Err(ImageError::ResizeTo {
+            from: (image.width(), image.height()),
+            to: (width, height),
+        });
     }
     // No more than the image has.
     Ok(width as usize * height as usize * image.pixel())
 }
 
-/// Writes the image in `width` x `height` pixels to `out`, without padding: rgb8 of a coloured image (also of bgr8), mono8 of a
-/// grey one. It is what [`Frame::resize`](crate::Frame::resize) makes, byte for byte, where no side grows.
+/// Writes the image in `width` x `height` pixels to `out`, without padding: rgb8 of a coloured
+/// image (also of bgr8), mono8 of a grey one. It is what [`Frame::resize`](crate::Frame::resize)
+/// makes, byte for byte, where no side grows.
 ///
-/// A new pixel is the mean of the area that it covers, exact and rounded to nearest (a half goes up). Takes memory of 4 bytes for
-/// each byte in a row of the old image.
+/// A new pixel is the mean of the area that it covers, exact and rounded to nearest (a half goes
+/// up). Takes memory of 4 bytes for each byte in a row of the old image.
 ///
 /// # Errors
 ///
 /// As [`downscaled`], and [`ImageError::Output`] if `out` has another length.
-pub fn downscale(image: &Image<'_>, width: u32, height: u32, out: &mut [u8]) -> Result<(), ImageError> {
+pub fn downscale(
+    image: &Image<'_>,
+    width: u32,
+    height: u32,
+    out: &mut [u8],
+) -> Result<(), ImageError> {
     let needed = downscaled(image, width, height)?;
     if out.len() != needed {
         return Err(ImageError::Output { needed, found: out.len() });
@@ -49,16 +59,19 @@ pub fn downscale(image: &Image<'_>, width: u32, height: u32, out: &mut [u8]) -> 
         match image.colours {
             Colours::Grey => blend(&columns, across, rounded, line, |[grey]| [grey]),
             Colours::Rgb => blend(&columns, across, rounded, line, |rgb: [u8; 3]| rgb),
-            Colours::Bgr => blend(&columns, across, rounded, line, |[blue, green, red]| [red, green, blue]),
+            Colours::Bgr => {
+                blend(&columns, across, rounded, line, |[blue, green, red]| [red, green, blue])
+            }
         }
     }
     Ok(())
 }
 
-/// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no sum reaches 2^24; checked
-/// arithmetic would not become a vector's.
+/// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no
+/// sum reaches 2^24; checked arithmetic would not become a vector's.
 fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
-    let add = |sum: &mut u32, byte: &u8| *sum = sum.wrapping_add(weight.wrapping_mul(u32::from(*byte)));
+    let add =
+        |sum: &mut u32, byte: &u8| *sum = sum.wrapping_add(weight.wrapping_mul(u32::from(*byte)));
     let (turns, rest) = row.as_chunks::<TURN>();
     let (column_turns, column_rest) = columns.as_chunks_mut::<TURN>();
     for (sums, bytes) in column_turns.iter_mut().zip(turns) {
@@ -83,7 +96,9 @@ fn blend<const N: usize>(
     for (x, pixel) in (0..).zip(line.as_chunks_mut::<N>().0) {
         let taps = across.taps(x);
         let mut sums = [0_u64; N];
-        for (source, values) in (taps.first..).zip(&columns[taps.first as usize..=taps.last as usize]) {
+        for (source, values) in
+            (taps.first..).zip(&columns[taps.first as usize..=taps.last as usize])
+        {
             let weight = u64::from(across.weight(taps, source));
             for (sum, value) in sums.iter_mut().zip(values) {
                 // Below 2^16 * 2^24.
@@ -119,8 +134,8 @@ impl Axis {
         Self { from: from / divisor, to: to / divisor }
     }
 
-    /// What new pixel `at` is made of; `from` is the sum of all weights. No product is larger than the square of
-    /// [`MAX_SIDE`](super::MAX_SIDE), which fits a `u32`.
+    /// What new pixel `at` is made of; `from` is the sum of all weights. No product is larger than
+    /// the square of [`MAX_SIDE`](super::MAX_SIDE), which fits a `u32`.
     fn taps(self, at: u32) -> Taps {
         let Self { from, to } = self;
         let (start, end) = (at * from, (at + 1) * from);
@@ -150,9 +165,10 @@ struct Rounded {
 impl Rounded {
     const SHIFT: u32 = 55;
 
-    /// A sum and half of `total` are below 256 * total. The factor is too large by less than 1, which moves the quotient by
-    /// less than 256 * total / 2^55. Up to a total of 2^23 that is at most 1 / total, too little to reach the next whole number;
-    /// and no product exceeds 2^63 + 2^31.
+    /// A sum and half of `total` are below 256 * total. The factor is too large by less than 1,
+    /// which moves the quotient by less than 256 * total / 2^55. Up to a total of 2^23 that is at
+    /// most 1 / total, too little to reach the next whole number; and no product exceeds 2^63 +
+    /// 2^31.
     fn to(total: u64) -> Self {
         let factor = (total <= 1 << 23).then(|| (1_u64 << Self::SHIFT).div_ceil(total));
         Self { total, factor }
@@ -174,13 +190,29 @@ mod tests {
 
     #[test]
     fn a_product_divides_as_a_division_does() {
-        for total in [1, 2, 3, 7, 1000, 65_535, 2_073_600, (1 << 23) - 1, 1 << 23, (1 << 23) + 1, 4_294_836_225] {
+        for total in [
+            1,
+            2,
+            3,
+            7,
+            1000,
+            65_535,
+            2_073_600,
+            (1 << 23) - 1,
+            1 << 23,
+            (1 << 23) + 1,
+            4_294_836_225,
+        ] {
             let rounded = Rounded::to(total);
             for level in 0..=255 {
                 // Around the places where the result changes.
                 let edge = level * total + total.div_ceil(2);
                 for sum in (edge.saturating_sub(2)..edge + 2).filter(|sum| *sum <= 255 * total) {
-                    assert_eq!(u64::from(rounded.divide(sum)), (sum + total / 2) / total, "{sum} / {total}");
+                    assert_eq!(
+                        u64::from(rounded.divide(sum)),
+                        (sum + total / 2) / total,
+                        "{sum} / {total}"
+                    );
                 }
             }
         }
@@ -205,7 +237,9 @@ mod tests {
     #[test]
     fn growing_and_wrong_places_are_refused() {
         let image = Image::new(2, 1, 2, Encoding::Mono8, &[1, 2]).unwrap();
-        let refused = |width, height, out| downscale(&image, width, height, &mut vec![0; out]).unwrap_err().to_string();
+        let refused = |width, height, out| {
+            downscale(&image, width, height, &mut vec![0; out]).unwrap_err().to_string()
+        };
         assert!(refused(3, 1, 3).starts_with("2x1 pixels cannot become 3x1"));
         assert!(refused(0, 1, 0).starts_with("2x1 pixels cannot become 0x1"));
         assert_eq!(refused(1, 1, 2), "the result takes 1 bytes; the place for it has 2");

@@ -22,18 +22,20 @@ impl Real for f64 {}
 
 /// The power spectral density of signals of one length, planned once: make it in `init`.
 ///
-/// Per signal `x` of `n` samples, oldest first, at `rate_hz`, with the periodic Hann window `w[j] = (1 - cos(2 pi j / n)) / 2`:
+/// Per signal `x` of `n` samples, oldest first, at `rate_hz`, with the periodic Hann window `w[j] =
+/// (1 - cos(2 pi j / n)) / 2`:
 ///
 /// ```text
 /// density[k] = c[k] |sum over j of w[j] x[j] exp(-2 pi i j k / n)|^2 / (rate_hz * sum over j of w[j]^2)
 /// ```
 ///
-/// for the bins `k` of 0 to `n / 2`, which lie at `k * rate_hz / n`; `c` is 1 for the first and the last bin and 2 for those between, which
-/// stand for negative frequencies as well. Its unit is that of the signal, squared, per Hz: (m/s²)²/Hz of an acceleration. The mean is
-/// not taken out: it is in the first bin and, by the window, half as much in the second.
+/// for the bins `k` of 0 to `n / 2`, which lie at `k * rate_hz / n`; `c` is 1 for the first and the
+/// last bin and 2 for those between, which stand for negative frequencies as well. Its unit is that
+/// of the signal, squared, per Hz: (m/s²)²/Hz of an acceleration. The mean is not taken out: it is
+/// in the first bin and, by the window, half as much in the second.
 ///
-/// On one machine and in every component it gives the same bits again. A component and a native test agree to the last few bits
-/// only: sine and cosine come from other libraries.
+/// On one machine and in every component it gives the same bits again. A component and a native
+/// test agree to the last few bits only: sine and cosine come from other libraries.
 ///
 /// ```
 /// use gleaner_sdk::kernels::fft::{Spectrum, band_power};
@@ -47,7 +49,8 @@ impl Real for f64 {}
 /// assert!((power - 2.0).abs() < 1e-12);
 /// ```
 ///
-/// Source: P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra" (1967), for a single segment.
+/// Source: P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra"
+/// (1967), for a single segment.
 pub struct Spectrum<T: Real> {
     /// Of half the length: two samples are one complex number.
     fft: Arc<dyn Fft<T>>,
@@ -66,8 +69,8 @@ impl<T: Real> Spectrum<T> {
     ///
     /// # Errors
     ///
-    /// [`SpectrumError::Samples`] unless `samples` is even and from 4 to [`MAX_SAMPLES`]; [`SpectrumError::Rate`] unless `rate_hz` is
-    /// finite and above 0.
+    /// [`SpectrumError::Samples`] unless `samples` is even and from 4 to [`MAX_SAMPLES`];
+    /// [`SpectrumError::Rate`] unless `rate_hz` is finite and above 0.
     pub fn hann(samples: usize, rate_hz: f64) -> Result<Self, SpectrumError> {
         if !samples.is_multiple_of(2) || !(4..=MAX_SAMPLES).contains(&samples) {
             return Err(SpectrumError::Samples { samples });
@@ -77,12 +80,14 @@ impl<T: Real> Spectrum<T> {
         }
         let (n, half) = (samples as f64, samples / 2);
         let fft = FftPlanner::new().plan_fft_forward(half);
-        let window = (0..samples).map(|j| 0.5 - 0.5 * (TAU * j as f64 / n).cos()).collect::<Vec<_>>();
+        let window =
+            (0..samples).map(|j| 0.5 - 0.5 * (TAU * j as f64 / n).cos()).collect::<Vec<_>>();
         let turn = |k: usize| {
             let (sine, cosine) = (TAU * k as f64 / n).sin_cos();
             Complex::new(real(cosine), real(-sine))
         };
-        // `untangle` leaves each amplitude twice as large as it is, and a bin between stands for two.
+        // `untangle` leaves each amplitude twice as large as it is, and a bin between stands for
+        // two.
         let energy = window.iter().map(|weight| weight * weight).sum::<f64>();
         Ok(Self {
             window: window.into_iter().map(real).collect(),
@@ -110,8 +115,9 @@ impl<T: Real> Spectrum<T> {
         self.bin_hz
     }
 
-    /// Writes the density of `signal`, one of [`samples`](Self::samples), oldest first, to `density`, which has
-    /// [`bins`](Self::bins). Takes no memory. A NaN or an infinity in the signal makes bins NaN.
+    /// Writes the density of `signal`, one of [`samples`](Self::samples), oldest first, to
+    /// `density`, which has [`bins`](Self::bins). Takes no memory. A NaN or an infinity in the
+    /// signal makes bins NaN.
     ///
     /// # Errors
     ///
@@ -136,23 +142,27 @@ impl<T: Real> Spectrum<T> {
         let (signal, window) = (signal.as_chunks::<2>().0, self.window.as_chunks::<2>().0);
         let pair = |[even, odd]: [T; 2], [a, b]: [T; 2]| Complex::new(even * a, odd * b);
         let (packed, packed_rest) = self.packed.as_chunks_mut::<TURN>();
-        let ((signal, signal_rest), (window, window_rest)) = (signal.as_chunks::<TURN>(), window.as_chunks::<TURN>());
+        let ((signal, signal_rest), (window, window_rest)) =
+            (signal.as_chunks::<TURN>(), window.as_chunks::<TURN>());
         for ((packed, samples), weights) in packed.iter_mut().zip(signal).zip(window) {
             *packed = std::array::from_fn(|at| pair(samples[at], weights[at]));
         }
-        for ((packed, samples), weights) in packed_rest.iter_mut().zip(signal_rest).zip(window_rest) {
+        for ((packed, samples), weights) in packed_rest.iter_mut().zip(signal_rest).zip(window_rest)
+        {
             *packed = pair(*samples, *weights);
         }
     }
 
     /// From the transform of the packed signal to the density of the signal itself.
     ///
-    /// With Z the former, E = Z[k] + conj(Z[h - k]) is twice the transform of the even samples and O = -i (Z[k] - conj(Z[h - k])) twice
-    /// that of the odd ones; E + turns[k] O is then twice that of the signal at bin k, and E - turns[k] O, conjugated, at h - k.
+    /// With Z the former, E = Z[k] + conj(Z[h - k]) is twice the transform of the even samples and
+    /// O = -i (Z[k] - conj(Z[h - k])) twice that of the odd ones; E + turns[k] O is then twice that
+    /// of the signal at bin k, and E - turns[k] O, conjugated, at h - k.
     fn untangle(&self, density: &mut [T]) {
         let half = self.packed.len();
         let first = self.packed[0];
-        // The first and the last bin are real, and stand for themselves alone: half the scale, of the square of twice the sum.
+        // The first and the last bin are real, and stand for themselves alone: half the scale, of
+        // the square of twice the sum.
         let two = T::one() + T::one();
         density[0] = two * self.scale * (first.re + first.im) * (first.re + first.im);
         density[half] = two * self.scale * (first.re - first.im) * (first.re - first.im);
@@ -172,13 +182,17 @@ impl<T: Real> Spectrum<T> {
         let (back_rest, back) = self.packed[half - pairs..].as_rchunks::<TURN>();
         let (turns, turns_rest) = self.turns[1..=pairs].as_chunks::<TURN>();
         let inputs = ahead.iter().zip(back.iter().rev()).zip(turns);
-        for ((low, high), ((ahead, back), turns)) in low.iter_mut().zip(high.iter_mut().rev()).zip(inputs) {
+        for ((low, high), ((ahead, back), turns)) in
+            low.iter_mut().zip(high.iter_mut().rev()).zip(inputs)
+        {
             for at in 0..TURN {
                 (low[at], high[TURN - 1 - at]) = both(ahead[at], back[TURN - 1 - at], turns[at]);
             }
         }
         let inputs = ahead_rest.iter().zip(back_rest.iter().rev()).zip(turns_rest);
-        for ((low, high), ((ahead, back), turn)) in low_rest.iter_mut().zip(high_rest.iter_mut().rev()).zip(inputs) {
+        for ((low, high), ((ahead, back), turn)) in
+            low_rest.iter_mut().zip(high_rest.iter_mut().rev()).zip(inputs)
+        {
             (*low, *high) = both(*ahead, *back, *turn);
         }
         if half.is_multiple_of(2) {
@@ -188,8 +202,9 @@ impl<T: Real> Spectrum<T> {
     }
 }
 
-/// Power between `low_hz` and `high_hz`: the sum of the bins of `density` from `low_hz` on and below `high_hz`, times their distance
-/// `bin_hz`. In the unit of the signal, squared: a sine of amplitude a, well inside, has a² / 2. Bands that touch share no bin.
+/// Power between `low_hz` and `high_hz`: the sum of the bins of `density` from `low_hz` on and
+/// below `high_hz`, times their distance `bin_hz`. In the unit of the signal, squared: a sine of
+/// amplitude a, well inside, has a² / 2. Bands that touch share no bin.
 ///
 /// Source: Parseval's theorem.
 pub fn band_power<T: Real>(density: &[T], bin_hz: f64, low_hz: f64, high_hz: f64) -> T {
@@ -219,11 +234,18 @@ impl fmt::Display for SpectrumError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Samples { samples } => {
-                write!(f, "a spectrum of {samples} samples; their number is even, and from 4 to {MAX_SAMPLES}")
+                write!(
+                    f,
+                    "a spectrum of {samples} samples; their number is even, and from 4 to {MAX_SAMPLES}"
+                )
             }
             Self::Rate { rate_hz } => write!(f, "a rate of {rate_hz} Hz; it is finite and above 0"),
-            Self::Signal { needed, found } => write!(f, "the spectrum is of {needed} samples; the signal has {found}"),
-            Self::Density { needed, found } => write!(f, "the density has {needed} bins; the place for it has {found}"),
+            Self::Signal { needed, found } => {
+                write!(f, "the spectrum is of {needed} samples; the signal has {found}")
+            }
+            Self::Density { needed, found } => {
+                write!(f, "the density has {needed} bins; the place for it has {found}")
+            }
         }
     }
 }
@@ -279,9 +301,17 @@ mod tests {
             let largest = expected.iter().copied().fold(0.0, f64::max);
             for (bin, expected) in expected.iter().enumerate() {
                 let off = (ours[bin] - expected).abs() / largest;
-                assert!(off < 1e-13, "{samples} samples, bin {bin}: {} is not {expected}", ours[bin]);
+                assert!(
+                    off < 1e-13,
+                    "{samples} samples, bin {bin}: {} is not {expected}",
+                    ours[bin]
+                );
                 let off = (f64::from(single[bin]) - expected).abs() / largest;
-                assert!(off < 1e-5, "{samples} samples of f32, bin {bin}: {} is not {expected}", single[bin]);
+                assert!(
+                    off < 1e-5,
+                    "{samples} samples of f32, bin {bin}: {} is not {expected}",
+                    single[bin]
+                );
             }
         }
     }
@@ -292,7 +322,8 @@ mod tests {
         let power = band_power(&density(&signal, 50.0), 50.0 / 128.0, 0.0, f64::INFINITY);
         let window = |j: usize| (std::f64::consts::PI * j as f64 / 128.0).sin().powi(2);
         let energy = (0..128).map(|j| window(j).powi(2)).sum::<f64>();
-        let expected = signal.iter().enumerate().map(|(j, x)| (window(j) * x).powi(2)).sum::<f64>() / energy;
+        let expected =
+            signal.iter().enumerate().map(|(j, x)| (window(j) * x).powi(2)).sum::<f64>() / energy;
         assert!((power / expected - 1.0).abs() < 1e-12, "{power} is not {expected}");
     }
 
@@ -317,9 +348,15 @@ mod tests {
 
     #[test]
     fn what_cannot_be_planned_or_does_not_fit_is_refused() {
-        let refused = |samples, rate_hz| Spectrum::<f64>::hann(samples, rate_hz).err().map(|error| error.to_string());
+        let refused = |samples, rate_hz| {
+            Spectrum::<f64>::hann(samples, rate_hz).err().map(|error| error.to_string())
+        };
         for samples in [0, 2, 63, MAX_SAMPLES + 2] {
-            assert!(refused(samples, 1.0).unwrap().starts_with(&format!("a spectrum of {samples} samples")));
+            assert!(
+                refused(samples, 1.0)
+                    .unwrap()
+                    .starts_with(&format!("a spectrum of {samples} samples"))
+            );
         }
         for rate_hz in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             assert!(refused(64, rate_hz).unwrap().starts_with("a rate of "));

@@ -12,8 +12,8 @@ const TURN: usize = 32;
 /// Tables that are counted in by turns: one that has just been written to is slow to read.
 const TABLES: usize = 4;
 
-/// How many pixels have each grey level: what [`Frame::histogram`](crate::Frame::histogram) says, with the levels of
-/// [`to_gray`](super::luma::to_gray).
+/// How many pixels have each grey level: what [`Frame::histogram`](crate::Frame::histogram) says,
+/// with the levels of [`to_gray`](super::luma::to_gray).
 pub fn histogram(image: &Image<'_>) -> [u32; 256] {
     // 65,535^2 pixels of one level still fit a `u32`.
     let mut tables = [[0_u32; 256]; TABLES];
@@ -56,7 +56,8 @@ mod tests {
         let image = Image::new(333, 3, 333, Encoding::Mono8, &levels).unwrap();
         let counts = histogram(&image);
         for (level, count) in counts.iter().enumerate() {
-            let expected = levels[..999].iter().filter(|found| usize::from(**found) == level).count();
+            let expected =
+                levels[..999].iter().filter(|found| usize::from(**found) == level).count();
             assert_eq!(*count as usize, expected, "level {level}");
         }
     }

@@ -4,11 +4,12 @@ use std::hint::black_box;
 
 use super::{Colours, Image, ImageError};
 
-/// Byte positions that are summed side by side: whole pixels of 1 and 3 bytes, and whole vectors of 16.
+/// Byte positions that are summed side by side: whole pixels of 1 and 3 bytes, and whole vectors of
+/// 16.
 const LANES: usize = 48;
 
-/// Bytes that are summed in a turn of the loop: four for each lane. An array of arrays, so that the distance of each vector from the
-/// first stands in the instruction that loads it.
+/// Bytes that are summed in a turn of the loop: four for each lane. An array of arrays, so that the
+/// distance of each vector from the first stands in the instruction that loads it.
 type Turn = [[u8; LANES]; 4];
 
 /// Turns after which sums of 16 bits must be emptied: 64 * 4 * 255 = 65,280.
@@ -19,7 +20,8 @@ const PIXELS: usize = 32;
 
 /// Mean luma, 0 to 255: what [`Frame::mean_luma`](crate::Frame::mean_luma) says, bit for bit.
 ///
-/// Luma is (299 R + 587 G + 114 B) / 1000, and the value itself for mono8. The sums are exact and divided once.
+/// Luma is (299 R + 587 G + 114 B) / 1000, and the value itself for mono8. The sums are exact and
+/// divided once.
 ///
 /// Source: luma weights of ITU-R BT.601.
 pub fn mean_luma(image: &Image<'_>) -> f64 {
@@ -63,16 +65,19 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
     }
 }
 
-/// Sums of at most [`TURNS`] turns. By itself, since together with what surrounds it the compiler finds no vectors in it.
+/// Sums of at most [`TURNS`] turns. By itself, since together with what surrounds it the compiler
+/// finds no vectors in it.
 ///
-/// Two bytes at a time are a number of 16 bits: the upper bytes are summed, and the whole numbers. What the upper bytes make of the
-/// latter is taken off at the end; modulo 2^16, since that sum wraps. A checked addition would not become a vector's.
+/// Two bytes at a time are a number of 16 bits: the upper bytes are summed, and the whole numbers.
+/// What the upper bytes make of the latter is taken off at the end; modulo 2^16, since that sum
+/// wraps. A checked addition would not become a vector's.
 #[inline(never)]
 fn short_sums(turns: &[Turn]) -> [u16; LANES] {
     let mut whole = [0_u16; LANES / 2];
     let mut upper = [0_u16; LANES / 2];
     for turn in turns {
-        // Or some compilers sum over turns instead, and gather single bytes for that. It changes no result.
+        // Or some compilers sum over turns instead, and gather single bytes for that. It changes no
+        // result.
         let turn = black_box(turn);
         for group in turn {
             for (lane, bytes) in group.as_chunks::<2>().0.iter().enumerate() {
@@ -88,8 +93,9 @@ fn short_sums(turns: &[Turn]) -> [u16; LANES] {
     })
 }
 
-/// Writes the image as mono8 to `out`, without padding, width * height bytes: what [`Frame::to_gray`](crate::Frame::to_gray)
-/// makes, byte for byte. A grey level is the luma of [`mean_luma`], rounded down.
+/// Writes the image as mono8 to `out`, without padding, width * height bytes: what
+/// [`Frame::to_gray`](crate::Frame::to_gray) makes, byte for byte. A grey level is the luma of
+/// [`mean_luma`], rounded down.
 ///
 /// # Errors
 ///
@@ -118,7 +124,9 @@ fn weigh<const RED: usize, const BLUE: usize>(row: &[u8], levels: &mut [u8]) {
     let (groups, rest) = row.as_chunks::<{ 3 * PIXELS }>();
     let (grey_groups, grey_rest) = levels.as_chunks_mut::<PIXELS>();
     for (group, levels) in groups.iter().zip(grey_groups) {
-        *levels = std::array::from_fn(|at| luma_of(group[3 * at + RED], group[3 * at + 1], group[3 * at + BLUE]));
+        *levels = std::array::from_fn(|at| {
+            luma_of(group[3 * at + RED], group[3 * at + 1], group[3 * at + BLUE])
+        });
     }
     for (pixel, level) in rest.as_chunks::<3>().0.iter().zip(grey_rest) {
         *level = luma_of(pixel[RED], pixel[1], pixel[BLUE]);
@@ -128,8 +136,8 @@ fn weigh<const RED: usize, const BLUE: usize>(row: &[u8], levels: &mut [u8]) {
 /// (299 R + 587 G + 114 B) / 1000, rounded down.
 fn luma_of(red: u8, green: u8, blue: u8) -> u8 {
     let thousandths = 299 * u32::from(red) + 587 * u32::from(green) + 114 * u32::from(blue);
-    // A division by 8 and one by 125, as vectors have none: 33,555 / 2^22 exceeds 1 / 125 by so little that no quotient of numbers
-    // up to 255,000 / 8 changes. No product reaches 2^31.
+    // A division by 8 and one by 125, as vectors have none: 33,555 / 2^22 exceeds 1 / 125 by so
+    // little that no quotient of numbers up to 255,000 / 8 changes. No product reaches 2^31.
     (((thousandths >> 3) * 33_555) >> 22) as u8
 }
 

@@ -6,13 +6,16 @@ use super::{Colours, Image};
 /// Sums that are kept side by side.
 const LANES: usize = 16;
 
-/// Values that are added in a turn of the loop: to keep the sums while fuel and deadline are looked at takes as long as to add 16.
+/// Values that are added in a turn of the loop: to keep the sums while fuel and deadline are looked
+/// at takes as long as to add 16.
 const TURN: usize = 8 * LANES;
 
-/// Arithmetic mean of `values`, of any number type that fits an `f64`; none if there are none. In the unit of the values.
+/// Arithmetic mean of `values`, of any number type that fits an `f64`; none if there are none. In
+/// the unit of the values.
 ///
-/// Sixteen sums are kept side by side and added up in a fixed order, so the result is equal on every machine; it may differ in
-/// its last bits from a sum from left to right, such as [`Column::mean`](crate::Column::mean), and is the more exact one.
+/// Sixteen sums are kept side by side and added up in a fixed order, so the result is equal on
+/// every machine; it may differ in its last bits from a sum from left to right, such as
+/// [`Column::mean`](crate::Column::mean), and is the more exact one.
 pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
     let (turns, rest) = values.as_chunks::<TURN>();
     let mut lanes = long_sums(turns);
@@ -24,7 +27,8 @@ pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
     (!values.is_empty()).then(|| lanes.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Sums of every sixteenth value. By itself, since together with what surrounds it the compiler finds no vectors in it.
+/// Sums of every sixteenth value. By itself, since together with what surrounds it the compiler
+/// finds no vectors in it.
 #[inline(never)]
 fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
     let mut lanes = [0.0_f64; LANES];
@@ -38,7 +42,8 @@ fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
     lanes
 }
 
-/// Mean of red, green and blue, each 0 to 255; of a mono8 image, three times that of its grey. The sums are exact.
+/// Mean of red, green and blue, each 0 to 255; of a mono8 image, three times that of its grey. The
+/// sums are exact.
 pub fn mean_rgb(image: &Image<'_>) -> [f64; 3] {
     let count = (image.width * image.height) as f64;
     let [first, second, third] = sums(image).map(|sum| sum as f64 / count);

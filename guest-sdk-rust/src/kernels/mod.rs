@@ -1,14 +1,17 @@
 //! Arithmetic on pixels and signals inside of a lambda.
 //!
-//! Each kernel is a plain function over slices, tested natively as any Rust code. The same source becomes vector instructions
-//! of 128 bits in a component, which `gleaner build` compiles with `simd128`, and on the machine it is tested on. Loops handle 64
-//! bytes and more at a time: fuel and deadline are checked once for each turn, so that this costs little.
+//! Each kernel is a plain function over slices, tested natively as any Rust code. The same source
+//! becomes vector instructions of 128 bits in a component, which `gleaner build` compiles with
+//! `simd128`, and on the machine it is tested on. Loops handle 64 bytes and more at a time: fuel
+//! and deadline are checked once for each turn, so that this costs little.
 //!
-//! Kernels on pixels compute in integers and give, bit for bit, what the operation of the same name on a [`Frame`](crate::Frame)
-//! gives. Ask the frame first: the host reads its pixels where they are, while a kernel needs them copied into the lambda. Kernels
-//! are for pixels that the lambda has anyway, or has changed. `docs/kernels.md` says what each way costs.
+//! Kernels on pixels compute in integers and give, bit for bit, what the operation of the same name
+//! on a [`Frame`](crate::Frame) gives. Ask the frame first: the host reads its pixels where they
+//! are, while a kernel needs them copied into the lambda. Kernels are for pixels that the lambda
+//! has anyway, or has changed. `docs/kernels.md` says what each way costs.
 //!
-//! Never: a call to the host; memory taken in a loop, except where a function says so; pixels other than rgb8, bgr8 and mono8.
+//! Never: a call to the host; memory taken in a loop, except where a function says so; pixels other
+//! than rgb8, bgr8 and mono8.
 
 pub mod downscale;
 #[cfg(feature = "fft")]
@@ -52,14 +55,22 @@ enum Colours {
 }
 
 impl<'a> Image<'a> {
-    /// The image of `width` x `height` pixels in `data`, where a row starts every `step` bytes. Bytes behind a row and behind
-    /// the image are ignored; those behind the last row may be missing.
+    /// The image of `width` x `height` pixels in `data`, where a row starts every `step` bytes.
+    /// Bytes behind a row and behind the image are ignored; those behind the last row may be
+    /// missing.
     ///
     /// # Errors
     ///
-    /// [`ImageError::Encoding`] unless the pixels are rgb8, bgr8 or mono8; [`ImageError::Size`] if a side is 0 or above
-    /// [`MAX_SIDE`]; [`ImageError::Step`] and [`ImageError::Data`] if rows or image do not fit.
-    pub fn new(width: u32, height: u32, step: u32, encoding: Encoding, data: &'a [u8]) -> Result<Self, ImageError> {
+    /// [`ImageError::Encoding`] unless the pixels are rgb8, bgr8 or mono8; [`ImageError::Size`] if
+    /// a side is 0 or above [`MAX_SIDE`]; [`ImageError::Step`] and [`ImageError::Data`] if rows or
+    /// image do not fit.
+    pub fn new(
+        width: u32,
+        height: u32,
+        step: u32,
+        encoding: Encoding,
+        data: &'a [u8],
+    ) -> Result<Self, ImageError> {
         let colours = match encoding {
             Encoding::Mono8 => Colours::Grey,
             Encoding::Rgb8 => Colours::Rgb,
@@ -81,7 +92,8 @@ impl<'a> Image<'a> {
         Ok(Self { width, height, step, colours, data })
     }
 
-    /// The pixels of a frame in `data`, as [`Frame::copy_to`](crate::Frame::copy_to) has put them there.
+    /// The pixels of a frame in `data`, as [`Frame::copy_to`](crate::Frame::copy_to) has put them
+    /// there.
     ///
     /// # Errors
     ///
@@ -98,10 +110,19 @@ impl<'a> Image<'a> {
     pub fn part(&self, roi: Roi) -> Result<Self, ImageError> {
         let [x, y, width, height] = [roi.x, roi.y, roi.width, roi.height].map(|side| side as usize);
         if x >= self.width || y >= self.height || width == 0 || height == 0 {
-            return Err(ImageError::Roi { roi, width: self.width as u32, height: self.height as u32 });
+            return Err(ImageError::Roi {
+                roi,
+                width: self.width as u32,
+                height: self.height as u32,
+            });
         }
         let data = &self.data[y * self.step + x * self.pixel()..];
-        Ok(Self { width: width.min(self.width - x), height: height.min(self.height - y), data, ..*self })
+        Ok(Self {
+            width: width.min(self.width - x),
+            height: height.min(self.height - y),
+            data,
+            ..*self
+        })
     }
 
     /// Pixels in a row, 1 to [`MAX_SIDE`].
@@ -155,11 +176,16 @@ impl fmt::Display for ImageError {
             Self::Size { width, height } => {
                 write!(f, "an image of {width}x{height} pixels; each side has 1 to {MAX_SIDE}")
             }
-            Self::Step { step, needed } => write!(f, "a row takes {needed} bytes, but one starts every {step}"),
+            Self::Step { step, needed } => {
+                write!(f, "a row takes {needed} bytes, but one starts every {step}")
+            }
             Self::Data { needed } => write!(f, "the image takes {needed} bytes, there are fewer"),
             Self::Roi { roi, width, height } => {
                 let Roi { x, y, width: across, height: down } = roi;
-                write!(f, "no pixel of the image of {width}x{height} is in the region of {across}x{down} at ({x}, {y})")
+                write!(
+                    f,
+                    "no pixel of the image of {width}x{height} is in the region of {across}x{down} at ({x}, {y})"
+                )
             }
             Self::Output { needed, found } => {
                 write!(f, "the result takes {needed} bytes; the place for it has {found}")
@@ -184,11 +210,20 @@ mod tests {
         let refused = |width, height, step, encoding, bytes| {
             Image::new(width, height, step, encoding, &vec![0; bytes]).unwrap_err().to_string()
         };
-        assert_eq!(refused(2, 2, 5, Encoding::Rgb8, 99), "a row takes 6 bytes, but one starts every 5");
-        assert_eq!(refused(2, 2, 8, Encoding::Bgr8, 13), "the image takes 14 bytes, there are fewer");
+        assert_eq!(
+            refused(2, 2, 5, Encoding::Rgb8, 99),
+            "a row takes 6 bytes, but one starts every 5"
+        );
+        assert_eq!(
+            refused(2, 2, 8, Encoding::Bgr8, 13),
+            "the image takes 14 bytes, there are fewer"
+        );
         assert!(refused(65_536, 1, 65_536, Encoding::Mono8, 65_536).contains("65536x1 pixels"));
         assert!(refused(0, 1, 0, Encoding::Mono8, 0).contains("0x1 pixels"));
-        assert!(refused(65_535, 65_535, u32::MAX, Encoding::Mono8, 9).starts_with("the image takes 281"));
+        assert!(
+            refused(65_535, 65_535, u32::MAX, Encoding::Mono8, 9)
+                .starts_with("the image takes 281")
+        );
         assert!(refused(2, 2, 4, Encoding::Yuv422, 99).contains("not yuv422"));
     }
 
@@ -198,10 +233,16 @@ mod tests {
         let image = Image::new(3, 2, 4, Encoding::Mono8, &data).unwrap();
         assert_eq!(image.rows().collect::<Vec<_>>(), [[1, 2, 3], [4, 5, 6]]);
         let part = image.part(Roi { x: 1, y: 1, width: 9, height: 9 }).unwrap();
-        assert_eq!((part.width(), part.height(), part.rows().collect::<Vec<_>>()), (2, 1, vec![&[5, 6][..]]));
+        assert_eq!(
+            (part.width(), part.height(), part.rows().collect::<Vec<_>>()),
+            (2, 1, vec![&[5, 6][..]])
+        );
         let left = image.part(Roi { x: 0, y: 0, width: 1, height: 2 }).unwrap();
         assert_eq!(left.rows().collect::<Vec<_>>(), [[1], [4]]);
         let outside = image.part(Roi { x: 3, y: 0, width: 1, height: 1 }).unwrap_err();
-        assert_eq!(outside.to_string(), "no pixel of the image of 3x2 is in the region of 1x1 at (3, 0)");
+        assert_eq!(
+            outside.to_string(),
+            "no pixel of the image of 3x2 is in the region of 1x1 at (3, 0)"
+        );
     }
 }

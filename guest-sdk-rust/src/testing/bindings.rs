@@ -1,4 +1,5 @@
-//! What stands natively where wit-bindgen's code stands in a component: the same names, over the fake host beside this file.
+//! What stands natively where wit-bindgen's code stands in a component: the same names, over the
+//! fake host beside this file.
 //!
 //! The SDK is written against both, so a name that is missing in one of them fails a build.
 

@@ -1,4 +1,5 @@
-//! `gleaner:lambda/data`: samples and fields, as a lambda reads them. Every number that it passes is clamped here.
+//! `gleaner:lambda/data`: samples and fields, as a lambda reads them. Every number that it passes
+//! is clamped here.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -91,7 +92,11 @@ impl Source {
     }
 
     fn malformed(&self, why: &str) -> DataError {
-        DataError::Malformed(refused::malformed(&self.declared.topic, &self.declared.type_name, why))
+        DataError::Malformed(refused::malformed(
+            &self.declared.topic,
+            &self.declared.type_name,
+            why,
+        ))
     }
 
     fn find<'a>(&self, path: &Path, message: &'a Message) -> Answer<Found<'a>> {
@@ -108,16 +113,26 @@ impl Source {
 
     fn number(&self, path: &Path, cell: &Cell) -> Answer<f64> {
         let found = self.find(path, &cell.sample.message)?;
-        found.number().ok_or_else(|| WrongField::no_number(&path.text, &self.declared.type_name).into())
+        found
+            .number()
+            .ok_or_else(|| WrongField::no_number(&path.text, &self.declared.type_name).into())
     }
 
     pub(super) fn identity(&self, cell: &Cell) -> Identity {
-        Identity { topic: self.declared.topic.clone(), writer: cell.sample.writer, seq: cell.sample.seq }
+        Identity {
+            topic: self.declared.topic.clone(),
+            writer: cell.sample.writer,
+            seq: cell.sample.seq,
+        }
     }
 
     pub(super) fn stamps(&self, cell: &Cell) -> Stamps {
         let arrival = &cell.sample;
-        Stamps { at_ns: arrival.at_ns, publish_ns: arrival.publish_ns, header_ns: arrival.message.header_ns() }
+        Stamps {
+            at_ns: arrival.at_ns,
+            publish_ns: arrival.publish_ns,
+            header_ns: arrival.message.header_ns(),
+        }
     }
 }
 
@@ -169,7 +184,8 @@ impl Topic {
 
     fn samples(&self, most: usize, since_ns: i64, all: bool) -> Vec<Sample> {
         let most = most.min(self.source.limits.per_call.samples());
-        let cells = self.source.lock().ring.newest_while(most, |arrival| all || arrival.at_ns > since_ns);
+        let cells =
+            self.source.lock().ring.newest_while(most, |arrival| all || arrival.at_ns > since_ns);
         cells.into_iter().map(|cell| self.source.sample(cell)).collect()
     }
 
@@ -179,15 +195,23 @@ impl Topic {
 
     pub(crate) fn field(&self, path: &str) -> Answer<Field> {
         clamps::path(path)?;
-        let path = Path::new(path).map_err(|malformed| DataError::NoSuchField(malformed.to_string()))?;
+        let path =
+            Path::new(path).map_err(|malformed| DataError::NoSuchField(malformed.to_string()))?;
         if let Some(blank) = &self.source.blank
             && let Err(Missing::Field(known)) = path.find(&blank.fields)
         {
             let type_name = &self.source.declared.type_name;
-            let why = format!("type `{type_name}`, as the test has it, has no field `{}`{known}", path.text);
+            let why = format!(
+                "type `{type_name}`, as the test has it, has no field `{}`{known}",
+                path.text
+            );
             return Err(DataError::NoSuchField(why));
         }
-        Ok(Field { source: Arc::clone(&self.source), path, _handle: self.source.handles.hand_out() })
+        Ok(Field {
+            source: Arc::clone(&self.source),
+            path,
+            _handle: self.source.handles.hand_out(),
+        })
     }
 
     pub(crate) fn column(&self, field: &Field, n: u32) -> Answer<Column> {
@@ -198,7 +222,12 @@ impl Topic {
         self.read_column(field, usize::MAX, |at_ns| at_ns > since_ns)
     }
 
-    fn read_column(&self, field: &Field, most: usize, keep: impl Fn(i64) -> bool) -> Answer<Column> {
+    fn read_column(
+        &self,
+        field: &Field,
+        most: usize,
+        keep: impl Fn(i64) -> bool,
+    ) -> Answer<Column> {
         let source = &self.source;
         let path = field.of(source)?;
         let most = most.min(source.limits.per_call.items);
@@ -217,7 +246,12 @@ impl Field {
         if Arc::ptr_eq(&self.source, source) {
             return Ok(&self.path);
         }
-        Err(WrongField::elsewhere(&self.path.text, &self.source.declared.name, &source.declared.name).into())
+        Err(WrongField::elsewhere(
+            &self.path.text,
+            &self.source.declared.name,
+            &source.declared.name,
+        )
+        .into())
     }
 }
 
@@ -238,7 +272,9 @@ impl Sample {
             Value::Bytes(bytes) => Length::Bytes(bytes.len()),
             Value::Numbers(numbers) => Length::Numbers(numbers.len()),
             Value::Texts(texts) => Length::Texts(texts.len()),
-            Value::Boolean(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => Length::One,
+            Value::Boolean(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => {
+                Length::One
+            }
         };
         self.source.limits.per_call.value(&path.text, length)?;
         Ok(found.value().clone())
@@ -284,11 +320,13 @@ impl Sample {
     /// A field of an image.
     pub(super) fn need<'a>(&'a self, path: &str) -> Answer<&'a Value> {
         let fields = &self.cell.sample.message.fields;
-        let why = || format!("it has no `{path}`{}; make it with `Message::image`", known(path, fields));
+        let why =
+            || format!("it has no `{path}`{}; make it with `Message::image`", known(path, fields));
         fields.get(path).ok_or_else(|| self.source.malformed(&why()))
     }
 
     pub(super) fn wrong_sort(&self, path: &str) -> DataError {
-        self.source.malformed(&format!("`{path}` is of another sort; make it with `Message::image`"))
+        self.source
+            .malformed(&format!("`{path}` is of another sort; make it with `Message::image`"))
     }
 }

@@ -2,7 +2,8 @@
 
 pub use gleaner_rules::triggers::{AttributeValue, Kind as TriggerKind};
 
-/// The outcome of one wake: what a line of `decisions.jsonl` says of it, but for the digits of the writer, fuel and time.
+/// The outcome of one wake: what a line of `decisions.jsonl` says of it, but for the digits of the
+/// writer, fuel and time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decision {
     /// Time of the sample or tick that woke the lambda, in nanoseconds.

@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-/// A manifest, config value, message or lambda that cannot be used: what, why, and the way out. It prints alike with `{}` and `{:?}`,
-/// so that `unwrap` shows it as it is.
+/// A manifest, config value, message or lambda that cannot be used: what, why, and the way out. It
+/// prints alike with `{}` and `{:?}`, so that `unwrap` shows it as it is.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Error {
     what: String,
@@ -13,7 +13,11 @@ pub struct Error {
 
 impl Error {
     /// `cause` and `help` may be empty.
-    pub(super) fn new(what: impl Into<String>, cause: impl Into<String>, help: impl Into<String>) -> Self {
+    pub(super) fn new(
+        what: impl Into<String>,
+        cause: impl Into<String>,
+        help: impl Into<String>,
+    ) -> Self {
         Self { what: what.into(), cause: cause.into(), help: help.into() }
     }
 }
@@ -40,18 +44,22 @@ impl std::error::Error for Error {}
 
 /// The one of `known` that `word` was most likely meant to be.
 pub(super) fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
-    // The distance takes time in proportion to both lengths, and nobody misspells a name with a page of text.
+    // The distance takes time in proportion to both lengths, and nobody misspells a name with a
+    // page of text.
     if word.len() > 64 {
         return None;
     }
     let allowed = (word.chars().count() / 3).max(1);
     let known = known.into_iter().filter(|candidate| candidate.len() <= 128);
     let distances = known.map(|candidate| (distance(word, candidate), candidate));
-    let near = distances.filter(|(distance, _)| *distance <= allowed).min_by_key(|(distance, _)| *distance);
+    let near = distances
+        .filter(|(distance, _)| *distance <= allowed)
+        .min_by_key(|(distance, _)| *distance);
     near.map(|(_, candidate)| candidate)
 }
 
-/// Letters to insert, take away or change. Source: Wagner and Fischer, The String-to-String Correction Problem, 1974.
+/// Letters to insert, take away or change. Source: Wagner and Fischer, The String-to-String
+/// Correction Problem, 1974.
 fn distance(from: &str, to: &str) -> usize {
     let to = to.chars().collect::<Vec<_>>();
     let mut row = (0..=to.len()).collect::<Vec<_>>();

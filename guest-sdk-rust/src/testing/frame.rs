@@ -130,18 +130,23 @@ impl Frame {
     }
 
     pub(crate) fn histogram(&self, roi: Option<Roi>) -> Answer<Vec<u32>> {
-        ops::histogram(&self.view()?, roi.map(region)).map(Vec::from).map_err(|error| self.refused(error))
+        ops::histogram(&self.view()?, roi.map(region))
+            .map(Vec::from)
+            .map_err(|error| self.refused(error))
     }
 
     pub(crate) fn resize(&self, width: u32, height: u32) -> Answer<Self> {
         let view = self.view()?;
-        let (encoding, _) = ops::resized(&view, width, height).map_err(|error| self.refused(error))?;
+        let (encoding, _) =
+            ops::resized(&view, width, height).map_err(|error| self.refused(error))?;
         self.made((width, height), encoding, |out| ops::resize(&view, width, height, out).map(drop))
     }
 
     pub(crate) fn to_gray(&self) -> Answer<Self> {
         let view = self.view()?;
-        self.made((self.info.width, self.info.height), rules::Encoding::Mono8, |out| ops::to_gray(&view, out))
+        self.made((self.info.width, self.info.height), rules::Encoding::Mono8, |out| {
+            ops::to_gray(&view, out)
+        })
     }
 
     /// Room is taken before anything is made.
@@ -247,7 +252,9 @@ fn raw(sample: &Sample) -> Answer<FrameInfo> {
         };
         number.and_then(|number| u32::try_from(number).ok()).ok_or_else(|| sample.wrong_sort(path))
     };
-    let Value::Text(encoding) = sample.need("encoding")? else { return Err(sample.wrong_sort("encoding")) };
+    let Value::Text(encoding) = sample.need("encoding")? else {
+        return Err(sample.wrong_sort("encoding"));
+    };
     let Value::Bytes(data) = sample.need("data")? else { return Err(sample.wrong_sort("data")) };
     let (width, height) = (number("width")?, number("height")?);
     let (step, big_endian) = (number("step")?, number("is_bigendian")? != 0);

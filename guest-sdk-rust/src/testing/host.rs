@@ -28,21 +28,25 @@ pub struct Host {
 }
 
 impl Host {
-    /// A host for the lambda with this `lambda.toml`, usually `include_str!("../lambda.toml")`. It is read by [`load`](Self::load).
+    /// A host for the lambda with this `lambda.toml`, usually `include_str!("../lambda.toml")`. It
+    /// is read by [`load`](Self::load).
     pub fn from_manifest(text: &str) -> Self {
         Self { manifest: text.to_owned(), set: Vec::new(), blanks: Vec::new() }
     }
 
-    /// Sets a value of `[config]`, as `gleaner replay --set` does: of the type of its default, and within its range.
+    /// Sets a value of `[config]`, as `gleaner replay --set` does: of the type of its default, and
+    /// within its range.
     pub fn set(mut self, key: &str, value: impl Into<Setting>) -> Self {
         self.set.push((key.to_owned(), value.into().0));
         self
     }
 
-    /// Says which fields messages of an input have, and what stands there where a message does not say otherwise.
+    /// Says which fields messages of an input have, and what stands there where a message does not
+    /// say otherwise.
     ///
-    /// Then a lambda that asks `init` for another field is refused there, as on a vehicle, and a message with another field is an
-    /// error. Without it, a field counts as missing only once it is read from a message that has not got it.
+    /// Then a lambda that asks `init` for another field is refused there, as on a vehicle, and a
+    /// message with another field is an error. Without it, a field counts as missing only once it
+    /// is read from a message that has not got it.
     pub fn blank(mut self, input: &str, message: Message) -> Self {
         self.blanks.push((input.to_owned(), message));
         self
@@ -63,15 +67,24 @@ impl Host {
             When::Period(period_ns) => Schedule::periodic(*period_ns),
             When::Event(name) => {
                 let woken_by = session.inputs.iter().find(|source| source.declared.name == *name);
-                Schedule::event(Input(Arc::clone(woken_by.expect("the manifest was checked"))), Backlog::Each)
+                Schedule::event(
+                    Input(Arc::clone(woken_by.expect("the manifest was checked"))),
+                    Backlog::Each,
+                )
             }
         };
         Run::start(&manifest.name, config, session, schedule)
     }
 
-    fn inputs(&self, manifest: &Manifest, handles: &Arc<Handles>) -> Result<Vec<Arc<Source>>, Error> {
+    fn inputs(
+        &self,
+        manifest: &Manifest,
+        handles: &Arc<Handles>,
+    ) -> Result<Vec<Arc<Source>>, Error> {
         let names = || manifest.inputs.iter().map(|input| input.name.as_str());
-        if let Some((asked, _)) = self.blanks.iter().find(|(asked, _)| names().all(|name| name != asked)) {
+        if let Some((asked, _)) =
+            self.blanks.iter().find(|(asked, _)| names().all(|name| name != asked))
+        {
             let help = format!("the manifest has {}", quoted(names()));
             return Err(Error::new(format!("no input `{asked}` for a blank message"), "", help));
         }

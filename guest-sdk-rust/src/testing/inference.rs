@@ -1,4 +1,5 @@
-//! `gleaner:lambda/inference`. As hosts are built today, there is no model runtime: every call says so.
+//! `gleaner:lambda/inference`. As hosts are built today, there is no model runtime: every call says
+//! so.
 
 use super::data::Frame;
 use super::session::current;
@@ -43,7 +44,8 @@ pub struct DetectOptions {
     pub classes: Vec<u32>,
     /// Detections below are dropped, 0 to 1.
     pub min_score: f32,
-    /// Overlap (intersection over union) above which the weaker of two detections is dropped, 0 to 1.
+    /// Overlap (intersection over union) above which the weaker of two detections is dropped, 0 to
+    /// 1.
     pub max_iou: f32,
     /// At most so many, strongest first; clamped to 1,024.
     pub max_count: u32,
@@ -92,7 +94,11 @@ impl Model {
         match *self {}
     }
 
-    pub(crate) fn detect(&self, _frame: &Frame, _options: &DetectOptions) -> Answer<Vec<Detection>> {
+    pub(crate) fn detect(
+        &self,
+        _frame: &Frame,
+        _options: &DetectOptions,
+    ) -> Answer<Vec<Detection>> {
         match *self {}
     }
 }

@@ -1,4 +1,5 @@
-//! `gleaner:lambda/log`: lines are cut, and what is over the limits of a second is dropped and counted.
+//! `gleaner:lambda/log`: lines are cut, and what is over the limits of a second is dropped and
+//! counted.
 
 use gleaner_rules::log::{Rate, line};
 

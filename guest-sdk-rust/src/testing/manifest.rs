@@ -1,4 +1,5 @@
-//! `lambda.toml`, as far as the fake host needs it. `gleaner build` reads all of it, and is stricter in places.
+//! `lambda.toml`, as far as the fake host needs it. `gleaner build` reads all of it, and is
+//! stricter in places.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -77,12 +78,17 @@ struct Item {
 /// Reads the text of a manifest.
 pub(super) fn read(text: &str) -> Result<Manifest> {
     let entries = text.parse::<toml::Table>();
-    let entries =
-        entries.map_err(|error| Error::new("cannot use the manifest", format!("it is no TOML: {error}"), ""))?;
+    let entries = entries.map_err(|error| {
+        Error::new("cannot use the manifest", format!("it is no TOML: {error}"), "")
+    })?;
     let known = ["lambda", "schedule", "input", "model", "record", "limits", "config"];
     let root = Table::of("the file", &entries, &known)?;
     let known = ["name", "version", "kind", "entry", "description", "deterministic"];
-    let lambda = Table::new("[lambda]", root.need("lambda", "[lambda] with name, version, kind and entry")?, &known)?;
+    let lambda = Table::new(
+        "[lambda]",
+        root.need("lambda", "[lambda] with name, version, kind and entry")?,
+        &known,
+    )?;
     if lambda.choice("kind", &["wasm", "python"])? != Some("wasm") {
         return Err(lambda.refusal("is not of kind `wasm`", "a lambda in Rust has kind = \"wasm\""));
     }
@@ -91,7 +97,8 @@ pub(super) fn read(text: &str) -> Result<Manifest> {
     unique("name", inputs.iter().map(|input| &input.name))?;
     unique("topic", inputs.iter().map(|input| &input.topic))?;
     if let Some(value) = root.get("record") {
-        let known = ["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
+        let known =
+            ["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
         Table::new("[record]", value, &known)?;
     }
     Ok(Manifest {
@@ -114,22 +121,32 @@ fn unique<'a>(what: &str, names: impl Iterator<Item = &'a String>) -> Result<()>
 
 fn schedule(root: &Table, inputs: &[Input]) -> Result<When> {
     let example = "[schedule] with event = \"<an input's name>\" or period = \"100ms\"";
-    let table = Table::new("[schedule]", root.need("schedule", example)?, &["event", "period", "backlog"])?;
+    let table =
+        Table::new("[schedule]", root.need("schedule", example)?, &["event", "period", "backlog"])?;
     let backlog = table.choice("backlog", &["each", "latest"])?;
     match (table.get("event"), table.get("period")) {
         (Some(_), None) => {
             let event = table.text("event", "event = \"<an input's name>\"", |_| true)?;
             if !inputs.iter().any(|input| input.name == event) {
                 let names = quoted(inputs.iter().map(|input| input.name.as_str()));
-                return Err(table.refusal(&format!("names no input: `{event}`"), &format!("the inputs are {names}")));
+                return Err(table.refusal(
+                    &format!("names no input: `{event}`"),
+                    &format!("the inputs are {names}"),
+                ));
             }
             Ok(When::Event(event))
         }
         (None, Some(_)) if backlog.is_none() => {
             Ok(When::Period(table.duration("period", (MS, 0, 3600 * SECOND))? as i64))
         }
-        (None, Some(_)) => Err(table.refusal("has a `backlog` beside `period`", "remove it: missed ticks are counted")),
-        _ => Err(table.refusal("needs one of `event` and `period`", "a lambda runs on one input or on the clock")),
+        (None, Some(_)) => {
+            Err(table
+                .refusal("has a `backlog` beside `period`", "remove it: missed ticks are counted"))
+        }
+        _ => Err(table.refusal(
+            "needs one of `event` and `period`",
+            "a lambda runs on one input or on the clock",
+        )),
     }
 }
 
@@ -138,9 +155,13 @@ fn input(value: &Value) -> Result<Input> {
     let table = Table::new("[[input]]", value, &known)?;
     let type_name = table.text("type", "type = \"sensor_msgs/msg/Imu\"", names::is_type)?;
     let is_compressed = type_name == COMPRESSED_IMAGE;
-    let (depth, hold, size) = if names::is_large(&type_name) { (4, 2, 8 * MIB) } else { (64, 8, 4 * KIB) };
+    let (depth, hold, size) =
+        if names::is_large(&type_name) { (4, 2, 8 * MIB) } else { (64, 8, 4 * KIB) };
     if table.get("decoded_size").is_some() && !is_compressed {
-        return Err(table.refusal(&format!("has a `decoded_size`, and {type_name} is not decoded"), "remove it"));
+        return Err(table.refusal(
+            &format!("has a `decoded_size`, and {type_name} is not decoded"),
+            "remove it",
+        ));
     }
     let decoded_size = table.size("decoded_size", (1, 8 * MIB, 256 * MIB))?;
     Ok(Input {
@@ -182,7 +203,9 @@ fn limits(root: &Table) -> Result<Limits> {
 
 fn items(root: &Table) -> Result<Vec<Item>> {
     let Some(value) = root.get("config") else { return Ok(Vec::new()) };
-    let entries = value.as_table().ok_or_else(|| root.refusal("has a `config` that is no table", "see the README"))?;
+    let entries = value
+        .as_table()
+        .ok_or_else(|| root.refusal("has a `config` that is no table", "see the README"))?;
     entries.iter().map(|(name, value)| item(name, value)).collect()
 }
 
@@ -191,18 +214,29 @@ fn item(name: &str, value: &Value) -> Result<Item> {
     let plain = toml::Table::from_iter([("default".to_owned(), value.clone())]);
     let entries = value.as_table().unwrap_or(&plain);
     let table = Table::of(&title, entries, &["default", "min", "max", "unit", "description"])?;
-    let default = match table.need("default", "default = 1.0, or another value that says what type it is")? {
-        Value::Boolean(value) => ConfigValue::Boolean(*value),
-        Value::Integer(value) => ConfigValue::Integer(*value),
-        Value::Float(value) if value.is_finite() => ConfigValue::Real(*value),
-        Value::String(value) => ConfigValue::Text(value.clone()),
-        _ => return Err(table.refusal("has a `default` of another type", "give a number, a text, or true or false")),
-    };
+    let default =
+        match table.need("default", "default = 1.0, or another value that says what type it is")? {
+            Value::Boolean(value) => ConfigValue::Boolean(*value),
+            Value::Integer(value) => ConfigValue::Integer(*value),
+            Value::Float(value) if value.is_finite() => ConfigValue::Real(*value),
+            Value::String(value) => ConfigValue::Text(value.clone()),
+            _ => {
+                return Err(table.refusal(
+                    "has a `default` of another type",
+                    "give a number, a text, or true or false",
+                ));
+            }
+        };
     let limit = |key: &str| match (table.get(key), &default) {
         (None, _) => Ok(None),
-        (Some(Value::Integer(limit)), ConfigValue::Integer(_) | ConfigValue::Real(_)) => Ok(Some(*limit as f64)),
+        (Some(Value::Integer(limit)), ConfigValue::Integer(_) | ConfigValue::Real(_)) => {
+            Ok(Some(*limit as f64))
+        }
         (Some(Value::Float(limit)), ConfigValue::Real(_)) if limit.is_finite() => Ok(Some(*limit)),
-        _ => Err(table.refusal(&format!("has a `{key}` that does not fit its default"), "give numbers of one type")),
+        _ => Err(table.refusal(
+            &format!("has a `{key}` that does not fit its default"),
+            "give numbers of one type",
+        )),
     };
     let item = Item { name: name.to_owned(), min: limit("min")?, max: limit("max")?, default };
     item.within(&item.default)?;
@@ -218,7 +252,11 @@ impl Item {
         };
         let refuse = |which, limit| {
             let what = format!("config value `{}` cannot be {number}", self.name);
-            Err(Error::new(what, format!("its {which} is {limit}"), "give a value within its range"))
+            Err(Error::new(
+                what,
+                format!("its {which} is {limit}"),
+                "give a value within its range",
+            ))
         };
         match (self.min, self.max) {
             (Some(min), _) if number < min => refuse("min", min),
@@ -231,7 +269,9 @@ impl Item {
     fn set(&self, given: &ConfigValue) -> Result<ConfigValue> {
         let value = match (&self.default, given) {
             (ConfigValue::Real(_), ConfigValue::Integer(given)) => ConfigValue::Real(*given as f64),
-            (ConfigValue::Real(_), ConfigValue::Real(given)) if given.is_finite() => ConfigValue::Real(*given),
+            (ConfigValue::Real(_), ConfigValue::Real(given)) if given.is_finite() => {
+                ConfigValue::Real(*given)
+            }
             (ConfigValue::Boolean(_), ConfigValue::Boolean(_))
             | (ConfigValue::Integer(_), ConfigValue::Integer(_))
             | (ConfigValue::Text(_), ConfigValue::Text(_)) => given.clone(),
@@ -257,13 +297,17 @@ impl Manifest {
         let names = || self.items.iter().map(|item| item.name.as_str());
         if let Some((key, _)) = set.iter().find(|(key, _)| names().all(|name| name != key)) {
             let many = || format!("its config values are {}", quoted(names()));
-            let help = nearest(key, names()).map_or_else(many, |near| format!("did you mean `{near}`?"));
+            let help =
+                nearest(key, names()).map_or_else(many, |near| format!("did you mean `{near}`?"));
             return Err(Error::new(format!("the lambda has no config value `{key}`"), "", help));
         }
         let value = |item: &Item| {
             let given = set.iter().rev().find(|(key, _)| *key == item.name);
             given.map_or_else(|| Ok(item.default.clone()), |(_, given)| item.set(given))
         };
-        self.items.iter().map(|item| Ok(ConfigEntry { key: item.name.clone(), value: value(item)? })).collect()
+        self.items
+            .iter()
+            .map(|item| Ok(ConfigEntry { key: item.name.clone(), value: value(item)? }))
+            .collect()
     }
 }

@@ -19,8 +19,9 @@ use crate::data::{bytes_per_pixel, encoding_name};
 ///     .stamped(1_500_000_000);
 /// ```
 ///
-/// A lambda reads the fields that are given, and no others: nobody here knows the type. What stands for the rest may be said once for
-/// all messages of an input, by [`Host::blank`](super::Host::blank).
+/// A lambda reads the fields that are given, and no others: nobody here knows the type. What stands
+/// for the rest may be said once for all messages of an input, by
+/// [`Host::blank`](super::Host::blank).
 #[derive(Clone, Default)]
 pub struct Message {
     pub(super) fields: BTreeMap<String, Value>,
@@ -48,34 +49,37 @@ impl Message {
 
     /// An image of `width` x `height` pixels, rows from top to bottom without padding.
     ///
-    /// On an input of `sensor_msgs/msg/Image` it is that message, with the fields `height`, `width`, `encoding`, `is_bigendian`,
-    /// `step` and `data`, which [`with`](Self::with) may still change. On one of `sensor_msgs/msg/CompressedImage` it is what the
-    /// host makes of a JPEG or PNG, so `encoding` must be rgb8.
+    /// On an input of `sensor_msgs/msg/Image` it is that message, with the fields `height`,
+    /// `width`, `encoding`, `is_bigendian`, `step` and `data`, which [`with`](Self::with) may still
+    /// change. On one of `sensor_msgs/msg/CompressedImage` it is what the host makes of a JPEG or
+    /// PNG, so `encoding` must be rgb8.
     pub fn image(width: u32, height: u32, encoding: Encoding, pixels: impl Into<Vec<u8>>) -> Self {
         let pixels: Vec<u8> = pixels.into();
         let picture = Picture { width, height, encoding, data: pixels.into() };
         Self { picture: Some(picture), ..Self::default() }
     }
 
-    /// Gives the field at `path`, as a lambda would write it, such as `linear_acceleration.x` or `fields[2].name`. An array is given
-    /// as a whole; a lambda may ask for it, and for its elements.
+    /// Gives the field at `path`, as a lambda would write it, such as `linear_acceleration.x` or
+    /// `fields[2].name`. An array is given as a whole; a lambda may ask for it, and for its
+    /// elements.
     ///
-    /// A lambda that asks for [`Value`](crate::data::Value) gets the sort that is given here: `i32` and such are signed, `u32` and
-    /// such unsigned.
+    /// A lambda that asks for [`Value`](crate::data::Value) gets the sort that is given here: `i32`
+    /// and such are signed, `u32` and such unsigned.
     pub fn with(mut self, path: &str, value: impl Into<FieldValue>) -> Self {
         self.fields.insert(path.to_owned(), value.into().0);
         self
     }
 
-    /// Gives `header.stamp`, in nanoseconds: the fields `header.stamp.sec` and `header.stamp.nanosec`, and with them
-    /// [`Stamps::header_ns`](crate::data::Stamps::header_ns).
+    /// Gives `header.stamp`, in nanoseconds: the fields `header.stamp.sec` and
+    /// `header.stamp.nanosec`, and with them [`Stamps::header_ns`](crate::data::Stamps::header_ns).
     pub fn stamped(self, header_ns: i64) -> Self {
         let (sec, nanosec) = (header_ns.div_euclid(SECOND_NS), header_ns.rem_euclid(SECOND_NS));
         self.with(STAMP[0], sec).with(STAMP[1], nanosec as u64)
     }
 
-    /// Gives the bytes for [`Sample::cdr`](crate::Sample::cdr) and [`Sample::size`](crate::Sample::size): CDR with its
-    /// encapsulation, four bytes of which the second says the byte order, as drives have it. No field is read from it.
+    /// Gives the bytes for [`Sample::cdr`](crate::Sample::cdr) and
+    /// [`Sample::size`](crate::Sample::size): CDR with its encapsulation, four bytes of which the
+    /// second says the byte order, as drives have it. No field is read from it.
     pub fn cdr(mut self, bytes: impl Into<Vec<u8>>) -> Self {
         self.cdr = Some(bytes.into());
         self
@@ -87,8 +91,8 @@ impl Message {
         self
     }
 
-    /// Its number, for gaps; else one more than that of the message before, from 1. A message with the same or a smaller number than
-    /// that is refused.
+    /// Its number, for gaps; else one more than that of the message before, from 1. A message with
+    /// the same or a smaller number than that is refused.
     pub fn numbered(mut self, seq: u64) -> Self {
         self.seq = Some(seq);
         self
@@ -103,7 +107,8 @@ impl Message {
         whole(STAMP[0])?.checked_mul(SECOND_NS)?.checked_add(whole(STAMP[1])?)
     }
 
-    /// Gives the fields that stand for the picture in a `sensor_msgs/msg/Image`, unless they are given.
+    /// Gives the fields that stand for the picture in a `sensor_msgs/msg/Image`, unless they are
+    /// given.
     pub(super) fn spread_picture(&mut self) {
         let Some(Picture { width, height, encoding, data }) = self.picture.take() else { return };
         let step = u64::from(width) * u64::from(bytes_per_pixel(encoding));
@@ -145,7 +150,8 @@ impl fmt::Debug for Message {
     }
 }
 
-/// What a field of a [`Message`] holds; made from numbers, `bool`, texts, and arrays of numbers, bytes or texts.
+/// What a field of a [`Message`] holds; made from numbers, `bool`, texts, and arrays of numbers,
+/// bytes or texts.
 #[derive(Clone, Debug)]
 pub struct FieldValue(Value);
 

@@ -42,15 +42,18 @@
 //! # Ok::<(), gleaner_sdk::testing::Error>(())
 //! ```
 //!
-//! The lambda is the same source; only what it calls is another. The rules are those of the host: rings with `depth` and `hold`,
-//! schedules, columns, what is clamped and refused and in which words, operations on pixels to the last bit, limits of triggers,
-//! log, scratch, frames, handles and bytes of a call, faults and the lambda made anew after one, rests. Most of them are the host's
-//! own code, in `gleaner-rules`.
+//! The lambda is the same source; only what it calls is another. The rules are those of the host:
+//! rings with `depth` and `hold`, schedules, columns, what is clamped and refused and in which
+//! words, operations on pixels to the last bit, limits of triggers, log, scratch, frames, handles
+//! and bytes of a call, faults and the lambda made anew after one, rests. Most of them are the
+//! host's own code, in `gleaner-rules`.
 //!
-//! Not here: fuel, time and memory, but for pixels of frames that are made; decoders of JPEG and PNG; definitions of messages, so
-//! that a message has the fields that the test gives; clips; models. `docs/rust.md` says what follows from that.
+//! Not here: fuel, time and memory, but for pixels of frames that are made; decoders of JPEG and
+//! PNG; definitions of messages, so that a message has the fields that the test gives; clips;
+//! models. `docs/rust.md` says what follows from that.
 //!
-//! It exists natively only, so use it in `#[cfg(test)]`. A call of the SDK while no lambda runs panics, and says what to do.
+//! It exists natively only, so use it in `#[cfg(test)]`. A call of the SDK while no lambda runs
+//! panics, and says what to do.
 
 #[doc(hidden)]
 pub mod bindings;

@@ -34,25 +34,42 @@ impl Path {
     /// The message says where `text` goes wrong.
     pub(super) fn new(text: &str) -> Result<Self, Malformed> {
         let element = match segments(text)?.last() {
-            Some(Segment::Index(index)) => text.rsplit_once('[').map(|(array, _)| (array.to_owned(), *index)),
+            Some(Segment::Index(index)) => {
+                text.rsplit_once('[').map(|(array, _)| (array.to_owned(), *index))
+            }
             _ => None,
         };
         Ok(Self { text: text.to_owned(), element })
     }
 
-    pub(super) fn find<'a>(&self, fields: &'a BTreeMap<String, Value>) -> Result<Found<'a>, Missing> {
+    pub(super) fn find<'a>(
+        &self,
+        fields: &'a BTreeMap<String, Value>,
+    ) -> Result<Found<'a>, Missing> {
         if let Some(value) = fields.get(&self.text) {
             return Ok(Found::Whole(value));
         }
-        let array = self.element.as_ref().and_then(|(array, index)| Some((fields.get(array)?, *index)));
-        let Some((array, index)) = array else { return Err(Missing::Field(known(&self.text, fields))) };
+        let array =
+            self.element.as_ref().and_then(|(array, index)| Some((fields.get(array)?, *index)));
+        let Some((array, index)) = array else {
+            return Err(Missing::Field(known(&self.text, fields)));
+        };
         let (len, element) = match array {
-            Value::Numbers(numbers) => (numbers.len(), numbers.get(index).copied().map(Value::Real)),
-            Value::Bytes(bytes) => (bytes.len(), bytes.get(index).map(|byte| Value::Unsigned((*byte).into()))),
+            Value::Numbers(numbers) => {
+                (numbers.len(), numbers.get(index).copied().map(Value::Real))
+            }
+            Value::Bytes(bytes) => {
+                (bytes.len(), bytes.get(index).map(|byte| Value::Unsigned((*byte).into())))
+            }
             Value::Texts(texts) => (texts.len(), texts.get(index).cloned().map(Value::Text)),
             _ => return Err(Missing::Field(known(&self.text, fields))),
         };
-        let why = || Missing::Element(format!("it has {len} elements where `{}` wants element {index}", self.text));
+        let why = || {
+            Missing::Element(format!(
+                "it has {len} elements where `{}` wants element {index}",
+                self.text
+            ))
+        };
         element.map(Found::Element).ok_or_else(why)
     }
 }
@@ -95,8 +112,13 @@ mod tests {
             ("cov[1]".to_owned(), Value::Real(9.0)),
             ("raw".to_owned(), Value::Bytes(vec![7])),
         ]);
-        let number = |path: &str| Path::new(path).unwrap().find(&fields).ok().and_then(|found| found.number());
-        assert_eq!([number("cov[0]"), number("cov[1]"), number("raw[0]")], [Some(1.0), Some(9.0), Some(7.0)]);
+        let number = |path: &str| {
+            Path::new(path).unwrap().find(&fields).ok().and_then(|found| found.number())
+        };
+        assert_eq!(
+            [number("cov[0]"), number("cov[1]"), number("raw[0]")],
+            [Some(1.0), Some(9.0), Some(7.0)]
+        );
         let missing = |path: &str| match Path::new(path).unwrap().find(&fields) {
             Err(Missing::Field(why)) => why,
             Err(Missing::Element(why)) => why,

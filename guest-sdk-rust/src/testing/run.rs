@@ -40,26 +40,40 @@ enum Due {
 }
 
 impl<L: Lambda> Run<L> {
-    pub(super) fn start(name: &str, config: Config, session: Arc<Session>, schedule: Schedule) -> Result<Self, Error> {
+    pub(super) fn start(
+        name: &str,
+        config: Config,
+        session: Arc<Session>,
+        schedule: Schedule,
+    ) -> Result<Self, Error> {
         let (lambda, now_ns, decisions, faults) = (None, None, Vec::new(), Faults::default());
         let mut run = Self { config, session, schedule, lambda, now_ns, decisions, faults };
         match run.init() {
             Ok(()) => Ok(run),
-            Err(fault) => Err(Error::new(format!("cannot start lambda `{name}`"), fault.message, "")),
+            Err(fault) => {
+                Err(Error::new(format!("cannot start lambda `{name}`"), fault.message, ""))
+            }
         }
     }
 
-    /// Delivers a message to an input at `at_ns`, and runs the lambda as its schedule says: first the ticks that were due before, then
-    /// once for the message, if it wakes the lambda. Returns what was decided in these wakes.
+    /// Delivers a message to an input at `at_ns`, and runs the lambda as its schedule says: first
+    /// the ticks that were due before, then once for the message, if it wakes the lambda. Returns
+    /// what was decided in these wakes.
     ///
     /// # Errors
     ///
-    /// If there is no such input, time would go back, or the message cannot be one of this input. Nothing has happened then. A fault of
-    /// the lambda is no error: it stands in its decision.
-    pub fn deliver(&mut self, input: &str, at_ns: i64, message: Message) -> Result<&[Decision], Error> {
+    /// If there is no such input, time would go back, or the message cannot be one of this input.
+    /// Nothing has happened then. A fault of the lambda is no error: it stands in its decision.
+    pub fn deliver(
+        &mut self,
+        input: &str,
+        at_ns: i64,
+        message: Message,
+    ) -> Result<&[Decision], Error> {
         let found = self.session.inputs.iter().position(|source| source.declared.name == input);
         let Some(number) = found else {
-            let names = quoted(self.session.inputs.iter().map(|source| source.declared.name.as_str()));
+            let names =
+                quoted(self.session.inputs.iter().map(|source| source.declared.name.as_str()));
             return Err(Error::new(
                 format!("no input `{input}` to deliver to"),
                 "",
@@ -86,8 +100,12 @@ impl<L: Lambda> Run<L> {
         {
             let arrived = &mut *source.lock();
             arrived.seq = seq;
-            let writer = Guid { high: u64::from(u32::from_be_bytes(*b"desk")) << 32, low: (number as u64) << 32 };
-            let (publish_ns, bytes) = (message.publish_ns.unwrap_or(at_ns), message.bytes_at_least());
+            let writer = Guid {
+                high: u64::from(u32::from_be_bytes(*b"desk")) << 32,
+                low: (number as u64) << 32,
+            };
+            let (publish_ns, bytes) =
+                (message.publish_ns.unwrap_or(at_ns), message.bytes_at_least());
             arrived.ring.push(Arrival { at_ns, publish_ns, writer, seq, message }, bytes);
         }
         while let Some((source, cell)) = self.schedule.next_event() {
@@ -96,8 +114,9 @@ impl<L: Lambda> Run<L> {
         Ok(&self.decisions[decided..])
     }
 
-    /// Lets time pass up to `at_ns` without a message: ticks run that are due until then, that instant included. Returns what was decided
-    /// in them. The first tick is due a period after the first message, or the first call of this.
+    /// Lets time pass up to `at_ns` without a message: ticks run that are due until then, that
+    /// instant included. Returns what was decided in them. The first tick is due a period after the
+    /// first message, or the first call of this.
     ///
     /// # Errors
     ///
@@ -122,19 +141,25 @@ impl<L: Lambda> Run<L> {
         self.decisions.iter().flat_map(|decision| &decision.triggers)
     }
 
-    /// The faults so far. A test that expects none asks for this, or a lambda that never got further passes it.
+    /// The faults so far. A test that expects none asks for this, or a lambda that never got
+    /// further passes it.
     pub fn faults(&self) -> impl Iterator<Item = &Fault> {
         self.decisions.iter().filter_map(|decision| decision.fault.as_ref())
     }
 
-    /// What was logged so far, and what the host noted. What a lambda prints is not in it: it is the test's own output.
+    /// What was logged so far, and what the host noted. What a lambda prints is not in it: it is
+    /// the test's own output.
     pub fn log(&self) -> Vec<Line> {
         self.session.lock().log.lines.clone()
     }
 
     /// What became of the samples of an input; none if there is no such input.
     pub fn counts(&self, input: &str) -> Option<Counts> {
-        self.session.inputs.iter().find(|source| source.declared.name == input).map(|source| source.counts())
+        self.session
+            .inputs
+            .iter()
+            .find(|source| source.declared.name == input)
+            .map(|source| source.counts())
     }
 
     /// The lambda itself; none after a fault, until the next wake makes it anew.
@@ -222,7 +247,8 @@ impl<L: Lambda> Run<L> {
             Due::Tick(tick) => lambda.on_tick(tick),
         });
         if ran.is_err() {
-            // Its handles are given back. A component ends without dropping anything; what its `drop` does is lost there, too.
+            // Its handles are given back. A component ends without dropping anything; what its
+            // `drop` does is lost there, too.
             let lambda = self.lambda.take();
             let _ = session.aside(|| dropped(&session, lambda));
         }
@@ -248,7 +274,15 @@ fn dropped<L>(session: &Arc<Session>, lambda: Option<L>) -> Result<(), Fault> {
 fn cause(at_ns: i64, due: &Due) -> Decision {
     let (triggers, fault) = (Vec::new(), None);
     match due {
-        Due::Tick(_) => Decision { at_ns, cause: Cause::Tick, input: None, topic: None, seq: None, triggers, fault },
+        Due::Tick(_) => Decision {
+            at_ns,
+            cause: Cause::Tick,
+            input: None,
+            topic: None,
+            seq: None,
+            triggers,
+            fault,
+        },
         Due::Event(source, cell) => Decision {
             at_ns,
             cause: Cause::Event,
@@ -261,11 +295,13 @@ fn cause(at_ns: i64, due: &Due) -> Decision {
     }
 }
 
-/// The message as it comes to an input: over its blank, and with the fields that stand for a picture.
+/// The message as it comes to an input: over its blank, and with the fields that stand for a
+/// picture.
 fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
     let (name, type_name) = (&source.declared.name, source.declared.type_name.as_str());
-    let refuse =
-        |cause: String, help: &str| Err(Error::new(format!("cannot deliver a message to input `{name}`"), cause, help));
+    let refuse = |cause: String, help: &str| {
+        Err(Error::new(format!("cannot deliver a message to input `{name}`"), cause, help))
+    };
     if message.cdr.as_ref().is_some_and(|cdr| cdr.len() < ENCAPSULATION) {
         return refuse(
             "its CDR is too short".to_owned(),
@@ -279,14 +315,27 @@ fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
                 let needed = 3 * u64::from(picture.width) * u64::from(picture.height);
                 let found = picture.data.len() as u64;
                 if picture.encoding != Encoding::Rgb8 || found != needed || needed == 0 {
-                    let cause = format!("{}x{} pixels of rgb8 have {needed} bytes", picture.width, picture.height);
-                    let cause = format!("{cause}; it has {found} of {}", crate::data::encoding_name(picture.encoding));
-                    return refuse(cause, "give what the host makes of JPEG and PNG: rgb8, without padding");
+                    let cause = format!(
+                        "{}x{} pixels of rgb8 have {needed} bytes",
+                        picture.width, picture.height
+                    );
+                    let cause = format!(
+                        "{cause}; it has {found} of {}",
+                        crate::data::encoding_name(picture.encoding)
+                    );
+                    return refuse(
+                        cause,
+                        "give what the host makes of JPEG and PNG: rgb8, without padding",
+                    );
                 }
             }
             _ => {
-                let help = format!("an image goes to an input of `{IMAGE}` or `{COMPRESSED_IMAGE}`");
-                return refuse(format!("it is an image, and the input is of type `{type_name}`"), &help);
+                let help =
+                    format!("an image goes to an input of `{IMAGE}` or `{COMPRESSED_IMAGE}`");
+                return refuse(
+                    format!("it is an image, and the input is of type `{type_name}`"),
+                    &help,
+                );
             }
         }
     }
@@ -300,7 +349,8 @@ fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
             );
         };
         if !fit(value, usual) {
-            let cause = format!("its field `{path}` is of another sort than that of the blank message");
+            let cause =
+                format!("its field `{path}` is of another sort than that of the blank message");
             return refuse(cause, "give both alike");
         }
     }
@@ -310,13 +360,18 @@ fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
     Ok(message)
 }
 
-/// Whether `value` is of the sort of `usual`; a number is made one of its sort, if it keeps its value.
+/// Whether `value` is of the sort of `usual`; a number is made one of its sort, if it keeps its
+/// value.
 fn fit(value: &mut Value, usual: &Value) -> bool {
     let made = match (&*value, usual) {
         (Value::Signed(number), Value::Real(_)) => Some(Value::Real(*number as f64)),
         (Value::Unsigned(number), Value::Real(_)) => Some(Value::Real(*number as f64)),
-        (Value::Signed(number), Value::Unsigned(_)) => u64::try_from(*number).ok().map(Value::Unsigned),
-        (Value::Unsigned(number), Value::Signed(_)) => i64::try_from(*number).ok().map(Value::Signed),
+        (Value::Signed(number), Value::Unsigned(_)) => {
+            u64::try_from(*number).ok().map(Value::Unsigned)
+        }
+        (Value::Unsigned(number), Value::Signed(_)) => {
+            i64::try_from(*number).ok().map(Value::Signed)
+        }
         (value, usual) => {
             return std::mem::discriminant(value) == std::mem::discriminant(usual);
         }

@@ -1,4 +1,5 @@
-//! `gleaner:lambda/scratch`: what is kept by name, within `scratch` of `[limits]`, beyond faults of the lambda.
+//! `gleaner:lambda/scratch`: what is kept by name, within `scratch` of `[limits]`, beyond faults of
+//! the lambda.
 
 pub use gleaner_rules::scratch::Entry;
 use gleaner_rules::scratch::ScratchError as Refused;

@@ -1,4 +1,5 @@
-//! What one lambda sees and causes for as long as a run lasts, and how the functions of the SDK find it.
+//! What one lambda sees and causes for as long as a run lasts, and how the functions of the SDK
+//! find it.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -45,17 +46,24 @@ impl Session {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The lambda passes so many bytes in one call. More than `call_bytes` of `[limits]` end it, as they end a component.
+    /// The lambda passes so many bytes in one call. More than `call_bytes` of `[limits]` end it, as
+    /// they end a component.
     pub(super) fn passed(&self, bytes: usize) {
         let allowed = self.limits.per_call.bytes;
         if bytes > allowed {
             let what = "too much data is being copied between the host and the guest";
             let message = format!("{what}: at most {} in one call", size_in_words(allowed as u64));
-            end(Fault { kind: FaultKind::HostCall, message, used: None, allowed: Some(allowed as u64) });
+            end(Fault {
+                kind: FaultKind::HostCall,
+                message,
+                used: None,
+                allowed: Some(allowed as u64),
+            });
         }
     }
 
-    /// Runs an `init`, or drops a lambda: in the middle of a wake maybe, but no part of it. It can cause nothing.
+    /// Runs an `init`, or drops a lambda: in the middle of a wake maybe, but no part of it. It can
+    /// cause nothing.
     pub(super) fn aside<R>(&self, run: impl FnOnce() -> R) -> R {
         let triggers = self.lock().triggers.suspend();
         let result = run();
@@ -83,7 +91,8 @@ pub(super) fn current() -> Arc<Session> {
     })
 }
 
-/// Calls code of the lambda over `session`. An error is a fault, and so is a panic; both are said with `when` before them.
+/// Calls code of the lambda over `session`. An error is a fault, and so is a panic; both are said
+/// with `when` before them.
 pub(super) fn attempt<R>(
     session: &Arc<Session>,
     when: &str,
@@ -117,7 +126,8 @@ fn end(fault: Fault) -> ! {
 
 fn said(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
-    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("it did not say why")
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str))
+        .unwrap_or("it did not say why")
 }
 
 /// How many samples, frames, fields and topics a lambda may hold, and holds.
@@ -142,7 +152,12 @@ impl Handles {
         if held >= allowed {
             let message = refused::too_many_handles(allowed);
             drop(handle);
-            end(Fault { kind: FaultKind::HostCall, message, used: Some(allowed + 1), allowed: Some(allowed) });
+            end(Fault {
+                kind: FaultKind::HostCall,
+                message,
+                used: Some(allowed + 1),
+                allowed: Some(allowed),
+            });
         }
         handle
     }

@@ -1,4 +1,5 @@
-//! One table of a `lambda.toml`, whose keys are known: each is read as what it should be, or refused by its name.
+//! One table of a `lambda.toml`, whose keys are known: each is read as what it should be, or
+//! refused by its name.
 
 use gleaner_rules::text::quoted;
 use gleaner_rules::units;
@@ -45,11 +46,17 @@ impl<'a> Table<'a> {
     }
 
     pub(super) fn need(&self, key: &str, example: &str) -> Result<&'a Value> {
-        self.get(key).ok_or_else(|| self.refusal(&format!("has no `{key}`"), &format!("add {example}")))
+        self.get(key)
+            .ok_or_else(|| self.refusal(&format!("has no `{key}`"), &format!("add {example}")))
     }
 
     /// A text that `is_right`.
-    pub(super) fn text(&self, key: &str, example: &str, is_right: fn(&str) -> bool) -> Result<String> {
+    pub(super) fn text(
+        &self,
+        key: &str,
+        example: &str,
+        is_right: fn(&str) -> bool,
+    ) -> Result<String> {
         let help = format!("write it as in {example}");
         match self.need(key, example)?.as_str() {
             Some(text) if is_right(text) => Ok(text.to_owned()),
@@ -65,14 +72,18 @@ impl<'a> Table<'a> {
         let Some(value) = self.get(key) else { return Ok(None) };
         let chosen = value.as_str().filter(|text| choices.contains(text));
         let help = || format!("choose {}", quoted(choices.iter().copied()));
-        chosen.map(Some).ok_or_else(|| self.refusal(&format!("has the {key} {}", shown(value)), &help()))
+        chosen
+            .map(Some)
+            .ok_or_else(|| self.refusal(&format!("has the {key} {}", shown(value)), &help()))
     }
 
     pub(super) fn integer(&self, key: &str, bounds: Bounds) -> Result<u64> {
         let Some(value) = self.get(key) else { return Ok(bounds.1) };
         let help = || format!("for example {key} = {}", bounds.1);
         let whole = value.as_integer();
-        let whole = whole.ok_or_else(|| self.refusal(&format!("has a `{key}` that is no whole number"), &help()))?;
+        let whole = whole.ok_or_else(|| {
+            self.refusal(&format!("has a `{key}` that is no whole number"), &help())
+        })?;
         self.within(key, u64::try_from(whole).ok(), value, bounds)
     }
 
@@ -83,8 +94,9 @@ impl<'a> Table<'a> {
             Some(Value::Integer(_)) => self.integer(key, bounds),
             Some(value) => {
                 let bytes = value.as_str().and_then(units::size);
-                let bytes =
-                    bytes.ok_or_else(|| self.refusal(&format!("has the {key} {}", shown(value)), units::SIZE_RULE))?;
+                let bytes = bytes.ok_or_else(|| {
+                    self.refusal(&format!("has the {key} {}", shown(value)), units::SIZE_RULE)
+                })?;
                 self.within(key, Some(bytes), value, bounds)
             }
         }
@@ -94,13 +106,24 @@ impl<'a> Table<'a> {
     pub(super) fn duration(&self, key: &str, bounds: Bounds) -> Result<u64> {
         let Some(value) = self.get(key) else { return Ok(bounds.1) };
         let ns = value.as_str().and_then(units::duration);
-        let ns = ns.ok_or_else(|| self.refusal(&format!("has the {key} {}", shown(value)), units::TIME_RULE))?;
+        let ns = ns.ok_or_else(|| {
+            self.refusal(&format!("has the {key} {}", shown(value)), units::TIME_RULE)
+        })?;
         self.within(key, Some(ns), value, bounds)
     }
 
-    fn within(&self, key: &str, given: Option<u64>, value: &Value, (min, _, max): Bounds) -> Result<u64> {
+    fn within(
+        &self,
+        key: &str,
+        given: Option<u64>,
+        value: &Value,
+        (min, _, max): Bounds,
+    ) -> Result<u64> {
         given.filter(|given| (min..=max).contains(given)).ok_or_else(|| {
-            self.refusal(&format!("has a `{key}` of {}", shown(value)), &format!("its range is {min} to {max}"))
+            self.refusal(
+                &format!("has a `{key}` of {}", shown(value)),
+                &format!("its range is {min} to {max}"),
+            )
         })
     }
 
@@ -119,7 +142,9 @@ fn shown(value: &Value) -> String {
         Value::Integer(number) => number.to_string(),
         Value::Float(number) => number.to_string(),
         Value::Boolean(value) => value.to_string(),
-        Value::Datetime(_) | Value::Array(_) | Value::Table(_) => format!("of type {}", value.type_str()),
+        Value::Datetime(_) | Value::Array(_) | Value::Table(_) => {
+            format!("of type {}", value.type_str())
+        }
     }
 }
 

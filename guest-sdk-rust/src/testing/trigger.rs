@@ -1,4 +1,5 @@
-//! `gleaner:lambda/trigger`: what a lambda causes, checked and counted by `gleaner_rules::triggers`.
+//! `gleaner:lambda/trigger`: what a lambda causes, checked and counted by
+//! `gleaner_rules::triggers`.
 
 pub use gleaner_rules::triggers::{Attribute, AttributeValue};
 use gleaner_rules::triggers::{Kind, TriggerError as Refused};
@@ -10,8 +11,8 @@ use super::types::refusal;
 /// The call is refused and had no effect. The message names the limit.
 #[derive(Clone, Debug)]
 pub enum TriggerError {
-    /// No wake; label empty or over 128 bytes; score or value not finite; key empty, over 64 bytes or given twice; text over
-    /// 1,024 bytes; more than 16 attributes.
+    /// No wake; label empty or over 128 bytes; score or value not finite; key empty, over 64 bytes
+    /// or given twice; text over 1,024 bytes; more than 16 attributes.
     Invalid(String),
     /// More than 16 triggers in one wake, or more than `events_per_minute` of `[limits]`.
     TooMany(String),
@@ -35,15 +36,22 @@ pub(crate) fn stop(label: &str) -> Answer {
 
 fn cause(kind: Kind, label: &str, score: Option<f64>, attributes: &[Attribute]) -> Answer {
     let session = current();
-    let text = |value: &AttributeValue| if let AttributeValue::Text(text) = value { text.len() } else { 0 };
-    let texts = attributes.iter().map(|attribute| attribute.key.len() + text(&attribute.value)).sum::<usize>();
+    let text = |value: &AttributeValue| {
+        if let AttributeValue::Text(text) = value { text.len() } else { 0 }
+    };
+    let texts = attributes
+        .iter()
+        .map(|attribute| attribute.key.len() + text(&attribute.value))
+        .sum::<usize>();
     session.passed(label.len() + texts);
     let state = &mut *session.lock();
     let at_ns = state.now_ns;
-    let caused = state.triggers.cause(at_ns, kind, (label, score), attributes.to_vec(), |attributes| {
-        let attributes = attributes.into_iter().map(|Attribute { key, value }| (key, value)).collect();
-        Trigger { at_ns, kind, label: label.to_owned(), score, attributes }
-    });
+    let caused =
+        state.triggers.cause(at_ns, kind, (label, score), attributes.to_vec(), |attributes| {
+            let attributes =
+                attributes.into_iter().map(|Attribute { key, value }| (key, value)).collect();
+            Trigger { at_ns, kind, label: label.to_owned(), score, attributes }
+        });
     caused.map_err(|refused: Refused| match refused.is_too_many() {
         true => TriggerError::TooMany(refused.to_string()),
         false => TriggerError::Invalid(refused.to_string()),

@@ -22,7 +22,8 @@ pub struct Identity {
 /// When a sample came to be, in nanoseconds. The three clocks may differ: compare like with like.
 #[derive(Clone, Copy, Debug)]
 pub struct Stamps {
-    /// When the vehicle received it: the clock that orders samples, wakes and clips. In replay: the log time.
+    /// When the vehicle received it: the clock that orders samples, wakes and clips. In replay: the
+    /// log time.
     pub at_ns: i64,
     /// When the writer published it, by the writer's clock.
     pub publish_ns: i64,
@@ -157,8 +158,8 @@ pub enum DataError {
     Malformed(String),
     /// The sample is no image, or an image that the host cannot read.
     NotAFrame(String),
-    /// The image is larger than the input's `decoded_size`, every decoded slot is held, or the frames that the lambda made
-    /// take all of `memory` in `[limits]`.
+    /// The image is larger than the input's `decoded_size`, every decoded slot is held, or the
+    /// frames that the lambda made take all of `memory` in `[limits]`.
     NoRoom(String),
     /// A region, size or offset is out of range.
     OutOfRange(String),

@@ -16,10 +16,19 @@ fn operations_reach_the_pixels_and_refuse_by_kind() {
     let mut run = on_event(camera(false, ""), |sample| {
         let frame = sample.as_frame()?;
         let right = Some(Roi { x: 1, y: 0, width: 9, height: 9 });
-        assert_eq!((frame.mean_luma(None)?, frame.mean_luma(right)?), (273.15 / 4.0, (149.685 + 18.15) / 2.0));
-        assert_eq!([76, 149, 29, 18].map(|level: usize| frame.histogram(None).unwrap()[level]), [1; 4]);
+        assert_eq!(
+            (frame.mean_luma(None)?, frame.mean_luma(right)?),
+            (273.15 / 4.0, (149.685 + 18.15) / 2.0)
+        );
+        assert_eq!(
+            [76, 149, 29, 18].map(|level: usize| frame.histogram(None).unwrap()[level]),
+            [1; 4]
+        );
         assert_eq!(pixels(frame.to_gray()?), (2, 2, Encoding::Mono8, vec![76, 149, 29, 18]));
-        assert_eq!(pixels(frame.resize(1, 2)?), (1, 2, Encoding::Rgb8, vec![128, 128, 0, 5, 10, 143]));
+        assert_eq!(
+            pixels(frame.resize(1, 2)?),
+            (1, 2, Encoding::Rgb8, vec![128, 128, 0, 5, 10, 143])
+        );
         // With the padding of a row between two, and without that behind the last.
         assert_eq!((frame.info().size, frame.read(5, 4)), (14, vec![0, 99, 99, 0]));
         let outside = frame.mean_luma(Some(Roi { x: 2, y: 0, width: 1, height: 1 }));
@@ -51,7 +60,8 @@ fn pictures_that_contradict_themselves_are_refused_in_the_hosts_words() {
         (4, 2, 4, "x", 9, "encoding `x` is not supported; supported are rgb8, bgr8, 8UC3, "),
     ]) {
         let message = Message::new().with("width", width).with("height", height).with("step", step);
-        let message = message.with("encoding", name).with("is_bigendian", 0).with("data", vec![0_u8; bytes]);
+        let message =
+            message.with("encoding", name).with("is_bigendian", 0).with("data", vec![0_u8; bytes]);
         let decisions = run.deliver("camera", n, message).unwrap();
         let fault = decisions[0].fault.as_ref().unwrap();
         let wanted = format!("a sample of `/camera` is no image that can be read: {why}");
@@ -68,17 +78,26 @@ fn decoded_pictures_have_slots_and_a_size_and_each_is_decoded_once() {
         assert_eq!(frames[0].read(0, 3), [9; 3]);
         Ok(())
     });
-    let picture = |side: u32| Message::image(side, side, Encoding::Rgb8, vec![9; (3 * side * side) as usize]);
+    let picture =
+        |side: u32| Message::image(side, side, Encoding::Rgb8, vec![9; (3 * side * side) as usize]);
     run.deliver("camera", 0, picture(10)).unwrap();
     assert_eq!(run.faults().next(), None);
     run.deliver("camera", 1, picture(11)).unwrap();
     let fault = run.faults().next().unwrap();
-    assert!(fault.message.contains("is too large: image says it is 11x11 (363 bytes as rgb8)"), "{fault:?}");
+    assert!(
+        fault.message.contains("is too large: image says it is 11x11 (363 bytes as rgb8)"),
+        "{fault:?}"
+    );
     let jpeg = run.deliver("camera", 2, Message::new().with("data", vec![0xff_u8, 0xd8])).unwrap();
-    assert!(jpeg[0].fault.as_ref().unwrap().message.contains("make the message with `Message::image`"));
+    assert!(
+        jpeg[0].fault.as_ref().unwrap().message.contains("make the message with `Message::image`")
+    );
     for (message, wanted) in [
         (Message::image(2, 2, Encoding::Mono8, vec![0; 4]), "it has 4 of mono8"),
-        (Message::image(2, 2, Encoding::Rgb8, vec![0; 4]), "2x2 pixels of rgb8 have 12 bytes; it has 4"),
+        (
+            Message::image(2, 2, Encoding::Rgb8, vec![0; 4]),
+            "2x2 pixels of rgb8 have 12 bytes; it has 4",
+        ),
     ] {
         let refused = run.deliver("camera", 3, message).unwrap_err().to_string();
         assert!(refused.contains(wanted), "{refused}");
@@ -88,7 +107,8 @@ fn decoded_pictures_have_slots_and_a_size_and_each_is_decoded_once() {
 #[test]
 fn frames_and_their_bytes_are_bounded_and_given_back() {
     let mut run = on_event(camera(false, "[limits]\nframes = 3\nmemory = \"1 MiB\""), |sample| {
-        let refused = |result: Result<Frame>| result.err().map(|error| (error.kind(), error.to_string()));
+        let refused =
+            |result: Result<Frame>| result.err().map(|error| (error.kind(), error.to_string()));
         let frame = sample.as_frame()?;
         let large = frame.resize(1000, 1000)?;
         assert_eq!(large.info().size, 1_000_000);

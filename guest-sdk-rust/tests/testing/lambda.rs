@@ -54,19 +54,23 @@ pub fn on_event(host: Host, handler: impl Fn(Sample) -> Result<()> + Copy + 'sta
 
 /// A manifest that begins with a usual lambda, and goes on with `rest`.
 pub fn manifest(rest: &str) -> String {
-    let lambda = "[lambda]\nname = \"told\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"told.wasm\"\n";
+    let lambda =
+        "[lambda]\nname = \"told\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"told.wasm\"\n";
     format!("{lambda}{rest}")
 }
 
 /// Woken by an IMU, with these further keys of its input, and `rest` behind.
 pub fn imu(keys: &str, rest: &str) -> Host {
-    let input = "[[input]]\nname = \"imu\"\ntopic = \"/imu/data\"\ntype = \"sensor_msgs/msg/Imu\"\n";
+    let input =
+        "[[input]]\nname = \"imu\"\ntopic = \"/imu/data\"\ntype = \"sensor_msgs/msg/Imu\"\n";
     Host::from_manifest(&manifest(&format!("[schedule]\nevent = \"imu\"\n{input}{keys}\n{rest}")))
 }
 
 /// Woken by a camera with raw pictures or, if `compressed`, others.
 pub fn camera(compressed: bool, rest: &str) -> Host {
     let kind = if compressed { "CompressedImage" } else { "Image" };
-    let input = format!("[[input]]\nname = \"camera\"\ntopic = \"/camera\"\ntype = \"sensor_msgs/msg/{kind}\"\n");
+    let input = format!(
+        "[[input]]\nname = \"camera\"\ntopic = \"/camera\"\ntype = \"sensor_msgs/msg/{kind}\"\n"
+    );
     Host::from_manifest(&manifest(&format!("[schedule]\nevent = \"camera\"\n{input}{rest}")))
 }

@@ -23,15 +23,25 @@ fn fields_are_what_the_test_gave_and_stamps_too() {
         assert_eq!(sample.number(&input("imu")?.field("d")?)?, 1.0);
         let (identity, stamps) = (sample.identity(), sample.stamps());
         assert_eq!((identity.topic.as_str(), identity.seq), ("/imu/data", 7));
-        assert_eq!((stamps.at_ns, stamps.publish_ns, stamps.header_ns), (30, 20, Some(-1_500_000_000)));
+        assert_eq!(
+            (stamps.at_ns, stamps.publish_ns, stamps.header_ns),
+            (30, 20, Some(-1_500_000_000))
+        );
         assert!(matches!(get(&sample, "header.stamp.sec")?, Value::Signed(-2)));
         assert_eq!((sample.cdr(1, 2), sample.size(), sample.big_endian()), (vec![6, 7], 4, false));
         assert_eq!((sample.cdr(9, 2), sample.cdr(3, 99)), (vec![], vec![8]));
         Ok(())
     });
-    let message = Message::new().with("a", -4.0).with("b", -4).with("c", 4_u8).with("d", true).with("e.f", "link");
-    let message = message.with("cov", [1.0, 2.0]).with("raw", vec![7_u8, 8]).with("names", ["x", "y"]);
-    let message = message.stamped(-1_500_000_000).published(20).numbered(7).cdr([0, 1, 0, 0, 5, 6, 7, 8]);
+    let message = Message::new()
+        .with("a", -4.0)
+        .with("b", -4)
+        .with("c", 4_u8)
+        .with("d", true)
+        .with("e.f", "link");
+    let message =
+        message.with("cov", [1.0, 2.0]).with("raw", vec![7_u8, 8]).with("names", ["x", "y"]);
+    let message =
+        message.stamped(-1_500_000_000).published(20).numbered(7).cdr([0, 1, 0, 0, 5, 6, 7, 8]);
     run.deliver("imu", 30, message).unwrap();
     assert_eq!((run.decisions().len(), run.faults().next()), (1, None));
 }
@@ -49,7 +59,9 @@ fn a_field_that_a_message_has_not_got_is_refused_by_name_when_it_is_read() {
     let fault = run.faults().next().unwrap();
     assert_eq!(fault.kind, FaultKind::Exception);
     assert!(
-        fault.message.contains("no field `linear_aceleration.x`; did you mean `linear_acceleration.x`?"),
+        fault
+            .message
+            .contains("no field `linear_aceleration.x`; did you mean `linear_acceleration.x`?"),
         "{fault:?}"
     );
 }
@@ -61,8 +73,12 @@ fn a_blank_message_says_which_fields_there_are_and_what_stands_in_them() {
         let imu = input("imu")?;
         let error = imu.field("z").err().ok_or(Error::new("there is a z"))?;
         assert_eq!(error.kind(), Some("no-such-field"));
-        assert_eq!([sample.number(&imu.field("x")?)?, sample.number(&imu.field("y")?)?], [2.0, 5.0]);
-        let error = imu.column(&imu.field("name")?, 1).err().ok_or(Error::new("a name is a number"))?;
+        assert_eq!(
+            [sample.number(&imu.field("x")?)?, sample.number(&imu.field("y")?)?],
+            [2.0, 5.0]
+        );
+        let error =
+            imu.column(&imu.field("name")?, 1).err().ok_or(Error::new("a name is a number"))?;
         assert_eq!(error.kind(), Some("wrong-field"));
         Ok(())
     });
@@ -70,8 +86,14 @@ fn a_blank_message_says_which_fields_there_are_and_what_stands_in_them() {
     run.deliver("imu", 0, Message::new().with("x", 2)).unwrap();
     assert_eq!(run.faults().next(), None);
     for (message, wanted) in [
-        (Message::new().with("xx", 2.0), "`xx` is not in the blank message of this input; did you mean `x`?"),
-        (Message::new().with("name", 2.0), "`name` is of another sort than that of the blank message"),
+        (
+            Message::new().with("xx", 2.0),
+            "`xx` is not in the blank message of this input; did you mean `x`?",
+        ),
+        (
+            Message::new().with("name", 2.0),
+            "`name` is of another sort than that of the blank message",
+        ),
     ] {
         let refused = run.deliver("imu", 1, message).unwrap_err().to_string();
         assert!(refused.contains(wanted), "{refused}");

@@ -6,11 +6,14 @@ use super::lambda::{Told, imu, manifest, on_event};
 #[test]
 fn triggers_are_checked_and_counted() {
     let mut run = on_event(imu("", "[limits]\nevents_per_minute = 18"), |sample| {
-        let refused = |result: gleaner_sdk::Result<()>| result.err().map(|error| (error.kind(), error.to_string()));
+        let refused = |result: gleaner_sdk::Result<()>| {
+            result.err().map(|error| (error.kind(), error.to_string()))
+        };
         if sample.identity().seq == 1 {
             let (kind, why) = refused(event("", 1.0).send()).ok_or(Error::new("sent"))?;
             assert_eq!((kind, why.as_str()), (Some("invalid"), "the label is empty"));
-            let twice = refused(event("x", 1.0).with("k", 1.0).with("k", 2.0).send()).ok_or(Error::new("sent"))?;
+            let twice = refused(event("x", 1.0).with("k", 1.0).with("k", 2.0).send())
+                .ok_or(Error::new("sent"))?;
             assert_eq!(twice.1, "attribute `k` of `x`: the key is given twice");
             assert!(refused(event("x", 1.0).with("k", f64::NAN).send()).is_some());
             assert!(refused(event("x", 1.0).with("k", "x".repeat(1025).as_str()).send()).is_some());
@@ -30,7 +33,9 @@ fn triggers_are_checked_and_counted() {
     // Two more in this minute, and then an error of the lambda's own making.
     let decision = &run.deliver("imu", 1, Message::new()).unwrap()[0];
     assert_eq!(decision.triggers.len(), 2);
-    assert!(decision.fault.as_ref().unwrap().message.contains("18 triggers in this minute already"));
+    assert!(
+        decision.fault.as_ref().unwrap().message.contains("18 triggers in this minute already")
+    );
     assert_eq!(run.triggers_refused(), 1);
     let next_minute = run.deliver("imu", 60_000_000_000, Message::new()).unwrap();
     assert_eq!(next_minute[0].triggers.len(), 16);
@@ -57,7 +62,10 @@ fn a_flood_of_lines_is_dropped_and_counted_and_long_ones_are_cut() {
     run.deliver("imu", 1_000_000_000, Message::new()).unwrap();
     let lines = run.log();
     assert_eq!((lines.len(), run.log_dropped()), (6, 4));
-    assert_eq!((lines[0].message.len(), lines[0].level, lines[3].at_ns), (4096, log::Level::Info, 1_000_000_000));
+    assert_eq!(
+        (lines[0].message.len(), lines[0].level, lines[3].at_ns),
+        (4096, log::Level::Info, 1_000_000_000)
+    );
 }
 
 #[test]
@@ -74,12 +82,21 @@ fn scratch_is_kept_by_name_within_its_grant() {
         assert_eq!(scratch::free(), 1024 - (64 + 1 + 3));
         let why = scratch::put("b", &[0; 900]).unwrap_err();
         assert_eq!(kind(why.clone()), Some("no-room"));
-        assert!(why.to_string().contains("`b` needs 965 bytes of scratch and 956 are free"), "{why}");
+        assert!(
+            why.to_string().contains("`b` needs 965 bytes of scratch and 956 are free"),
+            "{why}"
+        );
         // What is replaced is given back.
         scratch::put("a", &[0; 959])?;
-        assert_eq!(scratch::put("bad\u{7}name", &[]).map_err(kind).unwrap_err(), Some("wrong-name"));
         assert_eq!(
-            scratch::entries().iter().map(|entry| (entry.name.as_str(), entry.bytes)).collect::<Vec<_>>(),
+            scratch::put("bad\u{7}name", &[]).map_err(kind).unwrap_err(),
+            Some("wrong-name")
+        );
+        assert_eq!(
+            scratch::entries()
+                .iter()
+                .map(|entry| (entry.name.as_str(), entry.bytes))
+                .collect::<Vec<_>>(),
             [("a", 959)]
         );
         scratch::remove("a")
@@ -120,7 +137,10 @@ fn manifests_and_settings_that_cannot_be_used_are_refused_with_a_way_out() {
     let input = "[[input]]\nname = \"a\"\ntopic = \"/a\"\ntype = \"a/msg/A\"\n";
     for (rest, wanted) in [
         ("", "the file has no `schedule`"),
-        ("[schedule]\nperiod = \"0.1ms\"\n", "[schedule] has a `period` of \"0.1ms\"\n  help:  its range is"),
+        (
+            "[schedule]\nperiod = \"0.1ms\"\n",
+            "[schedule] has a `period` of \"0.1ms\"\n  help:  its range is",
+        ),
         ("[schedule]\nperiod = 100\n", "for example \"50ms\""),
         ("[schedule]\nevent = \"b\"\n", "names no input: `b`"),
         (&format!("{schedule}{input}dept = 3\n"), "did you mean `depth`?"),
@@ -128,7 +148,10 @@ fn manifests_and_settings_that_cannot_be_used_are_refused_with_a_way_out() {
         (&format!("{schedule}{input}{input}"), "two [[input]] with the name `a`"),
         (&format!("{schedule}{input}decoded_size = \"1 MiB\"\n"), "is not decoded"),
         (&format!("{schedule}[limits]\nfuel = 1\n"), "has a `fuel` of 1"),
-        (&format!("{schedule}[limits]\nscratch = \"1 MB\"\n"), "a whole number and its unit, B, KiB, MiB or GiB"),
+        (
+            &format!("{schedule}[limits]\nscratch = \"1 MB\"\n"),
+            "a whole number and its unit, B, KiB, MiB or GiB",
+        ),
         (
             &format!("{schedule}[config]\nx = {{ default = 1, max = 0 }}\n"),
             "config value `x` cannot be 1\n  cause: its max is 0",
@@ -136,15 +159,26 @@ fn manifests_and_settings_that_cannot_be_used_are_refused_with_a_way_out() {
         (&format!("{schedule}[config]\nx = [1]\n"), "has a `default` of another type"),
         ("x = ", "it is no TOML"),
     ] {
-        let error = Host::from_manifest(&manifest(rest)).load::<Told>().err().expect(rest).to_string();
+        let error =
+            Host::from_manifest(&manifest(rest)).load::<Told>().err().expect(rest).to_string();
         assert!(error.contains(wanted), "{rest}: {error}");
     }
     let python = manifest(schedule).replace("\"wasm\"", "\"python\"");
-    assert!(Host::from_manifest(&python).load::<Told>().err().unwrap().to_string().contains("kind = \"wasm\""));
+    assert!(
+        Host::from_manifest(&python)
+            .load::<Told>()
+            .err()
+            .unwrap()
+            .to_string()
+            .contains("kind = \"wasm\"")
+    );
     let host = || imu("", "[config]\nrate = 1.0\ncount = 3\n");
     for (host, wanted) in [
         (host().set("rat", 1.0), "no config value `rat`\n  help:  did you mean `rate`?"),
-        (host().set("count", 1.0), "config value `count` cannot be Real(1.0)\n  help:  give a whole number"),
+        (
+            host().set("count", 1.0),
+            "config value `count` cannot be Real(1.0)\n  help:  give a whole number",
+        ),
         (host().set("rate", f64::NAN), "give a finite number"),
         (host().blank("imo", Message::new()), "no input `imo` for a blank message"),
     ] {

@@ -73,7 +73,9 @@ fn a_fault_gives_back_what_the_lambda_held() {
 fn too_large_a_message_is_counted_and_wakes_nobody() {
     let mut run = on_event(imu("max_size = \"8 B\"", ""), |_| Ok(()));
     assert!(run.deliver("imu", 1, Message::new().cdr(vec![0; 4 + 9])).unwrap().is_empty());
-    assert!(run.deliver("imu", 2, Message::new().with("name", "more than eight")).unwrap().is_empty());
+    assert!(
+        run.deliver("imu", 2, Message::new().with("name", "more than eight")).unwrap().is_empty()
+    );
     assert_eq!(run.deliver("imu", 3, Message::new().cdr(vec![0; 4 + 8])).unwrap().len(), 1);
     assert_eq!(run.counts("imu").unwrap().too_big, 2);
 }

@@ -13,7 +13,9 @@ fn ticking() -> Run<Told> {
     load(host, |_| {
         Ok(Handler::Tick(Box::new(|tick| {
             assert_eq!(tick.at_ns, now_ns());
-            event("tick", input("imu")?.last(99).len() as f64).with("missed", tick.missed as i64).send()
+            event("tick", input("imu")?.last(99).len() as f64)
+                .with("missed", tick.missed as i64)
+                .send()
         })))
     })
     .unwrap()
@@ -33,7 +35,11 @@ fn ticks_come_before_the_message_that_is_later_and_after_the_one_of_the_same_ins
     let seen = run.triggers().map(|trigger| trigger.score.unwrap()).collect::<Vec<_>>();
     assert_eq!(seen, [2.0, 2.0, 2.0]);
     assert_eq!(run.pass_to(1400 * MS).unwrap().len(), 1);
-    assert!(run.decisions().iter().all(|decision| decision.cause == Cause::Tick && decision.seq.is_none()));
+    assert!(
+        run.decisions()
+            .iter()
+            .all(|decision| decision.cause == Cause::Tick && decision.seq.is_none())
+    );
 }
 
 #[test]
@@ -73,7 +79,10 @@ fn what_is_triggered_before_a_fault_counts_and_the_lambda_is_made_anew() {
     let scores = run.triggers().map(|trigger| trigger.score.unwrap()).collect::<Vec<_>>();
     assert_eq!(scores, [1.0, 2.0, 3.0]);
     let faults = run.faults().map(|fault| (fault.kind, fault.message.as_str())).collect::<Vec<_>>();
-    assert_eq!(faults, [(FaultKind::Exception, "an error"), (FaultKind::Trap, "panicked: a panic of 2")]);
+    assert_eq!(
+        faults,
+        [(FaultKind::Exception, "an error"), (FaultKind::Trap, "panicked: a panic of 2")]
+    );
     assert!(run.log()[0].message.contains("made anew after a fault"));
 }
 
@@ -91,9 +100,13 @@ fn after_eight_faults_in_a_row_the_lambda_rests() {
 
 #[test]
 fn a_fault_in_init_is_the_error_of_loading_and_later_the_fault_of_a_wake() {
-    let refused = load(imu("", ""), |_| event("early", 1.0).send().map(|()| unreachable!())).err().unwrap();
+    let refused =
+        load(imu("", ""), |_| event("early", 1.0).send().map(|()| unreachable!())).err().unwrap();
     let said = refused.to_string();
-    assert!(said.starts_with("cannot start lambda `told`\n  cause: in init: triggers belong to a wake"), "{said}");
+    assert!(
+        said.starts_with("cannot start lambda `told`\n  cause: in init: triggers belong to a wake"),
+        "{said}"
+    );
     let mut inits = 0;
     let mut run = load(imu("", ""), move |_| {
         inits += 1;
@@ -131,17 +144,22 @@ fn what_cannot_be_delivered_is_an_error_and_changes_nothing() {
     }
     assert!(run.pass_to(9).is_err());
     let next = &run.deliver("imu", 10, Message::new()).unwrap()[0];
-    assert_eq!((next.seq, next.input.as_deref(), next.topic.as_deref()), (Some(6), Some("imu"), Some("/imu/data")));
+    assert_eq!(
+        (next.seq, next.input.as_deref(), next.topic.as_deref()),
+        (Some(6), Some("imu"), Some("/imu/data"))
+    );
 }
 
 #[test]
 fn two_runs_on_one_thread_know_nothing_of_each_other() {
-    let seen = || on_event(imu("", ""), |_| event("seen", input("imu")?.counts().received as f64).send());
+    let seen =
+        || on_event(imu("", ""), |_| event("seen", input("imu")?.counts().received as f64).send());
     let (mut a, mut b) = (seen(), seen());
     a.deliver("imu", 5, Message::new()).unwrap();
     b.deliver("imu", 1, Message::new()).unwrap();
     a.deliver("imu", 6, Message::new()).unwrap();
-    let scores = |run: &Run<Told>| run.triggers().map(|trigger| trigger.score.unwrap()).collect::<Vec<_>>();
+    let scores =
+        |run: &Run<Told>| run.triggers().map(|trigger| trigger.score.unwrap()).collect::<Vec<_>>();
     assert_eq!((scores(&a), scores(&b)), (vec![1.0, 2.0], vec![1.0]));
 }
 
@@ -158,7 +176,9 @@ fn a_lambda_is_dropped_where_it_may_still_call_its_host() {
     let held = Rc::clone(&counted);
     let mut run = load(imu("", ""), move |_| {
         let last = Last(Rc::clone(&held));
-        Ok(Handler::Event(Box::new(move |_| Err(Error::new(format!("{} hold it", Rc::strong_count(&last.0)))))))
+        Ok(Handler::Event(Box::new(move |_| {
+            Err(Error::new(format!("{} hold it", Rc::strong_count(&last.0))))
+        })))
     })
     .unwrap();
     run.deliver("imu", 0, Message::new()).unwrap();

@@ -1,4 +1,5 @@
-//! Why a pool or a ring cannot be built, and why a draft is refused. Written by hand: this crate depends on std only.
+//! Why a pool or a ring cannot be built, and why a draft is refused. Written by hand: this crate
+//! depends on std only.
 
 use std::{error::Error, fmt};
 
@@ -60,7 +61,10 @@ impl fmt::Display for PoolError {
             }
             Self::OutOfMemory { bytes } => write!(f, "cannot allocate a region of {bytes} bytes"),
             Self::Depth { depth, slots } => {
-                write!(f, "ring of depth {depth} over a pool of {slots} slots; depth must be 1 to {slots}")
+                write!(
+                    f,
+                    "ring of depth {depth} over a pool of {slots} slots; depth must be 1 to {slots}"
+                )
             }
         }
     }

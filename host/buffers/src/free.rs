@@ -1,7 +1,7 @@
 //! Which slots are free: one bit each.
 //!
-//! A bit means "free now", whatever happened to the slot before. Nothing can be confused with its own past, as a
-//! linked free list can be (ABA), and a look at 512 slots is 8 loads.
+//! A bit means "free now", whatever happened to the slot before. Nothing can be confused with its
+//! own past, as a linked free list can be (ABA), and a look at 512 slots is 8 loads.
 
 use crate::sync::{AtomicU64, Ordering};
 
@@ -19,7 +19,8 @@ impl FreeSet {
         Self { words: (0..slots).step_by(64).map(|first| AtomicU64::new(word(first))).collect() }
     }
 
-    /// Takes a slot out, the lowest one seen. Everything that was done to it before [`give`](Self::give) is visible.
+    /// Takes a slot out, the lowest one seen. Everything that was done to it before
+    /// [`give`](Self::give) is visible.
     ///
     /// May answer `None` although a slot is free, if others take and give at the same time.
     pub(crate) fn take(&self) -> Option<u32> {
@@ -27,8 +28,8 @@ impl FreeSet {
             let mut seen = word.load(Ordering::Relaxed);
             while seen != 0 {
                 let bit = seen.trailing_zeros();
-                // Acquire pairs with `give`. All changes are read-modify-writes, so each `give` before this one is in
-                // the release sequence that it reads from.
+                // Acquire pairs with `give`. All changes are read-modify-writes, so each `give`
+                // before this one is in the release sequence that it reads from.
                 seen = word.fetch_and(!(1 << bit), Ordering::Acquire);
                 if seen & (1 << bit) != 0 {
                     return Some(first + bit);

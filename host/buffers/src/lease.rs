@@ -16,8 +16,8 @@ use crate::{
 
 /// A slot to fill, owned by one: the bytes are a `&mut [u8]` of exactly the length asked for.
 ///
-/// They hold what the slot's last sample left there: write all of them, or [`truncate`](Self::truncate). Dropping the
-/// draft gives the slot back.
+/// They hold what the slot's last sample left there: write all of them, or
+/// [`truncate`](Self::truncate). Dropping the draft gives the slot back.
 pub struct Draft<M> {
     slots: Arc<Slots<M>>,
     index: u32,
@@ -27,8 +27,8 @@ pub struct Draft<M> {
 impl<M> Draft<M> {
     /// # Safety
     ///
-    /// The slot is out of the free set, its count is 0, and no other draft is of it: it is the caller's, who hands it
-    /// over. `len <= slot_bytes`.
+    /// The slot is out of the free set, its count is 0, and no other draft is of it: it is the
+    /// caller's, who hands it over. `len <= slot_bytes`.
     pub(crate) unsafe fn new(slots: Arc<Slots<M>>, index: u32, len: usize) -> Self {
         let mut draft = Self { slots, index, len };
         draft.headroom_mut().fill(0);
@@ -47,7 +47,8 @@ impl<M> Draft<M> {
     /// The bytes in front of the sample; 0 in a new draft.
     pub fn headroom_mut(&mut self) -> &mut [u8; HEADROOM] {
         let payload = self.slots.payload(self.index);
-        // SAFETY: the bytes before each payload belong to its slot, the slot to this draft, and the draft is borrowed.
+        // SAFETY: the bytes before each payload belong to its slot, the slot to this draft, and the
+        // draft is borrowed.
         unsafe { payload.sub(HEADROOM).cast().as_mut() }
     }
 
@@ -71,7 +72,8 @@ impl<M> Draft<M> {
         let slots = unsafe { ptr::read(&draft.slots) };
         let slot = slots.slot(index);
         slot.seal.with_mut(|seal| {
-            // SAFETY: the count is 0 and the slot was this draft's, so nobody else looks at the seal.
+            // SAFETY: the count is 0 and the slot was this draft's, so nobody else looks at the
+            // seal.
             unsafe { (*seal).write(Seal { len, stamp, meta }) };
         });
         // Release pairs with `pin`: who sees the count above 0 sees the seal and the bytes.
@@ -85,7 +87,8 @@ impl<M> Deref for Draft<M> {
 
     fn deref(&self) -> &[u8] {
         let payload = self.slots.payload(self.index);
-        // SAFETY: a slot holds `slot_bytes >= len` initialised bytes, and only this draft can write to this one.
+        // SAFETY: a slot holds `slot_bytes >= len` initialised bytes, and only this draft can write
+        // to this one.
         unsafe { slice::from_raw_parts(payload.as_ptr(), self.len) }
     }
 }
@@ -112,8 +115,8 @@ impl<M> fmt::Debug for Draft<M> {
 
 /// A read-only hold on a sealed sample, whose bytes never change while it lives.
 ///
-/// Clones are further holds; the last one to go frees the slot. More than 2^31 holds at once, which takes leaked
-/// leases, abort the process, as they do for `Arc`.
+/// Clones are further holds; the last one to go frees the slot. More than 2^31 holds at once, which
+/// takes leaked leases, abort the process, as they do for `Arc`.
 pub struct Lease<M> {
     slots: Arc<Slots<M>>,
     index: u32,
@@ -144,15 +147,15 @@ impl<M> Lease<M> {
     /// The [`HEADROOM`] bytes and the sample as one slice.
     pub fn with_headroom(&self) -> &[u8] {
         let payload = self.slots.payload(self.index);
-        // SAFETY: the headroom and the `len` bytes after it are one initialised stretch of the region, and our hold
-        // keeps writers away until `self` is dropped.
+        // SAFETY: the headroom and the `len` bytes after it are one initialised stretch of the
+        // region, and our hold keeps writers away until `self` is dropped.
         unsafe { slice::from_raw_parts(payload.sub(HEADROOM).as_ptr(), HEADROOM + self.seal().len) }
     }
 
     fn seal(&self) -> &Seal<M> {
         let seal = &self.slots.slot(self.index).seal;
-        // SAFETY: our hold keeps the count above 0: the seal is initialised, visible to us since we saw that count,
-        // and nobody writes to it until `self` is dropped.
+        // SAFETY: our hold keeps the count above 0: the seal is initialised, visible to us since we
+        // saw that count, and nobody writes to it until `self` is dropped.
         seal.with(|seal| unsafe { (*seal).assume_init_ref() })
     }
 }
@@ -185,6 +188,9 @@ impl<M> Drop for Lease<M> {
 
 impl<M> fmt::Debug for Lease<M> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Lease").field("len", &self.len()).field("position", &self.position()).finish_non_exhaustive()
+        f.debug_struct("Lease")
+            .field("len", &self.len())
+            .field("position", &self.position())
+            .finish_non_exhaustive()
     }
 }

@@ -1,13 +1,13 @@
 //! Pre-faulted slots, counted leases on them, and rings that show the newest of them.
 //!
-//! A [`Pool`] cuts a [`Region`] into slots of one size. [`Pool::draft`] hands out a free slot as a [`Draft`], which
-//! one owner fills; sealing turns it into a [`Lease`], which many may read and none may change. A ring over a pool
-//! ([`ring`]) numbers what its one [`RingWriter`] publishes 0, 1, 2, ... and shows the newest `depth` of it to any
-//! number of [`RingReader`]s on any thread.
+//! A [`Pool`] cuts a [`Region`] into slots of one size. [`Pool::draft`] hands out a free slot as a
+//! [`Draft`], which one owner fills; sealing turns it into a [`Lease`], which many may read and
+//! none may change. A ring over a pool ([`ring`]) numbers what its one [`RingWriter`] publishes 0,
+//! 1, 2, ... and shows the newest `depth` of it to any number of [`RingReader`]s on any thread.
 //!
-//! A sample that a reader holds keeps its bytes until the last lease on it is dropped, even after it has left the
-//! ring, and after the ring and the pool are gone. Every sample that a ring loses is counted by cause
-//! ([`RingCounts`]).
+//! A sample that a reader holds keeps its bytes until the last lease on it is dropped, even after
+//! it has left the ring, and after the ring and the pool are gone. Every sample that a ring loses
+//! is counted by cause ([`RingCounts`]).
 //!
 //! ```
 //! use gleaner_buffers::{HeapRegion, Pool, ring};
@@ -28,18 +28,19 @@
 //!
 //! # How large a pool must be
 //!
-//! A ring of depth `d` whose readers hold at most `p` leases never refuses a draft, and never gives up a sample
-//! early, if it has `d + 1 + p` slots to itself. A reader inside a call counts as one lease. With fewer slots the
-//! writer takes back the oldest sample that nobody holds; that may be the newest one, so that a reader can find the
-//! ring empty for as long as the draft takes to fill.
+//! A ring of depth `d` whose readers hold at most `p` leases never refuses a draft, and never gives
+//! up a sample early, if it has `d + 1 + p` slots to itself. A reader inside a call counts as one
+//! lease. With fewer slots the writer takes back the oldest sample that nobody holds; that may be
+//! the newest one, so that a reader can find the ring empty for as long as the draft takes to fill.
 //!
 //! # What never happens here
 //!
-//! Nothing blocks, and nothing is allocated after construction, except that a caller's `Vec` may grow. Publishing
-//! and evicting are wait-free. Drafting is lock-free: it repeats a step only if another thread drafted from the same
-//! 64 slots in the meantime, so it is wait-free too where one ring has the pool to itself. Finding a sample is
-//! lock-free: a pin is repeated only if another thread pinned or dropped the same sample in the meantime, and
-//! [`RingReader::newest`] starts over only if a sample was published in the meantime.
+//! Nothing blocks, and nothing is allocated after construction, except that a caller's `Vec` may
+//! grow. Publishing and evicting are wait-free. Drafting is lock-free: it repeats a step only if
+//! another thread drafted from the same 64 slots in the meantime, so it is wait-free too where one
+//! ring has the pool to itself. Finding a sample is lock-free: a pin is repeated only if another
+//! thread pinned or dropped the same sample in the meantime, and [`RingReader::newest`] starts over
+//! only if a sample was published in the meantime.
 //!
 //! The atomics are loom's under `--cfg loom` (`tests/loom.rs`), and std's otherwise.
 

@@ -1,8 +1,9 @@
 //! Slots of one size, and the count on each.
 //!
-//! The count says who may do what. At 0 the slot is free, or one [`Draft`] owns it, and nobody else looks at its
-//! bytes. Above 0 it is sealed, and nobody writes: each [`Lease`] holds 1, and the ring that shows it holds 1. Only
-//! sealing raises the count from 0; whoever lowers it to 0 owns the slot, and frees it or drafts it again.
+//! The count says who may do what. At 0 the slot is free, or one [`Draft`] owns it, and nobody else
+//! looks at its bytes. Above 0 it is sealed, and nobody writes: each [`Lease`] holds 1, and the
+//! ring that shows it holds 1. Only sealing raises the count from 0; whoever lowers it to 0 owns
+//! the slot, and frees it or drafts it again.
 #![allow(unsafe_code)]
 
 use std::{fmt, mem::MaybeUninit, ptr::NonNull};
@@ -13,7 +14,8 @@ use crate::{
     sync::{Arc, AtomicU32, AtomicU64, Ordering, UnsafeCell},
 };
 
-/// Spare bytes in front of every slot, so that an encapsulation header and the payload can be one slice.
+/// Spare bytes in front of every slot, so that an encapsulation header and the payload can be one
+/// slice.
 pub const HEADROOM: usize = 4;
 
 /// Alignment of each payload: a cache line, and any vector type.
@@ -24,7 +26,8 @@ pub(crate) const MOST_HOLDS: u32 = u32::MAX / 2;
 
 /// Slots of one size over one region. Clones are handles to the same slots.
 ///
-/// `M` is what a sample carries besides its bytes: stamps, writer, encoding. Leases keep the pool alive.
+/// `M` is what a sample carries besides its bytes: stamps, writer, encoding. Leases keep the pool
+/// alive.
 pub struct Pool<M>(Arc<Slots<M>>);
 
 pub(crate) struct Slots<M> {
@@ -52,15 +55,17 @@ pub(crate) struct Seal<M> {
     pub(crate) meta: M,
 }
 
-/// Which ring published a sample, and as which. Rings share a pool, so a position alone could be a stranger's.
+/// Which ring published a sample, and as which. Rings share a pool, so a position alone could be a
+/// stranger's.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Stamp {
     pub(crate) ring: u64,
     pub(crate) position: u64,
 }
 
-// SAFETY: the bytes and the seal of a slot are written by the one owner of its draft, and read by others only after
-// they saw its count above 0 (see the head of this file). `M` is moved in on one thread and shared from there.
+// SAFETY: the bytes and the seal of a slot are written by the one owner of its draft, and read by
+// others only after they saw its count above 0 (see the head of this file). `M` is moved in on one
+// thread and shared from there.
 unsafe impl<M: Send + Sync> Send for Slots<M> {}
 // SAFETY: as above.
 unsafe impl<M: Send + Sync> Sync for Slots<M> {}
@@ -73,7 +78,8 @@ impl<M> Slots<M> {
     /// First payload byte of a slot; the headroom lies before it.
     pub(crate) fn payload(&self, index: u32) -> NonNull<u8> {
         assert!((index as usize) < self.slots.len());
-        // SAFETY: `Pool::new` checked that the region holds `slots` strides after `first`, and `index < slots`.
+        // SAFETY: `Pool::new` checked that the region holds `slots` strides after `first`, and
+        // `index < slots`.
         unsafe { self.first.add(index as usize * self.stride) }
     }
 
@@ -83,7 +89,8 @@ impl<M> Slots<M> {
     ///
     /// The caller owns a hold on the slot, and loses it here.
     pub(crate) unsafe fn release(&self, index: u32) {
-        // Release: what we read comes before any later write. Acquire, for the last one: what the others read, too.
+        // Release: what we read comes before any later write. Acquire, for the last one: what the
+        // others read, too.
         if self.slot(index).count.fetch_sub(1, Ordering::AcqRel) == 1 {
             self.free.give(index);
         }
@@ -95,8 +102,9 @@ impl<M: Copy + Send + Sync + 'static> Pool<M> {
     ///
     /// # Errors
     ///
-    /// [`PoolError::SlotCount`] for 0 or more than 2^31 - 1 slots, [`PoolError::TooLarge`] if their size overflows,
-    /// [`PoolError::RegionTooSmall`] and [`PoolError::RegionUnaligned`] if they do not fit `region`.
+    /// [`PoolError::SlotCount`] for 0 or more than 2^31 - 1 slots, [`PoolError::TooLarge`] if their
+    /// size overflows, [`PoolError::RegionTooSmall`] and [`PoolError::RegionUnaligned`] if they do
+    /// not fit `region`.
     pub fn new(region: impl Region, slots: usize, slot_bytes: usize) -> Result<Self, PoolError> {
         let count = match u32::try_from(slots) {
             Ok(count @ 1..=0x7fff_ffff) => count,
@@ -115,7 +123,8 @@ impl<M: Copy + Send + Sync + 'static> Pool<M> {
         if !address.is_multiple_of(LINE) {
             return Err(PoolError::RegionUnaligned { address });
         }
-        let slot = |_| Slot { count: AtomicU32::new(0), seal: UnsafeCell::new(MaybeUninit::uninit()) };
+        let slot =
+            |_| Slot { count: AtomicU32::new(0), seal: UnsafeCell::new(MaybeUninit::uninit()) };
         Ok(Self(Arc::new(Slots {
             // SAFETY: the region has at least `needed` bytes, which is `LINE` and then the strides.
             first: unsafe { region.base().add(LINE) },
@@ -137,7 +146,8 @@ impl<M: Copy + Send + Sync + 'static> Pool<M> {
     }
 }
 
-/// Bytes from one payload to the next: itself and the headroom of the next one, rounded up to [`LINE`].
+/// Bytes from one payload to the next: itself and the headroom of the next one, rounded up to
+/// [`LINE`].
 fn stride(slot_bytes: usize) -> Option<usize> {
     slot_bytes.checked_add(HEADROOM)?.checked_next_multiple_of(LINE)
 }
@@ -147,8 +157,8 @@ impl<M> Pool<M> {
     ///
     /// # Errors
     ///
-    /// [`Refusal::TooBig`] if `len` exceeds [`slot_bytes`](Self::slot_bytes); [`Refusal::NoSlot`] if none is free. A
-    /// slot that is freed while others draft may be missed.
+    /// [`Refusal::TooBig`] if `len` exceeds [`slot_bytes`](Self::slot_bytes); [`Refusal::NoSlot`]
+    /// if none is free. A slot that is freed while others draft may be missed.
     pub fn draft(&self, len: usize) -> Result<Draft<M>, Refusal> {
         let max = self.0.slot_bytes;
         if len > max {
@@ -185,17 +195,18 @@ impl<M> Pool<M> {
 
     /// A lease on a slot, if it is sealed and carries `stamp`.
     ///
-    /// If this answers `None`, then all that was done before the slot lost that stamp is visible to the caller.
+    /// If this answers `None`, then all that was done before the slot lost that stamp is visible to
+    /// the caller.
     pub(crate) fn pin(&self, index: u32, stamp: Stamp) -> Option<Lease<M>> {
         let one_more = |count| (1..MOST_HOLDS).contains(&count).then_some(count + 1);
         let count = &self.0.slot(index).count;
-        // Acquire on success pairs with `Draft::sealed`; on failure, with what brought the count to 0: `release` or
-        // `reclaim`.
+        // Acquire on success pairs with `Draft::sealed`; on failure, with what brought the count to
+        // 0: `release` or `reclaim`.
         count.fetch_update(Ordering::Acquire, Ordering::Acquire, one_more).ok()?;
         // SAFETY: we have just raised the count from above 0, and hand that hold over.
         let lease = unsafe { Lease::new(Arc::clone(&self.0), index) };
-        // The slot may have been sealed anew since the caller learnt its index. Then we held a stranger's sample for a
-        // moment, and drop it here.
+        // The slot may have been sealed anew since the caller learnt its index. Then we held a
+        // stranger's sample for a moment, and drop it here.
         (lease.stamp() == Some(stamp)).then_some(lease)
     }
 
@@ -216,10 +227,11 @@ impl<M> Pool<M> {
     /// The caller owns that hold, and loses it if a draft comes back. `len <= slot_bytes`.
     pub(crate) unsafe fn reclaim(&self, index: u32, len: usize) -> Option<Draft<M>> {
         let count = &self.0.slot(index).count;
-        // Acquire pairs with `release`: what former holders read comes before what the draft's owner writes. Release
-        // pairs with a `pin` that fails.
+        // Acquire pairs with `release`: what former holders read comes before what the draft's
+        // owner writes. Release pairs with a `pin` that fails.
         count.compare_exchange(1, 0, Ordering::AcqRel, Ordering::Relaxed).ok()?;
-        // SAFETY: the count is 0 and we brought it there, so the slot is ours alone; the caller checked `len`.
+        // SAFETY: the count is 0 and we brought it there, so the slot is ours alone; the caller
+        // checked `len`.
         Some(unsafe { Draft::new(Arc::clone(&self.0), index, len) })
     }
 }

@@ -1,8 +1,9 @@
 //! The newest samples of one writer, by position.
 //!
-//! A ring of depth `d` has `d + 1` places. A place names a slot on which the ring owns one hold, or none. The writer
-//! fills the spare place, then raises `head`, and only then empties the place of the sample that leaves. A reader that
-//! misses the newest sample therefore sees a higher `head`, or knows that the sample was evicted.
+//! A ring of depth `d` has `d + 1` places. A place names a slot on which the ring owns one hold, or
+//! none. The writer fills the spare place, then raises `head`, and only then empties the place of
+//! the sample that leaves. A reader that misses the newest sample therefore sees a higher `head`,
+//! or knows that the sample was evicted.
 #![allow(unsafe_code)]
 
 use std::{error::Error, fmt};
@@ -18,7 +19,8 @@ const EMPTY: u32 = u32::MAX;
 
 /// A ring that shows the newest `depth` samples, over slots of `pool`.
 ///
-/// Rings may share a pool; each evicts only its own samples. See the crate's page for how many slots are enough.
+/// Rings may share a pool; each evicts only its own samples. See the crate's page for how many
+/// slots are enough.
 ///
 /// # Errors
 ///
@@ -94,14 +96,15 @@ impl<M> Shared<M> {
 
     /// The sample of a position below a `head` that the caller has loaded, if it is still there.
     fn at(&self, position: u64) -> Option<Lease<M>> {
-        // That load of `head` shows the place as it was filled, or later. Acquire shows why the sample left: see
-        // `newest_at`.
+        // That load of `head` shows the place as it was filled, or later. Acquire shows why the
+        // sample left: see `newest_at`.
         let index = self.place(position).load(Ordering::Acquire);
         let stamp = Stamp { ring: self.id, position };
         (index != EMPTY).then(|| self.pool.pin(index, stamp))?
     }
 
-    /// Counts a sample that has left. Release, so that who sees the count sees the `head` that it belongs to.
+    /// Counts a sample that has left. Release, so that who sees the count sees the `head` that it
+    /// belongs to.
     fn count_overwritten(&self) {
         self.overwritten.fetch_add(1, Ordering::Release);
     }
@@ -112,7 +115,8 @@ impl<M> Drop for Shared<M> {
         for place in &self.places {
             let index = place.load(Ordering::Relaxed);
             if index != EMPTY {
-                // SAFETY: a place that is not empty stands for one hold, and nobody uses the places any more.
+                // SAFETY: a place that is not empty stands for one hold, and nobody uses the places
+                // any more.
                 unsafe { self.pool.release(index) };
             }
         }
@@ -129,14 +133,16 @@ pub struct RingWriter<M> {
 }
 
 impl<M> RingWriter<M> {
-    /// A slot for the next sample, `len` bytes: a free one, else that of the oldest sample which nobody holds.
+    /// A slot for the next sample, `len` bytes: a free one, else that of the oldest sample which
+    /// nobody holds.
     ///
     /// A sample evicted in this way is counted and gone, even if the draft is dropped.
     ///
     /// # Errors
     ///
-    /// [`Refusal::TooBig`] and, if none is free and all samples of this ring are held, [`Refusal::NoSlot`]; both are
-    /// counted. A reader that looks at a sample holds it for an instant.
+    /// [`Refusal::TooBig`] and, if none is free and all samples of this ring are held,
+    /// [`Refusal::NoSlot`]; both are counted. A reader that looks at a sample holds it for an
+    /// instant.
     pub fn draft(&mut self, len: usize) -> Result<Draft<M>, Refusal> {
         let drafted = self.shared.pool.draft(len).or_else(|refusal| match refusal {
             Refusal::NoSlot => self.evict(len).ok_or(refusal),
@@ -160,8 +166,8 @@ impl<M> RingWriter<M> {
             if index == EMPTY {
                 continue;
             }
-            // SAFETY: a place that is not empty stands for one hold, we are the only writer, and the place is emptied
-            // as soon as that hold is gone. `Pool::draft` has checked `len`.
+            // SAFETY: a place that is not empty stands for one hold, we are the only writer, and
+            // the place is emptied as soon as that hold is gone. `Pool::draft` has checked `len`.
             if let Some(draft) = unsafe { ring.pool.reclaim(index, len) } {
                 place.store(EMPTY, Ordering::Release);
                 ring.count_overwritten();
@@ -173,8 +179,8 @@ impl<M> RingWriter<M> {
 
     /// Shows a sample to the readers, and answers its position: 0, 1, 2, ...
     ///
-    /// The sample `depth` positions before it leaves the ring, and is counted unless it was evicted before. Its slot
-    /// returns to the pool with the last lease on it.
+    /// The sample `depth` positions before it leaves the ring, and is counted unless it was evicted
+    /// before. Its slot returns to the pool with the last lease on it.
     ///
     /// # Errors
     ///
@@ -187,8 +193,9 @@ impl<M> RingWriter<M> {
         let position = self.head;
         let stamp = Stamp { ring: ring.id, position };
         let index = draft.into_hold(stamp, meta);
-        // The spare place: its last sample left when `position - 1` was published. Release pairs with `at`: a reader
-        // that still looks for that sample, and finds this one, also finds the `head` of then.
+        // The spare place: its last sample left when `position - 1` was published. Release pairs
+        // with `at`: a reader that still looks for that sample, and finds this one, also finds the
+        // `head` of then.
         ring.place(position).store(index, Ordering::Release);
         self.head = position + 1;
         ring.head.store(self.head, Ordering::Release);
@@ -234,12 +241,14 @@ impl<M> RingReader<M> {
         (1..=self.0.depth()).contains(&age).then(|| self.0.at(position))?
     }
 
-    /// The newest sample; `None` only if there was a moment during the call at which the ring showed none.
+    /// The newest sample; `None` only if there was a moment during the call at which the ring
+    /// showed none.
     ///
-    /// A sample that leaves while we look for it either was evicted, and then the one before it is the newest, or was
-    /// followed by others; then we see a higher `head` and start there. Each new start is paid for by a sample that
-    /// was published during the call, and at most `depth` looks lie between two, so the call ends unless the writer
-    /// is forever as fast as the few instructions of one look.
+    /// A sample that leaves while we look for it either was evicted, and then the one before it is
+    /// the newest, or was followed by others; then we see a higher `head` and start there. Each new
+    /// start is paid for by a sample that was published during the call, and at most `depth` looks
+    /// lie between two, so the call ends unless the writer is forever as fast as the few
+    /// instructions of one look.
     pub fn newest(&self) -> Option<Lease<M>> {
         self.newest_before(u64::MAX)
     }
@@ -257,9 +266,9 @@ impl<M> RingReader<M> {
             if let Some(lease) = self.0.at(position) {
                 return Some((lease, position));
             }
-            // Place or count told us, by an Acquire load, that the sample is gone. What the writer did before it took
-            // the sample away is therefore visible: a publication that replaced it, or went before its eviction, had
-            // raised `head`, and this load sees it.
+            // Place or count told us, by an Acquire load, that the sample is gone. What the writer
+            // did before it took the sample away is therefore visible: a publication that replaced
+            // it, or went before its eviction, had raised `head`, and this load sees it.
             let now = self.head().min(end);
             back = if now == head { back + 1 } else { 1 };
             head = now;
@@ -279,7 +288,8 @@ impl<M> RingReader<M> {
         self.newest_while_before(end, n, |_| true, out);
     }
 
-    /// Fills `out` with the newest samples, at most `max`, back to the first one that `keep` refuses; oldest first.
+    /// Fills `out` with the newest samples, at most `max`, back to the first one that `keep`
+    /// refuses; oldest first.
     ///
     /// Positions that were evicted are passed over. `keep` is asked newest first.
     pub fn newest_while(&self, max: usize, keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
@@ -287,7 +297,13 @@ impl<M> RingReader<M> {
     }
 
     /// As [`RingReader::newest_while`], of the samples at positions below `end`.
-    pub fn newest_while_before(&self, end: u64, max: usize, mut keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
+    pub fn newest_while_before(
+        &self,
+        end: u64,
+        max: usize,
+        mut keep: impl FnMut(&M) -> bool,
+        out: &mut Vec<Lease<M>>,
+    ) {
         out.clear();
         if max == 0 {
             return;
@@ -297,7 +313,9 @@ impl<M> RingReader<M> {
         };
         let oldest = (position + 1).saturating_sub(self.0.depth());
         let older = (oldest..position).rev().filter_map(|older| self.0.at(older));
-        out.extend(std::iter::once(newest).chain(older).take_while(|lease| keep(lease.meta())).take(max));
+        out.extend(
+            std::iter::once(newest).chain(older).take_while(|lease| keep(lease.meta())).take(max),
+        );
         out.reverse();
     }
 

@@ -9,13 +9,16 @@ use serde_json::{Value, json};
 
 #[test]
 fn a_ring_answers_as_the_rules_have_it() {
-    let cases: Vec<Value> = serde_json::from_str(include_str!("../../../rules/cases/ring.json")).unwrap();
+    let cases: Vec<Value> =
+        serde_json::from_str(include_str!("../../../rules/cases/ring.json")).unwrap();
     for case in &cases {
         let [depth, hold, max_size] =
             ["depth", "hold", "max_size"].map(|key| case["given"][key].as_u64().unwrap() as usize);
         let slots = depth + hold + 1;
-        let region = HeapRegion::zeroed(Pool::<i64>::bytes_needed(slots, max_size).unwrap()).unwrap();
-        let (mut writer, reader) = ring(Pool::new(region, slots, max_size).unwrap(), depth).unwrap();
+        let region =
+            HeapRegion::zeroed(Pool::<i64>::bytes_needed(slots, max_size).unwrap()).unwrap();
+        let (mut writer, reader) =
+            ring(Pool::new(region, slots, max_size).unwrap(), depth).unwrap();
         let (mut held, mut found) = (BTreeMap::new(), Vec::new());
         for (n, call) in case["calls"].as_array().unwrap().iter().enumerate() {
             let given = call[1].as_u64().unwrap_or_default();

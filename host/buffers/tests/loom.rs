@@ -2,8 +2,9 @@
 //!
 //! Run with `RUSTFLAGS="--cfg loom" LOOM_MAX_PREEMPTIONS=3 cargo test --release --test loom`.
 //!
-//! Loom runs the first thread as far as it gets, and looks back from what the others do. It can overlook that a load
-//! may come after another thread's load and store, so the writer is always the first thread, and readers the others.
+//! Loom runs the first thread as far as it gets, and looks back from what the others do. It can
+//! overlook that a load may come after another thread's load and store, so the writer is always the
+//! first thread, and readers the others.
 #![cfg(loom)]
 
 use gleaner_buffers::{HeapRegion, Lease, Pool, RingReader, RingWriter, ring};
@@ -63,7 +64,8 @@ fn newest_never_misses_although_its_place_holds_a_slot_used_for_the_first_time()
     loom::model(|| {
         let (mut writer, reader) = ring(pool(3), 1).unwrap();
         publish(&mut writer, 0);
-        // Pinned, its slot does not come back: 2 goes to the place of 0, but to a slot that no reader has met.
+        // Pinned, its slot does not come back: 2 goes to the place of 0, but to a slot that no
+        // reader has met.
         let pinned = reader.get(0).unwrap();
         let reading = thread::spawn(move || drop(reader.newest().unwrap()));
         assert!(publish(&mut writer, 1));
@@ -166,7 +168,8 @@ fn a_reader_never_takes_a_sample_of_another_ring_for_its_own() {
             let seen = reader.get(0).map(|lease| value(&lease));
             assert!(seen.is_none_or(|value| value == 7));
         });
-        // Evicts ours at position 0, frees the slot, and publishes in it at position 0 of the other ring.
+        // Evicts ours at position 0, frees the slot, and publishes in it at position 0 of the other
+        // ring.
         drop(ours.draft(8));
         publish(&mut others, 8);
         reading.join().unwrap();

@@ -1,7 +1,9 @@
 //! Rings through the public interface, one thread at a time.
 #![cfg(not(loom))]
 
-use gleaner_buffers::{HeapRegion, Lease, Pool, PoolError, Refusal, RingCounts, RingReader, RingWriter, ring};
+use gleaner_buffers::{
+    HeapRegion, Lease, Pool, PoolError, Refusal, RingCounts, RingReader, RingWriter, ring,
+};
 
 fn pool(slots: usize) -> Pool<u64> {
     let bytes = Pool::<u64>::bytes_needed(slots, 8).unwrap();
@@ -132,7 +134,8 @@ fn without_a_free_slot_the_oldest_unpinned_sample_is_evicted() {
     let pinned = reader.get(0).unwrap();
     publish(&mut writer, 3);
     assert!(reader.get(1).is_none());
-    // 0 has left because three newer ones were published, 1 because its slot was needed; each is counted once.
+    // 0 has left because three newer ones were published, 1 because its slot was needed; each is
+    // counted once.
     assert_eq!(last(&reader, 3), [2, 3]);
     assert_eq!(reader.counts().overwritten, 2);
     assert_eq!(value(&pinned), 0);
@@ -243,5 +246,9 @@ fn a_reader_can_be_kept_from_what_came_after_a_position() {
     assert_eq!(before(9, 2), [3, 4]);
     assert_eq!(reader.newest_before(4).as_ref().map(value), Some(3));
     // What has left the ring does not come back.
-    assert!(before(1, 9).is_empty() && reader.newest_before(1).is_none() && reader.newest_before(0).is_none());
+    assert!(
+        before(1, 9).is_empty()
+            && reader.newest_before(1).is_none()
+            && reader.newest_before(0).is_none()
+    );
 }

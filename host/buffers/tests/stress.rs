@@ -1,4 +1,5 @@
-//! Rings on real threads: what readers see is whole, in order, and accounted for. Bounded by counts, not by time.
+//! Rings on real threads: what readers see is whole, in order, and accounted for. Bounded by
+//! counts, not by time.
 #![cfg(not(loom))]
 
 use std::{
@@ -55,7 +56,8 @@ fn write_all(mut writer: RingWriter<Meta>, ring: u64) -> u64 {
     refused
 }
 
-/// Reads until `writers` is 0, holding up to three samples; `turn` sets readers apart from each other.
+/// Reads until `writers` is 0, holding up to three samples; `turn` sets readers apart from each
+/// other.
 fn read_all(reader: &RingReader<Meta>, ring: u64, turn: u64, writers: &AtomicUsize) {
     let mut held: Vec<Lease<Meta>> = Vec::new();
     let mut batch = Vec::new();

@@ -1,4 +1,5 @@
-//! From a component to its entry in the cache: compiled, written beside its place, synced and renamed.
+//! From a component to its entry in the cache: compiled, written beside its place, synced and
+//! renamed.
 
 use std::io::{self, Write};
 use std::os::unix::fs::MetadataExt;
@@ -8,12 +9,13 @@ use tempfile::NamedTempFile;
 
 use super::prune::prune;
 use super::{
-    CACHE_BYTES, CODE_BYTES, CompileError, Entry, Found, GUEST_STACK_BYTES, Nans, NoComponent, engine, make_cache,
-    read_component,
+    CACHE_BYTES, CODE_BYTES, CompileError, Entry, Found, GUEST_STACK_BYTES, Nans, NoComponent,
+    engine, make_cache, read_component,
 };
 
-/// Compiles the component at `path` into `cache` and returns the entry; a healthy one is left as it is, a damaged one replaced. So that
-/// the cache does not grow without end, what is beyond [`CACHE_BYTES`] leaves it.
+/// Compiles the component at `path` into `cache` and returns the entry; a healthy one is left as it
+/// is, a damaged one replaced. So that the cache does not grow without end, what is beyond
+/// [`CACHE_BYTES`] leaves it.
 ///
 /// # Errors
 ///
@@ -41,8 +43,9 @@ pub fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<PathBuf, Compile
     Ok(entry.path().to_owned())
 }
 
-/// Writes a file that is either whole or as it was before, whenever the power fails. A healthy file is never missing on the way, so
-/// processes that replace a damaged one at once do not disturb each other.
+/// Writes a file that is either whole or as it was before, whenever the power fails. A healthy file
+/// is never missing on the way, so processes that replace a damaged one at once do not disturb each
+/// other.
 fn write_whole(path: &Path, parts: &[&[u8]]) -> io::Result<()> {
     let mut partial = begin_beside(path)?;
     parts.iter().try_for_each(|part| partial.write_all(part))?;
@@ -51,7 +54,8 @@ fn write_whole(path: &Path, parts: &[&[u8]]) -> io::Result<()> {
     Ok(())
 }
 
-/// Begins a file of a name of its own beside `path`. It stays locked until it is closed: one without a lock was left by a killed process.
+/// Begins a file of a name of its own beside `path`. It stays locked until it is closed: one
+/// without a lock was left by a killed process.
 fn begin_beside(path: &Path) -> io::Result<NamedTempFile> {
     let (folder, name) = (path.parent().unwrap_or(path), path.file_stem().unwrap_or_default());
     loop {

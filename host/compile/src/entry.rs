@@ -1,7 +1,9 @@
-//! An entry of the cache: native code below a digest, which binds the code to all that it was made from.
+//! An entry of the cache: native code below a digest, which binds the code to all that it was made
+//! from.
 //!
-//! Whoever changes a bit of an entry, cuts it, or copies another over it has code that is never run. An attacker who can write into
-//! the cache can make the digest as well; that is why owners and modes are checked first.
+//! Whoever changes a bit of an entry, cuts it, or copies another over it has code that is never
+//! run. An attacker who can write into the cache can make the digest as well; that is why owners
+//! and modes are checked first.
 
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
@@ -38,7 +40,8 @@ pub enum Found {
 }
 
 impl Entry {
-    /// The entry of `component`, compiled with `nans`, in the folder `cache`: `<cache>/<key>.cwasm`.
+    /// The entry of `component`, compiled with `nans`, in the folder `cache`:
+    /// `<cache>/<key>.cwasm`.
     pub fn of(cache: &Path, component: &[u8], nans: Nans) -> Self {
         let mut key = Sha256::new();
         let (arch, cpu) = (std::env::consts::ARCH.as_bytes(), cpu_features());
@@ -55,14 +58,14 @@ impl Entry {
         &self.path
     }
 
-    /// Reads the code into memory and compares it with its digest there: nothing that another process does to the file
-    /// afterwards changes what is loaded. The code counts as used.
+    /// Reads the code into memory and compares it with its digest there: nothing that another
+    /// process does to the file afterwards changes what is loaded. The code counts as used.
     ///
     /// # Errors
     ///
-    /// [`CompileError::Untrusted`] if another user could have written it: file and folders above it must belong to this user
-    /// or to root, and only they may write to them. The same if it is no file, such as a link, a pipe or a folder.
-    /// [`CompileError::ReadCode`] if it cannot be opened.
+    /// [`CompileError::Untrusted`] if another user could have written it: file and folders above it
+    /// must belong to this user or to root, and only they may write to them. The same if it is no
+    /// file, such as a link, a pipe or a folder. [`CompileError::ReadCode`] if it cannot be opened.
     pub fn read(&self) -> Result<Found, CompileError> {
         check_folder(self.path.parent().unwrap_or(&self.path))?;
         let untrusted = |why: String| CompileError::Untrusted { path: self.path.clone(), why };
@@ -79,7 +82,9 @@ impl Entry {
             return Err(untrusted(why.to_owned()));
         }
         // A disk that cannot give the bytes back is one more way of damage.
-        let found = self.compared(&file, meta.len()).unwrap_or_else(|error| Found::Damaged(error.to_string()));
+        let found = self
+            .compared(&file, meta.len())
+            .unwrap_or_else(|error| Found::Damaged(error.to_string()));
         if matches!(found, Found::Code(_)) {
             note_use(&file);
         }
@@ -88,7 +93,8 @@ impl Entry {
 
     fn compared(&self, mut file: &File, len: u64) -> io::Result<Found> {
         let damaged = |why: &str| Ok(Found::Damaged(why.to_owned()));
-        let Some(code_len) = usize::try_from(len).ok().and_then(|len| len.checked_sub(HEAD_BYTES)) else {
+        let Some(code_len) = usize::try_from(len).ok().and_then(|len| len.checked_sub(HEAD_BYTES))
+        else {
             return damaged("it is too short");
         };
         if code_len > CODE_BYTES {
@@ -98,7 +104,11 @@ impl Entry {
         file.read_exact(&mut head)?;
         let mut code = Vec::with_capacity(code_len);
         file.take(CODE_BYTES as u64).read_to_end(&mut code)?;
-        if head == self.head(&code) { Ok(Found::Code(code)) } else { damaged("its digest is not that of its content") }
+        if head == self.head(&code) {
+            Ok(Found::Code(code))
+        } else {
+            damaged("its digest is not that of its content")
+        }
     }
 
     /// What stands before `code` in the file.
@@ -111,25 +121,29 @@ impl Entry {
     }
 }
 
-/// Features of this machine's CPU, as the kernel names them: a cache in a home folder may be shared by several machines.
-/// Wasmtime checks the same again when it loads code, and refuses what does not fit.
+/// Features of this machine's CPU, as the kernel names them: a cache in a home folder may be shared
+/// by several machines. Wasmtime checks the same again when it loads code, and refuses what does
+/// not fit.
 fn cpu_features() -> String {
     let cpus = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let features = cpus.lines().find(|line| line.starts_with("flags") || line.starts_with("Features"));
+    let features =
+        cpus.lines().find(|line| line.starts_with("flags") || line.starts_with("Features"));
     features.unwrap_or_default().to_owned()
 }
 
 /// Checks that only this user can put files into `folder`, or replace it.
 fn check_folder(folder: &Path) -> Result<(), CompileError> {
     let read = |source| CompileError::ReadCode { path: folder.to_owned(), source };
-    let untrusted =
-        |path: &Path, why: &str| Err(CompileError::Untrusted { path: path.to_owned(), why: why.to_owned() });
+    let untrusted = |path: &Path, why: &str| {
+        Err(CompileError::Untrusted { path: path.to_owned(), why: why.to_owned() })
+    };
     let whole = fs::canonicalize(folder).map_err(read)?;
     for (above, path) in whole.ancestors().enumerate() {
         let meta = fs::symlink_metadata(path).map_err(read)?;
         let root_owns = meta.uid() == 0;
         let wrong = match foreign(&meta) {
-            // Folders above may be root's; in one that all may write to, like /tmp, the sticky bit protects what is ours.
+            // Folders above may be root's; in one that all may write to, like /tmp, the sticky bit
+            // protects what is ours.
             Some(NOT_OURS) if above > 0 && root_owns && meta.mode() & 0o022 == 0 => None,
             Some(_) if above > 0 && root_owns && meta.mode() & 0o1000 != 0 => None,
             wrong => wrong,
@@ -181,7 +195,8 @@ mod tests {
 
     /// A cache of this test's own with an entry in it, and the bytes of that.
     fn cache(name: &str) -> (PathBuf, Entry, Vec<u8>) {
-        let cache = std::env::temp_dir().join(format!("gleaner-entry-{name}-{}", std::process::id()));
+        let cache =
+            std::env::temp_dir().join(format!("gleaner-entry-{name}-{}", std::process::id()));
         make_cache(&cache).unwrap();
         let entry = Entry::of(&cache, b"component", Nans::AsMade);
         let bytes = [&entry.head(CODE), CODE].concat();

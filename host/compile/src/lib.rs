@@ -1,9 +1,10 @@
 //! The engine that all lambdas run on, and the cache of their native code.
 //!
-//! Compiling takes a second and 40 MB, loading 0.3 ms and 11 MB, and comparing it before 0.2 ms; so a component is compiled
-//! once, in a process of its own (`gleaner-compile`), and every runtime loads what that left. Loading native code means
-//! trusting it: an entry of the cache must belong to this user alone, and has a digest of its code that is bound to the
-//! component, to wasmtime's version, to the settings below and to the CPU. A component is hostile until proven otherwise, so
+//! Compiling takes a second and 40 MB, loading 0.3 ms and 11 MB, and comparing it before 0.2 ms; so
+//! a component is compiled once, in a process of its own (`gleaner-compile`), and every runtime
+//! loads what that left. Loading native code means trusting it: an entry of the cache must belong
+//! to this user alone, and has a digest of its code that is bound to the component, to wasmtime's
+//! version, to the settings below and to the CPU. A component is hostile until proven otherwise, so
 //! compiling has a limit of memory and of time.
 
 use std::io;
@@ -16,7 +17,8 @@ use wasmtime::{Config, Engine};
 /// Largest native code that is kept, in bytes.
 pub const CODE_BYTES: usize = 256 << 20;
 
-/// Memory that compiling may take, in bytes; an ordinary lambda takes some 50 MB. A small component can be made to take any.
+/// Memory that compiling may take, in bytes; an ordinary lambda takes some 50 MB. A small component
+/// can be made to take any.
 pub const COMPILE_MEMORY_BYTES: u64 = 2 << 30;
 
 /// Seconds of CPU time that compiling may take; an ordinary lambda takes one.
@@ -98,8 +100,12 @@ impl NoComponent {
 
     fn help(self) -> &'static str {
         match self {
-            Self::Foreign => "name the component as `entry` in lambda.toml, and build the lambda: gleaner build DIR",
-            Self::Module => "build the lambda with `gleaner build DIR`, which makes a component (target wasm32-wasip2)",
+            Self::Foreign => {
+                "name the component as `entry` in lambda.toml, and build the lambda: gleaner build DIR"
+            }
+            Self::Module => {
+                "build the lambda with `gleaner build DIR`, which makes a component (target wasm32-wasip2)"
+            }
         }
     }
 }
@@ -146,8 +152,8 @@ impl Explain for CompileError {
     }
 }
 
-/// The engine for which all lambdas are compiled and on which they run, with a stack of so many bytes, at most
-/// [`GUEST_STACK_BYTES`]. Native code does not depend on that, but on `nans`.
+/// The engine for which all lambdas are compiled and on which they run, with a stack of so many
+/// bytes, at most [`GUEST_STACK_BYTES`]. Native code does not depend on that, but on `nans`.
 ///
 /// # Errors
 ///
@@ -158,11 +164,13 @@ pub fn engine(stack_bytes: usize, nans: Nans) -> Result<Engine, CompileError> {
     Engine::new(&settings).map_err(|source| CompileError::Engine { source: source.into() })
 }
 
-/// What [`engine`] is set to, named by [`Nans::settings`]; benches change a part of it to tell its price.
+/// What [`engine`] is set to, named by [`Nans::settings`]; benches change a part of it to tell its
+/// price.
 pub fn settings(nans: Nans) -> Config {
     let mut config = Config::new();
     config
-        // Instructions are counted and the clock can interrupt, always: the same code serves replay and vehicle.
+        // Instructions are counted and the clock can interrupt, always: the same code serves replay
+        // and vehicle.
         .consume_fuel(true)
         .epoch_interruption(true)
         // A call into a guest costs 0.15 µs without it and 2.7 µs with it.
@@ -171,7 +179,9 @@ pub fn settings(nans: Nans) -> Config {
         .wasm_relaxed_simd(false)
         .max_wasm_stack(GUEST_STACK_BYTES);
     #[cfg(feature = "compiler")]
-    config.cranelift_opt_level(wasmtime::OptLevel::Speed).cranelift_nan_canonicalization(nans == Nans::Canonical);
+    config
+        .cranelift_opt_level(wasmtime::OptLevel::Speed)
+        .cranelift_nan_canonicalization(nans == Nans::Canonical);
     #[cfg(not(feature = "compiler"))]
     let _ = nans;
     config
@@ -185,7 +195,9 @@ pub fn settings(nans: Nans) -> Config {
 pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
     PlainFile::named(path, COMPONENT_MAX).and_then(PlainFile::read_whole).map_err(|source| {
         match NotPlain::of(&source) {
-            Some(NotPlain::TooLong { bytes, .. }) => CompileError::TooLarge { path: path.to_owned(), bytes: *bytes },
+            Some(NotPlain::TooLong { bytes, .. }) => {
+                CompileError::TooLarge { path: path.to_owned(), bytes: *bytes }
+            }
             _ => CompileError::Read { path: path.to_owned(), source },
         }
     })
@@ -218,13 +230,25 @@ mod tests {
 
     #[test]
     fn only_a_file_of_a_bounded_size_is_read_as_a_component() {
-        let folder = std::env::temp_dir().join(format!("gleaner-compile-read-{}", std::process::id()));
+        let folder =
+            std::env::temp_dir().join(format!("gleaner-compile-read-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
-        let (plain, pipe, device, large) =
-            (folder.join("plain"), folder.join("pipe"), folder.join("device"), folder.join("large"));
+        let (plain, pipe, device, large) = (
+            folder.join("plain"),
+            folder.join("pipe"),
+            folder.join("device"),
+            folder.join("large"),
+        );
         fs::write(&plain, b"bytes").unwrap();
         assert_eq!(read_component(&plain).unwrap(), b"bytes");
-        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::RUSR, 0).unwrap();
+        rustix::fs::mknodat(
+            rustix::fs::CWD,
+            &pipe,
+            rustix::fs::FileType::Fifo,
+            rustix::fs::Mode::RUSR,
+            0,
+        )
+        .unwrap();
         std::os::unix::fs::symlink("/dev/zero", &device).unwrap();
         for none in [&pipe, &device, &folder] {
             let error = read_component(none).unwrap_err();

@@ -1,4 +1,5 @@
-//! `gleaner-compile COMPONENT --cache DIR`: compiles a component and prints the path of its native code.
+//! `gleaner-compile COMPONENT --cache DIR`: compiles a component and prints the path of its native
+//! code.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -30,7 +31,9 @@ fn main() -> ExitCode {
     let args = Args::parse();
     bound_this_process(args.cpu_seconds);
     let nans = if args.deterministic { Nans::Canonical } else { Nans::AsMade };
-    match confine_to(&args).and_then(|()| gleaner_compile::compile(&args.component, &args.cache, nans)) {
+    match confine_to(&args)
+        .and_then(|()| gleaner_compile::compile(&args.component, &args.cache, nans))
+    {
         Ok(entry) => {
             println!("{}", entry.display());
             Exit::Ok.into()
@@ -43,8 +46,9 @@ fn main() -> ExitCode {
     }
 }
 
-/// Whatever a component makes of the compiler: it can read that component and the system's libraries, and write into the cache.
-/// Where the kernel cannot do that, the bounds above are all there is; what is below this process is said by who runs it.
+/// Whatever a component makes of the compiler: it can read that component and the system's
+/// libraries, and write into the cache. Where the kernel cannot do that, the bounds above are all
+/// there is; what is below this process is said by who runs it.
 fn confine_to(args: &Args) -> Result<(), CompileError> {
     gleaner_compile::make_cache(&args.cache)?;
     let paths = Paths { read: vec![args.component.clone()], write: vec![args.cache.clone()] };
@@ -53,11 +57,13 @@ fn confine_to(args: &Args) -> Result<(), CompileError> {
     Ok(())
 }
 
-/// Past these limits an allocation fails, or the kernel ends this process; whoever started it says so.
+/// Past these limits an allocation fails, or the kernel ends this process; whoever started it says
+/// so.
 fn bound_this_process(cpu_seconds: u64) {
     let limit = |value, hard| Rlimit { current: Some(value), maximum: Some(hard) };
     // They only tighten, so they fail only where something tighter holds already.
     let _ = setrlimit(Resource::As, limit(COMPILE_MEMORY_BYTES, COMPILE_MEMORY_BYTES));
-    // The first comes with a signal by which whoever started this knows the limit; the second cannot be ignored.
+    // The first comes with a signal by which whoever started this knows the limit; the second
+    // cannot be ignored.
     let _ = setrlimit(Resource::Cpu, limit(cpu_seconds, cpu_seconds + 1));
 }

@@ -7,8 +7,9 @@ use std::time::{Duration, SystemTime};
 
 use gleaner_base::own_file;
 
-/// Most bytes of native code that are kept; an ordinary lambda takes half a megabyte. It goes by when code was loaded last, so it is
-/// that of components that were built anew, of earlier versions and of other settings that goes.
+/// Most bytes of native code that are kept; an ordinary lambda takes half a megabyte. It goes by
+/// when code was loaded last, so it is that of components that were built anew, of earlier versions
+/// and of other settings that goes.
 pub const CACHE_BYTES: u64 = 1 << 30;
 
 /// When code was loaded is noted once in this time, so that a start does not write to the disk.
@@ -19,12 +20,17 @@ pub(crate) fn note_use(entry: &File) {
     let _ = (|| {
         let used = entry.metadata()?.modified()?;
         let now = SystemTime::now();
-        if now.duration_since(used).is_ok_and(|ago| ago < DAY) { Ok(()) } else { entry.set_modified(now) }
+        if now.duration_since(used).is_ok_and(|ago| ago < DAY) {
+            Ok(())
+        } else {
+            entry.set_modified(now)
+        }
     })();
 }
 
-/// Removes from `cache` what was not in use for longest, until at most `most` bytes are left, and what a killed process did not complete.
-/// `keep` stays. What a process has loaded stays for that. Another process may do the same meanwhile.
+/// Removes from `cache` what was not in use for longest, until at most `most` bytes are left, and
+/// what a killed process did not complete. `keep` stays. What a process has loaded stays for that.
+/// Another process may do the same meanwhile.
 ///
 /// # Errors
 ///
@@ -81,7 +87,9 @@ mod tests {
     fn what_nobody_used_for_longest_goes_first() {
         let cache = std::env::temp_dir().join(format!("gleaner-prune-{}", std::process::id()));
         fs::create_dir_all(&cache).unwrap();
-        for (day, name) in ["new.cwasm", "older.cwasm", "oldest.cwasm", "kept.cwasm"].into_iter().enumerate() {
+        for (day, name) in
+            ["new.cwasm", "older.cwasm", "oldest.cwasm", "kept.cwasm"].into_iter().enumerate()
+        {
             file(&cache.join(name), 1000, DAY * (day as u32 + 1));
         }
         file(&cache.join("x.17.part"), 10, DAY * 2);
@@ -91,12 +99,17 @@ mod tests {
         file(&cache.join("foreign.txt"), 10_000, DAY * 9);
         let left = |most| {
             prune(&cache, &cache.join("kept.cwasm"), most).unwrap();
-            let mut names: Vec<_> =
-                fs::read_dir(&cache).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+            let mut names: Vec<_> = fs::read_dir(&cache)
+                .unwrap()
+                .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+                .collect();
             names.sort();
             names.join(" ")
         };
-        assert_eq!(left(4000), "foreign.txt kept.cwasm new.cwasm older.cwasm oldest.cwasm y.18.part");
+        assert_eq!(
+            left(4000),
+            "foreign.txt kept.cwasm new.cwasm older.cwasm oldest.cwasm y.18.part"
+        );
         assert_eq!(left(3999), "foreign.txt kept.cwasm new.cwasm older.cwasm y.18.part");
         note_use(&File::open(cache.join("older.cwasm")).unwrap());
         assert_eq!(left(2000), "foreign.txt kept.cwasm older.cwasm y.18.part");

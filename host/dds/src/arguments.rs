@@ -16,7 +16,8 @@ pub struct NetworkArgs {
 }
 
 impl NetworkArgs {
-    /// The options of the node `node`: what the environment says, unless the arguments say otherwise.
+    /// The options of the node `node`: what the environment says, unless the arguments say
+    /// otherwise.
     ///
     /// # Errors
     ///

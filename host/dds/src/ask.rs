@@ -1,12 +1,16 @@
-//! Asking a node of ROS 2 what a message type is: its service `get_type_description`, which nodes of Iron and newer have.
+//! Asking a node of ROS 2 what a message type is: its service `get_type_description`, which nodes
+//! of Iron and newer have.
 //!
-//! The receive thread asks one question at a time, of one node, and hands the answer over as it came; who asked reads it. A
-//! node is known by the graph, and the type's hash, without which no node answers, by what the writer announced.
+//! The receive thread asks one question at a time, of one node, and hands the answer over as it
+//! came; who asked reads it. A node is known by the graph, and the type's hash, without which no
+//! node answers, by what the writer announced.
 //!
-//! Which question an answer belongs to is said in two ways: rmw_cyclonedds puts 16 bytes in front of both, all others name
-//! the question beside the answer. The participant's vendor tells which; where it does not, both are tried in turn.
+//! Which question an answer belongs to is said in two ways: rmw_cyclonedds puts 16 bytes in front
+//! of both, all others name the question beside the answer. The participant's vendor tells which;
+//! where it does not, both are tried in turn.
 //!
-//! Sources: rmw_cyclonedds_cpp `serdata.cpp`, rmw_fastrtps_shared_cpp `rmw_request.cpp`; OMG RPC over DDS 1.0, 7.2.4.
+//! Sources: rmw_cyclonedds_cpp `serdata.cpp`, rmw_fastrtps_shared_cpp `rmw_request.cpp`; OMG RPC
+//! over DDS 1.0, 7.2.4.
 
 use std::time::{Duration, Instant};
 
@@ -15,8 +19,8 @@ use mio::{Interest, Token};
 use rustdds::dds::CreateError;
 use rustdds::discovery::DiscoveredWriterData;
 use rustdds::{
-    DomainParticipant, QosPolicyBuilder, RTPSEntity, SampleIdentity, SequenceNumber, TopicKind, WriteOptionsBuilder,
-    policy,
+    DomainParticipant, QosPolicyBuilder, RTPSEntity, SampleIdentity, SequenceNumber, TopicKind,
+    WriteOptionsBuilder, policy,
 };
 
 use super::feed::Around;
@@ -124,7 +128,13 @@ impl Asker {
     }
 
     /// Goes on with it.
-    pub(super) fn look(&mut self, around: &Around<'_>, token: Token, writers: &[DiscoveredWriterData], nodes: &Nodes) {
+    pub(super) fn look(
+        &mut self,
+        around: &Around<'_>,
+        token: Token,
+        writers: &[DiscoveredWriterData],
+        nodes: &Nodes,
+    ) {
         let Some(open) = &mut self.open else { return };
         let mut outcome = open.proceed(around, token, writers, nodes);
         if outcome.is_none() && open.begun.elapsed() >= LIMIT {
@@ -149,7 +159,9 @@ impl Open {
         nodes: &Nodes,
     ) -> Option<Outcome> {
         if self.call.is_none() {
-            match whom(&self.ask, writers, nodes).and_then(|whom| Call::make(around, token, &self.ask, whom)) {
+            match whom(&self.ask, writers, nodes)
+                .and_then(|whom| Call::make(around, token, &self.ask, whom))
+            {
                 Ok(call) => self.call = Some(call),
                 // It may not have been heard of yet.
                 Err(Lack::Yet(why)) => self.lacks = (why, false),
@@ -159,12 +171,15 @@ impl Open {
         let call = self.call.as_mut()?;
         let node = visible(&call.whom.node);
         if call.sent.is_none() {
-            self.lacks = (format!("node `{node}` does not offer the service get_type_description"), false);
+            self.lacks =
+                (format!("node `{node}` does not offer the service get_type_description"), false);
             call.send(around, &self.ask)?;
         }
         self.lacks = (format!("node `{node}` did not answer within {} s", LIMIT.as_secs()), true);
         call.take(around).map(|answer| match answer {
-            Ok((cdr, endian)) => Outcome::Answer { node, hash: call.whom.hash.clone(), cdr, endian },
+            Ok((cdr, endian)) => {
+                Outcome::Answer { node, hash: call.whom.hash.clone(), cdr, endian }
+            }
             Err(why) => Outcome::Silence { why: format!("node `{node}`: {why}"), again: true },
         })
     }
@@ -178,12 +193,15 @@ enum Lack {
 /// Whom to ask: each time another node, if several write the type.
 fn whom(ask: &Ask, writers: &[DiscoveredWriterData], nodes: &Nodes) -> Result<Whom, Lack> {
     let yet = |why: &str| Lack::Yet(why.to_owned());
-    let type_name = dds_type(&ask.type_name).ok_or_else(|| Lack::Ever("it is no type of ROS 2".to_owned()))?;
-    let of_type = || writers.iter().filter(|writer| writer.publication_topic_data.type_name == type_name);
+    let type_name =
+        dds_type(&ask.type_name).ok_or_else(|| Lack::Ever("it is no type of ROS 2".to_owned()))?;
+    let of_type =
+        || writers.iter().filter(|writer| writer.publication_topic_data.type_name == type_name);
     if of_type().next().is_none() {
         return Err(yet("nobody writes it"));
     }
-    let announced: Vec<_> = of_type().filter_map(|writer| Some((writer, type_hash(&writer.user_data)?))).collect();
+    let announced: Vec<_> =
+        of_type().filter_map(|writer| Some((writer, type_hash(&writer.user_data)?))).collect();
     if announced.is_empty() {
         let why = "its writers do not announce the type's hash, as nodes of Iron and newer do";
         return Err(Lack::Ever(why.to_owned()));
@@ -201,7 +219,8 @@ fn whom(ask: &Ask, writers: &[DiscoveredWriterData], nodes: &Nodes) -> Result<Wh
     }
 }
 
-/// The hash of a writer's type, out of what nodes of Iron and newer announce with a writer: `typehash=RIHS01_…;`.
+/// The hash of a writer's type, out of what nodes of Iron and newer announce with a writer:
+/// `typehash=RIHS01_…;`.
 fn type_hash(user_data: &[u8]) -> Option<String> {
     const KEY: &[u8] = b"typehash=";
     const HASH: usize = "RIHS01_".len() + 64;
@@ -214,18 +233,24 @@ fn type_hash(user_data: &[u8]) -> Option<String> {
 impl Call {
     fn make(around: &Around<'_>, token: Token, ask: &Ask, whom: Whom) -> Result<Self, Lack> {
         let service = dds_topic(&format!("{}/get_type_description", whom.node));
-        let Some(service) = service.as_deref().and_then(|service| service.strip_prefix("rt")) else {
+        let Some(service) = service.as_deref().and_then(|service| service.strip_prefix("rt"))
+        else {
             return Err(Lack::Ever(format!("`{}` is no name of a node", visible(&whom.node))));
         };
-        let ever = |why: String| Lack::Ever(format!("node `{}` cannot be asked: {why}", visible(&whom.node)));
+        let ever = |why: String| {
+            Lack::Ever(format!("node `{}` cannot be asked: {why}", visible(&whom.node)))
+        };
         // Held, so that nobody can be connected before it is followed who.
         let mut peers = around.state.peers();
-        let (writer, mut reader) =
-            endpoints(around.participant, service).map_err(|error| ever(visible(&error.to_string())))?;
+        let (writer, mut reader) = endpoints(around.participant, service)
+            .map_err(|error| ever(visible(&error.to_string())))?;
         peers.follow(writer.guid());
         peers.follow(reader.guid());
         drop(peers);
-        around.registry.register(&mut reader, token, Interest::READABLE).map_err(|error| ever(error.to_string()))?;
+        around
+            .registry
+            .register(&mut reader, token, Interest::READABLE)
+            .map_err(|error| ever(error.to_string()))?;
         tracing::info!(
             type_name = ask.type_name,
             node = visible(&whom.node),
@@ -238,7 +263,8 @@ impl Call {
     /// What is in front of question and answer, if it is on a DDS that wants that.
     fn header(&self, around: &Around<'_>, ask: &Ask) -> Option<Header> {
         let guid = self.writer.guid().to_bytes();
-        let vendor = around.state.peers().vendor(prefix(&rustdds::GUID::from_bytes(self.whom.writer.0)));
+        let vendor =
+            around.state.peers().vendor(prefix(&rustdds::GUID::from_bytes(self.whom.writer.0)));
         let with = match vendor {
             Some(CYCLONE) => true,
             Some(vendor) if OTHERS.contains(&vendor) => false,
@@ -251,16 +277,22 @@ impl Call {
     /// Sends the question, as soon as there is somebody at both ends. `None` if there is not.
     fn send(&mut self, around: &Around<'_>, ask: &Ask) -> Option<()> {
         let peers = around.state.peers();
-        let here = peers.connected(self.writer.guid()) > 0 && peers.connected(self.reader.guid()) > 0;
+        let here =
+            peers.connected(self.writer.guid()) > 0 && peers.connected(self.reader.guid()) > 0;
         drop(peers);
         if !here {
             return None;
         }
         let header = self.header(around, ask);
         let question = Bytes::from(question(&ask.type_name, &self.whom.hash, header));
-        // Fast DDS waits for this reader, then, before it answers. The number is that of the question, which it knows.
-        let related = SampleIdentity { writer_guid: self.reader.guid(), sequence_number: SequenceNumber::UNKNOWN };
-        let options = WriteOptionsBuilder::new().related_sample_identity_opt(header.is_none().then_some(related));
+        // Fast DDS waits for this reader, then, before it answers. The number is that of the
+        // question, which it knows.
+        let related = SampleIdentity {
+            writer_guid: self.reader.guid(),
+            sequence_number: SequenceNumber::UNKNOWN,
+        };
+        let options = WriteOptionsBuilder::new()
+            .related_sample_identity_opt(header.is_none().then_some(related));
         let sent = self.writer.write_with_options(question, options.build()).ok()?;
         self.sent = Some((sent.sequence_number, header));
         Some(())
@@ -280,19 +312,22 @@ impl Call {
             };
             let (memory, endian) = (around.memory.borrow(), change.sample.endian);
             let ours = match header {
-                Some(header) => {
-                    Header::split(&memory, endian).and_then(|(found, cdr)| (found == header).then_some(cdr))
-                }
+                Some(header) => Header::split(&memory, endian)
+                    .and_then(|(found, cdr)| (found == header).then_some(cdr)),
                 None => change.related_sample_identity().and_then(|to| {
                     let guids = [self.reader.guid(), self.writer.guid()];
-                    (to.sequence_number == sent && guids.contains(&to.writer_guid)).then_some(memory.as_slice())
+                    (to.sequence_number == sent && guids.contains(&to.writer_guid))
+                        .then_some(memory.as_slice())
                 }),
             };
             match ours {
                 // Somebody else's.
                 None => {}
                 Some(cdr) if cdr.len() > LARGEST => {
-                    return Some(Err(format!("its answer has {} bytes, more than {LARGEST}", cdr.len())));
+                    return Some(Err(format!(
+                        "its answer has {} bytes, more than {LARGEST}",
+                        cdr.len()
+                    )));
                 }
                 Some(cdr) => return Some(Ok((cdr.to_vec(), endian))),
             }
@@ -309,7 +344,10 @@ impl Call {
 }
 
 /// Writes questions to a service, and reads its answers.
-fn endpoints(participant: &DomainParticipant, service: &str) -> Result<(RawWriter, RawReader), CreateError> {
+fn endpoints(
+    participant: &DomainParticipant,
+    service: &str,
+) -> Result<(RawWriter, RawReader), CreateError> {
     let policies = QosPolicyBuilder::new()
         // This is the receive thread: it waits for nobody.
         .reliability(policy::Reliability::Reliable { max_blocking_time: rustdds::Duration::ZERO })
@@ -318,11 +356,15 @@ fn endpoints(participant: &DomainParticipant, service: &str) -> Result<(RawWrite
         .build();
     let (name, type_name) = (format!("rq{service}Request"), REQUEST.to_owned());
     let topic = participant.create_topic(name, type_name, &policies, TopicKind::NoKey)?;
-    let writer = participant.create_publisher(&policies)?.create_datawriter_no_key(&topic, Some(policies))?;
+    let writer = participant
+        .create_publisher(&policies)?
+        .create_datawriter_no_key(&topic, Some(policies))?;
     let policies = Request { reliable: true, transient_local: false }.policies(KEPT);
     let (name, type_name) = (format!("rr{service}Reply"), RESPONSE.to_owned());
     let topic = participant.create_topic(name, type_name, &policies, TopicKind::NoKey)?;
-    let reader = participant.create_subscriber(&policies)?.create_simple_datareader_no_key(&topic, Some(policies))?;
+    let reader = participant
+        .create_subscriber(&policies)?
+        .create_simple_datareader_no_key(&topic, Some(policies))?;
     Ok((writer, reader))
 }
 
@@ -338,7 +380,8 @@ mod tests {
             assert_eq!(type_hash(&user_data), Some(hash.clone()));
             assert_eq!(type_hash(&user_data[..user_data.len() - 6]), None, "cut");
         }
-        for wrong in ["", "RIHS02_", "RIHS01_x", &hash.to_uppercase(), &hash.replace('7', "\u{1b}")] {
+        for wrong in ["", "RIHS02_", "RIHS01_x", &hash.to_uppercase(), &hash.replace('7', "\u{1b}")]
+        {
             assert_eq!(type_hash(format!("typehash={wrong};").as_bytes()), None, "{wrong}");
         }
     }

@@ -1,9 +1,10 @@
 //! Instructions of classic BPF, and jumps between them.
 //!
-//! A conditional jump passes over at most 255 instructions, and none goes back. So the exits that many places share are
-//! built again and again, as islands between them.
+//! A conditional jump passes over at most 255 instructions, and none goes back. So the exits that
+//! many places share are built again and again, as islands between them.
 //!
-//! Source: the kernel's `Documentation/networking/filter.rst` and `include/uapi/linux/bpf_common.h`.
+//! Source: the kernel's `Documentation/networking/filter.rst` and
+//! `include/uapi/linux/bpf_common.h`.
 
 /// Instructions that the kernel takes.
 pub(super) const MOST: usize = 4096;
@@ -76,7 +77,8 @@ pub(super) const NEXT: To = To::Over(0);
 #[derive(Default)]
 pub(super) struct Program {
     code: Vec<Instruction>,
-    /// Jumps to a place of the next island: by instruction, and whether it jumps if the condition holds.
+    /// Jumps to a place of the next island: by instruction, and whether it jumps if the condition
+    /// holds.
     exits: Vec<(usize, bool, To)>,
     /// Jumps to where the program ends.
     ends: Vec<usize>,
@@ -110,12 +112,17 @@ impl Program {
 
     /// Lets the unconditional jump `from` go to what is written next.
     pub(super) fn land(&mut self, from: usize) {
-        self.code[from].3 = u32::try_from(self.code.len() - from - 1).expect("a program has 4096 instructions");
+        self.code[from].3 =
+            u32::try_from(self.code.len() - from - 1).expect("a program has 4096 instructions");
     }
 
-    /// Sees to it that all exits reach an island that is written after `instructions` more. Whether one is written now.
+    /// Sees to it that all exits reach an island that is written after `instructions` more. Whether
+    /// one is written now.
     pub(super) fn reach(&mut self, instructions: usize) -> bool {
-        let far = self.exits.first().is_some_and(|(at, ..)| self.code.len() + instructions + ISLAND - at > FAR);
+        let far = self
+            .exits
+            .first()
+            .is_some_and(|(at, ..)| self.code.len() + instructions + ISLAND - at > FAR);
         if far {
             self.island();
         }
@@ -142,7 +149,8 @@ impl Program {
     fn island(&mut self) {
         let over = self.put(JA, 0);
         let drop = self.put(RET, 0);
-        // Without a length, paddings and time stamps are empty, and everything else is the packet's last.
+        // Without a length, paddings and time stamps are empty, and everything else is the packet's
+        // last.
         let endless = self.put(LD_BYTE, 0);
         self.jump(JEQ, PAD, To::Over(4), NEXT);
         self.jump(JEQ, INFO_TS, To::Over(3), To::Over(2));
@@ -168,7 +176,8 @@ impl Program {
                 To::Behind => behind,
                 To::Over(_) => continue,
             };
-            let far = u8::try_from(place - at - 1).expect("there is an island before it is too far");
+            let far =
+                u8::try_from(place - at - 1).expect("there is an island before it is too far");
             if holds { self.code[at].1 = far } else { self.code[at].2 = far }
         }
     }

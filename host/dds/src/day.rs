@@ -4,8 +4,8 @@ use gleaner_transport::clock::monotonic;
 
 /// Notices that the time of day was set back.
 ///
-/// RustDDS orders what readers of best effort get by the time of day at which it came, announcements of participants included,
-/// and shows nothing that is later than now.
+/// RustDDS orders what readers of best effort get by the time of day at which it came,
+/// announcements of participants included, and shows nothing that is later than now.
 #[derive(Debug)]
 pub(super) struct Day {
     shown: fn() -> i64,
@@ -16,7 +16,8 @@ pub(super) struct Day {
 impl Day {
     /// Less is not worth a restart: after so long all is well again.
     const MOST_NS: i64 = 1_000_000_000;
-    /// Between two looks at `CLOCK_MONOTONIC`; if it was longer, the thread was stopped between them.
+    /// Between two looks at `CLOCK_MONOTONIC`; if it was longer, the thread was stopped between
+    /// them.
     const AT_ONCE_NS: i64 = 100_000_000;
 
     /// `shown` tells the time of day, in ns.
@@ -24,8 +25,8 @@ impl Day {
         Self { shown, ahead_ns: None }
     }
 
-    /// By how many ns it was set back since the last look, if that is more than a second. A clock that is slewed, however
-    /// far, is not set.
+    /// By how many ns it was set back since the last look, if that is more than a second. A clock
+    /// that is slewed, however far, is not set.
     pub(super) fn set_back(&mut self) -> Option<i64> {
         let (before, day, after) = (monotonic(), (self.shown)(), monotonic());
         if after.saturating_sub(before) > Self::AT_ONCE_NS {
@@ -57,7 +58,10 @@ mod tests {
         let mut looks = |set: i64| {
             SET.set(set * 1_000_000_000);
             // A thread that is stopped between two looks does not know, and looks again.
-            (0..3).filter_map(|_| day.set_back()).map(|back| (back + 500_000_000) / 1_000_000_000).collect::<Vec<_>>()
+            (0..3)
+                .filter_map(|_| day.set_back())
+                .map(|back| (back + 500_000_000) / 1_000_000_000)
+                .collect::<Vec<_>>()
         };
         assert!(looks(1000).is_empty());
         assert!(looks(5000).is_empty(), "forward");

@@ -18,7 +18,8 @@ use super::state::{Once, State, Told, lock, panic_text};
 use super::types::Types;
 use gleaner_transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
 
-/// What RustDDS may keep of a topic: it frees a sample when newer ones have taken its place, not when it was taken.
+/// What RustDDS may keep of a topic: it frees a sample when newer ones have taken its place, not
+/// when it was taken.
 const KEPT_BYTES: usize = 64 << 20;
 const KEPT: std::ops::RangeInclusive<usize> = 4..=1024;
 /// However long a queue is asked for.
@@ -44,7 +45,8 @@ pub(super) struct Feed {
     request: Option<Request>,
     /// No writer offered this topic at the last look.
     alone: bool,
-    /// What an earlier reader had read: the samples that RustDDS keeps of a topic are there for a new reader, too.
+    /// What an earlier reader had read: the samples that RustDDS keeps of a topic are there for a
+    /// new reader, too.
     read_before: Gaps,
     gaps: Gaps,
     types: Types,
@@ -87,7 +89,12 @@ fn kept(spec: &TopicSpec) -> usize {
 
 impl Feed {
     /// `None` if a name is none in ROS 2.
-    pub(super) fn new(index: usize, spec: &TopicSpec, sink: Arc<dyn Sink>, told: Arc<Told>) -> Option<Self> {
+    pub(super) fn new(
+        index: usize,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+        told: Arc<Told>,
+    ) -> Option<Self> {
         Some(Self {
             index,
             topic: dds_topic(&spec.topic)?,
@@ -130,8 +137,11 @@ impl Feed {
             }
             around.state.deliver(self.index);
             let sink = self.sink.as_deref();
-            let change =
-                reader.try_take_one_with(CopyOrSay(CopyInto { sink, memory: around.memory, clock: around.clock }));
+            let change = reader.try_take_one_with(CopyOrSay(CopyInto {
+                sink,
+                memory: around.memory,
+                clock: around.clock,
+            }));
             around.state.deliver(self.index);
             match change {
                 Ok(None) => break,
@@ -140,7 +150,8 @@ impl Feed {
                     let seq = u64::try_from(i64::from(change.sequence_number)).unwrap_or(0).max(1);
                     let other = self.types.passes_over(around.participant, writer, &self.type_name);
                     if !other && !self.read_before.has(writer, seq) {
-                        let publish_ns = change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
+                        let publish_ns =
+                            change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
                         self.deliver(around, writer, seq, publish_ns, change.sample);
                     }
                 }
@@ -168,14 +179,23 @@ impl Feed {
             return self.note_malformed(why);
         }
         let Some(sink) = &self.sink else { return };
-        let meta = SampleMeta { at_ns: raw.at_ns, publish_ns, writer, seq, endian: raw.endian, options: [0; 2] };
+        let meta = SampleMeta {
+            at_ns: raw.at_ns,
+            publish_ns,
+            writer,
+            seq,
+            endian: raw.endian,
+            options: [0; 2],
+        };
         around.state.deliver(self.index);
         let delivered = match raw.held {
             Held::Sink => catch_unwind(AssertUnwindSafe(|| sink.accept(&meta))),
             Held::Memory => catch_unwind(AssertUnwindSafe(|| {
                 sink.deliver(&meta, &around.memory.borrow());
             })),
-            Held::Nobody(text) | Held::Unreadable(text) => Err(Box::new(text) as Box<dyn Any + Send>),
+            Held::Nobody(text) | Held::Unreadable(text) => {
+                Err(Box::new(text) as Box<dyn Any + Send>)
+            }
         };
         around.state.deliver(self.index);
         around.state.handled.fetch_add(1, Relaxed);
@@ -199,14 +219,17 @@ impl Feed {
         let (ours, others): (Vec<&Offer>, Vec<&Offer>) =
             here.into_iter().partition(|offer| offer.type_name == self.type_name);
         let wanted = match self.spec.qos {
-            Qos::Fixed { reliable, transient_local, .. } => Some(Request { reliable, transient_local }),
+            Qos::Fixed { reliable, transient_local, .. } => {
+                Some(Request { reliable, transient_local })
+            }
             Qos::Auto if ours.is_empty() => None,
             Qos::Auto => Some(Request::of_all(ours.iter().copied())),
         };
         if let Some(wanted) = wanted {
             match self.request {
                 None => self.ask(around, wanted),
-                // Asking for more would lose samples for no need, unless there is nobody to lose them from.
+                // Asking for more would lose samples for no need, unless there is nobody to lose
+                // them from.
                 Some(now) if now != wanted && (self.alone || !now.within(wanted)) => {
                     let unheard = ours.iter().find(|offer| !now.within(Request::of_all([**offer])));
                     self.ask_again(around, now, wanted, unheard.copied());
@@ -224,7 +247,8 @@ impl Feed {
         }
         let mut words = lock(&self.told.words);
         words.reader = self.guid();
-        words.qos = self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
+        words.qos =
+            self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
         words.trouble = trouble.into_iter().map(|(_, sentence)| sentence).collect();
         words.trouble.extend_from_slice(&self.asked_again);
         words.trouble.extend(self.types.trouble(&self.spec.topic));
@@ -235,7 +259,10 @@ impl Feed {
         let topic = &self.spec.topic;
         let of_another_type = others.iter().map(|offer| {
             let (found, wanted) = (visible(&ros_type(&offer.type_name)), ros_type(&self.type_name));
-            ("another type", format!("writer {} of `{topic}` sends `{found}`, not `{wanted}`", offer.guid))
+            (
+                "another type",
+                format!("writer {} of `{topic}` sends `{found}`, not `{wanted}`", offer.guid),
+            )
         });
         let mut trouble: Vec<_> = of_another_type.take(TROUBLE / 2).collect();
         let Some(request) = self.request else { return trouble };
@@ -265,7 +292,13 @@ impl Feed {
         trouble
     }
 
-    fn ask_again(&mut self, around: &Around<'_>, now: Request, wanted: Request, because: Option<&Offer>) {
+    fn ask_again(
+        &mut self,
+        around: &Around<'_>,
+        now: Request,
+        wanted: Request,
+        because: Option<&Offer>,
+    ) {
         if let Some(offer) = because {
             let (topic, writer, offered) = (&self.spec.topic, offer.guid, in_words(&offer.qos));
             warn!(%topic, %writer, offered, asked = %now, asking = %wanted, "a writer offers less: asking again");
@@ -292,7 +325,9 @@ impl Feed {
                 return;
             }
         };
-        if let Err(error) = around.registry.register(&mut reader, token(self.index), Interest::READABLE) {
+        if let Err(error) =
+            around.registry.register(&mut reader, token(self.index), Interest::READABLE)
+        {
             around.state.die(format!("topic `{}` cannot be waited for: {error}", self.spec.topic));
             return;
         }
@@ -301,9 +336,12 @@ impl Feed {
             self.read_before = self.gaps.clone();
             self.give_up(around);
         } else if !request.transient_local {
-            // What is kept of the topic from an earlier subscription is none of this one's business.
+            // What is kept of the topic from an earlier subscription is none of this one's
+            // business.
             let mut kept = (0..MOST_KEPT).map(|_| reader.try_take_one_with(PassOver));
-            kept.find(|passed| !matches!(passed, Ok(Some(_)) | Err(ReadError::Deserialization { .. })));
+            kept.find(|passed| {
+                !matches!(passed, Ok(Some(_)) | Err(ReadError::Deserialization { .. }))
+            });
         }
         info!(topic = %self.spec.topic, qos = %request, kept = kept(&self.spec), "subscribed");
         self.reader = Some(reader);
@@ -321,7 +359,8 @@ impl Feed {
             let subscriber = participant.create_subscriber(&policies)?;
             subscriber.create_simple_datareader_no_key(&topic, Some(policies.clone()))
         })();
-        let reader: RawReader = made.map_err(|error: rustdds::dds::CreateError| visible(&error.to_string()))?;
+        let reader: RawReader =
+            made.map_err(|error: rustdds::dds::CreateError| visible(&error.to_string()))?;
         around.state.peers().follow(reader.guid());
         Ok(reader)
     }

@@ -1,12 +1,15 @@
 //! The program by which the kernel drops hostile packets before RustDDS sees them: classic BPF.
 //!
-//! RustDDS reserves and fills what the first fragment of a sample claims to be the sample's size, up to 4 GiB, whoever sent
-//! it. And it writes down each of the numbers that a HEARTBEAT says there are, or that a GAP says there are not. The
-//! program walks the submessages of a packet and drops it if a fragment claims more than anybody subscribed to, if it has
-//! fragments of a participant that nobody knows, or if it speaks of too many numbers. All else passes. Classic BPF has no
-//! loops, so the walk ends somewhere: there the packet is cut off between two submessages, and what is reliable comes again.
+//! RustDDS reserves and fills what the first fragment of a sample claims to be the sample's size,
+//! up to 4 GiB, whoever sent it. And it writes down each of the numbers that a HEARTBEAT says there
+//! are, or that a GAP says there are not. The program walks the submessages of a packet and drops
+//! it if a fragment claims more than anybody subscribed to, if it has fragments of a participant
+//! that nobody knows, or if it speaks of too many numbers. All else passes. Classic BPF has no
+//! loops, so the walk ends somewhere: there the packet is cut off between two submessages, and what
+//! is reliable comes again.
 //!
-//! Sources: DDSI-RTPS 2.3, sections 8.3 and 9.4; the kernel's `Documentation/networking/filter.rst`.
+//! Sources: DDSI-RTPS 2.3, sections 8.3 and 9.4; the kernel's
+//! `Documentation/networking/filter.rst`.
 
 use socket2::SockFilter;
 
@@ -15,9 +18,11 @@ use super::bpf::*;
 /// The twelve bytes that all endpoints of a participant have in common.
 pub(super) type Prefix = [u8; 12];
 
-/// Most participants whose fragments are told from a stranger's. In larger domains nobody is a stranger.
+/// Most participants whose fragments are told from a stranger's. In larger domains nobody is a
+/// stranger.
 pub(super) const KNOWN: usize = 64;
-/// Submessages that may be fragments. Cyclone DDS sends at most 47 in a packet, unless it was told to send smaller ones.
+/// Submessages that may be fragments. Cyclone DDS sends at most 47 in a packet, unless it was told
+/// to send smaller ones.
 const FRAGMENTS: usize = 56;
 /// Of a machine whose numbers begin with the high byte. They are few, and their packets as well.
 const BIG_ENDIAN: usize = 16;
@@ -32,7 +37,8 @@ const GAP: u32 = 0x08;
 const INFO_SRC: u32 = 0x0c;
 const DATA_FRAG: u32 = 0x16;
 
-/// Most numbers that a HEARTBEAT or a GAP may span, in units of 65536: only the bytes above the lowest two are compared.
+/// Most numbers that a HEARTBEAT or a GAP may span, in units of 65536: only the bytes above the
+/// lowest two are compared.
 const SPAN: u32 = 16;
 
 /// In memory, besides [`PASS`]: whether there was a fragment.
@@ -49,15 +55,21 @@ enum Order {
     High,
 }
 
-/// A program that drops fragments of samples of more than `largest` bytes and, if `known` is given, fragments of others.
+/// A program that drops fragments of samples of more than `largest` bytes and, if `known` is given,
+/// fragments of others.
 ///
-/// There is a tolerance of at least 64 KiB for what encloses a sample: only the two high bytes are compared.
+/// There is a tolerance of at least 64 KiB for what encloses a sample: only the two high bytes are
+/// compared.
 pub(super) fn program(largest: usize, known: Option<&[Prefix]>) -> Vec<SockFilter> {
-    assemble(largest, known).into_iter().map(|(code, yes, no, k)| SockFilter::new(code, yes, no, k)).collect()
+    assemble(largest, known)
+        .into_iter()
+        .map(|(code, yes, no, k)| SockFilter::new(code, yes, no, k))
+        .collect()
 }
 
 fn assemble(largest: usize, known: Option<&[Prefix]>) -> Vec<Instruction> {
-    let limit = u32::try_from((largest >> 16).saturating_add(1)).map_or(0xffff, |high| high.min(0xffff));
+    let limit =
+        u32::try_from((largest >> 16).saturating_add(1)).map_or(0xffff, |high| high.min(0xffff));
     let known = known.map(|known| &known[..known.len().min(KNOWN)]);
     let mut program = Program::default();
     for (place, value) in [(FRAGMENT, 0), (PASS, ALL)] {
@@ -101,20 +113,28 @@ const TAIL_OF_ONE: usize = 8;
 const SWAP: [(u16, u32); 3] = [(MUL, 0x1_0001), (RSH, 8), (AND, 0xffff)];
 
 impl Program {
-    /// Goes from one submessage, at which X points, to the next; and over a time stamp before the first of them.
+    /// Goes from one submessage, at which X points, to the next; and over a time stamp before the
+    /// first of them.
     ///
-    /// A load behind the packet's end drops the packet: RustDDS would not take one that is not whole, either. Only steps
-    /// behind an island have room to look at a HEARTBEAT or a GAP: the others leave it to the next of those.
+    /// A load behind the packet's end drops the packet: RustDDS would not take one that is not
+    /// whole, either. Only steps behind an island have room to look at a HEARTBEAT or a GAP: the
+    /// others leave it to the next of those.
     fn step(&mut self, order: Order, limit: Option<u32>) {
         let has_room = self.reach(STEP);
         // Kind, flags and length.
         self.put(LD_WORD, 0);
-        self.jump(JEQ, if order == Order::Low { 0x0901_0800 } else { 0x0900_0008 }, NEXT, To::Over(4));
+        self.jump(
+            JEQ,
+            if order == Order::Low { 0x0901_0800 } else { 0x0900_0008 },
+            NEXT,
+            To::Over(4),
+        );
         self.put(TXA, 0);
         self.put(ADD, 12);
         self.put(TAX, 0);
         self.put(LD_WORD, 0);
-        // Numbers that begin the other way than the first ones: nobody sends them, and a length would be misread.
+        // Numbers that begin the other way than the first ones: nobody sends them, and a length
+        // would be misread.
         let (yes, no) = if order == Order::Low { (NEXT, To::Drop) } else { (To::Drop, NEXT) };
         self.jump(JSET, 0x0001_0000, yes, no);
         self.put(RSH, 24);
@@ -133,7 +153,8 @@ impl Program {
         self.put(LD_HALF, 2);
         self.jump(JEQ, 0, To::Endless, NEXT);
         if order == Order::Low {
-            // Swaps the bytes: 256 h + l times 256 is h + 256 l modulo 65535. A length of 65535 no packet has.
+            // Swaps the bytes: 256 h + l times 256 is h + 256 l modulo 65535. A length of 65535 no
+            // packet has.
             self.put(LSH, 8);
             self.put(MOD, 0xffff);
         }
@@ -144,7 +165,8 @@ impl Program {
         self.jump(JEQ_X, 0, To::End, NEXT);
     }
 
-    /// Drops a HEARTBEAT or a GAP of too many numbers. What it leaves behind is no kind of a submessage that is looked at.
+    /// Drops a HEARTBEAT or a GAP of too many numbers. What it leaves behind is no kind of a
+    /// submessage that is looked at.
     fn range(&mut self, order: Order) {
         let (swap, one, [top, first, last]): (&[_], _, _) = match order {
             Order::Low => (&SWAP, 0x0100_0000, [23, 18, 26]),
@@ -153,10 +175,12 @@ impl Program {
         let compare = 15 + 2 * swap.len() as u8;
         self.jump(JGT, GAP, To::Over(compare + 9), NEXT);
         self.jump(JGT, ACKNACK, NEXT, To::Over(compare + 8));
-        // Behind the last number that there is, RustDDS begins anew with the lowest, and would never end.
+        // Behind the last number that there is, RustDDS begins anew with the lowest, and would
+        // never end.
         self.put(LD_BYTE, top);
         self.jump(JEQ, 0, NEXT, To::Drop);
-        // A GAP from 1 on moves a mark, however long it is: a writer says so that all before is not for a late reader.
+        // A GAP from 1 on moves a mark, however long it is: a writer says so that all before is not
+        // for a late reader.
         self.put(LD_BYTE, 0);
         self.jump(JEQ, GAP, NEXT, To::Over(4));
         self.put(LD_WORD, 12);

@@ -1,7 +1,9 @@
-//! What is said in the graph of ROS 2, the topic `ros_discovery_info`: the nodes of a participant and their endpoints.
+//! What is said in the graph of ROS 2, the topic `ros_discovery_info`: the nodes of a participant
+//! and their endpoints.
 //!
-//! Nodes up to Humble name an endpoint with 24 bytes there, newer ones with 16. Whoever reads the wrong size fails, not
-//! only for us but for all nodes, so nothing is said before it is known who listens.
+//! Nodes up to Humble name an endpoint with 24 bytes there, newer ones with 16. Whoever reads the
+//! wrong size fails, not only for us but for all nodes, so nothing is said before it is known who
+//! listens.
 //!
 //! What never happens here: an allocation larger than the message, whatever it claims.
 
@@ -71,9 +73,15 @@ impl Hearing {
 
     pub(super) fn part(&self) -> Part {
         match (self.told, self.humble, self.newer) {
-            (_, true, true) => Part::Out("nodes of Humble and nodes of newer distributions are here"),
-            (Some(Distro::Humble), _, true) => Part::Out("ROS_DISTRO says Humble or older, others are newer"),
-            (Some(Distro::Newer), true, _) => Part::Out("ROS_DISTRO says Iron or newer, others are Humble or older"),
+            (_, true, true) => {
+                Part::Out("nodes of Humble and nodes of newer distributions are here")
+            }
+            (Some(Distro::Humble), _, true) => {
+                Part::Out("ROS_DISTRO says Humble or older, others are newer")
+            }
+            (Some(Distro::Newer), true, _) => {
+                Part::Out("ROS_DISTRO says Iron or newer, others are Humble or older")
+            }
             (Some(told), ..) => Part::In(told),
             (None, true, false) => Part::In(Distro::Humble),
             (None, false, true) => Part::In(Distro::Newer),
@@ -87,8 +95,12 @@ impl Part {
     pub(super) fn in_words(self, node: &str) -> String {
         match self {
             Self::Silent => "not listed: no node of ROS 2 was heard yet".to_owned(),
-            Self::In(Distro::Humble) => format!("listed as `{}`, as nodes of Humble are", visible(node)),
-            Self::In(Distro::Newer) => format!("listed as `{}`, as nodes of Iron and newer are", visible(node)),
+            Self::In(Distro::Humble) => {
+                format!("listed as `{}`, as nodes of Humble are", visible(node))
+            }
+            Self::In(Distro::Newer) => {
+                format!("listed as `{}`, as nodes of Iron and newer are", visible(node))
+            }
             Self::Out(why) => format!("not listed: {why}"),
         }
     }
@@ -101,7 +113,8 @@ fn gid_size(distro: Distro) -> usize {
     }
 }
 
-/// `rmw_dds_common/msg/ParticipantEntitiesInfo` in little-endian CDR. Without `entry`'s name, no node is listed.
+/// `rmw_dds_common/msg/ParticipantEntitiesInfo` in little-endian CDR. Without `entry`'s name, no
+/// node is listed.
 pub(super) fn encode(entry: &Entry, distro: Distro) -> Vec<u8> {
     let mut cdr = Vec::new();
     let gid = |cdr: &mut Vec<u8>, gid: &[u8; 16]| {
@@ -164,7 +177,10 @@ impl<'a> Rest<'a> {
             }
             self.gids(gid)?;
             let writers = self.gids(gid)?;
-            nodes.push(Node { name: format!("{}/{name}", namespace.trim_end_matches('/')), writers });
+            nodes.push(Node {
+                name: format!("{}/{name}", namespace.trim_end_matches('/')),
+                writers,
+            });
         }
         Some(nodes)
     }
@@ -232,8 +248,16 @@ mod tests {
             for (readers, writers) in [(0, 0), (1, 0), (0, 1), (9, 40)] {
                 for (distro, humble) in [(Distro::Humble, true), (Distro::Newer, false)] {
                     let cdr = encode(&entry(name, readers, writers), distro);
-                    assert_eq!(plausible(&cdr, Endian::Little, Distro::Humble), humble, "{name} {readers} {writers}");
-                    assert_eq!(plausible(&cdr, Endian::Little, Distro::Newer), !humble, "{name} {readers} {writers}");
+                    assert_eq!(
+                        plausible(&cdr, Endian::Little, Distro::Humble),
+                        humble,
+                        "{name} {readers} {writers}"
+                    );
+                    assert_eq!(
+                        plausible(&cdr, Endian::Little, Distro::Newer),
+                        !humble,
+                        "{name} {readers} {writers}"
+                    );
                 }
             }
         }

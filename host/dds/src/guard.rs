@@ -37,12 +37,14 @@ impl Guard {
         guard
     }
 
-    /// From now on, fragments of samples of up to `largest` bytes pass, of these participants and of our own.
+    /// From now on, fragments of samples of up to `largest` bytes pass, of these participants and
+    /// of our own.
     pub(super) fn update(&mut self, largest: usize, others: &[Prefix], state: &State) {
         if self.sockets.is_empty() {
             return;
         }
-        // Whoever wants to be known announces itself. So if they are too many, nothing is lost by knowing all.
+        // Whoever wants to be known announces itself. So if they are too many, nothing is lost by
+        // knowing all.
         let known = (others.len() < KNOWN).then(|| [&[self.own], others].concat());
         let wanted = (largest, known);
         if self.set.as_ref() == Some(&wanted) {
@@ -52,7 +54,8 @@ impl Guard {
         for socket in &self.sockets {
             let socket = SockRef::from(socket);
             let attached = socket.attach_filter(&program).or_else(|_| {
-                // The old one and the new one may be too much together. The first time there is no old one.
+                // The old one and the new one may be too much together. The first time there is no
+                // old one.
                 drop(socket.detach_filter());
                 socket.attach_filter(&program)
             });

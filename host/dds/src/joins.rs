@@ -1,15 +1,20 @@
-//! Keeps RustDDS from announcing a multicast address for samples, since Fast DDS aborts when two of our readers have the same one.
+//! Keeps RustDDS from announcing a multicast address for samples, since Fast DDS aborts when two of
+//! our readers have the same one.
 //!
-//! RustDDS announces the address when a socket could join its group, and has no option against that. Fast DDS 2.9.0 to 2.10.6,
-//! 2.11.0 to 2.14.4 and 3.0.0 to 3.1.2 notes the addresses to which a writer sends to all of its readers together: the multicast
-//! address, once two readers have the same one. The first HEARTBEAT goes to the second reader alone, at an address that is not noted:
-//! an assertion fails (`OutputTrafficManager::set_statistics_message_data`), or memory behind a list is changed in builds without
-//! assertions. The address of a reader without multicast is always noted.
+//! RustDDS announces the address when a socket could join its group, and has no option against
+//! that. Fast DDS 2.9.0 to 2.10.6, 2.11.0 to 2.14.4 and 3.0.0 to 3.1.2 notes the addresses to which
+//! a writer sends to all of its readers together: the multicast address, once two readers have the
+//! same one. The first HEARTBEAT goes to the second reader alone, at an address that is not noted:
+//! an assertion fails (`OutputTrafficManager::set_statistics_message_data`), or memory behind a
+//! list is changed in builds without assertions. The address of a reader without multicast is
+//! always noted.
 //!
-//! So the join fails, as it does on an interface without multicast. A filter of system calls sees no ports, and without the join of
-//! discovery RustDDS would not announce itself by multicast either. Holding the port would keep others from it. What is left is
-//! libc's `setsockopt`, in which the join ends: it is replaced for the whole program by a function that refuses this one join while
-//! a [`NoJoin`] lives on the thread, and passes on everything else. To be deleted once RustDDS has an option.
+//! So the join fails, as it does on an interface without multicast. A filter of system calls sees
+//! no ports, and without the join of discovery RustDDS would not announce itself by multicast
+//! either. Holding the port would keep others from it. What is left is libc's `setsockopt`, in
+//! which the join ends: it is replaced for the whole program by a function that refuses this one
+//! join while a [`NoJoin`] lives on the thread, and passes on everything else. To be deleted once
+//! RustDDS has an option.
 
 #![allow(unsafe_code)]
 
@@ -23,7 +28,8 @@ use nix::errno::Errno;
 use socket2::SockRef;
 
 thread_local! {
-    /// The port at which sockets join no group; 0 for none. It has no destructor, so it can be read as long as the thread runs.
+    /// The port at which sockets join no group; 0 for none. It has no destructor, so it can be read
+    /// as long as the thread runs.
     static REFUSED: Cell<u16> = const { Cell::new(0) };
 }
 
@@ -48,7 +54,8 @@ impl Drop for NoJoin {
 /// # Safety
 ///
 /// As for libc's: `value` points to `length` bytes.
-// SAFETY: name and signature are libc's, and so is what it does, with one more error that it may return.
+// SAFETY: name and signature are libc's, and so is what it does, with one more error that it may
+// return.
 #[unsafe(no_mangle)]
 unsafe extern "C" fn setsockopt(
     socket: c_int,
@@ -61,7 +68,8 @@ unsafe extern "C" fn setsockopt(
         Errno::EPERM.set();
         return -1;
     }
-    // SAFETY: the arguments are those of the system call; `value` is as the caller of this function promises.
+    // SAFETY: the arguments are those of the system call; `value` is as the caller of this function
+    // promises.
     let answer = unsafe { libc::syscall(libc::SYS_setsockopt, socket, level, name, value, length) };
     if answer < 0 { -1 } else { 0 }
 }
@@ -72,14 +80,17 @@ fn is_refused(socket: c_int) -> bool {
     if refused == 0 || socket < 0 {
         return false;
     }
-    // SAFETY: it is not -1, and is only handed to the kernel: if it is not open, the kernel says so.
+    // SAFETY: it is not -1, and is only handed to the kernel: if it is not open, the kernel says
+    // so.
     let socket = unsafe { BorrowedFd::borrow_raw(socket) };
-    let here = rustix::net::getsockname(socket).ok().and_then(|here| SocketAddrV4::try_from(here).ok());
+    let here =
+        rustix::net::getsockname(socket).ok().and_then(|here| SocketAddrV4::try_from(here).ok());
     let is_refused = here.is_some_and(|here| here.port() == refused);
     if is_refused {
-        // Otherwise Linux delivers what is sent to groups that any socket of the machine has joined. A writer sends to its readers with
-        // multicast by multicast and to us by unicast: each fragment would come twice, and one that comes after its sample is
-        // complete takes as much memory as the whole sample. It fails on no socket of IPv4.
+        // Otherwise Linux delivers what is sent to groups that any socket of the machine has
+        // joined. A writer sends to its readers with multicast by multicast and to us by unicast:
+        // each fragment would come twice, and one that comes after its sample is complete takes as
+        // much memory as the whole sample. It fails on no socket of IPv4.
         let _ = SockRef::from(&socket).set_multicast_all_v4(false);
     }
     is_refused
@@ -105,7 +116,10 @@ mod tests {
         let no_join = NoJoin::at(one.local_addr().unwrap().port());
         assert_eq!(join(&one).unwrap_err().kind(), ErrorKind::PermissionDenied);
         join(&other).unwrap();
-        assert_eq!([&one, &other].map(|socket| SockRef::from(socket).multicast_all_v4().unwrap()), [false, true]);
+        assert_eq!(
+            [&one, &other].map(|socket| SockRef::from(socket).multicast_all_v4().unwrap()),
+            [false, true]
+        );
         thread::scope(|scope| scope.spawn(|| join(&one)).join().unwrap()).unwrap();
         one.leave_multicast_v4(&GROUP, &Ipv4Addr::LOCALHOST).unwrap();
         drop(no_join);

@@ -1,4 +1,5 @@
-//! The definitions of message types: each is looked for once, here and, when somebody wants it, at the node that writes it.
+//! The definitions of message types: each is looked for once, here and, when somebody wants it, at
+//! the node that writes it.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -52,7 +53,10 @@ impl Known {
     }
 
     /// A type's definitions, if there are some; the same for all who ask.
-    pub(super) fn parsed(&mut self, type_name: &str) -> Result<Option<Arc<Definitions>>, MessageError> {
+    pub(super) fn parsed(
+        &mut self,
+        type_name: &str,
+    ) -> Result<Option<Arc<Definitions>>, MessageError> {
         let Entry::Text(text, parsed) = self.entry(type_name) else { return Ok(None) };
         if parsed.is_none() {
             *parsed = Some(Arc::new(Definitions::parse(type_name, text)?));
@@ -60,7 +64,8 @@ impl Known {
         Ok(parsed.clone())
     }
 
-    /// Whether it is worth while to look again for a type that had no definitions. If nobody was asked yet, somebody is now.
+    /// Whether it is worth while to look again for a type that had no definitions. If nobody was
+    /// asked yet, somebody is now.
     pub(super) fn may_come(&mut self, type_name: &str, line: &Line, state: &State) -> bool {
         self.collect(state);
         let before = match self.entry(type_name) {
@@ -98,18 +103,30 @@ impl Known {
                 warn!(type_name, why, asked = asked.times, "no node says what this type is");
                 Entry::Nowhere { asked, settled: !again }
             }
-            Outcome::Answer { node, hash, cdr, endian } => match Described::read(type_name, &hash, &cdr, endian) {
-                Ok(Described { text, without_texts }) => {
-                    let comments = without_texts.map_or("as their author wrote them".to_owned(), |why| visible(&why));
-                    info!(type_name, node, hash, comments, "definitions from a node that writes this type");
-                    Entry::Text(text, None)
+            Outcome::Answer { node, hash, cdr, endian } => {
+                match Described::read(type_name, &hash, &cdr, endian) {
+                    Ok(Described { text, without_texts }) => {
+                        let comments = without_texts
+                            .map_or("as their author wrote them".to_owned(), |why| visible(&why));
+                        info!(
+                            type_name,
+                            node, hash, comments, "definitions from a node that writes this type"
+                        );
+                        Entry::Text(text, None)
+                    }
+                    Err(error) => {
+                        let error = visible(&chain(&error));
+                        warn!(
+                            type_name,
+                            node,
+                            error,
+                            asked = asked.times,
+                            "what a node says of this type cannot be used"
+                        );
+                        Entry::Nowhere { asked, settled: false }
+                    }
                 }
-                Err(error) => {
-                    let error = visible(&chain(&error));
-                    warn!(type_name, node, error, asked = asked.times, "what a node says of this type cannot be used");
-                    Entry::Nowhere { asked, settled: false }
-                }
-            },
+            }
         };
         self.types.insert(ask.type_name, entry);
     }
@@ -117,14 +134,24 @@ impl Known {
     fn entry(&mut self, type_name: &str) -> &mut Entry {
         if self.types.len() >= MOST && !self.types.contains_key(type_name) {
             // Names from the network. What has a text is of this vehicle's own, or was asked for.
-            self.types.retain(|_, entry| !matches!(entry, Entry::Nowhere { asked: Asked { times: 0, .. }, .. }));
+            self.types.retain(|_, entry| {
+                !matches!(entry, Entry::Nowhere { asked: Asked { times: 0, .. }, .. })
+            });
         }
-        self.types.entry(type_name.to_owned()).or_insert_with(|| match self.sources.find(type_name) {
-            Ok(Some(text)) => Entry::Text(text, None),
-            Ok(None) | Err(SourcesError::Name { .. }) => Entry::Nowhere { asked: Asked::default(), settled: false },
-            Err(error) => {
-                warn!(type_name, error = &error as &dyn std::error::Error, "definitions that cannot be used");
-                Entry::Nowhere { asked: Asked::default(), settled: false }
+        self.types.entry(type_name.to_owned()).or_insert_with(|| {
+            match self.sources.find(type_name) {
+                Ok(Some(text)) => Entry::Text(text, None),
+                Ok(None) | Err(SourcesError::Name { .. }) => {
+                    Entry::Nowhere { asked: Asked::default(), settled: false }
+                }
+                Err(error) => {
+                    warn!(
+                        type_name,
+                        error = &error as &dyn std::error::Error,
+                        "definitions that cannot be used"
+                    );
+                    Entry::Nowhere { asked: Asked::default(), settled: false }
+                }
             }
         })
     }

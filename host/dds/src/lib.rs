@@ -1,18 +1,20 @@
 //! Live topics of ROS 2 over DDS.
 //!
-//! [`Dds`] is one participant in a domain. One thread of ours waits for all readers at once and hands every sample to its
-//! sink; RustDDS has two threads more, one for the network and one for discovery. A subscription with [`Qos::Auto`] asks
-//! for what writers offer, as `ros2 bag record` does: it has no reader until there is a writer.
+//! [`Dds`] is one participant in a domain. One thread of ours waits for all readers at once and
+//! hands every sample to its sink; RustDDS has two threads more, one for the network and one for
+//! discovery. A subscription with [`Qos::Auto`] asks for what writers offer, as `ros2 bag record`
+//! does: it has no reader until there is a writer.
 //!
-//! A sample is copied once: into the sink's memory, if the sink can do so before it knows whose sample it is. The kernel
-//! keeps packets away that would take more memory than anybody subscribed to. What RustDDS cannot do is told in
-//! `docs/dds-limits.md`.
+//! A sample is copied once: into the sink's memory, if the sink can do so before it knows whose
+//! sample it is. The kernel keeps packets away that would take more memory than anybody subscribed
+//! to. What RustDDS cannot do is told in `docs/dds-limits.md`.
 //!
-//! What never happens here: a sink that does more than to copy under a lock of RustDDS; a message being understood, apart from those of
-//! ROS 2's graph and the answers of nodes that are asked for definitions; a packet sent elsewhere than RustDDS sends it.
+//! What never happens here: a sink that does more than to copy under a lock of RustDDS; a message
+//! being understood, apart from those of ROS 2's graph and the answers of nodes that are asked for
+//! definitions; a packet sent elsewhere than RustDDS sends it.
 //!
-//! What RustDDS does not tell: bytes 2 and 3 of a sample's encapsulation, given as zeros, and samples that are so broken
-//! that it drops them itself, which show as lost.
+//! What RustDDS does not tell: bytes 2 and 3 of a sample's encapsulation, given as zeros, and
+//! samples that are so broken that it drops them itself, which show as lost.
 //!
 //! [`Qos::Auto`]: gleaner_transport::Qos::Auto
 
@@ -62,8 +64,8 @@ use gleaner_base::words::nearest;
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::Network;
 use gleaner_transport::{
-    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Status, Subscription, TopicSpec, Transport,
-    TransportError,
+    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Status, Subscription,
+    TopicSpec, Transport, TransportError,
 };
 use guard::Guard;
 use joins::NoJoin;
@@ -74,7 +76,8 @@ use sockets::Sockets;
 use state::{State, Told, lock};
 use watch::Watch;
 
-/// The receive buffer of a socket is to hold four of the largest samples, as far as that is sensible.
+/// The receive buffer of a socket is to hold four of the largest samples, as far as that is
+/// sensible.
 const SAMPLES_IN_BUFFER: usize = 4;
 const MOST_BUFFER: usize = 64 << 20;
 /// What RustDDS asks for by itself.
@@ -114,18 +117,23 @@ impl Dds {
         let asked = needed.max(LEAST_BUFFER);
         let opening = OPENING.lock().unwrap_or_else(PoisonError::into_inner);
         let before = sockets::library_threads();
-        let mut builder = DomainParticipantBuilder::new(options.domain).socket_receive_buffer_size(asked);
+        let mut builder =
+            DomainParticipantBuilder::new(options.domain).socket_receive_buffer_size(asked);
         if !options.interfaces.is_empty() {
             builder = builder.with_only_networks(options.interfaces.iter().copied());
         }
-        let join = |error: rustdds::dds::CreateError| DdsError::Join { domain: options.domain, source: error.into() };
+        let join = |error: rustdds::dds::CreateError| DdsError::Join {
+            domain: options.domain,
+            source: error.into(),
+        };
         let shield = Shield::up();
         let no_join = NoJoin::at(sockets::port_of_samples(options.domain));
         let participant = builder.build().map_err(join)?;
         drop(no_join);
         drop(shield);
         let made: HashSet<u32> = sockets::library_threads().difference(&before).copied().collect();
-        // If there are more, somebody else made a participant at the same time, and which are ours is not known.
+        // If there are more, somebody else made a participant at the same time, and which are ours
+        // is not known.
         let threads = if made.len() == LIBRARY_THREADS { made } else { HashSet::new() };
         let sockets = Sockets::of(options.domain, participant.participant_id());
         drop(opening);
@@ -186,7 +194,10 @@ fn granted(asked: usize, needed: usize) -> usize {
     let granted = sockets::granted(asked).unwrap_or(0);
     if granted < needed {
         let help = format!("sysctl -w net.core.rmem_max={needed}");
-        warn!(needed, granted, help, "the kernel grants less socket buffer than large samples need");
+        warn!(
+            needed,
+            granted, help, "the kernel grants less socket buffer than large samples need"
+        );
     }
     granted
 }
@@ -205,9 +216,13 @@ impl Transport for Dds {
         topics.into_iter().filter(|(found, _)| found.writers > 0).map(discovered).collect()
     }
 
-    /// As for every transport, but a topic that nobody writes yet can be subscribed. Names that ROS 2 does not have are
-    /// [`TransportError::NoSuchTopic`] and [`TransportError::NoDefinitions`].
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+    /// As for every transport, but a topic that nobody writes yet can be subscribed. Names that ROS
+    /// 2 does not have are [`TransportError::NoSuchTopic`] and [`TransportError::NoDefinitions`].
+    fn subscribe(
+        &mut self,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+    ) -> Result<Subscription, TransportError> {
         let told = Arc::new(Told::default());
         let index = self.subscriptions.len();
         let Some(feed) = Feed::new(index, spec, sink, told.clone()) else {
@@ -229,21 +244,27 @@ impl Transport for Dds {
         known.ok_or_else(|| TransportError::NoDefinitions { topic: topic.to_owned(), type_name })
     }
 
-    /// Asks the node that writes the topic, as far as one question at a time and three for a type allow.
+    /// Asks the node that writes the topic, as far as one question at a time and three for a type
+    /// allow.
     fn definitions_may_come(&self, topic: &str) -> bool {
         let type_name = self.type_of(topic);
-        type_name.is_ok_and(|type_name| lock(&self.known).may_come(&type_name, &self.line, &self.state))
+        type_name
+            .is_ok_and(|type_name| lock(&self.known).may_come(&type_name, &self.line, &self.state))
     }
 
     fn status(&self, subscription: Subscription) -> Status {
-        self.subscriptions.get(subscription.0).map(|(_, told)| told.status(&self.state)).unwrap_or_default()
+        self.subscriptions
+            .get(subscription.0)
+            .map(|(_, told)| told.status(&self.state))
+            .unwrap_or_default()
     }
 }
 
 impl LiveSource for Dds {
     /// What is dead is known after ten calls.
     fn health(&self) -> Health {
-        let topics: Vec<String> = self.subscriptions.iter().map(|(spec, _)| spec.topic.clone()).collect();
+        let topics: Vec<String> =
+            self.subscriptions.iter().map(|(spec, _)| spec.topic.clone()).collect();
         let (queues, dead) = lock(&self.watch).look(&self.state, &topics);
         let ended = self.thread.as_ref().is_none_or(JoinHandle::is_finished);
         let network = Network {
@@ -251,8 +272,8 @@ impl LiveSource for Dds {
             participants: self.state.peers().participants(),
             buffer_asked: self.buffer.0,
             buffer_granted: self.buffer.1,
-            // The kernel counts those for all programs of the network together, so if buffers of others were full as well, some
-            // that count here were filtered.
+            // The kernel counts those for all programs of the network together, so if buffers of
+            // others were full as well, some that count here were filtered.
             socket_drops: queues.drops,
             filtered: queues.filtered,
             unfiltered: self.state.unfiltered(),
@@ -261,8 +282,14 @@ impl LiveSource for Dds {
         Health { network: Some(network), dead }
     }
 
-    fn publisher(&self, topic: &str, type_name: &str, depth: usize) -> Result<Box<dyn Publisher>, PublishError> {
-        let writer = self.writer(topic, type_name, depth).map_err(|error| PublishError(error.into()))?;
+    fn publisher(
+        &self,
+        topic: &str,
+        type_name: &str,
+        depth: usize,
+    ) -> Result<Box<dyn Publisher>, PublishError> {
+        let writer =
+            self.writer(topic, type_name, depth).map_err(|error| PublishError(error.into()))?;
         Ok(Box::new(writer))
     }
 }

@@ -12,7 +12,8 @@ pub(super) fn dds_topic(topic: &str) -> Option<String> {
     Some(name.to_dds_name("rt", &root, "")).filter(|name| name.len() <= LONGEST)
 }
 
-/// `sensor_msgs/msg/Imu` as DDS has it: `sensor_msgs::msg::dds_::Imu_`. `None` if it is no name of a message type.
+/// `sensor_msgs/msg/Imu` as DDS has it: `sensor_msgs::msg::dds_::Imu_`. `None` if it is no name of
+/// a message type.
 pub(super) fn dds_type(type_name: &str) -> Option<String> {
     let (package, name) = type_name.split_once("/msg/").or_else(|| type_name.split_once('/'))?;
     let is_name = |part: &str| {
@@ -23,7 +24,8 @@ pub(super) fn dds_type(type_name: &str) -> Option<String> {
     (is_name(package) && is_name(name)).then(|| MessageTypeName::new(package, name).dds_msg_type())
 }
 
-/// `/camera/front` of `rt/camera/front`; `None` for what is no topic of ROS 2, such as the topics of its services.
+/// `/camera/front` of `rt/camera/front`; `None` for what is no topic of ROS 2, such as the topics
+/// of its services.
 pub(super) fn ros_topic(dds_name: &str) -> Option<&str> {
     dds_name.strip_prefix("rt").filter(|name| name.starts_with('/'))
 }
@@ -37,16 +39,18 @@ pub(super) fn ros_type(dds_type: &str) -> String {
     parts().unwrap_or_else(|| dds_type.to_owned())
 }
 
-/// Namespace and name of a node: `/gleaner` and `hello` of `/gleaner/hello`. `None` if they are no names.
+/// Namespace and name of a node: `/gleaner` and `hello` of `/gleaner/hello`. `None` if they are no
+/// names.
 pub(super) fn node(full: &str) -> Option<(String, String)> {
     let (namespace, base) = full.rsplit_once('/')?;
     let name = NodeName::new(if namespace.is_empty() { "/" } else { namespace }, base).ok()?;
     let (namespace, base) = (name.namespace().to_owned(), name.base_name().to_owned());
-    (namespace.len() + base.len() < LONGEST && !namespace.contains("//")).then_some((namespace, base))
+    (namespace.len() + base.len() < LONGEST && !namespace.contains("//"))
+        .then_some((namespace, base))
 }
 
-/// `text`, in which everything that a terminal or a log could take for something else is escaped, and which is cut where
-/// it is too long.
+/// `text`, in which everything that a terminal or a log could take for something else is escaped,
+/// and which is cut where it is too long.
 pub(super) fn visible(text: &str) -> String {
     let mut shown = String::new();
     for character in text.chars() {
@@ -81,10 +85,21 @@ mod tests {
 
     #[test]
     fn what_is_no_name_is_none() {
-        for topic in ["", "/", "camera", "/a//b", "/a/", "/1a", "/a b", "/a\n", &format!("/{}", "a".repeat(300))] {
+        for topic in [
+            "",
+            "/",
+            "camera",
+            "/a//b",
+            "/a/",
+            "/1a",
+            "/a b",
+            "/a\n",
+            &format!("/{}", "a".repeat(300)),
+        ] {
             assert_eq!(dds_topic(topic), None, "{topic}");
         }
-        for type_name in ["", "Imu", "a/b/c", "sensor_msgs/msg/", "/Imu", "a::b/Imu", "a/msg/I mu"] {
+        for type_name in ["", "Imu", "a/b/c", "sensor_msgs/msg/", "/Imu", "a::b/Imu", "a/msg/I mu"]
+        {
             assert_eq!(dds_type(type_name), None, "{type_name}");
         }
         for full in ["", "hello", "/", "/a//b", "/a/b c"] {

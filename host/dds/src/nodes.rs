@@ -8,8 +8,8 @@ use super::graph::{Node, nodes};
 use gleaner_messages::Endian;
 use gleaner_transport::Guid;
 
-/// Most participants whose nodes are known, and the longest word of one that is remembered: 4000 endpoints. Who says more is
-/// asked nothing.
+/// Most participants whose nodes are known, and the longest word of one that is remembered: 4000
+/// endpoints. Who says more is asked nothing.
 const MOST: usize = 256;
 const LONGEST: usize = 64 << 10;
 
@@ -22,7 +22,9 @@ impl Nodes {
     pub(super) fn hear(&mut self, sender: Prefix, cdr: &[u8], endian: Endian) {
         let known = if cdr.len() > LONGEST { None } else { nodes(cdr, endian, Distro::Newer) };
         match known {
-            Some(nodes) if self.0.len() < MOST || self.0.contains_key(&sender) => drop(self.0.insert(sender, nodes)),
+            Some(nodes) if self.0.len() < MOST || self.0.contains_key(&sender) => {
+                drop(self.0.insert(sender, nodes))
+            }
             _ => drop(self.0.remove(&sender)),
         }
     }
@@ -72,8 +74,12 @@ mod tests {
         }
         assert_eq!(nodes.0.len(), MOST);
         let mut nodes = Nodes::default();
-        let many =
-            Entry { writers: vec![[1; 16]; LONGEST / 16], namespace: "/".into(), name: "n".into(), ..Entry::default() };
+        let many = Entry {
+            writers: vec![[1; 16]; LONGEST / 16],
+            namespace: "/".into(),
+            name: "n".into(),
+            ..Entry::default()
+        };
         nodes.hear([1; 12], &encode(&many, Distro::Newer), Endian::Little);
         assert_eq!(nodes.0.len(), 0);
     }

@@ -30,8 +30,8 @@ pub(super) struct Offer {
 }
 
 impl Request {
-    /// The most that all of `offers` satisfy, as `ros2 bag record` asks: one writer that is not reliable, or that keeps
-    /// nothing for late readers, decides for all.
+    /// The most that all of `offers` satisfy, as `ros2 bag record` asks: one writer that is not
+    /// reliable, or that keeps nothing for late readers, decides for all.
     pub(super) fn of_all<'a>(offers: impl IntoIterator<Item = &'a Offer>) -> Self {
         offers.into_iter().fold(Self { reliable: true, transient_local: true }, |all, offer| Self {
             reliable: all.reliable && reliable(&offer.qos),
@@ -47,8 +47,13 @@ impl Request {
     /// The policies of a reader that keeps its `depth` newest samples.
     pub(super) fn policies(self, depth: usize) -> QosPolicies {
         let depth = i32::try_from(depth).unwrap_or(i32::MAX);
-        let durability = if self.transient_local { Durability::TransientLocal } else { Durability::Volatile };
-        let limits = ResourceLimits { max_samples: depth, max_instances: 1, max_samples_per_instance: depth };
+        let durability =
+            if self.transient_local { Durability::TransientLocal } else { Durability::Volatile };
+        let limits = ResourceLimits {
+            max_samples: depth,
+            max_instances: 1,
+            max_samples_per_instance: depth,
+        };
         let reliability = if self.reliable {
             Reliability::Reliable { max_blocking_time: Duration::from_millis(100) }
         } else {
@@ -70,7 +75,8 @@ impl fmt::Display for Request {
     }
 }
 
-/// A policy that is not announced has its default, which for a writer's reliability is the stronger one.
+/// A policy that is not announced has its default, which for a writer's reliability is the stronger
+/// one.
 fn reliable(qos: &QosPolicies) -> bool {
     !matches!(qos.reliability(), Some(Reliability::BestEffort))
 }
@@ -81,27 +87,34 @@ fn transient_local(qos: &QosPolicies) -> bool {
 
 /// What a writer offers, in words.
 pub(super) fn in_words(qos: &QosPolicies) -> String {
-    let mut words = Request { reliable: reliable(qos), transient_local: transient_local(qos) }.to_string();
-    if let Some(Deadline(period)) = qos.deadline().filter(|deadline| deadline.0 < Duration::INFINITE) {
+    let mut words =
+        Request { reliable: reliable(qos), transient_local: transient_local(qos) }.to_string();
+    if let Some(Deadline(period)) =
+        qos.deadline().filter(|deadline| deadline.0 < Duration::INFINITE)
+    {
         let _ = write!(words, ", deadline {} ms", period.to_nanoseconds() / 1_000_000);
     }
-    if let Some(lifespan) = qos.lifespan().filter(|lifespan| lifespan.duration < Duration::INFINITE) {
+    if let Some(lifespan) = qos.lifespan().filter(|lifespan| lifespan.duration < Duration::INFINITE)
+    {
         let _ = write!(words, ", lifespan {} ms", lifespan.duration.to_nanoseconds() / 1_000_000);
     }
     words
 }
 
-/// The offers as rosbag2 notes them: with numbers up to Iron, with names after it. What DDS does not announce, the depth
-/// of a writer's history, is said to be unknown.
+/// The offers as rosbag2 notes them: with numbers up to Iron, with names after it. What DDS does
+/// not announce, the depth of a writer's history, is said to be unknown.
 pub(super) fn as_rosbag2(offers: &[&Offer], distro: Option<Distro>) -> Option<String> {
     let numbers = distro == Some(Distro::Humble);
     let mut yaml = String::new();
     for Offer { qos, .. } in offers.iter().take(NOTED) {
         let (reliability, durability) = match (reliable(qos), transient_local(qos)) {
-            (reliable, local) if numbers => (if reliable { "1" } else { "2" }, if local { "1" } else { "2" }),
-            (reliable, local) => {
-                (if reliable { "reliable" } else { "best_effort" }, if local { "transient_local" } else { "volatile" })
+            (reliable, local) if numbers => {
+                (if reliable { "1" } else { "2" }, if local { "1" } else { "2" })
             }
+            (reliable, local) => (
+                if reliable { "reliable" } else { "best_effort" },
+                if local { "transient_local" } else { "volatile" },
+            ),
         };
         let manual = !matches!(qos.liveliness(), None | Some(Liveliness::Automatic { .. }));
         let liveliness = match (manual, numbers) {
@@ -125,10 +138,13 @@ pub(super) fn as_rosbag2(offers: &[&Offer], distro: Option<Distro>) -> Option<St
     (!yaml.is_empty()).then(|| yaml.trim_end().to_owned())
 }
 
-/// ROS 2 writes "without end" as the longest time that 64 bits of nanoseconds hold, cut in seconds and the rest.
+/// ROS 2 writes "without end" as the longest time that 64 bits of nanoseconds hold, cut in seconds
+/// and the rest.
 fn period(period: Option<Duration>) -> String {
     let endless = i64::MAX;
-    let ns = period.filter(|period| *period < Duration::INFINITE).map_or(endless, |period| period.to_nanoseconds());
+    let ns = period
+        .filter(|period| *period < Duration::INFINITE)
+        .map_or(endless, |period| period.to_nanoseconds());
     format!("    sec: {}\n    nsec: {}\n", ns / 1_000_000_000, ns % 1_000_000_000)
 }
 
@@ -177,10 +193,15 @@ mod tests {
         let (mine, other) = (offer(true, false), offer(false, true));
         let names = as_rosbag2(&[&mine, &other], None).unwrap();
         assert_eq!(names.matches("- history: unknown\n  depth: 0\n").count(), 2);
-        assert!(names.contains("  reliability: reliable\n  durability: volatile\n  deadline:\n    sec: 9223372036\n"));
+        assert!(names.contains(
+            "  reliability: reliable\n  durability: volatile\n  deadline:\n    sec: 9223372036\n"
+        ));
         assert!(names.contains("  reliability: best_effort\n  durability: transient_local\n"));
         let numbers = as_rosbag2(&[&mine], Some(Distro::Humble)).unwrap();
-        assert!(numbers.starts_with("- history: 3\n  depth: 0\n  reliability: 1\n  durability: 2\n"), "{numbers}");
+        assert!(
+            numbers.starts_with("- history: 3\n  depth: 0\n  reliability: 1\n  durability: 2\n"),
+            "{numbers}"
+        );
         assert_eq!(as_rosbag2(&[], None), None);
         let many = vec![&mine; 10_000];
         assert!(as_rosbag2(&many, None).unwrap().len() < 65_536);

@@ -34,7 +34,8 @@ pub struct Options {
     pub node: String,
     /// The distribution of the others; `None`: found out from what they say.
     pub distro: Option<Distro>,
-    /// Bytes of the largest sample, by which socket buffers are sized; 0 if no samples are to be received.
+    /// Bytes of the largest sample, by which socket buffers are sized; 0 if no samples are to be
+    /// received.
     pub largest: usize,
     /// Folders with message definitions, looked through first.
     pub messages: Vec<PathBuf>,
@@ -42,7 +43,8 @@ pub struct Options {
     pub prefixes: Vec<PathBuf>,
     /// The clock of receive stamps.
     pub clock: Clock,
-    /// What tells the time of day, in ns since 1970. No sample is stamped with it: it is watched, because RustDDS depends on it.
+    /// What tells the time of day, in ns since 1970. No sample is stamped with it: it is watched,
+    /// because RustDDS depends on it.
     pub time_of_day: fn() -> i64,
 }
 
@@ -94,7 +96,8 @@ pub enum DdsError {
 }
 
 impl Options {
-    /// Domain 0 on all interfaces as `node`, for samples of up to 8 MiB, with the time of day as clock.
+    /// Domain 0 on all interfaces as `node`, for samples of up to 8 MiB, with the time of day as
+    /// clock.
     pub fn new(node: impl Into<String>) -> Self {
         Self {
             domain: 0,
@@ -115,14 +118,17 @@ impl Options {
         Self { domain: domain.unwrap_or(self.domain), interfaces, ..self }
     }
 
-    /// As the environment of ROS 2 says: `ROS_DOMAIN_ID`, `ROS_LOCALHOST_ONLY`, `ROS_AUTOMATIC_DISCOVERY_RANGE`,
-    /// `ROS_DISTRO` and `AMENT_PREFIX_PATH`; otherwise as [`Options::new`].
+    /// As the environment of ROS 2 says: `ROS_DOMAIN_ID`, `ROS_LOCALHOST_ONLY`,
+    /// `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_DISTRO` and `AMENT_PREFIX_PATH`; otherwise as
+    /// [`Options::new`].
     ///
     /// # Errors
     ///
     /// [`DdsError::Setting`] if a variable has a value that means nothing.
     pub fn from_env(node: impl Into<String>) -> Result<Self, DdsError> {
-        Self::read(node.into(), |variable| std::env::var_os(variable).map(|value| value.to_string_lossy().into_owned()))
+        Self::read(node.into(), |variable| {
+            std::env::var_os(variable).map(|value| value.to_string_lossy().into_owned())
+        })
     }
 
     /// Namespace and name of the node, if all is as it must be.
@@ -131,20 +137,28 @@ impl Options {
             return Err(setting(DOMAIN, &self.domain.to_string(), DOMAINS));
         }
         let what = "a node's namespace and name";
-        super::names::node(&self.node).ok_or_else(|| DdsError::Name { name: super::names::visible(&self.node), what })
+        super::names::node(&self.node)
+            .ok_or_else(|| DdsError::Name { name: super::names::visible(&self.node), what })
     }
 
     fn read(node: String, variable: impl Fn(&str) -> Option<String>) -> Result<Self, DdsError> {
         let variable = |name| variable(name).filter(|value| !value.is_empty());
         let mut options = Self::new(node);
-        options.domain = domain_of(variable(DOMAIN).as_deref()).map_err(|value| setting(DOMAIN, value, DOMAINS))?;
+        options.domain = domain_of(variable(DOMAIN).as_deref())
+            .map_err(|value| setting(DOMAIN, value, DOMAINS))?;
         let range = variable("ROS_AUTOMATIC_DISCOVERY_RANGE");
         let here = match range.as_deref().map(str::to_ascii_uppercase).as_deref() {
-            None | Some("SUBNET" | "SYSTEM_DEFAULT") => variable("ROS_LOCALHOST_ONLY").as_deref() == Some("1"),
+            None | Some("SUBNET" | "SYSTEM_DEFAULT") => {
+                variable("ROS_LOCALHOST_ONLY").as_deref() == Some("1")
+            }
             Some("LOCALHOST") => true,
             Some(_) => {
                 let wanted = "Gleaner knows SUBNET, LOCALHOST and SYSTEM_DEFAULT";
-                return Err(setting("ROS_AUTOMATIC_DISCOVERY_RANGE", &range.unwrap_or_default(), wanted));
+                return Err(setting(
+                    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+                    &range.unwrap_or_default(),
+                    wanted,
+                ));
             }
         };
         if here {
@@ -164,7 +178,8 @@ impl Options {
     }
 }
 
-/// The domain that the content of `ROS_DOMAIN_ID` means; 0 if there is none. White space around it means nothing.
+/// The domain that the content of `ROS_DOMAIN_ID` means; 0 if there is none. White space around it
+/// means nothing.
 ///
 /// # Errors
 ///
@@ -198,7 +213,11 @@ mod tests {
 
     #[test]
     fn the_environment_of_ros_is_understood() {
-        let all = [("ROS_DOMAIN_ID", "232"), ("ROS_DISTRO", "humble"), ("AMENT_PREFIX_PATH", "/opt/a::/opt/b")];
+        let all = [
+            ("ROS_DOMAIN_ID", "232"),
+            ("ROS_DISTRO", "humble"),
+            ("AMENT_PREFIX_PATH", "/opt/a::/opt/b"),
+        ];
         let options = read(&all).unwrap();
         assert_eq!((options.domain, options.distro), (232, Some(Distro::Humble)));
         assert_eq!(options.prefixes, [PathBuf::from("/opt/a"), PathBuf::from("/opt/b")]);
@@ -212,7 +231,8 @@ mod tests {
 
     #[test]
     fn the_domain_is_that_which_all_programs_of_ours_read() {
-        // The same page is the test of `gleaner doctor` and of the player: they cannot share this code.
+        // The same page is the test of `gleaner doctor` and of the player: they cannot share this
+        // code.
         let page = include_str!("../../../tests/domains.txt");
         for line in page.lines().filter(|line| line.starts_with('|')) {
             let (content, domain) = line[1..].split_once('|').unwrap();
@@ -225,8 +245,16 @@ mod tests {
     fn values_that_mean_nothing_are_refused_by_name() {
         for domain in ["233", "-1", "one", "1 2", "99999999999"] {
             let error = read(&[("ROS_DOMAIN_ID", domain)]).unwrap_err().to_string();
-            assert_eq!(error, format!("ROS_DOMAIN_ID is `{domain}`; it may be a number from 0 to 232"));
+            assert_eq!(
+                error,
+                format!("ROS_DOMAIN_ID is `{domain}`; it may be a number from 0 to 232")
+            );
         }
-        assert!(read(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")]).unwrap_err().to_string().contains("`OFF`"));
+        assert!(
+            read(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")])
+                .unwrap_err()
+                .to_string()
+                .contains("`OFF`")
+        );
     }
 }

@@ -36,7 +36,9 @@ impl Peers {
             Event::ParticipantLost { id, .. } => {
                 let theirs = id.range();
                 self.participants.retain(|participant, _| !theirs.contains(participant));
-                self.matched.values_mut().for_each(|matched| matched.retain(|guid| !theirs.contains(guid)));
+                self.matched
+                    .values_mut()
+                    .for_each(|matched| matched.retain(|guid| !theirs.contains(guid)));
             }
             Event::WriterLost { guid, .. } | Event::ReaderLost { guid, .. } => {
                 for matched in self.matched.values_mut() {
@@ -46,7 +48,9 @@ impl Peers {
             Event::RemoteWriterMatched { local_reader: ours, remote_writer: theirs }
             | Event::RemoteReaderMatched { local_writer: ours, remote_reader: theirs } => {
                 // Endpoints of ours that RustDDS has for itself are not followed.
-                if let Some(matched) = self.matched.get_mut(ours).filter(|matched| matched.len() < MOST) {
+                if let Some(matched) =
+                    self.matched.get_mut(ours).filter(|matched| matched.len() < MOST)
+                {
                     matched.insert(*theirs);
                 }
                 return false;
@@ -75,7 +79,8 @@ impl Peers {
         self.participants.len()
     }
 
-    /// Whose DDS the participant is on whose endpoints' names begin so: the vendor's number, if it is known.
+    /// Whose DDS the participant is on whose endpoints' names begin so: the vendor's number, if it
+    /// is known.
     pub(super) fn vendor(&self, theirs: Prefix) -> Option<[u8; 2]> {
         self.participants.iter().find(|(guid, _)| prefix(guid) == theirs).map(|(_, vendor)| *vendor)
     }

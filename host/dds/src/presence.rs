@@ -44,12 +44,26 @@ impl Presence {
         let join = |source| DdsError::Join { domain: options.domain, source };
         let reader = (|| {
             let policies = Request { reliable: true, transient_local: true }.policies(KEPT);
-            let topic = participant.create_topic(TOPIC.to_owned(), TYPE.to_owned(), &policies, TopicKind::NoKey)?;
-            participant.create_subscriber(&policies)?.create_simple_datareader_no_key(&topic, Some(policies))
+            let topic = participant.create_topic(
+                TOPIC.to_owned(),
+                TYPE.to_owned(),
+                &policies,
+                TopicKind::NoKey,
+            )?;
+            participant
+                .create_subscriber(&policies)?
+                .create_simple_datareader_no_key(&topic, Some(policies))
         })();
         let mut reader: RawReader = reader.map_err(|error| join(error.into()))?;
-        registry.register(&mut reader, token, Interest::READABLE).map_err(|error| join(error.into()))?;
-        let entry = Entry { participant: participant.guid().to_bytes(), namespace, name, ..Entry::default() };
+        registry
+            .register(&mut reader, token, Interest::READABLE)
+            .map_err(|error| join(error.into()))?;
+        let entry = Entry {
+            participant: participant.guid().to_bytes(),
+            namespace,
+            name,
+            ..Entry::default()
+        };
         Ok(Self {
             node: options.node.clone(),
             entry,
@@ -66,7 +80,11 @@ impl Presence {
     pub(super) fn listen(&mut self, around: &Around<'_>) {
         self.reader.drain_read_notifications();
         for _ in 0..KEPT {
-            match self.reader.try_take_one_with(CopyInto { sink: None, memory: around.memory, clock: around.clock }) {
+            match self.reader.try_take_one_with(CopyInto {
+                sink: None,
+                memory: around.memory,
+                clock: around.clock,
+            }) {
                 Ok(None) => break,
                 Ok(Some(change)) => {
                     if change.writer_guid.prefix != self.reader.guid().prefix {
@@ -93,7 +111,9 @@ impl Presence {
         let part = self.hearing.part();
         if part != self.part {
             match part {
-                Part::Out(why) => warn!(why, "not listed in the graph of ROS 2; data flows all the same"),
+                Part::Out(why) => {
+                    warn!(why, "not listed in the graph of ROS 2; data flows all the same")
+                }
                 _ => info!(graph = part.in_words(&self.node), "in the graph of ROS 2"),
             }
             self.part = part;
@@ -101,7 +121,8 @@ impl Presence {
         self.tell(around.state);
         match part {
             Part::In(distro) => self.say(around.participant, self.entry.clone(), distro),
-            // First taken back, and at the next look the writer goes, so that nobody who comes later hears of us.
+            // First taken back, and at the next look the writer goes, so that nobody who comes
+            // later hears of us.
             Part::Silent | Part::Out(_) => match &self.said {
                 Some((entry, distro)) if !entry.name.is_empty() => {
                     let distro = *distro;
@@ -136,11 +157,17 @@ impl Presence {
     }
 
     fn say(&mut self, participant: &DomainParticipant, entry: Entry, distro: Distro) {
-        if self.said.as_ref().is_some_and(|(said, in_words_of)| *said == entry && *in_words_of == distro) {
+        if self
+            .said
+            .as_ref()
+            .is_some_and(|(said, in_words_of)| *said == entry && *in_words_of == distro)
+        {
             return;
         }
         if self.writer.is_none() {
-            self.writer = writer(participant).inspect_err(|error| warn!(%error, "cannot write the graph")).ok();
+            self.writer = writer(participant)
+                .inspect_err(|error| warn!(%error, "cannot write the graph"))
+                .ok();
         }
         let Some(writer) = &self.writer else { return };
         // What finds no room now is said at the next look.
@@ -157,6 +184,7 @@ fn writer(participant: &DomainParticipant) -> Result<RawWriter, CreateError> {
         .durability(policy::Durability::TransientLocal)
         .history(policy::History::KeepLast { depth: 1 })
         .build();
-    let topic = participant.create_topic(TOPIC.to_owned(), TYPE.to_owned(), &policies, TopicKind::NoKey)?;
+    let topic =
+        participant.create_topic(TOPIC.to_owned(), TYPE.to_owned(), &policies, TopicKind::NoKey)?;
     participant.create_publisher(&policies)?.create_datawriter_no_key(&topic, Some(policies))
 }

@@ -65,8 +65,8 @@ impl no_key::SerializerAdapter<Bytes> for RawAdapter {
     }
 }
 
-/// All that have a name. Only the first two are read; of a sample in one of the others, RustDDS tells whose it is and which,
-/// which it does not of a sample in one that is missing here.
+/// All that have a name. Only the first two are read; of a sample in one of the others, RustDDS
+/// tells whose it is and which, which it does not of a sample in one that is missing here.
 const ENCODINGS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::CDR_LE,
     RepresentationIdentifier::CDR_BE,
@@ -96,11 +96,11 @@ pub(super) enum Unreadable {
     Encoding { encoding: RepresentationIdentifier },
 }
 
-/// Copies a sample: into the sink's memory, if the sink can copy before it knows whose sample it is; else into memory of
-/// ours that all samples share, one after the other.
+/// Copies a sample: into the sink's memory, if the sink can copy before it knows whose sample it
+/// is; else into memory of ours that all samples share, one after the other.
 ///
-/// RustDDS shows the bytes while it holds the lock of the topic, and says who wrote them only afterwards. What unwound
-/// from here would poison that lock and end RustDDS's own thread.
+/// RustDDS shows the bytes while it holds the lock of the topic, and says who wrote them only
+/// afterwards. What unwound from here would poison that lock and end RustDDS's own thread.
 #[derive(Copy, Clone)]
 pub(super) struct CopyInto<'a> {
     pub(super) sink: Option<&'a dyn Sink>,
@@ -111,7 +111,11 @@ pub(super) struct CopyInto<'a> {
 impl<'de> no_key::Decode<'de, Raw> for CopyInto<'_> {
     type Error = Unreadable;
 
-    fn decode_bytes(self, bytes: &'de [u8], encoding: RepresentationIdentifier) -> Result<Raw, Unreadable> {
+    fn decode_bytes(
+        self,
+        bytes: &'de [u8],
+        encoding: RepresentationIdentifier,
+    ) -> Result<Raw, Unreadable> {
         let at_ns = self.clock.now();
         let endian = match encoding {
             RepresentationIdentifier::CDR_LE => Endian::Little,
@@ -134,14 +138,19 @@ impl<'de> no_key::Decode<'de, Raw> for CopyInto<'_> {
     }
 }
 
-/// Copies a sample, or says in its place why not: with an error RustDDS does not tell whose sample it was.
+/// Copies a sample, or says in its place why not: with an error RustDDS does not tell whose sample
+/// it was.
 #[derive(Copy, Clone)]
 pub(super) struct CopyOrSay<'a>(pub(super) CopyInto<'a>);
 
 impl<'de> no_key::Decode<'de, Raw> for CopyOrSay<'_> {
     type Error = Unreadable;
 
-    fn decode_bytes(self, bytes: &'de [u8], encoding: RepresentationIdentifier) -> Result<Raw, Unreadable> {
+    fn decode_bytes(
+        self,
+        bytes: &'de [u8],
+        encoding: RepresentationIdentifier,
+    ) -> Result<Raw, Unreadable> {
         let unreadable = |why: Unreadable| {
             let held = Held::Unreadable(why.to_string());
             Raw { at_ns: self.0.clock.now(), endian: Endian::Little, held }

@@ -1,4 +1,5 @@
-//! The receive thread: waits for all readers at once, hands over what came, and looks at who offers what.
+//! The receive thread: waits for all readers at once, hands over what came, and looks at who offers
+//! what.
 
 use std::cell::RefCell;
 use std::io;
@@ -130,7 +131,9 @@ impl Receiver {
         loop {
             match self.poll.poll(&mut events, Some(self.patience())) {
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-                Err(error) => return self.state.die(format!("the receive thread cannot wait: {error}")),
+                Err(error) => {
+                    return self.state.die(format!("the receive thread cannot wait: {error}"));
+                }
                 Ok(()) => {}
             }
             for event in &events {
@@ -139,7 +142,9 @@ impl Receiver {
                     STATUS => self.note_events(),
                     GRAPH | ANSWER => self.changed = true,
                     token => {
-                        if let Some(feed) = feed::index(token).and_then(|index| self.feeds.get_mut(index)) {
+                        if let Some(feed) =
+                            feed::index(token).and_then(|index| self.feeds.get_mut(index))
+                        {
                             feed.ready = true;
                         }
                     }
@@ -225,10 +230,12 @@ impl Receiver {
         self.note_events();
         let largest = self.feeds.iter().map(Feed::largest).max().unwrap_or(0);
         let largest = largest.max(self.largest).max(self.asker.largest());
-        // Before there are readers: fragments of the first sample have to pass. Participants are told of once; a writer that is
-        // known speaks for one that was missed.
+        // Before there are readers: fragments of the first sample have to pass. Participants are
+        // told of once; a writer that is known speaks for one that was missed.
         let mut others = self.state.peers().prefixes();
-        others.extend(offers.iter().map(|offer| *offer.guid.0.first_chunk::<12>().expect("12 of 16 bytes")));
+        others.extend(
+            offers.iter().map(|offer| *offer.guid.0.first_chunk::<12>().expect("12 of 16 bytes")),
+        );
         others.sort_unstable();
         others.dedup();
         self.guard.update(largest, &others, &self.state);
@@ -241,7 +248,8 @@ impl Receiver {
         };
         for feed in &mut self.feeds {
             feed.look(&around, &offers);
-            // RustDDS stops at what is no sample, a writer's leave for instance; what is behind it is found here.
+            // RustDDS stops at what is no sample, a writer's leave for instance; what is behind it
+            // is found here.
             feed.ready = true;
         }
         // What those say who come from now on is heard below, and kept.

@@ -16,7 +16,8 @@ const READS: &str = "RustDDS Partici";
 
 /// The port at which all participants of a domain receive samples by multicast.
 ///
-/// RTPS, "Default Port Numbers": multicast for discovery and for samples, and from the tenth on, two ports for each participant.
+/// RTPS, "Default Port Numbers": multicast for discovery and for samples, and from the tenth on,
+/// two ports for each participant.
 pub(super) fn port_of_samples(domain: u16) -> u16 {
     7401 + 250 * domain
 }
@@ -59,20 +60,25 @@ impl Sockets {
             waiting = waiting.saturating_add(row.waiting);
             drops = drops.saturating_add(row.drops);
         }
-        let full = self.full_before.zip(full()).map_or(u64::MAX, |(before, now)| now.saturating_sub(before)).min(drops);
+        let full = self
+            .full_before
+            .zip(full())
+            .map_or(u64::MAX, |(before, now)| now.saturating_sub(before))
+            .min(drops);
         Queues { waiting, drops: full, filtered: drops - full }
     }
 
     /// The sockets once more, for what RustDDS has no way to set.
     pub(super) fn duplicates(&self) -> io::Result<Vec<OwnedFd>> {
         let this = pidfd_open(getpid(), PidfdFlags::empty())?;
-        let duplicate = |descriptor: &i32| Ok(pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty())?);
+        let duplicate =
+            |descriptor: &i32| Ok(pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty())?);
         self.open.values().map(duplicate).collect()
     }
 }
 
-/// Datagrams for which sockets of this network had no room. What one socket dropped is told as one number only, whether its
-/// buffer was full or its filter said so.
+/// Datagrams for which sockets of this network had no room. What one socket dropped is told as one
+/// number only, whether its buffer was full or its filter said so.
 fn full() -> Option<u64> {
     let table = fs::read_to_string("/proc/self/net/snmp").ok()?;
     let mut lines = table.lines().filter_map(|line| line.strip_prefix("Udp:"));
@@ -118,8 +124,8 @@ fn inodes() -> HashMap<u64, i32> {
 
 /// Bytes of receive buffer that a socket gets which asks for `asked`.
 ///
-/// All sockets of a process get the same for the same, so one of our own tells what the participant's have. Linux
-/// reports twice what it grants.
+/// All sockets of a process get the same for the same, so one of our own tells what the
+/// participant's have. Linux reports twice what it grants.
 pub(super) fn granted(asked: usize) -> Option<usize> {
     let socket = UdpSocket::bind(("127.0.0.1", 0)).ok()?;
     sockopt::set_socket_recv_buffer_size(&socket, asked).ok()?;
@@ -138,7 +144,8 @@ pub(super) fn gone(threads: &HashSet<u32>) -> Option<u32> {
     threads.iter().copied().find(|id| !is_library(*id))
 }
 
-/// The CPU time that those of `threads` have used which read sockets, in ticks of the kernel, mostly of 10 ms.
+/// The CPU time that those of `threads` have used which read sockets, in ticks of the kernel,
+/// mostly of 10 ms.
 pub(super) fn busy(threads: &HashSet<u32>) -> u64 {
     let used = |thread: &u32| {
         let stat = fs::read_to_string(format!("/proc/self/task/{thread}/stat")).ok()?;
@@ -157,7 +164,8 @@ fn ticks(stat: &str, name: &str) -> Option<u64> {
 }
 
 fn is_library(thread: u32) -> bool {
-    fs::read_to_string(format!("/proc/self/task/{thread}/comm")).is_ok_and(|name| name.starts_with(LIBRARY))
+    fs::read_to_string(format!("/proc/self/task/{thread}/comm"))
+        .is_ok_and(|name| name.starts_with(LIBRARY))
 }
 
 #[cfg(test)]
@@ -172,7 +180,10 @@ mod tests {
     fn sockets_of(socket: &UdpSocket) -> Sockets {
         let port = u32::from(socket.local_addr().unwrap().port());
         let mut mine = inodes();
-        let open = rows().into_iter().filter(|row| row.port == port).find_map(|row| mine.remove_entry(&row.inode));
+        let open = rows()
+            .into_iter()
+            .filter(|row| row.port == port)
+            .find_map(|row| mine.remove_entry(&row.inode));
         Sockets { open: HashMap::from([open.unwrap()]), full_before: full() }
     }
 
@@ -188,7 +199,9 @@ mod tests {
 
     #[test]
     fn the_time_of_the_thread_that_reads_is_found_in_its_line() {
-        let line = |name: &str| format!("77 ({name}) S 1 77 77 0 -1 64 5 0 0 0 130 7 0 0 20 0 9 0 8315 1 2 3");
+        let line = |name: &str| {
+            format!("77 ({name}) S 1 77 77 0 -1 64 5 0 0 0 130 7 0 0 20 0 9 0 8315 1 2 3")
+        };
         assert_eq!(ticks(&line("RustDDS Partici"), READS), Some(137));
         assert_eq!(ticks(&line("RustDDS discove"), READS), None);
         assert_eq!(ticks(&line("a) S (b"), "a) S (b"), Some(137));
@@ -226,7 +239,8 @@ mod tests {
                 socket.send_to(&[0; 1000], socket.local_addr().unwrap()).unwrap();
             }
             let queues = sockets.queues();
-            // Where buffers of others were full meanwhile, the parts cannot be told apart: once more.
+            // Where buffers of others were full meanwhile, the parts cannot be told apart: once
+            // more.
             if full() == sockets.full_before {
                 assert_eq!(queues, Queues { waiting: 0, drops: 0, filtered: 7 });
                 return;

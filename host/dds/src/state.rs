@@ -116,8 +116,8 @@ impl Told {
     }
 }
 
-/// Says each thing once. Of one cause only so many things: what others send must not use up what there is to say of other
-/// causes.
+/// Says each thing once. Of one cause only so many things: what others send must not use up what
+/// there is to say of other causes.
 #[derive(Debug, Default)]
 pub(super) struct Once {
     said: HashMap<&'static str, HashSet<String>>,
@@ -135,7 +135,10 @@ impl Once {
 
 /// The text of a panic.
 pub(super) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
-    let text = panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    let text = panic
+        .downcast_ref::<&str>()
+        .copied()
+        .or_else(|| panic.downcast_ref::<String>().map(String::as_str));
     names::visible(text.unwrap_or("no text"))
 }
 
@@ -148,7 +151,8 @@ mod tests {
         let mut once = Once::default();
         assert!(once.first("lost", ""));
         assert!(!once.first("lost", ""));
-        let said = (0..10_000).filter(|n| once.first("another type", &format!("writer {n}"))).count();
+        let said =
+            (0..10_000).filter(|n| once.first("another type", &format!("writer {n}"))).count();
         assert_eq!(said, Once::MOST);
         assert!(once.first("malformed", "") && once.first("offers less", "writer 1"));
     }

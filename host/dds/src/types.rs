@@ -11,7 +11,8 @@ use gleaner_transport::Guid;
 /// Writers of another type that are remembered, if there are not more of them.
 const OTHERS: usize = 1024;
 
-/// Of one topic, the writers whose type was looked up: RustDDS connects them by the topic's name alone.
+/// Of one topic, the writers whose type was looked up: RustDDS connects them by the topic's name
+/// alone.
 #[derive(Debug, Default)]
 pub(super) struct Types {
     ours: HashSet<Guid>,
@@ -30,9 +31,14 @@ impl Types {
         self.others.extend(others.iter().map(|offer| offer.guid));
     }
 
-    /// Whether a sample of `writer` is to be passed over, because it announced another type than `type_name`. Looked up
-    /// once if it came after what was noted.
-    pub(super) fn passes_over(&mut self, participant: &DomainParticipant, writer: Guid, type_name: &str) -> bool {
+    /// Whether a sample of `writer` is to be passed over, because it announced another type than
+    /// `type_name`. Looked up once if it came after what was noted.
+    pub(super) fn passes_over(
+        &mut self,
+        participant: &DomainParticipant,
+        writer: Guid,
+        type_name: &str,
+    ) -> bool {
         if !self.ours.contains(&writer) && !self.others.contains(&writer) {
             let writers = participant.discovered_writers();
             let found = writers.iter().map(wire::offer).find(|offer| offer.guid == writer);

@@ -22,8 +22,9 @@ pub(super) struct Watch {
     handled: u64,
     /// CPU time of the thread that reads the sockets.
     busy: u64,
-    /// Looks in a row at which datagrams waited, nothing was handled, and nobody worked on it: datagrams that are none of our
-    /// business may keep a queue filled while nobody writes what we listen to.
+    /// Looks in a row at which datagrams waited, nothing was handled, and nobody worked on it:
+    /// datagrams that are none of our business may keep a queue filled while nobody writes what we
+    /// listen to.
     waiting: u32,
     delivery: Option<(u64, usize)>,
     /// Looks in a row at which the same delivery was going on.
@@ -45,19 +46,29 @@ impl Watch {
         }
     }
 
-    /// What the sockets' queues are like, and why the participant is dead, if it is. `topics` names subscriptions.
+    /// What the sockets' queues are like, and why the participant is dead, if it is. `topics` names
+    /// subscriptions.
     pub(super) fn look(&mut self, state: &State, topics: &[String]) -> (Queues, Option<String>) {
         let queues = self.sockets.queues();
         if self.looked.is_none_or(|looked| looked.elapsed() >= SPACING) {
             self.looked = Some(Instant::now());
-            self.count(queues, (state.handled.load(Relaxed), busy(&self.threads)), state.delivering());
+            self.count(
+                queues,
+                (state.handled.load(Relaxed), busy(&self.threads)),
+                state.delivering(),
+            );
         }
         self.queues = queues;
         let dead = state.dead().or_else(|| self.verdict(topics));
         (queues, dead)
     }
 
-    fn count(&mut self, queues: Queues, (handled, busy): (u64, u64), delivery: Option<(u64, usize)>) {
+    fn count(
+        &mut self,
+        queues: Queues,
+        (handled, busy): (u64, u64),
+        delivery: Option<(u64, usize)>,
+    ) {
         let still = queues.waiting > 0 && handled == self.handled && busy == self.busy;
         self.waiting = if still { self.waiting + 1 } else { 0 };
         (self.handled, self.busy) = (handled, busy);
@@ -71,11 +82,16 @@ impl Watch {
             return Some(format!("thread {thread} of RustDDS is gone"));
         }
         if self.delivering >= LOOKS {
-            let topic = self.delivery.and_then(|(_, index)| topics.get(index)).map_or("?", String::as_str);
-            return Some(format!("the sink of topic `{topic}` has not given back a sample for {LOOKS} s"));
+            let topic =
+                self.delivery.and_then(|(_, index)| topics.get(index)).map_or("?", String::as_str);
+            return Some(format!(
+                "the sink of topic `{topic}` has not given back a sample for {LOOKS} s"
+            ));
         }
         let bytes = self.queues.waiting;
-        (self.waiting >= LOOKS).then(|| format!("{bytes} bytes wait in sockets, and nothing was handled for {LOOKS} s"))
+        (self.waiting >= LOOKS).then(|| {
+            format!("{bytes} bytes wait in sockets, and nothing was handled for {LOOKS} s")
+        })
     }
 }
 
@@ -87,7 +103,12 @@ mod tests {
         Watch::new(Sockets::default(), HashSet::new())
     }
 
-    fn look(watch: &mut Watch, waiting: u64, handled: u64, delivery: Option<(u64, usize)>) -> Option<String> {
+    fn look(
+        watch: &mut Watch,
+        waiting: u64,
+        handled: u64,
+        delivery: Option<(u64, usize)>,
+    ) -> Option<String> {
         watch.queues = Queues { waiting, ..Queues::default() };
         watch.count(watch.queues, (handled, 0), delivery);
         watch.verdict(&["/imu".to_owned()])

@@ -20,7 +20,8 @@ const QUALITIES: usize = 16;
 pub struct TopicOnWire {
     /// Absolute name. What is not printable is escaped.
     pub topic: String,
-    /// `pkg/msg/Type`, or what DDS says if it is no type of ROS 2. What is not printable is escaped.
+    /// `pkg/msg/Type`, or what DDS says if it is no type of ROS 2. What is not printable is
+    /// escaped.
     pub type_name: String,
     /// Writers of others.
     pub writers: usize,
@@ -40,14 +41,21 @@ pub(super) fn offer(writer: &DiscoveredWriterData) -> Offer {
     }
 }
 
-/// The topics of others, sorted by name, and of one name by the number of writers, most first; with what their writers offer as
-/// rosbag2 notes it.
-pub(super) fn topics(participant: &DomainParticipant, distro: Option<Distro>) -> Vec<(TopicOnWire, Option<String>)> {
+/// The topics of others, sorted by name, and of one name by the number of writers, most first; with
+/// what their writers offer as rosbag2 notes it.
+pub(super) fn topics(
+    participant: &DomainParticipant,
+    distro: Option<Distro>,
+) -> Vec<(TopicOnWire, Option<String>)> {
     let ours = participant.guid().prefix;
     let writers = participant.discovered_writers();
     let readers = participant.discovered_readers();
-    let writers = writers.iter().filter(|writer| writer.writer_proxy.remote_writer_guid.prefix != ours).map(offer);
-    let readers = readers.iter().filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != ours);
+    let writers = writers
+        .iter()
+        .filter(|writer| writer.writer_proxy.remote_writer_guid.prefix != ours)
+        .map(offer);
+    let readers =
+        readers.iter().filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != ours);
     sorted(writers, readers.map(names), distro)
 }
 
@@ -62,7 +70,9 @@ fn sorted<'a>(
     distro: Option<Distro>,
 ) -> Vec<(TopicOnWire, Option<String>)> {
     let mut found: BTreeMap<(String, String), (Vec<Offer>, usize)> = BTreeMap::new();
-    let key = |topic: &str, type_name: &str| Some((visible(ros_topic(topic)?), visible(&ros_type(type_name))));
+    let key = |topic: &str, type_name: &str| {
+        Some((visible(ros_topic(topic)?), visible(&ros_type(type_name))))
+    };
     for offer in writers {
         let Some(key) = key(&offer.topic, &offer.type_name) else { continue };
         if found.len() < TOPICS || found.contains_key(&key) {
@@ -75,19 +85,22 @@ fn sorted<'a>(
             found.entry(key).or_default().1 += 1;
         }
     }
-    let shown = |((topic, type_name), (offers, readers)): ((String, String), (Vec<Offer>, usize))| {
-        let mut qos: Vec<String> = Vec::new();
-        for words in offers.iter().map(|offer| in_words(&offer.qos)) {
-            if qos.len() < QUALITIES && !qos.contains(&words) {
-                qos.push(words);
+    let shown =
+        |((topic, type_name), (offers, readers)): ((String, String), (Vec<Offer>, usize))| {
+            let mut qos: Vec<String> = Vec::new();
+            for words in offers.iter().map(|offer| in_words(&offer.qos)) {
+                if qos.len() < QUALITIES && !qos.contains(&words) {
+                    qos.push(words);
+                }
             }
-        }
-        let offered = as_rosbag2(&offers.iter().collect::<Vec<_>>(), distro);
-        (TopicOnWire { topic, type_name, writers: offers.len(), readers, qos }, offered)
-    };
+            let offered = as_rosbag2(&offers.iter().collect::<Vec<_>>(), distro);
+            (TopicOnWire { topic, type_name, writers: offers.len(), readers, qos }, offered)
+        };
     let mut topics: Vec<_> = found.into_iter().map(shown).collect();
     // Somebody who announces a topic as another type is not to be taken for the one who is meant.
-    topics.sort_by(|(one, _), (other, _)| one.topic.cmp(&other.topic).then(other.writers.cmp(&one.writers)));
+    topics.sort_by(|(one, _), (other, _)| {
+        one.topic.cmp(&other.topic).then(other.writers.cmp(&one.writers))
+    });
     topics
 }
 
@@ -98,13 +111,19 @@ mod tests {
 
     fn offer(topic: &str, type_name: &str, reliable: bool) -> Offer {
         let qos = Request { reliable, transient_local: false }.policies(1);
-        Offer { guid: Guid::default(), topic: topic.to_owned(), type_name: type_name.to_owned(), qos }
+        Offer {
+            guid: Guid::default(),
+            topic: topic.to_owned(),
+            type_name: type_name.to_owned(),
+            qos,
+        }
     }
 
     #[test]
     fn topics_are_sorted_and_their_offers_said_once() {
         let imu = "sensor_msgs::msg::dds_::Imu_";
-        let writers = [offer("rt/b", imu, true), offer("rt/a", imu, true), offer("rt/a", imu, false)];
+        let writers =
+            [offer("rt/b", imu, true), offer("rt/a", imu, true), offer("rt/a", imu, false)];
         let writers = writers.iter().chain(&writers).cloned();
         let readers = [("rt/a", imu), ("rt/c", "x"), ("rq/service", imu)];
         let topics = sorted(writers, readers.into_iter(), None);
@@ -119,10 +138,12 @@ mod tests {
 
     #[test]
     fn of_a_topic_of_several_types_the_one_that_most_write_comes_first() {
-        let types = ["aaa::msg::dds_::X_", "sensor_msgs::msg::dds_::Imu_", "sensor_msgs::msg::dds_::Imu_"];
+        let types =
+            ["aaa::msg::dds_::X_", "sensor_msgs::msg::dds_::Imu_", "sensor_msgs::msg::dds_::Imu_"];
         let writers = types.map(|type_name| offer("rt/imu", type_name, true));
         let topics = sorted(writers.into_iter(), [("rt/imu", "a")].into_iter(), None);
-        let types: Vec<_> = topics.iter().map(|(topic, _)| (topic.type_name.as_str(), topic.writers)).collect();
+        let types: Vec<_> =
+            topics.iter().map(|(topic, _)| (topic.type_name.as_str(), topic.writers)).collect();
         assert_eq!(types, [("sensor_msgs/msg/Imu", 2), ("aaa/msg/X", 1), ("a", 0)]);
     }
 
@@ -134,7 +155,11 @@ mod tests {
 
     #[test]
     fn hostile_names_are_shown_escaped() {
-        let topics = sorted([offer("rt/\u{1b}[2J", "\n", true)].into_iter(), std::iter::empty(), None);
-        assert_eq!((topics[0].0.topic.as_str(), topics[0].0.type_name.as_str()), ("/\\u{1b}[2J", "\\u{a}"));
+        let topics =
+            sorted([offer("rt/\u{1b}[2J", "\n", true)].into_iter(), std::iter::empty(), None);
+        assert_eq!(
+            (topics[0].0.topic.as_str(), topics[0].0.type_name.as_str()),
+            ("/\\u{1b}[2J", "\\u{a}")
+        );
     }
 }

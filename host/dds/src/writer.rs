@@ -12,8 +12,8 @@ use super::raw::RawWriter;
 use super::receive::{Command, Line};
 use super::state::State;
 
-/// How long a write waits for room: whoever writes is about to judge the next sample, and one reader that has stopped shall not hold
-/// that up.
+/// How long a write waits for room: whoever writes is about to judge the next sample, and one
+/// reader that has stopped shall not hold that up.
 const PATIENCE: Duration = Duration::ZERO;
 /// Samples that are kept for readers that ask again.
 const DEPTH: std::ops::RangeInclusive<usize> = 1..=65_536;
@@ -36,9 +36,10 @@ impl Writer {
         depth: usize,
     ) -> Result<Self, DdsError> {
         let name = |name: &str, what| DdsError::Name { name: visible(name), what };
-        let dds_topic = dds_topic(topic).ok_or_else(|| name(topic, "the absolute name of a topic"))?;
-        let dds_type =
-            dds_type(type_name).ok_or_else(|| name(type_name, "a message type, such as `std_msgs/msg/Empty`"))?;
+        let dds_topic =
+            dds_topic(topic).ok_or_else(|| name(topic, "the absolute name of a topic"))?;
+        let dds_type = dds_type(type_name)
+            .ok_or_else(|| name(type_name, "a message type, such as `std_msgs/msg/Empty`"))?;
         let depth = i32::try_from(depth.clamp(*DEPTH.start(), *DEPTH.end())).unwrap_or(i32::MAX);
         let policies = QosPolicyBuilder::new()
             .reliability(policy::Reliability::Reliable { max_blocking_time: PATIENCE })
@@ -48,11 +49,16 @@ impl Writer {
         // Held, so that nobody can be connected before it is followed who.
         let mut peers = state.peers();
         let made = (|| {
-            let topic = participant.create_topic(dds_topic, dds_type, &policies, TopicKind::NoKey)?;
-            participant.create_publisher(&policies)?.create_datawriter_no_key(&topic, Some(policies.clone()))
+            let topic =
+                participant.create_topic(dds_topic, dds_type, &policies, TopicKind::NoKey)?;
+            participant
+                .create_publisher(&policies)?
+                .create_datawriter_no_key(&topic, Some(policies.clone()))
         })();
-        let writer: RawWriter =
-            made.map_err(|error: CreateError| DdsError::Advertise { topic: topic.to_owned(), source: error.into() })?;
+        let writer: RawWriter = made.map_err(|error: CreateError| DdsError::Advertise {
+            topic: topic.to_owned(),
+            source: error.into(),
+        })?;
         peers.follow(writer.guid());
         drop(peers);
         line.send(Command::Writer(writer.guid()));
@@ -63,8 +69,8 @@ impl Writer {
     ///
     /// # Errors
     ///
-    /// [`DdsError`] if DDS refuses it, as it does while a reader has not confirmed the last 8,192 messages.
-    /// It never waits for one.
+    /// [`DdsError`] if DDS refuses it, as it does while a reader has not confirmed the last 8,192
+    /// messages. It never waits for one.
     pub fn write(&self, cdr: &[u8]) -> Result<(), DdsError> {
         let why = |error: WriteError<Bytes>| match error {
             WriteError::WouldBlock { .. } => "readers do not keep up".to_owned(),

@@ -17,7 +17,9 @@ const PACKED: &str = ".zstd";
 /// The files of the directory `folder`.
 pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
     let path = folder.join("metadata.yaml");
-    let root = folder.canonicalize().map_err(|source| ReplayError::Open { path: folder.to_owned(), source })?;
+    let root = folder
+        .canonicalize()
+        .map_err(|source| ReplayError::Open { path: folder.to_owned(), source })?;
     let text = match text_of(&path, &root) {
         Ok(text) => text,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return by_name(folder),
@@ -27,13 +29,19 @@ pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
         Ok(found) => found,
         Err(source) => return Err(ReplayError::Metadata { path, source }),
     };
-    let files =
-        found.files.into_iter().map(|file| named(folder, &root, &path, file)).collect::<Result<Vec<PathBuf>, _>>()?;
+    let files = found
+        .files
+        .into_iter()
+        .map(|file| named(folder, &root, &path, file))
+        .collect::<Result<Vec<PathBuf>, _>>()?;
     let read: HashSet<_> = files.iter().map(|file| unpacked(file)).collect();
-    let others: Vec<_> = of_a_bag(folder)?.into_iter().filter(|other| !read.contains(&unpacked(other))).collect();
+    let others: Vec<_> =
+        of_a_bag(folder)?.into_iter().filter(|other| !read.contains(&unpacked(other))).collect();
     let remark = others.first().map(|first| {
         let (count, first) = (others.len(), first.display());
-        format!("metadata.yaml does not name all files beside it: {count} are not read, `{first}` first")
+        format!(
+            "metadata.yaml does not name all files beside it: {count} are not read, `{first}` first"
+        )
     });
     Ok(Bag { files, messages: found.messages, remark })
 }
@@ -56,8 +64,14 @@ fn text_of(path: &Path, root: &Path) -> io::Result<String> {
     String::from_utf8(bytes).or_else(|_| invalid("it is not UTF-8"))
 }
 
-/// Where the file is that `metadata` name `file`; it has to be in `folder`, whose own path is `root`.
-fn named(folder: &Path, root: &Path, metadata: &Path, file: String) -> Result<PathBuf, ReplayError> {
+/// Where the file is that `metadata` name `file`; it has to be in `folder`, whose own path is
+/// `root`.
+fn named(
+    folder: &Path,
+    root: &Path,
+    metadata: &Path,
+    file: String,
+) -> Result<PathBuf, ReplayError> {
     let relative = Path::new(&file);
     let is_plain = |part| matches!(part, Component::Normal(_) | Component::CurDir);
     if file.is_empty() || !relative.components().all(is_plain) {
@@ -69,7 +83,10 @@ fn named(folder: &Path, root: &Path, metadata: &Path, file: String) -> Result<Pa
         // A recorder that was killed may not have come to packing, or to noting it.
         let packed = OsString::from_iter([path.as_os_str(), PACKED.as_ref()]);
         let unpacked = file.strip_suffix(PACKED).map(|_| path.with_extension(""));
-        [Some(path), Some(packed.into()), unpacked].into_iter().flatten().find(|path| path.is_file())
+        [Some(path), Some(packed.into()), unpacked]
+            .into_iter()
+            .flatten()
+            .find(|path| path.is_file())
     });
     let Some(found) = found else {
         return Err(ReplayError::NoSuchFile { metadata: metadata.to_owned(), file });
@@ -86,19 +103,23 @@ fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
     if files.is_empty() {
         return Err(ReplayError::NoBag { path: folder.to_owned() });
     }
-    let remark = Some(format!("no metadata.yaml: its {} files are read in the order of their names", files.len()));
+    let remark = Some(format!(
+        "no metadata.yaml: its {} files are read in the order of their names",
+        files.len()
+    ));
     Ok(Bag { files, remark, ..Bag::default() })
 }
 
-/// The files in `folder` that are called as those of a bag, in the order of their names; one that lies there packed and not
-/// packed is the latter.
+/// The files in `folder` that are called as those of a bag, in the order of their names; one that
+/// lies there packed and not packed is the latter.
 fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
     let failed = |source| ReplayError::Open { path: folder.to_owned(), source };
     let mut names = Vec::new();
     for entry in fs::read_dir(folder).map_err(failed)? {
         let entry = entry.map_err(failed)?;
         let name = entry.file_name();
-        let is_one = name.to_str().is_some_and(|name| ENDINGS.iter().any(|ending| name.ends_with(ending)));
+        let is_one =
+            name.to_str().is_some_and(|name| ENDINGS.iter().any(|ending| name.ends_with(ending)));
         // Of the entry itself: no link leads out.
         if is_one && entry.file_type().map_err(failed)?.is_file() {
             names.push(name);
@@ -114,5 +135,9 @@ fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
 
 /// The path without the ending of what is packed.
 fn unpacked(path: &Path) -> PathBuf {
-    if path.extension() == Some("zstd".as_ref()) { path.with_extension("") } else { path.to_owned() }
+    if path.extension() == Some("zstd".as_ref()) {
+        path.with_extension("")
+    } else {
+        path.to_owned()
+    }
 }

@@ -46,7 +46,10 @@ pub(super) struct Catalog {
 }
 
 impl Catalog {
-    pub(super) fn build(files: &[(&Path, &Contents)], sources: Option<Sources>) -> Result<Self, ReplayError> {
+    pub(super) fn build(
+        files: &[(&Path, &Contents)],
+        sources: Option<Sources>,
+    ) -> Result<Self, ReplayError> {
         let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
         for (file, (path, contents)) in files.iter().enumerate() {
             for (id, channel) in contents.channels.iter() {
@@ -72,8 +75,10 @@ impl Catalog {
                     });
                 }
                 let messages = contents.messages.get(&id).copied().unwrap_or(0);
-                let messages =
-                    topic.messages.filter(|_| !contents.uncounted).map(|known| known.saturating_add(messages));
+                let messages = topic
+                    .messages
+                    .filter(|_| !contents.uncounted)
+                    .map(|known| known.saturating_add(messages));
                 topic.messages = messages;
                 topic.channels.push((file, id));
                 if channel.message_encoding != "cdr" {
@@ -86,7 +91,8 @@ impl Catalog {
                     Some(text) if channel.schema_encoding == "ros2msg" => {
                         topic.text.get_or_insert_with(|| text.clone());
                     }
-                    // A writer that does not know a type leaves its text out, and how it is written with it.
+                    // A writer that does not know a type leaves its text out, and how it is written
+                    // with it.
                     None if !channel.type_name.is_empty() => {}
                     _ => {
                         topic.foreign_text.get_or_insert_with(|| channel.schema_encoding.clone());
@@ -110,7 +116,11 @@ impl Catalog {
     }
 
     /// The definitions of a topic's type: as its files have them, or else as they were found.
-    fn text<'a>(&'a self, name: &str, topic: &'a Topic) -> Result<Option<&'a Arc<str>>, TransportError> {
+    fn text<'a>(
+        &'a self,
+        name: &str,
+        topic: &'a Topic,
+    ) -> Result<Option<&'a Arc<str>>, TransportError> {
         let Some(sources) = self.sources.as_ref().filter(|_| topic.text.is_none()) else {
             return Ok(topic.text.as_ref());
         };
@@ -139,7 +149,12 @@ impl Catalog {
             });
         }
         let encoding = |what, found: &String, wanted| {
-            Err(TransportError::Encoding { topic: spec.topic.clone(), what, found: found.clone(), wanted })
+            Err(TransportError::Encoding {
+                topic: spec.topic.clone(),
+                what,
+                found: found.clone(),
+                wanted,
+            })
         };
         if let Some(found) = &topic.foreign {
             return encoding("message encoding", found, "cdr");

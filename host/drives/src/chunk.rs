@@ -88,21 +88,24 @@ impl OpenSegment {
         self.entries.clear();
     }
 
-    /// Adds a message behind all others, as a record of MCAP. Of equal times, the one added first comes first.
+    /// Adds a message behind all others, as a record of MCAP. Of equal times, the one added first
+    /// comes first.
     #[cfg(feature = "bags")]
     pub(super) fn push(&mut self, head: &MessageHead, data: &[u8]) {
-        // Fits: a database gives no message larger than a segment may be, and fills one with little more.
+        // Fits: a database gives no message larger than a segment may be, and fills one with little
+        // more.
         let at = (self.bytes.len() + HEAD as usize) as u32;
         self.bytes.push(op::MESSAGE);
-        self.bytes.extend_from_slice(&((super::records::MESSAGE_HEAD + data.len()) as u64).to_le_bytes());
+        self.bytes
+            .extend_from_slice(&((super::records::MESSAGE_HEAD + data.len()) as u64).to_le_bytes());
         self.bytes.extend_from_slice(&head.to_bytes());
         self.bytes.extend_from_slice(data);
         self.len = self.bytes.len();
         self.entries.push(Entry { log_time: head.log_time, channel: 0, at });
     }
 
-    /// Collects the messages of the channels that `wanted` accepts, and sorts them. What `segment` says of its times, and
-    /// the file of its `channels`, has to be so.
+    /// Collects the messages of the channels that `wanted` accepts, and sorts them. What `segment`
+    /// says of its times, and the file of its `channels`, has to be so.
     ///
     /// `wanted` answers `None` for a channel that does not exist.
     fn sort(
@@ -126,9 +129,15 @@ impl OpenSegment {
                 let (first, last) = (segment.start_time, segment.end_time);
                 return Err(Damage::OutsideChunk { found: head.log_time, first, last });
             }
-            if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))? && span.holds(head.log_time) {
+            if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))?
+                && span.holds(head.log_time)
+            {
                 // Fits: `Opener::new` clamps the size of a segment.
-                entries.push(Entry { log_time: head.log_time, channel: head.channel, at: at as u32 });
+                entries.push(Entry {
+                    log_time: head.log_time,
+                    channel: head.channel,
+                    at: at as u32,
+                });
             }
         }
         if !entries.is_sorted() {
@@ -139,9 +148,11 @@ impl OpenSegment {
     }
 }
 
-/// The front of a message record. Times are signed everywhere else: one that does not fit would become another.
+/// The front of a message record. Times are signed everywhere else: one that does not fit would
+/// become another.
 pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
-    let head = MessageHead::parse(body).ok_or(Damage::Malformed("a message record is shorter than its header"))?;
+    let head = MessageHead::parse(body)
+        .ok_or(Damage::Malformed("a message record is shorter than its header"))?;
     if i64::try_from(head.log_time).is_err() {
         return Err(Damage::Late(head.log_time));
     }
@@ -173,7 +184,8 @@ impl Opener {
         into: &mut OpenSegment,
     ) -> Result<(), ReplayError> {
         self.read(source, segment.offset, segment.len, segment.kind, into)?;
-        into.sort(segment, channels, span, wanted).map_err(|what| source.damaged(segment.offset, what))
+        into.sort(segment, channels, span, wanted)
+            .map_err(|what| source.damaged(segment.offset, what))
     }
 
     /// Reads a segment's records into `into`, unsorted.
@@ -203,9 +215,9 @@ impl Opener {
             SegmentKind::Chunk => {
                 let mut record = std::mem::take(&mut self.compressed);
                 record.resize(size.max(record.len()), 0);
-                let result = source
-                    .read(offset, &mut record[..size])
-                    .and_then(|()| self.unpack(&record[..size], into).map_err(|what| source.damaged(offset, what)));
+                let result = source.read(offset, &mut record[..size]).and_then(|()| {
+                    self.unpack(&record[..size], into).map_err(|what| source.damaged(offset, what))
+                });
                 self.compressed = record;
                 result
             }
@@ -217,7 +229,8 @@ impl Opener {
         let Some(Ok(Record { opcode: op::CHUNK, body, .. })) = Records::new(record).next() else {
             return Err(Damage::Malformed("there is no chunk where the index says"));
         };
-        let head = ChunkHead::parse(body).ok_or(Damage::Malformed("a chunk's header is cut off"))?;
+        let head =
+            ChunkHead::parse(body).ok_or(Damage::Malformed("a chunk's header is cut off"))?;
         let allowed = self.limits.chunk_bytes;
         let size = usize::try_from(head.uncompressed).ok().filter(|size| *size as u64 <= allowed);
         let size = size.ok_or(Damage::ChunkTooLarge { claimed: head.uncompressed, allowed })?;

@@ -35,7 +35,8 @@ pub enum Damage {
     /// A record contradicts itself or its surroundings.
     #[error("{0}")]
     Malformed(&'static str),
-    /// A schema or a channel is defined a second time, with other content: its messages would change their topic or type.
+    /// A schema or a channel is defined a second time, with other content: its messages would
+    /// change their topic or type.
     #[error("{what} {id} is defined again with another {field}{}", in_order(values))]
     Redefined {
         /// "schema" or "channel".
@@ -51,7 +52,9 @@ pub enum Damage {
     #[error("a message has log time {0} ns, which is after the year 2262")]
     Late(u64),
     /// A chunk holds a message from outside of the times that the index says of the chunk.
-    #[error("a message has log time {found} ns; by its index, the chunk holds {first} to {last} ns")]
+    #[error(
+        "a message has log time {found} ns; by its index, the chunk holds {first} to {last} ns"
+    )]
     OutsideChunk {
         /// The message's.
         found: u64,

@@ -1,7 +1,8 @@
 //! The databases of rosbag2: opened to be read, and not believed.
 //!
-//! A database brings its own schema, and a schema can bring views, triggers and columns that compute. None of that runs
-//! here: the three tables that count have to be tables, and their columns, columns. Nothing is written, not even beside it.
+//! A database brings its own schema, and a schema can bring views, triggers and columns that
+//! compute. None of that runs here: the three tables that count have to be tables, and their
+//! columns, columns. Nothing is written, not even beside it.
 //!
 //! Source: `rosbag2_storage_sqlite3`, schema versions 1 to 4.
 
@@ -32,7 +33,8 @@ const VERSIONS: RangeInclusive<i64> = 1..=4;
 
 /// SQLite counts the length of a row in 31 bits.
 const LARGEST_ROW: u64 = 1 << 30;
-/// Statements of ours have at most a list of 65536 topics; those of a schema have no reason to be longer.
+/// Statements of ours have at most a list of 65536 topics; those of a schema have no reason to be
+/// longer.
 const LONGEST_SQL: i32 = 4 << 20;
 
 /// What a row takes beside its texts, about. A damaged or made-up table has no end to them.
@@ -60,7 +62,11 @@ impl<'a> File<'a> {
 }
 
 /// Opens a database of `len` bytes.
-pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Contents), ReplayError> {
+pub(super) fn open(
+    file: File<'_>,
+    len: u64,
+    limits: Limits,
+) -> Result<(Rows, Contents), ReplayError> {
     if file.may_be_open {
         is_closed(file.real)?;
     }
@@ -71,7 +77,8 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
         }
         ReplayError::Database { path: path.clone(), source }
     };
-    let expected = claimed_len(file.real).map_err(|source| ReplayError::Open { path: path.clone(), source })?;
+    let expected = claimed_len(file.real)
+        .map_err(|source| ReplayError::Open { path: path.clone(), source })?;
     let is_cut_off = expected > len;
     let db = connect(file.real, limits, is_cut_off).map_err(|error| refused(error.into()))?;
     is_known_version(&db).map_err(refused)?;
@@ -83,8 +90,14 @@ pub(super) fn open(file: File<'_>, len: u64, limits: Limits) -> Result<(Rows, Co
     let first = edge(&db, &index, "ASC");
     // The newest is lost with the end of the file.
     let last = edge(&db, &index, "DESC").ok().flatten();
-    let mut contents = Contents { channels: known.channels, uncounted: true, ..Contents::default() };
-    contents.times = first.as_ref().ok().copied().flatten().map(|first| (first, last.unwrap_or(first).max(first)));
+    let mut contents =
+        Contents { channels: known.channels, uncounted: true, ..Contents::default() };
+    contents.times = first
+        .as_ref()
+        .ok()
+        .copied()
+        .flatten()
+        .map(|first| (first, last.unwrap_or(first).max(first)));
     if is_cut_off {
         warn!(path = %path.display(), expected, found = len, "database was cut off, its newest messages are lost");
         contents.is_end_unknown = last.is_none();
@@ -118,12 +131,14 @@ fn holds_something(path: &Path) -> io::Result<bool> {
     Ok(found.len() > 0 && std::fs::File::open(path)?.read(&mut start)? > 0 && start != [0])
 }
 
-/// The length that the header claims, in bytes; 0 if it claims none. Source: the database file format, section 1.3.
+/// The length that the header claims, in bytes; 0 if it claims none. Source: the database file
+/// format, section 1.3.
 fn claimed_len(path: &Path) -> std::io::Result<u64> {
     let mut header = Vec::new();
     std::fs::File::open(path)?.take(100).read_to_end(&mut header)?;
-    let u32_at =
-        |at: usize| header.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u32::from_be_bytes(*bytes));
+    let u32_at = |at: usize| {
+        header.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u32::from_be_bytes(*bytes))
+    };
     let page = match header.get(16..18) {
         Some([0, 1]) => 65_536,
         Some(&[high, low]) => u64::from(u16::from_be_bytes([high, low])),
@@ -138,13 +153,17 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
     let mut uri = "file:".to_owned();
     for byte in path.as_os_str().as_bytes() {
         match byte {
-            b'/' | b'.' | b'-' | b'_' | b'0'..=b'9' | b'A'..=b'Z' | b'a'..=b'z' => uri.push(char::from(*byte)),
+            b'/' | b'.' | b'-' | b'_' | b'0'..=b'9' | b'A'..=b'Z' | b'a'..=b'z' => {
+                uri.push(char::from(*byte))
+            }
             _ => uri += &format!("%{byte:02X}"),
         }
     }
     // Nobody else writes to it, so no lock is taken, and nothing is made beside it.
     uri += "?immutable=1";
-    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_URI | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY
+        | OpenFlags::SQLITE_OPEN_URI
+        | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let db = Connection::open_with_flags(uri, flags)?;
     for (limit, value) in [
         (Limit::SQLITE_LIMIT_LENGTH, limits.chunk_bytes.min(LARGEST_ROW) as i32),
@@ -167,14 +186,16 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
     ] {
         db.set_db_config(config, wanted)?;
     }
-    // Pages are read once, in order; a drive may have hundreds of databases, each with a cache (in KiB).
+    // Pages are read once, in order; a drive may have hundreds of databases, each with a cache (in
+    // KiB).
     db.execute_batch(
         "PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0; PRAGMA cache_size = -512;",
     )?;
     Ok(db)
 }
 
-/// Refuses a database of a later rosbag2: what it changed cannot be known. Version 1 did not say which it is.
+/// Refuses a database of a later rosbag2: what it changed cannot be known. Version 1 did not say
+/// which it is.
 fn is_known_version(db: &Connection) -> Result<(), Refused> {
     if kind(db, "schema")?.is_none() {
         return Ok(());
@@ -186,7 +207,10 @@ fn is_known_version(db: &Connection) -> Result<(), Refused> {
         None => Ok(()),
         Some(version) => {
             let (first, last) = (VERSIONS.start(), VERSIONS.end());
-            Err(format!("its schema has version {version}; only versions {first} to {last} can be read").into())
+            Err(format!(
+                "its schema has version {version}; only versions {first} to {last} can be read"
+            )
+            .into())
         }
     }
 }
@@ -212,7 +236,8 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
         if found.len() > usize::from(u16::MAX) {
             return Err("it has more than 65536 topics".into());
         }
-        let (number, topic, type_name): (_, String, String) = (row.get(0)?, row.get(1)?, row.get(2)?);
+        let (number, topic, type_name): (_, String, String) =
+            (row.get(0)?, row.get(1)?, row.get(2)?);
         let text = texts.get(&type_name);
         let info = ChannelInfo {
             offered_qos: offered_qos(&topic, row.get::<_, Option<String>>(4)?.as_deref()),
@@ -236,7 +261,8 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
     Ok(known)
 }
 
-/// The texts of message definitions by type, with how they are written. Databases from before ROS 2 Iron have none.
+/// The texts of message definitions by type, with how they are written. Databases from before ROS 2
+/// Iron have none.
 fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, Refused> {
     let name = "message_definitions";
     if kind(db, name)?.is_none() {
@@ -248,7 +274,8 @@ fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, R
     let mut rows = statement.query([])?;
     let (mut texts, mut room) = (HashMap::new(), Channels::default());
     while let Some(row) = rows.next()? {
-        let (type_name, encoding, text): (String, String, String) = (row.get(0)?, row.get(1)?, row.get(2)?);
+        let (type_name, encoding, text): (String, String, String) =
+            (row.get(0)?, row.get(1)?, row.get(2)?);
         room.make_room(ROW_BYTES + type_name.len() + encoding.len() + text.len())?;
         let text = text.trim();
         if !text.is_empty() {
@@ -258,9 +285,11 @@ fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, R
     Ok(texts)
 }
 
-/// What SQLite made of what the schema calls `name`: the text of a schema can be written in many ways.
+/// What SQLite made of what the schema calls `name`: the text of a schema can be written in many
+/// ways.
 fn kind(db: &Connection, name: &str) -> rusqlite::Result<Option<String>> {
-    let sql = "SELECT type FROM pragma_table_list WHERE schema = 'main' AND name = ?1 COLLATE NOCASE";
+    let sql =
+        "SELECT type FROM pragma_table_list WHERE schema = 'main' AND name = ?1 COLLATE NOCASE";
     db.query_row(sql, [name], |row| row.get(0)).optional()
 }
 
@@ -273,15 +302,17 @@ fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Re
     }
     // Columns that compute are hidden ones.
     let mut statement = db.prepare("SELECT name, hidden FROM pragma_table_xinfo(?1)")?;
-    let all: Vec<(String, i64)> =
-        statement.query_map([name], |row| Ok((row.get(0)?, row.get(1)?)))?.collect::<Result<_, _>>()?;
+    let all: Vec<(String, i64)> = statement
+        .query_map([name], |row| Ok((row.get(0)?, row.get(1)?)))?
+        .collect::<Result<_, _>>()?;
     if all.iter().any(|(column, _)| column.eq_ignore_ascii_case("rowid")) {
         return Err(format!(
             "its table `{name}` calls a column `rowid`, which is SQLite's own for the number of a row"
         )
         .into());
     }
-    let columns: Vec<_> = all.into_iter().filter(|(_, hidden)| *hidden == 0).map(|(column, _)| column).collect();
+    let columns: Vec<_> =
+        all.into_iter().filter(|(_, hidden)| *hidden == 0).map(|(column, _)| column).collect();
     match wanted.iter().find(|wanted| !columns.iter().any(|column| column == *wanted)) {
         None => Ok(columns),
         Some(column) => Err(format!("its table `{name}` has no column `{column}`").into()),
@@ -290,12 +321,15 @@ fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Re
 
 /// An index by which all messages can be read in the order of their times, quoted for SQL.
 fn index_of_times(db: &Connection) -> rusqlite::Result<Option<String>> {
-    let mut statement = db.prepare("SELECT name FROM pragma_index_list('messages') WHERE partial = 0")?;
-    let names: Vec<String> = statement.query_map([], |row| row.get(0))?.collect::<Result<_, _>>()?;
+    let mut statement =
+        db.prepare("SELECT name FROM pragma_index_list('messages') WHERE partial = 0")?;
+    let names: Vec<String> =
+        statement.query_map([], |row| row.get(0))?.collect::<Result<_, _>>()?;
     let mut columns = db.prepare("SELECT name, desc FROM pragma_index_xinfo(?1) ORDER BY seqno")?;
     for name in names {
-        let found: Vec<(Option<String>, i64)> =
-            columns.query_map([&name], |row| Ok((row.get(0)?, row.get(1)?)))?.collect::<Result<_, _>>()?;
+        let found: Vec<(Option<String>, i64)> = columns
+            .query_map([&name], |row| Ok((row.get(0)?, row.get(1)?)))?
+            .collect::<Result<_, _>>()?;
         // The second is the number of the row.
         if let [(Some(column), 0), (None, 0)] = found.as_slice()
             && column == "timestamp"
@@ -306,8 +340,9 @@ fn index_of_times(db: &Connection) -> rusqlite::Result<Option<String>> {
     Ok(None)
 }
 
-/// Refuses a database whose index does not give messages in the order of their times by itself, as with an order of its
-/// own for texts: SQLite would read all of them, and sort them in memory, for each piece.
+/// Refuses a database whose index does not give messages in the order of their times by itself, as
+/// with an order of its own for texts: SQLite would read all of them, and sort them in memory, for
+/// each piece.
 fn in_order(db: &Connection, index: &str) -> Result<(), Refused> {
     let pieces = [SAME_TIME, LATER].map(|condition| (select(index, "0", condition), false));
     let edges = ["ASC", "DESC"].map(|order| (edge_sql(index, order), true));
@@ -318,7 +353,9 @@ fn in_order(db: &Connection, index: &str) -> Result<(), Refused> {
         while let Some(step) = steps.next()? {
             let step: String = step.get("detail")?;
             if step.contains("TEMP B-TREE") || step.starts_with("SCAN") && !may_scan {
-                return Err(format!("its messages cannot be read in order by the index {index}").into());
+                return Err(
+                    format!("its messages cannot be read in order by the index {index}").into()
+                );
             }
         }
     }

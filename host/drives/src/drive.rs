@@ -16,7 +16,9 @@ use super::step::{Progress, Step};
 use super::storage;
 use super::track::{Routed, Track, nanoseconds};
 use gleaner_messages::Definitions;
-use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict};
+use gleaner_transport::{
+    DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict,
+};
 
 /// A drive: one or more files and rosbag2 directories, replayed as one.
 ///
@@ -41,10 +43,10 @@ use gleaner_transport::{DiscoveredTopic, Sink, Subscription, TopicSpec, Transpor
 ///
 /// A file that is readable to its end but has no footer, or a damaged summary, or another number of
 /// messages of a subscribed topic than the summary counts, is replayed whole and then reported as
-/// damaged; so is one whose index says other times of a chunk than the chunk itself, which is read as one without.
-/// Messages outside chunks have no checksum of their own; if the one of the whole data
-/// section is wrong, that too is reported after them. A writer may leave out any checksum; then
-/// only what contradicts itself is noticed.
+/// damaged; so is one whose index says other times of a chunk than the chunk itself, which is read
+/// as one without. Messages outside chunks have no checksum of their own; if the one of the whole
+/// data section is wrong, that too is reported after them. A writer may leave out any checksum;
+/// then only what contradicts itself is noticed.
 ///
 /// A database has no checksums: what its pages contradict is noticed when its turn comes, and every
 /// message before was delivered. So it is with a packed file that cannot be unpacked to its end.
@@ -91,14 +93,15 @@ struct Head {
 impl Replay {
     /// Opens the files of a drive and finds out what is in them.
     ///
-    /// A directory is one that rosbag2 wrote: all files that its metadata name, or if it has none, those of its
-    /// name that we read. A file with a summary, and a database, cost a few reads; a file without a summary is read through
-    /// once, and a packed one is unpacked.
+    /// A directory is one that rosbag2 wrote: all files that its metadata name, or if it has none,
+    /// those of its name that we read. A file with a summary, and a database, cost a few reads; a
+    /// file without a summary is read through once, and a packed one is unpacked.
     ///
     /// # Errors
     ///
-    /// [`ReplayError`] if there is no file, one cannot be opened, is nothing that we read or given twice, or
-    /// if they disagree on a topic's type. Damage further inside is reported by [`Replay::step`].
+    /// [`ReplayError`] if there is no file, one cannot be opened, is nothing that we read or given
+    /// twice, or if they disagree on a topic's type. Damage further inside is reported by
+    /// [`Replay::step`].
     pub fn open(paths: &[PathBuf]) -> Result<Self, ReplayError> {
         Self::open_as(paths, &Options::default())
     }
@@ -148,7 +151,8 @@ impl Replay {
         })
     }
 
-    /// Replays only messages with a log time from `from_ns` on and before `to_ns`; to be called before the first step.
+    /// Replays only messages with a log time from `from_ns` on and before `to_ns`; to be called
+    /// before the first step.
     ///
     /// Damage that shows behind all of them is not reported: it costs none.
     pub fn restrict(&mut self, from_ns: i64, to_ns: i64) {
@@ -222,8 +226,8 @@ impl Replay {
         starts.min().map(nanoseconds)
     }
 
-    /// Log time of the last message of any topic, in ns; `None` if there is none, or if nobody knows: of a database that was
-    /// cut off.
+    /// Log time of the last message of any topic, in ns; `None` if there is none, or if nobody
+    /// knows: of a database that was cut off.
     pub fn end_ns(&self) -> Option<i64> {
         if self.tracks.iter().any(Track::is_end_unknown) {
             return None;
@@ -246,7 +250,8 @@ impl Replay {
         self.progress
     }
 
-    /// Messages delivered after one with a later log time. 0 unless [`Limits::open_bytes`] was reached.
+    /// Messages delivered after one with a later log time. 0 unless [`Limits::open_bytes`] was
+    /// reached.
     pub fn out_of_order(&self) -> u64 {
         self.out_of_order
     }
@@ -280,7 +285,11 @@ impl Replay {
             self.damage = Some((before, error));
         }
         if top.is_none() {
-            let missing = if self.span == Span::ALL { self.tracks.iter().find_map(Track::missing) } else { None };
+            let missing = if self.span == Span::ALL {
+                self.tracks.iter().find_map(Track::missing)
+            } else {
+                None
+            };
             if let Some(error) = missing {
                 return Err(self.end(error));
             }
@@ -328,7 +337,8 @@ impl Replay {
 
     fn find_next_open(&mut self) {
         let starts = self.tracks.iter().enumerate();
-        self.next_open = starts.filter_map(|(index, track)| Some((track.next_start()?, index))).min();
+        self.next_open =
+            starts.filter_map(|(index, track)| Some((track.next_start()?, index))).min();
     }
 
     /// Moves on from the top message.
@@ -366,7 +376,11 @@ impl Transport for Replay {
         self.catalog.topics()
     }
 
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+    fn subscribe(
+        &mut self,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+    ) -> Result<Subscription, TransportError> {
         if self.started {
             return Err(TransportError::AlreadyStarted { topic: spec.topic.clone() });
         }

@@ -63,7 +63,9 @@ pub enum ReplayError {
         path: PathBuf,
     },
     /// The file does not begin like anything that we read.
-    #[error("`{path}` is not an MCAP file, nor a rosbag2 database, nor one of them packed with zstd")]
+    #[error(
+        "`{path}` is not an MCAP file, nor a rosbag2 database, nor one of them packed with zstd"
+    )]
     NotMcap {
         /// The file.
         path: PathBuf,
@@ -97,7 +99,9 @@ pub enum ReplayError {
         allowed: u64,
     },
     /// A packed file holds more than there is room for on the disk.
-    #[error("drive `{path}` unpacks to more than {allowed} bytes, which is nine tenths of what is free in `{folder}`")]
+    #[error(
+        "drive `{path}` unpacks to more than {allowed} bytes, which is nine tenths of what is free in `{folder}`"
+    )]
     NoRoom {
         /// The file.
         path: PathBuf,
@@ -137,7 +141,9 @@ pub enum ReplayError {
         what: &'static str,
     },
     /// Two files, or two channels of one, disagree on the type of a topic.
-    #[error("topic `{topic}` has type `{first_type}` in `{first}` and `{second_type}` in `{second}`")]
+    #[error(
+        "topic `{topic}` has type `{first_type}` in `{first}` and `{second_type}` in `{second}`"
+    )]
     TypeConflict {
         /// The topic.
         topic: String,
@@ -191,7 +197,9 @@ impl ReplayError {
             }
             Self::Metadata { path, .. } | Self::NoSuchFile { metadata: path, .. } => {
                 let folder = word(path.parent().unwrap_or(path));
-                format!("write it anew with `ros2 bag reindex {folder}`, or name the files in the directory themselves")
+                format!(
+                    "write it anew with `ros2 bag reindex {folder}`, or name the files in the directory themselves"
+                )
             }
             Self::Outside { .. } => "name that file itself, if you trust who wrote this".to_owned(),
             Self::Twice { .. } => "its samples would count twice; give each file once".to_owned(),
@@ -202,17 +210,29 @@ impl ReplayError {
                 format!("if you trust it, unpack it yourself: zstd -d {}", word(path))
             }
             Self::NoRoom { path, .. } => {
-                format!("make room, or unpack it where there is some: zstd -d {} -o FILE", word(path))
+                format!(
+                    "make room, or unpack it where there is some: zstd -d {} -o FILE",
+                    word(path)
+                )
             }
             Self::NotClosed { path, .. } => {
                 format!("close it: sqlite3 {} 'PRAGMA wal_checkpoint(TRUNCATE)'", word(path))
             }
             Self::NoTimes { path } => {
-                format!("make one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'", word(path))
+                format!(
+                    "make one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'",
+                    word(path)
+                )
             }
-            Self::Damaged { path, what: Damage::Database(_) | Damage::DatabaseCutOff { .. }, .. } => {
+            Self::Damaged {
+                path,
+                what: Damage::Database(_) | Damage::DatabaseCutOff { .. },
+                ..
+            } => {
                 let path = word(path);
-                format!("copy the file again if you can; `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more")
+                format!(
+                    "copy the file again if you can; `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more"
+                )
             }
             Self::Damaged { .. } => "copy the file again if you can".to_owned(),
             _ => return None,
@@ -222,7 +242,8 @@ impl ReplayError {
 
 const WHAT_IS_ONE: &str = "a .mcap or .db3 file, or a directory that `ros2 bag record` wrote";
 
-/// A path as one word of a command to paste into a shell: whoever made the drive chose the names in it.
+/// A path as one word of a command to paste into a shell: whoever made the drive chose the names in
+/// it.
 fn word(path: &Path) -> String {
     let text = path.to_string_lossy();
     let is_plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c);
@@ -248,7 +269,10 @@ mod tests {
             ("-init.db3", "./-init.db3"),
         ] {
             let help = ReplayError::NoTimes { path: path.into() }.help().unwrap();
-            assert!(help.starts_with(&format!("make one: sqlite3 {shown} 'CREATE INDEX")), "{help}");
+            assert!(
+                help.starts_with(&format!("make one: sqlite3 {shown} 'CREATE INDEX")),
+                "{help}"
+            );
         }
     }
 }

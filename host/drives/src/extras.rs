@@ -23,14 +23,16 @@ const NAME_CHARS: usize = 100;
 /// What a file holds besides messages.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Extras {
-    /// The metadata records in the order of the file, each with its name. Names may repeat. They have
-    /// no checksum.
+    /// The metadata records in the order of the file, each with its name. Names may repeat. They
+    /// have no checksum.
     pub metadata: Vec<(String, BTreeMap<String, String>)>,
     /// The attachments in the order of the file. Names may repeat.
     pub attachments: Vec<Attachment>,
-    /// Whether the file was finished and read to its end. If it was cut off, the rest is missing here.
+    /// Whether the file was finished and read to its end. If it was cut off, the rest is missing
+    /// here.
     pub is_whole: bool,
-    /// Where its indexes and its records do not fit, if so: a reader that goes by index would see something else.
+    /// Where its indexes and its records do not fit, if so: a reader that goes by index would see
+    /// something else.
     pub misfit: Option<String>,
 }
 
@@ -47,18 +49,21 @@ pub struct Attachment {
 
 /// Reads the metadata records and attachments of an MCAP file; chunks are stepped over unread.
 ///
-/// Names, texts and data may take `limit_bytes` in all, with 128 bytes more for each record and pair.
+/// Names, texts and data may take `limit_bytes` in all, with 128 bytes more for each record and
+/// pair.
 ///
-/// A file without a footer, which was cut off or is still being written, gives what stands before its end, or before the
-/// first damage: with a torn end, it cannot be told which of the two it is. Attachments without a checksum are not
-/// believed there. A finished file gives everything or an error.
+/// A file without a footer, which was cut off or is still being written, gives what stands before
+/// its end, or before the first damage: with a torn end, it cannot be told which of the two it is.
+/// Attachments without a checksum are not believed there. A finished file gives everything or an
+/// error.
 ///
 /// # Errors
 ///
-/// [`ReplayError`] if the file cannot be opened or read, is a directory or no MCAP file. [`ReplayError::Damaged`] if
-/// there is more than `limit_bytes`, or if a finished file is damaged: a record that is malformed, an attachment without
-/// its checksum (a writer may leave it out), fewer of either than the summary counts, or any byte of the data section that
-/// its checksum does not allow.
+/// [`ReplayError`] if the file cannot be opened or read, is a directory or no MCAP file.
+/// [`ReplayError::Damaged`] if there is more than `limit_bytes`, or if a finished file is damaged:
+/// a record that is malformed, an attachment without its checksum (a writer may leave it out),
+/// fewer of either than the summary counts, or any byte of the data section that its checksum does
+/// not allow.
 ///
 /// Source: the MCAP specification, version 0.
 pub fn read_extras(path: &Path, limit_bytes: u64) -> Result<Extras, ReplayError> {
@@ -80,7 +85,9 @@ pub fn read_extras(path: &Path, limit_bytes: u64) -> Result<Extras, ReplayError>
     };
     match walk.all() {
         Ok(()) => walk.extras.is_whole = !walk.is_cut_off,
-        Err(error @ ReplayError::Damaged { what: Damage::ExtrasTooLarge { .. }, .. }) => return Err(error),
+        Err(error @ ReplayError::Damaged { what: Damage::ExtrasTooLarge { .. }, .. }) => {
+            return Err(error);
+        }
         Err(ReplayError::Damaged { at, what, .. }) if walk.is_cut_off => {
             warn!(path = %path.display(), %at, %what, "file is cut off, its further metadata and attachments are lost");
         }
@@ -117,16 +124,23 @@ impl Walk {
             ("attachments", claimed.attachments, self.extras.attachments.len()),
         ] {
             if (found as u64) < u64::from(expected) {
-                return Err(self.source.damaged(self.end, Damage::MissingExtras { what, expected, found }));
+                return Err(self
+                    .source
+                    .damaged(self.end, Damage::MissingExtras { what, expected, found }));
             }
         }
         Ok(())
     }
 
-    /// Checks everything before `end` against the checksum that stands there: nothing else covers metadata, and indexes.
+    /// Checks everything before `end` against the checksum that stands there: nothing else covers
+    /// metadata, and indexes.
     fn whole_until(&mut self, end: u64, expected: u32) -> Result<(), ReplayError> {
         let found = if expected == 0 { 0 } else { self.source.checksum(end)? };
-        if found == expected { Ok(()) } else { Err(self.source.damaged(end, Damage::DataCrc { expected, found })) }
+        if found == expected {
+            Ok(())
+        } else {
+            Err(self.source.damaged(end, Damage::DataCrc { expected, found }))
+        }
     }
 
     /// Looks at the record at `at`, and returns where the next one is.
@@ -149,18 +163,31 @@ impl Walk {
             0 => Err(Damage::Malformed("a record has kind 0, which does not exist")),
             op::FOOTER => Err(Damage::Malformed("a footer stands in the middle of the file")),
             op::DATA_END => {
-                let crc = self.source.peek(at + HEAD, 4)?.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
+                let crc = self
+                    .source
+                    .peek(at + HEAD, 4)?
+                    .first_chunk()
+                    .map_or(0, |crc| u32::from_le_bytes(*crc));
                 return self.whole_until(at, crc).map(|()| next);
             }
-            op::STATISTICS if len > MAX_STATISTICS => Err(Damage::Summary("its statistics are too long")),
+            op::STATISTICS if len > MAX_STATISTICS => {
+                Err(Damage::Summary("its statistics are too long"))
+            }
             op::STATISTICS => {
                 self.claimed = Statistics::parse(&self.body(at, len)?);
-                self.claimed.as_ref().map(drop).ok_or(Damage::Summary("its statistics are malformed"))
+                self.claimed
+                    .as_ref()
+                    .map(drop)
+                    .ok_or(Damage::Summary("its statistics are malformed"))
             }
             op::METADATA | op::ATTACHMENT => match self.charge(len.saturating_add(ENTRY_BYTES)) {
                 Ok(()) => {
                     let body = self.body(at, len)?;
-                    if opcode == op::METADATA { self.metadata(&body) } else { self.attachment(body) }
+                    if opcode == op::METADATA {
+                        self.metadata(&body)
+                    } else {
+                        self.attachment(body)
+                    }
                 }
                 Err(too_large) => Err(too_large),
             },
@@ -178,7 +205,8 @@ impl Walk {
     }
 
     fn charge(&mut self, bytes: u64) -> Result<(), Damage> {
-        self.left = self.left.checked_sub(bytes).ok_or(Damage::ExtrasTooLarge { allowed: self.allowed })?;
+        self.left =
+            self.left.checked_sub(bytes).ok_or(Damage::ExtrasTooLarge { allowed: self.allowed })?;
         Ok(())
     }
 
@@ -204,14 +232,17 @@ impl Walk {
         let found = crc32fast::hash(&body[..len]);
         if crc == 0 && self.is_cut_off {
             // Pages that never reached the disk read as zeros, this checksum with them.
-            return Err(Damage::Malformed("an attachment in a file without a footer has no checksum"));
+            return Err(Damage::Malformed(
+                "an attachment in a file without a footer has no checksum",
+            ));
         }
         if crc != 0 && crc != found {
             let name = name.chars().take(NAME_CHARS).collect();
             return Err(Damage::AttachmentCrc { name, expected: crc, found });
         }
         let (name, media_type, start) = (name.to_owned(), media_type.to_owned(), len - data.len());
-        // The data stay where they are read: a second copy of them would double what a caller allowed.
+        // The data stay where they are read: a second copy of them would double what a caller
+        // allowed.
         body.truncate(len);
         body.drain(..start);
         self.extras.attachments.push(Attachment { name, media_type, data: body });

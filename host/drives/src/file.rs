@@ -48,7 +48,8 @@ pub(super) struct Channels {
     bytes: usize,
 }
 
-/// What all schemas and channels of a file may take; a drive with a hundred topics has some 100 KiB.
+/// What all schemas and channels of a file may take; a drive with a hundred topics has some 100
+/// KiB.
 const KNOWN_BYTES: usize = 64 << 20;
 /// The longest description of offered qualities of service that is kept; a usual one has 200 bytes.
 const QOS_BYTES: usize = 64 << 10;
@@ -85,8 +86,9 @@ impl Channels {
         if self.bytes > KNOWN_BYTES { Err(TOO_MUCH) } else { Ok(()) }
     }
 
-    /// Learns from a record; other records are skipped. Writers repeat schemas and channels, always with the same content:
-    /// a repetition that differs is damage, since messages would change their topic or their type.
+    /// Learns from a record; other records are skipped. Writers repeat schemas and channels, always
+    /// with the same content: a repetition that differs is damage, since messages would change
+    /// their topic or their type.
     pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
         match opcode {
             op::SCHEMA => {
@@ -111,7 +113,10 @@ impl Channels {
                     message_encoding: channel.encoding.to_owned(),
                     schema_encoding: of(|schema| &schema.encoding).unwrap_or_default(),
                     definitions_text: schema.and_then(|schema| schema.text.clone()),
-                    offered_qos: offered_qos(channel.topic, channel.metadata.get("offered_qos_profiles")),
+                    offered_qos: offered_qos(
+                        channel.topic,
+                        channel.metadata.get("offered_qos_profiles"),
+                    ),
                     writer: channel.metadata.get("gleaner.writer").and_then(Guid::from_hex),
                 };
                 self.by_id.insert(channel.id, info);
@@ -130,14 +135,17 @@ impl Channels {
             }
             op::CHANNEL => {
                 let channel = channel_of(body)?;
-                self.by_id.get(&channel.id).map_or(Ok(()), |known| self.check_channel(known, &channel))
+                self.by_id
+                    .get(&channel.id)
+                    .map_or(Ok(()), |known| self.check_channel(known, &channel))
             }
             _ => Ok(()),
         }
     }
 
     fn check_channel(&self, known: &ChannelInfo, again: &Channel<'_>) -> Result<(), Damage> {
-        let redefined = |field, first, second| redefined("channel", again.id, field, Some((first, second)));
+        let redefined =
+            |field, first, second| redefined("channel", again.id, field, Some((first, second)));
         if known.topic != again.topic {
             return redefined("topic", &known.topic, again.topic);
         }
@@ -163,7 +171,9 @@ impl Channels {
     /// The schema that a channel names; number 0 stands for none.
     fn schema_of_channel(&self, channel: &Channel<'_>) -> Result<Option<&SchemaInfo>, Damage> {
         match self.schemas.get(&channel.schema) {
-            None if channel.schema != 0 => Err(Damage::Malformed("a channel names a schema that is not defined")),
+            None if channel.schema != 0 => {
+                Err(Damage::Malformed("a channel names a schema that is not defined"))
+            }
             schema => Ok(schema),
         }
     }
@@ -173,7 +183,11 @@ impl SchemaInfo {
     fn of(schema: &Schema<'_>) -> Self {
         let text = definitions(schema);
         let (name, encoding) = (schema.name.to_owned(), schema.encoding.to_owned());
-        Self { name, encoding, text: Some(text.trim()).filter(|text| !text.is_empty()).map(Arc::from) }
+        Self {
+            name,
+            encoding,
+            text: Some(text.trim()).filter(|text| !text.is_empty()).map(Arc::from),
+        }
     }
 
     fn check(&self, again: &Schema<'_>) -> Result<(), Damage> {
@@ -204,7 +218,12 @@ fn channel_of(body: &[u8]) -> Result<Channel<'_>, Damage> {
     Channel::parse(body).ok_or(Damage::Malformed("a channel record is malformed"))
 }
 
-fn redefined(what: &'static str, id: u16, field: &'static str, values: Option<(&str, &str)>) -> Result<(), Damage> {
+fn redefined(
+    what: &'static str,
+    id: u16,
+    field: &'static str,
+    values: Option<(&str, &str)>,
+) -> Result<(), Damage> {
     let shown = |text: &str| text.chars().take(SHOWN_CHARS).collect();
     Err(Damage::Redefined {
         what,
@@ -218,7 +237,11 @@ fn redefined(what: &'static str, id: u16, field: &'static str, values: Option<(&
 pub(super) fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
     let found = found.filter(|text| !text.is_empty())?;
     if found.len() > QOS_BYTES {
-        warn!(topic, bytes = found.len(), "offered_qos_profiles is longer than 64 KiB, passed over");
+        warn!(
+            topic,
+            bytes = found.len(),
+            "offered_qos_profiles is longer than 64 KiB, passed over"
+        );
         return None;
     }
     Some(found.to_owned())
@@ -252,6 +275,8 @@ impl Contents {
         }
         // A chunk without messages has no times; writers put 0 in both.
         let segments = self.segments.iter().filter(|s| (s.start_time, s.end_time) != (0, 0));
-        segments.map(|segment| (segment.start_time, segment.end_time)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+        segments
+            .map(|segment| (segment.start_time, segment.end_time))
+            .reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
     }
 }

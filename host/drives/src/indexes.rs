@@ -1,4 +1,5 @@
-//! Whether the indexes of an MCAP file name the records that it holds, and no others: a reader that goes by index sees what they name.
+//! Whether the indexes of an MCAP file name the records that it holds, and no others: a reader that
+//! goes by index sees what they name.
 
 use std::collections::BTreeMap;
 
@@ -21,19 +22,30 @@ pub(super) struct Indexes {
 }
 
 impl Indexes {
-    /// Notes the record at `at`, which has `len` bytes with its head. Of an index record, `body` begins with [`INDEX_BYTES`], or has all.
+    /// Notes the record at `at`, which has `len` bytes with its head. Of an index record, `body`
+    /// begins with [`INDEX_BYTES`], or has all.
     pub(super) fn add(&mut self, opcode: u8, at: u64, len: u64, body: &[u8]) {
-        let number = |from: usize| body.get(from..from + 8)?.first_chunk().copied().map(u64::from_le_bytes);
+        let number =
+            |from: usize| body.get(from..from + 8)?.first_chunk().copied().map(u64::from_le_bytes);
         let is_new = match opcode {
-            op::CHUNK | op::ATTACHMENT | op::METADATA => self.held.insert(at, (opcode, len)).is_none(),
+            op::CHUNK | op::ATTACHMENT | op::METADATA => {
+                self.held.insert(at, (opcode, len)).is_none()
+            }
             op::CHUNK_INDEX => self.name(op::CHUNK, number(16), number(24)),
             op::ATTACHMENT_INDEX => self.name(op::ATTACHMENT, number(0), number(8)),
             op::METADATA_INDEX => self.name(op::METADATA, number(0), number(8)),
             op::HEADER..=op::DATA_END => true,
-            _ => return self.note(|| format!("a record of unknown kind {opcode:#04x} at byte {at}")),
+            _ => {
+                return self
+                    .note(|| format!("a record of unknown kind {opcode:#04x} at byte {at}"));
+            }
         };
         if !is_new {
-            self.note(|| format!("an index record at byte {at} that is malformed, or names a record once more"));
+            self.note(|| {
+                format!(
+                    "an index record at byte {at} that is malformed, or names a record once more"
+                )
+            });
         }
         if self.held.len() + self.named.len() > RECORDS_MAX {
             self.note(|| format!("more than {RECORDS_MAX} records with an index"));
@@ -41,14 +53,21 @@ impl Indexes {
         }
     }
 
-    /// Returns what is there and should not be, or the other way round; none in a file as writers make it.
+    /// Returns what is there and should not be, or the other way round; none in a file as writers
+    /// make it.
     pub(super) fn misfit(self) -> Option<String> {
         let Self { held, named, misfit } = self;
-        let differs =
-            |a: &Places, b: &Places| a.iter().find(|(at, record)| b.get(at) != Some(record)).map(|(at, _)| *at);
+        let differs = |a: &Places, b: &Places| {
+            a.iter().find(|(at, record)| b.get(at) != Some(record)).map(|(at, _)| *at)
+        };
         misfit
-            .or_else(|| differs(&named, &held).map(|at| format!("an index names byte {at}, where no such record is")))
-            .or_else(|| differs(&held, &named).map(|at| format!("no index names the record at byte {at}")))
+            .or_else(|| {
+                differs(&named, &held)
+                    .map(|at| format!("an index names byte {at}, where no such record is"))
+            })
+            .or_else(|| {
+                differs(&held, &named).map(|at| format!("no index names the record at byte {at}"))
+            })
     }
 
     fn name(&mut self, opcode: u8, at: Option<u64>, len: Option<u64>) -> bool {
@@ -84,9 +103,15 @@ mod tests {
             (vec![record.clone(), named(9, 20)], "an index names byte 9"),
             (vec![record.clone(), named(8, 21)], "an index names byte 8"),
             (vec![record.clone(), named(8, 20), named(8, 20)], "names a record once more"),
-            (vec![record.clone(), (op::ATTACHMENT_INDEX, 100, 30, index(8, 20))], "an index names byte 8"),
+            (
+                vec![record.clone(), (op::ATTACHMENT_INDEX, 100, 30, index(8, 20))],
+                "an index names byte 8",
+            ),
             (vec![record.clone(), (op::METADATA_INDEX, 100, 30, vec![1])], "malformed"),
-            (vec![record, named(8, 20), (0x80, 50, 20, Vec::new())], "a record of unknown kind 0x80 at byte 50"),
+            (
+                vec![record, named(8, 20), (0x80, 50, 20, Vec::new())],
+                "a record of unknown kind 0x80 at byte 50",
+            ),
         ] {
             let found = misfit(&records).unwrap();
             assert!(found.contains(expected), "{found}");

@@ -1,7 +1,8 @@
 //! `metadata.yaml`, which rosbag2 writes beside the files of a directory.
 //!
-//! Its versions 1 to 9 differ in what they add; what is needed here has not changed. So unknown keys are passed over, and
-//! what is needed is looked at closely: whoever wrote the directory wrote this, too.
+//! Its versions 1 to 9 differ in what they add; what is needed here has not changed. So unknown
+//! keys are passed over, and what is needed is looked at closely: whoever wrote the directory wrote
+//! this, too.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -79,7 +80,8 @@ pub(super) fn read(text: &str) -> Result<Metadata, Box<dyn Error + Send + Sync>>
     };
     let document: Document = serde_saphyr::from_str_with_options(text, options)?;
     let found = document.rosbag2_bagfile_information;
-    let shown = |text: &str| text.chars().filter(|c| !c.is_control()).take(SHOWN_CHARS).collect::<String>();
+    let shown =
+        |text: &str| text.chars().filter(|c| !c.is_control()).take(SHOWN_CHARS).collect::<String>();
     if !["mcap", "sqlite3"].contains(&found.storage_identifier.as_str()) {
         return Err(Refused::Storage(shown(&found.storage_identifier)).into());
     }
@@ -97,7 +99,8 @@ pub(super) fn read(text: &str) -> Result<Metadata, Box<dyn Error + Send + Sync>>
         return Err(Refused::NoFiles.into());
     }
     let mut messages = BTreeMap::<_, u64>::new();
-    for Counted { topic_metadata: Topic { name }, message_count } in found.topics_with_message_count {
+    for Counted { topic_metadata: Topic { name }, message_count } in found.topics_with_message_count
+    {
         let known = messages.entry(name).or_default();
         *known = known.saturating_add(message_count);
     }
@@ -125,8 +128,9 @@ mod tests {
 
     #[test]
     fn files_may_be_named_by_their_own_list_only() {
-        let text =
-            format!("{START}  relative_file_paths: []\n  files:\n    - path: a_0.mcap\n      message_count: 3\n");
+        let text = format!(
+            "{START}  relative_file_paths: []\n  files:\n    - path: a_0.mcap\n      message_count: 3\n"
+        );
         assert_eq!(read(&text).unwrap().files, ["a_0.mcap"]);
     }
 
@@ -135,7 +139,10 @@ mod tests {
         let file = "  relative_file_paths: [a]\n";
         for (text, said) in [
             (START.replace("mcap", "rosbag_v2") + file, "its storage is `rosbag_v2`"),
-            (format!("{START}{file}  compression_mode: FILE\n  compression_format: lz4\n"), "compressed with `lz4`"),
+            (
+                format!("{START}{file}  compression_mode: FILE\n  compression_format: lz4\n"),
+                "compressed with `lz4`",
+            ),
             (START.to_owned(), "it names no file"),
             (String::new(), "unexpected end"),
             ("other: 7\n".to_owned(), "rosbag2_bagfile_information"),

@@ -13,10 +13,11 @@ pub struct Options {
     pub limits: Limits,
     /// Where message definitions are looked for that the files do not carry; nowhere if `None`.
     pub sources: Option<Sources>,
-    /// The folder for the content of packed files, which is gone with the replay; the system's for temporary files if `None`.
+    /// The folder for the content of packed files, which is gone with the replay; the system's for
+    /// temporary files if `None`.
     pub unpack_in: Option<PathBuf>,
-    /// Packed files whose content is open already, for a process that may not write. Such a database is still given a name in
-    /// `unpack_in` while it is opened.
+    /// Packed files whose content is open already, for a process that may not write. Such a
+    /// database is still given a name in `unpack_in` while it is opened.
     #[cfg(feature = "bags")]
     pub unpacked: Vec<Unpacked>,
 }
@@ -24,21 +25,22 @@ pub struct Options {
 /// How much memory and disk a replay may use.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// The largest chunk, in bytes before or after decompression, that is opened, and the largest message of a
-    /// database; a larger one is damage. At most 2 GiB.
+    /// The largest chunk, in bytes before or after decompression, that is opened, and the largest
+    /// message of a database; a larger one is damage. At most 2 GiB.
     pub chunk_bytes: u64,
     /// Bytes of open chunks beyond which no further one is opened ahead of its turn. Chunks that
     /// overlap in time are open together; past this limit their messages may come out of order,
     /// which [`super::Replay::out_of_order`] counts.
     pub open_bytes: u64,
-    /// The most bytes of disk that the content of all packed files of a replay may take. One file may take 200 times its own
-    /// size or a 64th of this, whichever is more, and never more than nine tenths of what is free on the disk.
+    /// The most bytes of disk that the content of all packed files of a replay may take. One file
+    /// may take 200 times its own size or a 64th of this, whichever is more, and never more than
+    /// nine tenths of what is free on the disk.
     pub unpacked_bytes: u64,
 }
 
 impl Default for Limits {
-    /// 256 MiB for a chunk, 512 MiB for all open ones; usual chunks have 1 to 4 MiB. 64 GiB for what packed files
-    /// hold, all together.
+    /// 256 MiB for a chunk, 512 MiB for all open ones; usual chunks have 1 to 4 MiB. 64 GiB for
+    /// what packed files hold, all together.
     fn default() -> Self {
         Self { chunk_bytes: 256 << 20, open_bytes: 512 << 20, unpacked_bytes: 64 << 30 }
     }

@@ -142,7 +142,12 @@ pub(super) struct Schema<'a> {
 impl<'a> Schema<'a> {
     pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
-        Some(Self { id: fields.u16()?, name: fields.text()?, encoding: fields.text()?, data: fields.bytes()? })
+        Some(Self {
+            id: fields.u16()?,
+            name: fields.text()?,
+            encoding: fields.text()?,
+            data: fields.bytes()?,
+        })
     }
 }
 

@@ -1,8 +1,8 @@
 //! The messages of a database, in the order of their times.
 //!
-//! A piece at a time is read, and put into memory as the messages of a chunk are: so whoever merges files need not know
-//! what they are. The index of times gives one row after the other; that they really come in order is checked, so that no
-//! damaged page leads in circles.
+//! A piece at a time is read, and put into memory as the messages of a chunk are: so whoever merges
+//! files need not know what they are. The index of times gives one row after the other; that they
+//! really come in order is checked, so that no damaged page leads in circles.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -110,12 +110,24 @@ impl Rows {
     }
 
     /// Begins with the first message of `span`. `last_words` is the damage that is known already.
-    pub(super) fn start(&mut self, span: Span, last_words: Option<Damage>, is_wanted: impl Fn(u16) -> bool) {
-        self.wanted = self.channels.iter().filter(|(_, id)| is_wanted(**id)).map(|(topic, _)| *topic).collect();
+    pub(super) fn start(
+        &mut self,
+        span: Span,
+        last_words: Option<Damage>,
+        is_wanted: impl Fn(u16) -> bool,
+    ) {
+        self.wanted = self
+            .channels
+            .iter()
+            .filter(|(_, id)| is_wanted(**id))
+            .map(|(topic, _)| *topic)
+            .collect();
         self.wanted.sort_unstable();
         (self.span, self.last_words) = (span, last_words);
         match std::mem::replace(&mut self.first, Ok(None)) {
-            Ok(Some(first)) => self.next = Some(first.max(span.from)).filter(|next| !span.ends_before(*next)),
+            Ok(Some(first)) => {
+                self.next = Some(first.max(span.from)).filter(|next| !span.ends_before(*next))
+            }
             // No message at all, and perhaps there should be.
             Ok(None) => self.next = self.last_words.is_some().then_some(span.from),
             // The first in order makes no sense; from later on all may.
@@ -128,8 +140,8 @@ impl Rows {
         self.next
     }
 
-    /// Reads the next piece, and gives its number. What ends the database ends it in a piece of its own, so that all messages
-    /// before are delivered.
+    /// Reads the next piece, and gives its number. What ends the database ends it in a piece of its
+    /// own, so that all messages before are delivered.
     pub(super) fn open_next(&mut self, into: &mut OpenSegment) -> Result<u64, ReplayError> {
         into.clear();
         self.pieces += 1;
@@ -150,7 +162,8 @@ impl Rows {
             }
             Err(what) => Some(what),
         };
-        let behind = self.after.map_or(self.span.from, |(at, _)| at.unsigned_abs().saturating_add(1));
+        let behind =
+            self.after.map_or(self.span.from, |(at, _)| at.unsigned_abs().saturating_add(1));
         self.next = what.is_some().then_some(behind.max(self.span.from));
         self.broken = what;
         self.db = None;
@@ -162,7 +175,8 @@ impl Rows {
         let Some(db) = db else { return Ok(End::Table) };
         let list = wanted.iter().map(i64::to_string).collect::<Vec<_>>().join(",");
         // What nobody wants is not read, but its place in the order is.
-        let rows = |condition: &str| db.prepare(&select(index, &list, condition)).map_err(unreadable);
+        let rows =
+            |condition: &str| db.prepare(&select(index, &list, condition)).map_err(unreadable);
         let mut piece = Piece { channels, wanted, span: *span, after, into };
         if let Some((at, number)) = *piece.after {
             // First the rest of those that are of one time.
@@ -186,8 +200,12 @@ pub(super) fn is_of_system(error: &(dyn Error + 'static)) -> bool {
     let Some(error) = error.downcast_ref::<rusqlite::Error>() else { return false };
     // A file that is too short is no fault of the system.
     let is_short = error.sqlite_error().is_some_and(|error| error.extended_code == SHORT_READ);
-    let codes =
-        [ErrorCode::SystemIoFailure, ErrorCode::OutOfMemory, ErrorCode::CannotOpen, ErrorCode::PermissionDenied];
+    let codes = [
+        ErrorCode::SystemIoFailure,
+        ErrorCode::OutOfMemory,
+        ErrorCode::CannotOpen,
+        ErrorCode::PermissionDenied,
+    ];
     !is_short && error.sqlite_error_code().is_some_and(|code| codes.contains(&code))
 }
 
@@ -208,7 +226,8 @@ impl Piece<'_> {
     /// Takes `rows` until the piece is full; `None` if it is not.
     fn fill(&mut self, mut rows: Cursor<'_>) -> Result<Option<End>, Damage> {
         while let Some(row) = rows.next().map_err(unreadable)? {
-            let (number, at) = (row.get(0).map_err(unreadable)?, time(row.get_ref(1).map_err(unreadable)?)?);
+            let (number, at) =
+                (row.get(0).map_err(unreadable)?, time(row.get_ref(1).map_err(unreadable)?)?);
             // `time` gives nothing below 0.
             let log_time = at.unsigned_abs();
             if self.after.is_some_and(|after| after >= (at, number)) {
@@ -228,7 +247,9 @@ impl Piece<'_> {
 
     fn take(&mut self, row: &Row<'_>, log_time: u64) -> Result<(), Damage> {
         let ValueRef::Integer(topic) = row.get_ref(2).map_err(unreadable)? else {
-            return Err(Damage::Malformed("a message names a topic by something that is no number"));
+            return Err(Damage::Malformed(
+                "a message names a topic by something that is no number",
+            ));
         };
         let channel = *self.channels.get(&topic).ok_or(Damage::UnknownTopic(topic))?;
         match row.get_ref(3).map_err(unreadable)? {
@@ -271,7 +292,8 @@ mod tests {
             (ffi::SQLITE_NOTADB, true),
         ] {
             let db = Connection::open_in_memory().unwrap();
-            let rows = Rows::new(Path::new("drive.db3"), db, String::new(), HashMap::new(), Ok(None));
+            let rows =
+                Rows::new(Path::new("drive.db3"), db, String::new(), HashMap::new(), Ok(None));
             let what = unreadable(rusqlite::Error::SqliteFailure(ffi::Error::new(code), None));
             match rows.damaged(what) {
                 ReplayError::Damaged { .. } => assert!(is_damage, "{code}"),

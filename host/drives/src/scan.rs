@@ -1,10 +1,10 @@
 //! Finding out what a file contains, without holding it.
 //!
 //! The data section is walked record by record from its start. The summary at the end of a finished
-//! file saves most of that: a chunk that its index lists is stepped over unread. What the index does
-//! not list, for want of a summary or by the writer's choice, is opened and looked into. So every
-//! file is read the same way, whether it is indexed, cut off, or has no chunks at all, and an index
-//! that leaves a chunk out costs time but no messages.
+//! file saves most of that: a chunk that its index lists is stepped over unread. What the index
+//! does not list, for want of a summary or by the writer's choice, is opened and looked into. So
+//! every file is read the same way, whether it is indexed, cut off, or has no chunks at all, and an
+//! index that leaves a chunk out costs time but no messages.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -20,8 +20,8 @@ use super::summary::read_tail;
 
 /// Messages outside chunks are read in runs of about this many bytes.
 const RUN: u64 = 1 << 20;
-/// How many chunks of an index are compared with their own headers when a file is opened. The headers lie far apart: a
-/// disk that turns needs some milliseconds for each.
+/// How many chunks of an index are compared with their own headers when a file is opened. The
+/// headers lie far apart: a disk that turns needs some milliseconds for each.
 const COMPARED: usize = 64;
 /// The head of a chunk record, and its first and last time.
 const TIMES: u64 = HEAD + 16;
@@ -38,8 +38,10 @@ pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents,
     if let Some(summary) = &tail.summary
         && let Some(offset) = chunk_of_other_times(source, &summary.chunks)?
     {
-        // No time of the index is to be trusted then, so the file is read through, as one that has none.
-        tail.damage = Some((offset, Damage::Summary("it gives a chunk other times than the chunk itself")));
+        // No time of the index is to be trusted then, so the file is read through, as one that has
+        // none.
+        tail.damage =
+            Some((offset, Damage::Summary("it gives a chunk other times than the chunk itself")));
         tail.summary = None;
     }
     let mut contents = Contents::default();
@@ -50,7 +52,8 @@ pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents,
         contents.claimed = true;
         index = summary.chunks;
     }
-    let mut walk = Walk { source, opener, contents, index, buffer: OpenSegment::default(), data_crc: None };
+    let mut walk =
+        Walk { source, opener, contents, index, buffer: OpenSegment::default(), data_crc: None };
     let mut damage = walk.data_section()?;
     if damage.is_none() && !tail.finished {
         damage = Some((walk.source.len(), Damage::NoFooter));
@@ -66,14 +69,20 @@ pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents,
     Ok(contents)
 }
 
-/// Looks for a chunk that has other times in `index` than in its own header: among the earliest, the latest, and some
-/// in between. What is read of all others shows later, when they are opened; a chunk that a part of the drive leaves out
-/// is not opened.
-fn chunk_of_other_times(source: &mut Source, index: &HashMap<u64, ChunkIndex>) -> Result<Option<u64>, ReplayError> {
+/// Looks for a chunk that has other times in `index` than in its own header: among the earliest,
+/// the latest, and some in between. What is read of all others shows later, when they are opened; a
+/// chunk that a part of the drive leaves out is not opened.
+fn chunk_of_other_times(
+    source: &mut Source,
+    index: &HashMap<u64, ChunkIndex>,
+) -> Result<Option<u64>, ReplayError> {
     let mut chunks: Vec<_> =
         index.values().filter(|chunk| chunk.offset.saturating_add(TIMES) <= source.len()).collect();
     chunks.sort_unstable_by_key(|chunk| chunk.offset);
-    let edges = [chunks.iter().min_by_key(|chunk| chunk.start_time), chunks.iter().max_by_key(|chunk| chunk.end_time)];
+    let edges = [
+        chunks.iter().min_by_key(|chunk| chunk.start_time),
+        chunks.iter().max_by_key(|chunk| chunk.end_time),
+    ];
     let step = chunks.len().div_ceil(COMPARED).max(1);
     for chunk in edges.into_iter().flatten().chain(chunks.iter().step_by(step)) {
         let mut bytes = [0; TIMES as usize];
@@ -192,7 +201,11 @@ impl Walk<'_> {
         }
         let len = end - at;
         match self.contents.segments.last_mut() {
-            Some(run) if run.kind == SegmentKind::Run && run.offset + run.len == at && run.len + len <= RUN => {
+            Some(run)
+                if run.kind == SegmentKind::Run
+                    && run.offset + run.len == at
+                    && run.len + len <= RUN =>
+            {
                 run.len += len;
                 run.start_time = run.start_time.min(head.log_time);
                 run.end_time = run.end_time.max(head.log_time);

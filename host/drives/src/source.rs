@@ -40,7 +40,9 @@ impl Source {
     pub(super) fn over(file: Arc<File>, path: &Path) -> Result<Self, ReplayError> {
         let path = path.to_owned();
         match file.metadata() {
-            Ok(metadata) => Ok(Self { file, path, len: metadata.len(), window: Vec::new(), window_at: 0 }),
+            Ok(metadata) => {
+                Ok(Self { file, path, len: metadata.len(), window: Vec::new(), window_at: 0 })
+            }
             Err(source) => Err(ReplayError::Open { path, source }),
         }
     }

@@ -13,7 +13,8 @@ pub struct Step {
     pub verdict: Verdict,
     /// What the sink was told besides the bytes.
     pub meta: SampleMeta,
-    /// Length of the CDR payload, without encapsulation; of one that is packed and too big, as far as it was unpacked.
+    /// Length of the CDR payload, without encapsulation; of one that is packed and too big, as far
+    /// as it was unpacked.
     pub bytes: usize,
 }
 
@@ -22,7 +23,7 @@ pub struct Step {
 pub struct Progress {
     /// Deliveries made.
     pub done: u64,
-    /// Deliveries to expect if the files hold what they claim; `None` if nothing says, as in a database
-    /// without metadata, or where only a part is replayed.
+    /// Deliveries to expect if the files hold what they claim; `None` if nothing says, as in a
+    /// database without metadata, or where only a part is replayed.
     pub total: Option<u64>,
 }

@@ -31,18 +31,25 @@ pub(super) struct Bag {
     pub(super) remark: Option<String>,
 }
 
-/// The files that these paths name: each itself, and of a rosbag2 directory those that it consists of.
+/// The files that these paths name: each itself, and of a rosbag2 directory those that it consists
+/// of.
 ///
 /// # Errors
 ///
 /// [`ReplayError`] if a directory is none of rosbag2, or its metadata cannot be used.
 pub fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReplayError> {
-    paths.iter().map(|path| Ok(bag_of(path)?.files)).collect::<Result<Vec<_>, _>>().map(|files| files.concat())
+    paths
+        .iter()
+        .map(|path| Ok(bag_of(path)?.files))
+        .collect::<Result<Vec<_>, _>>()
+        .map(|files| files.concat())
 }
 
-/// Where SQLite keeps what is not yet in the database `path`, if there is something; [`super::Replay`] looks.
+/// Where SQLite keeps what is not yet in the database `path`, if there is something;
+/// [`super::Replay`] looks.
 pub fn journals_of(path: &Path) -> [PathBuf; 2] {
-    ["-wal", "-journal"].map(|suffix| OsString::from_iter([path.as_os_str(), suffix.as_ref()]).into())
+    ["-wal", "-journal"]
+        .map(|suffix| OsString::from_iter([path.as_os_str(), suffix.as_ref()]).into())
 }
 
 /// A file alone, or a directory of them.
@@ -57,7 +64,11 @@ fn bag_of(path: &Path) -> Result<Bag, ReplayError> {
 }
 
 /// Opens all files that `paths` name.
-pub(super) fn open(paths: &[PathBuf], options: &Options, opener: &mut Opener) -> Result<Vec<Track>, ReplayError> {
+pub(super) fn open(
+    paths: &[PathBuf],
+    options: &Options,
+    opener: &mut Opener,
+) -> Result<Vec<Track>, ReplayError> {
     let mut writers = Writers::default();
     let mut tracks = Vec::new();
     let mut seen = HashSet::new();
@@ -75,13 +86,15 @@ pub(super) fn open(paths: &[PathBuf], options: &Options, opener: &mut Opener) ->
             files.push(open_file(file, options, opener, &mut room)?);
         }
         count(&mut files, &bag.messages);
-        tracks.extend(files.into_iter().map(|(store, contents)| Track::new(store, contents, &mut writers)));
+        tracks.extend(
+            files.into_iter().map(|(store, contents)| Track::new(store, contents, &mut writers)),
+        );
     }
     Ok(tracks)
 }
 
-/// Has the files that nobody counted hold what the metadata say. Who holds how much of a topic is not known if there are
-/// several: then the first that has it counts for all.
+/// Has the files that nobody counted hold what the metadata say. Who holds how much of a topic is
+/// not known if there are several: then the first that has it counts for all.
 fn count(files: &mut [(Store, Contents)], messages: &BTreeMap<String, u64>) {
     if messages.is_empty() || files.iter().any(|(_, contents)| !contents.uncounted) {
         return;
@@ -90,7 +103,8 @@ fn count(files: &mut [(Store, Contents)], messages: &BTreeMap<String, u64>) {
     let mut left = messages.clone();
     for (_, contents) in files {
         let channels = contents.channels.iter();
-        contents.messages = channels.filter_map(|(id, info)| Some((id, left.remove(&info.topic)?))).collect();
+        contents.messages =
+            channels.filter_map(|(id, info)| Some((id, left.remove(&info.topic)?))).collect();
         contents.claimed = is_alone && contents.messages.len() == contents.channels.len();
         contents.uncounted = false;
     }
@@ -139,7 +153,9 @@ fn open_file(
     match kind_of(&mut source)? {
         Kind::Mcap => mcap(source, opener),
         #[cfg(feature = "bags")]
-        Kind::Database => database(super::database::File::beside_its_journal(path), source.len(), options),
+        Kind::Database => {
+            database(super::database::File::beside_its_journal(path), source.len(), options)
+        }
         #[cfg(feature = "bags")]
         Kind::Packed => content(&unpack_one(source, options, room)?, options, opener),
         #[cfg(not(feature = "bags"))]
@@ -157,22 +173,32 @@ fn mcap(mut source: Source, opener: &mut Opener) -> Result<(Store, Contents), Re
 }
 
 #[cfg(feature = "bags")]
-fn database(file: super::database::File<'_>, len: u64, options: &Options) -> Result<(Store, Contents), ReplayError> {
+fn database(
+    file: super::database::File<'_>,
+    len: u64,
+    options: &Options,
+) -> Result<(Store, Contents), ReplayError> {
     let (rows, contents) = super::database::open(file, len, options.limits)?;
     Ok((Store::Rows(Box::new(rows)), contents))
 }
 
 /// Opens the content of a packed file.
 #[cfg(feature = "bags")]
-fn content(unpacked: &Unpacked, options: &Options, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
+fn content(
+    unpacked: &Unpacked,
+    options: &Options,
+    opener: &mut Opener,
+) -> Result<(Store, Contents), ReplayError> {
     let path = &unpacked.path;
     let mut source = Source::over(unpacked.content.clone(), path)?;
     let len = source.len();
     let (store, mut contents) = match kind_of(&mut source)? {
         Kind::Mcap => mcap(source, opener)?,
-        Kind::Database => {
-            database(super::database::File::elsewhere(path, unpacked.name(options)?.as_ref()), len, options)?
-        }
+        Kind::Database => database(
+            super::database::File::elsewhere(path, unpacked.name(options)?.as_ref()),
+            len,
+            options,
+        )?,
         Kind::Packed => return Err(ReplayError::NotMcap { path: path.clone() }),
     };
     if let Some(error) = &unpacked.broken {

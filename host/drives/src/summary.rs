@@ -40,8 +40,11 @@ pub(super) fn read_tail(source: &mut Source) -> Result<Tail, ReplayError> {
     if start == 0 {
         return Ok(finished);
     }
-    let damaged =
-        |why| Tail { finished: true, summary: None, damage: Some((start.min(footer_at), Damage::Summary(why))) };
+    let damaged = |why| Tail {
+        finished: true,
+        summary: None,
+        damage: Some((start.min(footer_at), Damage::Summary(why))),
+    };
     let Some(len) = footer_at.checked_sub(start) else {
         return Ok(damaged("it starts beyond its end"));
     };

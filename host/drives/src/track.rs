@@ -84,7 +84,8 @@ pub(super) struct Routed<'a> {
     /// Whether no further subscription wants the message.
     pub(super) is_last: bool,
     pub(super) meta: SampleMeta,
-    /// Whether it is packed and larger than the subscription takes. Then `cdr` may be its beginning only.
+    /// Whether it is packed and larger than the subscription takes. Then `cdr` may be its beginning
+    /// only.
     pub(super) is_too_big: bool,
     pub(super) cdr: &'a [u8],
 }
@@ -126,15 +127,17 @@ impl Track {
         }
     }
 
-    /// Lines up the segments that hold subscribed messages of `span`. Returns the damage that the scan found,
-    /// if any, and the log time before which everything still counts.
+    /// Lines up the segments that hold subscribed messages of `span`. Returns the damage that the
+    /// scan found, if any, and the log time before which everything still counts.
     pub(super) fn start(&mut self, span: Span) -> Option<(u64, ReplayError)> {
         self.span = span;
         #[cfg(feature = "bags")]
         if let Store::Rows(rows) = &mut self.store {
             let routes = &self.routes;
             // It reports by itself what ends it.
-            rows.start(span, self.contents.damage.take().map(|(_, what)| what), |id| wanted(routes, id) == Some(true));
+            rows.start(span, self.contents.damage.take().map(|(_, what)| what), |id| {
+                wanted(routes, id) == Some(true)
+            });
             return None;
         }
         let last = self.contents.segments.iter().map(|segment| segment.end_time).max();
@@ -162,8 +165,13 @@ impl Track {
         }
     }
 
-    /// Opens the next segment and returns where it lies, or of a database, its number. After an error there are no more.
-    pub(super) fn open_next(&mut self, opener: &mut Opener, into: &mut OpenSegment) -> Result<u64, ReplayError> {
+    /// Opens the next segment and returns where it lies, or of a database, its number. After an
+    /// error there are no more.
+    pub(super) fn open_next(
+        &mut self,
+        opener: &mut Opener,
+        into: &mut OpenSegment,
+    ) -> Result<u64, ReplayError> {
         let source = match &mut self.store {
             Store::Mcap(source) => source,
             #[cfg(feature = "bags")]
@@ -173,7 +181,14 @@ impl Track {
             return Ok(0);
         };
         let routes = &self.routes;
-        let opened = opener.open(source, &segment, &self.contents.channels, self.span, |id| wanted(routes, id), into);
+        let opened = opener.open(
+            source,
+            &segment,
+            &self.contents.channels,
+            self.span,
+            |id| wanted(routes, id),
+            into,
+        );
         match opened {
             Ok(()) => Ok(segment.offset),
             Err(error) => {
@@ -183,8 +198,8 @@ impl Track {
         }
     }
 
-    /// Takes apart the message record in `body`; `fan` says how many subscriptions already have it. What is packed goes
-    /// through `inflate`, where it stays until the next that is.
+    /// Takes apart the message record in `body`; `fan` says how many subscriptions already have it.
+    /// What is packed goes through `inflate`, where it stays until the next that is.
     #[inline]
     pub(super) fn route<'a>(
         &mut self,
@@ -193,7 +208,10 @@ impl Track {
         inflate: &'a mut Inflate,
     ) -> Result<Routed<'a>, Damage> {
         let head = message_head(body)?;
-        let channel = self.routes.get_mut(usize::from(head.channel)).ok_or(Damage::UnknownChannel(head.channel))?;
+        let channel = self
+            .routes
+            .get_mut(usize::from(head.channel))
+            .ok_or(Damage::UnknownChannel(head.channel))?;
         let &wanted = channel.subscriptions.get(fan).ok_or(Damage::UnknownChannel(head.channel))?;
         let writer = channel.writer.as_ref().ok_or(Damage::UnknownChannel(head.channel))?;
         let mut message = &body[MESSAGE_HEAD..];
@@ -201,10 +219,14 @@ impl Track {
         if is_packed {
             if fan == 0 {
                 let topic = || topic_of(&self.contents, head.channel);
-                let unpacked = inflate.unpack(message, channel.most.saturating_add(ENCAPSULATION + 1));
+                let unpacked =
+                    inflate.unpack(message, channel.most.saturating_add(ENCAPSULATION + 1));
                 unpacked.map_err(|source| Damage::Unpack { topic: topic(), source })?;
                 if inflate.is_full() {
-                    return Err(Damage::MessageTooLarge { topic: topic(), allowed: inflate.allowed() });
+                    return Err(Damage::MessageTooLarge {
+                        topic: topic(),
+                        allowed: inflate.allowed(),
+                    });
                 }
             }
             message = inflate.bytes();
@@ -214,7 +236,10 @@ impl Track {
             &[0, 1, a, b, ref cdr @ ..] => (Endian::Little, [a, b], cdr),
             other => {
                 let topic = topic_of(&self.contents, head.channel);
-                return Err(Damage::Encapsulation { topic, found: other[..other.len().min(4)].to_vec() });
+                return Err(Damage::Encapsulation {
+                    topic,
+                    found: other[..other.len().min(4)].to_vec(),
+                });
             }
         };
         if fan == 0 {
@@ -251,7 +276,8 @@ impl Track {
             let (topic, found) = (info.topic.clone(), channel.seen);
             match &self.store {
                 Store::Mcap(source) => Some(source.damaged(source.len(), Damage::Missing { topic, expected, found })),
-                // rosbag2 also counts what it could not write in time: its recorder lost that, not this file.
+                // rosbag2 also counts what it could not write in time: its recorder lost that, not
+                // this file.
                 #[cfg(feature = "bags")]
                 Store::Rows(rows) => {
                     let path = rows.path().display();
@@ -267,8 +293,8 @@ fn topic_of(contents: &Contents, channel: u16) -> String {
     contents.channels.get(channel).map(|info| info.topic.clone()).unwrap_or_default()
 }
 
-/// A time of a file, where times are unsigned. Log times of messages fit; what an index says, and when a message was published,
-/// may be beyond the year 2262, and then reads as the end of time.
+/// A time of a file, where times are unsigned. Log times of messages fit; what an index says, and
+/// when a message was published, may be beyond the year 2262, and then reads as the end of time.
 pub(super) fn nanoseconds(log_time: u64) -> i64 {
     i64::try_from(log_time).unwrap_or(i64::MAX)
 }

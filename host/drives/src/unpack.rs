@@ -1,8 +1,8 @@
 //! Packed files: their content, in a file without a name.
 //!
-//! A packed file cannot be read from where one likes, and messages are not in the order of their times. So it is unpacked
-//! once, to the disk, which has more room than memory. The content has no name, so nothing of it stays when the process
-//! is killed.
+//! A packed file cannot be read from where one likes, and messages are not in the order of their
+//! times. So it is unpacked once, to the disk, which has more room than memory. The content has no
+//! name, so nothing of it stays when the process is killed.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -26,8 +26,8 @@ use super::storage::{Kind, START, files_of};
 
 /// Written at once.
 const PIECE: usize = 1 << 20;
-/// How many times its own size a packed file may hold. Sensor data packs to a half or a tenth, pictures of nothing to a
-/// thousandth, and a bomb to less.
+/// How many times its own size a packed file may hold. Sensor data packs to a half or a tenth,
+/// pictures of nothing to a thousandth, and a bomb to less.
 const RATIO: u64 = 200;
 /// The share of all that may be unpacked which one file may take in any case.
 const SHARE: u64 = 64;
@@ -78,8 +78,8 @@ enum Bound {
 }
 
 impl Bound {
-    /// The smallest of a file of `packed` bytes, where all files may take `room` of `most` bytes in all, on a disk with
-    /// `free` bytes.
+    /// The smallest of a file of `packed` bytes, where all files may take `room` of `most` bytes in
+    /// all, on a disk with `free` bytes.
     fn smallest(packed: u64, room: u64, most: u64, free: u64) -> Self {
         let by_size = packed.saturating_mul(RATIO).max(most / SHARE);
         // The rest is for the results, and for others.
@@ -95,15 +95,17 @@ impl Bound {
     fn exceeded(self, path: &Path, folder: &Path, options: &Options) -> ReplayError {
         let path = path.to_owned();
         match self {
-            Self::Drive(_) => ReplayError::UnpacksTooLarge { path, allowed: options.limits.unpacked_bytes },
+            Self::Drive(_) => {
+                ReplayError::UnpacksTooLarge { path, allowed: options.limits.unpacked_bytes }
+            }
             Self::Ratio(allowed) => ReplayError::UnpacksManyTimes { path, allowed },
             Self::Disk(allowed) => ReplayError::NoRoom { path, folder: folder.to_owned(), allowed },
         }
     }
 }
 
-/// Unpacks the files of a drive that are packed. A process that may write does it for one that may not, which opens the drive
-/// with [`Options::unpacked`].
+/// Unpacks the files of a drive that are packed. A process that may write does it for one that may
+/// not, which opens the drive with [`Options::unpacked`].
 ///
 /// # Errors
 ///
@@ -120,11 +122,17 @@ pub fn unpack(paths: &[PathBuf], options: &Options) -> Result<Vec<Unpacked>, Rep
     Ok(unpacked)
 }
 
-/// Unpacks what is in `source`, if it is something that we read. What that takes is taken from `room`.
-pub(super) fn unpack_one(source: Source, options: &Options, room: &mut u64) -> Result<Unpacked, ReplayError> {
+/// Unpacks what is in `source`, if it is something that we read. What that takes is taken from
+/// `room`.
+pub(super) fn unpack_one(
+    source: Source,
+    options: &Options,
+    room: &mut u64,
+) -> Result<Unpacked, ReplayError> {
     let (path, packed) = (source.path().to_owned(), source.len());
     let folder = folder(options);
-    let failed = |source| ReplayError::Unpack { path: path.clone(), folder: folder.clone(), source };
+    let failed =
+        |source| ReplayError::Unpack { path: path.clone(), folder: folder.clone(), source };
     let mut decoder = Decoder::new(source.into_file()).map_err(failed)?;
     let mut start = Vec::new();
     decoder.by_ref().take(START as u64).read_to_end(&mut start).map_err(failed)?;
@@ -163,14 +171,19 @@ pub(super) fn unpack_one(source: Source, options: &Options, room: &mut u64) -> R
 }
 
 impl Unpacked {
-    /// The content of the packed file `path`, which another process made by [`unpack`] and calls `name` for now; of a file that could
-    /// be unpacked only in part, `broken` says why.
+    /// The content of the packed file `path`, which another process made by [`unpack`] and calls
+    /// `name` for now; of a file that could be unpacked only in part, `broken` says why.
     ///
     /// # Errors
     ///
     /// Those of opening `name`.
     pub fn named(path: PathBuf, name: PathBuf, broken: Option<String>) -> io::Result<Self> {
-        Ok(Self { path, content: Arc::new(File::open(&name)?), broken, name: Some(Name::Given(name)) })
+        Ok(Self {
+            path,
+            content: Arc::new(File::open(&name)?),
+            broken,
+            name: Some(Name::Given(name)),
+        })
     }
 
     /// The name that another process gave the content, if one did.
@@ -186,8 +199,8 @@ impl Unpacked {
         (&self.path, self.broken.as_deref())
     }
 
-    /// Names the content for as long as the result lives: SQLite opens by name only, and follows the links in `/proc` to
-    /// names that are not there.
+    /// Names the content for as long as the result lives: SQLite opens by name only, and follows
+    /// the links in `/proc` to names that are not there.
     ///
     /// # Errors
     ///
@@ -212,8 +225,8 @@ fn folder(options: &Options) -> PathBuf {
     options.unpack_in.clone().unwrap_or_else(std::env::temp_dir)
 }
 
-/// A new file in `folder`, without a name where that is possible: some file systems, as those of networks, have none such, and
-/// then a database keeps its name until it is open.
+/// A new file in `folder`, without a name where that is possible: some file systems, as those of
+/// networks, have none such, and then a database keeps its name until it is open.
 fn new_file(folder: &Path, is_database: bool) -> io::Result<(File, Option<Name>)> {
     let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
     match open(folder, flags, Mode::RUSR | Mode::WUSR) {
@@ -226,11 +239,14 @@ fn new_file(folder: &Path, is_database: bool) -> io::Result<(File, Option<Name>)
     }
 }
 
-/// Removes content that processes left in `folder` that were killed: plain files of this user with one name, to which nothing
-/// has been written for long. Content has a name only until it is written, or opened.
+/// Removes content that processes left in `folder` that were killed: plain files of this user with
+/// one name, to which nothing has been written for long. Content has a name only until it is
+/// written, or opened.
 fn remove_stale(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
-    for entry in entries.flatten().filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX)) {
+    for entry in
+        entries.flatten().filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX))
+    {
         // Of the entry itself: no link is followed.
         let Ok(found) = entry.metadata() else { continue };
         let is_ours = found.is_file() && found.uid() == geteuid().as_raw() && found.nlink() == 1;
@@ -238,8 +254,12 @@ fn remove_stale(folder: &Path) {
         if is_ours && is_stale {
             let path = entry.path();
             match fs::remove_file(&path) {
-                Ok(()) => warn!(path = %path.display(), bytes = found.len(), "removed what a killed process unpacked"),
-                Err(error) => warn!(path = %path.display(), %error, "cannot remove what a killed process unpacked"),
+                Ok(()) => {
+                    warn!(path = %path.display(), bytes = found.len(), "removed what a killed process unpacked")
+                }
+                Err(error) => {
+                    warn!(path = %path.display(), %error, "cannot remove what a killed process unpacked")
+                }
             }
         }
     }

@@ -14,8 +14,8 @@ use gleaner_transport::Guid;
 #[derive(Default)]
 pub(super) struct Writers {
     files: u32,
-    /// By topic and writer. Two clips of one drive name the same writer, and it has to count on from
-    /// one to the other.
+    /// By topic and writer. Two clips of one drive name the same writer, and it has to count on
+    /// from one to the other.
     counters: HashMap<(String, Guid), Arc<AtomicU64>>,
 }
 
@@ -46,13 +46,15 @@ impl Writer {
 impl Writers {
     /// The writers of the channels of one more file, by channel id.
     ///
-    /// A channel has the writer that its metadata claims, unless another channel of its topic in this
-    /// file claimed it first: which of the two a sequence number belongs to could not be told. Those
-    /// without a claim get an identity made of the file's place in the drive and the channel's id.
+    /// A channel has the writer that its metadata claims, unless another channel of its topic in
+    /// this file claimed it first: which of the two a sequence number belongs to could not be told.
+    /// Those without a claim get an identity made of the file's place in the drive and the
+    /// channel's id.
     pub(super) fn of_next_file(&mut self, path: &Path, channels: &Channels) -> Vec<(u16, Writer)> {
         let mut taken = HashSet::new();
         let mut ignored = 0_u32;
-        // Claims come first, so that no identity made up for one channel is what a later one claims.
+        // Claims come first, so that no identity made up for one channel is what a later one
+        // claims.
         let claims: Vec<_> = channels
             .iter()
             .map(|(id, info)| {

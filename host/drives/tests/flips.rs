@@ -31,7 +31,10 @@ impl Random {
 fn random_byte_flips_never_panic_hang_or_take_much_memory() {
     // Without checksums, flips get past the first gate.
     let unchecked = |options: WriteOptions| {
-        options.calculate_chunk_crcs(false).calculate_data_section_crc(false).calculate_summary_section_crc(false)
+        options
+            .calculate_chunk_crcs(false)
+            .calculate_data_section_crc(false)
+            .calculate_summary_section_crc(false)
     };
     let messages = ticking(&["/a", "/b"], 40, 1000);
     let drives: Vec<Vec<u8>> = [

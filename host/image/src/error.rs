@@ -10,7 +10,8 @@ use super::{Format, Header};
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ImageError {
-    /// Pixels that are no image, an operation on them without a result, or one that the caller ended.
+    /// Pixels that are no image, an operation on them without a result, or one that the caller
+    /// ended.
     #[error(transparent)]
     Pixels(#[from] PixelError),
     /// Bytes that are no image file.

@@ -1,7 +1,8 @@
-//! From here on a process stays alone: no new processes, no new sockets, no signals to others, nothing that would let it take
-//! more than its share.
+//! From here on a process stays alone: no new processes, no new sockets, no signals to others,
+//! nothing that would let it take more than its share.
 //!
-//! What it has open stays usable. So a runtime calls this once its topics are open, and before the lambda is let in.
+//! What it has open stays usable. So a runtime calls this once its topics are open, and before the
+//! lambda is let in.
 
 use gleaner_protocol::Layer;
 
@@ -26,7 +27,8 @@ pub(crate) const NEW_SOCKETS: &[i64] = &[
     libc::SYS_accept4,
     // Those that are open belong to the transport.
     libc::SYS_connect,
-    // With a message files can be sent, of which the kernel counts those on their way for all processes of a user.
+    // With a message files can be sent, of which the kernel counts those on their way for all
+    // processes of a user.
     libc::SYS_sendmsg,
     libc::SYS_sendmmsg,
 ];
@@ -38,13 +40,17 @@ const NEW_PROCESSES: &[i64] = &[libc::SYS_fork, libc::SYS_vfork];
 const NEW_PROCESSES: &[i64] = &[];
 
 /// Signals to others than oneself.
-const SIGNALS: &[i64] =
-    &[libc::SYS_tkill, libc::SYS_rt_sigqueueinfo, libc::SYS_rt_tgsigqueueinfo, libc::SYS_pidfd_send_signal];
+const SIGNALS: &[i64] = &[
+    libc::SYS_tkill,
+    libc::SYS_rt_sigqueueinfo,
+    libc::SYS_rt_tgsigqueueinfo,
+    libc::SYS_pidfd_send_signal,
+];
 /// The transport needs them, to find its own sockets.
 const PIDFDS: &[i64] = &[libc::SYS_pidfd_open, libc::SYS_pidfd_getfd];
 
-/// More of the machine than one's share, memory that outlives a process, and the owners and dates of files, which Landlock
-/// leaves alone.
+/// More of the machine than one's share, memory that outlives a process, and the owners and dates
+/// of files, which Landlock leaves alone.
 const SHARED: &[i64] = &[
     libc::SYS_sched_setscheduler,
     libc::SYS_sched_setattr,
@@ -116,8 +122,8 @@ const SETXATTRAT: i64 = 463;
 const REMOVEXATTRAT: i64 = 466;
 const FILE_SETATTR: i64 = 469;
 
-/// Requests of `fcntl` that have the kernel send signals to others, leases and watches, for which others wait, and larger pipes, of
-/// which a user has a few.
+/// Requests of `fcntl` that have the kernel send signals to others, leases and watches, for which
+/// others wait, and larger pipes, of which a user has a few.
 const REQUESTS_OF_FILES: [u64; 6] = [8, 10, 15, 1024, 1026, 1031];
 /// Requests of `ioctl`: the same for sockets, and typing into somebody's terminal.
 const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
@@ -125,7 +131,8 @@ const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
 /// Types of sockets that DDS has no use for: streams above all, which may connect.
 const TYPES: [u64; 5] = [1, 4, 5, 6, 10];
 
-/// Descriptors that a process may still open: a drive's files again, modules, and what the transport makes for a new writer.
+/// Descriptors that a process may still open: a drive's files again, modules, and what the
+/// transport makes for a new writer.
 const MORE_FILES: u64 = 512;
 
 /// Families of sockets that Linux knows, with some to come.
@@ -136,24 +143,31 @@ const ALL: u64 = u32::MAX as u64;
 /// The bits of a socket's type that are not flags.
 const TYPE: u64 = 0xf;
 
-/// Leaves this process alone, in all of its threads. With `only_counted_memory` it can take none that a
-/// [`memory::limit`] does not count. Gives the layers with what was refused; whether they hold is for
-/// [`tried`](crate::tried) to see.
+/// Leaves this process alone, in all of its threads. With `only_counted_memory` it can take none
+/// that a [`memory::limit`] does not count. Gives the layers with what was refused; whether they
+/// hold is for [`tried`](crate::tried) to see.
 ///
 /// # Errors
 ///
-/// [`JailError::Loose`] if filters work here and another thread of this process cannot have this one: then nothing holds it.
+/// [`JailError::Loose`] if filters work here and another thread of this process cannot have this
+/// one: then nothing holds it.
 pub fn stay(only_counted_memory: bool) -> Result<Vec<Layer>, JailError> {
-    // An epoll can watch each of the others, and of these watches the user has a few: so many descriptors can make 70,000 of them.
+    // An epoll can watch each of the others, and of these watches the user has a few: so many
+    // descriptors can make 70,000 of them.
     never::open_files_beyond(MORE_FILES);
     Ok(match install_all(only_counted_memory) {
         Ok(()) => vec![
             Layer::yes(PROCESSES, "seccomp: no new ones, no programs, no signals to others"),
             Layer::yes(SOCKETS, "seccomp: no new ones, no connections"),
-            Layer::yes(SHARE, "seccomp: no priorities, no cores, no shared memory, no owners or dates of files"),
+            Layer::yes(
+                SHARE,
+                "seccomp: no priorities, no cores, no shared memory, no owners or dates of files",
+            ),
         ],
         Err(error @ JailError::Loose(_)) => return Err(error),
-        Err(error) => [PROCESSES, SOCKETS, SHARE].map(|name| Layer::no(name, error.told())).to_vec(),
+        Err(error) => {
+            [PROCESSES, SOCKETS, SHARE].map(|name| Layer::no(name, error.told())).to_vec()
+        }
     })
 }
 
@@ -175,10 +189,12 @@ fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
         refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
     }
     if only_counted_memory {
-        // Others would wait for a file that is locked, and a file that can only be read can be locked.
+        // Others would wait for a file that is locked, and a file that can only be read can be
+        // locked.
         refused = refused.calls(&[libc::SYS_flock]);
         refused = match memory::stack() {
-            // Moved elsewhere, it would still count as stack, and could be made any size. The allocator moves blocks of data so.
+            // Moved elsewhere, it would still count as stack, and could be made any size. The
+            // allocator moves blocks of data so.
             Some(stack) => counted_only(refused).between(libc::SYS_mremap, 0, stack),
             None => counted_only(refused).calls(&[libc::SYS_mremap]),
         };
@@ -188,13 +204,17 @@ fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
     install_everywhere(&refused.filter(libc::EPERM)?)
 }
 
-/// What a process that is about to become an interpreter does not need any more: no other process, no socket but those of DDS, and,
-/// with `only_counted_memory`, no memory as in [`stay`]. Signals to others neither. Nothing of the lambda's runs until [`stay`], but the
-/// interpreter may be any program that calls itself Python.
+/// What a process that is about to become an interpreter does not need any more: no other process,
+/// no socket but those of DDS, and, with `only_counted_memory`, no memory as in [`stay`]. Signals
+/// to others neither. Nothing of the lambda's runs until [`stay`], but the interpreter may be any
+/// program that calls itself Python.
 #[must_use]
 pub fn before_interpreter(only_counted_memory: bool) -> Layer {
     match install_before(only_counted_memory) {
-        Ok(()) => Layer::yes(START, "seccomp: no processes, no signals to others, no sockets but those of DDS"),
+        Ok(()) => Layer::yes(
+            START,
+            "seccomp: no processes, no signals to others, no sockets but those of DDS",
+        ),
         Err(error) => Layer::no(START, error.told()),
     }
 }

@@ -1,8 +1,10 @@
-//! A control group of its own for each runtime, where a supervisor was given a part of the tree (`Delegate=yes` of systemd).
+//! A control group of its own for each runtime, where a supervisor was given a part of the tree
+//! (`Delegate=yes` of systemd).
 //!
-//! It bounds what no limit of a single process can: memory and number of all processes of a lambda together, with everything
-//! that the kernel keeps for them. Version 2 only. The rule of the kernel is that processes live in leaves: the supervisor itself
-//! must not live in the folder that it hands to us.
+//! It bounds what no limit of a single process can: memory and number of all processes of a lambda
+//! together, with everything that the kernel keeps for them. Version 2 only. The rule of the kernel
+//! is that processes live in leaves: the supervisor itself must not live in the folder that it
+//! hands to us.
 
 use std::fs::{self, OpenOptions};
 use std::io;
@@ -40,13 +42,16 @@ pub struct Group {
 }
 
 impl Group {
-    /// Makes the group `name` in `tree`, a folder of a cgroup 2 file system that was delegated to this user.
+    /// Makes the group `name` in `tree`, a folder of a cgroup 2 file system that was delegated to
+    /// this user.
     ///
     /// # Errors
     ///
     /// A sentence: what is missing, and who can give it.
     pub fn make(tree: &Path, name: &str, bounds: Bounds) -> Result<Self, String> {
-        let cannot = |what: &str, error: io::Error| format!("cannot {what} in `{}`: {error}", tree.display());
+        let cannot = |what: &str, error: io::Error| {
+            format!("cannot {what} in `{}`: {error}", tree.display())
+        };
         let controllers = fs::read_to_string(tree.join("cgroup.controllers"));
         let controllers = controllers.map_err(|error| cannot("read cgroup.controllers", error))?;
         let missing: Vec<_> = ["memory", "pids"]
@@ -65,7 +70,9 @@ impl Group {
         let folder = tree.join(name);
         match fs::create_dir(&folder) {
             // Left by one that was killed; a group that still has processes refuses us below.
-            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(cannot("make a group", error)),
+            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+                return Err(cannot("make a group", error));
+            }
             _ => {}
         }
         let killed_before = killed_for_memory(&folder);
@@ -81,7 +88,8 @@ impl Group {
         for (file, value) in bounds {
             match fs::write(group.folder.join(file), value) {
                 // A kernel without swap has no file for it.
-                Err(error) if file == "memory.swap.max" && error.kind() == io::ErrorKind::NotFound => {}
+                Err(error)
+                    if file == "memory.swap.max" && error.kind() == io::ErrorKind::NotFound => {}
                 Err(error) => return Err(cannot(&format!("write {name}/{file}"), error)),
                 Ok(()) => {}
             }
@@ -89,8 +97,8 @@ impl Group {
         Ok(group)
     }
 
-    /// Has what `command` starts be in it from its first instruction on; if it cannot be, it does not start. It is told of its
-    /// group, for [`fit`].
+    /// Has what `command` starts be in it from its first instruction on; if it cannot be, it does
+    /// not start. It is told of its group, for [`fit`].
     ///
     /// # Errors
     ///
@@ -112,19 +120,25 @@ impl Group {
     }
 }
 
-/// Bounds the memory of the group of this process by `bytes`, unless its bound is smaller: for a runtime that knows what its lambda may
-/// take, before the lambda is in it. Gives the layer; `None` without a group.
+/// Bounds the memory of the group of this process by `bytes`, unless its bound is smaller: for a
+/// runtime that knows what its lambda may take, before the lambda is in it. Gives the layer; `None`
+/// without a group.
 pub fn fit(bytes: u64) -> Option<Layer> {
     let folder = PathBuf::from(std::env::var_os(CGROUP_ENV)?);
     Some(fit_in(&folder, bytes).unwrap_or_else(|error| {
-        let why = format!("cannot bound the memory of `{}` by {} MiB: {error}", folder.display(), bytes >> 20);
+        let why = format!(
+            "cannot bound the memory of `{}` by {} MiB: {error}",
+            folder.display(),
+            bytes >> 20
+        );
         Layer::partly(NAME, why)
     }))
 }
 
 fn fit_in(folder: &Path, bytes: u64) -> io::Result<Layer> {
     let file = folder.join(MEMORY_MAX);
-    let bound = fs::read_to_string(&file)?.trim().parse().map_or(bytes, |bound: u64| bound.min(bytes));
+    let bound =
+        fs::read_to_string(&file)?.trim().parse().map_or(bytes, |bound: u64| bound.min(bytes));
     fs::write(&file, bound.to_string())?;
     Ok(layer(folder))
 }
@@ -147,7 +161,8 @@ fn killed_for_memory(folder: &Path) -> u64 {
 
 impl Drop for Group {
     fn drop(&mut self) {
-        // All of its processes have ended. Where one has not, the folder stays, and the next of its name takes it over.
+        // All of its processes have ended. Where one has not, the folder stays, and the next of its
+        // name takes it over.
         let _ = fs::remove_dir(&self.folder);
     }
 }
@@ -158,12 +173,14 @@ mod tests {
 
     const BOUNDS: Bounds = Bounds { memory: Some(64 << 20), tasks: 32 };
 
-    /// A folder that looks as one that was delegated. The kernel's behaviour behind it is not there.
+    /// A folder that looks as one that was delegated. The kernel's behaviour behind it is not
+    /// there.
     struct Tree(PathBuf);
 
     impl Tree {
         fn with(controllers: &str, name: &str) -> Self {
-            let tree = std::env::temp_dir().join(format!("gleaner-cgroup-{}-{name}", std::process::id()));
+            let tree =
+                std::env::temp_dir().join(format!("gleaner-cgroup-{}-{name}", std::process::id()));
             fs::create_dir_all(&tree).unwrap();
             fs::write(tree.join("cgroup.controllers"), controllers).unwrap();
             Self(tree)
@@ -229,7 +246,10 @@ mod tests {
     fn what_was_not_delegated_is_named() {
         let tree = Tree::with("cpu pids\n", "missing");
         let why = Group::make(&tree.0, "x", BOUNDS).unwrap_err();
-        assert!(why.contains("has no controller for memory; delegate it: Delegate=memory pids"), "{why}");
+        assert!(
+            why.contains("has no controller for memory; delegate it: Delegate=memory pids"),
+            "{why}"
+        );
         let why = Group::make(&tree.0.join("nowhere"), "x", BOUNDS).unwrap_err();
         assert!(why.contains("cannot read cgroup.controllers"), "{why}");
     }

@@ -1,7 +1,8 @@
 //! The sandbox of a compiler, which runs code of a lambda's author: build scripts and macros.
 //!
-//! It has to start programs, and to change modes and dates of what it writes, so that less can be taken from it than from a lambda's
-//! process. It is not started without all of this: the user who requests it does not trust that code.
+//! It has to start programs, and to change modes and dates of what it writes, so that less can be
+//! taken from it than from a lambda's process. It is not started without all of this: the user who
+//! requests it does not trust that code.
 
 use gleaner_protocol::{Holds, Layer};
 
@@ -9,7 +10,8 @@ use crate::alone::{NEW_SOCKETS, SOCKETS, pairs_only};
 use crate::filter::{Refused, install};
 use crate::{JailError, Paths, files, never, tried};
 
-/// Files of other processes, owners and attributes of files, which Landlock leaves alone, and memory that outlives a process.
+/// Files of other processes, owners and attributes of files, which Landlock leaves alone, and
+/// memory that outlives a process.
 const CALLS: &[i64] = &[
     libc::SYS_pidfd_getfd,
     libc::SYS_fchown,
@@ -49,7 +51,8 @@ const CALLS_HERE: &[i64] = &[];
 /// Requests of `ioctl` that insert input into a terminal.
 const TYPING: [u64; 2] = [libc::TIOCSTI, 0x541C];
 
-/// From now on this process, and what it starts, can open only `paths` and the system's programs and libraries, and no socket.
+/// From now on this process, and what it starts, can open only `paths` and the system's programs
+/// and libraries, and no socket.
 ///
 /// # Errors
 ///
@@ -65,7 +68,8 @@ pub fn enter(paths: &Paths) -> Result<(), Layer> {
 }
 
 fn filter() -> Result<(), JailError> {
-    let mut refused = pairs_only(Refused::default()).calls(NEW_SOCKETS).calls(CALLS).calls(CALLS_HERE);
+    let mut refused =
+        pairs_only(Refused::default()).calls(NEW_SOCKETS).calls(CALLS).calls(CALLS_HERE);
     for call in OF_PROCESSES {
         refused = refused.unless(*call, 0, 0);
     }

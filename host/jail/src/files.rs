@@ -1,11 +1,12 @@
-//! Which files can be opened: Landlock, for this thread and what it starts. TCP, signals and abstract sockets go with it.
+//! Which files can be opened: Landlock, for this thread and what it starts. TCP, signals and
+//! abstract sockets go with it.
 
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::Layer;
 use landlock::{
-    ABI, Access, AccessFs, AccessNet, CompatLevel, Compatible, LandlockStatus, Ruleset, RulesetAttr,
-    RulesetCreatedAttr, RulesetStatus, Scope, path_beneath_rules,
+    ABI, Access, AccessFs, AccessNet, CompatLevel, Compatible, LandlockStatus, Ruleset,
+    RulesetAttr, RulesetCreatedAttr, RulesetStatus, Scope, path_beneath_rules,
 };
 
 use crate::JailError;
@@ -16,8 +17,9 @@ pub const NAME: &str = "files";
 /// The newest rules that are used. Older kernels leave some out, and the layer says so.
 const RULES: ABI = ABI::V6;
 
-/// Programs and libraries, and what they read to begin: nothing in them is somebody's secret. Not `/etc`, but for what the
-/// loader and the calendar need, and not `/usr/local/etc`, where installed programs keep tokens.
+/// Programs and libraries, and what they read to begin: nothing in them is somebody's secret. Not
+/// `/etc`, but for what the loader and the calendar need, and not `/usr/local/etc`, where installed
+/// programs keep tokens.
 const SYSTEM: [&str; 24] = [
     "/usr/bin",
     "/usr/lib",
@@ -44,7 +46,8 @@ const SYSTEM: [&str; 24] = [
     "/sys/class/net",
     "/sys/devices/virtual/net",
 ];
-/// Devices that everybody may use. Who may write to that of zeros could share it as memory, which no limit counts.
+/// Devices that everybody may use. Who may write to that of zeros could share it as memory, which
+/// no limit counts.
 const DEVICES: [&str; 4] = ["/dev/zero", "/dev/full", "/dev/random", "/dev/urandom"];
 const NOTHING: [&str; 1] = ["/dev/null"];
 
@@ -58,20 +61,29 @@ pub struct Paths {
 }
 
 impl Paths {
-    /// Adds what the interpreter `program` needs: of its own folder, and of the one that it was made from, programs and libraries.
-    /// Of an environment only what lies in it: whoever made it may have put links there that lead to anything.
+    /// Adds what the interpreter `program` needs: of its own folder, and of the one that it was
+    /// made from, programs and libraries. Of an environment only what lies in it: whoever made it
+    /// may have put links there that lead to anything.
     pub fn interpreter(&mut self, program: &Path) {
-        self.read
-            .extend(parts_of(program).into_iter().filter(|(prefix, part)| part.starts_with(prefix)).map(|it| it.1));
+        self.read.extend(
+            parts_of(program)
+                .into_iter()
+                .filter(|(prefix, part)| part.starts_with(prefix))
+                .map(|it| it.1),
+        );
         // What the system's own interpreters link to is theirs to say.
         let real = program.canonicalize().ok();
-        self.read.extend(real.as_deref().map(parts_of).unwrap_or_default().into_iter().map(|it| it.1));
+        self.read
+            .extend(real.as_deref().map(parts_of).unwrap_or_default().into_iter().map(|it| it.1));
     }
 }
 
-/// Of the environment around the interpreter `program`: its real folder, with each real path of what is needed of it.
+/// Of the environment around the interpreter `program`: its real folder, with each real path of
+/// what is needed of it.
 fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
-    let Some(prefix) = program.parent().and_then(Path::parent).and_then(|prefix| prefix.canonicalize().ok()) else {
+    let Some(prefix) =
+        program.parent().and_then(Path::parent).and_then(|prefix| prefix.canonicalize().ok())
+    else {
         return Vec::new();
     };
     let bin = program.parent().map(Path::to_owned);
@@ -80,7 +92,8 @@ fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
     real.map(|part| (prefix.clone(), part)).collect()
 }
 
-/// From now on this thread, and what it starts, can open only `paths` and the system's programs and libraries.
+/// From now on this thread, and what it starts, can open only `paths` and the system's programs and
+/// libraries.
 pub fn confine(paths: &Paths) -> Layer {
     match restrict(paths) {
         Ok(layer) => layer,
@@ -88,11 +101,13 @@ pub fn confine(paths: &Paths) -> Layer {
     }
 }
 
-/// From now on this thread, and what it starts, can change only `paths`; what it can read stays as it is. None if that
-/// changes nothing that is to be told.
+/// From now on this thread, and what it starts, can change only `paths`; what it can read stays as
+/// it is. None if that changes nothing that is to be told.
 pub fn confine_writes(paths: &[PathBuf]) -> Option<Layer> {
     let restricted = restrict_writes(paths);
-    restricted.err().map(|error| Layer::partly(NAME, format!("the results can still be changed: {}", error.told())))
+    restricted.err().map(|error| {
+        Layer::partly(NAME, format!("the results can still be changed: {}", error.told()))
+    })
 }
 
 fn restrict_writes(paths: &[PathBuf]) -> Result<(), JailError> {
@@ -129,17 +144,27 @@ fn restrict(paths: &Paths) -> Result<Layer, JailError> {
         (RulesetStatus::NotEnforced, _) => {
             Layer::no(NAME, "Landlock is not switched on; add it to the kernel's parameter lsm=")
         }
-        (RulesetStatus::FullyEnforced, _) => {
-            Layer::yes(NAME, "Landlock: only what belongs to the lambda; no TCP, no signals to others")
-        }
+        (RulesetStatus::FullyEnforced, _) => Layer::yes(
+            NAME,
+            "Landlock: only what belongs to the lambda; no TCP, no signals to others",
+        ),
         (RulesetStatus::PartiallyEnforced, LandlockStatus::Available { effective_abi, .. }) => {
             let abi = effective_abi as i32;
-            let lacks =
-                [(2, "renaming across folders"), (3, "cutting files"), (4, "TCP"), (5, "devices"), (6, "signals")];
-            let lacks: Vec<_> = lacks.iter().filter(|(since, _)| *since > abi).map(|(_, what)| *what).collect();
+            let lacks = [
+                (2, "renaming across folders"),
+                (3, "cutting files"),
+                (4, "TCP"),
+                (5, "devices"),
+                (6, "signals"),
+            ];
+            let lacks: Vec<_> =
+                lacks.iter().filter(|(since, _)| *since > abi).map(|(_, what)| *what).collect();
             Layer::partly(
                 NAME,
-                format!("Landlock {abi}: only what belongs to the lambda; not watched: {}", lacks.join(", ")),
+                format!(
+                    "Landlock {abi}: only what belongs to the lambda; not watched: {}",
+                    lacks.join(", ")
+                ),
             )
         }
         (RulesetStatus::PartiallyEnforced, _) => {
@@ -157,11 +182,18 @@ mod tests {
 
     #[test]
     fn links_that_lead_out_of_an_environment_open_nothing() {
-        let folder = std::env::temp_dir().join(format!("gleaner-jail-files-{}", std::process::id()));
+        let folder =
+            std::env::temp_dir().join(format!("gleaner-jail-files-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
         let folder = folder.canonicalize().unwrap();
         let (venv, real) = (folder.join("lambda/.venv"), folder.join("python"));
-        for made in [venv.join("bin"), venv.join("lib"), real.join("bin"), real.join("lib"), folder.join("secret")] {
+        for made in [
+            venv.join("bin"),
+            venv.join("lib"),
+            real.join("bin"),
+            real.join("lib"),
+            folder.join("secret"),
+        ] {
             fs::create_dir_all(made).unwrap();
         }
         fs::write(folder.join("secret/key"), "").unwrap();

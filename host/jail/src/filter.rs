@@ -5,7 +5,8 @@ use std::ops::Range;
 
 use rustix::thread::{SecureComputingMode, secure_computing_mode};
 use seccompiler::{
-    BpfProgram, SeccompAction, SeccompCmpArgLen, SeccompCmpOp, SeccompCondition, SeccompFilter, SeccompRule, TargetArch,
+    BpfProgram, SeccompAction, SeccompCmpArgLen, SeccompCmpOp, SeccompCondition, SeccompFilter,
+    SeccompRule, TargetArch,
 };
 
 use crate::JailError;
@@ -42,7 +43,9 @@ impl Refused {
 
     /// Refuses `call` where its argument `index`, an address, lies in `range`.
     pub(crate) fn between(mut self, call: i64, index: u8, range: Range<u64>) -> Self {
-        let condition = |operator, value| SeccompCondition::new(index, SeccompCmpArgLen::Qword, operator, value);
+        let condition = |operator, value| {
+            SeccompCondition::new(index, SeccompCmpArgLen::Qword, operator, value)
+        };
         let both = condition(SeccompCmpOp::Ge, range.start)
             .and_then(|from| SeccompRule::new(vec![from, condition(SeccompCmpOp::Lt, range.end)?]));
         self.insert(call, vec![both.expect("an index below 6, and two conditions")]);
@@ -50,11 +53,19 @@ impl Refused {
     }
 
     fn when(self, call: i64, index: u8, operator: SeccompCmpOp, value: u64) -> Self {
-        // Flags, process numbers and requests are `int`s: the kernel looks at the lower half only, and so must we.
+        // Flags, process numbers and requests are `int`s: the kernel looks at the lower half only,
+        // and so must we.
         self.of_width(call, index, SeccompCmpArgLen::Dword, operator, value)
     }
 
-    fn of_width(mut self, call: i64, index: u8, width: SeccompCmpArgLen, operator: SeccompCmpOp, value: u64) -> Self {
+    fn of_width(
+        mut self,
+        call: i64,
+        index: u8,
+        width: SeccompCmpArgLen,
+        operator: SeccompCmpOp,
+        value: u64,
+    ) -> Self {
         let condition = SeccompCondition::new(index, width, operator, value);
         let rule = condition.and_then(|condition| SeccompRule::new(vec![condition]));
         self.insert(call, vec![rule.expect("an index below 6, and one condition")]);
@@ -65,7 +76,8 @@ impl Refused {
         self.0.entry(call).or_default().extend(rules);
     }
 
-    /// Says that there is no `clone3`: a filter cannot read its flags, which are in memory, and libraries take `clone` instead.
+    /// Says that there is no `clone3`: a filter cannot read its flags, which are in memory, and
+    /// libraries take `clone` instead.
     pub(crate) fn no_clone3() -> Result<BpfProgram, JailError> {
         Self::default().calls(&[libc::SYS_clone3]).filter(libc::ENOSYS)
     }
@@ -76,14 +88,17 @@ impl Refused {
         let target: TargetArch = machine.try_into().map_err(|_| JailError::Machine(machine))?;
         self.refuse_other_numbers();
         let answer = SeccompAction::Errno(errno.unsigned_abs());
-        let filter = SeccompFilter::new(self.0, SeccompAction::Allow, answer, target).map_err(JailError::Build)?;
+        let filter = SeccompFilter::new(self.0, SeccompAction::Allow, answer, target)
+            .map_err(JailError::Build)?;
         filter.try_into().map_err(JailError::Build)
     }
 
-    /// The same calls by other numbers. Calls of another machine, such as 32-bit ones, end the process anyway.
+    /// The same calls by other numbers. Calls of another machine, such as 32-bit ones, end the
+    /// process anyway.
     #[cfg(target_arch = "x86_64")]
     fn refuse_other_numbers(&mut self) {
-        let twins: Vec<_> = self.0.iter().map(|(call, rules)| (call | X32, rules.clone())).collect();
+        let twins: Vec<_> =
+            self.0.iter().map(|(call, rules)| (call | X32, rules.clone())).collect();
         self.0.extend(twins);
         for call in X32_OWN {
             // Old kernels take them without the bit, too.
@@ -101,8 +116,9 @@ pub(crate) fn install(filter: &BpfProgram) -> Result<(), JailError> {
     seccompiler::apply_filter(filter).map_err(JailError::Install)
 }
 
-/// Installs `filter` for all threads of this process and all that they start. [`JailError::Loose`] where filters are known to work
-/// here and one of the threads cannot have it, since it has others than this one.
+/// Installs `filter` for all threads of this process and all that they start. [`JailError::Loose`]
+/// where filters are known to work here and one of the threads cannot have it, since it has others
+/// than this one.
 pub(crate) fn install_everywhere(filter: &BpfProgram) -> Result<(), JailError> {
     let works = matches!(secure_computing_mode(), Ok(SecureComputingMode::Filter));
     let error = if works { JailError::Loose } else { JailError::Install };

@@ -1,18 +1,24 @@
-//! What keeps a process from what it has no business with, as far as a process without privileges can have that.
+//! What keeps a process from what it has no business with, as far as a process without privileges
+//! can have that.
 //!
-//! Nothing here can be taken back, and all of it holds for what the process starts. In the order in which a runtime comes by it:
+//! Nothing here can be taken back, and all of it holds for what the process starts. In the order in
+//! which a runtime comes by it:
 //!
-//! 1. [`never`](mod@never), by `gleaner-shim`, before the runtime exists: no new privileges, no calls that no lambda's process ever needs.
-//! 2. [`files`], before the first foreign code is loaded: only the files that were named can be opened; no TCP.
-//! 3. [`alone`], once sockets and files are open: no further ones, no new processes, no signals to others.
+//! 1. [`never`](mod@never), by `gleaner-shim`, before the runtime exists: no new privileges, no
+//!    calls that no lambda's process ever needs.
+//! 2. [`files`], before the first foreign code is loaded: only the files that were named can be
+//!    opened; no TCP.
+//! 3. [`alone`], once sockets and files are open: no further ones, no new processes, no signals to
+//!    others.
 //! 4. [`memory`], with it: so much more than there is now.
 //!
 //! A compiler of a lambda whose author is not trusted enters [`compiler`] instead.
 //!
-//! [`tried`] then tries what should be impossible: a layer counts as one that holds only if it was seen to. [`cgroup`] is the
-//! supervisor's side, for memory and processes that a lambda starts. What is missing on a system is said and not fatal: a
-//! lambda runs with the layers that are there, and everybody can read which these are. What the system has and something in
-//! the process keeps away is fatal.
+//! [`tried`] then tries what should be impossible: a layer counts as one that holds only if it was
+//! seen to. [`cgroup`] is the supervisor's side, for memory and processes that a lambda starts.
+//! What is missing on a system is said and not fatal: a lambda runs with the layers that are there,
+//! and everybody can read which these are. What the system has and something in the process keeps
+//! away is fatal.
 
 pub mod alone;
 pub mod cgroup;

@@ -1,9 +1,11 @@
-//! What no lambda's process ever needs: looking into other processes, changing the system, becoming somebody else.
+//! What no lambda's process ever needs: looking into other processes, changing the system, becoming
+//! somebody else.
 
 use gleaner_protocol::Layer;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use rustix::thread::{
-    CapabilitySet, CapabilitySets, capabilities, remove_capability_from_bounding_set, set_capabilities,
+    CapabilitySet, CapabilitySets, capabilities, remove_capability_from_bounding_set,
+    set_capabilities,
 };
 
 use crate::JailError;
@@ -100,7 +102,8 @@ const CALLS: &[i64] = &[
 ];
 
 #[cfg(target_arch = "x86_64")]
-const MACHINE_CALLS: &[i64] = &[libc::SYS_iopl, libc::SYS_ioperm, libc::SYS_modify_ldt, libc::SYS_uselib];
+const MACHINE_CALLS: &[i64] =
+    &[libc::SYS_iopl, libc::SYS_ioperm, libc::SYS_modify_ldt, libc::SYS_uselib];
 #[cfg(not(target_arch = "x86_64"))]
 const MACHINE_CALLS: &[i64] = &[];
 
@@ -109,8 +112,8 @@ pub fn forbid() -> Vec<Layer> {
     vec![privileges(), powers(), core_dumps(), open_files(), calls()]
 }
 
-/// What root has, or who was given a part of it. Files stay as they are: in a container root often writes into a folder of
-/// somebody else, and which files there are at all is for Landlock to say.
+/// What root has, or who was given a part of it. Files stay as they are: in a container root often
+/// writes into a folder of somebody else, and which files there are at all is for Landlock to say.
 fn powers() -> Layer {
     const NAME: &str = "capabilities";
     const KEPT: CapabilitySet = CapabilitySet::DAC_OVERRIDE.union(CapabilitySet::DAC_READ_SEARCH);
@@ -120,11 +123,15 @@ fn powers() -> Layer {
             return Ok(had.permitted);
         }
         for power in CapabilitySet::all().difference(KEPT).iter() {
-            // One that is not known here is not there either; without leave to do this, no_new_privs keeps them from coming back.
+            // One that is not known here is not there either; without leave to do this,
+            // no_new_privs keeps them from coming back.
             let _ = remove_capability_from_bounding_set(power);
         }
         let (effective, permitted) = (had.effective & KEPT, had.permitted & KEPT);
-        set_capabilities(None, CapabilitySets { effective, permitted, inheritable: CapabilitySet::empty() })?;
+        set_capabilities(
+            None,
+            CapabilitySets { effective, permitted, inheritable: CapabilitySet::empty() },
+        )?;
         Ok(capabilities(None)?.permitted)
     };
     let given_up: rustix::io::Result<CapabilitySet> = given_up();
@@ -165,11 +172,12 @@ fn open_files() -> Layer {
     }
 }
 
-/// From now on this process can open only `more` files beyond those that it has. Where its own cannot be counted, the limit stays.
+/// From now on this process can open only `more` files beyond those that it has. Where its own
+/// cannot be counted, the limit stays.
 pub(crate) fn open_files_beyond(more: u64) {
-    let highest = std::fs::read_dir("/proc/self/fd")
-        .ok()
-        .and_then(|open| open.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse::<u64>().ok()).max());
+    let highest = std::fs::read_dir("/proc/self/fd").ok().and_then(|open| {
+        open.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse::<u64>().ok()).max()
+    });
     if let Some(highest) = highest {
         // It can only become smaller, which is never refused.
         let _ = limit_files(highest.saturating_add(more));
@@ -186,7 +194,10 @@ fn limit_files(most: u64) -> rustix::io::Result<u64> {
 
 fn calls() -> Layer {
     match install_both() {
-        Ok(()) => Layer::yes(NAME, "seccomp: other processes' memory, namespaces, mounts, keys, modules, time, users"),
+        Ok(()) => Layer::yes(
+            NAME,
+            "seccomp: other processes' memory, namespaces, mounts, keys, modules, time, users",
+        ),
         Err(error) => Layer::no(NAME, error.told()),
     }
 }

@@ -10,7 +10,8 @@ use gleaner_protocol::{Holds, Layer};
 
 use crate::{alone, files, never};
 
-/// Tries what each of `layers` should refuse to this process, and says of those that did not refuse it that they do not hold.
+/// Tries what each of `layers` should refuse to this process, and says of those that did not refuse
+/// it that they do not hold.
 pub fn tried(mut layers: Vec<Layer>) -> Vec<Layer> {
     for layer in &mut layers {
         if layer.holds == Holds::No {
@@ -31,7 +32,8 @@ pub fn tried(mut layers: Vec<Layer>) -> Vec<Layer> {
     layers
 }
 
-/// Asks for the namespace that a file stands for, of one that stands for none: without the filter that is said to be no use.
+/// Asks for the namespace that a file stands for, of one that stands for none: without the filter
+/// that is said to be no use.
 fn enter_no_namespace() -> io::Result<()> {
     let nothing = File::open("/dev/null")?;
     Ok(rustix::thread::move_into_link_name_space(nothing.as_fd(), None)?)

@@ -1,4 +1,5 @@
-//! What code that runs before the lambda can leave behind for later. Each test shuts in a process of its own.
+//! What code that runs before the lambda can leave behind for later. Each test shuts in a process
+//! of its own.
 
 use std::hint::black_box;
 use std::process::Command;
@@ -55,14 +56,17 @@ fn a_thread_with_a_filter_of_its_own_is_not_left_loose() {
 
 #[test]
 fn an_interpreter_that_starts_signals_nobody_and_has_no_memory_that_is_not_counted() {
-    apart("an_interpreter_that_starts_signals_nobody_and_has_no_memory_that_is_not_counted", || {
-        let parent = getppid().unwrap();
-        test_kill_process(parent).unwrap();
-        assert_eq!(alone::before_interpreter(true).holds, Holds::Yes);
-        assert_eq!(test_kill_process(parent), Err(Errno::PERM));
-        test_kill_process(getpid()).unwrap();
-        assert_eq!(memfd_create("more", MemfdFlags::CLOEXEC).unwrap_err(), Errno::PERM);
-    });
+    apart(
+        "an_interpreter_that_starts_signals_nobody_and_has_no_memory_that_is_not_counted",
+        || {
+            let parent = getppid().unwrap();
+            test_kill_process(parent).unwrap();
+            assert_eq!(alone::before_interpreter(true).holds, Holds::Yes);
+            assert_eq!(test_kill_process(parent), Err(Errno::PERM));
+            test_kill_process(getpid()).unwrap();
+            assert_eq!(memfd_create("more", MemfdFlags::CLOEXEC).unwrap_err(), Errno::PERM);
+        },
+    );
 }
 
 #[test]

@@ -115,7 +115,8 @@ impl Definitions {
         for builtin in ["builtin_interfaces/Time", "builtin_interfaces/Duration"] {
             parts.entry(builtin.to_owned()).or_insert_with(seconds_and_nanoseconds);
         }
-        let mut resolver = Resolver { parts, structs: Vec::new(), known: HashMap::new(), open: Vec::new() };
+        let mut resolver =
+            Resolver { parts, structs: Vec::new(), known: HashMap::new(), open: Vec::new() };
         resolver.resolve(&root)?;
         Ok(Self { type_name: full_name(&root), structs: resolver.structs })
     }
@@ -297,7 +298,8 @@ mod tests {
 
     #[test]
     fn nested_types_resolve_by_full_name_and_within_the_package() {
-        let text = "Inner a\nother/msg/Far b\n===\nMSG: pkg/Inner\nint8 x\n===\nMSG: other/Far\nint8 y\n";
+        let text =
+            "Inner a\nother/msg/Far b\n===\nMSG: pkg/Inner\nint8 x\n===\nMSG: other/Far\nint8 y\n";
         let definitions = Definitions::parse("pkg/msg/Outer", text).unwrap();
         assert_eq!(definitions.type_name(), "pkg/msg/Outer");
         assert_eq!(definitions.fields().collect::<Vec<_>>(), ["a", "b"]);
@@ -337,7 +339,10 @@ mod tests {
     #[test]
     fn a_missing_type_is_named() {
         let refused = Definitions::parse("p/T", "q/Gone[] x").unwrap_err();
-        assert_eq!(refused.to_string(), "field `x` of type `p/T` has type `q/Gone`, which is not defined");
+        assert_eq!(
+            refused.to_string(),
+            "field `x` of type `p/T` has type `q/Gone`, which is not defined"
+        );
     }
 
     #[test]

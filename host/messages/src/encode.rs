@@ -1,4 +1,5 @@
-//! CDR for messages of our own: a writer knows what it writes, so this is little more than alignment.
+//! CDR for messages of our own: a writer knows what it writes, so this is little more than
+//! alignment.
 
 /// A message as little-endian CDR, without the four bytes of encapsulation.
 #[derive(Debug, Default)]
@@ -44,7 +45,8 @@ impl CdrWriter {
         self
     }
 
-    /// Adds a `builtin_interfaces/Time` of nanoseconds; what it cannot hold becomes the nearest that it can.
+    /// Adds a `builtin_interfaces/Time` of nanoseconds; what it cannot hold becomes the nearest
+    /// that it can.
     pub fn time(&mut self, ns: i64) -> &mut Self {
         let seconds = ns.div_euclid(1_000_000_000).clamp(i32::MIN.into(), i32::MAX.into());
         self.i32(seconds as i32).u32(ns.rem_euclid(1_000_000_000) as u32)
@@ -75,6 +77,9 @@ mod tests {
     fn numbers_are_aligned_and_strings_end_in_zero() {
         let mut cdr = CdrWriter::new();
         cdr.string("ab").u32(7).time(-1);
-        assert_eq!(cdr.bytes(), [3, 0, 0, 0, b'a', b'b', 0, 0, 7, 0, 0, 0, 255, 255, 255, 255, 255, 201, 154, 59]);
+        assert_eq!(
+            cdr.bytes(),
+            [3, 0, 0, 0, b'a', b'b', 0, 0, 7, 0, 0, 0, 255, 255, 255, 255, 255, 201, 154, 59]
+        );
     }
 }

@@ -100,7 +100,8 @@ mod tests {
 
     #[test]
     fn a_run_counts_its_padding() {
-        let byte_then_double = Table::primitive(Primitive::U8).then(&Table::primitive(Primitive::F64)).unwrap();
+        let byte_then_double =
+            Table::primitive(Primitive::U8).then(&Table::primitive(Primitive::F64)).unwrap();
         assert_eq!(byte_then_double.after(0), 16);
         assert_eq!(byte_then_double.after(7), 16);
         assert_eq!(byte_then_double.after(8), 24);

@@ -87,7 +87,8 @@ pub(super) fn parts(text: &str) -> Result<Vec<Part<'_>>, MessageError> {
                 continue;
             }
             let name = line.strip_prefix("MSG:").map(str::trim);
-            let name = name.ok_or_else(|| syntax(index, line, "`MSG: pkg/Type` after a separator"))?;
+            let name =
+                name.ok_or_else(|| syntax(index, line, "`MSG: pkg/Type` after a separator"))?;
             parts.push(Part { name: Some(name), fields: Vec::new() });
             awaits_name = false;
             continue;
@@ -107,7 +108,9 @@ fn field(index: usize, line: &str) -> Result<Option<Field<String>>, MessageError
     if code.is_empty() {
         return Ok(None);
     }
-    let (ty, rest) = code.split_once(char::is_whitespace).ok_or_else(|| syntax(index, line, "a type and a name"))?;
+    let (ty, rest) = code
+        .split_once(char::is_whitespace)
+        .ok_or_else(|| syntax(index, line, "a type and a name"))?;
     let rest = rest.trim_start();
     let end = rest.find(|c: char| c.is_whitespace() || c == '=').unwrap_or(rest.len());
     let (name, value) = rest.split_at(end);
@@ -119,7 +122,8 @@ fn field(index: usize, line: &str) -> Result<Option<Field<String>>, MessageError
     if value.trim_start().starts_with('=') {
         return Ok(None);
     }
-    let (element, count) = field_type(ty).ok_or_else(|| syntax(index, line, "a known type form"))?;
+    let (element, count) =
+        field_type(ty).ok_or_else(|| syntax(index, line, "a known type form"))?;
     Ok(Some(Field { name: name.to_owned(), element, count }))
 }
 
@@ -210,7 +214,9 @@ mod tests {
 
     #[test]
     fn malformed_lines_name_their_line() {
-        for line in ["int32", "int32[ x", "int32[0] x", "int32[-1] x", "i!t x", "int32 9x", "string<=x s"] {
+        for line in
+            ["int32", "int32[ x", "int32[0] x", "int32[-1] x", "i!t x", "int32 9x", "string<=x s"]
+        {
             assert!(matches!(field(6, line), Err(MessageError::Syntax { line: 7, .. })), "{line}");
         }
     }

@@ -75,7 +75,9 @@ pub enum PathError {
     },
     /// A `wstring` is in the way. ROS 2's implementations disagree on the width of its characters,
     /// so neither it nor anything behind it can be found with certainty.
-    #[error("`{path}` is or lies behind the wstring `{field}`, whose size on the wire is not defined")]
+    #[error(
+        "`{path}` is or lies behind the wstring `{field}`, whose size on the wire is not defined"
+    )]
     WideText {
         /// The path.
         path: String,
@@ -102,7 +104,8 @@ impl FieldPath {
         })
     }
 
-    /// Whether reading it may walk over much of a message, because elements of varying size lie before the field.
+    /// Whether reading it may walk over much of a message, because elements of varying size lie
+    /// before the field.
     pub fn walks(&self) -> bool {
         self.ops.iter().any(|op| matches!(op, Op::Each { .. } | Op::Times { .. }))
     }
@@ -154,7 +157,11 @@ struct Compiler<'d> {
 
 impl Compiler<'_> {
     /// Emits the steps from the start of `owner` to the field that `segments` name.
-    fn enter_struct(&mut self, owner: &Struct, segments: &[Segment<'_>]) -> Result<Leaf, PathError> {
+    fn enter_struct(
+        &mut self,
+        owner: &Struct,
+        segments: &[Segment<'_>],
+    ) -> Result<Leaf, PathError> {
         let Some((Segment::Name(name), rest)) = segments.split_first() else {
             // `a[0][1]`: an array of structs is indexed twice.
             return Err(self.whole(owner));
@@ -190,19 +197,35 @@ impl Compiler<'_> {
     }
 
     /// Emits the steps into one element of `field`, which starts here.
-    fn enter_element(&mut self, field: &Field<usize>, rest: &[Segment<'_>]) -> Result<Leaf, PathError> {
+    fn enter_element(
+        &mut self,
+        field: &Field<usize>,
+        rest: &[Segment<'_>],
+    ) -> Result<Leaf, PathError> {
         match (&field.element, rest) {
             (Element::Struct(index), []) => Err(self.whole(self.definitions.get(*index))),
             (Element::Struct(index), rest) => self.enter_struct(self.definitions.get(*index), rest),
             (Element::WideText, _) => Err(self.wide(field)),
             (Element::Primitive(primitive), []) => Ok(Leaf::Scalar(*primitive)),
             (Element::Text, []) => Ok(Leaf::Text),
-            _ => Err(PathError::NothingInside { path: self.path.to_owned(), field: field.name.clone() }),
+            _ => Err(PathError::NothingInside {
+                path: self.path.to_owned(),
+                field: field.name.clone(),
+            }),
         }
     }
 
-    fn skip_to_element(&mut self, field: &Field<usize>, count: Count, index: usize) -> Result<(), PathError> {
-        let beyond = |len| PathError::OutOfRange { path: self.path.to_owned(), field: field.name.clone(), len };
+    fn skip_to_element(
+        &mut self,
+        field: &Field<usize>,
+        count: Count,
+        index: usize,
+    ) -> Result<(), PathError> {
+        let beyond = |len| PathError::OutOfRange {
+            path: self.path.to_owned(),
+            field: field.name.clone(),
+            len,
+        };
         match count {
             Count::Fixed(n) if index >= n => return Err(beyond(n)),
             Count::Sequence if u32::try_from(index).is_err() => {
@@ -256,7 +279,8 @@ impl Compiler<'_> {
 
     /// The steps over one element of `field`, which is of variable size.
     fn element_body(&self, field: &Field<usize>) -> Result<Box<[Op]>, PathError> {
-        let mut inner = Compiler { definitions: self.definitions, path: self.path, ops: Vec::new() };
+        let mut inner =
+            Compiler { definitions: self.definitions, path: self.path, ops: Vec::new() };
         match &field.element {
             Element::Primitive(_) => {}
             Element::Text => inner.ops.push(Op::Text),

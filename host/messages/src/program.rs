@@ -80,7 +80,9 @@ impl Leaf {
         match self {
             Self::Scalar(Primitive::Bool) => Kind::Bool,
             Self::Scalar(Primitive::F32 | Primitive::F64) => Kind::Real,
-            Self::Scalar(Primitive::U8 | Primitive::U16 | Primitive::U32 | Primitive::U64) => Kind::Unsigned,
+            Self::Scalar(Primitive::U8 | Primitive::U16 | Primitive::U32 | Primitive::U64) => {
+                Kind::Unsigned
+            }
             Self::Scalar(_) => Kind::Signed,
             Self::Text => Kind::Text,
             Self::Array(Primitive::U8, _) => Kind::Bytes,

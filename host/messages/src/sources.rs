@@ -1,9 +1,11 @@
 //! Where message definitions come from when no recording carries them.
 //!
-//! A type is looked for in folders of the user, then among those that are bundled, then where ROS 2 is installed. What is
-//! found is put together with all that it refers to, in the order and form in which MCAP files carry it.
+//! A type is looked for in folders of the user, then among those that are bundled, then where ROS 2
+//! is installed. What is found is put together with all that it refers to, in the order and form in
+//! which MCAP files carry it.
 //!
-//! What never happens here: a file being read whose path a type's name could choose. A name is letters, digits and `_`.
+//! What never happens here: a file being read whose path a type's name could choose. A name is
+//! letters, digits and `_`.
 
 use std::collections::{HashMap, HashSet};
 use std::fs::File;
@@ -14,7 +16,8 @@ use std::sync::{Arc, OnceLock};
 use super::definitions::{Definitions, MessageError, short_name};
 use super::parse::{self, Element};
 
-/// The largest file, the largest text and the most types. ROS 2's own stay below 20 KB, 40 KB and 30.
+/// The largest file, the largest text and the most types. ROS 2's own stay below 20 KB, 40 KB and
+/// 30.
 const MAX_FILE: usize = 1 << 20;
 const MAX_TEXT: usize = 8 << 20;
 const MAX_TYPES: usize = 256;
@@ -60,7 +63,8 @@ pub enum SourcesError {
         /// In which way.
         what: &'static str,
     },
-    /// The definition that was found in a file, or what it comes to with all it refers to, makes no sense.
+    /// The definition that was found in a file, or what it comes to with all it refers to, makes no
+    /// sense.
     #[error("the definition of `{type_name}` cannot be used")]
     Unusable {
         /// The type.
@@ -91,20 +95,22 @@ pub enum SourcesError {
 }
 
 impl Sources {
-    /// Looks in `folders` first, then among the bundled definitions, then below `ament_prefixes`, each in this order.
+    /// Looks in `folders` first, then among the bundled definitions, then below `ament_prefixes`,
+    /// each in this order.
     ///
-    /// In a folder, `pkg/msg/Type` is `pkg/msg/Type.msg`, `pkg/Type.msg` or `Type.msg`; below a prefix, as ROS 2 installs
-    /// it, `share/pkg/msg/Type.msg`.
+    /// In a folder, `pkg/msg/Type` is `pkg/msg/Type.msg`, `pkg/Type.msg` or `Type.msg`; below a
+    /// prefix, as ROS 2 installs it, `share/pkg/msg/Type.msg`.
     pub fn new(folders: &[PathBuf], ament_prefixes: &[PathBuf]) -> Self {
         Self { folders: folders.to_owned(), ament_prefixes: ament_prefixes.to_owned() }
     }
 
-    /// The ros2msg text of `type_name` (`pkg/msg/Type` or `pkg/Type`) with all types it refers to, as
-    /// [`Definitions::parse`] takes it; `None` if the type is nowhere.
+    /// The ros2msg text of `type_name` (`pkg/msg/Type` or `pkg/Type`) with all types it refers to,
+    /// as [`Definitions::parse`] takes it; `None` if the type is nowhere.
     ///
     /// # Errors
     ///
-    /// [`SourcesError`] if it is no name, or if what was found cannot be read, is incomplete or makes no sense.
+    /// [`SourcesError`] if it is no name, or if what was found cannot be read, is incomplete or
+    /// makes no sense.
     pub fn find(&self, type_name: &str) -> Result<Option<Arc<str>>, SourcesError> {
         let root = short_name(type_name);
         if !is_name(&root) {
@@ -132,11 +138,14 @@ impl Sources {
             return Ok(Some((*text).to_owned()));
         }
         for prefix in &self.ament_prefixes {
-            if let Some(text) = read(name, prefix.join("share").join(package).join("msg").join(&file))? {
+            if let Some(text) =
+                read(name, prefix.join("share").join(package).join("msg").join(&file))?
+            {
                 return Ok(Some(text));
             }
         }
-        // Last, as it says no package: a `Header.msg` for a type of the lambda's own must not stand for that of all others.
+        // Last, as it says no package: a `Header.msg` for a type of the lambda's own must not stand
+        // for that of all others.
         for folder in &self.folders {
             if let Some(text) = read(name, folder.join(&file))? {
                 return Ok(Some(text));
@@ -146,7 +155,8 @@ impl Sources {
     }
 }
 
-/// The text of `root`, which is a name, with all types it refers to. `one` has the text of one type, if there is one.
+/// The text of `root`, which is a name, with all types it refers to. `one` has the text of one
+/// type, if there is one.
 pub(super) fn gather(root: &str, one: &One<'_>) -> Result<Option<Arc<str>>, SourcesError> {
     let Some(text) = one(root)? else {
         return Ok(None);
@@ -161,7 +171,8 @@ pub(super) fn gather(root: &str, one: &One<'_>) -> Result<Option<Arc<str>>, Sour
 /// The text of one type, without those it refers to.
 type One<'s> = dyn Fn(&str) -> Result<Option<String>, SourcesError> + 's;
 
-/// A type and what it refers to, as far as they are known; depth first, each type where it is first needed.
+/// A type and what it refers to, as far as they are known; depth first, each type where it is first
+/// needed.
 struct Gathered<'s> {
     one: &'s One<'s>,
     root: &'s str,
@@ -170,7 +181,8 @@ struct Gathered<'s> {
 }
 
 impl Gathered<'_> {
-    /// Goes as deep as there are types, at most [`MAX_TYPES`]. Types that contain themselves are found by the parser later.
+    /// Goes as deep as there are types, at most [`MAX_TYPES`]. Types that contain themselves are
+    /// found by the parser later.
     fn add(&mut self, name: &str, text: &str) -> Result<(), SourcesError> {
         self.known.insert(name.to_owned());
         if self.known.len() > 1 {
@@ -196,12 +208,14 @@ impl Gathered<'_> {
         Ok(())
     }
 
-    /// Adds what `owner` calls `wanted`, by the rule of [`Definitions::parse`]: a bare name means the owner's package, or
-    /// the `Header` that ROS 1 habits left behind.
+    /// Adds what `owner` calls `wanted`, by the rule of [`Definitions::parse`]: a bare name means
+    /// the owner's package, or the `Header` that ROS 1 habits left behind.
     fn refer(&mut self, owner: &str, wanted: &str) -> Result<(), SourcesError> {
         let wanted = short_name(wanted);
         let candidates = match (wanted.contains('/'), owner.split_once('/')) {
-            (false, Some((package, _))) => vec![format!("{package}/{wanted}"), format!("std_msgs/{wanted}")],
+            (false, Some((package, _))) => {
+                vec![format!("{package}/{wanted}"), format!("std_msgs/{wanted}")]
+            }
             _ => vec![wanted.clone()],
         };
         for candidate in candidates.into_iter().filter(|candidate| is_name(candidate)) {
@@ -212,7 +226,10 @@ impl Gathered<'_> {
                 return self.add(&candidate, &text);
             }
         }
-        Err(SourcesError::Missing { type_name: owner.to_owned(), missing: wanted.chars().take(80).collect() })
+        Err(SourcesError::Missing {
+            type_name: owner.to_owned(),
+            missing: wanted.chars().take(80).collect(),
+        })
     }
 }
 
@@ -242,13 +259,18 @@ fn read(type_name: &str, path: PathBuf) -> Result<Option<String>, SourcesError> 
     match std::fs::metadata(&path) {
         Ok(found) if found.is_file() => {}
         Ok(_) => return Ok(None),
-        Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+        Err(error)
+            if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) =>
+        {
             return Ok(None);
         }
-        Err(source) => return Err(SourcesError::Read { type_name: type_name.to_owned(), path, source }),
+        Err(source) => {
+            return Err(SourcesError::Read { type_name: type_name.to_owned(), path, source });
+        }
     }
     let mut bytes = Vec::new();
-    let read = File::open(&path).and_then(|file| file.take(MAX_FILE as u64 + 1).read_to_end(&mut bytes));
+    let read =
+        File::open(&path).and_then(|file| file.take(MAX_FILE as u64 + 1).read_to_end(&mut bytes));
     if let Err(source) = read {
         return Err(SourcesError::Read { type_name: type_name.to_owned(), path, source });
     }

@@ -68,12 +68,17 @@ mod tests {
     fn what_only_has_the_names_of_a_stamp_is_none() {
         let text = "builtin_interfaces/Time stamp\n===\nMSG: builtin_interfaces/Time\n";
         assert!(stamp_of(&format!("{text}int32 sec\nuint32 nanosec\n")).is_some());
-        for other in ["int64 sec\nuint32 nanosec\n", "int32 sec\nint32 nanosec\n", "int32[1] sec\nuint32 nanosec\n"] {
+        for other in [
+            "int64 sec\nuint32 nanosec\n",
+            "int32 sec\nint32 nanosec\n",
+            "int32[1] sec\nuint32 nanosec\n",
+        ] {
             assert_eq!(stamp_of(&format!("{text}{other}")), None, "{other}");
         }
     }
 
-    const HEADER: &str = "===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n";
+    const HEADER: &str =
+        "===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n";
 
     #[test]
     fn a_leading_header_or_stamp_is_found() {

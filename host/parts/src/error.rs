@@ -61,7 +61,9 @@ pub enum PartsError {
         tried: Vec<Looked>,
     },
     /// There is no home to keep a cache in.
-    #[error("there is no folder for the cache: neither XDG_CACHE_HOME nor HOME is set to an absolute path")]
+    #[error(
+        "there is no folder for the cache: neither XDG_CACHE_HOME nor HOME is set to an absolute path"
+    )]
     NoCache,
 }
 
@@ -88,7 +90,9 @@ impl Explain for PartsError {
 
     fn exit(&self) -> Exit {
         match self {
-            PartsError::Home { .. } | PartsError::WantedPython { .. } | PartsError::Environment { .. } => Exit::Usage,
+            PartsError::Home { .. }
+            | PartsError::WantedPython { .. }
+            | PartsError::Environment { .. } => Exit::Usage,
             _ => Exit::Internal,
         }
     }

@@ -1,8 +1,9 @@
 //! Where the parts of an installation are: programs, the Python side, the interpreter, the cache.
 //!
-//! Looked for in this order: `$GLEANER_HOME`, `<exe>/../lib/gleaner`, and, for a program in a cargo target folder,
-//! beside it and in `guest-sdk-python/` of the checkout around that folder. Nothing is built, copied or remembered
-//! here, and no environment variable but those named in the docs is read.
+//! Looked for in this order: `$GLEANER_HOME`, `<exe>/../lib/gleaner`, and, for a program in a cargo
+//! target folder, beside it and in `guest-sdk-python/` of the checkout around that folder. Nothing
+//! is built, copied or remembered here, and no environment variable but those named in the docs is
+//! read.
 
 mod error;
 mod places;
@@ -26,12 +27,13 @@ pub struct Parts {
 }
 
 impl Parts {
-    /// The parts of the installation that the running program belongs to. Reads `GLEANER_HOME` and `GLEANER_PYTHON`.
+    /// The parts of the installation that the running program belongs to. Reads `GLEANER_HOME` and
+    /// `GLEANER_PYTHON`.
     ///
     /// # Errors
     ///
-    /// [`PartsError::NoExecutable`] if the system does not tell where the running program lies, [`PartsError::Home`] if
-    /// there is no part at all in `GLEANER_HOME`.
+    /// [`PartsError::NoExecutable`] if the system does not tell where the running program lies,
+    /// [`PartsError::Home`] if there is no part at all in `GLEANER_HOME`.
     pub fn find() -> Result<Parts, PartsError> {
         let exe = env::current_exe().map_err(|source| PartsError::NoExecutable { source })?;
         // Absolute, since what is found may be used by a program with another working folder.
@@ -54,7 +56,8 @@ impl Parts {
     /// [`PartsError::Missing`] with every place that was looked at.
     pub fn program(&self, name: &str) -> Result<PathBuf, PartsError> {
         // It is not built with the rest: see its docs.
-        let how = if name == "gleaner-player" { "cargo xtask player" } else { "cargo build --release" };
+        let how =
+            if name == "gleaner-player" { "cargo xtask player" } else { "cargo build --release" };
         self.places.first(name, how, |folder| {
             let program = folder.join(name);
             is_program(&program).then_some(program)
@@ -68,7 +71,8 @@ impl Parts {
     /// [`PartsError::Missing`] with every place that was looked at.
     pub fn python_home(&self) -> Result<PathBuf, PartsError> {
         self.places.first("start.py with the package gleaner", "cargo xtask demo", |folder| {
-            let complete = folder.join("start.py").is_file() && folder.join("gleaner/__init__.py").is_file();
+            let complete =
+                folder.join("start.py").is_file() && folder.join("gleaner/__init__.py").is_file();
             complete.then(|| folder.to_owned())
         })
     }
@@ -85,39 +89,47 @@ impl Parts {
         })
     }
 
-    /// The Python interpreter for the lambda in `lambda_dir`, as an absolute path: it runs, is 3.9 or newer and has
-    /// `venv` and `ensurepip`. That is `GLEANER_PYTHON` if it is set, else the first such of `lambda_dir/.venv`, the
-    /// checkout's `.venv`, and `python3`, `python3.13` … `python3.9` of `PATH`.
+    /// The Python interpreter for the lambda in `lambda_dir`, as an absolute path: it runs, is 3.9
+    /// or newer and has `venv` and `ensurepip`. That is `GLEANER_PYTHON` if it is set, else the
+    /// first such of `lambda_dir/.venv`, the checkout's `.venv`, and `python3`, `python3.13` …
+    /// `python3.9` of `PATH`.
     ///
     /// Each candidate is started once: a program that can be found may still not run.
     ///
     /// # Errors
     ///
-    /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` will not do, [`PartsError::Environment`] if `pyvenv.cfg` of the lambda is no file,
-    /// [`PartsError::NoPython`] with every candidate and why it was refused.
+    /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` will not do, [`PartsError::Environment`] if
+    /// `pyvenv.cfg` of the lambda is no file, [`PartsError::NoPython`] with every candidate and why
+    /// it was refused.
     pub fn python(&self, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
         self.python_or_why(lambda_dir).map(|(python, _)| python)
     }
 
-    /// As [`Parts::python`], and the environment that `lambda_dir` has though another interpreter was chosen, with why it is not used.
+    /// As [`Parts::python`], and the environment that `lambda_dir` has though another interpreter
+    /// was chosen, with why it is not used.
     ///
     /// # Errors
     ///
     /// As [`Parts::python`].
-    pub fn python_or_why(&self, lambda_dir: Option<&Path>) -> Result<(PathBuf, Option<Looked>), PartsError> {
+    pub fn python_or_why(
+        &self,
+        lambda_dir: Option<&Path>,
+    ) -> Result<(PathBuf, Option<Looked>), PartsError> {
         if let Some(wanted) = &self.wanted_python {
             return Ok((python::wanted(wanted)?, None));
         }
         let candidates = python::candidates(lambda_dir, self.places.checkout());
         let (python, tried) = python::first_that_runs(candidates, lambda_dir)?;
-        let environment = lambda_dir.map(|dir| dir.join(".venv")).filter(|it| it.symlink_metadata().is_ok());
-        let unused = environment.and_then(|it| tried.into_iter().find(|looked| looked.at.starts_with(&it)));
+        let environment =
+            lambda_dir.map(|dir| dir.join(".venv")).filter(|it| it.symlink_metadata().is_ok());
+        let unused =
+            environment.and_then(|it| tried.into_iter().find(|looked| looked.at.starts_with(&it)));
         Ok((python, unused))
     }
 }
 
-/// The folder for what can be made again, such as native code: `$XDG_CACHE_HOME/gleaner`, else `~/.cache/gleaner`.
-/// It need not exist.
+/// The folder for what can be made again, such as native code: `$XDG_CACHE_HOME/gleaner`, else
+/// `~/.cache/gleaner`. It need not exist.
 ///
 /// # Errors
 ///
@@ -130,7 +142,8 @@ pub fn cache_dir() -> Result<PathBuf, PartsError> {
 
 fn cache_below(xdg: Option<PathBuf>, home: Option<PathBuf>) -> Result<PathBuf, PartsError> {
     let absolute = |path: &PathBuf| path.is_absolute();
-    let cache = xdg.filter(absolute).or_else(|| home.filter(absolute).map(|home| home.join(".cache")));
+    let cache =
+        xdg.filter(absolute).or_else(|| home.filter(absolute).map(|home| home.join(".cache")));
     cache.map(|cache| cache.join("gleaner")).ok_or(PartsError::NoCache)
 }
 

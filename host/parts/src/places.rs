@@ -20,7 +20,8 @@ impl Places {
             folders.push(home);
         }
         let beside = exe.parent().unwrap_or(Path::new(""));
-        // A program that lies in `lib/gleaner` itself was started by one in `bin`: its parts are beside it.
+        // A program that lies in `lib/gleaner` itself was started by one in `bin`: its parts are
+        // beside it.
         if beside.ends_with("lib/gleaner") {
             folders.push(beside.to_owned());
         }
@@ -34,7 +35,8 @@ impl Places {
             if beside.ends_with("deps") {
                 folders.extend(beside.parent().map(Path::to_owned));
             }
-            checkout = target.ancestors().skip(1).find(|folder| is_checkout(folder)).map(Path::to_owned);
+            checkout =
+                target.ancestors().skip(1).find(|folder| is_checkout(folder)).map(Path::to_owned);
             folders.extend(checkout.as_ref().map(|checkout| checkout.join("guest-sdk-python")));
         }
         Places { folders, checkout }
@@ -52,7 +54,11 @@ impl Places {
         part: impl Fn(&Path) -> Option<PathBuf>,
     ) -> Result<PathBuf, PartsError> {
         let found = self.folders.iter().find_map(|folder| part(folder));
-        found.ok_or_else(|| PartsError::Missing { part: name.to_owned(), folders: self.folders.clone(), made_by })
+        found.ok_or_else(|| PartsError::Missing {
+            part: name.to_owned(),
+            folders: self.folders.clone(),
+            made_by,
+        })
     }
 }
 
@@ -64,8 +70,8 @@ pub(super) fn has_parts(home: &Path) -> bool {
         .any(|folder| parts.iter().any(|part| folder.join(part).is_file()))
 }
 
-/// The cargo target folder around `folder`, known by the tag that cargo leaves in it. Programs are at most
-/// `target/<triple>/<profile>/deps` deep.
+/// The cargo target folder around `folder`, known by the tag that cargo leaves in it. Programs are
+/// at most `target/<triple>/<profile>/deps` deep.
 fn cargo_target(folder: &Path) -> Option<&Path> {
     folder.ancestors().take(4).find(|folder| folder.join("CACHEDIR.TAG").is_file())
 }

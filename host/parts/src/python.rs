@@ -6,9 +6,10 @@ use super::{Looked, PartsError};
 use gleaner_base::words::excerpt;
 use gleaner_base::{ByteSize, NotPlain, PlainFile};
 
-/// Prints the version and the path of the interpreter itself: `python3` is often a script that chooses one, and would
-/// choose again at every start. Fails where the system's Python comes in pieces and lacks the two modules. They are looked for and
-/// not imported, which would take 30 ms at each start of a lambda.
+/// Prints the version and the path of the interpreter itself: `python3` is often a script that
+/// chooses one, and would choose again at every start. Fails where the system's Python comes in
+/// pieces and lacks the two modules. They are looked for and not imported, which would take 30 ms
+/// at each start of a lambda.
 const PROBE: &str = "\
 import sys
 for name in ('venv', 'ensurepip'):
@@ -19,10 +20,12 @@ print(sys.executable)";
 
 /// The interpreter that the user wants: if it will not do, another would hide that.
 pub(super) fn wanted(python: &Path) -> Result<PathBuf, PartsError> {
-    probe(python).map_err(|why| PartsError::WantedPython { wanted: Looked { at: python.to_owned(), why } })
+    probe(python)
+        .map_err(|why| PartsError::WantedPython { wanted: Looked { at: python.to_owned(), why } })
 }
 
-/// The interpreters to try, in order. Those with a folder are paths, the others are searched for in `PATH`.
+/// The interpreters to try, in order. Those with a folder are paths, the others are searched for in
+/// `PATH`.
 pub(super) fn candidates(lambda_dir: Option<&Path>, checkout: Option<&Path>) -> Vec<PathBuf> {
     let folders = [lambda_dir, checkout].into_iter().flatten();
     let mut candidates: Vec<PathBuf> = folders.map(|dir| dir.join(".venv/bin/python3")).collect();
@@ -31,8 +34,9 @@ pub(super) fn candidates(lambda_dir: Option<&Path>, checkout: Option<&Path>) -> 
     candidates
 }
 
-/// The first of `candidates` that runs, and those before it with why they will not do. What lies in `lambda_dir` is not run unless it is a link to a program elsewhere, and that
-/// program is then started by its own name: by that of the link, Python looks into the folder of the link.
+/// The first of `candidates` that runs, and those before it with why they will not do. What lies in
+/// `lambda_dir` is not run unless it is a link to a program elsewhere, and that program is then
+/// started by its own name: by that of the link, Python looks into the folder of the link.
 pub(super) fn first_that_runs(
     candidates: Vec<PathBuf>,
     lambda_dir: Option<&Path>,
@@ -45,7 +49,10 @@ pub(super) fn first_that_runs(
             && NotPlain::of(&source).is_some()
         {
             // Made on purpose: another interpreter would hide that.
-            return Err(PartsError::Environment { config: environment_of(&candidate).join(CONFIG), source });
+            return Err(PartsError::Environment {
+                config: environment_of(&candidate).join(CONFIG),
+                source,
+            });
         }
         match of_lambda.map_or_else(|| probe(&candidate), |dir| linked(&candidate, dir)) {
             Ok(interpreter) => return Ok((interpreter, tried)),
@@ -55,7 +62,8 @@ pub(super) fn first_that_runs(
     Err(PartsError::NoPython { tried })
 }
 
-/// `candidate`, in the environment of a lambda, if the interpreter that it links to will do; nothing of the environment is run.
+/// `candidate`, in the environment of a lambda, if the interpreter that it links to will do;
+/// nothing of the environment is run.
 fn linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
     let program = only_linked(candidate, lambda_dir)?;
     // A script that chooses an interpreter would choose without the environment.
@@ -74,8 +82,9 @@ const CONFIG_MAX: ByteSize = ByteSize::mib(1);
 /// Longest line of a `pyvenv.cfg`, in bytes: old Pythons take what is longer apart.
 const LINE_BYTES: usize = 4096;
 
-/// The program that `candidate`, in a virtual environment in the folder of a lambda, links to: one from elsewhere, with the libraries
-/// of that. Whatever else is in such a folder must not run before it is shut in.
+/// The program that `candidate`, in a virtual environment in the folder of a lambda, links to: one
+/// from elsewhere, with the libraries of that. Whatever else is in such a folder must not run
+/// before it is shut in.
 fn only_linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
     let real = |path: &Path| path.canonicalize().map_err(|_| "not found".to_owned());
     let (program, lambda) = (real(candidate)?, real(lambda_dir)?);
@@ -88,18 +97,29 @@ fn only_linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
     }
     let bin = candidate.parent().unwrap_or(lambda_dir);
     if let Some(file) = paths_of_its_own(bin)? {
-        return Err(format!("has `{}` beside it, which names other libraries; {ANEW}", excerpt(&file)));
+        return Err(format!(
+            "has `{}` beside it, which names other libraries; {ANEW}",
+            excerpt(&file)
+        ));
     }
     let config = config_of(candidate).unwrap_or_default();
     // Python takes some of these for blanks or ends of lines, others not.
-    if config.lines().any(|line| line.len() > LINE_BYTES || line.chars().any(|c| c.is_control() && c != '\t')) {
+    if config
+        .lines()
+        .any(|line| line.len() > LINE_BYTES || line.chars().any(|c| c.is_control() && c != '\t'))
+    {
         return Err(format!("its pyvenv.cfg has lines that can be read in two ways; {ANEW}"));
     }
     let entries = config.lines().filter_map(|line| line.split_once('='));
-    let homes: Vec<_> = entries.filter(|(key, _)| key.trim().eq_ignore_ascii_case("home")).collect();
-    let is_home = |home: &str| Path::new(home.trim()).canonicalize().ok().as_deref() == program.parent();
+    let homes: Vec<_> =
+        entries.filter(|(key, _)| key.trim().eq_ignore_ascii_case("home")).collect();
+    let is_home =
+        |home: &str| Path::new(home.trim()).canonicalize().ok().as_deref() == program.parent();
     if homes.is_empty() || !homes.iter().all(|(_, home)| is_home(home)) {
-        return Err("its pyvenv.cfg names another home than that of its program; make the environment anew".to_owned());
+        return Err(
+            "its pyvenv.cfg names another home than that of its program; make the environment anew"
+                .to_owned(),
+        );
     }
     Ok(program)
 }
@@ -111,14 +131,17 @@ fn environment_of(candidate: &Path) -> &Path {
 
 /// The `pyvenv.cfg` of that environment.
 fn config_of(candidate: &Path) -> io::Result<String> {
-    let config = PlainFile::inside(environment_of(candidate), Path::new(CONFIG), CONFIG_MAX)?.read_whole()?;
+    let config = PlainFile::inside(environment_of(candidate), Path::new(CONFIG), CONFIG_MAX)?
+        .read_whole()?;
     String::from_utf8(config).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
 }
 
-/// The name of a `._pth` file in `bin`: an interpreter that finds one takes its libraries from where it says.
+/// The name of a `._pth` file in `bin`: an interpreter that finds one takes its libraries from
+/// where it says.
 fn paths_of_its_own(bin: &Path) -> Result<Option<String>, String> {
     for entry in bin.read_dir().map_err(|error| error.to_string())? {
-        let name = entry.map_err(|error| error.to_string())?.file_name().to_string_lossy().into_owned();
+        let name =
+            entry.map_err(|error| error.to_string())?.file_name().to_string_lossy().into_owned();
         if name.to_ascii_lowercase().ends_with("._pth") {
             return Ok(Some(name));
         }
@@ -128,8 +151,10 @@ fn paths_of_its_own(bin: &Path) -> Result<Option<String>, String> {
 
 /// The interpreter that `candidate` starts, or why it will not do.
 fn probe(candidate: &Path) -> Result<PathBuf, String> {
-    // Isolated: else a `venv.py` in the current folder would be run. Without `site`: else what an environment has for its start.
-    let output = Command::new(candidate).args(["-I", "-S", "-c", PROBE]).stdin(Stdio::null()).output();
+    // Isolated: else a `venv.py` in the current folder would be run. Without `site`: else what an
+    // environment has for its start.
+    let output =
+        Command::new(candidate).args(["-I", "-S", "-c", PROBE]).stdin(Stdio::null()).output();
     let output = output.map_err(|error| match error.kind() {
         std::io::ErrorKind::NotFound => "not found".to_owned(),
         _ => error.to_string(),

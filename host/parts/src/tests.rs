@@ -4,14 +4,17 @@ use super::*;
 use crate::scratch::Scratch;
 use gleaner_base::{Exit, Explain};
 
-/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another test is about to
-/// start. Tests that write programs and start them take turns.
+/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another
+/// test is about to start. Tests that write programs and start them take turns.
 static TURN: Mutex<()> = Mutex::new(());
 
 /// A program that answers the probe as Python of this version would.
 fn python(dir: &Scratch, relative: &str, version: &str) -> PathBuf {
     let path = dir.path(relative);
-    dir.write_program(relative, &format!("#!/bin/sh\necho '{version}'\necho '{}'\n", path.display()))
+    dir.write_program(
+        relative,
+        &format!("#!/bin/sh\necho '{version}'\necho '{}'\n", path.display()),
+    )
 }
 
 /// An installation with `bin/gleaner` and everything else in `lib/gleaner`.
@@ -154,8 +157,13 @@ fn nothing_that_came_with_a_lambda_is_run_to_find_its_python() {
     let parts = Parts::around(&dir.path("target/release/gleaner"), None, None);
     let ran = dir.path("ran");
     let script = format!("#!/bin/sh\ntouch '{}'\n", ran.display());
-    assert_eq!(parts.python_or_why(Some(&lambda)).unwrap(), (shared.clone(), None), "it has no environment");
-    // A program of its own, as `python3 -m venv --copies` makes it, and one behind a link within the folder.
+    assert_eq!(
+        parts.python_or_why(Some(&lambda)).unwrap(),
+        (shared.clone(), None),
+        "it has no environment"
+    );
+    // A program of its own, as `python3 -m venv --copies` makes it, and one behind a link within
+    // the folder.
     let own = dir.write_program("lambda/.venv/bin/python3", &script);
     let (chosen, unused) = parts.python_or_why(Some(&lambda)).unwrap();
     assert_eq!(chosen, shared);
@@ -181,8 +189,11 @@ fn an_environment_of_a_lambda_is_not_asked_by_way_of_its_own_files() {
     // Says by which name it was started, and takes what lies beside that for its own.
     let asked = dir.path("asked");
     let home = dir.path("elsewhere/bin");
-    let script =
-        format!("#!/bin/sh\necho \"$0\" >> '{}'\necho '3 12'\necho '{}/python3'\n", asked.display(), home.display());
+    let script = format!(
+        "#!/bin/sh\necho \"$0\" >> '{}'\necho '3 12'\necho '{}/python3'\n",
+        asked.display(),
+        home.display()
+    );
     let own = dir.write_program("elsewhere/bin/python3", &script);
     environment(&dir, &own);
     assert_eq!(parts.python(Some(&lambda)).unwrap(), lambda.join(".venv/bin/python3"));
@@ -195,7 +206,11 @@ fn an_environment_of_a_lambda_is_not_asked_by_way_of_its_own_files() {
     }
     let home = format!("home = {}\n", home.display());
     let long = format!("#{}{home}{home}", "x".repeat(10_000));
-    for config in [format!("\u{1f}home = /evil/bin\n{home}"), format!("a = b\rhome = /evil/bin\n{home}"), long] {
+    for config in [
+        format!("\u{1f}home = /evil/bin\n{home}"),
+        format!("a = b\rhome = /evil/bin\n{home}"),
+        long,
+    ] {
         dir.write("lambda/.venv/pyvenv.cfg", &config);
         assert_eq!(parts.python(Some(&lambda)).unwrap(), shared, "{config:?}");
     }
@@ -218,7 +233,8 @@ fn a_wanted_python_that_will_not_do_is_refused_and_no_other_taken() {
     for (wanted, why) in [(dir.path("nope"), "not found"), (old, "is Python 3.8")] {
         let parts = Parts::around(&dir.path("target/release/gleaner"), None, Some(wanted.clone()));
         let error = parts.python(None).unwrap_err();
-        let message = format!("GLEANER_PYTHON is `{}`, which cannot be used: {why}", wanted.display());
+        let message =
+            format!("GLEANER_PYTHON is `{}`, which cannot be used: {why}", wanted.display());
         assert_eq!(error.to_string(), message);
         assert_eq!(error.exit(), Exit::Usage);
     }
@@ -259,7 +275,8 @@ fn without_a_python_that_runs_each_candidate_is_named_with_its_fault() {
     let locked = dir.write("locked", "");
     let missing = dir.path("missing");
     let root = dir.root().display().to_string();
-    let error = python::first_that_runs(vec![old, silent, split, other, locked, missing], None).unwrap_err();
+    let error = python::first_that_runs(vec![old, silent, split, other, locked, missing], None)
+        .unwrap_err();
     assert_eq!(
         error.to_string(),
         format!(
@@ -280,7 +297,10 @@ fn without_a_python_that_runs_each_candidate_is_named_with_its_fault() {
 fn the_cache_follows_xdg_and_ignores_relative_paths() {
     let path = |text: &str| Some(PathBuf::from(text));
     assert_eq!(cache_below(path("/x"), path("/home/u")).unwrap(), Path::new("/x/gleaner"));
-    assert_eq!(cache_below(path("x"), path("/home/u")).unwrap(), Path::new("/home/u/.cache/gleaner"));
+    assert_eq!(
+        cache_below(path("x"), path("/home/u")).unwrap(),
+        Path::new("/home/u/.cache/gleaner")
+    );
     assert_eq!(cache_below(None, path("/home/u")).unwrap(), Path::new("/home/u/.cache/gleaner"));
     let error = cache_below(None, path("u")).unwrap_err();
     assert_eq!(

@@ -25,7 +25,8 @@ struct Layout {
 }
 
 impl Layout {
-    /// Shape (height, width, channels), or (height, width) for one channel; padding behind rows is stepped over.
+    /// Shape (height, width, channels), or (height, width) for one channel; padding behind rows is
+    /// stepped over.
     fn of(info: &Info) -> Self {
         let (width, height, step) = (info.width as usize, info.height as usize, info.step as usize);
         let (pixel, channels) = (info.encoding.bytes_per_pixel(), info.encoding.channels());
@@ -41,7 +42,8 @@ impl Layout {
     }
 }
 
-/// A read-only array over the pixels of `frame`, which keeps the frame, and with it the slot, as long as any view lives.
+/// A read-only array over the pixels of `frame`, which keeps the frame, and with it the slot, as
+/// long as any view lives.
 pub(crate) fn over<'py>(frame: &Bound<'py, Frame>) -> PyResult<Bound<'py, PyAny>> {
     let py = frame.py();
     let host = frame.get().host();
@@ -54,8 +56,9 @@ pub(crate) fn over<'py>(frame: &Bound<'py, Frame>) -> PyResult<Bound<'py, PyAny>
         1 => dtype::<u8>(py),
         _ => PyArrayDescr::new(py, if info.big_endian { ">u2" } else { "<u2" })?,
     };
-    // SAFETY: `enter_environment` imported numpy. `dims` and `strides` have `count` entries or more and are copied. All
-    // elements lie within `bytes`, as checked above, and flags of 0 forbid writing. The reference to `descr` is given away.
+    // SAFETY: `enter_environment` imported numpy. `dims` and `strides` have `count` entries or more
+    // and are copied. All elements lie within `bytes`, as checked above, and flags of 0 forbid
+    // writing. The reference to `descr` is given away.
     let array = unsafe {
         let array = PY_ARRAY_API.PyArray_NewFromDescr(
             py,
@@ -70,9 +73,15 @@ pub(crate) fn over<'py>(frame: &Bound<'py, Frame>) -> PyResult<Bound<'py, PyAny>
         );
         Bound::from_owned_ptr_or_err(py, array)?
     };
-    // SAFETY: `array` is an array without a base, and a reference to `frame` is given away. From now on every view keeps
-    // `frame`, which is frozen; its lease keeps `bytes` where they are, and writers away from them.
-    let status =
-        unsafe { PY_ARRAY_API.PyArray_SetBaseObject(py, array.as_ptr().cast(), frame.clone().into_any().into_ptr()) };
+    // SAFETY: `array` is an array without a base, and a reference to `frame` is given away. From
+    // now on every view keeps `frame`, which is frozen; its lease keeps `bytes` where they are, and
+    // writers away from them.
+    let status = unsafe {
+        PY_ARRAY_API.PyArray_SetBaseObject(
+            py,
+            array.as_ptr().cast(),
+            frame.clone().into_any().into_ptr(),
+        )
+    };
     if status == 0 { Ok(array) } else { Err(PyErr::fetch(py)) }
 }

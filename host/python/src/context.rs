@@ -1,4 +1,5 @@
-//! What a lambda is given at each call: the functions of the WIT interfaces `data`, `trigger` and `log`.
+//! What a lambda is given at each call: the functions of the WIT interfaces `data`, `trigger` and
+//! `log`.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -52,7 +53,11 @@ impl Context {
     }
 
     /// The same object for every call, so that it compiles each path once.
-    fn topic<'py>(&self, py: Python<'py>, wanted: &Arc<data::Topic>) -> PyResult<&Bound<'py, Topic>> {
+    fn topic<'py>(
+        &self,
+        py: Python<'py>,
+        wanted: &Arc<data::Topic>,
+    ) -> PyResult<&Bound<'py, Topic>> {
         let mut topics = self.topics.iter().map(|topic| topic.bind(py));
         let found = topics.find(|topic| Arc::ptr_eq(topic.get().host(), wanted));
         Ok(found.expect("the session's inputs never change"))
@@ -104,7 +109,12 @@ impl Context {
     }
 
     #[pyo3(signature = (label, /, **attributes))]
-    fn start(&self, py: Python<'_>, label: Cow<'_, str>, attributes: Option<&Bound<'_, PyDict>>) -> PyResult<()> {
+    fn start(
+        &self,
+        py: Python<'_>,
+        label: Cow<'_, str>,
+        attributes: Option<&Bound<'_, PyDict>>,
+    ) -> PyResult<()> {
         let attributes = trigger::attributes(&label, attributes)?;
         self.session.start(&label, attributes).map_err(|error| trigger::refused(py, &error))
     }

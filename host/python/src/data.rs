@@ -20,7 +20,8 @@ static IDENTITY: SdkClass = SdkClass::new("gleaner.data", "Identity");
 static STAMPS: SdkClass = SdkClass::new("gleaner.data", "Stamps");
 static COLUMN: SdkClass = SdkClass::new("gleaner.data", "Column");
 
-/// Paths that a topic remembers. A lambda that makes up paths as it goes must not fill the memory with them.
+/// Paths that a topic remembers. A lambda that makes up paths as it goes must not fill the memory
+/// with them.
 const PATHS: usize = 256;
 
 /// The ring of one input.
@@ -56,7 +57,11 @@ impl Topic {
         Sample { inner, fields: self.fields.clone_ref(py) }
     }
 
-    fn samples(&self, py: Python<'_>, samples: Result<Vec<data::Sample>, OutOfFuel>) -> PyResult<Vec<Sample>> {
+    fn samples(
+        &self,
+        py: Python<'_>,
+        samples: Result<Vec<data::Sample>, OutOfFuel>,
+    ) -> PyResult<Vec<Sample>> {
         let samples = samples.map_err(|error| refused(py, error.into()))?;
         Ok(samples.into_iter().map(|sample| self.sample(py, sample)).collect())
     }
@@ -92,7 +97,8 @@ impl Topic {
     }
 
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } = self.inner.counts();
+        let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } =
+            self.inner.counts();
         COUNTS.make(py, (received, lost, overwritten, no_slot, too_big, skipped))
     }
 
@@ -100,7 +106,12 @@ impl Topic {
         field_at(path, &self.inner, &self.fields)
     }
 
-    fn column<'py>(&self, py: Python<'py>, field: &Bound<'py, PyAny>, n: usize) -> PyResult<Bound<'py, PyAny>> {
+    fn column<'py>(
+        &self,
+        py: Python<'py>,
+        field: &Bound<'py, PyAny>,
+        n: usize,
+    ) -> PyResult<Bound<'py, PyAny>> {
         let field = field_of(field, &self.inner, &self.fields)?;
         column(py, self.inner.column(&field.get().0, n))
     }
@@ -165,8 +176,16 @@ impl Sample {
     }
 
     #[pyo3(signature = (offset = 0, len = None))]
-    fn cdr<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self.inner.cdr(offset, len.unwrap_or(u32::MAX)).map_err(|error| refused(py, error.into()))?;
+    fn cdr<'py>(
+        &self,
+        py: Python<'py>,
+        offset: u64,
+        len: Option<u32>,
+    ) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self
+            .inner
+            .cdr(offset, len.unwrap_or(u32::MAX))
+            .map_err(|error| refused(py, error.into()))?;
         Ok(PyBytes::new(py, &bytes))
     }
 
@@ -233,7 +252,10 @@ fn value<'py>(py: Python<'py>, value: Value<'_>) -> PyResult<Bound<'py, PyAny>> 
     }
 }
 
-pub(crate) fn identity<'py>(py: Python<'py>, identity: &data::Identity) -> PyResult<Bound<'py, PyAny>> {
+pub(crate) fn identity<'py>(
+    py: Python<'py>,
+    identity: &data::Identity,
+) -> PyResult<Bound<'py, PyAny>> {
     let data::Identity { topic, writer, seq } = identity;
     let bytes = u128::from_be_bytes(writer.0);
     let writer = GUID.make(py, ((bytes >> 64) as u64, bytes as u64))?;

@@ -12,7 +12,8 @@ use crate::sdk::SdkClass;
 
 static FRAME_INFO: SdkClass = SdkClass::new("gleaner.data", "FrameInfo");
 
-/// A sample seen as an image. Nothing can replace what is inside while the object lives: arrays over its pixels rely on it.
+/// A sample seen as an image. Nothing can replace what is inside while the object lives: arrays
+/// over its pixels rely on it.
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Frame(frame::Frame);
 
@@ -56,7 +57,11 @@ impl Frame {
     }
 
     #[pyo3(signature = (roi = None))]
-    fn histogram<'py>(&self, py: Python<'py>, roi: Option<RoiFields>) -> PyResult<Bound<'py, PyArray1<u32>>> {
+    fn histogram<'py>(
+        &self,
+        py: Python<'py>,
+        roi: Option<RoiFields>,
+    ) -> PyResult<Bound<'py, PyArray1<u32>>> {
         let roi = roi.map(region);
         let counts = py.detach(|| self.0.histogram(roi)).map_err(|error| refused(py, error))?;
         Ok(PyArray1::from_slice(py, &counts))
@@ -71,8 +76,16 @@ impl Frame {
     }
 
     #[pyo3(signature = (offset = 0, len = None))]
-    fn read<'py>(&self, py: Python<'py>, offset: u64, len: Option<u32>) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self.0.read(offset, len.unwrap_or(u32::MAX)).map_err(|error| refused(py, error.into()))?;
+    fn read<'py>(
+        &self,
+        py: Python<'py>,
+        offset: u64,
+        len: Option<u32>,
+    ) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self
+            .0
+            .read(offset, len.unwrap_or(u32::MAX))
+            .map_err(|error| refused(py, error.into()))?;
         Ok(PyBytes::new(py, &bytes))
     }
 
@@ -90,7 +103,10 @@ impl Frame {
     }
 
     #[pyo3(signature = (**named))]
-    fn __dlpack__<'py>(slf: &Bound<'py, Self>, named: Option<&Bound<'py, PyDict>>) -> PyResult<Bound<'py, PyAny>> {
+    fn __dlpack__<'py>(
+        slf: &Bound<'py, Self>,
+        named: Option<&Bound<'py, PyDict>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
         array::over(slf)?.call_method("__dlpack__", (), named)
     }
 

@@ -1,4 +1,5 @@
-//! A Python lambda as a guest of the host, and the function through which `start.py` hands over the interpreter.
+//! A Python lambda as a guest of the host, and the function through which `start.py` hands over the
+//! interpreter.
 
 use std::ffi::OsString;
 use std::path::{self, PathBuf};
@@ -27,7 +28,8 @@ const WAKES_PER_TIDY: u64 = 10;
 /// `host` is the module `gleaner._host`: the part of hosting that is written in Python.
 #[pyfunction]
 pub(crate) fn main(py: Python<'_>, args: Vec<OsString>, host: Py<PyAny>) -> u8 {
-    // Attached only for the length of a call into the lambda, so that its own threads run between two wakes.
+    // Attached only for the length of a call into the lambda, so that its own threads run between
+    // two wakes.
     py.detach(|| {
         program::run_in_python(args, &mut |asked, manifest, session, bounds| {
             let host = Python::attach(|py| host.clone_ref(py));
@@ -66,7 +68,8 @@ impl Allowed {
     }
 }
 
-/// A lambda in a Python file. After a fault it is made anew; the globals of its module stay as they are.
+/// A lambda in a Python file. After a fault it is made anew; the globals of its module stay as they
+/// are.
 struct PythonGuest {
     host: Py<PyAny>,
     entry: PathBuf,
@@ -86,7 +89,13 @@ struct Live {
 }
 
 impl PythonGuest {
-    fn new(host: Py<PyAny>, entry: PathBuf, handler: &'static str, session: Session, allowed: Allowed) -> Self {
+    fn new(
+        host: Py<PyAny>,
+        entry: PathBuf,
+        handler: &'static str,
+        session: Session,
+        allowed: Allowed,
+    ) -> Self {
         Self { host, entry, handler, session, allowed, make: None, live: None, wakes: 0 }
     }
 
@@ -149,10 +158,12 @@ impl PythonGuest {
         Ok(())
     }
 
-    /// Calls the second of `call` with those behind it, all of it code of the lambda; the first is `allowed` in seconds.
+    /// Calls the second of `call` with those behind it, all of it code of the lambda; the first is
+    /// `allowed` in seconds.
     ///
-    /// `gleaner._host` catches what it raises, since a panic of ours below it must not come back here as an exception: where
-    /// an exception enters Rust, one that was made of a panic becomes a panic again, and would end the process.
+    /// `gleaner._host` catches what it raises, since a panic of ours below it must not come back
+    /// here as an exception: where an exception enters Rust, one that was made of a panic becomes a
+    /// panic again, and would end the process.
     fn attempt<'py>(
         &self,
         py: Python<'py>,
@@ -162,7 +173,9 @@ impl PythonGuest {
         let started = Instant::now();
         let ended = self.host.bind(py).call_method1(intern!(py, "attempt"), call)?;
         let elapsed = started.elapsed();
-        match ended.extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>, Bound<'py, PyString>)>()? {
+        match ended
+            .extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>, Bound<'py, PyString>)>()?
+        {
             // The signal never came: a lambda can ignore it, block it, or switch its timer off.
             (_, None, _) if !allowed.is_zero() && is_late(elapsed, allowed) => {
                 Err(Raised::late("the call came back by itself, too late", elapsed, allowed))
@@ -172,9 +185,12 @@ impl PythonGuest {
                 let told = told.to_string_lossy().into_owned();
                 Err(match &*kind.to_string_lossy() {
                     "deadline" => Raised::late(&told, elapsed, allowed),
-                    "memory" => {
-                        Raised { kind: FaultKind::Memory, told, used: None, allowed: Some(self.allowed.memory) }
-                    }
+                    "memory" => Raised {
+                        kind: FaultKind::Memory,
+                        told,
+                        used: None,
+                        allowed: Some(self.allowed.memory),
+                    },
                     _ => Raised { kind: FaultKind::Exception, told, used: None, allowed: None },
                 })
             }
@@ -185,14 +201,15 @@ impl PythonGuest {
     fn tidy(&mut self, py: Python<'_>) {
         self.wakes += 1;
         if self.wakes.is_multiple_of(WAKES_PER_TIDY) {
-            // It fails only if a lambda took the collector apart; then there is nothing to do between wakes.
+            // It fails only if a lambda took the collector apart; then there is nothing to do
+            // between wakes.
             let _ = self.host.call_method1(py, "tidy", (self.wakes,));
         }
     }
 }
 
-/// What ended a call into the lambda, told. Nothing else is kept of it: a traceback holds the frames of a call, and these
-/// the sample.
+/// What ended a call into the lambda, told. Nothing else is kept of it: a traceback holds the
+/// frames of a call, and these the sample.
 struct Raised {
     kind: FaultKind,
     told: String,
@@ -228,7 +245,8 @@ impl Guest for PythonGuest {
         Python::attach(|py| {
             let enter = || {
                 let enter = self.host.getattr(py, "enter_environment")?;
-                // The shim alone ends it: how long it takes is for the machine to say, and not for the lambda.
+                // The shim alone ends it: how long it takes is for the machine to say, and not for
+                // the lambda.
                 self.attempt(py, Duration::ZERO, (0.0, enter)).map(drop)
             };
             enter().map_err(|raised: Raised| raised.fault("at the start of its environment: "))
@@ -265,7 +283,10 @@ impl Guest for PythonGuest {
         Python::attach(|py| {
             let version = Python::version_str();
             let python = version.split(' ').next().unwrap_or(version);
-            let numpy = self.host.call_method0(py, "numpy_version").and_then(|version| version.extract::<String>(py));
+            let numpy = self
+                .host
+                .call_method0(py, "numpy_version")
+                .and_then(|version| version.extract::<String>(py));
             format!("Python {python}, numpy {}", numpy.as_deref().unwrap_or("unknown"))
         })
     }
@@ -273,9 +294,11 @@ impl Guest for PythonGuest {
 
 impl Drop for PythonGuest {
     fn drop(&mut self) {
-        // What a detached thread lets go of lives on until the next one attaches; the slots should be free now.
+        // What a detached thread lets go of lives on until the next one attaches; the slots should
+        // be free now.
         Python::attach(|py| {
-            // The log is written: what is printed from now on, if only by what goes away here, is for standard error.
+            // The log is written: what is printed from now on, if only by what goes away here, is
+            // for standard error.
             let _ = self.host.call_method1(py, "print_to", (py.None(),));
             self.live = None;
             self.make = None;
@@ -283,7 +306,8 @@ impl Drop for PythonGuest {
     }
 }
 
-/// The longest end of `text` that fits into `bytes` and begins at a character boundary: a traceback says what happened last.
+/// The longest end of `text` that fits into `bytes` and begins at a character boundary: a traceback
+/// says what happened last.
 fn ending(text: &str, bytes: usize) -> &str {
     &text[text.ceil_char_boundary(text.len().saturating_sub(bytes))..]
 }

@@ -1,6 +1,7 @@
 //! `gleaner:lambda/inference` over `gleaner_host::api::inference`.
 //!
-//! This build has no model runtime: nothing can be opened or made, and what would work on it is never reached.
+//! This build has no model runtime: nothing can be opened or made, and what would work on it is
+//! never reached.
 
 use std::borrow::Cow;
 
@@ -28,14 +29,26 @@ fn refused(py: Python<'_>, error: &InferenceError) -> PyErr {
 impl Tensor {
     #[staticmethod]
     #[expect(unused_variables)]
-    fn from_values(py: Python<'_>, shape: &Bound<'_, PyAny>, values: &Bound<'_, PyAny>) -> PyResult<Self> {
-        inference::Tensor::from_values(0, &Fuel::default()).map(Self).map_err(|error| refused(py, &error))
+    fn from_values(
+        py: Python<'_>,
+        shape: &Bound<'_, PyAny>,
+        values: &Bound<'_, PyAny>,
+    ) -> PyResult<Self> {
+        inference::Tensor::from_values(0, &Fuel::default())
+            .map(Self)
+            .map_err(|error| refused(py, &error))
     }
 
     #[staticmethod]
     #[expect(unused_variables)]
-    fn from_frame(py: Python<'_>, frame: &Bound<'_, PyAny>, how: &Bound<'_, PyAny>) -> PyResult<Self> {
-        inference::Tensor::from_frame(&Fuel::default()).map(Self).map_err(|error| refused(py, &error))
+    fn from_frame(
+        py: Python<'_>,
+        frame: &Bound<'_, PyAny>,
+        how: &Bound<'_, PyAny>,
+    ) -> PyResult<Self> {
+        inference::Tensor::from_frame(&Fuel::default())
+            .map(Self)
+            .map_err(|error| refused(py, &error))
     }
 
     #[getter]
@@ -54,7 +67,9 @@ impl Tensor {
 impl Model {
     #[staticmethod]
     fn open(py: Python<'_>, name: Cow<'_, str>) -> PyResult<Self> {
-        inference::Model::open(&name, &Fuel::default()).map(Self).map_err(|error| refused(py, &error))
+        inference::Model::open(&name, &Fuel::default())
+            .map(Self)
+            .map_err(|error| refused(py, &error))
     }
 
     #[expect(unused_variables)]

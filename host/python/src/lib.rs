@@ -1,11 +1,13 @@
 //! The extension module `_gleaner`: the runtime's library, hosted by a Python interpreter.
 //!
-//! `data`, `frame`, `trigger`, `inference`, `log` and `scratch` are thin skins over the files of the same names in `gleaner_host::api`:
-//! they convert arguments and errors, and decide nothing. `guest` wakes the lambda. Plain values and exceptions are
-//! classes of the Python package `gleaner`, defined once, there; `sdk` finds them.
+//! `data`, `frame`, `trigger`, `inference`, `log` and `scratch` are thin skins over the files of
+//! the same names in `gleaner_host::api`: they convert arguments and errors, and decide nothing.
+//! `guest` wakes the lambda. Plain values and exceptions are classes of the Python package
+//! `gleaner`, defined once, there; `sdk` finds them.
 //!
-//! One thread runs all of it. No thread that receives samples ever attaches to the interpreter, and nothing here is
-//! `unsafe` but `array`, which lends the pixels of a frame to numpy, and `memory`, which notices where there is none left.
+//! One thread runs all of it. No thread that receives samples ever attaches to the interpreter, and
+//! nothing here is `unsafe` but `array`, which lends the pixels of a frame to numpy, and `memory`,
+//! which notices where there is none left.
 
 mod array;
 mod context;
@@ -21,7 +23,8 @@ mod trigger;
 
 use pyo3::prelude::*;
 
-/// What `start.py` loads, before anything of the lambda's environment: `gleaner._host` imports numpy, once the process is shut.
+/// What `start.py` loads, before anything of the lambda's environment: `gleaner._host` imports
+/// numpy, once the process is shut.
 #[pymodule]
 mod _gleaner {
     use super::*;

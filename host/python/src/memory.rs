@@ -1,5 +1,5 @@
-//! Memory of our part of an interpreter: it is counted, since the rest is the lambda's. Rust ends a process to which it is refused;
-//! then the shim can say why.
+//! Memory of our part of an interpreter: it is counted, since the rest is the lambda's. Rust ends a
+//! process to which it is refused; then the shim can say why.
 #![allow(unsafe_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -11,7 +11,8 @@ struct Counted;
 #[global_allocator]
 static ALLOCATOR: Counted = Counted;
 
-// SAFETY: all is left to the system's allocator, with the same arguments, and what it gives is given on; counting takes no memory.
+// SAFETY: all is left to the system's allocator, with the same arguments, and what it gives is
+// given on; counting takes no memory.
 unsafe impl GlobalAlloc for Counted {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         // SAFETY: whoever called us has kept what `System` asks for, which is the same.

@@ -44,7 +44,10 @@ impl Scratch {
         offset: u64,
         len: Option<u64>,
     ) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self.0.get(&name, offset, len.unwrap_or(u64::MAX)).map_err(|error| refused(py, &error))?;
+        let bytes = self
+            .0
+            .get(&name, offset, len.unwrap_or(u64::MAX))
+            .map_err(|error| refused(py, &error))?;
         Ok(PyBytes::new(py, &bytes))
     }
 

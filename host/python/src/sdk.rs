@@ -18,11 +18,16 @@ impl SdkClass {
     }
 
     /// A value of the class, from its fields in their order.
-    pub(crate) fn make<'py>(&self, py: Python<'py>, fields: impl PyCallArgs<'py>) -> PyResult<Bound<'py, PyAny>> {
+    pub(crate) fn make<'py>(
+        &self,
+        py: Python<'py>,
+        fields: impl PyCallArgs<'py>,
+    ) -> PyResult<Bound<'py, PyAny>> {
         self.class.import(py, self.module, self.name)?.call1(fields)
     }
 
-    /// An exception of the class, with the message of the host's error and the name of its case in the WIT.
+    /// An exception of the class, with the message of the host's error and the name of its case in
+    /// the WIT.
     pub(crate) fn error(&self, py: Python<'_>, message: String, kind: &'static str) -> PyErr {
         match self.class.import(py, self.module, self.name) {
             Ok(class) => PyErr::from_type(class.clone(), (message, kind)),

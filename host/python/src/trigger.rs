@@ -14,7 +14,10 @@ pub(crate) fn refused(py: Python<'_>, error: &TriggerError) -> PyErr {
 }
 
 /// Keyword arguments as attributes of `label`, in the order in which they were written.
-pub(crate) fn attributes(label: &str, named: Option<&Bound<'_, PyDict>>) -> PyResult<Vec<Attribute>> {
+pub(crate) fn attributes(
+    label: &str,
+    named: Option<&Bound<'_, PyDict>>,
+) -> PyResult<Vec<Attribute>> {
     let Some(named) = named else { return Ok(Vec::new()) };
     let attribute = |(key, value): (Bound<'_, PyAny>, Bound<'_, PyAny>)| {
         let key = key.extract::<String>()?;
@@ -35,7 +38,9 @@ fn attribute_value(label: &str, key: &str, value: &Bound<'_, PyAny>) -> PyResult
         return Ok(plain);
     }
     let given = value.get_type().name()?;
-    let message = format!("attribute `{key}` of `{label}` is of type `{given}`; give bool, int, float or str");
+    let message = format!(
+        "attribute `{key}` of `{label}` is of type `{given}`; give bool, int, float or str"
+    );
     Err(PyTypeError::new_err(message))
 }
 

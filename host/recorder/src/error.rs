@@ -77,7 +77,8 @@ pub enum RecordError {
         /// What the system said.
         source: io::Error,
     },
-    /// A clip is whole, but the list of clips does not name it; it will when the folder is opened the next time.
+    /// A clip is whole, but the list of clips does not name it; it will when the folder is opened
+    /// the next time.
     #[error("cannot list a clip in `{}`", path.display())]
     List {
         /// The list.
@@ -201,7 +202,8 @@ impl RecordError {
 
     /// The errors of the file system in the chain of causes.
     fn io(&self) -> impl Iterator<Item = &io::Error> {
-        let chain = std::iter::successors(Some(self as &(dyn Error + 'static)), |&error| error.source());
+        let chain =
+            std::iter::successors(Some(self as &(dyn Error + 'static)), |&error| error.source());
         chain.filter_map(|error| error.downcast_ref())
     }
 }
@@ -213,7 +215,9 @@ impl Explain for RecordError {
             (Self::TooManyTopics { .. } | Self::LongNames { .. }, _) => {
                 "record fewer topics: [record] topics in lambda.toml, or --topics of a replay"
             }
-            (Self::PrerollMemory { .. }, _) => "keep less: preroll_size in lambda.toml, or --preroll-memory BYTES",
+            (Self::PrerollMemory { .. }, _) => {
+                "keep less: preroll_size in lambda.toml, or --preroll-memory BYTES"
+            }
             (Self::LongTopic { .. }, _) => "remove the topic from [record]",
             (_, Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)) => {
                 "make room on the disk, or choose another folder: --out DIR"
@@ -252,13 +256,17 @@ mod tests {
     fn a_full_disk_is_explained_however_deep_it_lies() {
         let write = RecordError::Write { path: "clips/a.mcap.part".into(), source: full() };
         assert_eq!(write.to_string(), "cannot write `clips/a.mcap.part`");
-        let format = RecordError::Format { path: "a".into(), source: Box::new(mcap::McapError::Io(full())) };
+        let format =
+            RecordError::Format { path: "a".into(), source: Box::new(mcap::McapError::Io(full())) };
         let recover = RecordError::Recover {
             path: "a".into(),
             source: Box::new(RecordError::Write { path: "b".into(), source: full() }),
         };
         for error in [write, format, recover] {
-            assert_eq!(error.help().as_deref(), Some("make room on the disk, or choose another folder: --out DIR"));
+            assert_eq!(
+                error.help().as_deref(),
+                Some("make room on the disk, or choose another folder: --out DIR")
+            );
             assert_eq!(error.exit(), Exit::Internal);
         }
     }

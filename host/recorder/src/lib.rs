@@ -1,15 +1,18 @@
-//! Keeps the moments around triggers: the preroll, the windows that triggers open, and the clips that are cut there.
+//! Keeps the moments around triggers: the preroll, the windows that triggers open, and the clips
+//! that are cut there.
 //!
 //! - `preroll`: what came lately, in memory or on disk, within a bound.
 //! - `window`: from triggers to windows, from windows to clips; pure bookkeeping.
 //! - `recorder`: the two together, sample by sample and wake by wake.
-//! - `file`: clips as MCAP files that are whole or not there, the list of them, and what a death leaves.
+//! - `file`: clips as MCAP files that are whole or not there, the list of them, and what a death
+//!   leaves.
 //! - `thumbnail`: a small picture of a moment.
-//! - `program`: the process that does it live, for all lambdas of a vehicle; with the feature of that name.
+//! - `program`: the process that does it live, for all lambdas of a vehicle; with the feature of
+//!   that name.
 //!
-//! A recorder of a replay is synchronous and without threads: what is recorded depends on the stamps of samples and wakes only.
-//! One that is fed live is the same, but for a thread that writes the files. What never happens here: running a lambda, deciding
-//! what is worth keeping.
+//! A recorder of a replay is synchronous and without threads: what is recorded depends on the
+//! stamps of samples and wakes only. One that is fed live is the same, but for a thread that writes
+//! the files. What never happens here: running a lambda, deciding what is worth keeping.
 
 // The tests within the crate share support with those outside of it.
 #[cfg(test)]
@@ -31,8 +34,11 @@ mod window;
 pub use digest::lambda_digest;
 pub use error::RecordError;
 pub use file::{Earlier, Folder, LossList, MESSAGE_MAX, Stated, Topic, Untrue};
-pub use recorder::{Commanded, Counts, LambdaId, Member, Recorder, Settings, TOPICS_MAX, TopicId, Work};
+pub use recorder::{
+    Commanded, Counts, LambdaId, Member, Recorder, Settings, TOPICS_MAX, TopicId, Work,
+};
 pub use thumbnail::{is_image, thumbnail};
 
-/// Most lambdas of one recorder, counted with each start, and of one clip: of each a header is kept.
+/// Most lambdas of one recorder, counted with each start, and of one clip: of each a header is
+/// kept.
 const LAMBDAS_MAX: usize = 1024;

@@ -1,4 +1,5 @@
-//! `gleaner-recorder`: the process that records for all lambdas of a vehicle. `gleaner` starts it; see `gleaner-recorder --help`.
+//! `gleaner-recorder`: the process that records for all lambdas of a vehicle. `gleaner` starts it;
+//! see `gleaner-recorder --help`.
 
 use std::process::ExitCode;
 

@@ -12,17 +12,21 @@ const QUALITY: u8 = 80;
 /// Most bytes that a compressed image may have as rgb8; 21 megapixels.
 const DECODED_BYTES: usize = 64 << 20;
 
-/// Whether messages of this type are images, of which there are thumbnails; the name with or without `msg/`.
+/// Whether messages of this type are images, of which there are thumbnails; the name with or
+/// without `msg/`.
 pub fn is_image(type_name: &str) -> bool {
     ["Image", "CompressedImage"].iter().any(|image| {
-        type_name.strip_prefix("sensor_msgs/").is_some_and(|name| name.trim_start_matches("msg/") == *image)
+        type_name
+            .strip_prefix("sensor_msgs/")
+            .is_some_and(|name| name.trim_start_matches("msg/") == *image)
     })
 }
 
 /// A JPEG of the image message `cdr`, 320x640 pixels at most and never larger than the image.
 ///
-/// `None` if the type is no image, or if the message or its image is broken, of a kind that we do not read, or larger
-/// than 64 MiB once it is decoded. Images without colour, among them those of raw sensors, become grey.
+/// `None` if the type is no image, or if the message or its image is broken, of a kind that we do
+/// not read, or larger than 64 MiB once it is decoded. Images without colour, among them those of
+/// raw sensors, become grey.
 pub fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>> {
     match type_name {
         "sensor_msgs/msg/Image" | "sensor_msgs/Image" => raw(&ImageView::read(cdr, endian).ok()?),
@@ -34,8 +38,8 @@ pub fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>>
 }
 
 fn raw(message: &ImageView<'_>) -> Option<Vec<u8>> {
-    // The colours of a raw sensor lie side by side. Their mean over an area is its grey level, near enough to know the
-    // place by.
+    // The colours of a raw sensor lie side by side. Their mean over an area is its grey level, near
+    // enough to know the place by.
     let encoding = match Encoding::from_ros(message.encoding).ok()? {
         Encoding::Bayer8(_) => Encoding::Mono8,
         Encoding::Bayer16(_) => Encoding::Mono16,
@@ -66,10 +70,12 @@ fn small(view: &View<'_>) -> Option<Vec<u8>> {
     Some(jpeg)
 }
 
-/// The largest size in the box of a thumbnail that has the ratio of `width` x `height`, and is not larger.
+/// The largest size in the box of a thumbnail that has the ratio of `width` x `height`, and is not
+/// larger.
 fn fit(width: u32, height: u32) -> (u32, u32) {
     let scaled = |side: u32, to: u32, from: u32| {
-        let exact = (u64::from(side) * u64::from(to) + u64::from(from) / 2) / u64::from(from.max(1));
+        let exact =
+            (u64::from(side) * u64::from(to) + u64::from(from) / 2) / u64::from(from.max(1));
         u32::try_from(exact).unwrap_or(u32::MAX).max(1)
     };
     let (mut fit_width, mut fit_height) = (width, height);
@@ -151,14 +157,16 @@ mod tests {
             seen(&thumbnail(IMAGE, &image(640, 480, "rgb8", 1920, &rgb), Endian::Little).unwrap());
         assert_eq!((width, height), (320, 240));
         assert!(near(mean, [200, 100, 50]), "{mean:?}");
-        let (_, _, mean) = seen(&thumbnail(IMAGE, &image(640, 480, "bgr8", 1920, &rgb), Endian::Little).unwrap());
+        let (_, _, mean) =
+            seen(&thumbnail(IMAGE, &image(640, 480, "bgr8", 1920, &rgb), Endian::Little).unwrap());
         assert!(near(mean, [50, 100, 200]), "{mean:?}");
     }
 
     #[test]
     fn a_small_image_is_not_enlarged() {
-        let (width, height, mean) =
-            seen(&thumbnail(IMAGE, &image(20, 10, "mono8", 20, &[90; 200]), Endian::Little).unwrap());
+        let (width, height, mean) = seen(
+            &thumbnail(IMAGE, &image(20, 10, "mono8", 20, &[90; 200]), Endian::Little).unwrap(),
+        );
         assert_eq!((width, height), (20, 10));
         assert!(near(mean, [90; 3]), "{mean:?}");
     }
@@ -166,8 +174,9 @@ mod tests {
     #[test]
     fn a_raw_sensor_becomes_grey() {
         let mosaic = [[100, 200].repeat(8), [0, 100].repeat(8)].concat().repeat(4);
-        let (width, height, mean) =
-            seen(&thumbnail(IMAGE, &image(16, 8, "bayer_rggb8", 16, &mosaic), Endian::Little).unwrap());
+        let (width, height, mean) = seen(
+            &thumbnail(IMAGE, &image(16, 8, "bayer_rggb8", 16, &mosaic), Endian::Little).unwrap(),
+        );
         assert_eq!((width, height), (16, 8));
         assert!(near(mean, [100; 3]), "{mean:?}");
     }
@@ -177,7 +186,8 @@ mod tests {
         let rgb: Vec<u8> = [10, 220, 30].repeat(800 * 400);
         let mut jpeg = Vec::new();
         Encoder::new(&mut jpeg, 90).encode(&rgb, 800, 400, ColorType::Rgb).unwrap();
-        let (width, height, mean) = seen(&thumbnail(COMPRESSED, &packed(&jpeg), Endian::Little).unwrap());
+        let (width, height, mean) =
+            seen(&thumbnail(COMPRESSED, &packed(&jpeg), Endian::Little).unwrap());
         assert_eq!((width, height), (320, 160));
         assert!(near(mean, [10, 220, 30]), "{mean:?}");
     }
@@ -198,8 +208,13 @@ mod tests {
         assert!(thumbnail("sensor_msgs/msg/Imu", &good, Endian::Little).is_none());
         assert!(thumbnail(COMPRESSED, &good, Endian::Little).is_none());
         assert!(thumbnail(IMAGE, &image(20, 10, "nv12", 20, &[90; 200]), Endian::Little).is_none());
-        assert!(thumbnail(IMAGE, &image(20, 10, "mono8", 20, &[90; 199]), Endian::Little).is_none());
-        assert!(thumbnail(IMAGE, &image(u32::MAX, u32::MAX, "rgb8", u32::MAX, &[0; 9]), Endian::Little).is_none());
+        assert!(
+            thumbnail(IMAGE, &image(20, 10, "mono8", 20, &[90; 199]), Endian::Little).is_none()
+        );
+        assert!(
+            thumbnail(IMAGE, &image(u32::MAX, u32::MAX, "rgb8", u32::MAX, &[0; 9]), Endian::Little)
+                .is_none()
+        );
         for len in 0..good.len() {
             assert!(thumbnail(IMAGE, &good[..len], Endian::Little).is_none(), "{len} bytes");
         }

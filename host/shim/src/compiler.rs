@@ -1,4 +1,5 @@
-//! A compiler in the place of a runtime: while a lambda is built, code of its author runs, in build scripts and macros.
+//! A compiler in the place of a runtime: while a lambda is built, code of its author runs, in build
+//! scripts and macros.
 
 use std::ffi::OsStr;
 use std::os::unix::process::CommandExt;
@@ -17,24 +18,32 @@ use crate::{Args, end_alike, left_behind};
 /// How long a build may take.
 const LONGEST: Duration = Duration::from_secs(24 * 3600);
 
-/// Starts the program where it can read what is named and the system, and write only what is named, and waits for its end.
+/// Starts the program where it can read what is named and the system, and write only what is named,
+/// and waits for its end.
 ///
-/// It starts itself for that, and the second process is the one that is sandboxed and becomes the program: so the code of the lambda's
-/// author can neither read the environment of the first, nor end it.
+/// It starts itself for that, and the second process is the one that is sandboxed and becomes the
+/// program: so the code of the lambda's author can neither read the environment of the first, nor
+/// end it.
 pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
-    let cannot = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
-    left_behind::adopt().map_err(|error| cannot("cannot adopt what a compiler leaves behind", &error))?;
-    let (pulse, page) = Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
+    let cannot =
+        |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
+    left_behind::adopt()
+        .map_err(|error| cannot("cannot adopt what a compiler leaves behind", &error))?;
+    let (pulse, page) =
+        Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
     pulse.alive(LONGEST);
     drop(page);
-    let shim = std::env::current_exe().map_err(|error| cannot("cannot find gleaner-shim", &error))?;
+    let shim =
+        std::env::current_exe().map_err(|error| cannot("cannot find gleaner-shim", &error))?;
     let mut command = Command::new(&shim);
     command.args(["--compiler", "--inside"]);
     for (flag, paths) in [("--read", &args.read), ("--write", &args.write)] {
         command.args(paths.iter().flat_map(|path| [OsStr::new(flag), path.as_os_str()]));
     }
     command.arg("--").args(&args.program).env_clear().envs(environment::of_compiler());
-    let child = command.spawn().map_err(|error| cannot(&format!("cannot start `{}`", shim.display()), &error))?;
+    let child = command
+        .spawn()
+        .map_err(|error| cannot(&format!("cannot start `{}`", shim.display()), &error))?;
     let ended = Watched { child, pulse, signals, group: None }.until_its_end();
     let ended = ended.map_err(|error| cannot("cannot watch over the compiler", &error))?;
     // What still runs could change what was built, while it is copied.
@@ -46,12 +55,18 @@ pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
 pub(crate) fn enter(args: &Args) -> Failure {
     let paths = Paths { read: args.read.clone(), write: args.write.clone() };
     if let Err(layer) = compiler::enter(&paths) {
-        let message =
-            format!("this machine cannot sandbox a compiler: `{}` does not hold ({})", layer.name, layer.note);
+        let message = format!(
+            "this machine cannot sandbox a compiler: `{}` does not hold ({})",
+            layer.name, layer.note
+        );
         return Failure::new(Exit::Denied, message)
             .with_help("build on a kernel that has it (Landlock with signals: Linux 6.12), or, if you trust the lambda's author, without --sandboxed");
     }
     let (program, arguments) = args.program.split_first().expect("clap asks for a program");
     let error = Command::new(program).args(arguments).exec();
-    Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.to_string_lossy()), &error)
+    Failure::caused_by(
+        Exit::Internal,
+        format!("cannot start `{}`", program.to_string_lossy()),
+        &error,
+    )
 }

@@ -1,4 +1,5 @@
-//! The part of our environment that a runtime is given. What else is in it, such as somebody's keys, is not for a lambda.
+//! The part of our environment that a runtime is given. What else is in it, such as somebody's
+//! keys, is not for a lambda.
 
 use std::env;
 use std::ffi::{OsStr, OsString};
@@ -21,7 +22,8 @@ const NAMES: [&str; 14] = [
     "NO_COLOR",
 ];
 
-/// Those of CUDA and of NVIDIA's containers, by name: services of the same maker have keys under names that begin like these.
+/// Those of CUDA and of NVIDIA's containers, by name: services of the same maker have keys under
+/// names that begin like these.
 const CUDA: [&str; 16] = [
     "CUDA_VISIBLE_DEVICES",
     "CUDA_DEVICE_ORDER",
@@ -62,7 +64,9 @@ pub(crate) fn of_compiler() -> impl Iterator<Item = (OsString, OsString)> {
 }
 
 fn is_of_compiler(name: &OsStr) -> bool {
-    let is_its_own = |name: &str| NAMES.contains(&name) || COMPILER.iter().any(|beginning| name.starts_with(beginning));
+    let is_its_own = |name: &str| {
+        NAMES.contains(&name) || COMPILER.iter().any(|beginning| name.starts_with(beginning))
+    };
     name.to_str().is_some_and(|name| is_its_own(name) && !is_secret(name))
 }
 
@@ -88,19 +92,33 @@ mod tests {
         for name in ["AWS_SECRET_ACCESS_KEY", "SSH_AUTH_SOCK", "PATHS", "XGLEANER_", "LD_PRELOAD"] {
             assert!(!is_handed_on(OsStr::new(name)), "{name}");
         }
-        for name in ["PATH", "ROS_DOMAIN_ID", "OMP_NUM_THREADS", "GLEANER_PYTHON", "CUDA_VISIBLE_DEVICES"] {
+        for name in
+            ["PATH", "ROS_DOMAIN_ID", "OMP_NUM_THREADS", "GLEANER_PYTHON", "CUDA_VISIBLE_DEVICES"]
+        {
             assert!(is_handed_on(OsStr::new(name)), "{name}");
         }
     }
 
     #[test]
     fn a_compiler_gets_its_own_and_no_secrets() {
-        for name in ["PATH", "CARGO_HOME", "CARGO_NET_OFFLINE", "RUSTC", "RUSTFLAGS", "RUST_BACKTRACE", "TMPDIR"] {
+        for name in [
+            "PATH",
+            "CARGO_HOME",
+            "CARGO_NET_OFFLINE",
+            "RUSTC",
+            "RUSTFLAGS",
+            "RUST_BACKTRACE",
+            "TMPDIR",
+        ] {
             assert!(is_of_compiler(OsStr::new(name)), "{name}");
         }
-        for name in
-            ["CARGO_REGISTRY_TOKEN", "CARGO_REGISTRIES_X_SECRET_KEY", "GLEANER_HOME", "SSH_AUTH_SOCK", "XCARGO_"]
-        {
+        for name in [
+            "CARGO_REGISTRY_TOKEN",
+            "CARGO_REGISTRIES_X_SECRET_KEY",
+            "GLEANER_HOME",
+            "SSH_AUTH_SOCK",
+            "XCARGO_",
+        ] {
             assert!(!is_of_compiler(OsStr::new(name)), "{name}");
         }
     }

@@ -32,8 +32,10 @@ pub(crate) fn end() -> u32 {
     }
 }
 
-/// Our children, from the list that the kernel keeps for each thread: the first one starts and adopts them.
+/// Our children, from the list that the kernel keeps for each thread: the first one starts and
+/// adopts them.
 fn children() -> Vec<Pid> {
-    let list = fs::read_to_string(format!("/proc/self/task/{}/children", std::process::id())).unwrap_or_default();
+    let list = fs::read_to_string(format!("/proc/self/task/{}/children", std::process::id()))
+        .unwrap_or_default();
     list.split_whitespace().filter_map(|pid| pid.parse().ok().and_then(Pid::from_raw)).collect()
 }

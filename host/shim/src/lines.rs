@@ -16,7 +16,8 @@ pub(crate) struct Lines {
 }
 
 impl Lines {
-    /// Gives `each` line that is whole with these bytes, and `None` once for one that is too long. Returns the cost of the bytes.
+    /// Gives `each` line that is whole with these bytes, and `None` once for one that is too long.
+    /// Returns the cost of the bytes.
     pub(crate) fn add(&mut self, bytes: &[u8], mut each: impl FnMut(Option<&[u8]>)) -> usize {
         let mut cost = 0;
         for part in bytes.split_inclusive(|byte| *byte == b'\n') {
@@ -51,7 +52,8 @@ impl Lines {
 mod tests {
     use super::*;
 
-    /// The lines of `text`, which comes in pieces of `size` bytes; one that is too long has the length 0.
+    /// The lines of `text`, which comes in pieces of `size` bytes; one that is too long has the
+    /// length 0.
     fn lengths(text: &[u8], size: usize) -> Vec<usize> {
         let mut lines = Lines::default();
         let mut lengths = Vec::new();
@@ -66,10 +68,22 @@ mod tests {
         let fits = [vec![b'x'; PAGE_BYTES - 1], b"\n".to_vec()].concat();
         let long = [vec![b'x'; PAGE_BYTES], b"\n".to_vec()].concat();
         let longer = [vec![b'x'; 3 * PAGE_BYTES], b"\n".to_vec()].concat();
-        let text =
-            [b"ab\n\n".to_vec(), fits, b"c\n".to_vec(), long, b"cd\n".to_vec(), longer, b"e\nrest".to_vec()].concat();
+        let text = [
+            b"ab\n\n".to_vec(),
+            fits,
+            b"c\n".to_vec(),
+            long,
+            b"cd\n".to_vec(),
+            longer,
+            b"e\nrest".to_vec(),
+        ]
+        .concat();
         for size in [7, PIECE - 1, PIECE, PAGE_BYTES, text.len()] {
-            assert_eq!(lengths(&text, size), [3, 1, PAGE_BYTES, 2, 0, 3, 0, 2], "in pieces of {size}");
+            assert_eq!(
+                lengths(&text, size),
+                [3, 1, PAGE_BYTES, 2, 0, 3, 0, 2],
+                "in pieces of {size}"
+            );
         }
     }
 

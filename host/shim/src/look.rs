@@ -6,18 +6,23 @@ use gleaner_protocol::{Doing, Killed, Why};
 use gleaner_vitals::Pulse;
 use gleaner_vitals::usage::{Process, data_limit};
 
-/// Time between two looks that both find a runtime late, before it is killed. After a suspend it has this long to return.
+/// Time between two looks that both find a runtime late, before it is killed. After a suspend it
+/// has this long to return.
 const AGAIN: Duration = Duration::from_millis(100);
-/// Longest time that a runtime may be stopped by a signal. Between two wakes nothing is overdue, and it would stay so.
+/// Longest time that a runtime may be stopped by a signal. Between two wakes nothing is overdue,
+/// and it would stay so.
 const STOPPED: Duration = Duration::from_millis(350);
-/// Longest time above the memory limit, in which a wake must have ended: its own process makes that a fault, and takes the memory away.
+/// Longest time above the memory limit, in which a wake must have ended: its own process makes that
+/// a fault, and takes the memory away.
 const TOO_MUCH: Duration = Duration::from_secs(1);
 /// Looks that are further apart than this do not count as two: the shim itself did not run.
 const ASLEEP: Duration = Duration::from_secs(1);
 
-/// Most threads of a runtime, its own twenty included. Each costs the kernel some memory that no limit of a process counts.
+/// Most threads of a runtime, its own twenty included. Each costs the kernel some memory that no
+/// limit of a process counts.
 const THREADS: u64 = 512;
-/// Memory that RLIMIT_DATA does not count in a healthy process: stacks, what the loader has made read-only, page tables.
+/// Memory that RLIMIT_DATA does not count in a healthy process: stacks, what the loader has made
+/// read-only, page tables.
 const UNCOUNTED: u64 = 64 << 20;
 
 /// State of the looks at one process.
@@ -31,7 +36,12 @@ pub(crate) struct Look {
 impl Look {
     /// Looks at the process `pid`.
     pub(crate) fn at(pid: u32) -> Self {
-        Self { pid, late: Lasting::default(), stopped: Lasting::default(), too_much: Lasting::default() }
+        Self {
+            pid,
+            late: Lasting::default(),
+            stopped: Lasting::default(),
+            too_much: Lasting::default(),
+        }
     }
 
     /// Returns why to kill the runtime, or the time until the next look.
@@ -53,22 +63,25 @@ impl Look {
     fn by_itself(&mut self, pulse: &Pulse) -> Option<Killed> {
         // One that has just ended has no memory.
         let seen = Process::seen(Some(self.pid))?;
-        if let Some(stopped) = self.stopped.seen(seen.is_stopped).filter(|stopped| *stopped >= STOPPED) {
+        if let Some(stopped) =
+            self.stopped.seen(seen.is_stopped).filter(|stopped| *stopped >= STOPPED)
+        {
             let [ran_ns, allowed_ns] = [stopped, STOPPED].map(|time| time.as_nanos() as u64);
             return Some(Killed { ran_ns, allowed_ns, ..pulse.killed(Why::Stopped) });
         }
         if seen.threads > THREADS {
             return Some(pulse.killed(Why::Threads { used: seen.threads, allowed: THREADS }));
         }
-        // The kernel's number, which the process cannot raise. What it counts no more, such as pages that were made read-only, is
-        // still there.
+        // The kernel's number, which the process cannot raise. What it counts no more, such as
+        // pages that were made read-only, is still there.
         if let Some(most) = data_limit(self.pid)
             && seen.held > most.saturating_add(UNCOUNTED)
         {
             return Some(pulse.killed(Why::Memory { used: seen.held, allowed: most }));
         }
         let (share, used) = pulse.share(seen.held)?;
-        let lasts = self.too_much.seen(share.is_exceeded_by(used)).filter(|lasts| *lasts >= TOO_MUCH)?;
+        let lasts =
+            self.too_much.seen(share.is_exceeded_by(used)).filter(|lasts| *lasts >= TOO_MUCH)?;
         let killed = pulse.killed(Why::Memory { used, allowed: share.most });
         // A wake that began before is not over: when it is, its own process takes the memory away.
         let came_back = killed.doing == Doing::Rounds || killed.ran_ns < lasts.as_nanos() as u64;

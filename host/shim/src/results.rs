@@ -1,7 +1,9 @@
-//! The files of a live lambda's results. Its process hands pages on through a pipe, and a thread of this program writes them.
+//! The files of a live lambda's results. Its process hands pages on through a pipe, and a thread of
+//! this program writes them.
 //!
-//! Native code of a lambda can write into the pipe as well. So each page is parsed before it is written, has a bounded length, and is
-//! counted if it is refused: whatever arrives costs the lambda its own results, and no more than a share of a core.
+//! Native code of a lambda can write into the pipe as well. So each page is parsed before it is
+//! written, has a bounded length, and is counted if it is refused: whatever arrives costs the
+//! lambda its own results, and no more than a share of a core.
 
 use std::fmt::Display;
 use std::fs;
@@ -22,14 +24,16 @@ use rustix::io::ioctl_fionbio;
 
 use crate::lines::{Lines, PIECE};
 
-/// How long lines may wait until they are written to the file. Decisions with a trigger or a fault do not wait.
+/// How long lines may wait until they are written to the file. Decisions with a trigger or a fault
+/// do not wait.
 const FLUSH: Duration = Duration::from_millis(500);
-/// Bytes that are read in a turn. More stay in the pipe: a flood of 16 MiB or 65,000 lines a second is no lambda's honest work, and
-/// must not take a core or the disk from others.
+/// Bytes that are read in a turn. More stay in the pipe: a flood of 16 MiB or 65,000 lines a second
+/// is no lambda's honest work, and must not take a core or the disk from others.
 const TURN_BYTES: usize = 1600 << 10;
 /// The length of a turn.
 const TURN: Duration = Duration::from_millis(100);
-/// Bytes that are still read once the runtime has ended. A pipe has room for 1 MiB, unless root allowed more.
+/// Bytes that are still read once the runtime has ended. A pipe has room for 1 MiB, unless root
+/// allowed more.
 const LEFT: usize = 4 << 20;
 
 /// Results that are being written.
@@ -40,15 +44,22 @@ pub(crate) struct Results {
 }
 
 impl Results {
-    /// Makes `folder`, and returns the end of the pipe that is the runtime's. With `again`, lines are added to the files that are
-    /// there; else these stay until the runtime is about to enter its lambda.
-    pub(crate) fn begin(folder: &Path, again: bool, pulse: &Pulse) -> Result<(Self, PipeWriter), Failure> {
-        let cannot = |error: io::Error| Failure::caused_by(Exit::Internal, "cannot receive results", &error);
+    /// Makes `folder`, and returns the end of the pipe that is the runtime's. With `again`, lines
+    /// are added to the files that are there; else these stay until the runtime is about to enter
+    /// its lambda.
+    pub(crate) fn begin(
+        folder: &Path,
+        again: bool,
+        pulse: &Pulse,
+    ) -> Result<(Self, PipeWriter), Failure> {
+        let cannot =
+            |error: io::Error| Failure::caused_by(Exit::Internal, "cannot receive results", &error);
         let mut writer = Writer::new(folder, pulse.clone());
         if again {
             writer.output = Some(begun(folder, again)?);
         } else {
-            let made = fs::create_dir_all(folder).and_then(|()| Ok(access(folder, Access::WRITE_OK)?));
+            let made =
+                fs::create_dir_all(folder).and_then(|()| Ok(access(folder, Access::WRITE_OK)?));
             made.map_err(|source| OutputError { path: folder.to_owned(), source })?;
         }
         let (pages, runtimes) = io::pipe().map_err(cannot)?;
@@ -151,14 +162,18 @@ impl Writer {
         self
     }
 
-    /// Adds the summary and, where the runtime's end ended a wake, the decision of that, which is reported as well.
+    /// Adds the summary and, where the runtime's end ended a wake, the decision of that, which is
+    /// reported as well.
     ///
     /// # Errors
     ///
     /// A failure that names the first file that could not be written.
     pub(crate) fn finish(mut self, record: &ExitRecord) -> Result<(), Failure> {
         // A lambda can have its process end as if that had been asked for.
-        let is_complete = self.last.is_some() && record.asked && record.signal.is_none() && record.killed.is_none();
+        let is_complete = self.last.is_some()
+            && record.asked
+            && record.signal.is_none()
+            && record.killed.is_none();
         // None if the lambda was not entered.
         let undecided = self.woken_by.clone().and_then(|woken_by| record.undecided(woken_by));
         if let Some(decision) = undecided.filter(|_| !is_complete) {
@@ -274,7 +289,8 @@ fn begun(folder: &Path, again: bool) -> Result<Output, OutputError> {
     Ok(Output::begin(folder, true, again)?.with_log_of(LIVE_LOG_MAX.bytes()))
 }
 
-/// Waits for `pages`, if there are any to wait for, but not longer than `patience`. Returns whether `ended` is closed.
+/// Waits for `pages`, if there are any to wait for, but not longer than `patience`. Returns whether
+/// `ended` is closed.
 fn wait(pages: Option<BorrowedFd<'_>>, ended: &PipeReader, patience: Option<Duration>) -> bool {
     let patience = patience.and_then(|patience| Timespec::try_from(patience).ok());
     let mut waited: Vec<_> = [Some(ended.as_fd()), pages]
@@ -289,7 +305,8 @@ fn wait(pages: Option<BorrowedFd<'_>>, ended: &PipeReader, patience: Option<Dura
 
 /// Reports `decision` to the starter, as the runtime did while it lived.
 fn report(decision: Decision) {
-    let report = serde_json::to_string(&Report::Decision(Box::new(decision))).expect("a decision is plain data");
+    let report = serde_json::to_string(&Report::Decision(Box::new(decision)))
+        .expect("a decision is plain data");
     // The runtime may have ended within a line. Where the starter has gone there is the file.
     let _ = writeln!(io::stdout(), "\n{report}");
 }

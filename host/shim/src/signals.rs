@@ -11,8 +11,12 @@ use rustix::time::{ClockId, clock_gettime};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 
 /// What somebody may send us to say it to the runtime.
-const PASSED_ON: [(i32, Signal); 4] =
-    [(SIGTERM, Signal::TERM), (SIGINT, Signal::INT), (SIGHUP, Signal::HUP), (SIGQUIT, Signal::QUIT)];
+const PASSED_ON: [(i32, Signal); 4] = [
+    (SIGTERM, Signal::TERM),
+    (SIGINT, Signal::INT),
+    (SIGHUP, Signal::HUP),
+    (SIGQUIT, Signal::QUIT),
+];
 
 /// Signals that came.
 pub(crate) struct Signals {
@@ -43,11 +47,16 @@ impl Signals {
     pub(crate) fn take(&mut self) -> impl Iterator<Item = Signal> + '_ {
         let mut heard = [0; 64];
         while matches!(self.bell.read(&mut heard), Ok(1..)) {}
-        PASSED_ON.iter().zip(&self.came).filter(|(_, came)| came.swap(false, Ordering::Relaxed)).map(|((_, it), _)| *it)
+        PASSED_ON
+            .iter()
+            .zip(&self.came)
+            .filter(|(_, came)| came.swap(false, Ordering::Relaxed))
+            .map(|((_, it), _)| *it)
     }
 }
 
-/// Ends this process by `signal`, as far as that is possible; else returns nothing and the exit code has to tell it.
+/// Ends this process by `signal`, as far as that is possible; else returns nothing and the exit
+/// code has to tell it.
 pub(crate) fn end_by(signal: i32) -> ! {
     if let Some(signal) = Signal::from_named_raw(signal) {
         // A handler of ours, or none, would let us live.

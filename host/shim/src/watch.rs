@@ -59,10 +59,14 @@ impl Watched {
             if asked.is_some_and(|asked| asked.elapsed() >= UNTIL_KILLED) {
                 kill_process(pid, Signal::KILL)?;
             }
-            let patience =
-                Timespec { tv_sec: patience.as_secs().cast_signed(), tv_nsec: i64::from(patience.subsec_nanos()) };
-            let mut heard =
-                [PollFd::new(&process, PollFlags::IN), PollFd::from_borrowed_fd(self.signals.bell(), PollFlags::IN)];
+            let patience = Timespec {
+                tv_sec: patience.as_secs().cast_signed(),
+                tv_nsec: i64::from(patience.subsec_nanos()),
+            };
+            let mut heard = [
+                PollFd::new(&process, PollFlags::IN),
+                PollFd::from_borrowed_fd(self.signals.bell(), PollFlags::IN),
+            ];
             match poll(&mut heard, Some(&patience)) {
                 Ok(_) | Err(rustix::io::Errno::INTR) => {}
                 Err(error) => return Err(error.into()),
@@ -74,12 +78,21 @@ impl Watched {
             }
             if let Some(status) = self.child.try_wait()? {
                 let full = status.signal() == Some(Signal::ABORT.as_raw()) && self.pulse.was_full();
-                let out_of_memory = full || self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
+                let out_of_memory =
+                    full || self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
                 // It may have come back, or ended by itself, just before it was killed.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
                 let pid = self.child.id();
                 let (asked, doing) = (asked.is_some(), Some(self.pulse.doing()));
-                return Ok(Ended { pid, status, killed, out_of_memory, asked, doing, _group: self.group });
+                return Ok(Ended {
+                    pid,
+                    status,
+                    killed,
+                    out_of_memory,
+                    asked,
+                    doing,
+                    _group: self.group,
+                });
             }
         }
     }
@@ -89,7 +102,8 @@ impl Ended {
     pub(crate) fn record(&self, started_ns: i64, left_behind: u32) -> ExitRecord {
         // It was our only child that we waited for, but for those that it left behind.
         let usage = getrusage(UsageWho::RUSAGE_CHILDREN).ok();
-        let cpu = usage.map_or(0, |usage| (usage.user_time() + usage.system_time()).num_microseconds());
+        let cpu =
+            usage.map_or(0, |usage| (usage.user_time() + usage.system_time()).num_microseconds());
         ExitRecord {
             pid: self.pid,
             started_ns,
@@ -98,7 +112,8 @@ impl Ended {
             signal: self.status.signal(),
             killed: self.killed,
             out_of_memory: self.out_of_memory,
-            max_rss_bytes: usage.map_or(0, |usage| u64::try_from(usage.max_rss()).unwrap_or(0) * 1024),
+            max_rss_bytes: usage
+                .map_or(0, |usage| u64::try_from(usage.max_rss()).unwrap_or(0) * 1024),
             cpu_ns: u64::try_from(cpu).unwrap_or(0) * 1000,
             left_behind,
             asked: self.asked,

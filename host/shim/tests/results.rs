@@ -1,4 +1,5 @@
-//! Results of a live lambda, written by the shim: small programs stand for a runtime, and write into the pipe whatever they like.
+//! Results of a live lambda, written by the shim: small programs stand for a runtime, and write
+//! into the pipe whatever they like.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -11,8 +12,8 @@ use rustix::process::{Pid, Signal, kill_process};
 
 const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
 
-/// What a script begins with: `page TEXT` writes one, `woken` the first one, `log N` a line of the log, `tick N` a decision without a
-/// trigger. `asked` has the script asked to end, by its shim.
+/// What a script begins with: `page TEXT` writes one, `woken` the first one, `log N` a line of the
+/// log, `tick N` a decision without a trigger. `asked` has the script asked to end, by its shim.
 const PAGES: &str = r#"
 page() { printf '%s\n' "$1" > "/proc/self/fd/$GLEANER_RESULTS"; }
 log() { page '{"log":{"at_ns":'$1',"level":"info","message":"m"}}'; }
@@ -27,7 +28,8 @@ struct Folder(PathBuf);
 
 impl Folder {
     fn of(test: &str) -> Self {
-        let path = std::env::temp_dir().join(format!("gleaner-shim-results-{}-{test}", std::process::id()));
+        let path = std::env::temp_dir()
+            .join(format!("gleaner-shim-results-{}-{test}", std::process::id()));
         fs::create_dir(&path).unwrap();
         Self(path)
     }
@@ -68,7 +70,8 @@ fn run(folder: &Folder, script: &str) -> Output {
 /// Starts `script`, and waits for its first line.
 fn start(folder: &Folder, script: &str) -> Child {
     let mut shim = shim(&folder.out(), script);
-    let mut child = shim.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child =
+        shim.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut line = String::new();
     BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
     child
@@ -82,13 +85,20 @@ fn stderr(output: &Output) -> String {
 fn reported(output: &Output) -> Vec<Decision> {
     let text = String::from_utf8_lossy(&output.stdout);
     let reports = text.lines().filter_map(|line| serde_json::from_str(line).ok());
-    reports.filter_map(|report| if let Report::Decision(decision) = report { Some(*decision) } else { None }).collect()
+    reports
+        .filter_map(
+            |report| if let Report::Decision(decision) = report { Some(*decision) } else { None },
+        )
+        .collect()
 }
 
 #[test]
 fn what_a_killed_runtime_left_in_the_pipe_is_written_and_so_is_the_wake_that_ended_with_it() {
     let folder = Folder::of("killed");
-    let output = run(&folder, "woken; for n in $(seq 200); do tick $n; log $n; done; printf '{\"rep'; kill -KILL $$");
+    let output = run(
+        &folder,
+        "woken; for n in $(seq 200); do tick $n; log $n; done; printf '{\"rep'; kill -KILL $$",
+    );
     let decisions = folder.decisions();
     assert_eq!(decisions.len(), 201);
     assert_eq!(folder.logged(), (1..=200).collect::<Vec<_>>());
@@ -99,7 +109,12 @@ fn what_a_killed_runtime_left_in_the_pipe_is_written_and_so_is_the_wake_that_end
         (FaultKind::Killed, Some("camera"), Some("/camera"))
     );
     assert!(fault.message.contains("was ended by signal 9"), "{}", fault.message);
-    assert_eq!(reported(&output), std::slice::from_ref(last), "{}", String::from_utf8_lossy(&output.stdout));
+    assert_eq!(
+        reported(&output),
+        std::slice::from_ref(last),
+        "{}",
+        String::from_utf8_lossy(&output.stdout)
+    );
     assert!(!folder.out().join("summary.json").exists());
 }
 
@@ -114,7 +129,11 @@ fn a_runtime_that_was_asked_to_end_or_never_entered_its_lambda_has_lost_no_wake(
     fs::create_dir(folder.out()).unwrap();
     fs::write(folder.out().join("log.jsonl"), "of an earlier run").unwrap();
     let output = run(&folder, "log 1; kill -SEGV $$");
-    assert!(stderr(&output).contains("another one comes first") && reported(&output).is_empty(), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("another one comes first") && reported(&output).is_empty(),
+        "{}",
+        stderr(&output)
+    );
     // Its results have not begun, so that those of the run before are still there.
     assert_eq!(fs::read_to_string(folder.out().join("log.jsonl")).unwrap(), "of an earlier run");
 }
@@ -143,7 +162,8 @@ fn what_is_no_page_is_counted_and_named_once_and_what_comes_after_it_is_written(
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let at: Vec<_> = folder.decisions().iter().map(|decision| decision.at_ns).collect();
     assert_eq!((at, folder.logged()), (vec![7], vec![8]));
-    let summary: Live = serde_json::from_slice(&fs::read(folder.out().join("summary.json")).unwrap()).unwrap();
+    let summary: Live =
+        serde_json::from_slice(&fs::read(folder.out().join("summary.json")).unwrap()).unwrap();
     // What the runtime counted itself, one that is no text, one that is too long, and a half.
     assert_eq!(summary.unwritten, 5 + garbage.len() as u64 + 3);
     let said = stderr(&output);
@@ -155,10 +175,17 @@ fn what_is_no_page_is_counted_and_named_once_and_what_comes_after_it_is_written(
 fn an_endless_line_takes_no_memory_and_does_not_keep_the_shim_from_what_follows() {
     let folder = Folder::of("endless");
     let pipe = "\"/proc/self/fd/$GLEANER_RESULTS\"";
-    let mut shim =
-        start(&folder, &format!("woken; head -c 50000000 /dev/zero > {pipe}; page; tick 7; echo; read -r line"));
+    let mut shim = start(
+        &folder,
+        &format!("woken; head -c 50000000 /dev/zero > {pipe}; page; tick 7; echo; read -r line"),
+    );
     let status = fs::read_to_string(format!("/proc/{}/status", shim.id())).unwrap();
-    let most = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap().trim().trim_end_matches(" kB");
+    let most = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmHWM:"))
+        .unwrap()
+        .trim()
+        .trim_end_matches(" kB");
     assert!(most.parse::<u64>().unwrap() < 32 << 10, "{most} KiB");
     shim.stdin.take().unwrap().write_all(b"\n").unwrap();
     assert!(shim.wait().unwrap().success());
@@ -169,8 +196,10 @@ fn an_endless_line_takes_no_memory_and_does_not_keep_the_shim_from_what_follows(
 fn a_flood_does_not_keep_a_runtime_that_hangs_from_being_ended() {
     let folder = Folder::of("flood");
     let pipe = "/proc/self/fd/$GLEANER_RESULTS";
-    let shim =
-        start(&folder, &format!("woken; yes | head -n 100000 > {pipe}; (exec yes > {pipe}) & echo; read -r line"));
+    let shim = start(
+        &folder,
+        &format!("woken; yes | head -n 100000 > {pipe}; (exec yes > {pipe}) & echo; read -r line"),
+    );
     kill_process(Pid::from_raw(i32::try_from(shim.id()).unwrap()).unwrap(), Signal::TERM).unwrap();
     // `yes` is left behind, and ended.
     let output = shim.wait_with_output().unwrap();
@@ -183,7 +212,13 @@ fn results_begin_again_or_go_on_as_the_starter_says() {
     let run = |script: &str, again: bool| {
         let mut shim = Command::new(SHIM);
         shim.arg("--results").arg(folder.out()).args(again.then_some("--again"));
-        assert!(shim.args(["--", "bash", "-c", &format!("{PAGES}woken; {script}")]).output().unwrap().status.success());
+        assert!(
+            shim.args(["--", "bash", "-c", &format!("{PAGES}woken; {script}")])
+                .output()
+                .unwrap()
+                .status
+                .success()
+        );
         folder.logged()
     };
     assert_eq!(run("log 1", false), [1]);
@@ -213,7 +248,9 @@ fn what_a_full_disk_refuses_is_counted_and_what_comes_later_is_written_again() {
     // The runtime ended well, and does not know that something is missing.
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(
-        said.contains("results are written again") && said.contains("log.jsonl") && said.contains("make room"),
+        said.contains("results are written again")
+            && said.contains("log.jsonl")
+            && said.contains("make room"),
         "{said}"
     );
     assert!(folder.logged().ends_with(&[2]));
@@ -227,7 +264,10 @@ fn results_that_cannot_begin_are_an_error_before_anything_is_started() {
     fs::write(&precious, "precious").unwrap();
     std::os::unix::fs::symlink(&precious, folder.out().join("log.jsonl")).unwrap();
     let mut shim = Command::new(SHIM);
-    shim.arg("--results").arg(folder.out()).args(["--again", "--", "touch"]).arg(folder.0.join("started"));
+    shim.arg("--results")
+        .arg(folder.out())
+        .args(["--again", "--", "touch"])
+        .arg(folder.0.join("started"));
     let output = shim.output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     assert!(stderr(&output).contains("it is a link"), "{}", stderr(&output));
@@ -238,7 +278,8 @@ fn results_that_cannot_begin_are_an_error_before_anything_is_started() {
 #[test]
 fn after_a_shim_that_was_killed_the_next_goes_on_with_whole_lines() {
     let folder = Folder::of("killed-shim");
-    let mut killed = start(&folder, "woken; (while :; do log 1; tick 2; done) & echo; read -r line");
+    let mut killed =
+        start(&folder, "woken; (while :; do log 1; tick 2; done) & echo; read -r line");
     while fs::metadata(folder.out().join("log.jsonl")).is_ok_and(|log| log.len() < 10_000) {
         std::thread::yield_now();
     }
@@ -246,7 +287,13 @@ fn after_a_shim_that_was_killed_the_next_goes_on_with_whole_lines() {
     killed.wait().unwrap();
     // The system may have taken only a part of the last line: the kill ended the write.
     let mut next = Command::new(SHIM);
-    next.arg("--results").arg(folder.out()).args(["--again", "--", "bash", "-c", &format!("{PAGES}woken; log 7")]);
+    next.arg("--results").arg(folder.out()).args([
+        "--again",
+        "--",
+        "bash",
+        "-c",
+        &format!("{PAGES}woken; log 7"),
+    ]);
     assert!(next.output().unwrap().status.success());
     let logged = folder.logged();
     assert!(logged.len() > 100);

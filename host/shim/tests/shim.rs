@@ -10,7 +10,9 @@ use std::time::Duration;
 use gleaner_protocol::{Doing, ExitRecord, Holds, Killed, Layer, Why};
 use gleaner_vitals::usage::Process;
 use gleaner_vitals::{PULSE_ENV, Pulse, Share};
-use rustix::process::{Pid, Resource, Rlimit, Signal, getpid, kill_process, setrlimit, test_kill_process};
+use rustix::process::{
+    Pid, Resource, Rlimit, Signal, getpid, kill_process, setrlimit, test_kill_process,
+};
 
 const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
 
@@ -60,7 +62,10 @@ fn the_exit_code_is_that_of_the_runtime_and_is_written_down() {
     let record = Record::of("code");
     assert_eq!(run(&record, "exit 7").status.code(), Some(7));
     let written = record.read();
-    assert_eq!((written.code, written.signal, written.killed, written.left_behind), (Some(7), None, None, 0));
+    assert_eq!(
+        (written.code, written.signal, written.killed, written.left_behind),
+        (Some(7), None, None, 0)
+    );
     assert!(written.ended_ns > written.started_ns && written.max_rss_bytes > 0);
     assert!(!written.asked);
 }
@@ -76,7 +81,8 @@ fn a_runtime_that_crashes_takes_its_shim_along_by_the_same_signal() {
 #[test]
 fn a_signal_to_the_shim_reaches_the_runtime() {
     let record = Record::of("term");
-    let (mut shim, _) = start(&record, "trap 'exit 5' TERM; echo ready; while :; do sleep 0.01; done");
+    let (mut shim, _) =
+        start(&record, "trap 'exit 5' TERM; echo ready; while :; do sleep 0.01; done");
     kill_process(pid(shim.id()), Signal::TERM).unwrap();
     assert_eq!(shim.wait().unwrap().code(), Some(5));
     assert_eq!((record.read().code, record.read().asked), (Some(5), true));
@@ -101,11 +107,16 @@ fn killed(name: &str) -> (Killed, String) {
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(6), "{said}");
     let killed = record.read().killed.unwrap();
-    assert!(said.contains(&format!("its process {}", killed.sentence())) && said.contains(killed.help()), "{said}");
+    assert!(
+        said.contains(&format!("its process {}", killed.sentence()))
+            && said.contains(killed.help()),
+        "{said}"
+    );
     (killed, said)
 }
 
-/// The page of the shim, in a test that [`killed`] starts as a runtime. By itself such a test is over at once.
+/// The page of the shim, in a test that [`killed`] starts as a runtime. By itself such a test is
+/// over at once.
 fn below_shim() -> Option<Pulse> {
     std::env::var_os(PULSE_ENV).map(|_| Pulse::inherited().unwrap())
 }
@@ -185,7 +196,11 @@ fn a_runtime_with_more_than_its_limit_of_data() {
 #[test]
 fn secrets_of_the_starter_are_not_handed_on() {
     let record = Record::of("secrets");
-    let output = shim(&record, &["sh", "-c", "env"]).env("CLOUD_TOKEN", "hush").env("GLEANER_X", "y").output().unwrap();
+    let output = shim(&record, &["sh", "-c", "env"])
+        .env("CLOUD_TOKEN", "hush")
+        .env("GLEANER_X", "y")
+        .output()
+        .unwrap();
     let environment = String::from_utf8(output.stdout).unwrap();
     assert!(!environment.contains("hush") && environment.contains("GLEANER_X=y"), "{environment}");
 }
@@ -211,7 +226,9 @@ fn every_layer_says_whether_it_holds_here() {
         assert!(names.contains(&name), "{name} is missing in {names:?}");
     }
     // Every Linux that Gleaner runs on has these; Landlock and control groups are told as they are.
-    for layer in layers.iter().filter(|layer| !["files", "control group"].contains(&layer.name.as_str())) {
+    for layer in
+        layers.iter().filter(|layer| !["files", "control group"].contains(&layer.name.as_str()))
+    {
         assert_eq!(layer.holds, Holds::Yes, "{layer:?}");
     }
 }
@@ -219,12 +236,18 @@ fn every_layer_says_whether_it_holds_here() {
 #[test]
 fn a_starter_that_is_not_there_any_more_gets_nothing_started() {
     let folder = std::env::temp_dir().join(format!("gleaner-shim-starter-{}", std::process::id()));
-    let output = Command::new(SHIM).args(["--starter=1", "--", "/bin/mkdir"]).arg(&folder).output().unwrap();
+    let output =
+        Command::new(SHIM).args(["--starter=1", "--", "/bin/mkdir"]).arg(&folder).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8(output.stderr).unwrap().contains("process 1 is not the parent of gleaner-shim"));
+    assert!(
+        String::from_utf8(output.stderr)
+            .unwrap()
+            .contains("process 1 is not the parent of gleaner-shim")
+    );
     assert!(!folder.exists());
     let starter = format!("--starter={}", std::process::id());
-    let status = Command::new(SHIM).args([&starter, "--", "/bin/mkdir"]).arg(&folder).status().unwrap();
+    let status =
+        Command::new(SHIM).args([&starter, "--", "/bin/mkdir"]).arg(&folder).status().unwrap();
     assert!(status.success());
     std::fs::remove_dir(folder).unwrap();
 }
@@ -236,7 +259,11 @@ fn what_root_may_do_is_given_up_but_for_files() {
     // Of all: reading and writing files of others.
     const FILES: u64 = 1 << 1 | 1 << 2;
     for set in ["CapInh:", "CapPrm:", "CapEff:", "CapAmb:"] {
-        let bits = text.lines().find_map(|line| line.strip_prefix(set)).expect("a line of this set").trim();
+        let bits = text
+            .lines()
+            .find_map(|line| line.strip_prefix(set))
+            .expect("a line of this set")
+            .trim();
         assert_eq!(u64::from_str_radix(bits, 16).unwrap() & !FILES, 0, "{set} {bits}");
     }
 }

@@ -1,4 +1,5 @@
-//! What one call of a lambda may take: bytes, items, fuel and time. Neither fuel nor a deadline ends a call from outside.
+//! What one call of a lambda may take: bytes, items, fuel and time. Neither fuel nor a deadline
+//! ends a call from outside.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -27,10 +28,16 @@ impl PerCall {
     /// By these limits, without end and without a price.
     pub fn new(limits: &Limits) -> Self {
         let items = usize::try_from(limits.call_items).unwrap_or(usize::MAX);
-        Self { bytes: limits.call_bytes.as_usize(), items, due: Due::default(), fuel: Fuel::default() }
+        Self {
+            bytes: limits.call_bytes.as_usize(),
+            items,
+            due: Due::default(),
+            fuel: Fuel::default(),
+        }
     }
 
-    /// Charges a call that touches so many bytes. Each call of a lambda is charged once, before its work.
+    /// Charges a call that touches so many bytes. Each call of a lambda is charged once, before its
+    /// work.
     pub(super) fn charge(&self, bytes: impl FnOnce() -> usize) -> Result<(), OutOfFuel> {
         self.fuel.charge(bytes)
     }
@@ -44,7 +51,8 @@ impl PerCall {
 /// Never.
 const NEVER: u64 = 0;
 
-/// When the lambda that runs has to end: what takes long looks at it now and then. Never, in a replay.
+/// When the lambda that runs has to end: what takes long looks at it now and then. Never, in a
+/// replay.
 #[derive(Clone)]
 pub struct Due(Arc<Clock>);
 
@@ -63,7 +71,9 @@ impl Default for Due {
 impl Due {
     /// From now on it is at that time, or never.
     pub fn set(&self, at: Option<Instant>) {
-        let since = |at: Instant| at.saturating_duration_since(self.0.base).max(Duration::from_nanos(NEVER + 1));
+        let since = |at: Instant| {
+            at.saturating_duration_since(self.0.base).max(Duration::from_nanos(NEVER + 1))
+        };
         let ns = at.map_or(NEVER, |at| u64::try_from(since(at).as_nanos()).unwrap_or(u64::MAX));
         self.0.at.store(ns, Ordering::Relaxed);
     }
@@ -73,8 +83,9 @@ impl Due {
         self.allows(0, 1)
     }
 
-    /// Refuses to begin what nothing could end: `bytes` that no machine goes through in the time that is left. So what is begun
-    /// takes longer than allowed by no more than this machine is slower than `fastest`, in bytes for each microsecond.
+    /// Refuses to begin what nothing could end: `bytes` that no machine goes through in the time
+    /// that is left. So what is begun takes longer than allowed by no more than this machine is
+    /// slower than `fastest`, in bytes for each microsecond.
     pub(super) fn allows(&self, bytes: usize, fastest: u64) -> Result<(), DataError> {
         let at = self.0.at.load(Ordering::Relaxed);
         if at == NEVER {

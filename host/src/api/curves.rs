@@ -1,6 +1,7 @@
 //! What a lambda read of its samples, number by number, for the report of a replay.
 //!
-//! Nothing here changes what a lambda sees or what it costs in fuel. Live nobody asks for it, and nothing is kept.
+//! Nothing here changes what a lambda sees or what it costs in fuel. Live nobody asks for it, and
+//! nothing is kept.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -42,7 +43,8 @@ impl Curves {
 
     /// The curve of `path` in the messages of `topic`; none if there are too many.
     pub(super) fn pen(&self, topic: &Topic, path: String) -> Option<Arc<Pen>> {
-        let source = Source { input: topic.name().to_owned(), topic: topic.ros_topic().to_owned(), path };
+        let source =
+            Source { input: topic.name().to_owned(), topic: topic.ros_topic().to_owned(), path };
         let mut list = self.lock();
         if let Some((_, pen)) = list.kept.iter().find(|(kept, _)| *kept == source) {
             return Some(Arc::clone(pen));
@@ -58,7 +60,8 @@ impl Curves {
         Some(pen)
     }
 
-    /// The curves so far, without those of what is no number; and how many fields have none, since there were too many.
+    /// The curves so far, without those of what is no number; and how many fields have none, since
+    /// there were too many.
     pub fn take(&self) -> (Vec<Curve>, u64) {
         let list = self.lock();
         let drawn = list.kept.iter().filter_map(|(source, pen)| pen.lock().curve(source)).collect();
@@ -74,8 +77,8 @@ impl Curves {
 #[derive(Default)]
 pub(super) struct Pen(Mutex<Points>);
 
-/// Sums of neighbouring samples. When there is no room for a further one, each two become one: a curve gets coarser as it gets
-/// longer, evenly over all of its time.
+/// Sums of neighbouring samples. When there is no room for a further one, each two become one: a
+/// curve gets coarser as it gets longer, evenly over all of its time.
 #[derive(Default)]
 struct Points {
     last_ns: Option<i64>,
@@ -90,7 +93,8 @@ struct Points {
 }
 
 impl Pen {
-    /// The number of the sample of `at_ns` is `value`. What was read before, or of an older sample, is no news.
+    /// The number of the sample of `at_ns` is `value`. What was read before, or of an older sample,
+    /// is no news.
     pub(super) fn number(&self, at_ns: i64, value: f64) {
         self.lock().add(at_ns, value);
     }
@@ -98,7 +102,9 @@ impl Pen {
     /// The same for a column, whose samples are oldest first.
     pub(super) fn column(&self, column: &Column) {
         let mut points = self.lock();
-        let new = column.at_ns.partition_point(|at_ns| points.last_ns.is_some_and(|last_ns| *at_ns <= last_ns));
+        let new = column
+            .at_ns
+            .partition_point(|at_ns| points.last_ns.is_some_and(|last_ns| *at_ns <= last_ns));
         for (at_ns, value) in column.at_ns.iter().zip(&column.values).skip(new) {
             points.add(*at_ns, *value);
         }
@@ -201,7 +207,10 @@ mod tests {
         pen.number(4, 4.0);
         pen.number(1, 1.0);
         let curve = pen.lock().curve(&source()).unwrap();
-        assert_eq!((curve.at_ns, curve.max, curve.samples), (vec![1, 2, 3, 4], vec![1.0, 2.0, 3.0, 4.0], 4));
+        assert_eq!(
+            (curve.at_ns, curve.max, curve.samples),
+            (vec![1, 2, 3, 4], vec![1.0, 2.0, 3.0, 4.0], 4)
+        );
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Samples, fields and frames, as a lambda reads them.
 //!
-//! Every number that a lambda passes is clamped here, and nothing is allocated in proportion to it beyond the clamps below.
+//! Every number that a lambda passes is clamped here, and nothing is allocated in proportion to it
+//! beyond the clamps below.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -44,7 +45,8 @@ pub struct Topic {
     pub(super) images: Images,
     pub(super) per_call: PerCall,
     skipped: AtomicU64,
-    /// Samples at this position in the ring and beyond came after the wake began: the lambda does not see them.
+    /// Samples at this position in the ring and beyond came after the wake began: the lambda does
+    /// not see them.
     until: AtomicU64,
     /// The newest that it sees, held while it runs: however many arrive meanwhile, this one stays.
     newest: Mutex<Option<Lease<SampleMeta>>>,
@@ -59,7 +61,8 @@ pub struct Topic {
 }
 
 impl Topic {
-    /// The topic behind input `input`, whose samples arrive through `reader` and are summed up in `arrivals`.
+    /// The topic behind input `input`, whose samples arrive through `reader` and are summed up in
+    /// `arrivals`.
     pub fn new(
         input: &str,
         topic: &str,
@@ -112,18 +115,24 @@ impl Topic {
         newest.map(|lease| self.sample(lease))
     }
 
-    /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and what `[limits]` allows.
+    /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and what `[limits]`
+    /// allows.
     ///
     /// # Errors
     ///
     /// [`OutOfFuel`].
     pub fn last(self: &Arc<Self>, n: usize) -> Result<Vec<Sample>, OutOfFuel> {
         let mut leases = Vec::new();
-        self.reader.last_before(self.until(), n.min(self.per_call.clamps().samples()).min(self.depth), &mut leases);
+        self.reader.last_before(
+            self.until(),
+            n.min(self.per_call.clamps().samples()).min(self.depth),
+            &mut leases,
+        );
         self.hand_out(leases)
     }
 
-    /// Samples received later than `since_ns`, oldest first; as many of the newest as [`Topic::last`] gives at most.
+    /// Samples received later than `since_ns`, oldest first; as many of the newest as
+    /// [`Topic::last`] gives at most.
     ///
     /// # Errors
     ///
@@ -140,7 +149,10 @@ impl Topic {
         self.hand_out(leases)
     }
 
-    fn hand_out(self: &Arc<Self>, leases: Vec<Lease<SampleMeta>>) -> Result<Vec<Sample>, OutOfFuel> {
+    fn hand_out(
+        self: &Arc<Self>,
+        leases: Vec<Lease<SampleMeta>>,
+    ) -> Result<Vec<Sample>, OutOfFuel> {
         self.looked.at(leases.first());
         self.per_call.charge(|| leases.len() * FIELD_BYTES)?;
         Ok(leases.into_iter().map(|lease| self.sample(lease)).collect())
@@ -163,7 +175,10 @@ impl Topic {
         self.per_call.charge(|| path.len())?;
         clamps::path(path)?;
         let Some(definitions) = &self.definitions else {
-            let why = format!("cannot be found: nobody here has message definitions of `{}`", self.type_name);
+            let why = format!(
+                "cannot be found: nobody here has message definitions of `{}`",
+                self.type_name
+            );
             return Err(WrongField::new(path, why).into());
         };
         let path = FieldPath::compile(definitions, path).map_err(DataError::NoSuchField)?;
@@ -174,8 +189,8 @@ impl Topic {
     ///
     /// # Errors
     ///
-    /// [`DataError::WrongField`] if the field is no number or belongs to another topic; [`DataError::Malformed`];
-    /// [`DataError::OutOfTime`].
+    /// [`DataError::WrongField`] if the field is no number or belongs to another topic;
+    /// [`DataError::Malformed`]; [`DataError::OutOfTime`].
     pub fn column(self: &Arc<Self>, field: &Field, n: usize) -> Result<Column, DataError> {
         self.per_call.charge(|| self.column_work(field, n))?;
         let until = self.until();
@@ -189,8 +204,13 @@ impl Topic {
     /// # Errors
     ///
     /// As [`Topic::column`].
-    pub fn column_since(self: &Arc<Self>, field: &Field, since_ns: i64) -> Result<Column, DataError> {
-        // How many samples it is shows only on the way. At fixed places they cost little, and are charged afterwards.
+    pub fn column_since(
+        self: &Arc<Self>,
+        field: &Field,
+        since_ns: i64,
+    ) -> Result<Column, DataError> {
+        // How many samples it is shows only on the way. At fixed places they cost little, and are
+        // charged afterwards.
         let whole_ring = || self.column_work(field, usize::MAX);
         if field.walks() {
             self.per_call.charge(whole_ring)?;
@@ -217,16 +237,17 @@ impl Topic {
         select(&self.reader, &mut leases);
         self.looked.at(leases.first());
         let mut unlooked = 0;
-        let column = leases.iter().try_fold(Column::with_capacity(leases.len()), |mut column, lease| {
-            unlooked += field.work(lease.len()).max(BYTES_PER_LOOK / SAMPLES_PER_LOOK);
-            if unlooked >= BYTES_PER_LOOK {
-                unlooked = 0;
-                self.per_call.due.check()?;
-            }
-            column.values.push(self.number(&field.path, lease)?);
-            column.at_ns.push(lease.meta().at_ns);
-            Ok(column)
-        });
+        let column =
+            leases.iter().try_fold(Column::with_capacity(leases.len()), |mut column, lease| {
+                unlooked += field.work(lease.len()).max(BYTES_PER_LOOK / SAMPLES_PER_LOOK);
+                if unlooked >= BYTES_PER_LOOK {
+                    unlooked = 0;
+                    self.per_call.due.check()?;
+                }
+                column.values.push(self.number(&field.path, lease)?);
+                column.at_ns.push(lease.meta().at_ns);
+                Ok(column)
+            });
         // Nothing of the ring may stay pinned between two calls.
         leases.clear();
         if let (Some(pen), Ok(column)) = (&field.pen, &column) {
@@ -246,19 +267,27 @@ impl Topic {
         self.curves.get().and_then(|curves| curves.pen(self, name()))
     }
 
-    pub(super) fn number(&self, path: &FieldPath, lease: &Lease<SampleMeta>) -> Result<f64, DataError> {
+    pub(super) fn number(
+        &self,
+        path: &FieldPath,
+        lease: &Lease<SampleMeta>,
+    ) -> Result<f64, DataError> {
         path.number(lease, lease.meta().endian).map_err(|error| self.unreadable(path, error))
     }
 
     pub(super) fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {
         match error {
             CdrError::NotANumber => WrongField::no_number(path.path(), &self.type_name).into(),
-            source => DataError::Malformed { topic: self.topic.clone(), type_name: self.type_name.clone(), source },
+            source => DataError::Malformed {
+                topic: self.topic.clone(),
+                type_name: self.type_name.clone(),
+                source,
+            },
         }
     }
 
-    /// Bytes that a column of `field` over `n` samples may touch, judged by the newest sample; the ring holds no more than
-    /// its depth.
+    /// Bytes that a column of `field` over `n` samples may touch, judged by the newest sample; the
+    /// ring holds no more than its depth.
     fn column_work(&self, field: &Field, n: usize) -> usize {
         let held = usize::try_from(self.reader.head()).unwrap_or(usize::MAX).min(self.depth);
         let message_bytes = self.reader.newest_before(self.until()).map_or(0, |lease| lease.len());
@@ -309,18 +338,21 @@ impl Topic {
 
 /// What only matters while time passes.
 impl Topic {
-    /// From now on the lambda sees the samples received until `at_ns`, and `woken_by` at most: what arrives while it runs belongs to
-    /// the next wake, as in a replay.
+    /// From now on the lambda sees the samples received until `at_ns`, and `woken_by` at most: what
+    /// arrives while it runs belongs to the next wake, as in a replay.
     pub(crate) fn see_until(&self, at_ns: i64, woken_by: Option<u64>) {
         let until = woken_by.map_or_else(|| self.received_until(at_ns), |position| position + 1);
         self.until.store(until, Ordering::Relaxed);
-        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = self.reader.newest_before(until);
+        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) =
+            self.reader.newest_before(until);
     }
 
     fn received_until(&self, at_ns: i64) -> u64 {
         let head = self.reader.head();
         let oldest = head.saturating_sub(self.reader.depth() as u64);
-        let is_later = |position: &u64| self.reader.get(*position).is_none_or(|lease| lease.meta().at_ns > at_ns);
+        let is_later = |position: &u64| {
+            self.reader.get(*position).is_none_or(|lease| lease.meta().at_ns > at_ns)
+        };
         head - (oldest..head).rev().take_while(is_later).count() as u64
     }
 

@@ -19,12 +19,14 @@ pub struct Field {
 }
 
 impl Field {
-    /// Whether elements of varying size lie before it, so that reading it walks over much of a message.
+    /// Whether elements of varying size lie before it, so that reading it walks over much of a
+    /// message.
     pub(super) fn walks(&self) -> bool {
         self.path.walks()
     }
 
-    /// Bytes that reading it from a message of `message_bytes` may touch: all of them if elements of varying size lie before it.
+    /// Bytes that reading it from a message of `message_bytes` may touch: all of them if elements
+    /// of varying size lie before it.
     pub(super) fn work(&self, message_bytes: usize) -> usize {
         if self.walks() { message_bytes.max(FIELD_BYTES) } else { FIELD_BYTES }
     }

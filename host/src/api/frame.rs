@@ -1,4 +1,5 @@
-//! A sample seen as an image: raw pixels in place, JPEG and PNG decoded lazily into slots of their own.
+//! A sample seen as an image: raw pixels in place, JPEG and PNG decoded lazily into slots of their
+//! own.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
@@ -10,16 +11,20 @@ use gleaner_messages::{CdrError, CompressedView, Endian, ImageView};
 use super::data::{DataError, Identity, OutOfFuel, Sample, Stamps};
 pub use super::images::Images;
 use super::piece::Piece;
-use gleaner_image::{self as image, Encoding, ImageError, Pace, PixelError, PixelErrorKind, Roi, View, ops};
+use gleaner_image::{
+    self as image, Encoding, ImageError, Pace, PixelError, PixelErrorKind, Roi, View, ops,
+};
 pub use gleaner_rules::frames::Budget;
 use gleaner_rules::frames::Taken;
 use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 
-/// Bytes of pixels that the fastest machine decodes in a microsecond: four times what was measured (0.5 GB/s on an x86-64 server).
+/// Bytes of pixels that the fastest machine decodes in a microsecond: four times what was measured
+/// (0.5 GB/s on an x86-64 server).
 const FASTEST_DECODE: u64 = 2_000;
 
-/// Bytes that are copied while one is worked on, if a copy makes 22 GB/s: then 8 bytes of it take as long as a unit of fuel. Measured on
-/// an x86-64 server: 2.7 and 4.3 to 41 GB/s, and 0.5 GB/s for decoding, which costs `images::DECODE`.
+/// Bytes that are copied while one is worked on, if a copy makes 22 GB/s: then 8 bytes of it take
+/// as long as a unit of fuel. Measured on an x86-64 server: 2.7 and 4.3 to 41 GB/s, and 0.5 GB/s
+/// for decoding, which costs `images::DECODE`.
 const HISTOGRAM: u64 = 8;
 const GRAY: u64 = 4;
 
@@ -63,7 +68,11 @@ pub(super) enum Picture<'a> {
 
 impl<'a> Picture<'a> {
     /// None if the type is no image.
-    pub(super) fn of(type_name: &str, cdr: &'a [u8], endian: Endian) -> Result<Option<Self>, CdrError> {
+    pub(super) fn of(
+        type_name: &str,
+        cdr: &'a [u8],
+        endian: Endian,
+    ) -> Result<Option<Self>, CdrError> {
         Ok(match type_name {
             IMAGE => Some(Self::Raw(ImageView::read(cdr, endian)?)),
             COMPRESSED_IMAGE => Some(Self::Compressed(CompressedView::read(cdr, endian)?)),
@@ -90,19 +99,36 @@ struct Source {
 
 impl Frame {
     pub(super) fn of(sample: &Sample) -> Result<Self, DataError> {
-        let source = Source { topic: Arc::clone(sample.topic()), identity: sample.identity(), stamps: sample.stamps() };
+        let source = Source {
+            topic: Arc::clone(sample.topic()),
+            identity: sample.identity(),
+            stamps: sample.stamps(),
+        };
         let picture = sample.picture()?;
         let taken = source.topic.images.made.take(0)?;
         match picture {
             Picture::Raw(raw) => Self::raw(source, sample, &raw, taken),
-            Picture::Compressed(compressed) => Self::decoded(source, sample, compressed.data, taken),
+            Picture::Compressed(compressed) => {
+                Self::decoded(source, sample, compressed.data, taken)
+            }
         }
     }
 
-    fn raw(source: Source, sample: &Sample, raw: &ImageView<'_>, taken: Taken) -> Result<Self, DataError> {
-        let encoding = Encoding::from_ros(raw.encoding).map_err(|error| source.not_a_frame(error))?;
-        let info =
-            Info { width: raw.width, height: raw.height, encoding, step: raw.step, big_endian: raw.is_bigendian };
+    fn raw(
+        source: Source,
+        sample: &Sample,
+        raw: &ImageView<'_>,
+        taken: Taken,
+    ) -> Result<Self, DataError> {
+        let encoding =
+            Encoding::from_ros(raw.encoding).map_err(|error| source.not_a_frame(error))?;
+        let info = Info {
+            width: raw.width,
+            height: raw.height,
+            encoding,
+            step: raw.step,
+            big_endian: raw.is_bigendian,
+        };
         let view = info.view(raw.data).map_err(|error| source.not_a_frame(error))?;
         // The pixels were borrowed from the message, so they lie within it.
         let start = raw.data.as_ptr().addr() - sample.bytes().as_ptr().addr();
@@ -110,11 +136,17 @@ impl Frame {
         Ok(Self { source, info, pixels, _taken: taken })
     }
 
-    fn decoded(source: Source, sample: &Sample, data: &[u8], taken: Taken) -> Result<Self, DataError> {
+    fn decoded(
+        source: Source,
+        sample: &Sample,
+        data: &[u8],
+        taken: Taken,
+    ) -> Result<Self, DataError> {
         let owner = Arc::clone(&source.topic);
         let images = &owner.images;
         let Some(pool) = &images.decoded else {
-            let (topic, type_name) = (source.identity.topic.clone(), source.topic.type_name().to_owned());
+            let (topic, type_name) =
+                (source.identity.topic.clone(), source.topic.type_name().to_owned());
             return Err(DataError::NoImageType { topic, type_name });
         };
         let mut newest = images.newest.lock().unwrap_or_else(PoisonError::into_inner);
@@ -125,8 +157,10 @@ impl Frame {
         // The older image's slot may be the one that is needed now.
         *newest = None;
         let started = Instant::now();
-        let bytes =
-            image::probe(data).ok().and_then(|header| header.rgb8_len()).map_or(0, |len| len.min(pool.slot_bytes()));
+        let bytes = image::probe(data)
+            .ok()
+            .and_then(|header| header.rgb8_len())
+            .map_or(0, |len| len.min(pool.slot_bytes()));
         owner.per_call.due.allows(bytes, FASTEST_DECODE)?;
         let lease = decode(&source, pool, data)?;
         images.decode_ns.fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
@@ -153,17 +187,20 @@ impl Frame {
         self.source.stamps
     }
 
-    /// Work of an operation, in bytes that are copied in the same time: the price of a call, on whatever machine.
+    /// Work of an operation, in bytes that are copied in the same time: the price of a call, on
+    /// whatever machine.
     fn work(&self, operation: Operation) -> usize {
         let work = self.view().and_then(|view| {
             let work = match operation {
                 Operation::MeanLuma(roi) => ops::work(&view, roi),
                 Operation::Histogram(roi) => ops::work(&view, roi).map(|bytes| HISTOGRAM * bytes),
                 Operation::ToGray => ops::work(&view, None).map(|bytes| GRAY * bytes),
-                Operation::Resize(width, height) => ops::resized(&view, width, height).and_then(|(_, bytes)| {
-                    let has_room = self.source.topic.images.made.has(bytes);
-                    if has_room { ops::resize_work(&view, width, height) } else { Ok(0) }
-                }),
+                Operation::Resize(width, height) => {
+                    ops::resized(&view, width, height).and_then(|(_, bytes)| {
+                        let has_room = self.source.topic.images.made.has(bytes);
+                        if has_room { ops::resize_work(&view, width, height) } else { Ok(0) }
+                    })
+                }
             };
             work.map_err(|error| self.source.refused(error))
         });
@@ -192,8 +229,8 @@ impl Frame {
     ///
     /// # Errors
     ///
-    /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer encodings;
-    /// [`DataError::OutOfTime`].
+    /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer
+    /// encodings; [`DataError::OutOfTime`].
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
         let luma = self.begin(Operation::MeanLuma(roi))?.work(|view| ops::mean_luma(view, roi))?;
         self.source.draw_luma(roi, luma);
@@ -219,10 +256,12 @@ impl Frame {
     ///
     /// # Errors
     ///
-    /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`]; [`DataError::NoRoom`]; as [`Frame::mean_luma`].
+    /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`];
+    /// [`DataError::NoRoom`]; as [`Frame::mean_luma`].
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
         let paid = self.begin(Operation::Resize(width, height))?;
-        let (encoding, _) = ops::resized(&self.view()?, width, height).map_err(|error| self.source.refused(error))?;
+        let (encoding, _) = ops::resized(&self.view()?, width, height)
+            .map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
         paid.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
     }
@@ -247,7 +286,10 @@ struct Paid<'a>(&'a Frame);
 
 impl Paid<'_> {
     /// Works on the pixels until the call is due.
-    fn work<T>(self, work: impl FnOnce(&View<'_>) -> Result<T, PixelError>) -> Result<T, DataError> {
+    fn work<T>(
+        self,
+        work: impl FnOnce(&View<'_>) -> Result<T, PixelError>,
+    ) -> Result<T, DataError> {
         let source = &self.0.source;
         let in_time = || source.topic.per_call.due.check().is_ok();
         work(&self.0.view()?.paced(&Pace::new(&in_time))).map_err(|error| source.refused(error))
@@ -278,7 +320,9 @@ impl Source {
     fn draw_luma(&self, roi: Option<Roi>, luma: f64) {
         let name = || match roi {
             None => "mean luma".to_owned(),
-            Some(Roi { x, y, width, height }) => format!("mean luma of {width}x{height} at {x},{y}"),
+            Some(Roi { x, y, width, height }) => {
+                format!("mean luma of {width}x{height} at {x},{y}")
+            }
         };
         if let Some(pen) = self.topic.pen(name) {
             pen.number(self.stamps.at_ns, luma);
@@ -306,11 +350,16 @@ fn decode(source: &Source, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<Info>
     let too_large = || {
         let (width, height) = (header.width, header.height);
         let needed = 3 * u64::from(width) * u64::from(height);
-        DataError::TooLarge { topic: topic(), source: ImageError::Bomb { width, height, needed, allowed } }
+        DataError::TooLarge {
+            topic: topic(),
+            source: ImageError::Bomb { width, height, needed, allowed },
+        }
     };
     let len = header.rgb8_len().ok_or_else(too_large)?;
     let mut draft = pool.draft(len).map_err(|refusal| match refusal {
-        Refusal::NoSlot => DataError::NoSlot { topic: topic(), input: source.topic.name().to_owned() },
+        Refusal::NoSlot => {
+            DataError::NoSlot { topic: topic(), input: source.topic.name().to_owned() }
+        }
         Refusal::TooBig { .. } => too_large(),
     })?;
     let in_time = || source.topic.per_call.due.check().is_ok();

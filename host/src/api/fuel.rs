@@ -1,20 +1,22 @@
 //! What calls of a lambda cost: units of fuel for the bytes that the host touches.
 //!
-//! Each call is charged here, by the room that does its work, before the work is done. So the price of a call is the same
-//! for every kind of guest; only a guest that has an allowance can run out of it.
+//! Each call is charged here, by the room that does its work, before the work is done. So the price
+//! of a call is the same for every kind of guest; only a guest that has an allowance can run out of
+//! it.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in the same time.
+/// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in
+/// the same time.
 const BYTES_PER_FUEL: u64 = 8;
 /// Fuel for the call itself.
 const FUEL_PER_CALL: u64 = 20;
 /// The allowance of guests that nobody charges.
 const ENDLESS: u64 = u64::MAX;
 
-/// The work of host calls in the current wake. A guest's own instructions are counted elsewhere. Clones share one account,
-/// which one thread uses.
+/// The work of host calls in the current wake. A guest's own instructions are counted elsewhere.
+/// Clones share one account, which one thread uses.
 #[derive(Clone)]
 pub struct Fuel(Arc<Account>);
 
@@ -56,7 +58,8 @@ impl Fuel {
         self.charge(|| 0)
     }
 
-    /// Charges one call that touches so many bytes. They are not even computed for a guest without an allowance.
+    /// Charges one call that touches so many bytes. They are not even computed for a guest without
+    /// an allowance.
     ///
     /// # Errors
     ///

@@ -12,7 +12,8 @@ use super::frame::Info;
 /// Bytes that are copied in the time in which one is decoded; see `HISTOGRAM` in `frame`.
 const DECODE: usize = 40;
 
-/// Room for the images of one input, beyond the ring: decoded ones in slots, made ones out of a budget.
+/// Room for the images of one input, beyond the ring: decoded ones in slots, made ones out of a
+/// budget.
 pub struct Images {
     pub(super) decoded: Option<Pool<Info>>,
     pub(super) made: Budget,
@@ -22,12 +23,14 @@ pub struct Images {
 }
 
 impl Images {
-    /// `decoded` holds what JPEG and PNG become (none for raw images); `made` is shared by all inputs of a lambda.
+    /// `decoded` holds what JPEG and PNG become (none for raw images); `made` is shared by all
+    /// inputs of a lambda.
     pub fn new(decoded: Option<Pool<Info>>, made: Budget) -> Self {
         Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
     }
 
-    /// Work of decoding `data`, by its header, in bytes; none if it is the newest decoded image already.
+    /// Work of decoding `data`, by its header, in bytes; none if it is the newest decoded image
+    /// already.
     pub(super) fn decode_work(&self, position: Option<u64>, data: &[u8]) -> usize {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
         if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {

@@ -13,8 +13,8 @@ use super::fuel::OutOfFuel;
 pub(super) struct Log {
     lines: Vec<Line>,
     rate: Rate,
-    /// Lines since the last call of `take`, those included that were dropped, and the CRC-32 over them: how many the rate limit
-    /// lets pass depends on wakes before.
+    /// Lines since the last call of `take`, those included that were dropped, and the CRC-32 over
+    /// them: how many the rate limit lets pass depends on wakes before.
     said: Said,
 }
 
@@ -82,7 +82,8 @@ impl Session {
         state.log.write(at_ns, level, message);
     }
 
-    /// The host says something about the lambda, as a warning at the time of this wake; the same thing once in a second.
+    /// The host says something about the lambda, as a warning at the time of this wake; the same
+    /// thing once in a second.
     pub fn note(&self, text: &'static str) {
         let mut state = self.lock();
         let at_ns = state.now_ns;

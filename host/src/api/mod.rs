@@ -1,11 +1,13 @@
 //! What a lambda may do, written once, in plain Rust.
 //!
-//! Five of the files beside this one carry the names of the five WIT interfaces. WebAssembly (`guest::wasm`) and Python
-//! (`host/python`) are thin skins over them: they convert arguments and errors, and decide nothing. What is here knows neither.
+//! Five of the files beside this one carry the names of the five WIT interfaces. WebAssembly
+//! (`guest::wasm`) and Python (`host/python`) are thin skins over them: they convert arguments and
+//! errors, and decide nothing. What is here knows neither.
 //!
-//! So each call does three things here: it is charged ([`fuel`]), before its work wherever that is known; what takes long looks
-//! at the deadline as it goes (`call`); and a refusal says which one of the WIT it is (`kind`). A call that only looks at a
-//! value costs what any call costs, which a skin charges where it looks up what a handle stands for.
+//! So each call does three things here: it is charged ([`fuel`]), before its work wherever that is
+//! known; what takes long looks at the deadline as it goes (`call`); and a refusal says which one
+//! of the WIT it is (`kind`). A call that only looks at a value costs what any call costs, which a
+//! skin charges where it looks up what a handle stands for.
 
 mod call;
 pub mod curves;
@@ -38,7 +40,8 @@ use log::{Line, Log};
 use scratch::Scratch;
 use trigger::Triggers;
 
-/// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call, by one thread.
+/// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call,
+/// by one thread.
 #[derive(Clone)]
 pub struct Session {
     state: Arc<Mutex<State>>,
@@ -57,14 +60,20 @@ struct State {
 }
 
 impl Session {
-    /// A session over these inputs, in the manifest's order, and this configuration, within these limits.
-    pub fn new(inputs: Vec<Arc<Topic>>, config: Vec<(String, ConfigValue)>, limits: &Limits) -> Self {
+    /// A session over these inputs, in the manifest's order, and this configuration, within these
+    /// limits.
+    pub fn new(
+        inputs: Vec<Arc<Topic>>,
+        config: Vec<(String, ConfigValue)>,
+        limits: &Limits,
+    ) -> Self {
         // All inputs of a lambda have the same.
         let due = inputs.first().map(|topic| topic.due());
         let fuel = inputs.first().map(|topic| topic.fuel()).unwrap_or_default();
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(limits));
         let scratch = Scratch::new(limits.scratch.bytes(), limits.call_bytes.as_usize());
-        let state = State { inputs, config, now_ns: 0, triggers, log, scratch, due, passed_over: 0 };
+        let state =
+            State { inputs, config, now_ns: 0, triggers, log, scratch, due, passed_over: 0 };
         Self { state: Arc::new(Mutex::new(state)), fuel }
     }
 
@@ -80,7 +89,8 @@ impl Session {
         self.lock().triggers.end()
     }
 
-    /// Runs an `init`, which may come in the middle of a wake but is no part of it: it can cause nothing.
+    /// Runs an `init`, which may come in the middle of a wake but is no part of it: it can cause
+    /// nothing.
     pub fn during_init<R>(&self, init: impl FnOnce() -> R) -> R {
         let triggers = self.lock().triggers.suspend();
         let result = init();
@@ -165,7 +175,8 @@ impl Session {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // No call leaves the state half changed, so a poisoned lock holds nothing worse than a shorter list.
+        // No call leaves the state half changed, so a poisoned lock holds nothing worse than a
+        // shorter list.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,4 +1,5 @@
-//! What a lambda caused in another process: read out there, and taken over here by the rules that hold for its calls.
+//! What a lambda caused in another process: read out there, and taken over here by the rules that
+//! hold for its calls.
 
 use gleaner_journal::Said;
 use gleaner_lambda::{Trigger, TriggerKind};
@@ -35,7 +36,8 @@ impl Session {
     /// [`TriggerError`] if no call could have caused it.
     pub fn relay_trigger(&self, trigger: Trigger) -> Result<(), TriggerError> {
         let Trigger { kind, label, score, attributes } = trigger;
-        let wrong = |key: &str, why| Refusal::Attribute { label: label.clone(), key: key.to_owned(), why };
+        let wrong =
+            |key: &str, why| Refusal::Attribute { label: label.clone(), key: key.to_owned(), why };
         if score.is_some() != (kind == TriggerKind::Event) {
             return Err(wrong("score", "an event has a score, and nothing else has one").into());
         }
@@ -45,14 +47,17 @@ impl Session {
         });
         let attributes = attributes.collect::<Result<_, Refusal>>()?;
         match (kind, score) {
-            (TriggerKind::Event, score) => self.event(&label, score.unwrap_or_default(), attributes),
+            (TriggerKind::Event, score) => {
+                self.event(&label, score.unwrap_or_default(), attributes)
+            }
             (TriggerKind::Start, _) => self.start(&label, attributes),
             (TriggerKind::Stop, _) => self.stop(&label),
         }
     }
 
-    /// Takes over what another process counted in a call: all lines that the lambda logged, of which those that passed the rate
-    /// limit were taken over by `Session::write`, and what was dropped and refused.
+    /// Takes over what another process counted in a call: all lines that the lambda logged, of
+    /// which those that passed the rate limit were taken over by `Session::write`, and what was
+    /// dropped and refused.
     pub fn relay_counts(&self, said: Said, log_dropped: u64, triggers_refused: u64) {
         let mut state = self.lock();
         state.log.relay(said, log_dropped);
@@ -130,11 +135,13 @@ mod tests {
             ("event", "a", json!(1.0), json!({"": 1})),
             ("event", "a", json!(1.0), json!({"text": "x".repeat(2000)})),
         ] {
-            let text = json!({"kind": kind, "label": label, "score": score, "attributes": attributes});
+            let text =
+                json!({"kind": kind, "label": label, "score": score, "attributes": attributes});
             assert!(session().relay_trigger(trigger(text.clone())).is_err(), "{text}");
         }
         let here = session();
-        let one = || trigger(json!({"kind": "event", "label": "a", "score": 1.0, "attributes": {}}));
+        let one =
+            || trigger(json!({"kind": "event", "label": "a", "score": 1.0, "attributes": {}}));
         assert_eq!((0..20).filter(|_| here.relay_trigger(one()).is_ok()).count(), 16);
     }
 }

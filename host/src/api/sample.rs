@@ -34,7 +34,11 @@ impl Sample {
     /// When it came to be.
     pub fn stamps(&self) -> Stamps {
         let meta = self.lease.meta();
-        let header_ns = self.topic.header.as_ref().and_then(|header| header.read(&self.lease, meta.endian).ok());
+        let header_ns = self
+            .topic
+            .header
+            .as_ref()
+            .and_then(|header| header.read(&self.lease, meta.endian).ok());
         Stamps { at_ns: meta.at_ns, publish_ns: meta.publish_ns, header_ns }
     }
 
@@ -42,8 +46,8 @@ impl Sample {
     ///
     /// # Errors
     ///
-    /// [`DataError::WrongField`] if the field belongs to another topic or is longer than one call hands out;
-    /// [`DataError::Malformed`].
+    /// [`DataError::WrongField`] if the field belongs to another topic or is longer than one call
+    /// hands out; [`DataError::Malformed`].
     pub fn get(&self, field: &Field) -> Result<Value<'_>, DataError> {
         // A path may walk over the whole message, and the value may be most of it.
         self.topic.per_call.charge(|| self.lease.len())?;
@@ -89,7 +93,8 @@ impl Sample {
         self.lease.meta().endian == Endian::Big
     }
 
-    /// Bytes from `offset`, `len` at most, clamped to the message and to `call_bytes` of `[limits]`.
+    /// Bytes from `offset`, `len` at most, clamped to the message and to `call_bytes` of
+    /// `[limits]`.
     ///
     /// # Errors
     ///
@@ -101,7 +106,8 @@ impl Sample {
         Ok(piece)
     }
 
-    /// Work of [`Sample::as_frame`], by the header of what it has to decode, in bytes; none if that is done already.
+    /// Work of [`Sample::as_frame`], by the header of what it has to decode, in bytes; none if that
+    /// is done already.
     fn decode_work(&self) -> usize {
         match self.picture() {
             Ok(Picture::Compressed(compressed)) => {
@@ -115,8 +121,8 @@ impl Sample {
     ///
     /// # Errors
     ///
-    /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`], [`DataError::NoSlot`],
-    /// [`DataError::NoRoom`].
+    /// [`DataError::NoImageType`], [`DataError::NotAFrame`], [`DataError::TooLarge`],
+    /// [`DataError::NoSlot`], [`DataError::NoRoom`].
     pub fn as_frame(&self) -> Result<Frame, DataError> {
         self.topic.per_call.charge(|| self.decode_work())?;
         Frame::of(self)
@@ -125,8 +131,15 @@ impl Sample {
     pub(super) fn picture(&self) -> Result<Picture<'_>, DataError> {
         let Topic { topic, type_name, .. } = &*self.topic;
         Picture::of(type_name, &self.lease, self.lease.meta().endian)
-            .map_err(|source| DataError::Malformed { topic: topic.clone(), type_name: type_name.clone(), source })?
-            .ok_or_else(|| DataError::NoImageType { topic: topic.clone(), type_name: type_name.clone() })
+            .map_err(|source| DataError::Malformed {
+                topic: topic.clone(),
+                type_name: type_name.clone(),
+                source,
+            })?
+            .ok_or_else(|| DataError::NoImageType {
+                topic: topic.clone(),
+                type_name: type_name.clone(),
+            })
     }
 
     /// Where it stands in its ring.

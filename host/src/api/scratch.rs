@@ -1,7 +1,8 @@
-//! What the host keeps for a lambda, by name, within `scratch` of `[limits]`; the rules are those of `gleaner_rules::scratch`.
+//! What the host keeps for a lambda, by name, within `scratch` of `[limits]`; the rules are those
+//! of `gleaner_rules::scratch`.
 //!
-//! Memory and no folder: so its bound is exact, no call waits for a disk, a replay finds what the vehicle found, and the jail around
-//! the lambda needs no hole.
+//! Memory and no folder: so its bound is exact, no call waits for a disk, a replay finds what the
+//! vehicle found, and the jail around the lambda needs no hole.
 
 pub use gleaner_rules::scratch::Entry;
 pub(super) use gleaner_rules::scratch::Scratch;
@@ -78,7 +79,8 @@ impl Session {
         Ok(self.lock().scratch.append(name, bytes)?)
     }
 
-    /// Bytes from `offset`, `len` at most; clamped to what is there, and to `call_bytes` of `[limits]`.
+    /// Bytes from `offset`, `len` at most; clamped to what is there, and to `call_bytes` of
+    /// `[limits]`.
     ///
     /// # Errors
     ///

@@ -1,4 +1,5 @@
-//! What a journal notes of one topic: which samples came since the wake before, and how far back the lambda looked.
+//! What a journal notes of one topic: which samples came since the wake before, and how far back
+//! the lambda looked.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 
@@ -11,8 +12,8 @@ use super::data::Topic;
 /// No sample was looked at in this wake.
 const NONE: u64 = u64::MAX;
 
-/// What arrived at a ring, summed up by the thread that fills it: as of each sample, so that a wake can be told what it saw while
-/// further samples arrive.
+/// What arrived at a ring, summed up by the thread that fills it: as of each sample, so that a wake
+/// can be told what it saw while further samples arrive.
 pub struct Arrivals {
     wanted: AtomicBool,
     /// Changed by the filling thread only, as are those below.
@@ -46,7 +47,8 @@ impl Arrivals {
             next: AtomicU64::new(0),
             digest: AtomicU32::new(0),
             refused: AtomicU64::new(0),
-            // Twice the samples that a ring shows: a mark that is asked for was among them a moment ago.
+            // Twice the samples that a ring shows: a mark that is asked for was among them a moment
+            // ago.
             marks: (0..2 * (depth + 1)).map(|_| Mark::default()).collect(),
         }
     }
@@ -79,15 +81,19 @@ impl Arrivals {
     }
 
     fn now(&self) -> Sums {
-        Sums { digest: self.digest.load(Ordering::Relaxed), refused: self.refused.load(Ordering::Relaxed) }
+        Sums {
+            digest: self.digest.load(Ordering::Relaxed),
+            refused: self.refused.load(Ordering::Relaxed),
+        }
     }
 }
 
-/// CRC-32 of a sample, plus its stamps: any flipped byte changes it. The stamps are not worth a CRC of their own, which would
-/// cost as much as that of a small sample.
+/// CRC-32 of a sample, plus its stamps: any flipped byte changes it. The stamps are not worth a CRC
+/// of their own, which would cost as much as that of a small sample.
 fn sample_digest(meta: &SampleMeta, cdr: &[u8]) -> u32 {
     let fold = |stamp: i64| stamp as u32 ^ (stamp >> 32) as u32;
-    let stamps = fold(meta.at_ns).wrapping_mul(3).wrapping_add(fold(meta.publish_ns).wrapping_mul(5));
+    let stamps =
+        fold(meta.at_ns).wrapping_mul(3).wrapping_add(fold(meta.publish_ns).wrapping_mul(5));
     crc32fast::hash(cdr).wrapping_add(stamps)
 }
 
@@ -144,14 +150,20 @@ impl Trace {
         Self { offered: offered(topic), until: topic.reader().head(), digest: 0 }
     }
 
-    /// Before a wake: notes what came since the one before. If a sample of this topic wakes the lambda, `woken_by` is its place
-    /// in the ring, and itself: most often it is the newest, and need not be looked for.
+    /// Before a wake: notes what came since the one before. If a sample of this topic wakes the
+    /// lambda, `woken_by` is its place in the ring, and itself: most often it is the newest, and
+    /// need not be looked for.
     pub fn begin(&mut self, topic: &Topic, woken_by: Option<(u64, &SampleMeta)>, seen: &mut Seen) {
         let head = topic.reader().head();
         let until = topic.until().min(head);
-        // Where samples arrive meanwhile, only the mark of the last one that is seen tells what had come with it.
+        // Where samples arrive meanwhile, only the mark of the last one that is seen tells what had
+        // come with it.
         let is_still = topic.until() == u64::MAX;
-        let sums = if is_still { None } else { until.checked_sub(1).and_then(|last| topic.arrivals.at(last)) };
+        let sums = if is_still {
+            None
+        } else {
+            until.checked_sub(1).and_then(|last| topic.arrivals.at(last))
+        };
         let Sums { digest, refused } = sums.unwrap_or_else(|| topic.arrivals.now());
         let offered = (until + refused).max(self.offered);
         seen.new = offered - self.offered;
@@ -171,7 +183,8 @@ impl Trace {
         topic.looked.forget();
     }
 
-    /// After a wake that `woken_by` caused, if it is a sample of this topic: notes how far back the lambda looked.
+    /// After a wake that `woken_by` caused, if it is a sample of this topic: notes how far back the
+    /// lambda looked.
     pub fn end(&self, topic: &Topic, woken_by: Option<u64>, seen: &mut Seen) {
         let oldest = topic.looked.0.load(Ordering::Relaxed).min(woken_by.unwrap_or(NONE));
         seen.reach = self.until.saturating_sub(oldest);

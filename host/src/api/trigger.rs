@@ -48,7 +48,8 @@ impl TriggerError {
     }
 }
 
-/// What an attribute costs, in bytes, besides its texts: it was made for the host before it could be refused.
+/// What an attribute costs, in bytes, besides its texts: it was made for the host before it could
+/// be refused.
 const ATTRIBUTE_BYTES: usize = 64;
 
 fn work(attribute: &Attribute) -> usize {
@@ -65,7 +66,12 @@ impl Session {
     /// # Errors
     ///
     /// [`TriggerError`] if a limit of this file is passed; nothing is caused then.
-    pub fn event(&self, label: &str, score: f64, attributes: Vec<Attribute>) -> Result<(), TriggerError> {
+    pub fn event(
+        &self,
+        label: &str,
+        score: f64,
+        attributes: Vec<Attribute>,
+    ) -> Result<(), TriggerError> {
         self.cause(TriggerKind::Event, label, Some(score), attributes)
     }
 
@@ -96,10 +102,19 @@ impl Session {
     ) -> Result<(), TriggerError> {
         self.fuel.charge(|| label.len() + attributes.iter().map(work).sum::<usize>())?;
         let state = &mut *self.lock();
-        let caused = state.triggers.cause(state.now_ns, as_asked(kind), (label, score), attributes, |attributes| {
-            let attributes = attributes.into_iter().map(|Attribute { key, value }| (key, json(value))).collect();
-            Trigger { kind, label: label.to_owned(), score, attributes }
-        });
+        let caused = state.triggers.cause(
+            state.now_ns,
+            as_asked(kind),
+            (label, score),
+            attributes,
+            |attributes| {
+                let attributes = attributes
+                    .into_iter()
+                    .map(|Attribute { key, value }| (key, json(value)))
+                    .collect();
+                Trigger { kind, label: label.to_owned(), score, attributes }
+            },
+        );
         Ok(caused?)
     }
 }
@@ -144,7 +159,10 @@ mod tests {
         session.start("rain", vec![real("wet", 0.5)]).unwrap();
         session.event("brake", 3.5, Vec::new()).unwrap();
         let triggers = session.end();
-        assert_eq!(triggers.iter().map(|trigger| trigger.label.as_str()).collect::<Vec<_>>(), ["rain", "brake"]);
+        assert_eq!(
+            triggers.iter().map(|trigger| trigger.label.as_str()).collect::<Vec<_>>(),
+            ["rain", "brake"]
+        );
         assert_eq!(triggers[0].attributes["wet"], 0.5);
         assert_eq!((triggers[0].score, triggers[1].score), (None, Some(3.5)));
     }
@@ -164,7 +182,10 @@ mod tests {
     fn outside_of_a_wake_nothing_can_be_caused() {
         let session = session();
         session.event("before", 1.0, Vec::new()).unwrap();
-        assert_eq!(session.during_init(|| session.event("init", 1.0, Vec::new())), Err(Refusal::NoWake.into()));
+        assert_eq!(
+            session.during_init(|| session.event("init", 1.0, Vec::new())),
+            Err(Refusal::NoWake.into())
+        );
         session.event("after", 1.0, Vec::new()).unwrap();
         assert_eq!(session.end().len(), 2);
         assert_eq!(session.stop("late"), Err(Refusal::NoWake.into()));

@@ -1,7 +1,8 @@
 //! Memory that a lambda takes of a process that it shares with our code.
 //!
-//! The kernel's own limit (RLIMIT_DATA) has room for our code, too, and does not count what was filled and then made read-only. So
-//! the pages that the process really has are counted here after its wakes, and by `gleaner-shim` ten times a second.
+//! The kernel's own limit (RLIMIT_DATA) has room for our code, too, and does not count what was
+//! filled and then made read-only. So the pages that the process really has are counted here after
+//! its wakes, and by `gleaner-shim` ten times a second.
 
 use std::io;
 use std::time::{Duration, Instant};
@@ -10,7 +11,8 @@ use gleaner_lambda::{Fault, FaultKind};
 use gleaner_vitals::usage::{PrivatePages, Process};
 use gleaner_vitals::{Pulse, Share, own};
 
-/// Time between two looks, at least. One takes about a microsecond, and a wake of a fast replay seven.
+/// Time between two looks, at least. One takes about a microsecond, and a wake of a fast replay
+/// seven.
 const BETWEEN: Duration = Duration::from_millis(1);
 
 /// Counts for one lambda.
@@ -21,7 +23,8 @@ pub(super) struct Meter {
 }
 
 impl Meter {
-    /// Counts what the process takes from now on; `most` bytes of it are the lambda's. The shim counts, too.
+    /// Counts what the process takes from now on; `most` bytes of it are the lambda's. The shim
+    /// counts, too.
     pub(super) fn start(most: u64, pulse: &Pulse) -> io::Result<Self> {
         let unreadable = || io::Error::other("/proc/self does not show the memory of this process");
         let pages = PrivatePages::open()?;

@@ -24,8 +24,8 @@ use gleaner_vitals::usage;
 use crate::api::curves::Curves;
 use crate::api::data::{Counts, Topic, Wake};
 
-/// Whether a call that came back by itself after `elapsed` is a fault, though nothing ended it when `allowed` was over. All time counts,
-/// also that in which the machine did something else.
+/// Whether a call that came back by itself after `elapsed` is a fault, though nothing ended it when
+/// `allowed` was over. All time counts, also that in which the machine did something else.
 pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
     /// What would have ended it comes about so late.
     const TOLERANCE: Duration = Duration::from_millis(2);
@@ -34,7 +34,8 @@ pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
 
 /// A lambda that can be woken.
 pub trait Guest {
-    /// Runs what comes before the lambda and is as foreign as it. Called once, before the first `init`, or by that.
+    /// Runs what comes before the lambda and is as foreign as it. Called once, before the first
+    /// `init`, or by that.
     ///
     /// # Errors
     ///
@@ -50,7 +51,8 @@ pub trait Guest {
     /// The fault that ended `init`.
     fn init(&mut self) -> Result<(), Fault>;
 
-    /// Whether the lambda runs at `wake`: in another process, the sample that is to wake it may have found no room.
+    /// Whether the lambda runs at `wake`: in another process, the sample that is to wake it may
+    /// have found no room.
     fn expects(&mut self, _wake: &Wake) -> bool {
         true
     }
@@ -58,7 +60,8 @@ pub trait Guest {
     /// Runs one wake to its end.
     fn wake(&mut self, wake: Wake) -> Outcome;
 
-    /// Gives up the lambda after a wake that was good in itself, as after a fault: the next wake begins with a fresh one.
+    /// Gives up the lambda after a wake that was good in itself, as after a fault: the next wake
+    /// begins with a fresh one.
     fn discard(&mut self) {}
 
     /// What runs the lambda, with its version: a decision is only the same again on the same.
@@ -83,7 +86,8 @@ pub trait Guest {
         usage::most_resident()
     }
 
-    /// Ends a lambda that runs in another process, after its last wake; returns what is known there alone.
+    /// Ends a lambda that runs in another process, after its last wake; returns what is known there
+    /// alone.
     ///
     /// # Errors
     ///

@@ -1,4 +1,5 @@
-//! A guest that is entered only once this process is shut, and whose shim knows by when it has to be back.
+//! A guest that is entered only once this process is shut, and whose shim knows by when it has to
+//! be back.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +13,8 @@ use super::{Guest, Outcome};
 use crate::api::data::Wake;
 use crate::isolation::Isolation;
 
-/// How long a guest may take before its process is killed. Longer than its deadline, upon which it is asked to end.
+/// How long a guest may take before its process is killed. Longer than its deadline, upon which it
+/// is asked to end.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Patience {
     /// For `init`.
@@ -41,7 +43,8 @@ pub struct Watched {
     guest: Box<dyn Guest>,
     isolation: Arc<Isolation>,
     patience: Patience,
-    /// Memory that the lambda may take of this process, in bytes; none where its kind counts that by itself.
+    /// Memory that the lambda may take of this process, in bytes; none where its kind counts that
+    /// by itself.
     memory: Option<u64>,
     meter: Option<Meter>,
     is_prepared: bool,
@@ -50,9 +53,14 @@ pub struct Watched {
 }
 
 impl Watched {
-    /// `guest`, which has not been entered yet. `memory` is what it may take of this process, in bytes, where it shares that with
-    /// our code.
-    pub fn new(guest: Box<dyn Guest>, isolation: Arc<Isolation>, patience: Patience, memory: Option<u64>) -> Self {
+    /// `guest`, which has not been entered yet. `memory` is what it may take of this process, in
+    /// bytes, where it shares that with our code.
+    pub fn new(
+        guest: Box<dyn Guest>,
+        isolation: Arc<Isolation>,
+        patience: Patience,
+        memory: Option<u64>,
+    ) -> Self {
         Self { guest, isolation, patience, memory, meter: None, is_prepared: false, is_new: false }
     }
 }
@@ -66,19 +74,25 @@ fn excess(guest: &mut dyn Guest, meter: &mut Option<Meter>) -> Option<Fault> {
     fault
 }
 
-/// How long what comes before a lambda may take: an environment that starts, and numpy from a cold disk.
+/// How long what comes before a lambda may take: an environment that starts, and numpy from a cold
+/// disk.
 const PREPARE: Duration = Duration::from_secs(300);
 
 impl Guest for Watched {
     fn prepare(&mut self) -> Result<(), Fault> {
-        let loose = |message| Fault { kind: FaultKind::HostCall, message, used: None, allowed: None };
-        self.isolation.close().map_err(|failure| loose([failure.message, failure.causes.join(": ")].join(": ")))?;
+        let loose =
+            |message| Fault { kind: FaultKind::HostCall, message, used: None, allowed: None };
+        self.isolation
+            .close()
+            .map_err(|failure| loose([failure.message, failure.causes.join(": ")].join(": ")))?;
         let busy = self.isolation.pulse().busy(Doing::Init, PREPARE, 0);
         self.guest.prepare()?;
         drop(busy);
         self.isolation.bound_memory().map_err(loose)?;
-        let meter = self.memory.map(|memory| Meter::start(memory, self.isolation.pulse())).transpose();
-        self.meter = meter.map_err(|error| loose(format!("cannot count the memory of the lambda: {error}")))?;
+        let meter =
+            self.memory.map(|memory| Meter::start(memory, self.isolation.pulse())).transpose();
+        self.meter = meter
+            .map_err(|error| loose(format!("cannot count the memory of the lambda: {error}")))?;
         self.is_prepared = true;
         Ok(())
     }

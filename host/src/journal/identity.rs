@@ -67,7 +67,9 @@ impl Identity<'_> {
         let Self { manifest, build, config, remaps, engine, clock, part } = self;
         let lambda = &manifest.lambda;
         let event = match &manifest.schedule {
-            Schedule::Event { input, .. } => manifest.inputs.iter().position(|known| known.name == *input),
+            Schedule::Event { input, .. } => {
+                manifest.inputs.iter().position(|known| known.name == *input)
+            }
             Schedule::Periodic { .. } => None,
         };
         Ok(Header {
@@ -83,7 +85,10 @@ impl Identity<'_> {
             limits: manifest.limits,
             inputs: manifest.inputs.iter().map(|input| journal_input(input, remaps)).collect(),
             event_input: event,
-            config: config.iter().map(|(key, value)| (key.clone(), json(value))).collect::<Map<_, _>>(),
+            config: config
+                .iter()
+                .map(|(key, value)| (key.clone(), json(value)))
+                .collect::<Map<_, _>>(),
             remaps: remaps.iter().map(|remap| (remap.from.clone(), remap.to.clone())).collect(),
             clock: clock.to_owned(),
             part,
@@ -147,5 +152,9 @@ fn digest_of_file(build: &BuildDir, path: &Path) -> Result<FileDigest, IdentityE
     let mut file = PlainFile::inside(build.path(), path, FILE_MAX).map_err(failed)?;
     let mut digest = Sha256::new();
     let bytes = io::copy(&mut file, &mut digest).map_err(failed)?;
-    Ok(FileDigest { path: path.to_string_lossy().into_owned(), bytes, sha256: hex(&digest.finalize()) })
+    Ok(FileDigest {
+        path: path.to_string_lossy().into_owned(),
+        bytes,
+        sha256: hex(&digest.finalize()),
+    })
 }

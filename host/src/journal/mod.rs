@@ -1,5 +1,5 @@
-//! What is written down of each wake, so that the decision can be made again and compared. The format is
-//! `gleaner_journal`; here it is filled in.
+//! What is written down of each wake, so that the decision can be made again and compared. The
+//! format is `gleaner_journal`; here it is filled in.
 
 mod identity;
 
@@ -29,7 +29,8 @@ pub struct Scribe {
 impl Scribe {
     /// Begins with what is in the rings now.
     pub fn new(inputs: &[Arc<Topic>]) -> Self {
-        let topics: Vec<_> = inputs.iter().map(|topic| (Arc::clone(topic), Trace::of(topic))).collect();
+        let topics: Vec<_> =
+            inputs.iter().map(|topic| (Arc::clone(topic), Trace::of(topic))).collect();
         let entry = Entry {
             at_ns: 0,
             cause: Woken::Tick { missed: 0 },
@@ -50,13 +51,17 @@ impl Scribe {
             Wake::Event(sample) => {
                 let meta = sample.meta();
                 self.entry.cause = Woken::Sample { writer: meta.writer.0, seq: meta.seq };
-                let input = self.topics.iter().position(|(topic, _)| Arc::ptr_eq(topic, sample.topic()));
+                let input =
+                    self.topics.iter().position(|(topic, _)| Arc::ptr_eq(topic, sample.topic()));
                 self.woken_by = input.zip(sample.position());
             }
             Wake::Tick(tick) => self.entry.cause = Woken::Tick { missed: tick.missed },
         }
-        for (index, ((topic, trace), seen)) in self.topics.iter_mut().zip(&mut self.entry.seen).enumerate() {
-            let woken_by = self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
+        for (index, ((topic, trace), seen)) in
+            self.topics.iter_mut().zip(&mut self.entry.seen).enumerate()
+        {
+            let woken_by =
+                self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
             let sample = if let Wake::Event(sample) = wake { Some(sample.meta()) } else { None };
             trace.begin(topic, woken_by.zip(sample), seen);
         }
@@ -71,8 +76,11 @@ impl Scribe {
 
     /// After a wake that led to `decision` and said `log`.
     pub fn end(&mut self, decision: &Decision, log: Said) -> &Entry {
-        for (index, ((topic, trace), seen)) in self.topics.iter().zip(&mut self.entry.seen).enumerate() {
-            let woken_by = self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
+        for (index, ((topic, trace), seen)) in
+            self.topics.iter().zip(&mut self.entry.seen).enumerate()
+        {
+            let woken_by =
+                self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
             trace.end(topic, woken_by, seen);
         }
         self.entry.triggers.clone_from(&decision.triggers);

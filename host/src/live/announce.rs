@@ -1,7 +1,8 @@
-//! On request, decisions with a trigger or a fault are published, for recorders and dashboards of others.
+//! On request, decisions with a trigger or a fault are published, for recorders and dashboards of
+//! others.
 //!
-//! `std_msgs/msg/String`, a type that every ROS 2 has; its text is a line of `decisions.jsonl`, with the lambda's name before it:
-//! `{"lambda": "hello", "decision": {...}}`.
+//! `std_msgs/msg/String`, a type that every ROS 2 has; its text is a line of `decisions.jsonl`,
+//! with the lambda's name before it: `{"lambda": "hello", "decision": {...}}`.
 
 use gleaner_base::Failure;
 use gleaner_lambda::Decision;
@@ -27,7 +28,11 @@ struct Announced<'a> {
 
 impl Announcer {
     /// Publishes decisions of `lambda` on `topic`.
-    pub(super) fn open(source: &dyn LiveSource, topic: &str, lambda: &str) -> Result<Self, Failure> {
+    pub(super) fn open(
+        source: &dyn LiveSource,
+        topic: &str,
+        lambda: &str,
+    ) -> Result<Self, Failure> {
         Ok(Self { speaker: Speaker::open(source, topic, TYPE, DEPTH)?, lambda: lambda.to_owned() })
     }
 
@@ -42,7 +47,8 @@ impl Announcer {
             return;
         }
         let announced = Announced { lambda: &self.lambda, decision };
-        let text = serde_json::to_string(&announced).expect("a decision has text keys and finite numbers");
+        let text =
+            serde_json::to_string(&announced).expect("a decision has text keys and finite numbers");
         self.speaker.say(|message| message.string(&text));
     }
 }

@@ -1,4 +1,5 @@
-//! The course of time: wait, wake the lambda, hand out what it decided, and look after everything now and then.
+//! The course of time: wait, wake the lambda, hand out what it decided, and look after everything
+//! now and then.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -20,7 +21,8 @@ use crate::api::data::{Topic, Wake};
 use crate::judge::Judge;
 use crate::schedule::Schedule;
 
-/// How long nobody looks at signals, the recorder and the time for a report. A wake does not wait for it.
+/// How long nobody looks at signals, the recorder and the time for a report. A wake does not wait
+/// for it.
 const ROUND: Duration = Duration::from_millis(50);
 /// How long it may take until we are back here, all that stands still on the way included.
 const ALIVE: Duration = Duration::from_secs(30);
@@ -56,13 +58,20 @@ impl Course {
                 self.ledger.flush();
                 self.look_after(now)?;
             }
-            if let Some(wake) = self.schedule.next_tick(now).or_else(|| self.schedule.next_event()) {
+            if let Some(wake) = self.schedule.next_tick(now).or_else(|| self.schedule.next_event())
+            {
                 self.wake(wake)?;
                 continue;
             }
-            let due = self.schedule.next_due().unwrap_or(i64::MAX).min(looked.saturating_add(nanoseconds(ROUND)));
+            let due = self
+                .schedule
+                .next_due()
+                .unwrap_or(i64::MAX)
+                .min(looked.saturating_add(nanoseconds(ROUND)));
             // A bell that was rung meanwhile ends this at once.
-            thread::park_timeout(Duration::from_nanos(u64::try_from(due.saturating_sub(now)).unwrap_or(0)));
+            thread::park_timeout(Duration::from_nanos(
+                u64::try_from(due.saturating_sub(now)).unwrap_or(0),
+            ));
         }
     }
 
@@ -73,7 +82,9 @@ impl Course {
         }
         let sample = if let Wake::Event(sample) = &wake { Some(sample) } else { None };
         for topic in &self.inputs {
-            let woken_by = sample.filter(|sample| Arc::ptr_eq(sample.topic(), topic)).and_then(|it| it.position());
+            let woken_by = sample
+                .filter(|sample| Arc::ptr_eq(sample.topic(), topic))
+                .and_then(|it| it.position());
             topic.see_until(at_ns, woken_by);
         }
         let cause = self.round_trip.is_some().then(|| RoundTrip::cause(&wake, self.clock));
@@ -117,9 +128,11 @@ impl Course {
         }
         let health = self.source.health();
         if let Some(why) = &health.dead {
-            let mut failure = Failure::new(Exit::Unreachable, "nothing of the network is handled any more");
+            let mut failure =
+                Failure::new(Exit::Unreachable, "nothing of the network is handled any more");
             failure.causes = vec![why.clone()];
-            return Err(failure.with_help("start again; where it happens often, report it with these words"));
+            return Err(failure
+                .with_help("start again; where it happens often, report it with these words"));
         }
         let live = self.watch.report(&Around {
             source: &*self.source,

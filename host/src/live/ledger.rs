@@ -1,5 +1,5 @@
-//! What leaves the process of a lambda: results to `gleaner-shim`, which writes them, and reports to the starter. A disk that is slow,
-//! or a reader that has stopped, never holds up the lambda.
+//! What leaves the process of a lambda: results to `gleaner-shim`, which writes them, and reports
+//! to the starter. A disk that is slow, or a reader that has stopped, never holds up the lambda.
 
 use std::io::Write;
 use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
@@ -15,7 +15,8 @@ use crate::api::log::Line;
 
 /// Reports that may wait while the starter does not read.
 const REPORTS: usize = 256;
-/// How long the last results may take on their way to the shim, and then the last report to the starter.
+/// How long the last results may take on their way to the shim, and then the last report to the
+/// starter.
 const LAST_RESULTS: Duration = Duration::from_secs(20);
 const LAST_REPORT: Duration = Duration::from_secs(2);
 
@@ -29,8 +30,13 @@ pub(super) struct Ledger {
 }
 
 impl Ledger {
-    /// Hands results to `pages`, and writes reports to `reports`. With `all`, decisions without trigger and fault are results, too.
-    pub(super) fn start(pages: Pages, all: bool, reports: impl Write + Send + 'static) -> Result<Self, Failure> {
+    /// Hands results to `pages`, and writes reports to `reports`. With `all`, decisions without
+    /// trigger and fault are results, too.
+    pub(super) fn start(
+        pages: Pages,
+        all: bool,
+        reports: impl Write + Send + 'static,
+    ) -> Result<Self, Failure> {
         let cannot = |error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
         let (say, said) = mpsc::sync_channel(REPORTS);
         let speaker = thread::Builder::new().name("gleaner-report".to_owned());
@@ -38,8 +44,8 @@ impl Ledger {
         Ok(Self { pages, all, reports: say, speaker })
     }
 
-    /// Keeps a decision; one with a trigger or a fault is reported, too, and is with the shim before: the shim writes it even if this
-    /// process is killed a moment later.
+    /// Keeps a decision; one with a trigger or a fault is reported, too, and is with the shim
+    /// before: the shim writes it even if this process is killed a moment later.
     pub(super) fn decision(&mut self, decision: Decision) {
         if decision.triggers.is_empty() && decision.fault.is_none() {
             if self.all {

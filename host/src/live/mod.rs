@@ -1,8 +1,10 @@
-//! A lambda live: on the topics of a vehicle, in its time, with a deadline, until it is told to stop.
+//! A lambda live: on the topics of a vehicle, in its time, with a deadline, until it is told to
+//! stop.
 //!
-//! One thread owns the lambda and waits here; the transport's thread fills the rings and rings a bell. Files of results are written by
-//! another process, and reports to the starter by a thread of their own. Nothing here knows which kind of lambda runs, nor which
-//! network its samples come over; `process` does, and has the process to itself.
+//! One thread owns the lambda and waits here; the transport's thread fills the rings and rings a
+//! bell. Files of results are written by another process, and reports to the starter by a thread of
+//! their own. Nothing here knows which kind of lambda runs, nor which network its samples come
+//! over; `process` does, and has the process to itself.
 
 mod announce;
 mod course;
@@ -59,7 +61,8 @@ pub struct Run<'a> {
     pub results: Pages,
     /// The page that shows how long this thread may be away.
     pub pulse: Pulse,
-    /// Gives up what the process does not need any more, before the lambda is entered; returns what holds.
+    /// Gives up what the process does not need any more, before the lambda is entered; returns what
+    /// holds.
     pub close: &'a mut dyn FnMut() -> Result<Vec<Layer>, Failure>,
     /// Raised when the run is to end.
     pub stop: &'a AtomicBool,
@@ -89,12 +92,20 @@ impl Run<'_> {
     ///
     /// # Errors
     ///
-    /// A failure if it cannot start, if the network or the recorder fails, or if results could not be handed on.
-    pub fn run(self, load: Load<'_>, reports: impl Write + Send + 'static) -> Result<Exit, Failure> {
-        let Self { asked, manifest, settings, mut source, recorder, results, pulse, close, stop } = self;
+    /// A failure if it cannot start, if the network or the recorder fails, or if results could not
+    /// be handed on.
+    pub fn run(
+        self,
+        load: Load<'_>,
+        reports: impl Write + Send + 'static,
+    ) -> Result<Exit, Failure> {
+        let Self { asked, manifest, settings, mut source, recorder, results, pulse, close, stop } =
+            self;
         let clock = settings.clock;
         let bell = match &manifest.schedule {
-            Declared::Event { input, .. } => Some(Bell { input: input.to_string(), thread: std::thread::current() }),
+            Declared::Event { input, .. } => {
+                Some(Bell { input: input.to_string(), thread: std::thread::current() })
+            }
             Declared::Periodic { .. } => None,
         };
         let bounds = Bounds::Live(manifest.limits.deadline);
@@ -118,8 +129,12 @@ impl Run<'_> {
             None => None,
         };
         let name = manifest.lambda.name.as_str();
-        let round_trip = settings.round_trip.map(|topic| RoundTrip::open(&*source, &topic, clock, name)).transpose()?;
-        let announcer = settings.announce.map(|topic| Announcer::open(&*source, &topic, name)).transpose()?;
+        let round_trip = settings
+            .round_trip
+            .map(|topic| RoundTrip::open(&*source, &topic, clock, name))
+            .transpose()?;
+        let announcer =
+            settings.announce.map(|topic| Announcer::open(&*source, &topic, name)).transpose()?;
         let mut ledger = Ledger::start(results, settings.all, reports)?;
         ledger.page(&Page::Woken(WokenBy::schedule_of(&manifest)));
         ledger.report(Report::Isolation { layers: close()? });

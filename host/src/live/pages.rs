@@ -1,7 +1,8 @@
-//! Results on their way to `gleaner-shim`, which writes the files: this process holds none that it could write.
+//! Results on their way to `gleaner-shim`, which writes the files: this process holds none that it
+//! could write.
 //!
-//! Nothing here waits while the lambda lives. What the pipe does not take waits in memory that was reserved before, and what has no
-//! room there is counted.
+//! Nothing here waits while the lambda lives. What the pipe does not take waits in memory that was
+//! reserved before, and what has no room there is counted.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -39,19 +40,24 @@ impl Pages {
     ///
     /// A failure if this process was started without one.
     pub fn open(pulse: Pulse) -> Result<Self, Failure> {
-        let cannot = |error: &io::Error| Failure::caused_by(Exit::Internal, "cannot hand on results", error);
+        let cannot =
+            |error: &io::Error| Failure::caused_by(Exit::Internal, "cannot hand on results", error);
         let pipe = inherited(RESULTS_ENV).map_err(|error| cannot(&error))?.ok_or_else(|| {
             Failure::new(Exit::Usage, "no process writes the results of this one")
                 .with_help("start it by `gleaner run`, or by `gleaner-shim --results DIR -- gleaner-runtime run`")
         })?;
         let found = fstat(&pipe).map_err(|error| cannot(&error.into()))?;
         if FileType::from_raw_mode(found.st_mode) != FileType::Fifo {
-            return Err(cannot(&io::Error::new(io::ErrorKind::InvalidInput, format!("{RESULTS_ENV} names no pipe"))));
+            return Err(cannot(&io::Error::new(
+                io::ErrorKind::InvalidInput,
+                format!("{RESULTS_ENV} names no pipe"),
+            )));
         }
         Ok(Self::over(pipe.into(), pulse))
     }
 
-    /// Results go into `pipe`, which does not block; `pulse` shows what of them could not be written.
+    /// Results go into `pipe`, which does not block; `pulse` shows what of them could not be
+    /// written.
     pub fn over(pipe: File, pulse: Pulse) -> Self {
         let waiting = VecDeque::with_capacity(WAITING);
         Self { pipe, waiting, line: Vec::new(), unwritten: 0, pulse }
@@ -60,9 +66,11 @@ impl Pages {
     /// Adds `page`, to be sent with what waits. Returns whether there was room.
     pub(super) fn add(&mut self, page: &Page) -> bool {
         self.line.clear();
-        serde_json::to_writer(&mut self.line, page).expect("a page has text keys and finite numbers");
+        serde_json::to_writer(&mut self.line, page)
+            .expect("a page has text keys and finite numbers");
         self.line.push(b'\n');
-        let has_room = self.line.len() <= PAGE_BYTES && self.waiting.len() + self.line.len() <= WAITING;
+        let has_room =
+            self.line.len() <= PAGE_BYTES && self.waiting.len() + self.line.len() <= WAITING;
         if has_room {
             self.waiting.extend(&self.line);
         } else {
@@ -110,8 +118,10 @@ impl Pages {
                 return Ok(());
             }
             if left.is_zero() {
-                let failure =
-                    Failure::new(Exit::Internal, "results are not written: their disk has stood still too long");
+                let failure = Failure::new(
+                    Exit::Internal,
+                    "results are not written: their disk has stood still too long",
+                );
                 return Err(failure.with_help("choose a folder on another disk: --out DIR"));
             }
             let patience = Timespec::try_from(left.min(Duration::from_secs(1))).ok();

@@ -1,4 +1,5 @@
-//! The process of a live run: its arguments, the network that it joins, its socket to the recorder, its signals.
+//! The process of a live run: its arguments, the network that it joins, its socket to the recorder,
+//! its signals.
 
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
@@ -71,7 +72,8 @@ impl Job {
         Paths { read, write: Vec::new() }
     }
 
-    /// Memory that our own threads may still take, in bytes: messages that the network puts together, beside those in the rings.
+    /// Memory that our own threads may still take, in bytes: messages that the network puts
+    /// together, beside those in the rings.
     pub fn own_memory(&self) -> u64 {
         unfinished_bytes(&self.manifest)
     }
@@ -86,11 +88,18 @@ impl Job {
         let mut manifest = Manifest::load(build.path())?;
         let messages = vec![build.path().join("msg")];
         let asked = Asked::new(args.asked, build, &mut manifest)?;
-        let name: String =
-            manifest.lambda.name.as_str().chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
-        let mut dds = args.network.options(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
+        let name: String = manifest
+            .lambda
+            .name
+            .as_str()
+            .chars()
+            .map(|c| if c.is_ascii_alphanumeric() { c } else { '_' })
+            .collect();
+        let mut dds =
+            args.network.options(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
         dds.clock = args.clock_offset.map_or_else(Clock::of_today, Clock::new);
-        dds.largest = manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
+        dds.largest =
+            manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
         dds.messages = messages;
         let settings = Settings {
             out: args.out,
@@ -115,8 +124,9 @@ impl Job {
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
         let Self { asked, manifest, settings, has_recorder, dds } = self;
-        let stop =
-            stop_flag().map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error))?;
+        let stop = stop_flag().map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error)
+        })?;
         let source = Dds::open(dds).map_err(NetworkError::failure)?;
         let pulse = isolation.pulse().clone();
         let run = Run {
@@ -134,11 +144,14 @@ impl Job {
     }
 }
 
-/// Takes the socket that standard input is, and leaves nothing there: a lambda may read its standard input.
+/// Takes the socket that standard input is, and leaves nothing there: a lambda may read its
+/// standard input.
 fn take_stdin() -> Result<OwnedFd, Failure> {
-    let failed =
-        |error: io::Error| Failure::caused_by(Exit::Internal, "cannot take the socket to the recorder", &error);
-    let socket = rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;
+    let failed = |error: io::Error| {
+        Failure::caused_by(Exit::Internal, "cannot take the socket to the recorder", &error)
+    };
+    let socket =
+        rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;
     let nothing = std::fs::File::open("/dev/null").map_err(failed)?;
     rustix::stdio::dup2_stdin(&nothing).map_err(io::Error::from).map_err(failed)?;
     Ok(socket)

@@ -1,4 +1,5 @@
-//! The recorder, as the lambda's side of the socket sees it: every wake is told, and nothing here waits for it.
+//! The recorder, as the lambda's side of the socket sees it: every wake is told, and nothing here
+//! waits for it.
 
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
@@ -13,8 +14,8 @@ use gleaner_protocol::link::{LinkError, RecorderLink};
 use crate::api::data::{Topic, Wake};
 use crate::journal::Scribe;
 
-/// How long the recorder may take to get ready: on a busy machine, with a large preroll to take from the system. What an earlier one
-/// left it recovers afterwards.
+/// How long the recorder may take to get ready: on a busy machine, with a large preroll to take
+/// from the system. What an earlier one left it recovers afterwards.
 const READY: Duration = Duration::from_secs(120);
 /// How long it may take for the last wakes.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -27,7 +28,11 @@ pub(super) struct ToRecorder {
 
 impl ToRecorder {
     /// Says which lambda this is, and waits until the recorder is ready for it.
-    pub(super) fn join(socket: OwnedFd, header: &Header, inputs: &[Arc<Topic>]) -> Result<Self, Failure> {
+    pub(super) fn join(
+        socket: OwnedFd,
+        header: &Header,
+        inputs: &[Arc<Topic>],
+    ) -> Result<Self, Failure> {
         let mut link = RecorderLink::new(socket);
         link.hello(header, READY).map_err(failed)?;
         Ok(Self { link, scribe: Scribe::new(inputs) })
@@ -39,7 +44,12 @@ impl ToRecorder {
     }
 
     /// After a wake. `decided_ns` is the CLOCK_MONOTONIC at which the lambda was left.
-    pub(super) fn end(&mut self, decision: &Decision, said: Said, decided_ns: i64) -> Result<(), Failure> {
+    pub(super) fn end(
+        &mut self,
+        decision: &Decision,
+        said: Said,
+        decided_ns: i64,
+    ) -> Result<(), Failure> {
         let entry = self.scribe.end(decision, said);
         self.link.wake(entry, decided_ns).map_err(failed)
     }

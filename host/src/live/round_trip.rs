@@ -1,9 +1,11 @@
-//! On request each wake is answered on a topic, so that a bench can measure the way from a sensor to a decision.
+//! On request each wake is answered on a topic, so that a bench can measure the way from a sensor
+//! to a decision.
 //!
-//! `sensor_msgs/msg/TimeReference`, a type that every ROS 2 has: `header.stamp` is that of the waking message (its receive stamp
-//! where it has none; for a tick, when it was due), `time_ref` is when the decision was out, `source` is
-//! `LAMBDA:WAKE:TRIGGERS` with the labels of the triggers in between commas. Both stamps are of CLOCK_MONOTONIC if the
-//! message's is, as with `gleaner play --stamp monotonic`.
+//! `sensor_msgs/msg/TimeReference`, a type that every ROS 2 has: `header.stamp` is that of the
+//! waking message (its receive stamp where it has none; for a tick, when it was due), `time_ref` is
+//! when the decision was out, `source` is `LAMBDA:WAKE:TRIGGERS` with the labels of the triggers in
+//! between commas. Both stamps are of CLOCK_MONOTONIC if the message's is, as with `gleaner play
+//! --stamp monotonic`.
 
 use gleaner_base::Failure;
 use gleaner_lambda::Decision;
@@ -25,8 +27,18 @@ pub(super) struct RoundTrip {
 
 impl RoundTrip {
     /// Answers of `lambda` on `topic`.
-    pub(super) fn open(source: &dyn LiveSource, topic: &str, clock: Clock, lambda: &str) -> Result<Self, Failure> {
-        Ok(Self { speaker: Speaker::open(source, topic, TYPE, DEPTH)?, clock, lambda: lambda.to_owned(), wakes: 0 })
+    pub(super) fn open(
+        source: &dyn LiveSource,
+        topic: &str,
+        clock: Clock,
+        lambda: &str,
+    ) -> Result<Self, Failure> {
+        Ok(Self {
+            speaker: Speaker::open(source, topic, TYPE, DEPTH)?,
+            clock,
+            lambda: lambda.to_owned(),
+            wakes: 0,
+        })
     }
 
     /// The stamp of what woke the lambda, in ns.
@@ -47,7 +59,8 @@ impl RoundTrip {
 
     /// Sends the answer to one wake.
     pub(super) fn answer(&mut self, cause_ns: i64, decision: &Decision) {
-        let labels: Vec<&str> = decision.triggers.iter().map(|trigger| trigger.label.as_str()).collect();
+        let labels: Vec<&str> =
+            decision.triggers.iter().map(|trigger| trigger.label.as_str()).collect();
         let source = format!("{}:{}:{}", self.lambda, self.wakes, labels.join(","));
         self.wakes += 1;
         let now = self.clock.monotonic(self.clock.now());

@@ -1,4 +1,5 @@
-//! A topic that a lambda's process writes on request. Nothing waits for it: what cannot be sent is counted, and said now and then.
+//! A topic that a lambda's process writes on request. Nothing waits for it: what cannot be sent is
+//! counted, and said now and then.
 
 use gleaner_base::Failure;
 use gleaner_messages::CdrWriter;
@@ -13,7 +14,12 @@ pub(super) struct Speaker {
 
 impl Speaker {
     /// Writes `topic`; its `depth` newest messages are kept for a reader that is slow to take them.
-    pub(super) fn open(source: &dyn LiveSource, topic: &str, type_name: &str, depth: usize) -> Result<Self, Failure> {
+    pub(super) fn open(
+        source: &dyn LiveSource,
+        topic: &str,
+        type_name: &str,
+        depth: usize,
+    ) -> Result<Self, Failure> {
         let publisher = source.publisher(topic, type_name, depth)?;
         Ok(Self { topic: topic.to_owned(), publisher, unsent: 0, message: CdrWriter::new() })
     }

@@ -60,7 +60,13 @@ pub(super) struct Watch {
 }
 
 impl Watch {
-    pub(super) fn new(manifest: &Manifest, remaps: &[Remap], out: PathBuf, restarts: u32, clock: Clock) -> Self {
+    pub(super) fn new(
+        manifest: &Manifest,
+        remaps: &[Remap],
+        out: PathBuf,
+        restarts: u32,
+        clock: Clock,
+    ) -> Self {
         let now = clock.now();
         let base = Live {
             lambda: manifest.lambda.name.to_string(),
@@ -90,7 +96,10 @@ impl Watch {
             rss_bytes: 0,
             cpu_s: 0.0,
         };
-        let wire = manifest.inputs.iter().map(|input| Remap::apply(remaps, input.topic.as_str()).to_owned());
+        let wire = manifest
+            .inputs
+            .iter()
+            .map(|input| Remap::apply(remaps, input.topic.as_str()).to_owned());
         Self {
             base,
             clock,
@@ -139,8 +148,13 @@ impl Watch {
         self.as_of_now(around, spreads)
     }
 
-    fn as_of_now(&mut self, around: &Around, [wake_up, run, hand_out]: [Option<Spread>; 3]) -> Live {
-        let Around { source, health, inputs, schedule, session, unwritten, unsent, recorder } = *around;
+    fn as_of_now(
+        &mut self,
+        around: &Around,
+        [wake_up, run, hand_out]: [Option<Spread>; 3],
+    ) -> Live {
+        let Around { source, health, inputs, schedule, session, unwritten, unsent, recorder } =
+            *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
         self.reported = now;
@@ -152,7 +166,9 @@ impl Watch {
                 topic.set_lost(lost);
             }
             let counts = topic.counts();
-            let came = counts.received.saturating_sub(std::mem::replace(&mut self.before[index], counts.received));
+            let came = counts
+                .received
+                .saturating_sub(std::mem::replace(&mut self.before[index], counts.received));
             topics.push(LiveTopic {
                 name: topic.name().to_owned(),
                 topic: self.wire[index].clone(),

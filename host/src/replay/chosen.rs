@@ -1,4 +1,5 @@
-//! Which topics of a drive its clips hold: those of `[record]`, or those that the command line chooses instead.
+//! Which topics of a drive its clips hold: those of `[record]`, or those that the command line
+//! chooses instead.
 
 use std::collections::HashSet;
 
@@ -29,14 +30,21 @@ pub(super) fn topics(
         }
     };
     if options.topics.is_empty() {
-        rules.topics.iter().for_each(|topic| add(Remap::apply(&options.asked.remaps, topic.as_str())));
+        rules
+            .topics
+            .iter()
+            .for_each(|topic| add(Remap::apply(&options.asked.remaps, topic.as_str())));
         return Ok(names);
     }
     for pattern in &options.topics {
         let found: Vec<_> = known.iter().filter(|topic| matches(pattern, &topic.topic)).collect();
         if found.is_empty() {
-            let failure = Failure::new(Exit::Usage, format!("the drive has no topic `{pattern}` of --topics"));
-            return Err(failure.with_help(format!("the drive has {}; a * stands for any letters", list(known))));
+            let failure = Failure::new(
+                Exit::Usage,
+                format!("the drive has no topic `{pattern}` of --topics"),
+            );
+            return Err(failure
+                .with_help(format!("the drive has {}; a * stands for any letters", list(known))));
         }
         let (readable, others): (Vec<_>, Vec<_>) =
             found.into_iter().partition(|topic| drive.can_subscribe(&spec_of(topic)).is_ok());
@@ -50,13 +58,18 @@ pub(super) fn topics(
             tracing::warn!(topic = %topic.topic, %error, "clips are made without this topic");
         }
         if others.len() > NAMED {
-            tracing::warn!(topics = others.len() - NAMED, "clips are made without further topics, for such reasons");
+            tracing::warn!(
+                topics = others.len() - NAMED,
+                "clips are made without further topics, for such reasons"
+            );
         }
         readable.iter().for_each(|topic| add(&topic.topic));
     }
     if names.len() > TOPICS_MAX {
-        let message = format!("--topics chooses {} topics; clips hold at most {TOPICS_MAX}", names.len());
-        return Err(Failure::new(Exit::Usage, message).with_help("choose fewer: --topics PATTERN, as in '/camera/*'"));
+        let message =
+            format!("--topics chooses {} topics; clips hold at most {TOPICS_MAX}", names.len());
+        return Err(Failure::new(Exit::Usage, message)
+            .with_help("choose fewer: --topics PATTERN, as in '/camera/*'"));
     }
     Ok(names)
 }
@@ -83,7 +96,8 @@ fn nothing_readable(
 /// The names of some topics, for a message.
 pub(super) fn list<'a>(topics: impl IntoIterator<Item = &'a DiscoveredTopic>) -> String {
     let mut topics = topics.into_iter();
-    let names: Vec<_> = topics.by_ref().take(NAMED).map(|topic| format!("`{}`", topic.topic)).collect();
+    let names: Vec<_> =
+        topics.by_ref().take(NAMED).map(|topic| format!("`{}`", topic.topic)).collect();
     match (names.is_empty(), topics.count()) {
         (true, _) => "no topic".to_owned(),
         (false, 0) => names.join(", "),

@@ -1,4 +1,5 @@
-//! The course of a drive: every sample delivered, and every wake that the schedule asks for, in the drive's time.
+//! The course of a drive: every sample delivered, and every wake that the schedule asks for, in the
+//! drive's time.
 
 use gleaner_base::Failure;
 use gleaner_drives::{Replay, ReplayError, Step};
@@ -19,8 +20,8 @@ pub(super) trait Course {
     fn sample(&mut self, drive: &Replay, step: &Step) -> Result<(), Failure>;
 }
 
-/// From when until when a drive is, in ns, both inclusive, and whatever is read of it: ticks must not depend on which topics are
-/// recorded. `None` where nobody knows.
+/// From when until when a drive is, in ns, both inclusive, and whatever is read of it: ticks must
+/// not depend on which topics are recorded. `None` where nobody knows.
 #[derive(Copy, Clone, Debug, Default)]
 pub(super) struct Span {
     pub(super) start_ns: Option<i64>,
@@ -30,9 +31,12 @@ pub(super) struct Span {
 impl Span {
     /// Of this part of `drive`.
     pub(super) fn of(drive: &Replay, part: Part) -> Self {
-        let start_ns = drive.start_ns().map(|start_ns| part.from_ns.map_or(start_ns, |from_ns| from_ns.max(start_ns)));
-        let end_ns =
-            drive.end_ns().map(|end_ns| part.to_ns.map_or(end_ns, |to_ns| end_ns.min(to_ns.saturating_sub(1))));
+        let start_ns = drive
+            .start_ns()
+            .map(|start_ns| part.from_ns.map_or(start_ns, |from_ns| from_ns.max(start_ns)));
+        let end_ns = drive
+            .end_ns()
+            .map(|end_ns| part.to_ns.map_or(end_ns, |to_ns| end_ns.min(to_ns.saturating_sub(1))));
         Self { start_ns, end_ns }
     }
 }
@@ -47,9 +51,13 @@ pub(super) struct Reached {
     pub(super) stopped: bool,
 }
 
-/// Takes a lambda through a drive. A sample is delivered, what it wakes runs, then the next; ticks come before the first sample
-/// that is later, and go on to the end of the drive.
-pub(super) fn take(drive: &mut Replay, span: Span, course: &mut impl Course) -> Result<Reached, Failure> {
+/// Takes a lambda through a drive. A sample is delivered, what it wakes runs, then the next; ticks
+/// come before the first sample that is later, and go on to the end of the drive.
+pub(super) fn take(
+    drive: &mut Replay,
+    span: Span,
+    course: &mut impl Course,
+) -> Result<Reached, Failure> {
     let mut reached = Reached { at_ns: 0, broken: None, stopped: false };
     if let Some(start_ns) = span.start_ns {
         course.schedule().begin(start_ns);
@@ -84,9 +92,12 @@ pub(super) fn take(drive: &mut Replay, span: Span, course: &mut impl Course) -> 
             }
         }
     }
-    // Of a damaged drive nobody knows what came after the last sample. A tick of the very last instant is still due.
-    let end_ns =
-        span.end_ns.filter(|_| reached.broken.is_none()).map_or(reached.at_ns, |end_ns| end_ns.max(reached.at_ns));
+    // Of a damaged drive nobody knows what came after the last sample. A tick of the very last
+    // instant is still due.
+    let end_ns = span
+        .end_ns
+        .filter(|_| reached.broken.is_none())
+        .map_or(reached.at_ns, |end_ns| end_ns.max(reached.at_ns));
     reached.stopped = !ticks(course, end_ns.saturating_add(1))?;
     Ok(reached)
 }

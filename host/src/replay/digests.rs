@@ -21,7 +21,8 @@ pub(super) struct DigestError {
 
 impl Explain for DigestError {}
 
-/// Checksums that are taken on a thread of its own while the lambda runs, from the files that it is about to read anyway.
+/// Checksums that are taken on a thread of its own while the lambda runs, from the files that it is
+/// about to read anyway.
 pub(super) struct Digests(JoinHandle<Result<Vec<DriveDigest>, DigestError>>);
 
 impl Digests {

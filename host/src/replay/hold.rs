@@ -1,4 +1,5 @@
-//! The folder of the results, held by one replay at a time: those of two, mixed, would look like those of one.
+//! The folder of the results, held by one replay at a time: those of two, mixed, would look like
+//! those of one.
 
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -24,7 +25,8 @@ pub(super) enum HoldError {
 }
 
 impl Hold {
-    /// Takes `out`, which is made if there is none. Its lock stays there: who removed it could remove that of another.
+    /// Takes `out`, which is made if there is none. Its lock stays there: who removed it could
+    /// remove that of another.
     pub(super) fn take(out: &Path) -> Result<Self, HoldError> {
         let path = out.join(LOCK);
         let lock = match fs::create_dir_all(out).and_then(|()| own_file::write(&path)) {
@@ -42,8 +44,12 @@ impl Hold {
 impl Explain for HoldError {
     fn help(&self) -> Option<String> {
         Some(match self {
-            Self::Busy { .. } => "wait until it ends, or choose another folder: --out DIR".to_owned(),
-            Self::Lock { source, .. } if InTheWay::of(source).is_some() => InTheWay::HELP.to_owned(),
+            Self::Busy { .. } => {
+                "wait until it ends, or choose another folder: --out DIR".to_owned()
+            }
+            Self::Lock { source, .. } if InTheWay::of(source).is_some() => {
+                InTheWay::HELP.to_owned()
+            }
             Self::Lock { .. } => "choose a folder that you may write to: --out DIR".to_owned(),
         })
     }

@@ -10,7 +10,9 @@ use gleaner_base::{Exit, Failure};
 use gleaner_drives::{Options, Replay, Step, files_of};
 use gleaner_messages::{CompressedView, ImageView, Sources};
 use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen, Report, Spread};
-use gleaner_transport::{DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{
+    DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict,
+};
 use gleaner_vitals::Durations;
 
 use super::open::DriveError;
@@ -45,12 +47,17 @@ pub struct InspectArgs {
 ///
 /// A failure that names the drive that cannot be opened.
 pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Failure> {
-    let options = Options { sources: Some(Sources::new(&[], &definitions())), ..Options::default() };
+    let options =
+        Options { sources: Some(Sources::new(&[], &definitions())), ..Options::default() };
     let open = || Replay::open_as(&args.drives, &options).map_err(DriveError);
     let mut drive = open()?;
     let (start_ns, end_ns) = (drive.start_ns(), drive.end_ns());
     let (mut topics, skipped) = looks(drive.topics());
-    let mut parts = if args.all || bytes(&args.drives)? <= WHOLE_BYTES { Vec::new() } else { spread(start_ns, end_ns) };
+    let mut parts = if args.all || bytes(&args.drives)? <= WHOLE_BYTES {
+        Vec::new()
+    } else {
+        spread(start_ns, end_ns)
+    };
     let (mut damaged, mut out_of_order) = (None, 0);
     if parts.is_empty() {
         damaged = read(&mut drive, &mut topics, None).1;
@@ -67,10 +74,11 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
         damaged = damaged.or(broken);
     }
     let mut topics: Vec<_> = topics.into_iter().map(Look::seen).collect();
-    // One who numbers the messages of all topics together leaves as many out in each as there are in the others.
-    let (read, missing) = topics
-        .iter()
-        .fold((0, 0), |(read, missing), topic| (read + topic.read, topic.missing.unwrap_or(0).saturating_add(missing)));
+    // One who numbers the messages of all topics together leaves as many out in each as there are
+    // in the others.
+    let (read, missing) = topics.iter().fold((0, 0), |(read, missing), topic| {
+        (read + topic.read, topic.missing.unwrap_or(0).saturating_add(missing))
+    });
     if missing > read / 2 {
         topics.iter_mut().for_each(|topic| topic.missing = None);
     }
@@ -79,7 +87,8 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
     Ok(Exit::Ok)
 }
 
-/// The topics that are looked at, by name, and how many there are beyond: those with messages come first.
+/// The topics that are looked at, by name, and how many there are beyond: those with messages come
+/// first.
 fn looks(mut found: Vec<DiscoveredTopic>) -> (Vec<Look>, u64) {
     let skipped = found.len().saturating_sub(TOPICS);
     if skipped > 0 {
@@ -108,8 +117,13 @@ fn spread(start_ns: Option<i64>, end_ns: Option<i64>) -> Vec<[i64; 2]> {
     (0..PARTS).map(|n| [from(n), from(n).saturating_add(PART_NS)]).collect()
 }
 
-/// Reads what it is restricted to, at most so many bytes of messages. Until when it read, if it ended before; and why, if it is damaged.
-fn read(drive: &mut Replay, topics: &mut [Look], most: Option<u64>) -> (Option<i64>, Option<String>) {
+/// Reads what it is restricted to, at most so many bytes of messages. Until when it read, if it
+/// ended before; and why, if it is damaged.
+fn read(
+    drive: &mut Replay,
+    topics: &mut [Look],
+    most: Option<u64>,
+) -> (Option<i64>, Option<String>) {
     let mut subscribed = HashMap::new();
     for (index, topic) in topics.iter_mut().enumerate() {
         topic.begin();
@@ -178,8 +192,10 @@ impl Look {
     /// Another part: what lies between two is no gap.
     fn begin(&mut self) {
         self.last_ns = None;
-        self.seen.missing =
-            self.seen.missing.map(|missing| missing.saturating_add(std::mem::take(&mut self.gaps).lost()));
+        self.seen.missing = self
+            .seen
+            .missing
+            .map(|missing| missing.saturating_add(std::mem::take(&mut self.gaps).lost()));
     }
 
     fn add(&mut self, step: &Step) {
@@ -203,7 +219,8 @@ impl Look {
         let picture = self.first.picture.lock().unwrap_or_else(PoisonError::into_inner).take();
         // Of those kept only two digits are, and no more than a day.
         let max_ns = u64::try_from(self.longest_ns).unwrap_or(0);
-        let interval = self.intervals.as_ref().and_then(Durations::all).map(|kept| Spread { max_ns, ..kept });
+        let interval =
+            self.intervals.as_ref().and_then(Durations::all).map(|kept| Spread { max_ns, ..kept });
         RecordedTopicSeen { interval, picture: picture.flatten(), ..self.seen }
     }
 }
@@ -227,14 +244,20 @@ impl First {
     fn picture(&self, meta: &SampleMeta, cdr: &[u8]) -> Option<Picture> {
         match self.type_name.as_str() {
             "sensor_msgs/msg/Image" => {
-                let ImageView { width, height, encoding, .. } = ImageView::read(cdr, meta.endian).ok()?;
+                let ImageView { width, height, encoding, .. } =
+                    ImageView::read(cdr, meta.endian).ok()?;
                 Some(Picture { encoding: encoding.to_owned(), width, height, is_compressed: false })
             }
             "sensor_msgs/msg/CompressedImage" => {
                 let view = CompressedView::read(cdr, meta.endian).ok()?;
                 let header = gleaner_image::probe(view.data).ok()?;
                 let encoding = header.format.to_string();
-                Some(Picture { encoding, width: header.width, height: header.height, is_compressed: true })
+                Some(Picture {
+                    encoding,
+                    width: header.width,
+                    height: header.height,
+                    is_compressed: true,
+                })
             }
             _ => None,
         }
@@ -252,7 +275,8 @@ mod tests {
         assert_eq!(parts.len(), 3);
         assert!(parts[0][0] == 7 && parts[2][1] > 7 + 100 * second, "{parts:?}");
         assert!(
-            parts.array_windows().all(|[a, b]| a[1] < b[0]) && parts.iter().all(|part| part[1] - part[0] == PART_NS)
+            parts.array_windows().all(|[a, b]| a[1] < b[0])
+                && parts.iter().all(|part| part[1] - part[0] == PART_NS)
         );
         assert_eq!(spread(Some(0), Some(5 * second)), Vec::<[i64; 2]>::new());
         assert_eq!(spread(None, None), Vec::<[i64; 2]>::new());

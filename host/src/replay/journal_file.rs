@@ -18,7 +18,8 @@ use crate::stage::OutputError;
 /// A failure that names it.
 pub(super) fn open(path: &Path) -> Result<File, Failure> {
     own_file::write(path).map_err(|source| match InTheWay::of(&source) {
-        // A pipe would never end, a device is no file to verify later, and a link leads to what is not named here.
+        // A pipe would never end, a device is no file to verify later, and a link leads to what is
+        // not named here.
         Some(why) => {
             let mut failure = no_journal(path);
             failure.causes = vec![why.to_string()];
@@ -40,8 +41,12 @@ enum HeldError {
 impl Explain for HeldError {
     fn help(&self) -> Option<String> {
         Some(match self {
-            Self::Busy { .. } => "wait until it ends, or choose another file: --journal FILE".to_owned(),
-            Self::Lock { .. } => "choose a file on a file system that has locks: --journal FILE".to_owned(),
+            Self::Busy { .. } => {
+                "wait until it ends, or choose another file: --journal FILE".to_owned()
+            }
+            Self::Lock { .. } => {
+                "choose a file on a file system that has locks: --journal FILE".to_owned()
+            }
         })
     }
 
@@ -74,7 +79,8 @@ fn no_journal(path: &Path) -> Failure {
     Failure::new(Exit::Usage, message).with_help("choose another name: --journal FILE")
 }
 
-/// Returns whether a file begins as a journal does, be it of another version, damaged or cut off: such a one may be replaced.
+/// Returns whether a file begins as a journal does, be it of another version, damaged or cut off:
+/// such a one may be replaced.
 fn is_journal(file: &File) -> bool {
     !matches!(Reader::open(file), Err(JournalError::NotAJournal | JournalError::Read { .. }))
 }
@@ -86,15 +92,21 @@ pub struct JournalFile {
 }
 
 impl JournalFile {
-    /// Begins the journal `path` anew. A file there that is no journal is left alone: it may be a drive, named by mistake.
+    /// Begins the journal `path` anew. A file there that is no journal is left alone: it may be a
+    /// drive, named by mistake.
     pub fn create(path: &Path, header: &Header) -> Result<Self, Failure> {
         let failed = |source| OutputError { path: path.to_owned(), source };
         let mut file = open(path)?;
-        // A journal that another process writes must not be emptied. The lock lasts as long as the file is open.
+        // A journal that another process writes must not be emptied. The lock lasts as long as the
+        // file is open.
         match file.try_lock() {
             Ok(()) => {}
-            Err(TryLockError::WouldBlock) => return Err(HeldError::Busy { path: path.to_owned() }.into()),
-            Err(TryLockError::Error(source)) => return Err(HeldError::Lock { path: path.to_owned(), source }.into()),
+            Err(TryLockError::WouldBlock) => {
+                return Err(HeldError::Busy { path: path.to_owned() }.into());
+            }
+            Err(TryLockError::Error(source)) => {
+                return Err(HeldError::Lock { path: path.to_owned(), source }.into());
+            }
         }
         if file.metadata().map_err(failed)?.len() > 0 && !is_journal(&file) {
             return Err(no_journal(path));
@@ -107,11 +119,13 @@ impl JournalFile {
     /// Adds a wake. One with triggers is written at once, as its clip may be listed next.
     pub fn wake(&mut self, entry: &Entry) -> Result<(), OutputError> {
         let written = self.writer.wake(entry);
-        let written = written.and_then(|()| if entry.triggers.is_empty() { Ok(()) } else { self.writer.flush() });
+        let written = written
+            .and_then(|()| if entry.triggers.is_empty() { Ok(()) } else { self.writer.flush() });
         written.map_err(|source| OutputError { path: self.path.clone(), source })
     }
 
-    /// Writes what waits. Where that happens at a time of the clock, the journals of equal replays differ.
+    /// Writes what waits. Where that happens at a time of the clock, the journals of equal replays
+    /// differ.
     pub fn flush(&mut self) -> Result<(), OutputError> {
         self.writer.flush().map_err(|source| OutputError { path: self.path.clone(), source })
     }
@@ -135,13 +149,17 @@ mod tests {
     #[test]
     fn a_journal_is_made_and_a_link_is_none() {
         let folder = tempfile::tempdir().unwrap();
-        let [journal, target, link] = ["drive.journal", "target", "link"].map(|name| folder.path().join(name));
+        let [journal, target, link] =
+            ["drive.journal", "target", "link"].map(|name| folder.path().join(name));
         open(&journal).unwrap();
         assert_eq!(fs::read(&journal).unwrap(), b"");
         std::os::unix::fs::symlink(&target, &link).unwrap();
         let failure = open(&link).unwrap_err();
         let text = failure.to_string();
-        assert!(text.contains("link` is there and is no journal") && text.contains("it is a link"), "{text}");
+        assert!(
+            text.contains("link` is there and is no journal") && text.contains("it is a link"),
+            "{text}"
+        );
         assert_eq!(failure.exit, Exit::Usage);
         assert!(!target.exists());
         fs::hard_link(&journal, &target).unwrap();

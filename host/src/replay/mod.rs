@@ -1,7 +1,8 @@
-//! A built lambda over recorded drives: the very same artifact as on the vehicle, pulled as fast as the machine goes.
+//! A built lambda over recorded drives: the very same artifact as on the vehicle, pulled as fast as
+//! the machine goes.
 //!
-//! Time is the drive's. A sample is delivered, the lambda runs if its schedule says so, then the next: nothing is skipped,
-//! and nothing depends on how fast the machine is.
+//! Time is the drive's. A sample is delivered, the lambda runs if its schedule says so, then the
+//! next: nothing is skipped, and nothing depends on how fast the machine is.
 
 mod chosen;
 mod course;
@@ -42,12 +43,14 @@ const CLOCK: &str = crate::journal::CLOCK_OF_DRIVE;
 impl Job {
     /// Does it, and writes reports to `reports`.
     ///
-    /// For a replay, the exit is [`Exit::DriveDamaged`] if the drive ended in damage, or [`Exit::Internal`] if it could not be
-    /// read further (results up to there are kept); else [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
+    /// For a replay, the exit is [`Exit::DriveDamaged`] if the drive ended in damage, or
+    /// [`Exit::Internal`] if it could not be read further (results up to there are kept); else
+    /// [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
     ///
     /// # Errors
     ///
-    /// A failure if it cannot start, or results cannot be written; of a comparison, the first difference.
+    /// A failure if it cannot start, or results cannot be written; of a comparison, the first
+    /// difference.
     pub fn run(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
         let Self { options, manifest, task } = self;
         match task {
@@ -60,18 +63,23 @@ impl Job {
         }
     }
 
-    /// Does what a worker has to do for it: the guest that `load` makes sends the outcome of each wake, and the rest goes to
-    /// `reports`.
+    /// Does what a worker has to do for it: the guest that `load` makes sends the outcome of each
+    /// wake, and the rest goes to `reports`.
     ///
     /// # Errors
     ///
-    /// A failure if it cannot start. What is found wrong later, the process that reads the outcomes finds as well.
+    /// A failure if it cannot start. What is found wrong later, the process that reads the outcomes
+    /// finds as well.
     pub fn work(self, load: Load<'_>, reports: &Reports) -> Result<Exit, Failure> {
         let Self { options, manifest, task } = self;
         match task {
-            Task::Replay(results) => work::work(&options, results.record, &manifest, load, reports)?,
+            Task::Replay(results) => {
+                work::work(&options, results.record, &manifest, load, reports)?
+            }
             // Over a drive the schedule leads, whatever the journal holds; in a clip, the journal.
-            Task::Verify(claim) if claim.clip.is_none() => work::work(&options, false, &manifest, load, reports)?,
+            Task::Verify(claim) if claim.clip.is_none() => {
+                work::work(&options, false, &manifest, load, reports)?
+            }
             Task::Verify(mut claim) => drop(verify::run(&options, &manifest, &mut claim, load)?),
         }
         Ok(Exit::Ok)

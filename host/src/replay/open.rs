@@ -18,7 +18,10 @@ impl Drives {
         let files = files_of(&named).map_err(DriveError)?;
         // Under whatever name.
         let mut seen = std::collections::HashSet::new();
-        match files.iter().find(|file| std::fs::canonicalize(file).is_ok_and(|path| !seen.insert(path))) {
+        match files
+            .iter()
+            .find(|file| std::fs::canonicalize(file).is_ok_and(|path| !seen.insert(path)))
+        {
             Some(twice) => Err(DriveError(ReplayError::Twice { path: twice.clone() }).into()),
             None => Ok(Self { named, files }),
         }
@@ -34,12 +37,17 @@ pub(super) fn open_drives(options: &Options) -> Result<(Replay, Part), Failure> 
 
 /// Opens the drives, merged by time.
 ///
-/// What a drive does not say of its types is looked for as live: beside the lambda, among those that are bundled, where ROS 2 is
-/// installed.
+/// What a drive does not say of its types is looked for as live: beside the lambda, among those
+/// that are bundled, where ROS 2 is installed.
 pub(super) fn open(options: &Options) -> Result<Replay, ReplayError> {
     let sources = Sources::new(&[options.asked.build.path().join("msg")], &definitions());
     let (unpack_in, unpacked) = (options.unpack_in.clone(), options.unpacked.clone());
-    let opening = replay::Options { sources: Some(sources), unpack_in, unpacked, ..replay::Options::default() };
+    let opening = replay::Options {
+        sources: Some(sources),
+        unpack_in,
+        unpacked,
+        ..replay::Options::default()
+    };
     Replay::open_as(&options.drives.named, &opening)
 }
 
@@ -52,7 +60,9 @@ impl Explain for DriveError {
     fn help(&self) -> Option<String> {
         let help = self.0.help();
         match self.0 {
-            ReplayError::Damaged { .. } => help.map(|help| format!("the results up to the damage are kept; {help}")),
+            ReplayError::Damaged { .. } => {
+                help.map(|help| format!("the results up to the damage are kept; {help}"))
+            }
             _ => help,
         }
     }
@@ -60,7 +70,9 @@ impl Explain for DriveError {
     fn exit(&self) -> Exit {
         match self.0 {
             ReplayError::Damaged { .. } => Exit::DriveDamaged,
-            ReplayError::Read { .. } | ReplayError::Unpack { .. } | ReplayError::NoRoom { .. } => Exit::Internal,
+            ReplayError::Read { .. } | ReplayError::Unpack { .. } | ReplayError::NoRoom { .. } => {
+                Exit::Internal
+            }
             _ => Exit::Usage,
         }
     }

@@ -40,7 +40,8 @@ pub struct ReplayArgs {
     /// Leave out the clips that the table `record` of the manifest asks for.
     #[arg(long)]
     pub no_record: bool,
-    /// Have clips hold these topics of the drive instead of those of the manifest; a `*` stands for any letters.
+    /// Have clips hold these topics of the drive instead of those of the manifest; a `*` stands for
+    /// any letters.
     #[arg(long, value_name = "PATTERN", conflicts_with_all = ["no_record", "verify"])]
     pub topics: Vec<String>,
     /// Write a journal of every wake.
@@ -121,7 +122,8 @@ pub struct Job {
 }
 
 impl Job {
-    /// What a replay may open while the lambda runs: drives again in a further pass, the results, the code that was compiled.
+    /// What a replay may open while the lambda runs: drives again in a further pass, the results,
+    /// the code that was compiled.
     pub fn paths(&self) -> Paths {
         let Options { asked, drives, unpacked, .. } = &self.options;
         let mut read = definitions();
@@ -129,21 +131,33 @@ impl Job {
         read.extend(asked.vehicle.clone());
         read.extend(drives.named.iter().chain(&drives.files).cloned());
         read.extend(unpacked.iter().filter_map(Unpacked::given_name).map(Path::to_owned));
-        read.extend(drives.files.iter().flat_map(|file| journals_of(file)).filter(|journal| journal.is_file()));
+        read.extend(
+            drives
+                .files
+                .iter()
+                .flat_map(|file| journals_of(file))
+                .filter(|journal| journal.is_file()),
+        );
         if let Task::Verify(claim) = &self.task {
             read.push(claim.path().to_owned());
         }
         read.extend(code(self.manifest.lambda.kind));
-        let journal = if let Task::Replay(results) = &self.task { results.journal.clone() } else { None };
-        Paths { read, write: self.results().map(Path::to_owned).into_iter().chain(journal).collect() }
+        let journal =
+            if let Task::Replay(results) = &self.task { results.journal.clone() } else { None };
+        Paths {
+            read,
+            write: self.results().map(Path::to_owned).into_iter().chain(journal).collect(),
+        }
     }
 
-    /// Memory that our own part of the process may still take, in bytes: chunks of drives, unpacked, and of clips.
+    /// Memory that our own part of the process may still take, in bytes: chunks of drives,
+    /// unpacked, and of clips.
     pub fn own_memory(&self) -> u64 {
         512 << 20
     }
 
-    /// Makes an empty journal where none is: nothing but what exists can be granted, and nothing but a file of ours is.
+    /// Makes an empty journal where none is: nothing but what exists can be granted, and nothing
+    /// but a file of ours is.
     ///
     /// # Errors
     ///
@@ -161,11 +175,13 @@ impl Job {
         }
     }
 
-    /// A replay, or with `--verify` a comparison with an earlier one, checked against the build and its manifest.
+    /// A replay, or with `--verify` a comparison with an earlier one, checked against the build and
+    /// its manifest.
     ///
     /// # Errors
     ///
-    /// A failure that names the manifest's line, the key, the topic or what differs from the journal, and the way out.
+    /// A failure that names the manifest's line, the key, the topic or what differs from the
+    /// journal, and the way out.
     pub fn replay(args: ReplayArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.asked.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
@@ -179,24 +195,36 @@ impl Job {
         let (lambda, build) = (&asked.lambda, &asked.build);
         let out = args.out.unwrap_or_else(|| lambda.join("out"));
         if lies_in(&out, build.path()) {
-            let message = format!("`{}` lies in the build, and would change the lambda", out.display());
-            return Err(Failure::new(Exit::Usage, message).with_help("choose another folder: --out DIR"));
+            let message =
+                format!("`{}` lies in the build, and would change the lambda", out.display());
+            return Err(
+                Failure::new(Exit::Usage, message).with_help("choose another folder: --out DIR")
+            );
         }
         if let Some(journal) = args.journal.as_deref().filter(|journal| is_result(journal, &out)) {
             let message = format!("`{}` is a file of the results", journal.display());
-            return Err(
-                Failure::new(Exit::Usage, message).with_help("give the journal a name of its own: --journal FILE")
-            );
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("give the journal a name of its own: --journal FILE"));
         }
-        if let Some(journal) = args.journal.as_deref().filter(|journal| lies_in(journal, build.path())) {
-            let message = format!("`{}` lies in the build, and would change the lambda", journal.display());
-            return Err(Failure::new(Exit::Usage, message).with_help("write the journal elsewhere: --journal FILE"));
+        if let Some(journal) =
+            args.journal.as_deref().filter(|journal| lies_in(journal, build.path()))
+        {
+            let message =
+                format!("`{}` lies in the build, and would change the lambda", journal.display());
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("write the journal elsewhere: --journal FILE"));
         }
-        let results =
-            Results { out, all: args.all, record: !args.no_record, journal: args.journal, repeat: args.repeat };
+        let results = Results {
+            out,
+            all: args.all,
+            record: !args.no_record,
+            journal: args.journal,
+            repeat: args.repeat,
+        };
         let part = Wanted { from: args.from, to: args.to };
         let unpack_in = Some(results.out.clone());
-        let options = Options { asked, drives, part, topics: args.topics, unpack_in, unpacked: Vec::new() };
+        let options =
+            Options { asked, drives, part, topics: args.topics, unpack_in, unpacked: Vec::new() };
         Ok(Self { options, manifest, task: Task::Replay(results) })
     }
 
@@ -209,14 +237,20 @@ impl Job {
         let build = BuildDir::check_fresh(&args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
         let mut claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
-        let asked = AskedArgs { lambda: args.lambda, set: Vec::new(), remap: Vec::new(), vehicle: args.vehicle };
+        let asked = AskedArgs {
+            lambda: args.lambda,
+            set: Vec::new(),
+            remap: Vec::new(),
+            vehicle: args.vehicle,
+        };
         let clip = Drives { named: vec![args.clip.clone()], files: vec![args.clip] };
         let options = claim.options(asked, build, &mut manifest, clip)?;
         Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
     }
 }
 
-/// Whether `path` is within `folder`, under whatever name. What is not there yet is where the nearest folder is that is.
+/// Whether `path` is within `folder`, under whatever name. What is not there yet is where the
+/// nearest folder is that is.
 fn lies_in(path: &Path, folder: &Path) -> bool {
     let Ok(folder) = folder.canonicalize() else { return path.starts_with(folder) };
     let Ok(path) = std::path::absolute(path) else { return false };
@@ -230,9 +264,13 @@ fn is_result(path: &Path, out: &Path) -> bool {
         return true;
     }
     let is_name = path.file_name().is_some_and(|name| RESULTS.iter().any(|result| name == *result));
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder =
+        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let same = |a: &Path, b: &Path| {
-        a == b || std::fs::canonicalize(a).ok().is_some_and(|a| std::fs::canonicalize(b).ok() == Some(a))
+        a == b
+            || std::fs::canonicalize(a)
+                .ok()
+                .is_some_and(|a| std::fs::canonicalize(b).ok() == Some(a))
     };
     is_name && same(folder, out)
 }

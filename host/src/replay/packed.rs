@@ -42,7 +42,8 @@ impl Job {
     /// The packed files among the drives.
     pub fn packed(&self) -> Packed {
         let Options { drives, unpack_in, .. } = &self.options;
-        let options = replay::Options { unpack_in: unpack_in.clone(), ..replay::Options::default() };
+        let options =
+            replay::Options { unpack_in: unpack_in.clone(), ..replay::Options::default() };
         Packed { named: drives.named.clone(), options }
     }
 
@@ -59,9 +60,14 @@ impl Job {
         };
         for pair in unpacked.chunks_exact(2) {
             let [path, name] = pair else { continue };
-            let named = Unpacked::named(path.clone(), name.clone(), broken(path)).map_err(|error| {
-                Failure::caused_by(Exit::Internal, format!("cannot open the content of `{}`", path.display()), &error)
-            })?;
+            let named =
+                Unpacked::named(path.clone(), name.clone(), broken(path)).map_err(|error| {
+                    Failure::caused_by(
+                        Exit::Internal,
+                        format!("cannot open the content of `{}`", path.display()),
+                        &error,
+                    )
+                })?;
             self.options.unpacked.push(named);
         }
         Ok(())
@@ -69,7 +75,8 @@ impl Job {
 }
 
 impl Packed {
-    /// Unpacks the files again for a worker: the content that this process reads has no name any more, and cannot be given one.
+    /// Unpacks the files again for a worker: the content that this process reads has no name any
+    /// more, and cannot be given one.
     ///
     /// # Errors
     ///

@@ -45,9 +45,12 @@ impl Wanted {
 
 fn nothing_in(part: Part, start_ns: i64, end_ns: Option<i64>) -> Failure {
     let seconds = |ns: i64| format!("{:.3} s", ns.saturating_sub(start_ns) as f64 / 1e9);
-    let side = |flag: &str, ns: Option<i64>| ns.map(|ns| format!("{flag} is {} after its start", seconds(ns)));
+    let side = |flag: &str, ns: Option<i64>| {
+        ns.map(|ns| format!("{flag} is {} after its start", seconds(ns)))
+    };
     let asked = [side("--from", part.from_ns), side("--to", part.to_ns)];
-    let mut failure = Failure::new(Exit::Usage, "the drive has nothing in the part that is asked for");
+    let mut failure =
+        Failure::new(Exit::Usage, "the drive has nothing in the part that is asked for");
     failure.causes = vec![asked.into_iter().flatten().collect::<Vec<_>>().join(", ")];
     failure.with_help(format!(
         "the drive is {} long, from @{}.{:09} on",

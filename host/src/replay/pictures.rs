@@ -29,7 +29,11 @@ pub(super) struct Camera {
 
 impl Camera {
     pub(super) fn new(topic: &str, type_name: &str) -> Arc<Self> {
-        Arc::new(Self { topic: topic.to_owned(), type_name: type_name.to_owned(), newest: Mutex::default() })
+        Arc::new(Self {
+            topic: topic.to_owned(),
+            type_name: type_name.to_owned(),
+            newest: Mutex::default(),
+        })
     }
 
     pub(super) fn see(&self, meta: &SampleMeta, cdr: &[u8]) {
@@ -41,8 +45,8 @@ impl Camera {
     }
 }
 
-/// Pictures at the triggers of one pass over a drive. Where there are too many, every second is given up, again and again, so that
-/// those that stay are spread over all of the drive.
+/// Pictures at the triggers of one pass over a drive. Where there are too many, every second is
+/// given up, again and again, so that those that stay are spread over all of the drive.
 pub(super) struct Pictures {
     inputs: Vec<Arc<Topic>>,
     camera: Option<Arc<Camera>>,
@@ -92,18 +96,27 @@ impl Pictures {
     }
 
     fn make(&self, wake: u64, at_ns: i64) -> Option<Made> {
-        let made = |topic: &str, image_ns, jpeg| Made { wake, at_ns, topic: topic.to_owned(), image_ns, jpeg };
+        let made = |topic: &str, image_ns, jpeg| Made {
+            wake,
+            at_ns,
+            topic: topic.to_owned(),
+            image_ns,
+            jpeg,
+        };
         for topic in &self.inputs {
             // Not as the lambda would: a journal notes how far that one looked back.
             let Some(lease) = topic.reader().newest() else { continue };
             let meta = *lease.meta();
-            let jpeg = self.as_before(meta.at_ns).or_else(|| thumbnail(topic.type_name(), &lease, meta.endian));
+            let jpeg = self
+                .as_before(meta.at_ns)
+                .or_else(|| thumbnail(topic.type_name(), &lease, meta.endian));
             return jpeg.map(|jpeg| made(topic.ros_topic(), meta.at_ns, jpeg));
         }
         let camera = self.camera.as_ref()?;
         let newest = camera.newest.lock().unwrap_or_else(PoisonError::into_inner);
         let (meta, cdr) = newest.as_ref()?;
-        let jpeg = self.as_before(meta.at_ns).or_else(|| thumbnail(&camera.type_name, cdr, meta.endian));
+        let jpeg =
+            self.as_before(meta.at_ns).or_else(|| thumbnail(&camera.type_name, cdr, meta.endian));
         jpeg.map(|jpeg| made(&camera.topic, meta.at_ns, jpeg))
     }
 
@@ -112,7 +125,8 @@ impl Pictures {
         self.made.last().filter(|made| made.image_ns == image_ns).map(|made| made.jpeg.clone())
     }
 
-    /// Writes them below `out`, in place of those that were there; also says how many wakes that triggered have none.
+    /// Writes them below `out`, in place of those that were there; also says how many wakes that
+    /// triggered have none.
     pub(super) fn write(self, out: &Path) -> Result<(Vec<Picture>, u64), OutputError> {
         let folder = out.join(FOLDER);
         remove(&folder)?;
@@ -147,11 +161,14 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
     for entry in entries {
         let entry = entry.map_err(failed)?;
         let name = entry.file_name();
-        let number =
-            name.to_str().and_then(|name| name.strip_prefix(PREFIX)).and_then(|name| name.strip_suffix(".jpg"));
+        let number = name
+            .to_str()
+            .and_then(|name| name.strip_prefix(PREFIX))
+            .and_then(|name| name.strip_suffix(".jpg"));
         let number = number.unwrap_or_default();
         if !number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit()) {
-            fs::remove_file(entry.path()).map_err(|source| OutputError { path: entry.path(), source })?;
+            fs::remove_file(entry.path())
+                .map_err(|source| OutputError { path: entry.path(), source })?;
         }
     }
     // It stays if it holds what is not ours.
@@ -194,7 +211,8 @@ mod tests {
 
     fn decision(at_ns: i64) -> Decision {
         let attributes = serde_json::Map::new();
-        let trigger = Trigger { kind: TriggerKind::Event, label: "x".to_owned(), score: None, attributes };
+        let trigger =
+            Trigger { kind: TriggerKind::Event, label: "x".to_owned(), score: None, attributes };
         Decision {
             at_ns,
             cause: Cause::Tick,

@@ -1,4 +1,5 @@
-//! Clips in a replay: the recorder sees the drive's samples beside the lambda, and every wake after it.
+//! Clips in a replay: the recorder sees the drive's samples beside the lambda, and every wake after
+//! it.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,7 +10,8 @@ use gleaner_journal::{Entry, Header};
 use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::{Manifest, Record};
 use gleaner_recorder::{
-    Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image, lambda_digest,
+    Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image,
+    lambda_digest,
 };
 use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, Transport, Verdict};
 
@@ -69,7 +71,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What an earlier replay left in `out`, if it left clips: this one makes none, and results of two would lie side by side.
+/// What an earlier replay left in `out`, if it left clips: this one makes none, and results of two
+/// would lie side by side.
 pub(super) fn remove_clips(out: &Path) -> Result<u64, Failure> {
     if !out.join("clips.jsonl").exists() {
         return Ok(0);
@@ -81,8 +84,9 @@ pub(super) fn remove_clips(out: &Path) -> Result<u64, Failure> {
 impl ReplayRecorder {
     /// Subscribes the topics of `[record]`; none if the manifest has no such table.
     ///
-    /// A topic that the drive does not have is no error: a vehicle's sensors differ from drive to drive. Its clips say so.
-    /// Subscribed before the lambda's inputs, the recorder has the sample that a trigger is about.
+    /// A topic that the drive does not have is no error: a vehicle's sensors differ from drive to
+    /// drive. Its clips say so. Subscribed before the lambda's inputs, the recorder has the sample
+    /// that a trigger is about.
     pub(super) fn subscribe(
         manifest: &Manifest,
         options: &Options,
@@ -92,8 +96,10 @@ impl ReplayRecorder {
             if options.topics.is_empty() {
                 return Ok(None);
             }
-            let failure = Failure::new(Exit::Usage, "there are no clips whose topics --topics could choose");
-            return Err(failure.with_help("add a table [record] to lambda.toml, which says how long clips are"));
+            let failure =
+                Failure::new(Exit::Usage, "there are no clips whose topics --topics could choose");
+            return Err(failure
+                .with_help("add a table [record] to lambda.toml, which says how long clips are"));
         };
         let shared = Arc::new(Mutex::new(Shared { recorder: None, failed: None }));
         let known = drive.topics();
@@ -102,7 +108,10 @@ impl ReplayRecorder {
         let mut is_seen = manifest.inputs.iter().any(|input| is_image(input.type_name.as_str()));
         for name in chosen::topics(rules, options, drive, &known)? {
             let name = name.as_str();
-            let found = known.binary_search_by(|topic| topic.topic.as_str().cmp(name)).ok().map(|at| &known[at]);
+            let found = known
+                .binary_search_by(|topic| topic.topic.as_str().cmp(name))
+                .ok()
+                .map(|at| &known[at]);
             if found.is_none() {
                 tracing::warn!(topic = %name, "the drive does not have this topic of [record]: clips are made without it");
             }
@@ -118,16 +127,25 @@ impl ReplayRecorder {
             if let Some(found) = found
                 && let Err(error) = drive.subscribe(&chosen::spec_of(found), lane.clone())
             {
-                let failure = Failure::caused_by(Exit::Usage, format!("cannot record topic `{name}`"), &error);
-                return Err(failure.with_help("remove the topic from [record], or replay without clips: --no-record"));
+                let failure = Failure::caused_by(
+                    Exit::Usage,
+                    format!("cannot record topic `{name}`"),
+                    &error,
+                );
+                return Err(failure.with_help(
+                    "remove the topic from [record], or replay without clips: --no-record",
+                ));
             }
             lanes.push(lane);
         }
         if !lanes.iter().any(|lane| lane.is_there) {
-            let mut failure = Failure::new(Exit::Usage, "the drive has none of the topics of [record]");
+            let mut failure =
+                Failure::new(Exit::Usage, "the drive has none of the topics of [record]");
             let list = |names: Vec<&str>| names.join("`, `");
-            failure.causes =
-                vec![format!("[record] has `{}`", list(lanes.iter().map(|lane| lane.topic.name.as_str()).collect()))];
+            failure.causes = vec![format!(
+                "[record] has `{}`",
+                list(lanes.iter().map(|lane| lane.topic.name.as_str()).collect())
+            )];
             let help = format!(
                 "the drive has {}; pass --remap FROM:=TO, or replay without clips: --no-record",
                 chosen::list(&known)
@@ -142,8 +160,9 @@ impl ReplayRecorder {
         self.lanes.iter().find_map(|lane| lane.camera.clone())
     }
 
-    /// Makes the recorder, which takes hold of the clips in `out`. What a killed replay left there is recovered, kept
-    /// until the next, and said; what an earlier one left stays until [`ReplayRecorder::replace`].
+    /// Makes the recorder, which takes hold of the clips in `out`. What a killed replay left there
+    /// is recovered, kept until the next, and said; what an earlier one left stays until
+    /// [`ReplayRecorder::replace`].
     pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
         let (folder, recovered) = Folder::open(out)?;
         for clip in &recovered {
@@ -170,12 +189,14 @@ impl ReplayRecorder {
             topics.push(id);
         }
         let (header, digest) = (header.clone(), lambda_digest(&header.files));
-        self.lambda = Some(recorder.add_lambda(Member { header, rules: self.rules.clone(), digest, topics }));
+        self.lambda =
+            Some(recorder.add_lambda(Member { header, rules: self.rules.clone(), digest, topics }));
         lock(&self.shared).recorder = Some(recorder);
         Ok(())
     }
 
-    /// Replaces the clips of an earlier replay, but not those that were recovered; returns how many.
+    /// Replaces the clips of an earlier replay, but not those that were recovered; returns how
+    /// many.
     pub(super) fn replace(&mut self) -> Result<u64, Failure> {
         Ok(self.earlier.take().map_or(Ok(0), |(earlier, recovered)| earlier.replace(&recovered))?)
     }
@@ -204,7 +225,10 @@ impl ReplayRecorder {
         })
     }
 
-    fn with<T: Default>(&self, act: impl FnOnce(&mut Recorder) -> Result<T, RecordError>) -> Result<T, Failure> {
+    fn with<T: Default>(
+        &self,
+        act: impl FnOnce(&mut Recorder) -> Result<T, RecordError>,
+    ) -> Result<T, Failure> {
         match &mut lock(&self.shared).recorder {
             Some(recorder) => Ok(act(recorder)?),
             None => Ok(T::default()),

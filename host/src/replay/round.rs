@@ -83,7 +83,8 @@ impl Course for Pass<'_> {
             if let Some(journal) = &mut self.journal {
                 journal.wake(entry)?;
             }
-            // A clip is listed after the decisions that it is about, wherever a kill meets this process.
+            // A clip is listed after the decisions that it is about, wherever a kill meets this
+            // process.
             if !entry.triggers.is_empty() {
                 self.output.flush()?;
             }
@@ -91,8 +92,12 @@ impl Course for Pass<'_> {
                 recording.wake(entry)?;
             }
         }
-        // In a replay a killed process is not started again: what it kept is gone, and what would follow is no replay of the vehicle.
-        self.stopped = decision.fault.filter(|fault| fault.kind == FaultKind::Killed).map(|fault| fault.message);
+        // In a replay a killed process is not started again: what it kept is gone, and what would
+        // follow is no replay of the vehicle.
+        self.stopped = decision
+            .fault
+            .filter(|fault| fault.kind == FaultKind::Killed)
+            .map(|fault| fault.message);
         Ok(self.stopped.is_none())
     }
 
@@ -105,7 +110,8 @@ impl Course for Pass<'_> {
             self.looked = Instant::now();
             self.output.flush()?;
             let progress = drive.progress();
-            let report = Report::Progress { done: progress.done, total: progress.total, at_ns: step.at_ns };
+            let report =
+                Report::Progress { done: progress.done, total: progress.total, at_ns: step.at_ns };
             send(self.reports, &report);
         }
         Ok(())
@@ -138,13 +144,19 @@ impl Pass<'_> {
     }
 
     /// Goes through the drive, and closes what is recorded.
-    fn run(&mut self, drive: &mut Replay) -> Result<(Reached, gleaner_protocol::Recording), Failure> {
+    fn run(
+        &mut self,
+        drive: &mut Replay,
+    ) -> Result<(Reached, gleaner_protocol::Recording), Failure> {
         let span = Span::of(drive, self.part);
         let reached = course::take(drive, span, self)?;
         // Of a damaged drive nobody knows what came after the last sample.
         let is_whole = reached.broken.is_none() && !reached.stopped;
         let end_ns = span.end_ns.filter(|_| is_whole).unwrap_or(reached.at_ns);
-        let recorded = self.recording.as_ref().map_or(Ok(Default::default()), |recording| recording.finish(end_ns))?;
+        let recorded = self
+            .recording
+            .as_ref()
+            .map_or(Ok(Default::default()), |recording| recording.finish(end_ns))?;
         Ok((reached, recorded))
     }
 }
@@ -168,15 +180,29 @@ pub(super) fn replay(
 ) -> Result<Ended, Failure> {
     let name = manifest.lambda.name.as_str();
     let (mut drive, part) = open_drives(options)?;
-    let mut recording = if results.record { ReplayRecorder::subscribe(manifest, options, &mut drive)? } else { None };
+    let mut recording = if results.record {
+        ReplayRecorder::subscribe(manifest, options, &mut drive)?
+    } else {
+        None
+    };
     let Stage { inputs, session, mut guest } =
         Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
     let started = Instant::now();
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {
         let Asked { build, config, remaps, .. } = &options.asked;
-        header =
-            Some(Identity { manifest, build, config, remaps, engine: guest.engine(), clock: CLOCK, part }.header()?);
+        header = Some(
+            Identity {
+                manifest,
+                build,
+                config,
+                remaps,
+                engine: guest.engine(),
+                clock: CLOCK,
+                part,
+            }
+            .header()?,
+        );
     }
     // The memory of its preroll is none of the lambda's, which is bounded from `init` on.
     if let (Some(recording), Some(header)) = (&mut recording, &header) {
@@ -192,7 +218,8 @@ pub(super) fn replay(
     // What `init` says is no part of a wake.
     let (said, _) = session.take_log();
     initialised.map_err(|fault| not_started(name, fault, &said))?;
-    // Only now does it cost the results of an earlier replay: what could not start must not touch them.
+    // Only now does it cost the results of an earlier replay: what could not start must not touch
+    // them.
     let journal = results.journal.as_deref().zip(header.as_ref());
     let journal = journal.map(|(path, header)| JournalFile::create(path, header)).transpose()?;
     let mut output = Output::create(&results.out, results.all)?;
@@ -230,7 +257,8 @@ pub(super) fn replay(
     let totals = if pass.stopped.is_none() { pass.finish(reached.at_ns, manifest)? } else { None };
     if let (Some(journal), Some(digests)) = (pass.journal.take(), digests) {
         let samples = inputs.iter().map(|topic| offered(topic)).collect();
-        // A journal of a damaged drive, or of a lambda that was killed, has no end: it cannot say what comes there.
+        // A journal of a damaged drive, or of a lambda that was killed, has no end: it cannot say
+        // what comes there.
         let end = End { wakes: pass.wakes, samples, drives: digests.take()? };
         journal.finish((broken.is_none() && pass.stopped.is_none()).then_some(&end))?;
     }
@@ -245,7 +273,10 @@ pub(super) fn replay(
         wakes: pass.wakes,
         triggers: pass.triggers,
         faults: pass.faults,
-        skipped: totals.counts.iter().fold(0, |sum: u64, counts| sum.saturating_add(counts.skipped)),
+        skipped: totals
+            .counts
+            .iter()
+            .fold(0, |sum: u64, counts| sum.saturating_add(counts.skipped)),
         missed_ticks: pass.schedule.missed(),
         out_of_order: drive.out_of_order(),
         log_lines: pass.log_lines,
@@ -271,7 +302,8 @@ pub(super) fn replay(
         stopped: pass.stopped.clone(),
     };
     // A report is drawn from these. The other results are whole without them.
-    let incomplete = pass.gathered.write(&results.out, pass.output, &options.asked.config, totals).err();
+    let incomplete =
+        pass.gathered.write(&results.out, pass.output, &options.asked.config, totals).err();
     output.finish(&summary)?;
     Ok(Ended { summary, broken: broken.map(|error| error.exit()), incomplete })
 }
@@ -281,9 +313,13 @@ fn read_so_far(drive: &Replay, at_ns: i64) -> String {
     let Progress { done, total } = drive.progress();
     let seconds = at_ns.saturating_sub(drive.start_ns().unwrap_or(0)) as f64 / 1e9;
     match total.filter(|total| *total > done) {
-        Some(total) if done > 0 => format!("read: {done} of {total} messages, up to {seconds:.3} s"),
+        Some(total) if done > 0 => {
+            format!("read: {done} of {total} messages, up to {seconds:.3} s")
+        }
         // Without an index, nobody knows how many there were.
-        None if done > 0 => format!("read: {done} messages, up to {seconds:.3} s; what came later is lost"),
+        None if done > 0 => {
+            format!("read: {done} messages, up to {seconds:.3} s; what came later is lost")
+        }
         _ => "read: no message of these topics".to_owned(),
     }
 }

@@ -1,4 +1,5 @@
-//! What the report of a replay is drawn from, beside its results: what the lambda read, what its wakes cost, what a camera saw.
+//! What the report of a replay is drawn from, beside its results: what the lambda read, what its
+//! wakes cost, what a camera saw.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -55,7 +56,8 @@ impl Gathered {
     ///
     /// # Errors
     ///
-    /// [`OutputError`] of the first file that cannot be written. Without pictures, the signals are written all the same.
+    /// [`OutputError`] of the first file that cannot be written. Without pictures, the signals are
+    /// written all the same.
     pub(super) fn write(
         self,
         out: &Path,
@@ -85,7 +87,8 @@ impl Gathered {
 }
 
 fn spread(of: &Histogram<u64>) -> Spread {
-    // A histogram rounds to three digits; rounded up, a wake could seem to have used more than it may.
+    // A histogram rounds to three digits; rounded up, a wake could seem to have used more than it
+    // may.
     let down = |value: u64| of.lowest_equivalent(value);
     let mut bins: Vec<Bin> = Vec::new();
     for value in of.iter_recorded() {

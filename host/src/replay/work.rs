@@ -1,4 +1,5 @@
-//! The course of a replay in a worker: the lambda is woken as its schedule says, and nothing is written.
+//! The course of a replay in a worker: the lambda is woken as its schedule says, and nothing is
+//! written.
 
 use gleaner_base::Failure;
 use gleaner_drives::{Replay, Step};
@@ -17,7 +18,8 @@ use crate::judge::Judge;
 use crate::schedule::Schedule;
 use crate::stage::{Bounds, Load, Stage};
 
-/// Takes a lambda through its drives once, and sends the totals to `reports`. Its outcomes are sent by the guest that `load` makes.
+/// Takes a lambda through its drives once, and sends the totals to `reports`. Its outcomes are sent
+/// by the guest that `load` makes.
 pub(super) fn work(
     options: &Options,
     is_recorded: bool,
@@ -26,8 +28,10 @@ pub(super) fn work(
     reports: &Reports,
 ) -> Result<(), Failure> {
     let (mut drive, part) = open_drives(options)?;
-    // The steps of a drive are those of all topics that are read, recorded ones included, and ticks may be counted between them.
-    let _recorded = if is_recorded { ReplayRecorder::subscribe(manifest, options, &mut drive)? } else { None };
+    // The steps of a drive are those of all topics that are read, recorded ones included, and ticks
+    // may be counted between them.
+    let _recorded =
+        if is_recorded { ReplayRecorder::subscribe(manifest, options, &mut drive)? } else { None };
     let Stage { inputs, session, mut guest } =
         Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
     let curves = Curves::of(&inputs);

@@ -40,7 +40,8 @@ pub struct Asked {
 }
 
 impl Asked {
-    /// Checks the overrides against the manifest, and has the vehicle tighten its limits: from here on they are what holds.
+    /// Checks the overrides against the manifest, and has the vehicle tighten its limits: from here
+    /// on they are what holds.
     ///
     /// # Errors
     ///
@@ -56,7 +57,8 @@ impl Asked {
     }
 }
 
-/// Makes the limits of `manifest` those of the vehicle described in `file`, where these are smaller.
+/// Makes the limits of `manifest` those of the vehicle described in `file`, where these are
+/// smaller.
 ///
 /// # Errors
 ///
@@ -84,7 +86,8 @@ fn remap(text: &str) -> Result<Remap, String> {
 /// Refuses a remap of a topic that the manifest does not have.
 fn known_topics(remaps: &[Remap], manifest: &Manifest) -> Result<(), Failure> {
     let inputs = manifest.inputs.iter().map(|input| input.topic.as_str());
-    let recorded = manifest.record.iter().flat_map(|record| &record.topics).map(|topic| topic.as_str());
+    let recorded =
+        manifest.record.iter().flat_map(|record| &record.topics).map(|topic| topic.as_str());
     let mut known: Vec<&str> = Vec::new();
     for topic in inputs.chain(recorded) {
         if !known.contains(&topic) {
@@ -94,7 +97,10 @@ fn known_topics(remaps: &[Remap], manifest: &Manifest) -> Result<(), Failure> {
     match remaps.iter().find(|remap| !known.contains(&remap.from.as_str())) {
         None => Ok(()),
         Some(remap) => {
-            let failure = Failure::new(Exit::Usage, format!("no input has the topic `{}` of --remap", remap.from));
+            let failure = Failure::new(
+                Exit::Usage,
+                format!("no input has the topic `{}` of --remap", remap.from),
+            );
             Err(failure.with_help(format!("the manifest has `{}`", known.join("`, `"))))
         }
     }

@@ -1,5 +1,5 @@
-//! What every run of a lambda needs, be it over drives or live: what was asked for, rings that a transport fills, a guest that
-//! sees them, and the files of its decisions.
+//! What every run of a lambda needs, be it over drives or live: what was asked for, rings that a
+//! transport fills, a guest that sees them, and the files of its decisions.
 
 mod asked;
 
@@ -21,7 +21,8 @@ use crate::guest::Guest;
 use crate::input::{InputError, Live, open_inputs};
 
 /// Makes the guest of a lambda whose kind the caller can host.
-pub type Load<'a> = &'a mut dyn FnMut(&Asked, &Manifest, Session, Bounds) -> Result<Box<dyn Guest>, Failure>;
+pub type Load<'a> =
+    &'a mut dyn FnMut(&Asked, &Manifest, Session, Bounds) -> Result<Box<dyn Guest>, Failure>;
 
 /// What bounds a wake beside fuel and memory.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -43,7 +44,8 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// Opens the inputs and loads the lambda. `live` says what differs where samples arrive while it runs.
+    /// Opens the inputs and loads the lambda. `live` says what differs where samples arrive while
+    /// it runs.
     ///
     /// # Errors
     ///
@@ -56,16 +58,17 @@ impl Stage {
         live: Option<&Live>,
         load: Load<'_>,
     ) -> Result<Self, Failure> {
-        let inputs = open_inputs(manifest, &asked.remaps, transport, live)
-            .map_err(|error| Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))?;
+        let inputs = open_inputs(manifest, &asked.remaps, transport, live).map_err(|error| {
+            Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error)
+        })?;
         let session = Session::new(inputs.clone(), asked.config.clone(), &manifest.limits);
         let guest = load(asked, manifest, session.clone(), bounds)?;
         Ok(Self { inputs, session, guest })
     }
 }
 
-/// What a lambda's fault in `init` means for a run. What it `said` on the way may be why: what of that is in no file goes to standard
-/// error.
+/// What a lambda's fault in `init` means for a run. What it `said` on the way may be why: what of
+/// that is in no file goes to standard error.
 pub fn not_started(lambda: &str, fault: Fault, said: &[Line]) -> Failure {
     said.iter().for_each(|line| eprintln!("log: {}", visible(&line.message)));
     let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{lambda}`"));

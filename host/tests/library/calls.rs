@@ -29,7 +29,8 @@ fn pixels() -> Vec<u8> {
     noise.take((STEP * HEIGHT) as usize).collect()
 }
 
-/// What calls work on: a large raw picture, a coded one that nobody has decoded yet, and many small samples.
+/// What calls work on: a large raw picture, a coded one that nobody has decoded yet, and many small
+/// samples.
 struct Seen {
     session: Session,
     topic: Arc<Topic>,
@@ -50,7 +51,8 @@ impl Seen {
         };
         let lambda = "[lambda]\nname = \"x\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"x.wasm\"\n[schedule]\nevent = \"raw\"\n";
         let many = "[[input]]\nname = \"many\"\ntopic = \"/many\"\ntype = \"test_msgs/msg/Only\"\ndepth = 1024\nmax_size = \"16 B\"\n";
-        let manifest = [lambda, &input("raw", "Image"), &input("coded", "CompressedImage"), many].concat();
+        let manifest =
+            [lambda, &input("raw", "Image"), &input("coded", "CompressedImage"), many].concat();
         let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
         let mut transport = Loopback::new();
         for (input, definition) in manifest.inputs.iter().zip([IMAGE, COMPRESSED, "uint8 x\n"]) {
@@ -140,8 +142,10 @@ fn a_histogram_and_a_grey_image_made_in_pieces_miss_no_row() {
         let [r, g, b] = [0, 1, 2].map(|channel| u32::from(pixels[at + channel]));
         ((299 * r + 587 * g + 114 * b) / 1000) as u8
     };
-    let expected: Vec<u8> =
-        (0..HEIGHT).flat_map(|y| (0..WIDTH).map(move |x| (x, y))).map(|(x, y)| grey(x, y)).collect();
+    let expected: Vec<u8> = (0..HEIGHT)
+        .flat_map(|y| (0..WIDTH).map(move |x| (x, y)))
+        .map(|(x, y)| grey(x, y))
+        .collect();
     assert!(frame.to_gray().unwrap().bytes() == expected);
     let mut counts = [0_u32; 256];
     expected.iter().for_each(|level| counts[usize::from(*level)] += 1);

@@ -1,4 +1,5 @@
-//! A lambda that faults for ever leaves the host as it was. How often it does here is `GLEANER_FAULTS`.
+//! A lambda that faults for ever leaves the host as it was. How often it does here is
+//! `GLEANER_FAULTS`.
 
 use std::sync::Arc;
 
@@ -78,7 +79,8 @@ fn faults_in_a_row_leave_memory_slots_and_handles_where_they_were() {
         let counts = room.topic.counts();
         assert_eq!((counts.received, counts.no_slot), (u64::from(faults) + 500, 0), "{name}");
         // What it held last went with it: all frames can be had again.
-        let frames: Vec<_> = (0..small().frames).map(|_| room.topic.newest().unwrap().as_frame().unwrap()).collect();
+        let frames: Vec<_> =
+            (0..small().frames).map(|_| room.topic.newest().unwrap().as_frame().unwrap()).collect();
         assert_eq!(frames.len() as u64, small().frames, "{name}");
     }
 }

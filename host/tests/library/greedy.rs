@@ -1,4 +1,5 @@
-//! Guests by themselves: the lambda `greedy` or a component written by hand, with the transport that feeds it.
+//! Guests by themselves: the lambda `greedy` or a component written by hand, with the transport
+//! that feeds it.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -97,17 +98,25 @@ impl Room {
         Self::new(&folder.write("written.wasm", component), Vec::new(), limits, timed)
     }
 
-    fn new(component: &Path, config: Vec<(String, ConfigValue)>, limits: &Limits, timed: bool) -> Self {
-        let mut manifest = Manifest::load(root().join("tests/lambdas/greedy/rust")).expect("greedy has a manifest");
+    fn new(
+        component: &Path,
+        config: Vec<(String, ConfigValue)>,
+        limits: &Limits,
+        timed: bool,
+    ) -> Self {
+        let mut manifest = Manifest::load(root().join("tests/lambdas/greedy/rust"))
+            .expect("greedy has a manifest");
         manifest.limits = *limits;
         let (transport, topic) = subscribed(&manifest, IMAGE);
         let session = Session::new(vec![Arc::clone(&topic)], config, limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded =
-            Loaded::open(component, &cache, limits.stack.as_usize(), Nans::AsMade).expect("a component of this world");
+        let loaded = Loaded::open(component, &cache, limits.stack.as_usize(), Nans::AsMade)
+            .expect("a component of this world");
         let shortest = limits.deadline.min(limits.init_deadline);
-        let deadline = timed.then(|| Deadline::new(loaded.engine(), shortest).expect("a thread can be started"));
-        let guest = WasmGuest::new(loaded, session.clone(), limits, deadline).expect("a guest can be made");
+        let deadline = timed
+            .then(|| Deadline::new(loaded.engine(), shortest).expect("a thread can be started"));
+        let guest =
+            WasmGuest::new(loaded, session.clone(), limits, deadline).expect("a guest can be made");
         let picture = image(400, 250, "rgb8", 1200, &[9; PICTURE as usize]);
         Self { guest, session, topic, transport, picture, sent: 0 }
     }
@@ -186,7 +195,8 @@ pub fn publish(transport: &mut Loopback, topic: &str, seq: u64, cdr: &[u8]) {
     transport.publish(topic, &meta, cdr).expect("a topic");
 }
 
-/// A component of this world, by hand. `parts` come before the module `lambda`, which has `body` and gets `with`.
+/// A component of this world, by hand. `parts` come before the module `lambda`, which has `body`
+/// and gets `with`.
 pub fn component(parts: &str, with: &str, body: &str) -> String {
     format!(
         r#"(component

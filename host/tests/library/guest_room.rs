@@ -1,4 +1,5 @@
-//! The WebAssembly guest by itself: every limit is hit, every cause is named, and a fresh guest follows.
+//! The WebAssembly guest by itself: every limit is hit, every cause is named, and a fresh guest
+//! follows.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -48,8 +49,13 @@ impl Room {
         limits.deadline = deadline.unwrap_or(limits.deadline);
         let session = Session::new(inputs, config, &limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded =
-            Loaded::open(&lambda.join("misbehave.wasm"), &cache, limits.stack.as_usize(), Nans::AsMade).unwrap();
+        let loaded = Loaded::open(
+            &lambda.join("misbehave.wasm"),
+            &cache,
+            limits.stack.as_usize(),
+            Nans::AsMade,
+        )
+        .unwrap();
         let deadline = deadline.map(|allowed| Deadline::new(loaded.engine(), allowed).unwrap());
         let guest = WasmGuest::new(loaded, session.clone(), &limits, deadline).unwrap();
         Self { guest, session, transport, topic, sent: 0 }
@@ -116,7 +122,8 @@ fn the_same_wake_uses_the_same_fuel_also_after_a_trap() {
     let mut again = Room::of("ok");
     assert_eq!((used(&mut again), used(&mut again)), (first, second));
     let mut faulty = Room::of("error");
-    let faults = [faulty.wake(), faulty.wake()].map(|outcome| (outcome.result.is_err(), outcome.fuel));
+    let faults =
+        [faulty.wake(), faulty.wake()].map(|outcome| (outcome.result.is_err(), outcome.fuel));
     assert_eq!(faults[0], faults[1]);
 }
 
@@ -144,7 +151,10 @@ fn memory_beyond_the_cap_is_named_with_both_numbers() {
 fn a_panic_says_what_and_where() {
     let (kind, message) = Room::of("panic").fault();
     assert_eq!(kind, FaultKind::Trap);
-    assert!(message.starts_with("panicked at ") && message.ends_with(": wake 1 is one too many"), "{message}");
+    assert!(
+        message.starts_with("panicked at ") && message.ends_with(": wake 1 is one too many"),
+        "{message}"
+    );
     assert!(!message.contains('\n'), "{message}");
 }
 
@@ -198,7 +208,11 @@ fn a_refusal_in_init_ends_the_start() {
     }
     let fault = Room::new("panic_in_init", FUEL, None).guest.init().unwrap_err();
     assert_eq!(fault.kind, FaultKind::Trap);
-    assert!(fault.message.starts_with("in init: ") && fault.message.contains("no, not today"), "{}", fault.message);
+    assert!(
+        fault.message.starts_with("in init: ") && fault.message.contains("no, not today"),
+        "{}",
+        fault.message
+    );
 }
 
 #[test]

@@ -1,6 +1,6 @@
-//! Calls through the WIT, from the lambda `driver`. Each is paid for. In every order, with whatever arguments: the host stays whole,
-//! gives back what it lent, and decides the same again. Programs are made up by a generator of numbers that always begins with the
-//! same one.
+//! Calls through the WIT, from the lambda `driver`. Each is paid for. In every order, with whatever
+//! arguments: the host stays whole, gives back what it lent, and decides the same again. Programs
+//! are made up by a generator of numbers that always begins with the same one.
 //!
 //! `GLEANER_HOST_CALLS` says how many programs; 10,000 take half a minute, a million an hour.
 
@@ -25,7 +25,8 @@ use gleaner_vitals::usage;
 
 use crate::alone::ran_elsewhere;
 
-/// Most memory by which the process may grow over all programs. What it holds at a time is bounded by the limits of `driver`.
+/// Most memory by which the process may grow over all programs. What it holds at a time is bounded
+/// by the limits of `driver`.
 const GROWTH_BYTES: u64 = 32 << 20;
 
 /// xorshift64: good enough to make up arguments, and the same everywhere.
@@ -90,14 +91,21 @@ impl Driver {
         let lambda = root().join("tests/lambdas/driver/rust/build");
         let manifest = Manifest::load(&lambda).expect("driver is built; run: cargo xtask test");
         let mut transport = Loopback::new();
-        for (input, definition) in manifest.inputs.iter().zip(["uint8[] data\n", IMAGE, COMPRESSED]) {
+        for (input, definition) in manifest.inputs.iter().zip(["uint8[] data\n", IMAGE, COMPRESSED])
+        {
             transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
         }
         let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
         let limits: &Limits = &manifest.limits;
         let session = Session::new(inputs.clone(), Vec::new(), limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(&lambda.join("driver.wasm"), &cache, limits.stack.as_usize(), Nans::AsMade).unwrap();
+        let loaded = Loaded::open(
+            &lambda.join("driver.wasm"),
+            &cache,
+            limits.stack.as_usize(),
+            Nans::AsMade,
+        )
+        .unwrap();
         let deadline = timed.then(|| Deadline::new(loaded.engine(), limits.deadline).unwrap());
         let mut guest = WasmGuest::new(loaded, session.clone(), limits, deadline).unwrap();
         guest.init().unwrap();
@@ -108,7 +116,14 @@ impl Driver {
         self.sent += 1;
         let (at_ns, seq) = (self.sent as i64 * 1_000_000, self.sent);
         let endian = if cdr.len() % 7 == 5 { Endian::Big } else { Endian::Little };
-        let meta = SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian, options: [0; 2] };
+        let meta = SampleMeta {
+            at_ns,
+            publish_ns: at_ns,
+            writer: Guid::default(),
+            seq,
+            endian,
+            options: [0; 2],
+        };
         self.transport.publish(topic, &meta, cdr).unwrap();
     }
 
@@ -118,7 +133,8 @@ impl Driver {
         self.publish("/camera/coded", coded);
         self.publish("/program", &Cdr::default().bytes(program).done());
         self.session.begin(self.sent as i64 * 1_000_000);
-        // It keeps what it likes: then there may be no room for the program, and the one before runs again.
+        // It keeps what it likes: then there may be no room for the program, and the one before
+        // runs again.
         let Some(sample) = self.inputs[0].newest() else { return (Ok(()), None, Vec::new()) };
         let outcome = self.guest.wake(Wake::Event(sample));
         self.session.take_log();
@@ -129,10 +145,14 @@ impl Driver {
 fn pictures() -> Vec<(Vec<u8>, Vec<u8>)> {
     let noise: Vec<u8> = (0..64 * 48 * 3_u32).map(|n| (n * 7 + n / 11) as u8).collect();
     let mut jpeg = Vec::new();
-    jpeg_encoder::Encoder::new(&mut jpeg, 80).encode(&noise, 64, 48, jpeg_encoder::ColorType::Rgb).unwrap();
+    jpeg_encoder::Encoder::new(&mut jpeg, 80)
+        .encode(&noise, 64, 48, jpeg_encoder::ColorType::Rgb)
+        .unwrap();
     let raw = [("rgb8", 192), ("mono16", 128), ("yuv422", 128), ("bayer_rggb8", 64)];
-    raw.map(|(encoding, step)| (image(64, 48, encoding, step, &noise[..48 * step as usize]), compressed(&jpeg)))
-        .to_vec()
+    raw.map(|(encoding, step)| {
+        (image(64, 48, encoding, step, &noise[..48 * step as usize]), compressed(&jpeg))
+    })
+    .to_vec()
 }
 
 /// What the host did for each of some calls behind [`setup`], in units of fuel.
@@ -167,7 +187,9 @@ fn every_call_costs_what_the_list_says() {
         for (arguments, price) in calls {
             let paid = paid(*operation, arguments);
             if paid != price {
-                problems.push(format!("`{name}` {arguments:?} cost {paid} units of fuel; the list says {price}"));
+                problems.push(format!(
+                    "`{name}` {arguments:?} cost {paid} units of fuel; the list says {price}"
+                ));
             }
         }
     }
@@ -183,7 +205,8 @@ fn whatever_a_lambda_calls_the_host_stays_whole() {
     let pictures = pictures();
     let mut numbers = Numbers(0x9e37_79b9_7f4a_7c15);
     // The same calls twice, and once more with a deadline.
-    let (mut first, mut second, mut timed) = (Driver::new(false), Driver::new(false), Driver::new(true));
+    let (mut first, mut second, mut timed) =
+        (Driver::new(false), Driver::new(false), Driver::new(true));
     let (mut faults, mut triggers, mut longest) = ([0_u32; 9], 0, Duration::ZERO);
     let mut resident = None;
     for number in 0..programs {
@@ -191,7 +214,11 @@ fn whatever_a_lambda_calls_the_host_stays_whole() {
         let (raw, coded) = (numbers.message(raw), numbers.message(coded));
         let program = numbers.hostile(600);
         let outcome = first.run(&raw, &coded, &program);
-        assert_eq!(outcome, second.run(&raw, &coded, &program), "program {number} decides otherwise: {program:?}");
+        assert_eq!(
+            outcome,
+            second.run(&raw, &coded, &program),
+            "program {number} decides otherwise: {program:?}"
+        );
         let started = Instant::now();
         let _ = timed.run(&raw, &coded, &program);
         longest = longest.max(started.elapsed());
@@ -205,7 +232,9 @@ fn whatever_a_lambda_calls_the_host_stays_whole() {
         }
     }
     let (before, now) = (resident.unwrap_or_default(), usage::resident());
-    println!("{programs} programs: faults by kind {faults:?}, {triggers} triggers, longest wake {longest:?}");
+    println!(
+        "{programs} programs: faults by kind {faults:?}, {triggers} triggers, longest wake {longest:?}"
+    );
     println!("{} KiB resident after a tenth, {} KiB at the end", before / 1024, now / 1024);
     assert!(now < before + GROWTH_BYTES, "from {before} to {now} bytes");
     assert!(faults.iter().sum::<u32>() > 0 && triggers > 0, "the programs do nothing");

@@ -1,4 +1,5 @@
-//! What is not counted by instructions: calls of WASI cost fuel by what they make the host do, and a wake that comes back late is a fault.
+//! What is not counted by instructions: calls of WASI cost fuel by what they make the host do, and
+//! a wake that comes back late is a fault.
 
 use std::time::Duration;
 
@@ -7,8 +8,9 @@ use gleaner_base::ByteSize;
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
 
-/// A component with these imports of WASI, of which `functions` are known to its module by name; `fill` writes a number there as often
-/// as it is told, from 16 on, where the host reads, and `read` gives what is so far behind that.
+/// A component with these imports of WASI, of which `functions` are known to its module by name;
+/// `fill` writes a number there as often as it is told, from 16 on, where the host reads, and
+/// `read` gives what is so far behind that.
 fn calls_wasi(imports: &str, functions: &[&str], wake: &str) -> String {
     let lowered: String = functions
         .iter()
@@ -16,7 +18,8 @@ fn calls_wasi(imports: &str, functions: &[&str], wake: &str) -> String {
             format!("(core func ${name} (canon lower (func ${name}) (memory $its-memory) (realloc $its-realloc)))\n")
         })
         .collect();
-    let exported: String = functions.iter().map(|name| format!(r#"(export "{name}" (func ${name}))"#)).collect();
+    let exported: String =
+        functions.iter().map(|name| format!(r#"(export "{name}" (func ${name}))"#)).collect();
     let parts = format!(
         r#"{imports}
            (core module $store
@@ -105,7 +108,8 @@ fn a_long_list_of_things_to_wait_for_is_paid_for() {
     assert_eq!(waits_for(2000, more - 1).fault().kind, FaultKind::Fuel);
 }
 
-/// Looks up a name of so many bytes, as `wake` says, which has the answer at 16: whether it is an error, and its code.
+/// Looks up a name of so many bytes, as `wake` says, which has the answer at 16: whether it is an
+/// error, and its code.
 fn looks_up(bytes: u32, wake: &str) -> Room {
     let imports = r#"
         (import "wasi:sockets/network@0.2.0" (instance $network
@@ -145,10 +149,10 @@ fn a_name_of_another_machine_is_not_looked_up_and_costs_fuel_by_the_byte() {
     let code = "(if (i32.ne (call $read (i32.const 4)) (i32.const 20)) (then (unreachable)))";
     let error = "(if (i32.ne (call $read (i32.const 0)) (i32.const 1)) (then (unreachable)))";
     let answered = format!("(call $look_up (call $ours)) {error} {code}");
-    let [some, more, most] = [100_000, 200_000, 400_000].map(|bytes| looks_up(bytes, &answered).fuel());
+    let [some, more, most] =
+        [100_000, 200_000, 400_000].map(|bytes| looks_up(bytes, &answered).fuel());
     assert_eq!((more - some, most - more), (100_000 / 8, 200_000 / 8));
-    let endless =
-        "(local $network i32) (local.set $network (call $ours)) (loop (call $look_up (local.get $network)) (br 0))";
+    let endless = "(local $network i32) (local.set $network (call $ours)) (loop (call $look_up (local.get $network)) (br 0))";
     let outcome = looks_up(1_000_000, endless).wake();
     assert_eq!(outcome.result.unwrap_err().kind, FaultKind::Fuel);
     let fuel = outcome.fuel.unwrap();
@@ -198,7 +202,12 @@ fn a_wake_that_comes_back_late_is_a_fault_though_nothing_ended_it() {
     let mut room = Room::written_timed(&fills(), &limits);
     room.guest.init().unwrap();
     let fault = room.fault();
-    assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(2_000_000)), "{}", fault.message);
+    assert_eq!(
+        (fault.kind, fault.allowed),
+        (FaultKind::Deadline, Some(2_000_000)),
+        "{}",
+        fault.message
+    );
     assert!(fault.used > Some(4_000_000), "{}", fault.message);
     assert!(fault.message.ends_with("ms; the deadline is 2.0 ms"), "{}", fault.message);
     // A replay has no deadline, and a wake that is in time is none.
@@ -213,6 +222,11 @@ fn a_start_function_that_grows_a_memory_for_ever_is_ended_by_its_fuel() {
     let text = component("", "", &format!("(memory $large 1) {grow}"));
     let fault = Room::written(&text).guest.init().unwrap_err();
     // The host's part alone ends it: 64 KiB cost 8,192 units, and so does a refusal.
-    assert_eq!((fault.kind, fault.allowed), (FaultKind::Fuel, Some(20 * FUEL)), "{}", fault.message);
+    assert_eq!(
+        (fault.kind, fault.allowed),
+        (FaultKind::Fuel, Some(20 * FUEL)),
+        "{}",
+        fault.message
+    );
     assert!(fault.used < Some(20 * FUEL + 20 * FUEL / 20), "{}", fault.message);
 }

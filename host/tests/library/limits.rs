@@ -1,4 +1,5 @@
-//! What a lambda may have at most, limit by limit: a greedy guest is stopped with the cause, and the host stays small.
+//! What a lambda may have at most, limit by limit: a greedy guest is stopped with the cause, and
+//! the host stays small.
 
 use std::sync::Arc;
 
@@ -24,7 +25,11 @@ fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
         let first = room.fault();
         assert_eq!(first.kind, FaultKind::HostCall, "{behaviour}: {first:?}");
         let allowed = Limits::DEFAULT.handles;
-        assert!(first.message.contains(&format!("{allowed} handles")), "{behaviour}: {}", first.message);
+        assert!(
+            first.message.contains(&format!("{allowed} handles")),
+            "{behaviour}: {}",
+            first.message
+        );
         assert_eq!((first.used, first.allowed), (Some(allowed + 1), Some(allowed)), "{behaviour}");
         // What the guest held went with it, so the second one comes as far as the first.
         assert!(Arc::strong_count(&room.topic) < owners, "{behaviour}");
@@ -43,10 +48,14 @@ fn an_endless_init_ends_with_its_fuel() {
 #[test]
 fn the_work_of_the_host_costs_fuel_by_the_byte() {
     for behaviour in ["read_cdr", "read_frame"] {
-        let [some, more, most] = [50_000, 100_000, 200_000].map(|bytes| Room::greedy(behaviour, bytes).fuel());
+        let [some, more, most] =
+            [50_000, 100_000, 200_000].map(|bytes| Room::greedy(behaviour, bytes).fuel());
         // A unit for each eight bytes, and what the guest does itself does not depend on them.
         let near = |fuel: u64, bytes: u64| fuel.abs_diff(bytes / 8) < 500;
-        assert!(near(more - some, 50_000) && near(most - more, 100_000), "{behaviour}: {some} {more} {most}");
+        assert!(
+            near(more - some, 50_000) && near(most - more, 100_000),
+            "{behaviour}: {some} {more} {most}"
+        );
     }
     let (luma, idle) = (Room::greedy("mean_luma", 0).fuel(), Room::greedy("ok", 0).fuel());
     assert!(luma - idle >= u64::from(PICTURE) / 8, "{luma} and {idle}");
@@ -62,7 +71,8 @@ fn a_long_text_is_refused_by_its_length_and_paid_for() {
     assert!(outcome.fuel.unwrap() >= 100_000 / 8);
 }
 
-/// A component with two more memories or tables, each in a module of its own, that `$a` and `$b` grow.
+/// A component with two more memories or tables, each in a module of its own, that `$a` and `$b`
+/// grow.
 fn two_stores([a, b]: [&str; 2], wake: &str) -> String {
     let parts = format!(
         r#"(core module $a {a}) (core instance $a (instantiate $a))
@@ -78,7 +88,9 @@ fn two_stores([a, b]: [&str; 2], wake: &str) -> String {
 
 /// A store of `pages`, as in `1` or `1 2`.
 fn memory(pages: &str) -> String {
-    format!(r#"(memory {pages}) (func (export "grow") (param i32) (result i32) (memory.grow (local.get 0)))"#)
+    format!(
+        r#"(memory {pages}) (func (export "grow") (param i32) (result i32) (memory.grow (local.get 0)))"#
+    )
 }
 
 /// A store of elements, likewise.
@@ -94,20 +106,30 @@ const MUST_NOT: &str = "(if (i32.ne (i32.const -1)) (then (unreachable)))";
 #[test]
 fn the_memories_of_a_component_count_together() {
     // 100 pages for each are within the cap of 256; 200 for the one and then for the other are not.
-    let grow = |pages| format!("(call $a (i32.const {pages})) {MUST} (call $b (i32.const {pages})) {MUST}");
+    let grow = |pages| {
+        format!("(call $a (i32.const {pages})) {MUST} (call $b (i32.const {pages})) {MUST}")
+    };
     let stores = [memory("1"), memory("1")];
-    let wake = |pages| Room::written(&two_stores(stores.each_ref().map(String::as_str), &grow(pages))).wake();
+    let wake = |pages| {
+        Room::written(&two_stores(stores.each_ref().map(String::as_str), &grow(pages))).wake()
+    };
     wake(100).result.unwrap();
     let fault = wake(200).result.unwrap_err();
     let asked = (200 + 200 + 3) * PAGE;
-    assert_eq!((fault.kind, fault.used, fault.allowed), (FaultKind::Memory, Some(asked), Some(MEMORY)));
+    assert_eq!(
+        (fault.kind, fault.used, fault.allowed),
+        (FaultKind::Memory, Some(asked), Some(MEMORY))
+    );
 }
 
 #[test]
 fn a_component_that_starts_with_more_memory_than_it_may_have_does_not_start() {
     let large = memory("200");
     let fault = Room::written(&two_stores([&large, &large], "")).guest.init().unwrap_err();
-    assert_eq!((fault.kind, fault.used, fault.allowed), (FaultKind::Memory, Some(400 * PAGE), Some(MEMORY)));
+    assert_eq!(
+        (fault.kind, fault.used, fault.allowed),
+        (FaultKind::Memory, Some(400 * PAGE), Some(MEMORY))
+    );
     assert!(fault.message.starts_with("in init: asked for 26214400 bytes"), "{}", fault.message);
 }
 
@@ -121,7 +143,8 @@ fn memory_that_was_asked_for_and_not_given_is_not_counted() {
 #[test]
 fn the_tables_of_a_component_count_together() {
     let grow = |n| format!("(call $a (i32.const {n})) {MUST} (call $b (i32.const {n}))");
-    let wake = |wake: String| Room::written(&two_stores([&table("1"), &table("1")], &wake)).wake().result;
+    let wake =
+        |wake: String| Room::written(&two_stores([&table("1"), &table("1")], &wake)).wake().result;
     wake(grow(9000) + MUST).unwrap();
     wake(grow(15_000) + MUST_NOT).unwrap();
 }
@@ -132,8 +155,8 @@ fn elements_that_were_asked_for_and_not_given_are_not_counted() {
     Room::written(&two_stores([&table("1 2"), &table("1")], &wake)).wake().result.unwrap();
 }
 
-/// A component that at each wake does `first`, and then causes an event with 4,096 attributes whose keys are all the same:
-/// the second mebibyte of a memory that is zero.
+/// A component that at each wake does `first`, and then causes an event with 4,096 attributes whose
+/// keys are all the same: the second mebibyte of a memory that is zero.
 fn four_gibibytes(first: &str) -> String {
     let parts = r#"
         (import "gleaner:lambda/trigger@0.1.0" (instance $trigger
@@ -189,8 +212,15 @@ fn a_refusal_of_memory_that_a_guest_survives_is_not_the_cause_of_what_the_host_r
     assert_eq!(fault.kind, FaultKind::HostCall, "{}", fault.message);
 }
 
-/// An input without a guest, and so many of the same message in its ring. Of a type its name and definition are needed.
-fn topic((name, text): (&str, &str), depth: usize, max_size: &str, messages: u64, cdr: &[u8]) -> Arc<Topic> {
+/// An input without a guest, and so many of the same message in its ring. Of a type its name and
+/// definition are needed.
+fn topic(
+    (name, text): (&str, &str),
+    depth: usize,
+    max_size: &str,
+    messages: u64,
+    cdr: &[u8],
+) -> Arc<Topic> {
     let manifest = format!(
         "[lambda]\nname = \"many\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"many.wasm\"\n\
          [schedule]\nevent = \"many\"\nbacklog = \"each\"\n\
@@ -221,7 +251,9 @@ fn a_column_has_the_newest_65_536_values() {
     let sent = COLUMN_LEN as u64 + 100;
     let topic = topic(only("uint8 x\n"), COLUMN_LEN, "16 B", sent, &[7]);
     let field = topic.field("x").unwrap();
-    for column in [topic.column(&field, usize::MAX).unwrap(), topic.column_since(&field, 0).unwrap()] {
+    for column in
+        [topic.column(&field, usize::MAX).unwrap(), topic.column_since(&field, 0).unwrap()]
+    {
         assert_eq!((column.values.len(), column.at_ns.len()), (COLUMN_LEN, COLUMN_LEN));
         assert_eq!((column.at_ns[0], column.at_ns[COLUMN_LEN - 1]), (101, sent as i64));
     }
@@ -237,13 +269,20 @@ fn one_call_hands_out_one_mebibyte_of_a_message() {
     for (offset, left) in [(size - 3, 3), (size, 0), (size + 1, 0), (u64::MAX, 0)] {
         assert_eq!(sample.cdr(offset, u32::MAX).unwrap().len(), left);
     }
-    refused(&sample.get(&topic.field("x").unwrap()), "has 1048577 items, one call hands out 1048576");
+    refused(
+        &sample.get(&topic.field("x").unwrap()),
+        "has 1048577 items, one call hands out 1048576",
+    );
 }
 
 #[test]
 fn one_call_hands_out_one_mebibyte_of_a_frame() {
     let cdr = image(700, 600, "rgb8", 2100, &vec![9; 1_260_000]);
-    let frame = topic(("sensor_msgs/msg/Image", IMAGE), 1, "2 MiB", 1, &cdr).newest().unwrap().as_frame().unwrap();
+    let frame = topic(("sensor_msgs/msg/Image", IMAGE), 1, "2 MiB", 1, &cdr)
+        .newest()
+        .unwrap()
+        .as_frame()
+        .unwrap();
     let size = 1_260_000;
     assert_eq!(frame.read(0, u32::MAX).unwrap().len(), BYTES_PER_CALL);
     for (offset, left) in [(size - 3, 3), (size, 0), (u64::MAX, 0)] {
@@ -261,9 +300,15 @@ fn a_list_that_is_longer_than_one_call_hands_out_is_refused_and_not_cut() {
         sample.get(&field).map(drop)
     };
     get("string[] x\n", &texts(TEXTS_PER_FIELD)).unwrap();
-    refused(&get("string[] x\n", &texts(TEXTS_PER_FIELD + 1)), "has 4097 items, one call hands out 4096");
+    refused(
+        &get("string[] x\n", &texts(TEXTS_PER_FIELD + 1)),
+        "has 4097 items, one call hands out 4096",
+    );
     get("uint16[] x\n", &numbers(COLUMN_LEN)).unwrap();
-    refused(&get("uint16[] x\n", &numbers(COLUMN_LEN + 1)), "has 65537 items, one call hands out 65536");
+    refused(
+        &get("uint16[] x\n", &numbers(COLUMN_LEN + 1)),
+        "has 65537 items, one call hands out 65536",
+    );
 }
 
 #[test]
@@ -276,7 +321,9 @@ fn a_path_is_not_read_if_it_is_too_long() {
 
 fn refused<T>(answer: &Result<T, DataError>, why: &str) {
     match answer {
-        Err(error @ DataError::WrongField { .. }) => assert!(error.to_string().contains(why), "{error}"),
+        Err(error @ DataError::WrongField { .. }) => {
+            assert!(error.to_string().contains(why), "{error}")
+        }
         Err(error) => panic!("{error}"),
         Ok(_) => panic!("an answer"),
     }

@@ -1,4 +1,5 @@
-//! A whole live run over a loopback: time, results, reports and what is published, without DDS, a shim or a sandbox.
+//! A whole live run over a loopback: time, results, reports and what is published, without DDS, a
+//! shim or a sandbox.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, PipeReader, Read, pipe};
@@ -40,7 +41,12 @@ impl Guest for Numbers {
         let Wake::Event(sample) = wake else { panic!("samples wake this lambda") };
         let value = sample.number(&sample.topic().field("value").unwrap()).unwrap();
         self.0.event("number", value, Vec::new()).unwrap();
-        let fault = Fault { kind: FaultKind::Exception, message: "negative".to_owned(), used: None, allowed: None };
+        let fault = Fault {
+            kind: FaultKind::Exception,
+            message: "negative".to_owned(),
+            used: None,
+            allowed: None,
+        };
         Outcome { result: if value < 0.0 { Err(fault) } else { Ok(()) }, fuel: None, run_ns: None }
     }
 
@@ -67,12 +73,14 @@ impl Running {
                         [schedule]\nevent = \"numbers\"\n\
                         [[input]]\nname = \"numbers\"\ntopic = \"/numbers\"\ntype = \"test_msgs/msg/Number\"\n";
         let manifest = Manifest::parse(manifest, "lambda.toml").unwrap();
-        let (loopback, clock, stop) = (Loopback::new(), Clock::of_today(), Arc::<AtomicBool>::default());
+        let (loopback, clock, stop) =
+            (Loopback::new(), Clock::of_today(), Arc::<AtomicBool>::default());
         loopback.add_topic(NUMBERS, "test_msgs/msg/Number", "int64 value\n");
         loopback.add_topic(DECISIONS, "std_msgs/msg/String", "string data\n");
         let (reports, to_reports) = pipe().unwrap();
         let (results, to_results) = pipe().unwrap();
-        let (source, stopped, announce) = (loopback.clone(), Arc::clone(&stop), announce.map(str::to_owned));
+        let (source, stopped, announce) =
+            (loopback.clone(), Arc::clone(&stop), announce.map(str::to_owned));
         let run = thread::spawn(move || {
             let pulse = Pulse::make().unwrap().0;
             let folder = PathBuf::from("numbers");
@@ -85,7 +93,14 @@ impl Running {
                     vehicle: None,
                 },
                 manifest,
-                settings: Settings { out: folder, all: false, restarts: 0, clock, round_trip: None, announce },
+                settings: Settings {
+                    out: folder,
+                    all: false,
+                    restarts: 0,
+                    clock,
+                    round_trip: None,
+                    announce,
+                },
                 source: Box::new(source),
                 recorder: None,
                 results: Pages::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
@@ -93,11 +108,13 @@ impl Running {
                 close: &mut || Ok(Vec::new()),
                 stop: &stopped,
             };
-            let mut load =
-                |_: &Asked, _: &Manifest, session: Session, _| Ok(Box::new(Numbers(session)) as Box<dyn Guest>);
+            let mut load = |_: &Asked, _: &Manifest, session: Session, _| {
+                Ok(Box::new(Numbers(session)) as Box<dyn Guest>)
+            };
             run.run(&mut load, File::from(OwnedFd::from(to_reports)))
         });
-        let mut running = Self { loopback, clock, stop, reports: BufReader::new(reports), results, run, sent: 0 };
+        let mut running =
+            Self { loopback, clock, stop, reports: BufReader::new(reports), results, run, sent: 0 };
         running.until(|report| matches!(report, Report::Ready).then_some(()));
         running
     }
@@ -129,7 +146,9 @@ impl Running {
 
     /// Waits for the decision of the next wake with a trigger, and returns its score.
     fn decided(&mut self) -> f64 {
-        self.until(|report| if let Report::Decision(decision) = report { decision.triggers[0].score } else { None })
+        self.until(|report| {
+            if let Report::Decision(decision) = report { decision.triggers[0].score } else { None }
+        })
     }
 
     /// Stops the run; returns its end, and its results.
@@ -151,7 +170,13 @@ fn each_sample_wakes_the_lambda_and_each_decision_is_a_report_and_a_result() {
     }
     let (ended, pages) = running.stop();
     assert_eq!(ended.unwrap(), Exit::Ok);
-    let [Page::Woken(woken_by), Page::Decision(_), Page::Decision(_), Page::Decision(_), Page::Last(last)] = &pages[..]
+    let [
+        Page::Woken(woken_by),
+        Page::Decision(_),
+        Page::Decision(_),
+        Page::Decision(_),
+        Page::Last(last),
+    ] = &pages[..]
     else {
         panic!("{pages:?}");
     };
@@ -169,7 +194,9 @@ fn a_fault_is_a_decision_the_run_goes_on_and_its_exit_says_so() {
     assert_eq!(running.decided(), 5.0);
     let (ended, pages) = running.stop();
     assert_eq!(ended.unwrap(), Exit::LambdaFaulted);
-    let faults = pages.iter().filter(|page| matches!(page, Page::Decision(decision) if decision.fault.is_some()));
+    let faults = pages
+        .iter()
+        .filter(|page| matches!(page, Page::Decision(decision) if decision.fault.is_some()));
     assert_eq!(faults.count(), 1);
 }
 
@@ -182,7 +209,10 @@ fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_whole() {
     running.until(|report| matches!(report, Report::Ended(_)).then_some(()));
     let (ended, pages) = running.stop();
     let failure = ended.unwrap_err();
-    assert_eq!((failure.exit, failure.causes), (Exit::Unreachable, vec!["the cable is cut".to_owned()]));
+    assert_eq!(
+        (failure.exit, failure.causes),
+        (Exit::Unreachable, vec!["the cable is cut".to_owned()])
+    );
     assert!(matches!(pages.last(), Some(Page::Last(last)) if last.wakes == 1), "{pages:?}");
 }
 

@@ -1,5 +1,5 @@
-//! What the host's library does with guests and inputs that a test feeds by hand, as one program: each file is a subject.
-//! Tests that start programs lie in the workspace's `tests/`.
+//! What the host's library does with guests and inputs that a test feeds by hand, as one program:
+//! each file is a subject. Tests that start programs lie in the workspace's `tests/`.
 
 mod alone;
 mod calls;

@@ -1,4 +1,5 @@
-//! When a lambda runs, over a transport that the test feeds by hand. Ticks over a drive: `tests/tests/programs/schedule.rs`.
+//! When a lambda runs, over a transport that the test feeds by hand. Ticks over a drive:
+//! `tests/tests/programs/schedule.rs`.
 
 use std::sync::Arc;
 use std::thread;
@@ -45,7 +46,12 @@ impl Feed {
         let mut transport = Loopback::new();
         transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", IMU);
         let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
-        Self { transport, topic: Arc::clone(&inputs[0]), schedule: Schedule::new(&manifest, &inputs), sent: 0 }
+        Self {
+            transport,
+            topic: Arc::clone(&inputs[0]),
+            schedule: Schedule::new(&manifest, &inputs),
+            sent: 0,
+        }
     }
 
     /// Publishes so many samples, numbered from 1.
@@ -72,8 +78,14 @@ impl Feed {
 
 fn send(transport: &mut Loopback, seq: u64, cdr: &[u8]) {
     let at_ns = seq as i64 * MS;
-    let meta =
-        SampleMeta { at_ns, publish_ns: at_ns, writer: Guid::default(), seq, endian: Endian::Little, options: [0; 2] };
+    let meta = SampleMeta {
+        at_ns,
+        publish_ns: at_ns,
+        writer: Guid::default(),
+        seq,
+        endian: Endian::Little,
+        options: [0; 2],
+    };
     transport.publish("/imu/data", &meta, cdr).unwrap();
 }
 
@@ -148,8 +160,8 @@ fn no_sample_wakes_twice_or_after_a_newer_one_while_the_ring_takes_back_what_nob
     for backlog in ["each", "latest"].repeat(4) {
         let mut feed = Feed::new(backlog, DEPTH as usize, "1 MiB");
         let mut held = Vec::new();
-        // All cells but one are held, so each sample is written over the one before it. As long as that takes, the
-        // newest sample that the ring shows is one that has been judged.
+        // All cells but one are held, so each sample is written over the one before it. As long as
+        // that takes, the newest sample that the ring shows is one that has been judged.
         while feed.topic.counts().no_slot == 0 {
             feed.publish(1);
             held.extend(feed.next());

@@ -1,4 +1,5 @@
-//! Every limit of `[limits]`, made small and then hit: the cause is named with what was used and what was allowed.
+//! Every limit of `[limits]`, made small and then hit: the cause is named with what was used and
+//! what was allowed.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,7 +21,12 @@ fn with(change: impl FnOnce(&mut Limits)) -> Limits {
 
 #[track_caller]
 fn is(fault: &Fault, kind: FaultKind, used: Option<u64>, allowed: u64) {
-    assert_eq!((fault.kind, fault.used, fault.allowed), (kind, used, Some(allowed)), "{}", fault.message);
+    assert_eq!(
+        (fault.kind, fault.used, fault.allowed),
+        (kind, used, Some(allowed)),
+        "{}",
+        fault.message
+    );
 }
 
 #[test]
@@ -42,14 +48,19 @@ fn the_deadline_of_a_wake_and_of_init_are_two_limits() {
         let behaviour = if wake < init { "endless" } else { "endless_init" };
         let mut room = Room::timed(behaviour, 0, &limits);
         let fault = if wake < init { room.fault() } else { room.guest.init().unwrap_err() };
-        assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(20_000_000)), "{fault:?}");
+        assert_eq!(
+            (fault.kind, fault.allowed),
+            (FaultKind::Deadline, Some(20_000_000)),
+            "{fault:?}"
+        );
         assert!(fault.used >= fault.allowed && fault.used < Some(10_000_000_000), "{fault:?}");
     }
 }
 
 #[test]
 fn a_call_that_does_not_end_in_time_ends_between_two_rows() {
-    // 800 MB of pixels, for which no machine takes less than 150 ms; a limit that was computed once would let it begin.
+    // 800 MB of pixels, for which no machine takes less than 150 ms; a limit that was computed once
+    // would let it begin.
     let limits = with(|limits| {
         (limits.fuel, limits.memory) = (Limits::MOST.fuel, ByteSize::mib(1024));
         limits.deadline = Duration::from_millis(150);
@@ -89,17 +100,24 @@ fn a_smaller_stack_is_full_earlier() {
     let endless = component("", "", "(func $wake (call $wake) (call $wake))");
     let deep = |stack: ByteSize| {
         let fuel_lasts = |fuel: &u64| {
-            let outcome =
-                Room::written_within(&endless, &with(|limits| (limits.stack, limits.fuel) = (stack, *fuel))).wake();
+            let outcome = Room::written_within(
+                &endless,
+                &with(|limits| (limits.stack, limits.fuel) = (stack, *fuel)),
+            )
+            .wake();
             let fault = outcome.result.unwrap_err();
             if fault.kind == FaultKind::Stack {
                 is(&fault, FaultKind::Stack, None, stack.bytes());
-                // A journal would not be the same on another processor, whose code takes another amount of stack.
+                // A journal would not be the same on another processor, whose code takes another
+                // amount of stack.
                 assert_eq!(outcome.fuel, None);
             }
             fault.kind == FaultKind::Stack
         };
-        (0..24).map(|power| 64 << power).find(fuel_lasts).expect("some fuel lasts until the stack is full")
+        (0..24)
+            .map(|power| 64 << power)
+            .find(fuel_lasts)
+            .expect("some fuel lasts until the stack is full")
     };
     let (least, most) = (deep(Limits::LEAST.stack), deep(Limits::MOST.stack));
     assert!((16..=64).contains(&(most / least)), "{least} and {most}");
@@ -107,11 +125,15 @@ fn a_smaller_stack_is_full_earlier() {
 
 #[test]
 fn an_access_outside_of_memory_names_the_stack_as_a_possible_cause() {
-    // As of a compiler's stack, which lies at the low end of memory, when a recursion gets below it.
-    let fault = Room::written(&component("", "", "(func $wake (drop (i32.load (i32.const -8))))")).fault();
+    // As of a compiler's stack, which lies at the low end of memory, when a recursion gets below
+    // it.
+    let fault =
+        Room::written(&component("", "", "(func $wake (drop (i32.load (i32.const -8))))")).fault();
     assert_eq!(fault.kind, FaultKind::Trap, "{}", fault.message);
     assert!(
-        fault.message.ends_with("out of bounds memory access; perhaps its stack is exhausted by a deep recursion"),
+        fault.message.ends_with(
+            "out of bounds memory access; perhaps its stack is exhausted by a deep recursion"
+        ),
         "{}",
         fault.message
     );
@@ -154,7 +176,8 @@ fn topic(definition: &str, limits: &str, messages: u64, cdr: &[u8]) -> Arc<Topic
          [[input]]\nname = \"many\"\ntopic = \"/many\"\ntype = \"test_msgs/msg/Only\"\ndepth = 100\nmax_size = \"1 MiB\"\n\
          [limits]\n{limits}"
     );
-    let (mut transport, topic) = subscribed(&Manifest::parse(&manifest, "lambda.toml").unwrap(), definition);
+    let (mut transport, topic) =
+        subscribed(&Manifest::parse(&manifest, "lambda.toml").unwrap(), definition);
     (1..=messages).for_each(|seq| publish(&mut transport, "/many", seq, cdr));
     topic
 }
@@ -162,7 +185,8 @@ fn topic(definition: &str, limits: &str, messages: u64, cdr: &[u8]) -> Arc<Topic
 #[test]
 fn what_one_call_gives_is_limited() {
     let bytes = vec![7; 100_000];
-    let topic = topic("uint8[] x\n", "call_bytes = \"64 KiB\"", 1, &Cdr::default().bytes(&bytes).done());
+    let topic =
+        topic("uint8[] x\n", "call_bytes = \"64 KiB\"", 1, &Cdr::default().bytes(&bytes).done());
     let sample = topic.newest().unwrap();
     assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), 64 << 10);
     let error = sample.get(&topic.field("x").unwrap()).map(drop).unwrap_err();
@@ -210,7 +234,11 @@ fn triggers_beyond_those_of_a_minute_are_refused_and_counted() {
     room.wake().result.unwrap();
     assert_eq!(room.session.end().len(), 3);
     let fault = room.fault();
-    assert!(fault.message.contains("the lambda has caused 5 triggers in this minute already"), "{}", fault.message);
+    assert!(
+        fault.message.contains("the lambda has caused 5 triggers in this minute already"),
+        "{}",
+        fault.message
+    );
     // Those before it count, and in the next minute all is well again.
     assert_eq!((room.session.end().len(), room.session.triggers_refused()), (2, 1));
     room.wake_at(60_000_000_000).result.unwrap();

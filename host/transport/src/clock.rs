@@ -1,13 +1,15 @@
 //! The clock that orders everything on a vehicle.
 
-/// `CLOCK_MONOTONIC`, set to the time of day once. It never goes back, and its stamps can be read as dates.
+/// `CLOCK_MONOTONIC`, set to the time of day once. It never goes back, and its stamps can be read
+/// as dates.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Clock {
     offset_ns: i64,
 }
 
 impl Clock {
-    /// A clock that is `offset_ns` ahead of `CLOCK_MONOTONIC`. All processes of a vehicle use the same.
+    /// A clock that is `offset_ns` ahead of `CLOCK_MONOTONIC`. All processes of a vehicle use the
+    /// same.
     pub fn new(offset_ns: i64) -> Self {
         Self { offset_ns }
     }
@@ -35,7 +37,8 @@ impl Clock {
 
 /// Returns the time of day, in ns since 1970.
 pub fn time_of_day() -> i64 {
-    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    let now =
+        std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
     i64::try_from(now.as_nanos()).unwrap_or(0)
 }
 

@@ -4,15 +4,18 @@ use std::collections::VecDeque;
 
 use crate::transport::Guid;
 
-/// Writers that are followed at a time. When one more comes, the one that was silent for longest is forgotten.
+/// Writers that are followed at a time. When one more comes, the one that was silent for longest is
+/// forgotten.
 const WRITERS: usize = 256;
-/// Gaps of a writer that a late sample may still fill. The oldest gaps are final when there are more.
+/// Gaps of a writer that a late sample may still fill. The oldest gaps are final when there are
+/// more.
 const OPEN: usize = 64;
 
 /// Counts the samples that are missing between those that came, writer by writer.
 ///
-/// A writer's first sample says where its numbers begin: what it sent before is no loss. A sample that comes late, as
-/// networks may cause without any fault, takes its loss back. A writer that starts again has another [`Guid`].
+/// A writer's first sample says where its numbers begin: what it sent before is no loss. A sample
+/// that comes late, as networks may cause without any fault, takes its loss back. A writer that
+/// starts again has another [`Guid`].
 #[derive(Clone, Debug, Default)]
 pub struct Gaps {
     writers: Vec<Writer>,
@@ -61,7 +64,8 @@ impl Gaps {
         self.lost
     }
 
-    /// Whether that sample came, or is older than what is known: it is neither the next, nor in a gap that may be filled.
+    /// Whether that sample came, or is older than what is known: it is neither the next, nor in a
+    /// gap that may be filled.
     pub fn has(&self, writer: Guid, seq: u64) -> bool {
         let known = self.writers.iter().find(|known| known.guid == writer);
         known.is_some_and(|known| {
@@ -72,18 +76,26 @@ impl Gaps {
 
     fn follow(&mut self, guid: Guid, seq: u64) {
         if self.writers.len() >= WRITERS
-            && let Some(silent) = (0..self.writers.len()).min_by_key(|index| self.writers[*index].heard)
+            && let Some(silent) =
+                (0..self.writers.len()).min_by_key(|index| self.writers[*index].heard)
         {
             self.writers.swap_remove(silent);
         }
-        self.writers.push(Writer { guid, next: seq.checked_add(1), open: VecDeque::new(), heard: self.noted });
+        self.writers.push(Writer {
+            guid,
+            next: seq.checked_add(1),
+            open: VecDeque::new(),
+            heard: self.noted,
+        });
     }
 }
 
 impl Writer {
     /// Whether `seq` was missing until now.
     fn fill(&mut self, seq: u64) -> bool {
-        let Some(index) = self.open.iter().position(|(first, last)| (*first..=*last).contains(&seq)) else {
+        let Some(index) =
+            self.open.iter().position(|(first, last)| (*first..=*last).contains(&seq))
+        else {
             return false;
         };
         let (first, last) = self.open[index];
@@ -157,7 +169,9 @@ mod tests {
     #[test]
     fn writers_are_counted_apart_and_a_new_one_starts_anew() {
         let mut gaps = Gaps::default();
-        for (writer, seq, missing) in [(1, 1, 0), (2, 100, 0), (1, 3, 1), (2, 101, 0), (3, 1, 0), (2, 104, 2)] {
+        for (writer, seq, missing) in
+            [(1, 1, 0), (2, 100, 0), (1, 3, 1), (2, 101, 0), (3, 1, 0), (2, 104, 2)]
+        {
             assert_eq!(gaps.note(guid(writer), seq), missing);
         }
         assert_eq!(gaps.lost(), 3);
@@ -231,7 +245,9 @@ mod tests {
     fn random_orders_are_counted_as_by_a_model_that_remembers_everything() {
         let mut state = 0x9e37_79b9_7f4a_7c15_u64;
         let mut random = move |below: u64| {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             (state >> 33) % below
         };
         for _ in 0..300 {

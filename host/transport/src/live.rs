@@ -1,4 +1,5 @@
-//! What every live source of samples has beside [`Transport`]: a health, and topics that this process publishes.
+//! What every live source of samples has beside [`Transport`]: a health, and topics that this
+//! process publishes.
 
 use gleaner_base::{Exit, Explain};
 use gleaner_protocol::Network;
@@ -7,20 +8,28 @@ use crate::Transport;
 
 /// A source whose samples come while time passes.
 pub trait LiveSource: Transport + Send {
-    /// Returns the state of the source. Cheap enough for once a second, which is how often it is called.
+    /// Returns the state of the source. Cheap enough for once a second, which is how often it is
+    /// called.
     fn health(&self) -> Health;
 
-    /// Opens `topic`, whose messages are of `type_name`, to publish on it. A reader that is slow finds the `depth` newest messages.
+    /// Opens `topic`, whose messages are of `type_name`, to publish on it. A reader that is slow
+    /// finds the `depth` newest messages.
     ///
     /// # Errors
     ///
     /// [`PublishError`] if the topic or the type has no valid name, or if the network refuses it.
-    fn publisher(&self, topic: &str, type_name: &str, depth: usize) -> Result<Box<dyn Publisher>, PublishError>;
+    fn publisher(
+        &self,
+        topic: &str,
+        type_name: &str,
+        depth: usize,
+    ) -> Result<Box<dyn Publisher>, PublishError>;
 }
 
 /// A topic that this process publishes.
 pub trait Publisher: Send {
-    /// Publishes a message, little-endian CDR without its four bytes of encapsulation, without waiting for a reader.
+    /// Publishes a message, little-endian CDR without its four bytes of encapsulation, without
+    /// waiting for a reader.
     ///
     /// # Errors
     ///

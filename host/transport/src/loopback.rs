@@ -12,10 +12,12 @@ use gleaner_messages::{Definitions, Endian};
 use crate::clock::Clock;
 use crate::live::{Health, LiveSource, PublishError, Publisher};
 use crate::transport::{
-    DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict, same_type,
+    DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError,
+    Verdict, same_type,
 };
 
-/// The in-process transport. Clones are the same transport: one publishes, another one is subscribed.
+/// The in-process transport. Clones are the same transport: one publishes, another one is
+/// subscribed.
 #[derive(Clone, Default)]
 pub struct Loopback(Arc<Mutex<Topics>>);
 
@@ -59,7 +61,12 @@ impl Loopback {
     /// # Errors
     ///
     /// [`TransportError::NoSuchTopic`] if the topic was never added.
-    pub fn publish(&self, topic: &str, meta: &SampleMeta, cdr: &[u8]) -> Result<Option<Verdict>, TransportError> {
+    pub fn publish(
+        &self,
+        topic: &str,
+        meta: &SampleMeta,
+        cdr: &[u8],
+    ) -> Result<Option<Verdict>, TransportError> {
         // Not held while samples are delivered: a sink may publish in turn.
         let sinks = {
             let mut topics = self.lock();
@@ -114,7 +121,11 @@ impl Transport for Loopback {
         self.lock().topics.iter().map(discovered).collect()
     }
 
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+    fn subscribe(
+        &mut self,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+    ) -> Result<Subscription, TransportError> {
         let mut topics = self.lock();
         let found = topics.get(&spec.topic)?;
         if !same_type(&found.type_name, &spec.type_name) {
@@ -154,7 +165,12 @@ impl LiveSource for Loopback {
         Health { network: None, dead: self.lock().dead.clone() }
     }
 
-    fn publisher(&self, topic: &str, _type_name: &str, _depth: usize) -> Result<Box<dyn Publisher>, PublishError> {
+    fn publisher(
+        &self,
+        topic: &str,
+        _type_name: &str,
+        _depth: usize,
+    ) -> Result<Box<dyn Publisher>, PublishError> {
         self.lock().get(topic).map_err(|error| PublishError(error.into()))?;
         let published = Published {
             loopback: self.clone(),
@@ -179,7 +195,17 @@ impl Publisher for Published {
         let at_ns = self.clock.now();
         let seq = self.messages.fetch_add(1, Ordering::Relaxed) + 1;
         let writer = Guid(*b"gleaner loopback");
-        let meta = SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian: Endian::Little, options: [0; 2] };
-        self.loopback.publish(&self.topic, &meta, cdr).map(drop).map_err(|error| PublishError(error.into()))
+        let meta = SampleMeta {
+            at_ns,
+            publish_ns: at_ns,
+            writer,
+            seq,
+            endian: Endian::Little,
+            options: [0; 2],
+        };
+        self.loopback
+            .publish(&self.topic, &meta, cdr)
+            .map(drop)
+            .map_err(|error| PublishError(error.into()))
     }
 }

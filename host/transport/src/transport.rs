@@ -17,8 +17,9 @@ pub struct TopicSpec {
     /// pulled and holds none.
     pub queue: usize,
     /// The largest sample, in bytes of CDR, that the sink will take. A live transport sizes its
-    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`]. A larger sample that is packed is not
-    /// unpacked to its end, and not shown to the sink: it is told by [`Sink::too_big`].
+    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`]. A larger sample that
+    /// is packed is not unpacked to its end, and not shown to the sink: it is told by
+    /// [`Sink::too_big`].
     pub max_bytes: usize,
     /// How a live transport asks for it.
     pub qos: Qos,
@@ -44,10 +45,12 @@ pub enum Qos {
 /// How a subscription is doing.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Status {
-    /// Writers that are connected now; `None` where there are none, as in a replay. One that was killed counts until the
-    /// time is over for which it said that it would be heard from, with ROS 2 often 10 to 20 s.
+    /// Writers that are connected now; `None` where there are none, as in a replay. One that was
+    /// killed counts until the time is over for which it said that it would be heard from, with ROS
+    /// 2 often 10 to 20 s.
     pub writers: Option<usize>,
-    /// Samples that were lost on their way to us, as far as gaps in their numbers tell; `None` if nothing tells.
+    /// Samples that were lost on their way to us, as far as gaps in their numbers tell; `None` if
+    /// nothing tells.
     pub lost: Option<u64>,
     /// Samples that could not be read at all.
     pub malformed: u64,
@@ -99,8 +102,8 @@ pub struct SampleMeta {
     pub seq: u64,
     /// Byte order of the CDR payload.
     pub endian: Endian,
-    /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Nothing reads them; with them
-    /// a recorder can write the message again as it was, byte for byte.
+    /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Nothing reads them; with
+    /// them a recorder can write the message again as it was, byte for byte.
     pub options: [u8; 2],
 }
 
@@ -122,20 +125,22 @@ pub trait Sink: Send + Sync {
     /// Runs on the transport's thread: one copy, no lock that a lambda can hold, never blocks.
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict;
 
-    /// A sample was passed over that is larger than [`TopicSpec::max_bytes`]: it has at least `len` bytes of CDR. The
-    /// verdict is [`Verdict::TooBig`]; whoever counts what it refuses counts it here.
+    /// A sample was passed over that is larger than [`TopicSpec::max_bytes`]: it has at least `len`
+    /// bytes of CDR. The verdict is [`Verdict::TooBig`]; whoever counts what it refuses counts it
+    /// here.
     fn too_big(&self, _meta: &SampleMeta, _len: usize) {}
 
-    /// Copies one sample, where a transport shows its bytes before it knows whose they are. `None`, as here: the sink
-    /// wants both at once, so the transport makes a copy of its own for [`deliver`](Self::deliver).
+    /// Copies one sample, where a transport shows its bytes before it knows whose they are. `None`,
+    /// as here: the sink wants both at once, so the transport makes a copy of its own for
+    /// [`deliver`](Self::deliver).
     ///
     /// It may run under a lock of the transport: memory is copied, and nothing else is done.
     fn copy(&self, _cdr: &[u8]) -> Option<Verdict> {
         None
     }
 
-    /// What the last [`copy`](Self::copy) took or refused was this sample. One that is copied and never accepted was
-    /// none: the next copy takes its place.
+    /// What the last [`copy`](Self::copy) took or refused was this sample. One that is copied and
+    /// never accepted was none: the next copy takes its place.
     fn accept(&self, _meta: &SampleMeta) {}
 }
 
@@ -161,8 +166,8 @@ pub struct Subscription(pub usize);
 
 /// A source of samples. Object safe and synchronous.
 pub trait Transport {
-    /// The topics known now, sorted by name. A live transport may learn of more later, and may know one of several types: the one
-    /// that most write comes first.
+    /// The topics known now, sorted by name. A live transport may learn of more later, and may know
+    /// one of several types: the one that most write comes first.
     fn topics(&self) -> Vec<DiscoveredTopic>;
 
     /// Sends each sample of a topic to `sink` from now on. A topic may be subscribed several times;
@@ -172,7 +177,11 @@ pub trait Transport {
     ///
     /// [`TransportError`] if the topic does not exist, has another type or an encoding that we do
     /// not read, or if the transport can take no more subscriptions.
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError>;
+    fn subscribe(
+        &mut self,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+    ) -> Result<Subscription, TransportError>;
 
     /// The parsed message definitions of a topic, shared by all who ask.
     ///
@@ -181,8 +190,9 @@ pub trait Transport {
     /// [`TransportError`] if there is no such topic, or its definitions are missing or malformed.
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError>;
 
-    /// Whether it is worth while to ask soon once more for the definitions of a topic that has none. A live transport asks
-    /// whoever writes the topic, which takes at most some seconds; this sets it going.
+    /// Whether it is worth while to ask soon once more for the definitions of a topic that has
+    /// none. A live transport asks whoever writes the topic, which takes at most some seconds; this
+    /// sets it going.
     fn definitions_may_come(&self, _topic: &str) -> bool {
         false
     }
@@ -244,7 +254,8 @@ pub enum TransportError {
         /// What is wrong with them.
         source: MessageError,
     },
-    /// The definitions that were found for this topic's type, since the source does not carry them, cannot be used.
+    /// The definitions that were found for this topic's type, since the source does not carry them,
+    /// cannot be used.
     #[error("the message definitions of topic `{topic}` cannot be used")]
     UnusableDefinitions {
         /// The topic.
@@ -266,7 +277,9 @@ const NAMED: usize = 20;
 fn list(names: &[String]) -> String {
     match names.split_at_checked(NAMED) {
         _ if names.is_empty() => "none".to_owned(),
-        Some((first, rest)) if !rest.is_empty() => format!("{}, and {} more", first.join(", "), rest.len()),
+        Some((first, rest)) if !rest.is_empty() => {
+            format!("{}, and {} more", first.join(", "), rest.len())
+        }
         _ => names.join(", "),
     }
 }
@@ -292,9 +305,14 @@ mod tests {
         let guid = Guid(std::array::from_fn(|n| (n * 17) as u8));
         let text = guid.to_string();
         assert_eq!(Guid::from_hex(&text), Some(guid));
-        for wrong in
-            ["", &text[1..], &format!("{text}0"), &text.to_uppercase(), &text.replace('0', "+"), &"é".repeat(16)]
-        {
+        for wrong in [
+            "",
+            &text[1..],
+            &format!("{text}0"),
+            &text.to_uppercase(),
+            &text.replace('0', "+"),
+            &"é".repeat(16),
+        ] {
             assert_eq!(Guid::from_hex(wrong), None, "{wrong}");
         }
     }
@@ -308,7 +326,8 @@ mod tests {
     #[test]
     fn of_many_topics_a_missing_one_names_some() {
         let known = (0..1000).map(|n| format!("/t{n:03}")).collect();
-        let error = TransportError::NoSuchTopic { topic: "/imu".to_owned(), known, nearest: None }.to_string();
+        let error = TransportError::NoSuchTopic { topic: "/imu".to_owned(), known, nearest: None }
+            .to_string();
         assert!(error.starts_with("no topic `/imu`; there are: /t000, /t001, "), "{error}");
         assert!(error.ends_with(", /t019, and 980 more"), "{error}");
     }
@@ -320,6 +339,9 @@ mod tests {
             known: vec!["/imu/data".to_owned(), "/speed".to_owned()],
             nearest: Some("/imu/data".to_owned()),
         };
-        assert_eq!(error.to_string(), "no topic `/imu/dat` (did you mean `/imu/data`?); there are: /imu/data, /speed");
+        assert_eq!(
+            error.to_string(),
+            "no topic `/imu/dat` (did you mean `/imu/data`?); there are: /imu/data, /speed"
+        );
     }
 }

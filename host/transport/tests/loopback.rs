@@ -12,7 +12,14 @@ use gleaner_transport::{Guid, SampleMeta, Subscription, Transport, TransportErro
 use support::{Memory, TEXT, TYPE, spec};
 
 fn meta(at_ns: i64) -> SampleMeta {
-    SampleMeta { at_ns, publish_ns: 0, writer: Guid([7; 16]), seq: 1, endian: Endian::Little, options: [0; 2] }
+    SampleMeta {
+        at_ns,
+        publish_ns: 0,
+        writer: Guid([7; 16]),
+        seq: 1,
+        endian: Endian::Little,
+        options: [0; 2],
+    }
 }
 
 #[test]

@@ -1,4 +1,5 @@
-//! How a process of ours is doing, and what it says of itself: the same for the runtime and for the recorder.
+//! How a process of ours is doing, and what it says of itself: the same for the runtime and for the
+//! recorder.
 //!
 //! - [`hand_on`], [`inherited`], [`close_on_exec`]: open files that the shim hands to its runtime.
 //! - [`log`]: lines for people, on standard error.

@@ -11,10 +11,12 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt;
 
-/// Has log lines go to standard error from now on; `GLEANER_LOG` says which, and else it is warnings.
+/// Has log lines go to standard error from now on; `GLEANER_LOG` says which, and else it is
+/// warnings.
 pub fn prepare() {
     let wanted = std::env::var("GLEANER_LOG").unwrap_or_else(|_| "warn".to_owned());
-    // Not `EnvFilter`, which also filters by spans and values, of which we have none: that takes a library for regular expressions.
+    // Not `EnvFilter`, which also filters by spans and values, of which we have none: that takes a
+    // library for regular expressions.
     let filter = wanted.parse().unwrap_or_else(|error| {
         eprintln!("warning: GLEANER_LOG=`{wanted}` is no filter, `warn` is used: {error}");
         Targets::new().with_default(Level::WARN)
@@ -46,7 +48,12 @@ where
     S: Subscriber + for<'a> LookupSpan<'a>,
     N: for<'a> FormatFields<'a> + 'static,
 {
-    fn format_event(&self, context: &FmtContext<'_, S, N>, mut writer: Writer<'_>, event: &Event<'_>) -> fmt::Result {
+    fn format_event(
+        &self,
+        context: &FmtContext<'_, S, N>,
+        mut writer: Writer<'_>,
+        event: &Event<'_>,
+    ) -> fmt::Result {
         let level = match *event.metadata().level() {
             Level::ERROR => "trouble",
             Level::WARN => "warning",

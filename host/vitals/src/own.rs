@@ -1,11 +1,12 @@
-//! Memory of our own code in a process that it shares with a lambda. The allocator of our code counts here, so that the lambda is
-//! charged for the rest of the process and for nothing else.
+//! Memory of our own code in a process that it shares with a lambda. The allocator of our code
+//! counts here, so that the lambda is charged for the rest of the process and for nothing else.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use crate::Pulse;
 
-/// From this size on the system's allocator maps each block by itself, and returns it to the system when it is freed.
+/// From this size on the system's allocator maps each block by itself, and returns it to the system
+/// when it is freed.
 pub const LARGE_BYTES: usize = 128 << 10;
 
 static LARGE: AtomicU64 = AtomicU64::new(0);
@@ -18,7 +19,8 @@ pub fn allocated(bytes: usize) {
     let taken = taken(bytes);
     if bytes >= LARGE_BYTES {
         LARGE.fetch_add(taken, Relaxed);
-        // A message that the network puts together may come in the middle of a wake, and must not count as the lambda's.
+        // A message that the network puts together may come in the middle of a wake, and must not
+        // count as the lambda's.
         Pulse::tell_own();
         return;
     }

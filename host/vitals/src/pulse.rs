@@ -1,7 +1,9 @@
-//! The page through which `gleaner-shim` sees, without a message, what its runtime does and since when.
+//! The page through which `gleaner-shim` sees, without a message, what its runtime does and since
+//! when.
 //!
-//! The shim makes it, and hands it on as a file that the runtime inherits; its number stands in [`PULSE_ENV`]. The runtime says
-//! by when it will be back, before it enters code that is not ours. A runtime without a shim has a page that nobody reads.
+//! The shim makes it, and hands it on as a file that the runtime inherits; its number stands in
+//! [`PULSE_ENV`]. The runtime says by when it will be back, before it enters code that is not ours.
+//! A runtime without a shim has a page that nobody reads.
 #![allow(unsafe_code)]
 
 use std::fs::File;
@@ -34,7 +36,8 @@ struct Page {
     doing: AtomicU32,
     /// Not 0 once our part of the runtime was refused memory.
     full: AtomicU32,
-    /// The lambda's share of the process, in bytes: memory before it was entered, without that of our own code.
+    /// The lambda's share of the process, in bytes: memory before it was entered, without that of
+    /// our own code.
     base: AtomicU64,
     /// Memory that it may take beyond that; 0 if it is counted elsewhere. Written after `base`.
     most: AtomicU64,
@@ -59,8 +62,9 @@ impl Share {
         held.saturating_sub(own).saturating_sub(self.base)
     }
 
-    /// Whether `used` is more than the lambda may have. Not all in the process can be told apart: stacks of our threads, what C
-    /// libraries of ours take, pages that are kept for the next small object, and the kernel's own rounding.
+    /// Whether `used` is more than the lambda may have. Not all in the process can be told apart:
+    /// stacks of our threads, what C libraries of ours take, pages that are kept for the next small
+    /// object, and the kernel's own rounding.
     pub fn is_exceeded_by(self, used: u64) -> bool {
         const TOLERANCE: u64 = 16 << 20;
         used > self.most.saturating_add(TOLERANCE)
@@ -75,16 +79,18 @@ struct Mapped {
     page: NonNull<Page>,
 }
 
-// SAFETY: all fields of the page are atomics, so any thread may use them at any time; the mapping lives as long as this does.
+// SAFETY: all fields of the page are atomics, so any thread may use them at any time; the mapping
+// lives as long as this does.
 unsafe impl Send for Mapped {}
 // SAFETY: as above.
 unsafe impl Sync for Mapped {}
 
-/// The page of this process, for whoever finds that there is no memory left, and so can ask for nothing.
+/// The page of this process, for whoever finds that there is no memory left, and so can ask for
+/// nothing.
 static OURS: OnceLock<Pulse> = OnceLock::new();
 
-/// How long it may take from the end of one call into a lambda until there is a word again: writing results to a disk that stands
-/// still for a while, or reading on in a drive.
+/// How long it may take from the end of one call into a lambda until there is a word again: writing
+/// results to a disk that stands still for a while, or reading on in a drive.
 const BETWEEN: Duration = Duration::from_secs(300);
 
 /// For the runtime: what was begun goes on until this is dropped.
@@ -94,13 +100,17 @@ pub struct Busy<'a> {
 }
 
 impl Pulse {
-    /// A new page, and the file to hand on. The file is closed by `exec` unless [`Pulse::hand_on`] was called.
+    /// A new page, and the file to hand on. The file is closed by `exec` unless [`Pulse::hand_on`]
+    /// was called.
     ///
     /// # Errors
     ///
     /// Those of `memfd_create` and `mmap`.
     pub fn make() -> io::Result<(Self, OwnedFd)> {
-        let file = File::from(memfd_create("gleaner-pulse", MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING)?);
+        let file = File::from(memfd_create(
+            "gleaner-pulse",
+            MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING,
+        )?);
         file.set_len(size_of::<Page>() as u64)?;
         // Else the other side could cut it, and our next look would be our end.
         fcntl_add_seals(&file, SealFlags::SHRINK | SealFlags::GROW | SealFlags::SEAL)?;
@@ -125,13 +135,17 @@ impl Pulse {
     pub fn inherited() -> io::Result<Self> {
         let Some(file) = inherited(PULSE_ENV)? else { return Ok(Self::make()?.0) };
         if rustix::fs::fstat(&file)?.st_size != size_of::<Page>() as i64 {
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, format!("{PULSE_ENV} names no page")));
+            return Err(io::Error::new(
+                io::ErrorKind::InvalidInput,
+                format!("{PULSE_ENV} names no page"),
+            ));
         }
         let pulse = Self::over(file.as_fd())?;
         Ok(OURS.get_or_init(|| pulse).clone())
     }
 
-    /// Has the shim know that our part of this process was refused memory, should that be its end. Takes none.
+    /// Has the shim know that our part of this process was refused memory, should that be its end.
+    /// Takes none.
     pub fn say_full() {
         if let Some(pulse) = OURS.get() {
             pulse.page().full.store(1, Ordering::Release);
@@ -177,19 +191,28 @@ impl Pulse {
     fn over(file: impl AsFd) -> io::Result<Self> {
         // SAFETY: a new mapping at an address that the kernel chooses overlaps nothing of ours.
         let page = unsafe {
-            mmap(ptr::null_mut(), size_of::<Page>(), ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, file, 0)
+            mmap(
+                ptr::null_mut(),
+                size_of::<Page>(),
+                ProtFlags::READ | ProtFlags::WRITE,
+                MapFlags::SHARED,
+                file,
+                0,
+            )
         }?;
         let page = NonNull::new(page.cast()).ok_or_else(|| io::Error::other("mapped at 0"))?;
         Ok(Self(Arc::new(Mapped { page })))
     }
 
     fn page(&self) -> &Page {
-        // SAFETY: the mapping is page-aligned, at least as large as a `Page`, lives as long as `self.0`, and any bytes are
-        // valid values of its atomics. The file is sealed, so nobody can cut it under us.
+        // SAFETY: the mapping is page-aligned, at least as large as a `Page`, lives as long as
+        // `self.0`, and any bytes are valid values of its atomics. The file is sealed, so nobody
+        // can cut it under us.
         unsafe { self.0.page.as_ref() }
     }
 
-    /// From now on this process is busy with `doing`, and should be back within `allowed`. `at_ns` is the time of the wake.
+    /// From now on this process is busy with `doing`, and should be back within `allowed`. `at_ns`
+    /// is the time of the wake.
     pub fn busy(&self, doing: Doing, allowed: Duration, at_ns: i64) -> Busy<'_> {
         // What was refused before was no end.
         self.page().full.store(0, Ordering::Release);
@@ -205,12 +228,14 @@ impl Pulse {
     fn set(&self, doing: Doing, allowed: Duration, at_ns: i64) {
         let page = self.page();
         page.own.store(own::held(), Ordering::Relaxed);
-        // Whoever reads meanwhile must not take the old allowance with the new time, or the other way round.
+        // Whoever reads meanwhile must not take the old allowance with the new time, or the other
+        // way round.
         page.allowed_ns.store(0, Ordering::Release);
         page.since_ns.store(now_ns(), Ordering::Release);
         page.doing.store(doing as u32, Ordering::Release);
         page.at_ns.store(at_ns, Ordering::Release);
-        page.allowed_ns.store(u64::try_from(allowed.as_nanos()).unwrap_or(u64::MAX), Ordering::Release);
+        page.allowed_ns
+            .store(u64::try_from(allowed.as_nanos()).unwrap_or(u64::MAX), Ordering::Release);
     }
 
     /// For the shim: what the runtime reported last that it does.
@@ -218,7 +243,8 @@ impl Pulse {
         Doing::from_number(self.page().doing.load(Ordering::Acquire))
     }
 
-    /// For the shim: what the runtime was to be done with by now, or how long it is before there is reason to look again.
+    /// For the shim: what the runtime was to be done with by now, or how long it is before there is
+    /// reason to look again.
     pub fn overdue(&self) -> Result<Killed, Duration> {
         /// A call that begins just after a look is seen this much later, at the most.
         const LOOK: Duration = Duration::from_millis(100);
@@ -241,7 +267,8 @@ impl Pulse {
         Err(Duration::from_nanos(allowed_ns - ran_ns).min(LOOK))
     }
 
-    /// For the shim: what the runtime does, killed for `why`. A runtime that writes meanwhile is seen in one of both states.
+    /// For the shim: what the runtime does, killed for `why`. A runtime that writes meanwhile is
+    /// seen in one of both states.
     pub fn killed(&self, why: Why) -> Killed {
         let page = self.page();
         let since_ns = page.since_ns.load(Ordering::Acquire);
@@ -263,7 +290,8 @@ impl Drop for Busy<'_> {
 
 impl Drop for Mapped {
     fn drop(&mut self) {
-        // SAFETY: the mapping was made with this size, and nothing refers to it any more: `page` lends it for less than our life.
+        // SAFETY: the mapping was made with this size, and nothing refers to it any more: `page`
+        // lends it for less than our life.
         let _ = unsafe { munmap(self.page.as_ptr().cast(), size_of::<Page>()) };
     }
 }

@@ -21,7 +21,8 @@ impl Default for Spreads {
 impl Spreads {
     /// None so far.
     pub fn new() -> Self {
-        let empty = || Histogram::new_with_max(MOST_NS, 2).expect("two digits up to a day are no problem");
+        let empty =
+            || Histogram::new_with_max(MOST_NS, 2).expect("two digits up to a day are no problem");
         Self { now: empty(), all: empty() }
     }
 
@@ -45,8 +46,8 @@ impl Spreads {
     }
 }
 
-/// Durations of one of many sources. They take as much memory as the longest needs: 1 KiB at first, 9 KiB for 10 ms, 20 KiB for
-/// a day. Of one kind more than four thousand million count as so many.
+/// Durations of one of many sources. They take as much memory as the longest needs: 1 KiB at first,
+/// 9 KiB for 10 ms, 20 KiB for a day. Of one kind more than four thousand million count as so many.
 pub struct Durations(Histogram<u32>);
 
 impl Default for Durations {
@@ -96,7 +97,10 @@ mod tests {
         let Spread { n, p50_ns, max_ns, .. } = spreads.take().unwrap();
         assert_eq!(n, 101);
         // Two digits.
-        assert!((49_000..=51_000).contains(&p50_ns) && (100_000..=101_000).contains(&max_ns), "{p50_ns} {max_ns}");
+        assert!(
+            (49_000..=51_000).contains(&p50_ns) && (100_000..=101_000).contains(&max_ns),
+            "{p50_ns} {max_ns}"
+        );
         assert_eq!(spreads.take(), None);
         assert_eq!(spreads.all().unwrap().n, 101);
     }

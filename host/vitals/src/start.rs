@@ -9,8 +9,8 @@ use rustix::io::fcntl_dupfd_cloexec;
 use rustix::stdio::{dup2_stdout, stdout};
 use signal_hook::consts::SIGTERM;
 
-/// What was standard output, for reports. What a library writes there by itself goes to standard error from now on; what a lambda
-/// prints is in its log.
+/// What was standard output, for reports. What a library writes there by itself goes to standard
+/// error from now on; what a lambda prints is in its log.
 ///
 /// # Errors
 ///

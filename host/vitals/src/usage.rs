@@ -27,8 +27,8 @@ pub struct Process {
     pub is_stopped: bool,
     /// Its threads.
     pub threads: u64,
-    /// Memory that is its own: private pages, in RAM or swapped out, and page tables, in bytes. Pages of files count for nobody, and
-    /// shared memory is refused to a lambda.
+    /// Memory that is its own: private pages, in RAM or swapped out, and page tables, in bytes.
+    /// Pages of files count for nobody, and shared memory is refused to a lambda.
     pub held: u64,
 }
 
@@ -57,7 +57,8 @@ impl Process {
     }
 }
 
-/// The most private writable memory that process `pid` may map, in bytes: its own limit, which it cannot raise. None if it has none.
+/// The most private writable memory that process `pid` may map, in bytes: its own limit, which it
+/// cannot raise. None if it has none.
 pub fn data_limit(pid: u32) -> Option<u64> {
     let limits = fs::read_to_string(of(Some(pid), "limits")).ok()?;
     let line = limits.lines().find_map(|line| line.strip_prefix("Max data size"))?;
@@ -78,12 +79,14 @@ impl PrivatePages {
         File::open("/proc/self/statm").map(Self)
     }
 
-    /// Their size, in bytes. None if the list cannot be read any more: a lambda in this process may have closed it.
+    /// Their size, in bytes. None if the list cannot be read any more: a lambda in this process may
+    /// have closed it.
     pub fn bytes(&self) -> Option<u64> {
         let mut text = [0; 128];
         let length = self.0.read_at(&mut text, 0).ok()?;
         let text = std::str::from_utf8(&text[..length]).ok()?;
-        let mut pages = text.split_ascii_whitespace().skip(1).map_while(|count| count.parse::<u64>().ok());
+        let mut pages =
+            text.split_ascii_whitespace().skip(1).map_while(|count| count.parse::<u64>().ok());
         let (resident, shared) = (pages.next()?, pages.next()?);
         Some(resident.saturating_sub(shared) * rustix::param::page_size() as u64)
     }
@@ -128,7 +131,10 @@ mod tests {
         let after = (pages.bytes().unwrap(), Process::seen(Some(std::process::id())).unwrap());
         // Other tests run beside this one, and the kernel counts in pieces.
         let about = |more: u64| more.abs_diff(BYTES) < BYTES / 4;
-        assert!(about(after.0 - before.0) && about(after.1.held - before.1.held), "{before:?} {after:?}");
+        assert!(
+            about(after.0 - before.0) && about(after.1.held - before.1.held),
+            "{before:?} {after:?}"
+        );
         assert_eq!(data_limit(std::process::id()), None);
         drop(taken);
     }
@@ -137,7 +143,10 @@ mod tests {
     fn a_process_is_read_from_its_lines() {
         let status = "Name:\tx\nState:\tT (stopped)\nRssAnon:\t 10 kB\nRssFile:\t 99 kB\nRssShmem:\t 9 kB\n\
                       VmPTE:\t 2 kB\nVmSwap:\t 1 kB\nHugetlbPages:\t 4 kB\nThreads:\t3\n";
-        assert_eq!(Process::parse(status), Some(Process { is_stopped: true, threads: 3, held: 17 * 1024 }));
+        assert_eq!(
+            Process::parse(status),
+            Some(Process { is_stopped: true, threads: 3, held: 17 * 1024 })
+        );
         // One that has ended has no memory.
         assert_eq!(Process::parse("Name:\tx\nState:\tZ (zombie)\nThreads:\t1\n"), None);
     }

@@ -4,7 +4,8 @@ use super::*;
 
 #[track_caller]
 fn said(difference: Option<Difference>, what: &str, journal: &str, now: &str) {
-    let sides = Difference { what: what.to_owned(), journal: journal.to_owned(), now: now.to_owned() };
+    let sides =
+        Difference { what: what.to_owned(), journal: journal.to_owned(), now: now.to_owned() };
     assert_eq!(difference, Some(sides));
 }
 
@@ -32,18 +33,35 @@ fn the_most_telling_difference_of_a_header_comes_first() {
     let changes: [Case; 10] = [
         (|now| now.clock = "system".to_owned(), ["clock", "log time of the drive", "system"]),
         (|now| now.remaps.clear(), ["remapped topics", "/in0 is /wire0", "none"]),
-        (|now| now.event_input = None, ["what wakes the lambda", "samples of input `in0`", "the clock"]),
+        (
+            |now| now.event_input = None,
+            ["what wakes the lambda", "samples of input `in0`", "the clock"],
+        ),
         (
             |now| now.inputs[1].wire_topic = "/in1".to_owned(),
-            ["input", "`in1`: /in1, from /wire1, sensor_msgs/msg/Imu", "`in1`: /in1, sensor_msgs/msg/Imu"],
+            [
+                "input",
+                "`in1`: /in1, from /wire1, sensor_msgs/msg/Imu",
+                "`in1`: /in1, sensor_msgs/msg/Imu",
+            ],
         ),
         (|now| now.config["brake_mps2"] = json!(-3), ["config `brake_mps2`", "-3.0", "-3"]),
-        (|now| now.models.clear(), ["model `models/d.onnx`", "sha256 0123456789abcdef…", "not there"]),
+        (
+            |now| now.models.clear(),
+            ["model `models/d.onnx`", "sha256 0123456789abcdef…", "not there"],
+        ),
         (|now| now.limits.deadline /= 2, ["limit `deadline`", "50ms", "25ms"]),
-        (|now| now.manifest = "0a".to_owned(), ["manifest lambda.toml, less [record] and [limits]", "", "0a"]),
+        (
+            |now| now.manifest = "0a".to_owned(),
+            ["manifest lambda.toml, less [record] and [limits]", "", "0a"],
+        ),
         (
             |now| now.files[0].sha256 = "f".repeat(64),
-            ["build file `brake_dark.wasm`", "sha256 0123456789abcdef…", "sha256 ffffffffffffffff…"],
+            [
+                "build file `brake_dark.wasm`",
+                "sha256 0123456789abcdef…",
+                "sha256 ffffffffffffffff…",
+            ],
         ),
         (|now| now.version = "0.2.0".to_owned(), ["version of the lambda", "0.1.0", "0.2.0"]),
     ];
@@ -61,7 +79,12 @@ fn files_and_config_that_only_one_side_has_are_differences() {
     // Of the manifest only what a decision can depend on counts.
     assert_eq!(with(|now| now.files.remove(1).path.clear()), None);
     let more = FileDigest { path: "a.py".to_owned(), bytes: 1, sha256: "ab".repeat(32) };
-    said(with(|now| now.files.push(more)), "build file `a.py`", "not there", "sha256 abababababababab…");
+    said(
+        with(|now| now.files.push(more)),
+        "build file `a.py`",
+        "not there",
+        "sha256 abababababababab…",
+    );
     let difference = with(|now| {
         now.config.insert("new".to_owned(), json!(true));
     });
@@ -74,7 +97,12 @@ fn digests_that_begin_alike_are_shown_whole() {
     let begin = "0123456789abcdef";
     let other = format!("{begin}{}", "0".repeat(48));
     let (journal, now) = (format!("sha256 {}", begin.repeat(4)), format!("sha256 {other}"));
-    said(with(|header| header.files[0].sha256 = other), "build file `brake_dark.wasm`", &journal, &now);
+    said(
+        with(|header| header.files[0].sha256 = other),
+        "build file `brake_dark.wasm`",
+        &journal,
+        &now,
+    );
     // A digest of a journal may be any text.
     said(
         with(|header| header.files[0].sha256 = "ä".to_owned()),
@@ -88,7 +116,10 @@ fn entry() -> Entry {
     Entry {
         at_ns: 10,
         cause: Woken::Sample { writer: [0xab; 16], seq: (1 << 32) + 7 },
-        seen: vec![Seen { new: 1, digest: 0x1a, newest: Some(([0xab; 16], 7)), reach: 2 }, Seen::default()],
+        seen: vec![
+            Seen { new: 1, digest: 0x1a, newest: Some(([0xab; 16], 7)), reach: 2 },
+            Seen::default(),
+        ],
         triggers: vec![Trigger {
             kind: TriggerKind::Event,
             label: "brake".to_owned(),
@@ -121,9 +152,19 @@ fn what_woke_the_lambda_is_compared_with_the_writer() {
     let journal = format!("sample 4294967303 of writer {writer}");
     let cause = "what woke the lambda";
     said(changed(|now| now.cause = Woken::Tick { missed: 0 }), cause, &journal, "a tick");
-    said(changed(|now| now.cause = Woken::Tick { missed: 3 }), cause, &journal, "a tick after 3 missed ones");
+    said(
+        changed(|now| now.cause = Woken::Tick { missed: 3 }),
+        cause,
+        &journal,
+        "a tick after 3 missed ones",
+    );
     let now = format!("sample 4294967304 of writer {writer}");
-    said(changed(|now| now.cause = Woken::Sample { writer: [0xab; 16], seq: (1 << 32) + 8 }), cause, &journal, &now);
+    said(
+        changed(|now| now.cause = Woken::Sample { writer: [0xab; 16], seq: (1 << 32) + 8 }),
+        cause,
+        &journal,
+        &now,
+    );
 }
 
 #[test]
@@ -140,9 +181,19 @@ fn samples_of_a_clip_are_compared_without_what_a_clip_does_not_keep() {
 #[test]
 fn what_the_lambda_saw_is_named_by_its_input() {
     let input = "input `in0` (/wire0)";
-    said(changed(|now| now.seen[0].new = 2), &format!("number of new samples of {input}"), "1", "2");
+    said(
+        changed(|now| now.seen[0].new = 2),
+        &format!("number of new samples of {input}"),
+        "1",
+        "2",
+    );
     let what = format!("newest sample of {input}");
-    said(changed(|now| now.seen[0].newest = None), &what, &format!("7 of writer {}", "ab".repeat(16)), "none");
+    said(
+        changed(|now| now.seen[0].newest = None),
+        &what,
+        &format!("7 of writer {}", "ab".repeat(16)),
+        "none",
+    );
     let what = format!("samples of {input}");
     said(changed(|now| now.seen[0].digest = 0x1b), &what, "digest 0000001a", "digest 0000001b");
     let what = "how many samples of input `in1` (/wire1) the lambda looked back";
@@ -156,8 +207,18 @@ fn what_the_lambda_saw_is_named_by_its_input() {
 #[test]
 fn triggers_are_compared_bit_for_bit() {
     said(changed(|now| now.triggers.clear()), "number of triggers", "1", "0");
-    said(changed(|now| now.triggers[0].kind = TriggerKind::Stop), "trigger 1: kind", "event", "stop");
-    said(changed(|now| now.triggers[0].label = "x\u{1b}".to_owned()), "trigger 1: label", "`brake`", "`x\\u{1b}`");
+    said(
+        changed(|now| now.triggers[0].kind = TriggerKind::Stop),
+        "trigger 1: kind",
+        "event",
+        "stop",
+    );
+    said(
+        changed(|now| now.triggers[0].label = "x\u{1b}".to_owned()),
+        "trigger 1: label",
+        "`brake`",
+        "`x\\u{1b}`",
+    );
     said(changed(|now| now.triggers[0].score = Some(-0.0)), "trigger 1: score", "0", "-0");
     said(changed(|now| now.triggers[0].score = None), "trigger 1: score", "0", "none");
     let attribute = |key: &str, value| {
@@ -166,7 +227,12 @@ fn triggers_are_compared_bit_for_bit() {
             now.triggers[0].attributes.insert(key, value);
         })
     };
-    said(attribute("a", json!(0.500_000_000_000_000_1)), "trigger 1: attribute `a`", "0.5", "0.5000000000000001");
+    said(
+        attribute("a", json!(0.500_000_000_000_000_1)),
+        "trigger 1: attribute `a`",
+        "0.5",
+        "0.5000000000000001",
+    );
     said(attribute("b", json!(1.0)), "trigger 1: attribute `b`", "1", "1.0");
     said(attribute("c", json!("x")), "trigger 1: attribute `c`", "none", "\"x\"");
     let difference = changed(|now| {
@@ -178,14 +244,23 @@ fn triggers_are_compared_bit_for_bit() {
 
 #[test]
 fn faults_fuel_and_logs_are_compared() {
-    let fault =
-        Fault { kind: gleaner_lambda::FaultKind::HostCall, message: "no\n".to_owned(), used: None, allowed: Some(8) };
+    let fault = Fault {
+        kind: gleaner_lambda::FaultKind::HostCall,
+        message: "no\n".to_owned(),
+        used: None,
+        allowed: Some(8),
+    };
     let now = "host_call, `no\\n`, used none, allowed 8";
     said(changed(|now| now.fault = Some(fault)), "fault", "none", now);
     said(changed(|now| now.fuel = Some(6)), "fuel", "5", "6");
     said(changed(|now| now.fuel = None), "fuel", "5", "none");
     said(changed(|now| now.log.lines = 2), "number of log lines", "1", "2");
-    said(changed(|now| now.log.digest = 3), "text of the log lines", "digest 00000002", "digest 00000003");
+    said(
+        changed(|now| now.log.digest = 3),
+        "text of the log lines",
+        "digest 00000002",
+        "digest 00000003",
+    );
 }
 
 #[test]

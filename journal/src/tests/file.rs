@@ -59,7 +59,10 @@ fn a_journal_cut_off_at_any_byte_gives_its_whole_blocks() {
     for cut in 0..bytes.len() {
         let opened = Reader::open(&bytes[..cut]);
         if cut < header_len {
-            assert!(matches!(opened, Err(JournalError::NoHeader { bytes }) if bytes == cut as u64), "{cut}");
+            assert!(
+                matches!(opened, Err(JournalError::NoHeader { bytes }) if bytes == cut as u64),
+                "{cut}"
+            );
             continue;
         }
         let mut reader = opened.unwrap();
@@ -95,7 +98,10 @@ fn zeros_that_a_loss_of_power_left_at_the_end_are_torn_and_no_damage() {
         if zeros > HEAD_LEN {
             *bytes.last_mut().unwrap() = 1;
             let (_, error) = read_all(&mut Reader::open(bytes.as_slice()).unwrap());
-            assert!(matches!(error, Some(JournalError::Damaged { why: Damage::Head, .. })), "{zeros}");
+            assert!(
+                matches!(error, Some(JournalError::Damaged { why: Damage::Head, .. })),
+                "{zeros}"
+            );
         }
     }
 }
@@ -148,8 +154,10 @@ fn behind_a_block_that_a_full_disk_tore_nothing_is_written() {
     for room in [begin, begin + 1, begin + 20, begin + 60] {
         let disk = FullDisk { room, bytes: Vec::new() };
         let mut writer = Writer::begin(disk, &header(1)).unwrap();
-        let failed =
-            entries.iter().position(|entry| writer.wake(entry).and_then(|()| writer.flush()).is_err()).unwrap();
+        let failed = entries
+            .iter()
+            .position(|entry| writer.wake(entry).and_then(|()| writer.flush()).is_err())
+            .unwrap();
         let torn = writer.written().bytes.clone();
         assert!(writer.wake(&entries[0]).is_err() && writer.flush().is_err());
         assert_eq!(writer.written().bytes, torn);
@@ -196,9 +204,14 @@ fn a_wake_that_no_reader_would_take_is_refused_and_the_next_one_is_not() {
 fn the_largest_wake_that_the_host_allows_fits() {
     let text = "\u{1}".repeat(1024);
     let attributes: Map<_, _> = (0..16).map(|n| (format!("{n:\u{1}>64}"), json!(text))).collect();
-    let trigger = Trigger { kind: TriggerKind::Event, label: "l".repeat(128), score: Some(1.0), attributes };
-    let fault =
-        Fault { kind: gleaner_lambda::FaultKind::Trap, message: "m".repeat(4096), used: Some(1), allowed: Some(1) };
+    let trigger =
+        Trigger { kind: TriggerKind::Event, label: "l".repeat(128), score: Some(1.0), attributes };
+    let fault = Fault {
+        kind: gleaner_lambda::FaultKind::Trap,
+        message: "m".repeat(4096),
+        used: Some(1),
+        allowed: Some(1),
+    };
     let mut entries = usual_entries(1, 3);
     entries[1].triggers = vec![trigger; 16];
     entries[1].fault = Some(fault);
@@ -212,7 +225,10 @@ fn a_header_that_no_reader_would_take_is_not_begun() {
     let begin = |header: &Header| Writer::begin(Vec::new(), header).err().map(|error| error.kind());
     assert_eq!(begin(&header(INPUTS_MAX)), None);
     assert_eq!(begin(&header(INPUTS_MAX + 1)), Some(io::ErrorKind::InvalidInput));
-    assert_eq!(begin(&Header { event_input: Some(2), ..header(2) }), Some(io::ErrorKind::InvalidInput));
+    assert_eq!(
+        begin(&Header { event_input: Some(2), ..header(2) }),
+        Some(io::ErrorKind::InvalidInput)
+    );
     let long = Header { engine: "x".repeat(3 << 20), ..header(2) };
     assert_eq!(begin(&long), Some(io::ErrorKind::InvalidInput));
 }

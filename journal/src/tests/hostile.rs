@@ -1,4 +1,5 @@
-//! Journals that somebody changed: each change is found, none makes the reader panic or take memory.
+//! Journals that somebody changed: each change is found, none makes the reader panic or take
+//! memory.
 
 use super::*;
 
@@ -39,7 +40,9 @@ fn any_changed_byte_of_a_finished_journal_is_found() {
 fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
     let entries = usual_entries(1, 9);
     let mut bytes = journal(&header(1), &entries, 3);
-    let head = |bytes: &[u8], at: usize| u32::from_le_bytes(bytes[at + 1..][..4].try_into().unwrap()) as usize;
+    let head = |bytes: &[u8], at: usize| {
+        u32::from_le_bytes(bytes[at + 1..][..4].try_into().unwrap()) as usize
+    };
     let mut at = PREAMBLE_LEN;
     for _ in 0..2 {
         at += HEAD_LEN + head(&bytes, at);
@@ -49,8 +52,14 @@ fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
     let (read, error) = read_all(&mut reader);
     assert_eq!(read, entries[..3]);
     let error = error.unwrap();
-    assert_eq!(error.to_string(), format!("the journal is damaged in block 2, at byte {at}, after 3 whole wakes"));
-    assert_eq!(std::error::Error::source(&error).unwrap().to_string(), "the checksum of the block is wrong");
+    assert_eq!(
+        error.to_string(),
+        format!("the journal is damaged in block 2, at byte {at}, after 3 whole wakes")
+    );
+    assert_eq!(
+        std::error::Error::source(&error).unwrap().to_string(),
+        "the checksum of the block is wrong"
+    );
     let help = "it was changed after it was written: copy it again, or write a new one";
     assert_eq!((error.help().as_deref(), error.exit()), (Some(help), Exit::Usage));
     // It stays damaged, and is not taken for one that is cut off.
@@ -75,8 +84,13 @@ fn a_block_that_is_missing_doubled_or_elsewhere_is_found() {
         outcome(&all)
     };
     assert_eq!(of(&[0, 1, 2, 3, 4]).unwrap(), (entries, false));
-    for order in [&[0, 2, 3, 4][..], &[0, 1, 1, 2, 3, 4], &[0, 2, 1, 3, 4], &[0, 1, 3, 4], &[1, 2, 3, 4]] {
-        assert!(matches!(of(order), Err(JournalError::Damaged { why: Damage::Head, .. })), "{order:?}");
+    for order in
+        [&[0, 2, 3, 4][..], &[0, 1, 1, 2, 3, 4], &[0, 2, 1, 3, 4], &[0, 1, 3, 4], &[1, 2, 3, 4]]
+    {
+        assert!(
+            matches!(of(order), Err(JournalError::Damaged { why: Damage::Head, .. })),
+            "{order:?}"
+        );
     }
     let why = |blocks| match of(blocks) {
         Err(JournalError::Damaged { why, .. }) => why,
@@ -125,7 +139,8 @@ fn a_block_of_an_unknown_kind_is_stepped_over_and_counted() {
     let mut payload = vec![1];
     let entry = usual_entries(1, 1).remove(0);
     Encoder::new(1).encode(&entry, &mut payload);
-    let blocks = [header_block(&header(1)), (200, vec![1, 2, 3]), (kind::WAKES, payload), (0, Vec::new())];
+    let blocks =
+        [header_block(&header(1)), (200, vec![1, 2, 3]), (kind::WAKES, payload), (0, Vec::new())];
     let bytes = journal_of(&blocks);
     let mut reader = Reader::open(bytes.as_slice()).unwrap();
     assert_eq!(read_all(&mut reader).0, [entry]);
@@ -146,7 +161,9 @@ fn a_length_that_no_block_has_is_damage_and_takes_no_memory() {
     let head = Head { kind: kind::WAKES, len: u32::MAX, payload_crc: 0 };
     bytes.extend_from_slice(&head.to_bytes(1));
     let why = Damage::TooLong { len: u32::MAX };
-    assert!(matches!(outcome(&bytes), Err(JournalError::Damaged { why: found, .. }) if found == why));
+    assert!(
+        matches!(outcome(&bytes), Err(JournalError::Damaged { why: found, .. }) if found == why)
+    );
 }
 
 #[test]
@@ -155,7 +172,10 @@ fn other_versions_and_other_files_are_refused_with_a_way_out() {
     newer[8] = 2;
     let error = outcome(&newer).unwrap_err();
     assert_eq!(error.to_string(), "the journal is of version 2; this is a reader of version 1");
-    assert_eq!((error.help().as_deref(), error.exit()), (Some("use the gleaner that wrote it"), Exit::Usage));
+    assert_eq!(
+        (error.help().as_deref(), error.exit()),
+        (Some("use the gleaner that wrote it"), Exit::Usage)
+    );
     for other in [&b"\x89MCAP0\r\n and so on, for long enough"[..], b"{", b"\x89GLJRN\n\n"] {
         assert!(matches!(outcome(other), Err(JournalError::NotAJournal)));
     }
@@ -222,7 +242,8 @@ fn no_change_of_a_wake_makes_the_decoder_panic() {
 
 #[test]
 fn what_a_wake_claims_is_checked_before_memory_is_taken() {
-    let decode = |inputs: usize, bytes: &[u8]| Decoder::new(inputs).decode(&mut &*bytes).unwrap_err();
+    let decode =
+        |inputs: usize, bytes: &[u8]| Decoder::new(inputs).decode(&mut &*bytes).unwrap_err();
     let (tick, triggers, fault, log) = (1_u8, 1 << 4, 1 << 5, 1 << 6);
     assert_eq!(decode(1 << 40 >> 20, &[tick, 0, 0]), Malformed::Short);
     assert_eq!(decode(0, &[]), Malformed::Short);
@@ -240,14 +261,20 @@ fn what_a_wake_claims_is_checked_before_memory_is_taken() {
     let nan = [&[tick | triggers, 0, 1, 4, 0][..], &f64::NAN.to_le_bytes(), &[0]].concat();
     assert_eq!(decode(0, &nan), Malformed::Score);
     let found = ATTRIBUTES_MAX as u64 + 1;
-    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 0, 0x81, 0x80, 8]), Malformed::LongAttributes { found });
+    assert_eq!(
+        decode(0, &[tick | triggers, 0, 1, 0, 0, 0x81, 0x80, 8]),
+        Malformed::LongAttributes { found }
+    );
     assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 0, 2, b'[', b']']), Malformed::Attributes);
     let mut deep = vec![tick | triggers, 0, 1, 0, 0, 0x80, 0x80, 4];
     deep.extend(br#"{"a":"#.repeat(1 << 14));
     assert_eq!(decode(0, &deep), Malformed::Attributes);
     let kind = Malformed::Unknown { what: "kind of fault", value: 8 | 7 << 5 };
     assert_eq!(decode(0, &[tick | fault, 0, 8 | 7 << 5, 0]), kind);
-    assert_eq!(decode(0, &[tick | log, 0, 0xff, 0xff, 0xff, 0xff, 0x7f, 0, 0, 0, 0]), Malformed::Number);
+    assert_eq!(
+        decode(0, &[tick | log, 0, 0xff, 0xff, 0xff, 0xff, 0x7f, 0, 0, 0, 0]),
+        Malformed::Number
+    );
     let form = Malformed::Unknown { what: "form of a newest sample", value: 1 };
     assert_eq!(decode(1, &[tick, 0, 1 << 5, 1, 0]), form);
     let overflow = [&[tick, 0, 31][..], &[0xff; 9], &[1]].concat();

@@ -40,7 +40,11 @@ impl Random {
 }
 
 fn header(inputs: usize) -> Header {
-    let file = |path: &str| FileDigest { path: path.to_owned(), bytes: 7, sha256: "0123456789abcdef".repeat(4) };
+    let file = |path: &str| FileDigest {
+        path: path.to_owned(),
+        bytes: 7,
+        sha256: "0123456789abcdef".repeat(4),
+    };
     Header {
         gleaner: "0.1.0".to_owned(),
         engine: "wasmtime 48.0.8".to_owned(),
@@ -60,7 +64,10 @@ fn header(inputs: usize) -> Header {
             })
             .collect(),
         event_input: (inputs > 0).then_some(0),
-        config: Map::from_iter([("brake_mps2".to_owned(), json!(-3.0)), ("dark".to_owned(), json!("x"))]),
+        config: Map::from_iter([
+            ("brake_mps2".to_owned(), json!(-3.0)),
+            ("dark".to_owned(), json!("x")),
+        ]),
         remaps: vec![("/in0".to_owned(), "/wire0".to_owned())],
         clock: "log time of the drive".to_owned(),
         part: Default::default(),
@@ -124,7 +131,8 @@ fn any_trigger(random: &mut Random) -> Trigger {
     }
 }
 
-/// Wakes of a lambda with one or two inputs as they are in a drive: a camera at 10 Hz or an IMU at 100 Hz wakes it.
+/// Wakes of a lambda with one or two inputs as they are in a drive: a camera at 10 Hz or an IMU at
+/// 100 Hz wakes it.
 fn usual_entries(inputs: usize, n: usize) -> Vec<Entry> {
     let mut random = Random(7);
     let mut seq = 100;
@@ -134,12 +142,21 @@ fn usual_entries(inputs: usize, n: usize) -> Vec<Entry> {
         .map(|index| {
             let jitter_ns = random.below(1_000_000) as i64;
             seq += 1;
-            let mut seen =
-                vec![Seen { new: 1, digest: random.next() as u32 | 1, newest: Some(([7; 16], seq)), reach: 1 }];
+            let mut seen = vec![Seen {
+                new: 1,
+                digest: random.next() as u32 | 1,
+                newest: Some(([7; 16], seq)),
+                reach: 1,
+            }];
             if inputs == 2 {
                 let new = 9 + random.below(3);
                 imu += new;
-                seen.push(Seen { new, digest: random.next() as u32 | 1, newest: Some(([8; 16], imu)), reach: 200 });
+                seen.push(Seen {
+                    new,
+                    digest: random.next() as u32 | 1,
+                    newest: Some(([8; 16], imu)),
+                    reach: 200,
+                });
             }
             Entry {
                 at_ns: 1_533_199_000_000_000_000 + index as i64 * step_ns + jitter_ns,
@@ -184,7 +201,8 @@ fn journal_of(blocks: &[(u8, Vec<u8>)]) -> Vec<u8> {
     bytes.extend_from_slice(&VERSION.to_le_bytes());
     bytes.resize(PREAMBLE_LEN, 0);
     for (index, (kind, payload)) in blocks.iter().enumerate() {
-        let head = Head { kind: *kind, len: payload.len() as u32, payload_crc: crc32fast::hash(payload) };
+        let head =
+            Head { kind: *kind, len: payload.len() as u32, payload_crc: crc32fast::hash(payload) };
         bytes.extend_from_slice(&head.to_bytes(index as u64));
         bytes.extend_from_slice(payload);
     }

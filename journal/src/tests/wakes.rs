@@ -78,7 +78,12 @@ fn a_wake_is_laid_out_as_the_documentation_says() {
     let entry = Entry {
         at_ns: 5,
         cause: Woken::Sample { writer: [0xaa; 16], seq: 3 },
-        seen: vec![Seen { new: 40, digest: 0x0403_0201, newest: Some(([0xbb; 16], 300)), reach: 2 }],
+        seen: vec![Seen {
+            new: 40,
+            digest: 0x0403_0201,
+            newest: Some(([0xbb; 16], 300)),
+            reach: 2,
+        }],
         triggers: vec![Trigger {
             kind: TriggerKind::Stop,
             label: "x".to_owned(),
@@ -121,7 +126,8 @@ fn numbers_at_the_ends_of_their_range_do_not_overflow() {
         fuel: Some(number),
         log: Said { lines: u32::MAX, digest: 0 },
     };
-    let ends = [(i64::MIN, 0), (i64::MAX, u64::MAX), (i64::MIN, u64::MAX), (i64::MAX, 1), (-1, 1 << 63)];
+    let ends =
+        [(i64::MIN, 0), (i64::MAX, u64::MAX), (i64::MIN, u64::MAX), (i64::MAX, 1), (-1, 1 << 63)];
     let (mut encoder, mut bytes) = (Encoder::new(1), Vec::new());
     ends.iter().for_each(|&(at_ns, number)| encoder.encode(&entry(at_ns, number), &mut bytes));
     let (mut decoder, mut rest) = (Decoder::new(1), bytes.as_slice());
@@ -146,7 +152,8 @@ fn a_fraction_keeps_its_last_bit() {
         let mut bytes = Vec::new();
         Encoder::new(0).encode(&entry, &mut bytes);
         let read = Decoder::new(0).decode(&mut bytes.as_slice()).unwrap();
-        // Needs the feature `float_roundtrip` of serde_json: without it, a value read may be its neighbour.
+        // Needs the feature `float_roundtrip` of serde_json: without it, a value read may be its
+        // neighbour.
         assert_eq!(read.differs_from(&entry, &[], true), None);
     }
 }

@@ -24,8 +24,8 @@ pub struct ConfigItem {
     pub description: Option<String>,
 }
 
-/// A value of `[config]`. Floating-point values are finite. The order between values of one type is that of the type;
-/// values of different types are never compared.
+/// A value of `[config]`. Floating-point values are finite. The order between values of one type is
+/// that of the type; values of different types are never compared.
 #[derive(Debug, Clone, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum ConfigValue {
@@ -40,7 +40,8 @@ pub enum ConfigValue {
 }
 
 impl ConfigValue {
-    /// `text` as a value of the same type as `self`; a whole number is also accepted as a floating-point one.
+    /// `text` as a value of the same type as `self`; a whole number is also accepted as a
+    /// floating-point one.
     fn same_type(&self, text: &str) -> Option<ConfigValue> {
         match self {
             ConfigValue::Bool(_) => text.parse().ok().map(ConfigValue::Bool),
@@ -79,20 +80,23 @@ impl fmt::Display for ConfigValue {
 pub enum ConfigSet {}
 
 impl ConfigSet {
-    /// Every item of `manifest`, in its order, with its default or the last of `overrides` that names it.
+    /// Every item of `manifest`, in its order, with its default or the last of `overrides` that
+    /// names it.
     ///
-    /// An override is a name and a text, as in `--set name=text`; the text is read as the item's type, and a whole
-    /// number is accepted for a floating-point one.
+    /// An override is a name and a text, as in `--set name=text`; the text is read as the item's
+    /// type, and a whole number is accepted for a floating-point one.
     ///
     /// # Errors
     ///
-    /// [`ConfigError`] for the first override that names no item, or whose text is no value of that item.
+    /// [`ConfigError`] for the first override that names no item, or whose text is no value of that
+    /// item.
     pub fn resolve(
         manifest: &Manifest,
         overrides: &[(String, String)],
     ) -> Result<Vec<(String, ConfigValue)>, ConfigError> {
         let items = &manifest.config;
-        let mut values: Vec<_> = items.iter().map(|item| (item.name.to_string(), item.default.clone())).collect();
+        let mut values: Vec<_> =
+            items.iter().map(|item| (item.name.to_string(), item.default.clone())).collect();
         for (name, text) in overrides {
             let Some(index) = items.iter().position(|item| item.name == name.as_str()) else {
                 let known: Vec<_> = items.iter().map(|item| item.name.to_string()).collect();
@@ -118,12 +122,21 @@ impl ConfigItem {
     pub fn accept(&self, text: &str) -> Result<ConfigValue, ConfigError> {
         let name = self.name.to_string();
         let Some(value) = self.default.same_type(text) else {
-            return Err(ConfigError::WrongType { name, text: excerpt(text), wanted: self.default.type_in_words() });
+            return Err(ConfigError::WrongType {
+                name,
+                text: excerpt(text),
+                wanted: self.default.type_in_words(),
+            });
         };
         let too_small = self.min.as_ref().is_some_and(|min| value < *min);
         let too_large = self.max.as_ref().is_some_and(|max| value > *max);
         if too_small || too_large {
-            return Err(ConfigError::OutOfRange { name, value, min: self.min.clone(), max: self.max.clone() });
+            return Err(ConfigError::OutOfRange {
+                name,
+                value,
+                min: self.min.clone(),
+                max: self.max.clone(),
+            });
         }
         Ok(value)
     }
@@ -181,12 +194,16 @@ impl Explain for ConfigError {
     fn help(&self) -> Option<String> {
         Some(match self {
             ConfigError::Unknown { near: Some(near), .. } => format!("did you mean `{near}`?"),
-            ConfigError::Unknown { known, .. } if known.is_empty() => "its lambda.toml has no [config]".to_owned(),
+            ConfigError::Unknown { known, .. } if known.is_empty() => {
+                "its lambda.toml has no [config]".to_owned()
+            }
             ConfigError::Unknown { known, .. } => {
                 format!("its config values are {}", list(known, "and"))
             }
             ConfigError::WrongType { wanted, .. } => format!("give {wanted}"),
-            ConfigError::OutOfRange { .. } => "the range stands in [config] of its lambda.toml".to_owned(),
+            ConfigError::OutOfRange { .. } => {
+                "the range stands in [config] of its lambda.toml".to_owned()
+            }
         })
     }
 
@@ -247,13 +264,19 @@ mod tests {
         assert_eq!(set("dark_luma", "255").unwrap()[1].1, ConfigValue::Int(255));
         assert_eq!(set("on", "false").unwrap()[2].1, ConfigValue::Bool(false));
         assert_eq!(set("label", "3").unwrap()[3].1, ConfigValue::Text("3".to_owned()));
-        let twice = [("dark_luma", "1"), ("dark_luma", "2")].map(|(name, text)| (name.to_owned(), text.to_owned()));
+        let twice = [("dark_luma", "1"), ("dark_luma", "2")]
+            .map(|(name, text)| (name.to_owned(), text.to_owned()));
         assert_eq!(ConfigSet::resolve(&manifest(), &twice).unwrap()[1].1, ConfigValue::Int(2));
     }
 
     #[test]
     fn an_unknown_item_is_refused_with_the_nearest_name() {
-        refused("dark_lume", "1", "lambda `x` has no config value `dark_lume`", "did you mean `dark_luma`?");
+        refused(
+            "dark_lume",
+            "1",
+            "lambda `x` has no config value `dark_lume`",
+            "did you mean `dark_luma`?",
+        );
         refused(
             "speed",
             "1",
@@ -264,7 +287,12 @@ mod tests {
 
     #[test]
     fn a_text_of_another_type_is_refused() {
-        refused("dark_luma", "1.5", "config value `dark_luma` cannot be `1.5`", "give a whole number, for example 3");
+        refused(
+            "dark_luma",
+            "1.5",
+            "config value `dark_luma` cannot be `1.5`",
+            "give a whole number, for example 3",
+        );
         refused("on", "yes", "config value `on` cannot be `yes`", "give `true` or `false`");
         for text in ["nan", "inf", "-infinity", "1e999", "", "1,5"] {
             let message = format!("config value `brake_mps2` cannot be `{text}`");
@@ -275,7 +303,17 @@ mod tests {
     #[test]
     fn a_value_out_of_range_is_refused() {
         let help = "the range stands in [config] of its lambda.toml";
-        refused("dark_luma", "256", "config value `dark_luma` cannot be 256: its range is 0 to 255", help);
-        refused("brake_mps2", "0.5", "config value `brake_mps2` cannot be 0.5: its maximum is 0.0", help);
+        refused(
+            "dark_luma",
+            "256",
+            "config value `dark_luma` cannot be 256: its range is 0 to 255",
+            help,
+        );
+        refused(
+            "brake_mps2",
+            "0.5",
+            "config value `brake_mps2` cannot be 0.5: its maximum is 0.0",
+            help,
+        );
     }
 }

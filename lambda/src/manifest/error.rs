@@ -271,6 +271,8 @@ fn mebibytes(size: ByteSize) -> u64 {
 }
 
 fn shares(inputs: &[InputMemory]) -> String {
-    let share = |input: &InputMemory| format!("`{}` (line {}) {} MiB", input.name, input.line, mebibytes(input.asked));
+    let share = |input: &InputMemory| {
+        format!("`{}` (line {}) {} MiB", input.name, input.line, mebibytes(input.asked))
+    };
     inputs.iter().map(share).collect::<Vec<_>>().join(", ")
 }

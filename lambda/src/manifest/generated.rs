@@ -1,5 +1,6 @@
-//! Files of the checkout that are made of the manifest's types and of the table of limits, wholly or in part. `cargo xtask bless` writes
-//! them, and a test compares them, so that no number is said twice by hand.
+//! Files of the checkout that are made of the manifest's types and of the table of limits, wholly
+//! or in part. `cargo xtask bless` writes them, and a test compares them, so that no number is said
+//! twice by hand.
 
 use std::fmt::Write;
 
@@ -24,7 +25,8 @@ pub const GENERATED: &[Generated] = &[
 ];
 
 impl Generated {
-    /// The text that the file should have; `now` is the text that it has, of which what was written by hand stays.
+    /// The text that the file should have; `now` is the text that it has, of which what was written
+    /// by hand stays.
     ///
     /// # Errors
     ///
@@ -51,17 +53,22 @@ fn page(now: &str) -> Result<String, String> {
             text += line;
             continue;
         };
-        let limit = missing.iter().position(|limit| limit.key == key).map(|index| missing.remove(index));
+        let limit =
+            missing.iter().position(|limit| limit.key == key).map(|index| missing.remove(index));
         let limit = limit.ok_or_else(|| format!("`{key}` is no limit, or has two rows"))?;
         let [_, default, max] = &limit.words;
         let (default, max) = (format!(" {default} "), format!(" {max} "));
-        let places = cells.get_mut(3..5).ok_or_else(|| format!("the row of `{key}` is too short"))?;
+        let places =
+            cells.get_mut(3..5).ok_or_else(|| format!("the row of `{key}` is too short"))?;
         places.copy_from_slice(&[&default, &max]);
         text += &cells.join("|");
     }
     match missing.first() {
         None => Ok(format!("{before}{BEGIN}{text}{END}{after}")),
-        Some(limit) => Err(format!("`{}` has no row: write what it counts, and what happens beyond it", limit.key)),
+        Some(limit) => Err(format!(
+            "`{}` has no row: write what it counts, and what happens beyond it",
+            limit.key
+        )),
     }
 }
 
@@ -110,10 +117,14 @@ mod tests {
     fn numbers_on_a_page_are_mended_and_words_stay() {
         let limits = Limits::table();
         let stale: String = limits.iter().map(|limit| row(limit, "1", "2")).collect();
-        let fresh: String = limits.iter().map(|limit| row(limit, &limit.words[1], &limit.words[2])).collect();
+        let fresh: String =
+            limits.iter().map(|limit| row(limit, &limit.words[1], &limit.words[2])).collect();
         assert_eq!(page(&table(&stale)), Ok(table(&fresh)));
         assert_eq!(page(&table(&fresh)), Ok(table(&fresh)));
-        assert!(fresh.contains("| `fuel` | u | 50,000,000 | 1,000,000,000,000 | by hand |"), "{fresh}");
+        assert!(
+            fresh.contains("| `fuel` | u | 50,000,000 | 1,000,000,000,000 | by hand |"),
+            "{fresh}"
+        );
     }
 
     #[test]

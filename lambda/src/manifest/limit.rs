@@ -48,7 +48,11 @@ impl Unit for u64 {
 impl Unit for ByteSize {
     const NAME: &'static str = "size";
 
-    fn read(table: &Table, key: &str, bounds: &Bounds<ByteSize>) -> Result<ByteSize, ManifestError> {
+    fn read(
+        table: &Table,
+        key: &str,
+        bounds: &Bounds<ByteSize>,
+    ) -> Result<ByteSize, ManifestError> {
         table.size(key, bounds)
     }
 
@@ -68,7 +72,11 @@ impl Unit for ByteSize {
 impl Unit for Duration {
     const NAME: &'static str = "duration";
 
-    fn read(table: &Table, key: &str, bounds: &Bounds<Duration>) -> Result<Duration, ManifestError> {
+    fn read(
+        table: &Table,
+        key: &str,
+        bounds: &Bounds<Duration>,
+    ) -> Result<Duration, ManifestError> {
         table.duration(key, bounds)
     }
 
@@ -99,7 +107,11 @@ pub(super) struct Limit {
 }
 
 impl Limit {
-    pub(super) fn new<T: Unit>(key: &'static str, meaning: &'static str, bounds: Bounds<T>) -> Limit {
+    pub(super) fn new<T: Unit>(
+        key: &'static str,
+        meaning: &'static str,
+        bounds: Bounds<T>,
+    ) -> Limit {
         let Bounds { min, default, max } = bounds;
         let word = |value: T| match T::NAME {
             "number" => grouped(value.plain()),
@@ -122,11 +134,16 @@ pub(super) mod plain {
 
     use super::Unit;
 
-    pub(in super::super) fn serialize<T: Unit, S: Serializer>(value: &T, serializer: S) -> Result<S::Ok, S::Error> {
+    pub(in super::super) fn serialize<T: Unit, S: Serializer>(
+        value: &T,
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
         serializer.serialize_u64(value.plain())
     }
 
-    pub(in super::super) fn deserialize<'de, T: Unit, D: Deserializer<'de>>(deserializer: D) -> Result<T, D::Error> {
+    pub(in super::super) fn deserialize<'de, T: Unit, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<T, D::Error> {
         u64::deserialize(deserializer).map(T::of_plain)
     }
 }

@@ -1,8 +1,9 @@
 //! `[limits]`: what a lambda may use, and how a vehicle tightens it.
 //!
-//! A limit is one entry of the table below: its meaning, the reason for its numbers, key, unit, and bounds. The struct, its reader, its
-//! words and its JSON are made of the table here; the page on the manifest, two columns of `docs/limits.md` and the numbers of both
-//! SDKs' fake hosts by `cargo xtask bless` (`generated.rs`).
+//! A limit is one entry of the table below: its meaning, the reason for its numbers, key, unit, and
+//! bounds. The struct, its reader, its words and its JSON are made of the table here; the page on
+//! the manifest, two columns of `docs/limits.md` and the numbers of both SDKs' fake hosts by `cargo
+//! xtask bless` (`generated.rs`).
 
 use std::fmt;
 use std::time::Duration;
@@ -14,12 +15,14 @@ use super::limit::{Limit, Unit, plain};
 use super::table::Table;
 use super::{ByteSize, ManifestError};
 
-/// Makes all of the table. `as` gives the key that a limit has in JSON, where it is another one than in the file.
+/// Makes all of the table. `as` gives the key that a limit has in JSON, where it is another one
+/// than in the file.
 macro_rules! limits {
     ($($(#[doc = $meaning:literal])+ $key:ident $(as $json:literal)?: $unit:ty { $($bounds:tt)+ })+) => {
         /// What a lambda may use. `docs/limits.md` says what happens where it wants more.
         ///
-        /// As JSON it has the file's keys; durations are `_ns`, sizes are in bytes. What is missing there has its default.
+        /// As JSON it has the file's keys; durations are `_ns`, sizes are in bytes. What is missing
+        /// there has its default.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
         #[serde(default)]
         #[non_exhaustive]
@@ -76,7 +79,8 @@ limits! {
     // `init` builds its tables once, and may take as much as twenty wakes by default.
     init_fuel: u64 { min: 1_000, default: 1_000_000_000, max: 1_000_000_000_000 }
 
-    /// Time until a wake ends with a fault. Live only: in a replay it would make decisions depend on the machine.
+    /// Time until a wake ends with a fault. Live only: in a replay it would make decisions depend
+    /// on the machine.
     deadline as "deadline_ns": Duration {
         min: Duration::from_millis(1), default: Duration::from_millis(50), max: Duration::from_secs(60)
     }
@@ -87,22 +91,24 @@ limits! {
         min: Duration::from_millis(1), default: Duration::from_secs(10), max: Duration::from_secs(300)
     }
 
-    /// Memory that the lambda itself may allocate, and once more the pixels of the frames that it makes.
+    /// Memory that the lambda itself may allocate, and once more the pixels of the frames that it
+    /// makes.
     // The rings are beside it.
     memory: ByteSize { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) }
 
     /// Elements of all tables of a component together.
-    // A lambda built from Rust has some hundred, for its function pointers. The host keeps 8 bytes for each, beside `memory`: 8 MB at
-    // most.
+    // A lambda built from Rust has some hundred, for its function pointers. The host keeps 8 bytes
+    // for each, beside `memory`: 8 MB at most.
     tables: u64 { min: 1, default: 20_000, max: 1_000_000 }
 
     /// Stack of a component.
-    // The thread that runs it has 8 MiB, of which the host needs some for its own calls below the guest's; half a mebibyte is a
-    // recursion some thousand deep.
+    // The thread that runs it has 8 MiB, of which the host needs some for its own calls below the
+    // guest's; half a mebibyte is a recursion some thousand deep.
     stack: ByteSize { min: ByteSize::kib(16), default: ByteSize::kib(512), max: ByteSize::kib(512) }
 
     /// Handles that a component holds at a time, of all kinds.
-    // Samples, frames, fields, topics and what WASI hands out. The host keeps some 200 bytes for each: 13 MB at most.
+    // Samples, frames, fields, topics and what WASI hands out. The host keeps some 200 bytes for
+    // each: 13 MB at most.
     handles: u64 { min: 16, default: 4096, max: 65_536 }
 
     /// Frames that the lambda holds at a time, of all inputs.
@@ -110,7 +116,8 @@ limits! {
     frames: u64 { min: 1, default: 256, max: 4096 }
 
     /// Bytes that one call takes or gives.
-    // A call is the shortest thing that a deadline can end, and a mebibyte takes 0.1 ms. The SDK reads frames in pieces of 64 KiB.
+    // A call is the shortest thing that a deadline can end, and a mebibyte takes 0.1 ms. The SDK
+    // reads frames in pieces of 64 KiB.
     call_bytes: ByteSize { min: ByteSize::kib(64), default: ByteSize::mib(1), max: ByteSize::mib(1) }
 
     /// Samples, values or texts that one call gives.
@@ -130,8 +137,8 @@ limits! {
     log_bytes: ByteSize { min: ByteSize::kib(4), default: ByteSize::kib(400), max: ByteSize::mib(16) }
 
     /// Triggers for each minute of the lambda's time.
-    // Of all kinds. The default is 200 a second, which is what a recorder takes for long from one lambda; the maximum one for each
-    // wake of the shortest period.
+    // Of all kinds. The default is 200 a second, which is what a recorder takes for long from one
+    // lambda; the maximum one for each wake of the shortest period.
     events_per_minute: u64 { min: 1, default: 12_000, max: 60_000 }
 }
 
@@ -178,7 +185,8 @@ mod tests {
         (vehicle.fuel, vehicle.deadline) = (10_000_000, Duration::from_millis(20));
         vehicle.memory = ByteSize::gib(1);
         let (limits, tightened) = Limits::default().tightened_by(&vehicle);
-        let expected = Limits { fuel: 10_000_000, deadline: Duration::from_millis(20), ..Limits::default() };
+        let expected =
+            Limits { fuel: 10_000_000, deadline: Duration::from_millis(20), ..Limits::default() };
         assert_eq!(limits, expected);
         let said: Vec<_> = tightened.iter().map(Tightened::to_string).collect();
         assert_eq!(said, ["fuel 50000000 -> 10000000", "deadline 50ms -> 20ms"]);
@@ -200,9 +208,11 @@ mod tests {
 
     #[test]
     fn what_is_missing_in_json_has_its_default_and_what_is_there_reads_back() {
-        let limits: Limits = serde_json::from_str(r#"{"fuel":5000,"of a newer version":1}"#).unwrap();
+        let limits: Limits =
+            serde_json::from_str(r#"{"fuel":5000,"of a newer version":1}"#).unwrap();
         assert_eq!(limits, Limits { fuel: 5000, ..Limits::default() });
-        let again: Limits = serde_json::from_value(serde_json::to_value(Limits::MOST).unwrap()).unwrap();
+        let again: Limits =
+            serde_json::from_value(serde_json::to_value(Limits::MOST).unwrap()).unwrap();
         assert_eq!(again, Limits::MOST);
     }
 }

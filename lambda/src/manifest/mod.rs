@@ -1,8 +1,10 @@
-//! `lambda.toml`: read once, and turned into types that cannot be wrong, so that no later code has to check again.
+//! `lambda.toml`: read once, and turned into types that cannot be wrong, so that no later code has
+//! to check again.
 //!
-//! `table` and `value` walk the document, `read` says what each key is, `error` what a user sees when one is refused: the
-//! file, the line, the key, the cause and the way out. Nothing here looks at the file system except to read the
-//! manifest itself: whether `entry` exists is the business of [`layout`](crate::layout).
+//! `table` and `value` walk the document, `read` says what each key is, `error` what a user sees
+//! when one is refused: the file, the line, the key, the cause and the way out. Nothing here looks
+//! at the file system except to read the manifest itself: whether `entry` exists is the business of
+//! [`layout`](crate::layout).
 
 pub mod bounds;
 mod config;
@@ -27,9 +29,14 @@ pub use error::{InputMemory, ManifestError, Place};
 pub use generated::{GENERATED, Generated};
 use gleaner_base::{ByteSize, UnitError, format_duration, parse_duration};
 pub use limits::{Limits, Tightened};
-pub use names::{ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version};
+pub use names::{
+    ItemName, LambdaName, NameError, RelativePath, Sha256, TopicName, TypeName, Version,
+};
 pub use reference::reference;
-pub use types::{Backlog, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule, Store};
+pub use types::{
+    Backlog, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule,
+    Store,
+};
 
 use std::io;
 use std::path::Path;
@@ -64,8 +71,8 @@ impl Manifest {
     ///
     /// # Errors
     ///
-    /// If `dir/lambda.toml` cannot be read, is no file of that folder, is longer than [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no
-    /// UTF-8.
+    /// If `dir/lambda.toml` cannot be read, is no file of that folder, is longer than
+    /// [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no UTF-8.
     pub fn read(dir: impl AsRef<Path>) -> Result<String, ManifestError> {
         let dir = dir.as_ref();
         text(&dir.join(FILE), PlainFile::inside(dir, Path::new(FILE), bounds::MANIFEST_MAX))
@@ -84,10 +91,13 @@ pub(crate) fn read_text(path: &Path) -> Result<String, ManifestError> {
 
 fn text(path: &Path, opened: io::Result<PlainFile>) -> Result<String, ManifestError> {
     let path = || path.to_owned();
-    let bytes = opened.and_then(PlainFile::read_whole).map_err(|source| match NotPlain::of(&source) {
-        Some(NotPlain::TooLong { most, .. }) => ManifestError::TooLong { path: path(), limit: *most },
-        _ => ManifestError::Read { path: path(), source },
-    })?;
+    let bytes =
+        opened.and_then(PlainFile::read_whole).map_err(|source| match NotPlain::of(&source) {
+            Some(NotPlain::TooLong { most, .. }) => {
+                ManifestError::TooLong { path: path(), limit: *most }
+            }
+            _ => ManifestError::Read { path: path(), source },
+        })?;
     String::from_utf8(bytes).map_err(|error| {
         let source = io::Error::new(io::ErrorKind::InvalidData, error.utf8_error());
         ManifestError::Read { path: path(), source }

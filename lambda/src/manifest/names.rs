@@ -1,4 +1,5 @@
-//! Names that were checked once. Each is a text of one form, so that a path, a topic or a version in hand is a good one.
+//! Names that were checked once. Each is a text of one form, so that a path, a topic or a version
+//! in hand is a good one.
 
 use std::fmt;
 use std::path::Path;
@@ -89,15 +90,16 @@ macro_rules! checked_text {
 }
 
 checked_text! {
-    /// Name of a lambda: 1 to 63 lower-case letters, digits and hyphens, the first a letter. It becomes part of file
-    /// names, host labels and URLs, hence the length of a DNS label.
+    /// Name of a lambda: 1 to 63 lower-case letters, digits and hyphens, the first a letter. It
+    /// becomes part of file names, host labels and URLs, hence the length of a DNS label.
     LambdaName, "lambda name",
     "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a letter, for example `brake-dark`",
     names::is_lambda
 }
 
 checked_text! {
-    /// Name of an input, a model or a config item: 1 to 63 lower-case letters, digits, `_` and `-`, the first a letter.
+    /// Name of an input, a model or a config item: 1 to 63 lower-case letters, digits, `_` and `-`,
+    /// the first a letter.
     ItemName, "name",
     "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, for example `front_camera`",
     names::is_item
@@ -128,7 +130,8 @@ checked_text! {
 }
 
 checked_text! {
-    /// A path below the lambda's folder: relative, with `/` between its parts, and never leading out of it.
+    /// A path below the lambda's folder: relative, with `/` between its parts, and never leading
+    /// out of it.
     RelativePath, "path inside the lambda's folder",
     "give a path relative to the lambda's folder, without `..`, for example `models/detector.onnx`",
     is_relative_path
@@ -154,12 +157,14 @@ impl TypeName {
         self.0 == names::COMPRESSED_IMAGE
     }
 
-    /// Whether samples of this type are seen as frames: `sensor_msgs/msg/Image` and `CompressedImage`.
+    /// Whether samples of this type are seen as frames: `sensor_msgs/msg/Image` and
+    /// `CompressedImage`.
     pub fn is_frame(&self) -> bool {
         names::is_frame(&self.0)
     }
 
-    /// Whether samples of this type are large, so that few of them are kept: frames and point clouds.
+    /// Whether samples of this type are large, so that few of them are kept: frames and point
+    /// clouds.
     pub fn is_large(&self) -> bool {
         names::is_large(&self.0)
     }
@@ -172,8 +177,9 @@ fn is_version(text: &str) -> bool {
     };
     // A leading zero would make two texts of one version.
     let number = |part: &str| part.parse::<u32>().is_ok_and(|n| n.to_string() == part);
-    let identifier =
-        |part: &str| !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-');
+    let identifier = |part: &str| {
+        !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-')
+    };
     text.len() <= 63
         && core.split('.').count() == 3
         && core.split('.').all(number)
@@ -181,13 +187,17 @@ fn is_version(text: &str) -> bool {
 }
 
 fn is_relative_path(text: &str) -> bool {
-    // Checked as text, not by `Path::components`, which quietly drops `.` and doubled separators: one file, one text.
+    // Checked as text, not by `Path::components`, which quietly drops `.` and doubled separators:
+    // one file, one text.
     let part = |part: &str| !part.is_empty() && part != "." && part != "..";
-    text.len() <= 255 && text.split('/').all(part) && !text.contains(|c: char| c == '\\' || c.is_control())
+    text.len() <= 255
+        && text.split('/').all(part)
+        && !text.contains(|c: char| c == '\\' || c.is_control())
 }
 
 fn is_sha256(text: &str) -> bool {
-    text.len() == 64 && text.bytes().all(|byte| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte))
+    text.len() == 64
+        && text.bytes().all(|byte| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte))
 }
 
 #[cfg(test)]
@@ -211,7 +221,17 @@ mod tests {
     #[test]
     fn a_lambda_name_is_a_lower_case_label() {
         accepts::<LambdaName>(&["a", "brake-dark", "x1", &"a".repeat(63)]);
-        refuses::<LambdaName>(&["", "1x", "-x", "Brake", "a_b", "a b", "ä", "a/b", &"a".repeat(64)]);
+        refuses::<LambdaName>(&[
+            "",
+            "1x",
+            "-x",
+            "Brake",
+            "a_b",
+            "a b",
+            "ä",
+            "a/b",
+            &"a".repeat(64),
+        ]);
     }
 
     #[test]
@@ -224,7 +244,8 @@ mod tests {
     fn a_topic_name_is_absolute_and_has_no_empty_part() {
         accepts::<TopicName>(&["/a", "/imu/data", "/_x/y_2", "/Camera"]);
         refuses::<TopicName>(&[
-            "", "/", "imu", "/imu/", "//imu", "/a//b", "/2a", "/a/2b", "/a b", "/a-b", "/~x", "/{x}",
+            "", "/", "imu", "/imu/", "//imu", "/a//b", "/2a", "/a/2b", "/a b", "/a-b", "/~x",
+            "/{x}",
         ]);
         refuses::<TopicName>(&[&format!("/{}", "a".repeat(247))]);
         accepts::<TopicName>(&[&format!("/{}", "a".repeat(246))]);
@@ -282,6 +303,12 @@ mod tests {
     #[test]
     fn a_sha256_has_64_lower_case_digits() {
         accepts::<Sha256>(&[&"0123456789abcdef".repeat(4)]);
-        refuses::<Sha256>(&["", "abc", &"0123456789ABCDEF".repeat(4), &"g".repeat(64), &"a".repeat(65)]);
+        refuses::<Sha256>(&[
+            "",
+            "abc",
+            &"0123456789ABCDEF".repeat(4),
+            &"g".repeat(64),
+            &"a".repeat(65),
+        ]);
     }
 }

@@ -10,8 +10,8 @@ use super::syntax;
 use super::table::{Document, Table};
 use super::value::Value;
 use super::{
-    Backlog, ByteSize, Durability, Input, Kind, Lambda, Limits, Manifest, Model, Qos, Record, Reliability, Schedule,
-    Store, TopicName, TypeName,
+    Backlog, ByteSize, Durability, Input, Kind, Lambda, Limits, Manifest, Model, Qos, Record,
+    Reliability, Schedule, Store, TopicName, TypeName,
 };
 use gleaner_base::words::{excerpt, nearest};
 
@@ -19,17 +19,24 @@ type Result<T> = std::result::Result<T, ManifestError>;
 
 /// The manifest that `document` holds.
 pub(super) fn manifest(document: &Document) -> Result<Manifest> {
-    let entries = DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
+    let entries =
+        DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
     let known = &["lambda", "schedule", "input", "model", "record", "limits", "config"];
     let root = Table::root(document, entries.get_ref(), known)?;
     let needed = |table: &'static str, example: &'static str| {
-        root.get(table).ok_or_else(|| ManifestError::MissingTable { file: document.file.to_owned(), table, example })
+        root.get(table).ok_or_else(|| ManifestError::MissingTable {
+            file: document.file.to_owned(),
+            table,
+            example,
+        })
     };
 
     let lambda = lambda(&needed("lambda", "[lambda] with name, version, kind and entry")?)?;
     let inputs = inputs(document, &root)?;
-    let schedule =
-        schedule(&needed("schedule", "[schedule] with event = \"<an input's name>\" or period = \"100ms\"")?, &inputs)?;
+    let schedule = schedule(
+        &needed("schedule", "[schedule] with event = \"<an input's name>\" or period = \"100ms\"")?,
+        &inputs,
+    )?;
     Ok(Manifest {
         lambda,
         schedule,
@@ -42,14 +49,17 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
 }
 
 fn lambda(value: &Value) -> Result<Lambda> {
-    let table = value.table("[lambda]", &["name", "version", "kind", "entry", "description", "deterministic"])?;
+    let table = value
+        .table("[lambda]", &["name", "version", "kind", "entry", "description", "deterministic"])?;
     let lambda = Lambda {
         name: table.need("name", "name = \"brake-dark\"")?.parse()?,
         version: table.need("version", "version = \"0.1.0\"")?.parse()?,
         kind: table
             .need("kind", "kind = \"wasm\" or kind = \"python\"")?
             .choice(&[("wasm", Kind::Wasm), ("python", Kind::Python)])?,
-        entry: table.need("entry", "entry = \"brake_dark.wasm\", or entry = \"main.py\" for Python")?.parse()?,
+        entry: table
+            .need("entry", "entry = \"brake_dark.wasm\", or entry = \"main.py\" for Python")?
+            .parse()?,
         description: table.optional_text("description")?,
         deterministic: table.flag("deterministic")?,
     };
@@ -68,25 +78,32 @@ fn schedule(value: &Value, inputs: &[Input]) -> Result<Schedule> {
         (Some(event), None) => {
             let input = event_input(&event, inputs)?;
             let default = if input.type_name.is_large() { Backlog::Latest } else { Backlog::Each };
-            let backlog = table.choice("backlog", &[("each", Backlog::Each), ("latest", Backlog::Latest)], default)?;
+            let backlog = table.choice(
+                "backlog",
+                &[("each", Backlog::Each), ("latest", Backlog::Latest)],
+                default,
+            )?;
             Ok(Schedule::Event { input: input.name.clone(), backlog })
         }
-        (None, Some(period)) => {
-            match table.get("backlog") {
-                Some(backlog) => Err(backlog
-                    .misplaced("has no meaning with `period`", "remove it: missed ticks are counted, never queued")),
-                None => Ok(Schedule::Periodic { period: period.duration(&bounds::PERIOD)? }),
-            }
-        }
+        (None, Some(period)) => match table.get("backlog") {
+            Some(backlog) => Err(backlog.misplaced(
+                "has no meaning with `period`",
+                "remove it: missed ticks are counted, never queued",
+            )),
+            None => Ok(Schedule::Periodic { period: period.duration(&bounds::PERIOD)? }),
+        },
         (Some(event), Some(period)) => {
-            let (_, second) = if event.offset < period.offset { (event, period) } else { (period, event) };
+            let (_, second) =
+                if event.offset < period.offset { (event, period) } else { (period, event) };
             Err(second.misplaced(
                 "stands beside the other kind of schedule",
                 "keep `event` or `period`: a lambda runs on one input or on the clock",
             ))
         }
-        (None, None) => Err(value
-            .misplaced("has neither `event` nor `period`", "add event = \"<an input's name>\" or period = \"100ms\"")),
+        (None, None) => Err(value.misplaced(
+            "has neither `event` nor `period`",
+            "add event = \"<an input's name>\" or period = \"100ms\"",
+        )),
     }
 }
 
@@ -115,7 +132,11 @@ fn inputs(document: &Document, root: &Table) -> Result<Vec<Input>> {
         let input = input(&table, &name, &topic)?;
         names.add(input.name.as_str(), &name)?;
         topics.add(input.topic.as_str(), &topic)?;
-        memory.push(InputMemory { name: input.name.to_string(), line: table.line(), asked: input.memory() });
+        memory.push(InputMemory {
+            name: input.name.to_string(),
+            line: table.line(),
+            asked: input.memory(),
+        });
         inputs.push(input);
     }
     let total = memory.iter().fold(0, |sum: u64, input| sum.saturating_add(input.asked.bytes()));
@@ -136,9 +157,13 @@ fn input(table: &Table, name: &Value, topic: &Value) -> Result<Input> {
     let decoded_size = match table.get("decoded_size") {
         Some(value) if !type_name.is_compressed_image() => {
             let why = format!("has no meaning for {type_name}");
-            return Err(value.misplaced(why, "remove it: only sensor_msgs/msg/CompressedImage is decoded"));
+            return Err(
+                value.misplaced(why, "remove it: only sensor_msgs/msg/CompressedImage is decoded")
+            );
         }
-        _ if type_name.is_compressed_image() => Some(table.size("decoded_size", &bounds::DECODED_SIZE)?),
+        _ if type_name.is_compressed_image() => {
+            Some(table.size("decoded_size", &bounds::DECODED_SIZE)?)
+        }
         _ => None,
     };
     Ok(Input {
@@ -180,15 +205,22 @@ fn qos(value: &Value) -> Result<Qos> {
 fn models(document: &Document, root: &Table) -> Result<Vec<Model>> {
     let mut names = Unique::new(document, "model", "give each [[model]] a name of its own");
     let mut models = Vec::new();
-    for table in root.tables("model", &["name", "file", "sha256", "layout", "providers", "threads"])? {
+    for table in
+        root.tables("model", &["name", "file", "sha256", "layout", "providers", "threads"])?
+    {
         let name = table.need("name", "name = \"detector\"")?;
         let model = Model {
             name: name.parse()?,
             file: table.need("file", "file = \"models/detector.onnx\"")?.parse()?,
-            sha256: table.need("sha256", "sha256 = \"<what sha256sum prints for the file>\"")?.parse()?,
+            sha256: table
+                .need("sha256", "sha256 = \"<what sha256sum prints for the file>\"")?
+                .parse()?,
             layout: table.optional_text("layout")?,
             providers: table.get("providers").map_or(Ok(Vec::new()), |value| providers(&value))?,
-            threads: table.get("threads").map(|value| value.integer(&bounds::THREADS).map(count)).transpose()?,
+            threads: table
+                .get("threads")
+                .map(|value| value.integer(&bounds::THREADS).map(count))
+                .transpose()?,
         };
         names.add(model.name.as_str(), &name)?;
         models.push(model);
@@ -202,7 +234,8 @@ fn providers(value: &Value) -> Result<Vec<String>> {
 }
 
 fn record(document: &Document, value: &Value) -> Result<Record> {
-    let known = &["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
+    let known =
+        &["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
     let table = value.table("[record]", known)?;
     let list = table.need("topics", "topics = [\"/imu/data\"]: what a clip holds")?;
     let mut unique = Unique::new(document, "topic", "list each topic of [record] once");

@@ -23,20 +23,33 @@ pub(super) fn items(value: &Value) -> Result<Vec<ConfigItem>> {
 fn item(entry: &Value) -> Result<ConfigItem> {
     let name = entry.parse_key()?;
     if !entry.raw().is_table() {
-        let default =
-            scalar(entry, "a number, a text, true or false, or a table such as { default = 1.0, unit = \"m\" }")?;
-        return Ok(ConfigItem { name, default, min: None, max: None, unit: None, description: None });
+        let default = scalar(
+            entry,
+            "a number, a text, true or false, or a table such as { default = 1.0, unit = \"m\" }",
+        )?;
+        return Ok(ConfigItem {
+            name,
+            default,
+            min: None,
+            max: None,
+            unit: None,
+            description: None,
+        });
     }
     let title = format!("`{}`", entry.place().key);
     let table = entry.table(&title, &["default", "min", "max", "unit", "description"])?;
-    let given = table.need("default", "default = 1.0, or another value that says what type it is")?;
+    let given =
+        table.need("default", "default = 1.0, or another value that says what type it is")?;
     let default = scalar(&given, "a number, a text, or true or false")?;
     let min = limit(&table, "min", &default)?;
     let max = limit(&table, "max", &default)?;
     if let (Some((_, min)), Some((key, max))) = (&min, &max)
         && max < min
     {
-        return Err(key.misplaced(format!("is {max}, below `min`, which is {min}"), "give a `max` above `min`"));
+        return Err(key.misplaced(
+            format!("is {max}, below `min`, which is {min}"),
+            "give a `max` above `min`",
+        ));
     }
     let (min, max) = (min.map(|(_, value)| value), max.map(|(_, value)| value));
     given.within(&default, min.as_ref(), max.as_ref(), ConfigValue::to_string)?;
@@ -51,21 +64,26 @@ fn item(entry: &Value) -> Result<ConfigItem> {
 }
 
 /// The limit `key` of an item, as a value of the type of `default`.
-fn limit<'a>(table: &Table<'a>, key: &str, default: &ConfigValue) -> Result<Option<(Value<'a>, ConfigValue)>> {
+fn limit<'a>(
+    table: &Table<'a>,
+    key: &str,
+    default: &ConfigValue,
+) -> Result<Option<(Value<'a>, ConfigValue)>> {
     let Some(value) = table.get(key) else {
         return Ok(None);
     };
     let limit = match (default, scalar(&value, "a number")?) {
-        (ConfigValue::Int(_), limit @ ConfigValue::Int(_)) | (ConfigValue::Float(_), limit @ ConfigValue::Float(_)) => {
-            limit
-        }
+        (ConfigValue::Int(_), limit @ ConfigValue::Int(_))
+        | (ConfigValue::Float(_), limit @ ConfigValue::Float(_)) => limit,
         (ConfigValue::Float(_), ConfigValue::Int(limit)) => ConfigValue::Float(limit as f64),
         (ConfigValue::Int(_), _) => {
             return Err(value.wrong_type("a whole number, as `default` is one"));
         }
         (ConfigValue::Float(_), _) => return Err(value.wrong_type("a number, as `default` is one")),
         (ConfigValue::Bool(_) | ConfigValue::Text(_), _) => {
-            return Err(value.misplaced("has no meaning here", "remove it: only numbers have limits"));
+            return Err(
+                value.misplaced("has no meaning here", "remove it: only numbers have limits")
+            );
         }
     };
     Ok(Some((value, limit)))
@@ -77,9 +95,11 @@ fn scalar(value: &Value, wanted: &str) -> Result<ConfigValue> {
         DeValue::Boolean(truth) => Ok(ConfigValue::Bool(*truth)),
         DeValue::Float(float) => match float.as_str().parse::<f64>() {
             Ok(number) if number.is_finite() => Ok(ConfigValue::Float(number)),
-            _ => {
-                Err(value.wrong_form(float.as_str(), "finite number", "give a number that is neither infinite nor nan"))
-            }
+            _ => Err(value.wrong_form(
+                float.as_str(),
+                "finite number",
+                "give a number that is neither infinite nor nan",
+            )),
         },
         DeValue::Integer(_) => {
             let number = value.whole_number().unwrap_or(i128::MAX);
@@ -87,6 +107,8 @@ fn scalar(value: &Value, wanted: &str) -> Result<ConfigValue> {
             value.within(&number, Some(&min), Some(&max), i128::to_string)?;
             Ok(ConfigValue::Int(i64::try_from(number).unwrap_or(i64::MAX)))
         }
-        DeValue::Datetime(_) | DeValue::Array(_) | DeValue::Table(_) => Err(value.wrong_type(wanted)),
+        DeValue::Datetime(_) | DeValue::Array(_) | DeValue::Table(_) => {
+            Err(value.wrong_type(wanted))
+        }
     }
 }

@@ -1,4 +1,5 @@
-//! `[limits]` in `lambda.toml`, where it is what the lambda wants, and in `vehicle.toml`, where it is the most that a lambda gets.
+//! `[limits]` in `lambda.toml`, where it is what the lambda wants, and in `vehicle.toml`, where it
+//! is the most that a lambda gets.
 
 use toml::de::DeTable;
 
@@ -12,12 +13,14 @@ type Result<T> = std::result::Result<T, ManifestError>;
 
 /// The table `[limits]`, if there is one; limits that it does not name are those of `missing`.
 pub(super) fn limits(value: Option<&Value>, missing: Limits) -> Result<Limits> {
-    value.map_or(Ok(missing), |value| Limits::read(&value.table("[limits]", Limits::KEYS)?, missing))
+    value
+        .map_or(Ok(missing), |value| Limits::read(&value.table("[limits]", Limits::KEYS)?, missing))
 }
 
 /// The limits of a vehicle.
 pub(super) fn vehicle(document: &Document) -> Result<Limits> {
-    let entries = DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
+    let entries =
+        DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
     let root = Table::root(document, entries.get_ref(), &["limits"])?;
     limits(root.get("limits").as_ref(), Limits::MOST)
 }

@@ -1,5 +1,6 @@
-//! `docs/manifest.md`: every key of a `lambda.toml`. Meanings are the comments of the types that hold the values, rules are those that a
-//! name is refused by, and numbers the bounds that it is checked against; so nothing is said twice, and nothing can go stale.
+//! `docs/manifest.md`: every key of a `lambda.toml`. Meanings are the comments of the types that
+//! hold the values, rules are those that a name is refused by, and numbers the bounds that it is
+//! checked against; so nothing is said twice, and nothing can go stale.
 
 use std::fmt::{Display, Write};
 use std::ops::RangeInclusive;
@@ -9,8 +10,8 @@ use std::time::Duration;
 use super::bounds::{self, Bounds};
 use super::limit::Limit;
 use super::{
-    ByteSize, ItemName, LambdaName, Limits, NameError, RelativePath, Sha256, TopicName, TypeName, Version,
-    format_duration,
+    ByteSize, ItemName, LambdaName, Limits, NameError, RelativePath, Sha256, TopicName, TypeName,
+    Version, format_duration,
 };
 use gleaner_base::grouped;
 
@@ -48,7 +49,8 @@ pub(super) struct Key {
 impl Key {
     /// The key `name` that becomes `field` of the type `of`.
     fn new(name: &'static str, of: &str, field: &str, form: impl Into<String>) -> Key {
-        let meaning = meaning(of, field).unwrap_or_else(|| panic!("`{field}` of `{of}` has a comment"));
+        let meaning =
+            meaning(of, field).unwrap_or_else(|| panic!("`{field}` of `{of}` has a comment"));
         Key { name, form: form.into(), default: "none".to_owned(), range: String::new(), meaning }
     }
 
@@ -72,7 +74,11 @@ impl Key {
     }
 
     /// With other bounds for images and clouds.
-    fn or_large<T: Copy + PartialEq>(mut self, large: &Bounds<T>, show: impl Fn(T) -> String) -> Key {
+    fn or_large<T: Copy + PartialEq>(
+        mut self,
+        large: &Bounds<T>,
+        show: impl Fn(T) -> String,
+    ) -> Key {
         let _ = write!(self.default, "; of images and clouds {}", show(large.default));
         self
     }
@@ -135,7 +141,8 @@ fn input() -> Section {
         Key::new("max_size", "Input", "max_size", "size")
             .bounded(&bounds::MAX_SIZE_SMALL, size)
             .or_large(&bounds::MAX_SIZE_LARGE, size),
-        Key::new("decoded_size", "Input", "decoded_size", "size").bounded(&bounds::DECODED_SIZE, size),
+        Key::new("decoded_size", "Input", "decoded_size", "size")
+            .bounded(&bounds::DECODED_SIZE, size),
         Key::new("hold", "Input", "hold", "number")
             .bounded(&bounds::HOLD_SMALL, number)
             .or_large(&bounds::HOLD_LARGE, number),
@@ -151,8 +158,10 @@ fn input() -> Section {
 
 fn qos() -> Section {
     let keys = vec![
-        Key::new("reliability", "Qos", "reliability", "`\"reliable\"`, `\"best_effort\"`").default("`\"reliable\"`"),
-        Key::new("durability", "Qos", "durability", "`\"volatile\"`, `\"transient_local\"`").default("`\"volatile\"`"),
+        Key::new("reliability", "Qos", "reliability", "`\"reliable\"`, `\"best_effort\"`")
+            .default("`\"reliable\"`"),
+        Key::new("durability", "Qos", "durability", "`\"volatile\"`, `\"transient_local\"`")
+            .default("`\"volatile\"`"),
         Key::new("depth", "Qos", "depth", "number").bounded(&bounds::QOS_DEPTH, number),
     ];
     let note = "`qos = { ... }` of an input, for live topics: exactly this is asked for.";
@@ -185,7 +194,11 @@ fn limits() -> Section {
         Key { name: limit.key, form, default, range: format!("{min} to {max}"), meaning }
     };
     let keys = Limits::table().into_iter().map(key).collect();
-    Section { title: "[limits]", note: "What it may use. A vehicle can make each smaller.".to_owned(), keys }
+    Section {
+        title: "[limits]",
+        note: "What it may use. A vehicle can make each smaller.".to_owned(),
+        keys,
+    }
 }
 
 fn config() -> Section {
@@ -210,7 +223,11 @@ fn model() -> Section {
         Key::new("providers", "Model", "providers", "list of texts").default("empty"),
         Key::new("threads", "Model", "threads", "number").within(bounds::THREADS, number),
     ];
-    Section { title: "[[model]]", note: "Read and checked now, used once there are models.".to_owned(), keys }
+    Section {
+        title: "[[model]]",
+        note: "Read and checked now, used once there are models.".to_owned(),
+        keys,
+    }
 }
 
 /// The rule that a name is refused by; no name is empty.
@@ -233,14 +250,18 @@ fn duration(duration: Duration) -> String {
 /// The comment of a field, in one line; `of` is the struct or enum that has it.
 fn meaning(of: &str, field: &str) -> Option<String> {
     let body = SOURCES.iter().find_map(|source| {
-        let at = ["struct", "enum"].iter().find_map(|kind| source.find(&format!("pub {kind} {of} {{")))?;
+        let at = ["struct", "enum"]
+            .iter()
+            .find_map(|kind| source.find(&format!("pub {kind} {of} {{")))?;
         source[at..].split("\n}").next()
     })?;
     let mut comment = String::new();
     for line in body.lines().map(str::trim) {
         if let Some(text) = line.strip_prefix("///") {
             comment += text;
-        } else if line.trim_start_matches("pub ").starts_with(&format!("{field}:")) && !comment.is_empty() {
+        } else if line.trim_start_matches("pub ").starts_with(&format!("{field}:"))
+            && !comment.is_empty()
+        {
             return Some(comment.trim().replace('|', "\\|"));
         } else if !line.starts_with("#[") {
             comment.clear();

@@ -15,13 +15,20 @@ pub(super) fn explain(document: &Document, error: &TomlError) -> ManifestError {
         && let Some((what, first)) = earlier(document.text, key, line)
     {
         let way_out = "keep one of the two";
-        return ManifestError::Twice { what, name: excerpt(key), file, first, second: line, way_out };
+        return ManifestError::Twice {
+            what,
+            name: excerpt(key),
+            file,
+            first,
+            second: line,
+            way_out,
+        };
     }
     ManifestError::Syntax { file, line, message: excerpt(error.message()) }
 }
 
-/// Where `key`, refused as a duplicate in `line`, stood first. The parser knows but does not tell, so its text is
-/// looked for: as the name of a table, or as a key above it in the same table.
+/// Where `key`, refused as a duplicate in `line`, stood first. The parser knows but does not tell,
+/// so its text is looked for: as the name of a table, or as a key above it in the same table.
 fn earlier(text: &str, key: &str, line: usize) -> Option<(&'static str, usize)> {
     let above: Vec<&str> = text.lines().take(line).map(str::trim_start).collect();
     let (second, above) = above.split_last()?;

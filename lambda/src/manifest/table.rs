@@ -1,7 +1,7 @@
 //! Walks a TOML document and remembers where everything stands, so that a refusal can say it.
 //!
-//! A [`Table`] is made with the keys that it may have and refuses all others; a [`Value`] is read as what it should
-//! be. Neither knows what a lambda is.
+//! A [`Table`] is made with the keys that it may have and refuses all others; a [`Value`] is read
+//! as what it should be. Neither knows what a lambda is.
 
 use std::time::Duration;
 
@@ -46,19 +46,25 @@ impl<'a> Table<'a> {
         entries: &'a DeTable<'a>,
         known: &'static [&'static str],
     ) -> Result<Table<'a>> {
-        Table { document, path: String::new(), title: String::new(), offset: 0, entries }.knowing(known)
+        Table { document, path: String::new(), title: String::new(), offset: 0, entries }
+            .knowing(known)
     }
 
     /// The same table, if it has no key but these.
     pub(super) fn knowing(self, known: &'static [&'static str]) -> Result<Table<'a>> {
-        let Some(value) = self.entries().into_iter().find(|value| !known.contains(&value.name)) else {
+        let Some(value) = self.entries().into_iter().find(|value| !known.contains(&value.name))
+        else {
             return Ok(self);
         };
         Err(ManifestError::UnknownKey {
             file: self.document.file.to_owned(),
             line: value.line(),
             key: excerpt(value.name),
-            within: if self.path.is_empty() { "at the top level".to_owned() } else { format!("in {}", self.title) },
+            within: if self.path.is_empty() {
+                "at the top level".to_owned()
+            } else {
+                format!("in {}", self.title)
+            },
             near: nearest(value.name, known.iter().copied()),
             known,
         })
@@ -66,7 +72,8 @@ impl<'a> Table<'a> {
 
     /// All values, in the order of the file.
     pub(super) fn entries(&self) -> Vec<Value<'a>> {
-        let mut values: Vec<_> = self.entries.keys().filter_map(|key| self.get(key.get_ref())).collect();
+        let mut values: Vec<_> =
+            self.entries.keys().filter_map(|key| self.get(key.get_ref())).collect();
         values.sort_by_key(|value| value.offset);
         values
     }
@@ -99,7 +106,11 @@ impl<'a> Table<'a> {
     }
 
     /// The tables of `[[key]]`, none if there is no such key.
-    pub(super) fn tables(&self, key: &str, known: &'static [&'static str]) -> Result<Vec<Table<'a>>> {
+    pub(super) fn tables(
+        &self,
+        key: &str,
+        known: &'static [&'static str],
+    ) -> Result<Vec<Table<'a>>> {
         let Some(value) = self.get(key) else {
             return Ok(Vec::new());
         };
@@ -117,7 +128,12 @@ impl<'a> Table<'a> {
         self.get(key).map_or(Ok(false), |value| value.boolean())
     }
 
-    pub(super) fn choice<T: Copy>(&self, key: &str, choices: &[(&'static str, T)], default: T) -> Result<T> {
+    pub(super) fn choice<T: Copy>(
+        &self,
+        key: &str,
+        choices: &[(&'static str, T)],
+        default: T,
+    ) -> Result<T> {
         self.get(key).map_or(Ok(default), |value| value.choice(choices))
     }
 

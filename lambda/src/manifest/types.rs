@@ -2,9 +2,13 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize, Serializer};
 
-use super::{ByteSize, ConfigItem, ItemName, LambdaName, Limits, RelativePath, Sha256, TopicName, TypeName, Version};
+use super::{
+    ByteSize, ConfigItem, ItemName, LambdaName, Limits, RelativePath, Sha256, TopicName, TypeName,
+    Version,
+};
 
-/// What `lambda.toml` says, checked. As JSON it has the file's keys; durations are `_ns`, sizes are in bytes.
+/// What `lambda.toml` says, checked. As JSON it has the file's keys; durations are `_ns`, sizes are
+/// in bytes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct Manifest {
@@ -12,7 +16,8 @@ pub struct Manifest {
     pub lambda: Lambda,
     /// `[schedule]`: when it runs.
     pub schedule: Schedule,
-    /// `[[input]]`, in the order of the file. Names and topics are unique; an event schedule names one of them.
+    /// `[[input]]`, in the order of the file. Names and topics are unique; an event schedule names
+    /// one of them.
     #[serde(rename = "input")]
     pub inputs: Vec<Input>,
     /// `[[model]]`, in the order of the file, with unique names.
@@ -36,7 +41,8 @@ pub struct Lambda {
     pub version: Version,
     /// The language it is hosted as.
     pub kind: Kind,
-    /// What is loaded, relative to the build folder: a component, or the Python file with the lambda.
+    /// What is loaded, relative to the build folder: a component, or the Python file with the
+    /// lambda.
     pub entry: RelativePath,
     /// One line for people.
     pub description: Option<String>,
@@ -119,7 +125,8 @@ pub struct Input {
 }
 
 impl Input {
-    /// How many slots the samples of this input need: those in the ring, those held, and the one being written.
+    /// How many slots the samples of this input need: those in the ring, those held, and the one
+    /// being written.
     pub fn slots(&self) -> usize {
         self.depth + self.hold + 1
     }
@@ -129,7 +136,8 @@ impl Input {
         self.hold + 1
     }
 
-    /// Memory that this input takes before the first sample: its slots, and those of decoded images.
+    /// Memory that this input takes before the first sample: its slots, and those of decoded
+    /// images.
     pub fn memory(&self) -> ByteSize {
         let decoded = self.decoded_size.map_or(0, ByteSize::bytes);
         let samples = (self.slots() as u64).saturating_mul(self.max_size.bytes());
@@ -187,7 +195,8 @@ pub struct Model {
     pub sha256: Sha256,
     /// How its outputs are laid out, for example `yolov8`; `None` leaves them as tensors.
     pub layout: Option<String>,
-    /// Execution providers in the order in which they are tried; empty leaves the choice to the vehicle.
+    /// Execution providers in the order in which they are tried; empty leaves the choice to the
+    /// vehicle.
     pub providers: Vec<String>,
     /// Threads that one run may use; `None` leaves the choice to the vehicle.
     pub threads: Option<usize>,

@@ -1,4 +1,5 @@
-//! One value of a TOML document, read as what it should be, with its place for the refusal if it is not.
+//! One value of a TOML document, read as what it should be, with its place for the refusal if it is
+//! not.
 
 use std::ops::RangeInclusive;
 use std::str::FromStr;
@@ -32,7 +33,11 @@ impl<'a> Value<'a> {
     }
 
     pub(super) fn place(&self) -> Box<Place> {
-        Box::new(Place { file: self.document.file.to_owned(), line: self.line(), key: self.path.clone() })
+        Box::new(Place {
+            file: self.document.file.to_owned(),
+            line: self.line(),
+            key: self.path.clone(),
+        })
     }
 
     pub(super) fn raw(&self) -> &'a DeValue<'a> {
@@ -54,12 +59,21 @@ impl<'a> Value<'a> {
     }
 
     /// The error for a text that should be a `what`; `rule` is what such a text looks like.
-    pub(super) fn wrong_form(&self, text: &str, what: &'static str, rule: &'static str) -> ManifestError {
+    pub(super) fn wrong_form(
+        &self,
+        text: &str,
+        what: &'static str,
+        rule: &'static str,
+    ) -> ManifestError {
         ManifestError::WrongForm { at: self.place(), text: excerpt(text), what, rule }
     }
 
     /// The error for a value that does not fit its surroundings.
-    pub(super) fn misplaced(&self, why: impl Into<String>, way_out: impl Into<String>) -> ManifestError {
+    pub(super) fn misplaced(
+        &self,
+        why: impl Into<String>,
+        way_out: impl Into<String>,
+    ) -> ManifestError {
         ManifestError::Misplaced { at: self.place(), why: why.into(), way_out: way_out.into() }
     }
 
@@ -74,7 +88,13 @@ impl<'a> Value<'a> {
             return Err(self.wrong_type("a table"));
         };
         let title = title.to_owned();
-        Ok(Table { document: self.document, path: self.path.clone(), title, offset: self.offset, entries })
+        Ok(Table {
+            document: self.document,
+            path: self.path.clone(),
+            title,
+            offset: self.offset,
+            entries,
+        })
     }
 
     /// The elements of an array, each with its own line.
@@ -86,8 +106,11 @@ impl<'a> Value<'a> {
             let why = format!("has {} entries, above the maximum of {ITEMS_MAX}", items.len());
             return Err(self.misplaced(why, format!("keep {ITEMS_MAX} or fewer")));
         }
-        let item =
-            |item: &'a Spanned<DeValue<'a>>| Value { offset: item.span().start, value: item.get_ref(), ..self.clone() };
+        let item = |item: &'a Spanned<DeValue<'a>>| Value {
+            offset: item.span().start,
+            value: item.get_ref(),
+            ..self.clone()
+        };
         Ok(items.iter().map(item).collect())
     }
 
@@ -110,7 +133,9 @@ impl<'a> Value<'a> {
 
     /// The key itself, where its form matters because the author chose it.
     pub(super) fn parse_key<T: FromStr<Err = NameError>>(&self) -> Result<T> {
-        self.name.parse().map_err(|NameError { what, rule, .. }| self.wrong_form(self.name, what, rule))
+        self.name
+            .parse()
+            .map_err(|NameError { what, rule, .. }| self.wrong_form(self.name, what, rule))
     }
 
     /// One of a few words.
@@ -136,16 +161,22 @@ impl<'a> Value<'a> {
 
     pub(super) fn size(&self, range: &RangeInclusive<ByteSize>) -> Result<ByteSize> {
         if let Some(text) = self.value.as_str() {
-            let size = text.parse().map_err(|UnitError { what, rule, .. }| self.wrong_form(text, what, rule))?;
+            let size = text
+                .parse()
+                .map_err(|UnitError { what, rule, .. }| self.wrong_form(text, what, rule))?;
             self.within(&size, Some(range.start()), Some(range.end()), ByteSize::to_string)?;
             return Ok(size);
         }
         let Some(number) = self.whole_number() else {
-            return Err(self.wrong_type("a size in quotes, for example \"2 MiB\", or a whole number of bytes"));
+            return Err(self.wrong_type(
+                "a size in quotes, for example \"2 MiB\", or a whole number of bytes",
+            ));
         };
         // As whole numbers, since the one at hand may be negative or beyond 64 bits.
         let (min, max) = (i128::from(range.start().bytes()), i128::from(range.end().bytes()));
-        let show = |number: &i128| u64::try_from(*number).map_or(number.to_string(), |n| ByteSize::new(n).to_string());
+        let show = |number: &i128| {
+            u64::try_from(*number).map_or(number.to_string(), |n| ByteSize::new(n).to_string())
+        };
         self.within(&number, Some(&min), Some(&max), show)?;
         Ok(u64::try_from(number).map_or(*range.end(), ByteSize::new))
     }
@@ -154,8 +185,8 @@ impl<'a> Value<'a> {
         let Some(text) = self.value.as_str() else {
             return Err(self.wrong_type("a duration in quotes, for example \"50ms\""));
         };
-        let duration =
-            parse_duration(text).map_err(|UnitError { what, rule, .. }| self.wrong_form(text, what, rule))?;
+        let duration = parse_duration(text)
+            .map_err(|UnitError { what, rule, .. }| self.wrong_form(text, what, rule))?;
         let show = |duration: &Duration| format_duration(*duration);
         self.within(&duration, Some(range.start()), Some(range.end()), show)?;
         Ok(duration)

@@ -2,7 +2,8 @@ use serde::{Deserialize, Serialize};
 
 use gleaner_lambda::manifest::Kind;
 
-/// What was found out about a built lambda without any sample: it could be loaded, it fits the interface, and its `init` returned.
+/// What was found out about a built lambda without any sample: it could be loaded, it fits the
+/// interface, and its `init` returned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Checked {
     /// Name of the lambda.

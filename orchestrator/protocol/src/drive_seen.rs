@@ -9,7 +9,8 @@ pub struct DriveSeen {
     pub start_ns: Option<i64>,
     /// Log time of its last message, in ns since the epoch.
     pub end_ns: Option<i64>,
-    /// What of it was read: log times in ns, the second no longer of the part. All of it if there are none.
+    /// What of it was read: log times in ns, the second no longer of the part. All of it if there
+    /// are none.
     pub parts: Vec<[i64; 2]>,
     /// Messages that came after one with a later log time.
     pub out_of_order: u64,
@@ -41,7 +42,8 @@ pub struct RecordedTopicSeen {
     pub interval: Option<Spread>,
     /// Log time of the message before the longest of these times, in ns since the epoch.
     pub longest_after_ns: Option<i64>,
-    /// Numbers that are missing between those of its messages; `None` where the recorder did not number them one by one.
+    /// Numbers that are missing between those of its messages; `None` where the recorder did not
+    /// number them one by one.
     pub missing: Option<u64>,
     /// Bytes of the largest message there, as CDR.
     pub largest_bytes: u64,

@@ -14,7 +14,9 @@ pub enum DriveTime {
 
 /// A text that is no [`DriveTime`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("write seconds after the drive's start, as in 12.5 or 2min, or a time since 1970, as in @1700000000.5")]
+#[error(
+    "write seconds after the drive's start, as in 12.5 or 2min, or a time since 1970, as in @1700000000.5"
+)]
 pub struct DriveTimeError;
 
 impl FromStr for DriveTime {
@@ -28,7 +30,9 @@ impl FromStr for DriveTime {
         let duration = parse_duration(&seconds).map_err(|_| DriveTimeError)?;
         match since_1970 {
             false => Ok(DriveTime::After(duration)),
-            true => i64::try_from(duration.as_nanos()).map(DriveTime::At).map_err(|_| DriveTimeError),
+            true => {
+                i64::try_from(duration.as_nanos()).map(DriveTime::At).map_err(|_| DriveTimeError)
+            }
         }
     }
 }
@@ -60,7 +64,9 @@ mod tests {
 
     #[test]
     fn what_is_no_time_is_refused_with_examples() {
-        for text in ["", "@", "-1", "1m", "12:30", "1e3", "@-5", "@99999999999", "@@1", "1.0000000001", "s"] {
+        for text in
+            ["", "@", "-1", "1m", "12:30", "1e3", "@-5", "@99999999999", "@@1", "1.0000000001", "s"]
+        {
             assert_eq!(text.parse::<DriveTime>(), Err(DriveTimeError), "{text}");
         }
         assert!(DriveTimeError.to_string().contains("12.5 or 2min"));

@@ -6,10 +6,12 @@ use serde::{Deserialize, Serialize};
 
 use gleaner_base::{Exit, own_file, write_whole};
 
-/// How long a runtime may take for its end once it was asked for it; then `gleaner-shim` kills it. Who started both waits longer.
+/// How long a runtime may take for its end once it was asked for it; then `gleaner-shim` kills it.
+/// Who started both waits longer.
 pub const UNTIL_KILLED: Duration = Duration::from_secs(30);
 
-/// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if it was not there at that time.
+/// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if
+/// it was not there at that time.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ExitRecord {
     /// Process id that it had.
@@ -24,8 +26,8 @@ pub struct ExitRecord {
     pub signal: Option<i32>,
     /// Why `gleaner-shim` killed it, if it did.
     pub killed: Option<Killed>,
-    /// There was no memory left for it: the kernel killed some of it, for its control group had none; or, ended by SIGABRT, it was
-    /// refused more by its own limit.
+    /// There was no memory left for it: the kernel killed some of it, for its control group had
+    /// none; or, ended by SIGABRT, it was refused more by its own limit.
     pub out_of_memory: bool,
     /// The most memory that it had resident, in bytes.
     pub max_rss_bytes: u64,
@@ -33,7 +35,8 @@ pub struct ExitRecord {
     pub cpu_ns: u64,
     /// Processes that it left behind, which were killed.
     pub left_behind: u32,
-    /// `gleaner-shim` had been asked to end it. A lambda can ask its own process only, and not the shim.
+    /// `gleaner-shim` had been asked to end it. A lambda can ask its own process only, and not the
+    /// shim.
     #[serde(default)]
     pub asked: bool,
     /// What it was doing when it ended, if it reported that.
@@ -118,9 +121,13 @@ impl Killed {
             (Why::Memory { used, allowed }, _) => {
                 let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
                 let (used, allowed) = (mib(used), mib(allowed));
-                return format!("needed more memory than it may have: {used:.1} MiB, of {allowed:.1} MiB");
+                return format!(
+                    "needed more memory than it may have: {used:.1} MiB, of {allowed:.1} MiB"
+                );
             }
-            (Why::Threads { used, allowed }, _) => return format!("had {used} threads, and may have {allowed}"),
+            (Why::Threads { used, allowed }, _) => {
+                return format!("had {used} threads, and may have {allowed}");
+            }
         };
         format!("{what} for {ran:.2} s; after {allowed:.2} s it is killed")
     }
@@ -170,12 +177,18 @@ impl ExitRecord {
     /// Its name in the folder of a run's results.
     pub const FILE: &'static str = "exit.json";
 
-    /// Returns whether the lambda caused the end. Without a request, an end within a call into the lambda counts as caused by it, and so
-    /// does an exit code of success: our own failures come between two calls and have their own exit codes.
+    /// Returns whether the lambda caused the end. Without a request, an end within a call into the
+    /// lambda counts as caused by it, and so does an exit code of success: our own failures come
+    /// between two calls and have their own exit codes.
     pub fn is_the_lambdas(&self) -> bool {
-        let is_ours = |code| Exit::from_code(code).is_some_and(|exit| !matches!(exit, Exit::Ok | Exit::LambdaFaulted));
+        let is_ours = |code| {
+            Exit::from_code(code)
+                .is_some_and(|exit| !matches!(exit, Exit::Ok | Exit::LambdaFaulted))
+        };
         let is_within = matches!(self.doing, Some(Doing::Init | Doing::Wake));
-        self.killed.is_some() || self.out_of_memory || !self.asked && (is_within || !self.code.is_some_and(is_ours))
+        self.killed.is_some()
+            || self.out_of_memory
+            || !self.asked && (is_within || !self.code.is_some_and(is_ours))
     }
 
     /// Whether it ended by itself with an exit code of a run that was completed.
@@ -188,13 +201,18 @@ impl ExitRecord {
     pub fn sentence(&self) -> Option<String> {
         match (self.killed, self.out_of_memory, self.signal, self.code) {
             (Some(killed), ..) => Some(killed.sentence()),
-            (None, true, Some(SIGABRT), _) => {
-                Some("ended itself: it needed more memory than `memory` in [limits] leaves it".to_owned())
+            (None, true, Some(SIGABRT), _) => Some(
+                "ended itself: it needed more memory than `memory` in [limits] leaves it"
+                    .to_owned(),
+            ),
+            (None, true, ..) => {
+                Some("was killed by the kernel: its control group had no memory left".to_owned())
             }
-            (None, true, ..) => Some("was killed by the kernel: its control group had no memory left".to_owned()),
             (None, false, Some(signal), _) => Some(format!("was ended by signal {signal}")),
             (None, false, None, Some(0)) => None,
-            (None, false, None, code) => Some(format!("ended by itself, with exit code {}", code.unwrap_or(-1))),
+            (None, false, None, code) => {
+                Some(format!("ended by itself, with exit code {}", code.unwrap_or(-1)))
+            }
         }
     }
 
@@ -209,7 +227,8 @@ impl ExitRecord {
         write_whole(path, &text)
     }
 
-    /// Prints it as the last line of standard output, where its process may have left a part of a line.
+    /// Prints it as the last line of standard output, where its process may have left a part of a
+    /// line.
     ///
     /// # Errors
     ///
@@ -227,7 +246,8 @@ impl ExitRecord {
     pub fn read(path: &Path) -> io::Result<Self> {
         let mut text = Vec::new();
         own_file::read(path)?.take(RECORD_MAX).read_to_end(&mut text)?;
-        serde_json::from_slice(&text).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+        serde_json::from_slice(&text)
+            .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
     }
 }
 
@@ -273,9 +293,15 @@ mod tests {
     fn a_process_that_ends_unasked_as_if_asked_was_ended_by_its_lambda() {
         let ended = ExitRecord { killed: None, signal: None, code: Some(0), ..record() };
         assert!(ended.is_the_lambdas());
-        assert!(ExitRecord { code: Some(6), ..ended.clone() }.is_the_lambdas(), "it had faulted before");
+        assert!(
+            ExitRecord { code: Some(6), ..ended.clone() }.is_the_lambdas(),
+            "it had faulted before"
+        );
         assert!(!ExitRecord { asked: true, ..ended.clone() }.is_the_lambdas());
-        assert!(!ExitRecord { code: Some(5), ..ended.clone() }.is_the_lambdas(), "our programs have said why");
+        assert!(
+            !ExitRecord { code: Some(5), ..ended.clone() }.is_the_lambdas(),
+            "our programs have said why"
+        );
         assert!(ExitRecord { asked: true, killed: record().killed, ..ended }.is_the_lambdas());
     }
 
@@ -318,12 +344,21 @@ mod tests {
 
     #[test]
     fn a_person_reads_why_it_was_killed() {
-        assert_eq!(record().sentence().unwrap(), "was in one wake for 0.35 s; after 0.35 s it is killed");
+        assert_eq!(
+            record().sentence().unwrap(),
+            "was in one wake for 0.35 s; after 0.35 s it is killed"
+        );
         let crashed = ExitRecord { killed: None, signal: Some(11), ..record() };
         assert_eq!(crashed.sentence().unwrap(), "was ended by signal 11");
-        let full =
-            |signal| ExitRecord { out_of_memory: true, signal: Some(signal), ..crashed.clone() }.sentence().unwrap();
-        assert_eq!(full(6), "ended itself: it needed more memory than `memory` in [limits] leaves it");
+        let full = |signal| {
+            ExitRecord { out_of_memory: true, signal: Some(signal), ..crashed.clone() }
+                .sentence()
+                .unwrap()
+        };
+        assert_eq!(
+            full(6),
+            "ended itself: it needed more memory than `memory` in [limits] leaves it"
+        );
         assert_eq!(full(9), "was killed by the kernel: its control group had no memory left");
         assert_eq!(ExitRecord { code: Some(0), signal: None, ..crashed }.sentence(), None);
     }

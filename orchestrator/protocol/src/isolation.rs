@@ -2,7 +2,8 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// The environment variable in which `gleaner-shim` tells its runtime the layers that it has set up: a JSON list of [`Layer`].
+/// The environment variable in which `gleaner-shim` tells its runtime the layers that it has set
+/// up: a JSON list of [`Layer`].
 pub const LAYERS_ENV: &str = "GLEANER_LAYERS";
 
 /// A layer of isolation around a lambda's process, as it was found to hold on this machine.

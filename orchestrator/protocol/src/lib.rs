@@ -1,6 +1,8 @@
-//! Messages between Gleaner's programs: reports of a runtime, pages of results, exit records, frames to and from the recorder.
+//! Messages between Gleaner's programs: reports of a runtime, pages of results, exit records,
+//! frames to and from the recorder.
 //!
-//! Nothing here runs a lambda or listens on a socket. Programs talk to each other through these types; they never link each other.
+//! Nothing here runs a lambda or listens on a socket. Programs talk to each other through these
+//! types; they never link each other.
 
 mod checked;
 mod drive_seen;

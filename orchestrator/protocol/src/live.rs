@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 use crate::link::RecorderStatus;
 use gleaner_lambda::manifest::Kind;
 
-/// How a lambda is doing on live topics. Counts are since its start; spreads are since the report before, and in the last report
-/// since the start.
+/// How a lambda is doing on live topics. Counts are since its start; spreads are since the report
+/// before, and in the last report since the start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Live {
     /// Name of the lambda.
@@ -39,10 +39,11 @@ pub struct Live {
     pub triggers_refused: u64,
     /// Wakes that did not happen, since the lambda had faulted again and again.
     pub passed_over: u64,
-    /// Decisions and log lines that could not be written: the disk failed, or was too slow; and what native code of the lambda handed on
-    /// in their place, which is none.
+    /// Decisions and log lines that could not be written: the disk failed, or was too slow; and
+    /// what native code of the lambda handed on in their place, which is none.
     pub unwritten: u64,
-    /// Messages on the topics of `--rtt` and `--decisions` that were not sent, since a reader does not keep up.
+    /// Messages on the topics of `--rtt` and `--decisions` that were not sent, since a reader does
+    /// not keep up.
     #[serde(default)]
     pub unsent: u64,
     /// Sample received, or tick due, until the lambda is entered. `None` without wakes.
@@ -57,7 +58,8 @@ pub struct Live {
     pub network: Network,
     /// What became of the wakes on their way to the recorder; `None` without one.
     pub recorder: Option<ToRecorder>,
-    /// What the recorders of the run counted, in `summary.json` only: whoever starts them adds it. `None` without one.
+    /// What the recorders of the run counted, in `summary.json` only: whoever starts them adds it.
+    /// `None` without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recording: Option<Box<RecorderStatus>>,
     /// Resident memory, in bytes.
@@ -67,8 +69,8 @@ pub struct Live {
 }
 
 impl Live {
-    /// With what was counted of `before`, an earlier process of the same lambda. Spreads, rates, and what is true of an instant
-    /// stay those of this one.
+    /// With what was counted of `before`, an earlier process of the same lambda. Spreads, rates,
+    /// and what is true of an instant stay those of this one.
     #[must_use]
     pub fn after(mut self, before: &Live) -> Live {
         self.up_s += before.up_s;
@@ -90,9 +92,12 @@ impl Live {
         ];
         add(counts);
         for topic in &mut self.topics {
-            let Some(before) = before.topics.iter().find(|before| before.name == topic.name) else { continue };
+            let Some(before) = before.topics.iter().find(|before| before.name == topic.name) else {
+                continue;
+            };
             // Unknown in one of them is unknown in both.
-            topic.lost = topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
+            topic.lost =
+                topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
             add([
                 (&mut topic.received, before.received),
                 (&mut topic.malformed, before.malformed),
@@ -103,7 +108,10 @@ impl Live {
             ]);
         }
         if let (Some(now), Some(before)) = (&mut self.recorder, &before.recorder) {
-            add([(&mut now.wakes_dropped, before.wakes_dropped), (&mut now.triggers_lost, before.triggers_lost)]);
+            add([
+                (&mut now.wakes_dropped, before.wakes_dropped),
+                (&mut now.triggers_lost, before.triggers_lost),
+            ]);
         }
         self
     }
@@ -141,7 +149,8 @@ pub struct LiveTopic {
     pub rate_hz: f64,
     /// Samples that reached the ring.
     pub received: u64,
-    /// Samples that were lost before they reached us, as far as gaps in their numbers tell; `None` if nothing tells.
+    /// Samples that were lost before they reached us, as far as gaps in their numbers tell; `None`
+    /// if nothing tells.
     pub lost: Option<u64>,
     /// Samples that could not be read at all.
     pub malformed: u64,
@@ -174,8 +183,8 @@ pub struct Network {
     pub buffer_granted: usize,
     /// Datagrams that the system dropped because a buffer was full.
     pub socket_drops: u64,
-    /// Datagrams that nobody should send, with fragments that claim too much or with too many numbers, dropped before they could do
-    /// harm: see `docs/dds-limits.md`.
+    /// Datagrams that nobody should send, with fragments that claim too much or with too many
+    /// numbers, dropped before they could do harm: see `docs/dds-limits.md`.
     #[serde(default)]
     pub filtered: u64,
     /// Why such datagrams are let pass, if they are.
@@ -186,7 +195,8 @@ pub struct Network {
 /// What became of wakes on their way to the recorder.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ToRecorder {
-    /// Wakes without a trigger that were left out because the recorder was too slow: clips say how many they lack.
+    /// Wakes without a trigger that were left out because the recorder was too slow: clips say how
+    /// many they lack.
     pub wakes_dropped: u64,
     /// Triggers that could not be handed over.
     pub triggers_lost: u64,
@@ -236,7 +246,12 @@ mod tests {
             run: None,
             hand_out: None,
             topics: vec![topic],
-            network: Network { socket_drops: count, filtered: count, participants: 3, ..Network::default() },
+            network: Network {
+                socket_drops: count,
+                filtered: count,
+                participants: 3,
+                ..Network::default()
+            },
             recorder: Some(ToRecorder { wakes_dropped: count, triggers_lost: count }),
             recording: None,
             rss_bytes: count,
@@ -251,7 +266,11 @@ mod tests {
         (expected.restarts, expected.rss_bytes, expected.topics[0].rate_hz) = (2, 2, 2.0);
         expected.wake_up = live(2, None).wake_up;
         assert_eq!(both, expected);
-        assert_eq!(live(2, Some(3)).after(&live(40, None)).topics[0].lost, None, "unknown is never 0");
+        assert_eq!(
+            live(2, Some(3)).after(&live(40, None)).topics[0].lost,
+            None,
+            "unknown is never 0"
+        );
         let long = live(u64::MAX, None).after(&live(1, None));
         assert_eq!(long.wakes, u64::MAX);
     }

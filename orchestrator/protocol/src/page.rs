@@ -4,10 +4,12 @@ use crate::Live;
 use gleaner_lambda::manifest::{Manifest, Schedule};
 use gleaner_lambda::{Cause, Decision, LogLine};
 
-/// The environment variable with the number of the pipe by which a live lambda's process hands pages to `gleaner-shim`.
+/// The environment variable with the number of the pipe by which a live lambda's process hands
+/// pages to `gleaner-shim`.
 pub const RESULTS_ENV: &str = "GLEANER_RESULTS";
 
-/// What a live lambda's process hands to `gleaner-shim`, which writes the files of its results: one line of JSON.
+/// What a live lambda's process hands to `gleaner-shim`, which writes the files of its results: one
+/// line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Page {
@@ -39,6 +41,10 @@ impl WokenBy {
             return Self { cause: Cause::Tick, input: None, topic: None };
         };
         let input = manifest.inputs.iter().find(|input| input.name == *name);
-        Self { cause: Cause::Event, input: Some(name.to_string()), topic: input.map(|input| input.topic.to_string()) }
+        Self {
+            cause: Cause::Event,
+            input: Some(name.to_string()),
+            topic: input.map(|input| input.topic.to_string()),
+        }
     }
 }

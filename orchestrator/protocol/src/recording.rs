@@ -4,12 +4,14 @@ use gleaner_base::grouped;
 
 /// Makes all of the table: the counts, their sum, and how each is shown.
 ///
-/// A count of what is missing has after `=>` what it is shown as: one of it, several, and the cause.
+/// A count of what is missing has after `=>` what it is shown as: one of it, several, and the
+/// cause.
 macro_rules! recording {
     ($($(#[doc = $meaning:literal])+ $key:ident $(=> $outcome:ident $one:literal, $many:literal, $why:literal)?;)+) => {
         /// What a recorder counted since its start: each count has one cause.
         ///
-        /// It is a part of a replay's summary, and of what a recorder reports live. Of an older file, missing counts are 0.
+        /// It is a part of a replay's summary, and of what a recorder reports live. Of an older
+        /// file, missing counts are 0.
         #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
         #[serde(default)]
         pub struct Recording {
@@ -57,10 +59,12 @@ recording! {
     /// Triggers while as many windows waited for their clip as may.
     too_many_waiting => Lost "trigger", "triggers", "while as many windows waited for their clip as may";
 
-    /// Triggers but for stops, and commands, that opened no window, as the disk had too little room.
+    /// Triggers but for stops, and commands, that opened no window, as the disk had too little
+    /// room.
     held_back => Lost "trigger", "triggers", "without a window: the disk was too full";
 
-    /// Triggers of wakes that were refused, as the lambda causes more of them, or more bytes, than the recorder takes of one.
+    /// Triggers of wakes that were refused, as the lambda causes more of them, or more bytes, than
+    /// the recorder takes of one.
     triggers_over_rate => Lost "trigger", "triggers", "beyond what the recorder takes of one lambda";
 
     /// Triggers of wakes that were refused, as their stamps were of another time.
@@ -69,13 +73,15 @@ recording! {
     /// Wakes that did not reach the recorder: the journals of clips lack them, and the ones below.
     wakes_lost => Lost "wake", "wakes", "not in any journal: they did not reach the recorder";
 
-    /// Wakes that were refused, as the lambda causes more triggers or bytes than the recorder takes of one.
+    /// Wakes that were refused, as the lambda causes more triggers or bytes than the recorder takes
+    /// of one.
     wakes_over_rate => Lost "wake", "wakes", "not in any journal: beyond what the recorder takes of one lambda";
 
     /// Wakes that were refused, as their stamps were of another time.
     wakes_misstamped => Lost "wake", "wakes", "not in any journal: of another time than the recorder's";
 
-    /// Clips that could not be written, or recovered. What there is of them is recovered when the folder is opened again.
+    /// Clips that could not be written, or recovered. What there is of them is recovered when the
+    /// folder is opened again.
     failed => Lost "clip", "clips", "not written";
 
     /// Clips that were deleted to make room, and that nobody had fetched.
@@ -87,8 +93,8 @@ recording! {
     /// Samples that left the preroll for want of bytes before they were too old for any window.
     pushed_out => Lost "sample", "samples", "pushed out of the preroll too early: preroll_size";
 
-    /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless, unless they are larger than any
-    /// message of a clip, which is somewhat below 1 GiB.
+    /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless,
+    /// unless they are larger than any message of a clip, which is somewhat below 1 GiB.
     too_big => Lost "sample", "samples", "larger than the preroll: preroll_size";
 
     /// Samples and wakes with a stamp before 1970: they are not recorded.
@@ -126,7 +132,8 @@ pub struct Counted {
 }
 
 impl Counted {
-    /// Returns the count in words, for example `no window: 2 triggers, within the cooldown of another`.
+    /// Returns the count in words, for example `no window: 2 triggers, within the cooldown of
+    /// another`.
     pub fn in_words(&self) -> String {
         let Counted { outcome, count, thing, why, .. } = self;
         let outcome = match outcome {
@@ -152,7 +159,8 @@ mod tests {
             let mut sum = one;
             sum.add(&one);
             assert_eq!(serde_json::to_value(sum).unwrap()[key], 4000, "{key}");
-            let counted: Vec<_> = one.by_cause().into_iter().filter(|counted| counted.count > 0).collect();
+            let counted: Vec<_> =
+                one.by_cause().into_iter().filter(|counted| counted.count > 0).collect();
             assert_eq!(counted.is_empty(), ["clips", "windows"].contains(&key.as_str()), "{key}");
             shown += counted.len();
         }
@@ -161,7 +169,8 @@ mod tests {
 
     #[test]
     fn a_count_is_shown_with_its_cause() {
-        let few = Recording { in_cooldown: 1, pushed_out: 3000, not_deleted: 1, ..Recording::default() };
+        let few =
+            Recording { in_cooldown: 1, pushed_out: 3000, not_deleted: 1, ..Recording::default() };
         let shown = few.by_cause().into_iter().filter(|counted| counted.count > 0);
         assert_eq!(
             shown.map(|counted| counted.in_words()).collect::<Vec<_>>(),

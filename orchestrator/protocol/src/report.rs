@@ -7,7 +7,8 @@ use gleaner_journal::Part;
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Kind;
 
-/// One line of JSON that `gleaner-runtime` writes on its standard output for the program that started it.
+/// One line of JSON that `gleaner-runtime` writes on its standard output for the program that
+/// started it.
 ///
 /// The key `report` says which it is. Every floating-point value is finite: JSON has no other.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -33,7 +34,8 @@ pub enum Report {
     },
     /// Live: the lambda is ready for its first wake.
     Ready,
-    /// Live: a wake with a trigger or a fault. Where nobody reads fast enough, some are left out here; all are in the file.
+    /// Live: a wake with a trigger or a fault. Where nobody reads fast enough, some are left out
+    /// here; all are in the file.
     Decision(Box<Decision>),
     /// Live: sent once a second.
     Live(Box<Live>),
@@ -48,7 +50,8 @@ pub enum Report {
     Checked(Box<Checked>),
     /// Sent once, last: what is in a recorded drive.
     Drive(DriveSeen),
-    /// Sent once, last, instead of a summary: a journal was compared, and every decision was the same.
+    /// Sent once, last, instead of a summary: a journal was compared, and every decision was the
+    /// same.
     Verified(Verified),
 }
 
@@ -76,11 +79,13 @@ pub struct Verified {
     pub wakes: u64,
     /// Triggers in them.
     pub triggers: u64,
-    /// Those of the wakes that were not compared: the lambda had looked at samples from before the clip.
+    /// Those of the wakes that were not compared: the lambda had looked at samples from before the
+    /// clip.
     pub uncovered: u64,
     /// Triggers in these.
     pub uncovered_triggers: u64,
-    /// The journal has no end: its writer died, or its drive was damaged. What it holds was compared.
+    /// The journal has no end: its writer died, or its drive was damaged. What it holds was
+    /// compared.
     pub cut_off: bool,
     /// Duration, in s.
     pub wall_s: f64,
@@ -128,7 +133,8 @@ pub struct Summary {
     pub skipped: u64,
     /// Ticks of a periodic lambda that passed while it was still running.
     pub missed_ticks: u64,
-    /// Messages of the drive that came after one with a later log time: the index of a file lied, or was not there.
+    /// Messages of the drive that came after one with a later log time: the index of a file lied,
+    /// or was not there.
     pub out_of_order: u64,
     /// Log lines that the lambda wrote and that were kept.
     pub log_lines: u64,
@@ -157,7 +163,8 @@ pub struct Summary {
     pub peak_rss_bytes: u64,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<TopicReport>,
-    /// What was recorded, and what was not; `clips.jsonl` has a line for each clip, and for those that were recovered.
+    /// What was recorded, and what was not; `clips.jsonl` has a line for each clip, and for those
+    /// that were recovered.
     #[serde(flatten)]
     pub recording: Recording,
     /// Clips of an earlier replay that were deleted from the same folder.
@@ -180,7 +187,8 @@ pub struct TopicReport {
     pub type_name: String,
     /// Samples that reached the ring.
     pub received: u64,
-    /// Samples that were lost before they reached us; `None` where sequence numbers do not tell. Unknown is never 0.
+    /// Samples that were lost before they reached us; `None` where sequence numbers do not tell.
+    /// Unknown is never 0.
     pub lost: Option<u64>,
     /// Samples that a newer one pushed out of the ring.
     pub overwritten: u64,
@@ -204,7 +212,8 @@ mod tests {
     fn progress_and_rounds_are_tagged_lines() {
         let progress = Report::Progress { done: 10, total: None, at_ns: 5 };
         reads_back(&progress, r#"{"report":"progress","done":10,"total":null,"at_ns":5}"#);
-        let round = Round { n: 2, wakes: 100, faults: 0, wall_s: 0.5, wakes_per_s: 200.0, rss_bytes: 4096 };
+        let round =
+            Round { n: 2, wakes: 100, faults: 0, wall_s: 0.5, wakes_per_s: 200.0, rss_bytes: 4096 };
         reads_back(
             &Report::Round(round),
             r#"{"report":"round","n":2,"wakes":100,"faults":0,"wall_s":0.5,"wakes_per_s":200.0,"rss_bytes":4096}"#,
@@ -255,7 +264,10 @@ mod tests {
         };
         // Flat, whatever a recorder counts.
         let counts = serde_json::to_string(&summary.recording).unwrap();
-        assert!(counts.starts_with(r#"{"clips":2,"windows":0,"in_cooldown":3,"ignored":0,"#), "{counts}");
+        assert!(
+            counts.starts_with(r#"{"clips":2,"windows":0,"in_cooldown":3,"ignored":0,"#),
+            "{counts}"
+        );
         reads_back(
             &Report::Summary(Box::new(summary)),
             &concat!(

@@ -2,13 +2,15 @@ use crate::{Doing, ExitRecord, WokenBy};
 use gleaner_lambda::{Decision, Fault, FaultKind};
 
 impl ExitRecord {
-    /// Returns the decision of the wake in which the process of a lambda ended: a fault of kind `killed`. None if the end was requested,
-    /// or if something around the lambda failed.
+    /// Returns the decision of the wake in which the process of a lambda ended: a fault of kind
+    /// `killed`. None if the end was requested, or if something around the lambda failed.
     pub fn undecided(&self, woken_by: WokenBy) -> Option<Decision> {
         if !self.is_the_lambdas() {
             return None;
         }
-        let why = self.sentence().unwrap_or_else(|| "ended by itself without a request, with exit code 0".to_owned());
+        let why = self
+            .sentence()
+            .unwrap_or_else(|| "ended by itself without a request, with exit code 0".to_owned());
         let amounts = self.killed.map(|killed| killed.used_and_allowed());
         let wake = self.killed.filter(|killed| killed.doing == Doing::Wake);
         let fault = Fault {
@@ -17,7 +19,8 @@ impl ExitRecord {
             used: amounts.map(|(used, _)| used),
             allowed: amounts.map(|(_, allowed)| allowed),
         };
-        // Of a process that was not killed by the shim the wake is not known; the clocks agree but for what the time of day was set.
+        // Of a process that was not killed by the shim the wake is not known; the clocks agree but
+        // for what the time of day was set.
         let at_ns = wake.map_or(self.ended_ns, |killed| killed.at_ns);
         Some(woken_by.faulted(at_ns, wake.map_or(0, |killed| killed.ran_ns), fault))
     }
@@ -28,6 +31,17 @@ impl WokenBy {
     pub fn faulted(self, at_ns: i64, run_ns: u64, fault: Fault) -> Decision {
         let Self { cause, input, topic } = self;
         let (writer, seq, triggers, fuel) = (None, None, Vec::new(), None);
-        Decision { at_ns, cause, input, topic, writer, seq, triggers, fault: Some(fault), fuel, run_ns }
+        Decision {
+            at_ns,
+            cause,
+            input,
+            topic,
+            writer,
+            seq,
+            triggers,
+            fault: Some(fault),
+            fuel,
+            run_ns,
+        }
     }
 }

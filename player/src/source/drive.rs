@@ -32,7 +32,9 @@ impl Explain for DriveError {
     fn help(&self) -> Option<String> {
         let help = self.0.help();
         match self.0 {
-            ReplayError::Damaged { .. } => help.map(|help| format!("it was played up to the damage; {help}")),
+            ReplayError::Damaged { .. } => {
+                help.map(|help| format!("it was played up to the damage; {help}"))
+            }
             _ => help,
         }
     }
@@ -79,7 +81,11 @@ impl Sink for Inbox {
             return Verdict::Taken;
         }
         let len = cdr.len() + cdr::ENCAPSULATION;
-        let mut bytes = if len < LARGE { Buffer::from(Vec::with_capacity(len + 3)) } else { self.pool.take(len + 3) };
+        let mut bytes = if len < LARGE {
+            Buffer::from(Vec::with_capacity(len + 3))
+        } else {
+            self.pool.take(len + 3)
+        };
         bytes.clear();
         bytes.extend_from_slice(&cdr::encapsulation(meta.endian, meta.options));
         bytes.extend_from_slice(cdr);
@@ -103,13 +109,17 @@ impl Drive {
             let what = format!("the drive is only {seconds:.1} s long");
             return Err(Failure::new(Exit::Usage, what).with_help("give a smaller --start"));
         }
-        let round_ns =
-            if to_ns <= end_ns { to_ns - from_ns } else { end_ns.saturating_sub(from_ns).saturating_add(GAP_NS) };
+        let round_ns = if to_ns <= end_ns {
+            to_ns - from_ns
+        } else {
+            end_ns.saturating_sub(from_ns).saturating_add(GAP_NS)
+        };
         let inbox = Arc::new(Inbox { from_ns, pool: Pool::default(), taken: Mutex::new(None) });
         let mut renamed = Renamed::by(args);
         let (mut topics, mut recorded) = (Vec::<Topic>::new(), Vec::new());
         for found in wanted(&replay, &args.topics)? {
-            let decoded = args.raw_images && names::dds_type(&found.type_name).as_deref() == Some(COMPRESSED);
+            let decoded =
+                args.raw_images && names::dds_type(&found.type_name).as_deref() == Some(COMPRESSED);
             let to = renamed.take(&found.topic);
             let topic = play_as(&replay, &found, decoded, to);
             let spec = TopicSpec {
@@ -129,7 +139,9 @@ impl Drive {
                     recorded.push((spec, decoded));
                 }
                 // A topic that was asked for by its name is not left out.
-                Err(why) if args.topics.contains(&found.topic) => return Err(Failure::new(Exit::Usage, why)),
+                Err(why) if args.topics.contains(&found.topic) => {
+                    return Err(Failure::new(Exit::Usage, why));
+                }
                 Err(why) => warn(&format!("{why}; it is not played")),
             }
         }
@@ -160,9 +172,9 @@ impl Drive {
         self.replay = Replay::open(&self.paths).map_err(DriveError)?;
         for (spec, _) in &self.recorded {
             let sink: Arc<dyn Sink> = self.inbox.clone();
-            self.replay
-                .subscribe(spec, sink)
-                .map_err(|error| Failure::caused_by(Exit::Usage, "the drive changed while it was played", &error))?;
+            self.replay.subscribe(spec, sink).map_err(|error| {
+                Failure::caused_by(Exit::Usage, "the drive changed while it was played", &error)
+            })?;
         }
         self.is_alive = false;
         self.rounds += 1;
@@ -176,16 +188,29 @@ const COMPRESSED: &str = "sensor_msgs::msg::dds_::CompressedImage_";
 /// The topics of `replay` that are asked for, or all.
 fn wanted(replay: &Replay, names: &[String]) -> Result<Vec<DiscoveredTopic>, Failure> {
     let topics = replay.topics();
-    if let Some(unknown) = names.iter().find(|name| topics.iter().all(|topic| topic.topic != **name)) {
+    if let Some(unknown) =
+        names.iter().find(|name| topics.iter().all(|topic| topic.topic != **name))
+    {
         // Its error says which topics there are.
         let error = replay.definitions(unknown).err().map(|error| error.to_string());
-        return Err(Failure::new(Exit::Usage, error.unwrap_or_else(|| format!("no topic `{unknown}`"))));
+        return Err(Failure::new(
+            Exit::Usage,
+            error.unwrap_or_else(|| format!("no topic `{unknown}`")),
+        ));
     }
-    Ok(topics.into_iter().filter(|topic| names.is_empty() || names.contains(&topic.topic)).collect())
+    Ok(topics
+        .into_iter()
+        .filter(|topic| names.is_empty() || names.contains(&topic.topic))
+        .collect())
 }
 
 /// How a topic is played, under the name `to` if it is given; or why it cannot be.
-fn play_as(replay: &Replay, found: &DiscoveredTopic, decoded: bool, to: Option<&str>) -> Result<Topic, String> {
+fn play_as(
+    replay: &Replay,
+    found: &DiscoveredTopic,
+    decoded: bool,
+    to: Option<&str>,
+) -> Result<Topic, String> {
     let topic = match to {
         Some(to) => to.to_owned(),
         None if decoded => names::image_raw(&found.topic),
@@ -196,10 +221,13 @@ fn play_as(replay: &Replay, found: &DiscoveredTopic, decoded: bool, to: Option<&
     }
     let type_name = if decoded { "sensor_msgs/msg/Image" } else { &found.type_name };
     if names::dds_type(type_name).is_none() {
-        return Err(format!("topic `{}` has type `{type_name}`, which is none of ROS 2", found.topic));
+        return Err(format!(
+            "topic `{}` has type `{type_name}`, which is none of ROS 2",
+            found.topic
+        ));
     }
-    let is_stamped =
-        decoded || replay.definitions(&found.topic).is_ok_and(|definitions| stamp::has_stamp(&definitions));
+    let is_stamped = decoded
+        || replay.definitions(&found.topic).is_ok_and(|definitions| stamp::has_stamp(&definitions));
     let offer = Offer::recorded(found.offered_qos.as_deref()).of_large(is_large(type_name));
     Ok(Topic { topic, type_name: type_name.to_owned(), offer, is_stamped })
 }
@@ -226,7 +254,9 @@ impl Source for Drive {
                     Err(error) => {
                         if self.undecodable[topic] == 0 {
                             let topic = &self.recorded[topic].0.topic;
-                            warn(&format!("an image of `{topic}` is left out: {error}; the summary counts them"));
+                            warn(&format!(
+                                "an image of `{topic}` is left out: {error}; the summary counts them"
+                            ));
                         }
                         self.undecodable[topic] += 1;
                         continue;
@@ -257,7 +287,8 @@ mod tests {
     use super::*;
 
     /// 40 s of a camera at 10 Hz, an IMU at 100 Hz, and a speed.
-    const SAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/highway_drive.mcap");
+    const SAMPLE: &str =
+        concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/highway_drive.mcap");
 
     fn open(arguments: &[&str]) -> Result<Drive, Failure> {
         let line = ["gleaner-player", SAMPLE].into_iter().chain(arguments.iter().copied());
@@ -281,16 +312,24 @@ mod tests {
         assert_eq!(messages.len(), 400 + 4170 + 3316);
         assert_eq!(messages[0].at_ns, 0);
         assert!(messages.is_sorted_by_key(|message| message.at_ns));
-        assert!(messages.iter().all(|message| message.bytes.len() % 4 == 0 && message.bytes[..4] == [0, 1, 0, 0]));
+        assert!(
+            messages
+                .iter()
+                .all(|message| message.bytes.len() % 4 == 0 && message.bytes[..4] == [0, 1, 0, 0])
+        );
     }
 
     #[test]
     fn a_part_of_a_drive_begins_at_time_0_and_ends_before_its_end() {
-        let mut drive = open(&["--topics", "/imu/data", "--start", "10", "--duration", "2"]).unwrap();
+        let mut drive =
+            open(&["--topics", "/imu/data", "--start", "10", "--duration", "2"]).unwrap();
         assert_eq!(names(&drive), ["/imu/data"]);
-        let times: Vec<_> = std::iter::from_fn(|| drive.next().unwrap()).map(|message| message.at_ns).collect();
+        let times: Vec<_> =
+            std::iter::from_fn(|| drive.next().unwrap()).map(|message| message.at_ns).collect();
         assert!((190..220).contains(&times.len()), "{}", times.len());
-        assert!(times[0] < 20_000_000 && times.iter().all(|at_ns| (0..2_000_000_000).contains(at_ns)));
+        assert!(
+            times[0] < 20_000_000 && times.iter().all(|at_ns| (0..2_000_000_000).contains(at_ns))
+        );
     }
 
     #[test]
@@ -299,7 +338,8 @@ mod tests {
         let messages: Vec<_> = std::iter::from_fn(|| drive.next().unwrap()).take(1000).collect();
         assert_eq!(messages.len(), 1000);
         assert!(messages.is_sorted_by(|a, b| a.at_ns < b.at_ns));
-        let rounds: std::collections::BTreeSet<_> = messages.iter().map(|message| message.rounds_ns).collect();
+        let rounds: std::collections::BTreeSet<_> =
+            messages.iter().map(|message| message.rounds_ns).collect();
         let rounds: Vec<_> = rounds.into_iter().collect();
         assert!(rounds.len() > 5 && rounds[0] == 0);
         assert!(rounds.windows(2).all(|pair| pair[1] - pair[0] == rounds[1]));
@@ -313,7 +353,10 @@ mod tests {
         assert_eq!(drive.topics()[0].type_name, "sensor_msgs/msg/Image");
         let message = drive.next().unwrap().unwrap();
         let image = ImageView::read(&message.bytes[4..], message.endian).unwrap();
-        assert_eq!((image.width, image.height, image.encoding, image.data.len()), (64, 36, "bgr8", 64 * 36 * 3));
+        assert_eq!(
+            (image.width, image.height, image.encoding, image.data.len()),
+            (64, 36, "bgr8", 64 * 36 * 3)
+        );
         assert_eq!(drive.undecodable(0), 0);
     }
 

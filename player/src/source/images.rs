@@ -2,7 +2,8 @@
 
 use gleaner_image::{ImageError, decode_rgb8, probe};
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, Endian, FieldPath, HeaderStamp, Sources, Value, header_stamp,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, HeaderStamp, Sources, Value,
+    header_stamp,
 };
 
 use crate::args::Size;
@@ -38,10 +39,14 @@ const TYPE: &str = "sensor_msgs/msg/CompressedImage";
 impl Decoder {
     /// Makes images of `size`, or as large as they are.
     pub(crate) fn new(size: Option<Size>) -> Decoder {
-        let text = Sources::default().find(TYPE).expect("bundled definitions are sound").expect("it is bundled");
+        let text = Sources::default()
+            .find(TYPE)
+            .expect("bundled definitions are sound")
+            .expect("it is bundled");
         let definitions = Definitions::parse(TYPE, &text).expect("bundled definitions are sound");
         let stamp = header_stamp(&definitions).expect("it begins with a header");
-        let frame_id = FieldPath::compile(&definitions, "header.frame_id").expect("a header has it");
+        let frame_id =
+            FieldPath::compile(&definitions, "header.frame_id").expect("a header has it");
         Decoder { size, stamp, frame_id, rgb: Vec::new(), pool: Pool::default() }
     }
 
@@ -72,7 +77,8 @@ impl Decoder {
 
 /// Takes for each pixel the nearest one of `rgb`, and turns red, green, blue around.
 fn scale_to_bgr(rgb: &[u8], from: Size, bgr: &mut [u8], to: Size) {
-    let nearest = |at: u32, to: u32, from: u32| (u64::from(at) * u64::from(from) / u64::from(to)) as usize;
+    let nearest =
+        |at: u32, to: u32, from: u32| (u64::from(at) * u64::from(from) / u64::from(to)) as usize;
     let columns: Vec<usize> = (0..to.width).map(|x| nearest(x, to.width, from.width)).collect();
     let rows = rgb.chunks_exact(3 * from.width as usize).collect::<Vec<_>>();
     for (y, out) in (0..).zip(bgr.chunks_exact_mut(3 * to.width as usize)) {
@@ -135,7 +141,10 @@ mod tests {
         let mut no_picture = with_header(0, "");
         no_picture.string("jpeg").u32(0);
         let cdr = sealed(&no_picture);
-        assert!(matches!(decoder.convert(&cdr[4..], Endian::Little), Err(ConvertError::Picture(_))));
+        assert!(matches!(
+            decoder.convert(&cdr[4..], Endian::Little),
+            Err(ConvertError::Picture(_))
+        ));
         assert!(decoder.convert(&message(), Endian::Little).is_ok());
     }
 }

@@ -63,12 +63,14 @@ impl<'a> Renamed<'a> {
     fn check(&self, topics: &[Topic]) -> Result<(), Failure> {
         if let Some(name) = self.0.keys().next() {
             let what = format!("--remap names `{name}`, which is not played");
-            return Err(Failure::new(Exit::Usage, what).with_help("FROM is the name of a topic without --remap"));
+            return Err(Failure::new(Exit::Usage, what)
+                .with_help("FROM is the name of a topic without --remap"));
         }
         let mut names = BTreeSet::new();
         if let Some(twice) = topics.iter().find(|topic| !names.insert(&topic.topic)) {
             let what = format!("two topics would be played as `{}`", twice.topic);
-            return Err(Failure::new(Exit::Usage, what).with_help("give one of them another name with --remap"));
+            return Err(Failure::new(Exit::Usage, what)
+                .with_help("give one of them another name with --remap"));
         }
         Ok(())
     }

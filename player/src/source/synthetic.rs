@@ -1,7 +1,8 @@
-//! Sensors that are made up: a camera that sees noise, and an IMU at rest. For measurements and for tests of losses.
+//! Sensors that are made up: a camera that sees noise, and an IMU at rest. For measurements and for
+//! tests of losses.
 //!
-//! The pixels of all frames are equal, and equal in every run. Each message has its number, from 0, in `header.frame_id`,
-//! ten digits long, so that a reader can tell what was lost.
+//! The pixels of all frames are equal, and equal in every run. Each message has its number, from 0,
+//! in `header.frame_id`, ten digits long, so that a reader can tell what was lost.
 
 use gleaner_base::Failure;
 use gleaner_messages::Endian;
@@ -84,7 +85,8 @@ impl Source for Synthetic {
     }
 
     fn next(&mut self) -> Result<Option<Message>, Failure> {
-        let Some(topic) = (0..self.streams.len()).min_by_key(|index| self.streams[*index].at_ns()) else {
+        let Some(topic) = (0..self.streams.len()).min_by_key(|index| self.streams[*index].at_ns())
+        else {
             return Ok(None);
         };
         let &Stream { size, next, .. } = &self.streams[topic];
@@ -99,7 +101,12 @@ impl Source for Synthetic {
 
     /// A few frames: they cost next to nothing to make.
     fn read_ahead(&self) -> usize {
-        self.streams.iter().filter_map(|stream| stream.size).map(|size| 4 * size.bytes()).sum::<usize>() + (256 << 10)
+        self.streams
+            .iter()
+            .filter_map(|stream| stream.size)
+            .map(|size| 4 * size.bytes())
+            .sum::<usize>()
+            + (256 << 10)
     }
 
     fn undecodable(&self, _topic: usize) -> u64 {
@@ -156,7 +163,9 @@ mod tests {
         let messages = all(open(&["--imu", "100", "--duration", "1"]).unwrap());
         assert_eq!(messages.len(), 100);
         let cdr = &messages[42].bytes[4..];
-        let number = |path: &str| FieldPath::compile(&definitions, path).unwrap().number(cdr, Endian::Little).unwrap();
+        let number = |path: &str| {
+            FieldPath::compile(&definitions, path).unwrap().number(cdr, Endian::Little).unwrap()
+        };
         assert_eq!((number("orientation.w"), number("linear_acceleration.z")), (1.0, 9.806_65));
         assert_eq!(number("angular_velocity.x"), 0.0);
         assert_eq!(number("linear_acceleration_covariance[8]"), 1e-4);
@@ -173,7 +182,10 @@ mod tests {
             // Dropped at once, so that the next frame is made in its memory.
             let message = source.next().unwrap().unwrap();
             let image = ImageView::read(&message.bytes[4..], Endian::Little).unwrap();
-            assert_eq!((image.width, image.height, image.step, image.encoding), (33, 7, 99, "bgr8"));
+            assert_eq!(
+                (image.width, image.height, image.step, image.encoding),
+                (33, 7, 99, "bgr8")
+            );
             assert_eq!(&message.bytes[16..26], format!("{number:010}").as_bytes());
             let pixels = first.get_or_insert_with(|| image.data.to_vec());
             assert_eq!((image.data.len(), image.data), (693, pixels.as_slice()));
@@ -184,7 +196,8 @@ mod tests {
 
     #[test]
     fn sensors_are_merged_by_time() {
-        let messages = all(open(&["--synthetic", "4x4@10", "--imu", "40", "--duration", "0.3"]).unwrap());
+        let messages =
+            all(open(&["--synthetic", "4x4@10", "--imu", "40", "--duration", "0.3"]).unwrap());
         let topics: Vec<_> = messages.iter().map(|message| message.topic).collect();
         assert_eq!(topics, [0, 1, 1, 1, 1, 0, 1, 1, 1, 1, 0, 1, 1, 1, 1]);
         assert!(messages.is_sorted_by_key(|message| message.at_ns));

@@ -92,7 +92,12 @@ pub(super) fn wakes(a: Option<&Decision>, b: Option<&Decision>, start_ns: i64) -
         (None, Some(b)) => note(Of::Fault, Is::New, &kind(b), first_line(b)),
         (Some(a), Some(b)) if a.kind == b.kind && a.message == b.message => found.same_fault = true,
         (Some(a), Some(b)) if a.kind == b.kind => {
-            note(Of::Fault, Is::Changed, &kind(a), format!("{} → {}", first_line(a), first_line(b)));
+            note(
+                Of::Fault,
+                Is::Changed,
+                &kind(a),
+                format!("{} → {}", first_line(a), first_line(b)),
+            );
         }
         (Some(a), Some(b)) => {
             let kinds = format!("{} → {}", kind(a), kind(b));
@@ -110,8 +115,12 @@ fn fault(wake: Option<&Decision>) -> Option<&Fault> {
     wake?.fault.as_ref()
 }
 
-/// Triggers of one wake in pairs: first those of one kind and label, in their order; of the others, those at the same place.
-fn pairs<'a>(a: &'a [Trigger], b: &'a [Trigger]) -> Vec<(Option<&'a Trigger>, Option<&'a Trigger>)> {
+/// Triggers of one wake in pairs: first those of one kind and label, in their order; of the others,
+/// those at the same place.
+fn pairs<'a>(
+    a: &'a [Trigger],
+    b: &'a [Trigger],
+) -> Vec<(Option<&'a Trigger>, Option<&'a Trigger>)> {
     let mut left: Vec<Option<&Trigger>> = b.iter().map(Some).collect();
     let mut take = |wanted: &Trigger| {
         let is_it = |other: &Option<&Trigger>| other.is_some_and(|other| is_alike(wanted, other));
@@ -150,8 +159,10 @@ fn changes(a: &Trigger, b: &Trigger) -> Option<(String, String)> {
 
 fn attributes(a: &Map<String, Value>, b: &Map<String, Value>) -> Vec<String> {
     let word = |value: Option<&Value>| value.map_or("none".to_owned(), Value::to_string);
-    let changed = a.iter().filter(|(key, value)| !b.get(*key).is_some_and(|other| is_same(value, other)));
-    let gone = changed.map(|(key, value)| format!("{key} {} → {}", word(Some(value)), word(b.get(key))));
+    let changed =
+        a.iter().filter(|(key, value)| !b.get(*key).is_some_and(|other| is_same(value, other)));
+    let gone =
+        changed.map(|(key, value)| format!("{key} {} → {}", word(Some(value)), word(b.get(key))));
     let new = b.iter().filter(|(key, _)| !a.contains_key(*key));
     gone.chain(new.map(|(key, value)| format!("{key} none → {}", word(Some(value))))).collect()
 }

@@ -1,7 +1,7 @@
 //! What differs between two runs, decision by decision.
 //!
-//! `wakes` walks through both files at once and pairs the wakes, `compare` says what differs within a pair, and `whole` compares what the
-//! runs say of themselves.
+//! `wakes` walks through both files at once and pairs the wakes, `compare` says what differs within
+//! a pair, and `whole` compares what the runs say of themselves.
 
 mod compare;
 #[cfg(test)]
@@ -22,7 +22,8 @@ use crate::run_summary::OutputError;
 
 pub use compare::{Difference, Is, Of};
 
-/// So many differences are listed; of those that are rare, so many in any case. The others are counted.
+/// So many differences are listed; of those that are rare, so many in any case. The others are
+/// counted.
 const LISTED: usize = 1_000;
 const LISTED_OF_EACH: usize = 20;
 
@@ -130,9 +131,10 @@ impl Explain for DiffError {
     fn help(&self) -> Option<String> {
         match self {
             Self::Output(error) => error.help(),
-            Self::Read(_) | Self::Crowded { .. } => {
-                Some("name two folders that `gleaner replay` or `gleaner run` wrote to, whole".to_owned())
-            }
+            Self::Read(_) | Self::Crowded { .. } => Some(
+                "name two folders that `gleaner replay` or `gleaner run` wrote to, whole"
+                    .to_owned(),
+            ),
         }
     }
 
@@ -142,8 +144,8 @@ impl Explain for DiffError {
 }
 
 impl Diff {
-    /// What differs between the runs in these folders. Both are read once, side by side; the memory that it takes does not grow
-    /// with their length.
+    /// What differs between the runs in these folders. Both are read once, side by side; the memory
+    /// that it takes does not grow with their length.
     ///
     /// # Errors
     ///

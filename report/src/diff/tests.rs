@@ -26,7 +26,8 @@ fn faulty(ms: i64, kind: &str, message: &str) -> Value {
 
 /// The differences in words.
 fn lines(diff: &Diff) -> Vec<String> {
-    let line = |one: &Difference| format!("{:?} {:?}: {}, {}", one.of, one.is, one.label, one.detail);
+    let line =
+        |one: &Difference| format!("{:?} {:?}: {}, {}", one.of, one.is, one.label, one.detail);
     diff.differences.iter().map(line).collect()
 }
 
@@ -81,10 +82,17 @@ fn attributes_count_and_numbers_among_them_have_the_tolerance_of_scores() {
     };
     let a = with(json!({"mps2": -4.5, "n": 7, "word": "a", "old": true}));
     assert!(
-        diff(std::slice::from_ref(&a), &[with(json!({"mps2": -4.500_001, "n": 7, "word": "a", "old": true}))]).same
+        diff(
+            std::slice::from_ref(&a),
+            &[with(json!({"mps2": -4.500_001, "n": 7, "word": "a", "old": true}))]
+        )
+        .same
     );
     let diff = diff(&[a], &[with(json!({"mps2": -4.6, "n": 8, "word": "a", "young": null}))]);
-    assert_eq!(lines(&diff), ["Trigger Changed: x, mps2 -4.5 → -4.6, n 7 → 8, old true → none, young none → null"]);
+    assert_eq!(
+        lines(&diff),
+        ["Trigger Changed: x, mps2 -4.5 → -4.6, n 7 → 8, old true → none, young none → null"]
+    );
 }
 
 #[test]
@@ -126,8 +134,18 @@ fn a_part_of_a_drive_counts_its_samples_from_its_begin_and_has_the_same_decision
 
 #[test]
 fn faults_are_gone_new_or_changed() {
-    let a = [faulty(1, "trap", "x"), faulty(2, "fuel", "y"), faulty(3, "trap", "z"), faulty(4, "trap", "same")];
-    let b = [faulty(2, "memory", "y"), faulty(3, "trap", "zz"), faulty(4, "trap", "same"), faulty(5, "trap", "x")];
+    let a = [
+        faulty(1, "trap", "x"),
+        faulty(2, "fuel", "y"),
+        faulty(3, "trap", "z"),
+        faulty(4, "trap", "same"),
+    ];
+    let b = [
+        faulty(2, "memory", "y"),
+        faulty(3, "trap", "zz"),
+        faulty(4, "trap", "same"),
+        faulty(5, "trap", "x"),
+    ];
     let diff = diff(&a, &b);
     assert_eq!(diff.faults, Tally { same: 1, gone: 1, new: 1, changed: 2 });
     assert_eq!(lines(&diff)[1], "Fault Changed: fuel → memory, y → y");
@@ -137,7 +155,11 @@ fn faults_are_gone_new_or_changed() {
 fn wakes_out_of_order_are_compared_as_far_as_may_be() {
     let disorder = [one(5, "a", 1.0), one(1, "b", 1.0), one(6, "c", 1.0)];
     let alike = diff(&disorder, &disorder);
-    assert!(alike.same && alike.notes.iter().any(|note| note.contains("not in the order")), "{:?}", alike.notes);
+    assert!(
+        alike.same && alike.notes.iter().any(|note| note.contains("not in the order")),
+        "{:?}",
+        alike.notes
+    );
 }
 
 #[test]
@@ -166,15 +188,18 @@ fn other_lambdas_and_drives_are_said_first() {
         a: a.map(str::to_owned),
         b: Some(b.to_owned()),
     };
-    let changes =
-        [change("wakes", Some("400"), "500"), change("samples of `imu`, lost before they reached us", None, "4")];
+    let changes = [
+        change("wakes", Some("400"), "500"),
+        change("samples of `imu`, lost before they reached us", None, "4"),
+    ];
     assert_eq!(diff.counts, changes);
 }
 
 #[test]
 fn config_and_cost_are_compared_if_both_tell_them() {
     let signals = |brake: f64, p50: u64| {
-        let spread = json!({"count": 9, "min": 1, "p50": p50, "p90": 3, "p99": 4, "max": 5, "bins": []});
+        let spread =
+            json!({"count": 9, "min": 1, "p50": p50, "p90": 3, "p99": 4, "max": 5, "bins": []});
         json!({"config": {"brake": brake, "same": 1}, "curves": [], "curves_left_out": 0, "run_ns": spread, "fuel": spread,
             "pictures": [], "pictures_left_out": 0}).to_string()
     };
@@ -187,8 +212,14 @@ fn config_and_cost_are_compared_if_both_tell_them() {
     let diff = Diff::between(a.path(), b.path()).unwrap();
     assert_eq!(diff.notes, [""; 0]);
     let [config] = &diff.config[..] else { panic!("{:?}", diff.config) };
-    assert_eq!((&*config.what, config.a.as_deref(), config.b.as_deref()), ("brake", Some("-1.4"), Some("-2.0")));
-    assert_eq!((diff.cost[0].a, diff.cost[0].b, diff.cost[0].ratio), (Some(2000), Some(3000), Some(1.5)));
+    assert_eq!(
+        (&*config.what, config.a.as_deref(), config.b.as_deref()),
+        ("brake", Some("-1.4"), Some("-2.0"))
+    );
+    assert_eq!(
+        (diff.cost[0].a, diff.cost[0].b, diff.cost[0].ratio),
+        (Some(2000), Some(3000), Some(1.5))
+    );
 }
 
 #[test]
@@ -218,7 +249,11 @@ fn what_is_no_output_is_refused() {
     broken.write("decisions.jsonl", "{\"at_ns\":1");
     let error = Diff::between(whole.path(), broken.path()).unwrap_err();
     assert_eq!(error.exit(), Exit::Usage);
-    assert!(error.to_string().ends_with("line 1, is not what a replay writes") && error.help().is_some(), "{error}");
+    assert!(
+        error.to_string().ends_with("line 1, is not what a replay writes")
+            && error.help().is_some(),
+        "{error}"
+    );
     std::fs::remove_file(broken.path().join("summary.json")).unwrap();
     let error = Diff::between(broken.path(), whole.path()).unwrap_err();
     assert_eq!(error.exit(), Exit::Usage);

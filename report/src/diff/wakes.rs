@@ -6,7 +6,8 @@ use gleaner_lambda::{Cause, Decision};
 
 use crate::results::ResultsError;
 
-/// Most wakes at one instant, and most bytes of their lines if they are several: so much of each run is held in memory.
+/// Most wakes at one instant, and most bytes of their lines if they are several: so much of each
+/// run is held in memory.
 pub(super) const AT_ONCE: usize = 65_536;
 pub(super) const BYTES_AT_ONCE: usize = 32 << 20;
 
@@ -20,7 +21,8 @@ pub(super) enum WakesError {
     },
 }
 
-/// A wake, as both runs have it; `None` where a run has it not, or where it neither triggered nor faulted.
+/// A wake, as both runs have it; `None` where a run has it not, or where it neither triggered nor
+/// faulted.
 #[derive(Debug)]
 pub(super) struct Pair {
     pub(super) a: Option<Decision>,
@@ -61,7 +63,10 @@ where
         let (mut by_number, mut by_name) = (HashMap::new(), HashMap::new());
         for (place, decision) in of_b.iter().enumerate() {
             let name = Name::of(decision);
-            by_number.entry((name.clone(), decision.seq)).or_insert_with(VecDeque::new).push_back(place);
+            by_number
+                .entry((name.clone(), decision.seq))
+                .or_insert_with(VecDeque::new)
+                .push_back(place);
             by_name.entry(name).or_insert_with(VecDeque::new).push_back(place);
         }
         let mut left: Vec<_> = of_b.into_iter().map(Some).collect();
@@ -73,7 +78,8 @@ where
             let b = take(by_number.get_mut(&(Name::of(&decision), decision.seq)));
             self.ready.push_back(Pair { a: Some(decision), b, out_of_order });
         }
-        // Then those of other numbers, in the order of the files: of a part of a drive, samples may be counted from its begin.
+        // Then those of other numbers, in the order of the files: of a part of a drive, samples may
+        // be counted from its begin.
         for pair in self.ready.iter_mut().filter(|pair| pair.b.is_none()) {
             pair.b = pair.a.as_ref().and_then(|a| take(by_name.get_mut(&Name::of(a))));
         }
@@ -121,9 +127,11 @@ impl Name {
 struct Side<'a, I> {
     decisions: &'a mut I,
     is_first: bool,
-    /// The next one that triggered or faulted, the instant that it counts to, and the bytes of its line.
+    /// The next one that triggered or faulted, the instant that it counts to, and the bytes of its
+    /// line.
     next: Option<(i64, Decision, usize)>,
-    /// The latest time so far: who comes later with an earlier one counts to this instant, so that instants never go back.
+    /// The latest time so far: who comes later with an earlier one counts to this instant, so that
+    /// instants never go back.
     latest: i64,
     asked: bool,
 }
@@ -137,8 +145,11 @@ impl<'a, I: Iterator<Item = Result<(Decision, usize), ResultsError>>> Side<'a, I
         if !self.asked {
             self.asked = true;
             // With `--all` a run has quiet wakes, too: they are as good as none.
-            let speaks = |decision: &Decision| !decision.triggers.is_empty() || decision.fault.is_some();
-            let next = self.decisions.find(|next| next.as_ref().map_or(true, |(decision, _)| speaks(decision)));
+            let speaks =
+                |decision: &Decision| !decision.triggers.is_empty() || decision.fault.is_some();
+            let next = self
+                .decisions
+                .find(|next| next.as_ref().map_or(true, |(decision, _)| speaks(decision)));
             let next = next.transpose().map_err(WakesError::Read)?;
             self.next = next.map(|(decision, bytes)| {
                 self.latest = self.latest.max(decision.at_ns);

@@ -1,4 +1,5 @@
-//! What two runs say of themselves: which lambda, which drive, with which config, how much of what, at which cost.
+//! What two runs say of themselves: which lambda, which drive, with which config, how much of what,
+//! at which cost.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -20,7 +21,8 @@ const CHANGES_MAX: usize = 200;
 /// All that can be said without looking at a decision.
 pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     let mut notes = Vec::new();
-    let (told_a, told_b) = (RunSummary::bounded(a, &mut notes)?, RunSummary::bounded(b, &mut notes)?);
+    let (told_a, told_b) =
+        (RunSummary::bounded(a, &mut notes)?, RunSummary::bounded(b, &mut notes)?);
     apart(&told_a, &told_b, &mut notes);
     let (read_a, read_b) = (signals(a, &mut notes)?, signals(b, &mut notes)?);
     let clips = [clips(a)?, clips(b)?];
@@ -42,9 +44,10 @@ pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
 fn side(out: &Path, told: &RunSummary) -> Side {
     let (lambda, version, kind) = told.lambda();
     let (drive, start_ns) = match told {
-        RunSummary::Replay(summary) => {
-            (summary.drive.iter().map(|path| path.display().to_string()).collect(), Some(summary.start_ns))
-        }
+        RunSummary::Replay(summary) => (
+            summary.drive.iter().map(|path| path.display().to_string()).collect(),
+            Some(summary.start_ns),
+        ),
         RunSummary::Live(_) => (Vec::new(), None),
     };
     let (lambda, version) = (lambda.to_owned(), version.to_owned());
@@ -71,7 +74,12 @@ fn apart(a: &RunSummary, b: &RunSummary, notes: &mut Vec<String>) {
     };
     if (a.start_ns, a.end_ns) != (b.start_ns, b.end_ns) {
         let names = [a, b].map(|summary| {
-            summary.drive.iter().map(|path| format!("`{}`", path.display())).collect::<Vec<_>>().join(", ")
+            summary
+                .drive
+                .iter()
+                .map(|path| format!("`{}`", path.display()))
+                .collect::<Vec<_>>()
+                .join(", ")
         });
         notes.push(format!("different drives: {} and {}", names[0], names[1]));
     } else if a.part != b.part {
@@ -86,7 +94,10 @@ fn apart(a: &RunSummary, b: &RunSummary, notes: &mut Vec<String>) {
 
 fn config(a: Option<&Signals>, b: Option<&Signals>, notes: &mut Vec<String>) -> Vec<Change> {
     let (Some(a), Some(b)) = (a, b) else {
-        notes.push("config not compared: an output without `signals.json` does not tell which held".to_owned());
+        notes.push(
+            "config not compared: an output without `signals.json` does not tell which held"
+                .to_owned(),
+        );
         return Vec::new();
     };
     let word = |of: &BTreeMap<String, ConfigValue>, key: &str| {
@@ -130,7 +141,8 @@ fn counts(a: &RunSummary, b: &RunSummary, clips: [[u64; 2]; 2]) -> Vec<Change> {
         }
     };
     // The same things in the same order, first those that both have.
-    let numbers = |told: &RunSummary| told.wakes().into_iter().chain(told.missed()).collect::<Vec<_>>();
+    let numbers =
+        |told: &RunSummary| told.wakes().into_iter().chain(told.missed()).collect::<Vec<_>>();
     let (of_a, of_b) = (numbers(a), numbers(b));
     let find = |list: &[(&'static str, u64)], what: &str| {
         list.iter().find(|(name, _)| *name == what).map(|(_, count)| grouped(*count))
@@ -176,13 +188,19 @@ fn cost(a: (&RunSummary, Option<&Signals>), b: (&RunSummary, Option<&Signals>)) 
         (None, RunSummary::Replay(_)) => None,
     };
     let fuel = |(_, signals): (&RunSummary, Option<&Signals>)| {
-        signals.and_then(|signals| signals.fuel.as_ref()).filter(|fuel| fuel.count > 0).map(|fuel| fuel.p50)
+        signals
+            .and_then(|signals| signals.fuel.as_ref())
+            .filter(|fuel| fuel.count > 0)
+            .map(|fuel| fuel.p50)
     };
     let cost = |what, unit, a: Option<u64>, b: Option<u64>| {
         let ratio = a.zip(b).filter(|(a, _)| *a > 0).map(|(a, b)| b as f64 / a as f64);
         (a.is_some() || b.is_some()).then_some(Cost { what, unit, a, b, ratio })
     };
-    let all = [cost("time in the lambda", "ns", time(a), time(b)), cost("fuel", "fuel", fuel(a), fuel(b))];
+    let all = [
+        cost("time in the lambda", "ns", time(a), time(b)),
+        cost("fuel", "fuel", fuel(a), fuel(b)),
+    ];
     all.into_iter().flatten().collect()
 }
 

@@ -1,4 +1,5 @@
-//! How often something happened over time, in little memory: bins that grow wider as more is counted.
+//! How often something happened over time, in little memory: bins that grow wider as more is
+//! counted.
 
 use std::collections::BTreeMap;
 

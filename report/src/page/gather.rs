@@ -1,4 +1,5 @@
-//! The data of the page out of the files of an output. What cannot be used is left out, and the page says so.
+//! The data of the page out of the files of an output. What cannot be used is left out, and the
+//! page says so.
 
 use std::collections::HashMap;
 use std::fmt::Display;
@@ -34,8 +35,8 @@ struct Line {
     message: String,
 }
 
-/// What the page shows of `out`, which shares it with others: it has one part of `shares`. Times count from `from_ns`; of a run
-/// that is alone, from its own start.
+/// What the page shows of `out`, which shares it with others: it has one part of `shares`. Times
+/// count from `from_ns`; of a run that is alone, from its own start.
 pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<Run, OutputError> {
     let mut notes = Vec::new();
     let told = RunSummary::bounded(out, &mut notes)?;
@@ -79,7 +80,10 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
     })?;
 
     let mut pictures = Pictures::new(out, start_ns, shares);
-    pictures.at_triggers(&mut marks.triggers, signals.as_ref().map_or(&[][..], |signals| &signals.pictures));
+    pictures.at_triggers(
+        &mut marks.triggers,
+        signals.as_ref().map_or(&[][..], |signals| &signals.pictures),
+    );
     pictures.of_clips(&mut marks.triggers, &clips, &thumbnails);
     notes.extend(pictures.note());
 
@@ -130,7 +134,11 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
         faults: marks.faults,
         fault_causes: marks.causes,
         clips,
-        curves: signals.iter().flat_map(|signals| &signals.curves).map(|curve| curve_shown(curve, start_ns)).collect(),
+        curves: signals
+            .iter()
+            .flat_map(|signals| &signals.curves)
+            .map(|curve| curve_shown(curve, start_ns))
+            .collect(),
         spreads: spreads(&told, signals.as_ref()),
         topics: told.topics(),
         missed: told.missed(),
@@ -209,8 +217,11 @@ fn first_ns(out: &Path) -> Option<i64> {
     struct At {
         at_ns: i64,
     }
-    let first = |name| JsonLines::<At>::read(out.join(name)).ok()?.flatten().next().map(|at| at.at_ns);
-    let clip = JsonLines::<Clip>::read(out.join("clips.jsonl")).ok().and_then(|clips| clips.flatten().next());
+    let first =
+        |name| JsonLines::<At>::read(out.join(name)).ok()?.flatten().next().map(|at| at.at_ns);
+    let clip = JsonLines::<Clip>::read(out.join("clips.jsonl"))
+        .ok()
+        .and_then(|clips| clips.flatten().next());
     let clip = clip.map(|clip| clip_span(&clip)[0]);
     [first("decisions.jsonl"), first("log.jsonl"), clip].into_iter().flatten().min()
 }
@@ -218,10 +229,17 @@ fn first_ns(out: &Path) -> Option<i64> {
 fn clip_shown(clip: &Clip, start_ns: i64) -> ClipShown {
     let span_ns = clip_span(clip);
     let mut short: Vec<_> = clip.short.iter().take(20).map(|why| cut(why, 300)).collect();
-    short.extend(clip.recovered.iter().map(|recovered| format!("recovered: {}", cut(&recovered.what, 300))));
-    let lost = clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));
+    short.extend(
+        clip.recovered.iter().map(|recovered| format!("recovered: {}", cut(&recovered.what, 300))),
+    );
+    let lost =
+        clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));
     short.extend(lost.take(20).map(|(topic, lost)| {
-        format!("{} messages of {} lost before they reached the recorder", grouped(lost), cut(&topic.topic, 120))
+        format!(
+            "{} messages of {} lost before they reached the recorder",
+            grouped(lost),
+            cut(&topic.topic, 120)
+        )
     }));
     ClipShown {
         file: cut(&clip.file.to_string_lossy(), 300),
@@ -245,7 +263,11 @@ fn curve_shown(curve: &Curve, start_ns: i64) -> CurveShown {
         samples: curve.samples,
         not_finite: curve.not_finite,
         per_point: curve.per_point,
-        t: curve.at_ns.iter().map(|at_ns| (seconds(*at_ns, start_ns) * 1e6).round() / 1e6).collect(),
+        t: curve
+            .at_ns
+            .iter()
+            .map(|at_ns| (seconds(*at_ns, start_ns) * 1e6).round() / 1e6)
+            .collect(),
         max: if min == max { Vec::new() } else { max },
         min,
     }
@@ -261,15 +283,26 @@ fn spreads(told: &RunSummary, signals: Option<&Signals>) -> Vec<SpreadShown> {
         what,
         unit,
         count: spread.count,
-        marks: vec![("half", spread.p50), ("90 %", spread.p90), ("99 %", spread.p99), ("most", spread.max)],
+        marks: vec![
+            ("half", spread.p50),
+            ("90 %", spread.p90),
+            ("99 %", spread.p99),
+            ("most", spread.max),
+        ],
         bins: spread.bins.iter().take(1000).map(|bin| [bin.from, bin.to, bin.count]).collect(),
     };
     if let Some(signals) = signals {
         let fuel = signals.fuel.iter().map(|fuel| kept("fuel", "fuel", fuel));
-        return std::iter::once(kept("time in the lambda", "ns", &signals.run_ns)).chain(fuel).collect();
+        return std::iter::once(kept("time in the lambda", "ns", &signals.run_ns))
+            .chain(fuel)
+            .collect();
     }
     let RunSummary::Live(live) = told else { return Vec::new() };
-    let spreads = [("wake-up", live.wake_up), ("time in the lambda", live.run), ("decision handed out", live.hand_out)];
+    let spreads = [
+        ("wake-up", live.wake_up),
+        ("time in the lambda", live.run),
+        ("decision handed out", live.hand_out),
+    ];
     let shown = spreads.into_iter().filter_map(|(what, spread)| Some((what, spread?)));
     let shown = shown.map(|(what, spread)| SpreadShown {
         what,
@@ -285,8 +318,13 @@ fn facts(told: &RunSummary) -> Vec<Fact> {
     let fact = |what, text: String| Fact { what, text };
     match told {
         RunSummary::Replay(told) => {
-            let percent = 100.0 * told.decode_s / told.run_s.max(told.decode_s).max(f64::MIN_POSITIVE);
-            let decoding = if told.decode_s > 0.0 { format!(", {percent:.0} % decoding") } else { String::new() };
+            let percent =
+                100.0 * told.decode_s / told.run_s.max(told.decode_s).max(f64::MIN_POSITIVE);
+            let decoding = if told.decode_s > 0.0 {
+                format!(", {percent:.0} % decoding")
+            } else {
+                String::new()
+            };
             vec![
                 fact("in the lambda", format!("{:.3} s{decoding}", told.run_s)),
                 fact("replayed in", format!("{:.3} s", told.wall_s)),
@@ -302,13 +340,18 @@ fn facts(told: &RunSummary) -> Vec<Fact> {
                 fact("memory", size(told.rss_bytes)),
                 fact("restarts", told.restarts.to_string()),
             ];
-            facts.into_iter().chain(trouble.take(8).map(|why| fact("trouble", visible(why)))).collect()
+            facts
+                .into_iter()
+                .chain(trouble.take(8).map(|why| fact("trouble", visible(why))))
+                .collect()
         }
     }
 }
 
 /// Which of `values` stand at which key.
-pub(super) fn places<K: std::hash::Hash + Eq>(keys: impl Iterator<Item = K>) -> HashMap<K, Vec<usize>> {
+pub(super) fn places<K: std::hash::Hash + Eq>(
+    keys: impl Iterator<Item = K>,
+) -> HashMap<K, Vec<usize>> {
     let mut places: HashMap<K, Vec<usize>> = HashMap::new();
     for (place, key) in keys.enumerate() {
         places.entry(key).or_default().push(place);

@@ -1,6 +1,8 @@
-//! The page as one file: its style, its script and its data, and nothing that it would have to fetch.
+//! The page as one file: its style, its script and its data, and nothing that it would have to
+//! fetch.
 //!
-//! All that comes from files is in the data, and the data is no program: a browser runs only the script whose digest the page names.
+//! All that comes from files is in the data, and the data is no program: a browser runs only the
+//! script whose digest the page names.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -10,7 +12,8 @@ use sha2::{Digest, Sha256};
 use super::Page;
 
 const PAGE: &str = include_str!("../../assets/page/page.html");
-const STYLE: [&str; 2] = [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/page/page.css")];
+const STYLE: [&str; 2] =
+    [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/page/page.css")];
 /// The plots, which others made.
 const PLOTS: &str = include_str!("../../assets/uPlot.iife.min.js");
 const PLOTS_LICENSE: &str = include_str!("../../assets/uPlot.LICENSE");
@@ -69,7 +72,9 @@ pub(super) fn json(value: &impl Serialize) -> String {
     // Outside of texts JSON has none of these characters.
     for character in plain.chars() {
         match character {
-            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => text.push_str(&format!("\\u{:04x}", character as u32)),
+            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
+                text.push_str(&format!("\\u{:04x}", character as u32))
+            }
             other => text.push(other),
         }
     }
@@ -109,7 +114,15 @@ mod tests {
     #[test]
     fn the_page_fetches_nothing_and_sets_no_text_as_html() {
         let ours = [PAGE, STYLE[1]].iter().chain(SCRIPTS).copied().collect::<String>();
-        for word in ["http://", "https://", "innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("] {
+        for word in [
+            "http://",
+            "https://",
+            "innerHTML",
+            "outerHTML",
+            "insertAdjacentHTML",
+            "document.write",
+            "eval(",
+        ] {
             assert!(!ours.contains(word), "{word}");
         }
         assert!(PAGE.find("{{policy}}").unwrap() < PAGE.find("{{style}}").unwrap());

@@ -1,4 +1,5 @@
-//! Triggers and faults out of `decisions.jsonl`, of which there may be millions: some in detail, all by time, and how many there are.
+//! Triggers and faults out of `decisions.jsonl`, of which there may be millions: some in detail,
+//! all by time, and how many there are.
 
 use std::collections::HashMap;
 
@@ -9,7 +10,8 @@ use super::html;
 use super::model::{Amounts, FaultCause, FaultMark, Mark};
 use crate::words::{cut, grouped, seconds, size};
 
-/// Most triggers with all that is known of them, most faults, and most lines of the table of faults.
+/// Most triggers with all that is known of them, most faults, and most lines of the table of
+/// faults.
 pub(super) const TRIGGERS_MAX: usize = 5_000;
 pub(super) const FAULTS_MAX: usize = 500;
 const CAUSES_MAX: usize = 100;
@@ -23,7 +25,8 @@ const LABEL_CHARS: usize = 120;
 const MESSAGE_CHARS: usize = 2_000;
 const ATTRIBUTE_BYTES: usize = 2_048;
 
-/// Bytes that texts may take on the page: hostile ones are six times as long there as in their file.
+/// Bytes that texts may take on the page: hostile ones are six times as long there as in their
+/// file.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Room(pub(super) usize);
 
@@ -42,7 +45,8 @@ impl Room {
                 true
             }
             None => {
-                // What comes later is smaller perhaps, but a page with holes would not say where they are.
+                // What comes later is smaller perhaps, but a page with holes would not say where
+                // they are.
                 self.0 = 0;
                 false
             }
@@ -70,7 +74,8 @@ pub(super) struct Marks {
 }
 
 impl Marks {
-    /// None yet, of a drive that starts at `start_ns`; texts of triggers may take `room`, those of faults half of it.
+    /// None yet, of a drive that starts at `start_ns`; texts of triggers may take `room`, those of
+    /// faults half of it.
     pub(super) fn new(start_ns: i64, room: usize) -> Self {
         Self {
             start_ns,
@@ -118,7 +123,11 @@ impl Marks {
             label,
             kind: trigger.kind.as_str(),
             score: trigger.score,
-            attributes: if attributes_cut { Vec::new() } else { trigger.attributes.iter().map(shown).collect() },
+            attributes: if attributes_cut {
+                Vec::new()
+            } else {
+                trigger.attributes.iter().map(shown).collect()
+            },
             attributes_cut,
             cause: decision.cause,
             topic: decision.topic.as_deref().map(|topic| cut(topic, LABEL_CHARS)),
@@ -149,10 +158,11 @@ impl Marks {
 
     fn fault(&mut self, decision: &Decision, fault: &Fault) {
         self.faults_seen += 1;
-        let lane = self.fault_kinds.iter().position(|kind| *kind == fault.kind).unwrap_or_else(|| {
-            self.fault_kinds.push(fault.kind);
-            self.fault_kinds.len() - 1
-        });
+        let lane =
+            self.fault_kinds.iter().position(|kind| *kind == fault.kind).unwrap_or_else(|| {
+                self.fault_kinds.push(fault.kind);
+                self.fault_kinds.len() - 1
+            });
         self.fault_density.add(lane, decision.at_ns.saturating_sub(self.start_ns));
         let t = seconds(decision.at_ns, self.start_ns);
         let message = cut(&fault.message, MESSAGE_CHARS);
@@ -176,7 +186,14 @@ impl Marks {
         } else if self.causes.len() < CAUSES_MAX {
             let (kind, message) = cause.clone();
             self.of_cause.insert(cause, self.causes.len());
-            self.causes.push(FaultCause { kind, message, amounts: amounts(fault), count: 1, first: t, last: t });
+            self.causes.push(FaultCause {
+                kind,
+                message,
+                amounts: amounts(fault),
+                count: 1,
+                first: t,
+                last: t,
+            });
         } else {
             self.faults_in_no_line += 1;
         }

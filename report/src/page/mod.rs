@@ -1,7 +1,9 @@
-//! `OUT/report.html`: what a lambda did, when, why, what it missed and what it cost, on one page that needs nothing else.
+//! `OUT/report.html`: what a lambda did, when, why, what it missed and what it cost, on one page
+//! that needs nothing else.
 //!
-//! `gather` and `marks` read what the files say line by line, within bounds; `html` makes a file of it. Nothing of the drive is read, and
-//! nothing outside of the output. The script of the page is in `report/assets/page`.
+//! `gather` and `marks` read what the files say line by line, within bounds; `html` makes a file of
+//! it. Nothing of the drive is read, and nothing outside of the output. The script of the page is
+//! in `report/assets/page`.
 
 mod density;
 mod gather;
@@ -33,17 +35,20 @@ pub struct Page {
 }
 
 impl Page {
-    /// Gathers the page about the run that wrote to the folder `out`. What cannot be used of a file is left out, and the page says so.
+    /// Gathers the page about the run that wrote to the folder `out`. What cannot be used of a file
+    /// is left out, and the page says so.
     ///
     /// # Errors
     ///
-    /// [`OutputError`] if `out` has no `summary.json` of ours, or holds a link or a pipe where a result belongs.
+    /// [`OutputError`] if `out` has no `summary.json` of ours, or holds a link or a pipe where a
+    /// result belongs.
     pub fn of(out: &Path) -> Result<Page, OutputError> {
         Ok(Page::new(vec![gather::gather(out, 1, None)?], None))
     }
 
-    /// Gathers the page about the runs in `a` and `b`, and what differs between them: [`Diff::between`] of the same folders.
-    /// All times on it count from the start of the first run.
+    /// Gathers the page about the runs in `a` and `b`, and what differs between them:
+    /// [`Diff::between`] of the same folders. All times on it count from the start of the first
+    /// run.
     ///
     /// # Errors
     ///
@@ -57,7 +62,8 @@ impl Page {
         Ok(Page::new(vec![a, b], Some(diff)))
     }
 
-    /// The page as one file in UTF-8, of at most a few MiB: it loads nothing, and runs no script but its own, whatever the results say.
+    /// The page as one file in UTF-8, of at most a few MiB: it loads nothing, and runs no script
+    /// but its own, whatever the results say.
     pub fn to_html(&self) -> String {
         html::html(self)
     }

@@ -1,4 +1,5 @@
-//! The data of the page, as its script reads it. Times are in s after the start of the drive, of two runs that of the first; numbers that a script would round are texts.
+//! The data of the page, as its script reads it. Times are in s after the start of the drive, of
+//! two runs that of the first; numbers that a script would round are texts.
 
 use std::collections::BTreeMap;
 
@@ -85,7 +86,8 @@ pub(crate) struct Mark {
     pub(crate) label: usize,
     pub(crate) kind: &'static str,
     pub(crate) score: Option<f64>,
-    /// As they stand in the file; empty with `attributes_cut`, if there are more than the page has room for.
+    /// As they stand in the file; empty with `attributes_cut`, if there are more than the page has
+    /// room for.
     pub(crate) attributes: Vec<(String, String)>,
     pub(crate) attributes_cut: bool,
     pub(crate) cause: Cause,

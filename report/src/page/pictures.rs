@@ -1,6 +1,7 @@
 //! Pictures that go into the page: what a camera saw at triggers, else the thumbnails of clips.
 //!
-//! Where they lie is said by files that others may have written: nothing outside of the output is read, and nothing but a small JPEG.
+//! Where they lie is said by files that others may have written: nothing outside of the output is
+//! read, and nothing but a small JPEG.
 
 use std::io;
 use std::path::{Component, Path, PathBuf};
@@ -34,7 +35,14 @@ pub(super) struct Pictures<'a> {
 
 impl<'a> Pictures<'a> {
     pub(super) fn new(out: &'a Path, start_ns: i64, shares: usize) -> Self {
-        Self { out, start_ns, room: ALL_BYTES / shares, shown: Vec::new(), left_out: 0, refused: None }
+        Self {
+            out,
+            start_ns,
+            room: ALL_BYTES / shares,
+            shown: Vec::new(),
+            left_out: 0,
+            refused: None,
+        }
     }
 
     /// What cameras saw, each joined to the triggers of its wake.
@@ -42,7 +50,9 @@ impl<'a> Pictures<'a> {
         let marks_at = places(marks.iter().map(|mark| mark.at_ns));
         for picture in pictures {
             let age = seconds(picture.at_ns, picture.image_ns);
-            let Some(number) = self.add(&picture.file, picture.at_ns, cut(&picture.topic, 120), Some(age)) else {
+            let Some(number) =
+                self.add(&picture.file, picture.at_ns, cut(&picture.topic, 120), Some(age))
+            else {
                 continue;
             };
             for mark in marks_at.get(&picture.at_ns).into_iter().flatten() {
@@ -52,10 +62,16 @@ impl<'a> Pictures<'a> {
     }
 
     /// Thumbnails of clips, for triggers that have no picture yet.
-    pub(super) fn of_clips(&mut self, marks: &mut [Mark], clips: &[ClipShown], thumbnails: &[Option<PathBuf>]) {
+    pub(super) fn of_clips(
+        &mut self,
+        marks: &mut [Mark],
+        clips: &[ClipShown],
+        thumbnails: &[Option<PathBuf>],
+    ) {
         for (clip, thumbnail) in clips.iter().zip(thumbnails) {
             let Some(thumbnail) = thumbnail else { continue };
-            let is_in = |mark: &Mark| mark.at_ns >= clip.span_ns[0] && mark.at_ns <= clip.span_ns[1];
+            let is_in =
+                |mark: &Mark| mark.at_ns >= clip.span_ns[0] && mark.at_ns <= clip.span_ns[1];
             let waiting = |mark: &&mut Mark| is_in(mark) && mark.pictures.is_empty();
             let mut waiting = marks.iter_mut().filter(waiting).peekable();
             let Some(first) = waiting.peek() else { continue };
@@ -84,7 +100,12 @@ impl<'a> Pictures<'a> {
             return None;
         }
         self.room -= jpeg.len();
-        self.shown.push(PictureShown { t: seconds(at_ns, self.start_ns), of, age, src: jpeg_address(&jpeg) });
+        self.shown.push(PictureShown {
+            t: seconds(at_ns, self.start_ns),
+            of,
+            age,
+            src: jpeg_address(&jpeg),
+        });
         Some(self.shown.len() - 1)
     }
 

@@ -22,7 +22,11 @@ impl Out {
     /// Results without any wake.
     pub(crate) fn new() -> Out {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!("gleaner-report-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let name = format!(
+            "gleaner-report-{}-{}",
+            std::process::id(),
+            COUNT.fetch_add(1, Ordering::Relaxed)
+        );
         let folder = std::env::temp_dir().join(name);
         fs::create_dir(&folder).unwrap();
         let out = Out(folder);
@@ -44,7 +48,10 @@ impl Out {
 
     /// Writes these as `decisions.jsonl`.
     pub(crate) fn decisions(&self, decisions: &[Value]) {
-        self.write("decisions.jsonl", decisions.iter().map(|decision| format!("{decision}\n")).collect::<String>());
+        self.write(
+            "decisions.jsonl",
+            decisions.iter().map(|decision| format!("{decision}\n")).collect::<String>(),
+        );
     }
 
     fn data(&self) -> Value {
@@ -116,7 +123,10 @@ fn the_page_has_what_the_files_say() {
         wake(1500, json!([trigger("brake", 1.5), trigger("dark", 0.5)]), Value::Null),
         wake(2000, json!([]), fault),
     ]);
-    out.write("log.jsonl", format!("{}\n", json!({"at_ns": START_NS + 5, "level": "warn", "message": "hm"})));
+    out.write(
+        "log.jsonl",
+        format!("{}\n", json!({"at_ns": START_NS + 5, "level": "warn", "message": "hm"})),
+    );
     out.write("signals.json", signals().to_string());
     out.write("clips.jsonl", format!("{}\n", clip("clips/a.jpg")));
     out.write("clips/a.jpg", JPEG);
@@ -125,8 +135,14 @@ fn the_page_has_what_the_files_say() {
     assert_eq!(run["labels"], json!(["brake", "dark"]));
     assert_eq!(run["triggers"][0]["t"], 1.5);
     // A script would make another number of it.
-    assert_eq!(run["triggers"][0]["attributes"], json!([["mps2", "-1.5"], ["serial", "9007199254740993"]]));
-    assert_eq!(run["fault_causes"][0]["amounts"], json!({"used": "50,000,001", "allowed": "50,000,000"}));
+    assert_eq!(
+        run["triggers"][0]["attributes"],
+        json!([["mps2", "-1.5"], ["serial", "9007199254740993"]])
+    );
+    assert_eq!(
+        run["fault_causes"][0]["amounts"],
+        json!({"used": "50,000,001", "allowed": "50,000,000"})
+    );
     assert_eq!((&run["from"], &run["to"]), (&json!(0.0), &json!(40.0)));
     assert_eq!(run["config"], json!({"brake_mps2": -1.4, "name": "x"}));
     let curve = &run["curves"][0];
@@ -138,7 +154,10 @@ fn the_page_has_what_the_files_say() {
     assert_eq!(run["topics"][0]["lost"], Value::Null, "unknown is never 0");
     assert_eq!(run["clips"][0]["short"], json!(["it is short"]));
     // Both triggers are in the clip, whose thumbnail serves until there is something better.
-    assert_eq!((&run["triggers"][0]["pictures"], &run["triggers"][1]["pictures"]), (&json!([0]), &json!([0])));
+    assert_eq!(
+        (&run["triggers"][0]["pictures"], &run["triggers"][1]["pictures"]),
+        (&json!([0]), &json!([0]))
+    );
     assert_eq!(run["pictures"][0]["src"], "data:image/jpeg;base64,/9j/4AECAw==");
     assert_eq!(run["notes"], json!([]));
 }
@@ -149,15 +168,17 @@ fn a_picture_of_the_moment_is_preferred_to_a_thumbnail() {
     out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
     let mut signals = signals();
     let at_ns = START_NS + 1_500_000_000;
-    signals["pictures"] =
-        json!([{"at_ns": at_ns, "topic": "/camera", "image_ns": at_ns - 20_000_000, "file": "pictures/1.jpg"}]);
+    signals["pictures"] = json!([{"at_ns": at_ns, "topic": "/camera", "image_ns": at_ns - 20_000_000, "file": "pictures/1.jpg"}]);
     out.write("signals.json", signals.to_string());
     out.write("pictures/1.jpg", JPEG);
     out.write("clips.jsonl", format!("{}\n", clip("clips/a.jpg")));
     out.write("clips/a.jpg", JPEG);
     let run = out.data();
     assert_eq!(run["pictures"].as_array().unwrap().len(), 1);
-    assert_eq!((&run["pictures"][0]["of"], &run["pictures"][0]["age"]), (&json!("/camera"), &json!(0.02)));
+    assert_eq!(
+        (&run["pictures"][0]["of"], &run["pictures"][0]["age"]),
+        (&json!("/camera"), &json!(0.02))
+    );
     assert_eq!(run["triggers"][0]["pictures"], json!([0]));
 }
 
@@ -168,26 +189,46 @@ fn two_runs_count_from_the_start_of_the_first() {
     later["start_ns"] = (START_NS + 10_000_000_000).into();
     later["part"] = json!({"from_ns": START_NS + 12_000_000_000_i64, "to_ns": null});
     b.write("summary.json", later.to_string());
-    b.write("log.jsonl", format!("{}\n", json!({"at_ns": START_NS + 5_000_000_000, "level": "warn", "message": "hm"})));
+    b.write(
+        "log.jsonl",
+        format!(
+            "{}\n",
+            json!({"at_ns": START_NS + 5_000_000_000, "level": "warn", "message": "hm"})
+        ),
+    );
     let both = [wake(15_000, json!([trigger("brake", 1.5)]), Value::Null)];
     a.decisions(&both);
-    b.decisions(&[&both[..], &[wake(20_000, json!([trigger("brake", 1.5)]), Value::Null)]].concat());
-    for (first, second, new_s, [from_a, from_b]) in [(&a, &b, 20.0, [0.0, 12.0]), (&b, &a, 10.0, [2.0, -10.0])] {
+    b.decisions(
+        &[&both[..], &[wake(20_000, json!([trigger("brake", 1.5)]), Value::Null)]].concat(),
+    );
+    for (first, second, new_s, [from_a, from_b]) in
+        [(&a, &b, 20.0, [0.0, 12.0]), (&b, &a, 10.0, [2.0, -10.0])]
+    {
         let diff = Diff::between(first.path(), second.path()).unwrap();
         let html = Page::of_both(first.path(), second.path(), diff).unwrap().to_html();
         let (_, data) = html.split_once("application/json\">").unwrap();
         let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
         let run = |n: usize| &data["runs"][n];
-        assert_eq!(run(0)["triggers"][0]["t"], run(1)["triggers"][0]["t"], "one instant stands at one place");
+        assert_eq!(
+            run(0)["triggers"][0]["t"],
+            run(1)["triggers"][0]["t"],
+            "one instant stands at one place"
+        );
         assert_eq!((&run(0)["from"], &run(1)["from"]), (&json!(from_a), &json!(from_b)));
-        assert_eq!((&run(0)["start_ms"], &data["diff"]["differences"][0]["t"]), (&run(1)["start_ms"], &json!(new_s)));
+        assert_eq!(
+            (&run(0)["start_ms"], &data["diff"]["differences"][0]["t"]),
+            (&run(1)["start_ms"], &json!(new_s))
+        );
     }
 }
 
 #[test]
 fn without_signals_the_report_does_without() {
     let run = Out::new().data();
-    assert_eq!((&run["config"], &run["curves"], &run["spreads"]), (&Value::Null, &json!([]), &json!([])));
+    assert_eq!(
+        (&run["config"], &run["curves"], &run["spreads"]),
+        (&Value::Null, &json!([]), &json!([]))
+    );
     assert_eq!(run["notes"], json!([]));
 }
 
@@ -202,7 +243,10 @@ fn hostile_texts_stay_texts() {
     decision["topic"] = hostile.into();
     decision["triggers"][0]["attributes"] = json!({hostile: hostile});
     out.decisions(&[decision]);
-    out.write("log.jsonl", format!("{}\n", json!({"at_ns": START_NS, "level": hostile, "message": hostile})));
+    out.write(
+        "log.jsonl",
+        format!("{}\n", json!({"at_ns": START_NS, "level": hostile, "message": hostile})),
+    );
     let html = Page::of(out.path()).unwrap().to_html();
     assert!(!html.contains("<script>alert") && !html.contains('\u{2028}'));
     let (_, data) = html.split_once("application/json\">").unwrap();
@@ -220,7 +264,8 @@ fn lines_that_say_nothing_are_counted_and_the_others_are_shown() {
     assert_eq!(run["triggers"].as_array().unwrap().len(), 1);
     let note = run["notes"][0].as_str().unwrap();
     assert!(
-        note.starts_with("4 lines of `decisions.jsonl` left out; the first: ") && note.contains("line 1"),
+        note.starts_with("4 lines of `decisions.jsonl` left out; the first: ")
+            && note.contains("line 1"),
         "{note}"
     );
 }
@@ -257,10 +302,14 @@ fn nothing_outside_of_the_output_is_read() {
 fn a_page_has_bounds_and_says_what_is_beyond_them() {
     let out = Out::new();
     let fault = |n: usize| json!({"kind": "exception", "message": format!("cause {n}"), "used": null, "allowed": null});
-    let many: Vec<_> =
-        (0..6000).map(|n| wake(n as i64, json!([trigger(&format!("l{}", n % 40), 1.0)]), fault(n % 300))).collect();
+    let many: Vec<_> = (0..6000)
+        .map(|n| wake(n as i64, json!([trigger(&format!("l{}", n % 40), 1.0)]), fault(n % 300)))
+        .collect();
     out.decisions(&many);
-    let line = |n: i64| json!({"at_ns": START_NS + n, "level": "info", "message": "x".repeat(5000)}).to_string() + "\n";
+    let line = |n: i64| {
+        json!({"at_ns": START_NS + n, "level": "info", "message": "x".repeat(5000)}).to_string()
+            + "\n"
+    };
     out.write("log.jsonl", (0..3000).map(line).collect::<String>());
     let run = out.data();
     let length = |key: &str| run[key].as_array().unwrap().len();
@@ -268,9 +317,14 @@ fn a_page_has_bounds_and_says_what_is_beyond_them() {
     assert_eq!((length("faults"), &run["totals"]["faults"]), (500, &json!(6000)));
     assert_eq!((length("fault_causes"), &run["totals"]["faults_in_no_line"]), (100, &json!(4000)));
     assert_eq!(length("labels"), 25, "the last one stands for all others");
-    let dense = |key: &str| run[key].as_array().unwrap().iter().map(|bin| bin["count"].as_u64().unwrap()).sum::<u64>();
+    let dense = |key: &str| {
+        run[key].as_array().unwrap().iter().map(|bin| bin["count"].as_u64().unwrap()).sum::<u64>()
+    };
     assert_eq!((dense("trigger_density"), dense("fault_density")), (6000, 6000));
-    assert!(length("log") < 2000 && run["totals"]["log"] == 3000, "each line is cut, and all of them share a room");
+    assert!(
+        length("log") < 2000 && run["totals"]["log"] == 3000,
+        "each line is cut, and all of them share a room"
+    );
     let html = Page::of(out.path()).unwrap().to_html();
     assert!(html.len() < 10 << 20, "{}", html.len());
 }
@@ -285,14 +339,21 @@ fn names_values_and_lists_have_bounds_too() {
     }
     summary["drive"] = list(60).into();
     let topic = |name: String| json!({"name": name, "topic": name, "type_name": name, "received": 1, "lost": null, "overwritten": 0, "no_slot": 0, "too_big": 0});
-    summary["topics"] = list(270).into_iter().map(|name| topic(name.chars().take(4_000).collect())).collect();
+    summary["topics"] =
+        list(270).into_iter().map(|name| topic(name.chars().take(4_000).collect())).collect();
     out.write("summary.json", summary.to_string());
     let mut signals = signals();
-    signals["config"] =
-        list(250).into_iter().map(|key| (key.clone(), key.into())).collect::<serde_json::Map<_, _>>().into();
+    signals["config"] = list(250)
+        .into_iter()
+        .map(|key| (key.clone(), key.into()))
+        .collect::<serde_json::Map<_, _>>()
+        .into();
     out.write("signals.json", signals.to_string());
     let run = out.data();
-    assert_eq!((run["drive"].as_array().unwrap().len(), run["topics"].as_array().unwrap().len()), (50, 256));
+    assert_eq!(
+        (run["drive"].as_array().unwrap().len(), run["topics"].as_array().unwrap().len()),
+        (50, 256)
+    );
     assert_eq!(run["config"].as_object().unwrap().len(), 200);
     let said = run["notes"].to_string();
     for left_out in ["10 of 60 drives", "14 of 270 topics", "50 of 250 config values"] {
@@ -301,7 +362,11 @@ fn names_values_and_lists_have_bounds_too() {
     signals["config"] = json!({});
     other.write("signals.json", signals.to_string());
     let diff = Diff::between(out.path(), other.path()).unwrap();
-    assert!(diff.notes.iter().any(|note| note == "50 more config values differ"), "{:?}", diff.notes);
+    assert!(
+        diff.notes.iter().any(|note| note == "50 more config values differ"),
+        "{:?}",
+        diff.notes
+    );
     let bytes = Page::of_both(out.path(), other.path(), diff).unwrap().to_html().len();
     assert!(bytes < 8 << 20, "{bytes}");
 }
@@ -332,7 +397,9 @@ fn signals_that_contradict_themselves_are_left_out_and_named() {
     assert_eq!(run["curves"], json!([]));
     assert!(run["notes"][0].as_str().unwrap().contains("1 of 1 curves"), "{}", run["notes"]);
     out.write("signals.json", "{");
-    assert!(out.data()["notes"][0].as_str().unwrap().starts_with("`signals.json` cannot be understood"));
+    assert!(
+        out.data()["notes"][0].as_str().unwrap().starts_with("`signals.json` cannot be understood")
+    );
 }
 
 #[test]

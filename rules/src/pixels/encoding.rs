@@ -2,8 +2,8 @@
 
 use super::error::{PixelError, shortened};
 
-/// Arrangement of the colour filter in front of a raw sensor: the first two pixels of the first row,
-/// then of the second.
+/// Arrangement of the colour filter in front of a raw sensor: the first two pixels of the first
+/// row, then of the second.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Bayer {
     /// Red, green / green, blue.
@@ -77,9 +77,12 @@ impl Encoding {
     ///
     /// [`PixelError::UnknownEncoding`] with the list of names that are understood.
     pub fn from_ros(name: &str) -> Result<Self, PixelError> {
-        NAMES.iter().find(|(known, _)| *known == name).map(|(_, encoding)| *encoding).ok_or_else(|| {
-            PixelError::UnknownEncoding { name: shortened(name), supported: NAMES.map(|(known, _)| known).join(", ") }
-        })
+        NAMES.iter().find(|(known, _)| *known == name).map(|(_, encoding)| *encoding).ok_or_else(
+            || PixelError::UnknownEncoding {
+                name: shortened(name),
+                supported: NAMES.map(|(known, _)| known).join(", "),
+            },
+        )
     }
 
     /// The name of the encoding in ROS; of several names for one encoding, the current one.
@@ -154,9 +157,13 @@ mod tests {
 
     #[test]
     fn old_and_opencv_names_mean_the_same_as_the_current_ones() {
-        for (alias, current) in
-            [("8UC1", "mono8"), ("8UC3", "bgr8"), ("16UC1", "mono16"), ("yuv422", "uyvy"), ("yuv422_yuy2", "yuyv")]
-        {
+        for (alias, current) in [
+            ("8UC1", "mono8"),
+            ("8UC3", "bgr8"),
+            ("16UC1", "mono16"),
+            ("yuv422", "uyvy"),
+            ("yuv422_yuy2", "yuyv"),
+        ] {
             assert_eq!(Encoding::from_ros(alias).unwrap().name(), current);
         }
     }

@@ -133,10 +133,17 @@ impl fmt::Display for PixelError {
             }
             Self::Step { width, height, encoding, step, needed } => {
                 let name = encoding.name();
-                write!(f, "image of {width}x{height} {name} says a row has {step} bytes; it needs {needed}")
+                write!(
+                    f,
+                    "image of {width}x{height} {name} says a row has {step} bytes; it needs {needed}"
+                )
             }
             Self::Data { width, height, encoding, step, needed, found } => {
-                write!(f, "image of {width}x{height} {} with {step} bytes per row ", encoding.name())?;
+                write!(
+                    f,
+                    "image of {width}x{height} {} with {step} bytes per row ",
+                    encoding.name()
+                )?;
                 write!(f, "needs {needed} bytes; it has {found}")
             }
             Self::OddWidth { width, encoding } => {
@@ -144,7 +151,10 @@ impl fmt::Display for PixelError {
                 write!(f, "two pixels share a colour, so the width must be even")
             }
             Self::Roi { roi: Roi { x, y, width: across, height: down }, width, height } => {
-                write!(f, "region {across}x{down} at ({x}, {y}) has no pixel in the image of {width}x{height}")
+                write!(
+                    f,
+                    "region {across}x{down} at ({x}, {y}) has no pixel in the image of {width}x{height}"
+                )
             }
             Self::Raw { operation, encoding } => {
                 write!(f, "{operation} of a raw image ({}): ", encoding.name())?;

@@ -5,7 +5,8 @@ use std::fmt;
 
 use super::PixelError;
 
-/// Bytes that are worked on between two questions: below a tenth of a millisecond, and long enough for a look at a clock to be cheap.
+/// Bytes that are worked on between two questions: below a tenth of a millisecond, and long enough
+/// for a look at a clock to be cheap.
 const STRIDE: usize = 64 << 10;
 
 /// A question that operations ask now and then: may they go on?
@@ -16,7 +17,8 @@ pub struct Pace<'a> {
 }
 
 impl<'a> Pace<'a> {
-    /// Asks `may_go_on` at the beginning of an operation, and again before each further stretch of it.
+    /// Asks `may_go_on` at the beginning of an operation, and again before each further stretch of
+    /// it.
     pub fn new(may_go_on: &'a dyn Fn() -> bool) -> Self {
         Self { may_go_on, left: Cell::new(0) }
     }
@@ -43,8 +45,12 @@ mod tests {
     use super::*;
     use crate::pixels::{Encoding, View, ops};
 
-    /// How many rows of a picture of 1024 columns an operation reached that is stopped at its `asked`th question.
-    fn rows_reached(asked: u32, operation: impl Fn(&View<'_>) -> Result<(), PixelError>) -> Result<(), PixelError> {
+    /// How many rows of a picture of 1024 columns an operation reached that is stopped at its
+    /// `asked`th question.
+    fn rows_reached(
+        asked: u32,
+        operation: impl Fn(&View<'_>) -> Result<(), PixelError>,
+    ) -> Result<(), PixelError> {
         let data = vec![200; 1024 * 3 * 1024];
         let questions = Cell::new(0);
         let may_go_on = || {
@@ -52,7 +58,8 @@ mod tests {
             questions.get() < asked
         };
         let pace = Pace::new(&may_go_on);
-        let view = View::new(1024, 1024, 3 * 1024, Encoding::Rgb8, false, &data).unwrap().paced(&pace);
+        let view =
+            View::new(1024, 1024, 3 * 1024, Encoding::Rgb8, false, &data).unwrap().paced(&pace);
         let result = operation(&view);
         assert!(questions.get() <= asked, "it went on after it was stopped");
         result

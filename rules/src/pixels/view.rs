@@ -20,8 +20,8 @@ pub struct View<'a> {
 }
 
 impl<'a> View<'a> {
-    /// The image of `width` x `height` pixels in `data`, where a row starts every `step` bytes, as the
-    /// fields of `sensor_msgs/msg/Image` say. `big_endian` is the order of 16 bit values and
+    /// The image of `width` x `height` pixels in `data`, where a row starts every `step` bytes, as
+    /// the fields of `sensor_msgs/msg/Image` say. `big_endian` is the order of 16 bit values and
     /// means nothing for the other encodings. Bytes behind a row and behind the image are ignored;
     /// those behind the last row may be missing.
     ///
@@ -120,7 +120,11 @@ impl<'a> View<'a> {
         if roi.x >= width || roi.y >= height || roi.width == 0 || roi.height == 0 {
             return Err(PixelError::Roi { roi, width, height });
         }
-        Ok(Roi { width: roi.width.min(width - roi.x), height: roi.height.min(height - roi.y), ..roi })
+        Ok(Roi {
+            width: roi.width.min(width - roi.x),
+            height: roi.height.min(height - roi.y),
+            ..roi
+        })
     }
 
     /// The bytes of `roi`, which [`View::clip`] has made, row by row from the top.
@@ -173,7 +177,10 @@ mod tests {
 
     #[test]
     fn an_image_without_pixels_is_refused() {
-        assert_eq!(refusal(0, 480, 0, Encoding::Rgb8, 9), "image says it is 0x480; each side must be 1 to 65535");
+        assert_eq!(
+            refusal(0, 480, 0, Encoding::Rgb8, 9),
+            "image says it is 0x480; each side must be 1 to 65535"
+        );
         assert!(View::new(3, 0, 9, Encoding::Rgb8, false, &[0; 9]).is_err());
     }
 
@@ -188,7 +195,10 @@ mod tests {
 
     #[test]
     fn rows_that_overlap_are_refused() {
-        assert_eq!(refusal(2, 2, 5, Encoding::Rgb8, 100), "image of 2x2 rgb8 says a row has 5 bytes; it needs 6");
+        assert_eq!(
+            refusal(2, 2, 5, Encoding::Rgb8, 100),
+            "image of 2x2 rgb8 says a row has 5 bytes; it needs 6"
+        );
     }
 
     #[test]

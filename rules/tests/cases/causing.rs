@@ -12,7 +12,9 @@ fn attributes(given: &Value) -> Vec<Attribute> {
     let value = |given: &Value| match given {
         Value::Bool(value) => AttributeValue::Boolean(*value),
         Value::String(text) => AttributeValue::Text(text.clone()),
-        given => given.as_i64().map_or_else(|| AttributeValue::Real(float(given)), AttributeValue::Signed),
+        given => given
+            .as_i64()
+            .map_or_else(|| AttributeValue::Real(float(given)), AttributeValue::Signed),
     };
     let pairs = given.as_array().unwrap().iter();
     pairs.map(|pair| Attribute { key: text(&pair[0]).to_owned(), value: value(&pair[1]) }).collect()
@@ -45,7 +47,8 @@ fn triggers() {
             "end" => json!(triggers.end()),
             "init" => {
                 let wake = triggers.suspend();
-                let answer = cause(&mut triggers, at_ns, Kind::Event, (&given[0], Some(1.0)), Vec::new());
+                let answer =
+                    cause(&mut triggers, at_ns, Kind::Event, (&given[0], Some(1.0)), Vec::new());
                 triggers.resume(wake);
                 answer
             }
@@ -53,7 +56,9 @@ fn triggers() {
                 let asked = (&given[0], Some(float(&given[1])));
                 cause(&mut triggers, at_ns, Kind::Event, asked, attributes(&given[2]))
             }
-            "start" => cause(&mut triggers, at_ns, Kind::Start, (&given[0], None), attributes(&given[1])),
+            "start" => {
+                cause(&mut triggers, at_ns, Kind::Start, (&given[0], None), attributes(&given[1]))
+            }
             "stop" => cause(&mut triggers, at_ns, Kind::Stop, (&given[0], None), Vec::new()),
             "refused" => json!(triggers.refused()),
             other => panic!("{other}"),
@@ -64,7 +69,8 @@ fn triggers() {
 #[test]
 fn log_lines() {
     replay("log", include_str!("../../cases/log.json"), |given| {
-        let mut rate = Rate::new(given["lines"].as_u64().unwrap(), given["bytes"].as_u64().unwrap());
+        let mut rate =
+            Rate::new(given["lines"].as_u64().unwrap(), given["bytes"].as_u64().unwrap());
         Box::new(move |call, given| match call {
             "log" => {
                 let line = line(text(&given[1]));
@@ -98,17 +104,28 @@ fn kept<T>(result: Result<T, ScratchError>, answer: impl FnOnce(T) -> Value) -> 
 #[test]
 fn scratch() {
     replay("scratch", include_str!("../../cases/scratch.json"), |given| {
-        let mut scratch = Scratch::new(given["granted"].as_u64().unwrap(), whole(&given["call_bytes"]));
+        let mut scratch =
+            Scratch::new(given["granted"].as_u64().unwrap(), whole(&given["call_bytes"]));
         Box::new(move |call, given| match call {
-            "put" => kept(scratch.put(text(&given[0]), text(&given[1]).as_bytes()), |()| Value::Null),
-            "append" => kept(scratch.append(text(&given[0]), text(&given[1]).as_bytes()), |()| Value::Null),
-            "fill" => json!((0..whole(&given[0])).for_each(|n| scratch.put(&n.to_string(), b"").unwrap())),
+            "put" => {
+                kept(scratch.put(text(&given[0]), text(&given[1]).as_bytes()), |()| Value::Null)
+            }
+            "append" => {
+                kept(scratch.append(text(&given[0]), text(&given[1]).as_bytes()), |()| Value::Null)
+            }
+            "fill" => {
+                json!((0..whole(&given[0])).for_each(|n| scratch.put(&n.to_string(), b"").unwrap()))
+            }
             "get" => {
                 let (offset, len) = (given[1].as_u64().unwrap(), given[2].as_u64().unwrap());
-                kept(scratch.get(text(&given[0]), offset, len), |bytes| json!(String::from_utf8(bytes).unwrap()))
+                kept(scratch.get(text(&given[0]), offset, len), |bytes| {
+                    json!(String::from_utf8(bytes).unwrap())
+                })
             }
             "remove" => kept(scratch.remove(text(&given[0])), |()| Value::Null),
-            "entries" => scratch.entries().iter().map(|entry| json!([entry.name, entry.bytes])).collect(),
+            "entries" => {
+                scratch.entries().iter().map(|entry| json!([entry.name, entry.bytes])).collect()
+            }
             "free" => json!(scratch.free()),
             other => panic!("{other}"),
         })

@@ -43,8 +43,9 @@ fn pixels() {
         let (given, data) = (given.clone(), bytes(text(&given["data"])));
         Box::new(move |call, arguments| {
             let [width, height, step] = ["width", "height", "step"].map(|key| number(&given[key]));
-            let view = Encoding::from_ros(text(&given["encoding"]))
-                .and_then(|encoding| View::new(width, height, step, encoding, given["big_endian"] == true, &data));
+            let view = Encoding::from_ros(text(&given["encoding"])).and_then(|encoding| {
+                View::new(width, height, step, encoding, given["big_endian"] == true, &data)
+            });
             told(view.and_then(|view| match call {
                 "mean luma" => ops::mean_luma(&view, roi(&arguments[0])).map(Value::from),
                 "histogram" => {

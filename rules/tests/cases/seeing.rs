@@ -13,7 +13,8 @@ use crate::{ns, refused, replay, text, whole};
 #[test]
 fn rings() {
     replay("ring", include_str!("../../cases/ring.json"), |given| {
-        let mut ring = Ring::new(whole(&given["depth"]), whole(&given["hold"]), whole(&given["max_size"]));
+        let mut ring =
+            Ring::new(whole(&given["depth"]), whole(&given["hold"]), whole(&given["max_size"]));
         let mut held = BTreeMap::new();
         Box::new(move |call, given| match call {
             "push" => {
@@ -29,10 +30,17 @@ fn rings() {
                 held.remove(&given[0].as_u64().unwrap());
                 Value::Null
             }
-            "shows" => ring.newest_while(whole(&given[0]), |_| true).iter().map(|cell| json!(cell.position)).collect(),
+            "shows" => ring
+                .newest_while(whole(&given[0]), |_| true)
+                .iter()
+                .map(|cell| json!(cell.position))
+                .collect(),
             "since" => {
                 let since = ns(&given[0]);
-                ring.newest_while(99, |at_ns| *at_ns > since).iter().map(|cell| json!(cell.position)).collect()
+                ring.newest_while(99, |at_ns| *at_ns > since)
+                    .iter()
+                    .map(|cell| json!(cell.position))
+                    .collect()
             }
             "counts" => {
                 let Counts { received, overwritten, no_slot, too_big } = ring.counts();
@@ -50,7 +58,11 @@ fn clamps() {
         Box::new(move |call, given| match call {
             "samples" => json!(per_call.samples().min(whole(&given[0]))),
             "piece" => {
-                let place = per_call.piece(whole(&given[0]), given[1].as_u64().unwrap(), whole(&given[2]) as u32);
+                let place = per_call.piece(
+                    whole(&given[0]),
+                    given[1].as_u64().unwrap(),
+                    whole(&given[2]) as u32,
+                );
                 json!([place.start, place.len()])
             }
             "value" => {
@@ -66,9 +78,14 @@ fn clamps() {
             }
             "path" => refused(clamps::path(text(&given[0]))),
             "elsewhere" => {
-                json!(WrongField::elsewhere(text(&given[0]), text(&given[1]), text(&given[2])).to_string())
+                json!(
+                    WrongField::elsewhere(text(&given[0]), text(&given[1]), text(&given[2]))
+                        .to_string()
+                )
             }
-            "no number" => json!(WrongField::no_number(text(&given[0]), text(&given[1])).to_string()),
+            "no number" => {
+                json!(WrongField::no_number(text(&given[0]), text(&given[1])).to_string())
+            }
             other => panic!("{other}"),
         })
     });

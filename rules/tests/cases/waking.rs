@@ -42,7 +42,8 @@ impl schedule::Ring for Shown {
 #[test]
 fn schedules() {
     replay("schedule", include_str!("../../cases/schedule.json"), |given| {
-        let (depth, hold) = (given["depth"].as_u64().unwrap_or(1), given["hold"].as_u64().unwrap_or(1));
+        let (depth, hold) =
+            (given["depth"].as_u64().unwrap_or(1), given["hold"].as_u64().unwrap_or(1));
         let ring = Ring::new(depth as usize, hold as usize, 0);
         let shown = Shown(Rc::new((ring.into(), Cell::new(0))));
         let mut schedule = match given["backlog"].as_str() {
@@ -59,7 +60,9 @@ fn schedules() {
                 ticks.map(|tick| json!([tick.at_ns, tick.missed])).collect()
             }
             "missed" => json!(schedule.missed()),
-            "arrive" => json!((0..whole(&given[0])).for_each(|_| shown.0.0.borrow_mut().push((), 0))),
+            "arrive" => {
+                json!((0..whole(&given[0])).for_each(|_| shown.0.0.borrow_mut().push((), 0)))
+            }
             "wakes" => std::iter::from_fn(|| schedule.next_event()).map(Value::from).collect(),
             "skipped" => json!(shown.0.1.get()),
             "finish" => json!(schedule.finish()),

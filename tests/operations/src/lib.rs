@@ -1,8 +1,11 @@
-//! What of the host a lambda can call: one line for each function and method of `wit/`, with what it costs.
+//! What of the host a lambda can call: one line for each function and method of `wit/`, with what
+//! it costs.
 //!
-//! Tests, the lambda `driver` and the fuzzer of calls go through this list, so that a call which is missing in one of them does
-//! not compile or fails. `tests/tests/house/wit.rs` holds it against `wit/`, `host/tests/library/host_calls.rs` holds the prices against what
-//! the host charges, and `host/tests/library/calls.rs` tries the deadlines. It names nothing of ours, since `driver` is a component.
+//! Tests, the lambda `driver` and the fuzzer of calls go through this list, so that a call which is
+//! missing in one of them does not compile or fails. `tests/tests/house/wit.rs` holds it against
+//! `wit/`, `host/tests/library/host_calls.rs` holds the prices against what the host charges, and
+//! `host/tests/library/calls.rs` tries the deadlines. It names nothing of ours, since `driver` is a
+//! component.
 
 mod list;
 mod step;
@@ -10,7 +13,8 @@ mod step;
 pub use list::Operation;
 pub use step::{Extra, Step};
 
-/// Bytes of the pixels of the picture that [`setup`] looks at: 64 by 48, rgb8. The coded one has as many.
+/// Bytes of the pixels of the picture that [`setup`] looks at: 64 by 48, rgb8. The coded one has as
+/// many.
 pub const PIXELS: u64 = 64 * 48 * 3;
 /// Bytes of the message that it stands in, as `gleaner_tests::drive::image` makes it.
 pub const MESSAGE: u64 = 44 + PIXELS;
@@ -36,8 +40,8 @@ pub struct Call {
 /// What an operation costs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Price {
-    /// A unit for each eight bytes that the host touches, beside what a call costs by itself: shown on a modest and on an
-    /// expensive call. Where both are alike, all calls are.
+    /// A unit for each eight bytes that the host touches, beside what a call costs by itself: shown
+    /// on a modest and on an expensive call. Where both are alike, all calls are.
     Bytes([Call; 2]),
     /// As [`Price::Bytes`], and the price of a further call, for making something.
     Made([Call; 2]),
@@ -60,8 +64,9 @@ impl Price {
     }
 }
 
-/// A program for `driver` with which calls begin: all topics, by number the program's, the raw camera's and the coded one's; of the
-/// raw one the seconds of its stamp and its width; the newest sample of both; the raw one as a frame; `b` in scratch.
+/// A program for `driver` with which calls begin: all topics, by number the program's, the raw
+/// camera's and the coded one's; of the raw one the seconds of its stamp and its width; the newest
+/// sample of both; the raw one as a frame; `b` in scratch.
 pub fn setup() -> Vec<u8> {
     use Operation::{AsFrame, Field, Input, Newest, ScratchPut};
     let steps = [

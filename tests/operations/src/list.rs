@@ -1,13 +1,16 @@
-//! The list. A further operation is a line here; then the compiler and the tests say what it needs elsewhere.
+//! The list. A further operation is a line here; then the compiler and the tests say what it needs
+//! elsewhere.
 
 use crate::Deadline::{self, Looked, Short};
 use crate::Price::{self, Bytes, Made, Never};
 use crate::{Call, MESSAGE, PIXELS};
 
-/// Each line: the name in Rust, the name in the WIT, how it meets the deadline, and what it costs after [`crate::setup`].
+/// Each line: the name in Rust, the name in the WIT, how it meets the deadline, and what it costs
+/// after [`crate::setup`].
 macro_rules! operations {
     ($($operation:ident $name:literal $deadline:ident $price:expr;)*) => {
-        /// A function or a method of the WIT. What others need comes first, so that small numbers find a way.
+        /// A function or a method of the WIT. What others need comes first, so that small numbers
+        /// find a way.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         #[allow(missing_docs)]
         pub enum Operation { $($operation),* }

@@ -11,7 +11,8 @@ pub enum Step {
     Extra(Extra),
 }
 
-/// What a program does besides calls: to what it was given, to its memory, and to the WASI that a library calls.
+/// What a program does besides calls: to what it was given, to its memory, and to the WASI that a
+/// library calls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Extra {

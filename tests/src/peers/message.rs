@@ -1,4 +1,5 @@
-//! The messages that peers send each other: what is in one follows from its number, so that every byte can be checked.
+//! The messages that peers send each other: what is in one follows from its number, so that every
+//! byte can be checked.
 //!
 //! The same formulas stand in `tests/peers/sum.h` and `tests/peers/python/peer.py`.
 
@@ -68,16 +69,28 @@ impl Type {
     pub fn message(self, n: u32) -> Message {
         use Piece::{Bytes, F64, Text, U8, U32};
         let time = |n: u32| [U32(1000 + n), U32(7 * n + 3)];
-        let bytes = |length: u32| Bytes((0..length).map(|at| (31 * u64::from(at) + 7 * u64::from(n)) as u8).collect());
+        let bytes = |length: u32| {
+            Bytes((0..length).map(|at| (31 * u64::from(at) + 7 * u64::from(n)) as u8).collect())
+        };
         let mut pieces = Vec::from(time(n));
         pieces.push(Text(format!("frame_{n}")));
         match self {
-            Self::Imu => pieces.extend((0..37).map(|k| F64(100.0 * f64::from(n) + f64::from(k) + 0.25))),
+            Self::Imu => {
+                pieces.extend((0..37).map(|k| F64(100.0 * f64::from(n) + f64::from(k) + 0.25)))
+            }
             Self::Image { width, height } => {
-                pieces.extend([U32(height), U32(width), Text("rgb8".to_owned()), U8(0), U32(3 * width)]);
+                pieces.extend([
+                    U32(height),
+                    U32(width),
+                    Text("rgb8".to_owned()),
+                    U8(0),
+                    U32(3 * width),
+                ]);
                 pieces.push(bytes(3 * width * height));
             }
-            Self::CompressedImage(length) => pieces.extend([Text("jpeg".to_owned()), bytes(length)]),
+            Self::CompressedImage(length) => {
+                pieces.extend([Text("jpeg".to_owned()), bytes(length)])
+            }
             Self::PointCloud2(length) => {
                 pieces.extend([U32(1), U32(length / 16), U32(4)]);
                 for (k, name) in ["x", "y", "z", "intensity"].into_iter().enumerate() {

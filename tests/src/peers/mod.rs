@@ -1,4 +1,5 @@
-//! Programs on other people's DDS: starting one, and hearing what it says. `cargo xtask peers` builds them.
+//! Programs on other people's DDS: starting one, and hearing what it says. `cargo xtask peers`
+//! builds them.
 
 pub mod message;
 
@@ -13,7 +14,8 @@ use serde::Deserialize;
 
 use message::Type;
 
-/// How long a peer may take for anything: far longer than it does, so that only one that hangs is caught.
+/// How long a peer may take for anything: far longer than it does, so that only one that hangs is
+/// caught.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Whose DDS it is.
@@ -77,7 +79,11 @@ pub struct Node {
 impl Kind {
     /// Why it cannot be started; `None` if it can.
     pub fn unavailable(self) -> Option<&'static str> {
-        if self.files().iter().all(|file| file.is_file()) { None } else { Some("no peers; run: cargo xtask peers") }
+        if self.files().iter().all(|file| file.is_file()) {
+            None
+        } else {
+            Some("no peers; run: cargo xtask peers")
+        }
     }
 
     fn files(self) -> Vec<PathBuf> {
@@ -88,7 +94,9 @@ impl Kind {
         match self {
             Self::Cyclone => vec![built("cyclone-peer")],
             Self::Fast => vec![built("fast-peer")],
-            Self::Python => vec![built("venv/bin/python3"), crate::root().join("tests/peers/python/peer.py")],
+            Self::Python => {
+                vec![built("venv/bin/python3"), crate::root().join("tests/peers/python/peer.py")]
+            }
             Self::Graph(bytes) => vec![built(&format!("cyclone-graph-{bytes}"))],
         }
     }
@@ -101,7 +109,8 @@ impl Kind {
         command
     }
 
-    /// The program, to write messages of a type on a topic. `options` are further ones, such as `--count 200`.
+    /// The program, to write messages of a type on a topic. `options` are further ones, such as
+    /// `--count 200`.
     pub fn publisher(self, ty: Type, topic: &str, options: &str) -> Command {
         let mut command = self.command();
         command.args(["pub", ty.short_name(), topic]).args(options.split_whitespace());
@@ -117,7 +126,9 @@ impl Kind {
     /// The program, to read messages of a type from a topic, without forgetting any.
     pub fn subscriber(self, ty: Type, topic: &str, options: &str) -> Command {
         let mut command = self.command();
-        command.args(["sub", ty.short_name(), topic, "--depth", "0"]).args(options.split_whitespace());
+        command
+            .args(["sub", ty.short_name(), topic, "--depth", "0"])
+            .args(options.split_whitespace());
         command
     }
 }
@@ -136,7 +147,8 @@ impl Peer {
     ///
     /// If the program is not there; see [`Kind::unavailable`].
     pub fn start(mut command: Command) -> Self {
-        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a peer starts");
+        let mut child =
+            command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a peer starts");
         let stdout = BufReader::new(child.stdout.take().expect("its output is a pipe"));
         let (say, said) = mpsc::channel();
         thread::spawn(move || {
@@ -157,7 +169,11 @@ impl Peer {
     /// # Errors
     ///
     /// In words, if it ends or is silent for too long.
-    pub fn wait<T>(&mut self, what: &str, wanted: impl FnMut(Said) -> Option<T>) -> Result<T, String> {
+    pub fn wait<T>(
+        &mut self,
+        what: &str,
+        wanted: impl FnMut(Said) -> Option<T>,
+    ) -> Result<T, String> {
         self.wait_for(PATIENCE, wanted).ok_or_else(|| {
             let state = self.child.try_wait().map(|ended| ended.map(|status| status.to_string()));
             format!("waiting for {what}: peer is silent; ended: {state:?}")
@@ -165,10 +181,15 @@ impl Peer {
     }
 
     /// What `wanted` makes of the next lines; `None` if none of them comes in time.
-    pub fn wait_for<T>(&mut self, patience: Duration, mut wanted: impl FnMut(Said) -> Option<T>) -> Option<T> {
+    pub fn wait_for<T>(
+        &mut self,
+        patience: Duration,
+        mut wanted: impl FnMut(Said) -> Option<T>,
+    ) -> Option<T> {
         let deadline = Instant::now() + patience;
         loop {
-            let said = self.said.recv_timeout(deadline.saturating_duration_since(Instant::now())).ok()?;
+            let said =
+                self.said.recv_timeout(deadline.saturating_duration_since(Instant::now())).ok()?;
             if let Some(found) = wanted(said) {
                 return Some(found);
             }
@@ -190,12 +211,16 @@ impl Peer {
     ///
     /// As [`wait`](Self::wait).
     pub fn matched(&mut self) -> Result<(), String> {
-        self.wait("a peer to be connected", |said| matches!(said, Said::Matched { count: 1.. }).then_some(()))
+        self.wait("a peer to be connected", |said| {
+            matches!(said, Said::Matched { count: 1.. }).then_some(())
+        })
     }
 
     /// How it ended, in words; `None` while it runs.
     pub fn ended(&mut self) -> Option<String> {
-        self.child.try_wait().map_or_else(|error| Some(error.to_string()), |ended| Some(ended?.to_string()))
+        self.child
+            .try_wait()
+            .map_or_else(|error| Some(error.to_string()), |ended| Some(ended?.to_string()))
     }
 
     /// Ends it at once, without its knowing.

@@ -1,4 +1,5 @@
-//! What a recorder counts live is in the summary of the run, and a vehicle's limits are the same for it and for the lambda.
+//! What a recorder counts live is in the summary of the run, and a vehicle's limits are the same
+//! for it and for the lambda.
 
 use std::fs;
 use std::path::Path;
@@ -13,22 +14,39 @@ use libtest_mimic::Failed;
 use crate::Case;
 
 pub const CASES: &[Case] = &[
-    Case { name: "what_a_full_disk_held_back_is_in_the_summary_and_in_the_report", needs: &[], run: held_back },
-    Case { name: "a_recorder_takes_a_lambda_that_its_vehicle_makes_smaller", needs: &[], run: on_a_vehicle },
+    Case {
+        name: "what_a_full_disk_held_back_is_in_the_summary_and_in_the_report",
+        needs: &[],
+        run: held_back,
+    },
+    Case {
+        name: "a_recorder_takes_a_lambda_that_its_vehicle_makes_smaller",
+        needs: &[],
+        run: on_a_vehicle,
+    },
 ];
 
 fn held_back() -> Result<(), Failed> {
     let out = Folder::new();
     let floor = u64::MAX.to_string();
-    let (last, summary) = recorded(out.path(), "", &["--disk-floor", &floor], |status| status.recording.held_back > 2)?;
+    let (last, summary) = recorded(out.path(), "", &["--disk-floor", &floor], |status| {
+        status.recording.held_back > 2
+    })?;
     // The lambda went on until it was stopped.
     if summary.recording.held_back < last.recording.held_back {
         return Err(format!("{:?}, and before {:?}", summary.recording, last.recording).into());
     }
     let reported = Command::new(program("gleaner")).arg("report").arg(out.path()).output()?;
     let page = fs::read_to_string(out.path().join("report.html"))?;
-    let row = format!(r#"["triggers without a window: the disk was too full",{}]"#, summary.recording.held_back);
-    if page.contains(&row) { Ok(()) } else { Err(format!("no `{row}` on the page: {reported:?}").into()) }
+    let row = format!(
+        r#"["triggers without a window: the disk was too full",{}]"#,
+        summary.recording.held_back
+    );
+    if page.contains(&row) {
+        Ok(())
+    } else {
+        Err(format!("no `{row}` on the page: {reported:?}").into())
+    }
 }
 
 fn on_a_vehicle() -> Result<(), Failed> {
@@ -37,8 +55,9 @@ fn on_a_vehicle() -> Result<(), Failed> {
     let vehicle = vehicle.to_str().ok_or("a plain path")?;
     let results = out.path().join("live");
     let cooldown = "cooldown = \"1h\"\n";
-    let (_, summary) =
-        recorded(&results, cooldown, &["--vehicle", vehicle], |status| status.recording.in_cooldown > 2)?;
+    let (_, summary) = recorded(&results, cooldown, &["--vehicle", vehicle], |status| {
+        status.recording.in_cooldown > 2
+    })?;
     let counts = summary.recording;
     match (counts.windows, counts.lambdas_refused, counts.in_cooldown) {
         (1, 0, 3..) => Ok(()),
@@ -46,8 +65,8 @@ fn on_a_vehicle() -> Result<(), Failed> {
     }
 }
 
-/// Runs a lambda that triggers ten times a second until its recorder reports what is `wanted`; what it reported then, and what the summary
-/// says of the recorder.
+/// Runs a lambda that triggers ten times a second until its recorder reports what is `wanted`; what
+/// it reported then, and what the summary says of the recorder.
 fn recorded(
     out: &Path,
     record: &str,
@@ -64,6 +83,7 @@ fn recorded(
     started.signal("INT");
     let finished = started.finish();
     let summary: Live = serde_json::from_slice(&fs::read(out.join("summary.json"))?)?;
-    let of_recorder = summary.recording.ok_or_else(|| format!("no counts of the recorder: {}", finished.said))?;
+    let of_recorder =
+        summary.recording.ok_or_else(|| format!("no counts of the recorder: {}", finished.said))?;
     Ok((last, *of_recorder))
 }

@@ -16,17 +16,49 @@ const FAST: &[Need] = &[Need::Peer(Kind::Fast)];
 pub const CASES: &[Case] = &[
     Case { name: "an_imu_of_cyclone_arrives_whole", needs: CYCLONE, run: || imu(Kind::Cyclone) },
     Case { name: "an_imu_of_fast_dds_arrives_whole", needs: FAST, run: || imu(Kind::Fast) },
-    Case { name: "an_imu_of_python_arrives_whole", needs: &[Need::Peer(Kind::Python)], run: || imu(Kind::Python) },
-    Case { name: "images_of_cyclone_in_1080p_arrive_whole", needs: CYCLONE, run: || images(Kind::Cyclone) },
-    Case { name: "images_of_fast_dds_in_1080p_arrive_whole", needs: FAST, run: || images(Kind::Fast) },
-    Case { name: "compressed_images_of_cyclone_arrive_whole", needs: CYCLONE, run: || compressed(Kind::Cyclone) },
-    Case { name: "compressed_images_of_fast_dds_arrive_whole", needs: FAST, run: || compressed(Kind::Fast) },
-    Case { name: "point_clouds_of_cyclone_arrive_whole", needs: CYCLONE, run: || clouds(Kind::Cyclone) },
+    Case {
+        name: "an_imu_of_python_arrives_whole",
+        needs: &[Need::Peer(Kind::Python)],
+        run: || imu(Kind::Python),
+    },
+    Case {
+        name: "images_of_cyclone_in_1080p_arrive_whole",
+        needs: CYCLONE,
+        run: || images(Kind::Cyclone),
+    },
+    Case {
+        name: "images_of_fast_dds_in_1080p_arrive_whole",
+        needs: FAST,
+        run: || images(Kind::Fast),
+    },
+    Case {
+        name: "compressed_images_of_cyclone_arrive_whole",
+        needs: CYCLONE,
+        run: || compressed(Kind::Cyclone),
+    },
+    Case {
+        name: "compressed_images_of_fast_dds_arrive_whole",
+        needs: FAST,
+        run: || compressed(Kind::Fast),
+    },
+    Case {
+        name: "point_clouds_of_cyclone_arrive_whole",
+        needs: CYCLONE,
+        run: || clouds(Kind::Cyclone),
+    },
     Case { name: "point_clouds_of_fast_dds_arrive_whole", needs: FAST, run: || clouds(Kind::Fast) },
     Case { name: "a_best_effort_writer_is_heard", needs: CYCLONE, run: best_effort },
-    Case { name: "what_a_transient_local_writer_wrote_before_is_heard", needs: CYCLONE, run: transient_local },
+    Case {
+        name: "what_a_transient_local_writer_wrote_before_is_heard",
+        needs: CYCLONE,
+        run: transient_local,
+    },
     Case { name: "writers_with_different_offers_are_both_heard", needs: CYCLONE, run: mixed },
-    Case { name: "a_publisher_that_is_killed_and_started_again_is_heard_again", needs: CYCLONE, run: restarts },
+    Case {
+        name: "a_publisher_that_is_killed_and_started_again_is_heard_again",
+        needs: CYCLONE,
+        run: restarts,
+    },
 ];
 
 fn imu(kind: Kind) -> Result<(), Failed> {
@@ -48,7 +80,8 @@ fn clouds(kind: Kind) -> Result<(), Failed> {
 fn whole(kind: Kind, ty: Type, count: u32, rate_hz: u32) -> Result<(), Failed> {
     let mut dds = join(None)?;
     let heard = Heard::on(&mut dds, ty, "/sensor", Qos::Auto)?;
-    let _peer = Peer::start(kind.publisher(ty, "/sensor", &format!("--count {count} --rate {rate_hz}")));
+    let _peer =
+        Peer::start(kind.publisher(ty, "/sensor", &format!("--count {count} --rate {rate_hz}")));
     heard.all(&dds, count)
 }
 
@@ -75,13 +108,23 @@ fn mixed() -> Result<(), Failed> {
     let mut dds = join(None)?;
     let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
     let start = |offer: &str| {
-        Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", &format!("--count 0 --rate 50 {offer}")))
+        Peer::start(Kind::Cyclone.publisher(
+            Type::Imu,
+            "/sensor",
+            &format!("--count 0 --rate 50 {offer}"),
+        ))
     };
     let _first = start("--reliability reliable --durability transient_local");
     drop(heard.wait("the first writer", |samples| samples.len() >= 10)?);
     let _second = start("--reliability best_effort");
     let writers_of = |samples: &[Sample]| {
-        samples.iter().rev().take(20).map(|sample| sample.meta.writer).collect::<BTreeSet<_>>().len()
+        samples
+            .iter()
+            .rev()
+            .take(20)
+            .map(|sample| sample.meta.writer)
+            .collect::<BTreeSet<_>>()
+            .len()
     };
     heard.wait("both writers at once", |samples| writers_of(samples) == 2).map(drop)
 }
@@ -92,7 +135,8 @@ fn restarts() -> Result<(), Failed> {
     let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
     let mut known = BTreeSet::new();
     for time in 0..times {
-        let peer = Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", "--count 0 --rate 200"));
+        let peer =
+            Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", "--count 0 --rate 200"));
         let before = heard.count();
         // Of a writer that is new, so that a late message of the last one does not count.
         let fresh = |sample: &Sample, known: &BTreeSet<_>| !known.contains(&sample.meta.writer);

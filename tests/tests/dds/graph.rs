@@ -13,8 +13,16 @@ const NEED_24: &[Need] = &[Need::Peer(Kind::Graph(24))];
 const NEED_16: &[Need] = &[Need::Peer(Kind::Graph(16))];
 
 pub const CASES: &[Case] = &[
-    Case { name: "a_node_of_humble_sees_ours", needs: NEED_24, run: || seen(24, Some(Distro::Humble)) },
-    Case { name: "a_node_of_jazzy_sees_ours", needs: NEED_16, run: || seen(16, Some(Distro::Newer)) },
+    Case {
+        name: "a_node_of_humble_sees_ours",
+        needs: NEED_24,
+        run: || seen(24, Some(Distro::Humble)),
+    },
+    Case {
+        name: "a_node_of_jazzy_sees_ours",
+        needs: NEED_16,
+        run: || seen(16, Some(Distro::Newer)),
+    },
     Case { name: "that_others_are_of_humble_is_found_out", needs: NEED_24, run: || seen(24, None) },
     Case { name: "that_others_are_of_jazzy_is_found_out", needs: NEED_16, run: || seen(16, None) },
 ];
@@ -36,7 +44,8 @@ fn seen(gid_bytes: usize, distro: Option<Distro>) -> Result<(), Failed> {
     if (node.namespace.as_str(), node.name.as_str()) != ("/gleaner", "tests") {
         return Err(format!("our node is called {node:?}").into());
     }
-    // The first twelve bytes are the participant's, the same in all; what a Gid has more than sixteen is zeros.
+    // The first twelve bytes are the participant's, the same in all; what a Gid has more than
+    // sixteen is zeros.
     for other in node.readers.iter().chain(&node.writers).chain([&gid]) {
         let zeros = other.get(32..).is_some_and(|rest| rest.bytes().all(|digit| digit == b'0'));
         if other.len() != 2 * gid_bytes || other[..24] != gid[..24] || !zeros {

@@ -1,8 +1,8 @@
-//! Live topics with programs on other people's DDS: what they write arrives whole, what we write arrives there, and neither
-//! restarts, losses nor hostile packets keep it from doing so.
+//! Live topics with programs on other people's DDS: what they write arrives whole, what we write
+//! arrives there, and neither restarts, losses nor hostile packets keep it from doing so.
 //!
-//! Each case is this program once more, in a network of its own (`gleaner_tests::namespace`). `GLEANER_RESTARTS` says how often a
-//! publisher is killed; 5 times if it does not.
+//! Each case is this program once more, in a network of its own (`gleaner_tests::namespace`).
+//! `GLEANER_RESTARTS` says how often a publisher is killed; 5 times if it does not.
 
 mod counted;
 mod faults;
@@ -40,10 +40,19 @@ struct Case {
 const CASE: &str = "GLEANER_DDS_CASE";
 
 fn main() -> ExitCode {
-    let suites = [from_peers::CASES, to_peers::CASES, graph::CASES, faults::CASES, together::CASES, counted::CASES];
+    let suites = [
+        from_peers::CASES,
+        to_peers::CASES,
+        graph::CASES,
+        faults::CASES,
+        together::CASES,
+        counted::CASES,
+    ];
     let cases = || suites.into_iter().flatten();
     if let Ok(name) = std::env::var(CASE) {
-        let case = cases().find(|case| case.name == name).expect("this program gives itself the names of its cases");
+        let case = cases()
+            .find(|case| case.name == name)
+            .expect("this program gives itself the names of its cases");
         return match (case.run)() {
             Ok(()) => ExitCode::SUCCESS,
             Err(failed) => {
@@ -65,13 +74,14 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
 }
 
-/// Runs a case in a process of its own; one that moves images or point clouds while no other runs: two of them at the same time would
-/// show how small this machine is.
+/// Runs a case in a process of its own; one that moves images or point clouds while no other runs:
+/// two of them at the same time would show how small this machine is.
 fn run(case: &Case) -> Result<(), Failed> {
     static RUNNING: RwLock<()> = RwLock::new(());
     let is_large = ["images", "point_clouds"].iter().any(|large| case.name.contains(large));
     let _alone = is_large.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
-    let _beside_others = (!is_large).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
+    let _beside_others =
+        (!is_large).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
     namespace::case(CASE, case.name)
 }
 
@@ -85,6 +95,7 @@ fn unavailable(case: &Case) -> Option<&'static str> {
 
 fn can_filter() -> bool {
     let mut probe = namespace::command("nft".as_ref());
-    let probe = probe.args(["add", "table", "inet", "probe"]).stdin(Stdio::null()).stderr(Stdio::null());
+    let probe =
+        probe.args(["add", "table", "inet", "probe"]).stdin(Stdio::null()).stderr(Stdio::null());
     probe.status().is_ok_and(|status| status.success())
 }

@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 use gleaner_dds::{Dds, Distro, Options};
 use gleaner_tests::peers::PATIENCE;
 use gleaner_tests::peers::message::Type;
-use gleaner_transport::{Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
+use gleaner_transport::{
+    Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict,
+};
 use libtest_mimic::Failed;
 
 /// The largest message here: an image of 1080p.
@@ -66,10 +68,13 @@ impl Heard {
         let deadline = Instant::now() + PATIENCE;
         while !enough(&samples) {
             if Instant::now() > deadline {
-                return Err(format!("waited for {what}; {} samples were heard", samples.len()).into());
+                return Err(
+                    format!("waited for {what}; {} samples were heard", samples.len()).into()
+                );
             }
             // Asked again now and then: that something was lost comes without a sample.
-            samples = self.memory.arrived.wait_timeout(samples, Duration::from_millis(100)).unwrap().0;
+            samples =
+                self.memory.arrived.wait_timeout(samples, Duration::from_millis(100)).unwrap().0;
         }
         Ok(samples)
     }
@@ -79,7 +84,8 @@ impl Heard {
         self.memory.samples.lock().unwrap().len()
     }
 
-    /// Waits for messages 1 to `count` of one writer: each once, in order, every byte as it should be, none counted as lost.
+    /// Waits for messages 1 to `count` of one writer: each once, in order, every byte as it should
+    /// be, none counted as lost.
     pub fn all(&self, dds: &Dds, count: u32) -> Result<(), Failed> {
         let samples = self.wait("all messages", |samples| samples.len() >= count as usize)?;
         if samples.len() > count as usize {
@@ -100,7 +106,11 @@ impl Heard {
     }
 
     /// Checks that `samples` are messages from `first` on, of one writer, without a gap.
-    pub fn in_order<'s>(&self, samples: impl IntoIterator<Item = &'s Sample>, first: u32) -> Result<(), Failed> {
+    pub fn in_order<'s>(
+        &self,
+        samples: impl IntoIterator<Item = &'s Sample>,
+        first: u32,
+    ) -> Result<(), Failed> {
         let mut before: Option<(Guid, u64)> = None;
         for (n, Sample { meta, cdr }) in (first..).zip(samples) {
             if let Some(how) = self.ty.message(n).differs(cdr, meta.endian) {

@@ -1,4 +1,5 @@
-//! Packets of RTPS, sound and broken, made by hand. Source: OMG DDSI-RTPS 2.3, sections 8.3.7 and 9.4.5.
+//! Packets of RTPS, sound and broken, made by hand. Source: OMG DDSI-RTPS 2.3, sections 8.3.7 and
+//! 9.4.5.
 
 /// The four bytes that name an endpoint within a participant.
 pub type Entity = [u8; 4];
@@ -45,11 +46,17 @@ pub fn data(reader: Entity, writer: Entity, seq: u64, payload: &[u8]) -> Vec<u8>
 
 /// The first fragment of a sample that claims to have `size` bytes.
 pub fn data_frag(reader: Entity, writer: Entity, seq: u64, size: u32, payload: &[u8]) -> Vec<u8> {
-    let counts = [1_u32.to_le_bytes().as_slice(), &[1, 0], &(payload.len() as u16).to_le_bytes()].concat();
-    submessage(DATA_FRAG, 0, &[&[0, 0, 28, 0], &reader, &writer, &number(seq), &counts, &word(size), payload])
+    let counts =
+        [1_u32.to_le_bytes().as_slice(), &[1, 0], &(payload.len() as u16).to_le_bytes()].concat();
+    submessage(
+        DATA_FRAG,
+        0,
+        &[&[0, 0, 28, 0], &reader, &writer, &number(seq), &counts, &word(size), payload],
+    )
 }
 
-/// One packet of each kind that there is, as the writer `writer` of the participant `prefix` could send it.
+/// One packet of each kind that there is, as the writer `writer` of the participant `prefix` could
+/// send it.
 pub fn sound(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8>> {
     let sample = [&[0, 1, 0, 0][..], cdr].concat();
     // A list of parameters: PID_TOPIC_NAME with four characters, then the end.
@@ -66,11 +73,20 @@ pub fn sound(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8>> {
         one(data_frag(SPDP_READER, writer, 2_000, 4_096, &sample)),
         // HEARTBEAT, GAP, ACKNACK, NACK_FRAG, HEARTBEAT_FRAG.
         one(submessage(0x07, 0, &[&ANY, &writer, &number(1), &number(3_000), &word(9)])),
-        one(submessage(0x08, 0, &[&ANY, &writer, &number(1), &number(40), &word(32), &word(u32::MAX)])),
+        one(submessage(
+            0x08,
+            0,
+            &[&ANY, &writer, &number(1), &number(40), &word(32), &word(u32::MAX)],
+        )),
         one(submessage(0x06, 0, &[&writer, &ANY, &number(1), &word(256), &[0xff; 32], &word(7)])),
-        one(submessage(0x12, 0, &[&writer, &ANY, &number(1), &word(1), &word(256), &[0xff; 32], &word(7)])),
+        one(submessage(
+            0x12,
+            0,
+            &[&writer, &ANY, &number(1), &word(1), &word(256), &[0xff; 32], &word(7)],
+        )),
         one(submessage(0x13, 0, &[&ANY, &writer, &number(1), &word(900), &word(7)])),
-        // INFO_SRC, INFO_DST, INFO_REPLY with more locators than the packet has, PAD, one that nobody knows.
+        // INFO_SRC, INFO_DST, INFO_REPLY with more locators than the packet has, PAD, one that
+        // nobody knows.
         one(submessage(0x0c, 0, &[&word(0), &[2, 3, 1, 16], &[0xaa; 12]])),
         one(submessage(0x0e, 0, &[&[0xaa; 12]])),
         one(submessage(0x0f, 0, &[&word(0x0fff_ffff), &[0; 24]])),
@@ -97,7 +113,8 @@ impl Random {
     }
 }
 
-/// Breaks a packet in one of several ways, behind the first four bytes: without those nobody reads further.
+/// Breaks a packet in one of several ways, behind the first four bytes: without those nobody reads
+/// further.
 pub fn broken(packet: &[u8], random: &mut Random) -> Vec<u8> {
     const EXTREMES: [u32; 5] = [0, 1, 0x7fff_ffff, 0x8000_0000, u32::MAX];
     let mut packet = packet.to_vec();
@@ -121,7 +138,8 @@ pub fn broken(packet: &[u8], random: &mut Random) -> Vec<u8> {
                 packet[at..at + 4].copy_from_slice(&word(EXTREMES[random.below(EXTREMES.len())]));
             }
         }
-        _ => packet.extend((0..=random.below(200)).map(|_| random.below(256) as u8).collect::<Vec<_>>()),
+        _ => packet
+            .extend((0..=random.below(200)).map(|_| random.below(256) as u8).collect::<Vec<_>>()),
     }
     packet
 }
@@ -132,7 +150,11 @@ fn starts(packet: &[u8]) -> Vec<usize> {
     while let Some([_, flags, length @ ..]) = packet.get(at..at + 4) {
         starts.push(at);
         let length = [length[0], length[1]];
-        let length = if flags & LITTLE == 0 { u16::from_be_bytes(length) } else { u16::from_le_bytes(length) };
+        let length = if flags & LITTLE == 0 {
+            u16::from_be_bytes(length)
+        } else {
+            u16::from_le_bytes(length)
+        };
         at += 4 + usize::from(length);
     }
     starts

@@ -19,19 +19,43 @@ const COMPRESSED: Type = Type::CompressedImage(5_000);
 const CLOUD: Type = Type::PointCloud2(4_096);
 
 pub const CASES: &[Case] = &[
-    Case { name: "cyclone_hears_our_imu", needs: CYCLONE, run: || heard_by(Kind::Cyclone, Type::Imu) },
+    Case {
+        name: "cyclone_hears_our_imu",
+        needs: CYCLONE,
+        run: || heard_by(Kind::Cyclone, Type::Imu),
+    },
     Case {
         name: "cyclone_hears_our_time_reference",
         needs: CYCLONE,
         run: || heard_by(Kind::Cyclone, Type::TimeReference),
     },
-    Case { name: "cyclone_hears_our_images", needs: CYCLONE, run: || heard_by(Kind::Cyclone, IMAGE) },
-    Case { name: "cyclone_hears_our_compressed_images", needs: CYCLONE, run: || heard_by(Kind::Cyclone, COMPRESSED) },
-    Case { name: "cyclone_hears_our_point_clouds", needs: CYCLONE, run: || heard_by(Kind::Cyclone, CLOUD) },
+    Case {
+        name: "cyclone_hears_our_images",
+        needs: CYCLONE,
+        run: || heard_by(Kind::Cyclone, IMAGE),
+    },
+    Case {
+        name: "cyclone_hears_our_compressed_images",
+        needs: CYCLONE,
+        run: || heard_by(Kind::Cyclone, COMPRESSED),
+    },
+    Case {
+        name: "cyclone_hears_our_point_clouds",
+        needs: CYCLONE,
+        run: || heard_by(Kind::Cyclone, CLOUD),
+    },
     Case { name: "fast_dds_hears_our_imu", needs: FAST, run: || heard_by(Kind::Fast, Type::Imu) },
     Case { name: "fast_dds_hears_our_images", needs: FAST, run: || heard_by(Kind::Fast, IMAGE) },
-    Case { name: "fast_dds_hears_our_compressed_images", needs: FAST, run: || heard_by(Kind::Fast, COMPRESSED) },
-    Case { name: "fast_dds_hears_our_point_clouds", needs: FAST, run: || heard_by(Kind::Fast, CLOUD) },
+    Case {
+        name: "fast_dds_hears_our_compressed_images",
+        needs: FAST,
+        run: || heard_by(Kind::Fast, COMPRESSED),
+    },
+    Case {
+        name: "fast_dds_hears_our_point_clouds",
+        needs: FAST,
+        run: || heard_by(Kind::Fast, CLOUD),
+    },
     Case {
         name: "python_hears_our_imu",
         needs: &[Need::Peer(Kind::Python)],
@@ -55,8 +79,9 @@ fn heard_by(kind: Kind, ty: Type) -> Result<(), Failed> {
         }
         thread::sleep(Duration::from_millis(5));
     }
-    // Both sides know of each other, but a reader of Cyclone takes nothing of a writer before its first heartbeat, and what is
-    // volatile does not come again. So there are some before those that count.
+    // Both sides know of each other, but a reader of Cyclone takes nothing of a writer before its
+    // first heartbeat, and what is volatile does not come again. So there are some before those
+    // that count.
     let mut before = FIRST_BEFORE;
     let heard = |said| matches!(said, Said::Sample { .. }).then_some(());
     loop {

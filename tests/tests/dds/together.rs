@@ -1,4 +1,5 @@
-//! Several of our participants read one topic: its writer keeps running, and each of them receives samples.
+//! Several of our participants read one topic: its writer keeps running, and each of them receives
+//! samples.
 
 use gleaner_dds::Dds;
 use gleaner_tests::live::run;
@@ -23,14 +24,19 @@ pub const CASES: &[Case] = &[
         needs: &[Need::Peer(Kind::Cyclone)],
         run: || outlived(Kind::Cyclone),
     },
-    Case { name: "no_multicast_address_is_announced_for_samples", needs: &[], run: || announced(|| join(None)) },
+    Case {
+        name: "no_multicast_address_is_announced_for_samples",
+        needs: &[],
+        run: || announced(|| join(None)),
+    },
     Case {
         name: "no_multicast_address_is_announced_by_a_python_lambda",
         needs: &[],
         run: || {
             let out = Folder::new();
             announced(|| {
-                let lambda = run(&root().join("tests/lambdas/ticker/python"), out.path(), &["--no-record"]);
+                let lambda =
+                    run(&root().join("tests/lambdas/ticker/python"), out.path(), &["--no-record"]);
                 lambda.until_ready();
                 Ok(lambda)
             })
@@ -84,7 +90,8 @@ fn receives(writer: &mut Peer, heard: &[Heard]) -> Result<(), Failed> {
     Ok(())
 }
 
-/// Looks at what the one participant in this network announces, which lives as long as the result of `start`.
+/// Looks at what the one participant in this network announces, which lives as long as the result
+/// of `start`.
 fn announced<T>(start: impl FnOnce() -> Result<T, Failed>) -> Result<(), Failed> {
     let _participant = start()?;
     let packet = announcement(&udp_ports()?)?;
@@ -95,8 +102,9 @@ fn announced<T>(start: impl FnOnce() -> Result<T, Failed>) -> Result<(), Failed>
     };
     match (announces(METATRAFFIC_MULTICAST_LOCATOR), announces(DEFAULT_MULTICAST_LOCATOR)) {
         (true, false) => Ok(()),
-        (discovery, samples) => {
-            Err(format!("multicast is announced for discovery: {discovery}, for samples: {samples}").into())
-        }
+        (discovery, samples) => Err(format!(
+            "multicast is announced for discovery: {discovery}, for samples: {samples}"
+        )
+        .into()),
     }
 }

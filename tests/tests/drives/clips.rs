@@ -16,24 +16,34 @@ pub fn trials() -> Vec<Trial> {
     let mut trials = vec![
         Trial::test("two_triggers_4_s_apart_give_one_clip", || windows("10,14", &[(5.0, 19.0, 2)])),
         Trial::test("two_triggers_8_s_apart_overlap_too", || windows("10,18", &[(5.0, 23.0, 2)])),
-        Trial::test("two_triggers_11_s_apart_give_two_clips", || windows("10,21", &[(5.0, 15.0, 1), (16.0, 26.0, 1)])),
+        Trial::test("two_triggers_11_s_apart_give_two_clips", || {
+            windows("10,21", &[(5.0, 15.0, 1), (16.0, 26.0, 1)])
+        }),
         Trial::test("a_start_lasts_until_its_stop", starts_and_stops),
         Trial::test("a_window_that_outlasts_the_drive_is_short_and_says_so", at_the_end),
         Trial::test("a_preroll_from_before_the_drive_is_short_and_says_so", at_the_begin),
         Trial::test("a_long_recording_goes_on_in_a_next_clip_without_a_gap", rolls_over),
         Trial::test("what_the_preroll_has_no_room_for_is_counted_and_said", pushed_out),
         Trial::test("a_preroll_on_disk_gives_the_same_clips", on_disk),
-        Trial::test("a_topic_that_the_drive_does_not_have_is_listed_with_no_message", missing_topic),
+        Trial::test(
+            "a_topic_that_the_drive_does_not_have_is_listed_with_no_message",
+            missing_topic,
+        ),
         Trial::test("a_second_replay_replaces_the_clips_of_the_first", replaced),
         Trial::test("a_clip_that_somebody_copied_there_is_left_alone", copied),
         Trial::test("without_record_there_are_no_clips", no_record),
         Trial::test("two_topics_that_are_one_of_the_drive_are_recorded_once", one_of_two),
         Trial::test("where_a_drive_is_damaged_its_clip_ends_short", damaged),
-        Trial::test("a_lambda_that_does_not_start_leaves_every_earlier_result_as_it_was", not_started),
+        Trial::test(
+            "a_lambda_that_does_not_start_leaves_every_earlier_result_as_it_was",
+            not_started,
+        ),
         Trial::test("a_second_replay_at_once_is_refused_without_clips_too", busy_without_clips),
         Trial::test("a_second_replay_at_once_does_not_touch_the_results_of_the_first", busy),
     ];
-    let mut read = |name: &'static str, drive: Result<PathBuf, String>, args: &'static [&'static str]| {
+    let mut read = |name: &'static str,
+                    drive: Result<PathBuf, String>,
+                    args: &'static [&'static str]| {
         trials.push(match drive.and_then(|drive| python().map(|python| (drive, python))) {
             Ok((drive, python)) => Trial::test(name, move || reads(&python, &drive, args)),
             Err(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
@@ -59,7 +69,8 @@ fn python() -> Result<PathBuf, String> {
     if has.is_ok_and(|output| output.status.success()) {
         return Ok(python);
     }
-    Err("no Python with mcap, mcap-ros2-support and rosbags in .venv; run: cargo xtask test".to_owned())
+    Err("no Python with mcap, mcap-ros2-support and rosbags in .venv; run: cargo xtask test"
+        .to_owned())
 }
 
 fn alarm() -> PathBuf {
@@ -69,7 +80,11 @@ fn alarm() -> PathBuf {
 fn record(lambda: &Path, drive: &Path, args: &[&str]) -> Result<(Folder, Run), Failed> {
     let out = Folder::new();
     let run = replay_to(out.path(), lambda, &[drive.to_owned()], args);
-    if run.exit == 0 { Ok((out, run)) } else { Err(format!("exit {}: {}", run.exit, run.stderr).into()) }
+    if run.exit == 0 {
+        Ok((out, run))
+    } else {
+        Err(format!("exit {}: {}", run.exit, run.stderr).into())
+    }
 }
 
 fn seconds(run: &Run, at_ns: i64) -> f64 {
@@ -78,34 +93,46 @@ fn seconds(run: &Run, at_ns: i64) -> f64 {
 }
 
 fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), Failed> {
-    if found == expected { Ok(()) } else { Err(format!("found {found:?}, expected {expected:?}").into()) }
+    if found == expected {
+        Ok(())
+    } else {
+        Err(format!("found {found:?}, expected {expected:?}").into())
+    }
 }
 
 /// Events at `event_s` give clips from, to and of so many triggers.
 fn windows(event_s: &str, expected: &[(f64, f64, u64)]) -> Result<(), Failed> {
     let (out, run) = record(&alarm(), &sample_drive(), &["--set", &format!("event_s={event_s}")])?;
     let tenths = |clip: &Clip| {
-        let [from, to] = [clip.from_ns, clip.to_ns].map(|at_ns| (seconds(&run, at_ns) * 10.0).round() / 10.0);
+        let [from, to] =
+            [clip.from_ns, clip.to_ns].map(|at_ns| (seconds(&run, at_ns) * 10.0).round() / 10.0);
         (from, to, clip.triggers)
     };
     same(&run.clips.iter().map(tenths).collect(), &expected.to_vec())?;
     run.clips.iter().try_for_each(|clip| whole(out.path(), clip, clip.from_ns, clip.to_ns))
 }
 
-/// The clip is there with its thumbnail, and holds as many messages of each topic as the drive has in its window.
+/// The clip is there with its thumbnail, and holds as many messages of each topic as the drive has
+/// in its window.
 fn whole(out: &Path, clip: &Clip, from_ns: i64, to_ns: i64) -> Result<(), Failed> {
     let thumbnail = clip.thumbnail.as_ref().ok_or("no thumbnail")?;
     same(&std::fs::read(out.join(thumbnail))?.starts_with(&[0xff, 0xd8]), &true)?;
     same(&std::fs::metadata(out.join(&clip.file))?.len(), &clip.bytes)?;
     let (drive, found) = (messages(&sample_drive())?, messages(&out.join(&clip.file))?);
-    let wanted = drive.into_iter().filter(|message| (from_ns..=to_ns).contains(&message.1)).collect::<Vec<_>>();
+    let wanted = drive
+        .into_iter()
+        .filter(|message| (from_ns..=to_ns).contains(&message.1))
+        .collect::<Vec<_>>();
     same(&found.len(), &wanted.len())?;
     if found != wanted {
         return Err("the messages differ".into());
     }
     for topic in &clip.topics {
         let n = found.iter().filter(|message| message.0 == topic.topic).count() as u64;
-        same(&(topic.messages, topic.received, topic.overwritten, topic.too_big), &(n, Some(n), Some(0), Some(0)))?;
+        same(
+            &(topic.messages, topic.received, topic.overwritten, topic.too_big),
+            &(n, Some(n), Some(0), Some(0)),
+        )?;
         same(&topic.lost, &None)?;
     }
     Ok(())
@@ -120,14 +147,20 @@ fn messages(path: &Path) -> Result<Vec<Message>, Failed> {
     let mut all = Vec::new();
     for message in mcap::MessageStream::new(&bytes)? {
         let message = message?;
-        all.push((message.channel.topic.clone(), message.log_time as i64, message.publish_time, message.data.to_vec()));
+        all.push((
+            message.channel.topic.clone(),
+            message.log_time as i64,
+            message.publish_time,
+            message.data.to_vec(),
+        ));
     }
     all.sort();
     Ok(all)
 }
 
 fn starts_and_stops() -> Result<(), Failed> {
-    let (out, run) = record(&alarm(), &sample_drive(), &["--set", "start_s=12", "--set", "stop_s=20"])?;
+    let (out, run) =
+        record(&alarm(), &sample_drive(), &["--set", "start_s=12", "--set", "stop_s=20"])?;
     same(&run.clips.len(), &1)?;
     let clip = &run.clips[0];
     same(&[clip.from_ns, clip.to_ns].map(|at_ns| seconds(&run, at_ns).round()), &[7.0, 25.0])?;
@@ -136,7 +169,8 @@ fn starts_and_stops() -> Result<(), Failed> {
 }
 
 fn at_the_end() -> Result<(), Failed> {
-    let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=38", "--set", "start_s=20"])?;
+    let (out, run) =
+        record(&alarm(), &sample_drive(), &["--set", "event_s=38", "--set", "start_s=20"])?;
     same(&run.clips.len(), &1)?;
     let clip = &run.clips[0];
     same(&clip.short.iter().any(|why| why.contains("the drive ended")), &true)?;
@@ -152,9 +186,11 @@ fn at_the_begin() -> Result<(), Failed> {
 }
 
 fn rolls_over() -> Result<(), Failed> {
-    let lambda =
-        Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("[record]", "[record]\nmax_length = \"7s\""));
-    let (out, run) = record(lambda.path(), &sample_drive(), &["--set", "start_s=10", "--set", "stop_s=30"])?;
+    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+        manifest.replace("[record]", "[record]\nmax_length = \"7s\"")
+    });
+    let (out, run) =
+        record(lambda.path(), &sample_drive(), &["--set", "start_s=10", "--set", "stop_s=30"])?;
     same(&(run.clips.len() >= 4), &true)?;
     let (first, last) = (&run.clips[0], &run.clips[run.clips.len() - 1]);
     let mut found = Vec::new();
@@ -164,7 +200,9 @@ fn rolls_over() -> Result<(), Failed> {
     }
     found.sort();
     let drive = messages(&sample_drive())?.into_iter();
-    let wanted = drive.filter(|message| (first.from_ns..=last.to_ns).contains(&message.1)).collect::<Vec<_>>();
+    let wanted = drive
+        .filter(|message| (first.from_ns..=last.to_ns).contains(&message.1))
+        .collect::<Vec<_>>();
     same(&(found == wanted, found.len()), &(true, wanted.len()))?;
     same(&first.short.iter().any(|why| why.contains("next clip")), &true)
 }
@@ -180,9 +218,9 @@ fn pushed_out() -> Result<(), Failed> {
     let clip = &run.clips[0];
     let drive = messages(&sample_drive())?;
     for topic in &clip.topics {
-        let wanted = drive
-            .iter()
-            .filter(|(name, at_ns, ..)| *name == topic.topic && (clip.from_ns..=clip.to_ns).contains(at_ns));
+        let wanted = drive.iter().filter(|(name, at_ns, ..)| {
+            *name == topic.topic && (clip.from_ns..=clip.to_ns).contains(at_ns)
+        });
         let wanted = wanted.count() as u64;
         same(&(topic.messages < wanted, topic.received), &(true, Some(wanted)))?;
         same(&topic.overwritten, &Some(wanted - topic.messages))?;
@@ -195,8 +233,9 @@ fn pushed_out() -> Result<(), Failed> {
 }
 
 fn on_disk() -> Result<(), Failed> {
-    let lambda =
-        Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("[record]", "[record]\nstore = \"disk\""));
+    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+        manifest.replace("[record]", "[record]\nstore = \"disk\"")
+    });
     let args = ["--set", "event_s=10,14,30"];
     let (ram_out, ram) = record(&alarm(), &sample_drive(), &args)?;
     let (disk_out, disk) = record(lambda.path(), &sample_drive(), &args)?;
@@ -210,9 +249,15 @@ fn on_disk() -> Result<(), Failed> {
 }
 
 fn missing_topic() -> Result<(), Failed> {
-    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("/vehicle/speed", "/lidar/points"));
+    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+        manifest.replace("/vehicle/speed", "/lidar/points")
+    });
     let (_out, run) = record(lambda.path(), &sample_drive(), &["--set", "event_s=10"])?;
-    let lidar = run.clips[0].topics.iter().find(|topic| topic.topic == "/lidar/points").ok_or("it is not listed")?;
+    let lidar = run.clips[0]
+        .topics
+        .iter()
+        .find(|topic| topic.topic == "/lidar/points")
+        .ok_or("it is not listed")?;
     same(&(lidar.messages, lidar.received, &lidar.type_name), &(0, Some(0), &None))?;
     same(&run.stderr.contains("/lidar/points"), &true)
 }
@@ -247,8 +292,9 @@ fn no_record() -> Result<(), Failed> {
 }
 
 fn one_of_two() -> Result<(), Failed> {
-    let lambda =
-        Copy::of("tests/lambdas/alarm/rust", |manifest| manifest.replace("topics = [", "topics = [\"/imu/other\", "));
+    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+        manifest.replace("topics = [", "topics = [\"/imu/other\", ")
+    });
     let args = ["--set", "event_s=10", "--remap", "/imu/other:=/imu/data"];
     let (out, run) = record(lambda.path(), &sample_drive(), &args)?;
     whole(out.path(), &run.clips[0], run.clips[0].from_ns, run.clips[0].to_ns)
@@ -256,11 +302,19 @@ fn one_of_two() -> Result<(), Failed> {
 
 fn damaged() -> Result<(), Failed> {
     let (out, folder) = (Folder::new(), Folder::new());
-    let run = replay_to(out.path(), &alarm(), &[corrupted(&folder)], &["--set", "event_s=10", "--set", "start_s=12"]);
+    let run = replay_to(
+        out.path(),
+        &alarm(),
+        &[corrupted(&folder)],
+        &["--set", "event_s=10", "--set", "start_s=12"],
+    );
     same(&(run.exit, run.clips.len()), &(7, 1))?;
     let clip = &run.clips[0];
     same(&clip.short.iter().any(|why| why.contains("the drive ended")), &true)?;
-    same(&(Some(clip.to_ns) >= clip.last_ns, messages(&out.path().join(&clip.file))?.len() > 1000), &(true, true))
+    same(
+        &(Some(clip.to_ns) >= clip.last_ns, messages(&out.path().join(&clip.file))?.len() > 1000),
+        &(true, true),
+    )
 }
 
 fn busy() -> Result<(), Failed> {
@@ -283,7 +337,10 @@ fn busy_without_clips() -> Result<(), Failed> {
     let before = files(out.path())?;
     let second = replay_to(out.path(), &alarm(), &[sample_drive()], &args);
     let said = format!("another replay writes into `{}`", out.path().display());
-    same(&(second.exit, second.stderr.contains(&said), second.stderr.contains("--out DIR")), &(1, true, true))?;
+    same(
+        &(second.exit, second.stderr.contains(&said), second.stderr.contains("--out DIR")),
+        &(1, true, true),
+    )?;
     same(&(files(out.path())? == before), &true)?;
     lock.unlock()?;
     same(&replay_to(out.path(), &alarm(), &[sample_drive()], &args).exit, &0)
@@ -294,8 +351,14 @@ fn not_started() -> Result<(), Failed> {
         let out = Folder::new();
         let journal = out.path().join("wakes.journal");
         let args = [&["--journal", journal.to_str().ok_or("no text")?], with].concat();
-        let replay =
-            |event: &str| replay_to(out.path(), &alarm(), &[sample_drive()], &[&args[..], &["--set", event]].concat());
+        let replay = |event: &str| {
+            replay_to(
+                out.path(),
+                &alarm(),
+                &[sample_drive()],
+                &[&args[..], &["--set", event]].concat(),
+            )
+        };
         same(&(replay("event_s=10").exit, replay("event_s=10").exit), &(0, 0))?;
         let before = files(out.path())?;
         same(&(before.len() > 5), &true)?;
@@ -321,14 +384,21 @@ fn files(folder: &Path) -> Result<BTreeMap<PathBuf, Vec<u8>>, Failed> {
     Ok(found)
 }
 
-/// Three readers of others find exactly the messages of each clip's window, byte for byte as in the drive.
+/// Three readers of others find exactly the messages of each clip's window, byte for byte as in the
+/// drive.
 fn reads(python: &Path, drive: &Path, args: &[&str]) -> Result<(), Failed> {
     let (out, run) = record(&alarm(), drive, args)?;
     same(&(run.clips.len() >= 2), &true)?;
     for clip in &run.clips {
         let mut reader = Command::new(python);
-        reader.arg("-I").arg(root().join("tests/readers/clip.py")).arg(drive).arg(out.path().join(&clip.file));
-        reader.args([clip.from_ns, clip.to_ns].map(|at_ns| at_ns.to_string())).args(TOPICS.map(OsStr::new));
+        reader
+            .arg("-I")
+            .arg(root().join("tests/readers/clip.py"))
+            .arg(drive)
+            .arg(out.path().join(&clip.file));
+        reader
+            .args([clip.from_ns, clip.to_ns].map(|at_ns| at_ns.to_string()))
+            .args(TOPICS.map(OsStr::new));
         let output = reader.output()?;
         if !output.status.success() {
             return Err(String::from_utf8_lossy(&output.stderr).into_owned().into());

@@ -1,4 +1,5 @@
-//! Whatever ends the recorder, a clip that is listed is whole, and nothing under a final name is broken.
+//! Whatever ends the recorder, a clip that is listed is whole, and nothing under a final name is
+//! broken.
 //!
 //! `GLEANER_KILLS` says how often the process is killed; 25 times if it does not.
 
@@ -23,9 +24,10 @@ const EVENTS: &str = "event_s=2,8,14,20,26,32,38";
 pub fn trials() -> Vec<Trial> {
     let mut trials = vec![
         Trial::test("a_recorder_killed_at_any_moment_leaves_nothing_broken", || killed("ram")),
-        Trial::test("a_recorder_with_its_preroll_on_disk_killed_at_any_moment_leaves_nothing_broken", || {
-            killed("disk")
-        }),
+        Trial::test(
+            "a_recorder_with_its_preroll_on_disk_killed_at_any_moment_leaves_nothing_broken",
+            || killed("disk"),
+        ),
     ];
     let name = "a_replay_killed_while_it_replaces_clips_leaves_none_of_them_to_the_next";
     trials.push(Trial::test(name, killed_while_replacing));
@@ -33,7 +35,8 @@ pub fn trials() -> Vec<Trial> {
     trials.push(if can_mount() {
         Trial::test(name, full_disk)
     } else {
-        Trial::test(format!("{name} [no file system can be mounted here]"), || Ok(())).with_ignored_flag(true)
+        Trial::test(format!("{name} [no file system can be mounted here]"), || Ok(()))
+            .with_ignored_flag(true)
     });
     trials
 }
@@ -41,8 +44,9 @@ pub fn trials() -> Vec<Trial> {
 /// `alarm`, with short windows, so that there are several clips.
 fn alarm(store: &str) -> Copy {
     Copy::of("tests/lambdas/alarm/rust", |manifest| {
-        let manifest =
-            manifest.replace("preroll = \"5s\"", "preroll = \"2s\"").replace("postroll = \"5s\"", "postroll = \"2s\"");
+        let manifest = manifest
+            .replace("preroll = \"5s\"", "preroll = \"2s\"")
+            .replace("postroll = \"5s\"", "postroll = \"2s\"");
         manifest.replace("[record]", &format!("[record]\nstore = \"{store}\""))
     })
 }
@@ -75,7 +79,8 @@ fn killed(store: &str) -> Result<(), Failed> {
     while killed < kills || killed < 10 * kills && (seen[0] == 0 || seen[1] == 0) {
         let kill = killed;
         killed += 1;
-        // xorshift64: the moments differ, and a run can be repeated as far as a machine repeats itself.
+        // xorshift64: the moments differ, and a run can be repeated as far as a machine repeats
+        // itself.
         random ^= random << 13;
         random ^= random >> 7;
         random ^= random << 17;
@@ -84,10 +89,14 @@ fn killed(store: &str) -> Result<(), Failed> {
             out = Folder::new();
         }
         let mut child = replay(lambda.path(), out.path()).spawn()?;
-        thread::sleep(Duration::from_nanos((duration.as_nanos() as u64).saturating_mul(random % 1000) / 1000));
+        thread::sleep(Duration::from_nanos(
+            (duration.as_nanos() as u64).saturating_mul(random % 1000) / 1000,
+        ));
         child.kill()?;
         child.wait()?;
-        let here = |why: Failed| Failed::from(format!("kill {kill}: {}", why.message().unwrap_or_default()));
+        let here = |why: Failed| {
+            Failed::from(format!("kill {kill}: {}", why.message().unwrap_or_default()))
+        };
         for clip in listed(out.path())? {
             whole(&out.path().join(&clip.file)).map_err(here)?;
         }
@@ -109,7 +118,8 @@ fn killed(store: &str) -> Result<(), Failed> {
     Ok(())
 }
 
-/// Clips of an earlier replay that a kill leaves half deleted are never listed as results of the next one.
+/// Clips of an earlier replay that a kill leaves half deleted are never listed as results of the
+/// next one.
 fn killed_while_replacing() -> Result<(), Failed> {
     const EARLIER: u64 = 1000;
     let lambda = alarm("ram");
@@ -129,7 +139,8 @@ fn killed_while_replacing() -> Result<(), Failed> {
         for n in 1000..1000 + EARLIER {
             let file = format!("{stem}-{n}.mcap");
             std::fs::hard_link(out.path().join(&first.file), clips.join(&file))?;
-            let clip = Clip { file: Path::new("clips").join(file), thumbnail: None, ..first.clone() };
+            let clip =
+                Clip { file: Path::new("clips").join(file), thumbnail: None, ..first.clone() };
             list.push_str(&(serde_json::to_string(&clip)? + "\n"));
         }
         std::fs::write(out.path().join("clips.jsonl"), list)?;
@@ -145,7 +156,10 @@ fn killed_while_replacing() -> Result<(), Failed> {
         if !strangers.is_empty() || are_left() > 0 {
             let first = strangers.first();
             let (listed, left) = (strangers.len(), are_left());
-            return Err(format!("{listed} clips of an earlier replay are listed, {left} are left: {first:?}").into());
+            return Err(format!(
+                "{listed} clips of an earlier replay are listed, {left} are left: {first:?}"
+            )
+            .into());
         }
         if met >= 3 {
             return Ok(());
@@ -200,8 +214,9 @@ fn listed(out: &Path) -> Result<Vec<Clip>, Failed> {
 }
 
 fn listed_names(out: &Path) -> Result<BTreeSet<String>, Failed> {
-    let names =
-        listed(out)?.into_iter().map(|clip| clip.file.file_name().unwrap_or_default().to_string_lossy().into_owned());
+    let names = listed(out)?
+        .into_iter()
+        .map(|clip| clip.file.file_name().unwrap_or_default().to_string_lossy().into_owned());
     Ok(names.collect())
 }
 
@@ -213,7 +228,8 @@ fn whole(path: &PathBuf) -> Result<(), Failed> {
             Verdict::Taken
         }
     }
-    let failed = |error: &dyn std::error::Error| Failed::from(format!("{}: {error}", path.display()));
+    let failed =
+        |error: &dyn std::error::Error| Failed::from(format!("{}: {error}", path.display()));
     let mut clip = Replay::open(std::slice::from_ref(path)).map_err(|error| failed(&error))?;
     for topic in clip.topics() {
         let spec = TopicSpec {
@@ -250,7 +266,8 @@ fn in_namespace(script: &str, args: &[&OsStr]) -> Command {
 
 fn can_mount() -> bool {
     let folder = Folder::new();
-    let mount = in_namespace("mount -t tmpfs -o size=16k tmpfs \"$1\"", &[folder.path().as_ref()]).output();
+    let mount =
+        in_namespace("mount -t tmpfs -o size=16k tmpfs \"$1\"", &[folder.path().as_ref()]).output();
     mount.is_ok_and(|output| output.status.success())
 }
 
@@ -266,9 +283,20 @@ fn full_disk() -> Result<(), Failed> {
             std::fs::create_dir(copy.path().join("left"))?;
             let size = format!("{kib}k");
             let (program, drive) = (program("gleaner-runtime"), sample_drive());
-            let mut args: Vec<&OsStr> = vec![size.as_ref(), disk.path().as_ref(), copy.path().as_ref()];
-            args.extend([program.as_os_str(), "replay".as_ref(), lambda.path().as_ref(), drive.as_ref()]);
-            args.extend(["--set".as_ref(), EVENTS.as_ref(), "--out".as_ref(), disk.path().as_os_str()]);
+            let mut args: Vec<&OsStr> =
+                vec![size.as_ref(), disk.path().as_ref(), copy.path().as_ref()];
+            args.extend([
+                program.as_os_str(),
+                "replay".as_ref(),
+                lambda.path().as_ref(),
+                drive.as_ref(),
+            ]);
+            args.extend([
+                "--set".as_ref(),
+                EVENTS.as_ref(),
+                "--out".as_ref(),
+                disk.path().as_os_str(),
+            ]);
             let mut replay = in_namespace(ON_A_SMALL_DISK, &args);
             let output = replay.env("XDG_CACHE_HOME", root().join("target/test-cache")).output()?;
             let said = std::fs::read_to_string(copy.path().join("stderr"))?;
@@ -277,16 +305,27 @@ fn full_disk() -> Result<(), Failed> {
                 "0" => fits += 1,
                 "1" => {
                     full += 1;
-                    if said.contains("panicked") || !said.contains("error: cannot") || !said.contains("No space left") {
+                    if said.contains("panicked")
+                        || !said.contains("error: cannot")
+                        || !said.contains("No space left")
+                    {
                         return Err(here("the error does not say what happened"));
                     }
-                    if !said.contains("make room") || !said.contains(&*disk.path().to_string_lossy()) {
+                    if !said.contains("make room")
+                        || !said.contains(&*disk.path().to_string_lossy())
+                    {
                         return Err(here("the error names neither the file nor the way out"));
                     }
                 }
-                other => return Err(here(&format!("ended with {other}: {}", String::from_utf8_lossy(&output.stderr)))),
+                other => {
+                    return Err(here(&format!(
+                        "ended with {other}: {}",
+                        String::from_utf8_lossy(&output.stderr)
+                    )));
+                }
             }
-            inspect(&copy.path().join("left")).map_err(|why| here(why.message().unwrap_or_default()))?;
+            inspect(&copy.path().join("left"))
+                .map_err(|why| here(why.message().unwrap_or_default()))?;
             // Closer together where more of the small writes happen.
             kib += if kib < 256 { 12 } else { kib / 8 };
         }

@@ -1,7 +1,7 @@
 //! The examples and test lambdas over recorded drives: decisions as expected, and twins that agree.
 //!
-//! Drives that cannot come with the project lie in `../shared/data`; where they are missing, their tests are ignored with
-//! that reason.
+//! Drives that cannot come with the project lie in `../shared/data`; where they are missing, their
+//! tests are ignored with that reason.
 
 use std::path::{Path, PathBuf};
 
@@ -12,44 +12,72 @@ use libtest_mimic::{Failed, Trial};
 const KINDS: [&str; 2] = ["rust", "python"];
 
 /// Those with values that suit the sample drive, whose braking is gentle.
-const EXAMPLES: [(&str, &[&str]); 3] =
-    [("hello", &["--set", "brake_mps2=-1.4"]), ("brake-dark", &["--set", "brake_mps2=-1.4"]), ("imu-fft", &[])];
+const EXAMPLES: [(&str, &[&str]); 3] = [
+    ("hello", &["--set", "brake_mps2=-1.4"]),
+    ("brake-dark", &["--set", "brake_mps2=-1.4"]),
+    ("imu-fft", &[]),
+];
 
 pub fn trials() -> Vec<Trial> {
     let mut trials = Vec::new();
     for (example, set) in EXAMPLES {
         for kind in KINDS {
-            trials.push(Trial::test(format!("{example}_in_{kind}_decides_as_expected"), move || {
-                expected(example, kind, set)
-            }));
+            trials
+                .push(Trial::test(format!("{example}_in_{kind}_decides_as_expected"), move || {
+                    expected(example, kind, set)
+                }));
         }
-        trials.push(Trial::test(format!("the_twins_of_{example}_agree_on_every_wake"), move || {
-            twins(&format!("examples/{example}"), &sample_drive(), &[&["--all"], set].concat())
-        }));
+        trials.push(Trial::test(
+            format!("the_twins_of_{example}_agree_on_every_wake"),
+            move || {
+                twins(&format!("examples/{example}"), &sample_drive(), &[&["--all"], set].concat())
+            },
+        ));
     }
     trials.push(Trial::test("every_function_answers_both_twins_the_same", every_answer));
     for kind in KINDS {
-        trials.push(shared(format!("brake_dark_in_{kind}_finds_both_brakings_at_night"), "rec_brake_dark.mcap", {
-            move |drive| at(&drive, "examples/brake-dark", kind, &[15.84, 30.25])
-        }));
-        trials.push(shared(format!("hello_in_{kind}_finds_six_of_six_brakings"), "rec_brake_imu_trip17.mcap", {
-            move |drive| within_truth(&drive, kind)
-        }));
-        trials.push(shared(format!("pixels_in_{kind}_sees_the_recorded_pixels"), "rec_raw_image_bgr8_320x180.mcap", {
-            move |drive| pixels(&drive, kind)
-        }));
+        trials.push(shared(
+            format!("brake_dark_in_{kind}_finds_both_brakings_at_night"),
+            "rec_brake_dark.mcap",
+            { move |drive| at(&drive, "examples/brake-dark", kind, &[15.84, 30.25]) },
+        ));
+        trials.push(shared(
+            format!("hello_in_{kind}_finds_six_of_six_brakings"),
+            "rec_brake_imu_trip17.mcap",
+            { move |drive| within_truth(&drive, kind) },
+        ));
+        trials.push(shared(
+            format!("pixels_in_{kind}_sees_the_recorded_pixels"),
+            "rec_raw_image_bgr8_320x180.mcap",
+            { move |drive| pixels(&drive, kind) },
+        ));
     }
-    trials.push(shared("the_twins_of_imu_fft_agree_on_a_walk".to_owned(), "rec_sync_gopro_walk.mcap", |drive| {
-        twins("examples/imu-fft", &drive, &["--all", "--set", "window_s=5.2", "--set", "rough=0"])
-    }));
-    trials.push(shared("the_twins_of_pixels_agree".to_owned(), "rec_raw_image_bgr8_320x180.mcap", |drive| {
-        twins("tests/lambdas/pixels", &drive, &["--all"])
-    }));
+    trials.push(shared(
+        "the_twins_of_imu_fft_agree_on_a_walk".to_owned(),
+        "rec_sync_gopro_walk.mcap",
+        |drive| {
+            twins(
+                "examples/imu-fft",
+                &drive,
+                &["--all", "--set", "window_s=5.2", "--set", "rough=0"],
+            )
+        },
+    ));
+    trials.push(shared(
+        "the_twins_of_pixels_agree".to_owned(),
+        "rec_raw_image_bgr8_320x180.mcap",
+        |drive| twins("tests/lambdas/pixels", &drive, &["--all"]),
+    ));
     trials
 }
 
-/// A test on a drive beside the checkout; ignored, with the reason in its name, where that is missing.
-fn shared(name: String, drive: &str, test: impl FnOnce(PathBuf) -> Result<(), Failed> + Send + 'static) -> Trial {
+/// A test on a drive beside the checkout; ignored, with the reason in its name, where that is
+/// missing.
+fn shared(
+    name: String,
+    drive: &str,
+    test: impl FnOnce(PathBuf) -> Result<(), Failed> + Send + 'static,
+) -> Trial {
     match shared_drive(drive) {
         Ok(path) => Trial::test(name, move || test(path)),
         Err(reason) => Trial::test(format!("{name} [{reason}]"), || Ok(())).with_ignored_flag(true),
@@ -63,7 +91,8 @@ fn run(lambda: &str, kind: &str, drive: &Path, args: &[&str]) -> Result<Run, Fai
 
 fn expected(example: &str, kind: &str, set: &[&str]) -> Result<(), Failed> {
     let run = run(&format!("examples/{example}"), kind, &sample_drive(), set)?;
-    let expected = std::fs::read_to_string(root().join("examples").join(example).join("expected.txt"))?;
+    let expected =
+        std::fs::read_to_string(root().join("examples").join(example).join("expected.txt"))?;
     same(&run.rows(), &expected)
 }
 
@@ -132,9 +161,12 @@ fn within_truth(drive: &Path, kind: &str) -> Result<(), Failed> {
     let events = truth["labelled_events"].as_array().ok_or("the truth has no labelled events")?;
     let second = |event: &serde_json::Value, key: &str| event[key].as_f64().unwrap_or(f64::NAN);
     let brakings = events.iter().filter(|event| event["type"] == "hard_brake");
-    let spans = brakings.map(|event| (second(event, "start_s"), second(event, "end_s"))).collect::<Vec<_>>();
+    let spans = brakings
+        .map(|event| (second(event, "start_s"), second(event, "end_s")))
+        .collect::<Vec<_>>();
     let seconds = run("examples/hello", kind, drive, &["--set", "brake_mps2=-3.0"])?.seconds();
-    let inside = |(found, (start, end)): (&f64, &(f64, f64))| (start - 0.3..=end + 1.5).contains(found);
+    let inside =
+        |(found, (start, end)): (&f64, &(f64, f64))| (start - 0.3..=end + 1.5).contains(found);
     if spans.len() == 6 && seconds.len() == 6 && seconds.iter().zip(&spans).all(inside) {
         return Ok(());
     }
@@ -144,7 +176,8 @@ fn within_truth(drive: &Path, kind: &str) -> Result<(), Failed> {
 fn pixels(drive: &Path, kind: &str) -> Result<(), Failed> {
     let truth = truth(drive)?;
     let hashes = truth["fnv1a32_of_pixels"].as_array().ok_or("the truth has no hashes")?;
-    let hashes = hashes.iter().map(|hash| format!("{:08x}", hash.as_u64().unwrap_or(0))).collect::<Vec<_>>();
+    let hashes =
+        hashes.iter().map(|hash| format!("{:08x}", hash.as_u64().unwrap_or(0))).collect::<Vec<_>>();
     let found = run("tests/lambdas/pixels", kind, drive, &[])?;
     same(&found.decisions.len(), &21)?;
     same(&found.labels(), &hashes)
@@ -155,5 +188,9 @@ fn truth(drive: &Path) -> Result<serde_json::Value, Failed> {
 }
 
 fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), Failed> {
-    if found == expected { Ok(()) } else { Err(format!("found {found:?}, expected {expected:?}").into()) }
+    if found == expected {
+        Ok(())
+    } else {
+        Err(format!("found {found:?}, expected {expected:?}").into())
+    }
 }

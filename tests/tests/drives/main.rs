@@ -1,7 +1,7 @@
 //! What replays of drives leave: decisions of the examples, clips, and what is whole after a crash.
 //!
-//! Some drives, readers and file systems are not everywhere; a test that lacks them is ignored, with
-//! that reason.
+//! Some drives, readers and file systems are not everywhere; a test that lacks them is ignored,
+//! with that reason.
 
 mod clips;
 mod crash;
@@ -12,8 +12,11 @@ use std::process::ExitCode;
 use libtest_mimic::{Arguments, Trial};
 
 fn main() -> ExitCode {
-    let of = |file: &'static str, trials: Vec<Trial>| trials.into_iter().map(move |trial| trial.with_kind(file));
-    let trials =
-        of("clips", clips::trials()).chain(of("crash", crash::trials())).chain(of("examples", examples::trials()));
+    let of = |file: &'static str, trials: Vec<Trial>| {
+        trials.into_iter().map(move |trial| trial.with_kind(file))
+    };
+    let trials = of("clips", clips::trials())
+        .chain(of("crash", crash::trials()))
+        .chain(of("examples", examples::trials()));
     libtest_mimic::run(&Arguments::from_args(), trials.collect()).exit_code()
 }

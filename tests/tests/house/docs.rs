@@ -1,5 +1,5 @@
-//! The pages are true: links lead somewhere, commands exist, code is an excerpt of files that are tested, and what a page says that a
-//! command prints, it prints.
+//! The pages are true: links lead somewhere, commands exist, code is an excerpt of files that are
+//! tested, and what a page says that a command prints, it prints.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -15,10 +15,14 @@ use gleaner_tests::tree::{File, files};
 use gleaner_tests::{program, root};
 
 /// Whose Rust is all excerpts. The other pages show fragments that stand for themselves.
-const EXCERPTS_ONLY: [&str; 4] = ["docs/first-rust.md", "docs/data.md", "docs/cookbook.md", "docs/errors.md"];
+const EXCERPTS_ONLY: [&str; 4] =
+    ["docs/first-rust.md", "docs/data.md", "docs/cookbook.md", "docs/errors.md"];
 
 fn pages() -> Vec<File> {
-    files().into_iter().filter(|file| file.is_one_of(&["md"]) && !file.path.starts_with("cli/src/new/")).collect()
+    files()
+        .into_iter()
+        .filter(|file| file.is_one_of(&["md"]) && !file.path.starts_with("cli/src/new/"))
+        .collect()
 }
 
 /// Fails with every problem on a line of its own.
@@ -38,10 +42,14 @@ fn every_link_leads_to_a_file_and_to_a_heading_that_is_there() {
                 continue;
             }
             seen += 1;
-            let (path, anchor) = target.split_once('#').map_or((&*target, None), |(path, anchor)| (path, Some(anchor)));
+            let (path, anchor) = target
+                .split_once('#')
+                .map_or((&*target, None), |(path, anchor)| (path, Some(anchor)));
             let file = if path.is_empty() { root().join(&page.path) } else { folder.join(path) };
-            let known =
-                || fs::read_to_string(&file).is_ok_and(|text| anchors(&text).iter().any(|a| Some(&**a) == anchor));
+            let known = || {
+                fs::read_to_string(&file)
+                    .is_ok_and(|text| anchors(&text).iter().any(|a| Some(&**a) == anchor))
+            };
             if !file.exists() || anchor.is_some() && !known() {
                 problems.push(format!("{}:{line}: `{target}` leads nowhere", page.path));
             }
@@ -54,12 +62,16 @@ fn every_link_leads_to_a_file_and_to_a_heading_that_is_there() {
 #[test]
 fn the_book_has_every_page_once_and_its_pages_link_to_files_and_pages_of_the_book() {
     let summary = fs::read_to_string(root().join("docs/SUMMARY.md")).expect("docs/SUMMARY.md");
-    let chapters: Vec<_> = links(&summary).into_iter().map(|(_, target)| normal("docs", &target)).collect();
+    let chapters: Vec<_> =
+        links(&summary).into_iter().map(|(_, target)| normal("docs", &target)).collect();
     let distinct: BTreeSet<_> = chapters.iter().cloned().collect();
     assert_eq!(distinct.len(), chapters.len(), "a page stands twice in docs/SUMMARY.md");
     let mut problems = Vec::new();
     for page in pages() {
-        if page.path.starts_with("docs/") && page.path != "docs/SUMMARY.md" && !distinct.contains(&page.path) {
+        if page.path.starts_with("docs/")
+            && page.path != "docs/SUMMARY.md"
+            && !distinct.contains(&page.path)
+        {
             problems.push(format!("docs/SUMMARY.md lacks {}", page.path));
         }
         if !distinct.contains(&page.path) {
@@ -73,8 +85,10 @@ fn the_book_has_every_page_once_and_its_pages_link_to_files_and_pages_of_the_boo
             }
             // A book has no view of a folder, and renders no page that is none of its own.
             if root().join(&to).is_dir() || to.ends_with(".md") && !distinct.contains(&to) {
-                problems
-                    .push(format!("{}:{line}: `{target}` is not in the book; link to a file or a chapter", page.path));
+                problems.push(format!(
+                    "{}:{line}: `{target}` is not in the book; link to a file or a chapter",
+                    page.path
+                ));
             }
         }
     }
@@ -110,8 +124,11 @@ fn every_excerpt_stands_in_the_file_that_it_names() {
             let text = fs::read_to_string(root().join(file)).unwrap_or_default();
             let lines: Vec<_> = text.lines().collect();
             let excerpt: Vec<_> = block.lines.iter().map(String::as_str).collect();
-            if excerpt.is_empty() || !lines.windows(excerpt.len()).any(|window| indented_alike(window, &excerpt)) {
-                problems.push(format!("{}:{}: this does not stand in `{file}`", page.path, block.line));
+            if excerpt.is_empty()
+                || !lines.windows(excerpt.len()).any(|window| indented_alike(window, &excerpt))
+            {
+                problems
+                    .push(format!("{}:{}: this does not stand in `{file}`", page.path, block.line));
             }
         }
     }
@@ -123,7 +140,9 @@ fn every_excerpt_stands_in_the_file_that_it_names() {
 fn indented_alike(lines: &[&str], excerpt: &[&str]) -> bool {
     let indent = |line: &str| line.len() - line.trim_start().len();
     let shift = indent(lines[0]).saturating_sub(indent(excerpt[0]));
-    let same = |(line, shown): (&&str, &&str)| line.is_empty() && shown.is_empty() || line.get(shift..) == Some(shown);
+    let same = |(line, shown): (&&str, &&str)| {
+        line.is_empty() && shown.is_empty() || line.get(shift..) == Some(shown)
+    };
     lines.iter().zip(excerpt).all(same)
 }
 
@@ -134,7 +153,8 @@ fn manifests_that_are_shown_whole_can_be_used() {
         for block in blocks(&page.text).into_iter().filter(|block| block.language == "toml") {
             let text = block.lines.join("\n");
             if text.contains("[lambda]") && text.contains("[schedule]") {
-                let said = Manifest::parse(&text, "lambda.toml").err().map(|error| error.to_string());
+                let said =
+                    Manifest::parse(&text, "lambda.toml").err().map(|error| error.to_string());
                 assert_eq!(said, None, "{}:{}", page.path, block.line);
                 seen += 1;
             }
@@ -145,7 +165,8 @@ fn manifests_that_are_shown_whole_can_be_used() {
 
 #[test]
 fn python_that_is_shown_compiles() {
-    let mut python = Command::new(Parts::find().and_then(|parts| parts.python(None)).expect("a Python"));
+    let mut python =
+        Command::new(Parts::find().and_then(|parts| parts.python(None)).expect("a Python"));
     // A fragment may return or wait outside of a function, so each is the body of one.
     let check = "import ast, json, sys, textwrap\nfor name, text in json.load(sys.stdin):\n try:\n  try: ast.parse(text)\n  \
                  except SyntaxError: ast.parse('async def fragment():\\n' + textwrap.indent(text, ' '))\n except SyntaxError as \
@@ -157,8 +178,12 @@ fn python_that_is_shown_compiles() {
         }
     }
     assert!(shown.len() > 5, "{} blocks were found", shown.len());
-    let mut child =
-        python.args(["-c", check]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("Python starts");
+    let mut child = python
+        .args(["-c", check])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("Python starts");
     let json = serde_json::to_vec(&shown).expect("texts are JSON");
     child.stdin.take().expect("a pipe").write_all(&json).expect("Python reads");
     let output = child.wait_with_output().expect("Python ends");
@@ -172,10 +197,17 @@ fn every_command_that_is_shown_exists_with_its_flags() {
     let mut problems = Vec::new();
     let mut seen = 0;
     for page in pages() {
-        for block in blocks(&page.text).into_iter().filter(|block| ["sh", "text"].contains(&&*block.language)) {
+        for block in blocks(&page.text)
+            .into_iter()
+            .filter(|block| ["sh", "text"].contains(&&*block.language))
+        {
             for line in &block.lines {
                 let line = line.strip_prefix("$ ").unwrap_or(line);
-                let command = line.split(['#', '|', '>', ';']).next().unwrap_or_default().replace(['[', ']'], " ");
+                let command = line
+                    .split(['#', '|', '>', ';'])
+                    .next()
+                    .unwrap_or_default()
+                    .replace(['[', ']'], " ");
                 let mut words = command.split_whitespace();
                 if words.next() != Some("gleaner") {
                     continue;
@@ -189,9 +221,16 @@ fn every_command_that_is_shown_exists_with_its_flags() {
                     Some(_) if name == "play" => {}
                     Some(help) => {
                         let flags = words.filter(|word| word.starts_with("--"));
-                        let flags = flags.filter_map(|flag| flag.split('=').next().map(str::to_owned));
-                        let lacking = flags.filter(|flag| !help.split([' ', ',', '\n', '=']).any(|word| word == flag));
-                        problems.extend(lacking.map(|flag| format!("{}: `gleaner {name}` has no {flag}", page.path)));
+                        let flags =
+                            flags.filter_map(|flag| flag.split('=').next().map(str::to_owned));
+                        let lacking = flags.filter(|flag| {
+                            !help.split([' ', ',', '\n', '=']).any(|word| word == flag)
+                        });
+                        problems.extend(
+                            lacking.map(|flag| {
+                                format!("{}: `gleaner {name}` has no {flag}", page.path)
+                            }),
+                        );
                     }
                 }
             }
@@ -209,7 +248,8 @@ fn help(name: &str) -> Option<String> {
     if name == "play" {
         return Some(String::new());
     }
-    let output = Command::new(program("gleaner")).args([name, "--help"]).output().expect("gleaner starts");
+    let output =
+        Command::new(program("gleaner")).args([name, "--help"]).output().expect("gleaner starts");
     output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
@@ -220,7 +260,10 @@ fn every_recipe_is_in_the_book_with_what_it_finds() {
         let folder = folder.expect("it can be listed").path();
         let Ok(expected) = fs::read_to_string(folder.join("expected.txt")) else { continue };
         let name = folder.file_name().unwrap().to_string_lossy();
-        assert!(book.contains(&format!("](../examples/cookbook/{name}/lambda.toml)")), "docs/cookbook.md lacks {name}");
+        assert!(
+            book.contains(&format!("](../examples/cookbook/{name}/lambda.toml)")),
+            "docs/cookbook.md lacks {name}"
+        );
         let transcript = format!("```text\n$ {}\n```", expected.trim_end());
         assert!(book.contains(&transcript), "docs/cookbook.md should say:\n{transcript}");
     }
@@ -242,7 +285,9 @@ fn every_file_that_a_recipe_for_changes_names_exists() {
     for (index, line) in page.lines().enumerate() {
         // Between two marks is code.
         for word in line.split('`').skip(1).step_by(2) {
-            let is_file = Path::new(word).extension().is_some_and(|end| end.to_str().is_some_and(is_a_file_ending));
+            let is_file = Path::new(word)
+                .extension()
+                .is_some_and(|end| end.to_str().is_some_and(is_a_file_ending));
             if is_file || word.contains('/') && !word.contains(' ') {
                 seen += 1;
                 if !root().join(word).exists() {

@@ -1,5 +1,6 @@
-//! The WIT is one page for both languages: what it offers, the Rust SDK must offer, the probes must call, and the list of operations
-//! must have. (`guest-sdk-python/tests/test_contract.py` looks at the Python SDK, and the compiler at the host.)
+//! The WIT is one page for both languages: what it offers, the Rust SDK must offer, the probes must
+//! call, and the list of operations must have. (`guest-sdk-python/tests/test_contract.py` looks at
+//! the Python SDK, and the compiler at the host.)
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -19,7 +20,10 @@ fn functions() -> BTreeSet<String> {
                 resource = None;
             } else if let Some(name) = function(line) {
                 let of = resource.map_or_else(String::new, |resource| format!("{resource}."));
-                assert!(found.insert(format!("{interface}.{of}{name}")), "`{name}` stands twice in {interface}.wit");
+                assert!(
+                    found.insert(format!("{interface}.{of}{name}")),
+                    "`{name}` stands twice in {interface}.wit"
+                );
             }
         }
     }
@@ -43,8 +47,13 @@ fn spelled(name: &str) -> String {
 
 #[test]
 fn the_list_of_operations_is_that_of_the_interface() {
-    let listed: BTreeSet<_> = Operation::ALL.iter().map(|operation| operation.name().to_owned()).collect();
-    assert_eq!(listed.len(), Operation::ALL.len(), "an operation stands twice in tests/operations/src/list.rs");
+    let listed: BTreeSet<_> =
+        Operation::ALL.iter().map(|operation| operation.name().to_owned()).collect();
+    assert_eq!(
+        listed.len(),
+        Operation::ALL.len(),
+        "an operation stands twice in tests/operations/src/list.rs"
+    );
     let offered = functions();
     let lacking: Vec<_> = offered.difference(&listed).collect();
     let beyond: Vec<_> = listed.difference(&offered).collect();
@@ -58,20 +67,28 @@ fn the_rust_sdk_calls_every_function_of_the_interface() {
     for name in functions() {
         let (interface, _) = name.split_once('.').expect("an interface");
         let (sdk, function) = (read(&format!("guest-sdk-rust/src/{interface}.rs")), spelled(&name));
-        let called = [format!("self.0.{function}("), format!("::{function}(")].iter().any(|call| sdk.contains(call));
+        let called = [format!("self.0.{function}("), format!("::{function}(")]
+            .iter()
+            .any(|call| sdk.contains(call));
         assert!(called, "guest-sdk-rust/src/{interface}.rs does not call `{name}` of wit/");
     }
 }
 
 #[test]
 fn twins_among_the_test_lambdas_call_every_function() {
-    // That both are answered the same `drives` tests, and that the fake of the Rust SDK answers the same `native`.
+    // That both are answered the same `drives` tests, and that the fake of the Rust SDK answers the
+    // same `native`.
     for file in ["rust/src/lib.rs", "python/main.py"] {
-        let text = ["probe", "keeper"].map(|name| read(&format!("tests/lambdas/{name}/{file}"))).concat();
+        let text =
+            ["probe", "keeper"].map(|name| read(&format!("tests/lambdas/{name}/{file}"))).concat();
         let words: BTreeSet<_> = text.split(|c: char| !c.is_alphanumeric() && c != '_').collect();
-        for operation in Operation::ALL.iter().filter(|operation| operation.price() != Price::Never) {
+        for operation in Operation::ALL.iter().filter(|operation| operation.price() != Price::Never)
+        {
             let name = operation.name();
-            assert!(words.contains(&*spelled(name)), "neither probe nor keeper calls `{name}` in {file}");
+            assert!(
+                words.contains(&*spelled(name)),
+                "neither probe nor keeper calls `{name}` in {file}"
+            );
         }
     }
 }

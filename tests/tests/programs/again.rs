@@ -1,4 +1,5 @@
-//! The same lambda, drive and journal again: the same decisions, to the last bit. How often is `GLEANER_AGAIN`.
+//! The same lambda, drive and journal again: the same decisions, to the last bit. How often is
+//! `GLEANER_AGAIN`.
 
 use std::collections::HashSet;
 use std::path::Path;
@@ -41,23 +42,38 @@ fn a_lambda_that_faults_now_and_then_decides_the_same_bits_each_time() {
         let out = folder.path().join(name);
         std::fs::create_dir_all(&out).unwrap();
         let journal = out.join("wakes.journal");
-        let args = ["--set", "behaviour=now_and_then", "--all", "--journal", journal.to_str().unwrap()];
+        let args =
+            ["--set", "behaviour=now_and_then", "--all", "--journal", journal.to_str().unwrap()];
         let run = replay_to(&out, &lambda, &[sample_drive()], &args);
         (left(&out), run)
     };
     let (expected, run) = replayed("first");
-    let kinds: HashSet<_> = run.decisions.iter().filter_map(|decision| Some(decision.fault.as_ref()?.kind)).collect();
+    let kinds: HashSet<_> =
+        run.decisions.iter().filter_map(|decision| Some(decision.fault.as_ref()?.kind)).collect();
     assert!(kinds.len() >= 6, "it faults by {kinds:?} only");
     assert!(run.decisions.iter().any(|decision| !decision.triggers.is_empty()));
-    assert_eq!((expected.decisions.len(), expected.journal.len()), (run.decisions.len(), run.decisions.len()));
+    assert_eq!(
+        (expected.decisions.len(), expected.journal.len()),
+        (run.decisions.len(), run.decisions.len())
+    );
     for time in 1..=times("GLEANER_AGAIN", 3) {
         let (now, _) = replayed("again");
-        let line = expected.decisions.iter().zip(&now.decisions).position(|(before, now)| before != now);
+        let line =
+            expected.decisions.iter().zip(&now.decisions).position(|(before, now)| before != now);
         assert_eq!(line, None, "time {time}: this decision is another");
         assert!(now == expected, "time {time}: the log or the journal is another");
-        let again =
-            verify(&["replay".as_ref(), lambda.as_ref(), sample_drive().as_ref(), "--verify".as_ref(), first.as_ref()]);
+        let again = verify(&[
+            "replay".as_ref(),
+            lambda.as_ref(),
+            sample_drive().as_ref(),
+            "--verify".as_ref(),
+            first.as_ref(),
+        ]);
         let verified = again.verified.unwrap_or_else(|| panic!("time {time}: {}", again.stderr));
-        assert_eq!((verified.wakes, verified.uncovered), (run.decisions.len() as u64, 0), "time {time}");
+        assert_eq!(
+            (verified.wakes, verified.uncovered),
+            (run.decisions.len() as u64, 0),
+            "time {time}"
+        );
     }
 }

@@ -1,5 +1,5 @@
-//! Everything that a user can get wrong, and what Gleaner says about it: the message names the thing, the cause and the
-//! way out, and the exit code tells scripts which kind of mistake it was.
+//! Everything that a user can get wrong, and what Gleaner says about it: the message names the
+//! thing, the cause and the way out, and the exit code tells scripts which kind of mistake it was.
 
 use std::path::PathBuf;
 
@@ -38,7 +38,11 @@ fn an_unknown_key_is_named_with_its_line_and_the_nearest_one() {
     let run = hello(replaced("depth = 512", "dept = 512"), &[]);
     says(
         run.must_exit(USAGE),
-        &["error: ", "lambda.toml, line 16: unknown key `dept` in [[input]]", "help:  did you mean `depth`?"],
+        &[
+            "error: ",
+            "lambda.toml, line 16: unknown key `dept` in [[input]]",
+            "help:  did you mean `depth`?",
+        ],
     );
 }
 
@@ -47,7 +51,10 @@ fn depth_zero_is_refused_with_its_bounds() {
     let run = hello(replaced("depth = 512", "depth = 0"), &[]);
     says(
         run.must_exit(USAGE),
-        &["line 16: `input.depth` is 0, below the minimum of 1", "help:  give a value from 1 to 65536"],
+        &[
+            "line 16: `input.depth` is 0, below the minimum of 1",
+            "help:  give a value from 1 to 65536",
+        ],
     );
 }
 
@@ -85,7 +92,10 @@ fn a_remap_of_a_topic_that_no_input_has_is_refused() {
 
 #[test]
 fn a_wrong_type_is_named_with_the_one_found() {
-    let run = hello(replaced("type = \"sensor_msgs/msg/Imu\"", "type = \"sensor_msgs/msg/NavSatFix\""), &[]);
+    let run = hello(
+        replaced("type = \"sensor_msgs/msg/Imu\"", "type = \"sensor_msgs/msg/NavSatFix\""),
+        &[],
+    );
     says(
         run.must_exit(USAGE),
         &[
@@ -124,7 +134,11 @@ fn a_truncated_drive_keeps_what_was_decided_before_the_cut() {
 #[test]
 fn a_corrupt_chunk_ends_the_drive_and_is_named() {
     let folder = Folder::new();
-    let run = replay(&root().join("examples/hello/rust"), &[corrupted(&folder)], &["--set", "brake_mps2=-1.4"]);
+    let run = replay(
+        &root().join("examples/hello/rust"),
+        &[corrupted(&folder)],
+        &["--set", "brake_mps2=-1.4"],
+    );
     let summary = run.must_exit(DAMAGED).summary.as_ref().expect("a summary of what was read");
     assert!(summary.wakes > 0 && summary.wakes < 4170, "{summary:?}");
     let damaged = summary.damaged.as_deref().expect("the damage is named");
@@ -138,7 +152,10 @@ fn a_drive_that_is_none_is_refused() {
     let lambda = root().join("examples/hello/rust");
     says(replay(&lambda, &[text], &[]).must_exit(USAGE), &["notes.mcap` is not an MCAP file"]);
     let missing = folder.path().join("missing.mcap");
-    says(replay(&lambda, &[missing], &[]).must_exit(USAGE), &["cannot open drive", "missing.mcap", "No such file"]);
+    says(
+        replay(&lambda, &[missing], &[]).must_exit(USAGE),
+        &["cannot open drive", "missing.mcap", "No such file"],
+    );
 }
 
 #[test]
@@ -166,14 +183,19 @@ fn an_import_that_the_host_does_not_have_is_named() {
 
 #[test]
 fn a_small_component_that_grows_while_it_is_compiled_is_refused() {
-    // Each component holds sixty instances of the one before: a few kilobytes that stand for thirteen million.
-    let mut text = "(component (component $c0 (core module $m) (core instance (instantiate $m)))".to_owned();
+    // Each component holds sixty instances of the one before: a few kilobytes that stand for
+    // thirteen million.
+    let mut text =
+        "(component (component $c0 (core module $m) (core instance (instantiate $m)))".to_owned();
     for level in 1..=4 {
         let instances = format!("(instance (instantiate $c{}))", level - 1).repeat(60);
         text += &format!("(component $c{level} {instances})");
     }
     let run = with_component(&(text + "(instance (instantiate $c4)))"));
-    says(run.must_exit(USAGE), &["cannot compile component", "hello.wasm", "it takes more than 2048 MiB of memory"]);
+    says(
+        run.must_exit(USAGE),
+        &["cannot compile component", "hello.wasm", "it takes more than 2048 MiB of memory"],
+    );
 }
 
 fn with_component(text: &str) -> Run {
@@ -185,7 +207,10 @@ fn with_component(text: &str) -> Run {
 #[test]
 fn a_lambda_that_is_not_built_names_the_command() {
     let folder = Folder::new();
-    folder.write("lambda.toml", std::fs::read(root().join("examples/hello/rust/lambda.toml")).unwrap());
+    folder.write(
+        "lambda.toml",
+        std::fs::read(root().join("examples/hello/rust/lambda.toml")).unwrap(),
+    );
     let run = replay(folder.path(), &[sample_drive()], &[]);
     says(run.must_exit(USAGE), &["help:", "gleaner build"]);
 }
@@ -196,7 +221,10 @@ fn results_within_the_build_are_refused_under_whatever_name() {
     std::os::unix::fs::symlink(copy.path().join("build"), copy.path().join("link")).unwrap();
     for out in ["build", "build/out", "link/out/a"] {
         let run = replay_to(&copy.path().join(out), copy.path(), &[sample_drive()], &[]);
-        says(run.must_exit(USAGE), &[out, "lies in the build, and would change the lambda", "help:", "--out DIR"]);
+        says(
+            run.must_exit(USAGE),
+            &[out, "lies in the build, and would change the lambda", "help:", "--out DIR"],
+        );
     }
     assert!(!copy.path().join("build/out").exists() && !copy.path().join("build/.lock").exists());
 }
@@ -215,7 +243,10 @@ fn a_build_older_than_its_sources_names_the_source() {
 fn a_path_that_names_no_field_ends_the_start_with_the_fields_there_are() {
     for kind in ["rust", "python"] {
         let run = misbehave(kind, "bad_field");
-        says(run.must_exit(FAULTED), &["cannot start lambda `misbehave`", "in init: ", "has no field `w`", "x, y, z"]);
+        says(
+            run.must_exit(FAULTED),
+            &["cannot start lambda `misbehave`", "in init: ", "has no field `w`", "x, y, z"],
+        );
     }
 }
 
@@ -228,7 +259,10 @@ fn python_that_raises_in_import_ends_the_start_with_its_traceback() {
 #[test]
 fn python_that_raises_in_init_ends_the_start_with_its_traceback() {
     let run = misbehave("python", "error_in_init");
-    says(run.must_exit(FAULTED), &["cannot start lambda `misbehave`", "in init", "main.py", "line"]);
+    says(
+        run.must_exit(FAULTED),
+        &["cannot start lambda `misbehave`", "in init", "main.py", "line"],
+    );
 }
 
 #[test]
@@ -240,7 +274,10 @@ fn what_a_lambda_said_before_its_init_failed_is_shown() {
         format!("class Lambda:\n    {init}\n\n    def on_event(self, ctx, event):\n        pass\n"),
     );
     let run = replay(copy.path(), &[sample_drive()], &[]);
-    says(run.must_exit(FAULTED), &["log: no tea", "error: cannot start lambda `misbehave`", "no, not today"]);
+    says(
+        run.must_exit(FAULTED),
+        &["log: no tea", "error: cannot start lambda `misbehave`", "no, not today"],
+    );
 }
 
 #[test]
@@ -266,15 +303,18 @@ fn an_exit_of_python_code_is_a_fault_and_not_the_end() {
 fn went_on(run: &Run) {
     let summary = run.summary.as_ref().expect("a summary");
     assert!(run.decisions.len() > 8, "{} decisions", run.decisions.len());
-    assert_eq!((summary.faults, summary.wakes), (run.decisions.len() as u64, run.decisions.len() as u64));
+    assert_eq!(
+        (summary.faults, summary.wakes),
+        (run.decisions.len() as u64, run.decisions.len() as u64)
+    );
     assert_eq!(summary.wakes + summary.passed_over, 4170);
 }
 
 #[test]
 fn twins_are_refused_with_the_same_words() {
     for behaviour in ["huge_label", "too_many_triggers", "not_a_frame", "nan_score"] {
-        let [rust, python] =
-            ["rust", "python"].map(|kind| misbehave(kind, behaviour).first_fault().expect("a fault").1);
+        let [rust, python] = ["rust", "python"]
+            .map(|kind| misbehave(kind, behaviour).first_fault().expect("a fault").1);
         let said = rust.lines().next().unwrap_or_default();
         assert!(python.contains(said), "{behaviour}: {rust:?} and {python:?}");
     }
@@ -288,12 +328,19 @@ fn misbehave(kind: &str, behaviour: &str) -> Run {
 /// Replays `pixels`, of both kinds, over a drive of one raw image.
 fn pixels_of(message: Vec<u8>) -> [Run; 2] {
     let folder = Folder::new();
-    let drive = one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &[(1, message)]);
+    let drive = one_topic(
+        &folder,
+        "/camera/front/image_raw",
+        "sensor_msgs/msg/Image",
+        IMAGE,
+        &[(1, message)],
+    );
     pixels_over(&[drive])
 }
 
 fn pixels_over(drives: &[PathBuf]) -> [Run; 2] {
-    ["rust", "python"].map(|kind| replay(&root().join("tests/lambdas/pixels").join(kind), drives, &[]))
+    ["rust", "python"]
+        .map(|kind| replay(&root().join("tests/lambdas/pixels").join(kind), drives, &[]))
 }
 
 #[test]
@@ -318,7 +365,9 @@ fn an_image_of_no_size_or_unknown_encoding_is_refused() {
         assert!(run.first_fault().expect("a fault").1.contains("image says it is 0x10"));
     }
     for run in pixels_of(image(1, 1, "rgb565", 2, &[0; 2])) {
-        assert!(run.first_fault().expect("a fault").1.contains("encoding `rgb565` is not supported"));
+        assert!(
+            run.first_fault().expect("a fault").1.contains("encoding `rgb565` is not supported")
+        );
     }
 }
 
@@ -340,7 +389,13 @@ fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
     bomb.extend([0xFF, 0xDA, 0, 12, 3, 1, 0, 2, 0, 3, 0, 0, 63, 0, 0xFF, 0xD9]);
     let folder = Folder::new();
     let topic = "/camera/front/image_raw";
-    let drive = one_topic(&folder, topic, "sensor_msgs/msg/CompressedImage", COMPRESSED, &[(1, compressed(&bomb))]);
+    let drive = one_topic(
+        &folder,
+        topic,
+        "sensor_msgs/msg/CompressedImage",
+        COMPRESSED,
+        &[(1, compressed(&bomb))],
+    );
     for kind in ["rust", "python"] {
         let copy = Copy::of(
             &format!("tests/lambdas/pixels/{kind}"),
@@ -358,10 +413,19 @@ fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
 fn a_sample_larger_than_max_size_is_counted_and_said() {
     let folder = Folder::new();
     let message = image(1000, 1000, "rgb8", 3000, &vec![7; 3_000_000]);
-    let drive = one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &[(1, message)]);
+    let drive = one_topic(
+        &folder,
+        "/camera/front/image_raw",
+        "sensor_msgs/msg/Image",
+        IMAGE,
+        &[(1, message)],
+    );
     for run in pixels_over(&[drive]) {
         let summary = run.must_exit(0).summary.as_ref().expect("a summary");
-        assert_eq!((summary.wakes, summary.topics[0].too_big, summary.topics[0].received), (0, 1, 0));
+        assert_eq!(
+            (summary.wakes, summary.topics[0].too_big, summary.topics[0].received),
+            (0, 1, 0)
+        );
         says(&run, &["samples dropped: larger than max_size", "camera", "1048576"]);
     }
 }
@@ -373,10 +437,17 @@ fn a_page_of_the_shim_that_is_none_is_refused() {
     for number in ["", "seven", "-4", "1", "99999"] {
         let mut replay = runtime();
         replay.env("GLEANER_PULSE", number).arg("replay").arg(root().join("examples/hello/rust"));
-        let output =
-            replay.arg(sample_drive()).arg("--out").arg(folder.path()).output().expect("gleaner-runtime starts");
+        let output = replay
+            .arg(sample_drive())
+            .arg("--out")
+            .arg(folder.path())
+            .output()
+            .expect("gleaner-runtime starts");
         let said = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{number}: {said}");
-        assert!(said.contains("cannot use the shim's page") && said.contains("cause: GLEANER_PULSE "), "{said}");
+        assert!(
+            said.contains("cannot use the shim's page") && said.contains("cause: GLEANER_PULSE "),
+            "{said}"
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Drives as people have them: what a lambda decides over a rosbag2 directory is what it decides over the same drive in MCAP.
+//! Drives as people have them: what a lambda decides over a rosbag2 directory is what it decides
+//! over the same drive in MCAP.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -39,12 +40,15 @@ fn a_database_of_an_old_distribution_leads_to_the_same_decisions_and_clips() {
     for example in ["hello", "brake-dark"] {
         for kind in ["rust", "python"] {
             let lambda = lambda(example, kind);
-            let (ours, theirs) = (braking(&lambda, &sample_drive(), &["--all"]), braking(&lambda, &bag, &["--all"]));
+            let (ours, theirs) =
+                (braking(&lambda, &sample_drive(), &["--all"]), braking(&lambda, &bag, &["--all"]));
             ours.must_exit(OK);
             theirs.must_exit(OK);
             assert!(ours.decisions.len() > 300);
             assert_eq!(decided(&ours), decided(&theirs), "{example} in {kind}");
-            let clips = |run: &Run| run.clips.iter().map(|clip| (clip.first_ns, clip.last_ns)).collect::<Vec<_>>();
+            let clips = |run: &Run| {
+                run.clips.iter().map(|clip| (clip.first_ns, clip.last_ns)).collect::<Vec<_>>()
+            };
             assert_eq!(clips(&ours), clips(&theirs), "{example} in {kind}");
         }
     }
@@ -55,15 +59,22 @@ fn a_packed_drive_is_unpacked_beside_the_results_for_both_kinds() {
     let (folder, out) = (Folder::new(), Folder::new());
     let database = directory(&folder, 1).join("drive_0.db3");
     for (name, drive) in [("drive.mcap.zstd", sample_drive()), ("drive.db3.zstd", database)] {
-        let packed = folder.write(name, zstd::encode_all(&fs::read(drive).unwrap()[..], 1).unwrap());
+        let packed =
+            folder.write(name, zstd::encode_all(&fs::read(drive).unwrap()[..], 1).unwrap());
         for kind in ["rust", "python"] {
             let lambda = lambda("hello", kind);
             let args = ["--set", "brake_mps2=-1.4", "--all", "--repeat", "2"];
             let run = replay_to(out.path(), &lambda, std::slice::from_ref(&packed), &args);
             let plain = braking(&lambda, &sample_drive(), &["--all"]);
             assert_eq!(decided(run.must_exit(OK)), decided(&plain), "{name}, {kind}");
-            let left = fs::read_dir(out.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect::<Vec<_>>();
-            assert!(!left.iter().any(|name| name.to_string_lossy().contains("unpacked")), "{left:?}");
+            let left = fs::read_dir(out.path())
+                .unwrap()
+                .map(|entry| entry.unwrap().file_name())
+                .collect::<Vec<_>>();
+            assert!(
+                !left.iter().any(|name| name.to_string_lossy().contains("unpacked")),
+                "{left:?}"
+            );
         }
     }
 }
@@ -77,8 +88,13 @@ fn a_part_of_a_drive_is_what_lies_between_two_times() {
     for from in ["10", "10s", "10000ms", from.as_str()] {
         let part = braking(&lambda, &sample_drive(), &["--all", "--from", from, "--to", "12.5"]);
         let span = start_ns + 10_000_000_000..start_ns + 12_500_000_000;
-        let stamps: Vec<_> = part.must_exit(OK).decisions.iter().map(|decision| decision.at_ns).collect();
-        let expected = all.decisions.iter().map(|decision| decision.at_ns).filter(|at_ns| span.contains(at_ns));
+        let stamps: Vec<_> =
+            part.must_exit(OK).decisions.iter().map(|decision| decision.at_ns).collect();
+        let expected = all
+            .decisions
+            .iter()
+            .map(|decision| decision.at_ns)
+            .filter(|at_ns| span.contains(at_ns));
         assert!(expected.eq(stamps), "--from {from}");
         let summary = part.summary.as_ref().unwrap();
         // Seconds in the results stay those of the drive.
@@ -96,7 +112,12 @@ fn a_part_that_is_none_is_refused_with_what_there_is() {
             assert!(run.stderr.contains(said), "{args:?}: {}", run.stderr);
         }
     }
-    assert!(braking(&lambda, &sample_drive(), &["--from", "5", "--to", "5"]).must_exit(USAGE).stderr.contains("--to"));
+    assert!(
+        braking(&lambda, &sample_drive(), &["--from", "5", "--to", "5"])
+            .must_exit(USAGE)
+            .stderr
+            .contains("--to")
+    );
 }
 
 #[test]
@@ -107,8 +128,14 @@ fn clips_hold_the_topics_that_the_command_line_chooses() {
         let clip = &run.must_exit(OK).clips[0];
         clip.topics.iter().map(|topic| topic.topic.clone()).collect::<Vec<_>>()
     };
-    assert_eq!(kept(&["--topics", "*"]), ["/camera/front/compressed", "/imu/data", "/vehicle/speed"]);
-    assert_eq!(kept(&["--topics", "/v*d", "--topics", "/imu/data"]), ["/vehicle/speed", "/imu/data"]);
+    assert_eq!(
+        kept(&["--topics", "*"]),
+        ["/camera/front/compressed", "/imu/data", "/vehicle/speed"]
+    );
+    assert_eq!(
+        kept(&["--topics", "/v*d", "--topics", "/imu/data"]),
+        ["/vehicle/speed", "/imu/data"]
+    );
     let none = braking(&lambda, &sample_drive(), &["--topics", "/lidar/*"]);
     let said = &none.must_exit(USAGE).stderr;
     assert!(said.contains("no topic `/lidar/*`") && said.contains("`/imu/data`"), "{said}");
@@ -121,7 +148,9 @@ fn clips_hold_the_topics_that_the_command_line_chooses() {
 fn what_is_recorded_moves_no_tick() {
     // The wheels' speed begins 3 ms later than the camera.
     let lambda = Copy::of("tests/lambdas/ticker/python", |manifest| {
-        manifest.replace("/imu/data", "/vehicle/speed").replace("sensor_msgs/msg/Imu", "geometry_msgs/msg/TwistStamped")
+        manifest
+            .replace("/imu/data", "/vehicle/speed")
+            .replace("sensor_msgs/msg/Imu", "geometry_msgs/msg/TwistStamped")
             + "\n[record]\ntopics = [\"/vehicle/speed\"]\npreroll = \"100ms\"\npostroll = \"100ms\"\n"
     });
     lambda.replace("main.py", "def on_tick(ctx):\n    pass\n");
@@ -136,8 +165,13 @@ fn what_is_recorded_moves_no_tick() {
     assert_eq!(ticks(&[]), alone);
     assert_eq!(ticks(&["--topics", "*", "--journal", journal.to_str().unwrap()]), alone);
     let drive = sample_drive();
-    let line =
-        [OsStr::new("replay"), lambda.path().as_os_str(), drive.as_os_str(), "--verify".as_ref(), journal.as_os_str()];
+    let line = [
+        OsStr::new("replay"),
+        lambda.path().as_os_str(),
+        drive.as_os_str(),
+        "--verify".as_ref(),
+        journal.as_os_str(),
+    ];
     assert_eq!(verify(&line).verified.expect("it is verified").wakes, 399);
 }
 
@@ -150,7 +184,17 @@ fn a_journal_of_a_part_of_a_directory_is_verified_as_it_is() {
     braking(&lambda, &bag, &["--from", "5", "--to", "20", "--journal", journal_arg]).must_exit(OK);
     let again = |args: &[&str]| {
         let line =
-            [&["replay", lambda.to_str().unwrap(), bag.to_str().unwrap(), "--verify", journal_arg][..], args].concat();
+            [
+                &[
+                    "replay",
+                    lambda.to_str().unwrap(),
+                    bag.to_str().unwrap(),
+                    "--verify",
+                    journal_arg,
+                ][..],
+                args,
+            ]
+            .concat();
         verify(&line.iter().map(AsRef::as_ref).collect::<Vec<_>>())
     };
     let verified = again(&[]).verified.expect("it is verified");
@@ -197,21 +241,34 @@ fn a_stamp_beyond_all_clocks_ends_the_drive_and_what_was_decided_before_is_kept(
     });
     let run = braking(&lambda("hello", "rust"), &drive, &["--no-record", "--all"]);
     let summary = run.must_exit(DAMAGED).summary.as_ref().unwrap();
-    assert!(summary.wakes > 1000 && run.decisions.iter().all(|decision| decision.at_ns < i64::MAX), "{summary:?}");
+    assert!(
+        summary.wakes > 1000 && run.decisions.iter().all(|decision| decision.at_ns < i64::MAX),
+        "{summary:?}"
+    );
     let damaged = summary.damaged.as_deref().unwrap();
-    assert!(damaged.contains("is damaged at byte") && damaged.contains("after the year 2262"), "{damaged}");
+    assert!(
+        damaged.contains("is damaged at byte") && damaged.contains("after the year 2262"),
+        "{damaged}"
+    );
 }
 
 #[test]
 fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
     let (folder, lambda) = (Folder::new(), lambda("hello", "rust"));
     let bag = directory(&folder, 1);
-    folder.write("drive/metadata.yaml", "rosbag2_bagfile_information:\n  storage_identifier: bag_v2\n");
+    folder.write(
+        "drive/metadata.yaml",
+        "rosbag2_bagfile_information:\n  storage_identifier: bag_v2\n",
+    );
     let run = braking(&lambda, &bag, &[]);
     run.must_exit(USAGE);
-    for said in
-        ["error: cannot use `", "metadata.yaml`", "cause: its storage is `bag_v2`", "help:  ", "ros2 bag reindex"]
-    {
+    for said in [
+        "error: cannot use `",
+        "metadata.yaml`",
+        "cause: its storage is `bag_v2`",
+        "help:  ",
+        "ros2 bag reindex",
+    ] {
         assert!(run.stderr.contains(said), "{}", run.stderr);
     }
     fs::remove_file(bag.join("metadata.yaml")).unwrap();
@@ -238,7 +295,9 @@ fn files_that_the_metadata_pass_over_are_named() {
 #[test]
 fn a_drive_with_hours_between_its_messages_and_hostile_sizes_is_shown_as_it_is() {
     let message = || image(u32::MAX, u32::MAX, "rgb8", 3, &[0; 3]);
-    for (last, gap) in [(7_200_000_000_001, "  7200000.0 ms  "), (i64::MAX as u64, "  9223372036854.8 ms  ")] {
+    for (last, gap) in
+        [(7_200_000_000_001, "  7200000.0 ms  "), (i64::MAX as u64, "  9223372036854.8 ms  ")]
+    {
         let folder = Folder::new();
         let messages = [(1, message()), (last, message())];
         let drive = one_topic(&folder, "/camera", "sensor_msgs/msg/Image", IMAGE, &messages);
@@ -261,20 +320,28 @@ fn what_is_in_a_drive_is_shown_without_a_lambda() {
         let (code, json) = topics(&[drive.to_str().unwrap(), "--json"]);
         assert_eq!(code, Some(0));
         let seen: DriveSeen = serde_json::from_str(&json).unwrap();
-        let found: Vec<_> =
-            seen.topics.iter().map(|topic| (topic.topic.as_str(), topic.messages, topic.is_defined)).collect();
-        let expected = [("/camera/front/compressed", 400), ("/imu/data", 4170), ("/vehicle/speed", 3316)];
+        let found: Vec<_> = seen
+            .topics
+            .iter()
+            .map(|topic| (topic.topic.as_str(), topic.messages, topic.is_defined))
+            .collect();
+        let expected =
+            [("/camera/front/compressed", 400), ("/imu/data", 4170), ("/vehicle/speed", 3316)];
         assert_eq!(found, expected.map(|(topic, messages)| (topic, Some(messages), true)));
         let (_, text) = topics(&[drive.to_str().unwrap()]);
         assert!(text.contains("/imu/data") && text.contains("4,170"), "{text}");
         let imu = &seen.topics[1];
         let interval = imu.interval.unwrap();
-        assert_eq!((imu.read, interval.n, imu.missing, imu.largest_bytes), (4170, 4169, Some(0), 320));
+        assert_eq!(
+            (imu.read, interval.n, imu.missing, imu.largest_bytes),
+            (4170, 4169, Some(0), 320)
+        );
         assert!((9_500_000..9_700_000).contains(&interval.p50_ns), "{interval:?}");
         let picture = seen.topics[0].picture.clone().unwrap();
         assert_eq!((picture.width, picture.height, picture.is_compressed), (640, 360, true));
         // What is suggested is a manifest's.
-        let lambda = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\n";
+        let lambda =
+            "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\n";
         let (_, tables) = text.split_once("for lambda.toml:\n").unwrap();
         let manifest = folder.path().join("suggested");
         folder.write("suggested/lambda.toml", format!("{lambda}schedule.event = 'imu'\n{tables}"));

@@ -1,4 +1,5 @@
-//! A runtime in a control group. No machine of ours delegates one, so it is a folder that looks like one; what the kernel would do is not there.
+//! A runtime in a control group. No machine of ours delegates one, so it is a folder that looks
+//! like one; what the kernel would do is not there.
 
 use std::path::Path;
 use std::process::Command;
@@ -7,9 +8,9 @@ use gleaner_tests::{Copy, Folder, program, root, sample_drive};
 
 const MIB: u64 = 1 << 20;
 
-/// Makes the files that the kernel would, of the group that gleaner-shim makes next, and becomes that.
-const AS_THE_KERNEL: &str =
-    r#"tree=$1; shift; mkdir "$tree/gleaner-$$" && : > "$tree/gleaner-$$/cgroup.procs" && exec "$@""#;
+/// Makes the files that the kernel would, of the group that gleaner-shim makes next, and becomes
+/// that.
+const AS_THE_KERNEL: &str = r#"tree=$1; shift; mkdir "$tree/gleaner-$$" && : > "$tree/gleaner-$$/cgroup.procs" && exec "$@""#;
 
 /// The bound of the group after a replay by this lambda, with options of gleaner-shim.
 fn bound(lambda: &Path, options: &[&str]) -> u64 {
@@ -21,7 +22,12 @@ fn bound(lambda: &Path, options: &[&str]) -> u64 {
         .arg(program("gleaner-shim"))
         .arg("--cgroup")
         .arg(tree.path());
-    shim.args(options).arg("--").arg(program("gleaner-runtime")).arg("replay").arg(lambda).arg(sample_drive());
+    shim.args(options)
+        .arg("--")
+        .arg(program("gleaner-runtime"))
+        .arg("replay")
+        .arg(lambda)
+        .arg(sample_drive());
     shim.arg("--out").arg(out.path()).env("XDG_CACHE_HOME", root().join("target/test-cache"));
     let output = shim.output().expect("there is a `sh`");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -37,7 +43,11 @@ fn the_bound_of_a_control_group_is_what_the_manifest_lets_a_lambda_take() {
     for kind in ["rust", "python"] {
         let with = |memory: &str| {
             let other = |line: &str| {
-                if line.starts_with("memory = ") { format!("memory = \"{memory}\"") } else { line.to_owned() }
+                if line.starts_with("memory = ") {
+                    format!("memory = \"{memory}\"")
+                } else {
+                    line.to_owned()
+                }
             };
             Copy::of(&format!("tests/lambdas/misbehave/{kind}"), |manifest| {
                 manifest.lines().map(|line| other(line) + "\n").collect()

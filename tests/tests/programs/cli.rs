@@ -39,15 +39,22 @@ fn hello() -> PathBuf {
 #[test]
 fn json_is_the_summary_of_what_was_asked_for() {
     let (out, drive) = (Folder::new(), sample_drive());
-    let car = Copy::of("examples/hello/rust", |manifest| manifest.replace("\"/imu/data\"", "\"/car/imu\""));
+    let car = Copy::of("examples/hello/rust", |manifest| {
+        manifest.replace("\"/imu/data\"", "\"/car/imu\"")
+    });
     let args = ["--set", "brake_mps2=-1.4", "--remap", "/car/imu:=/imu/data", "--all", "--json"];
     let (stdout, stderr) = ends_with(OK, &mut replay(car.path(), &drive, &out, &args));
     let summary: Summary = serde_json::from_str(&stdout).expect("one summary and nothing else");
     assert_eq!((summary.lambda.as_str(), summary.triggers, summary.faults), ("hello", 3, 0));
     assert_eq!((&summary.drive, summary.out.as_path()), (&vec![drive], out.path()));
     assert_eq!(stderr, "");
-    let decisions = std::fs::read_to_string(out.path().join("decisions.jsonl")).expect("decisions are written");
-    assert_eq!(decisions.lines().count() as u64, summary.wakes, "with --all there is a line for each wake");
+    let decisions =
+        std::fs::read_to_string(out.path().join("decisions.jsonl")).expect("decisions are written");
+    assert_eq!(
+        decisions.lines().count() as u64,
+        summary.wakes,
+        "with --all there is a line for each wake"
+    );
 }
 
 #[test]
@@ -56,7 +63,8 @@ fn people_are_told_each_trigger_and_where_the_files_are() {
     let args = ["--set", "brake_mps2=-1.4"];
     let (stdout, _) = ends_with(OK, &mut replay(&hello(), &sample_drive(), &out, &args));
     assert!(stdout.starts_with("hello 0.1.0 (wasm): 3 triggers in "), "{stdout}");
-    let expected = std::fs::read_to_string(root().join("examples/hello/expected.txt")).expect("expected.txt");
+    let expected =
+        std::fs::read_to_string(root().join("examples/hello/expected.txt")).expect("expected.txt");
     for (line, expected) in stdout.lines().skip(1).zip(expected.lines()) {
         let words: Vec<_> = expected.split(' ').collect();
         assert_eq!(line.trim_start(), format!("{} s  {}  {}", words[0], words[1], words[2]));
@@ -87,7 +95,8 @@ fn a_faulty_lambda_gets_a_summary_with_the_cause() {
 fn a_damaged_drive_gets_a_summary_of_what_was_read() {
     let (folder, out) = (Folder::new(), Folder::new());
     let args = ["--set", "brake_mps2=-1.4"];
-    let (stdout, _) = ends_with(DAMAGED, &mut replay(&hello(), &truncated(&folder, 0.5), &out, &args));
+    let (stdout, _) =
+        ends_with(DAMAGED, &mut replay(&hello(), &truncated(&folder, 0.5), &out, &args));
     assert!(stdout.contains("hard-brake") && stdout.contains("the drive is damaged"), "{stdout}");
 }
 
@@ -105,7 +114,8 @@ fn a_reader_that_is_gone_is_no_failure() {
 }
 
 /// Runs its arguments on a terminal of their own, and shows what appears there.
-const TERMINAL: &str = "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))";
+const TERMINAL: &str =
+    "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))";
 
 #[test]
 fn on_a_terminal_an_error_is_shown_to_its_last_line() {
@@ -118,8 +128,10 @@ fn on_a_terminal_an_error_is_shown_to_its_last_line() {
         let gleaner = replay(&hello(), &sample_drive(), &out, &typo);
         let mut terminal = Command::new(&python);
         terminal.args(["-c", TERMINAL]).arg(gleaner.get_program()).args(gleaner.get_args());
-        let (shown, _) =
-            ends_with(USAGE, terminal.envs(gleaner.get_envs().filter_map(|(key, value)| Some((key, value?)))));
+        let (shown, _) = ends_with(
+            USAGE,
+            terminal.envs(gleaner.get_envs().filter_map(|(key, value)| Some((key, value?)))),
+        );
         for line in plain.lines() {
             assert!(shown.contains(line), "no `{line}` in:\n{shown}");
         }

@@ -1,5 +1,5 @@
-//! Compiling a component has a bound of memory and of CPU time, and what would go beyond is refused in words. Native code in the cache runs
-//! only as it was written there.
+//! Compiling a component has a bound of memory and of CPU time, and what would go beyond is refused
+//! in words. Native code in the cache runs only as it was written there.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -9,11 +9,13 @@ use std::process::{Command, Output, Stdio};
 use gleaner_base::Exit;
 use gleaner_tests::{Copy, Folder, program, replay, root, sample_drive};
 
-/// A component of so many functions, each of which takes a quarter of a second to be compiled, and not much memory: thousands of values
-/// live until its end, and blocks keep the compiler from putting them together.
+/// A component of so many functions, each of which takes a quarter of a second to be compiled, and
+/// not much memory: thousands of values live until its end, and blocks keep the compiler from
+/// putting them together.
 fn slow(functions: usize) -> Vec<u8> {
     const VALUES: usize = 4000;
-    let block = "block local.get 0 i32.wrap_i64 br_if 0 local.get 1 i64.const 3 i64.mul local.set 1 end ";
+    let block =
+        "block local.get 0 i32.wrap_i64 br_if 0 local.get 1 i64.const 3 i64.mul local.set 1 end ";
     let value = format!("local.get 0 i64.const 7 i64.rotl local.tee 0 {block}");
     let body = value.repeat(VALUES) + &"i64.xor ".repeat(VALUES - 1);
     let function = format!("(func (param i64 i64) (result i64) {body})");
@@ -26,11 +28,13 @@ fn check(component: &[u8], seconds: u64) -> Output {
     let (lambda, home) = (Copy::of("examples/hello/rust", |manifest| manifest), Folder::new());
     lambda.replace("hello.wasm", component);
     let compile = program("gleaner-compile");
-    let script = format!("#!/bin/sh\nexec '{}' --cpu-seconds {seconds} \"$@\"\n", compile.display());
+    let script =
+        format!("#!/bin/sh\nexec '{}' --cpu-seconds {seconds} \"$@\"\n", compile.display());
     let script = home.write("gleaner-compile", script);
     fs::set_permissions(script, PermissionsExt::from_mode(0o755)).unwrap();
     // Without it this would be no installation.
-    std::os::unix::fs::symlink(program("gleaner-runtime"), home.path().join("gleaner-runtime")).unwrap();
+    std::os::unix::fs::symlink(program("gleaner-runtime"), home.path().join("gleaner-runtime"))
+        .unwrap();
     let mut check = Command::new(program("gleaner"));
     check.env("GLEANER_HOME", home.path()).env("XDG_CACHE_HOME", home.path().join("cache"));
     check.arg("check").arg(lambda.path()).output().expect("gleaner starts")
@@ -59,11 +63,22 @@ fn a_component_that_is_compiled_for_too_long_is_refused() {
 fn the_bound_of_cpu_time_can_only_be_made_tighter() {
     let folder = Folder::new();
     let component = folder.write("few.wasm", slow(1));
-    for (seconds, ends_well) in [("120", true), ("121", false), ("0", false), ("-1", false), ("x", false)] {
+    for (seconds, ends_well) in
+        [("120", true), ("121", false), ("0", false), ("-1", false), ("x", false)]
+    {
         let mut compile = Command::new(program("gleaner-compile"));
-        compile.arg(&component).arg("--cache").arg(folder.path().join(seconds)).args(["--cpu-seconds", seconds]);
+        compile
+            .arg(&component)
+            .arg("--cache")
+            .arg(folder.path().join(seconds))
+            .args(["--cpu-seconds", seconds]);
         let output = compile.output().expect("gleaner-compile starts");
-        assert_eq!(output.status.success(), ends_well, "{seconds}: {}", String::from_utf8_lossy(&output.stderr));
+        assert_eq!(
+            output.status.success(),
+            ends_well,
+            "{seconds}: {}",
+            String::from_utf8_lossy(&output.stderr)
+        );
     }
 }
 
@@ -72,9 +87,21 @@ fn bytes_that_are_no_component_are_refused_once_with_a_help_that_fits() {
     let whole = fs::read(root().join("examples/hello/rust/build/hello.wasm")).unwrap();
     let threads = wat::parse_str("(component (core module (memory 1 1 shared)))").unwrap();
     let cases: [(&[u8], &str, &str); 4] = [
-        (b"not a component", "is no WebAssembly component: its first bytes are not", "name the component as `entry`"),
-        (b"\0asm\x01\0\0\0", "is no WebAssembly component: it is a core module", "`gleaner build DIR`, which makes"),
-        (&whole[..whole.len() / 2], "cannot compile component", "may be cut off or damaged; build the lambda again"),
+        (
+            b"not a component",
+            "is no WebAssembly component: its first bytes are not",
+            "name the component as `entry`",
+        ),
+        (
+            b"\0asm\x01\0\0\0",
+            "is no WebAssembly component: it is a core module",
+            "`gleaner build DIR`, which makes",
+        ),
+        (
+            &whole[..whole.len() / 2],
+            "cannot compile component",
+            "may be cut off or damaged; build the lambda again",
+        ),
         (&threads, "threads must be enabled", "without that proposal of WebAssembly"),
     ];
     for (component, cause, help) in cases {
@@ -84,7 +111,11 @@ fn bytes_that_are_no_component_are_refused_once_with_a_help_that_fits() {
         let said = &run.must_exit(Exit::Usage.code()).stderr;
         assert!(said.starts_with("error: cannot load lambda `hello`\n  cause: "), "{said}");
         assert!(said.contains(cause) && said.contains(help), "{said}");
-        assert_eq!([said.matches("hello.wasm").count(), said.matches("help:").count()], [1, 1], "{said}");
+        assert_eq!(
+            [said.matches("hello.wasm").count(), said.matches("help:").count()],
+            [1, 1],
+            "{said}"
+        );
     }
 }
 
@@ -101,14 +132,22 @@ impl Cache {
         fs::set_permissions(home.path(), PermissionsExt::from_mode(0o700)).unwrap();
         let mut cache = Self { home, entry: PathBuf::new(), healthy: Vec::new() };
         cache.replay("first");
-        cache.entry = fs::read_dir(cache.home.path().join("gleaner")).unwrap().next().unwrap().unwrap().path();
+        cache.entry = fs::read_dir(cache.home.path().join("gleaner"))
+            .unwrap()
+            .next()
+            .unwrap()
+            .unwrap()
+            .path();
         cache.healthy = fs::read(&cache.entry).unwrap();
         cache
     }
 
     fn command(&self, out: &str) -> Command {
         let mut replay = Command::new(program("gleaner-runtime"));
-        replay.env("XDG_CACHE_HOME", self.home.path()).arg("replay").arg(root().join("examples/hello/rust"));
+        replay
+            .env("XDG_CACHE_HOME", self.home.path())
+            .arg("replay")
+            .arg(root().join("examples/hello/rust"));
         replay.arg(sample_drive()).args(["--set", "brake_mps2=-1.4", "--no-record", "--out"]);
         replay.arg(self.home.path().join(out)).stdout(Stdio::null()).stderr(Stdio::piped());
         replay
@@ -123,7 +162,8 @@ impl Cache {
     fn ended_well(&self, out: &str, output: &Output) -> (String, String) {
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(0), "{said}");
-        let decisions = fs::read_to_string(self.home.path().join(out).join("decisions.jsonl")).unwrap();
+        let decisions =
+            fs::read_to_string(self.home.path().join(out).join("decisions.jsonl")).unwrap();
         (decisions.lines().map(without_time).collect(), said)
     }
 
@@ -134,13 +174,16 @@ impl Cache {
 
     fn warning(&self) -> String {
         let file = self.entry.display();
-        format!("warning: native code in the cache is damaged: the component is compiled again file={file} why=")
+        format!(
+            "warning: native code in the cache is damaged: the component is compiled again file={file} why="
+        )
     }
 }
 
 /// A line of `decisions.jsonl` but for times of this machine.
 fn without_time(line: &str) -> String {
-    let mut decision: serde_json::Map<String, serde_json::Value> = serde_json::from_str(line).unwrap();
+    let mut decision: serde_json::Map<String, serde_json::Value> =
+        serde_json::from_str(line).unwrap();
     decision.remove("run_ns");
     serde_json::Value::Object(decision).to_string() + "\n"
 }
@@ -158,7 +201,8 @@ fn native_code_that_was_changed_is_never_run_and_is_made_again() {
     };
     // A number of the lambda's: 3 s, within which it does not trigger again.
     let refractory = 3_000_000_000_u64.to_le_bytes();
-    let constant = cache.healthy.windows(8).position(|bytes| bytes == refractory).expect("it is in the code");
+    let constant =
+        cache.healthy.windows(8).position(|bytes| bytes == refractory).expect("it is in the code");
     let mut damaged = vec![
         flipped(constant + 3, 0x80),
         cache.healthy[..cache.healthy.len() / 2].to_vec(),
@@ -170,15 +214,23 @@ fn native_code_that_was_changed_is_never_run_and_is_made_again() {
     ];
     let mut state = 1_u64;
     damaged.extend((0..6).map(|bit| {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         flipped((state >> 33) as usize % cache.healthy.len(), 1 << bit)
     }));
     for (case, bytes) in damaged.iter().enumerate() {
         cache.put(bytes);
         let (decisions, said) = cache.replay("damaged");
         assert_eq!(decisions, expected, "case {case}");
-        assert!(said.starts_with(&cache.warning()) && said.lines().count() == 1, "case {case}: {said}");
-        assert_eq!(cache.replay("again"), (expected.clone(), String::new()), "case {case}: it was not made again");
+        assert!(
+            said.starts_with(&cache.warning()) && said.lines().count() == 1,
+            "case {case}: {said}"
+        );
+        assert_eq!(
+            cache.replay("again"),
+            (expected.clone(), String::new()),
+            "case {case}: it was not made again"
+        );
     }
 }
 
@@ -187,7 +239,8 @@ fn native_code_of_another_component_is_not_run() {
     let cache = Cache::new();
     let mut compile = Command::new(program("gleaner-compile"));
     let other = root().join("tests/lambdas/misbehave/rust/build/misbehave.wasm");
-    let output = compile.arg(other).arg("--cache").arg(cache.home.path().join("gleaner")).output().unwrap();
+    let output =
+        compile.arg(other).arg("--cache").arg(cache.home.path().join("gleaner")).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let (expected, _) = cache.replay("healthy");
     cache.put(&fs::read(String::from_utf8_lossy(&output.stdout).trim_end()).unwrap());
@@ -202,12 +255,18 @@ fn processes_that_meet_damaged_code_at_the_same_time_all_go_on() {
     let (expected, _) = cache.replay("healthy");
     cache.put(&cache.healthy[..1000]);
     let outs: Vec<_> = (0..8).map(|number| format!("at-once-{number}")).collect();
-    let replays: Vec<_> = outs.iter().map(|out| cache.command(out).spawn().expect("gleaner-runtime starts")).collect();
+    let replays: Vec<_> = outs
+        .iter()
+        .map(|out| cache.command(out).spawn().expect("gleaner-runtime starts"))
+        .collect();
     for (out, replay) in outs.iter().zip(replays) {
         let (decisions, _) = cache.ended_well(out, &replay.wait_with_output().unwrap());
         assert_eq!(decisions, expected, "{out}");
     }
-    assert_eq!(names(cache.entry.parent().unwrap()), [cache.entry.file_name().unwrap().to_str().unwrap()]);
+    assert_eq!(
+        names(cache.entry.parent().unwrap()),
+        [cache.entry.file_name().unwrap().to_str().unwrap()]
+    );
     assert_eq!(cache.replay("after"), (expected, String::new()));
 }
 

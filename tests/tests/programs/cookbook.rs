@@ -1,5 +1,5 @@
-//! The recipes of the cookbook in the real host: on the sample drive as `expected.txt` says, and, where that has no such moment, on the
-//! sample drive with the moment put into it.
+//! The recipes of the cookbook in the real host: on the sample drive as `expected.txt` says, and,
+//! where that has no such moment, on the sample drive with the moment put into it.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,7 +14,8 @@ const IMU: &str = "/imu/data";
 const SPEED: &str = "/vehicle/speed";
 const CAMERA: &str = "/camera/front/compressed";
 
-/// `linear_acceleration.y` of an IMU message: behind orientation, angular velocity and their covariances.
+/// `linear_acceleration.y` of an IMU message: behind orientation, angular velocity and their
+/// covariances.
 const LATERAL: usize = 4 + 9 + 3 + 9 + 1;
 /// `twist.linear.x`.
 const FORWARD: usize = 0;
@@ -22,7 +23,8 @@ const FORWARD: usize = 0;
 fn recipes() -> Vec<PathBuf> {
     let folders = fs::read_dir(root().join("examples/cookbook")).expect("there is a cookbook");
     let folders = folders.map(|folder| folder.expect("it can be listed").path());
-    let mut recipes: Vec<_> = folders.filter(|folder| folder.join("lambda.toml").is_file()).collect();
+    let mut recipes: Vec<_> =
+        folders.filter(|folder| folder.join("lambda.toml").is_file()).collect();
     recipes.sort();
     recipes
 }
@@ -38,7 +40,10 @@ fn on(recipe: &str, change: impl FnMut(&mut Changed) -> bool) -> Run {
 
 /// What a run found: labels, and times in seconds, rounded down to tenths.
 fn found(run: &Run) -> Vec<(String, f64)> {
-    run.labels().into_iter().zip(run.seconds().into_iter().map(|second| (second * 10.0).floor() / 10.0)).collect()
+    run.labels()
+        .into_iter()
+        .zip(run.seconds().into_iter().map(|second| (second * 10.0).floor() / 10.0))
+        .collect()
 }
 
 fn is(message: &Changed, topic: &str, from_s: f64, to_s: f64) -> bool {
@@ -47,7 +52,10 @@ fn is(message: &Changed, topic: &str, from_s: f64, to_s: f64) -> bool {
 
 #[test]
 fn there_are_ten_recipes_five_in_each_language() {
-    let kinds = recipes().iter().map(|recipe| Manifest::load(recipe).unwrap().lambda.kind).collect::<Vec<_>>();
+    let kinds = recipes()
+        .iter()
+        .map(|recipe| Manifest::load(recipe).unwrap().lambda.kind)
+        .collect::<Vec<_>>();
     let count = |kind| kinds.iter().filter(|other| **other == kind).count();
     assert_eq!((count(Kind::Wasm), count(Kind::Python)), (5, 5));
 }
@@ -61,7 +69,11 @@ fn every_recipe_decides_as_expected_on_the_sample_drive() {
         let (command, rows) = expected.split_once('\n').unwrap_or((&expected, ""));
         let words: Vec<_> = command.split(' ').collect();
         let folder = format!("examples/cookbook/{name}");
-        assert_eq!(words[..4], ["gleaner", "replay", &folder, "examples/data/highway_drive.mcap"], "{name}");
+        assert_eq!(
+            words[..4],
+            ["gleaner", "replay", &folder, "examples/data/highway_drive.mcap"],
+            "{name}"
+        );
         let run = replay(&recipe, &[sample_drive()], &words[4..]);
         run.must_exit(0);
         assert_eq!(run.rows(), rows, "{name}");

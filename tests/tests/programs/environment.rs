@@ -1,4 +1,5 @@
-//! What a Python lambda's own environment starts before the lambda, which it brings along as it likes, is shut in as the lambda is.
+//! What a Python lambda's own environment starts before the lambda, which it brings along as it
+//! likes, is shut in as the lambda is.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -35,15 +36,20 @@ for name, attempt in TRIES.items():
         print(f"<{name}> refused", file=sys.stderr)
 "#;
 
-/// A lambda with an environment that runs [`TRIES`] when its interpreter starts. It has no numpy, so that is all that comes of it.
+/// A lambda with an environment that runs [`TRIES`] when its interpreter starts. It has no numpy,
+/// so that is all that comes of it.
 fn hostile(folder: &Folder) -> PathBuf {
     copy_lambda("tests/lambdas/misbehave/python", folder, "lambda", |manifest| manifest);
     let lambda = folder.path().join("lambda");
     let python = Parts::find().and_then(|parts| parts.python(None)).expect("there is a Python");
-    let made = Command::new(python).args(["-m", "venv", "--without-pip", ".venv"]).current_dir(&lambda).status();
+    let made = Command::new(python)
+        .args(["-m", "venv", "--without-pip", ".venv"])
+        .current_dir(&lambda)
+        .status();
     assert!(made.expect("Python starts").success());
     let lib = lambda.join(".venv/lib");
-    let version = std::fs::read_dir(&lib).unwrap().next().expect("a folder for the version").unwrap().path();
+    let version =
+        std::fs::read_dir(&lib).unwrap().next().expect("a folder for the version").unwrap().path();
     std::fs::write(version.join("site-packages/sitecustomize.py"), TRIES).unwrap();
     lambda
 }
@@ -51,13 +57,21 @@ fn hostile(folder: &Folder) -> PathBuf {
 fn start(lambda: &Path, out: &Path, with_shim: bool) -> String {
     let mut command = if with_shim {
         let mut shim = Command::new(program("gleaner-shim"));
-        shim.arg("--").arg(program("gleaner-runtime")).env("XDG_CACHE_HOME", root().join("target/test-cache"));
+        shim.arg("--")
+            .arg(program("gleaner-runtime"))
+            .env("XDG_CACHE_HOME", root().join("target/test-cache"));
         shim
     } else {
         runtime()
     };
     // Or it would be taken instead of the lambda's own.
-    command.env_remove("GLEANER_PYTHON").arg("replay").arg(lambda).arg(sample_drive()).arg("--out").arg(out);
+    command
+        .env_remove("GLEANER_PYTHON")
+        .arg("replay")
+        .arg(lambda)
+        .arg(sample_drive())
+        .arg("--out")
+        .arg(out);
     let output = command.output().expect("it starts");
     assert_ne!(output.status.code(), Some(0), "an environment without numpy will not do");
     String::from_utf8_lossy(&output.stderr).into_owned()
@@ -67,7 +81,10 @@ fn start(lambda: &Path, out: &Path, with_shim: bool) -> String {
 fn start_up_code_of_an_environment_is_shut_in_before_it_runs() {
     let folder = Folder::new();
     let lambda = hostile(&folder);
-    let tries = TRIES.lines().filter_map(|line| line.strip_prefix("    \"")?.split_once('"')).map(|(name, _)| name);
+    let tries = TRIES
+        .lines()
+        .filter_map(|line| line.strip_prefix("    \"")?.split_once('"'))
+        .map(|(name, _)| name);
     let tries: Vec<_> = tries.collect();
     assert_eq!(tries.len(), 16);
     for with_shim in [true, false] {
@@ -75,8 +92,14 @@ fn start_up_code_of_an_environment_is_shut_in_before_it_runs() {
         for name in &tries {
             assert!(said.contains(&format!("<{name}> refused")), "{name}: {said}");
         }
-        assert!(said.contains("at the start of its environment: No module named 'numpy'; "), "{said}");
-        assert!(said.contains("pip install numpy, or name another interpreter: GLEANER_PYTHON"), "{said}");
+        assert!(
+            said.contains("at the start of its environment: No module named 'numpy'; "),
+            "{said}"
+        );
+        assert!(
+            said.contains("pip install numpy, or name another interpreter: GLEANER_PYTHON"),
+            "{said}"
+        );
     }
 }
 
@@ -87,8 +110,20 @@ fn an_environment_that_is_not_used_is_named_with_the_way_out() {
     let lambda = folder.path().join("lambda");
     let python = Parts::find().and_then(|parts| parts.python(None)).expect("there is a Python");
     let environment = ["-m", "venv", "--copies", "--without-pip", ".venv"];
-    assert!(Command::new(python).args(environment).current_dir(&lambda).status().expect("Python starts").success());
-    let output = runtime().env_remove("GLEANER_PYTHON").arg("check").arg(&lambda).output().expect("it starts");
+    assert!(
+        Command::new(python)
+            .args(environment)
+            .current_dir(&lambda)
+            .status()
+            .expect("Python starts")
+            .success()
+    );
+    let output = runtime()
+        .env_remove("GLEANER_PYTHON")
+        .arg("check")
+        .arg(&lambda)
+        .output()
+        .expect("it starts");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("warning: the lambda's environment is not used"), "{said}");
     assert!(said.contains("make the environment with `python3 -m venv`, which links"), "{said}");
@@ -101,8 +136,12 @@ fn a_lambda_whose_file_is_a_pipe_is_refused_and_not_waited_for() {
     let entry = folder.path().join("lambda/build/main.py");
     std::fs::remove_file(&entry).unwrap();
     assert!(Command::new("mkfifo").arg(&entry).status().expect("there is a `mkfifo`").success());
-    let output = runtime().arg("check").arg(folder.path().join("lambda")).output().expect("it starts");
+    let output =
+        runtime().arg("check").arg(folder.path().join("lambda")).output().expect("it starts");
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{said}");
-    assert!(said.contains("main.py`\n  cause: it is no file\n  help:  put a file in its place"), "{said}");
+    assert!(
+        said.contains("main.py`\n  cause: it is no file\n  help:  put a file in its place"),
+        "{said}"
+    );
 }

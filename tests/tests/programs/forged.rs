@@ -1,7 +1,8 @@
-//! A clip whose statements, messages or attachments were changed is refused, and the record and the key are named.
+//! A clip whose statements, messages or attachments were changed is refused, and the record and the
+//! key are named.
 //!
-//! Each forgery writes the clip again with right checksums of its own, so that nothing but the comparison of the clip with itself
-//! can find it.
+//! Each forgery writes the clip again with right checksums of its own, so that nothing but the
+//! comparison of the clip with itself can find it.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -36,7 +37,12 @@ impl Recorded {
 
     fn verify(&self, parts: &Parts) -> Verification {
         let path = self.out.write("forged.mcap", parts.bytes());
-        verify(&["verify".as_ref(), path.as_ref(), "--lambda".as_ref(), self.lambda.as_ref() as &OsStr])
+        verify(&[
+            "verify".as_ref(),
+            path.as_ref(),
+            "--lambda".as_ref(),
+            self.lambda.as_ref() as &OsStr,
+        ])
     }
 }
 
@@ -55,13 +61,15 @@ fn other(value: &str) -> String {
     }
 }
 
-/// Every record dropped and doubled, with a key more, and without each of its keys and with another value of it.
+/// Every record dropped and doubled, with a key more, and without each of its keys and with another
+/// value of it.
 fn records(parts: &Parts) -> Vec<Forgery> {
     let mut forgeries = Vec::new();
     for (index, Metadata { name, metadata }) in parts.metadata.iter().enumerate() {
         let of = |what: &str| format!("{what}: record {index}, {name}");
         let named = &[name.as_str()];
-        forgeries.push(forgery(&of("dropped"), named, move |parts| drop(parts.metadata.remove(index))));
+        forgeries
+            .push(forgery(&of("dropped"), named, move |parts| drop(parts.metadata.remove(index))));
         forgeries.push(forgery(&of("doubled"), named, move |parts| {
             let double = parts.metadata[index].clone();
             parts.metadata.push(double);
@@ -88,19 +96,30 @@ fn records(parts: &Parts) -> Vec<Forgery> {
 fn statements() -> Vec<Forgery> {
     vec![
         forgery("attributes of a decision", &["gleaner.decision"], |parts| {
-            parts.record("decision").insert("attributes".to_owned(), r#"{"pedestrian":true}"#.to_owned());
+            parts
+                .record("decision")
+                .insert("attributes".to_owned(), r#"{"pedestrian":true}"#.to_owned());
         }),
         forgery("attributes of a decision and of the line", &["gleaner.begin"], |parts| {
             let attributes = r#"{"pedestrian":true}"#;
             parts.record("decision").insert("attributes".to_owned(), attributes.to_owned());
-            parts.change_line(|line| line.moments[0].attributes = serde_json::from_str(attributes).unwrap());
+            parts.change_line(|line| {
+                line.moments[0].attributes = serde_json::from_str(attributes).unwrap()
+            });
         }),
         forgery("attributes everywhere", &["gleaner.decision"], |parts| {
             let attributes = r#"{"pedestrian":true}"#;
             parts.record("decision").insert("attributes".to_owned(), attributes.to_owned());
-            parts.change_line(|line| line.moments[0].attributes = serde_json::from_str(attributes).unwrap());
-            let moment = serde_json::from_str::<Clip>(&parts.record("clip")["line"]).unwrap().moments.remove(0);
-            parts.record("begin").insert("moment".to_owned(), serde_json::to_string(&moment).unwrap());
+            parts.change_line(|line| {
+                line.moments[0].attributes = serde_json::from_str(attributes).unwrap()
+            });
+            let moment = serde_json::from_str::<Clip>(&parts.record("clip")["line"])
+                .unwrap()
+                .moments
+                .remove(0);
+            parts
+                .record("begin")
+                .insert("moment".to_owned(), serde_json::to_string(&moment).unwrap());
         }),
         forgery("one trigger less, everywhere", &["gleaner.decision", "trigger 1"], |parts| {
             parts.metadata.retain(|metadata| metadata.name != "gleaner.decision");
@@ -110,7 +129,10 @@ fn statements() -> Vec<Forgery> {
                 line.moments.clear();
                 line.short.push("continues the clip before".to_owned());
             });
-            let short = serde_json::from_str::<Clip>(&parts.record("clip")["line"]).unwrap().short.join("; ");
+            let short = serde_json::from_str::<Clip>(&parts.record("clip")["line"])
+                .unwrap()
+                .short
+                .join("; ");
             parts.record("clip").insert("short".to_owned(), short);
         }),
         forgery("one trigger more, counted only", &["gleaner.clip", "triggers"], |parts| {
@@ -126,23 +148,34 @@ fn statements() -> Vec<Forgery> {
             let first_ns = other(&parts.record("clip")["first_ns"]);
             parts.record("clip").insert("first_ns".to_owned(), first_ns);
         }),
-        forgery("from_ns after the first message, three times", &["gleaner.clip", "from_ns"], |parts| {
-            let later = serde_json::from_str::<Clip>(&parts.record("clip")["line"]).unwrap().moments[0].at_ns;
-            parts.change_line(|line| line.from_ns = later);
-            parts.record("clip").insert("from_ns".to_owned(), later.to_string());
-            parts.record("begin").insert("from_ns".to_owned(), later.to_string());
-        }),
+        forgery(
+            "from_ns after the first message, three times",
+            &["gleaner.clip", "from_ns"],
+            |parts| {
+                let later =
+                    serde_json::from_str::<Clip>(&parts.record("clip")["line"]).unwrap().moments[0]
+                        .at_ns;
+                parts.change_line(|line| line.from_ns = later);
+                parts.record("clip").insert("from_ns".to_owned(), later.to_string());
+                parts.record("begin").insert("from_ns".to_owned(), later.to_string());
+            },
+        ),
         forgery("received, twice", &["gleaner.topic", "received"], |parts| {
             parts.topic(CAMERA).insert("received".to_owned(), "1000".to_owned());
             parts.change_line(|line| {
-                line.topics.iter_mut().filter(|of| of.topic == CAMERA).for_each(|of| of.received = Some(1000));
+                line.topics
+                    .iter_mut()
+                    .filter(|of| of.topic == CAMERA)
+                    .for_each(|of| of.received = Some(1000));
             });
         }),
         forgery("a number beyond all bounds", &["gleaner.topic", "overwritten"], |parts| {
             parts.topic(CAMERA).insert("overwritten".to_owned(), u64::MAX.to_string());
         }),
         forgery("a record of no recorder", &["gleaner.more"], |parts| {
-            parts.metadata.push(Metadata { name: "gleaner.more".to_owned(), metadata: BTreeMap::new() });
+            parts
+                .metadata
+                .push(Metadata { name: "gleaner.more".to_owned(), metadata: BTreeMap::new() });
         }),
     ]
 }
@@ -161,13 +194,20 @@ fn messages() -> Vec<Forgery> {
             parts.drop_messages_of(CAMERA);
             state_none(parts);
         }),
-        forgery("no camera message, and 0 stated twice", &["gleaner.topic", CAMERA, "received"], move |parts| {
-            parts.drop_messages_of(CAMERA);
-            state_none(parts);
-            parts.change_line(|line| {
-                line.topics.iter_mut().filter(|of| of.topic == CAMERA).for_each(|of| of.messages = 0);
-            });
-        }),
+        forgery(
+            "no camera message, and 0 stated twice",
+            &["gleaner.topic", CAMERA, "received"],
+            move |parts| {
+                parts.drop_messages_of(CAMERA);
+                state_none(parts);
+                parts.change_line(|line| {
+                    line.topics
+                        .iter_mut()
+                        .filter(|of| of.topic == CAMERA)
+                        .for_each(|of| of.messages = 0);
+                });
+            },
+        ),
         forgery("no camera message and no record of any topic", &["gleaner.topic"], |parts| {
             parts.drop_messages_of(CAMERA);
             parts.metadata.retain(|metadata| metadata.name != "gleaner.topic");
@@ -202,23 +242,33 @@ fn messages() -> Vec<Forgery> {
         forgery("one byte of a camera message", checksum, |parts| {
             *parts.messages_of(CAMERA)[2].2.last_mut().unwrap() ^= 1
         }),
-        forgery("the options of a camera message", checksum, |parts| parts.messages_of(CAMERA)[2].2[3] ^= 1),
-        forgery("the stamp of a camera message", checksum, |parts| parts.messages_of(CAMERA)[2].1.log_time += 1),
+        forgery("the options of a camera message", checksum, |parts| {
+            parts.messages_of(CAMERA)[2].2[3] ^= 1
+        }),
+        forgery("the stamp of a camera message", checksum, |parts| {
+            parts.messages_of(CAMERA)[2].1.log_time += 1
+        }),
         forgery("the time of a camera message's writer", checksum, |parts| {
             parts.messages_of(CAMERA)[2].1.publish_time += 1;
         }),
-        forgery("the number of a camera message", checksum, |parts| parts.messages_of(CAMERA)[2].1.sequence += 5000),
+        forgery("the number of a camera message", checksum, |parts| {
+            parts.messages_of(CAMERA)[2].1.sequence += 5000
+        }),
         forgery("a byte of an IMU message", &["gleaner.topic", IMU, "checksum"], |parts| {
             *parts.messages_of(IMU)[20].2.last_mut().unwrap() ^= 1;
         }),
-        forgery("another definition of the camera", &["gleaner.topic", CAMERA, "definitions"], |parts| {
-            let index = parts.channel_of(CAMERA);
-            let mut channel = Channel::clone(&parts.channels[index]);
-            let mut schema = mcap::Schema::clone(channel.schema.as_ref().unwrap());
-            schema.data = Cow::Owned([&schema.data[..], b"\nfloat64 more\n"].concat());
-            channel.schema = Some(Arc::new(schema));
-            parts.channels[index] = Arc::new(channel);
-        }),
+        forgery(
+            "another definition of the camera",
+            &["gleaner.topic", CAMERA, "definitions"],
+            |parts| {
+                let index = parts.channel_of(CAMERA);
+                let mut channel = Channel::clone(&parts.channels[index]);
+                let mut schema = mcap::Schema::clone(channel.schema.as_ref().unwrap());
+                schema.data = Cow::Owned([&schema.data[..], b"\nfloat64 more\n"].concat());
+                channel.schema = Some(Arc::new(schema));
+                parts.channels[index] = Arc::new(channel);
+            },
+        ),
         forgery("a second type on the camera's topic", &[CAMERA], |parts| {
             let mut channel = Channel::clone(&parts.channels[parts.channel_of(CAMERA)]);
             channel.schema.clone_from(&parts.channels[parts.channel_of(IMU)].schema);
@@ -235,7 +285,8 @@ fn messages() -> Vec<Forgery> {
 
 /// Changes of the files within the clip. `other` is the journal of another clip.
 fn attachments(other: Attached) -> Vec<Forgery> {
-    let picture = |parts: &Parts| parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap();
+    let picture =
+        |parts: &Parts| parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap();
     vec![
         forgery("a second journal of garbage", &["attachment `journal/hello.journal`"], |parts| {
             let garbage = Attached { data: b"garbage".to_vec(), ..parts.journal().clone() };
@@ -249,7 +300,9 @@ fn attachments(other: Attached) -> Vec<Forgery> {
             let double = parts.journal().clone();
             parts.attachments.push(double);
         }),
-        forgery("a journal of garbage", &["journal"], |parts| parts.journal().data = b"garbage".to_vec()),
+        forgery("a journal of garbage", &["journal"], |parts| {
+            parts.journal().data = b"garbage".to_vec()
+        }),
         forgery("an empty journal", &["journal"], |parts| parts.journal().data = Vec::new()),
         forgery("a journal with a changed byte", &["journal"], |parts| {
             let data = &mut parts.journal().data;
@@ -260,14 +313,23 @@ fn attachments(other: Attached) -> Vec<Forgery> {
             let data = &mut parts.journal().data;
             data.truncate(data.len() - 5);
         }),
-        forgery("the journal of another clip", &["sample", "journal"], move |parts| *parts.journal() = other.clone()),
+        forgery("the journal of another clip", &["sample", "journal"], move |parts| {
+            *parts.journal() = other.clone()
+        }),
         forgery("no journal", &["no journal"], |parts| {
             parts.attachments.retain(|attachment| !attachment.name.starts_with("journal/"));
         }),
-        forgery("the journal of a lambda that is not in the clip", &["attachment `journal/other.journal`"], |parts| {
-            let other = Attached { name: "journal/other.journal".to_owned(), ..parts.journal().clone() };
-            parts.attachments.push(other);
-        }),
+        forgery(
+            "the journal of a lambda that is not in the clip",
+            &["attachment `journal/other.journal`"],
+            |parts| {
+                let other = Attached {
+                    name: "journal/other.journal".to_owned(),
+                    ..parts.journal().clone()
+                };
+                parts.attachments.push(other);
+            },
+        ),
         forgery("another thumbnail", &["gleaner.clip", "thumbnail"], move |parts| {
             let index = picture(parts);
             *parts.attachments[index].data.last_mut().unwrap() ^= 1;
@@ -293,7 +355,10 @@ fn refused(kind: &str) {
     let control = recorded.verify(&whole);
     assert_eq!(control.exit, 0, "the clip is not forged: {}", control.stderr);
     let other = Parts::of(&recorded.clips[0]).journal().clone();
-    assert!(whole.messages_of(CAMERA).len() > 10 && whole.metadata.iter().any(|of| of.name == "gleaner.decision"));
+    assert!(
+        whole.messages_of(CAMERA).len() > 10
+            && whole.metadata.iter().any(|of| of.name == "gleaner.decision")
+    );
     let all = [records(&whole), statements(), messages(), attachments(other)];
     let forgeries: Vec<Forgery> = all.into_iter().flatten().collect();
     assert!(forgeries.len() > 150, "{}", forgeries.len());
@@ -308,7 +373,13 @@ fn refused(kind: &str) {
         }
     }
     println!("{} forgeries of a clip in {kind}", forgeries.len());
-    assert!(accepted.is_empty(), "{} of {}:\n{}", accepted.len(), forgeries.len(), accepted.join("\n"));
+    assert!(
+        accepted.is_empty(),
+        "{} of {}:\n{}",
+        accepted.len(),
+        forgeries.len(),
+        accepted.join("\n")
+    );
 }
 
 #[test]

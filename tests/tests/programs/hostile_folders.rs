@@ -1,5 +1,6 @@
-//! Folders that were made to do harm: links, pipes, devices and files without an end, wherever a program of ours reads what a lambda's
-//! author has put there. Each command ends, names the file and the way out, and leaves nothing half made.
+//! Folders that were made to do harm: links, pipes, devices and files without an end, wherever a
+//! program of ours reads what a lambda's author has put there. Each command ends, names the file
+//! and the way out, and leaves nothing half made.
 
 use std::fs::{self, File};
 use std::os::unix::fs::symlink;
@@ -88,7 +89,9 @@ impl Lambda {
         if args[0] == "replay" {
             gleaner.arg(sample_drive());
         }
-        gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache")).env_remove("GLEANER_PYTHON");
+        gleaner
+            .env("XDG_CACHE_HOME", root().join("target/test-cache"))
+            .env_remove("GLEANER_PYTHON");
         let output = gleaner.output().expect("it starts");
         (output.status.code().unwrap_or(128), String::from_utf8_lossy(&output.stderr).into_owned())
     }
@@ -99,7 +102,10 @@ impl Lambda {
         let (code, said) = self.gleaner(args);
         assert_eq!(code, USAGE, "{args:?} {wanted}: {said}");
         let (name, why) = wanted.split_once("` ").unwrap();
-        assert!(said.contains(&format!("{name}`")) && said.contains(why) && said.contains("help:"), "{wanted}: {said}");
+        assert!(
+            said.contains(&format!("{name}`")) && said.contains(why) && said.contains("help:"),
+            "{wanted}: {said}"
+        );
     }
 }
 

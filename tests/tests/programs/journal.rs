@@ -25,7 +25,8 @@ fn journaled(lambda: &Path, drive: &Path, args: &[&str]) -> Journaled {
 }
 
 fn verify_drive(lambda: &Path, drive: &Path, journal: &Path, args: &[&str]) -> Verification {
-    let mut line: Vec<&OsStr> = vec!["replay".as_ref(), lambda.as_ref(), drive.as_ref(), "--verify".as_ref()];
+    let mut line: Vec<&OsStr> =
+        vec!["replay".as_ref(), lambda.as_ref(), drive.as_ref(), "--verify".as_ref()];
     line.push(journal.as_ref());
     line.extend(args.iter().map(OsStr::new));
     verify(&line)
@@ -44,7 +45,8 @@ fn differs(verification: &Verification, exit: u8, words: &[&str]) {
     assert!(verification.verified.is_none());
 }
 
-/// The sample drive with a byte of its `n`th IMU message changed, in a file whose checksums are right.
+/// The sample drive with a byte of its `n`th IMU message changed, in a file whose checksums are
+/// right.
 fn forged(folder: &Folder, n: usize) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).unwrap();
     let mut file = Cursor::new(Vec::new());
@@ -66,7 +68,8 @@ fn forged(folder: &Folder, n: usize) -> PathBuf {
             imu += 1;
         }
         let mcap::Message { sequence, log_time, publish_time, .. } = message;
-        let header = mcap::records::MessageHeader { channel_id: channel, sequence, log_time, publish_time };
+        let header =
+            mcap::records::MessageHeader { channel_id: channel, sequence, log_time, publish_time };
         writer.write_to_known_channel(&header, &message.data).unwrap();
     }
     writer.finish().unwrap();
@@ -74,13 +77,15 @@ fn forged(folder: &Folder, n: usize) -> PathBuf {
     folder.write(&format!("forged-{n}.mcap"), file.into_inner())
 }
 
-/// Replays with a journal and makes every decision again; gives the number of faults, and of wakes passed over after them.
+/// Replays with a journal and makes every decision again; gives the number of faults, and of wakes
+/// passed over after them.
 fn proved(lambda: &Path, args: &[&str]) -> (u64, u64) {
     let journaled = journaled(lambda, &sample_drive(), args);
     assert!([0, 6].contains(&journaled.run.exit), "{}", journaled.run.stderr);
     let summary = journaled.run.summary.unwrap();
     let again = verify_drive(lambda, &sample_drive(), &journaled.journal, &[]);
-    let verified = again.verified.unwrap_or_else(|| panic!("{} {args:?}: {}", lambda.display(), again.stderr));
+    let verified =
+        again.verified.unwrap_or_else(|| panic!("{} {args:?}: {}", lambda.display(), again.stderr));
     assert_eq!((verified.wakes, verified.triggers), (summary.wakes, summary.triggers));
     assert_eq!((verified.uncovered, verified.cut_off, verified.notes), (0, false, Vec::new()));
     (summary.faults, summary.passed_over)
@@ -105,18 +110,34 @@ fn every_decision_of_every_lambda_is_made_again() {
 
 #[test]
 fn every_fault_happens_again() {
-    let faults =
-        ["error", "panic", "event_then_error", "event_then_panic", "huge_label", "too_many_triggers", "nan_score"];
+    let faults = [
+        "error",
+        "panic",
+        "event_then_error",
+        "event_then_panic",
+        "huge_label",
+        "too_many_triggers",
+        "nan_score",
+    ];
     let wasm_faults = ["endless", "memory", "recurse"];
-    for (kind, behaviours) in [("rust", [&faults[..], &wasm_faults].concat()), ("python", faults.to_vec())] {
+    for (kind, behaviours) in
+        [("rust", [&faults[..], &wasm_faults].concat()), ("python", faults.to_vec())]
+    {
         for behaviour in behaviours {
             let lambda = root().join("tests/lambdas/misbehave").join(kind);
-            let (faults, passed_over) = proved(&lambda, &["--set", &format!("behaviour={behaviour}")]);
+            let (faults, passed_over) =
+                proved(&lambda, &["--set", &format!("behaviour={behaviour}")]);
             assert!(faults > 8, "{behaviour} in {kind} faulted {faults} times");
-            assert!(faults + passed_over > 4000, "{behaviour} in {kind} rested in {passed_over} wakes");
+            assert!(
+                faults + passed_over > 4000,
+                "{behaviour} in {kind} rested in {passed_over} wakes"
+            );
         }
         for behaviour in ["hold", "log_flood", "print"] {
-            proved(&root().join("tests/lambdas/misbehave").join(kind), &["--set", &format!("behaviour={behaviour}")]);
+            proved(
+                &root().join("tests/lambdas/misbehave").join(kind),
+                &["--set", &format!("behaviour={behaviour}")],
+            );
         }
     }
 }
@@ -142,7 +163,12 @@ fn a_flipped_byte_anywhere_in_the_drive_is_found() {
         bytes[at] ^= 0x10;
         let drive = folder.write("flipped.mcap", &bytes);
         let again = verify_drive(&root().join(HELLO), &drive, &journaled.journal, &[]);
-        assert!([2, 4, 7].contains(&again.exit), "flip at {at}: exit {} {}", again.exit, again.stderr);
+        assert!(
+            [2, 4, 7].contains(&again.exit),
+            "flip at {at}: exit {} {}",
+            again.exit,
+            again.stderr
+        );
         assert!(again.stderr.contains("flipped.mcap"), "flip at {at}: {}", again.stderr);
     }
 }
@@ -191,7 +217,8 @@ fn a_lambda_whose_nans_are_the_same_everywhere_says_so() {
     let copy = Copy::of(HELLO, |toml| at(&toml));
     let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
     assert_eq!(journaled.run.exit, 0, "{}", journaled.run.stderr);
-    // It is other native code, for which there is another entry; what it decides is what any other decides, as it looks at no NaN.
+    // It is other native code, for which there is another entry; what it decides is what any other
+    // decides, as it looks at no NaN.
     let plain = self::journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
     assert_eq!(journaled.run.labels(), plain.run.labels());
     let names = |journal: &Path| {
@@ -207,7 +234,9 @@ fn a_lambda_whose_nans_are_the_same_everywhere_says_so() {
 #[test]
 fn another_config_is_named_by_its_key_and_the_same_one_need_not_be_given() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let again = |args: &[&str]| verify_drive(&root().join(HELLO), &sample_drive(), &journaled.journal, args);
+    let again = |args: &[&str]| {
+        verify_drive(&root().join(HELLO), &sample_drive(), &journaled.journal, args)
+    };
     assert_eq!(again(&BRAKING).exit, 0);
     differs(&again(&["--set", "brake_mps2=-1.5"]), 4, &["config `brake_mps2`", "-1.4", "-1.5"]);
 }
@@ -265,10 +294,17 @@ fn a_clip_proves_its_decisions_alone_and_says_which_it_cannot() {
             assert!(!journaled.run.clips.is_empty());
             for clip in &journaled.run.clips {
                 let again = verify_clip(&lambda, &journaled.out.path().join(&clip.file));
-                let verified = again.verified.unwrap_or_else(|| panic!("{example} in {kind}: {}", again.stderr));
-                assert!(verified.wakes > 50 && verified.uncovered < verified.wakes / 2, "{verified:?}");
-                // Half a second of the first wakes reaches back before a clip that does not begin with the drive.
-                let from_the_start = clip.first_ns == journaled.run.summary.as_ref().map(|summary| summary.start_ns);
+                let verified = again
+                    .verified
+                    .unwrap_or_else(|| panic!("{example} in {kind}: {}", again.stderr));
+                assert!(
+                    verified.wakes > 50 && verified.uncovered < verified.wakes / 2,
+                    "{verified:?}"
+                );
+                // Half a second of the first wakes reaches back before a clip that does not begin
+                // with the drive.
+                let from_the_start =
+                    clip.first_ns == journaled.run.summary.as_ref().map(|summary| summary.start_ns);
                 assert_eq!(verified.uncovered == 0, from_the_start, "{verified:?}");
             }
         }
@@ -277,7 +313,8 @@ fn a_clip_proves_its_decisions_alone_and_says_which_it_cannot() {
 
 #[test]
 fn a_clip_without_a_topic_that_the_lambda_reads_cannot_be_proved_alone() {
-    let lambda = Copy::of("examples/brake-dark/rust", |manifest| manifest.replace("\"/imu/data\", ", ""));
+    let lambda =
+        Copy::of("examples/brake-dark/rust", |manifest| manifest.replace("\"/imu/data\", ", ""));
     let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
     differs(&verify_clip(lambda.path(), &clip), 2, &["/imu/data", "[record]", "--verify"]);
@@ -286,7 +323,8 @@ fn a_clip_without_a_topic_that_the_lambda_reads_cannot_be_proved_alone() {
 #[test]
 fn a_clip_that_shows_no_trigger_to_the_lambda_proves_nothing_and_says_so() {
     // Half a second is what hello looks back.
-    let lambda = Copy::of(HELLO, |manifest| manifest.replace("preroll = \"5s\"", "preroll = \"100ms\""));
+    let lambda =
+        Copy::of(HELLO, |manifest| manifest.replace("preroll = \"5s\"", "preroll = \"100ms\""));
     let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[2].file);
     differs(&verify_clip(lambda.path(), &clip), 2, &["proves no trigger", "preroll", "--verify"]);
@@ -299,7 +337,8 @@ fn a_clip_proves_a_lambda_that_logs_more_than_the_rate_limit_lets_pass() {
         format!("{manifest}\n{record}")
     });
     // It triggers and then faults in every wake, so that each is a fresh lambda.
-    let journaled = journaled(lambda.path(), &sample_drive(), &["--set", "behaviour=event_then_error"]);
+    let journaled =
+        journaled(lambda.path(), &sample_drive(), &["--set", "behaviour=event_then_error"]);
     assert!(journaled.run.clips.len() >= 2);
     let clip = journaled.out.path().join(&journaled.run.clips[1].file);
     let again = verify_clip(lambda.path(), &clip);
@@ -317,7 +356,12 @@ fn a_changed_clip_is_found() {
         bytes[at] ^= 0x20;
         let changed = journaled.out.write("changed.mcap", &bytes);
         let again = verify_clip(&root().join(HELLO), &changed);
-        assert!([2, 4, 7].contains(&again.exit), "flip at {at}: exit {} {}", again.exit, again.stderr);
+        assert!(
+            [2, 4, 7].contains(&again.exit),
+            "flip at {at}: exit {} {}",
+            again.exit,
+            again.stderr
+        );
     }
 }
 
@@ -327,5 +371,9 @@ fn another_lambda_finds_no_journal_of_its_own_in_a_clip() {
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
     let again = verify_clip(&root().join("examples/brake-dark/rust"), &clip);
     differs(&again, 2, &["no journal of lambda `brake-dark`", "hello"]);
-    differs(&verify_clip(&root().join(HELLO), &sample_drive()), 2, &["no journal of lambda `hello`"]);
+    differs(
+        &verify_clip(&root().join(HELLO), &sample_drive()),
+        2,
+        &["no journal of lambda `hello`"],
+    );
 }

@@ -1,4 +1,5 @@
-//! The file of `--journal`: one replay writes it at a time, equal replays write equal bytes, and a kill leaves what was decided.
+//! The file of `--journal`: one replay writes it at a time, equal replays write equal bytes, and a
+//! kill leaves what was decided.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -19,7 +20,8 @@ fn journaled(out: &Folder, journal: &Path, args: &[&str]) -> gleaner_tests::Run 
 
 fn verify_drive(lambda: &Path, journal: &Path, args: &[&str]) -> Verification {
     let drive = sample_drive();
-    let mut line: Vec<&OsStr> = vec!["replay".as_ref(), lambda.as_ref(), drive.as_ref(), "--verify".as_ref()];
+    let mut line: Vec<&OsStr> =
+        vec!["replay".as_ref(), lambda.as_ref(), drive.as_ref(), "--verify".as_ref()];
     line.push(journal.as_ref());
     line.extend(args.iter().map(OsStr::new));
     verify(&line)
@@ -42,13 +44,24 @@ fn a_journal_that_another_process_writes_is_refused_and_left_as_it_is() {
         let busy = journaled(&second, &journal, &["--repeat", repeat]);
         busy.must_exit(1);
         let said = format!("another process writes or verifies journal `{}`", journal.display());
-        assert!(busy.stderr.contains(&said) && busy.stderr.contains("--journal FILE"), "{}", busy.stderr);
+        assert!(
+            busy.stderr.contains(&said) && busy.stderr.contains("--journal FILE"),
+            "{}",
+            busy.stderr
+        );
         // The results of before are whole.
-        assert_eq!((busy.decisions.len(), busy.clips.len()), (results.decisions.len(), results.clips.len()));
+        assert_eq!(
+            (busy.decisions.len(), busy.clips.len()),
+            (results.decisions.len(), results.clips.len())
+        );
     }
     let again = verify_drive(&hello(), &journal, &[]);
     assert_eq!(again.exit, 2, "{}", again.stderr);
-    assert!(again.stderr.contains("a replay writes journal") && again.stderr.contains("x.journal"), "{}", again.stderr);
+    assert!(
+        again.stderr.contains("a replay writes journal") && again.stderr.contains("x.journal"),
+        "{}",
+        again.stderr
+    );
     assert_eq!(std::fs::read(&journal).unwrap(), before);
     lock.unlock().unwrap();
     assert_eq!(verify_drive(&hello(), &journal, &[]).exit, 0);
@@ -62,13 +75,20 @@ fn of_two_replays_with_one_journal_at_least_one_writes_it_whole() {
         let _ = std::fs::remove_file(&journal);
         let start = |name: &str, brake: &str| {
             let mut replay = runtime();
-            replay.arg("replay").arg(hello()).arg(sample_drive()).args(["--set", brake, "--journal"]).arg(&journal);
+            replay
+                .arg("replay")
+                .arg(hello())
+                .arg(sample_drive())
+                .args(["--set", brake, "--journal"])
+                .arg(&journal);
             replay.arg("--out").arg(folder.path().join(name));
             replay.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
         };
         let brakes = ["brake_mps2=-1.4", "brake_mps2=-1.3"];
-        let children: Vec<Child> = ["a", "b"].iter().zip(brakes).map(|(name, brake)| start(name, brake)).collect();
-        let outputs: Vec<_> = children.into_iter().map(|child| child.wait_with_output().unwrap()).collect();
+        let children: Vec<Child> =
+            ["a", "b"].iter().zip(brakes).map(|(name, brake)| start(name, brake)).collect();
+        let outputs: Vec<_> =
+            children.into_iter().map(|child| child.wait_with_output().unwrap()).collect();
         let ended = |index: usize| outputs[index].status.code();
         let refused: Vec<_> = (0..2).filter(|index| ended(*index) == Some(1)).collect();
         assert!(
@@ -80,7 +100,9 @@ fn of_two_replays_with_one_journal_at_least_one_writes_it_whole() {
             assert!(said.contains("another process writes"), "round {round}: {said}");
         }
         // Of two that came one after the other, the later one.
-        let proved = brakes.iter().filter(|brake| verify_drive(&hello(), &journal, &["--set", brake]).exit == 0);
+        let proved = brakes
+            .iter()
+            .filter(|brake| verify_drive(&hello(), &journal, &["--set", brake]).exit == 0);
         assert_eq!(proved.count(), 1, "round {round}: {refused:?} refused");
     }
 }
@@ -98,7 +120,10 @@ fn equal_replays_write_equal_journals() {
                 std::fs::read(&journal).unwrap()
             })
             .collect();
-        assert!(journals[0].len() > 10_000 && journals.iter().all(|journal| *journal == journals[0]), "{kind}");
+        assert!(
+            journals[0].len() > 10_000 && journals.iter().all(|journal| *journal == journals[0]),
+            "{kind}"
+        );
     }
 }
 
@@ -120,12 +145,17 @@ fn tighter_limits_in_a_header_are_noted_and_wider_ones_differ() {
     let out = Folder::new();
     let journal = out.path().join("x.journal");
     journaled(&out, &journal, &[]).must_exit(0);
-    let fuel = |fuel: u64| out.write("forged.journal", with_header(&journal, |header| header.limits.fuel = fuel));
+    let fuel = |fuel: u64| {
+        out.write("forged.journal", with_header(&journal, |header| header.limits.fuel = fuel))
+    };
     let whole = verify_drive(&hello(), &fuel(10_000_000), &[]).verified.unwrap();
     assert_eq!(whole.notes, [""; 0]);
     let tighter = verify_drive(&hello(), &fuel(9_000_000), &[]);
     let notes = tighter.verified.unwrap_or_else(|| panic!("{}", tighter.stderr)).notes;
-    assert!(matches!(&notes[..], [note] if note.contains("limit `fuel`: 9000000 in the journal")), "{notes:?}");
+    assert!(
+        matches!(&notes[..], [note] if note.contains("limit `fuel`: 9000000 in the journal")),
+        "{notes:?}"
+    );
     // Limits that cannot have held: each wake is made again under them.
     let too_tight = verify_drive(&hello(), &fuel(1000), &[]);
     let wider = verify_drive(&hello(), &fuel(10_000_001), &[]);
@@ -134,7 +164,8 @@ fn tighter_limits_in_a_header_are_noted_and_wider_ones_differ() {
         assert!(forged.stderr.contains(word), "{}", forged.stderr);
     }
     let vehicle = out.write("vehicle.toml", "[limits]\nfuel = 9_000_000\n");
-    let with_vehicle = |journal: &Path| verify_drive(&hello(), journal, &["--vehicle", vehicle.to_str().unwrap()]);
+    let with_vehicle =
+        |journal: &Path| verify_drive(&hello(), journal, &["--vehicle", vehicle.to_str().unwrap()]);
     assert_eq!(with_vehicle(&fuel(9_000_000)).verified.unwrap().notes, [""; 0]);
     assert_eq!(with_vehicle(&fuel(8_000_000)).exit, 4);
 }
@@ -144,17 +175,24 @@ fn a_journal_that_begins_in_the_middle_is_no_journal_of_a_replay() {
     let out = Folder::new();
     let journal = out.path().join("x.journal");
     journaled(&out, &journal, &[]).must_exit(0);
-    let forged = out.write("forged.journal", with_header(&journal, |header| header.wakes_before = 7));
+    let forged =
+        out.write("forged.journal", with_header(&journal, |header| header.wakes_before = 7));
     let again = verify_drive(&hello(), &forged, &[]);
     assert_eq!(again.exit, 4, "{}", again.stderr);
-    assert!(again.stderr.contains("wakes before the first one") && again.stderr.contains('7'), "{}", again.stderr);
+    assert!(
+        again.stderr.contains("wakes before the first one") && again.stderr.contains('7'),
+        "{}",
+        again.stderr
+    );
 }
 
 /// Kills a replay when it has listed a clip.
 #[test]
 fn what_a_listed_clip_is_about_is_in_the_decisions_and_in_the_journal_after_a_kill() {
     let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
-        manifest.replace("preroll = \"5s\"", "preroll = \"100ms\"").replace("postroll = \"5s\"", "postroll = \"100ms\"")
+        manifest
+            .replace("preroll = \"5s\"", "preroll = \"100ms\"")
+            .replace("postroll = \"5s\"", "postroll = \"100ms\"")
     });
     let mut met = 0;
     for attempt in 0..20 {
@@ -167,11 +205,15 @@ fn what_a_listed_clip_is_about_is_in_the_decisions_and_in_the_journal_after_a_ki
         let mut child = replay.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         // A different number of clips each time.
         let wanted = 1 + attempt % 5;
-        while lines::<Clip>(out.path(), "clips.jsonl").len() < wanted && child.try_wait().unwrap().is_none() {}
+        while lines::<Clip>(out.path(), "clips.jsonl").len() < wanted
+            && child.try_wait().unwrap().is_none()
+        {}
         child.kill().unwrap();
         child.wait().unwrap();
-        let (clips, decisions) =
-            (lines::<Clip>(out.path(), "clips.jsonl"), lines::<Decision>(out.path(), "decisions.jsonl"));
+        let (clips, decisions) = (
+            lines::<Clip>(out.path(), "clips.jsonl"),
+            lines::<Decision>(out.path(), "decisions.jsonl"),
+        );
         let mut reader = Reader::open(std::fs::File::open(&journal).unwrap()).unwrap();
         let mut wakes = Vec::new();
         while let Some(entry) = reader.next().unwrap() {
@@ -180,7 +222,11 @@ fn what_a_listed_clip_is_about_is_in_the_decisions_and_in_the_journal_after_a_ki
         for moment in clips.iter().flat_map(|clip| &clip.moments) {
             let is_there = decisions.iter().any(|decision| decision.at_ns == moment.at_ns);
             assert!(is_there, "attempt {attempt}: no decision at {} ns", moment.at_ns);
-            assert!(wakes.contains(&moment.at_ns), "attempt {attempt}: no wake at {} ns", moment.at_ns);
+            assert!(
+                wakes.contains(&moment.at_ns),
+                "attempt {attempt}: no wake at {} ns",
+                moment.at_ns
+            );
         }
         met += usize::from(!clips.is_empty() && clips.len() < events.len());
     }
@@ -227,7 +273,12 @@ fn a_journal_of_another_version_or_that_is_cut_off_is_replaced() {
 fn a_journal_is_not_written_over_a_drive() {
     let folder = Folder::new();
     let drive = folder.write("drive.mcap", std::fs::read(sample_drive()).unwrap());
-    let run = replay_to(folder.path(), &root().join(HELLO), &[sample_drive()], &["--journal", drive.to_str().unwrap()]);
+    let run = replay_to(
+        folder.path(),
+        &root().join(HELLO),
+        &[sample_drive()],
+        &["--journal", drive.to_str().unwrap()],
+    );
     run.must_exit(2);
     assert!(run.stderr.contains("is no journal"), "{}", run.stderr);
     assert_eq!(std::fs::read(drive).unwrap(), std::fs::read(sample_drive()).unwrap());

@@ -12,7 +12,8 @@ MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 #[test]
 fn a_component_computes_what_the_same_source_computes_natively() {
     let folder = Folder::new();
-    let drive = one_topic(&folder, "/imu/data", "sensor_msgs/msg/Imu", IMU, &[(1, Cdr::header().done())]);
+    let drive =
+        one_topic(&folder, "/imu/data", "sensor_msgs/msg/Imu", IMU, &[(1, Cdr::header().done())]);
     let run = replay(&root().join("tests/lambdas/kernels/rust"), &[drive], &[]);
     let found = &run.must_exit(0).decisions[0].triggers;
     let expected = kernels::results().unwrap();
@@ -23,14 +24,22 @@ fn a_component_computes_what_the_same_source_computes_natively() {
         // Sine and cosine come from other libraries, so spectra are nearly equal.
         let nearly = if expected.kernel.ends_with("f32") { 1e-6 } else { 1e-14 };
         let off = (found.score.unwrap() - expected.number).abs();
-        assert!(off <= nearly * expected.number, "{}: {:?}, natively {}", found.label, found.score, expected.number);
+        assert!(
+            off <= nearly * expected.number,
+            "{}: {:?}, natively {}",
+            found.label,
+            found.score,
+            expected.number
+        );
     }
 }
 
 #[test]
 fn components_are_built_with_vectors_of_128_bits_and_without_relaxed_ones() {
-    let component = std::fs::read(root().join("tests/lambdas/kernels/rust/build/kernels.wasm")).unwrap();
-    // The compiler lists what it used in a section of the module: a plus, the length of a name, the name.
+    let component =
+        std::fs::read(root().join("tests/lambdas/kernels/rust/build/kernels.wasm")).unwrap();
+    // The compiler lists what it used in a section of the module: a plus, the length of a name, the
+    // name.
     let has = |feature: &[u8]| component.windows(feature.len()).any(|bytes| bytes == feature);
     assert!(has(b"+\x07simd128"));
     assert!(!has(b"+\x0crelaxed-simd"));

@@ -1,5 +1,6 @@
-//! One lambda natively, in the fake host of the SDK, and as a component in the host: every decision is equal, to the last bit of its
-//! scores, and so are the log and what is counted. Both have the same rules, of `gleaner-rules`; here is what lies around them.
+//! One lambda natively, in the fake host of the SDK, and as a component in the host: every decision
+//! is equal, to the last bit of its scores, and so are the log and what is counted. Both have the
+//! same rules, of `gleaner-rules`; here is what lies around them.
 
 use std::path::{Path, PathBuf};
 
@@ -77,7 +78,11 @@ impl Both {
     /// Both, compared; what happened natively.
     fn agree<L: Lambda>(&self, unlike: &[&str]) -> Run<L> {
         let hosted = self.hosted();
-        let span = hosted.summary.as_ref().map(|summary| [summary.start_ns, summary.end_ns]).expect("a summary");
+        let span = hosted
+            .summary
+            .as_ref()
+            .map(|summary| [summary.start_ns, summary.end_ns])
+            .expect("a summary");
         let run = self.natively::<L>(span).unwrap();
         assert_eq!(run.decisions().len(), hosted.decisions.len(), "{}", hosted.stderr);
         for (n, (ours, theirs)) in run.decisions().iter().zip(&hosted.decisions).enumerate() {
@@ -89,20 +94,42 @@ impl Both {
         });
         let text = |line: &serde_json::Value, key: &str| line[key].as_str().unwrap().to_owned();
         let logged = hosted.log.iter();
-        let logged = logged.map(|line| (line["at_ns"].as_i64().unwrap(), text(line, "level"), text(line, "message")));
-        // What is written to standard error is a warning in the log, and natively in the test's output: the reason of a panic.
-        let is_printed =
-            |(_, level, message): &(i64, String, String)| level == "warn" && !message.starts_with("gleaner: ");
-        assert_eq!(said.collect::<Vec<_>>(), logged.filter(|line| !is_printed(line)).collect::<Vec<_>>());
+        let logged = logged.map(|line| {
+            (line["at_ns"].as_i64().unwrap(), text(line, "level"), text(line, "message"))
+        });
+        // What is written to standard error is a warning in the log, and natively in the test's
+        // output: the reason of a panic.
+        let is_printed = |(_, level, message): &(i64, String, String)| {
+            level == "warn" && !message.starts_with("gleaner: ")
+        };
+        assert_eq!(
+            said.collect::<Vec<_>>(),
+            logged.filter(|line| !is_printed(line)).collect::<Vec<_>>()
+        );
         let summary = hosted.summary.expect("a summary");
-        assert_eq!((run.log_dropped(), run.triggers_refused()), (summary.log_dropped, summary.triggers_refused));
-        assert_eq!((run.passed_over(), run.missed_ticks()), (summary.passed_over, summary.missed_ticks));
-        let skipped = summary.topics.iter().map(|topic| run.counts(&topic.name).unwrap().skipped).sum::<u64>();
+        assert_eq!(
+            (run.log_dropped(), run.triggers_refused()),
+            (summary.log_dropped, summary.triggers_refused)
+        );
+        assert_eq!(
+            (run.passed_over(), run.missed_ticks()),
+            (summary.passed_over, summary.missed_ticks)
+        );
+        let skipped = summary
+            .topics
+            .iter()
+            .map(|topic| run.counts(&topic.name).unwrap().skipped)
+            .sum::<u64>();
         assert_eq!(skipped, summary.skipped);
         for topic in &summary.topics {
             let counts = run.counts(&topic.name).unwrap();
             let ours = (counts.received, counts.overwritten, counts.no_slot, counts.too_big);
-            assert_eq!(ours, (topic.received, topic.overwritten, topic.no_slot, topic.too_big), "{}", topic.name);
+            assert_eq!(
+                ours,
+                (topic.received, topic.overwritten, topic.no_slot, topic.too_big),
+                "{}",
+                topic.name
+            );
         }
         run
     }
@@ -115,8 +142,13 @@ fn same(ours: &testing::Decision, theirs: &gleaner_lambda::Decision, unlike: &[&
         testing::Cause::Event => gleaner_lambda::Cause::Event,
         testing::Cause::Tick => gleaner_lambda::Cause::Tick,
     };
-    let woken = (theirs.at_ns, theirs.cause, theirs.input.clone(), theirs.topic.clone(), theirs.seq);
-    assert_eq!((ours.at_ns, cause, ours.input.clone(), ours.topic.clone(), ours.seq), woken, "{which}");
+    let woken =
+        (theirs.at_ns, theirs.cause, theirs.input.clone(), theirs.topic.clone(), theirs.seq);
+    assert_eq!(
+        (ours.at_ns, cause, ours.input.clone(), ours.topic.clone(), ours.seq),
+        woken,
+        "{which}"
+    );
     assert_eq!(ours.triggers.len(), theirs.triggers.len(), "{which}");
     for (ours, theirs) in ours.triggers.iter().zip(&theirs.triggers) {
         let kind = format!("{:?}", ours.kind).to_lowercase();
@@ -144,10 +176,16 @@ fn same(ours: &testing::Decision, theirs: &gleaner_lambda::Decision, unlike: &[&
                 FaultKind::Trap => gleaner_lambda::FaultKind::Trap,
                 _ => gleaner_lambda::FaultKind::HostCall,
             };
-            assert_eq!((kind, ours.used, ours.allowed), (theirs.kind, theirs.used, theirs.allowed), "{which}");
+            assert_eq!(
+                (kind, ours.used, ours.allowed),
+                (theirs.kind, theirs.used, theirs.allowed),
+                "{which}"
+            );
             // A component says where it panicked.
             match ours.message.strip_prefix("panicked: ") {
-                Some(reason) => assert!(theirs.message.ends_with(reason), "{which}: {}", theirs.message),
+                Some(reason) => {
+                    assert!(theirs.message.ends_with(reason), "{which}: {}", theirs.message)
+                }
                 None => assert_eq!(ours.message, theirs.message, "{which}"),
             }
         }
@@ -157,14 +195,17 @@ fn same(ours: &testing::Decision, theirs: &gleaner_lambda::Decision, unlike: &[&
 
 #[test]
 fn hello_finds_the_brakings_of_the_sample_drive() {
-    let run = Both::on_sample_drive("examples/hello/rust", &[IMU]).set("brake_mps2", -1.4).agree::<hello::Hello>(&[]);
+    let run = Both::on_sample_drive("examples/hello/rust", &[IMU])
+        .set("brake_mps2", -1.4)
+        .agree::<hello::Hello>(&[]);
     assert_eq!(run.triggers().count(), 3);
 }
 
 #[test]
 fn brake_dark_sees_the_pixels_that_the_host_decodes() {
     let both = Both::on_sample_drive("examples/brake-dark/rust", &[CAMERA, IMU]);
-    let run = both.set("brake_mps2", -1.4).set("dark_luma", 255.0).agree::<brake_dark::BrakeDark>(&[]);
+    let run =
+        both.set("brake_mps2", -1.4).set("dark_luma", 255.0).agree::<brake_dark::BrakeDark>(&[]);
     assert!(run.triggers().count() > 0);
     assert!(run.triggers().all(|trigger| trigger.attribute("luma").is_some()));
 }
@@ -172,24 +213,29 @@ fn brake_dark_sees_the_pixels_that_the_host_decodes() {
 #[test]
 fn every_function_of_the_interface_answers_alike() {
     // The writer is made up from the drive by the one, and by the other from nothing.
-    let run = Both::on_sample_drive("tests/lambdas/probe/rust", &[CAMERA, IMU]).agree::<probe::Probe>(&["writer"]);
+    let run = Both::on_sample_drive("tests/lambdas/probe/rust", &[CAMERA, IMU])
+        .agree::<probe::Probe>(&["writer"]);
     assert_eq!(run.faults().next(), None);
     assert!(run.triggers().filter(|trigger| trigger.label == "refusals").count() > 5);
 }
 
 #[test]
 fn ticks_come_at_the_same_times_and_see_the_same() {
-    let run = Both::on_sample_drive("tests/lambdas/ticker/rust", &[IMU]).agree::<ticker::Ticker>(&[]);
+    let run =
+        Both::on_sample_drive("tests/lambdas/ticker/rust", &[IMU]).agree::<ticker::Ticker>(&[]);
     assert_eq!(run.triggers().count(), 399);
 }
 
 #[test]
 fn misbehaviour_has_the_same_consequences() {
     let misbehave = |behaviour| {
-        let both = Both::on_sample_drive("tests/lambdas/misbehave/rust", &[IMU]).set("behaviour", behaviour);
+        let both = Both::on_sample_drive("tests/lambdas/misbehave/rust", &[IMU])
+            .set("behaviour", behaviour);
         both.agree::<misbehave::Misbehave>(&[])
     };
-    for behaviour in ["error", "panic", "not_a_frame", "huge_label", "too_many_triggers", "nan_score"] {
+    for behaviour in
+        ["error", "panic", "not_a_frame", "huge_label", "too_many_triggers", "nan_score"]
+    {
         let run = misbehave(behaviour);
         assert!(run.faults().count() >= 8 && run.passed_over() > 0, "{behaviour}");
     }
@@ -209,12 +255,16 @@ fn a_lambda_that_does_not_start_says_why_in_the_same_words() {
         ("bad_input", "no input `imo`; the manifest has `imu`"),
         ("bad_field", "has no field `"),
     ] {
-        let both = Both::on_sample_drive("tests/lambdas/misbehave/rust", &[IMU]).set("behaviour", behaviour);
+        let both = Both::on_sample_drive("tests/lambdas/misbehave/rust", &[IMU])
+            .set("behaviour", behaviour);
         let ours = both.natively::<misbehave::Misbehave>([0, 0]).err().unwrap().to_string();
         let hosted = both.hosted();
         hosted.must_exit(Exit::LambdaFaulted.code());
         for said in [&ours, &hosted.stderr] {
-            assert!(said.contains("cannot start lambda `misbehave`") && said.contains("in init: "), "{said}");
+            assert!(
+                said.contains("cannot start lambda `misbehave`") && said.contains("in init: "),
+                "{said}"
+            );
             assert!(said.contains(wanted), "{said}");
         }
     }
@@ -223,13 +273,16 @@ fn a_lambda_that_does_not_start_says_why_in_the_same_words() {
 /// A drive of pictures, and the same for the fake.
 fn pictures(folder: &Folder, lambda: &Path) -> Both {
     let (width, height) = (40, 30);
-    let pixels = |n: u32| (0..width * height * 3).map(|at| (at * 7 + n * 31) as u8).collect::<Vec<_>>();
+    let pixels =
+        |n: u32| (0..width * height * 3).map(|at| (at * 7 + n * 31) as u8).collect::<Vec<_>>();
     let cdr = |n| image(width, height, "rgb8", 3 * width, &pixels(n));
     let drive = (1..=12).map(|n| (u64::from(n) * 100_000_000, cdr(n))).collect::<Vec<_>>();
-    let drive = one_topic(folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &drive);
+    let drive =
+        one_topic(folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &drive);
     let given = (1..=12).map(|n| {
         let bytes = [&[0, 1, 0, 0], cdr(n).as_slice()].concat();
-        let message = Message::image(width, height, Encoding::Rgb8, pixels(n)).cdr(bytes).stamped(0);
+        let message =
+            Message::image(width, height, Encoding::Rgb8, pixels(n)).cdr(bytes).stamped(0);
         Given { input: "camera", at_ns: i64::from(n) * 100_000_000, message }
     });
     Both { folder: lambda.to_owned(), drive, given: given.collect(), set: Vec::new() }
@@ -248,8 +301,9 @@ fn greed_meets_the_same_limits() {
         ("ok", 0),
     ] {
         // What is written here fuel is not to end.
-        let lambda =
-            Copy::of("tests/lambdas/greedy/rust", |toml| toml.replace("fuel = 5_000_000", "fuel = 1_000_000_000"));
+        let lambda = Copy::of("tests/lambdas/greedy/rust", |toml| {
+            toml.replace("fuel = 5_000_000", "fuel = 1_000_000_000")
+        });
         let both = pictures(&folder, lambda.path()).set("behaviour", behaviour).set("bytes", bytes);
         let run = both.agree::<greedy::Greedy>(&[]);
         let good = ["read_cdr", "read_frame", "mean_luma", "ok"].contains(&behaviour);

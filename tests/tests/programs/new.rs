@@ -1,4 +1,5 @@
-//! `gleaner new`: what it makes passes its test, builds, and finds the brakings of the sample drive. Nothing is fetched.
+//! `gleaner new`: what it makes passes its test, builds, and finds the brakings of the sample
+//! drive. Nothing is fetched.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -17,14 +18,17 @@ fn gleaner(at: &Path) -> Command {
     let mut gleaner = Command::new(program("gleaner"));
     gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache")).current_dir(at);
     // Its lock file names the versions of this workspace, which are here.
-    gleaner.env("CARGO_NET_OFFLINE", "true").env("CARGO_TARGET_DIR", root().join("target/test-new"));
+    gleaner
+        .env("CARGO_NET_OFFLINE", "true")
+        .env("CARGO_TARGET_DIR", root().join("target/test-new"));
     gleaner
 }
 
 /// What it printed.
 fn done(command: &mut Command) -> String {
     let output = command.output().expect("the program starts");
-    let [out, error] = [output.stdout, output.stderr].map(|said| String::from_utf8_lossy(&said).into_owned());
+    let [out, error] =
+        [output.stdout, output.stderr].map(|said| String::from_utf8_lossy(&said).into_owned());
     assert!(output.status.success(), "{command:?}: {}\n{out}\n{error}", output.status);
     out
 }
@@ -42,7 +46,9 @@ fn a_new_lambda_in_rust_passes_its_test_builds_and_finds_something() {
     let folder = Folder::new();
     let lambda = new(&folder, "rust");
     let mut test = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    test.args(["test", "--offline"]).env("CARGO_TARGET_DIR", root().join("target/test-new")).current_dir(&lambda);
+    test.args(["test", "--offline"])
+        .env("CARGO_TARGET_DIR", root().join("target/test-new"))
+        .current_dir(&lambda);
     assert!(done(&mut test).contains("4 passed"));
     builds_and_finds_brakings(&lambda);
     done(gleaner(&lambda).args(["new", "--update", "."]));
@@ -53,7 +59,8 @@ fn a_new_lambda_in_rust_passes_its_test_builds_and_finds_something() {
 fn a_new_lambda_in_python_passes_its_test_builds_and_finds_something() {
     let folder = Folder::new();
     let lambda = new(&folder, "python");
-    let python = std::env::var_os("GLEANER_PYTHON").unwrap_or_else(|| root().join(".venv/bin/python3").into());
+    let python = std::env::var_os("GLEANER_PYTHON")
+        .unwrap_or_else(|| root().join(".venv/bin/python3").into());
     let mut test = Command::new(python);
     test.args(["-m", "pytest", "-q"]).current_dir(&lambda);
     assert!(done(&mut test).contains("2 passed"));
@@ -65,12 +72,17 @@ fn a_sandboxed_build_makes_the_same_component() {
     let folder = Folder::new();
     let lambda = new(&folder, "rust");
     let component = || {
-        std::fs::read(lambda.join("build/pot_hole.wasm")).or_else(|_| std::fs::read(lambda.join("build/pot-hole.wasm")))
+        std::fs::read(lambda.join("build/pot_hole.wasm"))
+            .or_else(|_| std::fs::read(lambda.join("build/pot-hole.wasm")))
     };
     done(gleaner(&lambda).args(["build", "."]));
     let plain = component().expect("a component");
     // In a folder that goes with the test.
-    let output = gleaner(&lambda).args(["build", "--sandboxed", "."]).env_remove("CARGO_TARGET_DIR").output().unwrap();
+    let output = gleaner(&lambda)
+        .args(["build", "--sandboxed", "."])
+        .env_remove("CARGO_TARGET_DIR")
+        .output()
+        .unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     if is_refused_here(&output) {
         return;
@@ -123,10 +135,15 @@ fn a_build_script_reaches_nothing_but_its_own_when_it_is_sandboxed() {
     ] {
         folder.write(name, text);
     }
-    let names = ["read", "list", "write", "truncate", "source", "datagrams", "connect", "environment"];
+    let names =
+        ["read", "list", "write", "truncate", "source", "datagrams", "connect", "environment"];
     let build = |args: &[&str], at: &Path| {
         let mut command = gleaner(at);
-        command.env("GLEANER_TEST_TOKEN", "secret").env_remove("CARGO_TARGET_DIR").arg("build").args(args);
+        command
+            .env("GLEANER_TEST_TOKEN", "secret")
+            .env_remove("CARGO_TARGET_DIR")
+            .arg("build")
+            .args(args);
         command.arg(folder.path()).output().unwrap()
     };
     let output = build(&["--sandboxed"], folder.path());
@@ -161,8 +178,12 @@ fn a_sandboxed_build_that_fails_names_what_its_code_may_not() {
         "[package]\nname = 'x'\nversion = '0.1.0'\nedition = '2024'\n[lib]\ncrate-type = ['cdylib']\n[workspace]\n",
     );
     // No build script is needed to have a file in a component.
-    folder.write("src/lib.rs", format!("pub static X: &[u8] = include_bytes!({:?});\n", canary.display().to_string()));
-    let output = gleaner(&root()).args(["build", "--sandboxed"]).arg(folder.path()).output().unwrap();
+    folder.write(
+        "src/lib.rs",
+        format!("pub static X: &[u8] = include_bytes!({:?});\n", canary.display().to_string()),
+    );
+    let output =
+        gleaner(&root()).args(["build", "--sandboxed"]).arg(folder.path()).output().unwrap();
     if is_refused_here(&output) {
         return;
     }
@@ -174,7 +195,8 @@ fn a_sandboxed_build_that_fails_names_what_its_code_may_not() {
     assert!(!folder.path().join(".build.partial").exists());
 }
 
-/// Whether this machine cannot sandbox a compiler: then it is said which layer is missing, and nothing is built.
+/// Whether this machine cannot sandbox a compiler: then it is said which layer is missing, and
+/// nothing is built.
 fn is_refused_here(output: &std::process::Output) -> bool {
     let said = String::from_utf8_lossy(&output.stderr);
     let is_refused = output.status.code() == Some(3);

@@ -1,4 +1,5 @@
-//! As `host/tests/library/faults.rs`, of a process that is an interpreter. How often its lambda faults is `GLEANER_FAULTS`, and some more.
+//! As `host/tests/library/faults.rs`, of a process that is an interpreter. How often its lambda
+//! faults is `GLEANER_FAULTS`, and some more.
 
 use gleaner_base::Exit;
 use gleaner_lambda::{Decision, FaultKind};
@@ -13,7 +14,8 @@ fn a_python_lambda_that_faults_again_and_again_holds_nothing() {
     const IN_A_ROUND: u32 = 3500;
     let rounds = times("GLEANER_FAULTS", IN_A_ROUND).div_ceil(IN_A_ROUND);
     let (folder, lambda) = (Folder::new(), root().join("tests/lambdas/misbehave/python"));
-    let run = replay(&lambda, &[imu_only(&folder, rounds.into())], &["--set", "behaviour=error_mostly"]);
+    let run =
+        replay(&lambda, &[imu_only(&folder, rounds.into())], &["--set", "behaviour=error_mostly"]);
     let summary = run.must_exit(Exit::LambdaFaulted.code()).summary.as_ref().expect("a summary");
     let faults = run.decisions.iter().filter(|decision| decision.fault.is_some()).count();
     let said: Vec<u64> = run
@@ -33,22 +35,35 @@ fn a_python_lambda_that_faults_again_and_again_holds_nothing() {
 }
 
 #[test]
-fn a_python_lambda_that_takes_more_memory_than_it_may_has_a_fault_with_both_numbers_and_is_made_again() {
+fn a_python_lambda_that_takes_more_memory_than_it_may_has_a_fault_with_both_numbers_and_is_made_again()
+ {
     const ALLOWED: u64 = 32 << 20;
     // What cannot be told apart is tolerated, and a wake adds to it before it is looked at.
     const AT_MOST: u64 = ALLOWED + (16 << 20) + (12 << 20);
-    let lambda = Copy::of("tests/lambdas/misbehave/python", |manifest| manifest.replace("\"256 MiB\"", "\"32 MiB\""));
+    let lambda = Copy::of("tests/lambdas/misbehave/python", |manifest| {
+        manifest.replace("\"256 MiB\"", "\"32 MiB\"")
+    });
     let folder = Folder::new();
     let run = replay(lambda.path(), &[imu_only(&folder, 1)], &["--set", "behaviour=hoard"]);
     run.must_exit(Exit::LambdaFaulted.code());
-    let faults: Vec<_> = run.decisions.iter().filter_map(|decision: &Decision| decision.fault.as_ref()).collect();
+    let faults: Vec<_> =
+        run.decisions.iter().filter_map(|decision: &Decision| decision.fault.as_ref()).collect();
     // Each new one comes as far: what it had went with it.
     assert!(faults.len() > 10, "{} faults", faults.len());
     for fault in faults {
-        assert_eq!((fault.kind, fault.allowed), (FaultKind::Memory, Some(ALLOWED)), "{}", fault.message);
+        assert_eq!(
+            (fault.kind, fault.allowed),
+            (FaultKind::Memory, Some(ALLOWED)),
+            "{}",
+            fault.message
+        );
         let used = fault.used.expect("it is known");
         assert!((ALLOWED..AT_MOST).contains(&used), "{}", fault.message);
-        assert!(fault.message.ends_with("`memory` in [limits] allows 32.0 MiB"), "{}", fault.message);
+        assert!(
+            fault.message.ends_with("`memory` in [limits] allows 32.0 MiB"),
+            "{}",
+            fault.message
+        );
     }
     let summary = run.summary.as_ref().expect("a summary");
     assert_eq!(summary.passed_over, 0, "there were good wakes between the faults");

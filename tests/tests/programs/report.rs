@@ -1,4 +1,5 @@
-//! The page that a replay leaves, and what `gleaner diff` says of two replays, with the real runtime.
+//! The page that a replay leaves, and what `gleaner diff` says of two replays, with the real
+//! runtime.
 
 use std::fs;
 use std::path::Path;
@@ -11,7 +12,8 @@ const OK: i32 = 0;
 const USAGE: i32 = 2;
 const DIFFERS: i32 = 4;
 
-/// Runs `gleaner` with these arguments, which must end with `code`; what it said on standard output.
+/// Runs `gleaner` with these arguments, which must end with `code`; what it said on standard
+/// output.
 #[track_caller]
 fn gleaner(code: i32, args: &[&str]) -> String {
     let mut gleaner = Command::new(program("gleaner"));
@@ -34,8 +36,11 @@ fn replay(out: &Folder, brake: &str) -> String {
 
 fn page(path: &Path) -> (String, Value) {
     let page = fs::read_to_string(path).expect("the page is there");
-    let (_, data) = page.split_once(r#"<script id="data" type="application/json">"#).expect("the page has data");
-    let data = serde_json::from_str(data.split_once("</script>").expect("it ends").0).expect("data is JSON");
+    let (_, data) = page
+        .split_once(r#"<script id="data" type="application/json">"#)
+        .expect("the page has data");
+    let data = serde_json::from_str(data.split_once("</script>").expect("it ends").0)
+        .expect("data is JSON");
     (page, data)
 }
 
@@ -48,10 +53,17 @@ fn a_replay_leaves_a_page_that_needs_nothing_else() {
     let (page, data) = page(&path);
 
     let run = &data["runs"][0];
-    assert_eq!((&run["lambda"], &run["labels"]), (&"hello".into(), &serde_json::json!(["hard-brake"])));
-    let expected = fs::read_to_string(root().join("examples/hello/expected.txt")).expect("expected.txt");
-    let seconds = |line: &str| line.split(' ').next().and_then(|word| word.parse::<f64>().ok()).expect("seconds");
-    let shown: Vec<_> = run["triggers"].as_array().expect("a list").iter().map(|mark| mark["t"].as_f64()).collect();
+    assert_eq!(
+        (&run["lambda"], &run["labels"]),
+        (&"hello".into(), &serde_json::json!(["hard-brake"]))
+    );
+    let expected =
+        fs::read_to_string(root().join("examples/hello/expected.txt")).expect("expected.txt");
+    let seconds = |line: &str| {
+        line.split(' ').next().and_then(|word| word.parse::<f64>().ok()).expect("seconds")
+    };
+    let shown: Vec<_> =
+        run["triggers"].as_array().expect("a list").iter().map(|mark| mark["t"].as_f64()).collect();
     assert_eq!(shown.len(), expected.lines().count());
     for (shown, line) in shown.iter().zip(expected.lines()) {
         assert!((shown.expect("a time") - seconds(line)).abs() < 0.001, "{shown:?} {line}");
@@ -60,7 +72,10 @@ fn a_replay_leaves_a_page_that_needs_nothing_else() {
     // The plotting library says in its first line where it comes from.
     let others = page.replacen("/*! https://github.com/leeoniya/uPlot", "", 1);
     assert_eq!((others.matches("https://").count(), others.matches("http://").count()), (0, 0));
-    assert!(page.contains("default-src 'none'"), "the browser fetches nothing, whatever the page says");
+    assert!(
+        page.contains("default-src 'none'"),
+        "the browser fetches nothing, whatever the page says"
+    );
     for element in ["<link", "<iframe", "<img", "src=", "@import", "url("] {
         assert!(!page.contains(element), "{element}");
     }
@@ -75,9 +90,12 @@ fn two_thresholds_differ_and_a_run_does_not_differ_from_itself() {
     let (strict, mild) = (Folder::new(), Folder::new());
     replay(&strict, "brake_mps2=-1.4");
     replay(&mild, "brake_mps2=-1.2");
-    let decisions = |out: &Folder| fs::read_to_string(out.path().join("decisions.jsonl")).expect("it is there");
+    let decisions =
+        |out: &Folder| fs::read_to_string(out.path().join("decisions.jsonl")).expect("it is there");
     let times = |out: &Folder| {
-        let at = |line: &str| serde_json::from_str::<Value>(line).expect("JSON")["at_ns"].as_i64().expect("a time");
+        let at = |line: &str| {
+            serde_json::from_str::<Value>(line).expect("JSON")["at_ns"].as_i64().expect("a time")
+        };
         decisions(out).lines().map(at).collect::<std::collections::BTreeSet<_>>()
     };
     // Counted another way: hello triggers once in a wake at most.
@@ -86,7 +104,8 @@ fn two_thresholds_differ_and_a_run_does_not_differ_from_itself() {
     assert!(gone + new > 0, "thresholds that do not differ test nothing");
 
     let (a, b) = (text(strict.path()), text(mild.path()));
-    let diff: Value = serde_json::from_str(&gleaner(DIFFERS, &["diff", a, b, "--json"])).expect("one object");
+    let diff: Value =
+        serde_json::from_str(&gleaner(DIFFERS, &["diff", a, b, "--json"])).expect("one object");
     assert_eq!((&diff["triggers"]["gone"], &diff["triggers"]["new"]), (&gone.into(), &new.into()));
     assert_eq!(diff["same"], false);
 
@@ -104,17 +123,28 @@ fn two_thresholds_differ_and_a_run_does_not_differ_from_itself() {
 #[test]
 fn a_folder_that_holds_no_results_is_refused() {
     let empty = Folder::new();
-    for args in [&["report", text(empty.path())][..], &["diff", text(empty.path()), text(empty.path())]] {
+    for args in
+        [&["report", text(empty.path())][..], &["diff", text(empty.path()), text(empty.path())]]
+    {
         assert_eq!(gleaner(USAGE, args), "");
     }
 }
 
-/// Runs `gleaner` where no file may become longer than `bytes`; its exit code, and what it said on standard error.
+/// Runs `gleaner` where no file may become longer than `bytes`; its exit code, and what it said on
+/// standard error.
 fn with_files_of(bytes: u64, args: &[&str]) -> (Option<i32>, String) {
     let mut limited = Command::new("sh");
     // The signal would end a process before its write fails. Blocks have 512 bytes.
-    limited.args(["-c", r#"trap "" XFSZ; ulimit -f "$1"; shift; exec "$@""#, "sh", &(bytes / 512).to_string()]);
-    limited.arg(program("gleaner")).args(args).env("XDG_CACHE_HOME", root().join("target/test-cache"));
+    limited.args([
+        "-c",
+        r#"trap "" XFSZ; ulimit -f "$1"; shift; exec "$@""#,
+        "sh",
+        &(bytes / 512).to_string(),
+    ]);
+    limited
+        .arg(program("gleaner"))
+        .args(args)
+        .env("XDG_CACHE_HOME", root().join("target/test-cache"));
     let output = limited.output().expect("it starts");
     (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
 }
@@ -124,8 +154,20 @@ fn what_a_report_needs_and_cannot_be_written_is_an_error_and_the_results_are_the
     let (lambda, drive) = (root().join("examples/brake-dark/rust"), sample_drive());
     let args = |out: &Path, more: &[&'static str]| {
         let out = text(out).to_owned();
-        let line = ["replay", text(&lambda), text(&drive), "--set", "brake_mps2=-1.4", "--no-record", "--out"];
-        let line = line.into_iter().map(str::to_owned).chain([out]).chain(more.iter().map(|arg| (*arg).to_owned()));
+        let line = [
+            "replay",
+            text(&lambda),
+            text(&drive),
+            "--set",
+            "brake_mps2=-1.4",
+            "--no-record",
+            "--out",
+        ];
+        let line = line
+            .into_iter()
+            .map(str::to_owned)
+            .chain([out])
+            .chain(more.iter().map(|arg| (*arg).to_owned()));
         line.collect::<Vec<_>>()
     };
     let run = |bytes: u64, out: &Path, more: &[&'static str]| {
@@ -136,14 +178,22 @@ fn what_a_report_needs_and_cannot_be_written_is_an_error_and_the_results_are_the
     assert_eq!(run(1 << 40, whole.path(), &[]), (Some(OK), String::new()));
     let len = |name: &str| fs::metadata(whole.path().join(name)).expect("it is there").len();
     let (report, signals) = (len("report.html"), len("signals.json"));
-    assert!(report > signals + 4096 && signals > len("decisions.jsonl") + 4096 && signals > len("summary.json") + 4096);
+    assert!(
+        report > signals + 4096
+            && signals > len("decisions.jsonl") + 4096
+            && signals > len("summary.json") + 4096
+    );
 
     let same_results = |out: &Path| {
-        let triggers = |out: &Path| fs::read_to_string(out.join("decisions.jsonl")).expect("decisions").lines().count();
+        let triggers = |out: &Path| {
+            fs::read_to_string(out.join("decisions.jsonl")).expect("decisions").lines().count()
+        };
         assert_eq!(triggers(out), triggers(whole.path()));
         assert!(out.join("summary.json").exists());
-        let names = fs::read_dir(out).expect("results").map(|entry| entry.expect("a file").file_name());
-        let parts: Vec<_> = names.filter(|name| name.to_string_lossy().ends_with(".part")).collect();
+        let names =
+            fs::read_dir(out).expect("results").map(|entry| entry.expect("a file").file_name());
+        let parts: Vec<_> =
+            names.filter(|name| name.to_string_lossy().ends_with(".part")).collect();
         assert!(parts.is_empty(), "{parts:?}");
     };
     for (bytes, more, names) in [
@@ -152,7 +202,10 @@ fn what_a_report_needs_and_cannot_be_written_is_an_error_and_the_results_are_the
     ] {
         let out = Folder::new();
         let (exit, said) = run(bytes, out.path(), more);
-        assert!(exit == Some(1) && said.contains("error: ") && said.contains(names), "{exit:?} {said}");
+        assert!(
+            exit == Some(1) && said.contains("error: ") && said.contains(names),
+            "{exit:?} {said}"
+        );
         assert!(!out.path().join("report.html").exists());
         same_results(out.path());
     }
@@ -163,7 +216,10 @@ fn what_a_report_needs_and_cannot_be_written_is_an_error_and_the_results_are_the
         out.write(part, "of a replay that was killed");
     }
     let (exit, said) = run(1 << 40, out.path(), &[]);
-    assert!(exit == Some(1) && said.contains("pictures`") && said.contains("it is no folder"), "{exit:?} {said}");
+    assert!(
+        exit == Some(1) && said.contains("pictures`") && said.contains("it is no folder"),
+        "{exit:?} {said}"
+    );
     assert!(out.path().join("report.html").exists() && out.path().join("signals.json").exists());
     same_results(out.path());
 }

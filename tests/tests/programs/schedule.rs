@@ -1,4 +1,5 @@
-//! When a lambda runs over a drive: ticks of its twins. `host/tests/library/schedule.rs` has what samples wake.
+//! When a lambda runs over a drive: ticks of its twins. `host/tests/library/schedule.rs` has what
+//! samples wake.
 
 use std::path::PathBuf;
 
@@ -68,9 +69,11 @@ fn ticks_of_a_gap_that_is_too_long_to_catch_up_are_missed_and_counted_to_the_las
     let missed = (after - before) / PERIOD + 1;
     assert_eq!(missed, 299_991);
     assert_eq!(summary.missed_ticks, missed as u64);
-    let told: Vec<_> = run.decisions.iter().map(|decision| said(decision, "missed")).filter(|n| *n != 0).collect();
+    let told: Vec<_> =
+        run.decisions.iter().map(|decision| said(decision, "missed")).filter(|n| *n != 0).collect();
     assert_eq!(told, [missed]);
-    let (early, late): (Vec<_>, Vec<_>) = run.decisions.iter().partition(|decision| decision.at_ns < before);
+    let (early, late): (Vec<_>, Vec<_>) =
+        run.decisions.iter().partition(|decision| decision.at_ns < before);
     assert_eq!((early.len(), late.len()), (9, 10));
     assert!(said(late[0], "missed") == missed && late[0].at_ns > after);
 }

@@ -1,20 +1,32 @@
-//! What the host keeps for a lambda: the same for both kinds, beyond faults, and never from one replay to the next.
+//! What the host keeps for a lambda: the same for both kinds, beyond faults, and never from one
+//! replay to the next.
 
 use gleaner_lambda::{Decision, FaultKind};
 use gleaner_tests::{Copy, Run, replay, root, sample_drive};
 
 fn keeper(args: &[&str]) -> Run {
     let [rust, python] = ["rust", "python"].map(|kind| {
-        replay(&root().join("tests/lambdas/keeper").join(kind), &[sample_drive()], &[&["--all"], args].concat())
+        replay(
+            &root().join("tests/lambdas/keeper").join(kind),
+            &[sample_drive()],
+            &[&["--all"], args].concat(),
+        )
     });
     // Each says a fault in its own words, and the one counts fuel.
     let told = |run: &Run| {
-        let decisions = run.decisions.iter().map(|decision| (decision.at_ns, decision.triggers.clone()));
+        let decisions =
+            run.decisions.iter().map(|decision| (decision.at_ns, decision.triggers.clone()));
         decisions.collect::<Vec<_>>()
     };
     assert_eq!(rust.decisions.len(), 399);
     assert_eq!(told(&rust), told(&python));
-    assert!(python.decisions.iter().zip(&rust.decisions).all(|(a, b)| a.fault.is_some() == b.fault.is_some()));
+    assert!(
+        python
+            .decisions
+            .iter()
+            .zip(&rust.decisions)
+            .all(|(a, b)| a.fault.is_some() == b.fault.is_some())
+    );
     rust
 }
 
@@ -43,15 +55,20 @@ fn what_is_kept_outlives_faults_and_its_bound_is_exact() {
     assert!(why.contains("`bulk` needs 100000 bytes of scratch and 48431 are free"), "{why}");
     assert_eq!(run.decisions[1].triggers[0].attributes["last"], "[2, 2]");
     // The second replay in one process begins with nothing, as the first did.
-    let twice = replay(&root().join("tests/lambdas/keeper/rust"), &[sample_drive()], &["--all", "--repeat", "2"]);
+    let twice = replay(
+        &root().join("tests/lambdas/keeper/rust"),
+        &[sample_drive()],
+        &["--all", "--repeat", "2"],
+    );
     assert_eq!(twice.decisions.last().map(counted), Some(399));
 }
 
 #[test]
 fn without_a_grant_there_is_none() {
     for kind in ["rust", "python"] {
-        let lambda =
-            Copy::of(&format!("tests/lambdas/keeper/{kind}"), |toml| toml.replace("scratch = \"1 MiB\"\n", ""));
+        let lambda = Copy::of(&format!("tests/lambdas/keeper/{kind}"), |toml| {
+            toml.replace("scratch = \"1 MiB\"\n", "")
+        });
         let run = replay(lambda.path(), &[sample_drive()], &["--all"]);
         let (fault, why) = run.first_fault().unwrap();
         assert_eq!(fault, FaultKind::Exception);

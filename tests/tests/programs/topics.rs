@@ -1,4 +1,5 @@
-//! Drives of many topics, and of topics that cannot be read: what is looked at, what clips hold, and what is refused.
+//! Drives of many topics, and of topics that cannot be read: what is looked at, what clips hold,
+//! and what is refused.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -28,13 +29,17 @@ fn a_file_of_sixty_thousand_topics_is_looked_into_in_bounded_memory() {
     let output = inspect.output().expect("a shell starts");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let reports = String::from_utf8_lossy(&output.stdout);
-    let Some(Ok(Report::Drive(seen))) = reports.lines().map(serde_json::from_str).next_back() else {
+    let Some(Ok(Report::Drive(seen))) = reports.lines().map(serde_json::from_str).next_back()
+    else {
         panic!("{reports}")
     };
     let DriveSeen { topics, skipped, .. } = seen;
     assert_eq!(topics.len() as u64 + skipped, 60_001);
     assert_eq!(skipped, 60_001 - 4096);
-    let imu = topics.iter().find(|topic| topic.topic == "/imu/data").expect("it has a name among the first");
+    let imu = topics
+        .iter()
+        .find(|topic| topic.topic == "/imu/data")
+        .expect("it has a name among the first");
     assert_eq!((imu.read, imu.messages), (4170, Some(4170)));
     assert!(topics.iter().filter(|topic| topic.topic != "/imu/data").all(|topic| topic.read == 10));
 }
@@ -49,14 +54,18 @@ fn topics_with_messages_are_looked_at_before_those_without() {
         writer.add_channel(schema, &format!("/empty/{n}"), "cdr", &BTreeMap::new()).unwrap();
     }
     let channel_id = writer.add_channel(schema, "/last", "cdr", &BTreeMap::new()).unwrap();
-    let header = mcap::records::MessageHeader { channel_id, sequence: 1, log_time: 5, publish_time: 5 };
+    let header =
+        mcap::records::MessageHeader { channel_id, sequence: 1, log_time: 5, publish_time: 5 };
     writer.write_to_known_channel(&header, &[0, 1, 0, 0, 1, 0, 0, 0, 0]).unwrap();
     writer.finish().unwrap();
     drop(writer);
     let drive = folder.write("sparse.mcap", file.into_inner());
     let output = Command::new(program("gleaner")).arg("inspect").arg(drive).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
-    assert!(text.contains("/last ") && text.contains("and 905 more topics, not looked at"), "{text}");
+    assert!(
+        text.contains("/last ") && text.contains("and 905 more topics, not looked at"),
+        "{text}"
+    );
 }
 
 #[test]
@@ -67,7 +76,10 @@ fn clips_hold_all_topics_of_a_drive_of_five_hundred() {
     assert_eq!(clips.len(), 2);
     for clip in clips {
         assert_eq!(clip.topics.len(), 501);
-        assert!(clip.topics.iter().all(|topic| topic.messages > 0 && topic.overwritten == Some(0)), "{clip:?}");
+        assert!(
+            clip.topics.iter().all(|topic| topic.messages > 0 && topic.overwritten == Some(0)),
+            "{clip:?}"
+        );
     }
 }
 
@@ -82,7 +94,10 @@ fn more_topics_than_clips_hold_are_counted_before_anything_is_read() {
     // A message names some of them only.
     let none = braking(&[drive], &["--topics", "/lidar/*"]);
     let said = &none.must_exit(USAGE).stderr;
-    assert!(said.contains("the drive has no topic `/lidar/*`") && said.contains("and 1981 more"), "{said}");
+    assert!(
+        said.contains("the drive has no topic `/lidar/*`") && said.contains("and 1981 more"),
+        "{said}"
+    );
     assert!(said.len() < 2000, "{said}");
 }
 
@@ -93,7 +108,8 @@ fn a_pattern_that_matches_nothing_readable_names_what_is() {
     let mut writer = mcap::WriteOptions::new().create(&mut file).unwrap();
     let channel_id = writer.add_channel(0, "/notes", "json", &BTreeMap::new()).unwrap();
     let at = 1_533_199_500_000_000_000;
-    let header = mcap::records::MessageHeader { channel_id, sequence: 1, log_time: at, publish_time: at };
+    let header =
+        mcap::records::MessageHeader { channel_id, sequence: 1, log_time: at, publish_time: at };
     writer.write_to_known_channel(&header, b"{}").unwrap();
     writer.finish().unwrap();
     drop(writer);
@@ -101,9 +117,17 @@ fn a_pattern_that_matches_nothing_readable_names_what_is() {
     for pattern in ["/notes", "/no*"] {
         let run = braking(&drives, &["--topics", pattern]);
         let said = &run.must_exit(USAGE).stderr;
-        assert!(said.contains(&format!("error: no topic that --topics `{pattern}` matches can be recorded")), "{said}");
+        assert!(
+            said.contains(&format!(
+                "error: no topic that --topics `{pattern}` matches can be recorded"
+            )),
+            "{said}"
+        );
         assert!(said.contains("cause: topic `/notes` has message encoding `json`"), "{said}");
-        assert!(said.contains("help:  the drive has `/camera/front/compressed`, `/imu/data`"), "{said}");
+        assert!(
+            said.contains("help:  the drive has `/camera/front/compressed`, `/imu/data`"),
+            "{said}"
+        );
     }
     let all = braking(&drives, &["--topics", "*"]);
     assert_eq!(all.must_exit(0).clips[0].topics.len(), 3);

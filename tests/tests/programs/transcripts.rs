@@ -1,5 +1,5 @@
-//! What pages show of commands is what these print. `GLEANER_BLESS=1 cargo test --release -p gleaner-tests --test programs transcripts` writes what
-//! they print today into the pages.
+//! What pages show of commands is what these print. `GLEANER_BLESS=1 cargo test --release -p
+//! gleaner-tests --test programs transcripts` writes what they print today into the pages.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -36,7 +36,8 @@ fn holds(page: &str, folder: &Folder) {
 /// A folder with the sample drive.
 fn with_drive() -> Folder {
     let folder = Folder::new();
-    symlink(sample_drive(), folder.path().join("highway_drive.mcap")).expect("the folder is writable");
+    symlink(sample_drive(), folder.path().join("highway_drive.mcap"))
+        .expect("the folder is writable");
     folder
 }
 
@@ -86,10 +87,20 @@ fn kitchen() -> Folder {
         copy_lambda(RUST, &folder, name, replaced(from, to));
     }
     // Rings of messages without a field of that name.
-    copy_lambda(PYTHON, &folder, "no-field", replaced("sensor_msgs/msg/Imu", "sensor_msgs/msg/Range"));
-    let main = fs::read_to_string(root().join(PYTHON).join("main.py")).expect("the example's source");
+    copy_lambda(
+        PYTHON,
+        &folder,
+        "no-field",
+        replaced("sensor_msgs/msg/Imu", "sensor_msgs/msg/Range"),
+    );
+    let main =
+        fs::read_to_string(root().join(PYTHON).join("main.py")).expect("the example's source");
     for (name, from, to) in [
-        ("syntax-error", "def __init__(self, ctx: Context) -> None:", "def __init__(self, ctx: Context) -> None"),
+        (
+            "syntax-error",
+            "def __init__(self, ctx: Context) -> None:",
+            "def __init__(self, ctx: Context) -> None",
+        ),
         ("misspelt", "ctx.event(\"hard-brake\", -mean)", "ctx.evnt(\"hard-brake\", -mean)"),
         (
             "greedy",
@@ -101,7 +112,8 @@ fn kitchen() -> Folder {
         assert!(main.contains(from), "main.py has no {from}");
         folder.write(&format!("{name}/build/main.py"), main.replace(from, to));
     }
-    let manifest = fs::read_to_string(root().join(RUST).join("lambda.toml")).expect("the example's manifest");
+    let manifest =
+        fs::read_to_string(root().join(RUST).join("lambda.toml")).expect("the example's manifest");
     folder.write("not-built/lambda.toml", &manifest);
     folder.write(
         "python-without-file/lambda.toml",
@@ -110,7 +122,11 @@ fn kitchen() -> Folder {
     copy_lambda(RUST, &folder, "stale", |manifest| manifest);
     let source = folder.write("stale/src/lib.rs", "");
     let newer = SystemTime::now() + Duration::from_secs(60);
-    fs::File::options().write(true).open(source).and_then(|file| file.set_modified(newer)).expect("a time can be set");
+    fs::File::options()
+        .write(true)
+        .open(source)
+        .and_then(|file| file.set_modified(newer))
+        .expect("a time can be set");
     fs::create_dir(folder.path().join("empty")).expect("the folder is writable");
     folder.write("empty.mcap", "");
     folder.write("notes.mcap", "this is no drive");
@@ -118,7 +134,10 @@ fn kitchen() -> Folder {
     drop(corrupted(&folder));
     // An environment as `python -m venv` makes it, without numpy.
     let python = Parts::find().and_then(|parts| parts.python(None)).expect("a Python");
-    let made = Command::new(python).args(["-m", "venv", "--without-pip", "bare"]).current_dir(folder.path()).status();
+    let made = Command::new(python)
+        .args(["-m", "venv", "--without-pip", "bare"])
+        .current_dir(folder.path())
+        .status();
     assert!(made.expect("Python starts").success());
     folder
 }

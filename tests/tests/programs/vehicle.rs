@@ -1,4 +1,5 @@
-//! A vehicle makes the limits of a lambda smaller: in a replay, in what its journal says, and when that is made again.
+//! A vehicle makes the limits of a lambda smaller: in a replay, in what its journal says, and when
+//! that is made again.
 
 use std::path::Path;
 
@@ -20,8 +21,13 @@ fn on(folder: &Folder, lambda: &Path, vehicle: &str, args: &[&str]) -> Run {
 /// Makes the journal again on that vehicle, if one is named.
 fn again(folder: &Folder, lambda: &Path, vehicle: Option<&str>) -> Verification {
     let (drive, journal) = (sample_drive(), folder.path().join("journal"));
-    let mut args =
-        vec!["replay".as_ref(), lambda.as_os_str(), drive.as_os_str(), "--verify".as_ref(), journal.as_os_str()];
+    let mut args = vec![
+        "replay".as_ref(),
+        lambda.as_os_str(),
+        drive.as_os_str(),
+        "--verify".as_ref(),
+        journal.as_os_str(),
+    ];
     let file = vehicle.map(|text| folder.write("another.toml", text));
     if let Some(file) = &file {
         args.extend(["--vehicle".as_ref(), file.as_os_str()]);
@@ -35,7 +41,11 @@ fn the_smaller_limit_holds_and_is_named() {
     let run = on(&folder, &lambda, "[limits]\nfuel = 1_000\nmemory = \"1 GiB\"\n", &[]);
     let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
     assert!(message.ends_with("of 1000 units of fuel"), "{message}");
-    assert!(run.stderr.contains("fuel 10000000 -> 1000") && !run.stderr.contains("memory"), "{}", run.stderr);
+    assert!(
+        run.stderr.contains("fuel 10000000 -> 1000") && !run.stderr.contains("memory"),
+        "{}",
+        run.stderr
+    );
     let run = on(&folder, &lambda, "[limits]\nfuel = 100_000_000\n", &BRAKING);
     assert!(run.must_exit(OK).stderr.is_empty(), "{}", run.stderr);
 }
@@ -45,7 +55,10 @@ fn a_mistake_in_the_file_of_a_vehicle_is_refused_with_its_line() {
     let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
     let run = on(&folder, &lambda, "[limits]\nfule = 1_000\n", &[]);
     let said = &run.must_exit(USAGE).stderr;
-    assert!(said.contains("vehicle.toml, line 2: unknown key `fule`") && said.contains("`fuel`?"), "{said}");
+    assert!(
+        said.contains("vehicle.toml, line 2: unknown key `fule`") && said.contains("`fuel`?"),
+        "{said}"
+    );
 }
 
 #[test]
@@ -53,7 +66,13 @@ fn a_journal_is_made_again_under_the_limits_that_it_names() {
     let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
     let journal = folder.path().join("journal");
     let tight = "[limits]\nfuel = 100_000\n";
-    on(&folder, &lambda, tight, &[&BRAKING[..], &["--journal", journal.to_str().unwrap()]].concat()).must_exit(OK);
+    on(
+        &folder,
+        &lambda,
+        tight,
+        &[&BRAKING[..], &["--journal", journal.to_str().unwrap()]].concat(),
+    )
+    .must_exit(OK);
     for vehicle in [None, Some(tight)] {
         let again = again(&folder, &lambda, vehicle);
         assert!(again.verified.is_some(), "{}", again.stderr);
@@ -64,9 +83,15 @@ fn a_journal_is_made_again_under_the_limits_that_it_names() {
         assert!(other.stderr.contains(part), "{part}: {}", other.stderr);
     }
     // A journal cannot have more than the manifest gives.
-    let poor = Copy::of("examples/hello/rust", |manifest| manifest.replace("fuel = 10_000_000", "fuel = 50_000"));
+    let poor = Copy::of("examples/hello/rust", |manifest| {
+        manifest.replace("fuel = 10_000_000", "fuel = 50_000")
+    });
     let poor = again(&folder, poor.path(), None);
-    assert!(poor.exit == DIFFERS && poor.stderr.contains("now:            50000"), "{}", poor.stderr);
+    assert!(
+        poor.exit == DIFFERS && poor.stderr.contains("now:            50000"),
+        "{}",
+        poor.stderr
+    );
 }
 
 #[test]

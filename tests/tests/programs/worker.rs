@@ -1,4 +1,5 @@
-//! A Python lambda of a replay runs in a process that can write nothing, and whose end is no end of the replay's own.
+//! A Python lambda of a replay runs in a process that can write nothing, and whose end is no end of
+//! the replay's own.
 
 use std::io::Read;
 use std::process::Stdio;
@@ -22,7 +23,8 @@ fn misbehave(folder: &Folder, behaviour: &str, target: &str, args: &[&str]) -> R
 /// The one fault of a run that ended with its lambda's process: the wake, the message.
 #[track_caller]
 fn killed(run: &Run) -> (usize, &str) {
-    let faults: Vec<_> = run.decisions.iter().enumerate().filter(|(_, decision)| decision.fault.is_some()).collect();
+    let faults: Vec<_> =
+        run.decisions.iter().enumerate().filter(|(_, decision)| decision.fault.is_some()).collect();
     let [(wake, decision)] = faults[..] else { panic!("{} faults: {}", faults.len(), run.stderr) };
     let fault = decision.fault.as_ref().unwrap();
     assert_eq!(fault.kind, FaultKind::Killed, "{}", fault.message);
@@ -38,7 +40,8 @@ fn the_process_of_a_python_lambda_can_write_no_file() {
     let lambda = root().join("tests/lambdas/misbehave/python");
     let journal = out.path().join("drive.journal");
     let target = format!("target={}", out.path().display());
-    let args = ["--set", "behaviour=write", "--set", &target, "--journal", journal.to_str().unwrap()];
+    let args =
+        ["--set", "behaviour=write", "--set", &target, "--journal", journal.to_str().unwrap()];
     let run = replay_to(out.path(), &lambda, &[imu_only(&folder, 1)], &args);
     let summary = run.must_exit(0).summary.as_ref().expect("a summary");
     assert!(summary.wakes > 0 && run.decisions.is_empty(), "{:?}", run.decisions);
@@ -63,9 +66,16 @@ fn a_process_that_is_killed_leaves_a_fault_and_all_results_before_it() {
     let journaled = ["--all", "--journal", journal.to_str().unwrap()];
     let run = misbehave(&folder, "kill_itself", "", &journaled);
     assert_eq!(killed(run.must_exit(FAULTED)), (3, "the lambda's process was ended by signal 9"));
-    // Its journal has no end, and holds the wake that it did not survive: made again, it is the same.
+    // Its journal has no end, and holds the wake that it did not survive: made again, it is the
+    // same.
     let (lambda, drive) = (root().join("tests/lambdas/misbehave/python"), imu_only(&folder, 1));
-    let args = ["replay".as_ref(), lambda.as_os_str(), drive.as_os_str(), "--verify".as_ref(), journal.as_os_str()];
+    let args = [
+        "replay".as_ref(),
+        lambda.as_os_str(),
+        drive.as_os_str(),
+        "--verify".as_ref(),
+        journal.as_os_str(),
+    ];
     let proved = verify(&args);
     let verified = proved.verified.unwrap_or_else(|| panic!("{}", proved.stderr));
     assert_eq!((proved.exit, verified.wakes, verified.cut_off), (0, 3, true));
@@ -84,7 +94,10 @@ fn messages_that_a_lambda_forges_end_the_replay_and_are_named() {
         let folder = Folder::new();
         let run = misbehave(&folder, "forge_messages", message, &["--all"]);
         let (wake, why) = killed(run.must_exit(FAULTED));
-        assert!(why.starts_with("the lambda's process reported ") && why.contains(named), "{named}: {why}");
+        assert!(
+            why.starts_with("the lambda's process reported ") && why.contains(named),
+            "{named}: {why}"
+        );
         assert_eq!(wake, 3);
     }
 }
@@ -93,8 +106,14 @@ fn messages_that_a_lambda_forges_end_the_replay_and_are_named() {
 fn nothing_outlives_a_replay_that_is_killed() {
     let folder = Folder::new();
     let mut command = runtime();
-    command.arg("replay").arg(root().join("tests/lambdas/misbehave/python")).arg(imu_only(&folder, 600));
-    command.args(["--set", "behaviour=sleep", "--out"]).arg(folder.path().join("out")).stdout(Stdio::piped());
+    command
+        .arg("replay")
+        .arg(root().join("tests/lambdas/misbehave/python"))
+        .arg(imu_only(&folder, 600));
+    command
+        .args(["--set", "behaviour=sleep", "--out"])
+        .arg(folder.path().join("out"))
+        .stdout(Stdio::piped());
     let mut replay = command.spawn().expect("gleaner-runtime starts");
     let mut first = [0];
     replay.stdout.take().unwrap().read_exact(&mut first).expect("it reports its layers");
@@ -102,7 +121,9 @@ fn nothing_outlives_a_replay_that_is_killed() {
     assert_eq!(processes.len(), 2, "a shim and a worker");
     replay.kill().unwrap();
     replay.wait().unwrap();
-    let lives = |pid: &u32| std::fs::read(format!("/proc/{pid}/cmdline")).is_ok_and(|line| !line.is_empty());
+    let lives = |pid: &u32| {
+        std::fs::read(format!("/proc/{pid}/cmdline")).is_ok_and(|line| !line.is_empty())
+    };
     let begun = Instant::now();
     while processes.iter().any(lives) {
         assert!(begun.elapsed() < Duration::from_secs(120), "what a replay started lives on");

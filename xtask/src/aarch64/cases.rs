@@ -32,7 +32,8 @@ const fn case(lambda: &'static str, set: &'static [&'static str]) -> Case {
     Case { lambda, set, limit: None, deterministic: false, known: None }
 }
 
-/// Triggers, all pixels of all pictures, floating point, and every way to fault that a processor has a part in.
+/// Triggers, all pixels of all pictures, floating point, and every way to fault that a processor
+/// has a part in.
 pub(super) const CASES: [Case; 13] = [
     case("examples/hello/rust", &["brake_mps2=-1.4"]),
     case("examples/brake-dark/rust", &["brake_mps2=-1.4", "dark_luma=50"]),
@@ -45,7 +46,10 @@ pub(super) const CASES: [Case; 13] = [
     case("tests/lambdas/misbehave/rust", &["behaviour=panic"]),
     case("tests/lambdas/misbehave/rust", &["behaviour=memory"]),
     case("tests/lambdas/misbehave/rust", &["behaviour=host_calls"]),
-    Case { limit: Some("stack = \"16 KiB\""), ..case("tests/lambdas/misbehave/rust", &["behaviour=recurse"]) },
+    Case {
+        limit: Some("stack = \"16 KiB\""),
+        ..case("tests/lambdas/misbehave/rust", &["behaviour=recurse"])
+    },
     Case {
         known: Some("a NaN that arithmetic makes has a sign here and none there"),
         ..case("tests/lambdas/misbehave/rust", &["behaviour=nan_bits"])
@@ -87,7 +91,11 @@ impl<'c> Machine<'c> {
     fn run(&self, mut command: Command) -> Result<Output, Failure> {
         command.output().map_err(|error| {
             let program = command.get_program().display();
-            Failure::caused_by(Exit::Internal, format!("cannot start `{program}` for {}", self.name), &error)
+            Failure::caused_by(
+                Exit::Internal,
+                format!("cannot start `{program}` for {}", self.name),
+                &error,
+            )
         })
     }
 
@@ -96,8 +104,12 @@ impl<'c> Machine<'c> {
         let output = self.run(command)?;
         serde_json::from_slice(&output.stdout).map_err(|_| {
             let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-            let mut failure = Failure::new(Exit::Internal, format!("no result on {} ({})", self.name, output.status));
-            failure.causes = vec![if said.is_empty() { "it said nothing".to_owned() } else { said }];
+            let mut failure = Failure::new(
+                Exit::Internal,
+                format!("no result on {} ({})", self.name, output.status),
+            );
+            failure.causes =
+                vec![if said.is_empty() { "it said nothing".to_owned() } else { said }];
             failure
         })
     }
@@ -118,15 +130,22 @@ impl Case {
             return Ok(PathBuf::from(self.lambda));
         }
         let copy = Path::new(OUT).join("deterministic");
-        copy_deterministic(&checkout.path(self.lambda), &checkout.path(&copy)).map_err(|error| {
-            Failure::caused_by(Exit::Internal, format!("cannot copy `{}` to `{}`", self.lambda, copy.display()), &error)
-        })?;
+        copy_deterministic(&checkout.path(self.lambda), &checkout.path(&copy)).map_err(
+            |error| {
+                Failure::caused_by(
+                    Exit::Internal,
+                    format!("cannot copy `{}` to `{}`", self.lambda, copy.display()),
+                    &error,
+                )
+            },
+        )?;
         Ok(copy)
     }
 
     /// The folder of its results on `machine`, relative to the checkout.
     fn out(&self, machine: &Machine<'_>) -> PathBuf {
-        let plain = |character: char| if character.is_ascii_alphanumeric() { character } else { '-' };
+        let plain =
+            |character: char| if character.is_ascii_alphanumeric() { character } else { '-' };
         Path::new(OUT).join(self.name().chars().map(plain).collect::<String>()).join(machine.name)
     }
 
@@ -158,12 +177,19 @@ impl Case {
     }
 
     /// Makes every decision of `writer`'s journal again on `reader`; says how many there were.
-    pub(super) fn verify(&self, writer: &Machine<'_>, reader: &Machine<'_>) -> Result<String, Failure> {
+    pub(super) fn verify(
+        &self,
+        writer: &Machine<'_>,
+        reader: &Machine<'_>,
+    ) -> Result<String, Failure> {
         let mut verify = reader.program("gleaner");
         verify.arg("replay").arg(self.lambda(reader.checkout)?).arg(DRIVE);
         verify.arg("--verify").arg(journal(&self.out(writer))).arg("--json");
         let verified: Verified = reader.report(verify)?;
-        Ok(format!("and {} decisions of the journal of {} made again on {}", verified.wakes, writer.name, reader.name))
+        Ok(format!(
+            "and {} decisions of the journal of {} made again on {}",
+            verified.wakes, writer.name, reader.name
+        ))
     }
 }
 
@@ -187,8 +213,8 @@ fn journal(out: &Path) -> PathBuf {
     out.join("wakes.journal")
 }
 
-/// Puts code that was compiled here to where the emulated machine expects its own, and sees that it is not loaded, but compiled again.
-/// Returns the warning.
+/// Puts code that was compiled here to where the emulated machine expects its own, and sees that it
+/// is not loaded, but compiled again. Returns the warning.
 pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<String, Failure> {
     let lambda = CASES[0].lambda;
     let cache = Cache::make()?;
@@ -201,36 +227,56 @@ pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<St
         if output.status.success() {
             Ok(PathBuf::from(entry))
         } else {
-            Err(Failure::new(Exit::Internal, format!("cannot compile for {} ({})", machine.name, output.status)))
+            Err(Failure::new(
+                Exit::Internal,
+                format!("cannot compile for {} ({})", machine.name, output.status),
+            ))
         }
     };
     // A program finds its cache in the folder `gleaner` of the one that it is told.
     let (foreign, own) = (compile(here, "here")?, compile(there, "gleaner")?);
     if foreign.file_name() == own.file_name() {
-        return Err(Failure::new(Exit::Differs, "code of both processors has the same name in the cache"));
+        return Err(Failure::new(
+            Exit::Differs,
+            "code of both processors has the same name in the cache",
+        ));
     }
-    fs::copy(&foreign, &own).map_err(|error| Failure::caused_by(Exit::Internal, "cannot copy code", &error))?;
+    fs::copy(&foreign, &own)
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot copy code", &error))?;
     let mut replay = there.program("gleaner");
-    replay.env("XDG_CACHE_HOME", &cache.0).arg("replay").arg(lambda).arg(DRIVE).arg("--out").arg(cache.0.join("out"));
+    replay
+        .env("XDG_CACHE_HOME", &cache.0)
+        .arg("replay")
+        .arg(lambda)
+        .arg(DRIVE)
+        .arg("--out")
+        .arg(cache.0.join("out"));
     let output = there.run(replay)?;
     let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
     if !output.status.success() || !said.contains("native code in the cache is damaged") {
-        let mut failure =
-            Failure::new(Exit::Differs, format!("code of {} was not replaced on {}", here.name, there.name));
+        let mut failure = Failure::new(
+            Exit::Differs,
+            format!("code of {} was not replaced on {}", here.name, there.name),
+        );
         failure.causes = vec![format!("it ended with {}: {said}", output.status)];
         return Err(failure);
     }
     Ok(said)
 }
 
-/// A cache of our own, below a folder where only we may write; else code in it would not be looked at. It goes in the end.
+/// A cache of our own, below a folder where only we may write; else code in it would not be looked
+/// at. It goes in the end.
 struct Cache(PathBuf);
 
 impl Cache {
     fn make() -> Result<Cache, Failure> {
         let folder = std::env::temp_dir().join(format!("gleaner-aarch64-{}", std::process::id()));
         fs::DirBuilder::new().mode(0o700).create(&folder).map_err(|error| {
-            Failure::caused_by(Exit::Internal, format!("cannot make `{}`", folder.display()), &error)
+            Failure::caused_by(
+                Exit::Internal,
+                format!("cannot make `{}`", folder.display()),
+                &error,
+            )
         })?;
         Ok(Cache(folder))
     }

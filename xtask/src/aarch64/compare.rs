@@ -24,9 +24,14 @@ pub(super) fn read(folder: &Path, wakes: u64, seconds: f64) -> Result<Replayed, 
     };
     let path = folder.join("decisions.jsonl");
     let text = fs::read_to_string(&path).map_err(|error| cannot(&path, &error))?;
-    let decisions = text.lines().map(decision).collect::<Result<Vec<_>, _>>().map_err(|error| cannot(&path, &error))?;
+    let decisions = text
+        .lines()
+        .map(decision)
+        .collect::<Result<Vec<_>, _>>()
+        .map_err(|error| cannot(&path, &error))?;
     if decisions.len() as u64 != wakes {
-        let message = format!("`{}` has {} decisions of {wakes} wakes", path.display(), decisions.len());
+        let message =
+            format!("`{}` has {} decisions of {wakes} wakes", path.display(), decisions.len());
         return Err(Failure::new(Exit::Internal, message));
     }
     let files = others(folder).map_err(|error| cannot(folder, &error))?;
@@ -40,13 +45,17 @@ fn decision(line: &str) -> Result<Map<String, Value>, serde_json::Error> {
 }
 
 fn others(folder: &Path) -> io::Result<BTreeMap<PathBuf, Vec<u8>>> {
-    let mut files = BTreeMap::from([(PathBuf::from("log.jsonl"), fs::read(folder.join("log.jsonl"))?)]);
+    let mut files =
+        BTreeMap::from([(PathBuf::from("log.jsonl"), fs::read(folder.join("log.jsonl"))?)]);
     let clips = folder.join("clips");
     if clips.is_dir() {
         for entry in fs::read_dir(clips)? {
             let path = entry?.path();
             if path.extension().is_some_and(|extension| extension == "jpg") {
-                files.insert(path.strip_prefix(folder).unwrap_or(&path).to_owned(), fs::read(&path)?);
+                files.insert(
+                    path.strip_prefix(folder).unwrap_or(&path).to_owned(),
+                    fs::read(&path)?,
+                );
             }
         }
     }
@@ -55,7 +64,11 @@ fn others(folder: &Path) -> io::Result<BTreeMap<PathBuf, Vec<u8>>> {
 
 /// How many wakes, triggers and faults there were, and how much fuel was used.
 pub(super) fn counted(decisions: &[Map<String, Value>]) -> String {
-    let triggers = decisions.iter().filter_map(|decision| decision["triggers"].as_array()).map(Vec::len).sum::<usize>();
+    let triggers = decisions
+        .iter()
+        .filter_map(|decision| decision["triggers"].as_array())
+        .map(Vec::len)
+        .sum::<usize>();
     let faults = decisions.iter().filter(|decision| !decision["fault"].is_null()).count();
     let fuel = decisions.iter().filter_map(|decision| decision["fuel"].as_u64()).sum::<u64>();
     format!("{} wakes, {triggers} triggers, {faults} faults, {fuel} fuel", decisions.len())
@@ -64,23 +77,33 @@ pub(super) fn counted(decisions: &[Map<String, Value>]) -> String {
 /// What differs first, for a person; `None` if nothing does.
 pub(super) fn difference(a: &Replayed, b: &Replayed) -> Option<String> {
     let pairs = a.decisions.iter().zip(&b.decisions).enumerate();
-    let decision = |(index, (a, b))| Some(format!("decision {}: {}", index + 1, key_that_differs(a, b)?));
+    let decision =
+        |(index, (a, b))| Some(format!("decision {}: {}", index + 1, key_that_differs(a, b)?));
     let number = || {
         let (a, b) = (a.decisions.len(), b.decisions.len());
         (a != b).then(|| format!("the number of decisions: {a} and {b}"))
     };
-    pairs.into_iter().find_map(decision).or_else(number).or_else(|| file_that_differs(&a.files, &b.files))
+    pairs
+        .into_iter()
+        .find_map(decision)
+        .or_else(number)
+        .or_else(|| file_that_differs(&a.files, &b.files))
 }
 
 /// Compared as it is written, by which two zeros and any last bits differ.
 fn key_that_differs(a: &Map<String, Value>, b: &Map<String, Value>) -> Option<String> {
-    let written = |of: &Map<String, Value>, key: &str| of.get(key).map_or("nothing".to_owned(), Value::to_string);
+    let written = |of: &Map<String, Value>, key: &str| {
+        of.get(key).map_or("nothing".to_owned(), Value::to_string)
+    };
     let mut keys = a.keys().chain(b.keys());
     let key = keys.find(|key| written(a, key) != written(b, key))?;
     Some(format!("{key} is {} and {}", written(a, key), written(b, key)))
 }
 
-fn file_that_differs(a: &BTreeMap<PathBuf, Vec<u8>>, b: &BTreeMap<PathBuf, Vec<u8>>) -> Option<String> {
+fn file_that_differs(
+    a: &BTreeMap<PathBuf, Vec<u8>>,
+    b: &BTreeMap<PathBuf, Vec<u8>>,
+) -> Option<String> {
     let mut names = a.keys().chain(b.keys());
     let name = names.find(|name| a.get(*name) != b.get(*name))?;
     Some(format!("`{}`", name.display()))
@@ -104,7 +127,8 @@ mod tests {
 
     #[test]
     fn the_first_difference_is_named() {
-        let of = |score: &str| format!(r#"{{"at_ns":1,"triggers":[{{"score":{score}}}],"fuel":7}}"#);
+        let of =
+            |score: &str| format!(r#"{{"at_ns":1,"triggers":[{{"score":{score}}}],"fuel":7}}"#);
         let found = |a: &str, b: &str| {
             let same = of("1.0");
             difference(&replayed(&[&same, &of(a)], b""), &replayed(&[&same, &of(b)], b""))
@@ -112,7 +136,8 @@ mod tests {
         assert_eq!(found("0.1", "0.1"), None);
         // Its last bit; and the sign of a zero.
         for (a, b) in [("0.3", "0.30000000000000004"), ("0.0", "-0.0")] {
-            let said = format!(r#"decision 2: triggers is [{{"score":{a}}}] and [{{"score":{b}}}]"#);
+            let said =
+                format!(r#"decision 2: triggers is [{{"score":{a}}}] and [{{"score":{b}}}]"#);
             assert_eq!(found(a, b), Some(said));
         }
         let [one, none] = [replayed(&["{}"], b""), replayed(&[], b"")];

@@ -1,10 +1,12 @@
-//! `cargo xtask aarch64`: builds what goes into a vehicle with an ARM processor, and finds out whether lambdas decide there
-//! what they decide here: every decision of the same replays, bit for bit, and the fuel that it took.
+//! `cargo xtask aarch64`: builds what goes into a vehicle with an ARM processor, and finds out
+//! whether lambdas decide there what they decide here: every decision of the same replays, bit for
+//! bit, and the fuel that it took.
 //!
-//! The programs for ARM run in qemu's user mode, which emulates the processor; the kernel remains this machine's. So nothing is
-//! said about speed, and nothing about isolation: qemu knows neither Landlock nor seccomp, and the programs say that these do
-//! not hold. It lacks a call without which `gleaner-shim` does not start, so that one is built but not run: its place is taken by
-//! this machine's.
+//! The programs for ARM run in qemu's user mode, which emulates the processor; the kernel remains
+//! this machine's. So nothing is said about speed, and nothing about isolation: qemu knows neither
+//! Landlock nor seccomp, and the programs say that these do not hold. It lacks a call without which
+//! `gleaner-shim` does not start, so that one is built but not run: its place is taken by this
+//! machine's.
 
 mod cases;
 mod compare;
@@ -24,8 +26,14 @@ use cases::{CASES, Case, Machine};
 use tools::{TARGET, Tools};
 
 /// Packages with what goes into a vehicle.
-const PACKAGES: [&str; 6] =
-    ["gleaner-cli", "gleaner-compile", "gleaner-host", "gleaner-python", "gleaner-recorder", "gleaner-shim"];
+const PACKAGES: [&str; 6] = [
+    "gleaner-cli",
+    "gleaner-compile",
+    "gleaner-host",
+    "gleaner-python",
+    "gleaner-recorder",
+    "gleaner-shim",
+];
 /// The programs in them that are run.
 const PROGRAMS: [&str; 3] = ["gleaner", "gleaner-compile", "gleaner-runtime"];
 const SHIM: &str = "gleaner-shim";
@@ -33,7 +41,8 @@ const SHIM: &str = "gleaner-shim";
 /// Builds, replays here and there, and compares.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     if env::consts::ARCH == "aarch64" {
-        return Err(Failure::new(Exit::Usage, "this machine is an aarch64 itself").with_help("run `cargo xtask demo`"));
+        return Err(Failure::new(Exit::Usage, "this machine is an aarch64 itself")
+            .with_help("run `cargo xtask demo`"));
     }
     let mut steps = Steps::of(5);
     steps.begin(&format!("cross compiler, emulator and compilation target {TARGET}"));
@@ -49,24 +58,34 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let (here, there) = (Machine::here(checkout), Machine::emulated(checkout, emulated));
     println!("{}", cases::foreign_code(&here, &there)?);
     steps.begin(&format!("{} replays, each on both processors", CASES.len()));
-    let unexpected = CASES.iter().map(|case| compare(case, &here, &there)).sum::<Result<usize, Failure>>()?;
+    let unexpected =
+        CASES.iter().map(|case| compare(case, &here, &there)).sum::<Result<usize, Failure>>()?;
     println!("{} of {} replays went as they must", CASES.len() - unexpected, CASES.len());
     println!("files: {}/", cases::OUT);
     Ok(if unexpected == 0 { Exit::Ok } else { Exit::Differs })
 }
 
-/// Builds, and puts a script for each program into a folder, by which programs start each other emulated. Gives the folder.
+/// Builds, and puts a script for each program into a folder, by which programs start each other
+/// emulated. Gives the folder.
 fn build(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
     let mut build = tools.cargo(checkout);
     build.args(["build", "--release", "--target", TARGET]);
     build.args(PACKAGES.iter().flat_map(|package| ["-p", package]));
     steps::run(&mut build, "see the first error above")?;
-    let (built, scripts) =
-        (checkout.target().join(TARGET).join("release"), checkout.target().join(TARGET).join("emulated"));
+    let (built, scripts) = (
+        checkout.target().join(TARGET).join("release"),
+        checkout.target().join(TARGET).join("emulated"),
+    );
     let here = (SHIM, Tools::script_here(&checkout.program(SHIM)));
-    for (name, script) in PROGRAMS.map(|name| (name, tools.script(&built.join(name)))).into_iter().chain([here]) {
+    for (name, script) in
+        PROGRAMS.map(|name| (name, tools.script(&built.join(name)))).into_iter().chain([here])
+    {
         write_program(&scripts, name, &script).map_err(|error| {
-            Failure::caused_by(Exit::Internal, format!("cannot write `{}`", scripts.join(name).display()), &error)
+            Failure::caused_by(
+                Exit::Internal,
+                format!("cannot write `{}`", scripts.join(name).display()),
+                &error,
+            )
         })?;
     }
     Ok(scripts)

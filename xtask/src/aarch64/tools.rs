@@ -1,4 +1,5 @@
-//! What it takes to build for the other processor and to run what was built: a C compiler for it, its C library, and an emulator.
+//! What it takes to build for the other processor and to run what was built: a C compiler for it,
+//! its C library, and an emulator.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -36,13 +37,19 @@ impl Tools {
             (libraries.is_some(), "libc6-dev-arm64-cross"),
             (emulator.is_some(), "qemu-user-static"),
         ];
-        let missing = packages.iter().filter(|(there, _)| !there).map(|(_, package)| *package).collect::<Vec<_>>();
+        let missing = packages
+            .iter()
+            .filter(|(there, _)| !there)
+            .map(|(_, package)| *package)
+            .collect::<Vec<_>>();
         let (Some(emulator), Some(libraries), true) = (emulator, libraries, compiler) else {
-            let help = format!("as root, on Debian and Ubuntu: apt-get install {}", missing.join(" "));
+            let help =
+                format!("as root, on Debian and Ubuntu: apt-get install {}", missing.join(" "));
             return Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help));
         };
         // Who cannot fetch it may do without; what does not compile is another matter.
-        setup::target(checkout, TARGET).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
+        setup::target(checkout, TARGET)
+            .map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
         Ok(Tools { emulator, libraries })
     }
 
@@ -50,16 +57,23 @@ impl Tools {
     pub(super) fn cargo(&self, checkout: &Checkout) -> Command {
         let name = TARGET.replace('-', "_");
         let mut cargo = checkout.cargo();
-        cargo.env(format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), COMPILER).env(format!("CC_{name}"), COMPILER);
-        // The extension module takes its symbols from whatever interpreter loads it, and keeps to what 3.9 had: no Python
-        // of the other processor is asked for anything.
+        cargo
+            .env(format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), COMPILER)
+            .env(format!("CC_{name}"), COMPILER);
+        // The extension module takes its symbols from whatever interpreter loads it, and keeps to
+        // what 3.9 had: no Python of the other processor is asked for anything.
         cargo.env("PYO3_NO_PYTHON", "1");
         cargo
     }
 
     /// A script for `sh` that is `program`, emulated.
     pub(super) fn script(&self, program: &Path) -> String {
-        format!("#!/bin/sh\nexec {} -L {} {} \"$@\"\n", self.emulator, quoted(&self.libraries), quoted(program))
+        format!(
+            "#!/bin/sh\nexec {} -L {} {} \"$@\"\n",
+            self.emulator,
+            quoted(&self.libraries),
+            quoted(program)
+        )
     }
 
     /// A script for `sh` that is `program` of this machine.
@@ -71,8 +85,10 @@ impl Tools {
 /// The C compiler knows where the C library is.
 fn libraries(checkout: &Checkout) -> Result<Option<PathBuf>, Failure> {
     let mut ask = checkout.command(COMPILER);
-    let loader = steps::output(ask.arg(format!("-print-file-name={LOADER}")), "see the error above")?;
-    // Its bare name, if it does not. Else it lies in FOLDER/lib, by way of the compiler's own folder.
+    let loader =
+        steps::output(ask.arg(format!("-print-file-name={LOADER}")), "see the error above")?;
+    // Its bare name, if it does not. Else it lies in FOLDER/lib, by way of the compiler's own
+    // folder.
     let loader = Path::new(loader.trim()).canonicalize().ok().filter(|loader| loader.is_file());
     Ok(loader.and_then(|loader| Some(loader.parent()?.parent()?.to_owned())))
 }

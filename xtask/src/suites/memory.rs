@@ -26,14 +26,16 @@ pub(super) struct Folder {
 }
 
 impl Folder {
-    /// A new folder; `None` where memory is scarce, or the user has named a folder for temporary files.
+    /// A new folder; `None` where memory is scarce, or the user has named a folder for temporary
+    /// files.
     pub(super) fn new() -> Option<Folder> {
         if env::var_os("TMPDIR").is_some() {
             return None;
         }
         remove_left();
         let found = statvfs(SHARED_MEMORY).ok()?;
-        let is_roomy = found.f_bavail * found.f_frsize >= ROOM_BYTES && available()? >= ROOM_BYTES + LEFT_BYTES;
+        let is_roomy = found.f_bavail * found.f_frsize >= ROOM_BYTES
+            && available()? >= ROOM_BYTES + LEFT_BYTES;
         // Tests start programs that they have built there.
         let runs_programs = !found.f_flag.contains(StatVfsMountFlags::NOEXEC);
         if !is_roomy || !runs_programs {
@@ -57,8 +59,9 @@ impl Drop for Folder {
     }
 }
 
-/// Removes folders of this user whose process was killed: nothing else would give their memory back. A process is known by its lock, as
-/// its number may be that of another one in another container.
+/// Removes folders of this user whose process was killed: nothing else would give their memory
+/// back. A process is known by its lock, as its number may be that of another one in another
+/// container.
 fn remove_left() {
     for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
         let is_ours = entry.file_name().to_str().is_some_and(|name| name.starts_with(NAME));

@@ -1,7 +1,7 @@
 //! `cargo xtask test`: every suite of the project, one after the other, and one count at the end.
 //!
-//! A suite that fails does not keep the next from running. `tally` counts from what a suite prints; nothing else
-//! knows how the different test runners speak.
+//! A suite that fails does not keep the next from running. `tally` counts from what a suite prints;
+//! nothing else knows how the different test runners speak.
 
 mod memory;
 mod tally;
@@ -43,7 +43,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin("mypy, pytest, readers of drives, and what runs notebooks");
     venv::set_up_for_tests(checkout)?;
     let mut total = Tally::new(Speech::None);
-    let mut table = format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
+    let mut table =
+        format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
     let folder = memory::Folder::new();
     for mut suite in suites {
         steps.begin(&suite.name);
@@ -54,7 +55,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let tally = suite.how.run();
         let seconds = started.elapsed().as_secs_f64();
         let Tally { passed, failed, skipped, .. } = &tally;
-        table += &format!("{:<44} {passed:>7} {failed:>7} {skipped:>7} {seconds:>7.1}\n", suite.name);
+        table +=
+            &format!("{:<44} {passed:>7} {failed:>7} {skipped:>7} {seconds:>7.1}\n", suite.name);
         total.add(tally, &suite.name);
     }
     print!("{table}");
@@ -66,14 +68,26 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
 }
 
 fn suites(checkout: &Checkout) -> Vec<Suite> {
-    let suite = |name: &str, command, speech| Suite { name: name.to_owned(), how: How::Run(command, speech) };
+    let suite = |name: &str, command, speech| Suite {
+        name: name.to_owned(),
+        how: How::Run(command, speech),
+    };
 
     let mut tests = checkout.cargo();
     tests.args(["test", "--release", "--no-fail-fast"]);
 
-    // Of the fuzz targets, with the features of all that is built by default, so that nothing is built twice.
+    // Of the fuzz targets, with the features of all that is built by default, so that nothing is
+    // built twice.
     let mut seeds = checkout.cargo();
-    seeds.args(["test", "--release", "--workspace", "--exclude", "gleaner-player", "--features", "gleaner-fuzz/calls"]);
+    seeds.args([
+        "test",
+        "--release",
+        "--workspace",
+        "--exclude",
+        "gleaner-player",
+        "--features",
+        "gleaner-fuzz/calls",
+    ]);
     seeds.args(["--test", "seeds"]);
 
     // In target folders of their own: their flags would have everything else compiled anew.
@@ -118,27 +132,53 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
 fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     let suite = |name: &str, how| Suite { name: name.to_owned(), how };
     if !checkout.program("gleaner-player").is_file() {
-        return Ok(vec![suite("cargo test: player", How::Skip("no gleaner-player; run: cargo xtask player"))]);
+        return Ok(vec![suite(
+            "cargo test: player",
+            How::Skip("no gleaner-player; run: cargo xtask player"),
+        )]);
     }
     let mut lints = player::cargo(checkout)?;
-    lints.args(["clippy", "--release", "-p", "gleaner-player", "--all-targets", "--", "-D", "warnings"]);
+    lints.args([
+        "clippy",
+        "--release",
+        "-p",
+        "gleaner-player",
+        "--all-targets",
+        "--",
+        "-D",
+        "warnings",
+    ]);
     let mut tests = player::cargo(checkout)?;
-    tests.args(["test", "--release", "--workspace", "--bin", "gleaner-player", "--test", "program"]);
+    tests.args([
+        "test",
+        "--release",
+        "--workspace",
+        "--bin",
+        "gleaner-player",
+        "--test",
+        "program",
+    ]);
     Ok(vec![
         suite("lints: player", How::Run(lints, Speech::None)),
         suite("cargo test: player", How::Run(tests, Speech::Libtest)),
     ])
 }
 
-/// What mypy checks, relative to the checkout: the SDK and its tests, and each lambda by itself, as all are called `main`.
+/// What mypy checks, relative to the checkout: the SDK and its tests, and each lambda by itself, as
+/// all are called `main`.
 fn typed(checkout: &Checkout) -> Vec<PathBuf> {
     let mains = checkout.lambdas(&FAMILIES).into_iter().map(|lambda| lambda.join("main.py"));
     let mains = mains.filter(|main| checkout.path(main).is_file());
-    ["guest-sdk-python/gleaner", "guest-sdk-python/tests"].map(PathBuf::from).into_iter().chain(mains).collect()
+    ["guest-sdk-python/gleaner", "guest-sdk-python/tests"]
+        .map(PathBuf::from)
+        .into_iter()
+        .chain(mains)
+        .collect()
 }
 
 fn miri(checkout: &Checkout) -> How {
-    // Only rustup's cargo understands `+nightly`; ours is the cargo of one toolchain, and names it to its children.
+    // Only rustup's cargo understands `+nightly`; ours is the cargo of one toolchain, and names it
+    // to its children.
     let cargo = || {
         let mut cargo = checkout.command("cargo");
         cargo.arg("+nightly").arg("miri").env_remove("CARGO").env_remove("RUSTUP_TOOLCHAIN");
@@ -180,10 +220,12 @@ impl How {
     }
 }
 
-/// Runs a suite and shows what it says, on both streams in the order in which it does, while `tally` listens.
+/// Runs a suite and shows what it says, on both streams in the order in which it does, while
+/// `tally` listens.
 fn listen(mut command: Command, tally: &mut Tally) -> io::Result<ExitStatus> {
     let (said, speak) = io::pipe()?;
-    let mut child = command.stdin(Stdio::null()).stdout(speak.try_clone()?).stderr(speak).spawn()?;
+    let mut child =
+        command.stdin(Stdio::null()).stdout(speak.try_clone()?).stderr(speak).spawn()?;
     // It holds our ends for writing: with them open, reading would never come to an end.
     drop(command);
     let mut said = BufReader::new(said);

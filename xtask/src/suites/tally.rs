@@ -54,8 +54,9 @@ impl Tally {
         }
     }
 
-    /// Ends the suite. One that does not succeed has at least one failed test, named by `how_it_ended` if it did not
-    /// tell one; one that counts its tests and had none is blind, which is a failure too.
+    /// Ends the suite. One that does not succeed has at least one failed test, named by
+    /// `how_it_ended` if it did not tell one; one that counts its tests and had none is blind,
+    /// which is a failure too.
     pub(super) fn end(&mut self, success: bool, how_it_ended: &str) {
         self.close();
         if self.speech == Speech::None && success {
@@ -78,13 +79,17 @@ impl Tally {
 
     fn hear_libtest(&mut self, line: &str) {
         let line = line.trim_start();
-        if let Some((_, program)) = line.strip_prefix("Running ").and_then(|rest| rest.rsplit_once(" (")) {
+        if let Some((_, program)) =
+            line.strip_prefix("Running ").and_then(|rest| rest.rsplit_once(" ("))
+        {
             self.close();
             self.program = program_name(program.trim_end_matches(')'));
         } else if let Some(package) = line.strip_prefix("Doc-tests ") {
             self.close();
             self.program = format!("docs of {package}");
-        } else if line.strip_prefix("running ").is_some_and(|rest| rest.ends_with(" test") || rest.ends_with(" tests"))
+        } else if line
+            .strip_prefix("running ")
+            .is_some_and(|rest| rest.ends_with(" test") || rest.ends_with(" tests"))
         {
             self.close();
             self.open = true;
@@ -93,7 +98,9 @@ impl Tally {
             self.passed += count_before(counts, " passed");
             self.failed += count_before(counts, " failed");
             self.skipped += count_before(counts, " ignored");
-        } else if let Some(name) = line.strip_prefix("test ").and_then(|rest| rest.strip_suffix("... FAILED")) {
+        } else if let Some(name) =
+            line.strip_prefix("test ").and_then(|rest| rest.strip_suffix("... FAILED"))
+        {
             self.names.push(format!("{}: {}", self.program, name.trim_end()));
         }
     }
@@ -207,13 +214,15 @@ mod tests {
 
     #[test]
     fn unittest_counts_its_skipped_and_failed_tests_among_those_it_ran() {
-        let text =
-            "FAIL: test_a (m.C)\nERROR: test_b (m.C)\nRan 9 tests in 0.1s\n\nFAILED (failures=1, errors=1, skipped=2)";
+        let text = "FAIL: test_a (m.C)\nERROR: test_b (m.C)\nRan 9 tests in 0.1s\n\nFAILED (failures=1, errors=1, skipped=2)";
         let tally = heard(Speech::Unittest, false, text);
         assert_eq!(counts(&tally), [5, 2, 2]);
         assert_eq!(tally.names, ["test_a (m.C)", "test_b (m.C)"]);
         assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 1 test in 0.1s\n\nOK")), [1, 0, 0]);
-        assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 3 tests in 0.1s\n\nOK (skipped=1)")), [2, 0, 1]);
+        assert_eq!(
+            counts(&heard(Speech::Unittest, true, "Ran 3 tests in 0.1s\n\nOK (skipped=1)")),
+            [2, 0, 1]
+        );
     }
 
     #[test]
@@ -223,24 +232,40 @@ mod tests {
         let tally = heard(Speech::Pytest, false, text);
         assert_eq!(counts(&tally), [12, 3, 3]);
         assert_eq!(tally.names, ["examples/a/tests/test_a.py::test_x[1]", "b/test_b.py"]);
-        assert_eq!(counts(&heard(Speech::Pytest, true, "17 passed in 62.21s (0:01:02)")), [17, 0, 0]);
+        assert_eq!(
+            counts(&heard(Speech::Pytest, true, "17 passed in 62.21s (0:01:02)")),
+            [17, 0, 0]
+        );
         assert_eq!(counts(&heard(Speech::Pytest, false, "no tests ran in 0.01s")), [0, 1, 0]);
     }
 
     #[test]
     fn a_suite_without_any_test_is_a_failure() {
         // Up to Python 3.11 it calls that a success.
-        assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 0 tests in 0.000s\n\nOK")), [0, 1, 0]);
-        assert_eq!(counts(&heard(Speech::Unittest, false, "Ran 0 tests in 0.000s\n\nNO TESTS RAN")), [0, 1, 0]);
         assert_eq!(
-            counts(&heard(Speech::Libtest, true, "running 0 tests\n\ntest result: ok. 0 passed; 0 failed")),
+            counts(&heard(Speech::Unittest, true, "Ran 0 tests in 0.000s\n\nOK")),
+            [0, 1, 0]
+        );
+        assert_eq!(
+            counts(&heard(Speech::Unittest, false, "Ran 0 tests in 0.000s\n\nNO TESTS RAN")),
+            [0, 1, 0]
+        );
+        assert_eq!(
+            counts(&heard(
+                Speech::Libtest,
+                true,
+                "running 0 tests\n\ntest result: ok. 0 passed; 0 failed"
+            )),
             [0, 1, 0]
         );
     }
 
     #[test]
     fn a_suite_that_says_nothing_is_one_test() {
-        assert_eq!(counts(&heard(Speech::None, true, "Success: no issues found in 5 source files")), [1, 0, 0]);
+        assert_eq!(
+            counts(&heard(Speech::None, true, "Success: no issues found in 5 source files")),
+            [1, 0, 0]
+        );
         assert_eq!(counts(&heard(Speech::None, false, "Found 1 error")), [0, 1, 0]);
     }
 }

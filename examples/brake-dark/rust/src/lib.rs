@@ -57,9 +57,11 @@ mod tests {
 
     /// A second of braking at 5 m/s², with a picture of that grey at its end.
     fn brake(grey: u8) -> Run<BrakeDark> {
-        let mut run = Host::from_manifest(include_str!("../lambda.toml")).load::<BrakeDark>().unwrap();
+        let mut run =
+            Host::from_manifest(include_str!("../lambda.toml")).load::<BrakeDark>().unwrap();
         for n in 0..100 {
-            run.deliver("imu", n * 10_000_000, Message::new().with("linear_acceleration.x", -5.0)).unwrap();
+            run.deliver("imu", n * 10_000_000, Message::new().with("linear_acceleration.x", -5.0))
+                .unwrap();
         }
         let picture = Message::image(64, 36, Encoding::Rgb8, vec![grey; 64 * 36 * 3]);
         run.deliver("camera", 1_000_000_000, picture).unwrap();
@@ -71,14 +73,19 @@ mod tests {
     fn braking_counts_in_the_dark_only() {
         let dark = brake(20);
         let found = dark.triggers().collect::<Vec<_>>();
-        assert_eq!((found.len(), found[0].label.as_str(), found[0].score), (1, "brake-dark", Some(5.0)));
+        assert_eq!(
+            (found.len(), found[0].label.as_str(), found[0].score),
+            (1, "brake-dark", Some(5.0))
+        );
         assert_eq!(found[0].attribute("luma"), Some(&AttributeValue::Real(20.0)));
         assert_eq!(brake(200).triggers().next(), None);
     }
 
     #[test]
     fn the_threshold_of_darkness_is_a_setting() {
-        let refused = Host::from_manifest(include_str!("../lambda.toml")).set("dark_luma", 256).load::<BrakeDark>();
+        let refused = Host::from_manifest(include_str!("../lambda.toml"))
+            .set("dark_luma", 256)
+            .load::<BrakeDark>();
         assert!(refused.err().unwrap().to_string().contains("its max is 255"));
     }
 

@@ -1,7 +1,8 @@
-//! Dark to bright: the picture turns bright within seconds, as at the end of a tunnel. There cameras are blind for a moment.
+//! Dark to bright: the picture turns bright within seconds, as at the end of a tunnel. There
+//! cameras are blind for a moment.
 //!
-//! Two limits, one for dark and one for bright: what lies between changes nothing, so that lamps in a tunnel are no daylight.
-//! And one dark picture is no tunnel: it must have been dark for a time.
+//! Two limits, one for dark and one for bright: what lies between changes nothing, so that lamps in
+//! a tunnel are no daylight. And one dark picture is no tunnel: it must have been dark for a time.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, now_ns};
 
@@ -11,11 +12,12 @@ struct DarkToBright {
 
 impl Lambda for DarkToBright {
     fn init(config: &Config) -> Result<Self> {
-        let [dark_ns, within_ns] =
-            [config.real("dark_s")?, config.real("within_s")?].map(|seconds| (seconds * 1e9) as i64);
+        let [dark_ns, within_ns] = [config.real("dark_s")?, config.real("within_s")?]
+            .map(|seconds| (seconds * 1e9) as i64);
         let (dark, bright) = (config.real("dark_luma")?, config.real("bright_luma")?);
         if bright <= dark {
-            let why = format!("bright_luma is {bright}; it has to be above dark_luma, which is {dark}");
+            let why =
+                format!("bright_luma is {bright}; it has to be above dark_luma, which is {dark}");
             return Err(Error::new(why));
         }
         Ok(Self { light: Light { dark, bright, dark_ns, within_ns, seen: None } })
@@ -24,7 +26,10 @@ impl Lambda for DarkToBright {
     fn on_event(&mut self, camera: Sample) -> Result<()> {
         let luma = camera.as_frame()?.mean_luma(None)?;
         if let Some(Change { from, took_ns }) = self.light.note(now_ns(), luma) {
-            event("dark-to-bright", luma - from).with("luma", luma).with("took_s", took_ns as f64 / 1e9).send()?;
+            event("dark-to-bright", luma - from)
+                .with("luma", luma)
+                .with("took_s", took_ns as f64 / 1e9)
+                .send()?;
         }
         Ok(())
     }
@@ -76,19 +81,27 @@ mod tests {
 
     /// The changes in pictures of these mean greys, one a second.
     fn changes(lumas: &[f64]) -> Vec<Change> {
-        let mut light = Light { dark: 50.0, bright: 80.0, dark_ns: SECOND, within_ns: 3 * SECOND, seen: None };
+        let mut light =
+            Light { dark: 50.0, bright: 80.0, dark_ns: SECOND, within_ns: 3 * SECOND, seen: None };
         (0..).zip(lumas).filter_map(|(second, luma)| light.note(second * SECOND, *luma)).collect()
     }
 
     #[test]
     fn the_end_of_a_tunnel_is_told_once() {
-        assert_eq!(changes(&[120.0, 20.0, 30.0, 60.0, 90.0, 130.0]), [Change { from: 30.0, took_ns: 2 * SECOND }]);
+        assert_eq!(
+            changes(&[120.0, 20.0, 30.0, 60.0, 90.0, 130.0]),
+            [Change { from: 30.0, took_ns: 2 * SECOND }]
+        );
     }
 
     #[test]
     fn a_dark_picture_alone_is_no_tunnel() {
         assert_eq!(changes(&[120.0, 20.0, 120.0]), []);
-        assert_eq!(changes(&[120.0, 20.0, 120.0, 20.0, 120.0]), [], "nor are two with light between them");
+        assert_eq!(
+            changes(&[120.0, 20.0, 120.0, 20.0, 120.0]),
+            [],
+            "nor are two with light between them"
+        );
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! Every kilometre: a sample of the road at even distances, as a map or a training set wants it, however fast the car goes.
+//! Every kilometre: a sample of the road at even distances, as a map or a training set wants it,
+//! however fast the car goes.
 //!
 //! The odometer is kept in `scratch`: a fault does not set it back.
 
@@ -25,7 +26,10 @@ impl Lambda for EveryKilometre {
     fn on_event(&mut self, speed: Sample) -> Result<()> {
         let mps = speed.number(&self.forward)?.abs();
         if let Some(mark) = self.road.drive(now_ns(), mps) {
-            event("kilometre", self.road.driven_m / 1000.0).with("mark", mark).with("speed_mps", mps).send()?;
+            event("kilometre", self.road.driven_m / 1000.0)
+                .with("mark", mark)
+                .with("speed_mps", mps)
+                .send()?;
         }
         scratch::put(ODOMETER, &self.road.driven_m.to_le_bytes())
     }
@@ -64,7 +68,9 @@ mod tests {
 
     /// The marks passed at a speed in m/s, ten samples a second, and the metres driven.
     fn marks(mps: f64, seconds: std::ops::Range<i64>, road: &mut Road) -> Vec<i64> {
-        (seconds.start * 10..seconds.end * 10).filter_map(|tick| road.drive(tick * 100_000_000, mps)).collect()
+        (seconds.start * 10..seconds.end * 10)
+            .filter_map(|tick| road.drive(tick * 100_000_000, mps))
+            .collect()
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Frozen image: the camera goes on sending, but always the same picture, while the car moves.
 //!
-//! Pictures are compared small and grey, so that the noise of a sensor and of JPEG does not hide it. The host makes them small;
-//! what comes into the lambda is 2,304 bytes.
+//! Pictures are compared small and grey, so that the noise of a sensor and of JPEG does not hide
+//! it. The host makes them small; what comes into the lambda is 2,304 bytes.
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input};
 
@@ -21,7 +21,14 @@ impl Lambda for FrozenImage {
         let speed = input("speed")?;
         let forward = speed.field("twist.linear.x")?;
         let (limit, frames) = (config.real("same_luma")?, config.integer("frames")?);
-        let camera = Camera { limit, frames, before: vec![0; PIXELS], now: vec![0; PIXELS], same: 0, seen: false };
+        let camera = Camera {
+            limit,
+            frames,
+            before: vec![0; PIXELS],
+            now: vec![0; PIXELS],
+            same: 0,
+            seen: false,
+        };
         Ok(Self { speed, forward, moving_mps: config.real("moving_mps")?, camera })
     }
 
@@ -50,7 +57,8 @@ struct Camera {
 }
 
 impl Camera {
-    /// Whether the picture in `now` is the one that makes it sure; once for each time that it freezes.
+    /// Whether the picture in `now` is the one that makes it sure; once for each time that it
+    /// freezes.
     fn freezes(&mut self, moves: bool) -> bool {
         let is_same = self.seen && difference(&self.before, &self.now) < self.limit;
         self.seen = true;
@@ -74,12 +82,23 @@ mod tests {
 
     /// Which pictures, each of one grey, make it sure that the camera is frozen.
     fn frozen(greys: &[u8], moves: bool) -> Vec<usize> {
-        let mut camera = Camera { limit: 0.1, frames: 3, before: vec![0; 9], now: vec![0; 9], same: 0, seen: false };
+        let mut camera = Camera {
+            limit: 0.1,
+            frames: 3,
+            before: vec![0; 9],
+            now: vec![0; 9],
+            same: 0,
+            seen: false,
+        };
         let mut freezes = |grey: u8| {
             camera.now.fill(grey);
             camera.freezes(moves)
         };
-        greys.iter().enumerate().filter_map(|(index, grey)| freezes(*grey).then_some(index)).collect()
+        greys
+            .iter()
+            .enumerate()
+            .filter_map(|(index, grey)| freezes(*grey).then_some(index))
+            .collect()
     }
 
     #[test]

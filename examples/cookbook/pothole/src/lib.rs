@@ -1,6 +1,7 @@
 //! Pothole: one hard jolt in the vertical acceleration, far above how rough the road is anyway.
 //!
-//! Most samples are answered by the span of a seventh of a second. Only when a jolt has ended is the road around it looked at.
+//! Most samples are answered by the span of a seventh of a second. Only when a jolt has ended is
+//! the road around it looked at.
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, now_ns};
 
@@ -34,7 +35,8 @@ impl Lambda for Pothole {
     }
 }
 
-/// A jolt begins above the limit and ends below half of it, so that one jolt is one event, with its largest value.
+/// A jolt begins above the limit and ends below half of it, so that one jolt is one event, with its
+/// largest value.
 struct Jolts {
     limit: f64,
     largest: Option<f64>,
@@ -59,12 +61,14 @@ impl Jolts {
 
 /// Largest less smallest value, in their unit; minus infinity for none.
 fn span(values: &[f64]) -> f64 {
-    let (low, high) =
-        values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+    let (low, high) = values
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
     high - low
 }
 
-/// Median distance from the median: a jolt of a few samples hardly changes it, as it would a standard deviation.
+/// Median distance from the median: a jolt of a few samples hardly changes it, as it would a
+/// standard deviation.
 fn spread(values: Vec<f64>) -> f64 {
     let centre = median(values.clone());
     median(values.into_iter().map(|value| (value - centre).abs()).collect())
@@ -92,7 +96,8 @@ mod tests {
 
     #[test]
     fn the_spread_of_a_road_does_not_mind_a_jolt() {
-        let road: Vec<f64> = (0..100).map(|i| 9.7 + if i % 2 == 0 { 0.25 } else { -0.25 }).collect();
+        let road: Vec<f64> =
+            (0..100).map(|i| 9.7 + if i % 2 == 0 { 0.25 } else { -0.25 }).collect();
         let mut jolted = road.clone();
         jolted[50..55].copy_from_slice(&[3.0, 15.0, 4.0, 14.0, 9.0]);
         assert!((spread(road) - spread(jolted)).abs() <= 0.5);

@@ -1,8 +1,8 @@
 //! Time jump: the clock of a sensor jumps against that of the vehicle, forwards or backwards.
 //!
-//! Compared is how far `header.stamp` is from the time of reception. One sample that came late is no jump, so several in a row
-//! must agree, and for a time: samples that waited for each other come late all at once. And a clock that drifts is followed, so
-//! that only what is sudden counts.
+//! Compared is how far `header.stamp` is from the time of reception. One sample that came late is
+//! no jump, so several in a row must agree, and for a time: samples that waited for each other come
+//! late all at once. And a clock that drifts is followed, so that only what is sudden counts.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event};
 
@@ -21,10 +21,16 @@ impl Lambda for TimeJump {
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         let stamps = sample.stamps();
-        let header_ns = stamps.header_ns.ok_or_else(|| Error::new("messages of this type have no header.stamp"))?;
-        if let Some(jump_ns) = self.clock.note(stamps.at_ns, header_ns.saturating_sub(stamps.at_ns)) {
+        let header_ns = stamps
+            .header_ns
+            .ok_or_else(|| Error::new("messages of this type have no header.stamp"))?;
+        if let Some(jump_ns) = self.clock.note(stamps.at_ns, header_ns.saturating_sub(stamps.at_ns))
+        {
             let jump_s = jump_ns as f64 / 1e9;
-            event("time-jump", jump_s.abs()).with("jump_s", jump_s).with("header_ns", header_ns).send()?;
+            event("time-jump", jump_s.abs())
+                .with("jump_s", jump_s)
+                .with("header_ns", header_ns)
+                .send()?;
         }
         Ok(())
     }
@@ -37,7 +43,8 @@ struct Clock {
     elsewhere: Option<Elsewhere>,
 }
 
-/// Samples in a row that agree on another offset than the usual one: when the first came, its offset, and how many there are.
+/// Samples in a row that agree on another offset than the usual one: when the first came, its
+/// offset, and how many there are.
 #[derive(Clone, Copy)]
 struct Elsewhere {
     since_ns: i64,

@@ -51,7 +51,12 @@ mod tests {
     fn drive(forward: &[f64]) -> Run<Hello> {
         let mut run = Host::from_manifest(include_str!("../lambda.toml")).load::<Hello>().unwrap();
         for (n, forward) in (0..).zip(forward) {
-            run.deliver("imu", n * 10_000_000, Message::new().with("linear_acceleration.x", *forward)).unwrap();
+            run.deliver(
+                "imu",
+                n * 10_000_000,
+                Message::new().with("linear_acceleration.x", *forward),
+            )
+            .unwrap();
         }
         assert_eq!(run.faults().next(), None);
         run

@@ -1,6 +1,8 @@
-//! Road roughness: how much of the vertical acceleration lies at frequencies at which a road shakes a car.
+//! Road roughness: how much of the vertical acceleration lies at frequencies at which a road shakes
+//! a car.
 //!
-//! The rules stand at the top of its twin, `../python/main.py`, with their numbers. `road` keeps them; here it meets the host.
+//! The rules stand at the top of its twin, `../python/main.py`, with their numbers. `road` keeps
+//! them; here it meets the host.
 
 mod road;
 
@@ -20,7 +22,12 @@ impl Lambda for ImuFft {
     fn init(config: &Config) -> Result<Self> {
         let imu = input("imu")?;
         let vertical = imu.field("linear_acceleration.z")?;
-        Ok(Self { imu, vertical, rough: config.real("rough")?, road: Road::new(config.real("window_s")?) })
+        Ok(Self {
+            imu,
+            vertical,
+            rough: config.real("rough")?,
+            road: Road::new(config.real("window_s")?),
+        })
     }
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
@@ -62,7 +69,9 @@ mod tests {
         let run = shake(3.0);
         let rough = run.triggers().next().expect("a trigger");
         assert_eq!(rough.label, "rough-road");
-        let Some(AttributeValue::Real(peak_hz)) = rough.attribute("peak_hz") else { panic!("{rough:?}") };
+        let Some(AttributeValue::Real(peak_hz)) = rough.attribute("peak_hz") else {
+            panic!("{rough:?}")
+        };
         assert!((3.0..5.0).contains(peak_hz), "{peak_hz}");
         assert_eq!(shake(0.1).triggers().next(), None);
     }

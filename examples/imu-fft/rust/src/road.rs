@@ -44,7 +44,14 @@ pub(crate) struct Roughness {
 
 impl Road {
     pub(crate) fn new(window_s: f64) -> Self {
-        Self { window_s, learning: Vec::with_capacity(LEARN), period_ns: 0, last_ns: 0, run: 0, plan: None }
+        Self {
+            window_s,
+            learning: Vec::with_capacity(LEARN),
+            period_ns: 0,
+            last_ns: 0,
+            run: 0,
+            plan: None,
+        }
     }
 
     /// Takes note of a sample; of how many samples the window is that it completes, if it does.
@@ -70,7 +77,8 @@ impl Road {
         if self.learning.len() < LEARN {
             return Ok(());
         }
-        let intervals: Vec<i64> = self.learning.array_windows().map(|[earlier, later]| later - earlier).collect();
+        let intervals: Vec<i64> =
+            self.learning.array_windows().map(|[earlier, later]| later - earlier).collect();
         let mut sorted = intervals.clone();
         sorted.sort_unstable();
         self.period_ns = sorted[sorted.len() / 2];
@@ -78,7 +86,11 @@ impl Road {
         intervals.into_iter().for_each(|interval| self.go_on(interval));
         let samples = nearest_power_of_two(self.window_s * 1e9 / self.period_ns as f64);
         let spectrum = Spectrum::hann(samples, 1.0)?;
-        self.plan = Some(Plan { density: vec![0.0; spectrum.bins()], centred: vec![0.0; samples], spectrum });
+        self.plan = Some(Plan {
+            density: vec![0.0; spectrum.bins()],
+            centred: vec![0.0; samples],
+            spectrum,
+        });
         self.learning = Vec::new();
         Ok(())
     }
@@ -88,10 +100,17 @@ impl Road {
         self.run = if follows { self.run + 1 } else { 1 };
     }
 
-    /// Of the window that was just completed: stamps, and vertical accelerations in m/s², oldest first.
-    pub(crate) fn roughness(&mut self, at_ns: &[i64], signal: &[f64]) -> Result<Roughness, SpectrumError> {
+    /// Of the window that was just completed: stamps, and vertical accelerations in m/s², oldest
+    /// first.
+    pub(crate) fn roughness(
+        &mut self,
+        at_ns: &[i64],
+        signal: &[f64],
+    ) -> Result<Roughness, SpectrumError> {
         let none = Roughness { score: 0.0, peak_hz: 0.0 };
-        let (Some(plan), [first, .., last], [start, ..]) = (&mut self.plan, at_ns, signal) else { return Ok(none) };
+        let (Some(plan), [first, .., last], [start, ..]) = (&mut self.plan, at_ns, signal) else {
+            return Ok(none);
+        };
         let samples = signal.len() as f64;
         let rate_hz = (samples - 1.0) * 1e9 / (last - first) as f64;
         let bin_hz = rate_hz / samples;
@@ -101,8 +120,13 @@ impl Road {
         plan.centred.iter_mut().for_each(|value| *value -= mean);
         plan.spectrum.density(&plan.centred, &mut plan.density)?;
         plan.density.iter_mut().for_each(|power| *power /= rate_hz);
-        let in_band = |(low, high, weight): (f64, f64, f64)| weight * band_power(&plan.density, bin_hz, low, high);
-        Ok(Roughness { score: BANDS.map(in_band).iter().sum(), peak_hz: peak(&plan.density, bin_hz) })
+        let in_band = |(low, high, weight): (f64, f64, f64)| {
+            weight * band_power(&plan.density, bin_hz, low, high)
+        };
+        Ok(Roughness {
+            score: BANDS.map(in_band).iter().sum(),
+            peak_hz: peak(&plan.density, bin_hz),
+        })
     }
 }
 
@@ -110,7 +134,9 @@ impl Road {
 fn peak(density: &[f64], bin_hz: f64) -> f64 {
     let bins = density.iter().enumerate().map(|(bin, power)| (bin as f64 * bin_hz, *power));
     let within = bins.filter(|(at_hz, _)| (PEAK_HZ.0..=PEAK_HZ.1).contains(at_hz));
-    within.reduce(|largest, next| if next.1 > largest.1 { next } else { largest }).map_or(0.0, |(at_hz, _)| at_hz)
+    within
+        .reduce(|largest, next| if next.1 > largest.1 { next } else { largest })
+        .map_or(0.0, |(at_hz, _)| at_hz)
 }
 
 /// Of two that are as near, the larger one.
@@ -132,7 +158,8 @@ mod tests {
 
     /// The sample with which each window ends, and its roughness; sample `i` is at `i / rate_hz`.
     fn windows(road: &mut Road, rate_hz: f64, signal: &[f64]) -> Vec<(usize, Roughness)> {
-        let at_ns: Vec<i64> = (0..signal.len()).map(|i| (i as f64 / rate_hz * 1e9).round() as i64).collect();
+        let at_ns: Vec<i64> =
+            (0..signal.len()).map(|i| (i as f64 / rate_hz * 1e9).round() as i64).collect();
         let mut found = Vec::new();
         for end in 0..signal.len() {
             if let Some(samples) = road.note(at_ns[end]).unwrap() {
@@ -161,7 +188,10 @@ mod tests {
         for (hz, weight) in [(1.171_875, 0.2), (4.687_5, 0.5), (12.5, 1.0), (23.437_5, 0.0)] {
             for (end, found) in windows(&mut Road::new(5.0), 50.0, &sine(hz, 3.0, 600)) {
                 assert!((found.score - weight * 4.5).abs() < 0.01, "{hz} Hz at {end}: {found:?}");
-                assert!((found.peak_hz - hz).abs() < 1e-9 || hz > PEAK_HZ.1, "{hz} Hz at {end}: {found:?}");
+                assert!(
+                    (found.peak_hz - hz).abs() < 1e-9 || hz > PEAK_HZ.1,
+                    "{hz} Hz at {end}: {found:?}"
+                );
             }
         }
     }
@@ -184,27 +214,39 @@ mod tests {
     #[test]
     fn what_is_no_number_is_not_above_anything() {
         let found = windows(&mut Road::new(1.25), 50.0, &[f64::NAN; 100]);
-        assert!(!found.is_empty() && found.iter().all(|(_, found)| found.score.is_nan()), "{found:?}");
+        assert!(
+            !found.is_empty() && found.iter().all(|(_, found)| found.score.is_nan()),
+            "{found:?}"
+        );
     }
 
-    /// 300 series of the vertical acceleration at 50 Hz, regular road and four kinds of bad road. The data cannot come with the project.
+    /// 300 series of the vertical acceleration at 50 Hz, regular road and four kinds of bad road.
+    /// The data cannot come with the project.
     #[test]
     fn regular_roads_score_lower_than_others() {
-        let path =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/road_surface/accz_50hz_labelled.csv");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../../../../shared/data/road_surface/accz_50hz_labelled.csv");
         let Ok(text) = fs::read_to_string(&path) else {
-            return println!("skipped: no {}, which does not come with the project", path.display());
+            return println!(
+                "skipped: no {}, which does not come with the project",
+                path.display()
+            );
         };
         let (mut regular, mut others) = (Vec::new(), Vec::new());
         for line in text.lines().skip(1) {
-            let [_, label, values] = line.split(',').collect::<Vec<_>>()[..] else { panic!("three columns") };
+            let [_, label, values] = line.split(',').collect::<Vec<_>>()[..] else {
+                panic!("three columns")
+            };
             let signal: Vec<f64> = values.split(';').map(|value| value.parse().unwrap()).collect();
             let found = windows(&mut Road::new(1.25), 50.0, &signal);
             let score = found.iter().map(|(_, found)| found.score).fold(0.0, f64::max);
             if label == "regular_road" { &mut regular } else { &mut others }.push(score);
         }
         assert_eq!((regular.len(), others.len()), (60, 240));
-        let above = others.iter().map(|other| regular.iter().filter(|score| other > *score).count()).sum::<usize>();
+        let above = others
+            .iter()
+            .map(|other| regular.iter().filter(|score| other > *score).count())
+            .sum::<usize>();
         let area = above as f64 / (regular.len() * others.len()) as f64;
         println!("area under the curve: {area:.3}");
         assert!(area >= 0.80, "{area}");

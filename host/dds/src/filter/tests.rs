@@ -41,8 +41,10 @@ fn fragment(size: u32) -> Vec<u8> {
 /// A HEARTBEAT or a GAP of these numbers.
 fn range_of(little: bool, kind: u8, numbers: [i64; 2]) -> Vec<u8> {
     let words = numbers.map(|number| [(number >> 32) as u32, number as u32]);
-    let bytes =
-        words.as_flattened().iter().flat_map(|word| if little { word.to_le_bytes() } else { word.to_be_bytes() });
+    let bytes = words
+        .as_flattened()
+        .iter()
+        .flat_map(|word| if little { word.to_le_bytes() } else { word.to_be_bytes() });
     submessage(little, kind, &[vec![0; 8], bytes.collect(), vec![0; 4]].concat())
 }
 
@@ -81,10 +83,23 @@ fn pass(packets: &[Vec<u8>]) -> Vec<bool> {
 
 #[test]
 fn a_fragment_that_claims_more_than_anybody_asked_for_is_dropped_in_either_byte_order() {
-    let claims = [1_u32, 0xffff, 0x1_0000, 25 << 20, (25 << 20) + 65_536, (25 << 20) + 131_072, 1 << 30, u32::MAX];
+    let claims = [
+        1_u32,
+        0xffff,
+        0x1_0000,
+        25 << 20,
+        (25 << 20) + 65_536,
+        (25 << 20) + 131_072,
+        1 << 30,
+        u32::MAX,
+    ];
     for little in [true, false] {
         let packets = claims.map(|size| packet(FRIEND, &[fragment_of(little, size, 1000)]));
-        assert_eq!(pass(&packets), [true, true, true, true, true, false, false, false], "little: {little}");
+        assert_eq!(
+            pass(&packets),
+            [true, true, true, true, true, false, false, false],
+            "little: {little}"
+        );
         let nothing = packet(FRIEND, &[fragment_of(little, 1000, 0)]);
         assert_eq!(pass(&[nothing]), [false], "fragments of no bytes");
     }
@@ -96,11 +111,18 @@ fn every_limit_is_kept() {
         let sizes = (0..32).flat_map(|bit| [1_u32 << bit, (1 << bit) - 1, u32::MAX << bit]);
         for little in [true, false] {
             let sizes: Vec<u32> = sizes.clone().collect();
-            let packets: Vec<_> = sizes.iter().map(|n| packet(FRIEND, &[fragment_of(little, *n, 9)])).collect();
+            let packets: Vec<_> =
+                sizes.iter().map(|n| packet(FRIEND, &[fragment_of(little, *n, 9)])).collect();
             for (size, passed) in sizes.iter().zip(through(largest, None, &packets)) {
                 let (size, largest) = (u64::from(*size), largest as u64);
-                let (must, may) = (size <= largest.saturating_add(65_536), size < largest.saturating_add(131_072));
-                assert!(if passed > 0 { may } else { !must }, "{size} of at most {largest}: {passed}");
+                let (must, may) = (
+                    size <= largest.saturating_add(65_536),
+                    size < largest.saturating_add(131_072),
+                );
+                assert!(
+                    if passed > 0 { may } else { !must },
+                    "{size} of at most {largest}: {passed}"
+                );
             }
         }
     }
@@ -109,21 +131,40 @@ fn every_limit_is_kept() {
 #[test]
 fn a_heartbeat_or_a_gap_of_more_than_a_million_numbers_is_dropped_in_either_byte_order() {
     const HIGH: i64 = 1 << 32;
-    let few = [[1, 0], [7, 7], [0x1_0000, 0xffff], [1, 1 << 20], [HIGH - 9, HIGH - 1], [HIGH + 7, HIGH + (1 << 20)]];
-    let many = [[2, 1 << 21], [2, HIGH], [HIGH, 2 * HIGH], [2, 1 << 40], [i64::MAX - 9, i64::MAX], [-9, -1], [-9, 9]];
+    let few = [
+        [1, 0],
+        [7, 7],
+        [0x1_0000, 0xffff],
+        [1, 1 << 20],
+        [HIGH - 9, HIGH - 1],
+        [HIGH + 7, HIGH + (1 << 20)],
+    ];
+    let many = [
+        [2, 1 << 21],
+        [2, HIGH],
+        [HIGH, 2 * HIGH],
+        [2, 1 << 40],
+        [i64::MAX - 9, i64::MAX],
+        [-9, -1],
+        [-9, 9],
+    ];
     for (little, kind) in [(true, 7), (false, 7), (true, 8), (false, 8)] {
         let of = |numbers| packet(FRIEND, &[range_of(little, kind, numbers)]);
         assert_eq!(pass(&few.map(of)), [true; 6], "little: {little}, kind {kind}");
         assert_eq!(pass(&many.map(of)), [false; 7], "little: {little}, kind {kind}");
         let from_one = pass(&[[1, 1 << 21], [1, 1 << 40], [1, i64::MAX]].map(of));
         assert_eq!(from_one, [kind == 8, kind == 8, false], "little: {little}, kind {kind}");
-        let spans =
-            (0..22).flat_map(|bit| [1 << bit, (1 << bit) - 1, 0xf_fff0 + bit, 0x10_fff0 + bit, 0x11_fff0 + bit]);
+        let spans = (0..22).flat_map(|bit| {
+            [1 << bit, (1 << bit) - 1, 0xf_fff0 + bit, 0x10_fff0 + bit, 0x11_fff0 + bit]
+        });
         for first in [2, 0xfffe, 0x1_0000, 0xabc_def0, HIGH + 0xffff] {
             let spans: Vec<i64> = spans.clone().collect();
             let packets: Vec<_> = spans.iter().map(|span| of([first, first + span])).collect();
             for (span, passed) in spans.iter().zip(pass(&packets)) {
-                assert!(if passed { *span < 17 << 16 } else { *span > 1 << 20 }, "{span} from {first}: {passed}");
+                assert!(
+                    if passed { *span < 17 << 16 } else { *span > 1 << 20 },
+                    "{span} from {first}: {passed}"
+                );
             }
         }
     }
@@ -131,11 +172,15 @@ fn a_heartbeat_or_a_gap_of_more_than_a_million_numbers_is_dropped_in_either_byte
 
 #[test]
 fn fragments_of_strangers_are_dropped_and_everything_else_of_theirs_passes() {
-    let claims = [fragment(1000), [stamp(), fragment(1000)].concat(), [data(), fragment(1000)].concat()];
+    let claims =
+        [fragment(1000), [stamp(), fragment(1000)].concat(), [data(), fragment(1000)].concat()];
     let packets = claims.map(|claim| packet(STRANGER, &[claim]));
     assert_eq!(pass(&packets), [false; 3]);
     assert_eq!(pass(&[packet(STRANGER, &[stamp(), data()]), packet(STRANGER, &[])]), [true; 2]);
-    assert!(through(IMAGE, None, &packets).iter().all(|passed| *passed > 0), "where nobody is a stranger");
+    assert!(
+        through(IMAGE, None, &packets).iter().all(|passed| *passed > 0),
+        "where nobody is a stranger"
+    );
     assert_eq!(through(IMAGE, Some(&[]), &[packet(FRIEND, &[fragment(1000)])]), [0]);
 }
 
@@ -150,12 +195,23 @@ fn each_of_as_many_participants_as_can_be_known_is_known() {
 
 #[test]
 fn a_claim_is_found_wherever_it_hides() {
-    let evils = [fragment(u32::MAX), range_of(true, 7, [1, 1 << 40]), range_of(true, 8, [2, 1 << 40])];
+    let evils =
+        [fragment(u32::MAX), range_of(true, 7, [1, 1 << 40]), range_of(true, 8, [2, 1 << 40])];
     let pad = submessage(true, 1, &[]);
     let empty_stamp = vec![0x09, 3, 0, 0];
     let beat = range_of(true, 7, [1, 9]);
-    let fronts = [vec![], stamp(), data(), pad, empty_stamp, fragment(1000), beat, [stamp(), stamp(), data()].concat()];
-    for (front, evil) in fronts.iter().flat_map(|front| evils.iter().map(move |evil| (front, evil))) {
+    let fronts = [
+        vec![],
+        stamp(),
+        data(),
+        pad,
+        empty_stamp,
+        fragment(1000),
+        beat,
+        [stamp(), stamp(), data()].concat(),
+    ];
+    for (front, evil) in fronts.iter().flat_map(|front| evils.iter().map(move |evil| (front, evil)))
+    {
         for repeat in [1, 2, 3, 4, 5, 6, 9, 30, 99] {
             let hidden = packet(FRIEND, &[front.repeat(repeat), evil.clone()]);
             let passed = through(IMAGE, None, std::slice::from_ref(&hidden))[0];
@@ -175,14 +231,20 @@ fn ordinary_packets_pass_whole() {
     let mut last = data();
     last[2..4].fill(0);
     let beat = || range_of(true, 7, [1, 9]);
-    let dense: Vec<_> = (0..47).flat_map(|_| [stamp(), fragment(6 << 20)]).chain([data(), beat()]).collect();
+    let dense: Vec<_> =
+        (0..47).flat_map(|_| [stamp(), fragment(6 << 20)]).chain([data(), beat()]).collect();
     let pairs = [stamp(), data()].concat().repeat(PLAIN);
     let answer = [beat(), range_of(true, 8, [1, 1 << 30]), data()].concat().repeat(6);
     let big_endian: Vec<_> = (0..15).map(|_| fragment_of(false, 6 << 20, 1000)).collect();
     let empty_stamps = [vec![9, 3, 0, 0], data()].concat().repeat(5);
-    let contents = [dense, vec![pairs], vec![answer], big_endian, vec![empty_stamps], vec![last], vec![]];
+    let contents =
+        [dense, vec![pairs], vec![answer], big_endian, vec![empty_stamps], vec![last], vec![]];
     assert_eq!(pass(&contents.map(|content| packet(FRIEND, &content))), [true; 7]);
-    assert_eq!(pass(&[b"RTPS\x02\x03\x01\x10\0DDSPING".to_vec()]), [true], "a ping is no packet of RTPS");
+    assert_eq!(
+        pass(&[b"RTPS\x02\x03\x01\x10\0DDSPING".to_vec()]),
+        [true],
+        "a ping is no packet of RTPS"
+    );
 }
 
 #[test]
@@ -204,10 +266,12 @@ fn what_nobody_walks_to_the_end_is_cut_between_two_submessages() {
 fn bytes_that_mean_nothing_harm_nothing() {
     let mut state = 1_u64;
     let mut random = move || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 33) as usize
     };
-    let packets: Vec<Vec<u8>> = (0..500).map(|_| (0..2 + random() % 200).map(|_| random() as u8).collect()).collect();
+    let packets: Vec<Vec<u8>> =
+        (0..500).map(|_| (0..2 + random() % 200).map(|_| random() as u8).collect()).collect();
     drop(through(IMAGE, Some(&[FRIEND]), &packets));
 }
 
@@ -215,6 +279,9 @@ fn bytes_that_mean_nothing_harm_nothing() {
 fn no_program_is_longer_than_the_kernel_takes() {
     for known in 0..=KNOWN + 1 {
         let length = assemble(IMAGE, Some(&vec![FRIEND; known])).len();
-        assert!(length <= MOST && length + 200 > MOST, "{known} participants: {length} instructions");
+        assert!(
+            length <= MOST && length + 200 > MOST,
+            "{known} participants: {length} instructions"
+        );
     }
 }

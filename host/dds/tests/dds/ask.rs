@@ -10,7 +10,10 @@ use gleaner_dds::{Dds, Options};
 use gleaner_messages::FieldPath;
 use gleaner_transport::{LiveSource, Transport, TransportError};
 use ros2_client::qos::{Durability, History, WhenFull};
-use ros2_client::{Context, Message, MessageTypeName, Name, Node, NodeName, NodeOptions, QosProfile, ServiceTypeName};
+use ros2_client::{
+    Context, Message, MessageTypeName, Name, Node, NodeName, NodeOptions, QosProfile,
+    ServiceTypeName,
+};
 use ros2_client::{Server, ServiceMapping};
 use rustdds::no_key::SerializerAdapter;
 use rustdds::{CDRSerializerAdapter, DomainParticipant, GUID};
@@ -92,14 +95,20 @@ fn honest(request: &Request) -> Response {
     let tyre = described("Tyre", &[("bar", 11, "")]);
     let tyre_source = source("Tyre", "float64 bar\n");
     match request.type_name.as_str() {
-        "car_msgs/msg/Tyre" => {
-            Response { successful: true, root: tyre, sources: vec![tyre_source], ..Response::default() }
-        }
+        "car_msgs/msg/Tyre" => Response {
+            successful: true,
+            root: tyre,
+            sources: vec![tyre_source],
+            ..Response::default()
+        },
         "car_msgs/msg/Wheel" => Response {
             successful: true,
             root: described("Wheel", &[("tyre", 1, "car_msgs/msg/Tyre"), ("bolts", 151, "")]),
             referenced: vec![tyre],
-            sources: vec![source("Wheel", "# One of four.\nTyre tyre\nuint32[] bolts\n"), tyre_source],
+            sources: vec![
+                source("Wheel", "# One of four.\nTyre tyre\nuint32[] bolts\n"),
+                tyre_source,
+            ],
             ..Response::default()
         },
         _ => Response { failure_reason: "unknown type".to_owned(), ..Response::default() },
@@ -123,8 +132,9 @@ impl Car {
         let participant = DomainParticipant::new(domain).unwrap();
         let context = Context::from_domain_participant(participant.clone()).unwrap();
         let name = NodeName::new("/front", "car").unwrap();
-        let mut node =
-            context.new_node(name, NodeOptions::new().enable_rosout(false).start_parameter_services(false)).unwrap();
+        let mut node = context
+            .new_node(name, NodeOptions::new().enable_rosout(false).start_parameter_services(false))
+            .unwrap();
         let qos = QosProfile::publisher_default()
             .reliability_reliable(WhenFull::DEFAULT)
             .durability(Durability::Volatile)
@@ -133,15 +143,17 @@ impl Car {
         let serving = service.map(|(mapping, say)| {
             let name = Name::new("/front/car", "get_type_description").unwrap();
             let ty = ServiceTypeName::new("type_description_interfaces", "GetTypeDescription");
-            let server =
-                node.create_server::<Request, Response>(mapping, &name, &ty, qos.clone(), qos.clone()).unwrap();
+            let server = node
+                .create_server::<Request, Response>(mapping, &name, &ty, qos.clone(), qos.clone())
+                .unwrap();
             let (asked, stop) = (asked.clone(), stop.clone());
             thread::spawn(move || serve(&server, say, &asked, &stop))
         });
         // Last, so that what follows in discovery is ours to say.
         let writers = ["Wheel", "Tyre"].map(|ty| {
             let topic = Name::new("/", &ty.to_lowercase()).unwrap();
-            let topic = node.create_topic(&topic, MessageTypeName::new("car_msgs", ty), &qos).unwrap();
+            let topic =
+                node.create_topic(&topic, MessageTypeName::new("car_msgs", ty), &qos).unwrap();
             let publisher = node.create_publisher::<String>(&topic, None).unwrap();
             let guid = publisher.guid();
             // It lives as long as the process.
@@ -151,7 +163,8 @@ impl Car {
         Self { participant, _node: node, writers, asked, stop, serving }
     }
 
-    /// Announces the writers once more, with the hashes of their types: RustDDS has no way to say them.
+    /// Announces the writers once more, with the hashes of their types: RustDDS has no way to say
+    /// them.
     fn announce_hashes(&self, dds: &Dds, domain: u16) {
         both(dds);
         let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -159,7 +172,9 @@ impl Car {
         for seq in 1..60 {
             let (guid, topic, ty, hash) = match seq {
                 50.. => (GUID::default(), "rt/mark", "car_msgs::msg::dds_::Mark_", WHEEL),
-                _ if seq % 2 == 0 => (self.writers[0], "rt/wheel", "car_msgs::msg::dds_::Wheel_", WHEEL),
+                _ if seq % 2 == 0 => {
+                    (self.writers[0], "rt/wheel", "car_msgs::msg::dds_::Wheel_", WHEEL)
+                }
                 _ => (self.writers[1], "rt/tyre", "car_msgs::msg::dds_::Tyre_", TYRE),
             };
             let prefix = self.writers[0].to_bytes();
@@ -169,7 +184,11 @@ impl Car {
                 guid.to_bytes().to_vec()
             };
             let guid = GUID::from_bytes(guid.try_into().unwrap());
-            wire.send_to(&announcement(guid, seq, topic, ty, hash), ("127.0.0.1", 7400 + 250 * domain + 10)).unwrap();
+            wire.send_to(
+                &announcement(guid, seq, topic, ty, hash),
+                ("127.0.0.1", 7400 + 250 * domain + 10),
+            )
+            .unwrap();
         }
         until("the hashes", || dds.discovered().iter().any(|topic| topic.topic == "/mark"));
     }
@@ -184,7 +203,12 @@ impl Drop for Car {
     }
 }
 
-fn serve(server: &Server<Request, Response>, say: Say, asked: &Mutex<Vec<Request>>, stop: &AtomicBool) {
+fn serve(
+    server: &Server<Request, Response>,
+    say: Say,
+    asked: &Mutex<Vec<Request>>,
+    stop: &AtomicBool,
+) {
     while !stop.load(Ordering::Relaxed) {
         match server.receive_request() {
             Ok(Some((id, request))) => {
@@ -215,9 +239,13 @@ fn announcement(writer: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Ve
     body.extend_from_slice(&seq.to_le_bytes());
     // Encapsulation: a list of parameters, little-endian.
     body.extend_from_slice(&[0, 3, 0, 0]);
-    for (id, value) in
-        [(0x5a_u16, writer.to_bytes().to_vec()), (5, text(topic)), (7, text(ty)), (0x1a, reliable), (0x2c, octets)]
-    {
+    for (id, value) in [
+        (0x5a_u16, writer.to_bytes().to_vec()),
+        (5, text(topic)),
+        (7, text(ty)),
+        (0x1a, reliable),
+        (0x2c, octets),
+    ] {
         body.extend_from_slice(&id.to_le_bytes());
         body.extend_from_slice(&(value.len() as u16).to_le_bytes());
         body.extend_from_slice(&value);
@@ -234,7 +262,9 @@ fn both(dds: &Dds) {
 
 /// Waits as whoever records does: until there are definitions, or none will come.
 fn wait(dds: &Dds, topic: &str) -> bool {
-    until("the end of asking", || dds.definitions(topic).is_ok() || !dds.definitions_may_come(topic));
+    until("the end of asking", || {
+        dds.definitions(topic).is_ok() || !dds.definitions_may_come(topic)
+    });
     let found = dds.definitions(topic);
     assert!(matches!(found, Ok(_) | Err(TransportError::NoDefinitions { .. })), "{found:?}");
     found.is_ok()
@@ -289,13 +319,17 @@ fn long() {
     let (name, ty) = service("rq", "Request");
     let requests = peer.reader(&format!("{name}Request"), &ty, &policies);
     let (name, ty) = service("rr", "Response");
-    let replies = peer.writer_of::<Little>(&peer.topic(&format!("{name}Reply"), &ty, &policies), &policies);
+    let replies =
+        peer.writer_of::<Little>(&peer.topic(&format!("{name}Reply"), &ty, &policies), &policies);
     let _ready = peer.writer("/ready", true, false);
     until("the service", || dds.discovered().iter().any(|topic| topic.topic == "/ready"));
     car.announce_hashes(&dds, domain);
 
-    let request =
-        Request { type_name: "car_msgs/msg/Wheel".to_owned(), type_hash: WHEEL.to_owned(), include_type_sources: true };
+    let request = Request {
+        type_name: "car_msgs/msg/Wheel".to_owned(),
+        type_hash: WHEEL.to_owned(),
+        include_type_sources: true,
+    };
     let mut answer = honest(&request);
     answer.sources[0].2 += &"# A long story.\n".repeat(TEXT / 16);
     let answer = CDRSerializerAdapter::<Response>::to_bytes(&answer).unwrap();
@@ -318,7 +352,8 @@ fn refused() {
     let car = Car::join(domain, Some((ServiceMapping::Enhanced, say)));
     car.announce_hashes(&dds, domain);
     assert!(!wait(&dds, "/wheel"));
-    // On a slow machine, one that answers late may be asked in the other way, which it does not understand.
+    // On a slow machine, one that answers late may be asked in the other way, which it does not
+    // understand.
     assert!((1..=3).contains(&car.asked.lock().unwrap().len()), "{:?}", car.asked);
     assert!(!dds.definitions_may_come("/wheel"), "that was all");
 }

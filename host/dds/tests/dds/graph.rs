@@ -5,7 +5,9 @@ use gleaner_transport::{LiveSource, Transport};
 use rustdds::RTPSEntity;
 
 use super::Test;
-use super::peer::{Kept, LittleWriter, Peer, connected, domain, options, policies, spec, take, until, write};
+use super::peer::{
+    Kept, LittleWriter, Peer, connected, domain, options, policies, spec, take, until, write,
+};
 
 pub const TESTS: &[Test] = &[
     ("nothing_is_said_in_the_graph_before_somebody_is_heard", silent),
@@ -60,13 +62,15 @@ fn understand(cdr: &[u8], gid: usize) -> Option<Said> {
     };
     let participant = bytes(gid, 1)?;
     let mut nodes = Vec::new();
-    let number = |four: Vec<u8>| four.iter().rev().fold(0, |sum, byte| sum * 256 + usize::from(*byte));
+    let number =
+        |four: Vec<u8>| four.iter().rev().fold(0, |sum, byte| sum * 256 + usize::from(*byte));
     for _ in 0..number(bytes(4, 4)?) {
         let mut texts = Vec::new();
         let mut lists = Vec::new();
         for _ in 0..2 {
             let length = number(bytes(4, 4)?);
-            texts.push(String::from_utf8(bytes(length, 1)?).ok()?.trim_end_matches('\0').to_owned());
+            texts
+                .push(String::from_utf8(bytes(length, 1)?).ok()?.trim_end_matches('\0').to_owned());
         }
         for _ in 0..2 {
             let count = number(bytes(4, 4)?);
@@ -113,7 +117,9 @@ fn listed(distro: Distro) {
     until("our word", || {
         while let Some(said) = take(&reader) {
             let said = understand(&said, gid).expect("it is understood");
-            last = (said.participant[..12] != imu.guid().to_bytes()[..12]).then_some(said).or(last.take());
+            last = (said.participant[..12] != imu.guid().to_bytes()[..12])
+                .then_some(said)
+                .or(last.take());
         }
         last.as_ref().is_some_and(|said| said.nodes.len() == 1 && said.nodes[0].writers.len() == 1)
     });
@@ -122,7 +128,8 @@ fn listed(distro: Distro) {
     assert_eq!((namespace.as_str(), name.as_str()), ("/gleaner", "test"));
     assert_eq!((readers.len(), writers.len()), (1, 1));
     let found = peer.0.discovered_writers();
-    let found = found.iter().find(|writer| writer.publication_topic_data.topic_name == "rt/out").unwrap();
+    let found =
+        found.iter().find(|writer| writer.publication_topic_data.topic_name == "rt/out").unwrap();
     let guid = found.writer_proxy.remote_writer_guid;
     assert_ne!(guid.prefix, own);
     assert_eq!(writers[0][..16], guid.to_bytes());
@@ -139,7 +146,10 @@ fn listed(distro: Distro) {
     });
     drop(dds);
     until("our end", || {
-        peer.0.discovered_writers().iter().all(|writer| writer.writer_proxy.remote_writer_guid.prefix == own)
+        peer.0
+            .discovered_writers()
+            .iter()
+            .all(|writer| writer.writer_proxy.remote_writer_guid.prefix == own)
     });
 }
 
@@ -153,7 +163,8 @@ fn both() {
     let _new = announce(&new, 16);
     until("staying out", || dds.graph().contains("Humble and nodes of newer"));
     until("taking it back", || {
-        take(&reader).is_some_and(|said| understand(&said, 24).is_some_and(|said| said.nodes.is_empty()))
+        take(&reader)
+            .is_some_and(|said| understand(&said, 24).is_some_and(|said| said.nodes.is_empty()))
     });
     let ours = |peer: &Peer| {
         let info = peer.0.discovered_writers();

@@ -42,7 +42,8 @@ pub fn data(writer: GUID, seq: i64, payload: &[u8], encoding: [u8; 2]) -> Vec<u8
     packet(writer, 0x15, &body)
 }
 
-/// A DATA_FRAG submessage: the first fragment, for all readers, of a sample that is said to have `size` bytes.
+/// A DATA_FRAG submessage: the first fragment, for all readers, of a sample that is said to have
+/// `size` bytes.
 fn fragment(writer: GUID, seq: u32, size: u32) -> Vec<u8> {
     let mut body = vec![0, 0, 28, 0, 0, 0, 0, 0];
     body.extend_from_slice(&writer.to_bytes()[12..]);
@@ -97,8 +98,14 @@ fn gaps() {
     write(&writer, b"1...");
     sink.wait(1);
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
-    for (count, (seq, lost)) in [(5, 3), (6, 3), (3, 2), (9, 4), (4, 3), (2, 2), (8, 1)].into_iter().enumerate() {
-        wire.send_to(&data(writer.guid(), seq, b"from a hand", LITTLE), ("127.0.0.1", port(domain))).unwrap();
+    for (count, (seq, lost)) in
+        [(5, 3), (6, 3), (3, 2), (9, 4), (4, 3), (2, 2), (8, 1)].into_iter().enumerate()
+    {
+        wire.send_to(
+            &data(writer.guid(), seq, b"from a hand", LITTLE),
+            ("127.0.0.1", port(domain)),
+        )
+        .unwrap();
         assert_eq!(sink.wait(count + 2)[count + 1].0.seq, u64::try_from(seq).unwrap());
         until("the count", || dds.status(subscription).lost == Some(lost));
     }
@@ -118,7 +125,11 @@ fn malformed() {
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     // PL_CDR and XCDR2; the fourth sample is lost indeed.
     for (seq, encoding) in [(2, [0, 3]), (3, [0, 7]), (5, LITTLE)] {
-        wire.send_to(&data(writer.guid(), seq, b"from a hand.", encoding), ("127.0.0.1", port(domain))).unwrap();
+        wire.send_to(
+            &data(writer.guid(), seq, b"from a hand.", encoding),
+            ("127.0.0.1", port(domain)),
+        )
+        .unwrap();
     }
     sink.wait(2);
     until("the loss", || dds.status(subscription).lost != Some(0));
@@ -157,17 +168,24 @@ fn broken() {
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     let mut state = 1_u64;
     let mut random = move || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 33) as usize
     };
     let whole = data(writer.guid(), 7, &[0; 64], LITTLE);
-    let kinds = [0x01, 0x06, 0x07, 0x08, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x13, 0x15, 0x16, 0x80, 0xff];
+    let kinds =
+        [0x01, 0x06, 0x07, 0x08, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x13, 0x15, 0x16, 0x80, 0xff];
     for n in 0..3000 {
         let mut bytes = match n % 3 {
-            // Cut anywhere; some bytes changed; and every kind of submessage with bytes that mean nothing.
+            // Cut anywhere; some bytes changed; and every kind of submessage with bytes that mean
+            // nothing.
             0 => whole[..random() % whole.len()].to_vec(),
             1 => whole.clone(),
-            _ => packet(writer.guid(), kinds[random() % kinds.len()], &vec![random() as u8; random() % 80]),
+            _ => packet(
+                writer.guid(),
+                kinds[random() % kinds.len()],
+                &vec![random() as u8; random() % 80],
+            ),
         };
         for _ in 0..3 {
             // Neither the sender nor what makes it RTPS.

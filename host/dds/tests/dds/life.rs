@@ -16,7 +16,8 @@ use super::Test;
 use super::peer::{Kept, Peer, connected, domain, matched, open, options, spec, until, write};
 
 /// While it runs, no other may have threads of the library.
-pub const ALONE: &str = "no_signal_interrupts_the_threads_of_the_library_and_ours_take_them_as_before";
+pub const ALONE: &str =
+    "no_signal_interrupts_the_threads_of_the_library_and_ours_take_them_as_before";
 
 pub const TESTS: &[Test] = &[
     ("the_buffer_that_was_granted_is_told", buffer),
@@ -50,7 +51,11 @@ fn buffer() {
     for (largest, asked) in [(1, 8 << 20), (4 << 20, 16 << 20), (usize::MAX, 64 << 20)] {
         let dds = Dds::open(Options { largest, ..options(domain()) }).unwrap();
         let Network { buffer_asked, buffer_granted, .. } = dds.health().network.unwrap();
-        let limit = std::fs::read_to_string("/proc/sys/net/core/rmem_max").unwrap().trim().parse::<usize>().unwrap();
+        let limit = std::fs::read_to_string("/proc/sys/net/core/rmem_max")
+            .unwrap()
+            .trim()
+            .parse::<usize>()
+            .unwrap();
         assert_eq!((buffer_asked, buffer_granted), (asked, asked.min(limit)));
     }
 }
@@ -141,7 +146,8 @@ fn panicking() {
     let bad = dds.subscribe(&spec("/bad", Qos::Auto), Arc::new(Panicking)).unwrap();
     let good = dds.subscribe(&spec("/good", Qos::Auto), kept.clone()).unwrap();
     let peer = Peer::join(domain);
-    let (bad_writer, good_writer) = (peer.writer("/bad", true, false), peer.writer("/good", true, false));
+    let (bad_writer, good_writer) =
+        (peer.writer("/bad", true, false), peer.writer("/good", true, false));
     connected(&dds, bad, 1);
     connected(&dds, good, 1);
     matched(&bad_writer);
@@ -207,7 +213,8 @@ fn dropped_while_stuck() {
 
 fn bad_node() {
     for node in ["", "gleaner", "/", "/a b"] {
-        let error = Dds::open(Options { node: node.to_owned(), ..options(domain()) }).err().unwrap();
+        let error =
+            Dds::open(Options { node: node.to_owned(), ..options(domain()) }).err().unwrap();
         assert_eq!(error.to_string(), format!("`{node}` is not a node's namespace and name"));
     }
 }

@@ -1,7 +1,7 @@
 //! The DDS transport against peers in the same process, in a network of their own.
 //!
-//! All this runs in a network namespace in which there is nothing but `lo`, so that nothing is sent elsewhere and nobody
-//! else is heard. Where there may be none, every test is skipped and says so.
+//! All this runs in a network namespace in which there is nothing but `lo`, so that nothing is sent
+//! elsewhere and nobody else is heard. Where there may be none, every test is skipped and says so.
 
 mod apart;
 mod ask;
@@ -21,7 +21,8 @@ use libtest_mimic::{Arguments, Failed, Trial};
 
 type Test = (&'static str, fn());
 
-/// Held by each test while it runs, and by [`life::ALONE`] alone: that one looks at all threads of this process.
+/// Held by each test while it runs, and by [`life::ALONE`] alone: that one looks at all threads of
+/// this process.
 static RUNNING: RwLock<()> = RwLock::new(());
 
 fn main() -> ExitCode {
@@ -47,7 +48,8 @@ fn main() -> ExitCode {
         Ok(()) => Trial::test(name, move || -> Result<(), Failed> {
             let is_alone = name == life::ALONE;
             let _alone = is_alone.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
-            let _beside = (!is_alone).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
+            let _beside =
+                (!is_alone).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
             test();
             Ok(())
         }),

@@ -16,7 +16,10 @@ pub const TESTS: &[Test] = &[
     ("auto_gets_what_a_writer_kept_for_late_readers", auto_transient_local),
     ("auto_asks_for_more_again_when_all_writers_have_gone", auto_recovers),
     ("a_fixed_request_that_a_writer_does_not_satisfy_is_trouble_with_names", fixed_does_not_fit),
-    ("a_writer_of_another_type_is_trouble_with_both_types_and_none_of_its_samples_come", another_type),
+    (
+        "a_writer_of_another_type_is_trouble_with_both_types_and_none_of_its_samples_come",
+        another_type,
+    ),
     ("a_number_that_is_far_ahead_hides_no_sample_from_a_reader_that_asks_again", far_ahead),
 ];
 
@@ -43,11 +46,17 @@ fn auto_adapts() {
     sink.mark(&reliable, b"from the first..");
     let samples = sink.bytes(12);
     for n in 0..10 {
-        assert_eq!(samples.iter().filter(|bytes| **bytes == [n; 4]).count(), 1, "no sample comes a second time");
+        assert_eq!(
+            samples.iter().filter(|bytes| **bytes == [n; 4]).count(),
+            1,
+            "no sample comes a second time"
+        );
     }
     let trouble = dds.status(subscription).trouble;
     assert!(
-        trouble.iter().any(|line| line.contains("differ") && line.contains("best effort, volatile")),
+        trouble
+            .iter()
+            .any(|line| line.contains("differ") && line.contains("best effort, volatile")),
         "{trouble:?}"
     );
     assert!(trouble.iter().any(|line| line.contains("asked for again")), "{trouble:?}");
@@ -90,9 +99,12 @@ fn auto_recovers() {
         drop(strong.take());
         connected(&dds, subscription, 0);
         strong = Some(peer.writer("/driver", true, false));
-        // One that comes in the moment in which the reader is made anew is not always seen (docs/dds-limits.md): then the next one.
+        // One that comes in the moment in which the reader is made anew is not always seen
+        // (docs/dds-limits.md): then the next one.
         let begun = Instant::now();
-        while dds.status(subscription).writers != Some(1) && begun.elapsed() < Duration::from_secs(3) {
+        while dds.status(subscription).writers != Some(1)
+            && begun.elapsed() < Duration::from_secs(3)
+        {
             thread::sleep(Duration::from_millis(2));
         }
         let status = dds.status(subscription);
@@ -113,7 +125,9 @@ fn fixed_does_not_fit() {
     let status = dds.status(subscription);
     let [line] = status.trouble.as_slice() else { panic!("{:?}", status.trouble) };
     assert!(
-        line.contains("`/strict` offers best effort, volatile, asked for is reliable, volatile: Reliability"),
+        line.contains(
+            "`/strict` offers best effort, volatile, asked for is reliable, volatile: Reliability"
+        ),
         "{line}"
     );
     assert_eq!((status.writers, status.qos.as_deref()), (Some(0), Some("reliable, volatile")));
@@ -136,7 +150,10 @@ fn another_type() {
     let passed_over = "1 sample of `/typed`, of another type, passed over";
     until("trouble", || dds.status(subscription).trouble.iter().any(|line| line == passed_over));
     let trouble = dds.status(subscription).trouble;
-    assert!(trouble[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"), "{trouble:?}");
+    assert!(
+        trouble[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"),
+        "{trouble:?}"
+    );
     sink.mark(&ours, b"of ours.");
     assert!(sink.bytes(1).iter().all(|bytes| bytes == b"of ours."));
 }
@@ -148,12 +165,16 @@ fn far_ahead() {
     let subscription = dds.subscribe(&spec("/far", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/far", false, true);
-    assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("best effort, transient local"));
+    assert_eq!(
+        connected(&dds, subscription, 1).qos.as_deref(),
+        Some("best effort, transient local")
+    );
     matched(&writer);
     write(&writer, b"1...");
     sink.wait(1);
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
-    wire.send_to(&data(writer.guid(), 1 << 40, b"far.", LITTLE), ("127.0.0.1", port(domain))).unwrap();
+    wire.send_to(&data(writer.guid(), 1 << 40, b"far.", LITTLE), ("127.0.0.1", port(domain)))
+        .unwrap();
     sink.wait(2);
     let _less = peer.writer("/far", false, false);
     assert_eq!(connected(&dds, subscription, 2).qos.as_deref(), Some("best effort, volatile"));

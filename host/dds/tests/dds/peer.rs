@@ -8,12 +8,16 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use gleaner_dds::{Dds, Options};
-use gleaner_transport::{Clock, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict};
-use rustdds::no_key::{DataWriter, Decode, DeserializerAdapter, SerializerAdapter, SimpleDataReader};
+use gleaner_transport::{
+    Clock, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict,
+};
+use rustdds::no_key::{
+    DataWriter, Decode, DeserializerAdapter, SerializerAdapter, SimpleDataReader,
+};
 use rustdds::policy::{Durability, History, Reliability};
 use rustdds::{
-    DataWriterStatus, DomainParticipant, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, StatusEvented, Topic,
-    TopicKind,
+    DataWriterStatus, DomainParticipant, QosPolicies, QosPolicyBuilder, RepresentationIdentifier,
+    StatusEvented, Topic, TopicKind,
 };
 
 /// How long something may take that happens at all.
@@ -55,8 +59,13 @@ pub fn connected(dds: &Dds, subscription: Subscription, writers: usize) -> Statu
 
 pub fn policies(reliable: bool, transient_local: bool) -> QosPolicies {
     let max_blocking_time = rustdds::Duration::from_secs(10);
-    let reliability = if reliable { Reliability::Reliable { max_blocking_time } } else { Reliability::BestEffort };
-    let durability = if transient_local { Durability::TransientLocal } else { Durability::Volatile };
+    let reliability = if reliable {
+        Reliability::Reliable { max_blocking_time }
+    } else {
+        Reliability::BestEffort
+    };
+    let durability =
+        if transient_local { Durability::TransientLocal } else { Durability::Volatile };
     let history = History::KeepLast { depth: 100 };
     QosPolicyBuilder::new().reliability(reliability).durability(durability).history(history).build()
 }
@@ -72,7 +81,9 @@ impl Peer {
     }
 
     pub fn topic(&self, name: &str, type_name: &str, policies: &QosPolicies) -> Topic {
-        self.0.create_topic(name.to_owned(), type_name.to_owned(), policies, TopicKind::NoKey).unwrap()
+        self.0
+            .create_topic(name.to_owned(), type_name.to_owned(), policies, TopicKind::NoKey)
+            .unwrap()
     }
 
     pub fn writer_of<A: SerializerAdapter<Bytes>>(
@@ -87,10 +98,18 @@ impl Peer {
     /// A writer of `std_msgs/msg/String`.
     pub fn writer(&self, topic: &str, reliable: bool, transient_local: bool) -> LittleWriter {
         let policies = policies(reliable, transient_local);
-        self.writer_of(&self.topic(&format!("rt{topic}"), "std_msgs::msg::dds_::String_", &policies), &policies)
+        self.writer_of(
+            &self.topic(&format!("rt{topic}"), "std_msgs::msg::dds_::String_", &policies),
+            &policies,
+        )
     }
 
-    pub fn reader(&self, topic: &str, type_name: &str, policies: &QosPolicies) -> SimpleDataReader<Vec<u8>, Little> {
+    pub fn reader(
+        &self,
+        topic: &str,
+        type_name: &str,
+        policies: &QosPolicies,
+    ) -> SimpleDataReader<Vec<u8>, Little> {
         let topic = self.topic(topic, type_name, policies);
         let subscriber = self.0.create_subscriber(policies).unwrap();
         subscriber.create_simple_datareader_no_key(&topic, Some(policies.clone())).unwrap()
@@ -105,7 +124,9 @@ pub fn take(reader: &SimpleDataReader<Vec<u8>, Little>) -> Option<Vec<u8>> {
 
 /// Waits until a writer knows its reader; what it writes before is not for that one.
 pub fn matched<A: SerializerAdapter<Bytes>>(writer: &DataWriter<Bytes, A>) {
-    until("a reader", || matches!(writer.try_recv_status(), Some(DataWriterStatus::PublicationMatched { .. })));
+    until("a reader", || {
+        matches!(writer.try_recv_status(), Some(DataWriterStatus::PublicationMatched { .. }))
+    });
 }
 
 /// Writes what RTPS does not have to fill up: its messages have multiples of four bytes.
@@ -146,7 +167,11 @@ pub struct Whole;
 
 impl<'de> Decode<'de, Vec<u8>> for Whole {
     type Error = Infallible;
-    fn decode_bytes(self, bytes: &'de [u8], _: RepresentationIdentifier) -> Result<Vec<u8>, Infallible> {
+    fn decode_bytes(
+        self,
+        bytes: &'de [u8],
+        _: RepresentationIdentifier,
+    ) -> Result<Vec<u8>, Infallible> {
         Ok(bytes.to_vec())
     }
 }
@@ -174,7 +199,10 @@ impl Kept {
     /// Waits until there are `count`, and returns all there are.
     pub fn wait(&self, count: usize) -> Vec<(SampleMeta, Vec<u8>)> {
         let samples = self.samples.lock().unwrap();
-        let (samples, late) = self.came.wait_timeout_while(samples, PATIENCE, |samples| samples.len() < count).unwrap();
+        let (samples, late) = self
+            .came
+            .wait_timeout_while(samples, PATIENCE, |samples| samples.len() < count)
+            .unwrap();
         assert!(!late.timed_out(), "{} of {count} samples came", samples.len());
         samples.clone()
     }
@@ -184,7 +212,8 @@ impl Kept {
         self.wait(count).into_iter().map(|(_, bytes)| bytes).collect()
     }
 
-    /// Publishes `mark` until it arrives, which tells that everything from before has arrived or never will.
+    /// Publishes `mark` until it arrives, which tells that everything from before has arrived or
+    /// never will.
     pub fn mark(&self, writer: &LittleWriter, mark: &[u8]) {
         until("a sample", || {
             write(writer, mark);

@@ -8,14 +8,19 @@ use gleaner_transport::{Guid, LiveSource, Qos, SampleMeta, Sink, TopicSpec, Tran
 use rustdds::{RTPSEntity, Timestamp};
 
 use super::Test;
-use super::peer::{Big, Kept, Parameters, Peer, connected, domain, matched, open, policies, spec, until, write};
+use super::peer::{
+    Big, Kept, Parameters, Peer, connected, domain, matched, open, policies, spec, until, write,
+};
 
 pub const TESTS: &[Test] = &[
     ("samples_arrive_whole_with_who_wrote_them_and_when", samples_arrive),
     ("a_sample_of_many_fragments_arrives_whole", fragments),
     ("the_first_sample_of_many_fragments_arrives_even_if_nothing_is_sent_again", first_fragments),
     ("a_sink_that_can_copy_gets_the_bytes_once", copied),
-    ("a_sink_that_panics_while_it_copies_is_death_with_a_name_and_other_topics_go_on", panics_in_copy),
+    (
+        "a_sink_that_panics_while_it_copies_is_death_with_a_name_and_other_topics_go_on",
+        panics_in_copy,
+    ),
     ("the_byte_order_of_each_sample_is_known", byte_order),
     ("a_sample_in_an_encoding_that_nobody_reads_is_counted_and_the_next_arrives", malformed),
     ("two_subscriptions_of_a_topic_both_get_every_sample", two_subscriptions),
@@ -35,7 +40,9 @@ fn samples_arrive() {
     connected(&dds, subscription, 1);
     matched(&writer);
     // 2.5 s after 1970.
-    writer.write(Bytes::from(vec![7; 324]), Some(Timestamp::from_ticks(2 << 32 | 1 << 31))).unwrap();
+    writer
+        .write(Bytes::from(vec![7; 324]), Some(Timestamp::from_ticks(2 << 32 | 1 << 31)))
+        .unwrap();
     write(&writer, b"the second..");
     let samples = sink.wait(2);
     let (first, bytes) = &samples[0];
@@ -43,11 +50,17 @@ fn samples_arrive() {
     assert_eq!((first.seq, first.publish_ns, first.options), (1, 2_500_000_000, [0, 0]));
     assert_eq!((first.writer, first.endian), (Guid(writer.guid().to_bytes()), Endian::Little));
     let (second, bytes) = &samples[1];
-    assert_eq!((second.seq, second.writer, bytes.as_slice()), (2, first.writer, b"the second..".as_slice()));
+    assert_eq!(
+        (second.seq, second.writer, bytes.as_slice()),
+        (2, first.writer, b"the second..".as_slice())
+    );
     assert!(second.at_ns > first.at_ns && first.at_ns > 0);
     let status = dds.status(subscription);
     assert_eq!((status.writers, status.lost, status.malformed), (Some(1), Some(0), 0));
-    assert_eq!((status.qos.as_deref(), status.trouble.as_slice()), (Some("reliable, volatile"), [].as_slice()));
+    assert_eq!(
+        (status.qos.as_deref(), status.trouble.as_slice()),
+        (Some("reliable, volatile"), [].as_slice())
+    );
     drop(writer);
     connected(&dds, subscription, 0);
 }
@@ -119,7 +132,10 @@ fn copied() {
     }
     until("all", || sink.accepted.lock().unwrap().len() == 3);
     let accepted = sink.accepted.lock().unwrap();
-    assert_eq!(*accepted, [(1, Some(b"1...".to_vec())), (2, None), (3, Some(b"3.......".to_vec()))]);
+    assert_eq!(
+        *accepted,
+        [(1, Some(b"1...".to_vec())), (2, None), (3, Some(b"3.......".to_vec()))]
+    );
 }
 
 struct PanicsInCopy;
@@ -145,7 +161,8 @@ fn panics_in_copy() {
     let (writer, other) = (peer.writer("/both", true, false), peer.writer("/other", true, false));
     connected(&dds, bad, 1);
     connected(&dds, good, 1);
-    // The first is also what tells that RustDDS goes on: both read it under the lock of the same topic.
+    // The first is also what tells that RustDDS goes on: both read it under the lock of the same
+    // topic.
     first.mark(&writer, b"1...");
     second.mark(&other, b"2...");
     until("death", || dds.health().dead.is_some());
@@ -161,7 +178,10 @@ fn byte_order() {
     let subscription = dds.subscribe(&spec("/big", FIXED), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let policies = policies(true, false);
-    let writer = peer.writer_of::<Big>(&peer.topic("rt/big", "std_msgs::msg::dds_::String_", &policies), &policies);
+    let writer = peer.writer_of::<Big>(
+        &peer.topic("rt/big", "std_msgs::msg::dds_::String_", &policies),
+        &policies,
+    );
     connected(&dds, subscription, 1);
     matched(&writer);
     write(&writer, &[0, 0, 0, 1]);
@@ -176,7 +196,10 @@ fn malformed() {
     let subscription = dds.subscribe(&spec("/odd", FIXED), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let policies = policies(true, false);
-    let odd = peer.writer_of::<Parameters>(&peer.topic("rt/odd", "std_msgs::msg::dds_::String_", &policies), &policies);
+    let odd = peer.writer_of::<Parameters>(
+        &peer.topic("rt/odd", "std_msgs::msg::dds_::String_", &policies),
+        &policies,
+    );
     let good = peer.writer("/odd", true, false);
     connected(&dds, subscription, 2);
     matched(&odd);
@@ -212,8 +235,14 @@ fn two_subscriptions() {
 
 fn bad_names() {
     let mut dds = open(domain());
-    for (topic, type_name) in [("no_slash", "a/msg/B"), ("/a b", "a/msg/B"), ("/a", "B"), ("/a", "a/msg/B\n")] {
-        let names = TopicSpec { topic: topic.to_owned(), type_name: type_name.to_owned(), ..spec("/a", FIXED) };
+    for (topic, type_name) in
+        [("no_slash", "a/msg/B"), ("/a b", "a/msg/B"), ("/a", "B"), ("/a", "a/msg/B\n")]
+    {
+        let names = TopicSpec {
+            topic: topic.to_owned(),
+            type_name: type_name.to_owned(),
+            ..spec("/a", FIXED)
+        };
         assert!(dds.subscribe(&names, Kept::new()).is_err(), "{topic} {type_name:?}");
         assert!(dds.writer(topic, type_name, 1).is_err(), "{topic} {type_name:?}");
     }

@@ -25,7 +25,10 @@ fn written() {
         came.extend(take(&reader));
         came.len() == 50
     });
-    assert!(came.iter().enumerate().all(|(n, bytes)| *bytes == [n as u8; 332]), "in order, as they were");
+    assert!(
+        came.iter().enumerate().all(|(n, bytes)| *bytes == [n as u8; 332]),
+        "in order, as they were"
+    );
     drop(reader);
     until("nobody", || writer.readers() == 0);
 }

@@ -75,7 +75,8 @@ pub fn database_of(path: &Path, messages: &[Written], bytes: impl Fn(&Written) -
     add_text(&db, TYPE, "ros2msg", TEXT);
     let mut topics = HashMap::new();
     for message in messages {
-        let topic = *topics.entry(message.topic).or_insert_with(|| add_topic(&db, message.topic, TYPE));
+        let topic =
+            *topics.entry(message.topic).or_insert_with(|| add_topic(&db, message.topic, TYPE));
         add_message(&db, topic, message.at as i64, &bytes(message));
     }
     db.execute_batch("COMMIT").unwrap();
@@ -90,9 +91,11 @@ pub fn mcap_of(messages: &[Written], bytes: impl Fn(&Written) -> Vec<u8>) -> Vec
     let mut writer = small_chunks().create(std::io::Cursor::new(Vec::new())).unwrap();
     let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
     for message in messages {
-        let channel_id = writer.add_channel(schema, message.topic, "cdr", &BTreeMap::new()).unwrap();
+        let channel_id =
+            writer.add_channel(schema, message.topic, "cdr", &BTreeMap::new()).unwrap();
         let (log_time, publish_time) = (message.at, message.at);
-        let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time, publish_time };
+        let header =
+            mcap::records::MessageHeader { channel_id, sequence: 0, log_time, publish_time };
         writer.write_to_known_channel(&header, &bytes(message)).unwrap();
     }
     writer.finish().unwrap();
@@ -120,7 +123,11 @@ pub fn bag(storage: Storage, packing: Packed, parts: &[&[Written]]) -> TempDir {
             Storage::Sqlite3 => database_of(&path, messages, bytes),
         }
         if packing == Packed::Files {
-            fs::write(path.with_extension(format!("{ending}.zstd")), packed(&fs::read(&path).unwrap())).unwrap();
+            fs::write(
+                path.with_extension(format!("{ending}.zstd")),
+                packed(&fs::read(&path).unwrap()),
+            )
+            .unwrap();
             fs::remove_file(path).unwrap();
             names.push(format!("{name}.zstd"));
         } else {
@@ -139,7 +146,13 @@ pub fn bag(storage: Storage, packing: Packed, parts: &[&[Written]]) -> TempDir {
 }
 
 /// `metadata.yaml` of a version.
-pub fn metadata(version: u32, storage: &str, mode: &str, files: &[&str], messages: &[Written]) -> String {
+pub fn metadata(
+    version: u32,
+    storage: &str,
+    mode: &str,
+    files: &[&str],
+    messages: &[Written],
+) -> String {
     let mut counts = BTreeMap::<_, u64>::new();
     messages.iter().for_each(|message| *counts.entry(message.topic).or_default() += 1);
     let files: String = files.iter().map(|file| format!("    - {file}\n")).collect();

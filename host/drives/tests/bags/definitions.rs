@@ -1,4 +1,5 @@
-//! Where the definitions of a recorded topic come from: its file first, then the places that live topics have.
+//! Where the definitions of a recorded topic come from: its file first, then the places that live
+//! topics have.
 
 use std::fs;
 use std::path::PathBuf;
@@ -35,7 +36,13 @@ fn a_type_that_the_file_does_not_carry_is_found_among_those_of_ros_2() {
     let replay = open(path.clone(), None);
     FieldPath::compile(&replay.definitions("/a").unwrap(), "linear_acceleration.x").unwrap();
     // A recorder writes them into its clips.
-    assert!(replay.topics()[0].definitions_text.as_ref().unwrap().contains("MSG: geometry_msgs/Vector3"));
+    assert!(
+        replay.topics()[0]
+            .definitions_text
+            .as_ref()
+            .unwrap()
+            .contains("MSG: geometry_msgs/Vector3")
+    );
     // Who only looks into files finds what is there.
     let plain = Replay::open(&[path]).unwrap();
     assert!(matches!(plain.definitions("/a"), Err(TransportError::NoDefinitions { .. })));
@@ -63,7 +70,10 @@ fn a_text_in_idl_is_refused_unless_there_is_another() {
     let (_folder, path) = database(ty, Some(("ros2idl", "module test_msgs {};")));
     let memory = std::sync::Arc::new(crate::support::Memory::default());
     let refused = open(path.clone(), None).subscribe(&spec("/a"), memory).unwrap_err();
-    assert_eq!(refused.to_string(), "topic `/a` has schema encoding `ros2idl`; only `ros2msg` can be read");
+    assert_eq!(
+        refused.to_string(),
+        "topic `/a` has schema encoding `ros2idl`; only `ros2msg` can be read"
+    );
     let msg = folder();
     fs::create_dir_all(msg.path().join("test_msgs/msg")).unwrap();
     fs::write(msg.path().join("test_msgs/msg/Number.msg"), "int64 value\n").unwrap();

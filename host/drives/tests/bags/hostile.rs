@@ -121,7 +121,8 @@ fn a_message_without_bytes_is_damage_and_not_passed_over() {
     let tables = crate::bag::TABLES.replace("data BLOB NOT NULL", "data BLOB");
     db.execute_batch(&tables).unwrap();
     let topic = add_topic(&db, "/a", TYPE);
-    db.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?1, 5, NULL)", [topic]).unwrap();
+    db.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?1, 5, NULL)", [topic])
+        .unwrap();
     drop(db);
     let what = damage(replayed(&path).1).1.to_string();
     assert!(what.contains("something else than bytes"), "{what}");
@@ -138,9 +139,14 @@ fn times_that_are_none_are_damage() {
         let folder = folder();
         let path = folder.path().join("drive.db3");
         let db = Connection::open(&path).unwrap();
-        db.execute_batch(&crate::bag::TABLES.replace("timestamp INTEGER NOT NULL", "timestamp INTEGER")).unwrap();
+        db.execute_batch(
+            &crate::bag::TABLES.replace("timestamp INTEGER NOT NULL", "timestamp INTEGER"),
+        )
+        .unwrap();
         let topic = add_topic(&db, "/a", TYPE);
-        ticking(&["/a"], 5, 10).iter().for_each(|message| add_message(&db, topic, message.at as i64, &cdr(message)));
+        ticking(&["/a"], 5, 10)
+            .iter()
+            .for_each(|message| add_message(&db, topic, message.at as i64, &cdr(message)));
         db.execute_batch(&format!("UPDATE messages SET timestamp = {time} WHERE id = 3")).unwrap();
         drop(db);
         let (all, error) = replayed(&path);
@@ -208,20 +214,21 @@ fn a_database_without_an_index_of_times_says_how_to_make_one() {
         assert!(error.help().unwrap().contains("CREATE INDEX timestamp_idx"));
     }
     // Any name will do.
-    let (_folder, path) = changed("DROP INDEX timestamp_idx; CREATE INDEX \"a \"\" b\" ON messages (timestamp);");
+    let (_folder, path) =
+        changed("DROP INDEX timestamp_idx; CREATE INDEX \"a \"\" b\" ON messages (timestamp);");
     assert_eq!(replayed(&path).0.len(), 5);
 }
 
 #[test]
 fn what_sqlite_would_have_to_sort_in_memory_is_refused() {
-    let table =
-        "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER";
+    let table = "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER";
     for (columns, index, said) in [
         ("COLLATE NOCASE, data BLOB", "timestamp COLLATE BINARY", "cannot be read in order"),
         (", data BLOB, RowID INTEGER", "timestamp", "calls a column `rowid`"),
         (", data BLOB, rowid INTEGER AS (1)", "timestamp", "calls a column `rowid`"),
     ] {
-        let (_folder, path) = changed(&format!("{table} {columns}); CREATE INDEX at ON messages ({index});"));
+        let (_folder, path) =
+            changed(&format!("{table} {columns}); CREATE INDEX at ON messages ({index});"));
         let ReplayError::Database { source, .. } = refused(&path) else { panic!("{columns}") };
         assert!(source.to_string().contains(said), "{columns}: {source}");
     }
@@ -229,11 +236,16 @@ fn what_sqlite_would_have_to_sort_in_memory_is_refused() {
 
 #[test]
 fn a_schema_of_a_version_that_is_not_known_is_refused_by_its_number() {
-    let schema = "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);";
+    let schema =
+        "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);";
     for version in [0, 5, 99, -1] {
-        let (_folder, path) = changed(&format!("{schema} INSERT INTO schema VALUES ({version}, 'x');"));
+        let (_folder, path) =
+            changed(&format!("{schema} INSERT INTO schema VALUES ({version}, 'x');"));
         let ReplayError::Database { source, .. } = refused(&path) else { panic!("{version}") };
-        assert_eq!(source.to_string(), format!("its schema has version {version}; only versions 1 to 4 can be read"));
+        assert_eq!(
+            source.to_string(),
+            format!("its schema has version {version}; only versions 1 to 4 can be read")
+        );
     }
     for rows in ["", "INSERT INTO schema VALUES (1, 'x');", "INSERT INTO schema VALUES (4, 'x');"] {
         let (_folder, path) = changed(&format!("{schema} {rows}"));
@@ -247,7 +259,9 @@ fn a_number_that_two_topics_have_is_refused() {
         "DROP TABLE topics; CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT);
          INSERT INTO topics VALUES (1, '/a', 'test_msgs/msg/Number', 'cdr'), (1, '/b', 'test_msgs/msg/Number', 'cdr');",
     );
-    let ReplayError::Database { source, .. } = refused(&path) else { panic!("it is another error") };
+    let ReplayError::Database { source, .. } = refused(&path) else {
+        panic!("it is another error")
+    };
     assert!(source.to_string().contains("two of its topics have the number 1"), "{source}");
 }
 
@@ -258,7 +272,9 @@ fn more_definitions_than_a_drive_can_need_are_refused_however_short() {
          INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash)
          SELECT '', '', '', '' FROM n;",
     );
-    let ReplayError::Database { source, .. } = refused(&path) else { panic!("it is another error") };
+    let ReplayError::Database { source, .. } = refused(&path) else {
+        panic!("it is another error")
+    };
     assert!(source.to_string().contains("more than 64 MiB"), "{source}");
 }
 
@@ -305,7 +321,10 @@ fn a_journal_that_cannot_be_looked_into_is_not_taken_for_none() {
     for suffix in ["-wal", "-journal"] {
         let beside = folder.path().join(format!("drive.db3{suffix}"));
         fs::create_dir(&beside).unwrap();
-        assert!(matches!(refused(&path), ReplayError::Open { path, .. } if path == beside), "{suffix}");
+        assert!(
+            matches!(refused(&path), ReplayError::Open { path, .. } if path == beside),
+            "{suffix}"
+        );
         fs::remove_dir(&beside).unwrap();
         // As SQLite leaves it.
         fs::write(&beside, [0; 512]).unwrap();
@@ -318,7 +337,8 @@ fn a_pipe_is_refused_and_not_waited_for() {
     let folder = folder();
     let path = database_in(&folder, &ticking(&["/a"], 5, 10));
     let pipe = |name: &str| {
-        let made = std::process::Command::new("mkfifo").arg(folder.path().join(name)).status().unwrap();
+        let made =
+            std::process::Command::new("mkfifo").arg(folder.path().join(name)).status().unwrap();
         assert!(made.success());
     };
     pipe("drive.db3-wal");

@@ -38,7 +38,8 @@ fn a_path_that_leaves_the_directory_is_refused() {
     fs::create_dir(&inside).unwrap();
     symlink(&secret, inside.join("link.mcap")).unwrap();
     let absolute = secret.display().to_string();
-    for name in ["../secret.mcap", "bag/../../secret.mcap", absolute.as_str(), "link.mcap", "\"\""] {
+    for name in ["../secret.mcap", "bag/../../secret.mcap", absolute.as_str(), "link.mcap", "\"\""]
+    {
         write_metadata(&inside, &metadata(5, "mcap", "", &[name], &messages));
         let error = refused(&inside);
         assert!(matches!(error, ReplayError::Outside { .. }), "{name}: {error}");
@@ -80,7 +81,10 @@ fn metadata_that_are_none_are_refused_with_their_path() {
 fn an_empty_directory_says_what_is_missing() {
     let folder = folder();
     let error = refused(folder.path());
-    assert!(error.to_string().ends_with("has no metadata.yaml, and no .mcap or .db3 file"), "{error}");
+    assert!(
+        error.to_string().ends_with("has no metadata.yaml, and no .mcap or .db3 file"),
+        "{error}"
+    );
     assert!(error.help().is_some());
 }
 

@@ -49,7 +49,9 @@ fn a_message_that_unpacks_to_too_much_is_too_big_and_the_next_is_not() {
     assert_eq!(sink.shown.load(Ordering::Relaxed), 8);
     // Whoever takes anything is told where it ends.
     let mut replay = open(Limits { chunk_bytes: 1 << 20, ..Limits::default() });
-    replay.subscribe(&TopicSpec { max_bytes: usize::MAX, ..spec("/a") }, Arc::new(Memory::default())).unwrap();
+    replay
+        .subscribe(&TopicSpec { max_bytes: usize::MAX, ..spec("/a") }, Arc::new(Memory::default()))
+        .unwrap();
     let (steps, error) = run(&mut replay);
     assert_eq!(steps.len(), 1);
     assert!(matches!(damage(error).1, Damage::MessageTooLarge { allowed: 1_048_576, .. }));
@@ -101,7 +103,8 @@ fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let folder = folder();
     let small = drive(small_chunks(), &ticking(&["/a"], 3, 10));
     let limits = Limits { unpacked_bytes: 1 << 20, ..Limits::default() };
-    let options = Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+    let options =
+        Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
     let open = |paths: &[PathBuf]| Replay::open_as(paths, &options).map(drop);
     let error = open(&[file(&packed(&[&small[..], &noise(2 << 20)].concat()))]).unwrap_err();
     assert!(matches!(error, ReplayError::UnpacksTooLarge { allowed: 1_048_576, .. }), "{error}");
@@ -111,16 +114,22 @@ fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let parts = [file(&packed(&part)), file(&packed(&part))];
     open(&parts[..1]).unwrap();
     let error = open(&parts).unwrap_err();
-    assert!(matches!(&error, ReplayError::UnpacksTooLarge { path, .. } if *path == parts[1]), "{error}");
+    assert!(
+        matches!(&error, ReplayError::UnpacksTooLarge { path, .. } if *path == parts[1]),
+        "{error}"
+    );
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
 #[test]
 fn a_bomb_is_refused_by_its_size_long_before_the_disk_is_full() {
     let folder = folder();
-    let bomb = packed(&[&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 64 << 20]].concat());
+    let bomb = packed(
+        &[&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 64 << 20]].concat(),
+    );
     let limits = Limits { unpacked_bytes: 64 << 20, ..Limits::default() };
-    let options = Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+    let options =
+        Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
     let error = Replay::open_as(&[file(&bomb)], &options).err().unwrap();
     let ReplayError::UnpacksManyTimes { allowed, .. } = &error else { panic!("{error}") };
     assert_eq!(*allowed, (200 * bomb.len() as u64).max(1 << 20));
@@ -150,7 +159,8 @@ fn content_that_another_process_unpacked_is_read_where_nothing_may_be_written() 
     let names: Vec<_> = unpacked.iter().map(|one| one.name(&Options::default()).unwrap()).collect();
     let handed = unpacked.iter().zip(&names).map(|(one, name)| {
         let (path, broken) = one.parts();
-        Unpacked::named(path.to_owned(), name.as_ref().to_owned(), broken.map(str::to_owned)).unwrap()
+        Unpacked::named(path.to_owned(), name.as_ref().to_owned(), broken.map(str::to_owned))
+            .unwrap()
     });
     let nowhere = Some(bag.path().join("nowhere"));
     let options = Options { unpack_in: nowhere, unpacked: handed.collect(), ..Options::default() };
@@ -189,7 +199,8 @@ fn what_killed_processes_left_is_removed_and_nothing_else() {
     std::os::unix::fs::symlink(path("drive.mcap"), path(".unpacked-link")).unwrap();
     let options = Options { unpack_in: Some(folder.path().to_owned()), ..Options::default() };
     Replay::open_as(&[packed], &options).unwrap();
-    let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    let mut left: Vec<_> =
+        fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();
     let others = [".unpacked-folder", ".unpacked-link", ".unpacked-new", ".unpacked-twice"];
     assert_eq!(left, [&others[..], &["drive.mcap", "second", "unpacked-old"]].concat());

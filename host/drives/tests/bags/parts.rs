@@ -26,15 +26,23 @@ fn a_part_has_its_first_time_and_not_its_last() {
     let mcap = small_chunks();
     let unindexed = small_chunks().emit_summary_records(false).emit_summary_offsets(false);
     let runs = small_chunks().use_chunks(false);
-    let mut paths: Vec<_> = [mcap, unindexed, runs].into_iter().map(|how| file(&drive(how, &messages))).collect();
+    let mut paths: Vec<_> =
+        [mcap, unindexed, runs].into_iter().map(|how| file(&drive(how, &messages))).collect();
     paths.push(database_in(&folder, &messages));
     for path in paths {
-        for (from, to) in
-            [(0, i64::MAX), (1000, 1010), (1500, 2500), (1505, 1515), (3990, i64::MAX), (3991, 9000), (0, 1000)]
-        {
+        for (from, to) in [
+            (0, i64::MAX),
+            (1000, 1010),
+            (1500, 2500),
+            (1505, 1515),
+            (3990, i64::MAX),
+            (3991, 9000),
+            (0, 1000),
+        ] {
             let (all, error) = part(&path, from, to);
             assert!(error.is_none(), "{}: {error:?}", path.display());
-            let wanted: Vec<_> = expected(&messages).into_iter().filter(|(at, _)| (from..to).contains(at)).collect();
+            let wanted: Vec<_> =
+                expected(&messages).into_iter().filter(|(at, _)| (from..to).contains(at)).collect();
             assert_eq!(all, wanted, "{}, from {from} to {to}", path.display());
         }
     }
@@ -68,6 +76,9 @@ fn a_part_of_a_database_that_was_cut_off_is_whole_if_it_lies_before() {
     let (_, error) = part(&path, 1100, i64::MAX);
     assert!(matches!(
         error,
-        Some(ReplayError::Damaged { what: Damage::Database(_) | Damage::DatabaseCutOff { .. }, .. })
+        Some(ReplayError::Damaged {
+            what: Damage::Database(_) | Damage::DatabaseCutOff { .. },
+            ..
+        })
     ));
 }

@@ -6,10 +6,12 @@ use gleaner_drives::{Options, Progress, Replay, files_of};
 use gleaner_transport::Transport;
 
 use crate::bag::{
-    Packed, Storage, add_message, add_topic, bag, cdr, database, database_in, database_of, empty_database, folder,
-    metadata, packed, write_metadata,
+    Packed, Storage, add_message, add_topic, bag, cdr, database, database_in, database_of,
+    empty_database, folder, metadata, packed, write_metadata,
 };
-use crate::support::{Written, drive, expected, file, listen, replayed, run, small_chunks, ticking};
+use crate::support::{
+    Written, drive, expected, file, listen, replayed, run, small_chunks, ticking,
+};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
 
@@ -29,7 +31,14 @@ fn every_storage_and_packing_gives_the_same_messages() {
 #[test]
 fn a_database_is_read_by_time_and_then_by_number() {
     let at = |topic, at, value| Written { topic, at, sequence: 0, value };
-    let messages = [at("/b", 7, 0), at("/a", 5, 1), at("/b", 5, 2), at("/a", 5, 3), at("/a", 6, 4), at("/b", 0, 5)];
+    let messages = [
+        at("/b", 7, 0),
+        at("/a", 5, 1),
+        at("/b", 5, 2),
+        at("/a", 5, 3),
+        at("/a", 6, 4),
+        at("/b", 0, 5),
+    ];
     let folder = folder();
     let path = database_in(&folder, &messages);
     let (all, error) = replayed(&[path], &TOPICS);
@@ -41,7 +50,12 @@ fn a_database_is_read_by_time_and_then_by_number() {
 fn a_database_of_many_pieces_keeps_its_order_where_times_are_equal() {
     // Some 8 MB; five thousand messages at a time, so that pieces end between equal times.
     let messages: Vec<_> = (0..20_000)
-        .map(|n| Written { topic: TOPICS[n % 2], at: n as u64 / 5000, sequence: 0, value: n as i64 })
+        .map(|n| Written {
+            topic: TOPICS[n % 2],
+            at: n as u64 / 5000,
+            sequence: 0,
+            value: n as i64,
+        })
         .collect();
     let folder = folder();
     let path = folder.path().join("drive.db3");
@@ -89,7 +103,10 @@ fn topics_are_described_as_the_directory_says() {
     let topics = replay.topics();
     assert_eq!(topics.iter().map(|topic| topic.topic.as_str()).collect::<Vec<_>>(), TOPICS);
     assert!(topics.iter().all(|topic| topic.messages == Some(15)), "{topics:?}");
-    assert!(topics.iter().all(|topic| topic.offered_qos.as_deref() == Some("- depth: 5")), "{topics:?}");
+    assert!(
+        topics.iter().all(|topic| topic.offered_qos.as_deref() == Some("- depth: 5")),
+        "{topics:?}"
+    );
     listen(&mut replay, &TOPICS);
     assert_eq!(replay.progress(), Progress { done: 0, total: Some(30) });
 }
@@ -152,7 +169,8 @@ fn a_directory_without_metadata_is_read_file_by_file() {
     // The same once more, as a recorder leaves it that was killed while it packed.
     fs::write(bag.path().join("bag_1.mcap.zstd"), packed(b"begun")).unwrap();
     let path = [bag.path().to_owned()];
-    let names: Vec<_> = files_of(&path).unwrap().iter().map(|path| path.file_name().unwrap().to_owned()).collect();
+    let names: Vec<_> =
+        files_of(&path).unwrap().iter().map(|path| path.file_name().unwrap().to_owned()).collect();
     assert_eq!(names, ["bag_0.mcap", "bag_1.mcap"]);
     let (all, error) = replayed(&path, &TOPICS);
     assert!(error.is_none(), "{error:?}");
@@ -179,7 +197,11 @@ fn files_that_were_packed_or_unpacked_since_are_found() {
         let bytes = if there.ends_with("zstd") { packed(&bytes) } else { bytes };
         fs::write(folder.path().join(there), bytes).unwrap();
         write_metadata(folder.path(), &metadata(8, "mcap", "FILE", &[named], &messages));
-        assert_eq!(replayed(&[folder.path().to_owned()], &TOPICS).0, expected(&messages), "{there}");
+        assert_eq!(
+            replayed(&[folder.path().to_owned()], &TOPICS).0,
+            expected(&messages),
+            "{there}"
+        );
     }
 }
 
@@ -195,7 +217,8 @@ fn what_is_unpacked_goes_where_it_is_told_and_does_not_stay() {
         assert!(run(&mut replay).1.is_none());
         assert_eq!(memory.values(), expected(&messages));
         // And not anywhere.
-        let nowhere = Options { unpack_in: Some(folder.path().join("missing")), ..Options::default() };
+        let nowhere =
+            Options { unpack_in: Some(folder.path().join("missing")), ..Options::default() };
         let refused = Replay::open_as(&[bag.path().to_owned()], &nowhere).err().unwrap();
         assert!(refused.help().unwrap().contains("zstd -d"), "{refused}");
     }

@@ -1,4 +1,5 @@
-//! What channels say of themselves: who wrote their messages, and the quality of service they offered.
+//! What channels say of themselves: who wrote their messages, and the quality of service they
+//! offered.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Cursor;
@@ -25,7 +26,8 @@ fn drive_of(channels: &[Channel<'_>], first: u64) -> PathBuf {
         .enumerate()
         .map(|(n, (topic, key, value))| {
             // The writer under the tests joins equal channels; ours are to differ.
-            let metadata = [("n".to_owned(), n.to_string()), (key.to_string(), value.to_string())].into();
+            let metadata =
+                [("n".to_owned(), n.to_string()), (key.to_string(), value.to_string())].into();
             writer.add_channel(schema, topic, "cdr", &metadata).unwrap()
         })
         .collect();
@@ -84,7 +86,10 @@ fn a_message_keeps_the_options_of_its_encapsulation() {
 fn a_channel_names_the_writer_of_its_messages() {
     let other = CLAIM.replace('0', "7");
     let key = "gleaner.writer";
-    let path = drive_of(&[("/a", key, CLAIM), ("/a", key, &other), ("/a", "writer", CLAIM), ("/b", key, CLAIM)], 0);
+    let path = drive_of(
+        &[("/a", key, CLAIM), ("/a", key, &other), ("/a", "writer", CLAIM), ("/b", key, CLAIM)],
+        0,
+    );
     let steps = steps(&[path], &["/a", "/b"]);
     assert_eq!(writers(&steps), [CLAIM, &other, &made_up(0, 3)]);
     assert_eq!(Guid::from_hex(CLAIM), Some(steps[0].meta.writer));
@@ -95,7 +100,9 @@ fn a_channel_names_the_writer_of_its_messages() {
 #[test]
 fn a_name_that_is_not_32_lower_case_hex_digits_is_ignored() {
     let upper = CLAIM.to_uppercase();
-    for name in ["", "0x112233", &CLAIM[1..], &format!("{CLAIM}0"), &format!(" {}", &CLAIM[1..]), &upper] {
+    for name in
+        ["", "0x112233", &CLAIM[1..], &format!("{CLAIM}0"), &format!(" {}", &CLAIM[1..]), &upper]
+    {
         let path = drive_of(&[("/a", "gleaner.writer", name)], 0);
         assert_eq!(writers(&steps(&[path], &["/a"])), [made_up(0, 1)], "{name}");
     }
@@ -114,7 +121,8 @@ fn no_writer_is_made_up_that_another_channel_claims() {
     // What clips of drives hold that named no writers.
     let (one, two) = (made_up(0, 1), made_up(0, 2));
     let key = "gleaner.writer";
-    let path = drive_of(&[("/a", "", ""), ("/a", key, &one), ("/a", key, &two), ("/a", key, &two)], 0);
+    let path =
+        drive_of(&[("/a", "", ""), ("/a", key, &one), ("/a", key, &two), ("/a", key, &two)], 0);
     let found = writers(&steps(&[path], &["/a"]));
     assert_eq!(found.iter().collect::<BTreeSet<_>>().len(), 4);
     assert_eq!(found[1..3], [one.clone(), two]);
@@ -140,8 +148,12 @@ fn a_topic_has_the_quality_of_service_of_its_first_channel_that_names_one() {
     let key = "offered_qos_profiles";
     let long = "x".repeat(65 << 10);
     let fits = "y".repeat(64 << 10);
-    let first = drive_of(&[("/a", "", ""), ("/a", key, ""), ("/a", key, &long), ("/b", key, "- depth: 1\n")], 0);
-    let second = drive_of(&[("/a", key, &fits), ("/a", key, "z"), ("/b", key, "z"), ("/c", "", "")], 0);
+    let first = drive_of(
+        &[("/a", "", ""), ("/a", key, ""), ("/a", key, &long), ("/b", key, "- depth: 1\n")],
+        0,
+    );
+    let second =
+        drive_of(&[("/a", key, &fits), ("/a", key, "z"), ("/b", key, "z"), ("/c", "", "")], 0);
     assert_eq!(qos(std::slice::from_ref(&first)), [None, Some("- depth: 1\n".to_owned())]);
     assert_eq!(qos(&[first, second]), [Some(fits), Some("- depth: 1\n".to_owned()), None]);
 }
@@ -153,7 +165,9 @@ fn text(text: &str) -> Vec<u8> {
 /// How a file ends that defines one channel whose record has `metadata` at its end.
 fn ending(metadata: &[u8]) -> (Damage, Vec<gleaner_transport::DiscoveredTopic>) {
     let schema = [&1u16.to_le_bytes()[..], &text(TYPE), &text("ros2msg"), &text(TEXT)].concat();
-    let channel = [&1u16.to_le_bytes()[..], &1u16.to_le_bytes(), &text("/a"), &text("cdr"), metadata].concat();
+    let channel =
+        [&1u16.to_le_bytes()[..], &1u16.to_le_bytes(), &text("/a"), &text("cdr"), metadata]
+            .concat();
     let bytes = [&MAGIC[..], &record(3, &schema), &record(4, &channel)].concat();
     let mut replay = Replay::open(&[file(&bytes)]).unwrap();
     let topics = replay.topics();
@@ -176,7 +190,10 @@ fn a_channel_whose_metadata_is_malformed_is_damage() {
         map(&[text("key"), vec![0xff; 4]].concat()),
     ] {
         let (what, topics) = ending(&bad);
-        assert!(matches!(what, Damage::Malformed("a channel record is malformed")), "{bad:?}: {what}");
+        assert!(
+            matches!(what, Damage::Malformed("a channel record is malformed")),
+            "{bad:?}: {what}"
+        );
         assert!(topics.is_empty());
     }
 }

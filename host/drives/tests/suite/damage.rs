@@ -4,7 +4,9 @@ use gleaner_drives::{Damage, Limits, Place, Replay, ReplayError};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
-use crate::support::{Written, drive, expected, file, listen, replayed, run, small_chunks, ticking};
+use crate::support::{
+    Written, drive, expected, file, listen, replayed, run, small_chunks, ticking,
+};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
 
@@ -89,8 +91,10 @@ fn a_flipped_byte_in_a_chunk_ends_the_drive_before_that_chunk() {
             let mut bytes = bytes.clone();
             bytes[(bad.chunk_start_offset + bad.chunk_length) as usize - 20] ^= 0x10;
             let (all, error) = replayed(&[file(&bytes)], &TOPICS);
-            let before: Vec<_> =
-                expected(&messages()).into_iter().filter(|(at, _)| *at < bad.message_start_time as i64).collect();
+            let before: Vec<_> = expected(&messages())
+                .into_iter()
+                .filter(|(at, _)| *at < bad.message_start_time as i64)
+                .collect();
             assert_eq!(all, before);
             let (offset, what) = damage(error);
             assert_eq!(offset, bad.chunk_start_offset);
@@ -174,7 +178,12 @@ fn messages_that_are_not_cdr_end_the_drive_where_they_stand() {
         for message in ticking(&["/a"], 5, 10) {
             crate::support::write(&mut writer, channel_id, &message);
         }
-        let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time: 1000, publish_time: 0 };
+        let header = mcap::records::MessageHeader {
+            channel_id,
+            sequence: 0,
+            log_time: 1000,
+            publish_time: 0,
+        };
         writer.write_to_known_channel(&header, bad).unwrap();
         writer.finish().unwrap();
         let (all, error) = replayed(&[file(&writer.into_inner().into_inner())], &["/a"]);

@@ -43,7 +43,8 @@ fn held() -> Extras {
 fn clip(options: WriteOptions) -> Vec<u8> {
     let mut writer = options.create(Cursor::new(Vec::new())).unwrap();
     let held = held();
-    let mut metadata = held.metadata.into_iter().map(|(name, metadata)| Metadata { name, metadata });
+    let mut metadata =
+        held.metadata.into_iter().map(|(name, metadata)| Metadata { name, metadata });
     let mut attachments = held.attachments.into_iter().map(|attachment| mcap::Attachment {
         log_time: 5,
         create_time: 6,
@@ -174,7 +175,10 @@ fn an_attachment_without_its_checksum_is_named() {
     let at = find(&bytes, &[0xff, 0xd8, 1, 2, 3]);
     bytes[at + 2] = 9;
     let what = damage(read(&bytes, LIMIT));
-    assert!(matches!(&what, Damage::AttachmentCrc { name, .. } if name == "thumbnail.jpg"), "{what}");
+    assert!(
+        matches!(&what, Damage::AttachmentCrc { name, .. } if name == "thumbnail.jpg"),
+        "{what}"
+    );
     // The checksum covers what stands before the data, too.
     let mut bytes = clip(small_chunks());
     let at = find(&bytes, b"image/jpeg");
@@ -189,7 +193,8 @@ fn a_record_that_is_missing_is_noticed_by_the_count_in_the_summary() {
     let heads = [(13, b"gleaner.begin", "metadata records"), (13, b"thumbnail.jpg", "attachments")];
     for (len, name, kind) in heads {
         let mut bytes = bytes.clone();
-        // The kind stands 9 bytes before the body, where a metadata record has its name and an attachment two stamps.
+        // The kind stands 9 bytes before the body, where a metadata record has its name and an
+        // attachment two stamps.
         let before = if kind == "attachments" { 9 + 16 + 4 } else { 9 + 4 };
         let at = find(&bytes, &name[..len]) - before;
         bytes[at] = 0x80;
@@ -213,9 +218,15 @@ fn more_than_the_limit_is_refused_before_memory_is_taken_for_it() {
     let needed = (0..LIMIT).find(|limit| read(&bytes, *limit).is_ok()).unwrap();
     assert_eq!(read(&bytes, needed).unwrap(), held());
     let what = damage(read(&bytes, needed - 1));
-    assert_eq!(what.to_string(), format!("its metadata and attachments take more than {} bytes", needed - 1));
+    assert_eq!(
+        what.to_string(),
+        format!("its metadata and attachments take more than {} bytes", needed - 1)
+    );
     // A cut-off file is not excused.
-    assert!(matches!(damage(read(&bytes[..bytes.len() - 1], 10)), Damage::ExtrasTooLarge { allowed: 10 }));
+    assert!(matches!(
+        damage(read(&bytes[..bytes.len() - 1], 10)),
+        Damage::ExtrasTooLarge { allowed: 10 }
+    ));
     // Many tiny pairs take more than their bytes.
     let pair = |n| [&[3, 0, 0, 0][..], format!("{n:03}").as_bytes(), &[0; 4]].concat();
     let tiny: Vec<u8> = (0..1000).flat_map(pair).collect();
@@ -228,8 +239,16 @@ fn more_than_the_limit_is_refused_before_memory_is_taken_for_it() {
 #[test]
 fn hostile_lengths_are_damage() {
     let attachment = |name: u32, len: u64| {
-        [&[0; 16][..], &name.to_le_bytes(), &[b'n'; 4], &0u32.to_le_bytes(), &len.to_le_bytes(), &[7; 4], &[0; 4]]
-            .concat()
+        [
+            &[0; 16][..],
+            &name.to_le_bytes(),
+            &[b'n'; 4],
+            &0u32.to_le_bytes(),
+            &len.to_le_bytes(),
+            &[7; 4],
+            &[0; 4],
+        ]
+        .concat()
     };
     let sound = finished(&[record(9, &attachment(4, 4))]);
     assert_eq!(read(&sound, LIMIT).unwrap().attachments[0].data, [7; 4]);
@@ -262,12 +281,18 @@ fn hostile_lengths_are_damage() {
         assert_eq!(cut, Extras::default(), "{bad:?}");
     }
     // Large, but in the file: more than statistics can have.
-    assert!(matches!(damage(read(&finished(&[record(11, &vec![0; 2 << 20])]), LIMIT)), Damage::Summary(_)));
+    assert!(matches!(
+        damage(read(&finished(&[record(11, &vec![0; 2 << 20])]), LIMIT)),
+        Damage::Summary(_)
+    ));
 }
 
 #[test]
 fn what_is_no_drive_is_refused() {
     assert!(matches!(read_extras("no/such/file".as_ref(), LIMIT), Err(ReplayError::Open { .. })));
-    assert!(matches!(read_extras(&std::env::temp_dir(), LIMIT), Err(ReplayError::Directory { .. })));
+    assert!(matches!(
+        read_extras(&std::env::temp_dir(), LIMIT),
+        Err(ReplayError::Directory { .. })
+    ));
     assert!(matches!(read(b"SQLite format 3\0", LIMIT), Err(ReplayError::NotMcap { .. })));
 }

@@ -1,11 +1,13 @@
-//! Files that contradict themselves without any byte being lost: each is damage, named with its place.
+//! Files that contradict themselves without any byte being lost: each is damage, named with its
+//! place.
 
 use gleaner_drives::{Damage, Place, Replay, ReplayError};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
 use crate::support::{
-    TEXT, TYPE, Written, drive, expected, file, listen, record, replayed, run, small_chunks, ticking,
+    TEXT, TYPE, Written, drive, expected, file, listen, record, replayed, run, small_chunks,
+    ticking,
 };
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
@@ -27,7 +29,11 @@ fn schema(id: u16, name: &str, encoding: &str, definitions: &str) -> Vec<u8> {
 }
 
 fn channel(id: u16, schema: u16, topic: &str, encoding: &str) -> Vec<u8> {
-    record(4, &[&id.to_le_bytes()[..], &schema.to_le_bytes(), &text(topic), &text(encoding), &[0; 4]].concat())
+    record(
+        4,
+        &[&id.to_le_bytes()[..], &schema.to_le_bytes(), &text(topic), &text(encoding), &[0; 4]]
+            .concat(),
+    )
 }
 
 fn message(channel: u16, at: u64) -> Vec<u8> {
@@ -45,16 +51,26 @@ fn finished(records: &[Vec<u8>]) -> Vec<u8> {
 fn chunk(records: &[Vec<u8>], first: u64, last: u64) -> Vec<u8> {
     let bytes = records.concat();
     let len = (bytes.len() as u64).to_le_bytes();
-    record(6, &[&first.to_le_bytes()[..], &last.to_le_bytes(), &len, &[0; 4], &text(""), &len, &bytes].concat())
+    record(
+        6,
+        &[&first.to_le_bytes()[..], &last.to_le_bytes(), &len, &[0; 4], &text(""), &len, &bytes]
+            .concat(),
+    )
 }
 
 #[test]
 fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
     let (number, a) = (schema(1, TYPE, "ros2msg", TEXT), channel(1, 1, "/a", "cdr"));
     for (again, said) in [
-        (vec![channel(1, 1, "/b", "cdr")], "channel 1 is defined again with another topic: first `/a`, then `/b`"),
         (
-            vec![schema(2, "std_msgs/msg/String", "ros2msg", "string data"), channel(1, 2, "/a", "cdr")],
+            vec![channel(1, 1, "/b", "cdr")],
+            "channel 1 is defined again with another topic: first `/a`, then `/b`",
+        ),
+        (
+            vec![
+                schema(2, "std_msgs/msg/String", "ros2msg", "string data"),
+                channel(1, 2, "/a", "cdr"),
+            ],
             "channel 1 is defined again with another type: first `test_msgs/msg/Number`, then `std_msgs/msg/String`",
         ),
         (
@@ -74,7 +90,10 @@ fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
             vec![schema(1, TYPE, "ros2idl", TEXT)],
             "schema 1 is defined again with another encoding: first `ros2msg`, then `ros2idl`",
         ),
-        (vec![schema(1, TYPE, "ros2msg", "int64 other")], "schema 1 is defined again with another text"),
+        (
+            vec![schema(1, TYPE, "ros2msg", "int64 other")],
+            "schema 1 is defined again with another text",
+        ),
     ] {
         let before = [number.clone(), a.clone(), message(1, 10), message(1, 20)];
         let behind = [again, vec![message(1, 30), message(1, 40)]].concat();
@@ -94,7 +113,10 @@ fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
 
 #[test]
 fn a_channel_that_a_chunk_defines_other_than_the_index_is_damage() {
-    let options = small_chunks().compression(None).calculate_chunk_crcs(false).calculate_data_section_crc(false);
+    let options = small_chunks()
+        .compression(None)
+        .calculate_chunk_crcs(false)
+        .calculate_data_section_crc(false);
     let mut bytes = drive(options, &ticking(&TOPICS, 300, 1000));
     // The first of the two stands in the first chunk, the second in the summary.
     let needle = channel(2, 1, "/b", "cdr");
@@ -102,15 +124,20 @@ fn a_channel_that_a_chunk_defines_other_than_the_index_is_damage() {
     bytes[at + 9] = 1;
     let (all, error) = replayed(&[file(&bytes)], &TOPICS);
     assert_eq!(all, []);
-    assert_eq!(damage(error).1.to_string(), "channel 1 is defined again with another topic: first `/a`, then `/b`");
+    assert_eq!(
+        damage(error).1.to_string(),
+        "channel 1 is defined again with another topic: first `/a`, then `/b`"
+    );
 }
 
 #[test]
 fn channels_and_schemas_that_are_repeated_are_none() {
     let definitions = [schema(1, TYPE, "ros2msg", TEXT), channel(1, 1, "/a", "cdr")];
     let one = |at| [definitions.to_vec(), vec![message(1, at)]].concat();
-    for bytes in [finished(&[one(10), one(20)].concat()), finished(&[chunk(&one(10), 10, 10), chunk(&one(20), 20, 20)])]
-    {
+    for bytes in [
+        finished(&[one(10), one(20)].concat()),
+        finished(&[chunk(&one(10), 10, 10), chunk(&one(20), 20, 20)]),
+    ] {
         let (all, error) = replayed(&[file(&bytes)], &["/a"]);
         assert!(error.is_none(), "{error:?}");
         assert_eq!(all, [(10, 10), (20, 20)]);
@@ -127,7 +154,10 @@ fn a_stamp_that_no_clock_can_show_is_damage_and_no_other_stamp() {
             assert!((whole..=200).contains(&all.len()), "{}", all.len());
             assert_eq!(all, expected(&messages[..200])[..all.len()]);
             let what = damage(error).1.to_string();
-            assert_eq!(what, format!("a message has log time {late} ns, which is after the year 2262"));
+            assert_eq!(
+                what,
+                format!("a message has log time {late} ns, which is after the year 2262")
+            );
         }
     }
     let messages = [Written { topic: "/a", at: i64::MAX as u64, sequence: 1, value: 7 }];
@@ -136,7 +166,8 @@ fn a_stamp_that_no_clock_can_show_is_damage_and_no_other_stamp() {
     assert_eq!(all, [(i64::MAX, 7)]);
 }
 
-/// A drive whose index says other times of some chunks than these have; and where the first of those lies.
+/// A drive whose index says other times of some chunks than these have; and where the first of
+/// those lies.
 fn lying(
     options: WriteOptions,
     messages: &[Written],
@@ -147,7 +178,9 @@ fn lying(
     chunks.sort_by_key(|chunk| chunk.chunk_start_offset);
     let mut first = None;
     for (n, chunk) in chunks.iter().enumerate() {
-        let words = |start: u64, end: u64| [start, end, chunk.chunk_start_offset].map(u64::to_le_bytes).concat();
+        let words = |start: u64, end: u64| {
+            [start, end, chunk.chunk_start_offset].map(u64::to_le_bytes).concat()
+        };
         let needle = words(chunk.message_start_time, chunk.message_end_time);
         let (start, end) = lies(n, chunk);
         let lie = words(start, end);
@@ -167,15 +200,24 @@ fn an_index_of_wrong_times_is_not_believed_and_costs_no_message() {
     let lies: [Lie; 4] = [
         |_, chunk| (chunk.message_start_time + 1_000_000, chunk.message_end_time + 1_000_000),
         |n, chunk| if n == 0 { (7, 7) } else { (chunk.message_start_time, chunk.message_end_time) },
-        |n, chunk| if n == 9 { (1000, 1000) } else { (chunk.message_start_time, chunk.message_end_time) },
-        |n, chunk| if n == 9 { (0, u64::MAX) } else { (chunk.message_start_time, chunk.message_end_time) },
+        |n, chunk| {
+            if n == 9 { (1000, 1000) } else { (chunk.message_start_time, chunk.message_end_time) }
+        },
+        |n, chunk| {
+            if n == 9 { (0, u64::MAX) } else { (chunk.message_start_time, chunk.message_end_time) }
+        },
     ];
     for lie in lies {
         let (bytes, _) = lying(small_chunks(), &messages, lie);
         let path = file(&bytes);
         let (all, error) = replayed(std::slice::from_ref(&path), &TOPICS);
         assert_eq!(all, expected(&messages));
-        assert!(damage(error).1.to_string().contains("it gives a chunk other times than the chunk itself"));
+        assert!(
+            damage(error)
+                .1
+                .to_string()
+                .contains("it gives a chunk other times than the chunk itself")
+        );
         let mut part = Replay::open(&[path]).unwrap();
         assert_eq!((part.start_ns(), part.end_ns()), (Some(1000), Some(3990)));
         part.restrict(1500, 2500);

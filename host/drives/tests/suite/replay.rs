@@ -11,8 +11,8 @@ use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions};
 
 use crate::support::{
-    Memory, TYPE, Written, drive, expected, file, listen, replayed, run, sample_drive, small_chunks, spec, ticking,
-    write,
+    Memory, TYPE, Written, drive, expected, file, listen, replayed, run, sample_drive,
+    small_chunks, spec, ticking, write,
 };
 
 const SAMPLE: [(&str, &str, u64); 3] = [
@@ -269,7 +269,10 @@ fn refusals_name_the_topic_and_the_alternatives() {
     let mut replay = Replay::open(&[path]).unwrap();
     let memory = Arc::new(Memory::default());
     let absent = replay.subscribe(&spec("/camra"), memory.clone()).unwrap_err();
-    assert_eq!(absent.to_string(), "no topic `/camra` (did you mean `/camera`?); there are: /camera, /imu");
+    assert_eq!(
+        absent.to_string(),
+        "no topic `/camra` (did you mean `/camera`?); there are: /camera, /imu"
+    );
     let other = TopicSpec { type_name: "sensor_msgs/msg/Imu".to_owned(), ..spec("/imu") };
     let wrong = replay.subscribe(&other, memory.clone()).unwrap_err();
     assert!(matches!(wrong, TransportError::WrongType { .. }));
@@ -301,9 +304,15 @@ fn what_is_no_drive_is_refused_at_once() {
     assert!(matches!(refuse(file(b"")), ReplayError::NotMcap { .. }));
     // With the feature `bags` and without it.
     let database = refuse(file(b"SQLite format 3\0"));
-    assert!(matches!(database, ReplayError::Database { .. } | ReplayError::NotBuiltIn { .. }), "{database}");
+    assert!(
+        matches!(database, ReplayError::Database { .. } | ReplayError::NotBuiltIn { .. }),
+        "{database}"
+    );
     let directory = refuse(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src"));
-    assert!(matches!(directory, ReplayError::NoBag { .. } | ReplayError::NotBuiltIn { .. }), "{directory}");
+    assert!(
+        matches!(directory, ReplayError::NoBag { .. } | ReplayError::NotBuiltIn { .. }),
+        "{directory}"
+    );
 }
 
 #[test]

@@ -122,9 +122,9 @@ pub fn drive(options: WriteOptions, messages: &[Written]) -> Vec<u8> {
     let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
     let mut channels = BTreeMap::new();
     for message in messages {
-        let channel = *channels
-            .entry(message.topic)
-            .or_insert_with(|| writer.add_channel(schema, message.topic, "cdr", &BTreeMap::new()).unwrap());
+        let channel = *channels.entry(message.topic).or_insert_with(|| {
+            writer.add_channel(schema, message.topic, "cdr", &BTreeMap::new()).unwrap()
+        });
         write(&mut writer, channel, message);
     }
     writer.finish().unwrap();

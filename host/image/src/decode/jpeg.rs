@@ -5,11 +5,11 @@
 //! one scan, a progressive one has at most [`MAX_SCANS`].
 //!
 //! Compared with libjpeg-turbo on files of every subsampling, `zune-jpeg` 0.5.15 silently makes
-//! wrong pictures of two rare kinds: components in scans of their own (sequential), and luma that is
-//! coarser than chroma. Both are refused here. On x86-64, its vector and scalar code made the same
-//! bytes of 85 photographs and of 60,000 damaged files, so its vector code stays on. NEON, emulated,
-//! made the bytes of x86-64 and of its own scalar code of 16,000 files, most of them damaged, of every
-//! subsampling.
+//! wrong pictures of two rare kinds: components in scans of their own (sequential), and luma that
+//! is coarser than chroma. Both are refused here. On x86-64, its vector and scalar code made the
+//! same bytes of 85 photographs and of 60,000 damaged files, so its vector code stays on. NEON,
+//! emulated, made the bytes of x86-64 and of its own scalar code of 16,000 files, most of them
+//! damaged, of every subsampling.
 
 use std::cell::Cell;
 
@@ -88,9 +88,9 @@ impl Frame {
         Header { format: Format::Jpeg, width: self.width, height: self.height }
     }
 
-    /// Bytes that `zune-jpeg` 0.5 allocates at most: two for each coefficient of a progressive image,
-    /// and rows of blocks in several states of upsampling, which are, read off its source, at
-    /// most 35 values of two bytes for each sample of a row of luma and component.
+    /// Bytes that `zune-jpeg` 0.5 allocates at most: two for each coefficient of a progressive
+    /// image, and rows of blocks in several states of upsampling, which are, read off its source,
+    /// at most 35 values of two bytes for each sample of a row of luma and component.
     fn working_memory(&self) -> u64 {
         let sampling = &self.sampling[..self.components];
         let (wide, high) = (u64::from(sampling[0].0), u64::from(sampling[0].1));
@@ -245,8 +245,8 @@ impl<'a> Segments<'a> {
         self.data.get(at).copied().ok_or_else(|| cut_off(self.data))
     }
 
-    /// Moves to the next marker, or the end of the data. In entropy-coded data, 0xff is followed by 0
-    /// if it is data, and by 0xd0 to 0xd7 if it is a restart.
+    /// Moves to the next marker, or the end of the data. In entropy-coded data, 0xff is followed by
+    /// 0 if it is data, and by 0xd0 to 0xd7 if it is a restart.
     fn skip_pixels(&mut self) {
         while let Some(rest) = self.data.get(self.at..) {
             let Some(marker) = rest.iter().position(|byte| *byte == 0xff) else {

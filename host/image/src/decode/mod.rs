@@ -1,8 +1,8 @@
 //! JPEG and PNG bytes become rgb8.
 //!
 //! Inside: what a file is and how large its image claims to be ([`probe`]), by its first bytes
-//! alone, and the decoding into memory of the caller ([`decode_rgb8`]). The pixels are worked out by
-//! `zune-jpeg` and `png`; what this room adds is the price, which is known before it is paid.
+//! alone, and the decoding into memory of the caller ([`decode_rgb8`]). The pixels are worked out
+//! by `zune-jpeg` and `png`; what this room adds is the price, which is known before it is paid.
 //!
 //! Never: an allocation before the size has been compared with the caller's limit; a file that is
 //! cut off passed as a whole image; pixels of an earlier image left in the output.
@@ -51,7 +51,10 @@ pub struct Header {
 impl Header {
     /// Bytes of the image as rgb8, or `None` where this machine cannot count them.
     pub fn rgb8_len(&self) -> Option<usize> {
-        usize::try_from(self.width).ok()?.checked_mul(usize::try_from(self.height).ok()?)?.checked_mul(3)
+        usize::try_from(self.width)
+            .ok()?
+            .checked_mul(usize::try_from(self.height).ok()?)?
+            .checked_mul(3)
     }
 }
 
@@ -90,16 +93,22 @@ pub fn probe(data: &[u8]) -> Result<Header, ImageError> {
 /// # Errors
 ///
 /// [`ImageError::Bomb`] if the image is larger than `max_bytes`, before any memory is touched;
-/// [`ImageError::WorkingMemory`] if the decoder would need too much; [`PixelError::Output`] if `out`
-/// has another length; [`ImageError::OtherImage`] if `header` is not that of `data`;
+/// [`ImageError::WorkingMemory`] if the decoder would need too much; [`PixelError::Output`] if
+/// `out` has another length; [`ImageError::OtherImage`] if `header` is not that of `data`;
 /// [`ImageError::CutOff`], [`ImageError::Damaged`], [`ImageError::Unsupported`],
-/// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken, or not of a kind that we read.
-pub fn decode_rgb8(data: &[u8], header: &Header, max_bytes: usize, out: &mut [u8]) -> Result<(), ImageError> {
+/// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken, or not of a kind that we
+/// read.
+pub fn decode_rgb8(
+    data: &[u8],
+    header: &Header,
+    max_bytes: usize,
+    out: &mut [u8],
+) -> Result<(), ImageError> {
     decode_rgb8_paced(data, header, max_bytes, out, &Pace::new(&|| true))
 }
 
-/// As [`decode_rgb8`], for a caller that may want it to end early. The last step of a progressive JPEG, from coefficients to pixels, is
-/// one piece.
+/// As [`decode_rgb8`], for a caller that may want it to end early. The last step of a progressive
+/// JPEG, from coefficients to pixels, is one piece.
 ///
 /// # Errors
 ///

@@ -5,10 +5,12 @@ use std::cell::Cell;
 use gleaner_rules::pixels::Pace;
 use zune_core::bytestream::{ZByteIoError, ZByteReaderTrait, ZCursor, ZSeekFrom};
 
-/// Work on a byte of a JPEG, in bytes of other work: it becomes a dozen bytes of pixels or more, each of which takes some time.
+/// Work on a byte of a JPEG, in bytes of other work: it becomes a dozen bytes of pixels or more,
+/// each of which takes some time.
 const WEIGHT: usize = 64;
 
-/// Reads `data`, and fails from the moment on at which `pace` wants the decoder to stop; `stopped` keeps that.
+/// Reads `data`, and fails from the moment on at which `pace` wants the decoder to stop; `stopped`
+/// keeps that.
 pub(super) struct Paced<'a> {
     data: ZCursor<&'a [u8]>,
     pace: &'a Pace<'a>,

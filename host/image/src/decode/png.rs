@@ -13,7 +13,8 @@ pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 
 /// The header of `data`, which starts with [`MAGIC`].
 pub(super) fn header(data: &[u8]) -> Result<Header, ImageError> {
-    let Some((chunk, _)) = data.get(MAGIC.len()..).and_then(|rest| rest.split_first_chunk::<16>()) else {
+    let Some((chunk, _)) = data.get(MAGIC.len()..).and_then(|rest| rest.split_first_chunk::<16>())
+    else {
         return Err(cut_off(data));
     };
     let [start @ .., w3, w2, w1, w0, h3, h2, h1, h0] = chunk;
@@ -88,7 +89,11 @@ fn to_rgb(color: ColorType, line: &[u8], rgb: &mut [u8]) {
 }
 
 /// Writes the colour of each pixel of `BYTES` bytes.
-fn spread<const BYTES: usize>(line: &[u8], rgb: &mut [u8], colour: impl Fn(&[u8; BYTES]) -> [u8; 3]) {
+fn spread<const BYTES: usize>(
+    line: &[u8],
+    rgb: &mut [u8],
+    colour: impl Fn(&[u8; BYTES]) -> [u8; 3],
+) {
     for (rgb, pixel) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(line.as_chunks::<BYTES>().0) {
         *rgb = colour(pixel);
     }
@@ -114,7 +119,12 @@ mod tests {
     use crate::decode::{decode_rgb8, probe};
 
     /// A PNG of `WIDTH` x `HEIGHT` pixels.
-    fn png(color: ColorType, depth: BitDepth, palette: Option<&'static [u8]>, data: &[u8]) -> Vec<u8> {
+    fn png(
+        color: ColorType,
+        depth: BitDepth,
+        palette: Option<&'static [u8]>,
+        data: &[u8],
+    ) -> Vec<u8> {
         let mut file = Vec::new();
         let mut encoder = Encoder::new(&mut file, WIDTH, HEIGHT);
         encoder.set_color(color);
@@ -195,7 +205,9 @@ mod tests {
 
     #[test]
     fn a_png_cut_off_anywhere_is_refused() {
-        for file in [&png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour)), &samples::INTERLACED[..]] {
+        for file in
+            [&png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour)), &samples::INTERLACED[..]]
+        {
             for len in 0..file.len() {
                 let error = decoded(&file[..len]).unwrap_err();
                 let expected = if len < 8 { "NotAnImage" } else { "CutOff" };

@@ -25,14 +25,20 @@ pub(super) fn assert_close(rgb: &[u8], tolerance: u8, expected: impl Fn(usize, u
 
 #[test]
 fn decoding_stops_when_its_caller_wants_that() {
-    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY, &samples::INTERLACED] {
+    for file in
+        [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY, &samples::INTERLACED]
+    {
         let header = probe(file).unwrap();
         let mut out = vec![0; header.rgb8_len().unwrap()];
         let mut decode = |may_go_on: &dyn Fn() -> bool| {
-            decode_rgb8_paced(file, &header, 1 << 20, &mut out, &Pace::new(may_go_on)).map(|()| out.clone())
+            decode_rgb8_paced(file, &header, 1 << 20, &mut out, &Pace::new(may_go_on))
+                .map(|()| out.clone())
         };
         let stopped = decode(&|| false);
-        assert!(matches!(stopped, Err(ImageError::Pixels(PixelError::Stopped))), "{header}: {stopped:?}");
+        assert!(
+            matches!(stopped, Err(ImageError::Pixels(PixelError::Stopped))),
+            "{header}: {stopped:?}"
+        );
         assert_eq!(decode(&|| true).unwrap(), decoded(file).unwrap(), "{header}");
     }
 }
@@ -149,12 +155,18 @@ fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
         let mut file = samples::BASELINE.to_vec();
         let at = first(&file, 0xc0);
         file[at + 1] = marker;
-        assert_eq!(probe(&file).unwrap_err().to_string(), format!("JPEG is {kind}, which is not supported"));
+        assert_eq!(
+            probe(&file).unwrap_err().to_string(),
+            format!("JPEG is {kind}, which is not supported")
+        );
     }
     let twelve = patched(&samples::BASELINE, 0xc0, &[0, 17, 12]);
     assert!(matches!(probe(&twelve), Err(ImageError::Unsupported { .. })));
     let no_height = patched(&samples::BASELINE, 0xc0, &[0, 17, 8, 0, 0]);
-    assert!(matches!(probe(&no_height), Err(ImageError::Pixels(PixelError::Size { width: 24, height: 0 }))));
+    assert!(matches!(
+        probe(&no_height),
+        Err(ImageError::Pixels(PixelError::Size { width: 24, height: 0 }))
+    ));
 }
 
 #[test]
@@ -189,7 +201,8 @@ fn kinds_of_jpeg_that_the_decoder_gets_wrong_are_refused() {
         decoded(&one_of_three).unwrap_err().to_string(),
         "JPEG is sequential with components in scans of their own, which is not supported"
     );
-    for factors in [[0x11, 0x21, 0x21], [0x21, 0x12, 0x12], [0x22, 0x11, 0x21], [0x33, 0x11, 0x11]] {
+    for factors in [[0x11, 0x21, 0x21], [0x21, 0x12, 0x12], [0x22, 0x11, 0x21], [0x33, 0x11, 0x11]]
+    {
         let mut file = samples::BASELINE.to_vec();
         let parts = first(&file, 0xc0) + 10;
         for (part, factors) in file[parts..].chunks_mut(3).zip(factors) {
@@ -202,9 +215,11 @@ fn kinds_of_jpeg_that_the_decoder_gets_wrong_are_refused() {
 
 #[test]
 fn other_bytes_are_refused_by_their_start() {
-    for (data, len, start) in
-        [(&b""[..], 0, "[]"), (b"\xff\xd8", 2, "[ff, d8]"), (b"jpeg; rgb8", 10, "[6a, 70, 65, 67, 3b, 20, 72, 67]")]
-    {
+    for (data, len, start) in [
+        (&b""[..], 0, "[]"),
+        (b"\xff\xd8", 2, "[ff, d8]"),
+        (b"jpeg; rgb8", 10, "[6a, 70, 65, 67, 3b, 20, 72, 67]"),
+    ] {
         assert_eq!(
             probe(data).unwrap_err().to_string(),
             format!("data is neither JPEG nor PNG: its {len} bytes start with {start}")

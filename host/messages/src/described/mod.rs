@@ -1,13 +1,16 @@
-//! What a node says of a message type: the service `type_description_interfaces/srv/GetTypeDescription`, read from CDR.
+//! What a node says of a message type: the service
+//! `type_description_interfaces/srv/GetTypeDescription`, read from CDR.
 //!
-//! An answer has the fields of the type and of all it refers to, and often the texts that they were made from. The type's
-//! hash, which came by another way, is that of the fields; so the fields are believed if they have this hash, and the
-//! texts if they say the same as the fields. Nothing more is believed: all goes through the parser of every definition.
+//! An answer has the fields of the type and of all it refers to, and often the texts that they were
+//! made from. The type's hash, which came by another way, is that of the fields; so the fields are
+//! believed if they have this hash, and the texts if they say the same as the fields. Nothing more
+//! is believed: all goes through the parser of every definition.
 //!
-//! What never happens here: an allocation larger than the answer asks bytes for; a name taken for one that is none.
+//! What never happens here: an allocation larger than the answer asks bytes for; a name taken for
+//! one that is none.
 //!
-//! Sources: REP 2016 and the `.msg` and `.srv` files of `type_description_interfaces`; the hash is SHA-256 of the fields
-//! as JSON, spelled as `rcl_calculate_type_hash` does.
+//! Sources: REP 2016 and the `.msg` and `.srv` files of `type_description_interfaces`; the hash is
+//! SHA-256 of the fields as JSON, spelled as `rcl_calculate_type_hash` does.
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
@@ -63,7 +66,9 @@ pub enum DescribedError {
 pub fn question(type_name: &str, hash: &str, header: Option<Header>) -> Vec<u8> {
     let mut cdr = CdrWriter::new();
     cdr.string(&full_name(&short_name(type_name))).string(hash).u8(1);
-    let header = header.map_or(Vec::new(), |Header(words)| words.iter().flat_map(|word| word.to_le_bytes()).collect());
+    let header = header.map_or(Vec::new(), |Header(words)| {
+        words.iter().flat_map(|word| word.to_le_bytes()).collect()
+    });
     // 16 bytes: what follows stays aligned.
     [header, cdr.bytes().to_vec()].concat()
 }
@@ -78,8 +83,14 @@ impl Header {
 }
 
 impl Described {
-    /// Definitions of `type_name` out of an answer, which has no header any more. `announced` is the hash that it has to have.
-    pub fn read(type_name: &str, announced: &str, cdr: &[u8], endian: Endian) -> Result<Self, DescribedError> {
+    /// Definitions of `type_name` out of an answer, which has no header any more. `announced` is
+    /// the hash that it has to have.
+    pub fn read(
+        type_name: &str,
+        announced: &str,
+        cdr: &[u8],
+        endian: Endian,
+    ) -> Result<Self, DescribedError> {
         let answer = Answer::read(&mut Cursor::new(cdr, endian))?;
         let root = short_name(type_name);
         let found = short_name(answer.types[0].name);
@@ -207,12 +218,13 @@ fn from_fields(root: &str, types: &[Type<'_>]) -> Result<Arc<str>, DescribedErro
 /// The texts that came along, if they are there and say what `fields` says.
 fn from_texts(root: &str, answer: &Answer<'_>, fields: &str) -> Result<Arc<str>, String> {
     let texts = answer.texts.iter().filter(|(_, encoding, _)| *encoding == MSG);
-    let texts: HashMap<String, String> = texts.map(|(name, _, text)| (name.clone(), (*text).to_owned())).collect();
+    let texts: HashMap<String, String> =
+        texts.map(|(name, _, text)| (name.clone(), (*text).to_owned())).collect();
     if !texts.contains_key(root) {
         return Err("it sent no `.msg` text".to_owned());
     }
-    let text =
-        gathered(root, &texts).map_err(|error| format!("the text that it sent cannot be used: {}", chain(&error)))?;
+    let text = gathered(root, &texts)
+        .map_err(|error| format!("the text that it sent cannot be used: {}", chain(&error)))?;
     let parse = |text: &str| Definitions::parse(root, text).map_err(|error| error.to_string());
     if !parse(&text)?.says_as(&parse(fields)?) {
         return Err("the text that it sent says something else than the description".to_owned());
@@ -225,7 +237,8 @@ fn gathered(root: &str, texts: &HashMap<String, String>) -> Result<Arc<str>, Des
     Ok(gather(root, &|name| Ok(texts.get(name).cloned()))?.ok_or_else(missing)?)
 }
 
-/// A field's type as a `.msg` file says it. The numbers are those of `type_description_interfaces/msg/FieldType`.
+/// A field's type as a `.msg` file says it. The numbers are those of
+/// `type_description_interfaces/msg/FieldType`.
 fn in_msg(field: &Field<'_>) -> Result<String, DescribedError> {
     let unknown = || DescribedError::Kind { field: cut(field.name), kind: field.kind };
     let base = match field.kind % 48 {
@@ -233,8 +246,10 @@ fn in_msg(field: &Field<'_>) -> Result<String, DescribedError> {
         21 => format!("string<={}", field.text_capacity),
         22 => format!("wstring<={}", field.text_capacity),
         kind => {
-            const NAMES: [&str; 10] =
-                ["int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"];
+            const NAMES: [&str; 10] = [
+                "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
+                "float32", "float64",
+            ];
             let name = match kind {
                 2..=11 => NAMES[usize::from(kind) - 2],
                 13 => "char",
@@ -261,7 +276,8 @@ fn a_type(name: &str) -> Result<&str, DescribedError> {
 }
 
 fn a_word(name: &str) -> Result<&str, DescribedError> {
-    let is_word = !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
+    let is_word =
+        !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
     is_word.then_some(name).ok_or_else(|| DescribedError::Name(cut(name)))
 }
 

@@ -13,7 +13,11 @@ const OF_HEADER: Types<'_> = &[
     ("builtin_interfaces/msg/Time", &[("sec", 6, ""), ("nanosec", 7, "")]),
 ];
 const TEXTS: &[(&str, &str, &str)] = &[
-    ("std_msgs/msg/Header", "msg", "# When and where.\nbuiltin_interfaces/Time stamp\nstring frame_id\n"),
+    (
+        "std_msgs/msg/Header",
+        "msg",
+        "# When and where.\nbuiltin_interfaces/Time stamp\nstring frame_id\n",
+    ),
     ("builtin_interfaces/msg/Time", "msg", "int32 sec\nuint32 nanosec\n"),
 ];
 
@@ -56,12 +60,18 @@ fn texts_are_taken_where_they_say_what_the_fields_say() {
     let described = read("std_msgs/Header", HEADER, &answer(OF_HEADER, TEXTS)).unwrap();
     assert_eq!(described.without_texts, None);
     assert!(described.text.starts_with("# When and where.\n"), "{}", described.text);
-    assert!(described.text.contains("MSG: builtin_interfaces/Time\nint32 sec\n"), "{}", described.text);
+    assert!(
+        described.text.contains("MSG: builtin_interfaces/Time\nint32 sec\n"),
+        "{}",
+        described.text
+    );
 }
 
 #[test]
 fn texts_that_are_missing_strange_or_lies_are_replaced_by_the_fields() {
-    let root = |encoding: &'static str, text: &'static str| [("std_msgs/msg/Header", encoding, text), TEXTS[1]];
+    let root = |encoding: &'static str, text: &'static str| {
+        [("std_msgs/msg/Header", encoding, text), TEXTS[1]]
+    };
     let plain = "builtin_interfaces/Time stamp\nstring frame_id\n";
     for (texts, why) in [
         (&[][..], "no `.msg` text"),
@@ -73,14 +83,20 @@ fn texts_that_are_missing_strange_or_lies_are_replaced_by_the_fields() {
     ] {
         let described = read("std_msgs/Header", HEADER, &answer(OF_HEADER, texts)).unwrap();
         assert!(described.text.starts_with(plain), "{}", described.text);
-        assert!(described.without_texts.as_ref().unwrap().contains(why), "{:?} is not {why}", described.without_texts);
+        assert!(
+            described.without_texts.as_ref().unwrap().contains(why),
+            "{:?} is not {why}",
+            described.without_texts
+        );
     }
 }
 
 #[test]
 fn what_is_of_another_hash_or_another_type_is_refused() {
     let another = HEADER.replace('f', "0");
-    assert!(read("std_msgs/Header", &another, &answer(OF_HEADER, TEXTS)).unwrap_err().contains("hash"));
+    assert!(
+        read("std_msgs/Header", &another, &answer(OF_HEADER, TEXTS)).unwrap_err().contains("hash")
+    );
     let error = read("std_msgs/msg/String", HEADER, &answer(OF_HEADER, TEXTS)).unwrap_err();
     assert!(error.contains("describes `std_msgs/Header` instead"), "{error}");
 }
@@ -97,14 +113,18 @@ fn a_node_that_cannot_is_quoted() {
 fn names_that_are_none_and_kinds_that_no_file_can_say_are_refused() {
     for name in ["", "a b", "a\nuint8 b", "a\"", "é"] {
         let types: Types<'_> = &[("p/msg/T", &[(name, 3, "")])];
-        assert!(read("p/T", "", &answer(types, &[])).unwrap_err().contains("a name in it is none"), "{name}");
+        assert!(
+            read("p/T", "", &answer(types, &[])).unwrap_err().contains("a name in it is none"),
+            "{name}"
+        );
     }
     for nested in ["", "T", "../T", "p/msg/a/b", "p/T\n"] {
         let types: Types<'_> = &[("p/msg/T", &[("a", 1, nested)])];
         let error = match read("p/T", "", &answer(types, &[])).unwrap_err() {
             // Its hash is of no interest here.
             error if error.contains("of hash RIHS01_") => {
-                let hash = error.split_whitespace().find(|word| word.starts_with("RIHS01_")).unwrap();
+                let hash =
+                    error.split_whitespace().find(|word| word.starts_with("RIHS01_")).unwrap();
                 read("p/T", hash.trim_end_matches(','), &answer(types, &[])).unwrap_err()
             }
             error => error,
@@ -129,7 +149,10 @@ fn every_kind_that_a_file_can_say_is_said() {
         (96 + 22, "", "wstring<=5[<=9]"),
         (144 + 16, "", "byte[]"),
     ] {
-        assert_eq!(in_msg(&Field { name: "a", kind, capacity: 9, text_capacity: 5, nested }).unwrap(), said);
+        assert_eq!(
+            in_msg(&Field { name: "a", kind, capacity: 9, text_capacity: 5, nested }).unwrap(),
+            said
+        );
     }
 }
 

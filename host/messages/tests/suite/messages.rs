@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use gleaner_drives::Replay;
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Value, header_stamp,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Value,
+    header_stamp,
 };
 use gleaner_transport::Transport;
 
@@ -203,7 +204,9 @@ fn wrong_paths_say_what_would_be_right() {
     assert!(matches!(refuse("items[99999999999].id"), PathError::OutOfRange { .. }));
     assert!(matches!(refuse("flag.x"), PathError::NothingInside { .. }));
     assert!(matches!(refuse("flag[0]"), PathError::NothingInside { .. }));
-    for malformed in ["", ".", "a.", "a..b", "a[", "a[x]", "a[-1]", "a[+1]", "a[]", "a]", "[0]", "a[0]b"] {
+    for malformed in
+        ["", ".", "a.", "a..b", "a[", "a[x]", "a[-1]", "a[+1]", "a[]", "a]", "[0]", "a[0]b"]
+    {
         assert!(matches!(refuse(malformed), PathError::Syntax { .. }), "`{malformed}`");
     }
 }
@@ -241,7 +244,10 @@ fn the_image_view_agrees_with_the_field_paths() {
             let bytes = cdr.u8(0).u32(9).blob(&[1; 18]).bytes;
             let view = ImageView::read(&bytes, endian).unwrap();
             assert_eq!((view.width, view.height, view.step), (3, 2, 9));
-            assert_eq!((view.encoding, view.is_bigendian, view.data), ("bgr8", false, &[1; 18][..]));
+            assert_eq!(
+                (view.encoding, view.is_bigendian, view.data),
+                ("bgr8", false, &[1; 18][..])
+            );
             for (name, value) in [("width", 3.0), ("step", 9.0), ("header.stamp.nanosec", 7.0)] {
                 let path = FieldPath::compile(&definitions, name).unwrap();
                 assert_eq!(path.number(&bytes, endian), Ok(value));

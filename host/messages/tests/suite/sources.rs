@@ -1,4 +1,5 @@
-//! Definitions of topics that bring none: from folders, from what is bundled, from where ROS 2 is installed.
+//! Definitions of topics that bring none: from folders, from what is bundled, from where ROS 2 is
+//! installed.
 
 use std::path::{Path, PathBuf};
 use std::slice;
@@ -16,7 +17,8 @@ struct Folder(PathBuf);
 impl Folder {
     fn new() -> Self {
         static NEXT: AtomicUsize = AtomicUsize::new(0);
-        let name = format!("definitions-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+        let name =
+            format!("definitions-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
         std::fs::create_dir_all(&path).unwrap();
         Self(path)
@@ -96,7 +98,12 @@ fn the_text_is_what_recordings_carry() {
     assert!(topics.len() >= 3);
     for topic in topics {
         let ours = bundled().find(&topic.type_name).unwrap().unwrap();
-        assert_eq!(ours.trim_end(), topic.definitions_text.unwrap().trim_end(), "{}", topic.type_name);
+        assert_eq!(
+            ours.trim_end(),
+            topic.definitions_text.unwrap().trim_end(),
+            "{}",
+            topic.type_name
+        );
     }
 }
 
@@ -115,7 +122,8 @@ fn a_type_is_found_in_each_of_the_three_places_in_a_folder() {
 fn a_folder_wins_over_what_is_bundled_and_that_over_what_is_installed() {
     let (folder, installed) = (Folder::new(), Folder::new());
     folder.write("std_msgs/msg/Bool.msg", "bool ours");
-    for (name, text) in [("std_msgs/msg/Bool", "bool theirs"), ("std_msgs/msg/Int8", "int8 theirs")] {
+    for (name, text) in [("std_msgs/msg/Bool", "bool theirs"), ("std_msgs/msg/Int8", "int8 theirs")]
+    {
         installed.write(&format!("share/{name}.msg"), text);
     }
     installed.write("share/maker/msg/Odd.msg", "Part part\n");
@@ -124,7 +132,10 @@ fn a_folder_wins_over_what_is_bundled_and_that_over_what_is_installed() {
     let text = |name| sources.find(name).unwrap().unwrap();
     assert_eq!(&*text("std_msgs/msg/Bool"), "bool ours\n");
     assert_eq!(&*text("std_msgs/msg/Int8"), "int8 data\n");
-    assert_eq!(*text("maker/msg/Odd"), format!("Part part\n{}\nMSG: maker/Part\nint8 x\n", "=".repeat(80)));
+    assert_eq!(
+        *text("maker/msg/Odd"),
+        format!("Part part\n{}\nMSG: maker/Part\nint8 x\n", "=".repeat(80))
+    );
 }
 
 #[test]
@@ -136,11 +147,20 @@ fn a_type_that_is_nowhere_is_no_error() {
 
 #[test]
 fn a_name_that_could_be_a_path_is_refused() {
-    let (_folder, sources) = in_folder(&[("up/msg/Secret.msg", "int8 x"), ("Secret.msg", "int8 x")]);
+    let (_folder, sources) =
+        in_folder(&[("up/msg/Secret.msg", "int8 x"), ("Secret.msg", "int8 x")]);
     let long = format!("up/{}", "x".repeat(200));
-    for name in
-        ["", "/", "../up/Secret", "up/../Secret", "up/msg/../Secret", "/etc/passwd", "up/srv/Secret", "up", &long]
-    {
+    for name in [
+        "",
+        "/",
+        "../up/Secret",
+        "up/../Secret",
+        "up/msg/../Secret",
+        "/etc/passwd",
+        "up/srv/Secret",
+        "up",
+        &long,
+    ] {
         assert!(matches!(sources.find(name), Err(SourcesError::Name { .. })), "{name}");
     }
     let said = sources.find("up/\u{1b}[2J").unwrap_err().to_string();
@@ -193,7 +213,8 @@ fn circles_depth_and_numbers_without_end_are_refused() {
 
 #[test]
 fn a_file_that_is_no_definition_is_named() {
-    let (folder, sources) = in_folder(&[("p/msg/Bad.msg", "int8\n"), ("p/msg/Two.msg", "int8 x\n===\nMSG: p/B\n")]);
+    let (folder, sources) =
+        in_folder(&[("p/msg/Bad.msg", "int8\n"), ("p/msg/Two.msg", "int8 x\n===\nMSG: p/B\n")]);
     folder.write("p/msg/Big.msg", vec![b'\n'; (1 << 20) + 1]);
     folder.write("p/msg/Latin.msg", b"int8 x # \xe4\n");
     std::fs::create_dir_all(folder.0.join("p/msg/Folder.msg")).unwrap();

@@ -26,16 +26,19 @@ pub(super) fn sync_file(path: &Path) -> Result<(), RecordError> {
 
 /// Gives the file `from`, whose content is durable, the name `to`.
 pub(super) fn rename(from: &Path, to: &Path, folder: &Path) -> Result<(), RecordError> {
-    step("rename", to).and_then(|()| fs::rename(from, to)).map_err(|source| RecordError::Rename {
-        from: from.to_owned(),
-        to: to.to_owned(),
-        source,
+    step("rename", to).and_then(|()| fs::rename(from, to)).map_err(|source| {
+        RecordError::Rename { from: from.to_owned(), to: to.to_owned(), source }
     })?;
     sync_folder(folder)
 }
 
 /// Writes `to` by way of `part`, so that it is whole or not there.
-pub(super) fn write(part: &Path, to: &Path, folder: &Path, content: &[u8]) -> Result<(), RecordError> {
+pub(super) fn write(
+    part: &Path,
+    to: &Path,
+    folder: &Path,
+    content: &[u8],
+) -> Result<(), RecordError> {
     write_with(part, to, folder, |file| file.write_all(content))
 }
 
@@ -46,17 +49,20 @@ pub(super) fn write_with(
     folder: &Path,
     fill: impl FnOnce(&mut File) -> io::Result<()>,
 ) -> Result<(), RecordError> {
-    let mut file = own_file::anew(part).map_err(|source| RecordError::Create { path: part.to_owned(), source })?;
+    let mut file = own_file::anew(part)
+        .map_err(|source| RecordError::Create { path: part.to_owned(), source })?;
     fill(&mut file).map_err(|source| RecordError::Write { path: part.to_owned(), source })?;
     file.sync_all().map_err(|source| RecordError::Sync { path: part.to_owned(), source })?;
     rename(part, to, folder)
 }
 
-/// Copies the content of `from` into the file `to`, which must not exist yet, and makes it durable there. What was read
-/// is what is on the disk then, even if an earlier attempt to make it durable where it was had failed.
+/// Copies the content of `from` into the file `to`, which must not exist yet, and makes it durable
+/// there. What was read is what is on the disk then, even if an earlier attempt to make it durable
+/// where it was had failed.
 pub(super) fn copy(from: &Path, to: &Path, pause: &mut Pause) -> Result<(), RecordError> {
     let cannot_write = |source| RecordError::Write { path: to.to_owned(), source };
-    let source = own_file::read(from).map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
+    let source = own_file::read(from)
+        .map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
     let copy = step("copy", to).and_then(|()| File::create_new(to));
     let mut copy = copy.map_err(|source| RecordError::Create { path: to.to_owned(), source })?;
     while io::copy(&mut (&source).take(PIECE), &mut copy).map_err(cannot_write)? > 0 {

@@ -1,5 +1,5 @@
-//! Statements of a clip about itself: its line in the list, and the metadata records in the file. `stated` compares them with
-//! its content, by making the records once more.
+//! Statements of a clip about itself: its line in the list, and the metadata records in the file.
+//! `stated` compares them with its content, by making the records once more.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fmt::Display;
@@ -40,7 +40,12 @@ const UNKNOWN: &str = "unknown";
 pub(super) type Record = (String, BTreeMap<String, String>);
 
 /// The line of a clip, but for its length.
-pub(super) fn clip(ending: &Ending, written: &Written, file: PathBuf, thumbnail: Option<PathBuf>) -> Clip {
+pub(super) fn clip(
+    ending: &Ending,
+    written: &Written,
+    file: PathBuf,
+    thumbnail: Option<PathBuf>,
+) -> Clip {
     Clip {
         file,
         thumbnail,
@@ -58,14 +63,18 @@ pub(super) fn clip(ending: &Ending, written: &Written, file: PathBuf, thumbnail:
     }
 }
 
-/// The topics that the recorder names, then those that it forgot: their messages are in the file all the same.
+/// The topics that the recorder names, then those that it forgot: their messages are in the file
+/// all the same.
 fn topics(ending: &Ending, written: &Written) -> Vec<ClipTopic> {
     let mut topics = Vec::new();
     for counts in &ending.topics {
         let found = written.topic(&counts.topic);
         topics.push(ClipTopic {
             topic: counts.topic.clone(),
-            type_name: counts.type_name.clone().or_else(|| found.map(|found| found.type_name.clone())),
+            type_name: counts
+                .type_name
+                .clone()
+                .or_else(|| found.map(|found| found.type_name.clone())),
             messages: found.map_or(0, |found| found.messages),
             received: counts.received,
             lost: counts.lost,
@@ -170,7 +179,10 @@ pub(super) fn about_clip(
 /// The record of a topic; `found` is its content.
 pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> Record {
     let metadata = pairs([
-        ("checksum", found.map_or_else(|| WrittenTopic::default().checksum(), WrittenTopic::checksum)),
+        (
+            "checksum",
+            found.map_or_else(|| WrittenTopic::default().checksum(), WrittenTopic::checksum),
+        ),
         ("definitions", known(found.and_then(|found| found.definitions.clone()))),
         ("lost", known(topic.lost)),
         ("messages", topic.messages.to_string()),
@@ -192,7 +204,12 @@ pub(super) fn lambda(lambda: &ClipLambda, header: Option<&Header>) -> Record {
         ("engine", known(header.map(|header| &header.engine))),
         ("gleaner", known(header.map(|header| &header.gleaner))),
         ("kind", lambda.kind.as_str().to_owned()),
-        ("models", known(header.map(|header| header.models.iter().map(model).collect::<Vec<_>>().join(", ")))),
+        (
+            "models",
+            known(
+                header.map(|header| header.models.iter().map(model).collect::<Vec<_>>().join(", ")),
+            ),
+        ),
         ("name", lambda.name.clone()),
         ("version", lambda.version.clone()),
         ("windows", lambda.windows.to_string()),
@@ -215,20 +232,25 @@ pub(super) fn decision(moment: &Moment) -> Record {
     if let Some(source) = &moment.source {
         metadata.insert("source".to_owned(), source.clone());
     }
-    metadata.insert("attributes".to_owned(), moment.attributes.as_ref().map_or(UNKNOWN.to_owned(), json));
+    metadata.insert(
+        "attributes".to_owned(),
+        moment.attributes.as_ref().map_or(UNKNOWN.to_owned(), json),
+    );
     (DECISION_RECORD.to_owned(), metadata)
 }
 
 /// Reads a record of [`decision`]; the key that is malformed if it is.
 pub(super) fn read_decision(metadata: &BTreeMap<String, String>) -> Result<Moment, &'static str> {
-    let score = metadata.get("score").map(|score| score.parse::<f64>()).transpose().map_err(|_| "score")?;
+    let score =
+        metadata.get("score").map(|score| score.parse::<f64>()).transpose().map_err(|_| "score")?;
     let attributes = match value(metadata, "attributes")?.as_str() {
         UNKNOWN => None,
         text => Some(serde_json::from_str(text).map_err(|_| "attributes")?),
     };
     Ok(Moment {
         lambda: value(metadata, "lambda")?.clone(),
-        kind: serde_json::from_value(value(metadata, "kind")?.as_str().into()).map_err(|_| "kind")?,
+        kind: serde_json::from_value(value(metadata, "kind")?.as_str().into())
+            .map_err(|_| "kind")?,
         label: value(metadata, "label")?.clone(),
         score,
         attributes,
@@ -237,7 +259,10 @@ pub(super) fn read_decision(metadata: &BTreeMap<String, String>) -> Result<Momen
     })
 }
 
-fn value<'a>(metadata: &'a BTreeMap<String, String>, key: &'static str) -> Result<&'a String, &'static str> {
+fn value<'a>(
+    metadata: &'a BTreeMap<String, String>,
+    key: &'static str,
+) -> Result<&'a String, &'static str> {
     metadata.get(key).ok_or(key)
 }
 

@@ -13,8 +13,9 @@ use super::durable;
 use super::place::{CLIP, CLIPS, JPG};
 use crate::error::RecordError;
 
-/// Longer lines are not ours. One of ours has some KB; at most 13 MB: 1,024 topics, whose names and types of 256 KiB may stand
-/// in it and in six texts of `short`, six bytes for each if they are control characters, and 100 moments of some 3 KB.
+/// Longer lines are not ours. One of ours has some KB; at most 13 MB: 1,024 topics, whose names and
+/// types of 256 KiB may stand in it and in six texts of `short`, six bytes for each if they are
+/// control characters, and 100 moments of some 3 KB.
 const LINE_MAX: u64 = 16 << 20;
 
 /// The list of clips.
@@ -66,7 +67,8 @@ impl List {
         let before = file.metadata().map_err(failed)?.len();
         durable::step("append", &self.path).map_err(failed)?;
         if let Err(error) = file.write_all(&line(clip)).and_then(|()| file.sync_all()) {
-            // A torn line would swallow the next one. If this fails as well, the next start cuts it off.
+            // A torn line would swallow the next one. If this fails as well, the next start cuts it
+            // off.
             let _ = file.set_len(before);
             return Err(failed(error));
         }
@@ -75,18 +77,23 @@ impl List {
 
     /// Starts anew with these clips, behind the lines that are not ours.
     pub(super) fn replace(&self, clips: &[Clip]) -> Result<(), RecordError> {
-        durable::write_with(&self.folder.join("clips.jsonl.part"), &self.path, &self.folder, |file| {
-            let mut new = BufWriter::new(file);
-            match own_file::read(&self.path) {
-                Ok(old) => {
-                    read_lines(&old, |foreign| new.write_all(foreign))?;
+        durable::write_with(
+            &self.folder.join("clips.jsonl.part"),
+            &self.path,
+            &self.folder,
+            |file| {
+                let mut new = BufWriter::new(file);
+                match own_file::read(&self.path) {
+                    Ok(old) => {
+                        read_lines(&old, |foreign| new.write_all(foreign))?;
+                    }
+                    Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                    Err(error) => return Err(error),
                 }
-                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-                Err(error) => return Err(error),
-            }
-            clips.iter().try_for_each(|clip| new.write_all(&line(clip)))?;
-            new.flush()
-        })
+                clips.iter().try_for_each(|clip| new.write_all(&line(clip)))?;
+                new.flush()
+            },
+        )
     }
 }
 
@@ -96,8 +103,9 @@ fn line(clip: &Clip) -> Vec<u8> {
     line
 }
 
-/// The clips in `file`, how many of its bytes are whole lines, and how many there are. The lines that are not ours are given
-/// to `foreign`, each in one piece or, if it is longer than any of ours, in several.
+/// The clips in `file`, how many of its bytes are whole lines, and how many there are. The lines
+/// that are not ours are given to `foreign`, each in one piece or, if it is longer than any of
+/// ours, in several.
 pub(super) fn read_lines(
     file: &File,
     mut foreign: impl FnMut(&[u8]) -> io::Result<()>,
@@ -141,16 +149,22 @@ fn names(line: Line) -> Option<Listed> {
     Some(Listed { file: plain_name(&line.file, CLIP)?, thumbnail })
 }
 
-/// The file name of `path` if it is `clips/NAME` with that ending and nothing else: what a list says is deleted, and
-/// nobody but us may say so of other files.
+/// The file name of `path` if it is `clips/NAME` with that ending and nothing else: what a list
+/// says is deleted, and nobody but us may say so of other files.
 pub(super) fn plain_name(path: &Path, ending: &str) -> Option<String> {
     let mut components = path.components();
     let (folder, name) = (components.next()?, components.next()?);
-    let (Component::Normal(folder), Component::Normal(name), None) = (folder, name, components.next()) else {
+    let (Component::Normal(folder), Component::Normal(name), None) =
+        (folder, name, components.next())
+    else {
         return None;
     };
-    let fits =
-        |name: &&str| name.ends_with(ending) && name.len() > ending.len() && name.len() <= 255 && !name.contains('\0');
+    let fits = |name: &&str| {
+        name.ends_with(ending)
+            && name.len() > ending.len()
+            && name.len() <= 255
+            && !name.contains('\0')
+    };
     let name = name.to_str().filter(fits)?;
     (folder == CLIPS && path.to_str()? == format!("{CLIPS}/{name}")).then(|| name.to_owned())
 }

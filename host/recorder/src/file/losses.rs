@@ -1,5 +1,5 @@
-//! `losses.jsonl`: a line for each thing that was wanted and is not there. Whoever notes one does it here, so that lines stay
-//! whole.
+//! `losses.jsonl`: a line for each thing that was wanted and is not there. Whoever notes one does
+//! it here, so that lines stay whole.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};

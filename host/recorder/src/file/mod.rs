@@ -12,12 +12,14 @@
 //! OUT/clips/NAME.jpg.part         a thumbnail that is being written
 //! ```
 //!
-//! A clip is written chunk by chunk, so that a death costs a second of it; then its metadata, attachments and footer;
-//! then it is synced and gets its name; then it is listed. `Recovery` finishes what a death interrupted, wherever that was,
-//! and a death in the middle of that changes nothing; what it cannot finish stays for the next start.
+//! A clip is written chunk by chunk, so that a death costs a second of it; then its metadata,
+//! attachments and footer; then it is synced and gets its name; then it is listed. `Recovery`
+//! finishes what a death interrupted, wherever that was, and a death in the middle of that changes
+//! nothing; what it cannot finish stays for the next start.
 //!
-//! Never: a file touched that this program did not write; a clip that was acknowledged deleted other than by
-//! [`Earlier::replace`], or that nobody fetched other than by [`Folder::keep_at_most`].
+//! Never: a file touched that this program did not write; a clip that was acknowledged deleted
+//! other than by [`Earlier::replace`], or that nobody fetched other than by
+//! [`Folder::keep_at_most`].
 
 mod durable;
 mod ending;
@@ -53,12 +55,15 @@ pub(crate) use unfinished::Unfinished;
 
 use crate::error::RecordError;
 
-/// Most bytes of a topic's name, and of its type's; ROS 2 allows 255. Both stand in a line of the list.
+/// Most bytes of a topic's name, and of its type's; ROS 2 allows 255. Both stand in a line of the
+/// list.
 const NAME_MAX: usize = 1 << 10;
-/// Most bytes of a topic's definitions and quality of service together: whoever reads a clip has to hold them.
+/// Most bytes of a topic's definitions and quality of service together: whoever reads a clip has to
+/// hold them.
 const DEFINITIONS_MAX: usize = 8 << 20;
 
-/// What is known when a clip begins. It stands in front of the messages, so that a recovered clip still says what it is.
+/// What is known when a clip begins. It stands in front of the messages, so that a recovered clip
+/// still says what it is.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct About {
     /// What the stamps are, for example "log time of the drive".
@@ -85,8 +90,8 @@ pub struct Topic {
 }
 
 impl Topic {
-    /// Whether a clip has room for what a topic says of itself. The fields of the file are larger; but what a file says of
-    /// its topics is held by all who read it.
+    /// Whether a clip has room for what a topic says of itself. The fields of the file are larger;
+    /// but what a file says of its topics is held by all who read it.
     pub(crate) fn check(&self) -> Result<(), RecordError> {
         let definitions = self.definitions.as_deref().map_or(0, str::len);
         let about = definitions + self.offered_qos.as_deref().map_or(0, str::len);
@@ -114,8 +119,8 @@ pub(crate) struct Ending {
     pub to_ns: i64,
     /// The lambdas whose windows it holds.
     pub lambdas: Vec<ClipLambda>,
-    /// What the journals of these lambdas say of them, in the same order; empty where nobody knows. Two of them may have one
-    /// name: a lambda that was started again.
+    /// What the journals of these lambdas say of them, in the same order; empty where nobody knows.
+    /// Two of them may have one name: a lambda that was started again.
     pub headers: Vec<Arc<Header>>,
     /// Triggers within it.
     pub triggers: u64,

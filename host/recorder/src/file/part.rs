@@ -10,7 +10,8 @@ use gleaner_base::own_file;
 pub(super) enum Origin {
     /// A recorder, its header is whole.
     Ours,
-    /// Nothing was written yet, or none of it reached the disk: empty, zeros, or cut off within our header.
+    /// Nothing was written yet, or none of it reached the disk: empty, zeros, or cut off within our
+    /// header.
     Nothing,
     /// Somebody else.
     Foreign,
@@ -22,7 +23,10 @@ pub(super) fn origin(path: &Path) -> io::Result<Origin> {
     let mut file = BufReader::new(own_file::read(path)?);
     let mut begin = Vec::new();
     file.by_ref().take(header.len() as u64).read_to_end(&mut begin)?;
-    let is_ours = begin.iter().zip(&header).all(|(found, wanted)| wanted.is_none_or(|wanted| wanted == *found));
+    let is_ours = begin
+        .iter()
+        .zip(&header)
+        .all(|(found, wanted)| wanted.is_none_or(|wanted| wanted == *found));
     if is_ours {
         return Ok(if begin.len() == header.len() { Origin::Ours } else { Origin::Nothing });
     }
@@ -40,7 +44,8 @@ pub(super) fn origin(path: &Path) -> io::Result<Origin> {
 
 /// How our files begin, up to the version; `None` for bytes that depend on it.
 ///
-/// Source: the MCAP specification, version 0: magic, header record, its length, profile and library.
+/// Source: the MCAP specification, version 0: magic, header record, its length, profile and
+/// library.
 fn header() -> Vec<Option<u8>> {
     let mut header: Vec<_> = b"\x89MCAP0\r\n\x01".iter().copied().map(Some).collect();
     header.extend([None; 8]);

@@ -30,7 +30,8 @@ const STEM_MAX: usize = 160;
 pub(super) struct Place {
     folder: PathBuf,
     list: List,
-    /// File names that the list holds or will: none is given twice, even after its clip was fetched and deleted.
+    /// File names that the list holds or will: none is given twice, even after its clip was fetched
+    /// and deleted.
     taken: Mutex<HashSet<String>>,
     _lock: File,
 }
@@ -84,7 +85,8 @@ impl Place {
         names(&stem)
             .find(|name| {
                 let is_file = |ending: &&str| self.exists(name, ending);
-                ![CLIP, PART, AGAIN, JPG, JPG_PART].iter().any(is_file) && !self.is_taken(&format!("{name}{CLIP}"))
+                ![CLIP, PART, AGAIN, JPG, JPG_PART].iter().any(is_file)
+                    && !self.is_taken(&format!("{name}{CLIP}"))
             })
             .expect("numbers do not end before the files do")
     }
@@ -102,7 +104,8 @@ pub(crate) fn names(stem: &str) -> impl Iterator<Item = String> + '_ {
 /// `stem` as the begin of a file name on any system.
 fn plain(stem: &str) -> String {
     let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
-    let name: String = stem.chars().map(|c| if allowed(c) { c } else { '-' }).take(STEM_MAX).collect();
+    let name: String =
+        stem.chars().map(|c| if allowed(c) { c } else { '-' }).take(STEM_MAX).collect();
     match name.trim_start_matches('.') {
         "" => "clip".to_owned(),
         name => name.to_owned(),

@@ -46,7 +46,10 @@ impl Reading {
             };
             replay
                 .subscribe(&spec, Arc::clone(&held) as Arc<dyn gleaner_transport::Sink>)
-                .map_err(|source| RecordError::Topic { path: path.to_owned(), source: Box::new(source) })?;
+                .map_err(|source| RecordError::Topic {
+                    path: path.to_owned(),
+                    source: Box::new(source),
+                })?;
             topics.push(Topic {
                 name: spec.topic,
                 type_name: spec.type_name,
@@ -58,7 +61,10 @@ impl Reading {
     }
 
     /// Gives the next message, with the index of its topic, to `act`; `None` at the end.
-    fn next<T>(&mut self, act: impl FnOnce(usize, &SampleMeta, &[u8]) -> T) -> Result<Option<T>, ReplayError> {
+    fn next<T>(
+        &mut self,
+        act: impl FnOnce(usize, &SampleMeta, &[u8]) -> T,
+    ) -> Result<Option<T>, ReplayError> {
         Ok(self.replay.step()?.map(|step| {
             let cdr = self.held.0.lock().unwrap_or_else(PoisonError::into_inner);
             act(step.subscription.0, &step.meta, &cdr)
@@ -66,8 +72,8 @@ impl Reading {
     }
 }
 
-/// Gives each message of the clip `path` to `act`, in the order of their stamps, up to the end or to the damage that
-/// it returns.
+/// Gives each message of the clip `path` to `act`, in the order of their stamps, up to the end or
+/// to the damage that it returns.
 pub(super) fn each_message(
     path: &Path,
     mut act: impl FnMut(&Topic, &SampleMeta, &[u8]) -> Result<(), RecordError>,
@@ -78,20 +84,27 @@ pub(super) fn each_message(
         match reading.next(|topic, meta, cdr| act(&topics[topic], meta, cdr)) {
             Ok(Some(done)) => done?,
             Ok(None) => return Ok(None),
-            Err(ReplayError::Damaged { at: Place::Byte(at), what, .. }) => return Ok(Some(End { at, why: what })),
+            Err(ReplayError::Damaged { at: Place::Byte(at), what, .. }) => {
+                return Ok(Some(End { at, why: what }));
+            }
             Err(error) => return Err(unreadable(path)(error)),
         }
     }
 }
 
-/// The messages of the clip `path`, counted. It may come from anywhere: its chunks are bounded as those of a drive.
+/// The messages of the clip `path`, counted. It may come from anywhere: its chunks are bounded as
+/// those of a drive.
 pub(super) fn written(path: &Path) -> Result<Written, RecordError> {
     let mut reading = Reading::open(path, Limits::default())?;
     let mut written = Written::default();
     for topic in &reading.topics {
         written.add_topic(topic);
     }
-    while reading.next(|topic, meta, cdr| written.count(topic, meta, cdr)).map_err(unreadable(path))?.is_some() {}
+    while reading
+        .next(|topic, meta, cdr| written.count(topic, meta, cdr))
+        .map_err(unreadable(path))?
+        .is_some()
+    {}
     Ok(written)
 }
 
@@ -118,13 +131,21 @@ pub(super) fn whole(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, Reco
         return Ok(None);
     }
     let extras = read_extras(path, EXTRAS_BYTES).map_err(unreadable(path))?;
-    Ok(extras.metadata.iter().find(|(name, _)| name == CLIP_RECORD).and_then(|(_, metadata)| read_line(metadata)))
+    Ok(extras
+        .metadata
+        .iter()
+        .find(|(name, _)| name == CLIP_RECORD)
+        .and_then(|(_, metadata)| read_line(metadata)))
 }
 
 /// What the clip `path` says of its begin; `None` if that cannot be read.
 pub(super) fn about(path: &Path) -> Option<About> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
-    extras.metadata.iter().find(|(name, _)| name == BEGIN).and_then(|(_, metadata)| read_begin(metadata).ok())
+    extras
+        .metadata
+        .iter()
+        .find(|(name, _)| name == BEGIN)
+        .and_then(|(_, metadata)| read_begin(metadata).ok())
 }
 
 /// The file that the clip `path` was saved from, if it was.

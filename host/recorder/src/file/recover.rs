@@ -1,7 +1,8 @@
 //! What a recorder that died left behind becomes whole clips.
 //!
-//! Every step may be the last one of this process, too. So each leaves the folder in a state that the next attempt
-//! reads as it was meant: the unfinished file goes last, and a clip that was saved says from which file.
+//! Every step may be the last one of this process, too. So each leaves the folder in a state that
+//! the next attempt reads as it was meant: the unfinished file goes last, and a clip that was saved
+//! says from which file.
 
 use std::collections::VecDeque;
 use std::fs;
@@ -21,14 +22,16 @@ use super::unfinished::{CHUNK_SPAN_NS, Saved, Unfinished};
 use super::{Ending, durable};
 use crate::error::RecordError;
 
-/// What an earlier process left in a folder. It is found before this one writes there, and completed one by one.
+/// What an earlier process left in a folder. It is found before this one writes there, and
+/// completed one by one.
 #[derive(Default)]
 pub(crate) struct Recovery {
     place: Option<Arc<Place>>,
     left: VecDeque<(&'static str, String)>,
 }
 
-/// Is called again and again while something takes long. It may do other things meanwhile; an error of it ends what takes long.
+/// Is called again and again while something takes long. It may do other things meanwhile; an error
+/// of it ends what takes long.
 pub(super) type Pause<'a> = dyn FnMut() -> Result<(), RecordError> + 'a;
 
 impl Recovery {
@@ -41,9 +44,13 @@ impl Recovery {
         Ok(Recovery { place: Some(Arc::clone(place)), left })
     }
 
-    /// The next clip that came back, which is listed, or why one did not: that is left as it is, for a later process. `go_on` is
-    /// asked again and again; once it says no, what is under way is left as well, and nothing more comes.
-    pub(crate) fn next(&mut self, go_on: &mut dyn FnMut() -> bool) -> Option<Result<Clip, RecordError>> {
+    /// The next clip that came back, which is listed, or why one did not: that is left as it is,
+    /// for a later process. `go_on` is asked again and again; once it says no, what is under way is
+    /// left as well, and nothing more comes.
+    pub(crate) fn next(
+        &mut self,
+        go_on: &mut dyn FnMut() -> bool,
+    ) -> Option<Result<Clip, RecordError>> {
         let place = self.place.as_ref()?;
         while go_on() {
             let (ending, name) = self.left.pop_front()?;
@@ -71,7 +78,8 @@ impl Recovery {
     }
 }
 
-/// The files in `folder` that end so, without the ending, sorted. What has another name, or is no file, is not ours.
+/// The files in `folder` that end so, without the ending, sorted. What has another name, or is no
+/// file, is not ours.
 fn files(folder: &Path, ending: &str) -> Result<Vec<String>, RecordError> {
     let cannot_read = |source| RecordError::Read { path: folder.to_owned(), source };
     let mut names = Vec::new();
@@ -122,7 +130,8 @@ fn list(place: &Place, name: &str, pause: &mut Pause) -> Result<Option<Clip>, Re
         // A clip that somebody copied here, under a name of theirs, is theirs.
         Ok(Some(clip)) if !is_own_name(name, &clip) => Ok(None),
         Ok(Some(clip)) => {
-            // Whoever gave it its name may have died, or its disk lost its power, before the name was on the disk.
+            // Whoever gave it its name may have died, or its disk lost its power, before the name
+            // was on the disk.
             durable::sync_file(&path)?;
             durable::sync_folder(place.folder())?;
             add(place, name, clip).map(Some)
@@ -138,14 +147,21 @@ fn list(place: &Place, name: &str, pause: &mut Pause) -> Result<Option<Clip>, Re
     }
 }
 
-/// Whether a clip that is called `name` was called so by its recorder, or by a recovery that found its name taken.
+/// Whether a clip that is called `name` was called so by its recorder, or by a recovery that found
+/// its name taken.
 fn is_own_name(name: &str, clip: &Clip) -> bool {
-    let own = clip.file.file_stem().map(|own| own.to_string_lossy().into_owned()).unwrap_or_default();
+    let own =
+        clip.file.file_stem().map(|own| own.to_string_lossy().into_owned()).unwrap_or_default();
     let number = name.strip_prefix(&own).and_then(|rest| rest.strip_prefix('-'));
     name == own || number.is_some_and(|number| number.bytes().all(|digit| digit.is_ascii_digit()))
 }
 
-fn attempt(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
+fn attempt(
+    place: &Arc<Place>,
+    name: &str,
+    part: &Path,
+    pause: &mut Pause,
+) -> Result<Option<Clip>, RecordError> {
     match origin(part).map_err(|source| RecordError::Read { path: part.to_owned(), source })? {
         Origin::Foreign => {
             warn!(path = %part.display(), "file is not of this program, left alone");
@@ -170,15 +186,21 @@ fn attempt(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Re
     }
 }
 
-/// Whether an earlier attempt got as far as a whole clip: one that says so, or a copy of the unfinished file.
+/// Whether an earlier attempt got as far as a whole clip: one that says so, or a copy of the
+/// unfinished file.
 fn was_saved(place: &Place, name: &str, part: &Path) -> Result<bool, RecordError> {
     let from = format!("{name}{PART}");
-    for path in names(name).map(|name| place.path(&name, CLIP)).take_while(|path| path.symlink_metadata().is_ok()) {
+    for path in names(name)
+        .map(|name| place.path(&name, CLIP))
+        .take_while(|path| path.symlink_metadata().is_ok())
+    {
         if !path.symlink_metadata().is_ok_and(|found| found.is_file()) {
             // Not ours. A pipe would be waited for.
             continue;
         }
-        let is_copy = || is_same(&path, part).map_err(|source| RecordError::Read { path: path.clone(), source });
+        let is_copy = || {
+            is_same(&path, part).map_err(|source| RecordError::Read { path: path.clone(), source })
+        };
         if read::recovered_from(&path).is_some_and(|named| named == from) || is_copy()? {
             return Ok(true);
         }
@@ -207,10 +229,12 @@ fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
     }
 }
 
-/// The name for the clip of the unfinished file `name`: its own, as it was free when the file was begun, unless
-/// somebody has put another file there since. No clip that is begun meanwhile gets it.
+/// The name for the clip of the unfinished file `name`: its own, as it was free when the file was
+/// begun, unless somebody has put another file there since. No clip that is begun meanwhile gets
+/// it.
 fn name_for(place: &Place, name: &str) -> String {
-    let is_free = |name: &String| !place.exists(name, CLIP) && !place.is_taken(&format!("{name}{CLIP}"));
+    let is_free =
+        |name: &String| !place.exists(name, CLIP) && !place.is_taken(&format!("{name}{CLIP}"));
     let free = names(name).find(is_free).expect("numbers do not end before the files do");
     place.take(&free);
     free
@@ -218,9 +242,16 @@ fn name_for(place: &Place, name: &str) -> String {
 
 /// Makes a clip of an unfinished file that is whole.
 ///
-/// Its recorder may have died because the file could not be synced. The system then believes that its pages are on the
-/// disk, and to sync it again would prove nothing: only bytes that are written anew are known to arrive.
-fn adopt(place: &Place, name: &str, part: &Path, clip: Clip, pause: &mut Pause) -> Result<Clip, RecordError> {
+/// Its recorder may have died because the file could not be synced. The system then believes that
+/// its pages are on the disk, and to sync it again would prove nothing: only bytes that are written
+/// anew are known to arrive.
+fn adopt(
+    place: &Place,
+    name: &str,
+    part: &Path,
+    clip: Clip,
+    pause: &mut Pause,
+) -> Result<Clip, RecordError> {
     let free = name_for(place, name);
     let again = place.path(name, AGAIN);
     if let Err(error) = durable::copy(part, &again, pause) {
@@ -242,7 +273,8 @@ fn adopt(place: &Place, name: &str, part: &Path, clip: Clip, pause: &mut Pause) 
 /// Lists a whole clip whose line is that of its own record.
 fn add(place: &Place, name: &str, mut clip: Clip) -> Result<Clip, RecordError> {
     let path = place.path(name, CLIP);
-    let metadata = fs::metadata(&path).map_err(|source| RecordError::Read { path: path.clone(), source })?;
+    let metadata =
+        fs::metadata(&path).map_err(|source| RecordError::Read { path: path.clone(), source })?;
     clip.file = format!("{CLIPS}/{name}{CLIP}").into();
     clip.thumbnail = place.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
     clip.bytes = metadata.len();
@@ -267,7 +299,12 @@ fn discard(place: &Place, name: &str) -> Result<(), RecordError> {
 }
 
 /// Copies the messages of `part` into a clip of their own.
-fn save(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
+fn save(
+    place: &Arc<Place>,
+    name: &str,
+    part: &Path,
+    pause: &mut Pause,
+) -> Result<Option<Clip>, RecordError> {
     let again = place.path(name, AGAIN);
     let saved = copy(place, name, part, pause);
     if saved.as_ref().is_ok_and(Option::is_some) {
@@ -283,8 +320,15 @@ fn save(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Resul
     saved
 }
 
-fn copy(place: &Arc<Place>, name: &str, part: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
-    let len = fs::metadata(part).map_err(|source| RecordError::Read { path: part.to_owned(), source })?.len();
+fn copy(
+    place: &Arc<Place>,
+    name: &str,
+    part: &Path,
+    pause: &mut Pause,
+) -> Result<Option<Clip>, RecordError> {
+    let len = fs::metadata(part)
+        .map_err(|source| RecordError::Read { path: part.to_owned(), source })?
+        .len();
     let about = read::about(part);
     let free = name_for(place, name);
     let mut clip = Unfinished::create(Arc::clone(place), name.to_owned(), AGAIN, about.as_ref())?;

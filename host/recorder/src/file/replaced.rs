@@ -1,4 +1,5 @@
-//! `clips/.replaced`: the clips that a replay is about to delete, noted before the list loses them. It is gone once they are.
+//! `clips/.replaced`: the clips that a replay is about to delete, noted before the list loses them.
+//! It is gone once they are.
 
 use std::collections::HashSet;
 use std::fs;
@@ -33,8 +34,8 @@ fn line(Listed { file, thumbnail }: &Listed) -> Vec<u8> {
     format!("{line}\n").into_bytes()
 }
 
-/// Deletes the noted clips, and returns how many these were. Clips that the list names stay: the process died before it wrote the
-/// list.
+/// Deletes the noted clips, and returns how many these were. Clips that the list names stay: the
+/// process died before it wrote the list.
 pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
     // A process that died while it wrote the note had changed nothing else.
     let _ = fs::remove_file(folder.join(NOTE_PART));
@@ -51,7 +52,9 @@ pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
     for doomed in doomed.into_iter().filter(|doomed| !listed.contains(&doomed.file)) {
         let Listed { file, thumbnail } = &doomed;
         // The thumbnail first: one without its clip would belong to nothing.
-        let thumbnail = thumbnail.as_ref().map_or(Ok(false), |thumbnail| durable::remove(&folder.join(thumbnail)));
+        let thumbnail = thumbnail
+            .as_ref()
+            .map_or(Ok(false), |thumbnail| durable::remove(&folder.join(thumbnail)));
         match thumbnail.and_then(|_| durable::remove(&folder.join(file))) {
             Ok(was_there) => deleted += u64::from(was_there),
             // A folder of this name, for example: it stays, and is no clip of the list any more.
@@ -62,8 +65,8 @@ pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
         }
     }
     durable::sync_folder(folder)?;
-    // A clip of the same name may come next: the note must not outlive it. One that is still there would be taken for a clip that no
-    // process had listed.
+    // A clip of the same name may come next: the note must not outlive it. One that is still there
+    // would be taken for a clip that no process had listed.
     if left.is_empty() {
         durable::remove(&path)?;
         durable::sync_folder(folder)?;

@@ -45,7 +45,12 @@ impl Shelf {
         let (clips_max, bytes_max) = (clips_max.unwrap_or(u64::MAX), bytes_max.unwrap_or(u64::MAX));
         let mut shelf = Shelf { clips_max, bytes_max, clips: VecDeque::new(), bytes: 0, losses };
         for Listed { file, thumbnail } in listed {
-            let bytes = place.folder().join(&file).symlink_metadata().ok().filter(|metadata| metadata.is_file());
+            let bytes = place
+                .folder()
+                .join(&file)
+                .symlink_metadata()
+                .ok()
+                .filter(|metadata| metadata.is_file());
             if let Some(bytes) = bytes.map(|metadata| metadata.len()) {
                 shelf.push(Kept { file, thumbnail, bytes, is_stuck: false });
             }
@@ -58,7 +63,8 @@ impl Shelf {
         self.clips.push_back(kept);
     }
 
-    /// Adds a clip that is whole now; deletes the oldest until the others have room. The newest stays in any case.
+    /// Adds a clip that is whole now; deletes the oldest until the others have room. The newest
+    /// stays in any case.
     pub(super) fn add(&mut self, place: &Place, clip: &Clip) -> Vec<Loss> {
         let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         let (file, thumbnail) = (name(&clip.file), clip.thumbnail.as_deref().and_then(name));
@@ -68,7 +74,8 @@ impl Shelf {
         self.make_room(place)
     }
 
-    /// Deletes the oldest until the others have room. What cannot be deleted is passed over, and tried again the next time.
+    /// Deletes the oldest until the others have room. What cannot be deleted is passed over, and
+    /// tried again the next time.
     pub(super) fn make_room(&mut self, place: &Place) -> Vec<Loss> {
         // Those that somebody has fetched take no room any more.
         self.clips.retain(|kept| place.folder().join(&kept.file).symlink_metadata().is_ok());
@@ -123,7 +130,8 @@ impl Kept {
         }
         let failure = Failure::from(error);
         error!(clip = %self.file, %failure, "a clip cannot be deleted to make room, and stays");
-        let why = std::iter::once(failure.message).chain(failure.causes).collect::<Vec<_>>().join(": ");
+        let why =
+            std::iter::once(failure.message).chain(failure.causes).collect::<Vec<_>>().join(": ");
         let loss = Loss::NotDeleted { at_ns: now(), file: self.path(), bytes: self.bytes, why };
         if let Err(error) = losses.note(&loss) {
             error!(error = &error as &dyn std::error::Error, "cannot note a loss");

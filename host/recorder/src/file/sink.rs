@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// Records around chunks are written in many small pieces; they are collected up to this size.
 const BUFFER: usize = 64 << 10;
 
-/// A file that only grows, and that nothing more is written to once a write has failed: behind a torn record nothing
-/// could be read.
+/// A file that only grows, and that nothing more is written to once a write has failed: behind a
+/// torn record nothing could be read.
 pub(super) struct Sink {
     file: File,
     buffer: Vec<u8>,
@@ -35,7 +35,11 @@ impl Sink {
     }
 
     fn check(&self) -> io::Result<()> {
-        if self.failed { Err(io::Error::other("an earlier write to this file failed")) } else { Ok(()) }
+        if self.failed {
+            Err(io::Error::other("an earlier write to this file failed"))
+        } else {
+            Ok(())
+        }
     }
 
     fn through(&mut self, bytes: &[u8]) -> io::Result<()> {

@@ -1,7 +1,9 @@
-//! Compares the statements of a finished clip about itself with its content. The file may come from anywhere.
+//! Compares the statements of a finished clip about itself with its content. The file may come from
+//! anywhere.
 //!
-//! The records are made once more, out of what they follow from: the line of the clip, the header of a journal in it, its messages.
-//! A statement that follows from nothing else in the file has to be the same wherever it stands. `docs/clips.md` lists them.
+//! The records are made once more, out of what they follow from: the line of the clip, the header
+//! of a journal in it, its messages. A statement that follows from nothing else in the file has to
+//! be the same wherever it stands. `docs/clips.md` lists them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -12,7 +14,8 @@ use gleaner_journal::Header;
 use gleaner_lambda::{Clip, ClipLambda, ClipTopic, Moment};
 
 use super::ending::{
-    self, BEGIN, CLIP_RECORD, CONTINUES, DECISION_RECORD, LAMBDA_RECORD, LINE, THUMBNAIL, TOPIC_RECORD, json,
+    self, BEGIN, CLIP_RECORD, CONTINUES, DECISION_RECORD, LAMBDA_RECORD, LINE, THUMBNAIL,
+    TOPIC_RECORD, json,
 };
 use super::list::plain_name;
 use super::place::{CLIP, CLIPS, JPG, names};
@@ -27,7 +30,8 @@ type Values = BTreeMap<String, String>;
 /// The records of a clip.
 const RECORDS: [&str; 5] = [BEGIN, CLIP_RECORD, TOPIC_RECORD, LAMBDA_RECORD, DECISION_RECORD];
 
-/// Of two long texts, so many bytes are shown of what they have in common before the first difference.
+/// Of two long texts, so many bytes are shown of what they have in common before the first
+/// difference.
 const IN_COMMON: usize = 24;
 
 /// A statement of a clip that the rest of the clip contradicts.
@@ -45,7 +49,10 @@ impl Untrue {
     fn new(what: impl Into<String>, stated: &str, found: &str) -> Self {
         // Of two texts that begin alike, the begin shows nothing.
         let alike = stated.bytes().zip(found.bytes()).take_while(|(a, b)| a == b).count();
-        let from = (0..=alike.saturating_sub(IN_COMMON)).rev().find(|at| stated.is_char_boundary(*at)).unwrap_or(0);
+        let from = (0..=alike.saturating_sub(IN_COMMON))
+            .rev()
+            .find(|at| stated.is_char_boundary(*at))
+            .unwrap_or(0);
         let side = |text: &str| match from {
             0 => excerpt(text),
             from => format!("…{}", excerpt(&text[from..])),
@@ -68,19 +75,26 @@ pub struct Stated {
 }
 
 impl Stated {
-    /// Reads the records of a clip that holds the journal with this header, and compares them with each other, with the header and
-    /// with the attachments.
+    /// Reads the records of a clip that holds the journal with this header, and compares them with
+    /// each other, with the header and with the attachments.
     ///
     /// # Errors
     ///
-    /// The first [`Untrue`] statement: a record or an attachment that is missing, doubled or of another kind, a value that is not as
-    /// recorders write it, or that contradicts the rest.
+    /// The first [`Untrue`] statement: a record or an attachment that is missing, doubled or of
+    /// another kind, a value that is not as recorders write it, or that contradicts the rest.
     pub fn read(extras: &Extras, header: &Header) -> Result<Self, Untrue> {
-        if let Some((name, _)) = extras.metadata.iter().find(|(name, _)| !RECORDS.contains(&name.as_str())) {
-            return Err(Untrue::new(format!("record `{}`", excerpt(name)), "is there", "no recorder writes it"));
+        if let Some((name, _)) =
+            extras.metadata.iter().find(|(name, _)| !RECORDS.contains(&name.as_str()))
+        {
+            return Err(Untrue::new(
+                format!("record `{}`", excerpt(name)),
+                "is there",
+                "no recorder writes it",
+            ));
         }
-        let records =
-            |of: &'static str| extras.metadata.iter().filter(move |(name, _)| name == of).map(|(_, values)| values);
+        let records = |of: &'static str| {
+            extras.metadata.iter().filter(move |(name, _)| name == of).map(|(_, values)| values)
+        };
         let only = |of: &'static str| match records(of).collect::<Vec<_>>()[..] {
             [values] => Ok(values),
             ref found => Err(Untrue::count(format!("record {of}"), found.len(), 1)),
@@ -116,14 +130,23 @@ impl Stated {
     }
 
     fn compare(&self, written: &Written) -> Result<(), Untrue> {
-        if let Some(found) = written.topics().iter().find(|found| !self.topics.contains_key(&found.name)) {
-            return Err(Untrue::count(format!("record {TOPIC_RECORD} of `{}`", excerpt(&found.name)), 0, 1));
+        if let Some(found) =
+            written.topics().iter().find(|found| !self.topics.contains_key(&found.name))
+        {
+            return Err(Untrue::count(
+                format!("record {TOPIC_RECORD} of `{}`", excerpt(&found.name)),
+                0,
+                1,
+            ));
         }
         for topic in &self.clip.topics {
             let found = written.topic(&topic.topic);
             let messages = found.map_or(0, |found| found.messages);
-            let received =
-                || topic.received.and(Some(messages.saturating_add(topic.overwritten?).saturating_add(topic.too_big?)));
+            let received = || {
+                topic.received.and(Some(
+                    messages.saturating_add(topic.overwritten?).saturating_add(topic.too_big?),
+                ))
+            };
             let is = ClipTopic {
                 type_name: found.map(|found| found.type_name.clone()),
                 messages,
@@ -132,7 +155,11 @@ impl Stated {
             };
             let (_, expected) = ending::topic(&is, found);
             let name = excerpt(&topic.topic);
-            same(&format!("record {TOPIC_RECORD} of `{name}`"), &self.topics[&topic.topic], &expected)?;
+            same(
+                &format!("record {TOPIC_RECORD} of `{name}`"),
+                &self.topics[&topic.topic],
+                &expected,
+            )?;
             let what = format!("{LINE} of record {CLIP_RECORD}, topic `{name}`");
             same(&what, &ending::topic(topic, found).1, &expected)?;
         }
@@ -147,11 +174,19 @@ impl Stated {
         }
         let is_late = first_ns.is_some_and(|first_ns| first_ns < self.clip.from_ns);
         if is_late {
-            return Err(Untrue::new(in_clip("from_ns"), &self.clip.from_ns.to_string(), &stamp(first_ns)));
+            return Err(Untrue::new(
+                in_clip("from_ns"),
+                &self.clip.from_ns.to_string(),
+                &stamp(first_ns),
+            ));
         }
         let is_early = last_ns.is_some_and(|last_ns| last_ns > self.clip.to_ns);
         if is_early {
-            return Err(Untrue::new(in_clip("to_ns"), &self.clip.to_ns.to_string(), &stamp(last_ns)));
+            return Err(Untrue::new(
+                in_clip("to_ns"),
+                &self.clip.to_ns.to_string(),
+                &stamp(last_ns),
+            ));
         }
         Ok(())
     }
@@ -174,7 +209,11 @@ fn same(record: &str, stated: &Values, expected: &Values) -> Result<(), Untrue> 
         let (stated, expected) = (value(stated, key), value(expected, key));
         if stated != expected {
             let text = |value: Option<String>| value.unwrap_or_else(|| "not there".to_owned());
-            return Err(Untrue::new(format!("`{}` of {record}", excerpt(key)), &text(stated), &text(expected)));
+            return Err(Untrue::new(
+                format!("`{}` of {record}", excerpt(key)),
+                &text(stated),
+                &text(expected),
+            ));
         }
     }
     Ok(())
@@ -193,18 +232,26 @@ fn clip(values: &Values, attachments: &[Attachment], header: &Header) -> Result<
     if json(&clip) != line {
         return Err(of_line(&json(&clip)));
     }
-    let stem = plain_name(&clip.file, CLIP).and_then(|name| name.strip_suffix(CLIP).map(str::to_owned));
-    let stem = stem.ok_or_else(|| Untrue::new(in_clip("file"), &clip.file.to_string_lossy(), "clips/NAME.mcap"))?;
+    let stem =
+        plain_name(&clip.file, CLIP).and_then(|name| name.strip_suffix(CLIP).map(str::to_owned));
+    let stem = stem.ok_or_else(|| {
+        Untrue::new(in_clip("file"), &clip.file.to_string_lossy(), "clips/NAME.mcap")
+    })?;
     let thumbnail = attachments.iter().find(|attachment| attachment.name == THUMBNAIL);
     let picture = thumbnail.map(|_| format!("{CLIPS}/{stem}{JPG}"));
     let stated = clip.thumbnail.as_ref().map(|path| path.to_string_lossy().into_owned());
     if stated != picture {
         let text = |path: Option<String>| path.unwrap_or_else(|| "none".to_owned());
-        let what = format!("`thumbnail` in {LINE} of record {CLIP_RECORD}, by attachment `{THUMBNAIL}`");
+        let what =
+            format!("`thumbnail` in {LINE} of record {CLIP_RECORD}, by attachment `{THUMBNAIL}`");
         return Err(Untrue::new(what, &text(stated), &text(picture)));
     }
     if clip.bytes != 0 {
-        return Err(Untrue::new(format!("`bytes` in {LINE} of record {CLIP_RECORD}"), &clip.bytes.to_string(), "0"));
+        return Err(Untrue::new(
+            format!("`bytes` in {LINE} of record {CLIP_RECORD}"),
+            &clip.bytes.to_string(),
+            "0",
+        ));
     }
     let picture = thumbnail.map(|attachment| attachment.data.as_slice());
     let (_, expected) = ending::about_clip(&clip, &header.clock, &library(header), picture, None);
@@ -235,15 +282,27 @@ fn attachments(attachments: &[Attachment], clip: &Clip) -> Result<(), Untrue> {
 
 fn lambdas(records: &[&Values], clip: &Clip, header: &Header) -> Result<(), Untrue> {
     if records.len() != clip.lambdas.len() {
-        return Err(Untrue::count(format!("record {LAMBDA_RECORD}"), records.len(), clip.lambdas.len()));
+        return Err(Untrue::count(
+            format!("record {LAMBDA_RECORD}"),
+            records.len(),
+            clip.lambdas.len(),
+        ));
     }
     if clip.lambdas.len() > LAMBDAS_MAX {
         let what = format!("number of lambdas in {LINE} of record {CLIP_RECORD}");
-        return Err(Untrue::new(what, &clip.lambdas.len().to_string(), &format!("{LAMBDAS_MAX} at most")));
+        return Err(Untrue::new(
+            what,
+            &clip.lambdas.len().to_string(),
+            &format!("{LAMBDAS_MAX} at most"),
+        ));
     }
     if !clip.lambdas.iter().any(|of| of.name == header.lambda) {
         let stated = clip.lambdas.iter().map(|of| of.name.as_str()).collect::<Vec<_>>().join(", ");
-        return Err(Untrue::new(format!("lambdas in {LINE} of record {CLIP_RECORD}"), &stated, &header.lambda));
+        return Err(Untrue::new(
+            format!("lambdas in {LINE} of record {CLIP_RECORD}"),
+            &stated,
+            &header.lambda,
+        ));
     }
     for (values, of) in records.iter().zip(&clip.lambdas) {
         let record = format!("record {LAMBDA_RECORD} of `{}`", excerpt(&of.name));
@@ -255,9 +314,9 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &Header) -> Result<(), Untr
         if header.is_none() {
             // The journal of this one leads nowhere else.
             for (key, value) in &mut expected {
-                let stated = values
-                    .get(key)
-                    .filter(|_| !["name", "version", "kind", "digest", "windows"].contains(&key.as_str()));
+                let stated = values.get(key).filter(|_| {
+                    !["name", "version", "kind", "digest", "windows"].contains(&key.as_str())
+                });
                 value.clone_from(stated.unwrap_or(&value.clone()));
             }
         }
@@ -274,19 +333,24 @@ fn by_header(of: &ClipLambda, header: &Header) -> ClipLambda {
 }
 
 fn moment(values: &Values) -> Result<Moment, Untrue> {
-    let moment = ending::read_decision(values).map_err(|key| malformed(DECISION_RECORD, key, values))?;
+    let moment =
+        ending::read_decision(values).map_err(|key| malformed(DECISION_RECORD, key, values))?;
     let record = format!("record {DECISION_RECORD} at {} ns", moment.at_ns);
     same(&record, values, &ending::decision(&moment).1)?;
     Ok(moment)
 }
 
-/// Compares the decisions with the line, which has the first of them. Their number is compared with the journal later.
+/// Compares the decisions with the line, which has the first of them. Their number is compared with
+/// the journal later.
 fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), Untrue> {
     let kept = &moments[..moments.len().min(Clip::MOMENTS_MAX)];
     let of_line = format!("moments in {LINE} of record {CLIP_RECORD}");
     for (index, (record, line)) in kept.iter().zip(&clip.moments).enumerate() {
         if let Some((key, [record, line])) = record.differs_from(line) {
-            let what = format!("`{key}` of record {DECISION_RECORD} number {}, by the {of_line}", index + 1);
+            let what = format!(
+                "`{key}` of record {DECISION_RECORD} number {}, by the {of_line}",
+                index + 1
+            );
             return Err(Untrue::new(what, &record, &line));
         }
     }
@@ -295,28 +359,47 @@ fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), Untrue> {
         return Err(Untrue::new(what, &kept.len().to_string(), &clip.moments.len().to_string()));
     }
     if (moments.len() as u64) > clip.triggers {
-        return Err(Untrue::new(in_clip("triggers"), &clip.triggers.to_string(), &moments.len().to_string()));
+        return Err(Untrue::new(
+            in_clip("triggers"),
+            &clip.triggers.to_string(),
+            &moments.len().to_string(),
+        ));
     }
-    let outside = moments.iter().find(|moment| !(clip.from_ns..=clip.to_ns).contains(&moment.at_ns));
+    let outside =
+        moments.iter().find(|moment| !(clip.from_ns..=clip.to_ns).contains(&moment.at_ns));
     outside.map_or(Ok(()), |moment| {
         let window = format!("{} to {}", clip.from_ns, clip.to_ns);
-        Err(Untrue::new(format!("`at_ns` of record {DECISION_RECORD}"), &moment.at_ns.to_string(), &window))
+        Err(Untrue::new(
+            format!("`at_ns` of record {DECISION_RECORD}"),
+            &moment.at_ns.to_string(),
+            &window,
+        ))
     })
 }
 
-/// Compares the record in front of the messages: later windows may have added lambdas and windows since.
+/// Compares the record in front of the messages: later windows may have added lambdas and windows
+/// since.
 fn begin(values: &Values, clip: &Clip, moments: &[Moment], header: &Header) -> Result<(), Untrue> {
     let about = ending::read_begin(values).map_err(|key| malformed(BEGIN, key, values))?;
     let is = About { clock: header.clock.clone(), from_ns: clip.from_ns, ..about };
     same(&format!("record {BEGIN}"), values, &ending::begin(&is, &library(header)).1)?;
     let was_there = |of: &ClipLambda| {
-        clip.lambdas
-            .iter()
-            .any(|now| of.windows <= now.windows && *of == ClipLambda { windows: of.windows, ..now.clone() })
+        clip.lambdas.iter().any(|now| {
+            of.windows <= now.windows && *of == ClipLambda { windows: of.windows, ..now.clone() }
+        })
     };
     let most = clip.lambdas.len();
-    if let Some(of) = is.lambdas.iter().enumerate().find_map(|(n, of)| (n >= most || !was_there(of)).then_some(of)) {
-        return Err(Untrue::new(format!("`lambdas` of record {BEGIN}"), &json(of), &json(&clip.lambdas)));
+    if let Some(of) = is
+        .lambdas
+        .iter()
+        .enumerate()
+        .find_map(|(n, of)| (n >= most || !was_there(of)).then_some(of))
+    {
+        return Err(Untrue::new(
+            format!("`lambdas` of record {BEGIN}"),
+            &json(of),
+            &json(&clip.lambdas),
+        ));
     }
     let opening = json(&is.moment);
     let is_of_another_clip = clip.short.iter().any(|why| why == CONTINUES);
@@ -329,7 +412,10 @@ fn begin(values: &Values, clip: &Clip, moments: &[Moment], header: &Header) -> R
 }
 
 /// Returns the records of the topics: one for each topic of the line.
-fn topics<'a>(records: impl Iterator<Item = &'a Values>, clip: &Clip) -> Result<BTreeMap<String, Values>, Untrue> {
+fn topics<'a>(
+    records: impl Iterator<Item = &'a Values>,
+    clip: &Clip,
+) -> Result<BTreeMap<String, Values>, Untrue> {
     let what = |topic: &str| format!("record {TOPIC_RECORD} of `{}`", excerpt(topic));
     let mut topics = BTreeMap::new();
     for values in records {

@@ -19,8 +19,9 @@ use super::written::{Written, encapsulation, stamp};
 use super::{About, Ending, Topic};
 use crate::error::RecordError;
 
-/// On the example drive (JPEG, IMU, speed) zstd at level 1 leaves 0.74 of the bytes at 590 MB/s, lz4 0.77 at 650 MB/s, and none
-/// at all 1.06 at 1760 MB/s; without the camera 0.23, 0.28 and 1.25. Every reader of MCAP knows zstd.
+/// On the example drive (JPEG, IMU, speed) zstd at level 1 leaves 0.74 of the bytes at 590 MB/s,
+/// lz4 0.77 at 650 MB/s, and none at all 1.06 at 1760 MB/s; without the camera 0.23, 0.28 and 1.25.
+/// Every reader of MCAP knows zstd.
 const COMPRESSION: Option<Compression> = Some(Compression::Zstd);
 /// A chunk is closed when it has as many bytes, before compression.
 const CHUNK_BYTES: u64 = 1 << 20;
@@ -29,13 +30,15 @@ pub(super) const CHUNK_SPAN_NS: i64 = 1_000_000_000;
 /// Most channels of a clip. Writers beyond share the channel of their topic that names no writer.
 pub(super) const CHANNELS_MAX: usize = 16 << 10;
 
-/// Most bytes of a message. The fields of the file have room for more, but whoever reads a clip holds a chunk of it in
-/// memory, and our reader no more than 1 GiB: a message with what else may be in its chunk.
+/// Most bytes of a message. The fields of the file have room for more, but whoever reads a clip
+/// holds a chunk of it in memory, and our reader no more than 1 GiB: a message with what else may
+/// be in its chunk.
 pub const MESSAGE_MAX: usize = 960 << 20;
 /// Most bytes of a metadata record; ours have some KB, and with it the config of a lambda.
 pub(super) const METADATA_MAX: usize = 64 << 20;
 
-/// A clip that is being written. Unless it is finished, its file stays unfinished, for [`super::Folder::open`] to recover.
+/// A clip that is being written. Unless it is finished, its file stays unfinished, for
+/// [`super::Folder::open`] to recover.
 pub(crate) struct Unfinished {
     place: Arc<Place>,
     name: String,
@@ -134,14 +137,21 @@ impl Unfinished {
     ///
     /// # Errors
     ///
-    /// [`RecordError::TooLarge`] above [`MESSAGE_MAX`]: nothing was written then. [`RecordError`] if it cannot be written. The clip must not be used further then: what it has is recovered when
-    /// the folder is opened again.
-    pub fn message(&mut self, topic: &Topic, meta: &SampleMeta, cdr: &[u8]) -> Result<(), RecordError> {
+    /// [`RecordError::TooLarge`] above [`MESSAGE_MAX`]: nothing was written then. [`RecordError`]
+    /// if it cannot be written. The clip must not be used further then: what it has is recovered
+    /// when the folder is opened again.
+    pub fn message(
+        &mut self,
+        topic: &Topic,
+        meta: &SampleMeta,
+        cdr: &[u8],
+    ) -> Result<(), RecordError> {
         self.check("a message", cdr.len(), MESSAGE_MAX)?;
         if self.chunk.is_some_and(|chunk| chunk.is_closed_by(meta.at_ns)) {
             self.flush()?;
         }
-        let Channel { index, id: channel_id, new_bytes } = self.channel(topic, Some(meta.writer))?;
+        let Channel { index, id: channel_id, new_bytes } =
+            self.channel(topic, Some(meta.writer))?;
         let mut frame = std::mem::take(&mut self.frame);
         frame.clear();
         frame.extend_from_slice(&encapsulation(meta));
@@ -158,7 +168,8 @@ impl Unfinished {
         self.frame = frame;
         written?;
         self.written.count(index, meta, cdr);
-        let chunk = self.chunk.get_or_insert(Chunk { first_ns: meta.at_ns, last_ns: meta.at_ns, bytes: 0 });
+        let chunk =
+            self.chunk.get_or_insert(Chunk { first_ns: meta.at_ns, last_ns: meta.at_ns, bytes: 0 });
         chunk.first_ns = chunk.first_ns.min(meta.at_ns);
         chunk.last_ns = chunk.last_ns.max(meta.at_ns);
         chunk.bytes += bytes;
@@ -179,8 +190,8 @@ impl Unfinished {
         if channel.new_bytes > CHUNK_BYTES / 16 { self.flush() } else { Ok(()) }
     }
 
-    /// Closes the open chunk: what was added until now survives the death of this process. Called by itself at least
-    /// for every second of messages.
+    /// Closes the open chunk: what was added until now survives the death of this process. Called
+    /// by itself at least for every second of messages.
     ///
     /// # Errors
     ///
@@ -191,7 +202,8 @@ impl Unfinished {
         Ok(())
     }
 
-    /// Completes the clip, gives it its name, and lists it. When this returns, all of it is on the disk.
+    /// Completes the clip, gives it its name, and lists it. When this returns, all of it is on the
+    /// disk.
     ///
     /// # Errors
     ///
@@ -202,14 +214,25 @@ impl Unfinished {
     }
 
     /// As [`Unfinished::finish`], under the name `name`.
-    pub(super) fn close(mut self, ending: Ending, name: &str, saved: Option<Saved>) -> Result<Clip, RecordError> {
+    pub(super) fn close(
+        mut self,
+        ending: Ending,
+        name: &str,
+        saved: Option<Saved>,
+    ) -> Result<Clip, RecordError> {
         let place = Arc::clone(&self.place);
         // Before the footer: the clip of a whole unfinished file then has its thumbnail.
         if let Some(jpeg) = &ending.thumbnail {
-            durable::write(&place.path(name, JPG_PART), &place.path(name, JPG), place.folder(), jpeg)?;
+            durable::write(
+                &place.path(name, JPG_PART),
+                &place.path(name, JPG),
+                place.folder(),
+                jpeg,
+            )?;
         }
         let thumbnail = place.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
-        let mut clip = ending::clip(&ending, &self.written, format!("{CLIPS}/{name}{CLIP}").into(), thumbnail);
+        let mut clip =
+            ending::clip(&ending, &self.written, format!("{CLIPS}/{name}{CLIP}").into(), thumbnail);
         clip.recovered = saved.as_ref().map(|saved| saved.recovered.clone());
         let from = saved.as_ref().map(|saved| saved.from.as_str());
         let written = std::mem::take(&mut self.written);
@@ -217,16 +240,27 @@ impl Unfinished {
             self.metadata(name, metadata)?;
         }
         for (lambda, journal) in ending.journals {
-            self.attach(format!("journal/{lambda}.journal"), "application/octet-stream", journal, ending.to_ns)?;
+            self.attach(
+                format!("journal/{lambda}.journal"),
+                "application/octet-stream",
+                journal,
+                ending.to_ns,
+            )?;
         }
         if let Some(jpeg) = ending.thumbnail {
             self.attach(THUMBNAIL.to_owned(), "image/jpeg", jpeg, ending.to_ns)?;
         }
         self.with_writer(|writer| writer.finish().map(drop))?;
         let cannot_sync = |source| RecordError::Sync { path: self.path.clone(), source };
-        let sink = self.writer.take().expect("nothing takes the writer before its clip is closed").into_inner();
+        let sink = self
+            .writer
+            .take()
+            .expect("nothing takes the writer before its clip is closed")
+            .into_inner();
         clip.bytes = self.closed_bytes.load(Ordering::Relaxed);
-        let file = sink.into_file().map_err(|source| RecordError::Write { path: self.path.clone(), source })?;
+        let file = sink
+            .into_file()
+            .map_err(|source| RecordError::Write { path: self.path.clone(), source })?;
         file.sync_all().map_err(cannot_sync)?;
         durable::rename(&self.path, &place.path(name, CLIP), place.folder())?;
         place.add(name, &clip)?;
@@ -243,23 +277,42 @@ impl Unfinished {
         self.written.span
     }
 
-    fn metadata(&mut self, name: String, metadata: BTreeMap<String, String>) -> Result<(), RecordError> {
+    fn metadata(
+        &mut self,
+        name: String,
+        metadata: BTreeMap<String, String>,
+    ) -> Result<(), RecordError> {
         let bytes = metadata.iter().map(|(key, value)| key.len() + value.len()).sum();
         self.check("a metadata record", bytes, METADATA_MAX)?;
         let record = Metadata { name, metadata };
         self.with_writer(|writer| writer.write_metadata(&record))
     }
 
-    fn attach(&mut self, name: String, media_type: &str, data: Vec<u8>, at_ns: i64) -> Result<(), RecordError> {
+    fn attach(
+        &mut self,
+        name: String,
+        media_type: &str,
+        data: Vec<u8>,
+        at_ns: i64,
+    ) -> Result<(), RecordError> {
         let (log_time, create_time) = (stamp(at_ns), stamp(at_ns));
-        let attachment =
-            Attachment { log_time, create_time, name, media_type: media_type.to_owned(), data: data.into() };
+        let attachment = Attachment {
+            log_time,
+            create_time,
+            name,
+            media_type: media_type.to_owned(),
+            data: data.into(),
+        };
         self.with_writer(|writer| writer.attach(&attachment))
     }
 
     /// Whether a clip has room for `bytes` of something.
     fn check(&self, what: &'static str, bytes: usize, most: usize) -> Result<(), RecordError> {
-        if bytes <= most { Ok(()) } else { Err(RecordError::TooLarge { path: self.path.clone(), what, bytes, most }) }
+        if bytes <= most {
+            Ok(())
+        } else {
+            Err(RecordError::TooLarge { path: self.path.clone(), what, bytes, most })
+        }
     }
 
     /// The channel for messages of the topic by this writer, or by none that is named.
@@ -267,7 +320,13 @@ impl Unfinished {
         let is_full = self.channels.count >= CHANNELS_MAX;
         let mut key = writer;
         if let Some(known) = self.channels.by_topic.get(&topic.name) {
-            let of = |key| known.by_writer.get(&key).map(|id| Channel { index: known.index, id: *id, new_bytes: 0 });
+            let of = |key| {
+                known.by_writer.get(&key).map(|id| Channel {
+                    index: known.index,
+                    id: *id,
+                    new_bytes: 0,
+                })
+            };
             if let Some(found) = of(key) {
                 return Ok(found);
             }
@@ -286,18 +345,17 @@ impl Unfinished {
             metadata.insert("gleaner.writer".to_owned(), writer.to_string());
         }
         let definitions = topic.definitions.as_deref().unwrap_or_default();
-        let new_bytes = definitions.len() + topic.offered_qos.as_deref().map_or(0, str::len) + topic.name.len();
+        let new_bytes =
+            definitions.len() + topic.offered_qos.as_deref().map_or(0, str::len) + topic.name.len();
         let id = self.with_writer(|writer| {
             // Without definitions the type still has a name.
             let schema = writer.add_schema(&topic.type_name, "ros2msg", definitions.as_bytes())?;
             writer.add_channel(schema, &topic.name, "cdr", &metadata)
         })?;
         let written = &mut self.written;
-        let known = self
-            .channels
-            .by_topic
-            .entry(topic.name.clone())
-            .or_insert_with(|| TopicChannels { index: written.add_topic(topic), by_writer: HashMap::new() });
+        let known = self.channels.by_topic.entry(topic.name.clone()).or_insert_with(|| {
+            TopicChannels { index: written.add_topic(topic), by_writer: HashMap::new() }
+        });
         known.by_writer.insert(key, id);
         self.channels.count += 1;
         Ok(Channel { index: known.index, id, new_bytes: new_bytes as u64 })
@@ -307,7 +365,8 @@ impl Unfinished {
         &mut self,
         act: impl FnOnce(&mut Writer<Sink>) -> Result<T, McapError>,
     ) -> Result<T, RecordError> {
-        let writer = self.writer.as_mut().expect("nothing takes the writer before its clip is closed");
+        let writer =
+            self.writer.as_mut().expect("nothing takes the writer before its clip is closed");
         act(writer).map_err(|error| cannot_write(&self.path, error))
     }
 }

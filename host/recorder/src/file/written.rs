@@ -1,4 +1,5 @@
-//! Counts and checksums of the messages in a clip, by topic: taken while it is written, and again when it is read.
+//! Counts and checksums of the messages in a clip, by topic: taken while it is written, and again
+//! when it is read.
 
 use std::collections::HashMap;
 
@@ -39,7 +40,8 @@ impl Written {
     /// Adds a topic, which is not there yet; returns its index.
     pub(super) fn add_topic(&mut self, topic: &Topic) -> usize {
         // Readers trim them.
-        let definitions = topic.definitions.as_deref().map(str::trim).filter(|text| !text.is_empty());
+        let definitions =
+            topic.definitions.as_deref().map(str::trim).filter(|text| !text.is_empty());
         self.topics.push(WrittenTopic {
             name: topic.name.clone(),
             type_name: topic.type_name.clone(),
@@ -55,8 +57,9 @@ impl Written {
     pub(super) fn count(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) {
         let topic = &mut self.topics[topic];
         topic.messages += 1;
-        // Readers sort messages by their stamps, so their order must not count. A plain sum would stay the same in one of 10,000
-        // exchanges of bytes between two messages, as a CRC is linear; a sum of squares changes.
+        // Readers sort messages by their stamps, so their order must not count. A plain sum would
+        // stay the same in one of 10,000 exchanges of bytes between two messages, as a CRC is
+        // linear; a sum of squares changes.
         let crc = u64::from(checksum(meta, cdr));
         topic.checksum = topic.checksum.wrapping_add(crc * crc);
         let (first, last) = self.span.unwrap_or((meta.at_ns, meta.at_ns));
@@ -111,7 +114,14 @@ mod tests {
     use super::*;
 
     fn meta(at_ns: i64) -> SampleMeta {
-        SampleMeta { at_ns, publish_ns: 2, writer: Guid([0; 16]), seq: 3, endian: Endian::Little, options: [4, 5] }
+        SampleMeta {
+            at_ns,
+            publish_ns: 2,
+            writer: Guid([0; 16]),
+            seq: 3,
+            endian: Endian::Little,
+            options: [4, 5],
+        }
     }
 
     #[test]
@@ -119,7 +129,12 @@ mod tests {
         let mut written = Written::default();
         for (name, text) in [("/a", "float64 x"), ("/b", "\nfloat64 x\n"), ("/c", " \n")] {
             let (name, definitions) = (name.to_owned(), Some(text.into()));
-            written.add_topic(&Topic { name, type_name: "T".to_owned(), definitions, offered_qos: None });
+            written.add_topic(&Topic {
+                name,
+                type_name: "T".to_owned(),
+                definitions,
+                offered_qos: None,
+            });
         }
         let [a, b, c] = written.topics() else { panic!("three topics") };
         assert_eq!((&a.definitions, &c.definitions), (&b.definitions, &None));
@@ -127,13 +142,19 @@ mod tests {
 
     fn checksum_of(messages: &[(i64, &[u8])]) -> String {
         let mut written = Written::default();
-        let imu = Topic { name: "/imu".to_owned(), type_name: "T".to_owned(), definitions: None, offered_qos: None };
+        let imu = Topic {
+            name: "/imu".to_owned(),
+            type_name: "T".to_owned(),
+            definitions: None,
+            offered_qos: None,
+        };
         let topic = written.add_topic(&imu);
         messages.iter().for_each(|(at_ns, cdr)| written.count(topic, &meta(*at_ns), cdr));
         written.topics()[topic].checksum()
     }
 
-    /// Worked out in Python: `zlib.crc32(struct.pack("<QQI4B", 1, 2, 3, 0, 1, 4, 5) + b"abc") ** 2`.
+    /// Worked out in Python: `zlib.crc32(struct.pack("<QQI4B", 1, 2, 3, 0, 1, 4, 5) + b"abc") **
+    /// 2`.
     #[test]
     fn a_checksum_is_that_of_the_page() {
         assert_eq!(checksum_of(&[(1, b"abc")]), "2030abf0358c4d19");

@@ -1,7 +1,8 @@
 //! A preroll on disk: chunk files that are written once and deleted whole, with an index in memory.
 //!
-//! The bound holds for files and index together. Room is made by the chunk, so that up to a sixteenth of the bound more
-//! goes than in memory would. Where the disk has less room than the bound, the oldest chunks go as well.
+//! The bound holds for files and index together. Room is made by the chunk, so that up to a
+//! sixteenth of the bound more goes than in memory would. Where the disk has less room than the
+//! bound, the oldest chunks go as well.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -18,7 +19,8 @@ use crate::RecordError;
 /// What an entry costs in the index.
 const INDEXED: u64 = size_of::<Indexed>() as u64;
 
-/// Most entries in the index, so that small samples in a large store do not fill the memory: 72 MiB.
+/// Most entries in the index, so that small samples in a large store do not fill the memory: 72
+/// MiB.
 const INDEX_MAX: usize = 1 << 20;
 
 /// A chunk is a sixteenth of the store, within these bounds.
@@ -91,7 +93,12 @@ impl Disk {
     }
 
     /// On a full disk the oldest go for it as well; where that does not help, it goes itself.
-    pub(super) fn push(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
+    pub(super) fn push(
+        &mut self,
+        held: &Held,
+        bytes: &[u8],
+        gone: &mut dyn FnMut(&Held),
+    ) -> Result<bool, RecordError> {
         loop {
             match self.add(held, bytes, gone) {
                 Err(error) if error.is_full_disk() => {
@@ -112,7 +119,12 @@ impl Disk {
     }
 
     /// As [`push`](Self::push), but a full disk is an error, after which nothing has changed.
-    pub(super) fn add(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
+    pub(super) fn add(
+        &mut self,
+        held: &Held,
+        bytes: &[u8],
+        gone: &mut dyn FnMut(&Held),
+    ) -> Result<bool, RecordError> {
         if !self.fits(bytes.len()) {
             return Ok(false);
         }
@@ -120,7 +132,11 @@ impl Disk {
         while self.bytes + len + INDEXED > self.bound || self.index.len() >= INDEX_MAX {
             self.drop_oldest(gone)?;
         }
-        if self.chunks.back().is_some_and(|chunk| chunk.bytes > 0 && chunk.bytes + len > self.chunk_bytes) {
+        if self
+            .chunks
+            .back()
+            .is_some_and(|chunk| chunk.bytes > 0 && chunk.bytes + len > self.chunk_bytes)
+        {
             self.flush()?;
             self.newest = None;
         }
@@ -191,7 +207,11 @@ impl Disk {
         Some(entry.held)
     }
 
-    pub(super) fn trim(&mut self, before: i64, aged: &mut dyn FnMut(&Held)) -> Result<(), RecordError> {
+    pub(super) fn trim(
+        &mut self,
+        before: i64,
+        aged: &mut dyn FnMut(&Held),
+    ) -> Result<(), RecordError> {
         while self.index.front().is_some_and(|entry| entry.held.at_ns < before) {
             if let Some(held) = self.pop() {
                 aged(&held);
@@ -247,7 +267,8 @@ impl Disk {
             chunk.bytes
         };
         if let Some(begin) = offset.checked_sub(written) {
-            // Nothing follows the last entry of a chunk, so one of no bytes ends where the written ones do.
+            // Nothing follows the last entry of a chunk, so one of no bytes ends where the written
+            // ones do.
             return Ok(&self.pending[begin as usize..][..len]);
         }
         let (number, path) = (chunk.number, path_of(&self.folder, chunk.number));
@@ -308,7 +329,9 @@ fn path_of(folder: &Path, number: u64) -> PathBuf {
 fn is_chunk(path: &Path) -> bool {
     let name = path.file_name().and_then(|name| name.to_str());
     let number = name.and_then(|name| name.strip_suffix(".chunk"));
-    number.is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()))
+    number.is_some_and(|number| {
+        !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit())
+    })
 }
 
 fn failed(path: &Path) -> impl FnOnce(io::Error) -> RecordError {

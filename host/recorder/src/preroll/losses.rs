@@ -2,7 +2,8 @@
 
 use std::collections::VecDeque;
 
-/// Stamps that are remembered of each source and cause. A window that reaches further back cannot be told how many.
+/// Stamps that are remembered of each source and cause. A window that reaches further back cannot
+/// be told how many.
 const REMEMBERED: usize = 4096;
 
 /// What one source has lost.
@@ -44,14 +45,18 @@ impl Gone {
 
     /// One of those that went last and are in no clip's count has come after all.
     pub fn take_back(&mut self) {
-        if let Some((_, _, count)) = self.stamps.iter_mut().rev().find(|(_, group, count)| *group == 0 && *count > 0) {
+        if let Some((_, _, count)) =
+            self.stamps.iter_mut().rev().find(|(_, group, count)| *group == 0 && *count > 0)
+        {
             *count -= 1;
         }
     }
 
-    /// How many of those that `covered` wants are missing from the clips of group `group`. They are counted once.
+    /// How many of those that `covered` wants are missing from the clips of group `group`. They are
+    /// counted once.
     pub fn count(&mut self, group: u64, covered: impl Fn(i64) -> bool) -> u64 {
-        let missing = self.stamps.iter_mut().filter(|(at, in_clip, _)| *in_clip != group && covered(*at));
+        let missing =
+            self.stamps.iter_mut().filter(|(at, in_clip, _)| *in_clip != group && covered(*at));
         missing
             .map(|(_, in_clip, count)| {
                 *in_clip = group;
@@ -95,7 +100,8 @@ impl Horizon {
         }
     }
 
-    /// Whether a window of group `group` that begins at `from` reaches over something that is in none of its clips.
+    /// Whether a window of group `group` that begins at `from` reaches over something that is in
+    /// none of its clips.
     pub fn hides(&self, from: i64, group: u64) -> bool {
         from <= self.unwritten || (group != self.written.0 && from <= self.written.1)
     }

@@ -1,7 +1,8 @@
-//! What came lately, in order of arrival, within a bound of bytes and of time: where clips begin before their trigger.
+//! What came lately, in order of arrival, within a bound of bytes and of time: where clips begin
+//! before their trigger.
 //!
-//! One store for everything. It knows nothing of windows; who reads it walks from the oldest to the newest and marks what
-//! was written to a clip, so that nothing is written to it twice.
+//! One store for everything. It knows nothing of windows; who reads it walks from the oldest to the
+//! newest and marks what was written to a clip, so that nothing is written to it twice.
 
 mod disk;
 mod losses;
@@ -123,7 +124,8 @@ impl Held {
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Place(u64);
 
-/// An entry that a walk from the oldest on has come to. Unlike a [`Place`] it may be kept while the store changes.
+/// An entry that a walk from the oldest on has come to. Unlike a [`Place`] it may be kept while the
+/// store changes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Walked {
     place: Place,
@@ -152,14 +154,19 @@ enum Kind {
 }
 
 impl Preroll {
-    /// An empty store of at most `bytes`. On disk it is in `folder`, where what an earlier process left is deleted. In
-    /// memory, `prefault` takes it from the system at once.
+    /// An empty store of at most `bytes`. On disk it is in `folder`, where what an earlier process
+    /// left is deleted. In memory, `prefault` takes it from the system at once.
     ///
     /// # Errors
     ///
-    /// [`RecordError::Preroll`] if the folder cannot be made or emptied, [`RecordError::PrerollMemory`] if the system does not
-    /// have as much memory.
-    pub fn open(store: Store, bytes: u64, folder: PathBuf, prefault: bool) -> Result<Preroll, RecordError> {
+    /// [`RecordError::Preroll`] if the folder cannot be made or emptied,
+    /// [`RecordError::PrerollMemory`] if the system does not have as much memory.
+    pub fn open(
+        store: Store,
+        bytes: u64,
+        folder: PathBuf,
+        prefault: bool,
+    ) -> Result<Preroll, RecordError> {
         let kind = match store {
             Store::Ram => {
                 let ram = Ram::new(usize::try_from(bytes).unwrap_or(usize::MAX), prefault);
@@ -170,13 +177,19 @@ impl Preroll {
         Ok(Preroll { kind, highest: 0, gone: 0 })
     }
 
-    /// Lets it hold `bytes`, on disk if `store` is that. What it holds stays, but may lie elsewhere: `true` says that no
-    /// [`Walked`] is of use any more.
+    /// Lets it hold `bytes`, on disk if `store` is that. What it holds stays, but may lie
+    /// elsewhere: `true` says that no [`Walked`] is of use any more.
     ///
     /// # Errors
     ///
     /// As for [`Preroll::open`] and [`Preroll::push`].
-    pub fn grow(&mut self, store: Store, bytes: u64, folder: PathBuf, prefault: bool) -> Result<bool, RecordError> {
+    pub fn grow(
+        &mut self,
+        store: Store,
+        bytes: u64,
+        folder: PathBuf,
+        prefault: bool,
+    ) -> Result<bool, RecordError> {
         if let Kind::Disk(disk) = &mut self.kind {
             disk.grow(bytes);
             return Ok(false);
@@ -197,13 +210,18 @@ impl Preroll {
         Ok(true)
     }
 
-    /// Adds an entry; the oldest go to make room for it, and are told to `gone`: on a full disk it may be told itself. `false`
-    /// if it is larger than the store.
+    /// Adds an entry; the oldest go to make room for it, and are told to `gone`: on a full disk it
+    /// may be told itself. `false` if it is larger than the store.
     ///
     /// # Errors
     ///
     /// [`RecordError::Preroll`] if the disk fails.
-    pub fn push(&mut self, held: Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> Result<bool, RecordError> {
+    pub fn push(
+        &mut self,
+        held: Held,
+        bytes: &[u8],
+        gone: &mut dyn FnMut(&Held),
+    ) -> Result<bool, RecordError> {
         let Ok(len) = u32::try_from(bytes.len()) else { return Ok(false) };
         let held = Held { len, ..held };
         let count = &mut self.gone;
@@ -219,7 +237,8 @@ impl Preroll {
         Ok(taken)
     }
 
-    /// Whether it gets smaller with what comes, as its disk has too little room. In memory that changes nothing.
+    /// Whether it gets smaller with what comes, as its disk has too little room. In memory that
+    /// changes nothing.
     pub fn shrink(&mut self, shrinks: bool) {
         if let Kind::Disk(disk) = &mut self.kind {
             disk.shrink(shrinks);

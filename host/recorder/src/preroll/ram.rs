@@ -1,4 +1,5 @@
-//! A preroll in memory: one block, in which entries follow each other, each behind a head of [`OVERHEAD`] bytes.
+//! A preroll in memory: one block, in which entries follow each other, each behind a head of
+//! [`OVERHEAD`] bytes.
 
 use std::collections::TryReserveError;
 use std::hint::black_box;
@@ -32,7 +33,8 @@ impl Ram {
     pub(super) fn new(bytes: usize, prefault: bool) -> Result<Ram, TryReserveError> {
         // Asked for first: what follows would end the process.
         Vec::<u8>::new().try_reserve_exact(bytes)?;
-        // Zeroed memory comes from the system untouched, so that a large block costs nothing before it is filled.
+        // Zeroed memory comes from the system untouched, so that a large block costs nothing before
+        // it is filled.
         let mut arena = vec![0; bytes];
         if prefault {
             arena.iter_mut().step_by(PAGE).for_each(|byte| *black_box(byte) = 0);
@@ -80,7 +82,8 @@ impl Ram {
         Some(0)
     }
 
-    /// Takes out the oldest entry, of which there is one: a store without entries has room for all that fits into it.
+    /// Takes out the oldest entry, of which there is one: a store without entries has room for all
+    /// that fits into it.
     fn pop(&mut self) -> Held {
         let held = self.held(Place(self.head as u64));
         let size = size(held.len as usize);

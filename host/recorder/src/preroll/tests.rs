@@ -39,7 +39,8 @@ fn scratch(name: &str) -> PathBuf {
 
 /// Each store, with the most that it may hold.
 fn stores(name: &str, bytes: u64) -> [Preroll; 2] {
-    [Store::Ram, Store::Disk].map(|store| Preroll::open(store, bytes, scratch(name), false).unwrap())
+    [Store::Ram, Store::Disk]
+        .map(|store| Preroll::open(store, bytes, scratch(name), false).unwrap())
 }
 
 #[test]
@@ -138,20 +139,27 @@ fn the_disk_holds_no_more_files_than_are_needed_and_none_at_the_end() {
         fs::write(folder.join(name), "earlier").unwrap();
     }
     let names = || {
-        let mut names: Vec<_> =
-            fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        let mut names: Vec<_> = fs::read_dir(&folder)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect();
         names.sort();
         names
     };
     let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
-    assert_eq!(names(), ["notes.txt", "x.chunk"], "chunks of an earlier process go, other files stay");
+    assert_eq!(
+        names(),
+        ["notes.txt", "x.chunk"],
+        "chunks of an earlier process go, other files stay"
+    );
     for at in 0..1_000 {
         preroll.push(held(1, at), &[at as u8; 100_000], &mut |_| {}).unwrap();
         preroll.trim(at - 30, &mut |_| {}).unwrap();
     }
     let chunks = names().len() - 2;
     assert!((3..=5).contains(&chunks), "31 samples of 100 kB are in 1 MiB each: {chunks}");
-    let bytes: u64 = names().iter().map(|name| fs::metadata(folder.join(name)).unwrap().len()).sum();
+    let bytes: u64 =
+        names().iter().map(|name| fs::metadata(folder.join(name)).unwrap().len()).sum();
     assert!(bytes <= preroll.bytes_held());
     drop(preroll);
     assert_eq!(names(), ["notes.txt", "x.chunk"]);
@@ -164,10 +172,16 @@ fn a_disk_that_fails_is_named() {
     let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
     fs::remove_dir_all(&folder).unwrap();
     let error = preroll.push(held(0, 1), b"x", &mut |_| {}).unwrap_err();
-    assert!(matches!(&error, RecordError::Preroll { path, .. } if path.ends_with("0.chunk")), "{error:?}");
+    assert!(
+        matches!(&error, RecordError::Preroll { path, .. } if path.ends_with("0.chunk")),
+        "{error:?}"
+    );
     fs::write(&folder, "a file").unwrap();
     let refused = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).err().unwrap();
-    assert!(matches!(&refused, RecordError::Preroll { path, .. } if *path == folder), "{refused:?}");
+    assert!(
+        matches!(&refused, RecordError::Preroll { path, .. } if *path == folder),
+        "{refused:?}"
+    );
     fs::remove_file(folder).unwrap();
 }
 
@@ -180,28 +194,47 @@ fn on_a_full_disk_the_oldest_go_and_nothing_fails() {
     for bytes in [300_000, 100_000] {
         gone.clear();
         for at in 0..50 {
-            preroll.push(held(1, at), &vec![at as u8; bytes], &mut |_| panic!("there is room")).unwrap();
+            preroll
+                .push(held(1, at), &vec![at as u8; bytes], &mut |_| panic!("there is room"))
+                .unwrap();
         }
-        let number = |path: fs::DirEntry| path.path().file_stem().unwrap().to_str().unwrap().parse::<u64>().unwrap();
-        let next = 1 + fs::read_dir(&folder).unwrap().map(|path| number(path.unwrap())).max().unwrap();
+        let number = |path: fs::DirEntry| {
+            path.path().file_stem().unwrap().to_str().unwrap().parse::<u64>().unwrap()
+        };
+        let next =
+            1 + fs::read_dir(&folder).unwrap().map(|path| number(path.unwrap())).max().unwrap();
         let full = next..next + 30;
         for number in full.clone() {
-            std::os::unix::fs::symlink("/dev/full", folder.join(format!("{number}.chunk"))).unwrap();
+            std::os::unix::fs::symlink("/dev/full", folder.join(format!("{number}.chunk")))
+                .unwrap();
         }
         let mut at = 50;
         while folder.join(format!("{}.chunk", full.end - 1)).symlink_metadata().is_ok() {
-            preroll.push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns)).unwrap();
+            preroll
+                .push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns))
+                .unwrap();
             at += 1;
         }
         // There is room again.
         let last = at + 5;
         for at in at..=last {
-            preroll.push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns)).unwrap();
+            preroll
+                .push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns))
+                .unwrap();
         }
         let all = everything(&mut preroll);
-        assert!(all.len() >= 5 && all.iter().all(|(held, bytes)| bytes.iter().all(|byte| *byte == held.at_ns as u8)));
+        assert!(
+            all.len() >= 5
+                && all
+                    .iter()
+                    .all(|(held, bytes)| bytes.iter().all(|byte| *byte == held.at_ns as u8))
+        );
         let stamps = gone.iter().copied().chain(all.iter().map(|(held, _)| held.at_ns));
-        assert_eq!(stamps.collect::<Vec<_>>(), (0..=last).collect::<Vec<_>>(), "each is held, or was told");
+        assert_eq!(
+            stamps.collect::<Vec<_>>(),
+            (0..=last).collect::<Vec<_>>(),
+            "each is held, or was told"
+        );
         preroll.trim(last + 1, &mut |_| {}).unwrap();
     }
 }

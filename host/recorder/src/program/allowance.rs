@@ -36,7 +36,11 @@ mod tests {
     #[test]
     fn an_allowance_is_used_up_and_comes_back() {
         let (mut allowance, start) = (Allowance::of(10.0, 100.0), Instant::now());
-        assert!(allowance.take(60.0, start) && !allowance.take(60.0, start) && allowance.take(40.0, start));
+        assert!(
+            allowance.take(60.0, start)
+                && !allowance.take(60.0, start)
+                && allowance.take(40.0, start)
+        );
         assert!(!allowance.take(5.0, start + Duration::from_millis(400)));
         assert!(allowance.take(5.0, start + Duration::from_millis(600)));
         assert!(allowance.take(100.0, start + Duration::from_secs(3600)));

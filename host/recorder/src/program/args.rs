@@ -11,8 +11,8 @@ use gleaner_transport::{Clock, LiveSource};
 
 use super::Options;
 
-/// Records for lambdas from live topics of ROS 2. Lambdas come over standard input, which is a socket of the starter; reports, a
-/// JSON object a line, go to standard output.
+/// Records for lambdas from live topics of ROS 2. Lambdas come over standard input, which is a
+/// socket of the starter; reports, a JSON object a line, go to standard output.
 #[derive(Parser)]
 #[command(name = "gleaner-recorder", version)]
 pub(super) struct Args {
@@ -21,7 +21,8 @@ pub(super) struct Args {
     out: PathBuf,
     #[command(flatten)]
     network: NetworkArgs,
-    /// How far the clock of samples is ahead of CLOCK_MONOTONIC, in ns; without it, it shows the time of day.
+    /// How far the clock of samples is ahead of CLOCK_MONOTONIC, in ns; without it, it shows the
+    /// time of day.
     #[arg(long, value_name = "NS", allow_negative_numbers = true)]
     clock_offset: Option<i64>,
     /// Folder with message definitions, looked through first.
@@ -42,7 +43,8 @@ pub(super) struct Args {
     /// Most bytes of clips that are kept; of more, the oldest that nobody fetched are deleted.
     #[arg(long, value_name = "BYTES")]
     bytes_max: Option<u64>,
-    /// Topic of commands, of type `std_msgs/msg/String`: whoever writes it can have something recorded. Without it, nobody can.
+    /// Topic of commands, of type `std_msgs/msg/String`: whoever writes it can have something
+    /// recorded. Without it, nobody can.
     #[arg(long, value_name = "TOPIC")]
     commands: Option<TopicName>,
 }
@@ -52,8 +54,11 @@ pub(super) struct Network(dds::Options);
 
 impl Args {
     pub(super) fn read(self) -> Result<(Options, Network), Failure> {
-        let usage = |error: &dds::DdsError| Failure::caused_by(Exit::Usage, "cannot use the network", error);
-        let mut network = self.network.options("/gleaner/recorder").map_err(|error| usage(&error))?;
+        let usage = |error: &dds::DdsError| {
+            Failure::caused_by(Exit::Usage, "cannot use the network", error)
+        };
+        let mut network =
+            self.network.options("/gleaner/recorder").map_err(|error| usage(&error))?;
         network.largest = self.largest.unwrap_or(network.largest);
         network.messages = self.messages;
         network.clock = self.clock_offset.map_or(network.clock, Clock::new);
@@ -72,8 +77,9 @@ impl Args {
 
 impl Network {
     pub(super) fn open(self) -> Result<Box<dyn LiveSource>, Failure> {
-        let dds = Dds::open(self.0)
-            .map_err(|error| Failure::caused_by(Exit::Unreachable, "cannot join the network", &error))?;
+        let dds = Dds::open(self.0).map_err(|error| {
+            Failure::caused_by(Exit::Unreachable, "cannot join the network", &error)
+        })?;
         Ok(Box::new(dds))
     }
 }

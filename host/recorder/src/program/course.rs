@@ -1,5 +1,5 @@
-//! The loop: it owns the recorder. It takes its turns in small pieces, so that a trigger is heard within a fraction of a
-//! millisecond, whatever else there is to do.
+//! The loop: it owns the recorder. It takes its turns in small pieces, so that a trigger is heard
+//! within a fraction of a millisecond, whatever else there is to do.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -38,7 +38,8 @@ const BYTES_TURN: usize = 256 << 10;
 const LOOK: Duration = Duration::from_millis(5);
 /// And for the thread that writes, if that is behind.
 const BEHIND: Duration = Duration::from_millis(1);
-/// A sample is stamped before it is staged: time passes for the recorder only when all up to then must have come.
+/// A sample is stamped before it is staged: time passes for the recorder only when all up to then
+/// must have come.
 const MARGIN_NS: i64 = 100_000_000;
 /// How long the last words of lambdas may take, and the last sample.
 const LAST_WORDS: Duration = Duration::from_secs(1);
@@ -52,7 +53,8 @@ const SLACK: u64 = 64 << 20;
 ///
 /// # Errors
 ///
-/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead: whoever started this starts it again.
+/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead:
+/// whoever started this starts it again.
 pub fn run(
     options: Options,
     source: impl FnOnce() -> Result<Box<dyn LiveSource>, Failure>,
@@ -60,7 +62,8 @@ pub fn run(
     reports: File,
     stop: Arc<AtomicBool>,
 ) -> Result<(), Failure> {
-    let internal = |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
+    let internal =
+        |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
     let mut folder = Folder::hold(&options.out)?;
     let mut say = Say::start(reports, folder.losses()).map_err(internal)?;
     // Before anything is recovered, which takes room.
@@ -88,7 +91,8 @@ pub fn run(
         reader: reader.clone(),
         out: options.out.clone(),
     };
-    let watch = Builder::new().name("watch".to_owned()).spawn(move || watch.run()).map_err(internal)?;
+    let watch =
+        Builder::new().name("watch".to_owned()).spawn(move || watch.run()).map_err(internal)?;
     starter(control, events, reader.clone()).map_err(internal)?;
     let commands = options.commands.clone().map(|name| {
         let (commands, sink) = Commands::new(name.clone(), reader.clone());
@@ -167,8 +171,8 @@ pub(super) struct Course {
     pub(super) said: Said,
     pub(super) beat: Beat,
     pub(super) spreads: Spreads,
-    /// What is counted here: lambdas and wakes that are refused, and clips that were deleted before anything was recorded. The
-    /// recorder counts the rest.
+    /// What is counted here: lambdas and wakes that are refused, and clips that were deleted before
+    /// anything was recorded. The recorder counts the rest.
     pub(super) counted: Recording,
     is_ending: bool,
     pub(super) options: Options,
@@ -189,7 +193,10 @@ impl Course {
             self.tell(false)?;
             if let Some(why) = self.beat.health.dead.take() {
                 self.finish()?;
-                return Err(Failure { causes: vec![why], ..Failure::new(Exit::Internal, "the network is dead") });
+                return Err(Failure {
+                    causes: vec![why],
+                    ..Failure::new(Exit::Internal, "the network is dead")
+                });
             }
             if self.is_ending || self.stop.load(Ordering::Relaxed) {
                 return self.finish();
@@ -215,7 +222,10 @@ impl Course {
                         (Ok(()), Some(recorded)) => recorded.type_name = Some(type_name),
                         (Ok(()), None) => {}
                         (Err(error), _) => {
-                            error!(error = &error as &dyn std::error::Error, "a topic is not recorded");
+                            error!(
+                                error = &error as &dyn std::error::Error,
+                                "a topic is not recorded"
+                            );
                         }
                     }
                 }
@@ -230,7 +240,9 @@ impl Course {
 
     /// Below the floor no clip is begun, and the open one ends.
     fn look_at_disk(&mut self) -> Result<(), Failure> {
-        let (Some(free), floor) = (self.beat.disk_free, self.options.disk_floor) else { return Ok(()) };
+        let (Some(free), floor) = (self.beat.disk_free, self.options.disk_floor) else {
+            return Ok(());
+        };
         let is_held = self.recorder.is_held();
         if free < floor && !is_held {
             let why = format!("less than {} MiB of the disk were free", floor >> 20);
@@ -252,7 +264,12 @@ impl Course {
         while index < self.lambdas.len() {
             let (now, clock) = (self.clock.now(), self.clock);
             let monotonic = || clock.monotonic(clock.now());
-            let listened = self.lambdas[index].listen(&mut self.recorder, now, monotonic, &mut self.spreads)?;
+            let listened = self.lambdas[index].listen(
+                &mut self.recorder,
+                now,
+                monotonic,
+                &mut self.spreads,
+            )?;
             heard |= listened.heard;
             self.counted.lambdas_refused += u64::from(listened.is_refused);
             self.counted.add(&listened.counted);

@@ -1,4 +1,5 @@
-//! What the starter and the lambdas say, on its way to the loop. A thread each: their frames may come in pieces, or not at all.
+//! What the starter and the lambdas say, on its way to the loop. A thread each: their frames may
+//! come in pieces, or not at all.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -14,7 +15,8 @@ use tracing::warn;
 
 use super::watch::Seen;
 
-/// What one lambda said waits for the loop, up to this; then its socket waits, and then the lambda's own queue.
+/// What one lambda said waits for the loop, up to this; then its socket waits, and then the
+/// lambda's own queue.
 const SPOKEN: usize = 64;
 
 /// What the loop hears beside samples and lambdas.
@@ -54,7 +56,11 @@ pub(super) enum Spoken {
 }
 
 /// Hears the starter until it ends.
-pub(super) fn starter(control: OwnedFd, events: SyncSender<Event>, reader: Thread) -> io::Result<()> {
+pub(super) fn starter(
+    control: OwnedFd,
+    events: SyncSender<Event>,
+    reader: Thread,
+) -> io::Result<()> {
     Builder::new().name("starter".to_owned()).spawn(move || {
         let mut control = Controlled::new(control);
         loop {
@@ -63,7 +69,10 @@ pub(super) fn starter(control: OwnedFd, events: SyncSender<Event>, reader: Threa
                     .map_or(Event::Refused, |announced| Event::Announced(Box::new(announced))),
                 Ok(Some(Order::Stop) | None) => Event::Stop,
                 Err(error) => {
-                    warn!(error = &error as &dyn std::error::Error, "the starter cannot be understood");
+                    warn!(
+                        error = &error as &dyn std::error::Error,
+                        "the starter cannot be understood"
+                    );
                     Event::Stop
                 }
             };
@@ -141,7 +150,8 @@ impl Expected {
     fn differs(&self, header: &Header) -> Option<String> {
         let lambda = &self.manifest.lambda;
         let text = |what: &str, wanted: &str, found: &str| {
-            (wanted != found).then(|| format!("its {what} is `{found}`; the recorder was told of `{wanted}`"))
+            (wanted != found)
+                .then(|| format!("its {what} is `{found}`; the recorder was told of `{wanted}`"))
         };
         let manifest = header.files.iter().find(|file| file.path == "lambda.toml");
         text("name", lambda.name.as_str(), &header.lambda)
@@ -153,18 +163,22 @@ impl Expected {
             })
             .or_else(|| {
                 let is_other = header.remaps != self.remaps;
-                is_other.then(|| "its topics are remapped in another way than the recorder was told".to_owned())
+                is_other.then(|| {
+                    "its topics are remapped in another way than the recorder was told".to_owned()
+                })
             })
             .or_else(|| {
-                let limits = header.limits.in_words().into_iter().zip(self.manifest.limits.in_words());
-                limits
-                    .into_iter()
-                    .find_map(|((key, found), (_, wanted))| text(&format!("limit `{key}`"), &wanted, &found))
+                let limits =
+                    header.limits.in_words().into_iter().zip(self.manifest.limits.in_words());
+                limits.into_iter().find_map(|((key, found), (_, wanted))| {
+                    text(&format!("limit `{key}`"), &wanted, &found)
+                })
             })
     }
 }
 
-/// The manifest of a build with the limits that it gets on this vehicle, and its digest: of the same bytes.
+/// The manifest of a build with the limits that it gets on this vehicle, and its digest: of the
+/// same bytes.
 fn load(add: &Add) -> Result<(Manifest, String), Failure> {
     let build = BuildDir::of(&add.lambda);
     let text = Manifest::read(build.path())?;

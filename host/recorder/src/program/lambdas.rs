@@ -22,7 +22,8 @@ const TRIGGERS: Allowance = Allowance::of(200.0, 1000.0);
 /// Bytes of wakes per second that a lambda may fill the preroll with, and at once.
 const BYTES: Allowance = Allowance::of(1048576.0, 4194304.0);
 
-/// How far a wake's stamp may lie behind the clock, and ahead of it: it is the stamp of a sample or of a tick.
+/// How far a wake's stamp may lie behind the clock, and ahead of it: it is the stamp of a sample or
+/// of a tick.
 const BEHIND_NS: i64 = 60_000_000_000;
 const AHEAD_NS: i64 = 1_000_000_000;
 
@@ -63,7 +64,17 @@ impl Lambda {
         spoken: Receiver<Spoken>,
         answers: Answers,
     ) -> Lambda {
-        Lambda { name, rules, topics, spoken, answers, id: None, triggers: TRIGGERS, bytes: BYTES, is_warned: false }
+        Lambda {
+            name,
+            rules,
+            topics,
+            spoken,
+            answers,
+            id: None,
+            triggers: TRIGGERS,
+            bytes: BYTES,
+            is_warned: false,
+        }
     }
 
     /// Hears what it has said, up to its turn.
@@ -86,7 +97,8 @@ impl Lambda {
                 Spoken::Hello(header) => {
                     let digest = lambda_digest(&header.files);
                     let (rules, topics) = (self.rules.clone(), self.topics.clone());
-                    match recorder.try_add_lambda(Member { header: *header, rules, digest, topics }) {
+                    match recorder.try_add_lambda(Member { header: *header, rules, digest, topics })
+                    {
                         Ok(id) => {
                             self.id = Some(id);
                             listened.is_new = Some(id);
@@ -142,12 +154,15 @@ impl Lambda {
         Ok(listened)
     }
 
-    /// Counts a wake that an honest host would not send, and its triggers: a lambda cannot fill what all share.
+    /// Counts a wake that an honest host would not send, and its triggers: a lambda cannot fill
+    /// what all share.
     fn refused(&mut self, entry: &Entry, bytes: usize, now_ns: i64) -> Option<Recording> {
         let now = Instant::now();
-        let is_now = (now_ns.saturating_sub(BEHIND_NS)..=now_ns.saturating_add(AHEAD_NS)).contains(&entry.at_ns);
+        let is_now = (now_ns.saturating_sub(BEHIND_NS)..=now_ns.saturating_add(AHEAD_NS))
+            .contains(&entry.at_ns);
         let triggers = entry.triggers.len() as u64;
-        if is_now && self.bytes.take(bytes as f64, now) && self.triggers.take(triggers as f64, now) {
+        if is_now && self.bytes.take(bytes as f64, now) && self.triggers.take(triggers as f64, now)
+        {
             return None;
         }
         if !self.is_warned {
@@ -155,8 +170,16 @@ impl Lambda {
             warn!(lambda = %self.name, is_now, "wakes of a lambda are not recorded: too many, or of another time");
         }
         Some(match is_now {
-            true => Recording { wakes_over_rate: 1, triggers_over_rate: triggers, ..Recording::default() },
-            false => Recording { wakes_misstamped: 1, triggers_misstamped: triggers, ..Recording::default() },
+            true => Recording {
+                wakes_over_rate: 1,
+                triggers_over_rate: triggers,
+                ..Recording::default()
+            },
+            false => Recording {
+                wakes_misstamped: 1,
+                triggers_misstamped: triggers,
+                ..Recording::default()
+            },
         })
     }
 }

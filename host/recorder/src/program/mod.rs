@@ -1,16 +1,22 @@
 //! The program `gleaner-recorder`: one process records for all lambdas, from live topics.
 //!
 //! - `args`: the command line.
-//! - `hear`: a thread for the starter, and one for each lambda: what they say, on its way to the loop.
-//! - `staging`: samples on their way from the transport's thread to the loop; all memory of it is there before they come.
-//! - `watch`: a thread that finds topics, subscribes them, and looks after the network and the disk.
+//! - `hear`: a thread for the starter, and one for each lambda: what they say, on its way to the
+//!   loop.
+//! - `staging`: samples on their way from the transport's thread to the loop; all memory of it is
+//!   there before they come.
+//! - `watch`: a thread that finds topics, subscribes them, and looks after the network and the
+//!   disk.
 //! - `announce`: a lambda will come: what it records is wanted, and room for it made.
 //! - `lambdas`: who is heard, and how much each may ask for: `allowance`.
 //! - `commands`: what somebody outside may ask for, over a topic.
-//! - `course`: the loop: it owns the recorder, and nothing in it waits for a disk, a lambda or the network.
-//! - `telling`, `say`: what the starter is told, and a thread that writes reports, for a starter that may be slow to read them.
+//! - `course`: the loop: it owns the recorder, and nothing in it waits for a disk, a lambda or the
+//!   network.
+//! - `telling`, `say`: what the starter is told, and a thread that writes reports, for a starter
+//!   that may be slow to read them.
 //!
-//! What never happens here: a lambda's code; a lambda that speaks for another; a sample that is kept waiting for a file.
+//! What never happens here: a lambda's code; a lambda that speaks for another; a sample that is
+//! kept waiting for a file.
 
 mod allowance;
 mod announce;
@@ -71,8 +77,11 @@ pub fn main() -> ExitCode {
 }
 
 fn start(args: Args) -> Result<(), Failure> {
-    let internal = |what: &'static str| move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error);
-    // A starter that dies closes our standard input as well. Whatever comes first, open clips are completed.
+    let internal = |what: &'static str| {
+        move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
+    };
+    // A starter that dies closes our standard input as well. Whatever comes first, open clips are
+    // completed.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
         .map_err(internal("cannot be told of the starter's death"))?;

@@ -1,5 +1,5 @@
-//! Reports to the starter, and losses to their list, by a thread each: a starter that is slow to read keeps no loss from being
-//! noted, and a slow disk no report from being said.
+//! Reports to the starter, and losses to their list, by a thread each: a starter that is slow to
+//! read keeps no loss from being noted, and a slow disk no report from being said.
 
 use std::fs::File;
 use std::io::Write;
@@ -13,7 +13,8 @@ use tracing::{error, warn};
 
 use crate::LossList;
 
-/// Reports that wait, and losses. Those of clips are few; of status, one more or less does not matter.
+/// Reports that wait, and losses. Those of clips are few; of status, one more or less does not
+/// matter.
 const WAITING: usize = 1024;
 
 /// How long a starter is waited for that does not read, and a disk that does not write.
@@ -65,7 +66,8 @@ impl Say {
         }
     }
 
-    /// Says the last thing, and waits until all is said and noted; not for a starter that does not read.
+    /// Says the last thing, and waits until all is said and noted; not for a starter that does not
+    /// read.
     pub(super) fn end(mut self, report: RecorderReport) {
         self.say(report);
         let Say { reports, losses, ended, left_out } = self;
@@ -127,7 +129,9 @@ mod tests {
         // The loss itself may have found a place that was just made.
         assert!(say.left_out >= 1);
         // A starter that reads again has every report that waited.
-        let reading = std::thread::spawn(move || BufReader::new(reader).lines().map_while(Result::ok).count());
+        let reading = std::thread::spawn(move || {
+            BufReader::new(reader).lines().map_while(Result::ok).count()
+        });
         drop(say);
         assert!(reading.join().unwrap() >= WAITING);
     }

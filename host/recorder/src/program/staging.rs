@@ -1,11 +1,13 @@
 //! Samples on their way from the transport to the loop.
 //!
-//! Two blocks of memory: into one the transport's thread writes, the other is read by the loop, and they change places when
-//! that one is empty. Nothing is allocated while samples come. A sample is copied here once, from the transport's own memory,
-//! before it is known whose it is: it counts when that is accepted.
+//! Two blocks of memory: into one the transport's thread writes, the other is read by the loop, and
+//! they change places when that one is empty. Nothing is allocated while samples come. A sample is
+//! copied here once, from the transport's own memory, before it is known whose it is: it counts
+//! when that is accepted.
 //!
-//! The loop never waits for the transport's copying: meanwhile that has the block, and the loop comes back later. The transport's
-//! thread waits for the loop only if that moves a copy which is not accepted yet behind samples that are, once for each such copy.
+//! The loop never waits for the transport's copying: meanwhile that has the block, and the loop
+//! comes back later. The transport's thread waits for the loop only if that moves a copy which is
+//! not accepted yet behind samples that are, once for each such copy.
 
 use std::hint::black_box;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -66,7 +68,8 @@ impl Block {
 /// Where the sinks of all topics put samples. They are all called by one thread, the transport's.
 pub(super) struct Staging {
     filling: Mutex<Filling>,
-    /// The loop, which looks by itself every few ms; it is woken only when half of the room is taken.
+    /// The loop, which looks by itself every few ms; it is woken only when half of the room is
+    /// taken.
     reader: Thread,
 }
 
@@ -93,8 +96,9 @@ impl Staging {
         Arc::new(Staging { filling: Mutex::new(filling), reader })
     }
 
-    /// Takes what came, for `empty`, which has as much room as the one before at least. `empty` comes back if a sample is
-    /// just being copied or about to be accepted: whoever asks is to come again.
+    /// Takes what came, for `empty`, which has as much room as the one before at least. `empty`
+    /// comes back if a sample is just being copied or about to be accepted: whoever asks is to come
+    /// again.
     pub(super) fn exchange(&self, mut empty: Block) -> Result<Block, Block> {
         let mut filling = self.filling();
         let Filling { block: Some(block), copied } = &mut *filling else { return Err(empty) };
@@ -103,8 +107,9 @@ impl Staging {
                 copied.is_awaited = true;
                 return Err(empty);
             }
-            // It may be nobody's, and never be accepted; or its thread was interrupted. What came before is not kept waiting
-            // for it: it goes along to the next block. Alone it stays where it is.
+            // It may be nobody's, and never be accepted; or its thread was interrupted. What came
+            // before is not kept waiting for it: it goes along to the next block. Alone it stays
+            // where it is.
             if block.samples.is_empty() {
                 return Ok(empty);
             }
@@ -146,9 +151,11 @@ impl Staging {
         let mut filling = self.filling();
         let copied = filling.copied.take_if(|copied| copied.topic == topic)?;
         let block = filling.block.as_mut()?;
-        // A sample without room is still known to have been there. If there is no room even for that, its number will be missing.
+        // A sample without room is still known to have been there. If there is no room even for
+        // that, its number will be missing.
         if block.samples.len() < SAMPLES {
-            let bytes = (copied.verdict == Verdict::Taken).then(|| (copied.at, block.bytes.len() - copied.at));
+            let bytes = (copied.verdict == Verdict::Taken)
+                .then(|| (copied.at, block.bytes.len() - copied.at));
             block.samples.push(Staged { topic, meta: *meta, bytes });
         }
         let is_late = block.bytes.len() > block.room() / 2 || block.samples.len() > SAMPLES / 2;
@@ -223,7 +230,9 @@ mod tests {
     type Came = (TopicId, u64, Option<Vec<u8>>);
 
     fn came(block: &Block) -> Vec<Came> {
-        let came = |(staged, cdr): (Staged, &[u8])| (staged.topic, staged.meta.seq, staged.bytes.map(|_| cdr.to_vec()));
+        let came = |(staged, cdr): (Staged, &[u8])| {
+            (staged.topic, staged.meta.seq, staged.bytes.map(|_| cdr.to_vec()))
+        };
         (0..).map_while(|index| block.get(index).map(came)).collect()
     }
 
@@ -239,7 +248,8 @@ mod tests {
         assert_eq!(b.deliver(&meta(2, 2), b"second"), Verdict::Taken);
         a.accept(&meta(3, 3));
         b.accept(&meta(3, 3));
-        let expected = [(a.topic, 1, Some(b"first".to_vec())), (b.topic, 2, Some(b"second".to_vec()))];
+        let expected =
+            [(a.topic, 1, Some(b"first".to_vec())), (b.topic, 2, Some(b"second".to_vec()))];
         assert_eq!(take(&staging), expected, "there was nothing else to accept");
         assert_eq!(a.arrivals.received.load(Ordering::Relaxed), 1);
     }
@@ -251,7 +261,8 @@ mod tests {
         for _ in 0..10 {
             assert_eq!(a.copy(&[7; 60]), Some(Verdict::Taken));
         }
-        let empty = staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
+        let empty =
+            staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
         let block = staging.exchange(empty).ok().expect("or never");
         assert_eq!(came(&block), [(b.topic, 1, Some(b"before".to_vec()))]);
         assert_eq!(b.deliver(&meta(2, 2), &[8; 100]), Verdict::Taken, "its room is free again");
@@ -263,7 +274,8 @@ mod tests {
     fn a_copy_that_waits_alone_is_not_moved() {
         let (staging, [a, _]) = lanes();
         a.copy(b"late");
-        let mut empty = staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
+        let mut empty =
+            staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
         for _ in 0..3 {
             empty = staging.exchange(empty).ok().expect("nothing to take");
             assert!(empty.bytes.is_empty());
@@ -277,11 +289,15 @@ mod tests {
         let (staging, [a, b]) = lanes();
         b.deliver(&meta(1, 1), b"before");
         a.copy(b"late");
-        let empty = staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
+        let empty =
+            staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
         assert!(staging.exchange(empty).is_ok());
         a.accept(&meta(2, 2));
         b.deliver(&meta(3, 3), b"after");
-        assert_eq!(take(&staging), [(a.topic, 2, Some(b"late".to_vec())), (b.topic, 3, Some(b"after".to_vec()))]);
+        assert_eq!(
+            take(&staging),
+            [(a.topic, 2, Some(b"late".to_vec())), (b.topic, 3, Some(b"after".to_vec()))]
+        );
     }
 
     #[test]
@@ -293,7 +309,10 @@ mod tests {
         a.accept(&meta(2, 2));
         assert_eq!(b.copy(&[2; 60]), Some(Verdict::NoSlot));
         b.accept(&meta(3, 3));
-        assert_eq!(take(&staging), [(a.topic, 1, None), (a.topic, 2, Some(vec![1; 60])), (b.topic, 3, None)]);
+        assert_eq!(
+            take(&staging),
+            [(a.topic, 1, None), (a.topic, 2, Some(vec![1; 60])), (b.topic, 3, None)]
+        );
         let counts = |lane: &Lane| {
             let Arrivals { received, no_slot, too_big } = &*lane.arrivals;
             [received, no_slot, too_big].map(|count| count.load(Ordering::Relaxed))

@@ -36,7 +36,10 @@ impl Course {
         for error in self.recorder.take_failures() {
             let failure = Failure::from(error);
             error!(%failure, "a clip could not be written");
-            let why = std::iter::once(failure.message).chain(failure.causes).collect::<Vec<_>>().join(": ");
+            let why = std::iter::once(failure.message)
+                .chain(failure.causes)
+                .collect::<Vec<_>>()
+                .join(": ");
             self.say.say(RecorderReport::Loss(Loss::Failed { at_ns, why }));
         }
         for loss in self.recorder.take_deleted() {
@@ -86,7 +89,10 @@ impl Course {
             preroll_bound: counts.preroll_bound,
             in_flight: counts.in_flight,
             trigger_to_open: None,
-            commands: self.commands.as_ref().map(|commands| commands.status(self.beat.commands.as_ref())),
+            commands: self
+                .commands
+                .as_ref()
+                .map(|commands| commands.status(self.beat.commands.as_ref())),
             topics: self.topics.iter().map(topic).collect(),
             network: self.beat.health.network.clone(),
             disk_free: self.beat.disk_free,

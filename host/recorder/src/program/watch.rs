@@ -1,4 +1,5 @@
-//! Finds the topics that are wanted and subscribes them; looks after the network and the disk once a second.
+//! Finds the topics that are wanted and subscribes them; looks after the network and the disk once
+//! a second.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -34,7 +35,8 @@ pub(super) struct Want {
     pub(super) sink: Arc<dyn Sink>,
 }
 
-/// How long a topic may wait for somebody to say what it is; others are asked about others meanwhile.
+/// How long a topic may wait for somebody to say what it is; others are asked about others
+/// meanwhile.
 const ASKING: Duration = Duration::from_secs(6);
 
 /// What a topic is wanted for.
@@ -46,7 +48,8 @@ pub(super) enum Wanted {
         /// How large its samples are. Of several wants of a topic, the largest counts.
         largest: Largest,
     },
-    /// Commands come over it. It is heard before anybody writes, where the network can do that: a command is written once.
+    /// Commands come over it. It is heard before anybody writes, where the network can do that: a
+    /// command is written once.
     Commands,
 }
 
@@ -55,7 +58,8 @@ pub(super) enum Wanted {
 pub(super) struct Largest {
     /// The most that a manifest says, in bytes.
     said: usize,
-    /// Whether somebody wants it whose manifest does not say: the usual size of its type counts as well.
+    /// Whether somebody wants it whose manifest does not say: the usual size of its type counts as
+    /// well.
     is_usual: bool,
 }
 
@@ -154,7 +158,8 @@ impl Watch {
         let mut beat_at = Instant::now();
         // Since when each topic waits for its definitions.
         let mut asking: HashMap<String, Instant> = HashMap::new();
-        // Topics that were found as several types, or as another than is wanted; what they are was said.
+        // Topics that were found as several types, or as another than is wanted; what they are was
+        // said.
         let mut odd: HashSet<String> = HashSet::new();
         loop {
             match self.wants.recv_timeout(LOOK) {
@@ -172,10 +177,15 @@ impl Watch {
                     let found = choose(&topics, want, &mut odd);
                     match (want.what, found) {
                         _ if *wait > 0 => return true,
-                        // Whoever writes it is asked what it is. Until then it is not recorded, so it is not waited for longer.
+                        // Whoever writes it is asked what it is. Until then it is not recorded, so
+                        // it is not waited for longer.
                         (Wanted::Recorded { .. }, Some(found))
                             if found.definitions_text.is_none()
-                                && asking.entry(want.name.clone()).or_insert_with(Instant::now).elapsed() < ASKING
+                                && asking
+                                    .entry(want.name.clone())
+                                    .or_insert_with(Instant::now)
+                                    .elapsed()
+                                    < ASKING
                                 && self.source.definitions_may_come(&want.name) =>
                         {
                             return true;
@@ -197,11 +207,21 @@ impl Watch {
             }
             if beat_at.elapsed() >= PULSE {
                 beat_at = Instant::now();
-                let topics = heard.iter().map(|of| (of.topic, self.source.status(of.subscription))).collect();
+                let topics = heard
+                    .iter()
+                    .map(|of| (of.topic, self.source.status(of.subscription)))
+                    .collect();
                 let (rss_bytes, cpu_s) = (usage::resident(), usage::cpu_seconds());
                 let disk_free = free(&self.out);
                 let commands = commands.map(|of| self.source.status(of));
-                let beat = Beat { health: self.source.health(), topics, commands, disk_free, rss_bytes, cpu_s };
+                let beat = Beat {
+                    health: self.source.health(),
+                    topics,
+                    commands,
+                    disk_free,
+                    rss_bytes,
+                    cpu_s,
+                };
                 match self.events.try_send(Event::Seen(Seen::Pulse(Box::new(beat)))) {
                     Ok(()) => self.reader.unpark(),
                     // The next one comes soon.
@@ -212,7 +232,13 @@ impl Watch {
         }
     }
 
-    fn record(&mut self, want: &Want, topic: TopicId, largest: Largest, found: &DiscoveredTopic) -> Option<Heard> {
+    fn record(
+        &mut self,
+        want: &Want,
+        topic: TopicId,
+        largest: Largest,
+        found: &DiscoveredTopic,
+    ) -> Option<Heard> {
         if found.definitions_text.is_none() {
             let (topic, type_name) = (visible(&want.name), visible(&found.type_name));
             warn!(%topic, %type_name, "no definitions of this type: its messages are recorded without");
@@ -234,7 +260,9 @@ impl Watch {
         // Before its first sample.
         self.events.send(Event::Seen(Seen::Found { topic, of })).ok()?;
         match self.source.subscribe(&spec, Arc::clone(&want.sink)) {
-            Ok(subscription) => Some(Heard { topic, subscription, type_name: spec.type_name, max_bytes }),
+            Ok(subscription) => {
+                Some(Heard { topic, subscription, type_name: spec.type_name, max_bytes })
+            }
             Err(why) => {
                 error!(topic = %visible(&want.name), error = &why as &dyn std::error::Error, "cannot record a topic");
                 None
@@ -262,10 +290,17 @@ impl Watch {
     }
 }
 
-/// Of what is there, the topic that is wanted: of the type that a manifest says, else of the one that most write.
-fn choose<'a>(topics: &'a [DiscoveredTopic], want: &Want, odd: &mut HashSet<String>) -> Option<&'a DiscoveredTopic> {
+/// Of what is there, the topic that is wanted: of the type that a manifest says, else of the one
+/// that most write.
+fn choose<'a>(
+    topics: &'a [DiscoveredTopic],
+    want: &Want,
+    odd: &mut HashSet<String>,
+) -> Option<&'a DiscoveredTopic> {
     let mut named = topics.iter().filter(|topic| topic.topic == want.name);
-    let is_wanted = |found: &&DiscoveredTopic| want.type_name.as_ref().is_none_or(|wanted| found.type_name == *wanted);
+    let is_wanted = |found: &&DiscoveredTopic| {
+        want.type_name.as_ref().is_none_or(|wanted| found.type_name == *wanted)
+    };
     // The transport names first what most write.
     let found = named.clone().find(is_wanted);
     let chosen = found.map(|found| &found.type_name);
@@ -287,8 +322,9 @@ fn choose<'a>(topics: &'a [DiscoveredTopic], want: &Want, odd: &mut HashSet<Stri
     found
 }
 
-/// Bytes of the largest sample of a topic of which no manifest says more. What is larger may be dropped before anybody can count
-/// it, so this is generous; the staging area, which counts what it has no room for, is not.
+/// Bytes of the largest sample of a topic of which no manifest says more. What is larger may be
+/// dropped before anybody can count it, so this is generous; the staging area, which counts what it
+/// has no room for, is not.
 fn usual_bytes(type_name: &str) -> usize {
     match type_name.rsplit('/').next() {
         Some("Image" | "PointCloud2") => 32 << 20,
@@ -310,7 +346,11 @@ mod tests {
         let image = "sensor_msgs/msg/Image";
         let said = |bytes| Largest::of(Some(bytes));
         assert_eq!(said(100).and(said(300)).and(said(200)).bytes(image), 300);
-        assert_eq!(said(100).and(Largest::of(None)).bytes(image), 32 << 20, "somebody does not know");
+        assert_eq!(
+            said(100).and(Largest::of(None)).bytes(image),
+            32 << 20,
+            "somebody does not know"
+        );
         assert_eq!(Largest::of(None).and(said(64 << 20)).bytes(image), 64 << 20);
     }
 }

@@ -31,7 +31,14 @@ pub(super) struct Tally {
 
 impl Default for Tally {
     fn default() -> Tally {
-        Tally { messages: 0, overwritten: Some(0), too_big: Some(0), lost: None, huge: 0, is_aged: false }
+        Tally {
+            messages: 0,
+            overwritten: Some(0),
+            too_big: Some(0),
+            lost: None,
+            huge: 0,
+            is_aged: false,
+        }
     }
 }
 
@@ -213,7 +220,12 @@ impl Draft {
     }
 
     /// Completes the file; returns the clip if that is done already.
-    pub(super) fn finish(mut self, desk: &mut Desk, group: &Group, close: &Close) -> Result<Option<Clip>, RecordError> {
+    pub(super) fn finish(
+        mut self,
+        desk: &mut Desk,
+        group: &Group,
+        close: &Close,
+    ) -> Result<Option<Clip>, RecordError> {
         let topics = self.topics(desk, group);
         let begin = self.begin(desk, group);
         let there = topics.iter().map(|topic| &desk.lanes[*topic]).filter(|lane| !lane.is_missing);
@@ -222,7 +234,9 @@ impl Draft {
             from_ns: self.from(group),
             to_ns: match close {
                 Close::Full(boundary) => *boundary,
-                Close::EndOfDrive(end) | Close::Early(end, _) if group.waits_for_stop() => (*end).max(group.from),
+                Close::EndOfDrive(end) | Close::Early(end, _) if group.waits_for_stop() => {
+                    (*end).max(group.from)
+                }
                 Close::Complete | Close::EndOfDrive(_) | Close::Early(..) => group.to,
             },
             lambdas: desk.lambdas_of(group),
@@ -231,10 +245,14 @@ impl Draft {
         };
         self.say_ends(group, close, &mut ending.short);
         let name = |lambda: &usize| &desk.crews[*lambda].header.lambda;
-        ending.short.extend(self.ended.iter().map(|lambda| format!("{} ended before it said stop", name(lambda))));
+        ending.short.extend(
+            self.ended.iter().map(|lambda| format!("{} ended before it said stop", name(lambda))),
+        );
         ending.short.extend(self.uncertain.iter().map(|lambda| {
             let name = name(lambda);
-            format!("there are more triggers of {name} than are counted: too many waited for their clip")
+            format!(
+                "there are more triggers of {name} than are counted: too many waited for their clip"
+            )
         }));
         for topic in topics {
             ending.topics.push(self.counts(desk, topic, group, &mut ending.short));
@@ -253,10 +271,16 @@ impl Draft {
         desk.pen.finish(Last { clip: self.clip, begin, ending, topics: declared, journals })
     }
 
-    /// The topics of its lambdas; and those of which it holds late messages, for a lambda whose windows ended before it.
+    /// The topics of its lambdas; and those of which it holds late messages, for a lambda whose
+    /// windows ended before it.
     fn topics(&self, desk: &Desk, group: &Group) -> Vec<usize> {
         let mut topics = desk.topics_of(group);
-        let written = self.tallies.iter().enumerate().filter(|(_, tally)| tally.messages > 0).map(|(topic, _)| topic);
+        let written = self
+            .tallies
+            .iter()
+            .enumerate()
+            .filter(|(_, tally)| tally.messages > 0)
+            .map(|(topic, _)| topic);
         for topic in written {
             if !topics.contains(&topic) {
                 topics.push(topic);
@@ -275,7 +299,9 @@ impl Draft {
             short.push(format!("the preroll begins {late} late: nothing was recorded before"));
         }
         match close {
-            Close::Full(_) => short.push("continues in the next clip, if anything more came".to_owned()),
+            Close::Full(_) => {
+                short.push("continues in the next clip, if anything more came".to_owned())
+            }
             Close::EndOfDrive(_) if group.waits_for_stop() => {
                 short.push("the drive ended before the lambda said stop".to_owned());
             }
@@ -288,8 +314,15 @@ impl Draft {
         }
     }
 
-    fn counts(&mut self, desk: &Desk, topic: usize, group: &Group, short: &mut Vec<String>) -> TopicCounts {
-        let Tally { messages, overwritten, too_big, lost, huge, is_aged } = self.tally(topic).clone();
+    fn counts(
+        &mut self,
+        desk: &Desk,
+        topic: usize,
+        group: &Group,
+        short: &mut Vec<String>,
+    ) -> TopicCounts {
+        let Tally { messages, overwritten, too_big, lost, huge, is_aged } =
+            self.tally(topic).clone();
         let lane = &desk.lanes[topic];
         let name = &lane.topic.name;
         match overwritten {
@@ -304,12 +337,18 @@ impl Draft {
         }
         if huge > 0 {
             let most = self.limits.message_bytes >> 20;
-            short.push(format!("{} of {name} larger than {most} MiB: no clip holds such", plural(huge, "sample")));
+            short.push(format!(
+                "{} of {name} larger than {most} MiB: no clip holds such",
+                plural(huge, "sample")
+            ));
         }
         match too_big.map(|count| count.saturating_sub(huge)) {
             Some(0) => {}
             Some(count) => {
-                short.push(format!("{} of {name} did not fit into the preroll: preroll_size", plural(count, "sample")));
+                short.push(format!(
+                    "{} of {name} did not fit into the preroll: preroll_size",
+                    plural(count, "sample")
+                ));
             }
             None => {
                 short.push(format!(
@@ -320,7 +359,9 @@ impl Draft {
         if is_aged {
             short.push(format!("a trigger came late: samples of {name} had left the preroll"));
         }
-        if let Some(late) = lane.found_at.map(|at| at.saturating_sub(self.from(group))).filter(|late| *late > 0) {
+        if let Some(late) =
+            lane.found_at.map(|at| at.saturating_sub(self.from(group))).filter(|late| *late > 0)
+        {
             short.push(format!("{name} was found {} after the clip begins", seconds(late)));
         }
         if let Some(count) = lost.filter(|count| *count > 0) {
@@ -343,7 +384,9 @@ impl Draft {
         let unheard = *at(&mut self.wakes_unheard, lambda);
         if unheard > 0 {
             let wakes = plural(unheard, "wake");
-            short.push(format!("the journal of {name} lacks {wakes}: lost on the way to the recorder"));
+            short.push(format!(
+                "the journal of {name} lacks {wakes}: lost on the way to the recorder"
+            ));
             let apart = part.keep_run();
             if apart > 0 {
                 let wakes = plural(apart, "more wake");
@@ -352,13 +395,19 @@ impl Draft {
         }
         let lost = *at(&mut self.wakes_lost, lambda);
         if lost > 0 {
-            short.push(format!("the journal of {name} lacks {}: pushed out of the preroll", plural(lost, "wake")));
+            short.push(format!(
+                "the journal of {name} lacks {}: pushed out of the preroll",
+                plural(lost, "wake")
+            ));
         }
         if part.cut() > 0 {
             let last = plural(part.cut(), "wake");
             let why = match self.crowded.contains(&lambda) {
                 false => format!("longer than {} MiB", self.limits.part_bytes >> 20),
-                true => format!("the journals of all are longer than {} MiB", self.limits.parts_bytes >> 20),
+                true => format!(
+                    "the journals of all are longer than {} MiB",
+                    self.limits.parts_bytes >> 20
+                ),
             };
             short.push(format!("the journal of {name} lacks the last {last}: {why}"));
         }
@@ -366,7 +415,8 @@ impl Draft {
     }
 }
 
-/// The item at `index` of a list that grows as far as it is asked for. Topics and lambdas are numbered from 0.
+/// The item at `index` of a list that grows as far as it is asked for. Topics and lambdas are
+/// numbered from 0.
 fn at<T: Default>(list: &mut Vec<T>, index: usize) -> &mut T {
     if list.len() <= index {
         list.resize_with(index + 1, T::default);

@@ -13,7 +13,8 @@ pub(super) struct Limits {
     pub(super) part_bytes: usize,
     /// Most memory for the parts of all lambdas in one clip.
     pub(super) parts_bytes: usize,
-    /// Most triggers that wait for their clip. A lambda can trigger often, and windows wait for minutes.
+    /// Most triggers that wait for their clip. A lambda can trigger often, and windows wait for
+    /// minutes.
     pub(super) waiting: usize,
 }
 

@@ -24,13 +24,17 @@ const GRACE: Duration = Duration::from_millis(200);
 /// How many clips were deleted to make room, and how many could not be.
 pub(crate) fn counted(losses: &[Loss]) -> (u64, u64) {
     let count = |is_it: fn(&Loss) -> bool| losses.iter().filter(|loss| is_it(loss)).count() as u64;
-    (count(|loss| matches!(loss, Loss::Deleted { .. })), count(|loss| matches!(loss, Loss::NotDeleted { .. })))
+    (
+        count(|loss| matches!(loss, Loss::Deleted { .. })),
+        count(|loss| matches!(loss, Loss::NotDeleted { .. })),
+    )
 }
 
 impl Recorder {
-    /// A recorder without topics and lambdas, that is fed while it happens. A thread writes its clips; at most 16 MiB and
-    /// one message are on their way to it, and the preroll holds what has to wait. Gaps in the numbers of samples are losses.
-    /// What an earlier process left in a folder of [`Folder::hold`] is recovered by that thread, between what it has to write.
+    /// A recorder without topics and lambdas, that is fed while it happens. A thread writes its
+    /// clips; at most 16 MiB and one message are on their way to it, and the preroll holds what has
+    /// to wait. Gaps in the numbers of samples are losses. What an earlier process left in a folder
+    /// of [`Folder::hold`] is recovered by that thread, between what it has to write.
     ///
     /// # Errors
     ///
@@ -41,13 +45,14 @@ impl Recorder {
         Ok(recorder)
     }
 
-    /// Does a piece of what is to be done, which takes a tenth of a millisecond or two unless a single message takes longer.
-    /// To be called after every few samples and wakes, and again while it says so.
+    /// Does a piece of what is to be done, which takes a tenth of a millisecond or two unless a
+    /// single message takes longer. To be called after every few samples and wakes, and again while
+    /// it says so.
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if the preroll is on disk and that fails, or the thread that writes is gone. That a clip could not be
-    /// written is no such error: see [`Recorder::take_failures`].
+    /// [`RecordError`] if the preroll is on disk and that fails, or the thread that writes is gone.
+    /// That a clip could not be written is no such error: see [`Recorder::take_failures`].
     pub fn work(&mut self) -> Result<Work, RecordError> {
         let mut outcomes = Vec::new();
         self.stock.desk.pen.poll(&mut outcomes)?;
@@ -64,13 +69,14 @@ impl Recorder {
         std::mem::take(&mut self.finished.failures)
     }
 
-    /// Clips that an earlier process had left unfinished, and that are whole now, since this was asked last. One that cannot be
-    /// recovered is among the failures.
+    /// Clips that an earlier process had left unfinished, and that are whole now, since this was
+    /// asked last. One that cannot be recovered is among the failures.
     pub fn take_recovered(&mut self) -> Vec<Clip> {
         std::mem::take(&mut self.finished.recovered)
     }
 
-    /// Clips that had to go for others, or could not be deleted, since this was asked last; the first of them.
+    /// Clips that had to go for others, or could not be deleted, since this was asked last; the
+    /// first of them.
     pub fn take_deleted(&mut self) -> Vec<Loss> {
         std::mem::take(&mut self.finished.deleted)
     }
@@ -84,7 +90,8 @@ impl Recorder {
     ///
     /// # Errors
     ///
-    /// [`RecordError::LongTopic`] if a clip has no room for what it says of itself: it stays missing.
+    /// [`RecordError::LongTopic`] if a clip has no room for what it says of itself: it stays
+    /// missing.
     pub fn found_topic(&mut self, id: TopicId, topic: Topic) -> Result<(), RecordError> {
         topic.check()?;
         let now = self.now;
@@ -97,7 +104,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// So many wakes of a lambda were lost before they came here; the next one to come is of this stamp.
+    /// So many wakes of a lambda were lost before they came here; the next one to come is of this
+    /// stamp.
     pub fn lost_wakes(&mut self, lambda: LambdaId, at_ns: i64, count: u64) {
         self.stock.desk.crews[lambda.0].wakes += count;
         self.stock.wake_losses[lambda.0].lost.add_some(at_ns, 0, count);
@@ -109,8 +117,9 @@ impl Recorder {
         self.stock.losses[topic.0].lost.add(meta.at_ns, 0);
     }
 
-    /// Somebody commands what `lambda` could trigger; `source` says who, in words. It is no wake: no journal has it, and it has
-    /// no part in the lambda's cooldown. A stop ends what a command started with this label.
+    /// Somebody commands what `lambda` could trigger; `source` says who, in words. It is no wake:
+    /// no journal has it, and it has no part in the lambda's cooldown. A stop ends what a command
+    /// started with this label.
     ///
     /// # Errors
     ///
@@ -136,7 +145,8 @@ impl Recorder {
                 return Ok(Commanded::Ignored);
             }
         };
-        let moment = Moment { source: Some(source), ..Moment::of(self.name_of(lambda), trigger, at_ns) };
+        let moment =
+            Moment { source: Some(source), ..Moment::of(self.name_of(lambda), trigger, at_ns) };
         self.await_clip(lambda, moment);
         self.act()?;
         Ok(commanded)
@@ -157,7 +167,8 @@ impl Recorder {
         self.run()
     }
 
-    /// From now on no clip is begun, and the one that is open ends: `why` says it. A preroll on disk gets smaller. `None`: goes on.
+    /// From now on no clip is begun, and the one that is open ends: `why` says it. A preroll on
+    /// disk gets smaller. `None`: goes on.
     ///
     /// # Errors
     ///
@@ -175,7 +186,8 @@ impl Recorder {
         self.held.is_some()
     }
 
-    /// The preroll may take more from now on: `bytes`, and a disk if it was in memory. It is never made smaller.
+    /// The preroll may take more from now on: `bytes`, and a disk if it was in memory. It is never
+    /// made smaller.
     ///
     /// # Errors
     ///

@@ -40,26 +40,32 @@ pub(crate) use live::counted;
 pub use settings::{Commanded, Counts, LambdaId, Settings, TopicId, Work};
 pub use stock::Member;
 
-/// Most topics of one recorder. A vehicle has some hundreds. Of each, the stamps of some thousand lost samples are kept: 100 KiB.
+/// Most topics of one recorder. A vehicle has some hundreds. Of each, the stamps of some thousand
+/// lost samples are kept: 100 KiB.
 pub const TOPICS_MAX: usize = 1024;
 
-/// Most bytes of the names of all topics of one recorder, and of their types: they stand in a line of the list of clips, up to
-/// seven times and with six bytes for one, and a line has at most 16 MiB.
+/// Most bytes of the names of all topics of one recorder, and of their types: they stand in a line
+/// of the list of clips, up to seven times and with six bytes for one, and a line has at most 16
+/// MiB.
 const NAMES_MAX: usize = 256 << 10;
 
-/// Cuts clips out of what passes by. Time is what stamps and [`Recorder::advance`] say, and never goes back.
+/// Cuts clips out of what passes by. Time is what stamps and [`Recorder::advance`] say, and never
+/// goes back.
 ///
-/// One made by [`new`](Self::new) does everything within each call; what it records depends on stamps only. One made by
-/// [`live`](Self::live) leaves what takes long to a thread, and to [`work`](Self::work), which is to be called in between.
+/// One made by [`new`](Self::new) does everything within each call; what it records depends on
+/// stamps only. One made by [`live`](Self::live) leaves what takes long to a thread, and to
+/// [`work`](Self::work), which is to be called in between.
 ///
-/// After an error a recorder is of no use: drop it. What it has written is recovered by the next [`Folder::open`].
+/// After an error a recorder is of no use: drop it. What it has written is recovered by the next
+/// [`Folder::open`].
 pub struct Recorder {
     windows: Windows,
     stock: Stock,
     draft: Option<Draft>,
     /// A clip of windows before those of `draft`.
     stray: Option<Stray>,
-    /// What brings `stray`, or else `draft`, up to what is held. Nothing is decided while it is under way.
+    /// What brings `stray`, or else `draft`, up to what is held. Nothing is decided while it is
+    /// under way.
     walk: Option<Walk>,
     /// Messages after this one came while they could not be written to `draft`.
     behind: Option<Option<Walked>>,
@@ -88,7 +94,8 @@ impl Recorder {
 
     fn with(pen: Pen, settings: Settings, is_live: bool) -> Result<Recorder, RecordError> {
         let Settings { store, preroll_bytes, prefault, .. } = settings;
-        let preroll = Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
+        let preroll =
+            Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
         let max_length_ns = nanoseconds(settings.max_length).max(1);
         Ok(Recorder {
             windows: Windows::new(max_length_ns),
@@ -127,8 +134,9 @@ impl Recorder {
     ///
     /// # Errors
     ///
-    /// [`RecordError::TooManyTopics`] beyond [`TOPICS_MAX`]; [`RecordError::LongTopic`] and [`RecordError::LongNames`] if a clip has
-    /// no room for what it says of itself, or all together.
+    /// [`RecordError::TooManyTopics`] beyond [`TOPICS_MAX`]; [`RecordError::LongTopic`] and
+    /// [`RecordError::LongNames`] if a clip has no room for what it says of itself, or all
+    /// together.
     pub fn add_topic(&mut self, topic: Topic) -> Result<TopicId, RecordError> {
         self.add_lane(topic, false)
     }
@@ -139,7 +147,12 @@ impl Recorder {
     ///
     /// As [`Recorder::add_topic`].
     pub fn add_missing_topic(&mut self, name: &str) -> Result<TopicId, RecordError> {
-        let topic = Topic { name: name.to_owned(), type_name: String::new(), definitions: None, offered_qos: None };
+        let topic = Topic {
+            name: name.to_owned(),
+            type_name: String::new(),
+            definitions: None,
+            offered_qos: None,
+        };
         self.add_lane(topic, true)
     }
 
@@ -193,7 +206,13 @@ impl Recorder {
         }
         let Member { header, digest, topics, .. } = member;
         let encoder = Encoder::new(header.inputs.len());
-        self.stock.desk.crews.push(Crew { header: Arc::new(header), digest, topics, encoder, wakes: 0 });
+        self.stock.desk.crews.push(Crew {
+            header: Arc::new(header),
+            digest,
+            topics,
+            encoder,
+            wakes: 0,
+        });
         self.stock.wake_losses.push(Losses::default());
         Ok(LambdaId(lambda))
     }
@@ -203,7 +222,12 @@ impl Recorder {
     /// # Errors
     ///
     /// [`RecordError`] if the disk fails.
-    pub fn sample(&mut self, topic: TopicId, meta: &SampleMeta, cdr: &[u8]) -> Result<(), RecordError> {
+    pub fn sample(
+        &mut self,
+        topic: TopicId,
+        meta: &SampleMeta,
+        cdr: &[u8],
+    ) -> Result<(), RecordError> {
         if meta.at_ns < 0 {
             self.counts.recording.before_1970 += 1;
             return Ok(());
@@ -224,10 +248,13 @@ impl Recorder {
         self.stock.keep(Held::sample(topic.0, &meta, in_group), cdr, pushed_out, too_big)
     }
 
-    /// Writes a sample to the open clip, if it belongs there. Returns the group in whose clip it is then.
+    /// Writes a sample to the open clip, if it belongs there. Returns the group in whose clip it is
+    /// then.
     fn write(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) -> Result<u64, RecordError> {
         let is_prompt = self.is_prompt(meta.at_ns);
-        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else { return Ok(0) };
+        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else {
+            return Ok(0);
+        };
         let Stock { preroll, desk, .. } = &mut self.stock;
         if !desk.covers(group, topic, meta.at_ns) {
             return Ok(0);
@@ -248,7 +275,8 @@ impl Recorder {
 
     /// A lambda was woken: keeps the wake for its journal, and does what its triggers ask for.
     ///
-    /// Live, its stamp lets no time pass: samples from before it may still be on their way, and it may itself be up to 200 ms late.
+    /// Live, its stamp lets no time pass: samples from before it may still be on their way, and it
+    /// may itself be up to 200 ms late.
     ///
     /// # Errors
     ///
@@ -275,13 +303,19 @@ impl Recorder {
             in_group = draft.group;
         }
         let Recording { pushed_out, too_big, .. } = &mut self.counts.recording;
-        self.stock.keep(Held::wake(lambda.0, number, entry.at_ns, in_group), &self.encoded, pushed_out, too_big)?;
+        self.stock.keep(
+            Held::wake(lambda.0, number, entry.at_ns, in_group),
+            &self.encoded,
+            pushed_out,
+            too_big,
+        )?;
         if entry.triggers.is_empty() {
             return Ok(());
         }
         if self.held.is_some() {
             self.counts.recording.held_back +=
-                entry.triggers.iter().filter(|trigger| trigger.kind != TriggerKind::Stop).count() as u64;
+                entry.triggers.iter().filter(|trigger| trigger.kind != TriggerKind::Stop).count()
+                    as u64;
             return Ok(());
         }
         for trigger in &entry.triggers {
@@ -326,7 +360,8 @@ impl Recorder {
         self.pass(now_ns.max(0))
     }
 
-    /// The newest of the clips that are finished, in the order in which they were; `clips.jsonl` has all.
+    /// The newest of the clips that are finished, in the order in which they were; `clips.jsonl`
+    /// has all.
     pub fn clips(&self) -> &[Clip] {
         self.finished.newest()
     }

@@ -9,12 +9,15 @@ pub(super) fn stem(lambda: &str, at_ns: i64) -> String {
     let second = seconds.rem_euclid(DAY_S);
     let (hour, minute, second) = (second / 3600, second / 60 % 60, second % 60);
     let millisecond = nanoseconds / 1_000_000;
-    format!("{lambda}-{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}.{millisecond:03}Z")
+    format!(
+        "{lambda}-{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}.{millisecond:03}Z"
+    )
 }
 
 /// Year, month and day of the Gregorian calendar, `days` after 1 January 1970.
 ///
-/// Years are counted from March, so that the leap day is the last day of a year; 400 of them have 146097 days.
+/// Years are counted from March, so that the leap day is the last day of a year; 400 of them have
+/// 146097 days.
 fn date(days: i64) -> (i64, i64, i64) {
     // Days from 1 March of year 0 to 1 January 1970.
     let days = days + 719_468;

@@ -32,8 +32,9 @@ impl Recorder {
         self.run_within(if self.stock.desk.is_live { Budget::NONE } else { Budget::ALL })
     }
 
-    /// Whether a sample of this stamp may be written to the open clip when it comes. While the clip is being brought up to
-    /// what is held, or is full, it waits its turn in the preroll, so that a file is in the order in which things came.
+    /// Whether a sample of this stamp may be written to the open clip when it comes. While the clip
+    /// is being brought up to what is held, or is full, it waits its turn in the preroll, so that a
+    /// file is in the order in which things came.
     pub(super) fn is_prompt(&self, at_ns: i64) -> bool {
         !self.stock.desk.is_live
             || self.behind.is_none()
@@ -88,8 +89,12 @@ impl Recorder {
                 continue;
             };
             let is_done = match (&mut self.stray, &mut self.draft, self.windows.open()) {
-                (Some(stray), ..) => self.stock.walk(&mut walk, &mut stray.draft, &stray.group, budget)?,
-                (None, Some(draft), Some(group)) => self.stock.walk(&mut walk, draft, group, budget)?,
+                (Some(stray), ..) => {
+                    self.stock.walk(&mut walk, &mut stray.draft, &stray.group, budget)?
+                }
+                (None, Some(draft), Some(group)) => {
+                    self.stock.walk(&mut walk, draft, group, budget)?
+                }
                 _ => true,
             };
             if !is_done {
@@ -113,7 +118,8 @@ impl Recorder {
 
     fn settle(&mut self, windows: Vec<Window>, fresh_from: i64) -> Result<(), RecordError> {
         if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) {
-            let walk = self.stock.settle(draft, group, windows, self.windows.limit(), fresh_from)?;
+            let walk =
+                self.stock.settle(draft, group, windows, self.windows.limit(), fresh_from)?;
             self.walk = Some(walk);
         }
         Ok(())
@@ -121,7 +127,9 @@ impl Recorder {
 
     /// Goes on in a next clip.
     fn roll(&mut self, boundary: i64, before: &Group) -> Result<(), RecordError> {
-        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else { return Ok(()) };
+        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else {
+            return Ok(());
+        };
         if !draft.is_empty() {
             let next = draft.next(group, &mut self.stock.desk);
             let full = std::mem::replace(draft, next);
@@ -139,7 +147,8 @@ impl Recorder {
 
     pub(super) fn complete(&mut self, group: &Group, close: Close) -> Result<(), RecordError> {
         if let Some(draft) = self.draft.take() {
-            // The clip before promised that more would come; where nothing did, there is no clip of nothing.
+            // The clip before promised that more would come; where nothing did, there is no clip of
+            // nothing.
             if draft.continues && draft.is_empty() && draft.triggers == 0 {
                 return self.stock.desk.pen.forget(draft.clip);
             }
@@ -178,7 +187,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// The drive ends: completes what is open. A clip whose window had not ended says so. Live, this waits for the disk.
+    /// The drive ends: completes what is open. A clip whose window had not ended says so. Live,
+    /// this waits for the disk.
     ///
     /// # Errors
     ///
@@ -192,7 +202,10 @@ impl Recorder {
         self.settle_all()?;
         while let Some(group) = self.windows.close() {
             let why = || Arc::from("the recording was stopped before the window ended");
-            self.complete(&group, if is_live { Close::Early(end, why()) } else { Close::EndOfDrive(end) })?;
+            self.complete(
+                &group,
+                if is_live { Close::Early(end, why()) } else { Close::EndOfDrive(end) },
+            )?;
             self.run()?;
             self.settle_all()?;
         }

@@ -1,4 +1,5 @@
-//! What is held and known while no clip is written: the preroll and its losses, topics, lambdas, triggers that wait.
+//! What is held and known while no clip is written: the preroll and its losses, topics, lambdas,
+//! triggers that wait.
 
 use std::sync::Arc;
 
@@ -112,8 +113,9 @@ impl Desk {
     }
 }
 
-/// How far a clip has been settled: what came up to an entry will not be wanted by windows that cover nothing new before
-/// its newest stamp. So a lambda that triggers in every wake does not have the whole preroll looked through each time.
+/// How far a clip has been settled: what came up to an entry will not be wanted by windows that
+/// cover nothing new before its newest stamp. So a lambda that triggers in every wake does not have
+/// the whole preroll looked through each time.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Settled {
     pub(super) last: Walked,
@@ -134,7 +136,8 @@ pub(super) struct Stock {
 }
 
 impl Stock {
-    /// Keeps an entry. `pushed_out` counts samples that have to go for it, `too_big` is raised if it cannot be kept.
+    /// Keeps an entry. `pushed_out` counts samples that have to go for it, `too_big` is raised if
+    /// it cannot be kept.
     pub(super) fn keep(
         &mut self,
         held: Held,
@@ -237,7 +240,8 @@ impl Stock {
         for topic in self.desk.topics_of(group) {
             let desk = &self.desk;
             let lost = &mut self.losses[topic].lost;
-            let is_known = !lost.is_unknown(from, number) && desk.lanes[topic].found_at.is_none_or(|at| at <= from);
+            let is_known = !lost.is_unknown(from, number)
+                && desk.lanes[topic].found_at.is_none_or(|at| at <= from);
             let count = lost.count(number, |at| at <= limit && desk.covers(group, topic, at));
             draft.tally(topic).lost = is_known.then_some(count);
         }
@@ -294,13 +298,18 @@ impl Stock {
         let inside = group.begin..=group.to.min(limit);
         for (lambda, losses) in self.wake_losses.iter_mut().enumerate() {
             let covered = |at: i64| inside.contains(&at);
-            let lost = losses.overwritten.count(number, covered) + losses.too_big.count(number, covered);
+            let lost =
+                losses.overwritten.count(number, covered) + losses.too_big.count(number, covered);
             draft.lose_wakes(lambda, lost);
         }
     }
 }
 
-fn losses_of<'a>(topics: &'a mut [Losses], wakes: &'a mut [Losses], held: &Held) -> Option<&'a mut Losses> {
+fn losses_of<'a>(
+    topics: &'a mut [Losses],
+    wakes: &'a mut [Losses],
+    held: &Held,
+) -> Option<&'a mut Losses> {
     match held.source.lambda() {
         Some(lambda) => wakes.get_mut(lambda),
         None => topics.get_mut(held.source.as_topic()?),

@@ -6,7 +6,11 @@ use super::*;
 use crate::support::*;
 
 /// A recorder of one topic and one lambda, with these limits.
-fn recorder(scratch: &Scratch, rolls_ms: (i64, i64, i64), limits: Limits) -> (Recorder, TopicId, LambdaId) {
+fn recorder(
+    scratch: &Scratch,
+    rolls_ms: (i64, i64, i64),
+    limits: Limits,
+) -> (Recorder, TopicId, LambdaId) {
     let mut recorder = scratch.recorder(|_| {});
     recorder.stock.desk.limits = limits;
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -32,7 +36,8 @@ fn a_journal_that_is_too_long_has_no_hole_and_says_what_is_missing() {
     let kept = wakes.len() as i64;
     assert!((5..20).contains(&kept), "{kept}");
     assert_eq!(wakes, (0..kept).map(|n| T0 + (100 + n) * MS).collect::<Vec<_>>());
-    let short = format!("the journal of hello lacks the last {} wakes: longer than 0 MiB", 40 - kept);
+    let short =
+        format!("the journal of hello lacks the last {} wakes: longer than 0 MiB", 40 - kept);
     assert!(clip.short.contains(&short), "{:?}", clip.short);
 }
 
@@ -43,7 +48,9 @@ fn the_journals_of_a_clip_are_bounded_together_and_each_says_what_it_lacks() {
     let (mut recorder, a, first) = recorder(&scratch, (100, 50, 0), limits);
     let second = recorder.add_lambda(member("second", (100, 50, 0), &[a]));
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
-    (100..140).for_each(|ms| [first, second].into_iter().for_each(|lambda| wake(&mut recorder, lambda, ms)));
+    (100..140).for_each(|ms| {
+        [first, second].into_iter().for_each(|lambda| wake(&mut recorder, lambda, ms))
+    });
     let draft = recorder.draft.as_ref().unwrap();
     assert!(draft.journal_bytes() <= 3 << 10);
     recorder.finish(T0 + S).unwrap();
@@ -67,7 +74,8 @@ fn the_journals_of_a_clip_are_bounded_together_and_each_says_what_it_lacks() {
 #[test]
 fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
     let scratch = Scratch::new();
-    let (mut recorder, a, lambda) = recorder(&scratch, (100, 50, 0), Limits { moments: 150, ..Limits::default() });
+    let (mut recorder, a, lambda) =
+        recorder(&scratch, (100, 50, 0), Limits { moments: 150, ..Limits::default() });
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
     (100..300).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
@@ -75,8 +83,10 @@ fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
     assert_eq!((clip.triggers, clip.moments.len()), (200, Clip::MOMENTS_MAX));
     let records = scratch.metadata(clip);
     assert_eq!(records.iter().filter(|(name, _)| name == "gleaner.decision").count(), 150);
-    let lambda = records.iter().find(|(name, _)| name == "gleaner.lambda").map(|(_, of)| of).unwrap();
-    let said = ["name", "engine", "gleaner", "config", "models", "digest", "windows"].map(|key| lambda[key].as_str());
+    let lambda =
+        records.iter().find(|(name, _)| name == "gleaner.lambda").map(|(_, of)| of).unwrap();
+    let said = ["name", "engine", "gleaner", "config", "models", "digest", "windows"]
+        .map(|key| lambda[key].as_str());
     assert_eq!(said, ["hello", "Python", "0.1.0", "{}", "", "d1e5", "200"]);
     assert_eq!(Limits::default().moments, 10_000);
 }
@@ -95,8 +105,11 @@ fn triggers_that_wait_in_too_great_numbers_are_counted_in_the_clip_that_they_are
     wakes.push((900, slow, &[Event]));
     drive(&mut recorder, &[a], (0, 2000, 1), &wakes);
     recorder.finish(T0 + 2000 * MS).unwrap();
-    let told: Vec<_> =
-        recorder.clips().iter().map(|clip| (clip.triggers, clip.moments.len(), clip.short.len())).collect();
+    let told: Vec<_> = recorder
+        .clips()
+        .iter()
+        .map(|clip| (clip.triggers, clip.moments.len(), clip.short.len()))
+        .collect();
     let [first, second, third] = told[..] else { panic!("{told:?}") };
     assert_eq!((first.0, third.0), (1, 1));
     assert_eq!((second.0, second.2), (200, 0), "{:?}", recorder.clips()[1].short);
@@ -107,7 +120,8 @@ fn triggers_that_wait_in_too_great_numbers_are_counted_in_the_clip_that_they_are
 fn a_clip_says_so_if_nobody_knows_how_many_triggers_are_in_it() {
     let scratch = Scratch::new();
     // In the cooldown, triggers open no window; the next window reaches back over some of them.
-    let (mut recorder, a, lambda) = recorder(&scratch, (50, 0, 200), Limits { waiting: 10, ..Limits::default() });
+    let (mut recorder, a, lambda) =
+        recorder(&scratch, (50, 0, 200), Limits { waiting: 10, ..Limits::default() });
     drive(&mut recorder, &[a], (0, 1, 1), &[]);
     (100..=300).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
@@ -169,15 +183,16 @@ fn a_lambda_that_triggers_in_every_wake_looks_only_at_what_is_new() {
     }
 }
 
-/// What the clips of a random drive hold: late triggers, samples out of order, windows that reach back by different lengths.
-/// With `forgets`, everything is looked at in every wake.
+/// What the clips of a random drive hold: late triggers, samples out of order, windows that reach
+/// back by different lengths. With `forgets`, everything is looked at in every wake.
 fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
     let mut random = Random(seed);
     let scratch = Scratch::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let rolls = [(random.below(8), 0), (random.below(300), random.below(20))];
-    let lambdas = [0, 1].map(|n| recorder.add_lambda(member(&format!("l{n}"), (rolls[n].0, rolls[n].1, 0), &[a])));
+    let lambdas = [0, 1]
+        .map(|n| recorder.add_lambda(member(&format!("l{n}"), (rolls[n].0, rolls[n].1, 0), &[a])));
     for ms in 1000..1600 {
         let at = ms - random.below(3) * random.below(5);
         recorder.sample(a, &meta(T0 + at * MS, ms as u64), b"x").unwrap();
@@ -216,9 +231,14 @@ fn a_topic_that_says_too_much_of_itself_is_refused() {
     let named = Topic { name: long.clone(), ..topic("/a") };
     let typed = Topic { type_name: long.clone(), ..topic("/a") };
     let defined = Topic { definitions: Some("#".repeat(9 << 20).into()), ..topic("/a") };
-    for (topic, what) in [(named, "name"), (typed, "type name"), (defined, "definitions and quality of service")] {
+    for (topic, what) in
+        [(named, "name"), (typed, "type name"), (defined, "definitions and quality of service")]
+    {
         let error = recorder.add_topic(topic).unwrap_err();
-        assert!(matches!(&error, RecordError::LongTopic { what: found, .. } if *found == what), "{error:?}");
+        assert!(
+            matches!(&error, RecordError::LongTopic { what: found, .. } if *found == what),
+            "{error:?}"
+        );
         assert!(error.to_string().len() < 300);
     }
     assert!(recorder.add_missing_topic(&long).is_err());
@@ -230,7 +250,8 @@ fn a_start_that_lasts_keeps_being_settled() {
     let scratch = Scratch::new();
     let (mut recorder, a, lambda) = recorder(&scratch, (50, 0, 0), Limits::default());
     let second = recorder.add_lambda(member("second", (90, 0, 0), &[a]));
-    let wakes: [(_, _, &[_]); 3] = [(200, lambda, &[Start]), (210, second, &[Event]), (205, second, &[])];
+    let wakes: [(_, _, &[_]); 3] =
+        [(200, lambda, &[Start]), (210, second, &[Event]), (205, second, &[])];
     drive(&mut recorder, &[a], (0, 300, 1), &wakes);
     recorder.finish(T0 + 300 * MS).unwrap();
     assert_eq!(stamps(&scratch, &recorder.clips()[0], "/a"), every(120, 299, 1));

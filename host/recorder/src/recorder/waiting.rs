@@ -24,7 +24,8 @@ struct Untold {
 }
 
 impl Waiting {
-    /// A trigger came. At most `most` wait: of more, the oldest that no window wants yet goes, or else the new one.
+    /// A trigger came. At most `most` wait: of more, the oldest that no window wants yet goes, or
+    /// else the new one.
     pub(super) fn push(&mut self, lambda: usize, moment: Moment, windows: &Windows, most: usize) {
         let horizon = windows.horizon();
         while self.moments.front().is_some_and(|(_, moment)| moment.at_ns < horizon) {
@@ -35,22 +36,32 @@ impl Waiting {
             self.moments.push_back((lambda, moment));
             return;
         }
-        let (whose, at) = match self.moments.iter().position(|(whose, moment)| !windows.covers(*whose, moment.at_ns)) {
+        let (whose, at) = match self
+            .moments
+            .iter()
+            .position(|(whose, moment)| !windows.covers(*whose, moment.at_ns))
+        {
             Some(index) => {
-                let gone =
-                    self.moments.remove(index).map_or((lambda, moment.at_ns), |(whose, gone)| (whose, gone.at_ns));
+                let gone = self
+                    .moments
+                    .remove(index)
+                    .map_or((lambda, moment.at_ns), |(whose, gone)| (whose, gone.at_ns));
                 self.moments.push_back((lambda, moment));
                 gone
             }
             None => (lambda, moment.at_ns),
         };
         let untold = self.untold.entry(whose).or_insert(Untold { from: at, to: at, count: 0 });
-        *untold = Untold { from: untold.from.min(at), to: untold.to.max(at), count: untold.count + 1 };
+        *untold =
+            Untold { from: untold.from.min(at), to: untold.to.max(at), count: untold.count + 1 };
     }
 
     /// The trigger of `lambda` at `at_ns`, if it waits.
     pub(super) fn find(&self, lambda: usize, at_ns: i64) -> Option<&Moment> {
-        self.moments.iter().find(|(whose, moment)| *whose == lambda && moment.at_ns == at_ns).map(|(_, moment)| moment)
+        self.moments
+            .iter()
+            .find(|(whose, moment)| *whose == lambda && moment.at_ns == at_ns)
+            .map(|(_, moment)| moment)
     }
 
     /// Takes those out that are within `group` and not after `limit`, and how many more there were.
@@ -75,13 +86,16 @@ impl Waiting {
         count
     }
 
-    /// The lambdas of which more triggers may be within `group` and not after `limit` than were taken: they were only
-    /// counted, and some of them lie outside.
+    /// The lambdas of which more triggers may be within `group` and not after `limit` than were
+    /// taken: they were only counted, and some of them lie outside.
     pub(super) fn uncertain(&self, group: &Group, limit: i64) -> Vec<usize> {
         let inside = inside(group, limit);
-        let overlaps = |untold: &Untold| untold.from <= *inside.end() && *inside.start() <= untold.to;
-        let uncertain =
-            self.untold.iter().filter(|(lambda, untold)| group.lambdas.contains(lambda) && overlaps(untold));
+        let overlaps =
+            |untold: &Untold| untold.from <= *inside.end() && *inside.start() <= untold.to;
+        let uncertain = self
+            .untold
+            .iter()
+            .filter(|(lambda, untold)| group.lambdas.contains(lambda) && overlaps(untold));
         uncertain.map(|(lambda, _)| *lambda).collect()
     }
 }

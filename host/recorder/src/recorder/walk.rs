@@ -1,5 +1,5 @@
-//! Bringing into a clip what is held already: a way through the preroll from the oldest to the newest, in steps, so that
-//! whoever records live is never busy with it for long.
+//! Bringing into a clip what is held already: a way through the preroll from the oldest to the
+//! newest, in steps, so that whoever records live is never busy with it for long.
 
 use super::draft::Draft;
 use super::stock::{Settled, Stock};
@@ -66,8 +66,9 @@ impl Walk {
 }
 
 impl Stock {
-    /// Begins to bring a clip up to what its group covers and what is held, not after `limit`. `windows` are those that have
-    /// just joined the group; what is before `fresh_from` it has covered already.
+    /// Begins to bring a clip up to what its group covers and what is held, not after `limit`.
+    /// `windows` are those that have just joined the group; what is before `fresh_from` it has
+    /// covered already.
     pub(super) fn settle(
         &mut self,
         draft: &mut Draft,
@@ -79,18 +80,30 @@ impl Stock {
         windows.iter().for_each(|window| self.reach_back(draft, window));
         self.count_losses(draft, group, limit);
         let look = self.look(draft, group, limit)?;
-        let settles = windows.iter().map(|window| window.to.unwrap_or(i64::MAX)).max().unwrap_or(group.to).min(limit);
+        let settles = windows
+            .iter()
+            .map(|window| window.to.unwrap_or(i64::MAX))
+            .max()
+            .unwrap_or(group.to)
+            .min(limit);
         draft.settled = draft.settled.filter(|settled| settled.newest < fresh_from);
         let last = draft.settled.map(|settled| settled.last);
         Ok(Walk { windows, limit, settles: Some(settles), last, look })
     }
 
-    /// The picture is made when a clip first has a topic with images. A clip that continues another takes its own first one.
-    fn look(&mut self, draft: &mut Draft, group: &Group, limit: i64) -> Result<Option<Look>, RecordError> {
+    /// The picture is made when a clip first has a topic with images. A clip that continues another
+    /// takes its own first one.
+    fn look(
+        &mut self,
+        draft: &mut Draft,
+        group: &Group,
+        limit: i64,
+    ) -> Result<Option<Look>, RecordError> {
         if draft.has_images {
             return Ok(None);
         }
-        let images = self.desk.topics_of(group).into_iter().find(|topic| self.desk.lanes[*topic].is_image());
+        let images =
+            self.desk.topics_of(group).into_iter().find(|topic| self.desk.lanes[*topic].is_image());
         let Some(topic) = images else { return Ok(None) };
         draft.has_images = true;
         self.desk.pen.images(draft.clip, topic)?;
@@ -111,7 +124,8 @@ impl Stock {
                 return Ok(false);
             }
             if let Some(place) = look.newest.and_then(|(_, newest)| self.preroll.find(newest)) {
-                let (meta, of) = (self.preroll.held(place).meta(), &self.desk.lanes[look.topic].topic);
+                let (meta, of) =
+                    (self.preroll.held(place).meta(), &self.desk.lanes[look.topic].topic);
                 self.desk.pen.image(draft.clip, of, &meta, self.preroll.bytes(place)?)?;
             }
             walk.look = None;
@@ -137,7 +151,8 @@ impl Stock {
             }
             walk.settles = walk.settles.filter(|settles| held.at_ns <= *settles);
             if walk.settles.is_some() {
-                let newest = draft.settled.map_or(held.at_ns, |settled| settled.newest.max(held.at_ns));
+                let newest =
+                    draft.settled.map_or(held.at_ns, |settled| settled.newest.max(held.at_ns));
                 draft.settled = Some(Settled { last: walked, newest });
             }
             walk.last = Some(walked);
@@ -158,7 +173,8 @@ impl Stock {
             budget.entries -= 1;
             let held = self.preroll.held(walked.place());
             let is_newer = look.newest.is_none_or(|(at, _)| at <= held.at_ns);
-            let is_ours = held.source == Source::topic(look.topic) && self.desk.covers(group, look.topic, held.at_ns);
+            let is_ours = held.source == Source::topic(look.topic)
+                && self.desk.covers(group, look.topic, held.at_ns);
             if is_ours && held.at_ns <= look.until && is_newer {
                 look.newest = Some((held.at_ns, walked));
             }

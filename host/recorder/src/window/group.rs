@@ -3,12 +3,14 @@
 use super::Window;
 use super::intervals::Intervals;
 
-/// Windows of which each touches another: what one clip holds, or several in turn if it grows too long for one.
+/// Windows of which each touches another: what one clip holds, or several in turn if it grows too
+/// long for one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Group {
     /// Begin of the earliest window.
     pub begin: i64,
-    /// Begin of the clip that is being written: later than `begin` once a clip of this group was full.
+    /// Begin of the clip that is being written: later than `begin` once a clip of this group was
+    /// full.
     pub from: i64,
     /// End of the latest window, inclusive; [`i64::MAX`] while one waits for its stop.
     pub to: i64,
@@ -16,7 +18,8 @@ pub struct Group {
     pub first: (usize, i64),
     /// Lambdas with windows here, in the order in which they came.
     pub lambdas: Vec<usize>,
-    /// What the windows of each lambda cover; by lambda, shorter than the list of lambdas if the last have none.
+    /// What the windows of each lambda cover; by lambda, shorter than the list of lambdas if the
+    /// last have none.
     shares: Vec<Share>,
 }
 
@@ -36,7 +39,8 @@ impl Share {
 }
 
 impl Group {
-    /// A group of windows, of which there is at least one. Nobody will ask for instants before `horizon`.
+    /// A group of windows, of which there is at least one. Nobody will ask for instants before
+    /// `horizon`.
     pub(super) fn new(windows: &[Window], horizon: i64) -> Option<Group> {
         let first = windows.iter().min_by_key(|window| (window.anchor, window.lambda))?;
         let from = windows.iter().map(|window| window.from).min()?;
@@ -78,7 +82,9 @@ impl Group {
         let Some(share) = self.shares.get_mut(lambda) else { return false };
         let Some(from) = share.started.take() else { return false };
         share.ended.insert(from, to.max(from), horizon);
-        let end = |share: &Share| if share.started.is_some() { Some(i64::MAX) } else { share.ended.end() };
+        let end = |share: &Share| {
+            if share.started.is_some() { Some(i64::MAX) } else { share.ended.end() }
+        };
         self.to = self.shares.iter().filter_map(end).max().unwrap_or(to);
         true
     }
@@ -115,8 +121,8 @@ impl Group {
         }
     }
 
-    /// How many windows of `lambda` the present clip has. In a clip that continues another, windows that overlap count
-    /// as one.
+    /// How many windows of `lambda` the present clip has. In a clip that continues another, windows
+    /// that overlap count as one.
     pub fn windows(&self, lambda: usize) -> u64 {
         self.shares.get(lambda).map_or(0, |share| share.windows)
     }

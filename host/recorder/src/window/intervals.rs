@@ -8,7 +8,8 @@ pub struct Intervals(Vec<(i64, i64)>);
 const MANY: usize = 4096;
 
 impl Intervals {
-    /// Adds `from..=to`; what it touches becomes one with it. Nobody will ask for instants before `horizon`.
+    /// Adds `from..=to`; what it touches becomes one with it. Nobody will ask for instants before
+    /// `horizon`.
     pub fn insert(&mut self, from: i64, to: i64, horizon: i64) {
         if self.0.len() >= MANY {
             let old = self.0.partition_point(|(_, end)| *end < horizon);
@@ -16,13 +17,17 @@ impl Intervals {
         }
         let first = self.0.partition_point(|(_, end)| *end < from);
         let last = self.0.partition_point(|(begin, _)| *begin <= to);
-        let merged = self.0[first..last].iter().fold((from, to), |(a, b), (from, to)| (a.min(*from), b.max(*to)));
+        let merged = self.0[first..last]
+            .iter()
+            .fold((from, to), |(a, b), (from, to)| (a.min(*from), b.max(*to)));
         self.0.splice(first..last, [merged]);
     }
 
     /// Whether `at` is one of the instants.
     pub fn contains(&self, at: i64) -> bool {
-        self.0.get(self.0.partition_point(|(_, end)| *end < at)).is_some_and(|(begin, _)| *begin <= at)
+        self.0
+            .get(self.0.partition_point(|(_, end)| *end < at))
+            .is_some_and(|(begin, _)| *begin <= at)
     }
 
     /// The first instant of `from..=to` that is none of them.
@@ -69,7 +74,8 @@ mod tests {
         intervals.insert(30, 30, 0);
         let inside: Vec<_> = (8..32).filter(|at| intervals.contains(*at)).collect();
         assert_eq!(inside, (10..=20).chain([30]).collect::<Vec<_>>());
-        let outside = [(10, 20), (10, 21), (20, 30), (9, 9), (30, 40)].map(|(a, b)| intervals.first_outside(a, b));
+        let outside = [(10, 20), (10, 21), (20, 30), (9, 9), (30, 40)]
+            .map(|(a, b)| intervals.first_outside(a, b));
         assert_eq!(outside, [None, Some(21), Some(21), Some(9), Some(31)]);
         assert_eq!((intervals.end(), intervals.beyond(20), intervals.beyond(30)), (Some(30), 1, 0));
     }

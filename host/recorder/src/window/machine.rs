@@ -40,12 +40,12 @@ pub enum Step {
     Join {
         /// The windows.
         windows: Vec<Window>,
-        /// The first instant up to now that they cover and the clip did not: only what is held from there on has to be
-        /// looked through.
+        /// The first instant up to now that they cover and the clip did not: only what is held from
+        /// there on has to be looked through.
         fresh_from: Option<i64>,
     },
-    /// The clip is full: it ends at `boundary`, and a next one goes on after it. The open group is already that of the next;
-    /// `before` is the one that ends.
+    /// The clip is full: it ends at `boundary`, and a next one goes on after it. The open group is
+    /// already that of the next; `before` is the one that ends.
     Roll {
         /// Last instant of the full clip.
         boundary: i64,
@@ -54,7 +54,8 @@ pub enum Step {
     },
     /// No window can touch the open clip any more: it is complete.
     Finish(Box<Group>),
-    /// A trigger came so late that its windows lie before the open clip: a clip that is made at once.
+    /// A trigger came so late that its windows lie before the open clip: a clip that is made at
+    /// once.
     Stray(Vec<Window>, Box<Group>),
 }
 
@@ -68,7 +69,8 @@ pub struct Windows {
     grace_ns: i64,
     pub(super) now: i64,
     open: Option<Group>,
-    /// Windows that touch nothing that is open. They wait at most for the longest preroll, unless they came late.
+    /// Windows that touch nothing that is open. They wait at most for the longest preroll, unless
+    /// they came late.
     pending: Vec<Window>,
 }
 
@@ -77,15 +79,17 @@ struct Lambda {
     rules: Rules,
     /// Anchor of the last trigger that opened a window.
     opened_at: Option<i64>,
-    /// Recordings that were started and not stopped, by their labels. Together they are one window: it lasts until the last stop.
+    /// Recordings that were started and not stopped, by their labels. Together they are one window:
+    /// it lasts until the last stop.
     started: BTreeSet<(By, String)>,
 }
 
-/// Recordings of one lambda that may run at once, by their labels; and as many that commands started.
+/// Recordings of one lambda that may run at once, by their labels; and as many that commands
+/// started.
 pub const STARTED_MAX: usize = 64;
 
-/// Windows that may wait for an open clip to end. A lambda with windows that do not touch could fill the memory otherwise, while
-/// a disk is slow.
+/// Windows that may wait for an open clip to end. A lambda with windows that do not touch could
+/// fill the memory otherwise, while a disk is slow.
 const WAITING_MAX: usize = 4096;
 
 /// What a late trigger may lag behind the samples even if no window has a preroll.
@@ -114,13 +118,17 @@ impl Windows {
 
     /// How far back from now samples have to be held.
     ///
-    /// Let P be the longest preroll. A trigger whose anchor is now covers nothing before `now - P`. A window that waits,
-    /// because it lies behind the end `to` of the open clip, begins after `to`; and it waits no longer than until
-    /// `now > to + P + grace`, when that clip is finished: till then its begin is after `now - P - grace`. (A step that does both
-    /// at once is made before samples are given up, see `Recorder::pass`.) So P and the grace are enough for triggers that come at
-    /// once. Another P and a second let a trigger be late by as much.
+    /// Let P be the longest preroll. A trigger whose anchor is now covers nothing before `now - P`.
+    /// A window that waits, because it lies behind the end `to` of the open clip, begins after
+    /// `to`; and it waits no longer than until `now > to + P + grace`, when that clip is finished:
+    /// till then its begin is after `now - P - grace`. (A step that does both at once is made
+    /// before samples are given up, see `Recorder::pass`.) So P and the grace are enough for
+    /// triggers that come at once. Another P and a second let a trigger be late by as much.
     pub fn retention_ns(&self) -> i64 {
-        self.longest_preroll_ns.saturating_mul(2).saturating_add(LATE_NS).saturating_add(self.grace_ns)
+        self.longest_preroll_ns
+            .saturating_mul(2)
+            .saturating_add(LATE_NS)
+            .saturating_add(self.grace_ns)
     }
 
     /// Nobody will ask for instants before this one.
@@ -135,9 +143,11 @@ impl Windows {
 
     /// Whether a window of `lambda`, open or waiting, contains `at`.
     pub fn covers(&self, lambda: usize, at: i64) -> bool {
-        let waits =
-            |window: &Window| window.lambda == lambda && window.from <= at && window.to.is_none_or(|to| at <= to);
-        self.open.as_ref().is_some_and(|open| open.covers(lambda, at)) || self.pending.iter().any(waits)
+        let waits = |window: &Window| {
+            window.lambda == lambda && window.from <= at && window.to.is_none_or(|to| at <= to)
+        };
+        self.open.as_ref().is_some_and(|open| open.covers(lambda, at))
+            || self.pending.iter().any(waits)
     }
 
     /// Last instant that fits into the open clip.
@@ -150,22 +160,33 @@ impl Windows {
         self.now = self.now.max(now);
     }
 
-    /// Lambda `lambda` triggered in a wake at `anchor`. A stop ends the recording that was started with the same label.
+    /// Lambda `lambda` triggered in a wake at `anchor`. A stop ends the recording that was started
+    /// with the same label.
     pub fn trigger(&mut self, lambda: usize, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
         self.hear(lambda, By::Lambda, kind, label, anchor)
     }
 
-    /// Somebody commands at `anchor` what `lambda` could trigger. A stop ends only what a command started.
+    /// Somebody commands at `anchor` what `lambda` could trigger. A stop ends only what a command
+    /// started.
     pub fn command(&mut self, lambda: usize, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
         self.hear(lambda, By::Command, kind, label, anchor)
     }
 
-    fn hear(&mut self, lambda: usize, by: By, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
+    fn hear(
+        &mut self,
+        lambda: usize,
+        by: By,
+        kind: TriggerKind,
+        label: &str,
+        anchor: i64,
+    ) -> Heard {
         let Some(state) = self.lambdas.get_mut(lambda) else { return Heard::Ignored };
         let (rules, label) = (state.rules, (by, label.to_owned()));
         match kind {
             TriggerKind::Start if state.started.contains(&label) => return Heard::Ignored,
-            TriggerKind::Start if state.started_by(by) >= STARTED_MAX => return Heard::TooManyStarted,
+            TriggerKind::Start if state.started_by(by) >= STARTED_MAX => {
+                return Heard::TooManyStarted;
+            }
             TriggerKind::Stop if !state.started.remove(&label) => return Heard::Ignored,
             TriggerKind::Stop => {
                 if state.started.is_empty() {
@@ -179,7 +200,10 @@ impl Windows {
             TriggerKind::Event | TriggerKind::Start => {}
         }
         if by == By::Lambda {
-            if state.opened_at.is_some_and(|last| last.abs_diff(anchor) < rules.cooldown_ns.unsigned_abs()) {
+            if state
+                .opened_at
+                .is_some_and(|last| last.abs_diff(anchor) < rules.cooldown_ns.unsigned_abs())
+            {
                 return Heard::InCooldown;
             }
             state.opened_at = Some(anchor);
@@ -192,14 +216,24 @@ impl Windows {
             }
         }
         let to = (kind == TriggerKind::Event).then(|| anchor.saturating_add(rules.postroll_ns));
-        self.wait(Window { lambda, anchor, from: anchor.saturating_sub(rules.preroll_ns), to, windows: 1 });
+        self.wait(Window {
+            lambda,
+            anchor,
+            from: anchor.saturating_sub(rules.preroll_ns),
+            to,
+            windows: 1,
+        });
         Heard::Opened
     }
 
-    /// Joins overlapping windows of one lambda, so that a lambda that triggers in every wake does not fill the memory.
+    /// Joins overlapping windows of one lambda, so that a lambda that triggers in every wake does
+    /// not fill the memory.
     fn wait(&mut self, window: Window) {
         let same = |other: &&mut Window| {
-            other.lambda == window.lambda && other.to.is_some() && window.to.is_some() && other.touches(&window)
+            other.lambda == window.lambda
+                && other.to.is_some()
+                && window.to.is_some()
+                && other.touches(&window)
         };
         match self.pending.iter_mut().find(same) {
             Some(other) => {
@@ -218,7 +252,9 @@ impl Windows {
         if self.open.as_mut().is_some_and(|open| open.stop(lambda, written, horizon)) {
             return;
         }
-        if let Some(window) = self.pending.iter_mut().find(|window| window.lambda == lambda && window.to.is_none()) {
+        if let Some(window) =
+            self.pending.iter_mut().find(|window| window.lambda == lambda && window.to.is_none())
+        {
             window.to = Some(to.max(window.from));
         }
     }
@@ -239,15 +275,19 @@ impl Windows {
                 let window = self.pending.swap_remove(index);
                 let to = window.to.unwrap_or(i64::MAX).min(self.now);
                 let fresh = open.first_uncovered(window.lambda, window.from, to);
-                fresh_from = fresh.map(|fresh| fresh_from.map_or(fresh, |from: i64| from.min(fresh))).or(fresh_from);
+                fresh_from = fresh
+                    .map(|fresh| fresh_from.map_or(fresh, |from: i64| from.min(fresh)))
+                    .or(fresh_from);
                 open.add(&window, horizon);
                 joined.push(window);
             }
             if !joined.is_empty() {
                 return Some(Step::Join { windows: joined, fresh_from });
             }
-            if let Some(index) =
-                self.pending.iter().position(|window| window.to.is_some_and(|to| to < open.begin && to < due))
+            if let Some(index) = self
+                .pending
+                .iter()
+                .position(|window| window.to.is_some_and(|to| to < open.begin && to < due))
             {
                 let windows = take_group(&mut self.pending, index);
                 let group = Group::new(&windows, horizon)?;
@@ -266,17 +306,20 @@ impl Windows {
         None
     }
 
-    /// Lets the open clip begin later, at `from`: there is nothing to write before. Without this, a jump in time would cost
-    /// a step for each clip that could have been in between.
+    /// Lets the open clip begin later, at `from`: there is nothing to write before. Without this, a
+    /// jump in time would cost a step for each clip that could have been in between.
     pub fn slide(&mut self, from: i64) {
         if let Some(open) = &mut self.open {
             open.from = open.from.max(from.min(open.to));
         }
     }
 
-    /// A lambda has ended, at `at`: so does what it started, but not what commands did. `false` if that was nothing.
+    /// A lambda has ended, at `at`: so does what it started, but not what commands did. `false` if
+    /// that was nothing.
     pub fn end(&mut self, lambda: usize, at: i64) -> bool {
-        let Some(state) = self.lambdas.get_mut(lambda).filter(|state| state.started_by(By::Lambda) > 0) else {
+        let Some(state) =
+            self.lambdas.get_mut(lambda).filter(|state| state.started_by(By::Lambda) > 0)
+        else {
             return false;
         };
         state.started.retain(|(by, _)| *by != By::Lambda);
@@ -318,7 +361,9 @@ impl Lambda {
 /// Takes out the window at `index` and all that hang together with it.
 fn take_group(pending: &mut Vec<Window>, index: usize) -> Vec<Window> {
     let mut group = vec![pending.swap_remove(index)];
-    while let Some(index) = pending.iter().position(|window| group.iter().any(|other| other.touches(window))) {
+    while let Some(index) =
+        pending.iter().position(|window| group.iter().any(|other| other.touches(window)))
+    {
         group.push(pending.swap_remove(index));
     }
     group

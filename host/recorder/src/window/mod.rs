@@ -1,12 +1,12 @@
 //! Which stretches of time are kept: from triggers to windows, from windows to clips.
 //!
-//! - An `event` trigger at anchor `a` opens the window `[a - preroll, a + postroll]`, both ends inclusive. `start` opens
-//!   one at `a - preroll`, `stop` ends it at its own anchor `+ postroll`.
-//! - Windows that share an instant are of one [`Group`], whichever lambdas they are of. A group is one clip, or several in
-//!   turn if it grows longer than a clip may be.
-//! - One group is open at a time. It stays open until no trigger can come whose window would touch it; a window that does
-//!   not touch it waits meanwhile. So the groups do not depend on how soon a trigger comes after its anchor, as long as it
-//!   comes before the next sample.
+//! - An `event` trigger at anchor `a` opens the window `[a - preroll, a + postroll]`, both ends
+//!   inclusive. `start` opens one at `a - preroll`, `stop` ends it at its own anchor `+ postroll`.
+//! - Windows that share an instant are of one [`Group`], whichever lambdas they are of. A group is
+//!   one clip, or several in turn if it grows longer than a clip may be.
+//! - One group is open at a time. It stays open until no trigger can come whose window would touch
+//!   it; a window that does not touch it waits meanwhile. So the groups do not depend on how soon a
+//!   trigger comes after its anchor, as long as it comes before the next sample.
 //!
 //! Pure bookkeeping: nothing here knows of samples or files, and time is what the caller says.
 

@@ -66,7 +66,11 @@ fn windows_that_overlap_share_a_clip_and_others_do_not() {
     ];
     for (anchors, expected) in cases {
         let triggers: Vec<_> = anchors.iter().map(|at| (*at, Event)).collect();
-        assert_eq!(groups(&mut machine(LONG, &[rules(5, 5, 0)]), &triggers), expected, "{anchors:?}");
+        assert_eq!(
+            groups(&mut machine(LONG, &[rules(5, 5, 0)]), &triggers),
+            expected,
+            "{anchors:?}"
+        );
     }
 }
 
@@ -115,9 +119,16 @@ fn a_window_that_touches_neither_clip_may_still_join_two() {
     }
     windows.pass(1000);
     let finished = drain(&mut windows);
-    assert_eq!(finished.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(90, 141)]);
+    assert_eq!(
+        finished.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(),
+        [(90, 141)]
+    );
     let covered: Vec<_> = (80..130).filter(|at| finished[0].covers(0, *at)).collect();
-    assert_eq!(covered, [99, 100, 101, 119, 120, 121], "what lambda 0 does not want is not in it for its sake");
+    assert_eq!(
+        covered,
+        [99, 100, 101, 119, 120, 121],
+        "what lambda 0 does not want is not in it for its sake"
+    );
 }
 
 #[test]
@@ -157,7 +168,10 @@ fn a_long_clip_is_cut_without_a_gap() {
         while let Some(step) = windows.step() {
             let Step::Roll { boundary, before } = step else { panic!("{step:?}") };
             assert_eq!((now, before.from + 100), (boundary + 1, boundary));
-            assert_eq!(windows.open().map(|group| (group.from, group.windows(0))), Some((boundary + 1, 1)));
+            assert_eq!(
+                windows.open().map(|group| (group.from, group.windows(0))),
+                Some((boundary + 1, 1))
+            );
             boundaries.push(boundary);
         }
     }
@@ -234,7 +248,10 @@ fn random_triggers_make_the_groups_of_the_model() {
                 match step {
                     Step::Finish(group) => finished.push(*group),
                     Step::Begin(new) | Step::Join { windows: new, .. } => {
-                        assert!(new.iter().all(|window| window.from >= trimmed), "what it needs is gone: {seed}");
+                        assert!(
+                            new.iter().all(|window| window.from >= trimmed),
+                            "what it needs is gone: {seed}"
+                        );
                     }
                     step => panic!("{step:?}"),
                 }
@@ -263,16 +280,25 @@ fn random_triggers_make_the_groups_of_the_model() {
             finished.extend(drain(&mut windows));
         }
         let expected = model(&rules, &triggers);
-        let spans = |group: &Vec<Plain>| (group[0].1, group.iter().map(|window| window.2).max().unwrap());
+        let spans =
+            |group: &Vec<Plain>| (group[0].1, group.iter().map(|window| window.2).max().unwrap());
         let found: Vec<_> = finished.iter().map(|group| (group.begin, group.to)).collect();
-        assert_eq!(found, expected.iter().map(spans).collect::<Vec<_>>(), "seed {seed}: {rules:?} {triggers:?}");
+        assert_eq!(
+            found,
+            expected.iter().map(spans).collect::<Vec<_>>(),
+            "seed {seed}: {rules:?} {triggers:?}"
+        );
         for (group, expected) in finished.iter().zip(&expected) {
             for lambda in 0..lambdas {
                 let own: Vec<_> = expected.iter().filter(|window| window.0 == lambda).collect();
                 assert_eq!(group.windows(lambda), own.len() as u64, "seed {seed}");
                 for at in 0..now + 100 {
                     let covered = own.iter().any(|(_, from, to)| (*from..=*to).contains(&at));
-                    assert_eq!(group.covers(lambda, at), covered, "seed {seed}, lambda {lambda} at {at}");
+                    assert_eq!(
+                        group.covers(lambda, at),
+                        covered,
+                        "seed {seed}, lambda {lambda} at {at}"
+                    );
                 }
             }
         }
@@ -299,7 +325,9 @@ fn a_stop_ends_the_recording_of_its_label_and_the_clip_lasts_until_the_last() {
 fn a_lambda_that_starts_ever_new_recordings_is_heard_up_to_a_bound() {
     let mut windows = Windows::new(1_000_000);
     windows.add(Rules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
-    let heard = (0..STARTED_MAX + 1).map(|n| windows.trigger(0, Start, &n.to_string(), 100)).collect::<Vec<_>>();
+    let heard = (0..STARTED_MAX + 1)
+        .map(|n| windows.trigger(0, Start, &n.to_string(), 100))
+        .collect::<Vec<_>>();
     assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
     assert_eq!(heard.last(), Some(&Heard::TooManyStarted));
 }
@@ -309,7 +337,10 @@ fn more_windows_than_may_wait_are_refused_as_that() {
     let mut windows = machine(LONG, &[rules(0, 0, 0)]);
     let heard: Vec<_> = (0..4097).map(|n| windows.trigger(0, Event, "x", 10 * n)).collect();
     assert!(heard[..4096].iter().all(|heard| *heard == Heard::Opened));
-    assert_eq!((heard[4096], windows.trigger(0, Start, "y", 100_000)), (Heard::TooManyWaiting, Heard::TooManyWaiting));
+    assert_eq!(
+        (heard[4096], windows.trigger(0, Start, "y", 100_000)),
+        (Heard::TooManyWaiting, Heard::TooManyWaiting)
+    );
     assert_eq!(windows.forget_waiting(), 4096);
 }
 
@@ -330,7 +361,10 @@ fn what_comes_late_is_waited_for_before_anything_is_ended() {
     assert_eq!(drain(&mut windows).len(), 1);
     windows.trigger(0, Start, "x", 2000);
     windows.pass(2090 + 30);
-    assert!(matches!(windows.step(), Some(Step::Begin(_))) && windows.step().is_none(), "it is full, and waits");
+    assert!(
+        matches!(windows.step(), Some(Step::Begin(_))) && windows.step().is_none(),
+        "it is full, and waits"
+    );
     windows.pass(2091 + 30);
     assert!(matches!(windows.step(), Some(Step::Roll { boundary: 2090, .. })));
     // A stray is one that nothing can join any more.
@@ -363,7 +397,10 @@ fn commands_and_triggers_end_only_what_is_their_own() {
     assert!(!windows.end(0, 1401));
     assert_eq!(windows.command(0, Stop, "b", 1500), Heard::Stopped);
     windows.pass(LONG);
-    assert_eq!(drain(&mut windows).iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(90, 1510)]);
+    assert_eq!(
+        drain(&mut windows).iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(),
+        [(90, 1510)]
+    );
 }
 
 #[test]
@@ -372,6 +409,8 @@ fn a_lambda_that_starts_too_much_keeps_no_command_from_starting() {
     for n in 0..2 * STARTED_MAX {
         windows.trigger(0, Start, &n.to_string(), 100);
     }
-    let heard = (0..STARTED_MAX + 1).map(|n| windows.command(0, Start, &n.to_string(), 100)).collect::<Vec<_>>();
+    let heard = (0..STARTED_MAX + 1)
+        .map(|n| windows.command(0, Start, &n.to_string(), 100))
+        .collect::<Vec<_>>();
     assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
 }

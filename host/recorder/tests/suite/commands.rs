@@ -27,7 +27,8 @@ impl Commanded {
         let network = Network::default();
         network.add("/a");
         network.add_texts(TOPIC);
-        let running = Running::start(scratch, &network, |options| options.commands = Some(TOPIC.to_owned()));
+        let running =
+            Running::start(scratch, &network, |options| options.commands = Some(TOPIC.to_owned()));
         let sensor = Sensor::start(&network, running.clock);
         Commanded { running, network, _sensor: sensor }
     }
@@ -92,7 +93,10 @@ fn an_event_by_command_records_as_the_lambda_would_and_stands_in_no_journal() {
     assert_eq!((clip.moments[0].score, clip.moments[0].at_ns), (Some(0.25), at));
     assert_eq!(clip.lambdas[0].windows, 1);
     let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
-    assert!(numbers.len() > 50 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "{numbers:?}");
+    assert!(
+        numbers.len() > 50 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1),
+        "{numbers:?}"
+    );
     assert_eq!(scratch.journal(&clip, "first").1, [at_wake], "wakes, and nothing else");
     let told = scratch.metadata(&clip);
     let decisions: Vec<_> = told.iter().filter(|(name, _)| name == "gleaner.decision").collect();
@@ -146,13 +150,17 @@ fn too_many_too_long_and_senseless_commands_are_counted_and_do_nothing() {
     let mut commanded = Commanded::start(&scratch);
     let long = format!(r#"{{"command": "event", "label": "x"}}{}"#, " ".repeat(4096));
     assert_eq!(commanded.say(&long).1, Verdict::TooBig);
-    for text in ["", "{\"command\": \"event\", \"label\": \"\u{1b}[2J\", \"lambda\": \"\u{7}\"}", "{\"command\":\"x\"}"]
-    {
+    for text in [
+        "",
+        "{\"command\": \"event\", \"label\": \"\u{1b}[2J\", \"lambda\": \"\u{7}\"}",
+        "{\"command\":\"x\"}",
+    ] {
         assert_eq!(commanded.say(text).1, Verdict::Taken);
     }
     commanded.say([0xff; 100]);
     commanded.accepted_and_refused(0, 5);
-    let verdicts: Vec<_> = (0..10_000).map(|_| commanded.say(r#"{"command":"event","label":"x"}"#).1).collect();
+    let verdicts: Vec<_> =
+        (0..10_000).map(|_| commanded.say(r#"{"command":"event","label":"x"}"#).1).collect();
     let taken = verdicts.iter().filter(|verdict| **verdict == Verdict::Taken).count();
     assert!(taken < 100, "at most five at once, and one each second: {taken}");
     commanded.accepted_and_refused(0, 5 + 10_000);

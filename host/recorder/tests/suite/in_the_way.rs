@@ -1,4 +1,5 @@
-//! What others have put where a recorder's files belong: nothing is written to where it leads, and nobody waits for it.
+//! What others have put where a recorder's files belong: nothing is written to where it leads, and
+//! nobody waits for it.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -100,7 +101,12 @@ fn losses_are_noted_in_a_file_of_ours_only() {
         let (folder, _) = Folder::open(&scratch.0).unwrap();
         let path = scratch.0.join("losses.jsonl");
         put(&precious, &path);
-        let loss = Loss::NotDeleted { at_ns: 0, file: "clips/a.mcap".into(), bytes: 1, why: "why".to_owned() };
+        let loss = Loss::NotDeleted {
+            at_ns: 0,
+            file: "clips/a.mcap".into(),
+            bytes: 1,
+            why: "why".to_owned(),
+        };
         assert_refused(folder.losses().note(&loss).err().unwrap(), &path, why);
         assert!(is_untouched(&precious), "{why}");
     }
@@ -127,7 +133,9 @@ fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
         clock: "log time of the drive".to_owned(),
         prefault: false,
     };
-    let refused = gleaner_recorder::Recorder::new(Folder::open(&scratch.0).unwrap().0, settings).err().unwrap();
+    let refused = gleaner_recorder::Recorder::new(Folder::open(&scratch.0).unwrap().0, settings)
+        .err()
+        .unwrap();
     assert_refused(refused, &preroll, "it is a link");
     assert!(is_untouched(&elsewhere.0.join("0.chunk")));
     assert_eq!(fs::read_dir(&elsewhere.0).unwrap().count(), 1, "nothing was made there");
@@ -141,7 +149,9 @@ fn what_has_the_names_of_unfinished_files_loses_them_and_nothing_else() {
         let precious = precious(&scratch);
         fs::create_dir_all(scratch.0.join("clips")).unwrap();
         let stem = "clips/hello-20180802T083452.000Z";
-        for name in [&format!("{stem}.mcap.part"), &format!("{stem}-2.jpg.part"), "clips.jsonl.part"] {
+        for name in
+            [&format!("{stem}.mcap.part"), &format!("{stem}-2.jpg.part"), "clips.jsonl.part"]
+        {
             put(&precious, &scratch.0.join(name));
         }
         Folder::open(&scratch.0).unwrap().0.replace(&[]).unwrap();
@@ -164,7 +174,8 @@ fn a_pipe_that_is_named_like_a_clip_is_not_waited_for() {
         drive(&mut recorder, &topics, (0, 3000, 10), &[(2000, lambda, &[Start])]);
         // It dies: nothing is finished.
     }
-    let parts = || fs::read_dir(scratch.0.join("clips")).unwrap().map(|entry| entry.unwrap().path());
+    let parts =
+        || fs::read_dir(scratch.0.join("clips")).unwrap().map(|entry| entry.unwrap().path());
     let part = parts().find(|path| path.to_str().unwrap().ends_with(".mcap.part")).unwrap();
     pipe(&part.with_extension(""));
     let (_, found) = Folder::open(&scratch.0).unwrap();

@@ -1,4 +1,5 @@
-//! The process is killed while it records, at any moment: what it has reported is there, and what it was writing is saved.
+//! The process is killed while it records, at any moment: what it has reported is there, and what
+//! it was writing is saved.
 #![cfg(feature = "program")]
 
 use std::fs::{self, File};
@@ -33,7 +34,9 @@ fn child() {
     let (feed, options) = (network.clone(), options(&scratch.0, clock));
     // What is in a file was written, whenever the kill comes.
     let reports = File::create(scratch.0.join("reports.jsonl")).unwrap();
-    thread::spawn(move || run(options, || Ok(Box::new(feed) as Box<dyn LiveSource>), stdin, reports, Arc::default()));
+    thread::spawn(move || {
+        run(options, || Ok(Box::new(feed) as Box<dyn LiveSource>), stdin, reports, Arc::default())
+    });
     let (folder, header) = lambda(&scratch, "first", (300, 1500));
     let mut link = RecorderLink::new(control.add(&add(&folder)).unwrap());
     link.hello(&header, PATIENCE).unwrap();
@@ -59,11 +62,14 @@ fn reports(out: &Path) -> Vec<RecorderReport> {
     whole.map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-/// Numbers of the messages in the whole chunks of a file that has no end, as the crate `mcap` reads them.
+/// Numbers of the messages in the whole chunks of a file that has no end, as the crate `mcap` reads
+/// them.
 fn in_whole_chunks(part: &Path) -> Vec<u32> {
     let bytes = fs::read(part).unwrap();
     let options = mcap::read::Options::IgnoreEndMagic.into();
-    let Ok(messages) = mcap::MessageStream::new_with_options(&bytes, options) else { return Vec::new() };
+    let Ok(messages) = mcap::MessageStream::new_with_options(&bytes, options) else {
+        return Vec::new();
+    };
     messages.map_while(Result::ok).map(|message| message.sequence).collect()
 }
 
@@ -77,7 +83,11 @@ fn follow_each_other(numbers: &[u32]) -> bool {
 
 #[test]
 fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
-    let usual = if std::env::var("GLEANER_LONG").is_ok_and(|said| said == "1") { 20 * KILLS } else { KILLS };
+    let usual = if std::env::var("GLEANER_LONG").is_ok_and(|said| said == "1") {
+        20 * KILLS
+    } else {
+        KILLS
+    };
     let kills = std::env::var("GLEANER_KILLS").map_or(usual, |kills| kills.parse().unwrap());
     let mut random = Random(5);
     let (mut reported, mut saved, mut saved_messages) = (0, 0, 0);
@@ -91,7 +101,10 @@ fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
             .unwrap();
         let deadline = Instant::now() + PATIENCE;
         while reports(&scratch.0).is_empty() {
-            assert!(Instant::now() < deadline && child.try_wait().unwrap().is_none(), "kill {kill}: it does not start");
+            assert!(
+                Instant::now() < deadline && child.try_wait().unwrap().is_none(),
+                "kill {kill}: it does not start"
+            );
             thread::sleep(Duration::from_millis(1));
         }
         thread::sleep(Duration::from_millis(random.below(3000) as u64));
@@ -106,7 +119,8 @@ fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
             .collect();
         let (_folder, recovered) = Folder::open(&scratch.0).unwrap();
         let listed = fs::read_to_string(scratch.0.join("clips.jsonl")).unwrap_or_default();
-        let listed: Vec<Clip> = listed.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let listed: Vec<Clip> =
+            listed.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         for report in reports(&scratch.0) {
             let RecorderReport::Clip(clip) = report else { continue };
             assert!(listed.contains(&clip), "kill {kill}: {clip:?}");
@@ -115,25 +129,35 @@ fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
         for clip in &listed {
             let numbers = numbers(&scratch, clip);
             assert!(follow_each_other(&numbers), "kill {kill}: {numbers:?}");
-            assert_eq!(numbers.len() as u64, clip.topics.iter().map(|topic| topic.messages).sum::<u64>());
+            assert_eq!(
+                numbers.len() as u64,
+                clip.topics.iter().map(|topic| topic.messages).sum::<u64>()
+            );
             if clip.recovered.is_none() {
-                let journals = clip.lambdas.iter().map(|lambda| scratch.journal(clip, &lambda.name).1.len());
+                let journals =
+                    clip.lambdas.iter().map(|lambda| scratch.journal(clip, &lambda.name).1.len());
                 assert!(journals.sum::<usize>() > 0, "kill {kill}");
             }
         }
         // Whatever had come to the disk whole is saved.
         let mut wanted: Vec<_> = parts.into_iter().filter(|numbers| !numbers.is_empty()).collect();
         wanted.sort();
-        let mut found: Vec<_> =
-            recovered.iter().map(|clip| numbers(&scratch, clip)).filter(|n| !n.is_empty()).collect();
+        let mut found: Vec<_> = recovered
+            .iter()
+            .map(|clip| numbers(&scratch, clip))
+            .filter(|n| !n.is_empty())
+            .collect();
         found.sort();
         assert_eq!(found, wanted, "kill {kill}");
         saved += recovered.len();
         saved_messages += found.iter().map(Vec::len).sum::<usize>();
-        let files = fs::read_dir(scratch.0.join("clips")).unwrap().map(|file| file.unwrap().file_name());
+        let files =
+            fs::read_dir(scratch.0.join("clips")).unwrap().map(|file| file.unwrap().file_name());
         let whole = files.filter(|name| name.to_string_lossy().ends_with(".mcap")).count();
         assert_eq!(whole, listed.len(), "kill {kill}");
     }
-    println!("{kills} kills: {reported} clips reported, {saved} recovered with {saved_messages} messages");
+    println!(
+        "{kills} kills: {reported} clips reported, {saved} recovered with {saved_messages} messages"
+    );
     assert!(reported as u64 > kills / 10 && saved as u64 > kills / 10, "{reported} {saved}");
 }

@@ -7,8 +7,13 @@ use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 use gleaner_lambda::manifest::Store;
 use gleaner_recorder::{Folder, LambdaId, Recorder, Settings, TopicId};
 
-/// With one topic and a lambda that keeps nothing from before a trigger, so that nothing waits for longer than it must.
-fn recorder(scratch: &Scratch, postroll_ms: i64, max_length_ms: u64) -> (Recorder, TopicId, LambdaId) {
+/// With one topic and a lambda that keeps nothing from before a trigger, so that nothing waits for
+/// longer than it must.
+fn recorder(
+    scratch: &Scratch,
+    postroll_ms: i64,
+    max_length_ms: u64,
+) -> (Recorder, TopicId, LambdaId) {
     let settings = Settings {
         store: Store::Ram,
         preroll_bytes: 16 << 20,
@@ -23,12 +28,20 @@ fn recorder(scratch: &Scratch, postroll_ms: i64, max_length_ms: u64) -> (Recorde
     (recorder, a, lambda)
 }
 
-/// A sample and a wake each ms from 0 to before `to_ms`. Wakes are told together every 100 ms, or with the next one that triggers.
-fn late_drive(recorder: &mut Recorder, a: TopicId, lambda: LambdaId, to_ms: i64, triggers: &[(i64, TriggerKind)]) {
+/// A sample and a wake each ms from 0 to before `to_ms`. Wakes are told together every 100 ms, or
+/// with the next one that triggers.
+fn late_drive(
+    recorder: &mut Recorder,
+    a: TopicId,
+    lambda: LambdaId,
+    to_ms: i64,
+    triggers: &[(i64, TriggerKind)],
+) {
     let mut wait = Vec::new();
     for ms in 0..to_ms {
         recorder.sample(a, &meta(T0 + ms * MS, ms as u64 + 1), &ms.to_le_bytes()).unwrap();
-        let kinds: Vec<_> = triggers.iter().filter(|(at, _)| *at == ms).map(|(_, kind)| *kind).collect();
+        let kinds: Vec<_> =
+            triggers.iter().filter(|(at, _)| *at == ms).map(|(_, kind)| *kind).collect();
         wait.push(entry(T0 + ms * MS, &kinds));
         if !kinds.is_empty() || ms % 100 == 99 {
             wait.drain(..).for_each(|entry| recorder.wake(lambda, &entry).unwrap());
@@ -51,7 +64,8 @@ fn wakes_that_come_late_are_in_the_journals_of_their_clips() {
         assert_eq!(clip.short, [""; 0]);
         assert_eq!((clip.topics[0].lost, clip.topics[0].received), (Some(0), Some(151)));
         assert_eq!(stamps(&scratch, clip, "/a"), every(from, from + 150, 1));
-        let wakes: Vec<_> = scratch.journal(clip, "hello").1.iter().map(|at| (at - T0) / MS).collect();
+        let wakes: Vec<_> =
+            scratch.journal(clip, "hello").1.iter().map(|at| (at - T0) / MS).collect();
         assert_eq!(wakes, every(from, from + 150, 1));
     }
     assert_eq!(recorder.counts().out_of_order, 0);
@@ -66,7 +80,10 @@ fn clips_that_go_on_share_out_wakes_that_come_late() {
     let (mut samples, mut wakes) = (Vec::new(), Vec::new());
     for clip in recorder.clips() {
         let journal = scratch.journal(clip, "hello").1;
-        assert!(journal.iter().all(|at| (clip.from_ns..=clip.to_ns).contains(at)), "{clip:?}: {journal:?}");
+        assert!(
+            journal.iter().all(|at| (clip.from_ns..=clip.to_ns).contains(at)),
+            "{clip:?}: {journal:?}"
+        );
         wakes.extend(journal.iter().map(|at| (at - T0) / MS));
         samples.extend(stamps(&scratch, clip, "/a"));
     }
@@ -94,7 +111,11 @@ fn a_full_clip_that_waits_for_wakes_loses_nothing_when_everything_ends() {
         assert_eq!(stamps(&scratch, full, "/a"), every(100, 400, 1));
         assert_eq!(stamps(&scratch, rest, "/a"), every(401, 499, 1));
         assert_eq!(scratch.journal(rest, "hello").1.len(), 99);
-        let why = if is_held { "the disk is full" } else { "the recording was stopped before the window ended" };
+        let why = if is_held {
+            "the disk is full"
+        } else {
+            "the recording was stopped before the window ended"
+        };
         assert_eq!(rest.short, ["continues the clip before", why]);
     }
 }

@@ -23,22 +23,30 @@ fn live(scratch: &Scratch, change: impl FnOnce(&mut Settings)) -> Recorder {
     Recorder::live(Folder::open(&scratch.0).unwrap().0, settings).unwrap()
 }
 
-/// What the clips of a random drive hold, each by itself. Triggers come at once; `work` is done as often as chance has it.
+/// What the clips of a random drive hold, each by itself. Triggers come at once; `work` is done as
+/// often as chance has it.
 fn random_drive(seed: u64, is_live: bool) -> Vec<Vec<(String, i64, u32)>> {
     let (mut random, mut pace) = (Random(seed), Random(seed + 1000));
     let scratch = Scratch::new();
-    let store =
-        |settings: &mut Settings| settings.store = if seed.is_multiple_of(2) { Store::Ram } else { Store::Disk };
+    let store = |settings: &mut Settings| {
+        settings.store = if seed.is_multiple_of(2) { Store::Ram } else { Store::Disk }
+    };
     let mut recorder = if is_live { live(&scratch, store) } else { scratch.recorder(store) };
     let topics = ["/a", "/b", "/camera"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let rolls = [(random.below(80), random.below(60)), (random.below(500), random.below(20))];
     let lambdas = [
         recorder.add_lambda(member("l0", (rolls[0].0, rolls[0].1, 0), &[topics[0], topics[2]])),
-        recorder.add_lambda(member("l1", (rolls[1].0, rolls[1].1, random.below(40)), &[topics[1], topics[0]])),
+        recorder.add_lambda(member(
+            "l1",
+            (rolls[1].0, rolls[1].1, random.below(40)),
+            &[topics[1], topics[0]],
+        )),
     ];
     for ms in 1000..3000 {
         let at = ms - random.below(3) * random.below(5);
-        recorder.sample(topics[0], &meta(T0 + at * MS, ms as u64), &vec![7; random.below(300) as usize]).unwrap();
+        recorder
+            .sample(topics[0], &meta(T0 + at * MS, ms as u64), &vec![7; random.below(300) as usize])
+            .unwrap();
         if ms % 3 == 0 {
             recorder.sample(topics[1], &meta(T0 + at * MS, ms as u64), &[8; 3000]).unwrap();
         }
@@ -76,7 +84,8 @@ fn clips_are_those_of_a_drive_whenever_the_work_is_done() {
 fn clips_that_go_on_hold_everything_once_whenever_the_work_is_done() {
     for every in [1, 7, 60] {
         let scratch = Scratch::new();
-        let mut recorder = live(&scratch, |settings| settings.max_length = Duration::from_millis(100));
+        let mut recorder =
+            live(&scratch, |settings| settings.max_length = Duration::from_millis(100));
         let a = recorder.add_topic(topic("/a")).unwrap();
         let lambda = recorder.add_lambda(member("hello", (250, 0, 0), &[a]));
         for ms in 0..2000 {
@@ -335,7 +344,8 @@ fn the_oldest_clips_make_room_and_each_is_named() {
         recorder.work().unwrap();
     }
     recorder.finish(T0 + S).unwrap();
-    let is_there: Vec<_> = recorder.clips().iter().map(|clip| scratch.0.join(&clip.file).exists()).collect();
+    let is_there: Vec<_> =
+        recorder.clips().iter().map(|clip| scratch.0.join(&clip.file).exists()).collect();
     assert_eq!(is_there, [false, false, false, true, true]);
     let losses = std::fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap();
     assert_eq!(losses.lines().count(), 3);
@@ -382,5 +392,7 @@ fn a_clip_that_was_fetched_leaves_its_room_to_others() {
     recorder.sample(a, &meta(at, 1), b"x").unwrap();
     recorder.wake(lambda, &entry(at, EVENT)).unwrap();
     recorder.finish(at + S).unwrap();
-    assert!(oldest.exists() && recorder.clips().len() == 1 && recorder.counts().recording.deleted == 0);
+    assert!(
+        oldest.exists() && recorder.clips().len() == 1 && recorder.counts().recording.deleted == 0
+    );
 }

@@ -1,4 +1,5 @@
-//! The recorder through its public interface, and its process within a test, as one program: each file is a subject.
+//! The recorder through its public interface, and its process within a test, as one program: each
+//! file is a subject.
 
 mod commands;
 mod in_the_way;

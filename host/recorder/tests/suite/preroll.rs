@@ -1,4 +1,5 @@
-//! The preroll, seen from clips: what did not fit is counted, in the clip whose window reaches over it.
+//! The preroll, seen from clips: what did not fit is counted, in the clip whose window reaches over
+//! it.
 
 use std::fs;
 
@@ -13,7 +14,8 @@ const EVENT: &[TriggerKind] = &[Event];
 /// 100 bytes each ms on `/a` with a window of 1 s before 2000 ms, in a store of `bytes`.
 fn cut(store: Store, bytes: u64) -> (Scratch, Clip, u64) {
     let scratch = Scratch::new();
-    let mut recorder = scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, bytes));
+    let mut recorder =
+        scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, bytes));
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (1000, 100, 0), &[a]));
     for ms in 0..3000 {
@@ -31,7 +33,10 @@ fn cut(store: Store, bytes: u64) -> (Scratch, Clip, u64) {
 
 fn within_bound(recorder: &Recorder) {
     let counts = recorder.counts();
-    assert!(counts.preroll_bytes <= counts.preroll_highest && counts.preroll_highest <= counts.preroll_bound);
+    assert!(
+        counts.preroll_bytes <= counts.preroll_highest
+            && counts.preroll_highest <= counts.preroll_bound
+    );
 }
 
 #[test]
@@ -45,7 +50,9 @@ fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
         assert_eq!(scratch.contents(&clip).len() as u64, topic.messages);
         assert_eq!(
             clip.short,
-            [format!("the preroll was cut by preroll_size: {overwritten} samples of /a pushed out")]
+            [format!(
+                "the preroll was cut by preroll_size: {overwritten} samples of /a pushed out"
+            )]
         );
         assert!(pushed_out > overwritten);
         let (_scratch, clip, pushed_out) = cut(store, 16 << 20);
@@ -62,15 +69,23 @@ fn what_nobody_can_count_is_said_to_be_unknown() {
     drive(&mut recorder, &[a], (0, 6000, 1), &[(5999, lambda, EVENT)]);
     recorder.finish(T0 + 6000 * MS).unwrap();
     let clip = &recorder.clips()[0];
-    assert_eq!((clip.topics[0].overwritten, clip.topics[0].received, clip.topics[0].too_big), (None, None, Some(0)));
-    assert!(clip.short.iter().any(|short| short.ends_with("more than were counted")), "{:?}", clip.short);
+    assert_eq!(
+        (clip.topics[0].overwritten, clip.topics[0].received, clip.topics[0].too_big),
+        (None, None, Some(0))
+    );
+    assert!(
+        clip.short.iter().any(|short| short.ends_with("more than were counted")),
+        "{:?}",
+        clip.short
+    );
 }
 
 #[test]
 fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
     for store in [Store::Ram, Store::Disk] {
         let scratch = Scratch::new();
-        let mut recorder = scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, 5_000));
+        let mut recorder =
+            scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, 5_000));
         let a = recorder.add_topic(topic("/a")).unwrap();
         let lambda = recorder.add_lambda(member("hello", (1000, 1000, 0), &[a]));
         recorder.sample(a, &meta(T0 - 1500 * MS, 1), &[0; 10]).unwrap();
@@ -103,8 +118,14 @@ fn wakes_that_were_pushed_out_are_missing_from_the_journal_and_said() {
     recorder.finish(T0 + 3 * S).unwrap();
     let clip = &recorder.clips()[0];
     let (header, wakes) = scratch.journal(clip, "hello");
-    assert_eq!((header.wakes_before + wakes.len() as u64, wakes.last()), (100, Some(&(T0 + 99 * MS))));
-    let said = format!("the journal of hello lacks {} wakes: pushed out of the preroll", header.wakes_before);
+    assert_eq!(
+        (header.wakes_before + wakes.len() as u64, wakes.last()),
+        (100, Some(&(T0 + 99 * MS)))
+    );
+    let said = format!(
+        "the journal of hello lacks {} wakes: pushed out of the preroll",
+        header.wakes_before
+    );
     assert!(clip.short.contains(&said), "{:?}", clip.short);
 }
 
@@ -122,5 +143,8 @@ fn a_preroll_on_disk_is_deleted_in_the_end_and_its_failure_is_named() {
     let a = recorder.add_topic(topic("/a")).unwrap();
     fs::remove_dir_all(&folder).unwrap();
     let error = recorder.sample(a, &meta(T0, 1), b"x").unwrap_err();
-    assert!(matches!(&error, RecordError::Preroll { path, .. } if path.starts_with(&folder)), "{error:?}");
+    assert!(
+        matches!(&error, RecordError::Preroll { path, .. } if path.starts_with(&folder)),
+        "{error:?}"
+    );
 }

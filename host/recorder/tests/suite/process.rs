@@ -11,7 +11,9 @@ use crate::running::*;
 use crate::support::*;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::TriggerKind::{Event, Start};
-use gleaner_protocol::link::{Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said};
+use gleaner_protocol::link::{
+    Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said,
+};
 use gleaner_recorder::program::{Options, run};
 use gleaner_transport::{Clock, LiveSource};
 
@@ -24,11 +26,16 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     let clock = running.clock;
     let (first, first_header) = lambda(&scratch, "first", (200, 100));
     let (second, second_header) = lambda(&scratch, "second", (50, 300));
-    let sockets = [running.control.add(&add(&first)).unwrap(), running.control.add(&add(&second)).unwrap()];
+    let sockets =
+        [running.control.add(&add(&first)).unwrap(), running.control.add(&add(&second)).unwrap()];
     let [mut one, mut two] = sockets.map(RecorderLink::new);
     // Each is only what its own socket was made for.
-    let refused = RecorderLink::new(running.control.add(&add(&first)).unwrap()).hello(&second_header, PATIENCE);
-    assert!(matches!(&refused, Err(LinkError::Refused { why }) if why.contains("`second`")), "{refused:?}");
+    let refused = RecorderLink::new(running.control.add(&add(&first)).unwrap())
+        .hello(&second_header, PATIENCE);
+    assert!(
+        matches!(&refused, Err(LinkError::Refused { why }) if why.contains("`second`")),
+        "{refused:?}"
+    );
     one.hello(&first_header, PATIENCE).unwrap();
     two.hello(&second_header, PATIENCE).unwrap();
     let sensor = Sensor::start(&network, clock);
@@ -43,14 +50,26 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     }
     assert!(matches!(opened[..], [Said::Opened { .. }]), "{opened:?}");
     let clip = running.clip();
-    assert_eq!(clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(), ["first"]);
-    assert_eq!((clip.from_ns, clip.to_ns, clip.triggers), (anchor - 200 * MS, anchor + 100 * MS, 1));
+    assert_eq!(
+        clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(),
+        ["first"]
+    );
+    assert_eq!(
+        (clip.from_ns, clip.to_ns, clip.triggers),
+        (anchor - 200 * MS, anchor + 100 * MS, 1)
+    );
     // Every number from the first to the last, once, and all that there are of that time.
     let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
-    assert!(numbers.len() > 1 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "{numbers:?}");
+    assert!(
+        numbers.len() > 1 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1),
+        "{numbers:?}"
+    );
     assert_eq!(numbers, sensor.numbers(clip.from_ns, clip.to_ns));
-    let told: Vec<_> =
-        clip.topics.iter().map(|topic| (topic.topic.as_str(), topic.lost, topic.type_name.is_some())).collect();
+    let told: Vec<_> = clip
+        .topics
+        .iter()
+        .map(|topic| (topic.topic.as_str(), topic.lost, topic.type_name.is_some()))
+        .collect();
     assert_eq!((told[0].0, told[0].1, told[0].2), ("/a", Some(0), true));
     assert_eq!((told[1].0, told[1].2), ("/b", false), "one that is not there");
     assert_eq!(scratch.journal(&clip, "first").1, [anchor]);
@@ -61,7 +80,10 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!(ended, Ok(()));
-    assert_eq!((last.recording.clips, last.recording.windows, last.trigger_to_open.unwrap().n), (1, 1, 1));
+    assert_eq!(
+        (last.recording.clips, last.recording.windows, last.trigger_to_open.unwrap().n),
+        (1, 1, 1)
+    );
     drop(sensor);
 }
 
@@ -123,11 +145,16 @@ fn what_a_hostile_lambda_says_costs_nobody_else() {
     noisy.bye(PATIENCE);
     let status = running.status(|status| status.recording.triggers_over_rate > 10_000);
     assert_eq!((status.recording.wakes_misstamped, status.recording.triggers_misstamped), (4, 8));
-    assert_eq!((status.recording.wakes_over_rate, status.recording.ignored), (status.recording.triggers_over_rate, 0));
+    assert_eq!(
+        (status.recording.wakes_over_rate, status.recording.ignored),
+        (status.recording.triggers_over_rate, 0)
+    );
     let anchor = clock.now();
     honest.wake(&entry(anchor, &[Event]), monotonic(clock)).unwrap();
     let clip = running.until(|report| match report {
-        RecorderReport::Clip(clip) if clip.lambdas.iter().any(|lambda| lambda.name == "honest") => Some(*clip),
+        RecorderReport::Clip(clip) if clip.lambdas.iter().any(|lambda| lambda.name == "honest") => {
+            Some(*clip)
+        }
         _ => None,
     });
     assert_eq!(clip.topics[0].lost, Some(0));
@@ -147,9 +174,13 @@ fn the_limits_of_a_vehicle_hold_for_what_the_recorder_reads_of_a_manifest() {
     let mut announced = add(&folder);
     announced.most.fuel = 10_000;
     // A process with more than the vehicle gives is not the one that was announced.
-    let refused = RecorderLink::new(running.control.add(&announced).unwrap()).hello(&as_in_manifest, PATIENCE);
+    let refused = RecorderLink::new(running.control.add(&announced).unwrap())
+        .hello(&as_in_manifest, PATIENCE);
     let limit = "its limit `fuel` is `50000000`; the recorder was told of `10000`";
-    assert!(matches!(&refused, Err(LinkError::Refused { why }) if why.contains(limit)), "{refused:?}");
+    assert!(
+        matches!(&refused, Err(LinkError::Refused { why }) if why.contains(limit)),
+        "{refused:?}"
+    );
     let mut link = RecorderLink::new(running.control.add(&announced).unwrap());
     link.hello(&on_vehicle, PATIENCE).unwrap();
     running.control.stop().unwrap();
@@ -177,7 +208,11 @@ fn a_full_disk_is_said_and_no_clip_is_begun() {
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!((last.recording.held_back, last.recording.clips, ended), (1, 0, Ok(())));
-    assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains(r#""loss":"held_back""#));
+    assert!(
+        fs::read_to_string(scratch.0.join("losses.jsonl"))
+            .unwrap()
+            .contains(r#""loss":"held_back""#)
+    );
 }
 
 /// A clip whose recorder died.
@@ -208,7 +243,10 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
         RecorderReport::Loss(Loss::Failed { why, .. }) => Some(why),
         _ => None,
     });
-    assert!(why.contains("cannot recover the unfinished clip") && why.contains(".mcap.part2"), "{why}");
+    assert!(
+        why.contains("cannot recover the unfinished clip") && why.contains(".mcap.part2"),
+        "{why}"
+    );
     let (folder, header) = lambda(&scratch, "first", (10, 10));
     let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
     link.hello(&header, PATIENCE).unwrap();
@@ -231,7 +269,10 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
     });
     assert!(recovered.recovered.is_some() && recovered.lambdas[0].name == "dead");
     let (last, ended) = running.ended();
-    assert_eq!((last.recording.clips, last.recording.failed, last.recording.deleted, ended), (0, 0, 1, Ok(())));
+    assert_eq!(
+        (last.recording.clips, last.recording.failed, last.recording.deleted, ended),
+        (0, 0, 1, Ok(()))
+    );
     assert_eq!(find(".mcap"), [scratch.0.join(&recovered.file)]);
 }
 
@@ -251,7 +292,10 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     network.loopback.die("its thread is gone");
     running.clip();
     let failure = running.ended().1.unwrap_err();
-    assert_eq!((failure.exit, failure.causes), (Exit::Internal, vec!["its thread is gone".to_owned()]));
+    assert_eq!(
+        (failure.exit, failure.causes),
+        (Exit::Internal, vec!["its thread is gone".to_owned()])
+    );
 }
 
 #[test]
@@ -276,7 +320,10 @@ fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_e
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 1);
     let specs = network.specs.lock().unwrap();
-    assert_eq!(specs.iter().map(|spec| (spec.topic.as_str(), spec.max_bytes)).collect::<Vec<_>>(), [("/a", 3 << 20)]);
+    assert_eq!(
+        specs.iter().map(|spec| (spec.topic.as_str(), spec.max_bytes)).collect::<Vec<_>>(),
+        [("/a", 3 << 20)]
+    );
 }
 
 #[test]
@@ -291,10 +338,17 @@ fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
     link.hello(&header, PATIENCE).unwrap();
     // `/b` is no input, so that any type will do: once it is found, `/a` was looked for as well.
     let type_of = |status: &RecorderStatus, name: &str| {
-        status.topics.iter().find(|topic| topic.topic == name).and_then(|topic| topic.type_name.clone())
+        status
+            .topics
+            .iter()
+            .find(|topic| topic.topic == name)
+            .and_then(|topic| topic.type_name.clone())
     };
     let status = running.status(|status| type_of(status, "/b").is_some());
-    assert_eq!((type_of(&status, "/a"), type_of(&status, "/b").as_deref()), (None, Some("aaa/msg/X")));
+    assert_eq!(
+        (type_of(&status, "/a"), type_of(&status, "/b").as_deref()),
+        (None, Some("aaa/msg/X"))
+    );
     network.add("/a");
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
@@ -306,32 +360,45 @@ fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
 fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
     let scratch = Scratch::new();
     let network = Network::default();
-    let mut running = Running::start(&scratch, &network, |options| options.preroll_bytes = Some(1 << 20));
+    let mut running =
+        Running::start(&scratch, &network, |options| options.preroll_bytes = Some(1 << 20));
     let (folder, header) = lambda(&scratch, "one", (10, 10));
     let sockets: Vec<_> = (0..256).map(|_| running.control.add(&add(&folder)).unwrap()).collect();
     let mut last = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
     let refused = last.hello(&header, PATIENCE).unwrap_err();
-    assert_eq!(refused.to_string(), "the recorder refuses the lambda: it hears at most 256 lambdas at a time");
+    assert_eq!(
+        refused.to_string(),
+        "the recorder refuses the lambda: it hears at most 256 lambdas at a time"
+    );
     running.status(|status| (status.lambdas, status.recording.lambdas_refused) == (256, 1));
     let mut links = sockets.into_iter().map(RecorderLink::new);
     links.next_back().unwrap().hello(&header, PATIENCE).unwrap();
     // Where one goes, there is room for another.
     drop(links.next());
     running.status(|status| status.lambdas < 256);
-    RecorderLink::new(running.control.add(&add(&folder)).unwrap()).hello(&header, PATIENCE).unwrap();
+    RecorderLink::new(running.control.add(&add(&folder)).unwrap())
+        .hello(&header, PATIENCE)
+        .unwrap();
 }
 
 #[test]
 fn a_preroll_that_no_memory_holds_is_an_error_in_words() {
     for bytes in [u64::MAX, 1 << 60] {
         let scratch = Scratch::new();
-        let options = Options { preroll_bytes: Some(bytes), ..options(&scratch.0, Clock::of_today()) };
+        let options =
+            Options { preroll_bytes: Some(bytes), ..options(&scratch.0, Clock::of_today()) };
         let (_control, stdin) = Control::pair().unwrap();
         let (_reader, writer) = std::io::pipe().unwrap();
-        let never = || -> Result<Box<dyn LiveSource>, Failure> { panic!("the network is joined later") };
-        let failure = run(options, never, stdin, File::from(OwnedFd::from(writer)), Arc::default()).unwrap_err();
+        let never =
+            || -> Result<Box<dyn LiveSource>, Failure> { panic!("the network is joined later") };
+        let failure = run(options, never, stdin, File::from(OwnedFd::from(writer)), Arc::default())
+            .unwrap_err();
         assert_eq!(failure.exit, Exit::Usage);
         let said = failure.to_string();
-        assert!(said.contains("there is no memory for a preroll of") && said.contains("--preroll-memory"), "{said}");
+        assert!(
+            said.contains("there is no memory for a preroll of")
+                && said.contains("--preroll-memory"),
+            "{said}"
+        );
     }
 }

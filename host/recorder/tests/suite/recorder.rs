@@ -17,7 +17,12 @@ fn a_clip_holds_exactly_its_window_and_says_what_it_is() {
     let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let gone = recorder.add_missing_topic("/gone").unwrap();
     let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[topics[0], gone]));
-    drive(&mut recorder, &topics, (0, 3000, 10), &[(100, lambda, &[]), (1136, lambda, EVENT), (1200, lambda, &[])]);
+    drive(
+        &mut recorder,
+        &topics,
+        (0, 3000, 10),
+        &[(100, lambda, &[]), (1136, lambda, EVENT), (1200, lambda, &[])],
+    );
     assert_eq!(recorder.clips().len(), 1, "the clip is complete once no window can touch it");
     recorder.finish(T0 + 3000 * MS).unwrap();
     let clip = &recorder.clips()[0];
@@ -26,10 +31,19 @@ fn a_clip_holds_exactly_its_window_and_says_what_it_is() {
     assert!(stamps(&scratch, clip, "/b").is_empty());
     assert_eq!((clip.from_ns, clip.to_ns), (T0 + 636 * MS, T0 + 1436 * MS));
     assert_eq!((clip.triggers, clip.moments.len(), clip.moments[0].label.as_str()), (1, 1, "here"));
-    assert_eq!((clip.lambdas.len(), clip.lambdas[0].windows, clip.lambdas[0].digest.as_str()), (1, 1, "d1e5"));
+    assert_eq!(
+        (clip.lambdas.len(), clip.lambdas[0].windows, clip.lambdas[0].digest.as_str()),
+        (1, 1, "d1e5")
+    );
     let [a, missing] = &clip.topics[..] else { panic!("{:?}", clip.topics) };
-    assert_eq!((a.messages, a.received, a.lost, a.overwritten, a.too_big), (80, Some(80), None, Some(0), Some(0)));
-    assert_eq!((missing.topic.as_str(), &missing.type_name, missing.received), ("/gone", &None, Some(0)));
+    assert_eq!(
+        (a.messages, a.received, a.lost, a.overwritten, a.too_big),
+        (80, Some(80), None, Some(0), Some(0))
+    );
+    assert_eq!(
+        (missing.topic.as_str(), &missing.type_name, missing.received),
+        ("/gone", &None, Some(0))
+    );
     assert_eq!(clip.short, Vec::<String>::new());
     let (header, wakes) = scratch.journal(clip, "hello");
     assert_eq!((header.wakes_before, wakes), (1, vec![T0 + 1136 * MS, T0 + 1200 * MS]));
@@ -45,13 +59,17 @@ fn messages_are_written_byte_for_byte() {
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[a]));
     let mut sample = meta(T0, 5);
-    (sample.endian, sample.options, sample.publish_ns) = (gleaner_messages::Endian::Big, [3, 4], -9);
+    (sample.endian, sample.options, sample.publish_ns) =
+        (gleaner_messages::Endian::Big, [3, 4], -9);
     recorder.sample(a, &sample, b"before").unwrap();
     recorder.wake(lambda, &entry(T0, EVENT)).unwrap();
     recorder.sample(a, &meta(T0, 6), b"after").unwrap();
     recorder.finish(T0 + S).unwrap();
-    let data: Vec<_> =
-        scratch.messages(&recorder.clips()[0]).into_iter().map(|(_, _, seq, data)| (seq, data)).collect();
+    let data: Vec<_> = scratch
+        .messages(&recorder.clips()[0])
+        .into_iter()
+        .map(|(_, _, seq, data)| (seq, data))
+        .collect();
     assert_eq!(data, [(5, b"\0\0\x03\x04before".to_vec()), (6, b"\0\x01\0\0after".to_vec())]);
 }
 
@@ -63,14 +81,22 @@ fn lambdas_share_a_clip_each_with_its_own_topics() {
     let [a, b, both] = topics;
     let first = recorder.add_lambda(member("first", (100, 100, 0), &[a, both]));
     let second = recorder.add_lambda(member("second", (800, 50, 0), &[both, b]));
-    let wakes = [(1000, first, EVENT), (1150, second, EVENT), (950, second, &[] as &[_]), (300, second, &[])];
+    let wakes = [
+        (1000, first, EVENT),
+        (1150, second, EVENT),
+        (950, second, &[] as &[_]),
+        (300, second, &[]),
+    ];
     drive(&mut recorder, &topics, (0, 4000, 10), &wakes);
     let [clip] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
     assert_eq!((clip.from_ns, clip.to_ns), (T0 + 350 * MS, T0 + 1200 * MS));
     assert_eq!(stamps(&scratch, clip, "/a"), every(900, 1100, 10));
     assert_eq!(stamps(&scratch, clip, "/b"), every(350, 1200, 10));
     assert_eq!(stamps(&scratch, clip, "/both"), every(350, 1200, 10));
-    assert_eq!(clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(), ["first", "second"]);
+    assert_eq!(
+        clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(),
+        ["first", "second"]
+    );
     assert_eq!(scratch.journal(clip, "first").1, [T0 + 1000 * MS]);
     let (header, wakes) = scratch.journal(clip, "second");
     assert_eq!(
@@ -113,7 +139,8 @@ fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
     let [a, b] = topics;
     let first = recorder.add_lambda(member("first", (2500, 0, 0), &[a]));
     let second = recorder.add_lambda(member("second", (700, 100, 0), &[b]));
-    let wakes: [(_, _, &[_]); 3] = [(3000, first, &[Start]), (4400, second, EVENT), (6000, first, &[Stop])];
+    let wakes: [(_, _, &[_]); 3] =
+        [(3000, first, &[Start]), (4400, second, EVENT), (6000, first, &[Stop])];
     drive(&mut recorder, &topics, (0, 12_000, 10), &wakes);
     let clips = recorder.clips();
     let all: Vec<_> = clips.iter().flat_map(|clip| stamps(&scratch, clip, "/a")).collect();
@@ -150,7 +177,10 @@ fn a_jump_in_time_makes_no_clips_of_nothing() {
     recorder.sample(a, &meta(T0 + year, 1), b"much later").unwrap();
     recorder.sample(a, &meta(i64::MAX, 2), b"at the end of time").unwrap();
     recorder.finish(T0).unwrap();
-    assert_eq!(recorder.clips().iter().map(|clip| clip.topics[0].messages).collect::<Vec<_>>(), [20, 1, 1]);
+    assert_eq!(
+        recorder.clips().iter().map(|clip| clip.topics[0].messages).collect::<Vec<_>>(),
+        [20, 1, 1]
+    );
 }
 
 #[test]
@@ -162,9 +192,14 @@ fn what_is_open_at_the_end_of_the_drive_says_so() {
     drive(&mut recorder, &[a], (0, 6000, 10), &[(3100, event, EVENT)]);
     recorder.finish(T0 + 6000 * MS).unwrap();
     let [clip] = recorder.clips() else { panic!() };
-    let expected =
-        ["the preroll begins 1.9 s late: nothing was recorded before", "the drive ended 2.1 s before the window did"];
-    assert_eq!((clip.short.as_slice(), clip.to_ns), (expected.map(str::to_owned).as_slice(), T0 + 8100 * MS));
+    let expected = [
+        "the preroll begins 1.9 s late: nothing was recorded before",
+        "the drive ended 2.1 s before the window did",
+    ];
+    assert_eq!(
+        (clip.short.as_slice(), clip.to_ns),
+        (expected.map(str::to_owned).as_slice(), T0 + 8100 * MS)
+    );
 
     let scratch = Scratch::new();
     let mut recorder = scratch.recorder(|_| {});
@@ -193,7 +228,10 @@ fn what_is_before_1970_or_out_of_order_is_counted() {
     recorder.sample(a, &meta(T0 + 45 * MS, 4), b"x").unwrap();
     recorder.finish(T0 + S).unwrap();
     let counts = recorder.counts();
-    assert_eq!((counts.recording.before_1970, counts.recording.topic_unknown, counts.out_of_order), (2, 1, 2));
+    assert_eq!(
+        (counts.recording.before_1970, counts.recording.topic_unknown, counts.out_of_order),
+        (2, 1, 2)
+    );
     assert_eq!(stamps(&scratch, &recorder.clips()[0], "/a"), [40, 45, 50]);
 }
 
@@ -214,7 +252,8 @@ fn the_names_of_all_topics_have_an_end_before_a_line_of_the_list_has() {
     let scratch = Scratch::new();
     let mut recorder = scratch.recorder(|_| {});
     let name = |index: usize| format!("/t{index:03}{}", "x".repeat(1000));
-    let refused = (0..TOPICS_MAX).find_map(|index| recorder.add_topic(topic(&name(index))).err()).unwrap();
+    let refused =
+        (0..TOPICS_MAX).find_map(|index| recorder.add_topic(topic(&name(index))).err()).unwrap();
     assert!(matches!(refused, RecordError::LongNames { most: 262_144 }), "{refused}");
     assert!(refused.help().unwrap().contains("--topics"));
 }
@@ -244,7 +283,9 @@ fn the_picture_is_that_of_the_trigger() {
         let lambda = recorder.add_lambda(member("hello", (500, 500, 0), &[camera]));
         for ms in 0..500 {
             if ms % 100 == 50 {
-                recorder.sample(camera, &meta(T0 + ms * MS, ms as u64), &image(ms as u8 / 2)).unwrap();
+                recorder
+                    .sample(camera, &meta(T0 + ms * MS, ms as u64), &image(ms as u8 / 2))
+                    .unwrap();
             }
             if ms == anchor_ms {
                 recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
@@ -270,7 +311,11 @@ fn the_picture_is_in_the_clip() {
     drive(&mut recorder, &topics[..1], (20, 500, 10), &[(300, lambda, EVENT)]);
     recorder.finish(T0 + S).unwrap();
     let clip = &recorder.clips()[0];
-    assert_eq!((clip.thumbnail.as_ref(), clip.topics[1].messages), (None, 0), "the one image was long before");
+    assert_eq!(
+        (clip.thumbnail.as_ref(), clip.topics[1].messages),
+        (None, 0),
+        "the one image was long before"
+    );
 }
 
 #[test]
@@ -317,7 +362,10 @@ fn a_lambda_that_was_started_again_within_a_clip_is_told_from_itself() {
     recorder.finish(T0 + 500 * MS).unwrap();
     let [clip] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
     let records = scratch.metadata(clip);
-    let configs = records.iter().filter(|(name, _)| name == "gleaner.lambda").map(|(_, of)| of["config"].as_str());
+    let configs = records
+        .iter()
+        .filter(|(name, _)| name == "gleaner.lambda")
+        .map(|(_, of)| of["config"].as_str());
     assert_eq!(configs.collect::<Vec<_>>(), [r#"{"limit":1}"#, r#"{"limit":2}"#]);
     for (journal, limit) in [("hello", 1), ("hello-2", 2)] {
         assert_eq!(scratch.journal(clip, journal).0.config["limit"], limit);

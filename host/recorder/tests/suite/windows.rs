@@ -27,7 +27,14 @@ fn plan(seed: u64) -> Plan {
         .map(|_| {
             let topics: Vec<_> = (0..TOPICS.len()).filter(|_| random.below(2) == 0).collect();
             let topics = if topics.is_empty() { vec![0] } else { topics };
-            ((random.below(800), random.below(500), [0, random.below(900)][random.below(2) as usize]), topics)
+            (
+                (
+                    random.below(800),
+                    random.below(500),
+                    [0, random.below(900)][random.below(2) as usize],
+                ),
+                topics,
+            )
         })
         .collect::<Vec<_>>();
     let (mut samples, mut triggers, mut now) = (Vec::new(), Vec::new(), 0);
@@ -39,7 +46,11 @@ fn plan(seed: u64) -> Plan {
         samples.push((random.below(TOPICS.len() as u64) as usize, now));
         if random.below(25) == 0 {
             let lambda = random.below(lambdas.len() as u64) as usize;
-            triggers.push((now, lambda, [Event, Event, Start, Stop, Stop][random.below(5) as usize]));
+            triggers.push((
+                now,
+                lambda,
+                [Event, Event, Start, Stop, Stop][random.below(5) as usize],
+            ));
         }
     }
     // Samples of one instant come before its triggers.
@@ -86,12 +97,16 @@ fn expected(plan: &Plan) -> Vec<Contents> {
         end = end.max(window.2);
     }
     let holds = |group: &[(usize, i64, i64)], topic: usize, at: i64| {
-        group.iter().any(|(lambda, from, to)| plan.lambdas[*lambda].1.contains(&topic) && *from <= at && at <= *to)
+        group.iter().any(|(lambda, from, to)| {
+            plan.lambdas[*lambda].1.contains(&topic) && *from <= at && at <= *to
+        })
     };
     let contents = |group: &Vec<(usize, i64, i64)>| {
-        let inside = plan.samples.iter().enumerate().filter(|(_, (topic, at))| holds(group, *topic, *at));
-        let mut inside: Vec<_> =
-            inside.map(|(seq, (topic, at))| (TOPICS[*topic].to_owned(), T0 + at * MS, seq as u32 + 1)).collect();
+        let inside =
+            plan.samples.iter().enumerate().filter(|(_, (topic, at))| holds(group, *topic, *at));
+        let mut inside: Vec<_> = inside
+            .map(|(seq, (topic, at))| (TOPICS[*topic].to_owned(), T0 + at * MS, seq as u32 + 1))
+            .collect();
         inside.sort();
         inside
     };
@@ -101,7 +116,8 @@ fn expected(plan: &Plan) -> Vec<Contents> {
 /// What the recorder's clips hold, and why each is short.
 fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, Vec<String>)> {
     let scratch = Scratch::new();
-    let mut recorder = scratch.recorder(|settings| (settings.store, settings.max_length) = (store, max_length));
+    let mut recorder =
+        scratch.recorder(|settings| (settings.store, settings.max_length) = (store, max_length));
     let topics = TOPICS.map(|name| recorder.add_topic(topic(name)).unwrap());
     let lambdas: Vec<_> = (plan.lambdas.iter().enumerate())
         .map(|(index, (rolls, own))| {
@@ -111,9 +127,13 @@ fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, V
         .collect();
     let mut triggers = plan.triggers.iter().peekable();
     for (index, (topic, at)) in plan.samples.iter().enumerate() {
-        recorder.sample(topics[*topic], &meta(T0 + at * MS, index as u64 + 1), &[index as u8; 50]).unwrap();
+        recorder
+            .sample(topics[*topic], &meta(T0 + at * MS, index as u64 + 1), &[index as u8; 50])
+            .unwrap();
         let is_last_of_its_instant = plan.samples.get(index + 1).is_none_or(|(_, next)| next > at);
-        while let Some((_, lambda, kind)) = triggers.next_if(|(when, _, _)| is_last_of_its_instant && when == at) {
+        while let Some((_, lambda, kind)) =
+            triggers.next_if(|(when, _, _)| is_last_of_its_instant && when == at)
+        {
             recorder.wake(lambdas[*lambda], &entry(T0 + at * MS, &[*kind])).unwrap();
         }
     }
@@ -125,7 +145,10 @@ fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, V
         contents.iter().for_each(|(topic, _, _)| *counted.entry(topic.clone()).or_insert(0) += 1);
         for topic in &clip.topics {
             let messages = counted.remove(&topic.topic).unwrap_or(0);
-            assert_eq!((topic.messages, topic.received, topic.overwritten), (messages, Some(messages), Some(0)));
+            assert_eq!(
+                (topic.messages, topic.received, topic.overwritten),
+                (messages, Some(messages), Some(0))
+            );
         }
         assert!(counted.is_empty(), "a topic that the clip does not list: {counted:?}");
         (contents, clip.short.clone())
@@ -150,7 +173,11 @@ fn random_drives_are_cut_as_brute_force_says() {
 fn random_drives_are_cut_alike_from_memory_and_from_disk() {
     for seed in 100..120 {
         let (plan, max_length) = (plan(seed), Duration::from_millis(700));
-        assert_eq!(recorded(&plan, Store::Ram, max_length), recorded(&plan, Store::Disk, max_length), "seed {seed}");
+        assert_eq!(
+            recorded(&plan, Store::Ram, max_length),
+            recorded(&plan, Store::Disk, max_length),
+            "seed {seed}"
+        );
     }
 }
 

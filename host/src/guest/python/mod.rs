@@ -1,7 +1,8 @@
 //! Python lambdas: this process becomes the interpreter of the lambda's environment.
 //!
-//! `gleaner-runtime` links no libpython. It replaces itself by `python3 -I -S start.py`, which loads `_gleaner` (crate
-//! `host/python`), and that runs the same library again, now inside the interpreter. So any virtual environment works.
+//! `gleaner-runtime` links no libpython. It replaces itself by `python3 -I -S start.py`, which
+//! loads `_gleaner` (crate `host/python`), and that runs the same library again, now inside the
+//! interpreter. So any virtual environment works.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
@@ -15,9 +16,10 @@ use gleaner_protocol::LAYERS_ENV;
 
 use crate::isolation::{self, Inside};
 
-/// Threads of numpy's linear algebra, unless the user says otherwise: receivers share the cores, and with its default
-/// OpenBLAS hangs where memory is capped.
-const ONE_THREAD: [&str; 4] = ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"];
+/// Threads of numpy's linear algebra, unless the user says otherwise: receivers share the cores,
+/// and with its default OpenBLAS hangs where memory is capped.
+const ONE_THREAD: [&str; 4] =
+    ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"];
 
 /// Why Python cannot be started.
 #[derive(Debug, thiserror::Error)]
@@ -33,7 +35,9 @@ impl Explain for PythonError {
     fn help(&self) -> Option<String> {
         match self {
             Self::Parts(error) => error.help(),
-            Self::Start { .. } => Some("name another interpreter: GLEANER_PYTHON=/path/to/python3".to_owned()),
+            Self::Start { .. } => {
+                Some("name another interpreter: GLEANER_PYTHON=/path/to/python3".to_owned())
+            }
         }
     }
 
@@ -45,8 +49,9 @@ impl Explain for PythonError {
     }
 }
 
-/// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for our library in it, which can open no files but
-/// those of `inside`, its own and ours, and have as much memory. Returns only errors.
+/// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for our library in
+/// it, which can open no files but those of `inside`, its own and ours, and have as much memory.
+/// Returns only errors.
 pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) -> PythonError {
     match interpreter(lambda_dir, args, inside) {
         Ok((python, mut command)) => PythonError::Start { python, source: command.exec() },
@@ -54,7 +59,11 @@ pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) 
     }
 }
 
-fn interpreter(lambda_dir: &Path, args: &[OsString], mut inside: Inside) -> Result<(PathBuf, Command), PartsError> {
+fn interpreter(
+    lambda_dir: &Path,
+    args: &[OsString],
+    mut inside: Inside,
+) -> Result<(PathBuf, Command), PartsError> {
     let parts = Parts::find()?;
     let (python, unused) = parts.python_or_why(Some(lambda_dir))?;
     if let Some(Looked { at, why }) = unused {
@@ -64,10 +73,12 @@ fn interpreter(lambda_dir: &Path, args: &[OsString], mut inside: Inside) -> Resu
     let mut command = Command::new(&python);
     // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.
     let (home, extension) = (parts.python_home()?, parts.extension()?);
-    // Without `site`: what the environment starts by itself is the lambda's, and waits until this process is shut.
+    // Without `site`: what the environment starts by itself is the lambda's, and waits until this
+    // process is shut.
     command.args(["-I", "-S"]).arg(home.join("start.py")).arg(&extension).args(args);
     inside.paths.read.extend([home, extension]);
-    // It may be any program that calls itself Python, and its libraries are found by what lies around it.
+    // It may be any program that calls itself Python, and its libraries are found by what lies
+    // around it.
     command.env(LAYERS_ENV, isolation::before_interpreter(inside, &python)).env_remove(CGROUP_ENV);
     for name in ONE_THREAD {
         if std::env::var_os(name).is_none() {

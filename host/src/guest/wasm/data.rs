@@ -1,4 +1,5 @@
-//! `gleaner:lambda/data` and `types` over [`api::data`](crate::api::data) and [`api::frame`](crate::api::frame).
+//! `gleaner:lambda/data` and `types` over [`api::data`](crate::api::data) and
+//! [`api::frame`](crate::api::frame).
 
 use bytes::Bytes;
 use wasmtime::component::{Linker, Resource};
@@ -59,13 +60,18 @@ impl HostTopic for Hosted {
         self.hand_out_all(samples)
     }
 
-    fn since(&mut self, topic: Resource<Topic>, since_ns: i64) -> wasmtime::Result<Vec<Resource<Sample>>> {
+    fn since(
+        &mut self,
+        topic: Resource<Topic>,
+        since_ns: i64,
+    ) -> wasmtime::Result<Vec<Resource<Sample>>> {
         let samples = self.handles.get(&topic)?.since(since_ns)?;
         self.hand_out_all(samples)
     }
 
     fn counts(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Counts> {
-        let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } = self.look(&topic)?.counts();
+        let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } =
+            self.look(&topic)?.counts();
         Ok(Counts { received, lost, overwritten, no_slot, too_big, skipped })
     }
 
@@ -79,7 +85,12 @@ impl HostTopic for Hosted {
         answer(topic.column(field, n as usize).map(column_out))
     }
 
-    fn column_since(&mut self, topic: Resource<Topic>, field: Resource<Field>, since_ns: i64) -> Answer<Column> {
+    fn column_since(
+        &mut self,
+        topic: Resource<Topic>,
+        field: Resource<Field>,
+        since_ns: i64,
+    ) -> Answer<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
         answer(topic.column_since(field, since_ns).map(column_out))
     }
@@ -129,7 +140,12 @@ impl HostSample for Hosted {
     }
 
     /// Never called: see [`add_reads_to_linker`].
-    fn cdr(&mut self, sample: Resource<Sample>, offset: u64, len: u32) -> wasmtime::Result<Vec<u8>> {
+    fn cdr(
+        &mut self,
+        sample: Resource<Sample>,
+        offset: u64,
+        len: u32,
+    ) -> wasmtime::Result<Vec<u8>> {
         Ok(self.sample_cdr(&sample, offset, len)?.to_vec())
     }
 
@@ -168,7 +184,12 @@ impl HostFrame for Hosted {
         answer(self.handles.get(&frame)?.histogram(roi.map(roi_in)).map(Vec::from))
     }
 
-    fn resize(&mut self, frame: Resource<Frame>, width: u32, height: u32) -> Answer<Resource<Frame>> {
+    fn resize(
+        &mut self,
+        frame: Resource<Frame>,
+        width: u32,
+        height: u32,
+    ) -> Answer<Resource<Frame>> {
         let resized = self.handles.get(&frame)?.resize(width, height);
         self.hand_out(resized)
     }
@@ -189,31 +210,50 @@ impl HostFrame for Hosted {
     }
 }
 
-/// Defines what hands out bytes once more, so that they go from their cell into the guest's memory in one copy: what is generated
-/// wants them as a `Vec`.
+/// Defines what hands out bytes once more, so that they go from their cell into the guest's memory
+/// in one copy: what is generated wants them as a `Vec`.
 pub(super) fn add_reads_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
     linker.allow_shadowing(true);
     let mut data = linker.instance(DATA)?;
-    data.func_wrap("[method]sample.cdr", |mut store, (sample, offset, len): (Resource<Sample>, u64, u32)| {
-        Ok((store.data_mut().sample_cdr(&sample, offset, len)?,))
-    })?;
-    data.func_wrap("[method]frame.read", |mut store, (frame, offset, len): (Resource<Frame>, u64, u32)| {
-        Ok((store.data_mut().frame_read(&frame, offset, len)?,))
-    })?;
+    data.func_wrap(
+        "[method]sample.cdr",
+        |mut store, (sample, offset, len): (Resource<Sample>, u64, u32)| {
+            Ok((store.data_mut().sample_cdr(&sample, offset, len)?,))
+        },
+    )?;
+    data.func_wrap(
+        "[method]frame.read",
+        |mut store, (frame, offset, len): (Resource<Frame>, u64, u32)| {
+            Ok((store.data_mut().frame_read(&frame, offset, len)?,))
+        },
+    )?;
     linker.allow_shadowing(false);
     Ok(())
 }
 
 impl Hosted {
-    fn sample_cdr(&mut self, sample: &Resource<Sample>, offset: u64, len: u32) -> wasmtime::Result<Bytes> {
+    fn sample_cdr(
+        &mut self,
+        sample: &Resource<Sample>,
+        offset: u64,
+        len: u32,
+    ) -> wasmtime::Result<Bytes> {
         Ok(Bytes::from_owner(self.handles.get(sample)?.cdr(offset, len)?))
     }
 
-    fn frame_read(&mut self, frame: &Resource<Frame>, offset: u64, len: u32) -> wasmtime::Result<Bytes> {
+    fn frame_read(
+        &mut self,
+        frame: &Resource<Frame>,
+        offset: u64,
+        len: u32,
+    ) -> wasmtime::Result<Bytes> {
         Ok(Bytes::from_owner(self.handles.get(frame)?.read(offset, len)?))
     }
 
-    fn hand_out<T: Send + 'static>(&mut self, made: Result<T, data::DataError>) -> Answer<Resource<T>> {
+    fn hand_out<T: Send + 'static>(
+        &mut self,
+        made: Result<T, data::DataError>,
+    ) -> Answer<Resource<T>> {
         Ok(match answer(made)? {
             Ok(value) => Ok(self.handles.push(value)?),
             Err(refused) => Err(refused),
@@ -224,7 +264,8 @@ impl Hosted {
         samples.into_iter().map(|sample| Ok(self.handles.push(sample)?)).collect()
     }
 
-    /// What a handle stands for, for a call that only looks at it: one that is charged nowhere else.
+    /// What a handle stands for, for a call that only looks at it: one that is charged nowhere
+    /// else.
     fn look<T: 'static>(&self, handle: &Resource<T>) -> wasmtime::Result<&T> {
         self.session.fuel().charge_call()?;
         Ok(self.handles.get(handle)?)

@@ -1,5 +1,5 @@
-//! Wall-clock deadlines: a thread looks whether a call is over its time, and advances the engine's epoch then, upon which the guest
-//! traps.
+//! Wall-clock deadlines: a thread looks whether a call is over its time, and advances the engine's
+//! epoch then, upon which the guest traps.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,8 +11,9 @@ use wasmtime::{Engine, Store, Trap, UpdateDeadline};
 use super::Hosted;
 use crate::guest::is_late;
 
-/// How long nothing must have run for the ticker to sleep until something does. A lambda at 1 Hz wakes it with each call, one at
-/// 100 Hz never: waking a thread costs a call more than all else that hosting does.
+/// How long nothing must have run for the ticker to sleep until something does. A lambda at 1 Hz
+/// wakes it with each call, one at 100 Hz never: waking a thread costs a call more than all else
+/// that hosting does.
 const IDLE: Duration = Duration::from_millis(500);
 
 /// No call runs.
@@ -41,8 +42,8 @@ pub(super) struct Taken {
 }
 
 impl Taken {
-    /// Whether it came back too late. An instruction that fills or copies a large memory is not ended by an epoch, and if it was the
-    /// last, nothing else asks.
+    /// Whether it came back too late. An instruction that fills or copies a large memory is not
+    /// ended by an epoch, and if it was the last, nothing else asks.
     pub(super) fn is_late(self) -> bool {
         is_late(self.elapsed, self.allowed)
     }
@@ -61,8 +62,8 @@ pub(super) struct Armed<'a> {
 }
 
 impl Deadline {
-    /// A deadline for the guests of `engine`, whose calls may take `shortest` or longer. Starts the ticker, which sleeps until a
-    /// call runs.
+    /// A deadline for the guests of `engine`, whose calls may take `shortest` or longer. Starts the
+    /// ticker, which sleeps until a call runs.
     ///
     /// # Errors
     ///
@@ -103,7 +104,8 @@ impl Deadline {
 
 impl Shared {
     fn tick(&self, engine: &Engine, shortest: Duration) {
-        // A look at least every half of the shortest time finds each call before it is due, and sleeps exactly until then.
+        // A look at least every half of the shortest time finds each call before it is due, and
+        // sleeps exactly until then.
         let step = (shortest / 2).max(Duration::from_micros(500));
         let mut quiet = Instant::now();
         while !self.stop.load(Ordering::SeqCst) {
@@ -115,7 +117,8 @@ impl Shared {
                 if left.is_zero() {
                     engine.increment_epoch();
                 }
-                // A call in the host, which ends by itself, is asked again when it is back in the guest.
+                // A call in the host, which ends by itself, is asked again when it is back in the
+                // guest.
                 thread::park_timeout(left.clamp(Duration::from_micros(500), step));
             } else if now.duration_since(quiet) < IDLE {
                 thread::park_timeout(step);

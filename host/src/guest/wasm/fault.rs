@@ -42,13 +42,19 @@ pub(super) fn from_error(
     }
     if let Some(DataError::OutOfTime) = error.downcast_ref() {
         let (used, allowed) = time.unzip();
-        let message = "a call into the host takes longer than is left until the deadline".to_owned();
+        let message =
+            "a call into the host takes longer than is left until the deadline".to_owned();
         return Fault { kind: FaultKind::Deadline, message, used, allowed };
     }
     if trap == Some(&Trap::StackOverflow) {
         // How much it was that one call more would have taken nobody knows.
         let allowed = Some(hosted.allowed.stack.bytes());
-        return Fault { kind: FaultKind::Stack, message: "the call stack is full".to_owned(), used: None, allowed };
+        return Fault {
+            kind: FaultKind::Stack,
+            message: "the call stack is full".to_owned(),
+            used: None,
+            allowed,
+        };
     }
     let plain = |kind, message| Fault { kind, message, used: None, allowed: None };
     if error.downcast_ref::<Asleep>().is_some() {
@@ -60,29 +66,48 @@ pub(super) fn from_error(
     if let Some(ResourceTableError::Full) = error.downcast_ref() {
         let allowed = hosted.allowed.handles;
         let message = gleaner_rules::refused::too_many_handles(allowed);
-        return Fault { kind: FaultKind::HostCall, message, used: Some(allowed + 1), allowed: Some(allowed) };
+        return Fault {
+            kind: FaultKind::HostCall,
+            message,
+            used: Some(allowed + 1),
+            allowed: Some(allowed),
+        };
     }
     if error.root_cause().to_string().starts_with(TOO_MUCH_DATA) {
         let allowed = hosted.allowed.call_bytes;
         let message = format!("{TOO_MUCH_DATA}: at most {allowed} in one call");
-        return Fault { kind: FaultKind::HostCall, message, used: None, allowed: Some(allowed.bytes()) };
+        return Fault {
+            kind: FaultKind::HostCall,
+            message,
+            used: None,
+            allowed: Some(allowed.bytes()),
+        };
     }
     let said = hosted.printed.reason();
-    // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is the cause. But a guest may
-    // also survive the refusal and panic for another reason.
-    // A guest is on the stack if it called the host, and not yet while its memories are made.
+    // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is
+    // the cause. But a guest may also survive the refusal and panic for another reason. A guest is
+    // on the stack if it called the host, and not yet while its memories are made.
     let starting = trap.is_none() && error.downcast_ref::<WasmBacktrace>().is_none();
     let aborted = starting || trap == Some(&Trap::UnreachableCodeReached);
     let for_memory = said.as_ref().is_none_or(|said| said.contains("memory allocation of"));
-    if let Some(Refused { what, asked, allowed }) = hosted.caps.refused().filter(|_| aborted && for_memory) {
+    if let Some(Refused { what, asked, allowed }) =
+        hosted.caps.refused().filter(|_| aborted && for_memory)
+    {
         let message = format!("asked for {asked} {what}; {allowed} are allowed");
-        return Fault { kind: FaultKind::Memory, message, used: Some(asked), allowed: Some(allowed) };
+        return Fault {
+            kind: FaultKind::Memory,
+            message,
+            used: Some(asked),
+            allowed: Some(allowed),
+        };
     }
     match trap {
-        // A compiler keeps what it needs for calls at the low end of `memory`, beyond which a deep recursion gets.
-        Some(trap @ Trap::MemoryOutOfBounds) if said.is_none() => {
-            plain(FaultKind::Trap, format!("{trap}; perhaps its stack is exhausted by a deep recursion"))
-        }
+        // A compiler keeps what it needs for calls at the low end of `memory`, beyond which a deep
+        // recursion gets.
+        Some(trap @ Trap::MemoryOutOfBounds) if said.is_none() => plain(
+            FaultKind::Trap,
+            format!("{trap}; perhaps its stack is exhausted by a deep recursion"),
+        ),
         // A panic says why on standard error, and the trap only says that it happened.
         Some(trap) => plain(FaultKind::Trap, said.unwrap_or_else(|| trap.to_string())),
         None => plain(FaultKind::HostCall, format!("{}", error.root_cause())),

@@ -15,11 +15,16 @@ impl Host for Hosted {}
 
 impl HostTensor for Hosted {
     fn from_values(&mut self, shape: Vec<u32>, values: Vec<f32>) -> Answer<Resource<Tensor>> {
-        let made = Tensor::from_values(size_of_val(&*shape) + size_of_val(&*values), self.session.fuel());
+        let made =
+            Tensor::from_values(size_of_val(&*shape) + size_of_val(&*values), self.session.fuel());
         self.answer(made)
     }
 
-    fn from_frame(&mut self, _frame: Resource<Frame>, _how: Preprocess) -> Answer<Resource<Tensor>> {
+    fn from_frame(
+        &mut self,
+        _frame: Resource<Frame>,
+        _how: Preprocess,
+    ) -> Answer<Resource<Tensor>> {
         let made = Tensor::from_frame(self.session.fuel());
         self.answer(made)
     }
@@ -28,7 +33,12 @@ impl HostTensor for Hosted {
         match *self.handles.get(&tensor)? {}
     }
 
-    fn read(&mut self, tensor: Resource<Tensor>, _offset: u64, _len: u32) -> wasmtime::Result<Vec<f32>> {
+    fn read(
+        &mut self,
+        tensor: Resource<Tensor>,
+        _offset: u64,
+        _len: u32,
+    ) -> wasmtime::Result<Vec<f32>> {
         match *self.handles.get(&tensor)? {}
     }
 
@@ -43,7 +53,11 @@ impl HostModel for Hosted {
         self.answer(opened)
     }
 
-    fn run(&mut self, model: Resource<Model>, _inputs: Vec<Resource<Tensor>>) -> Answer<Vec<Resource<Tensor>>> {
+    fn run(
+        &mut self,
+        model: Resource<Model>,
+        _inputs: Vec<Resource<Tensor>>,
+    ) -> Answer<Vec<Resource<Tensor>>> {
         match *self.handles.get(&model)? {}
     }
 
@@ -62,7 +76,10 @@ impl HostModel for Hosted {
 }
 
 impl Hosted {
-    fn answer<T: Send + 'static>(&mut self, made: Result<T, inference::InferenceError>) -> Answer<Resource<T>> {
+    fn answer<T: Send + 'static>(
+        &mut self,
+        made: Result<T, inference::InferenceError>,
+    ) -> Answer<Resource<T>> {
         let error = match made {
             Ok(value) => return Ok(Ok(self.handles.push(value)?)),
             Err(inference::InferenceError::OutOfFuel(error)) => return Err(error.into()),

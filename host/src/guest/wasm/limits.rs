@@ -34,7 +34,14 @@ impl Caps {
     pub(super) fn new(limits: &Limits, fuel: Fuel) -> Self {
         let tables_allowed = usize::try_from(limits.tables).unwrap_or(usize::MAX);
         let memory_allowed = limits.memory.as_usize();
-        Self { memory_allowed, tables_allowed, memory_bytes: 0, table_elements: 0, refused: None, fuel }
+        Self {
+            memory_allowed,
+            tables_allowed,
+            memory_bytes: 0,
+            table_elements: 0,
+            refused: None,
+            fuel,
+        }
     }
 
     pub(super) fn forget_refusal(&mut self) {
@@ -48,14 +55,19 @@ impl Caps {
 }
 
 impl ResourceLimiter for Caps {
-    fn memory_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
+    fn memory_growing(
+        &mut self,
+        now: usize,
+        desired: usize,
+        max: Option<usize>,
+    ) -> wasmtime::Result<bool> {
         let more = desired.saturating_sub(now);
         let total = self.memory_bytes.saturating_add(more);
         let fits = total <= self.memory_allowed;
         // Beyond its own maximum it does not grow, and must not be counted as if it had.
         let grows = fits && max.is_none_or(|max| desired <= max);
-        // One instruction has the kernel clear all these pages, and a loop of refusals takes time, too. A memory's first bytes belong to
-        // its instance, which is no work of a loop.
+        // One instruction has the kernel clear all these pages, and a loop of refusals takes time,
+        // too. A memory's first bytes belong to its instance, which is no work of a loop.
         if now > 0 {
             self.fuel.charge(|| if grows { more } else { PAGE })?;
         }
@@ -70,7 +82,12 @@ impl ResourceLimiter for Caps {
         Ok(grows)
     }
 
-    fn table_growing(&mut self, now: usize, desired: usize, max: Option<usize>) -> wasmtime::Result<bool> {
+    fn table_growing(
+        &mut self,
+        now: usize,
+        desired: usize,
+        max: Option<usize>,
+    ) -> wasmtime::Result<bool> {
         let total = self.table_elements.saturating_add(desired.saturating_sub(now));
         if total > self.tables_allowed {
             let (asked, allowed) = (total as u64, self.tables_allowed as u64);
@@ -109,10 +126,16 @@ mod tests {
         assert_eq!(caps.refused(), None);
         assert!(!caps.memory_growing(MIB, MIB + 1, None).unwrap());
         let asked = MIB as u64 + 1;
-        assert_eq!(caps.refused(), Some(Refused { what: "bytes of memory", asked, allowed: asked - 1 }));
+        assert_eq!(
+            caps.refused(),
+            Some(Refused { what: "bytes of memory", asked, allowed: asked - 1 })
+        );
         caps.forget_refusal();
         assert!(!caps.table_growing(0, 101, None).unwrap());
-        assert_eq!(caps.refused(), Some(Refused { what: "elements of tables", asked: 101, allowed: 100 }));
+        assert_eq!(
+            caps.refused(),
+            Some(Refused { what: "elements of tables", asked: 101, allowed: 100 })
+        );
     }
 
     const MIB: usize = 1 << 20;
@@ -131,7 +154,8 @@ mod tests {
     #[test]
     fn growing_costs_fuel_by_the_byte_and_a_refusal_as_much_as_a_page() {
         let mut caps = caps();
-        let (grown, refused) = ((MIB / 2) as u64 / 8 + FUEL_PER_CALL, PAGE as u64 / 8 + FUEL_PER_CALL);
+        let (grown, refused) =
+            ((MIB / 2) as u64 / 8 + FUEL_PER_CALL, PAGE as u64 / 8 + FUEL_PER_CALL);
         caps.fuel.begin(grown + 2 * refused - 1);
         assert!(caps.memory_growing(0, MIB / 2, None).unwrap());
         assert_eq!(caps.fuel.used(), 0);

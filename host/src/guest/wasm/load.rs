@@ -1,4 +1,5 @@
-//! From a component to code that can be instantiated: found in the cache, or compiled there by `gleaner-compile`.
+//! From a component to code that can be instantiated: found in the cache, or compiled there by
+//! `gleaner-compile`.
 #![allow(unsafe_code)]
 
 use std::os::unix::process::ExitStatusExt;
@@ -7,7 +8,8 @@ use std::process::Command;
 
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_compile::{
-    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Entry, Found, Nans, make_cache, read_component,
+    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Entry, Found, Nans, make_cache,
+    read_component,
 };
 use gleaner_parts::{Parts, PartsError};
 use sha2::{Digest, Sha256};
@@ -30,7 +32,12 @@ pub enum WasmError {
     #[error("cannot start `{}`", program.display())]
     Start { program: PathBuf, source: std::io::Error },
     #[error("{message}")]
-    Compiler { message: String, source: Option<Box<CompilerSaid>>, help: Option<String>, exit: Exit },
+    Compiler {
+        message: String,
+        source: Option<Box<CompilerSaid>>,
+        help: Option<String>,
+        exit: Exit,
+    },
     #[error("cannot compile component `{}`", path.display())]
     Limit { path: PathBuf, source: CompilerSaid },
     #[error("cannot load native code `{}`", path.display())]
@@ -90,31 +97,45 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// Loads the component at `path`, compiling it into `cache` first if it is not there. It gets a stack of that many bytes, and NaNs of
-    /// this kind.
+    /// Loads the component at `path`, compiling it into `cache` first if it is not there. It gets a
+    /// stack of that many bytes, and NaNs of this kind.
     ///
     /// # Errors
     ///
     /// [`WasmError`] names the component and what does not fit.
-    pub fn open(path: &Path, cache: &Path, stack_bytes: usize, nans: Nans) -> Result<Self, WasmError> {
+    pub fn open(
+        path: &Path,
+        cache: &Path,
+        stack_bytes: usize,
+        nans: Nans,
+    ) -> Result<Self, WasmError> {
         let component = read_component(path)?;
         let engine = gleaner_compile::engine(stack_bytes, nans)?;
         let entry = Entry::of(cache, &component, nans);
         let code = native_code(&entry, path, cache, nans)?;
-        // SAFETY: these bytes are in memory of our own, where `Entry::read` found their digest to be that which
-        // `gleaner-compile` wrote for this component, engine and CPU, in a file and below folders to which only this user or
-        // root may write.
-        let code = unsafe { Component::deserialize(&engine, &code) }
-            .map_err(|source| WasmError::Load { path: entry.path().to_owned(), source: source.into() })?;
+        // SAFETY: these bytes are in memory of our own, where `Entry::read` found their digest to
+        // be that which `gleaner-compile` wrote for this component, engine and CPU, in a file and
+        // below folders to which only this user or root may write.
+        let code = unsafe { Component::deserialize(&engine, &code) }.map_err(|source| {
+            WasmError::Load { path: entry.path().to_owned(), source: source.into() }
+        })?;
         let lambda = Self::check(path, &engine, &code)?;
         Ok(Self { engine, lambda, seed: Sha256::digest(&component).into(), nans })
     }
 
-    fn check(path: &Path, engine: &Engine, code: &Component) -> Result<LambdaPre<Hosted>, WasmError> {
-        let world = |source: wasmtime::Error| WasmError::World { path: path.to_owned(), source: source.into() };
+    fn check(
+        path: &Path,
+        engine: &Engine,
+        code: &Component,
+    ) -> Result<LambdaPre<Hosted>, WasmError> {
+        let world = |source: wasmtime::Error| WasmError::World {
+            path: path.to_owned(),
+            source: source.into(),
+        };
         let mut linker = Linker::new(engine);
         wasi::add_to_linker(&mut linker).map_err(world)?;
-        Lambda::add_to_linker::<_, wasmtime::component::HasSelf<_>>(&mut linker, |hosted| hosted).map_err(world)?;
+        Lambda::add_to_linker::<_, wasmtime::component::HasSelf<_>>(&mut linker, |hosted| hosted)
+            .map_err(world)?;
         add_reads_to_linker(&mut linker).map_err(world)?;
         linker.instantiate_pre(code).and_then(LambdaPre::new).map_err(world)
     }
@@ -158,12 +179,14 @@ fn native_code(entry: &Entry, path: &Path, cache: &Path, nans: Nans) -> Result<V
     Err(WasmError::Load { path: entry.path().to_owned(), source: why.into() })
 }
 
-/// Most threads that compile at once. Each takes addresses, of which there is a bound, and a lambda's code is soon compiled.
+/// Most threads that compile at once. Each takes addresses, of which there is a bound, and a
+/// lambda's code is soon compiled.
 const COMPILE_THREADS: usize = 8;
 
 fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
     let program = Parts::find()?.program("gleaner-compile")?;
-    let threads = std::thread::available_parallelism().map_or(1, |cores| cores.get().min(COMPILE_THREADS));
+    let threads =
+        std::thread::available_parallelism().map_or(1, |cores| cores.get().min(COMPILE_THREADS));
     let output = Command::new(&program)
         .arg(path)
         .arg("--cache")
@@ -181,16 +204,28 @@ fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
         // Ended by a signal: it ran into its limits.
         let memory = COMPILE_MEMORY_BYTES >> 20;
         let said = match signal {
-            libc::SIGXCPU => format!("it takes more than {COMPILE_CPU_SECONDS} s of CPU time to compile"),
+            libc::SIGXCPU => {
+                format!("it takes more than {COMPILE_CPU_SECONDS} s of CPU time to compile")
+            }
             libc::SIGABRT => format!("it takes more than {memory} MiB of memory to compile"),
-            _ => format!("it takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s to compile"),
+            _ => format!(
+                "it takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s to compile"
+            ),
         };
-        return Err(WasmError::Limit { path: path.to_owned(), source: CompilerSaid { text: said, source: None } });
+        return Err(WasmError::Limit {
+            path: path.to_owned(),
+            source: CompilerSaid { text: said, source: None },
+        });
     }
     let said = String::from_utf8_lossy(&output.stderr);
     let exit = output.status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal);
-    let Failure { exit, message, causes, help } =
-        Failure::parse(&said, exit).unwrap_or_else(|| Failure::new(exit, format!("gleaner-compile: {}", said.trim())));
+    let Failure { exit, message, causes, help } = Failure::parse(&said, exit)
+        .unwrap_or_else(|| Failure::new(exit, format!("gleaner-compile: {}", said.trim())));
     let chain = |source, text| Some(Box::new(CompilerSaid { text, source }));
-    Err(WasmError::Compiler { message, source: causes.into_iter().rev().fold(None, chain), help, exit })
+    Err(WasmError::Compiler {
+        message,
+        source: causes.into_iter().rev().fold(None, chain),
+        help,
+        exit,
+    })
 }

@@ -1,7 +1,9 @@
-//! WebAssembly components: one store on one thread, fuel and a memory cap always on, a deadline where the clock is real.
+//! WebAssembly components: one store on one thread, fuel and a memory cap always on, a deadline
+//! where the clock is real.
 //!
-//! The five files named as the WIT interfaces are thin: they convert, and leave everything else to `api`, prices too. A trap
-//! ends the store; the next wake gets a new one. Nothing here compiles code.
+//! The five files named as the WIT interfaces are thin: they convert, and leave everything else to
+//! `api`, prices too. A trap ends the store; the next wake gets a new one. Nothing here compiles
+//! code.
 
 mod bindings;
 mod data;
@@ -41,7 +43,8 @@ pub struct WasmGuest {
     session: Session,
     limits: Limits,
     deadline: Option<Deadline>,
-    /// For the few calls of WASI that wait. Without one, the first print would start a thread for each core.
+    /// For the few calls of WASI that wait. Without one, the first print would start a thread for
+    /// each core.
     waiting: Runtime,
     live: Option<Live>,
 }
@@ -70,13 +73,18 @@ impl WasiView for Hosted {
 }
 
 impl WasmGuest {
-    /// A guest without an instance yet, within `limits`. With `deadline`, each call must end in time; in replay there is none. The
-    /// stack is that of the engine that `loaded` runs on.
+    /// A guest without an instance yet, within `limits`. With `deadline`, each call must end in
+    /// time; in replay there is none. The stack is that of the engine that `loaded` runs on.
     ///
     /// # Errors
     ///
     /// If the system has no more descriptors or memory.
-    pub fn new(loaded: Loaded, session: Session, limits: &Limits, deadline: Option<Deadline>) -> std::io::Result<Self> {
+    pub fn new(
+        loaded: Loaded,
+        session: Session,
+        limits: &Limits,
+        deadline: Option<Deadline>,
+    ) -> std::io::Result<Self> {
         let waiting = runtime::Builder::new_current_thread().build()?;
         Ok(Self { loaded, session, limits: *limits, deadline, waiting, live: None })
     }
@@ -128,19 +136,25 @@ impl Guest for WasmGuest {
     fn wake(&mut self, wake: Wake) -> Outcome {
         let waiting = self.waiting.handle().clone();
         let _waiting = waiting.enter();
-        let mut live = match self.live.take().map_or_else(|| self.session.clone().during_init(|| self.start()), Ok) {
+        let mut live = match self
+            .live
+            .take()
+            .map_or_else(|| self.session.clone().during_init(|| self.start()), Ok)
+        {
             Ok(live) => live,
             Err(fault) => return Outcome { result: Err(fault), fuel: None, run_ns: None },
         };
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));
         let mut call = Call::begin(&mut live.store, self.limits.fuel, deadline);
-        let result = call.hand_over(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
+        let result =
+            call.hand_over(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
         let (fuel, result) = call.end(result);
         let result = result.and_then(|answer| answer.map_err(exception));
         if result.is_ok() {
             self.live = Some(live);
         }
-        // How deep a stack reaches depends on the processor, for which the code was compiled, and so does the fuel until it is full.
+        // How deep a stack reaches depends on the processor, for which the code was compiled, and
+        // so does the fuel until it is full.
         let stacked = result.as_ref().is_err_and(|fault| fault.kind == FaultKind::Stack);
         Outcome { result, fuel: (!stacked).then_some(fuel), run_ns: None }
     }
@@ -168,7 +182,11 @@ struct Call<'a> {
 }
 
 impl<'a> Call<'a> {
-    fn begin(store: &'a mut Store<Hosted>, fuel: u64, deadline: Option<(&'a Deadline, Duration)>) -> Self {
+    fn begin(
+        store: &'a mut Store<Hosted>,
+        fuel: u64,
+        deadline: Option<(&'a Deadline, Duration)>,
+    ) -> Self {
         store.set_fuel(fuel).expect("the engine counts fuel");
         let hosted = store.data_mut();
         hosted.session.fuel().begin(fuel);
@@ -192,7 +210,9 @@ impl<'a> Call<'a> {
     fn hand_over(&mut self, wake: Wake) -> wasmtime::Result<wit::Wake> {
         Ok(match wake {
             Wake::Event(sample) => wit::Wake::Event(self.store.data_mut().handles.push(sample)?),
-            Wake::Tick(tick) => wit::Wake::Tick(wit::Tick { at_ns: tick.at_ns, missed: tick.missed }),
+            Wake::Tick(tick) => {
+                wit::Wake::Tick(wit::Tick { at_ns: tick.at_ns, missed: tick.missed })
+            }
         })
     }
 
@@ -202,14 +222,17 @@ impl<'a> Call<'a> {
         drop(self.armed);
         self.store.data().printed.end();
         let left = self.store.get_fuel().unwrap_or(0);
-        let used = (self.fuel - left.min(self.fuel)).saturating_add(self.store.data().session.fuel().used());
+        let used = (self.fuel - left.min(self.fuel))
+            .saturating_add(self.store.data().session.fuel().used());
         let time = taken.map(deadline::Taken::elapsed_and_allowed);
         let result = match result {
             // Guest and host each kept within the allowance; together they must as well.
             Ok(_) if used > self.fuel => Err(fault::fuel(used, self.fuel)),
             Ok(_) if taken.is_some_and(deadline::Taken::is_late) => Err(fault::deadline(time)),
             Ok(value) => Ok(value),
-            Err(error) => Err(fault::from_error(&error, self.store.data(), (used, self.fuel), time)),
+            Err(error) => {
+                Err(fault::from_error(&error, self.store.data(), (used, self.fuel), time))
+            }
         };
         (used, result)
     }

@@ -25,7 +25,10 @@ impl Host for Hosted {
 
     fn entries(&mut self) -> wasmtime::Result<Vec<Entry>> {
         let entries = self.session.entries()?;
-        Ok(entries.into_iter().map(|scratch::Entry { name, bytes }| Entry { name, bytes }).collect())
+        Ok(entries
+            .into_iter()
+            .map(|scratch::Entry { name, bytes }| Entry { name, bytes })
+            .collect())
     }
 
     fn free(&mut self) -> wasmtime::Result<u64> {

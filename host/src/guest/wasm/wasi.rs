@@ -1,7 +1,9 @@
-//! WASI as far as a lambda needs it: output becomes log lines, the clock is the wake's, random numbers are seeded.
+//! WASI as far as a lambda needs it: output becomes log lines, the clock is the wake's, random
+//! numbers are seeded.
 //!
-//! There are no files, no environment, no arguments, no sockets and no names of other machines: such calls answer with an error.
-//! Sleeping is a fault, since neither fuel nor a deadline could end it. What takes longer the more is asked for costs fuel, as other host calls do.
+//! There are no files, no environment, no arguments, no sockets and no names of other machines:
+//! such calls answer with an error. Sleeping is a fault, since neither fuel nor a deadline could
+//! end it. What takes longer the more is asked for costs fuel, as other host calls do.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -55,7 +57,8 @@ pub(super) fn add_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()>
     Ok(())
 }
 
-/// Has names of other machines looked up by nobody. What is generated would take a name of any length for nothing.
+/// Has names of other machines looked up by nobody. What is generated would take a name of any
+/// length for nothing.
 fn refuse_names(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
     linker.instance(NAMES)?.func_wrap(
         "resolve-addresses",
@@ -211,10 +214,14 @@ impl Printed {
         }
     }
 
-    /// What this call said last on standard error: the reason of a panic, without what the standard library adds to it.
+    /// What this call said last on standard error: the reason of a panic, without what the standard
+    /// library adds to it.
     pub(super) fn reason(&self) -> Option<String> {
         let state = self.stderr.lock();
-        let lines = state.said.lines().filter(|line| !line.trim().is_empty() && !line.starts_with("note: run with"));
+        let lines = state
+            .said
+            .lines()
+            .filter(|line| !line.trim().is_empty() && !line.starts_with("note: run with"));
         let message = lines.collect::<Vec<_>>().join("\n");
         // `thread '<unnamed>' (1) panicked at src/lib.rs:17:9:`, and the message in the next line.
         let message = match message.find(PANICKED) {
@@ -299,7 +306,10 @@ impl OutputStream for Lines {
         if bytes.len() > LINE_BYTES {
             return Err(StreamError::trap("a lambda wrote more than its stream had said to take"));
         }
-        self.session.fuel().charge(|| bytes.len()).map_err(|error| StreamError::Trap(error.into()))?;
+        self.session
+            .fuel()
+            .charge(|| bytes.len())
+            .map_err(|error| StreamError::Trap(error.into()))?;
         self.lock().write(&bytes, &self.session, self.level);
         Ok(())
     }

@@ -1,12 +1,15 @@
 //! A lambda in a process of its own, the *worker*: so a Python lambda runs in a replay.
 //!
-//! The worker opens the drives itself, follows the same schedule as the process that started it, and sends one message for
-//! each wake through what was its standard output. The process that started it reads the same drives, takes each outcome over
-//! as if the lambda had run there ([`Remote`]), and writes all results. So the worker needs no file that it may write, and
-//! nothing that native code in it does can change the cause of a decision, an exit code, or the results of an earlier wake.
+//! The worker opens the drives itself, follows the same schedule as the process that started it,
+//! and sends one message for each wake through what was its standard output. The process that
+//! started it reads the same drives, takes each outcome over as if the lambda had run there
+//! ([`Remote`]), and writes all results. So the worker needs no file that it may write, and nothing
+//! that native code in it does can change the cause of a decision, an exit code, or the results of
+//! an earlier wake.
 //!
-//! Messages flow one way: the worker never waits for an answer. The reader trusts none of them: lengths are bounded, triggers
-//! and log lines pass the same checks as calls of a lambda, and a message that does not fit the schedule ends the replay.
+//! Messages flow one way: the worker never waits for an answer. The reader trusts none of them:
+//! lengths are bounded, triggers and log lines pass the same checks as calls of a lambda, and a
+//! message that does not fit the schedule ends the replay.
 
 #[cfg(feature = "python")]
 mod process;
@@ -26,7 +29,8 @@ pub use sender::{Reports, Sender};
 use crate::api::data::Counts;
 use crate::api::log::Level;
 
-/// Longest message in bytes: a wake with all triggers and attributes that it may have, each character escaped, has some 2 MB.
+/// Longest message in bytes: a wake with all triggers and attributes that it may have, each
+/// character escaped, has some 2 MB.
 #[cfg(feature = "python")]
 const MESSAGE_MAX: u64 = 4 << 20;
 
@@ -46,7 +50,8 @@ enum Message {
     Woken(Woken),
     /// The course is over.
     Done(Done),
-    /// Values of one field that the lambda read. [`Message::Done`] says how many of these follow it.
+    /// Values of one field that the lambda read. [`Message::Done`] says how many of these follow
+    /// it.
     Curve(Curve),
 }
 
@@ -55,7 +60,8 @@ enum Message {
 struct Called {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     fault: Option<Fault>,
-    /// Lines that the lambda logged, and their checksum: those included that its rate limit dropped.
+    /// Lines that the lambda logged, and their checksum: those included that its rate limit
+    /// dropped.
     said: (u64, u32),
     /// Log lines that the rate limit dropped.
     #[serde(default, skip_serializing_if = "is_zero")]

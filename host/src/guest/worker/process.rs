@@ -19,7 +19,8 @@ use super::{MESSAGE_MAX, Message};
 /// The argument that makes `gleaner-runtime` a worker; it comes first.
 pub const WORKER: &str = "--worker";
 
-/// How long a worker may take to end once that was requested. What it wrote to standard error may take as long.
+/// How long a worker may take to end once that was requested. What it wrote to standard error may
+/// take as long.
 const UNTIL_KILLED: Duration = Duration::from_secs(2);
 /// Bytes of standard error that are held while it is not known whether they come from the lambda.
 const HELD: usize = 4 << 20;
@@ -38,8 +39,9 @@ pub(super) struct Process {
     passed_on: Receiver<bool>,
 }
 
-/// The reading end of the messages. It looks for them now and then and does not wait in the kernel, where each message would have to
-/// wake it: of a lambda that does nothing, a replay made 135,000 wakes a second with such wake-ups, and 190,000 without.
+/// The reading end of the messages. It looks for them now and then and does not wait in the kernel,
+/// where each message would have to wake it: of a lambda that does nothing, a replay made 135,000
+/// wakes a second with such wake-ups, and 190,000 without.
 struct Napping {
     messages: ChildStdout,
     /// Whether there may come more.
@@ -69,7 +71,8 @@ impl Read for Napping {
                 thread::sleep(pause);
                 pause *= 2;
             } else {
-                // A long wake: one wake-up costs less than looking again and again. A signal may end it early.
+                // A long wake: one wake-up costs less than looking again and again. A signal may
+                // end it early.
                 let _ = poll(&mut [PollFd::new(&self.messages, PollFlags::IN)], None);
             }
         }
@@ -97,9 +100,12 @@ pub(super) enum NoMessage {
 }
 
 impl Process {
-    /// Starts this program again as a worker, with `arguments` and those that this process was given.
+    /// Starts this program again as a worker, with `arguments` and those that this process was
+    /// given.
     pub(super) fn start(arguments: Vec<OsString>) -> Result<Self, Failure> {
-        let failed = |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
+        let failed = |what: &str, error: &dyn std::error::Error| {
+            Failure::caused_by(Exit::Internal, what, error)
+        };
         let parts = Parts::find()?;
         let (shim, runtime) = (parts.program("gleaner-shim")?, parts.program("gleaner-runtime")?);
         let starter: OsString = format!("--starter={}", std::process::id()).into();
@@ -107,10 +113,12 @@ impl Process {
         command.arg(starter).args(["--exit-record", "-", "--"]);
         command.arg(runtime).arg(WORKER).args(arguments).args(std::env::args_os().skip(1));
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut shim =
-            command.spawn().map_err(|error| failed(&format!("cannot start `{}`", shim.display()), &error))?;
+        let mut shim = command
+            .spawn()
+            .map_err(|error| failed(&format!("cannot start `{}`", shim.display()), &error))?;
         let messages = Napping::over(shim.stdout.take().expect("it is piped"));
-        let messages = messages.map_err(|error| failed("cannot read from the lambda's process", &error))?;
+        let messages =
+            messages.map_err(|error| failed("cannot read from the lambda's process", &error))?;
         let messages = Some(BufReader::with_capacity(1 << 16, messages));
         let (is_ready, decided) = mpsc::channel();
         let (end, passed_on) = mpsc::channel();
@@ -125,26 +133,32 @@ impl Process {
         loop {
             self.line.clear();
             let read = messages.take(MESSAGE_MAX).read_until(b'\n', &mut self.line);
-            // A process that is killed while it writes leaves a part of a message, which the shim ends before its own.
+            // A process that is killed while it writes leaves a part of a message, which the shim
+            // ends before its own.
             match (read, &*self.line) {
                 (Ok(1..), b"\n") => {}
                 (Ok(1..), line) if line.ends_with(b"\n") => break,
                 (Ok(1..), line) if line.len() as u64 == MESSAGE_MAX => {
-                    return Err(NoMessage::Malformed(format!("a message of more than {MESSAGE_MAX} bytes")));
+                    return Err(NoMessage::Malformed(format!(
+                        "a message of more than {MESSAGE_MAX} bytes"
+                    )));
                 }
                 _ => return Err(NoMessage::Ended),
             }
         }
-        serde_json::from_slice(&self.line).map_err(|error| match serde_json::from_slice(&self.line) {
-            Ok(record) => {
-                self.record = Some(record);
-                NoMessage::Ended
+        serde_json::from_slice(&self.line).map_err(|error| {
+            match serde_json::from_slice(&self.line) {
+                Ok(record) => {
+                    self.record = Some(record);
+                    NoMessage::Ended
+                }
+                Err(_) => NoMessage::Malformed(error.to_string()),
             }
-            Err(_) => NoMessage::Malformed(error.to_string()),
         })
     }
 
-    /// From now on what the process writes to standard error may come from the lambda: each line is marked as such.
+    /// From now on what the process writes to standard error may come from the lambda: each line is
+    /// marked as such.
     pub(super) fn ready(&self) {
         let _ = self.is_ready.send(true);
     }
@@ -175,7 +189,8 @@ impl Process {
         };
         // A process that the worker left behind may hold its standard error open.
         let is_explained = self.passed_on.recv_timeout(UNTIL_KILLED).unwrap_or(false);
-        // The last line is the shim's, whatever the lambda wrote before. A pipe holds less than a message may have.
+        // The last line is the shim's, whatever the lambda wrote before. A pipe holds less than a
+        // message may have.
         if let Some(messages) = &mut self.messages {
             messages.get_mut().waits = false;
             let mut rest = Vec::new();
@@ -188,8 +203,8 @@ impl Process {
     }
 }
 
-/// Passes on what a worker writes to standard error: as it is if the worker never became ready, and else with a mark. Sends to `end`
-/// whether it was an error of our own.
+/// Passes on what a worker writes to standard error: as it is if the worker never became ready, and
+/// else with a mark. Sends to `end` whether it was an error of our own.
 fn pass_on(mut from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>) {
     let mut held = Vec::new();
     // Nothing of the lambda has run until it is decided, and our own part writes no more than this.

@@ -46,8 +46,8 @@ struct Read {
 }
 
 impl Remote {
-    /// Starts a worker with `arguments` and those of this process, in the control group of this process if there is one, and waits until it
-    /// is sandboxed.
+    /// Starts a worker with `arguments` and those of this process, in the control group of this
+    /// process if there is one, and waits until it is sandboxed.
     ///
     /// # Errors
     ///
@@ -121,11 +121,14 @@ impl Remote {
 
     /// Takes over what a call counted; returns how the call ended.
     fn called(&mut self, called: Called) -> Result<(), Fault> {
-        let Called { fault, said: (lines, digest), log_dropped, triggers_refused, resident_bytes } = called;
+        let Called { fault, said: (lines, digest), log_dropped, triggers_refused, resident_bytes } =
+            called;
         let lines = u32::try_from(lines).unwrap_or(u32::MAX);
         self.session.relay_counts(Said { lines, digest }, log_dropped, triggers_refused);
         self.resident_bytes = self.resident_bytes.max(resident_bytes);
-        fault.map_or(Ok(()), |fault| Err(Fault { message: cut(&fault.message, LINE_BYTES).to_owned(), ..fault }))
+        fault.map_or(Ok(()), |fault| {
+            Err(Fault { message: cut(&fault.message, LINE_BYTES).to_owned(), ..fault })
+        })
     }
 
     fn woken(&mut self, wake: &Wake) -> Result<Woken, Fault> {
@@ -149,17 +152,22 @@ impl Remote {
         let killed = record.as_ref().and_then(|record| record.killed);
         let how = match (nonsense, record) {
             (Some(what), _) => format!("reported {what}, and was ended for it"),
-            (None, Some(record)) => record.sentence().unwrap_or_else(|| "ended by itself, with exit code 0".to_owned()),
+            (None, Some(record)) => {
+                record.sentence().unwrap_or_else(|| "ended by itself, with exit code 0".to_owned())
+            }
             (None, None) => "has ended".to_owned(),
         };
         let message = format!("the lambda's process {how}");
-        let (used, allowed) = (killed.map(|killed| killed.ran_ns), killed.map(|killed| killed.allowed_ns));
+        let (used, allowed) =
+            (killed.map(|killed| killed.ran_ns), killed.map(|killed| killed.allowed_ns));
         self.fault.insert(Fault { kind: FaultKind::Killed, message, used, allowed }).clone()
     }
 
     fn end(&mut self, patience: Duration) -> Option<Ended> {
         let ended = self.worker.take()?.end(patience);
-        let ended = ended.map_err(|error| tracing::warn!(%error, "the lambda's process cannot be waited for")).ok()?;
+        let ended = ended
+            .map_err(|error| tracing::warn!(%error, "the lambda's process cannot be waited for"))
+            .ok()?;
         self.most_resident_bytes = ended.record.as_ref().map_or(0, |record| record.max_rss_bytes);
         Some(ended)
     }
@@ -174,8 +182,10 @@ impl Remote {
         if ended.code == Some(0) {
             return Ok(());
         }
-        let how =
-            ended.record.and_then(|record| record.sentence()).unwrap_or_else(|| "did not end in order".to_owned());
+        let how = ended
+            .record
+            .and_then(|record| record.sentence())
+            .unwrap_or_else(|| "did not end in order".to_owned());
         let message = format!("the lambda's process {how}, after its last wake");
         Err(Fault { kind: FaultKind::Killed, message, used: None, allowed: None })
     }
@@ -187,7 +197,9 @@ fn is_possible(curve: &Curve, inputs: &[Arc<Topic>]) -> bool {
     points <= Signals::POINTS_MAX
         && [curve.min.len(), curve.max.len()] == [points; 2]
         && curve.path.len() <= LINE_BYTES
-        && inputs.iter().any(|topic| topic.name() == curve.input && topic.ros_topic() == curve.topic)
+        && inputs
+            .iter()
+            .any(|topic| topic.name() == curve.input && topic.ros_topic() == curve.topic)
 }
 
 /// Why there is no worker.
@@ -198,7 +210,8 @@ pub enum NotReady {
     Failed(Failure),
 }
 
-/// Returns the failure of a worker that ended before any code of the lambda ran: its exit code is that of our own programs.
+/// Returns the failure of a worker that ended before any code of the lambda ran: its exit code is
+/// that of our own programs.
 fn not_ready(worker: Process, manifest: &Manifest) -> NotReady {
     let message = format!("cannot start lambda `{}`", manifest.lambda.name);
     NotReady::Failed(match worker.end(UNTIL_KILLED) {
@@ -208,7 +221,8 @@ fn not_ready(worker: Process, manifest: &Manifest) -> NotReady {
                 return NotReady::Explained(exit);
             }
             let mut failure = Failure::new(exit.unwrap_or(Exit::Internal), message);
-            let how = record.and_then(|record| record.sentence()).unwrap_or_else(|| "ended".to_owned());
+            let how =
+                record.and_then(|record| record.sentence()).unwrap_or_else(|| "ended".to_owned());
             failure.causes = vec![format!("its process {how}, before the lambda was loaded")];
             failure
         }
@@ -255,13 +269,20 @@ impl Guest for Remote {
     }
 
     fn expects(&mut self, wake: &Wake) -> bool {
-        // Where the lambda holds all cells of a ring, that of the worker refuses a sample, and the next wake is later.
+        // Where the lambda holds all cells of a ring, that of the worker refuses a sample, and the
+        // next wake is later.
         let no_slot = match (wake, self.read().map(|read| &read.message)) {
-            (Wake::Event(_), Ok(Message::Woken(woken))) if woken.at_ns > wake.at_ns() => woken.no_slot,
+            (Wake::Event(_), Ok(Message::Woken(woken))) if woken.at_ns > wake.at_ns() => {
+                woken.no_slot
+            }
             (Wake::Event(_), Ok(Message::Done(done))) => done.no_slot(),
             _ => 0,
         };
-        let offered = self.session.inputs().iter().fold(0_u64, |sum, topic| sum.saturating_add(offered(topic)));
+        let offered = self
+            .session
+            .inputs()
+            .iter()
+            .fold(0_u64, |sum, topic| sum.saturating_add(offered(topic)));
         let is_left_out = self.left_out < no_slot.min(offered);
         self.left_out += u64::from(is_left_out);
         !is_left_out
@@ -306,9 +327,13 @@ impl Guest for Remote {
         }
         let is_counted = |(topic, counts): (&Arc<Topic>, &Counts)| {
             let parts = [counts.received, counts.no_slot, counts.too_big];
-            parts.into_iter().try_fold(0, u64::checked_add) == Some(offered(topic)) && counts.skipped <= offered(topic)
+            parts.into_iter().try_fold(0, u64::checked_add) == Some(offered(topic))
+                && counts.skipped <= offered(topic)
         };
-        if counts.len() != inputs.len() || !inputs.iter().zip(&counts).all(is_counted) || self.left_out > no_slot {
+        if counts.len() != inputs.len()
+            || !inputs.iter().zip(&counts).all(is_counted)
+            || self.left_out > no_slot
+        {
             return Err(self.killed(Some("counts of samples that cannot be")));
         }
         self.ended_well()?;

@@ -40,7 +40,12 @@ impl Reports {
     /// Sends what is known once the course is over.
     pub fn done(&self, totals: Totals) {
         let Totals { counts, decode_ns, curves, curves_left_out } = totals;
-        self.send(&Message::Done(Done { counts, decode_ns, curves: curves.len(), curves_left_out }));
+        self.send(&Message::Done(Done {
+            counts,
+            decode_ns,
+            curves: curves.len(),
+            curves_left_out,
+        }));
         curves.into_iter().for_each(|curve| self.send(&Message::Curve(curve)));
     }
 
@@ -50,7 +55,8 @@ impl Reports {
         pending.push(b'\n');
     }
 
-    /// Sends `message` behind those that were added, in one write: if this process ends in the next call, all of this one is known.
+    /// Sends `message` behind those that were added, in one write: if this process ends in the next
+    /// call, all of this one is known.
     fn send(&self, message: &Message) {
         self.add(message);
         let mut writer = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -86,8 +92,14 @@ pub struct Sender {
 }
 
 impl Sender {
-    /// Sends that `guest`, over `session`, is ready within `layers`, before anything of the lambda has run.
-    pub fn begin(guest: Box<dyn Guest>, session: Session, reports: Reports, layers: Vec<Layer>) -> Self {
+    /// Sends that `guest`, over `session`, is ready within `layers`, before anything of the lambda
+    /// has run.
+    pub fn begin(
+        guest: Box<dyn Guest>,
+        session: Session,
+        reports: Reports,
+        layers: Vec<Layer>,
+    ) -> Self {
         reports.send(&Message::Ready { engine: guest.engine(), layers });
         reports.0.lock().unwrap_or_else(PoisonError::into_inner).is_ready = true;
         Self { guest, session, reports, is_prepared: false, log_dropped: 0, triggers_refused: 0 }
@@ -148,7 +160,14 @@ impl Guest for Sender {
         let triggers = self.session.triggers();
         let looked = inputs.iter().map(|topic| topic.looked_back()).collect();
         let no_slot = inputs.iter().map(|topic| topic.counts().no_slot).sum();
-        self.reports.send(&Message::Woken(Woken { at_ns, run_ns, call, triggers, looked, no_slot }));
+        self.reports.send(&Message::Woken(Woken {
+            at_ns,
+            run_ns,
+            call,
+            triggers,
+            looked,
+            no_slot,
+        }));
         outcome
     }
 

@@ -19,14 +19,16 @@ use crate::replay::options::{Drives, Options};
 use crate::replay::part::Wanted;
 use crate::stage::{Asked, AskedArgs, tighten};
 
-/// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at most.
+/// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at
+/// most.
 const EXTRAS_BYTES: u64 = 256 << 20;
 
 /// A journal, opened.
 pub(in crate::replay) struct Claim {
     path: PathBuf,
     reader: Reader<Box<dyn Read + Send>>,
-    /// Statements of the clip that it is a part of, and begins in the middle of; none for the journal of a replay.
+    /// Statements of the clip that it is a part of, and begins in the middle of; none for the
+    /// journal of a replay.
     pub(in crate::replay) clip: Option<Stated>,
     /// Limits that held by the journal and not by the manifest.
     pub(super) limits: Vec<String>,
@@ -49,19 +51,27 @@ impl Claim {
         let mut extras = read_extras(path, EXTRAS_BYTES).map_err(unreadable_clip)?;
         if !extras.is_whole {
             let message = format!("clip `{}` is cut off or was never finished", path.display());
-            return Err(Failure::new(Exit::Usage, message).with_help("copy it again; a clip of Gleaner has its end"));
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("copy it again; a clip of Gleaner has its end"));
         }
         if let Some(misfit) = &extras.misfit {
-            let mut failure =
-                Failure::new(Exit::Differs, format!("clip `{}` is not as a recorder writes it", path.display()));
+            let mut failure = Failure::new(
+                Exit::Differs,
+                format!("clip `{}` is not as a recorder writes it", path.display()),
+            );
             failure.causes = vec![format!("it has {misfit}")];
-            return Err(failure.with_help("it was changed since it was made; readers may see other messages in it"));
+            return Err(failure.with_help(
+                "it was changed since it was made; readers may see other messages in it",
+            ));
         }
         let wanted = format!("journal/{lambda}.journal");
-        let Some(part) = extras.attachments.iter_mut().find(|attachment| attachment.name == wanted) else {
-            let message = format!("clip `{}` holds no journal of lambda `{lambda}`", path.display());
+        let Some(part) = extras.attachments.iter_mut().find(|attachment| attachment.name == wanted)
+        else {
+            let message =
+                format!("clip `{}` holds no journal of lambda `{lambda}`", path.display());
             let names = extras.attachments.iter().map(|attachment| attachment.name.as_str());
-            let others = names.filter(|name| name.starts_with("journal/")).map(excerpt).collect::<Vec<_>>();
+            let others =
+                names.filter(|name| name.starts_with("journal/")).map(excerpt).collect::<Vec<_>>();
             let help = if others.is_empty() {
                 "it was recovered after its recorder had died, or is no clip of Gleaner".to_owned()
             } else {
@@ -79,13 +89,16 @@ impl Claim {
     fn open(path: &Path, bytes: Box<dyn Read + Send>) -> Result<Self, Failure> {
         let reader = Reader::open(bytes).map_err(|error| unusable(path, &error))?;
         if reader.header().clock == CLOCK_OF_VEHICLE {
-            let message = format!("`{}` was recorded live, and cannot be verified yet", path.display());
+            let message =
+                format!("`{}` was recorded live, and cannot be verified yet", path.display());
             let mut failure = Failure::new(Exit::Usage, message);
             failure.causes = vec![
                 "lambda and recorder each received the samples by themselves, and the clip has the recorder's stamps"
                     .to_owned(),
             ];
-            return Err(failure.with_help("replay the lambda over the clip: gleaner replay DIR CLIP"));
+            return Err(
+                failure.with_help("replay the lambda over the clip: gleaner replay DIR CLIP")
+            );
         }
         Ok(Self { path: path.to_owned(), reader, clip: None, limits: Vec::new() })
     }
@@ -93,7 +106,8 @@ impl Claim {
     /// A comparison of nothing proves nothing.
     pub(super) fn empty(&self) -> Failure {
         let message = format!("the journal in `{}` holds no whole wake", self.path.display());
-        Failure::new(Exit::Usage, message).with_help("its writer died early, or it was cut off: write a new one")
+        Failure::new(Exit::Usage, message)
+            .with_help("its writer died early, or it was cut off: write a new one")
     }
 
     pub(super) fn header(&self) -> &Header {
@@ -109,9 +123,10 @@ impl Claim {
         &self.reader
     }
 
-    /// Returns what the journal was made with, unless `set`, `remaps` and the vehicle say otherwise, which then has to be the same.
-    /// Without a vehicle, limits of the journal that are tighter than those of the manifest count as those of the vehicle of then,
-    /// and are noted; they cannot be wider.
+    /// Returns what the journal was made with, unless `set`, `remaps` and the vehicle say
+    /// otherwise, which then has to be the same. Without a vehicle, limits of the journal that are
+    /// tighter than those of the manifest count as those of the vehicle of then, and are noted;
+    /// they cannot be wider.
     pub(in crate::replay) fn options(
         &mut self,
         args: AskedArgs,
@@ -149,7 +164,14 @@ impl Claim {
         compare(header, &asked, manifest)?;
         // A clip holds what it holds.
         let part = if self.clip.is_some() { Wanted::default() } else { Wanted::from(header.part) };
-        Ok(Options { asked, drives, part, topics: Vec::new(), unpack_in: None, unpacked: Vec::new() })
+        Ok(Options {
+            asked,
+            drives,
+            part,
+            topics: Vec::new(),
+            unpack_in: None,
+            unpacked: Vec::new(),
+        })
     }
 }
 
@@ -158,7 +180,9 @@ fn assignments(header: &Header) -> Vec<(String, String)> {
     let text = |value: &Value| match value {
         Value::String(text) => text.clone(),
         // As the manifest writes a whole number that is a float.
-        Value::Number(number) if number.is_f64() => ConfigValue::Float(number.as_f64().unwrap_or(0.0)).to_string(),
+        Value::Number(number) if number.is_f64() => {
+            ConfigValue::Float(number.as_f64().unwrap_or(0.0)).to_string()
+        }
         other => other.to_string(),
     };
     header.config.iter().map(|(key, value)| (key.clone(), text(value))).collect()
@@ -186,7 +210,8 @@ pub(super) fn different(message: impl Into<String>, difference: &Difference) -> 
 
 /// A failure: the clip makes an untrue statement about itself.
 pub(super) fn untrue(path: &Path, Untrue { what, stated, found }: &Untrue) -> Failure {
-    let mut failure = Failure::new(Exit::Differs, format!("clip `{}` contradicts itself", path.display()));
+    let mut failure =
+        Failure::new(Exit::Differs, format!("clip `{}` contradicts itself", path.display()));
     failure.causes = vec![format!("{what}\nthe clip says:  {stated}\nit should be:   {found}")];
     failure.with_help(
         "it was changed since it was made, or an older gleaner made it: replay the lambda over its drive again",
@@ -194,14 +219,16 @@ pub(super) fn untrue(path: &Path, Untrue { what, stated, found }: &Untrue) -> Fa
 }
 
 fn unusable(path: &Path, error: &JournalError) -> Failure {
-    let failure = Failure::caused_by(Exit::Usage, format!("the journal in `{}` cannot be used", path.display()), error);
+    let failure = Failure::caused_by(
+        Exit::Usage,
+        format!("the journal in `{}` cannot be used", path.display()),
+        error,
+    );
     match error {
-        JournalError::Damaged { .. } => {
-            failure.with_help("it was changed after it was written: copy it again, or write a new one")
-        }
-        JournalError::NotAJournal if begins_as_mcap(path) => {
-            failure.with_help("it is an MCAP file; to verify a clip: gleaner verify CLIP --lambda DIR")
-        }
+        JournalError::Damaged { .. } => failure
+            .with_help("it was changed after it was written: copy it again, or write a new one"),
+        JournalError::NotAJournal if begins_as_mcap(path) => failure
+            .with_help("it is an MCAP file; to verify a clip: gleaner verify CLIP --lambda DIR"),
         _ => failure.with_help("name a file that `gleaner replay --journal FILE` wrote"),
     }
 }
@@ -213,5 +240,7 @@ pub(super) fn unreadable_clip(error: ReplayError) -> Failure {
 
 fn begins_as_mcap(path: &Path) -> bool {
     let mut start = [0; 5];
-    own_file::read_named(path).and_then(|mut file| file.read_exact(&mut start)).is_ok_and(|()| start == *b"\x89MCAP")
+    own_file::read_named(path)
+        .and_then(|mut file| file.read_exact(&mut start))
+        .is_ok_and(|()| start == *b"\x89MCAP")
 }

@@ -20,7 +20,8 @@ use crate::replay::Options;
 use crate::replay::open::open;
 use crate::stage::Load;
 
-/// A sample may be newer than the one that caused a wake by so much, where each topic has a thread of its own.
+/// A sample may be newer than the one that caused a wake by so much, where each topic has a thread
+/// of its own.
 const SLACK_NS: i64 = 1_000_000_000;
 
 pub(super) fn prove(
@@ -61,13 +62,15 @@ pub(super) fn prove(
     };
     let wrong = counts_differ("wakes", end.wakes, wakes).or_else(|| triggers.differ(&stated));
     if let Some(difference) = wrong {
-        return Err(different("the clip and its journal name different triggers", &difference).with_help(CHANGED));
+        return Err(different("the clip and its journal name different triggers", &difference)
+            .with_help(CHANGED));
     }
     let triggers = triggers.count;
     if uncovered == wakes || triggers > 0 && uncovered_triggers == triggers {
         let message = format!("the clip alone proves no trigger of lambda `{}`", header.lambda);
         let mut failure = Failure::new(Exit::Usage, message);
-        let what = "in each wake that could show one, it had looked at samples from before the clip";
+        let what =
+            "in each wake that could show one, it had looked at samples from before the clip";
         failure.causes = vec![format!("{what} ({uncovered} of {wakes} wakes)")];
         return Err(failure.with_help(
             "make `preroll` longer than the lambda looks back; this clip can be verified against its drive: \
@@ -82,9 +85,15 @@ const CHANGED: &str = "the clip, or its journal, was changed since it was made";
 /// A clip cannot prove a decision over a topic that it does not hold.
 fn holds_all_inputs(clip: &Replay, header: &Header) -> Result<(), Failure> {
     let topics = clip.topics();
-    let missing = header.inputs.iter().find(|input| !topics.iter().any(|topic| topic.topic == input.wire_topic));
+    let missing = header
+        .inputs
+        .iter()
+        .find(|input| !topics.iter().any(|topic| topic.topic == input.wire_topic));
     let Some(input) = missing else { return Ok(()) };
-    let message = format!("the clip holds no `{}`, which input `{}` of the lambda reads", input.wire_topic, input.name);
+    let message = format!(
+        "the clip holds no `{}`, which input `{}` of the lambda reads",
+        input.wire_topic, input.name
+    );
     let help = "add the topic to [record] for further clips; this one can be verified against its drive only: \
                 gleaner replay DIR DRIVE --verify JOURNAL";
     Err(Failure::new(Exit::Usage, message).with_help(help))
@@ -154,7 +163,8 @@ impl Proof<'_> {
             now = Entry { triggers, fault, log, ..now };
         }
         if !is_covered || self.header.wakes_before > 0 {
-            // What the lambda keeps in its own variables since before the clip may cost it another step, or another look.
+            // What the lambda keeps in its own variables since before the clip may cost it another
+            // step, or another look.
             now.fuel = entry.fuel;
             for (now, journal) in now.seen.iter_mut().zip(&entry.seen) {
                 now.reach = journal.reach;
@@ -175,15 +185,18 @@ impl Proof<'_> {
         Ok(())
     }
 
-    /// Delivers what the clip holds up to the samples that were newest in its first wake. What came since the wake before is
-    /// summed up by itself.
+    /// Delivers what the clip holds up to the samples that were newest in its first wake. What came
+    /// since the wake before is summed up by itself.
     fn join(&mut self, entry: &Entry) -> Result<(), Failure> {
         let until_ns = entry.at_ns.saturating_add(SLACK_NS);
         let (mut earlier, mut new) = (Vec::new(), Vec::new());
         for (lane, seen) in entry.seen.iter().enumerate() {
-            let is_newest = |meta: &SampleMeta| seen.newest.is_some_and(|newest| is_sample(meta, newest));
+            let is_newest =
+                |meta: &SampleMeta| seen.newest.is_some_and(|newest| is_sample(meta, newest));
             let ahead = match seen.newest {
-                Some(_) => self.clip.ahead(lane, until_ns, is_newest).map_err(unreadable)?.unwrap_or(0),
+                Some(_) => {
+                    self.clip.ahead(lane, until_ns, is_newest).map_err(unreadable)?.unwrap_or(0)
+                }
                 None => 0,
             };
             earlier.push(ahead.saturating_sub(seen.new));
@@ -200,7 +213,9 @@ impl Proof<'_> {
 
     fn cause(&self, entry: &Entry) -> Result<Wake, Failure> {
         let (writer, seq) = match (entry.cause, self.header.event_input) {
-            (Woken::Tick { missed }, None) => return Ok(Wake::Tick(Tick { at_ns: entry.at_ns, missed })),
+            (Woken::Tick { missed }, None) => {
+                return Ok(Wake::Tick(Tick { at_ns: entry.at_ns, missed }));
+            }
             (Woken::Tick { .. }, Some(_)) => {
                 let (journal, now) = ("a tick".to_owned(), "samples, by its manifest".to_owned());
                 let what = "what woke the lambda".to_owned();
@@ -214,7 +229,9 @@ impl Proof<'_> {
             let head = reader.head();
             let oldest = head.saturating_sub(reader.depth() as u64);
             let mut leases = (oldest..head).rev().filter_map(|position| reader.get(position));
-            Some(Wake::Event(topic.sample(leases.find(|lease| is_sample(lease.meta(), (writer, seq)))?)))
+            Some(Wake::Event(
+                topic.sample(leases.find(|lease| is_sample(lease.meta(), (writer, seq)))?),
+            ))
         });
         found.ok_or_else(|| {
             let difference = Difference {
@@ -226,17 +243,22 @@ impl Proof<'_> {
         })
     }
 
-    /// Whether everything that the lambda looked at in this wake is there. It cannot look further back than its ring.
+    /// Whether everything that the lambda looked at in this wake is there. It cannot look further
+    /// back than its ring.
     fn covers(&self, entry: &Entry) -> bool {
         let mut inputs = self.inputs.iter().zip(&entry.seen);
-        inputs.all(|(topic, seen)| seen.reach.min(topic.reader().depth() as u64) <= topic.reader().head())
+        inputs.all(|(topic, seen)| {
+            seen.reach.min(topic.reader().depth() as u64) <= topic.reader().head()
+        })
     }
 
     fn differs(&self, entry: &Entry, difference: &Difference) -> Failure {
         match &self.losses {
-            None => different(format!("{} differs", self.wake_in_words(entry)), difference).with_help(CHANGED),
+            None => different(format!("{} differs", self.wake_in_words(entry)), difference)
+                .with_help(CHANGED),
             Some(losses) => {
-                let message = format!("the clip alone does not settle {}", self.wake_in_words(entry));
+                let message =
+                    format!("the clip alone does not settle {}", self.wake_in_words(entry));
                 let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
                 failure.with_help(format!(
                     "the clip itself says that messages are missing in it ({losses}): raise `preroll_size`; \
@@ -246,7 +268,8 @@ impl Proof<'_> {
         }
     }
 
-    /// The lambda saw the same and decided otherwise: that may be due to what it remembers from before the clip.
+    /// The lambda saw the same and decided otherwise: that may be due to what it remembers from
+    /// before the clip.
     fn unsettled(&self, entry: &Entry, difference: &Difference) -> Failure {
         let message = format!("the clip alone does not settle {}", self.wake_in_words(entry));
         let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
@@ -264,7 +287,8 @@ impl Proof<'_> {
     }
 }
 
-/// Whether `meta` is of the sample of this writer and number. A clip keeps the lower 32 bits of a number.
+/// Whether `meta` is of the sample of this writer and number. A clip keeps the lower 32 bits of a
+/// number.
 fn is_sample(meta: &SampleMeta, (writer, seq): ([u8; 16], u64)) -> bool {
     meta.writer.0 == writer && meta.seq as u32 == seq as u32
 }
@@ -272,8 +296,10 @@ fn is_sample(meta: &SampleMeta, (writer, seq): ([u8; 16], u64)) -> bool {
 fn unreadable(error: PaceError) -> Failure {
     match error {
         PaceError::Drive(error) => unreadable_clip(error),
-        PaceError::TooFarAhead => {
-            Failure::caused_by(Exit::Differs, "this clip does not have its samples in the order of the journal", &error)
-        }
+        PaceError::TooFarAhead => Failure::caused_by(
+            Exit::Differs,
+            "this clip does not have its samples in the order of the journal",
+            &error,
+        ),
     }
 }

@@ -1,8 +1,9 @@
 //! Makes every decision of a journal again and ends at the first that differs.
 //!
-//! From a drive, the schedule leads, as in the replay that wrote the journal: whatever wakes the lambda must stand in the
-//! journal next. From a clip, which begins in the middle, the journal leads: before a wake, as many samples of each input are
-//! delivered as it says. Both compare, bit for bit, what the lambda was shown and what it decided.
+//! From a drive, the schedule leads, as in the replay that wrote the journal: whatever wakes the
+//! lambda must stand in the journal next. From a clip, which begins in the middle, the journal
+//! leads: before a wake, as many samples of each input are delivered as it says. Both compare, bit
+//! for bit, what the lambda was shown and what it decided.
 
 mod claim;
 mod clip;
@@ -110,7 +111,11 @@ impl Remake {
 
 /// A difference in numbers, where there is one.
 fn counts_differ(what: impl Into<String>, journal: u64, now: u64) -> Option<Difference> {
-    (journal != now).then(|| Difference { what: what.into(), journal: journal.to_string(), now: now.to_string() })
+    (journal != now).then(|| Difference {
+        what: what.into(),
+        journal: journal.to_string(),
+        now: now.to_string(),
+    })
 }
 
 fn seconds(at_ns: i64, start_ns: i64) -> f64 {

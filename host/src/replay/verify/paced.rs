@@ -10,7 +10,8 @@ use gleaner_transport::{
     DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict,
 };
 
-/// Most bytes that wait until their input's turn. Inputs take turns as they did in the drive, so that few wait.
+/// Most bytes that wait until their input's turn. Inputs take turns as they did in the drive, so
+/// that few wait.
 const WAITING_BYTES: usize = 256 << 20;
 
 /// What a sample that waits takes beside its bytes: a clip may hold millions of empty ones.
@@ -33,7 +34,8 @@ pub(super) struct Paced {
     ended: bool,
 }
 
-/// One lane's way from the drive to its sink. The drive fills it and the comparison empties it, on one thread.
+/// One lane's way from the drive to its sink. The drive fills it and the comparison empties it, on
+/// one thread.
 struct Gate {
     /// Where samples go when it is their turn.
     sink: Arc<dyn Sink>,
@@ -125,7 +127,8 @@ impl Paced {
         Ok(())
     }
 
-    /// How many samples of `lane` come up to and with the one that `is_wanted`; none if there is none up to `until_ns`.
+    /// How many samples of `lane` come up to and with the one that `is_wanted`; none if there is
+    /// none up to `until_ns`.
     pub(super) fn ahead(
         &mut self,
         lane: usize,
@@ -168,8 +171,16 @@ impl Transport for Paced {
         self.drive.topics()
     }
 
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
-        let gate = Arc::new(Gate { sink, state: Mutex::default(), waiting_bytes: self.waiting_bytes.clone() });
+    fn subscribe(
+        &mut self,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+    ) -> Result<Subscription, TransportError> {
+        let gate = Arc::new(Gate {
+            sink,
+            state: Mutex::default(),
+            waiting_bytes: self.waiting_bytes.clone(),
+        });
         let subscription = self.drive.subscribe(spec, gate.clone())?;
         self.lanes.push(gate);
         Ok(subscription)

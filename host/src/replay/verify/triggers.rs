@@ -40,10 +40,13 @@ impl Triggers {
     /// The first difference between these and the triggers that the clip names.
     pub(super) fn differ(&self, stated: &Stated) -> Option<Difference> {
         let clip = stated.clip();
-        // In `short`, a clip states that its journal lacks wakes; the triggers of these cannot be made again.
+        // In `short`, a clip states that its journal lacks wakes; the triggers of these cannot be
+        // made again.
         let lacking = format!("the journal of {} lacks ", self.lambda);
         let is_short = clip.short.iter().any(|why| why.starts_with(&lacking));
-        let is_here = |at_ns: i64| !is_short || self.span.is_some_and(|(first, last)| (first..=last).contains(&at_ns));
+        let is_here = |at_ns: i64| {
+            !is_short || self.span.is_some_and(|(first, last)| (first..=last).contains(&at_ns))
+        };
         // A command is no trigger of the lambda: its journal does not have it.
         let ours = |moment: &&Moment| moment.lambda == self.lambda && moment.source.is_none();
         let mut named = stated.moments().iter().filter(ours).filter(|moment| is_here(moment.at_ns));
@@ -55,17 +58,26 @@ impl Triggers {
             if now.is_none() && (journal.is_none() || is_full) {
                 break;
             }
-            let record = format!("record gleaner.decision of trigger {number} of lambda `{}`", self.lambda);
+            let record =
+                format!("record gleaner.decision of trigger {number} of lambda `{}`", self.lambda);
             let label = |moment: &Moment| {
-                excerpt(&format!("{} `{}` at {} ns", moment.kind.as_str(), moment.label, moment.at_ns))
+                excerpt(&format!(
+                    "{} `{}` at {} ns",
+                    moment.kind.as_str(),
+                    moment.label,
+                    moment.at_ns
+                ))
             };
             let (what, journal, now) = match (journal, now) {
                 (Some(journal), Some(now)) => match journal.differs_from(now) {
                     None => continue,
-                    Some((key, [journal, now])) => (format!("`{key}` of {record}"), excerpt(&journal), excerpt(&now)),
+                    Some((key, [journal, now])) => {
+                        (format!("`{key}` of {record}"), excerpt(&journal), excerpt(&now))
+                    }
                 },
                 (journal, now) => {
-                    let side = |moment: Option<&Moment>| moment.map_or_else(|| "none".to_owned(), label);
+                    let side =
+                        |moment: Option<&Moment>| moment.map_or_else(|| "none".to_owned(), label);
                     (record, side(journal), side(now))
                 }
             };
@@ -74,7 +86,11 @@ impl Triggers {
         let others = stated.moments().iter().filter(|moment| !ours(moment)).count() as u64;
         match is_short || is_full && others > 0 {
             true => None,
-            false => counts_differ("`triggers` of record gleaner.clip", self.count + others, clip.triggers),
+            false => counts_differ(
+                "`triggers` of record gleaner.clip",
+                self.count + others,
+                clip.triggers,
+            ),
         }
     }
 }

@@ -4,7 +4,11 @@ use super::*;
 
 #[test]
 fn unknown_keys_are_refused_at_every_level() {
-    refused_below("[limit]", "lambda.toml, line 8: unknown key `limit` at the top level", "did you mean `limits`?");
+    refused_below(
+        "[limit]",
+        "lambda.toml, line 8: unknown key `limit` at the top level",
+        "did you mean `limits`?",
+    );
     refused_with(
         "event = \"camera\"",
         "evnt = \"camera\"",
@@ -36,7 +40,11 @@ fn unknown_keys_are_refused_at_every_level() {
 
 #[test]
 fn what_must_be_there_is_asked_for() {
-    refused("", "lambda.toml has no [lambda] table", "add [lambda] with name, version, kind and entry");
+    refused(
+        "",
+        "lambda.toml has no [lambda] table",
+        "add [lambda] with name, version, kind and entry",
+    );
     refused(
         &TICKER.replace("[schedule]\nperiod = \"100ms\"\n", ""),
         "lambda.toml has no [schedule] table",
@@ -81,7 +89,12 @@ fn only_a_component_can_be_deterministic() {
 #[test]
 fn values_of_another_type_are_refused() {
     let text = "give a text in quotes";
-    refused_with("version = \"0.1.0\"", "version = 1", "lambda.toml, line 3: `lambda.version` is a whole number", text);
+    refused_with(
+        "version = \"0.1.0\"",
+        "version = 1",
+        "lambda.toml, line 3: `lambda.version` is a whole number",
+        text,
+    );
     refused_with(
         "depth = 512",
         "depth = \"many\"",

@@ -69,13 +69,16 @@ fn refused(text: &str, message: &str, help: &str) {
 #[track_caller]
 fn refused_with(line: &str, instead: &str, message: &str, help: &str) {
     assert_eq!(BRAKE_DARK.lines().filter(|known| *known == line).count(), 1, "no line `{line}`");
-    let text: Vec<_> = BRAKE_DARK.lines().map(|known| if known == line { instead } else { known }).collect();
+    let text: Vec<_> =
+        BRAKE_DARK.lines().map(|known| if known == line { instead } else { known }).collect();
     refused(&text.join("\n"), message, help);
 }
 
 /// An `[[input]]` of IMU samples; `more` is its fifth line.
 fn input(name: &str, topic: &str, more: &str) -> String {
-    format!("[[input]]\nname = \"{name}\"\ntopic = \"{topic}\"\ntype = \"sensor_msgs/msg/Imu\"\n{more}\n")
+    format!(
+        "[[input]]\nname = \"{name}\"\ntopic = \"{topic}\"\ntype = \"sensor_msgs/msg/Imu\"\n{more}\n"
+    )
 }
 
 /// The ticker with more tables is refused.
@@ -98,13 +101,19 @@ fn the_example_of_the_design_is_read_whole() {
     assert_eq!(camera.decoded_size, Some(ByteSize::mib(8)));
     assert_eq!(camera.memory(), ByteSize::mib(7 * 2 + 3 * 8));
     let imu = manifest.input("imu").unwrap();
-    assert_eq!((imu.depth, imu.hold, imu.max_size, imu.decoded_size), (512, 8, ByteSize::kib(4), None));
+    assert_eq!(
+        (imu.depth, imu.hold, imu.max_size, imu.decoded_size),
+        (512, 8, ByteSize::kib(4), None)
+    );
     assert_eq!(imu.qos, Qos::Auto);
     assert_eq!(manifest.input("lidar"), None);
 
     let record = manifest.record.as_ref().unwrap();
     assert_eq!(record.topics.len(), 3);
-    assert_eq!((record.preroll, record.store, record.cooldown), (Duration::from_secs(5), Store::Ram, Duration::ZERO));
+    assert_eq!(
+        (record.preroll, record.store, record.cooldown),
+        (Duration::from_secs(5), Store::Ram, Duration::ZERO)
+    );
     assert_eq!(manifest.limits.deadline, Duration::from_millis(50));
     // An integer limit of a floating-point item becomes one; the order is that of the file.
     assert_eq!(manifest.config[0].default, ConfigValue::Float(-3.0));
@@ -129,16 +138,26 @@ fn the_default_of_the_preroll_size_is_that_of_its_store() {
         Manifest::parse(&text, "lambda.toml").unwrap().record.unwrap()
     };
     let plain = record("");
-    assert_eq!((plain.preroll_size, plain.max_length), (ByteSize::mib(64), Duration::from_secs(600)));
+    assert_eq!(
+        (plain.preroll_size, plain.max_length),
+        (ByteSize::mib(64), Duration::from_secs(600))
+    );
     assert_eq!(record("store = \"disk\"").preroll_size, ByteSize::gib(1));
     let given = record("store = \"disk\"\npreroll_size = \"256 GiB\"\nmax_length = \"1s\"");
-    assert_eq!((given.preroll_size, given.max_length), (ByteSize::gib(256), Duration::from_secs(1)));
-    assert_eq!(record("preroll_size = \"1 MiB\"\nmax_length = \"1h\"").preroll_size, ByteSize::mib(1));
+    assert_eq!(
+        (given.preroll_size, given.max_length),
+        (ByteSize::gib(256), Duration::from_secs(1))
+    );
+    assert_eq!(
+        record("preroll_size = \"1 MiB\"\nmax_length = \"1h\"").preroll_size,
+        ByteSize::mib(1)
+    );
 }
 
 #[test]
 fn as_json_a_record_has_its_sizes_in_bytes_and_its_times_in_nanoseconds() {
-    let manifest = Manifest::parse(&format!("{TICKER}[record]\ntopics = [\"/a\"]"), "lambda.toml").unwrap();
+    let manifest =
+        Manifest::parse(&format!("{TICKER}[record]\ntopics = [\"/a\"]"), "lambda.toml").unwrap();
     assert_eq!(
         manifest.to_json()["record"].to_string(),
         concat!(
@@ -159,7 +178,11 @@ fn the_backlog_is_each_for_small_samples_and_latest_for_large_ones() {
         let text = TICKER.replace("period = \"100ms\"", "event = \"x\"");
         let text = format!("{text}[[input]]\nname = \"x\"\ntopic = \"/x\"\ntype = \"{type_name}\"");
         let manifest = Manifest::parse(&text, "lambda.toml").unwrap();
-        assert_eq!(manifest.schedule, Schedule::Event { input: "x".parse().unwrap(), backlog }, "{type_name}");
+        assert_eq!(
+            manifest.schedule,
+            Schedule::Event { input: "x".parse().unwrap(), backlog },
+            "{type_name}"
+        );
         assert_eq!(manifest.inputs[0].depth, depth, "{type_name}");
     }
 }
@@ -168,7 +191,11 @@ fn the_backlog_is_each_for_small_samples_and_latest_for_large_ones() {
 fn a_fixed_qos_takes_what_it_leaves_out_from_the_default_profile_of_ros() {
     let text = BRAKE_DARK.replace("qos = \"auto\"", "qos = { reliability = \"best_effort\" }");
     let manifest = Manifest::parse(&text, "lambda.toml").unwrap();
-    let qos = Qos::Fixed { reliability: Reliability::BestEffort, durability: Durability::Volatile, depth: 10 };
+    let qos = Qos::Fixed {
+        reliability: Reliability::BestEffort,
+        durability: Durability::Volatile,
+        depth: 10,
+    };
     assert_eq!(manifest.inputs[0].qos, qos);
 }
 

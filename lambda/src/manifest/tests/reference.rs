@@ -22,13 +22,15 @@ fn the_reference_has_exactly_the_keys_that_are_read() {
             "[config]" => format!("{TICKER}[config]\nx = {{ none = 1 }}\n"),
             title => format!("{TICKER}{title}\nnone = 1\n"),
         };
-        let (mut known, mut listed) = (known(&manifest), section.keys.iter().map(|key| key.name).collect::<Vec<_>>());
+        let (mut known, mut listed) =
+            (known(&manifest), section.keys.iter().map(|key| key.name).collect::<Vec<_>>());
         known.sort_unstable();
         listed.sort_unstable();
         assert_eq!(listed, known, "{}", section.title);
     }
     let top = known(&format!("none = 1\n{TICKER}"));
-    let titles: Vec<_> = sections().iter().map(|section| section.title.trim_matches(['[', ']'])).collect();
+    let titles: Vec<_> =
+        sections().iter().map(|section| section.title.trim_matches(['[', ']'])).collect();
     assert!(top.iter().all(|table| titles.contains(table)), "{top:?} and {titles:?}");
 }
 
@@ -41,7 +43,9 @@ fn the_reference_says_the_defaults_that_a_manifest_gets() {
         let plain = row.replace([',', '`', '"'], "");
         assert!(plain.contains(&format!("| {value} |")), "{value}: {row}");
     }
-    for (number, is_there) in [("50,000,000", true), ("1,000 to 1,000,000,000,000", true), ("49,999,999", false)] {
+    for (number, is_there) in
+        [("50,000,000", true), ("1,000 to 1,000,000,000,000", true), ("49,999,999", false)]
+    {
         assert_eq!(page.contains(number), is_there, "{number}");
     }
 }

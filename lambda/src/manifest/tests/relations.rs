@@ -18,14 +18,22 @@ fn what_may_come_once_is_refused_with_both_lines() {
     );
     let model = format!("[[model]]\nname = \"m\"\nfile = \"m\"\nsha256 = \"{}\"\n", "0".repeat(64));
     let help = "give each [[model]] a name of its own";
-    refused_below(&model.repeat(2), "model `m` is listed twice in lambda.toml, lines 9 and 13", help);
+    refused_below(
+        &model.repeat(2),
+        "model `m` is listed twice in lambda.toml, lines 9 and 13",
+        help,
+    );
     let help = "keep one of the two";
     refused_below(
         "[limits]\nfuel = 1000\nfuel = 2000",
         "key `fuel` is listed twice in lambda.toml, lines 9 and 10",
         help,
     );
-    refused_below("[schedule]", "table `schedule` is listed twice in lambda.toml, lines 6 and 8", help);
+    refused_below(
+        "[schedule]",
+        "table `schedule` is listed twice in lambda.toml, lines 6 and 8",
+        help,
+    );
 }
 
 #[test]
@@ -92,18 +100,27 @@ fn keys_without_meaning_where_they_stand_are_refused() {
 
 #[test]
 fn a_text_that_is_no_toml_is_refused_with_its_line() {
-    let help =
-        "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there can be several";
-    refused_below("[limits]\nfuel 3", "lambda.toml, line 9: this is no TOML: key with no value, expected `=`", help);
+    let help = "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there can be several";
+    refused_below(
+        "[limits]\nfuel 3",
+        "lambda.toml, line 9: this is no TOML: key with no value, expected `=`",
+        help,
+    );
     let deep = format!("x = {}", "[".repeat(100_000));
-    refused(&deep, "lambda.toml, line 1: this is no TOML: cannot recurse further; max recursion depth met", help);
+    refused(
+        &deep,
+        "lambda.toml, line 1: this is no TOML: cannot recurse further; max recursion depth met",
+        help,
+    );
 }
 
 #[test]
 fn messages_stay_short_and_cannot_act_on_a_terminal() {
     let long = format!("{}\\u001B[2J", "x".repeat(70)) + &"y".repeat(100_000);
-    let error =
-        Manifest::parse(&BRAKE_DARK.replace("\"camera\"\nbacklog", &format!("\"{long}\"\nbacklog")), "lambda.toml");
+    let error = Manifest::parse(
+        &BRAKE_DARK.replace("\"camera\"\nbacklog", &format!("\"{long}\"\nbacklog")),
+        "lambda.toml",
+    );
     let message = error.unwrap_err().to_string();
     assert!(message.len() < 200 && message.contains("\\u{1b}[2Jyy"), "{message}");
 }
@@ -122,10 +139,16 @@ fn no_cut_of_a_manifest_makes_the_reader_panic() {
 fn a_manifest_is_loaded_from_its_folder_and_named_by_its_path() {
     let dir = Scratch::new();
     let path = dir.write("lambda.toml", TICKER);
-    assert_eq!(Manifest::load(dir.root()).unwrap(), Manifest::parse(TICKER, "lambda.toml").unwrap());
+    assert_eq!(
+        Manifest::load(dir.root()).unwrap(),
+        Manifest::parse(TICKER, "lambda.toml").unwrap()
+    );
     dir.write("lambda.toml", "\n[lamda]");
     let message = Manifest::load(dir.root()).unwrap_err().to_string();
-    assert_eq!(message, format!("{}, line 2: unknown key `lamda` at the top level", path.display()));
+    assert_eq!(
+        message,
+        format!("{}, line 2: unknown key `lamda` at the top level", path.display())
+    );
 }
 
 #[test]

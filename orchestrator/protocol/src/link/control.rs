@@ -9,8 +9,8 @@ use std::path::PathBuf;
 
 use rustix::io::Errno;
 use rustix::net::{
-    RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage, SendFlags,
-    recvmsg, send, sendmsg,
+    RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
+    SendAncillaryMessage, SendFlags, recvmsg, send, sendmsg,
 };
 use serde::{Deserialize, Serialize};
 
@@ -27,11 +27,13 @@ const SOCKETS: usize = 16;
 /// A lambda that the recorder is to hear.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Add {
-    /// Its folder. The manifest in its `build/` says its name and what it records, not the lambda's process.
+    /// Its folder. The manifest in its `build/` says its name and what it records, not the lambda's
+    /// process.
     pub lambda: PathBuf,
     /// Other names for topics of the manifest, from and to.
     pub remaps: Vec<(String, String)>,
-    /// The most that a lambda gets on this vehicle: the limits of its manifest count as far as they are smaller.
+    /// The most that a lambda gets on this vehicle: the limits of its manifest count as far as they
+    /// are smaller.
     pub most: Limits,
 }
 
@@ -56,14 +58,19 @@ impl Control {
     ///
     /// # Errors
     ///
-    /// [`LinkError::Gone`] if the recorder has ended, [`LinkError::Socket`] if there are too many open files.
+    /// [`LinkError::Gone`] if the recorder has ended, [`LinkError::Socket`] if there are too many
+    /// open files.
     pub fn add(&mut self, add: &Add) -> Result<OwnedFd, LinkError> {
         let failed = |source| LinkError::Socket { who: RECORDER, source };
         let (ours, theirs) = UnixStream::pair().map_err(failed)?;
         let payload = serde_json::to_vec(add).map_err(|error| failed(error.into()))?;
         let bytes = frame::whole(tag::ADD, &payload);
         if payload.len() > super::FRAME_MAX {
-            return Err(LinkError::TooLong { who: STARTER, frame: "add", bytes: payload.len() as u64 });
+            return Err(LinkError::TooLong {
+                who: STARTER,
+                frame: "add",
+                bytes: payload.len() as u64,
+            });
         }
         // With the first of its bytes, so that it is there when the frame is.
         let fds = [theirs.as_fd()];
@@ -136,10 +143,8 @@ impl Controlled {
             None => Ok(None),
             Some(tag::STOP) => Ok(Some(Order::Stop)),
             Some(tag::ADD) => {
-                let add = serde_json::from_slice(&self.payload).map_err(|error| LinkError::Malformed {
-                    who: STARTER,
-                    frame: "add",
-                    why: error.to_string(),
+                let add = serde_json::from_slice(&self.payload).map_err(|error| {
+                    LinkError::Malformed { who: STARTER, frame: "add", why: error.to_string() }
                 })?;
                 let socket = self.from.get_mut().received.pop_front().ok_or(LinkError::NoSocket)?;
                 Ok(Some(Order::Add(add, socket)))

@@ -9,7 +9,8 @@ use gleaner_journal::Malformed;
 /// Why two programs do not understand each other.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// The other side has closed the connection: it has ended, or does not want to be connected any more.
+    /// The other side has closed the connection: it has ended, or does not want to be connected any
+    /// more.
     #[error("{who} has ended, or closed the connection")]
     Gone {
         /// Who: "the recorder", "the lambda" or "the starter".
@@ -99,7 +100,9 @@ impl LinkError {
 impl Explain for LinkError {
     fn help(&self) -> Option<String> {
         match self {
-            LinkError::Refused { .. } => Some("build the lambda again, and start recorder and lambda anew".to_owned()),
+            LinkError::Refused { .. } => {
+                Some("build the lambda again, and start recorder and lambda anew".to_owned())
+            }
             LinkError::Unknown { .. } => Some("use recorder and runtime of one version".to_owned()),
             _ => None,
         }
@@ -107,7 +110,9 @@ impl Explain for LinkError {
 
     fn exit(&self) -> Exit {
         match self {
-            LinkError::Gone { .. } | LinkError::Silent { .. } | LinkError::Socket { .. } => Exit::Unreachable,
+            LinkError::Gone { .. } | LinkError::Silent { .. } | LinkError::Socket { .. } => {
+                Exit::Unreachable
+            }
             LinkError::Refused { .. } => Exit::Usage,
             _ => Exit::Internal,
         }

@@ -4,8 +4,8 @@ use std::io::{self, Read};
 
 use super::LinkError;
 
-/// Longest payload: as long as the longest block of a journal, which holds the header of a build with thousands of files, and the
-/// largest wake that a host allows.
+/// Longest payload: as long as the longest block of a journal, which holds the header of a build
+/// with thousands of files, and the largest wake that a host allows.
 pub const FRAME_MAX: usize = 2 << 20;
 
 /// Bytes before a payload.
@@ -19,7 +19,8 @@ pub(super) mod tag {
     pub(crate) const STOP: u8 = 2;
     /// Lambda to recorder: the header of its journal, as JSON. First, once.
     pub(crate) const HELLO: u8 = 16;
-    /// Lambda to recorder: `i64` time of the decision, `u32` wakes that are missing before it, and the wake as in a journal.
+    /// Lambda to recorder: `i64` time of the decision, `u32` wakes that are missing before it, and
+    /// the wake as in a journal.
     pub(crate) const WAKE: u8 = 17;
     /// Lambda to recorder: nothing more comes.
     pub(crate) const BYE: u8 = 18;
@@ -81,8 +82,13 @@ pub(super) fn head(bytes: [u8; HEAD], who: &'static str) -> Result<(u8, usize), 
     }
 }
 
-/// The next frame from `who`, into `payload`; `None` at the end. Memory is taken as bytes come, not as a head claims.
-pub(super) fn read(from: &mut impl Read, payload: &mut Vec<u8>, who: &'static str) -> Result<Option<u8>, LinkError> {
+/// The next frame from `who`, into `payload`; `None` at the end. Memory is taken as bytes come, not
+/// as a head claims.
+pub(super) fn read(
+    from: &mut impl Read,
+    payload: &mut Vec<u8>,
+    who: &'static str,
+) -> Result<Option<u8>, LinkError> {
     let failed = |source: io::Error| match source.kind() {
         io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe => LinkError::Gone { who },
         _ => LinkError::Socket { who, source },

@@ -61,7 +61,10 @@ impl LambdaLink {
     pub fn new(socket: OwnedFd) -> io::Result<(LambdaLink, Answers)> {
         let socket = UnixStream::from(socket);
         let answers = Answers { socket: socket.try_clone()?, rest: Vec::new() };
-        Ok((LambdaLink { from: BufReader::new(socket), payload: Vec::new(), decoder: None }, answers))
+        Ok((
+            LambdaLink { from: BufReader::new(socket), payload: Vec::new(), decoder: None },
+            answers,
+        ))
     }
 
     /// What it says next; waits for it. `None` when its process has ended.
@@ -70,15 +73,20 @@ impl LambdaLink {
     ///
     /// [`LinkError`] names the frame that makes no sense; nothing can be read after it.
     pub fn hear(&mut self) -> Result<Option<Heard>, LinkError> {
-        let Some(tag) = frame::read(&mut self.from, &mut self.payload, LAMBDA)? else { return Ok(None) };
+        let Some(tag) = frame::read(&mut self.from, &mut self.payload, LAMBDA)? else {
+            return Ok(None);
+        };
         let malformed = |frame, why| LinkError::Malformed { who: LAMBDA, frame, why };
         match (tag, &mut self.decoder) {
             (tag::HELLO, None) => {
-                let header: Header =
-                    serde_json::from_slice(&self.payload).map_err(|error| malformed("hello", error.to_string()))?;
+                let header: Header = serde_json::from_slice(&self.payload)
+                    .map_err(|error| malformed("hello", error.to_string()))?;
                 let inputs = header.inputs.len();
                 if inputs > INPUTS_MAX || header.event_input.is_some_and(|event| event >= inputs) {
-                    return Err(malformed("hello", "its inputs are more than there may be, or not there".to_owned()));
+                    return Err(malformed(
+                        "hello",
+                        "its inputs are more than there may be, or not there".to_owned(),
+                    ));
                 }
                 self.decoder = Some(Decoder::new(inputs));
                 Ok(Some(Heard::Hello(Box::new(header))))
@@ -92,7 +100,9 @@ impl LambdaLink {
                     return Err(malformed("wake", format!("it has {bytes} bytes")));
                 };
                 decoder.reset();
-                let entry = decoder.decode(&mut rest).map_err(|source| LinkError::Wake { who: LAMBDA, source })?;
+                let entry = decoder
+                    .decode(&mut rest)
+                    .map_err(|source| LinkError::Wake { who: LAMBDA, source })?;
                 if !rest.is_empty() {
                     return Err(malformed("wake", format!("{} bytes follow the wake", rest.len())));
                 }
@@ -104,7 +114,9 @@ impl LambdaLink {
                 }))
             }
             (tag::BYE, Some(_)) => Ok(Some(Heard::Bye)),
-            (tag::HELLO, Some(_)) => Err(LinkError::Order { who: LAMBDA, frame: "hello", due: "wake" }),
+            (tag::HELLO, Some(_)) => {
+                Err(LinkError::Order { who: LAMBDA, frame: "hello", due: "wake" })
+            }
             (tag::WAKE | tag::BYE, None) => {
                 Err(LinkError::Order { who: LAMBDA, frame: frame::name(tag), due: "hello" })
             }
@@ -121,7 +133,8 @@ impl Answers {
 
     /// The lambda is not heard. Whoever reads it needs not wait for its end.
     pub fn refused(&mut self, why: &str) {
-        let end = (0..=WHY_MAX.min(why.len())).rev().find(|end| why.is_char_boundary(*end)).unwrap_or(0);
+        let end =
+            (0..=WHY_MAX.min(why.len())).rev().find(|end| why.is_char_boundary(*end)).unwrap_or(0);
         self.send(tag::REFUSED, &why.as_bytes()[..end]);
     }
 
@@ -136,8 +149,8 @@ impl Answers {
         let _ = self.socket.shutdown(std::net::Shutdown::Both);
     }
 
-    /// Sends a frame, unless the other side does not read: then it is left out. Nothing but times is lost by that, as the
-    /// first answers fit in any case.
+    /// Sends a frame, unless the other side does not read: then it is left out. Nothing but times
+    /// is lost by that, as the first answers fit in any case.
     fn send(&mut self, tag: u8, payload: &[u8]) {
         let pending = std::mem::take(&mut self.rest);
         self.rest = self.try_send(pending);

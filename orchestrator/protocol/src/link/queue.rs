@@ -34,11 +34,19 @@ struct Frame {
 
 impl Queue {
     pub(super) fn new(most: usize) -> Queue {
-        Queue { frames: VecDeque::new(), bytes: 0, most, sent: 0, missing: 0, wakes_dropped: 0, triggers_lost: 0 }
+        Queue {
+            frames: VecDeque::new(),
+            bytes: 0,
+            most,
+            sent: 0,
+            missing: 0,
+            wakes_dropped: 0,
+            triggers_lost: 0,
+        }
     }
 
-    /// Adds a wake as a frame. If there is no room, wakes without triggers go for one with triggers, the oldest first; else
-    /// it goes itself. `false` if triggers are lost by that.
+    /// Adds a wake as a frame. If there is no room, wakes without triggers go for one with
+    /// triggers, the oldest first; else it goes itself. `false` if triggers are lost by that.
     pub(super) fn push(&mut self, bytes: &[u8], triggers: usize) -> bool {
         while self.bytes + bytes.len() > self.most {
             if triggers == 0 || !self.drop_one() {
@@ -64,7 +72,10 @@ impl Queue {
     /// Leaves out the oldest wake without triggers of which nothing is sent.
     fn drop_one(&mut self) -> bool {
         let begun = usize::from(self.sent > 0);
-        let Some(index) = self.frames.iter().skip(begun).position(|frame| frame.triggers == 0) else { return false };
+        let Some(index) = self.frames.iter().skip(begun).position(|frame| frame.triggers == 0)
+        else {
+            return false;
+        };
         let Some(gone) = self.frames.remove(begun + index) else { return false };
         self.bytes -= gone.bytes.len();
         self.wakes_dropped += 1;

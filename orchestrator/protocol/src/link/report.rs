@@ -6,7 +6,8 @@ use crate::live::add;
 use crate::{Network, Recording, Spread};
 use gleaner_lambda::Clip;
 
-/// One line of JSON that `gleaner-recorder` writes on its standard output for the program that started it.
+/// One line of JSON that `gleaner-recorder` writes on its standard output for the program that
+/// started it.
 ///
 /// The key `recorder` says which it is.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -41,8 +42,8 @@ pub enum Loss {
         /// Why, in words.
         why: String,
     },
-    /// A clip that should have been deleted to make room, and could not be: it is still there, whole or without its thumbnail,
-    /// though a line before may say that it was deleted.
+    /// A clip that should have been deleted to make room, and could not be: it is still there,
+    /// whole or without its thumbnail, though a line before may say that it was deleted.
     NotDeleted {
         /// When, in ns since 1970.
         at_ns: i64,
@@ -71,8 +72,8 @@ pub enum Loss {
     },
 }
 
-/// How the recorder is doing. Counts are since its start; the spread is since the report before, and in the last report since the
-/// start.
+/// How the recorder is doing. Counts are since its start; the spread is since the report before,
+/// and in the last report since the start.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecorderStatus {
     /// Lambdas that it hears.
@@ -107,8 +108,8 @@ pub struct RecorderStatus {
 }
 
 impl RecorderStatus {
-    /// With what was counted of `before`, an earlier recorder of the same run. Spreads, and what is true of an instant, stay those
-    /// of this one.
+    /// With what was counted of `before`, an earlier recorder of the same run. Spreads, and what is
+    /// true of an instant, stay those of this one.
     #[must_use]
     pub fn after(mut self, before: &RecorderStatus) -> RecorderStatus {
         self.recording.add(&before.recording);
@@ -117,9 +118,13 @@ impl RecorderStatus {
             add([(&mut now.accepted, before.accepted), (&mut now.refused, before.refused)]);
         }
         for topic in &mut self.topics {
-            let Some(before) = before.topics.iter().find(|before| before.topic == topic.topic) else { continue };
+            let Some(before) = before.topics.iter().find(|before| before.topic == topic.topic)
+            else {
+                continue;
+            };
             // Unknown in one of them is unknown in both.
-            topic.lost = topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
+            topic.lost =
+                topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
             add([
                 (&mut topic.received, before.received),
                 (&mut topic.no_slot, before.no_slot),
@@ -128,9 +133,13 @@ impl RecorderStatus {
             ]);
         }
         let known: Vec<_> = self.topics.iter().map(|topic| topic.topic.clone()).collect();
-        self.topics.extend(before.topics.iter().filter(|before| !known.contains(&before.topic)).cloned());
+        self.topics
+            .extend(before.topics.iter().filter(|before| !known.contains(&before.topic)).cloned());
         if let (Some(now), Some(before)) = (&mut self.network, &before.network) {
-            add([(&mut now.socket_drops, before.socket_drops), (&mut now.filtered, before.filtered)]);
+            add([
+                (&mut now.socket_drops, before.socket_drops),
+                (&mut now.filtered, before.filtered),
+            ]);
         }
         self
     }
@@ -192,7 +201,11 @@ mod tests {
         };
         RecorderStatus {
             recording: Recording { clips: count, held_back: count, ..Recording::default() },
-            commands: Some(CommandStatus { accepted: count, refused: count, ..CommandStatus::default() }),
+            commands: Some(CommandStatus {
+                accepted: count,
+                refused: count,
+                ..CommandStatus::default()
+            }),
             topics: topics.iter().map(topic).collect(),
             network: Some(Network { socket_drops: count, filtered: count, ..Network::default() }),
             ..RecorderStatus::default()

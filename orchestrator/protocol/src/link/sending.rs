@@ -19,8 +19,8 @@ const RECORDER: &str = "the recorder";
 /// Most bytes that wait for the recorder.
 const WAITING: usize = 4 << 20;
 
-/// Wakes without a trigger are sent when so many bytes wait. It is little beside [`WAITING`], and much beside what comes between
-/// two calls of [`RecorderLink::poll`].
+/// Wakes without a trigger are sent when so many bytes wait. It is little beside [`WAITING`], and
+/// much beside what comes between two calls of [`RecorderLink::poll`].
 const PROMPT: usize = 16 << 10;
 
 /// What is read of the recorder at a time: its frames are small.
@@ -33,21 +33,24 @@ pub enum Said {
     Ready,
     /// It does not, or not any more.
     Refused(String),
-    /// The windows of a decision with triggers are open: nothing that they cover is given up for its age.
+    /// The windows of a decision with triggers are open: nothing that they cover is given up for
+    /// its age.
     Opened {
         /// Time from the decision until then, in ns.
         wait_ns: u64,
     },
 }
 
-/// A lambda's connection to the recorder. Nothing but [`hello`](Self::hello) and [`bye`](Self::bye) ever waits for it.
+/// A lambda's connection to the recorder. Nothing but [`hello`](Self::hello) and [`bye`](Self::bye)
+/// ever waits for it.
 #[derive(Debug)]
 pub struct RecorderLink {
     socket: UnixStream,
     encoder: EncoderOf,
     frame: Vec<u8>,
     queue: Queue,
-    /// What is sent together. Not as slices: with what sends these, files could be sent, and a lambda's process may not.
+    /// What is sent together. Not as slices: with what sends these, files could be sent, and a
+    /// lambda's process may not.
     together: Vec<u8>,
     /// What came and is not a whole frame.
     heard: Vec<u8>,
@@ -79,14 +82,18 @@ impl RecorderLink {
     ///
     /// # Errors
     ///
-    /// [`LinkError::Refused`] if the recorder was told of another lambda, [`LinkError::Silent`] if it does not answer, and
-    /// [`LinkError::Gone`] if it has ended.
+    /// [`LinkError::Refused`] if the recorder was told of another lambda, [`LinkError::Silent`] if
+    /// it does not answer, and [`LinkError::Gone`] if it has ended.
     pub fn hello(&mut self, header: &Header, patience: Duration) -> Result<(), LinkError> {
         let until = Instant::now() + patience;
         let failed = |source: io::Error| LinkError::Socket { who: RECORDER, source };
         let payload = serde_json::to_vec(header).map_err(|error| failed(error.into()))?;
         if payload.len() > super::FRAME_MAX {
-            return Err(LinkError::TooLong { who: "the lambda", frame: "hello", bytes: payload.len() as u64 });
+            return Err(LinkError::TooLong {
+                who: "the lambda",
+                frame: "hello",
+                bytes: payload.len() as u64,
+            });
         }
         self.encoder = EncoderOf(Encoder::new(header.inputs.len()));
         let hello = frame::whole(tag::HELLO, &payload);
@@ -113,13 +120,15 @@ impl RecorderLink {
         }
     }
 
-    /// Tells the recorder of a wake, which was decided at `decided_monotonic_ns` of `CLOCK_MONOTONIC`.
+    /// Tells the recorder of a wake, which was decided at `decided_monotonic_ns` of
+    /// `CLOCK_MONOTONIC`.
     ///
-    /// A wake with triggers or a fault goes at once, behind those that wait. Any other waits for the next of these, for 16 KiB to
-    /// come together, for [`poll`](Self::poll) or for [`bye`](Self::bye): each sending wakes a thread of the recorder, which costs
-    /// more than many a wake of a lambda. Call `poll` every 50 ms or so: the recorder keeps a clip open for wakes that are up to
-    /// 200 ms late. What the recorder does not take waits, in 4 MiB at most; beyond that wakes are left out and counted, those
-    /// without triggers first.
+    /// A wake with triggers or a fault goes at once, behind those that wait. Any other waits for
+    /// the next of these, for 16 KiB to come together, for [`poll`](Self::poll) or for
+    /// [`bye`](Self::bye): each sending wakes a thread of the recorder, which costs more than many
+    /// a wake of a lambda. Call `poll` every 50 ms or so: the recorder keeps a clip open for wakes
+    /// that are up to 200 ms late. What the recorder does not take waits, in 4 MiB at most; beyond
+    /// that wakes are left out and counted, those without triggers first.
     ///
     /// # Errors
     ///
@@ -160,10 +169,14 @@ impl RecorderLink {
 
     /// Wakes and triggers that could not be told.
     pub fn dropped(&self) -> ToRecorder {
-        ToRecorder { wakes_dropped: self.queue.wakes_dropped, triggers_lost: self.queue.triggers_lost }
+        ToRecorder {
+            wakes_dropped: self.queue.wakes_dropped,
+            triggers_lost: self.queue.triggers_lost,
+        }
     }
 
-    /// Says that nothing more comes, after all that waits, but gives up after `patience`. Returns what could not be told.
+    /// Says that nothing more comes, after all that waits, but gives up after `patience`. Returns
+    /// what could not be told.
     pub fn bye(mut self, patience: Duration) -> ToRecorder {
         let until = Instant::now() + patience;
         while let Some(next) = self.queue.next().map(<[u8]>::to_vec) {
@@ -190,13 +203,20 @@ impl RecorderLink {
         Ok(())
     }
 
-    fn send_until(&self, mut bytes: &[u8], until: Instant, patience: Duration) -> Result<(), LinkError> {
+    fn send_until(
+        &self,
+        mut bytes: &[u8],
+        until: Instant,
+        patience: Duration,
+    ) -> Result<(), LinkError> {
         while !bytes.is_empty() {
             let rest = until.saturating_duration_since(Instant::now());
             if rest.is_zero() {
                 return Err(LinkError::Silent { seconds: patience.as_secs() });
             }
-            self.socket.set_write_timeout(Some(rest)).map_err(|source| LinkError::Socket { who: RECORDER, source })?;
+            self.socket
+                .set_write_timeout(Some(rest))
+                .map_err(|source| LinkError::Socket { who: RECORDER, source })?;
             match send(&self.socket, bytes, SendFlags::NOSIGNAL) {
                 Ok(sent) => bytes = &bytes[sent..],
                 Err(Errno::INTR | Errno::AGAIN) => {}

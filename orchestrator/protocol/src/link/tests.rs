@@ -68,7 +68,11 @@ fn connected() -> (RecorderLink, LambdaLink, Answers) {
 }
 
 fn add(lambda: &str) -> Add {
-    Add { lambda: lambda.into(), remaps: vec![("/imu".to_owned(), "/imu/data".to_owned())], most: Limits::DEFAULT }
+    Add {
+        lambda: lambda.into(),
+        remaps: vec![("/imu".to_owned(), "/imu/data".to_owned())],
+        most: Limits::DEFAULT,
+    }
 }
 
 #[test]
@@ -121,7 +125,8 @@ fn wakes_arrive_as_they_were_sent() {
         heard
     });
     lambda.hello(&header("hello"), PATIENCE).unwrap();
-    let sent: Vec<_> = (0..1000).map(|at| (entry(at, (at % 10 == 0).then_some("here")), at * 3)).collect();
+    let sent: Vec<_> =
+        (0..1000).map(|at| (entry(at, (at % 10 == 0).then_some("here")), at * 3)).collect();
     let mut said = Vec::new();
     for (entry, decided) in &sent {
         lambda.wake(entry, *decided).unwrap();
@@ -225,9 +230,15 @@ fn a_refusal_is_told_and_silence_has_an_end() {
     let (mut lambda, _link, mut answers) = connected();
     answers.refused("it is another \u{1b}[2J");
     let refused = lambda.hello(&header("x"), PATIENCE).unwrap_err();
-    assert!(matches!(&refused, LinkError::Refused { why } if why == "it is another \\u{1b}[2J"), "{refused}");
+    assert!(
+        matches!(&refused, LinkError::Refused { why } if why == "it is another \\u{1b}[2J"),
+        "{refused}"
+    );
     let (mut lambda, _link, _answers) = connected();
-    assert!(matches!(lambda.hello(&header("x"), Duration::from_millis(20)), Err(LinkError::Silent { .. })));
+    assert!(matches!(
+        lambda.hello(&header("x"), Duration::from_millis(20)),
+        Err(LinkError::Silent { .. })
+    ));
     let (mut lambda, _link, mut answers) = connected();
     answers.refused(&"é".repeat(5000));
     assert!(matches!(lambda.hello(&header("x"), PATIENCE), Err(LinkError::Refused { .. })));
@@ -261,12 +272,21 @@ fn nonsense_is_refused_by_name() {
     let said = |frames: &[Vec<u8>]| heard(frames).unwrap_err().to_string();
     assert_eq!(heard(&[hello()]).unwrap(), 1);
     assert_eq!(said(&[wake(&[0; 30])]), "frame `wake` from the lambda comes where `hello` is due");
-    assert_eq!(said(&[hello(), hello()]), "frame `hello` from the lambda comes where `wake` is due");
-    assert_eq!(said(&[hello(), wake(&[0; 11])]), "frame `wake` from the lambda cannot be read: it has 11 bytes");
+    assert_eq!(
+        said(&[hello(), hello()]),
+        "frame `hello` from the lambda comes where `wake` is due"
+    );
+    assert_eq!(
+        said(&[hello(), wake(&[0; 11])]),
+        "frame `wake` from the lambda cannot be read: it has 11 bytes"
+    );
     assert_eq!(said(&[hello(), wake(&[255; 40])]), "frame `wake` from the lambda is none");
     assert_eq!(said(&[frame::whole(99, &[])]), "frame 99 from the lambda is not known here");
     assert_eq!(said(&[frame::whole(tag::ADD, b"{}")]), "frame 1 from the lambda is not known here");
-    assert!(said(&[frame::whole(tag::HELLO, b"{}")]).starts_with("frame `hello` from the lambda cannot be read"));
+    assert!(
+        said(&[frame::whole(tag::HELLO, b"{}")])
+            .starts_with("frame `hello` from the lambda cannot be read")
+    );
     let claims = [&u32::MAX.to_le_bytes()[..], &[tag::HELLO]].concat();
     assert!(said(&[claims]).contains("has 4294967295 bytes, above the maximum of 2097152"));
     assert_eq!(said(&[hello()[..20].to_vec()]), "the lambda has ended, or closed the connection");
@@ -304,7 +324,10 @@ fn a_starter_that_talks_nonsense_is_refused_by_name() {
     };
     let add = serde_json::to_vec(&add("x")).unwrap();
     assert_eq!(said(&frame::whole(tag::ADD, &add)), "frame `add` came without a socket");
-    assert!(said(&frame::whole(tag::ADD, b"[]")).starts_with("frame `add` from the starter cannot be read"));
+    assert!(
+        said(&frame::whole(tag::ADD, b"[]"))
+            .starts_with("frame `add` from the starter cannot be read")
+    );
     assert_eq!(said(&frame::whole(tag::HELLO, &[])), "frame 16 from the starter is not known here");
     assert_eq!(said(&[1, 0, 0]), "the starter has ended, or closed the connection");
 }
@@ -338,9 +361,15 @@ fn a_recorder_that_talks_nonsense_is_refused_by_name() {
         RecorderLink::new(theirs.into()).poll().unwrap_err().to_string()
     };
     assert_eq!(said(&frame::whole(99, &[])), "frame 99 from the recorder is not known here");
-    assert_eq!(said(&frame::whole(tag::WAKE, &[0; 20])), "frame 17 from the recorder is not known here");
+    assert_eq!(
+        said(&frame::whole(tag::WAKE, &[0; 20])),
+        "frame 17 from the recorder is not known here"
+    );
     let short = frame::whole(tag::OPENED, &[0; 7]);
-    assert_eq!(said(&short), "frame `opened` from the recorder cannot be read: it has 7 bytes instead of 8");
+    assert_eq!(
+        said(&short),
+        "frame `opened` from the recorder cannot be read: it has 7 bytes instead of 8"
+    );
     let claims = [&5000_u32.to_le_bytes()[..], &[tag::REFUSED]].concat();
     assert_eq!(
         said(&claims),

@@ -3,8 +3,8 @@
 use super::pixels::Pixels;
 use crate::pixels::{PixelError, Roi, View};
 
-/// Byte positions that are summed side by side. 48 bytes are whole pixels of 1, 2, 3 and 4 bytes and
-/// whole vector registers of 16 bytes, so that one loop serves every encoding and vectorises.
+/// Byte positions that are summed side by side. 48 bytes are whole pixels of 1, 2, 3 and 4 bytes
+/// and whole vector registers of 16 bytes, so that one loop serves every encoding and vectorises.
 const LANES: usize = 48;
 
 /// Groups of [`LANES`] bytes after which 16 bit sums must be emptied: 257 * 255 = 65,535.
@@ -18,7 +18,8 @@ const GROUPS: usize = 257;
 ///
 /// # Errors
 ///
-/// [`PixelError::Roi`] if no pixel is in `roi`, [`PixelError::Raw`] for a Bayer image, [`PixelError::Stopped`].
+/// [`PixelError::Roi`] if no pixel is in `roi`, [`PixelError::Raw`] for a Bayer image,
+/// [`PixelError::Stopped`].
 ///
 /// Source: luma weights of ITU-R BT.601.
 pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, PixelError> {
@@ -34,7 +35,8 @@ pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, PixelError> {
     for (lane, sum) in lanes.iter().enumerate() {
         bytes[lane % view.encoding().bytes_per_pixel()] += sum;
     }
-    let colour = |red: usize, blue: usize| (299 * bytes[red] + 587 * bytes[1] + 114 * bytes[blue], 1000);
+    let colour =
+        |red: usize, blue: usize| (299 * bytes[red] + 587 * bytes[1] + 114 * bytes[blue], 1000);
     // At most 65,535^2 pixels of 255 * 1000: below 2^51, so neither `u64` nor `f64` rounds.
     let (sum, scale) = match pixels {
         Pixels::Grey8 | Pixels::Yuyv => (bytes[0], 1),
@@ -71,7 +73,8 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
 ///
 /// # Errors
 ///
-/// [`PixelError::Roi`] if no pixel is in `roi`, [`PixelError::Raw`] for a Bayer image, [`PixelError::Stopped`].
+/// [`PixelError::Roi`] if no pixel is in `roi`, [`PixelError::Raw`] for a Bayer image,
+/// [`PixelError::Stopped`].
 pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], PixelError> {
     let pixels = Pixels::of(view, "histogram")?;
     let roi = view.clip(roi)?;
@@ -99,7 +102,8 @@ pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], PixelE
 ///
 /// # Errors
 ///
-/// [`PixelError::Output`] if `out` has another length, [`PixelError::Raw`] for a Bayer image, [`PixelError::Stopped`].
+/// [`PixelError::Output`] if `out` has another length, [`PixelError::Raw`] for a Bayer image,
+/// [`PixelError::Stopped`].
 pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
     let pixels = Pixels::of(view, "grey image")?;
     let width = view.width() as usize;
@@ -149,7 +153,8 @@ mod tests {
         }
     }
 
-    const READABLE: [&str; 8] = ["mono8", "mono16", "rgb8", "bgr8", "rgba8", "bgra8", "uyvy", "yuyv"];
+    const READABLE: [&str; 8] =
+        ["mono8", "mono16", "rgb8", "bgr8", "rgba8", "bgra8", "uyvy", "yuyv"];
 
     #[test]
     fn the_mean_is_that_of_every_pixel_in_floating_point() {
@@ -253,7 +258,9 @@ mod tests {
             let view = View::new(2, 2, 4, encoding, false, &[0; 8]).unwrap();
             assert_eq!(
                 mean_luma(&view, WHOLE).unwrap_err().to_string(),
-                format!("mean luma of a raw image ({name}): its pixels have no colour until it is debayered")
+                format!(
+                    "mean luma of a raw image ({name}): its pixels have no colour until it is debayered"
+                )
             );
             assert!(histogram(&view, WHOLE).is_err());
             assert!(to_gray(&view, &mut [0; 4]).is_err());

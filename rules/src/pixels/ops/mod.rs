@@ -1,8 +1,9 @@
 //! What the host computes on frames for lambdas.
 //!
 //! Inside: grey levels (`luma`), size (`resize`), and how a pixel of each encoding is read
-//! (`pixels`). Every operation asks the view between rows whether it may go on ([`View::paced`]). All of it is exact integer arithmetic on a checked [`View`], so that every CPU and
-//! every call gives the same result, however the compiler arranges the loops.
+//! (`pixels`). Every operation asks the view between rows whether it may go on ([`View::paced`]).
+//! All of it is exact integer arithmetic on a checked [`View`], so that every CPU and every call
+//! gives the same result, however the compiler arranges the loops.
 //!
 //! Never: memory that grows with anything but the width of the image; a result for raw (Bayer)
 //! images, whose pixels have no colour until someone has chosen how to debayer them.

@@ -53,9 +53,13 @@ impl Pixels {
         }
     }
 
-    /// `CHANNELS` numbers of each pixel in `row`, a whole row: grey, or red, green and blue. They are in `row` itself or, if they have to be
-    /// rearranged, in `place`, which has room for them.
-    pub(super) fn row<'a, const CHANNELS: usize>(self, row: &'a [u8], place: &'a mut [u8]) -> &'a [u8] {
+    /// `CHANNELS` numbers of each pixel in `row`, a whole row: grey, or red, green and blue. They
+    /// are in `row` itself or, if they have to be rearranged, in `place`, which has room for them.
+    pub(super) fn row<'a, const CHANNELS: usize>(
+        self,
+        row: &'a [u8],
+        place: &'a mut [u8],
+    ) -> &'a [u8] {
         match (self, CHANNELS) {
             (Self::Grey8, 1) | (Self::Rgb, 3) => return row,
             (_, 1) => self.grey(row, place),
@@ -101,14 +105,20 @@ fn luma<const BYTES: usize, const RED: usize, const BLUE: usize>(row: &[u8], gre
 }
 
 /// Three bytes of each pixel of `BYTES` bytes.
-fn spread<const BYTES: usize, const RED: usize, const GREEN: usize, const BLUE: usize>(row: &[u8], rgb: &mut [u8]) {
+fn spread<const BYTES: usize, const RED: usize, const GREEN: usize, const BLUE: usize>(
+    row: &[u8],
+    rgb: &mut [u8],
+) {
     for (rgb, pixel) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(row.as_chunks::<BYTES>().0) {
         *rgb = [pixel[RED], pixel[GREEN], pixel[BLUE]];
     }
 }
 
 /// Two colours of each pair, whose U, left Y, V and right Y lie at the given offsets.
-fn pairs<const U: usize, const LEFT: usize, const V: usize, const RIGHT: usize>(row: &[u8], rgb: &mut [u8]) {
+fn pairs<const U: usize, const LEFT: usize, const V: usize, const RIGHT: usize>(
+    row: &[u8],
+    rgb: &mut [u8],
+) {
     for (rgb, pair) in rgb.as_chunks_mut::<6>().0.iter_mut().zip(row.as_chunks::<4>().0) {
         let [r0, g0, b0] = from_yuv(pair[LEFT], pair[U], pair[V]);
         let [r1, g1, b1] = from_yuv(pair[RIGHT], pair[U], pair[V]);
@@ -118,7 +128,8 @@ fn pairs<const U: usize, const LEFT: usize, const V: usize, const RIGHT: usize>(
 
 /// A colour from luma and chroma of full range (Y, U and V from 0 to 255, as in JPEG).
 ///
-/// Source: the inverse of ITU-R BT.601 as in JFIF 1.02, with factors in 1/65536, rounded to nearest.
+/// Source: the inverse of ITU-R BT.601 as in JFIF 1.02, with factors in 1/65536, rounded to
+/// nearest.
 fn from_yuv(y: u8, u: u8, v: u8) -> [u8; 3] {
     let y = (i32::from(y) << 16) + (1 << 15);
     let (u, v) = (i32::from(u) - 128, i32::from(v) - 128);
@@ -145,7 +156,8 @@ mod tests {
             for u in (0..=255).step_by(5) {
                 for v in (0..=255).step_by(5) {
                     let (yf, uf, vf) = (f64::from(y), f64::from(u) - 128.0, f64::from(v) - 128.0);
-                    let real = [yf + 1.402 * vf, yf - 0.344_136 * uf - 0.714_136 * vf, yf + 1.772 * uf];
+                    let real =
+                        [yf + 1.402 * vf, yf - 0.344_136 * uf - 0.714_136 * vf, yf + 1.772 * uf];
                     for (ours, real) in from_yuv(y as u8, u as u8, v as u8).iter().zip(real) {
                         let off = (f64::from(*ours) - real.clamp(0.0, 255.0)).abs();
                         assert!(off < 0.502, "({y}, {u}, {v}) is off by {off}");

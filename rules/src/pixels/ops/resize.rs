@@ -4,13 +4,14 @@
 //! rounded once:
 //!
 //! - smaller or equal: the mean of the area that a new pixel covers. Cut the axis of `from` pixels
-//!   into `from * to` pieces: an old pixel is `to` of them, a new one is `from`, and the weight of an
-//!   old pixel is the number of pieces that they share.
+//!   into `from * to` pieces: an old pixel is `to` of them, a new one is `from`, and the weight of
+//!   an old pixel is the number of pieces that they share.
 //! - larger: linear between the two old pixels around the middle of the new one, with the middle
 //!   measured in 1 / (2 `to`) of an old pixel. Beyond the outermost middles the edge is repeated.
 //!
-//! The axis along which less is left to do goes first: rows are added up before they get narrower or wider, but where the image grows
-//! downwards each old row gets its new width once, and serves several new rows. Sums are exact, so both give the same bytes.
+//! The axis along which less is left to do goes first: rows are added up before they get narrower
+//! or wider, but where the image grows downwards each old row gets its new width once, and serves
+//! several new rows. Sums are exact, so both give the same bytes.
 
 use super::pixels::Pixels;
 use super::rounded::Rounded;
@@ -19,8 +20,8 @@ use crate::pixels::{Encoding, PixelError, View};
 /// Largest width and height of a resized image, in pixels.
 pub const MAX_RESIZED_SIDE: u32 = 16_384;
 
-/// What [`resize`] of `view` to `width` x `height` makes: rgb8 of a colour image and mono8 of a grey
-/// one, and how many bytes.
+/// What [`resize`] of `view` to `width` x `height` makes: rgb8 of a colour image and mono8 of a
+/// grey one, and how many bytes.
 ///
 /// # Errors
 ///
@@ -37,8 +38,9 @@ pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, us
     Ok((encoding, width as usize * height as usize * encoding.bytes_per_pixel()))
 }
 
-/// Work of [`resize`], in bytes that are copied in the same time: a byte of the old image takes as long as 3, of yuv422 as 64, and a byte
-/// of the new one as 16. Where the image does not grow downwards, each new row goes over sums as wide as the old one, each as long as 8.
+/// Work of [`resize`], in bytes that are copied in the same time: a byte of the old image takes as
+/// long as 3, of yuv422 as 64, and a byte of the new one as 16. Where the image does not grow
+/// downwards, each new row goes over sums as wide as the old one, each as long as 8.
 ///
 /// # Errors
 ///
@@ -62,7 +64,12 @@ pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, Pixe
 /// # Errors
 ///
 /// As for [`resized`], [`PixelError::Output`] if `out` has another length, [`PixelError::Stopped`].
-pub fn resize(view: &View<'_>, width: u32, height: u32, out: &mut [u8]) -> Result<Encoding, PixelError> {
+pub fn resize(
+    view: &View<'_>,
+    width: u32,
+    height: u32,
+    out: &mut [u8],
+) -> Result<Encoding, PixelError> {
     let pixels = Pixels::of(view, "resize")?;
     let (encoding, needed) = resized(view, width, height)?;
     if out.len() != needed {
@@ -92,11 +99,21 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
     fn new(pixels: Pixels, across: Axis, down: Axis) -> Self {
         let rounded = Rounded::to(u64::from(down.total()) * u64::from(across.total()));
         let row = vec![0; across.from as usize * CHANNELS];
-        Self { pixels, down, across: (0..across.to).map(|x| across.taps(x)).collect(), rounded, row }
+        Self {
+            pixels,
+            down,
+            across: (0..across.to).map(|x| across.taps(x)).collect(),
+            rounded,
+            row,
+        }
     }
 
     fn fill(self, view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
-        if self.down.to > self.down.from { self.grow_down(view, out) } else { self.shrink_down(view, out) }
+        if self.down.to > self.down.from {
+            self.grow_down(view, out)
+        } else {
+            self.shrink_down(view, out)
+        }
     }
 
     /// Adds up the old rows of each new one, then blends the sums across.
@@ -135,7 +152,9 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
                 blended.swap(0, 1);
                 let row = self.pixels.row::<CHANNELS>(view.row(next), &mut self.row);
                 let (row, _) = row.as_chunks::<CHANNELS>();
-                for (sums, taps) in blended[1].as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&self.across) {
+                for (sums, taps) in
+                    blended[1].as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&self.across)
+                {
                     // Below 2^8 * 2^16.
                     *sums = taps.blend(row).map(|sum| sum as u32);
                 }
@@ -147,17 +166,18 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
             let (head, tail) = (u64::from(taps.head), u64::from(taps.tail));
             for ((byte, upper), lower) in line.iter_mut().zip(upper).zip(&blended[1]) {
                 // Below 2^24 * 2^15, as the weights add up to at most 2^15.
-                *byte = self
-                    .rounded
-                    .divide(head.wrapping_mul(u64::from(*upper)).wrapping_add(tail.wrapping_mul(u64::from(*lower))));
+                *byte = self.rounded.divide(
+                    head.wrapping_mul(u64::from(*upper))
+                        .wrapping_add(tail.wrapping_mul(u64::from(*lower))),
+                );
             }
         }
         Ok(())
     }
 }
 
-/// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no sum reaches 2^24; checked
-/// arithmetic would not become a vector's.
+/// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no
+/// sum reaches 2^24; checked arithmetic would not become a vector's.
 fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
     // A product of 16 bits is what vectors have at hand.
     let weight = weight as u16;
@@ -195,9 +215,13 @@ impl Taps {
     }
 
     /// Weighted sum of old pixels. Values below 2^24 make sums below 2^40.
-    fn blend<T: Copy + Into<u64>, const CHANNELS: usize>(&self, old: &[[T; CHANNELS]]) -> [u64; CHANNELS] {
-        let times =
-            |values: &[T; CHANNELS], weight: u32| values.map(|value| value.into().wrapping_mul(u64::from(weight)));
+    fn blend<T: Copy + Into<u64>, const CHANNELS: usize>(
+        &self,
+        old: &[[T; CHANNELS]],
+    ) -> [u64; CHANNELS] {
+        let times = |values: &[T; CHANNELS], weight: u32| {
+            values.map(|value| value.into().wrapping_mul(u64::from(weight)))
+        };
         let add = |sums: &mut [u64; CHANNELS], values: [u64; CHANNELS]| {
             sums.iter_mut().zip(values).for_each(|(sum, value)| *sum = sum.wrapping_add(value));
         };
@@ -206,7 +230,9 @@ impl Taps {
         if last > first {
             if last > first + 1 {
                 let mut middle = [0; CHANNELS];
-                old[first + 1..last].iter().for_each(|values| add(&mut middle, values.map(Into::into)));
+                old[first + 1..last]
+                    .iter()
+                    .for_each(|values| add(&mut middle, values.map(Into::into)));
                 add(&mut sums, middle.map(|sum| sum.wrapping_mul(u64::from(self.middle))));
             }
             add(&mut sums, times(&old[last], self.tail));
@@ -282,7 +308,8 @@ mod tests {
     fn every_size_agrees_with_floating_point() {
         let data = noise(7 * 5);
         let view = mono(7, 5, &data);
-        for (width, height) in [(3, 2), (7, 5), (1, 1), (6, 4), (14, 10), (20, 3), (2, 17), (8, 6)] {
+        for (width, height) in [(3, 2), (7, 5), (1, 1), (6, 4), (14, 10), (20, 3), (2, 17), (8, 6)]
+        {
             let ours = resized_to(&view, width, height);
             for y in 0..height {
                 for x in 0..width {

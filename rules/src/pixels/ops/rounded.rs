@@ -4,7 +4,8 @@
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Rounded {
     half: u64,
-    /// 2^63 times the largest power of 2 that is not above the divisor, divided by it and rounded up.
+    /// 2^63 times the largest power of 2 that is not above the divisor, divided by it and rounded
+    /// up.
     reciprocal: u64,
     shift: u32,
 }
@@ -19,10 +20,12 @@ impl Rounded {
 
     /// `sum` divided, which is at most 255 times the divisor.
     ///
-    /// The reciprocal is too large by less than `divisor` / 2^(63 + shift), so the quotient is by less than 1 / `divisor`, and none that
-    /// is not whole reaches the next whole number: `sum` * `divisor` < 2^8 * 2^(2 * (shift + 1)) < 2^(63 + shift).
+    /// The reciprocal is too large by less than `divisor` / 2^(63 + shift), so the quotient is by
+    /// less than 1 / `divisor`, and none that is not whole reaches the next whole number: `sum` *
+    /// `divisor` < 2^8 * 2^(2 * (shift + 1)) < 2^(63 + shift).
     ///
-    /// Source: T. Granlund and P. Montgomery, Division by Invariant Integers using Multiplication, 1994.
+    /// Source: T. Granlund and P. Montgomery, Division by Invariant Integers using Multiplication,
+    /// 1994.
     pub(super) fn divide(self, sum: u64) -> u8 {
         let twice = sum.wrapping_add(self.half) << 1;
         let high = (u128::from(twice) * u128::from(self.reciprocal)) >> 64;
@@ -38,14 +41,20 @@ mod tests {
     fn it_is_a_division_right_at_the_steps() {
         let small = 1..=300;
         let powers = (0..32).flat_map(|power| [(1 << power) - 1, 1 << power, (1 << power) + 1]);
-        let large = [65_535 * 65_535, (1 << 32) - 1, 16_384 * 16_384 * 4, 65_535 * 32_768, 4_294_967_291];
-        for divisor in small.chain(powers).chain(large).filter(|divisor| (1..1 << 32).contains(divisor)) {
+        let large =
+            [65_535 * 65_535, (1 << 32) - 1, 16_384 * 16_384 * 4, 65_535 * 32_768, 4_294_967_291];
+        for divisor in
+            small.chain(powers).chain(large).filter(|divisor| (1..1 << 32).contains(divisor))
+        {
             let rounded = Rounded::to(divisor);
             for whole in 0..=255 {
                 let step = whole * divisor;
-                for sum in
-                    [step.saturating_sub(divisor / 2 + 1), step.saturating_sub(divisor / 2), step, step + divisor / 2]
-                {
+                for sum in [
+                    step.saturating_sub(divisor / 2 + 1),
+                    step.saturating_sub(divisor / 2),
+                    step,
+                    step + divisor / 2,
+                ] {
                     let expected = (sum + divisor / 2) / divisor;
                     if expected <= 255 {
                         assert_eq!(u64::from(rounded.divide(sum)), expected, "{sum} / {divisor}");

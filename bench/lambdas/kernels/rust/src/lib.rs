@@ -1,4 +1,5 @@
-//! Does one thing over and over, for as many rounds as its caller says. The bench calls [`Work`] natively, too.
+//! Does one thing over and over, for as many rounds as its caller says. The bench calls [`Work`]
+//! natively, too.
 
 use std::hint::black_box;
 
@@ -43,7 +44,11 @@ impl<T: Real + Into<f64>> Density<T> {
     fn new(samples: usize) -> Result<Self> {
         let plan = Spectrum::hann(samples, 1000.0)?;
         let density = vec![T::zero(); plan.bins()];
-        Ok(Self { plan, signal: noise(samples).into_iter().filter_map(T::from_u8).collect(), density })
+        Ok(Self {
+            plan,
+            signal: noise(samples).into_iter().filter_map(T::from_u8).collect(),
+            density,
+        })
     }
 
     fn round(&mut self) -> Result<f64> {
@@ -132,11 +137,16 @@ struct Kernels {
 impl Lambda for Kernels {
     fn init(config: &Config) -> Result<Self> {
         let name = config.text("work")?.to_owned();
-        let work = if ["copy", "stream", "call"].contains(&name.as_str()) { None } else { Some(Work::new(&name)?) };
+        let work = if ["copy", "stream", "call"].contains(&name.as_str()) {
+            None
+        } else {
+            Some(Work::new(&name)?)
+        };
         Ok(Self { name, rounds: config.integer("rounds")?, work, pixels: Vec::new() })
     }
 
-    /// Work with the host, which has a frame: all pixels in pieces, kept or only passing through, or the smallest call there is.
+    /// Work with the host, which has a frame: all pixels in pieces, kept or only passing through,
+    /// or the smallest call there is.
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         if self.name == "call" {
             for _ in 0..self.rounds {
@@ -148,7 +158,9 @@ impl Lambda for Kernels {
         let size = frame.info().size;
         if self.name == "stream" {
             for _ in 0..self.rounds {
-                (0..size).step_by(PIECE as usize).for_each(|offset| drop(black_box(frame.read(offset, PIECE))));
+                (0..size)
+                    .step_by(PIECE as usize)
+                    .for_each(|offset| drop(black_box(frame.read(offset, PIECE))));
             }
             return Ok(());
         }
@@ -159,7 +171,8 @@ impl Lambda for Kernels {
         Ok(())
     }
 
-    /// Work without a host: `missed` rounds. What came out is told as an error, the only words that a wake returns.
+    /// Work without a host: `missed` rounds. What came out is told as an error, the only words that
+    /// a wake returns.
     fn on_tick(&mut self, tick: Tick) -> Result<()> {
         if tick.missed == 0 {
             return Ok(());

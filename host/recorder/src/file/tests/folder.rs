@@ -18,7 +18,8 @@ fn record(folder: &mut Folder, stem: &str) -> Clip {
 fn a_name_is_given_once() {
     let scratch = Scratch::new();
     let (mut folder, _) = scratch.open();
-    let files = [record(&mut folder, "a"), record(&mut folder, "a"), record(&mut folder, "../a")].map(|clip| clip.file);
+    let files = [record(&mut folder, "a"), record(&mut folder, "a"), record(&mut folder, "../a")]
+        .map(|clip| clip.file);
     assert_eq!(
         files.map(|file| file.to_str().unwrap().to_owned()),
         ["clips/a.mcap", "clips/a-2.mcap", "clips/-a.mcap"]
@@ -85,7 +86,15 @@ fn files_of_others_are_left_alone() {
     let (mut folder, _) = scratch.open();
     record(&mut folder, "a");
     drop(folder);
-    let foreign = ["notes.txt", "b.jpg", "b.jpg.part", "b.mcap", "c.mcap.part2", "c.mcap.part", ".mcap.part.swp"];
+    let foreign = [
+        "notes.txt",
+        "b.jpg",
+        "b.jpg.part",
+        "b.mcap",
+        "c.mcap.part2",
+        "c.mcap.part",
+        ".mcap.part.swp",
+    ];
     for name in foreign {
         fs::write(scratch.path("clips").join(name), b"precious").unwrap();
     }
@@ -127,17 +136,30 @@ fn a_replacement_that_dies_at_any_step_is_completed_or_never_begun() {
         steps::restart(usize::MAX);
         drop(folder);
         let (mut folder, found) = scratch.open();
-        assert!(found.is_empty(), "died after {last} steps, and {} clips are found that no list named", found.len());
+        assert!(
+            found.is_empty(),
+            "died after {last} steps, and {} clips are found that no list named",
+            found.len()
+        );
         let listed = scratch.listed();
         match listed.len() {
-            1 => assert_eq!((&listed[0], scratch.files()), (&keep, vec!["b.jpg".to_owned(), "b.mcap".to_owned()])),
-            _ => assert_eq!((listed, scratch.files().len()), (vec![a, keep, c], 6), "died after {last} steps"),
+            1 => assert_eq!(
+                (&listed[0], scratch.files()),
+                (&keep, vec!["b.jpg".to_owned(), "b.mcap".to_owned()])
+            ),
+            _ => assert_eq!(
+                (listed, scratch.files().len()),
+                (vec![a, keep, c], 6),
+                "died after {last} steps"
+            ),
         }
         // What is noted does not outlive the next clip of the same name.
         let next = record(&mut folder, "a");
         drop(folder);
         assert!(scratch.open().1.is_empty());
-        assert!(scratch.listed().contains(&next) && scratch.path(next.file.to_str().unwrap()).is_file());
+        assert!(
+            scratch.listed().contains(&next) && scratch.path(next.file.to_str().unwrap()).is_file()
+        );
         died += usize::from(replaced.is_err());
         if replaced.is_ok() {
             break;
@@ -155,7 +177,9 @@ fn a_note_of_others_deletes_no_more_than_a_list_does() {
     let victims = ["x.mcap", "clips/notes.txt"].map(|name| scratch.path(name));
     victims.iter().for_each(|victim| fs::write(victim, b"precious").unwrap());
     let files = ["clips/a.mcap", "clips/../x.mcap", "../x.mcap", "clips/notes.txt"];
-    let lines = files.map(|file| format!("{{\"file\":\"{file}\",\"thumbnail\":\"clips/../x.jpg\"}}\n")).concat();
+    let lines = files
+        .map(|file| format!("{{\"file\":\"{file}\",\"thumbnail\":\"clips/../x.jpg\"}}\n"))
+        .concat();
     fs::write(scratch.path("clips/.replaced"), lines + "no line").unwrap();
     assert!(scratch.open().1.is_empty());
     assert!(scratch.path(clip.file.to_str().unwrap()).is_file(), "the list names it");
@@ -172,11 +196,18 @@ fn lines_that_are_not_ours_stay_whatever_is_replaced() {
     let ours = fs::read_to_string(&list).unwrap();
     let (first, second) = ours.trim_end().split_once('\n').unwrap();
     // One line is longer than any of ours.
-    let foreign = ["# notes", r#"{"file":"../x.mcap","thumbnail":null}"#, "", "\u{fffd}", &"[".repeat(17 << 20)];
+    let foreign = [
+        "# notes",
+        r#"{"file":"../x.mcap","thumbnail":null}"#,
+        "",
+        "\u{fffd}",
+        &"[".repeat(17 << 20),
+    ];
     let [notes, other, empty, odd, long] = foreign;
     fs::write(&list, [notes, first, other, empty, long, second, odd, ""].join("\n")).unwrap();
     let kept = [notes, other, empty, long, odd];
-    let lines = || fs::read_to_string(&list).unwrap().lines().map(str::to_owned).collect::<Vec<_>>();
+    let lines =
+        || fs::read_to_string(&list).unwrap().lines().map(str::to_owned).collect::<Vec<_>>();
     for _ in 0..2 {
         folder.replace(std::slice::from_ref(&a)).unwrap();
         let found = lines();
@@ -195,13 +226,18 @@ fn the_longest_line_of_ours_is_read_again() {
     let (mut folder, _) = scratch.open();
     // No character takes more room in JSON than a control character.
     let name = |n: u64| format!("{}{n:04}", "\u{1}".repeat(1020));
-    let topic = |n: u64| Topic { name: name(n), type_name: name(n), definitions: None, offered_qos: None };
+    let topic =
+        |n: u64| Topic { name: name(n), type_name: name(n), definitions: None, offered_qos: None };
     assert!(topic(1).check().is_ok());
-    let counts = |n| TopicCounts { topic: name(n), type_name: Some(name(n)), ..TopicCounts::default() };
-    let attributes = || Some(serde_json::Map::from_iter([("text".to_owned(), "y".repeat(2000).into())]));
+    let counts =
+        |n| TopicCounts { topic: name(n), type_name: Some(name(n)), ..TopicCounts::default() };
+    let attributes =
+        || Some(serde_json::Map::from_iter([("text".to_owned(), "y".repeat(2000).into())]));
     let long = Ending {
         topics: (0..256).map(counts).collect(),
-        short: (0..4 * 256).map(|n| format!("there is less of {}: for a reason of many words", name(n))).collect(),
+        short: (0..4 * 256)
+            .map(|n| format!("there is less of {}: for a reason of many words", name(n)))
+            .collect(),
         moments: (0..200)
             .map(|n| Moment { label: "\u{1}".repeat(128), attributes: attributes(), ..moment(n) })
             .collect(),
@@ -222,7 +258,8 @@ fn a_hostile_list_deletes_nothing_outside() {
     let scratch = Scratch::new();
     let (mut folder, _) = scratch.open();
     let clip = record(&mut folder, "a");
-    let victims = ["x.mcap", "x.jpg", "clips/notes.txt", "clips/deep/y.mcap"].map(|name| scratch.path(name));
+    let victims =
+        ["x.mcap", "x.jpg", "clips/notes.txt", "clips/deep/y.mcap"].map(|name| scratch.path(name));
     fs::create_dir(scratch.path("clips/deep")).unwrap();
     for victim in &victims {
         fs::write(victim, b"precious").unwrap();
@@ -230,7 +267,15 @@ fn a_hostile_list_deletes_nothing_outside() {
     let absolute = scratch.path("x.mcap").to_str().unwrap().to_owned();
     let inside = scratch.path("clips/a.mcap").to_str().unwrap().to_owned();
     let mut list = OpenOptions::new().append(true).open(scratch.path("clips.jsonl")).unwrap();
-    for file in ["clips/../x.mcap", "../x.mcap", "x.mcap", "clips/notes.txt", "clips/deep/y.mcap", &absolute, &inside] {
+    for file in [
+        "clips/../x.mcap",
+        "../x.mcap",
+        "x.mcap",
+        "clips/notes.txt",
+        "clips/deep/y.mcap",
+        &absolute,
+        &inside,
+    ] {
         let line = serde_json::json!({ "file": file, "thumbnail": "clips/../x.jpg" });
         writeln!(list, "{line}").unwrap();
     }
@@ -261,17 +306,28 @@ fn a_clip_that_cannot_be_deleted_is_told_once_and_the_next_one_goes_for_it() {
     fs::rename(&stuck, &aside).unwrap();
     fs::create_dir(&stuck).unwrap();
     let told = added("c");
-    let [Loss::NotDeleted { file, why, .. }, Loss::Deleted { file: gone, .. }] = &told[..] else { panic!("{told:?}") };
+    let [Loss::NotDeleted { file, why, .. }, Loss::Deleted { file: gone, .. }] = &told[..] else {
+        panic!("{told:?}")
+    };
     assert_eq!((file.to_str(), gone.to_str()), (Some("clips/a.mcap"), Some("clips/b.mcap")));
     assert!(why.contains("cannot remove") && why.contains("a.mcap"), "{why}");
-    assert!(scratch.files().contains(&"c.mcap".to_owned()) && !scratch.files().contains(&"b.mcap".to_owned()));
+    assert!(
+        scratch.files().contains(&"c.mcap".to_owned())
+            && !scratch.files().contains(&"b.mcap".to_owned())
+    );
     // Both stay known: the bound holds as far as it can.
     let told = added("d");
-    assert!(matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/c.mcap")), "{told:?}");
+    assert!(
+        matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/c.mcap")),
+        "{told:?}"
+    );
     fs::remove_dir(&stuck).unwrap();
     fs::rename(&aside, &stuck).unwrap();
     let told = added("e");
-    assert!(matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/a.mcap")), "{told:?}");
+    assert!(
+        matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/a.mcap")),
+        "{told:?}"
+    );
     let noted = fs::read_to_string(scratch.path("losses.jsonl")).unwrap();
     let noted: Vec<Loss> = noted.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let names = noted.iter().map(|loss| match loss {

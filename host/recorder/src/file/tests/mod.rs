@@ -21,7 +21,11 @@ struct Scratch(PathBuf);
 impl Scratch {
     fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!("gleaner-recorder-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let name = format!(
+            "gleaner-recorder-{}-{}",
+            std::process::id(),
+            COUNT.fetch_add(1, Ordering::Relaxed)
+        );
         let folder = std::env::temp_dir().join(name);
         fs::create_dir(&folder).unwrap();
         Self(folder)
@@ -98,7 +102,14 @@ fn camera() -> Topic {
 
 fn meta(at_ns: i64, seq: u64) -> SampleMeta {
     let writer = Guid(*b"a writer of imus");
-    SampleMeta { at_ns, publish_ns: at_ns - 7, writer, seq, endian: Endian::Little, options: [0; 2] }
+    SampleMeta {
+        at_ns,
+        publish_ns: at_ns - 7,
+        writer,
+        seq,
+        endian: Endian::Little,
+        options: [0; 2],
+    }
 }
 
 /// The payload of message `n`: no two are equal.

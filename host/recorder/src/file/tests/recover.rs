@@ -7,7 +7,8 @@ use super::super::place::{AGAIN, CLIP, PART};
 use super::*;
 use crate::error::RecordError;
 
-/// The bytes of an unfinished clip of `messages` messages, some of them in a chunk that was not closed.
+/// The bytes of an unfinished clip of `messages` messages, some of them in a chunk that was not
+/// closed.
 fn part(messages: u64) -> Vec<u8> {
     let scratch = Scratch::new();
     let (mut folder, _) = scratch.open();
@@ -25,7 +26,8 @@ fn died(part: &[u8]) -> Scratch {
     scratch
 }
 
-/// How many messages the closed chunks of an unfinished clip of `messages` messages hold: five to a second.
+/// How many messages the closed chunks of an unfinished clip of `messages` messages hold: five to a
+/// second.
 fn closed(messages: u64) -> u64 {
     messages.saturating_sub(1) / 5 * 5
 }
@@ -59,7 +61,10 @@ fn a_recovered_clip_says_what_it_was_and_what_is_missing() {
     assert_eq!((clip.from_ns, clip.to_ns), (10 * SECOND, stamp(9)));
     assert_eq!((clip.first_ns, clip.last_ns), (Some(stamp(0)), Some(stamp(9))));
     assert_eq!((clip.triggers, clip.moments.as_slice()), (1, &[moment(12 * SECOND)][..]));
-    assert_eq!((clip.topics[0].messages, clip.topics[0].received, clip.topics[0].too_big), (10, None, None));
+    assert_eq!(
+        (clip.topics[0].messages, clip.topics[0].received, clip.topics[0].too_big),
+        (10, None, None)
+    );
     assert_eq!(clip.bytes, fs::metadata(scratch.path("clips/a.mcap")).unwrap().len());
     let recovered = clip.recovered.as_ref().unwrap();
     assert_eq!(recovered.lost_bytes, 3);
@@ -113,7 +118,8 @@ fn a_byte_flipped_anywhere_never_gives_a_broken_clip() {
     }
 }
 
-/// A whole clip, torn at every byte on its way through the disk: with its footer it is taken as it is.
+/// A whole clip, torn at every byte on its way through the disk: with its footer it is taken as it
+/// is.
 #[test]
 fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
     let source = Scratch::new();
@@ -141,7 +147,8 @@ fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
     }
 }
 
-/// A folder in which a recorder died that had finished a clip and not renamed it, the clip as it is listed then, and its bytes.
+/// A folder in which a recorder died that had finished a clip and not renamed it, the clip as it is
+/// listed then, and its bytes.
 fn died_before_the_name() -> (Scratch, Clip, Vec<u8>) {
     let source = Scratch::new();
     let (mut folder, _) = source.open();
@@ -172,8 +179,9 @@ fn a_finished_file_is_written_anew_before_it_gets_its_name() {
     ];
     steps::restart(usize::MAX);
     scratch.open();
-    let taken =
-        steps::taken().into_iter().map(|step| if step.contains("gleaner-") { "sync gleaner".into() } else { step });
+    let taken = steps::taken()
+        .into_iter()
+        .map(|step| if step.contains("gleaner-") { "sync gleaner".into() } else { step });
     assert_eq!(taken.collect::<Vec<_>>(), [&nothing[..], &expected[..]].concat());
 }
 
@@ -275,7 +283,8 @@ fn an_unfinished_clip_without_content_is_removed_and_one_of_somebody_else_is_not
 fn several_unfinished_clips_are_recovered_in_the_order_of_their_names() {
     let scratch = Scratch::new();
     let (mut folder, _) = scratch.open();
-    let mut open: Vec<Unfinished> = ["b", "a", "b"].map(|stem| folder.begin(stem, &about()).unwrap()).into();
+    let mut open: Vec<Unfinished> =
+        ["b", "a", "b"].map(|stem| folder.begin(stem, &about()).unwrap()).into();
     for clip in &mut open {
         add(clip, 0, 8);
     }
@@ -294,10 +303,16 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_keeps_nobody_fr
     for _ in 0..2 {
         let mut recovery = Folder::hold(&scratch.0).unwrap().take_left();
         let why = recovery.next(&mut || true).unwrap().unwrap_err();
-        assert!(matches!(&why, RecordError::Recover { path, .. } if path.ends_with("clips/a.mcap.part")), "{why:?}");
+        assert!(
+            matches!(&why, RecordError::Recover { path, .. } if path.ends_with("clips/a.mcap.part")),
+            "{why:?}"
+        );
     }
     let (mut folder, found) = scratch.open();
-    assert_eq!(found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(), ["clips/b.mcap"]);
+    assert_eq!(
+        found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(),
+        ["clips/b.mcap"]
+    );
     let mut next = folder.begin("a", &about()).unwrap();
     add(&mut next, 0, 6);
     assert_eq!(next.finish(ending()).unwrap().file, Path::new("clips/a-2.mcap"));
@@ -305,7 +320,10 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_keeps_nobody_fr
     assert_eq!(fs::read(scratch.path("clips/a.mcap.part")).unwrap(), part(14));
     fs::remove_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
     let (_, found) = scratch.open();
-    assert_eq!(found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(), ["clips/a.mcap"]);
+    assert_eq!(
+        found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(),
+        ["clips/a.mcap"]
+    );
 }
 
 #[test]

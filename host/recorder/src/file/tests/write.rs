@@ -40,7 +40,11 @@ fn a_clip_reads_back_byte_for_byte() {
     let other = Guid(*b"a second writer!");
     let messages = [
         (imu(), meta(10 * SECOND, 1), payload(1)),
-        (camera(), SampleMeta { endian: Endian::Big, options: [3, 4], ..meta(11 * SECOND, 5) }, vec![7; 3 << 20]),
+        (
+            camera(),
+            SampleMeta { endian: Endian::Big, options: [3, 4], ..meta(11 * SECOND, 5) },
+            vec![7; 3 << 20],
+        ),
         (imu(), SampleMeta { writer: other, ..meta(12 * SECOND, 1) }, payload(2)),
         (imu(), meta(13 * SECOND, 2), Vec::new()),
     ];
@@ -64,15 +68,24 @@ fn a_clip_reads_back_byte_for_byte() {
     assert_eq!(read.len(), messages.len());
     for ((topic, meta, cdr), found) in messages.iter().zip(&read) {
         let endian = u8::from(meta.endian == Endian::Little);
-        assert_eq!(*found.data, [&[0, endian, meta.options[0], meta.options[1]], cdr.as_slice()].concat());
-        assert_eq!((found.log_time, found.publish_time), (meta.at_ns as u64, meta.publish_ns as u64));
+        assert_eq!(
+            *found.data,
+            [&[0, endian, meta.options[0], meta.options[1]], cdr.as_slice()].concat()
+        );
+        assert_eq!(
+            (found.log_time, found.publish_time),
+            (meta.at_ns as u64, meta.publish_ns as u64)
+        );
         assert_eq!(u64::from(found.sequence), meta.seq);
         assert_eq!(found.channel.topic, topic.name);
         assert_eq!(found.channel.message_encoding, "cdr");
         assert_eq!(found.channel.metadata["gleaner.writer"], meta.writer.to_string());
         assert_eq!(found.channel.metadata.get("offered_qos_profiles"), topic.offered_qos.as_ref());
         let schema = found.channel.schema.as_ref().unwrap();
-        assert_eq!((schema.name.as_str(), schema.encoding.as_str()), (topic.type_name.as_str(), "ros2msg"));
+        assert_eq!(
+            (schema.name.as_str(), schema.encoding.as_str()),
+            (topic.type_name.as_str(), "ros2msg")
+        );
         assert_eq!(*schema.data, *topic.definitions.as_deref().unwrap_or_default().as_bytes());
     }
 }
@@ -93,8 +106,12 @@ fn a_clip_says_what_it_is() {
     assert_eq!((clip.from_ns, clip.to_ns), (10 * SECOND, 20 * SECOND));
     assert_eq!((clip.first_ns, clip.last_ns), (Some(10 * SECOND), Some(12 * SECOND)));
     assert_eq!((clip.triggers, clip.moments.len(), &clip.recovered), (2, 2, &None));
-    let topics: Vec<_> = clip.topics.iter().map(|t| (t.topic.as_str(), t.messages, t.received, t.lost)).collect();
-    assert_eq!(topics, [("/imu/data", 8, Some(9), None), ("/gone", 0, Some(0), None), ("/camera", 1, None, None)]);
+    let topics: Vec<_> =
+        clip.topics.iter().map(|t| (t.topic.as_str(), t.messages, t.received, t.lost)).collect();
+    assert_eq!(
+        topics,
+        [("/imu/data", 8, Some(9), None), ("/gone", 0, Some(0), None), ("/camera", 1, None, None)]
+    );
     assert_eq!(clip.topics[1].type_name, None);
 
     let file = fs::read(scratch.path("clips/hello-1.mcap")).unwrap();
@@ -116,9 +133,17 @@ fn a_clip_says_what_it_is() {
     assert!(!decisions[1].contains_key("score"));
 
     let summary = mcap::Summary::read(&file).unwrap().unwrap();
-    let attachments = summary.attachment_indexes.iter().map(|index| mcap::read::attachment(&file, index).unwrap());
-    let attachments: Vec<_> = attachments.map(|a| (a.name, a.media_type, a.data.into_owned())).collect();
-    let journal = ("journal/hello.journal".to_owned(), "application/octet-stream".to_owned(), b"a journal".to_vec());
+    let attachments = summary
+        .attachment_indexes
+        .iter()
+        .map(|index| mcap::read::attachment(&file, index).unwrap());
+    let attachments: Vec<_> =
+        attachments.map(|a| (a.name, a.media_type, a.data.into_owned())).collect();
+    let journal = (
+        "journal/hello.journal".to_owned(),
+        "application/octet-stream".to_owned(),
+        b"a journal".to_vec(),
+    );
     let thumbnail = ("thumbnail.jpg".to_owned(), "image/jpeg".to_owned(), b"a picture".to_vec());
     assert_eq!(attachments, [journal, thumbnail]);
 }
@@ -128,7 +153,11 @@ fn the_line_of_a_clip_keeps_a_hundred_moments_and_the_file_all() {
     let scratch = Scratch::new();
     let (mut folder, _) = scratch.open();
     let moments = (0..300).map(moment).collect();
-    let clip = folder.begin("many", &about()).unwrap().finish(Ending { moments, triggers: 500, ..ending() }).unwrap();
+    let clip = folder
+        .begin("many", &about())
+        .unwrap()
+        .finish(Ending { moments, triggers: 500, ..ending() })
+        .unwrap();
     assert_eq!((clip.moments.len(), clip.triggers), (Clip::MOMENTS_MAX, 500));
     let records = metadata(&fs::read(scratch.path("clips/many.mcap")).unwrap());
     assert_eq!(named(&records, "gleaner.decision").count(), 300);
@@ -140,9 +169,14 @@ fn a_clip_says_of_a_lambda_what_its_journal_says() {
     let (mut folder, _) = scratch.open();
     let mut header = crate::support::member("hello", (1, 1, 1), &[]).header;
     header.config.insert("limit".to_owned(), 3.into());
-    let model = |path: &str| FileDigest { path: path.to_owned(), bytes: 5, sha256: "ff".to_owned() };
+    let model =
+        |path: &str| FileDigest { path: path.to_owned(), bytes: 5, sha256: "ff".to_owned() };
     header.models = vec![model("a.onnx"), model("b.onnx")];
-    folder.begin("a", &about()).unwrap().finish(Ending { headers: vec![header.into()], ..ending() }).unwrap();
+    folder
+        .begin("a", &about())
+        .unwrap()
+        .finish(Ending { headers: vec![header.into()], ..ending() })
+        .unwrap();
     folder.begin("b", &about()).unwrap().finish(ending()).unwrap();
     let of = |name: &str| {
         let records = metadata(&fs::read(scratch.path(name)).unwrap());
@@ -170,12 +204,17 @@ fn a_topic_without_a_message_has_a_channel_all_the_same() {
     let path = scratch.path("clips/a.mcap");
     let file = fs::read(&path).unwrap();
     let channels = mcap::Summary::read(&file).unwrap().unwrap().channels;
-    let mut found: Vec<_> =
-        channels.values().map(|c| (c.topic.as_str(), c.metadata.keys().cloned().collect())).collect();
+    let mut found: Vec<_> = channels
+        .values()
+        .map(|c| (c.topic.as_str(), c.metadata.keys().cloned().collect()))
+        .collect();
     found.sort();
     let qos = || vec!["offered_qos_profiles".to_owned()];
     let writer = || vec!["gleaner.writer".to_owned()];
-    assert_eq!(found, [("/camera", vec![]), ("/imu/data", [writer(), qos()].concat()), ("/second", qos())]);
+    assert_eq!(
+        found,
+        [("/camera", vec![]), ("/imu/data", [writer(), qos()].concat()), ("/second", qos())]
+    );
     let seen = channels.values().find(|channel| channel.topic == "/camera").unwrap();
     assert_eq!(seen.schema.as_ref().unwrap().data.len(), 1 << 20);
     assert_eq!(replayed(&path).len(), 3);
@@ -217,7 +256,11 @@ fn a_chunk_spans_a_second_at_most() {
     let chunks = mcap::Summary::read(&file).unwrap().unwrap().chunk_indexes;
     // Five messages fit in a second, both ends included.
     assert_eq!(chunks.len(), 9);
-    assert!(chunks.iter().all(|chunk| chunk.message_end_time - chunk.message_start_time <= SECOND as u64));
+    assert!(
+        chunks
+            .iter()
+            .all(|chunk| chunk.message_end_time - chunk.message_start_time <= SECOND as u64)
+    );
 }
 
 #[test]
@@ -244,7 +287,8 @@ fn more_writers_than_channels_share_one_and_no_message_is_lost() {
     assert_eq!(clip.finish(ending()).unwrap().topics[0].messages, writers);
     let file = fs::read(scratch.path("clips/a.mcap")).unwrap();
     let channels = mcap::Summary::read(&file).unwrap().unwrap().channels;
-    let nameless: Vec<_> = channels.values().filter(|c| !c.metadata.contains_key("gleaner.writer")).collect();
+    let nameless: Vec<_> =
+        channels.values().filter(|c| !c.metadata.contains_key("gleaner.writer")).collect();
     assert_eq!((channels.len() as u64, nameless.len()), (writers - 2, 1));
     assert_eq!(replayed(&scratch.path("clips/a.mcap")).len() as u64, writers);
 }
@@ -260,12 +304,21 @@ fn a_full_disk_is_named_and_nothing_follows_it() {
     let place = std::sync::Arc::clone(&folder.place);
     let begun = Unfinished::begin(place, "a".to_owned(), path.clone(), full(), Some(&about()));
     let error = begun.err().expect("the disk is full");
-    assert!(matches!(&error, RecordError::Write { path: named, .. } if *named == path), "{error:?}");
-    assert_eq!(error.help().as_deref(), Some("make room on the disk, or choose another folder: --out DIR"));
+    assert!(
+        matches!(&error, RecordError::Write { path: named, .. } if *named == path),
+        "{error:?}"
+    );
+    assert_eq!(
+        error.help().as_deref(),
+        Some("make room on the disk, or choose another folder: --out DIR")
+    );
 
     let mut sink = full();
     std::io::Write::write_all(&mut sink, b"some").unwrap();
-    assert_eq!(std::io::Write::flush(&mut sink).unwrap_err().kind(), std::io::ErrorKind::StorageFull);
+    assert_eq!(
+        std::io::Write::flush(&mut sink).unwrap_err().kind(),
+        std::io::ErrorKind::StorageFull
+    );
     let again = std::io::Write::write_all(&mut sink, b"more").unwrap_err();
     assert_eq!(again.to_string(), "an earlier write to this file failed");
     assert!(scratch.listed().is_empty());

@@ -1,8 +1,10 @@
-//! Commands of people and other programs, over a topic of ROS 2: whoever writes it can have something recorded.
+//! Commands of people and other programs, over a topic of ROS 2: whoever writes it can have
+//! something recorded.
 //!
-//! A command asks for what a lambda could trigger, in the lambda's name. Who writes the topic is not known here, so nothing of a
-//! message is looked at before it is known to be short and not one of too many. What a command can cost others: the disk, within
-//! what the recorder may take, and the commands of others, which come too often with it.
+//! A command asks for what a lambda could trigger, in the lambda's name. Who writes the topic is
+//! not known here, so nothing of a message is looked at before it is known to be short and not one
+//! of too many. What a command can cost others: the disk, within what the recorder may take, and
+//! the commands of others, which come too often with it.
 //!
 //! - `order`: what one message says.
 
@@ -73,7 +75,8 @@ impl Sink for Ear {
             return Verdict::TooBig;
         }
         // Only the transport's thread is here.
-        let may = self.allowed.lock().unwrap_or_else(PoisonError::into_inner).take(1.0, Instant::now());
+        let may =
+            self.allowed.lock().unwrap_or_else(PoisonError::into_inner).take(1.0, Instant::now());
         if !may || self.messages.try_send(Message { meta: *meta, cdr: cdr.to_vec() }).is_err() {
             self.unread.too_many.fetch_add(1, Ordering::Relaxed);
             return Verdict::NoSlot;
@@ -88,9 +91,11 @@ pub(super) struct Commands {
     topic: String,
     messages: Receiver<Message>,
     unread: Arc<Unread>,
-    /// The newest of each name, also after its end: an operator need not wait for a lambda that is being started again.
+    /// The newest of each name, also after its end: an operator need not wait for a lambda that is
+    /// being started again.
     lambdas: BTreeMap<String, LambdaId>,
-    /// What runs, by lambda and label: with the lambda that it was started with, which may have ended since.
+    /// What runs, by lambda and label: with the lambda that it was started with, which may have
+    /// ended since.
     running: BTreeMap<(String, String), LambdaId>,
     accepted: u64,
     refused: u64,
@@ -103,7 +108,12 @@ impl Commands {
     pub(super) fn new(topic: String, reader: Thread) -> (Commands, Arc<dyn Sink>) {
         let (sender, messages) = sync_channel(WAITING);
         let unread = Arc::<Unread>::default();
-        let ear = Ear { allowed: Mutex::new(ALLOWED), messages: sender, unread: Arc::clone(&unread), reader };
+        let ear = Ear {
+            allowed: Mutex::new(ALLOWED),
+            messages: sender,
+            unread: Arc::clone(&unread),
+            reader,
+        };
         let commands = Commands {
             topic,
             messages,
@@ -203,7 +213,11 @@ impl Commands {
                 None => Err(CommandError::NoSuchLambda { name }),
             },
             None if known > 1 => Err(CommandError::WhichLambda { known }),
-            None => self.lambdas.first_key_value().map(|(name, id)| (name.clone(), *id)).ok_or(CommandError::NoLambdas),
+            None => self
+                .lambdas
+                .first_key_value()
+                .map(|(name, id)| (name.clone(), *id))
+                .ok_or(CommandError::NoLambdas),
         }
     }
 
@@ -232,6 +246,7 @@ impl Commands {
 
 /// An error with its cause, fit for a log.
 fn in_words(error: &CommandError) -> String {
-    let cause = std::error::Error::source(error).map(|cause| format!(": {cause}")).unwrap_or_default();
+    let cause =
+        std::error::Error::source(error).map(|cause| format!(": {cause}")).unwrap_or_default();
     visible(&format!("{error}{cause}")).chars().take(WHY_MAX).collect()
 }

@@ -59,14 +59,17 @@ struct Text {
 impl Order {
     /// What a message says, of [`MESSAGE_MAX`] bytes at most.
     pub(super) fn read(cdr: &[u8], endian: Endian) -> Result<Order, CommandError> {
-        let Text { command: kind, label, lambda, score } =
-            serde_json::from_str(text(cdr, endian)?).map_err(|source| CommandError::NoCommand { source })?;
+        let Text { command: kind, label, lambda, score } = serde_json::from_str(text(cdr, endian)?)
+            .map_err(|source| CommandError::NoCommand { source })?;
         match label.len() {
             0 => return Err(CommandError::NoLabel),
             bytes if bytes > LABEL_MAX => return Err(CommandError::LongLabel { bytes }),
             _ => {}
         }
-        Ok(Order { lambda, trigger: Trigger { kind, label, score, attributes: serde_json::Map::new() } })
+        Ok(Order {
+            lambda,
+            trigger: Trigger { kind, label, score, attributes: serde_json::Map::new() },
+        })
     }
 }
 
@@ -108,11 +111,16 @@ mod tests {
 
     #[test]
     fn a_command_is_what_a_lambda_could_trigger() {
-        let order =
-            read(r#" {"command": "start", "label": "test \u001b[2J", "lambda": "brake", "score": 1e2} "#).unwrap();
+        let order = read(
+            r#" {"command": "start", "label": "test \u001b[2J", "lambda": "brake", "score": 1e2} "#,
+        )
+        .unwrap();
         assert_eq!(order.lambda.as_deref(), Some("brake"));
         let Trigger { kind, label, score, attributes } = order.trigger;
-        assert_eq!((kind, label.as_str(), score), (TriggerKind::Start, "test \u{1b}[2J", Some(100.0)));
+        assert_eq!(
+            (kind, label.as_str(), score),
+            (TriggerKind::Start, "test \u{1b}[2J", Some(100.0))
+        );
         assert!(attributes.is_empty());
         let order = read(r#"{"label":"x","command":"event","lambda":null}"#).unwrap();
         assert_eq!((order.lambda, order.trigger.score), (None, None));
@@ -143,7 +151,10 @@ mod tests {
         let label = "é".repeat(64);
         let text = |label: &str| format!(r#"{{"command":"event","label":"{label}"}}"#);
         assert_eq!(read(&text(&label)).unwrap().trigger.label, label);
-        assert_eq!(refused(&text(&format!("{label}x"))), "its label has 129 bytes; at most 128 are allowed");
+        assert_eq!(
+            refused(&text(&format!("{label}x"))),
+            "its label has 129 bytes; at most 128 are allowed"
+        );
         assert!(matches!(read(&"[".repeat(TEXT_MAX)), Err(CommandError::NoCommand { .. })));
     }
 
@@ -151,7 +162,10 @@ mod tests {
     fn broken_messages_hold_no_text() {
         let good = message(r#"{"command":"event","label":"x"}"#);
         for len in 0..good.len() {
-            assert!(matches!(Order::read(&good[..len], Endian::Little), Err(CommandError::NoText)), "{len}");
+            assert!(
+                matches!(Order::read(&good[..len], Endian::Little), Err(CommandError::NoText)),
+                "{len}"
+            );
         }
         let filled = [&good[..], &[0; 3]].concat();
         assert!(Order::read(&filled, Endian::Little).is_ok());

@@ -1,7 +1,8 @@
-//! How clips are written: here and now, as a replay does, or by a thread of its own, so that nobody who records waits for
-//! a disk.
+//! How clips are written: here and now, as a replay does, or by a thread of its own, so that nobody
+//! who records waits for a disk.
 //!
-//! Both are the same [`Scribe`]. What is said to it is in one order, so that the files are the same.
+//! Both are the same [`Scribe`]. What is said to it is in one order, so that the files are the
+//! same.
 
 pub(super) mod part;
 mod scribe;
@@ -52,7 +53,12 @@ impl Pen {
     }
 
     /// Makes the file of a clip.
-    pub(super) fn begin(&mut self, clip: u64, stem: String, about: About) -> Result<(), RecordError> {
+    pub(super) fn begin(
+        &mut self,
+        clip: u64,
+        stem: String,
+        about: About,
+    ) -> Result<(), RecordError> {
         match self {
             Pen::Here(scribe) => scribe.begin(clip, &stem, &about),
             Pen::There(thread) => thread.begin(clip, stem, about),
@@ -125,12 +131,14 @@ impl Pen {
         }
     }
 
-    /// Whether more may be handed over. Whoever does it all the same makes the queue longer than it may be.
+    /// Whether more may be handed over. Whoever does it all the same makes the queue longer than it
+    /// may be.
     pub(super) fn has_room(&self) -> bool {
         self.in_flight() < IN_FLIGHT
     }
 
-    /// Hands over what was collected, if the thread has nothing else to do; and tells what became of clips.
+    /// Hands over what was collected, if the thread has nothing else to do; and tells what became
+    /// of clips.
     pub(super) fn poll(&mut self, outcomes: &mut Vec<Outcome>) -> Result<(), RecordError> {
         match self {
             Pen::Here(_) => Ok(()),

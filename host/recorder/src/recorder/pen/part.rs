@@ -10,8 +10,8 @@ const OVERHEAD: usize = 64;
 
 /// Wakes of one lambda, each encoded by itself; they come in any order.
 ///
-/// If there is no room for all, the last ones go: what a journal holds follows each other, so that it can be made again
-/// wake by wake.
+/// If there is no room for all, the last ones go: what a journal holds follows each other, so that
+/// it can be made again wake by wake.
 #[derive(Debug, Default)]
 pub(in crate::recorder) struct Part {
     /// By their numbers.
@@ -23,7 +23,8 @@ pub(in crate::recorder) struct Part {
 }
 
 impl Part {
-    /// Adds a wake, of which there is none with this number, if all of them take at most `most` bytes.
+    /// Adds a wake, of which there is none with this number, if all of them take at most `most`
+    /// bytes.
     pub(in crate::recorder) fn push(&mut self, number: u64, encoded: &[u8], most: usize) {
         if self.end.is_some_and(|end| number >= end) {
             self.cut += 1;
@@ -50,12 +51,16 @@ impl Part {
         self.bytes
     }
 
-    /// Keeps the longest run of wakes that follow each other, and returns how many others there were: some in between were
-    /// lost before they came here.
+    /// Keeps the longest run of wakes that follow each other, and returns how many others there
+    /// were: some in between were lost before they came here.
     pub(in crate::recorder) fn keep_run(&mut self) -> u64 {
         let (mut longest, mut run) = (0..0, 0..0);
         for number in self.wakes.keys() {
-            run = if *number == run.end && !run.is_empty() { run.start..number + 1 } else { *number..number + 1 };
+            run = if *number == run.end && !run.is_empty() {
+                run.start..number + 1
+            } else {
+                *number..number + 1
+            };
             if run.end - run.start > longest.end - longest.start {
                 longest = run.clone();
             }
@@ -79,7 +84,11 @@ impl Part {
             decoder.reset();
             writer.wake(&decoder.decode(&mut &encoded[..]).map_err(io::Error::other)?)?;
         }
-        writer.finish(&End { wakes: self.wakes.len() as u64, samples: Vec::new(), drives: Vec::new() })
+        writer.finish(&End {
+            wakes: self.wakes.len() as u64,
+            samples: Vec::new(),
+            drives: Vec::new(),
+        })
     }
 }
 
@@ -87,7 +96,8 @@ impl Part {
 mod tests {
     use super::*;
 
-    /// The numbers that a part of at most `most` bytes keeps of wakes of 36 bytes, and how many it cuts off.
+    /// The numbers that a part of at most `most` bytes keeps of wakes of 36 bytes, and how many it
+    /// cuts off.
     fn kept(numbers: impl IntoIterator<Item = u64>, most: usize) -> (Vec<u64>, u64) {
         let mut part = Part::default();
         for number in numbers {

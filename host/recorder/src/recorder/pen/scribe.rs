@@ -76,7 +76,12 @@ impl Scribe {
     }
 
     /// Makes the file of a clip.
-    pub(super) fn begin(&mut self, clip: u64, stem: &str, about: &About) -> Result<(), RecordError> {
+    pub(super) fn begin(
+        &mut self,
+        clip: u64,
+        stem: &str,
+        about: &About,
+    ) -> Result<(), RecordError> {
         let file = self.folder.begin(stem, about)?;
         self.sheet(clip).file = Some(file);
         Ok(())
@@ -128,7 +133,9 @@ impl Scribe {
                 Some(Ok(journal)) => ending.journals.push((name, journal)),
                 Some(Err(error)) => {
                     tracing::error!(lambda = %name, %error, "the journal of a clip cannot be written");
-                    ending.short.push(format!("the journal of {name} could not be written: {error}"));
+                    ending
+                        .short
+                        .push(format!("the journal of {name} could not be written: {error}"));
                 }
             }
         }
@@ -138,7 +145,8 @@ impl Scribe {
         sheet.file.expect("it was begun").finish(ending)
     }
 
-    /// Makes room for a clip that was finished, if there is a bound. What cannot be deleted stays, and is tried again with the next.
+    /// Makes room for a clip that was finished, if there is a bound. What cannot be deleted stays,
+    /// and is tried again with the next.
     pub(super) fn make_room(&mut self, clip: &Clip) -> Vec<Loss> {
         self.folder.added(clip)
     }

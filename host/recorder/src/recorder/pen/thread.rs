@@ -1,4 +1,5 @@
-//! The thread that writes clips, and what is on its way to it. It also recovers what an earlier process left, between its jobs.
+//! The thread that writes clips, and what is on its way to it. It also recovers what an earlier
+//! process left, between its jobs.
 
 use std::io;
 use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
@@ -21,7 +22,8 @@ const OVERHEAD: usize = 128;
 const JOB: usize = 4 << 10;
 /// Batches that were written and are kept for the next messages.
 const SPARE: usize = 16;
-/// How long a recovery may still take once the recording ends; what it does not reach is left for the next start.
+/// How long a recovery may still take once the recording ends; what it does not reach is left for
+/// the next start.
 const RECOVERY: Duration = Duration::from_secs(5);
 
 /// What the thread is to do.
@@ -80,7 +82,10 @@ impl Batch {
         self.bytes.len() + OVERHEAD * self.messages.len()
     }
 
-    fn each(&self, mut act: impl FnMut(&Message, &[u8]) -> Result<(), RecordError>) -> Result<(), RecordError> {
+    fn each(
+        &self,
+        mut act: impl FnMut(&Message, &[u8]) -> Result<(), RecordError>,
+    ) -> Result<(), RecordError> {
         let mut at = 0;
         for message in &self.messages {
             act(message, &self.bytes[at..at + message.len])?;
@@ -112,13 +117,16 @@ pub(in crate::recorder) struct Thread {
 
 impl Thread {
     pub(super) fn start(scribe: Scribe) -> Result<Thread, RecordError> {
-        // Neither queue has a bound of its own: what is in them is counted, and nothing is added beyond what a pen has room for.
+        // Neither queue has a bound of its own: what is in them is counted, and nothing is added
+        // beyond what a pen has room for.
         let ((jobs, inbox), (outbox, done)) = (channel(), channel());
         let until = Arc::<OnceLock<_>>::default();
         let given_up = Arc::clone(&until);
         let handle = Builder::new()
             .name("clips".to_owned())
-            .spawn(move || Writing { scribe, failed: Vec::new(), done: outbox }.run(&inbox, &given_up))
+            .spawn(move || {
+                Writing { scribe, failed: Vec::new(), done: outbox }.run(&inbox, &given_up)
+            })
             .map_err(|source| RecordError::Thread { source })?;
         let (batch, spare) = (Batch::default(), Vec::new());
         Ok(Thread {
@@ -142,7 +150,12 @@ impl Thread {
         self.is_recovering
     }
 
-    pub(super) fn begin(&mut self, clip: u64, stem: String, about: About) -> Result<(), RecordError> {
+    pub(super) fn begin(
+        &mut self,
+        clip: u64,
+        stem: String,
+        about: About,
+    ) -> Result<(), RecordError> {
         self.send(Job::Begin(clip, stem, Box::new(about)), JOB)
     }
 
@@ -217,7 +230,9 @@ impl Thread {
         self.in_flight -= cost;
         match done {
             // One that held a large message would keep its memory for nothing.
-            Done::Messages(batch) if self.spare.len() < SPARE && batch.bytes.capacity() <= 2 * BATCH => {
+            Done::Messages(batch)
+                if self.spare.len() < SPARE && batch.bytes.capacity() <= 2 * BATCH =>
+            {
                 self.spare.push(batch);
             }
             Done::Clip(outcome) => outcomes.push(outcome),
@@ -277,7 +292,8 @@ impl Writing {
     fn run(mut self, jobs: &Receiver<(usize, Job)>, until: &OnceLock<Instant>) {
         let mut recovery = self.scribe.take_left();
         while let Some(came) = recovery.next(&mut || {
-            let is_heard = std::iter::from_fn(|| jobs.try_recv().ok()).all(|(cost, job)| self.job(cost, job));
+            let is_heard =
+                std::iter::from_fn(|| jobs.try_recv().ok()).all(|(cost, job)| self.job(cost, job));
             is_heard && until.get().is_none_or(|until| Instant::now() < *until)
         }) {
             let outcome = match came {
@@ -346,7 +362,9 @@ fn act(scribe: &mut Scribe, job: Job) -> Result<Done, RecordError> {
         })?,
         Job::Messages(mut batch) => {
             let clip = batch.clip;
-            batch.each(|Message { topic, of, meta, .. }, cdr| scribe.message(clip, *topic, of, meta, cdr))?;
+            batch.each(|Message { topic, of, meta, .. }, cdr| {
+                scribe.message(clip, *topic, of, meta, cdr)
+            })?;
             batch.clear();
             return Ok(Done::Messages(batch));
         }

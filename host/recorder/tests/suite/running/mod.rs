@@ -20,8 +20,8 @@ use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
 use gleaner_recorder::program::{Options, run};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{
-    Clock, DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Subscription, TopicSpec, Transport,
-    TransportError, Verdict,
+    Clock, DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Subscription,
+    TopicSpec, Transport, TransportError, Verdict,
 };
 use sha2::{Digest, Sha256};
 
@@ -48,7 +48,13 @@ impl Network {
     pub fn add_other(&self, topic: &str, type_name: &str) {
         let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
         let definitions_text = Some("string other\n".into());
-        let other = DiscoveredTopic { topic, type_name, definitions_text, messages: None, offered_qos: None };
+        let other = DiscoveredTopic {
+            topic,
+            type_name,
+            definitions_text,
+            messages: None,
+            offered_qos: None,
+        };
         self.others.lock().unwrap().push(other);
     }
 
@@ -73,7 +79,11 @@ impl Transport for Network {
         topics
     }
 
-    fn subscribe(&mut self, spec: &TopicSpec, sink: Arc<dyn Sink>) -> Result<Subscription, TransportError> {
+    fn subscribe(
+        &mut self,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+    ) -> Result<Subscription, TransportError> {
         self.specs.lock().unwrap().push(spec.clone());
         self.loopback.subscribe(spec, sink)
     }
@@ -88,7 +98,12 @@ impl LiveSource for Network {
         self.loopback.health()
     }
 
-    fn publisher(&self, topic: &str, type_name: &str, depth: usize) -> Result<Box<dyn Publisher>, PublishError> {
+    fn publisher(
+        &self,
+        topic: &str,
+        type_name: &str,
+        depth: usize,
+    ) -> Result<Box<dyn Publisher>, PublishError> {
         self.loopback.publisher(topic, type_name, depth)
     }
 }
@@ -115,7 +130,11 @@ pub fn options(out: &Path, clock: Clock) -> Options {
 }
 
 impl Running {
-    pub fn start(scratch: &Scratch, network: &Network, change: impl FnOnce(&mut Options)) -> Running {
+    pub fn start(
+        scratch: &Scratch,
+        network: &Network,
+        change: impl FnOnce(&mut Options),
+    ) -> Running {
         let clock = Clock::of_today();
         let mut options = options(&scratch.0, clock);
         change(&mut options);
@@ -125,7 +144,13 @@ impl Running {
         let for_thread = Arc::clone(&stop);
         let thread = thread::spawn(move || {
             let reports = File::from(OwnedFd::from(writer));
-            run(options, || Ok(Box::new(network) as Box<dyn LiveSource>), stdin, reports, for_thread)
+            run(
+                options,
+                || Ok(Box::new(network) as Box<dyn LiveSource>),
+                stdin,
+                reports,
+                for_thread,
+            )
         });
         let mut running = Running { control, reports: BufReader::new(reader), thread, stop, clock };
         running.until(|report| matches!(report, RecorderReport::Ready).then_some(()));
@@ -144,7 +169,9 @@ impl Running {
     }
 
     pub fn clip(&mut self) -> Clip {
-        self.until(|report| if let RecorderReport::Clip(clip) = report { Some(*clip) } else { None })
+        self.until(
+            |report| if let RecorderReport::Clip(clip) = report { Some(*clip) } else { None },
+        )
     }
 
     pub fn status(&mut self, wanted: impl Fn(&RecorderStatus) -> bool) -> RecorderStatus {
@@ -155,7 +182,10 @@ impl Running {
     }
 
     pub fn ended(mut self) -> (RecorderStatus, Result<(), Failure>) {
-        let last = self.until(|report| if let RecorderReport::Ended(last) = report { Some(*last) } else { None });
+        let last =
+            self.until(
+                |report| if let RecorderReport::Ended(last) = report { Some(*last) } else { None },
+            );
         (last, self.thread.join().unwrap())
     }
 }
@@ -226,7 +256,11 @@ impl Sensor {
     /// The numbers of the samples of that time, both ends included.
     pub fn numbers(&self, from_ns: i64, to_ns: i64) -> Vec<u32> {
         let published = self.published.lock().unwrap();
-        published.iter().filter(|(_, at_ns)| (from_ns..=to_ns).contains(at_ns)).map(|(seq, _)| *seq as u32).collect()
+        published
+            .iter()
+            .filter(|(_, at_ns)| (from_ns..=to_ns).contains(at_ns))
+            .map(|(seq, _)| *seq as u32)
+            .collect()
     }
 }
 
@@ -239,5 +273,7 @@ impl Drop for Sensor {
 
 /// Waits for samples of `/a`.
 pub fn received(running: &mut Running, least: u64) {
-    running.status(|status| status.topics.iter().any(|topic| topic.topic == "/a" && topic.received >= least));
+    running.status(|status| {
+        status.topics.iter().any(|topic| topic.topic == "/a" && topic.received >= least)
+    });
 }

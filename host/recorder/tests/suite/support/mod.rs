@@ -123,7 +123,8 @@ impl Drop for Scratch {
 pub type Message = (String, i64, u32, Vec<u8>);
 
 pub fn topic(name: &str) -> Topic {
-    let type_name = if name.starts_with("/camera") { "sensor_msgs/msg/Image" } else { "test_msgs/msg/Number" };
+    let type_name =
+        if name.starts_with("/camera") { "sensor_msgs/msg/Image" } else { "test_msgs/msg/Number" };
     Topic {
         name: name.to_owned(),
         type_name: type_name.to_owned(),
@@ -185,7 +186,14 @@ cooldown = "{cooldown}ms"
 }
 
 pub fn meta(at_ns: i64, seq: u64) -> SampleMeta {
-    SampleMeta { at_ns, publish_ns: at_ns, writer: Guid([7; 16]), seq, endian: Endian::Little, options: [0; 2] }
+    SampleMeta {
+        at_ns,
+        publish_ns: at_ns,
+        writer: Guid([7; 16]),
+        seq,
+        endian: Endian::Little,
+        options: [0; 2],
+    }
 }
 
 pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> Entry {
@@ -206,8 +214,8 @@ pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> Entry {
     }
 }
 
-/// A sample every `every_ms` on each topic, from `T0 + from_ms` to before `T0 + to_ms`; numbered by its ms. Each of
-/// `wakes` wakes a lambda after the samples of its ms.
+/// A sample every `every_ms` on each topic, from `T0 + from_ms` to before `T0 + to_ms`; numbered by
+/// its ms. Each of `wakes` wakes a lambda after the samples of its ms.
 pub fn drive(
     recorder: &mut Recorder,
     topics: &[TopicId],

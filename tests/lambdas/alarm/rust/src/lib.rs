@@ -1,4 +1,5 @@
-//! A lambda that triggers at the times that its configuration says, so that a test knows the windows.
+//! A lambda that triggers at the times that its configuration says, so that a test knows the
+//! windows.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, now_ns, start, stop};
 
@@ -12,7 +13,12 @@ struct Alarm {
 impl Lambda for Alarm {
     fn init(config: &Config) -> Result<Self> {
         let times = |key: &str| times(config.text(key)?);
-        Ok(Self { first_ns: None, events: times("event_s")?, starts: times("start_s")?, stops: times("stop_s")? })
+        Ok(Self {
+            first_ns: None,
+            events: times("event_s")?,
+            starts: times("start_s")?,
+            stops: times("stop_s")?,
+        })
     }
 
     fn on_event(&mut self, _sample: Sample) -> Result<()> {
@@ -33,10 +39,12 @@ impl Lambda for Alarm {
 
 /// Times in ns, the earliest last.
 fn times(text: &str) -> Result<Vec<i64>> {
-    let seconds = text.split(',').filter(|part| !part.is_empty()).map(|part| part.trim().parse::<f64>());
+    let seconds =
+        text.split(',').filter(|part| !part.is_empty()).map(|part| part.trim().parse::<f64>());
     let times = seconds.map(|second| second.map(|second| (second * 1e9) as i64));
-    let mut times: Vec<_> =
-        times.collect::<core::result::Result<_, _>>().map_err(|error| Error::new(error.to_string()))?;
+    let mut times: Vec<_> = times
+        .collect::<core::result::Result<_, _>>()
+        .map_err(|error| Error::new(error.to_string()))?;
     times.sort_by_key(|time| std::cmp::Reverse(*time));
     Ok(times)
 }

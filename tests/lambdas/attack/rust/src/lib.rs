@@ -1,8 +1,8 @@
-//! A lambda that attacks whatever is around it, once, in its third wake. It says with an event what came of that: `refused` with
-//! the error, or `escaped`.
+//! A lambda that attacks whatever is around it, once, in its third wake. It says with an event what
+//! came of that: `refused` with the error, or `escaped`.
 //!
-//! For a bench it attacks again and again instead: every other `every_ms` milliseconds of the day's time. Two good wakes come before
-//! each attack that is a fault, so that it is never made to rest.
+//! For a bench it attacks again and again instead: every other `every_ms` milliseconds of the day's
+//! time. Two good wakes come before each attack that is a fault, so that it is never made to rest.
 
 use std::time::Duration;
 

@@ -1,14 +1,19 @@
-//! A lambda that makes the calls which the bytes of a sample say, with whatever arguments: the host must stay whole.
+//! A lambda that makes the calls which the bytes of a sample say, with whatever arguments: the host
+//! must stay whole.
 //!
-//! A program is a list of steps (`tests/operations`): a byte for the call, then what it takes. What a call gives is kept, and later steps take from it by
-//! number, so that they come in every order. What is missing at the end of the bytes is 0. Refusals are expected; a step that says so
-//! ends in a panic instead.
+//! A program is a list of steps (`tests/operations`): a byte for the call, then what it takes. What
+//! a call gives is kept, and later steps take from it by number, so that they come in every order.
+//! What is missing at the end of the bytes is 0. Refusals are expected; a step that says so ends in
+//! a panic instead.
 
 use gleaner_operations::{Extra, Operation, Step};
 use gleaner_sdk::data::{Frame, Roi};
 use gleaner_sdk::inference::{DetectOptions, Model, Preprocess, Tensor};
 use gleaner_sdk::log::{error, trace, warn};
-use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, inputs, now_ns, scratch, start, stop};
+use gleaner_sdk::{
+    Config, Field, Lambda, Result, Sample, Topic, event, input, inputs, now_ns, scratch, start,
+    stop,
+};
 
 /// Steps of one wake: more would only use up its fuel.
 const STEPS: usize = 256;
@@ -68,9 +73,15 @@ impl Kept {
             Operation::RosTopic => drop(of(&self.topics, bytes).map(Topic::ros_topic)),
             Operation::TypeName => drop(of(&self.topics, bytes).map(Topic::type_name)),
             Operation::TopicCounts => drop(of(&self.topics, bytes).map(Topic::counts)),
-            Operation::Newest => self.samples.extend(of(&self.topics, bytes).and_then(Topic::newest)),
-            Operation::Last => keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.last(bytes.u32()))),
-            Operation::Since => keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.since(bytes.i64()))),
+            Operation::Newest => {
+                self.samples.extend(of(&self.topics, bytes).and_then(Topic::newest))
+            }
+            Operation::Last => {
+                keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.last(bytes.u32())))
+            }
+            Operation::Since => {
+                keep(&mut self.samples, of(&self.topics, bytes).map(|it| it.since(bytes.i64())))
+            }
             Operation::Field => self.fields.extend(of(&self.topics, bytes).and_then(|it| {
                 match bytes.u8() % 2 {
                     0 => it.field(bytes.path()),
@@ -78,7 +89,9 @@ impl Kept {
                 }
                 .ok()
             })),
-            Operation::Column => drop(self.both(bytes).map(|(topic, field)| topic.column(field, bytes.u32()))),
+            Operation::Column => {
+                drop(self.both(bytes).map(|(topic, field)| topic.column(field, bytes.u32())))
+            }
             Operation::ColumnSince => {
                 drop(self.both(bytes).map(|(topic, field)| topic.column_since(field, bytes.i64())));
             }
@@ -88,14 +101,24 @@ impl Kept {
             Operation::Size => drop(of(&self.samples, bytes).map(Sample::size)),
             Operation::BigEndian => drop(of(&self.samples, bytes).map(Sample::big_endian)),
             Operation::Get => drop(self.reading(bytes).map(|(sample, field)| sample.get(field))),
-            Operation::Number => drop(self.reading(bytes).map(|(sample, field)| sample.number(field))),
-            Operation::Cdr => drop(of(&self.samples, bytes).map(|it| it.cdr(bytes.u64(), bytes.u32()))),
-            Operation::AsFrame => self.frames.extend(of(&self.samples, bytes).and_then(|it| it.as_frame().ok())),
+            Operation::Number => {
+                drop(self.reading(bytes).map(|(sample, field)| sample.number(field)))
+            }
+            Operation::Cdr => {
+                drop(of(&self.samples, bytes).map(|it| it.cdr(bytes.u64(), bytes.u32())))
+            }
+            Operation::AsFrame => {
+                self.frames.extend(of(&self.samples, bytes).and_then(|it| it.as_frame().ok()))
+            }
             Operation::Info => drop(of(&self.frames, bytes).map(Frame::info)),
             Operation::FrameIdentity => drop(of(&self.frames, bytes).map(Frame::identity)),
             Operation::FrameStamps => drop(of(&self.frames, bytes).map(Frame::stamps)),
-            Operation::MeanLuma => drop(of(&self.frames, bytes).map(|it| it.mean_luma(bytes.roi()))),
-            Operation::Histogram => drop(of(&self.frames, bytes).map(|it| it.histogram(bytes.roi()))),
+            Operation::MeanLuma => {
+                drop(of(&self.frames, bytes).map(|it| it.mean_luma(bytes.roi())))
+            }
+            Operation::Histogram => {
+                drop(of(&self.frames, bytes).map(|it| it.histogram(bytes.roi())))
+            }
             Operation::Resize => self.frames.extend(of(&self.frames, bytes).and_then(|it| {
                 let [width, height] = match bytes.u8() % 2 {
                     0 => [bytes.u8().into(), bytes.u8().into()],
@@ -103,22 +126,30 @@ impl Kept {
                 };
                 it.resize(width, height).ok()
             })),
-            Operation::ToGray => self.frames.extend(of(&self.frames, bytes).and_then(|it| it.to_gray().ok())),
-            Operation::Read => drop(of(&self.frames, bytes).map(|it| it.read(bytes.u64(), bytes.u32()))),
+            Operation::ToGray => {
+                self.frames.extend(of(&self.frames, bytes).and_then(|it| it.to_gray().ok()))
+            }
+            Operation::Read => {
+                drop(of(&self.frames, bytes).map(|it| it.read(bytes.u64(), bytes.u32())))
+            }
             Operation::Event => drop(event(&bytes.text(), bytes.f64()).send()),
             Operation::Start => drop(start(&bytes.text()).with("k", bytes.u8() > 0).send()),
             Operation::Stop => drop(stop(&bytes.text())),
             Operation::Log => [error, warn, trace][usize::from(bytes.u8() % 3)](&bytes.text()),
             Operation::FromValues => {
                 let shape = [bytes.u32(), bytes.u32()];
-                self.tensors.extend(Tensor::from_values(&shape, &vec![0.5; usize::from(bytes.u16())]));
+                self.tensors
+                    .extend(Tensor::from_values(&shape, &vec![0.5; usize::from(bytes.u16())]));
             }
             Operation::FromFrame => {
-                let made = of(&self.frames, bytes).map(|it| Tensor::from_frame(it, bytes.preprocess()));
+                let made =
+                    of(&self.frames, bytes).map(|it| Tensor::from_frame(it, bytes.preprocess()));
                 self.tensors.extend(made.and_then(Result::ok));
             }
             Operation::Shape => drop(of(&self.tensors, bytes).map(Tensor::shape)),
-            Operation::TensorRead => drop(of(&self.tensors, bytes).map(|it| it.read(bytes.u64(), bytes.u32()))),
+            Operation::TensorRead => {
+                drop(of(&self.tensors, bytes).map(|it| it.read(bytes.u64(), bytes.u32())))
+            }
             Operation::Open => self.models.extend(Model::open(&bytes.text())),
             Operation::Run => {
                 let tensors: Vec<_> = of(&self.tensors, bytes).into_iter().collect();
@@ -128,10 +159,18 @@ impl Kept {
                 let frame = of(&self.frames, bytes);
                 let (min_score, max_iou, max_count) = (0.0, f32::NAN, bytes.u32());
                 let options = DetectOptions { classes: Vec::new(), min_score, max_iou, max_count };
-                drop(of(&self.models, bytes).zip(frame).map(|(it, frame)| it.detect(frame, &options)));
+                drop(
+                    of(&self.models, bytes)
+                        .zip(frame)
+                        .map(|(it, frame)| it.detect(frame, &options)),
+                );
             }
-            Operation::ScratchPut => drop(scratch::put(bytes.name(), &vec![1; bytes.u32() as usize % TEXT])),
-            Operation::Append => drop(scratch::append(bytes.name(), &vec![2; usize::from(bytes.u16())])),
+            Operation::ScratchPut => {
+                drop(scratch::put(bytes.name(), &vec![1; bytes.u32() as usize % TEXT]))
+            }
+            Operation::Append => {
+                drop(scratch::append(bytes.name(), &vec![2; usize::from(bytes.u16())]))
+            }
             Operation::ScratchGet => drop(scratch::get(bytes.name(), bytes.u64(), bytes.u32())),
             Operation::Remove => drop(scratch::remove(bytes.name())),
             Operation::Entries => drop(scratch::entries()),
@@ -147,21 +186,32 @@ impl Kept {
             Extra::ForgetSample => forget(&mut self.samples, bytes),
             Extra::ForgetFrame => forget(&mut self.frames, bytes),
             Extra::EventWithTexts => {
-                drop(event("e", 0.5).with(&bytes.text(), bytes.f64()).with(&bytes.text(), &*bytes.text()).send());
+                drop(
+                    event("e", 0.5)
+                        .with(&bytes.text(), bytes.f64())
+                        .with(&bytes.text(), &*bytes.text())
+                        .send(),
+                );
             }
             Extra::EventWithMany => {
-                let many =
-                    (0..bytes.u8()).fold(event("many", 1.0), |event, key| event.with(&key.to_string(), i64::MIN));
+                let many = (0..bytes.u8())
+                    .fold(event("many", 1.0), |event, key| event.with(&key.to_string(), i64::MIN));
                 drop(many.send());
             }
             Extra::ColumnAtOnce => {
-                drop(of(&self.topics, bytes).map(|it| it.column(&it.field(bytes.path())?, u32::MAX)));
+                drop(
+                    of(&self.topics, bytes).map(|it| it.column(&it.field(bytes.path())?, u32::MAX)),
+                );
             }
             Extra::ScratchPutText => drop(scratch::put(&bytes.text(), b"")),
             Extra::Print => println!("{}", bytes.text()),
             Extra::PrintError => eprint!("{}", bytes.text()),
-            Extra::Allocate => drop(std::hint::black_box(vec![0_u8; bytes.u32() as usize % (8 << 20)])),
-            Extra::Wasi => drop((std::fs::read("/"), std::time::SystemTime::now(), std::time::Instant::now())),
+            Extra::Allocate => {
+                drop(std::hint::black_box(vec![0_u8; bytes.u32() as usize % (8 << 20)]))
+            }
+            Extra::Wasi => {
+                drop((std::fs::read("/"), std::time::SystemTime::now(), std::time::Instant::now()))
+            }
             Extra::Panic if bytes.u8() == 0xba => panic!("{}", bytes.text()),
             Extra::Exit if bytes.u8() == 0xba => std::process::exit(i32::from(bytes.u8())),
             Extra::Panic | Extra::Exit => {}
@@ -242,7 +292,16 @@ impl Bytes<'_> {
     }
 
     fn path(&mut self) -> &'static str {
-        let paths = ["data", "data[3]", "width", "header.frame_id", "header.stamp.sec", "format", "step", "encoding"];
+        let paths = [
+            "data",
+            "data[3]",
+            "width",
+            "header.frame_id",
+            "header.stamp.sec",
+            "format",
+            "step",
+            "encoding",
+        ];
         paths[usize::from(self.u8()) % paths.len()]
     }
 
@@ -260,7 +319,15 @@ impl Bytes<'_> {
     fn preprocess(&mut self) -> Preprocess {
         let (width, height, fill) = (self.u32(), self.u32(), self.u8());
         let (mean, scale) = ((0.0, 0.0, 0.0), (f32::NAN, 1.0, 1.0));
-        Preprocess { width, height, letterbox: fill > 99, fill, bgr: fill.is_multiple_of(2), mean, scale }
+        Preprocess {
+            width,
+            height,
+            letterbox: fill > 99,
+            fill,
+            bgr: fill.is_multiple_of(2),
+            mean,
+            scale,
+        }
     }
 }
 

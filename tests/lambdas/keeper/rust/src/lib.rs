@@ -1,4 +1,5 @@
-//! Counts its wakes in scratch, fills that up, and faults in every third wake. Its twin must say the same.
+//! Counts its wakes in scratch, fills that up, and faults in every third wake. Its twin must say
+//! the same.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Tick, event, scratch};
 

@@ -1,4 +1,5 @@
-//! Says what every kernel of the SDK makes of made-up pixels and signals: a test calls [`results`] natively and compares.
+//! Says what every kernel of the SDK makes of made-up pixels and signals: a test calls [`results`]
+//! natively and compares.
 
 use gleaner_sdk::data::{Encoding, Roi, encoding_name};
 use gleaner_sdk::kernels::fft::{Real, Spectrum, band_power};
@@ -21,22 +22,33 @@ pub struct Made {
 ///
 /// None, if the kernels are right.
 pub fn results() -> Result<Vec<Made>> {
-    let mut kernels = [Digest::of("mean_luma"), Digest::of("mean_rgb"), Digest::of("to_gray"), Digest::of("histogram")];
+    let mut kernels = [
+        Digest::of("mean_luma"),
+        Digest::of("mean_rgb"),
+        Digest::of("to_gray"),
+        Digest::of("histogram"),
+    ];
     let mut smaller = Digest::of("downscale");
-    for (width, height, padding) in [(1, 1, 0), (31, 7, 2), (97, 33, 5), (640, 3, 0), (8400, 2, 1)] {
+    for (width, height, padding) in [(1, 1, 0), (31, 7, 2), (97, 33, 5), (640, 3, 0), (8400, 2, 1)]
+    {
         let bytes = noise((3 * width + padding) * height);
         for encoding in [Encoding::Rgb8, Encoding::Bgr8, Encoding::Mono8] {
             let whole = Image::new(width, height, 3 * width + padding, encoding, &bytes)?;
-            let part = whole.part(Roi { x: width / 3, y: height / 2, width: width / 2 + 1, height })?;
+            let part =
+                whole.part(Roi { x: width / 3, y: height / 2, width: width / 2 + 1, height })?;
             for image in [whole, part] {
                 let (width, height) = (image.width(), image.height());
                 let mut grey = vec![0; (width * height) as usize];
                 luma::to_gray(&image, &mut grey)?;
                 kernels[0].add(&luma::mean_luma(&image).to_bits().to_le_bytes());
-                kernels[1].add(mean::mean_rgb(&image).map(|mean| mean.to_bits().to_le_bytes()).as_flattened());
+                kernels[1].add(
+                    mean::mean_rgb(&image).map(|mean| mean.to_bits().to_le_bytes()).as_flattened(),
+                );
                 kernels[2].add(&grey);
                 kernels[3].add(histogram::histogram(&image).map(u32::to_le_bytes).as_flattened());
-                for (width, height) in [(width, height), (width.div_ceil(2), height.div_ceil(2)), (1 + width / 5, 1)] {
+                for (width, height) in
+                    [(width, height), (width.div_ceil(2), height.div_ceil(2)), (1 + width / 5, 1)]
+                {
                     let mut out = vec![0; downscale::downscaled(&image, width, height)?];
                     downscale::downscale(&image, width, height, &mut out)?;
                     smaller.add(encoding_name(encoding).as_bytes());
@@ -56,7 +68,10 @@ pub fn results() -> Result<Vec<Made>> {
 fn signal_mean() -> Made {
     let mut digest = Digest::of("mean");
     for count in [1, 15, 16, 50, 1001] {
-        let values = noise(count).into_iter().map(|byte| (f64::from(byte) - 128.0) / 7.0).collect::<Vec<_>>();
+        let values = noise(count)
+            .into_iter()
+            .map(|byte| (f64::from(byte) - 128.0) / 7.0)
+            .collect::<Vec<_>>();
         digest.add(&mean::mean(&values).unwrap_or_default().to_bits().to_le_bytes());
     }
     digest.made()
@@ -98,7 +113,8 @@ impl Digest {
     }
 
     fn add(&mut self, bytes: &[u8]) {
-        let step = |state: u64, byte: &u8| (state ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
+        let step =
+            |state: u64, byte: &u8| (state ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
         self.state = bytes.iter().fold(self.state, step);
     }
 

@@ -64,7 +64,9 @@ impl Lambda for Misbehave {
             // Which NaN it is depends on the processor.
             "nan_bits" => {
                 let [a, b] = std::hint::black_box([0.0_f64, 0.0]);
-                event("nan", 0.0).with("bits", format!("{:016x}", (a / b).to_bits()).as_str()).send()?;
+                event("nan", 0.0)
+                    .with("bits", format!("{:016x}", (a / b).to_bits()).as_str())
+                    .send()?;
             }
             "hold" => self.held.push(sample),
             "measure" => {

@@ -1,9 +1,11 @@
-//! Calls every function of the interface and says what it answers. Its twin must be answered the same.
+//! Calls every function of the interface and says what it answers. Its twin must be answered the
+//! same.
 
 use gleaner_sdk::data::{Roi, Value, encoding_name};
 use gleaner_sdk::inference::{Model, Preprocess, Tensor};
 use gleaner_sdk::{
-    Config, Error, Field, Lambda, Result, Sample, Topic, event, input, inputs, log, now_ns, start, stop,
+    Config, Error, Field, Lambda, Result, Sample, Topic, event, input, inputs, log, now_ns, start,
+    stop,
 };
 
 /// The lambda.
@@ -21,7 +23,11 @@ pub struct Probe {
 impl Lambda for Probe {
     fn init(config: &Config) -> Result<Self> {
         let right = config.real("number")? == 1.5 && config.integer("count")? == 3;
-        if !(right && config.boolean("yes")? && config.text("word")? == "probe" && inputs() == ["camera", "imu"]) {
+        if !(right
+            && config.boolean("yes")?
+            && config.text("word")? == "probe"
+            && inputs() == ["camera", "imu"])
+        {
             return Err(Error::new(format!("unexpected {config:?}")));
         }
         let (camera, imu) = (input("camera")?, input("imu")?);
@@ -57,9 +63,13 @@ impl Probe {
         let counts = self.imu.counts();
         let newest = self.imu.newest().ok_or(Error::new("no sample"))?;
         let since = newest.stamps().at_ns - 50_000_000;
-        let (last, later) = (self.imu.column(&self.forward, 5)?, self.imu.column_since(&self.forward, since)?);
+        let (last, later) =
+            (self.imu.column(&self.forward, 5)?, self.imu.column_since(&self.forward, since)?);
         event("topic", newest.number(&self.forward)?)
-            .with("names", [self.imu.name(), self.imu.ros_topic(), self.imu.type_name()].join(" ").as_str())
+            .with(
+                "names",
+                [self.imu.name(), self.imu.ros_topic(), self.imu.type_name()].join(" ").as_str(),
+            )
             .with("received", counts.received as i64)
             .with("overwritten", counts.overwritten as i64)
             .with("refused", (counts.no_slot + counts.too_big + counts.skipped) as i64)
@@ -67,7 +77,10 @@ impl Probe {
             .with("last", last.values[0])
             .with("last_at", last.at_ns[0])
             .with("since", later.values.len() as i64)
-            .with("samples", self.imu.last(7).map(|sample| sample.identity().seq as i64).sum::<i64>())
+            .with(
+                "samples",
+                self.imu.last(7).map(|sample| sample.identity().seq as i64).sum::<i64>(),
+            )
             .with("samples_since", self.imu.since(since).len() as i64)
             .send()
     }
@@ -75,13 +88,24 @@ impl Probe {
     fn samples(&self, sample: &Sample) -> Result<()> {
         let (identity, stamps) = (sample.identity(), sample.stamps());
         let imu = self.imu.newest().ok_or(Error::new("no sample"))?;
-        let Value::Numbers(covariance) = imu.get(&self.covariance)? else { return Err(Error::new("no numbers")) };
-        let Value::Text(frame_id) = imu.get(&self.frame_id)? else { return Err(Error::new("no text")) };
-        let Value::Unsigned(nanosec) = imu.get(&self.stamp)? else { return Err(Error::new("no number")) };
-        let Value::Bytes(data) = sample.get(&self.data)? else { return Err(Error::new("no bytes")) };
+        let Value::Numbers(covariance) = imu.get(&self.covariance)? else {
+            return Err(Error::new("no numbers"));
+        };
+        let Value::Text(frame_id) = imu.get(&self.frame_id)? else {
+            return Err(Error::new("no text"));
+        };
+        let Value::Unsigned(nanosec) = imu.get(&self.stamp)? else {
+            return Err(Error::new("no number"));
+        };
+        let Value::Bytes(data) = sample.get(&self.data)? else {
+            return Err(Error::new("no bytes"));
+        };
         event("sample", sample.size() as f64)
             .with("topic", identity.topic.as_str())
-            .with("writer", format!("{:016x}{:016x}", identity.writer.high, identity.writer.low).as_str())
+            .with(
+                "writer",
+                format!("{:016x}{:016x}", identity.writer.high, identity.writer.low).as_str(),
+            )
             .with("seq", identity.seq as i64)
             .with("at", stamps.at_ns)
             .with("published", stamps.publish_ns)
@@ -100,7 +124,8 @@ impl Probe {
         let frame = sample.as_frame()?;
         let info = frame.info();
         let corner = Some(Roi { x: 10, y: 20, width: 33, height: 44 });
-        let histogram = frame.histogram(corner)?.into_iter().flat_map(u32::to_le_bytes).collect::<Vec<_>>();
+        let histogram =
+            frame.histogram(corner)?.into_iter().flat_map(u32::to_le_bytes).collect::<Vec<_>>();
         let (small, gray) = (frame.resize(60, 40)?, frame.to_gray()?);
         let mut pixels = vec![0; gray.info().size as usize];
         gray.copy_to(&mut pixels)?;
@@ -124,14 +149,25 @@ impl Probe {
     fn refusals(&self, sample: &Sample) -> Result<()> {
         let frame = sample.as_frame()?;
         let (mean, scale) = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0));
-        let how = Preprocess { width: 8, height: 8, letterbox: false, fill: 114, bgr: false, mean, scale };
+        let how = Preprocess {
+            width: 8,
+            height: 8,
+            letterbox: false,
+            fill: 114,
+            bgr: false,
+            mean,
+            scale,
+        };
         event("refusals", 0.0)
             .with("input", kind(input("nothing")))
             .with("field", kind(self.imu.field("nothing")))
             .with("other", kind(self.camera.column(&self.forward, 1)))
             .with("text", kind(self.imu.column(&self.frame_id, 1)))
             .with("image", kind(self.imu.newest().ok_or(Error::new("no sample"))?.as_frame()))
-            .with("outside", kind(frame.mean_luma(Some(Roi { x: 9999, y: 0, width: 1, height: 1 }))))
+            .with(
+                "outside",
+                kind(frame.mean_luma(Some(Roi { x: 9999, y: 0, width: 1, height: 1 }))),
+            )
             .with("size", kind(frame.resize(0, 1)))
             .with("room", kind(frame.resize(16_384, 16_384)))
             .with("label", kind(event("", 0.0).send()))
@@ -149,7 +185,11 @@ fn kind<T>(answer: Result<T>) -> &'static str {
 }
 
 fn fnv1a(bytes: &[u8]) -> i64 {
-    i64::from(bytes.iter().fold(0x811c_9dc5, |hash: u32, byte| (hash ^ u32::from(*byte)).wrapping_mul(0x0100_0193)))
+    i64::from(
+        bytes.iter().fold(0x811c_9dc5, |hash: u32, byte| {
+            (hash ^ u32::from(*byte)).wrapping_mul(0x0100_0193)
+        }),
+    )
 }
 
 gleaner_sdk::lambda!(Probe);

@@ -1,4 +1,5 @@
-//! A lambda that is slower than its camera, or keeps what it sees. The host must neither fall behind nor lose anything uncounted.
+//! A lambda that is slower than its camera, or keeps what it sees. The host must neither fall
+//! behind nor lose anything uncounted.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, Topic, event, input};
 
@@ -7,7 +8,8 @@ struct Slow {
     rounds: i64,
     camera: Topic,
     kept: Vec<Sample>,
-    /// Samples received less the number of the newest, at the least: one that is lost has a number, too.
+    /// Samples received less the number of the newest, at the least: one that is lost has a number,
+    /// too.
     least: i64,
 }
 
@@ -24,7 +26,8 @@ impl Lambda for Slow {
     }
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
-        let ahead = self.camera.counts().received.cast_signed() - sample.identity().seq.cast_signed();
+        let ahead =
+            self.camera.counts().received.cast_signed() - sample.identity().seq.cast_signed();
         self.least = self.least.min(ahead);
         // One may arrive between being chosen and being looked at.
         if ahead - self.least > 1 {

@@ -1,4 +1,5 @@
-//! Says at each tick what time it is, what it missed, and the newest acceleration. Its twin must say the same.
+//! Says at each tick what time it is, what it missed, and the newest acceleration. Its twin must
+//! say the same.
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Tick, Topic, event, input, now_ns};
 
