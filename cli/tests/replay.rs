@@ -11,7 +11,7 @@ use gleaner_protocol::Summary;
 
 const SUMMARY: &str = concat!(
     r#"{"lambda":"x","version":"0.1.0","kind":"wasm","drive":["a.mcap"],"out":"OUT","wakes":2,"triggers":1,"faults":0,"#,
-    r#""skipped":0,"missed_ticks":0,"out_of_order":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"passed_over":0,"start_ns":0,"#,
+    r#""skipped":0,"missed_ticks":0,"out_of_order":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,"start_ns":0,"#,
     r#""end_ns":3000000000,"wall_s":0.5,"run_s":0.25,"decode_s":0.0,"wakes_per_s":4.0,"peak_rss_bytes":1048576,"topics":[],"clips":0,"clips_replaced":0,"in_cooldown":0,"ignored":0,"damaged":null}"#
 );
 const DECISION: &str = concat!(

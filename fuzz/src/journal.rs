@@ -76,8 +76,8 @@ fn file(bytes: &[u8]) -> bool {
             assert_eq!(*first, again);
         }
     }
-    assert!(failed.is_none() || !reader.cut_off() && reader.end().is_none());
-    assert!(failed.is_some() || reader.cut_off() != reader.end().is_some());
+    assert!(failed.is_none() || !reader.truncated() && reader.end().is_none());
+    assert!(failed.is_some() || reader.truncated() != reader.end().is_some());
     assert!(reader.torn_bytes() <= bytes.len() as u64);
     let end =
         reader.end().cloned().unwrap_or(End { wakes: entries.len() as u64, ..End::default() });

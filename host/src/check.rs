@@ -143,8 +143,8 @@ fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>),
 fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
     let limits = &manifest.limits;
     let mut needs = Vec::new();
-    let mut need = |place, at_once, purpose: String, bytes| {
-        needs.push(Need { purpose, bytes, place, at_once })
+    let mut need = |place, preallocated, purpose: String, bytes| {
+        needs.push(Need { purpose, bytes, place, preallocated })
     };
     for input in &manifest.inputs {
         let (name, slots) = (&input.name, live_slots(input));
@@ -189,11 +189,16 @@ fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
         unfinished,
     );
     if let Some(record) = &manifest.record {
-        let (place, at_once) = match record.store {
+        let (place, preallocated) = match record.store {
             Store::Ram => (Place::Memory, true),
             Store::Disk => (Place::Disk, false),
         };
-        need(place, at_once, "recorder: preroll".to_owned(), Some(record.preroll_size.bytes()));
+        need(
+            place,
+            preallocated,
+            "recorder: preroll".to_owned(),
+            Some(record.preroll_size.bytes()),
+        );
         need(
             Place::Memory,
             false,

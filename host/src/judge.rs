@@ -25,7 +25,7 @@ impl Judge {
 
     /// Returns whether to skip this wake. A lambda that rests after faults skips it, and it is
     /// counted. So does a worker that had no room for the sample, which the worker counts.
-    pub fn passes_over(&mut self, wake: &Wake) -> bool {
+    pub fn is_backing_off(&mut self, wake: &Wake) -> bool {
         let rests = self.faults.rests(wake.at_ns());
         if rests {
             self.session.pass_over();
@@ -149,7 +149,7 @@ mod tests {
         let due = (from_ms..to_ms).step_by(10);
         due.filter(|ms| {
             let at_ns = ms * MS;
-            let runs = !judge.passes_over(&tick(at_ns));
+            let runs = !judge.is_backing_off(&tick(at_ns));
             if runs {
                 judge.judge(tick(at_ns));
             }
@@ -163,7 +163,7 @@ mod tests {
         let (mut judge, session) = room(i64::MAX);
         let first = runs(&mut judge, 0, 2000);
         assert_eq!(first, [0, 10, 20, 30, 40, 50, 60, 70, 170, 370, 770, 1570]);
-        assert_eq!(session.passed_over(), 200 - 12);
+        assert_eq!(session.backed_off(), 200 - 12);
         // The longest rest is 10 s.
         assert_eq!(
             runs(&mut judge, 2000, 60_000),

@@ -102,7 +102,7 @@ impl<R: Read> Reader<R> {
     }
 
     /// The next wake; `None` after the last one that is whole. Then [`end`](Self::end) and
-    /// [`cut_off`](Self::cut_off) tell whether the writer came to its end.
+    /// [`truncated`](Self::truncated) tell whether the writer came to its end.
     ///
     /// # Errors
     ///
@@ -143,7 +143,7 @@ impl<R: Read> Reader<R> {
     }
 
     /// Whether the journal has no end: its writer died. Known after the last wake.
-    pub fn cut_off(&self) -> bool {
+    pub fn truncated(&self) -> bool {
         matches!(self.state, State::CutOff { .. })
     }
 

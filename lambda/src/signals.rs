@@ -19,7 +19,7 @@ pub struct Signals {
     /// What the lambda read of each field, in the order in which it asked first.
     pub curves: Vec<Curve>,
     /// Fields that it looked up beyond [`Signals::CURVES_MAX`]: no curve was kept of them.
-    pub curves_left_out: u64,
+    pub curves_omitted: u64,
     /// Time in the lambda for each wake, in ns.
     pub run_ns: Spread,
     /// Fuel of each wake; none in Python, which has no fuel.
@@ -28,7 +28,7 @@ pub struct Signals {
     /// all of them.
     pub pictures: Vec<Picture>,
     /// Wakes that triggered and have no picture, since there were more of them, or no image.
-    pub pictures_left_out: u64,
+    pub pictures_omitted: u64,
 }
 
 impl Signals {
@@ -54,7 +54,7 @@ pub struct Curve {
     /// them were not looked at.
     pub samples: u64,
     /// Samples in which it was NaN or infinite: these are in no point.
-    pub not_finite: u64,
+    pub non_finite: u64,
     /// Samples summed up in one point.
     pub per_point: u64,
     /// Stamp of the first sample of each point, in ns since the epoch of the drive.

@@ -192,7 +192,7 @@ impl RunSummary {
                 let names = topics.flat_map(|topic| {
                     [&mut topic.name, &mut topic.topic, &mut topic.type_name]
                         .into_iter()
-                        .chain(&mut topic.trouble)
+                        .chain(&mut topic.qos_warnings)
                 });
                 shorten(names.chain([&mut live.lambda, &mut live.version]));
             }
@@ -235,7 +235,7 @@ impl RunSummary {
                     told.missed_ticks,
                     told.log_dropped,
                     told.triggers_refused,
-                    told.passed_over,
+                    told.backed_off,
                 );
                 counts.push(("messages out of order in the drive", told.out_of_order));
                 counts.extend(by_cause(&told.recording));
@@ -247,7 +247,7 @@ impl RunSummary {
                     told.missed_ticks,
                     told.log_dropped,
                     told.triggers_refused,
-                    told.passed_over,
+                    told.backed_off,
                 );
                 counts.push(("decisions and log lines not written", told.unwritten));
                 counts.push(("messages not sent, of `--rtt` and `--decisions`", told.unsent));

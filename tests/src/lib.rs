@@ -11,6 +11,7 @@ pub mod peers;
 pub mod rooms;
 pub mod transcript;
 pub mod tree;
+pub mod words;
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};

@@ -56,7 +56,7 @@ impl Victim {
     pub(super) fn listen(&mut self, course: &Course, clock: Clock) {
         while clock.now() < course.end_ns() {
             let live = self.started.until_live("a status", |_| true);
-            let entered = live.wake_up.map_or(f64::NAN, |spread| spread.p99_ns as f64 / 1e3);
+            let entered = live.wake_latency.map_or(f64::NAN, |spread| spread.p99_ns as f64 / 1e3);
             self.entered.push((clock.now(), entered));
         }
     }

@@ -178,8 +178,8 @@ fn receive(
         };
         let cpu = 100.0 * live.cpu_s / live.up_s;
         figures.push(Figure::told(&format!("{of}: share of a core"), "%", &[cpu]));
-        if let Some(wake_up) = live.wake_up {
-            for (what, ns) in [("median", wake_up.p50_ns), ("99 %", wake_up.p99_ns)] {
+        if let Some(wake_latency) = live.wake_latency {
+            for (what, ns) in [("median", wake_latency.p50_ns), ("99 %", wake_latency.p99_ns)] {
                 figures.push(Figure::told(
                     &format!("{of}: wake-up, {what}"),
                     "us",

@@ -44,8 +44,8 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
             &[quantile(&ns, 0.5) / base],
         ));
         let spreads = [
-            ("sample received to lambda entered", live.wake_up),
-            ("lambda left to decision out", live.hand_out),
+            ("sample received to lambda entered", live.wake_latency),
+            ("lambda left to decision out", live.decision_latency),
         ];
         for (what, spread) in spreads.iter().filter_map(|(what, spread)| Some((what, (*spread)?))) {
             let us = |ns: u64| ns as f64 / 1e3;

@@ -102,7 +102,7 @@ fn on_these_cores(seconds: u64) -> Live {
     program.join().expect("nothing fails");
     let last = reports.join().expect("nothing fails").expect("the program says how it ended");
     let lost = last.topics.iter().map(|topic| topic.no_slot + topic.too_big).sum::<u64>()
-        + last.recording.pushed_out;
+        + last.recording.evicted_early;
     Live { opened_ms, longest_ms, told_us, lost }
 }
 

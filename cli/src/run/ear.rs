@@ -148,7 +148,7 @@ impl Ear {
             RecorderReport::Loss(Loss::Failed { why, .. }) => {
                 screen.warn(&format!("a clip could not be written: {why}"))
             }
-            RecorderReport::Loss(Loss::HeldBack { triggers, why, .. }) => {
+            RecorderReport::Loss(Loss::DiskSuppressed { triggers, why, .. }) => {
                 screen.warn(&format!("{triggers} triggers opened no window: {why}"));
             }
             RecorderReport::Status(status) => {

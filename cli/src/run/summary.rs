@@ -60,7 +60,7 @@ impl Earlier {
         recorded
             .iter_mut()
             .flat_map(|status| &mut status.topics)
-            .for_each(|topic| topic.trouble.clear());
+            .for_each(|topic| topic.qos_warnings.clear());
         // Not where the report says: it comes from the lambda's process.
         let path = out.join("summary.json");
         let last =
@@ -109,15 +109,15 @@ mod tests {
     fn live(wakes: u64, unwritten: u64) -> Live {
         let text = format!(
             r#"{{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,"up_s":1.0,"wakes":{wakes},"triggers":0,
-            "faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"passed_over":0,
+            "faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,
             "unwritten":{unwritten},"topics":[],"network":{{"domain":0,"participants":0,"buffer_asked":0,"buffer_granted":0,
             "socket_drops":0}},"rss_bytes":0,"cpu_s":0.0}}"#
         );
         serde_json::from_str(&text).unwrap()
     }
 
-    fn recorded(held_back: u64) -> Option<Box<RecorderStatus>> {
-        let recording = Recording { held_back, ..Recording::default() };
+    fn recorded(disk_suppressed: u64) -> Option<Box<RecorderStatus>> {
+        let recording = Recording { disk_suppressed, ..Recording::default() };
         Some(Box::new(RecorderStatus { recording, ..RecorderStatus::default() }))
     }
 
@@ -136,7 +136,7 @@ mod tests {
             Earlier::default().complete(Some(live(5, 1)), recorded(7), out).unwrap();
         });
         assert_eq!((summary.wakes, summary.unwritten), (5, 3));
-        assert_eq!(summary.recording.unwrap().recording.held_back, 7);
+        assert_eq!(summary.recording.unwrap().recording.disk_suppressed, 7);
     }
 
     #[test]
@@ -156,6 +156,6 @@ mod tests {
             earlier.complete(Some(live(5, 1)), recorded(300), out).unwrap();
         });
         assert_eq!((summary.wakes, summary.faults, summary.unwritten), (15, 1, 3));
-        assert_eq!(summary.recording.unwrap().recording.held_back, 321);
+        assert_eq!(summary.recording.unwrap().recording.disk_suppressed, 321);
     }
 }

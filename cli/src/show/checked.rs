@@ -32,22 +32,24 @@ fn write_checked(text: &mut String, checked: &Checked, paint: Paint) -> fmt::Res
         if needs.is_empty() {
             continue;
         }
-        let sum = |at_once: bool| {
-            let bytes =
-                needs.iter().filter(|need| need.at_once == at_once).filter_map(|need| need.bytes);
+        let sum = |preallocated: bool| {
+            let bytes = needs
+                .iter()
+                .filter(|need| need.preallocated == preallocated)
+                .filter_map(|need| need.bytes);
             bytes.fold(0, u64::saturating_add)
         };
-        let (at_once, later) = (sum(true), sum(false));
-        let most = size(at_once.saturating_add(later));
+        let (preallocated, later) = (sum(true), sum(false));
+        let most = size(preallocated.saturating_add(later));
         let beyond = if needs.iter().any(|need| need.bytes.is_none()) {
             ", and what has no bound"
         } else {
             ""
         };
-        writeln!(text, "{word}: {} from the start, {most} at most{beyond}", size(at_once))?;
+        writeln!(text, "{word}: {} from the start, {most} at most{beyond}", size(preallocated))?;
         for need in needs {
             let bytes = need.bytes.map_or_else(|| "no bound".to_owned(), size);
-            let at_most = if need.at_once || need.bytes.is_none() { "" } else { ", at most" };
+            let at_most = if need.preallocated || need.bytes.is_none() { "" } else { ", at most" };
             writeln!(text, "{bytes:>12}  {}{at_most}", visible(&need.purpose))?;
         }
     }
@@ -66,9 +68,9 @@ mod tests {
 
     #[test]
     fn needs_are_summed_up_by_place_and_by_when_they_are_taken() {
-        let need = |purpose: &str, mib: u64, place, at_once| {
+        let need = |purpose: &str, mib: u64, place, preallocated| {
             let bytes = (mib > 0).then_some(mib << 20);
-            Need { purpose: purpose.to_owned(), bytes, place, at_once }
+            Need { purpose: purpose.to_owned(), bytes, place, preallocated }
         };
         let found = Checked {
             lambda: "dip".to_owned(),

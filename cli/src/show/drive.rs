@@ -61,7 +61,9 @@ fn row(topic: &RecordedTopicSeen, start_ns: i64) -> [String; 9] {
         topic
             .interval
             .map_or_else(unknown, |interval| format!("{:.1} ms", interval.max_ns as f64 / 1e6)),
-        topic.longest_after_ns.map_or_else(unknown, |at| format!("{:.3} s", seconds(at, start_ns))),
+        topic
+            .longest_gap_at_ns
+            .map_or_else(unknown, |at| format!("{:.3} s", seconds(at, start_ns))),
         topic.missing.map_or_else(unknown, grouped),
         if topic.read > 0 { size(topic.largest_bytes) } else { unknown() },
         notes.into_iter().flatten().collect::<Vec<_>>().join("; "),
@@ -165,7 +167,7 @@ mod tests {
             unreadable: None,
             read: 12_345,
             interval: Some(Spread { n: 12_344, p50_ns: ms(10), p99_ns: ms(11), max_ns: ms(52) }),
-            longest_after_ns: Some(1_500_000_001_250_000_000),
+            longest_gap_at_ns: Some(1_500_000_001_250_000_000),
             missing: Some(0),
             largest_bytes: 324,
             bytes: 324 * 12_345,
@@ -193,7 +195,7 @@ mod tests {
             is_defined: false,
             read: 0,
             interval: None,
-            longest_after_ns: None,
+            longest_gap_at_ns: None,
             missing: None,
             ..topic("/other")
         };

@@ -90,8 +90,11 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
             counted(live.faults, "fault")
         },
     )?;
-    let spreads =
-        [("wake-up", live.wake_up), ("in the lambda", live.run), ("handed out", live.hand_out)];
+    let spreads = [
+        ("wake-up", live.wake_latency),
+        ("in the lambda", live.run),
+        ("handed out", live.decision_latency),
+    ];
     let told: Vec<String> = spreads
         .iter()
         .filter_map(|(what, spread)| spread.map(|spread| format!("{what} {}", in_ms(&spread))))
@@ -119,15 +122,15 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         writeln!(text, "  {line}")?;
     }
     for topic in &live.topics {
-        for trouble in &topic.trouble {
-            writeln!(text, "  {}", paint.yellow(&visible(trouble)))?;
+        for qos_warnings in &topic.qos_warnings {
+            writeln!(text, "  {}", paint.yellow(&visible(qos_warnings)))?;
         }
     }
     let losses = [
         (live.missed_ticks, "tick", "missed"),
         (live.log_dropped, "log line", "over the rate limit"),
         (live.triggers_refused, "trigger", "refused: over `events_per_minute`"),
-        (live.passed_over, "wake", "passed over after repeated faults"),
+        (live.backed_off, "wake", "passed over after repeated faults"),
         (live.unwritten, "decision or log line", "not written"),
         (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` does not keep up"),
         (
@@ -208,8 +211,8 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
         );
         writeln!(text, "  {}", if commands.refused > 0 { paint.yellow(&line) } else { line })?;
     }
-    for trouble in status.topics.iter().flat_map(|topic| &topic.trouble) {
-        writeln!(text, "  {}", paint.yellow(&visible(trouble)))?;
+    for qos_warnings in status.topics.iter().flat_map(|topic| &topic.qos_warnings) {
+        writeln!(text, "  {}", paint.yellow(&visible(qos_warnings)))?;
     }
     super::write_counted(text, &status.recording, paint)?;
     match &status.network {

@@ -184,7 +184,7 @@ fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::
         let why = "not compared: the lambda looked at samples from before the clip";
         writeln!(text, "  {}", paint.yellow(&format!("{wakes} with {triggers} {why}")))?;
     }
-    if verified.cut_off {
+    if verified.truncated {
         let why = "the journal has no end: its writer died, or the drive was damaged; what it holds was compared";
         writeln!(text, "  {}", paint.yellow(why))?;
     }
@@ -344,8 +344,8 @@ fn losses(summary: &Summary) -> Vec<String> {
             ),
         ),
         (
-            summary.passed_over,
-            format!("{}, passed over after repeated faults", counted(summary.passed_over, "wake")),
+            summary.backed_off,
+            format!("{}, passed over after repeated faults", counted(summary.backed_off, "wake")),
         ),
     ];
     let all = summary.topics.iter().flat_map(of_topic).chain(overall);

@@ -23,7 +23,7 @@ fn replay() -> Summary {
         log_lines: 0,
         log_dropped: 0,
         triggers_refused: 0,
-        passed_over: 0,
+        backed_off: 0,
         start_ns: START_NS,
         end_ns: START_NS + 40_000_000_000,
         part: Part::default(),
@@ -190,7 +190,7 @@ fn a_long_message_of_a_fault_is_cut_where_a_person_reads_it() {
 fn a_loss_is_said_with_its_cause_and_an_overwritten_sample_is_none() {
     assert!(losses(&replay()).is_empty());
     let mut lossy =
-        Summary { skipped: 1, log_dropped: 3000, triggers_refused: 1, passed_over: 2, ..replay() };
+        Summary { skipped: 1, log_dropped: 3000, triggers_refused: 1, backed_off: 2, ..replay() };
     lossy.topics[0].lost = Some(2);
     lossy.topics[0].too_big = 4;
     assert_eq!(
@@ -277,7 +277,8 @@ fn starts_and_stops_are_told_from_events_and_what_made_no_clip_is_counted() {
         vec![decision(1000, Some("turn"), None), decision(1100, Some("turn"), None)];
     decisions[0].triggers[0].kind = TriggerKind::Start;
     decisions[1].triggers[0].kind = TriggerKind::Stop;
-    let recording = Recording { in_cooldown: 2, ignored: 1, pushed_out: 3, ..Recording::default() };
+    let recording =
+        Recording { in_cooldown: 2, ignored: 1, evicted_early: 3, ..Recording::default() };
     let quiet = Summary { recording, clips_replaced: 5, ..replay() };
     let text = summary(&quiet, &digest(decisions), &[], PLAIN);
     for line in [
@@ -307,7 +308,7 @@ fn a_verified_journal_says_how_many_decisions_are_the_same_and_what_was_not_comp
         triggers: 3,
         uncovered: 0,
         uncovered_triggers: 0,
-        cut_off: false,
+        truncated: false,
         wall_s: 0.25,
         notes: Vec::new(),
     };
@@ -316,7 +317,7 @@ fn a_verified_journal_says_how_many_decisions_are_the_same_and_what_was_not_comp
         "hello: 4,170 decisions with 3 triggers made again, all the same\n  0.250 s\n"
     );
     (proved.uncovered, proved.uncovered_triggers) = (50, 1);
-    proved.cut_off = true;
+    proved.truncated = true;
     proved.notes = vec!["machine: aarch64 in the journal, x86_64 now".to_owned()];
     let text = verified(&proved, PLAIN);
     assert!(

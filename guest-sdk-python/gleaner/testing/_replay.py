@@ -114,7 +114,7 @@ class _Pass:
             end_ns=drive.end_ns,
             log_dropped=session.log_dropped,
             triggers_refused=session.triggers_refused,
-            passed_over=session.passed_over,
+            backed_off=session.backed_off,
             missed_ticks=self._schedule.missed_total,
             windows=windows(self._manifest.record, triggers, drive.start_ns, drive.end_ns),
         )
@@ -138,7 +138,7 @@ class _Pass:
         """From cause to decision. What a lambda triggers before it faults still counts."""
         session = self._session
         if self._rest[0] <= at_ns < self._rest[1]:
-            session.passed_over += 1
+            session.backed_off += 1
             return
         session.begin(at_ns)
         if self._in_a_row > 0:

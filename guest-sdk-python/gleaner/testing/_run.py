@@ -66,7 +66,7 @@ class Run:
     """Lines beyond the limits of the log."""
     triggers_refused: int
     """Triggers beyond ``events_per_minute``."""
-    passed_over: int
+    backed_off: int
     """Wakes that did not happen, because the lambda had faulted again and again."""
     missed_ticks: int
     windows: List[Window]

@@ -45,7 +45,7 @@ class Session:
         self.limits = limits
         self.now_ns = 0
         self.lines: List[Line] = []
-        self.log_dropped = self.triggers_refused = self.passed_over = 0
+        self.log_dropped = self.triggers_refused = self.backed_off = 0
         self._triggers: Optional[List[Caused]] = None
         self._minute, self._caused = 0, 0
         self._second, self._said, self._said_bytes = 0, 0, 0

@@ -178,8 +178,8 @@ impl<L: Lambda> Run<L> {
     }
 
     /// Wakes passed over since the lambda had faulted again and again.
-    pub fn passed_over(&self) -> u64 {
-        self.session.lock().passed_over
+    pub fn backed_off(&self) -> u64 {
+        self.session.lock().backed_off
     }
 
     /// Ticks that were due and did not happen.
@@ -216,7 +216,7 @@ impl<L: Lambda> Run<L> {
     /// From cause to decision. What a lambda triggers before it faults still counts.
     fn wake(&mut self, at_ns: i64, due: Due) {
         if self.faults.rests(at_ns) {
-            self.session.lock().passed_over += 1;
+            self.session.lock().backed_off += 1;
             return;
         }
         let mut decision = cause(at_ns, &due);

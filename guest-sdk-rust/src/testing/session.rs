@@ -30,14 +30,14 @@ pub(super) struct State {
     pub(super) triggers: Triggers<Trigger>,
     pub(super) log: Log,
     pub(super) scratch: Scratch,
-    pub(super) passed_over: u64,
+    pub(super) backed_off: u64,
 }
 
 impl Session {
     pub(super) fn new(limits: Limits, inputs: Vec<Arc<Source>>) -> Arc<Self> {
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(&limits));
         let scratch = Scratch::new(limits.scratch, limits.per_call.bytes);
-        let state = Mutex::new(State { now_ns: 0, triggers, log, scratch, passed_over: 0 });
+        let state = Mutex::new(State { now_ns: 0, triggers, log, scratch, backed_off: 0 });
         Arc::new(Self { limits, inputs, state })
     }
 

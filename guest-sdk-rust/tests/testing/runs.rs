@@ -94,7 +94,7 @@ fn after_eight_faults_in_a_row_the_lambda_rests() {
     }
     // The eighth is at 70 ms, the next at 170, and then the rest is twice as long.
     assert_eq!(at_ms(&run), [0, 10, 20, 30, 40, 50, 60, 70, 170, 370]);
-    assert_eq!(run.passed_over(), 30);
+    assert_eq!(run.backed_off(), 30);
     assert!(run.log().iter().any(|line| line.message.contains("faulted 8 times in a row")));
 }
 

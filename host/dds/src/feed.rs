@@ -25,7 +25,7 @@ const KEPT: std::ops::RangeInclusive<usize> = 4..=1024;
 /// However long a queue is asked for.
 const MOST_KEPT_BYTES: usize = 1 << 30;
 const MOST_KEPT: usize = 65_536;
-/// Sentences of trouble: those of now, and those of times when it was asked again.
+/// Sentences of qos_warnings: those of now, and those of times when it was asked again.
 const TROUBLE: usize = 12;
 const REMEMBERED: usize = 4;
 
@@ -148,7 +148,8 @@ impl Feed {
                 Ok(Some(change)) => {
                     let writer = Guid(change.writer_guid.to_bytes());
                     let seq = u64::try_from(i64::from(change.sequence_number)).unwrap_or(0).max(1);
-                    let other = self.types.passes_over(around.participant, writer, &self.type_name);
+                    let other =
+                        self.types.is_backing_off(around.participant, writer, &self.type_name);
                     if !other && !self.read_before.has(writer, seq) {
                         let publish_ns =
                             change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
@@ -239,8 +240,8 @@ impl Feed {
         }
         self.alone = ours.is_empty();
         self.types.note(&ours, &others);
-        let trouble = self.trouble(&ours, &others);
-        for (cause, sentence) in &trouble {
+        let qos_warnings = self.qos_warnings(&ours, &others);
+        for (cause, sentence) in &qos_warnings {
             if self.once.first(cause, sentence) {
                 warn!(topic = %self.spec.topic, "{sentence}");
             }
@@ -249,13 +250,13 @@ impl Feed {
         words.reader = self.guid();
         words.qos =
             self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
-        words.trouble = trouble.into_iter().map(|(_, sentence)| sentence).collect();
-        words.trouble.extend_from_slice(&self.asked_again);
-        words.trouble.extend(self.types.trouble(&self.spec.topic));
+        words.qos_warnings = qos_warnings.into_iter().map(|(_, sentence)| sentence).collect();
+        words.qos_warnings.extend_from_slice(&self.asked_again);
+        words.qos_warnings.extend(self.types.qos_warnings(&self.spec.topic));
     }
 
     /// Why writers are not heard, or not as they could be: causes, and sentences.
-    fn trouble(&self, ours: &[&Offer], others: &[&Offer]) -> Vec<(&'static str, String)> {
+    fn qos_warnings(&self, ours: &[&Offer], others: &[&Offer]) -> Vec<(&'static str, String)> {
         let topic = &self.spec.topic;
         let of_another_type = others.iter().map(|offer| {
             let (found, wanted) = (visible(&ros_type(&offer.type_name)), ros_type(&self.type_name));
@@ -264,8 +265,8 @@ impl Feed {
                 format!("writer {} of `{topic}` sends `{found}`, not `{wanted}`", offer.guid),
             )
         });
-        let mut trouble: Vec<_> = of_another_type.take(TROUBLE / 2).collect();
-        let Some(request) = self.request else { return trouble };
+        let mut qos_warnings: Vec<_> = of_another_type.take(TROUBLE / 2).collect();
+        let Some(request) = self.request else { return qos_warnings };
         let policies = request.policies(1);
         for offer in ours {
             if let Some(policy) = offer.qos.compliance_failure_wrt(&policies) {
@@ -274,7 +275,7 @@ impl Feed {
                     "writer {} of `{topic}` offers {offered}, asked for is {request}: {policy:?} does not fit",
                     offer.guid
                 );
-                trouble.push(("offers less", sentence));
+                qos_warnings.push(("offers less", sentence));
             }
         }
         let most = Request::of_all(ours.first().copied());
@@ -286,10 +287,10 @@ impl Feed {
             let sentence = format!(
                 "writers of `{topic}` differ, {first} offers {a} and {second} {b}: all are asked for {request}"
             );
-            trouble.push(("differ", sentence));
+            qos_warnings.push(("differ", sentence));
         }
-        trouble.truncate(TROUBLE);
-        trouble
+        qos_warnings.truncate(TROUBLE);
+        qos_warnings
     }
 
     fn ask_again(

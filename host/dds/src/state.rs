@@ -41,7 +41,7 @@ pub(super) struct Told {
 pub(super) struct Words {
     pub(super) reader: Option<GUID>,
     pub(super) qos: Option<String>,
-    pub(super) trouble: Vec<String>,
+    pub(super) qos_warnings: Vec<String>,
 }
 
 /// A panic elsewhere does not make what is told less true.
@@ -111,7 +111,7 @@ impl Told {
             lost: Some(self.lost.load(Ordering::Relaxed)),
             malformed: self.malformed.load(Ordering::Relaxed),
             qos: words.qos.clone(),
-            trouble: words.trouble.clone(),
+            qos_warnings: words.qos_warnings.clone(),
         }
     }
 }

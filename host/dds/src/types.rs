@@ -17,7 +17,7 @@ const OTHERS: usize = 1024;
 pub(super) struct Types {
     ours: HashSet<Guid>,
     others: HashSet<Guid>,
-    passed_over: u64,
+    skipped: u64,
 }
 
 impl Types {
@@ -33,7 +33,7 @@ impl Types {
 
     /// Whether a sample of `writer` is to be passed over, because it announced another type than
     /// `type_name`. Looked up once if it came after what was noted.
-    pub(super) fn passes_over(
+    pub(super) fn is_backing_off(
         &mut self,
         participant: &DomainParticipant,
         writer: Guid,
@@ -46,14 +46,14 @@ impl Types {
             if other { &mut self.others } else { &mut self.ours }.insert(writer);
         }
         let other = self.others.contains(&writer);
-        self.passed_over += u64::from(other);
+        self.skipped += u64::from(other);
         other
     }
 
     /// How many samples of `topic` were passed over, in words.
-    pub(super) fn trouble(&self, topic: &str) -> Option<String> {
-        let samples = if self.passed_over == 1 { "sample" } else { "samples" };
-        let count = self.passed_over;
+    pub(super) fn qos_warnings(&self, topic: &str) -> Option<String> {
+        let samples = if self.skipped == 1 { "sample" } else { "samples" };
+        let count = self.skipped;
         (count > 0).then(|| format!("{count} {samples} of `{topic}`, of another type, passed over"))
     }
 }

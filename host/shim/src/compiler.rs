@@ -13,7 +13,7 @@ use gleaner_vitals::Pulse;
 use crate::environment;
 use crate::signals::Signals;
 use crate::watch::Watched;
-use crate::{Args, end_alike, left_behind};
+use crate::{Args, end_alike, orphans};
 
 /// How long a build may take.
 const LONGEST: Duration = Duration::from_secs(24 * 3600);
@@ -27,7 +27,7 @@ const LONGEST: Duration = Duration::from_secs(24 * 3600);
 pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
     let cannot =
         |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
-    left_behind::adopt()
+    orphans::adopt()
         .map_err(|error| cannot("cannot adopt what a compiler leaves behind", &error))?;
     let (pulse, page) =
         Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
@@ -47,8 +47,8 @@ pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
     let ended = Watched { child, pulse, signals, group: None }.until_its_end();
     let ended = ended.map_err(|error| cannot("cannot watch over the compiler", &error))?;
     // What still runs could change what was built, while it is copied.
-    let left_behind = left_behind::end();
-    Ok(end_alike(&ended.record(crate::signals::time_of_day_ns(), left_behind)))
+    let orphans = orphans::end();
+    Ok(end_alike(&ended.record(crate::signals::time_of_day_ns(), orphans)))
 }
 
 /// Enters the sandbox, and becomes the program. Returns only errors.

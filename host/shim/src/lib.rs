@@ -15,9 +15,9 @@
 
 mod compiler;
 mod environment;
-mod left_behind;
 mod lines;
 mod look;
+mod orphans;
 mod results;
 mod signals;
 mod watch;
@@ -123,7 +123,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     if args.compiler {
         return compiler::run(args, signals);
     }
-    left_behind::adopt()
+    orphans::adopt()
         .map_err(|error| cannot("cannot adopt what a runtime leaves behind", &error))?;
     let (pulse, page) =
         Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
@@ -173,11 +173,11 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let watched = Watched { child, pulse, signals, group };
     let ended =
         watched.until_its_end().map_err(|error| cannot("cannot watch over the runtime", &error))?;
-    let left_behind = left_behind::end();
-    if left_behind > 0 {
-        eprintln!("gleaner-shim: ended {left_behind} processes that the runtime had left behind");
+    let orphans = orphans::end();
+    if orphans > 0 {
+        eprintln!("gleaner-shim: ended {orphans} processes that the runtime had left behind");
     }
-    let record = ended.record(started_ns, left_behind);
+    let record = ended.record(started_ns, orphans);
     if let Some(path) = &args.exit_record {
         // A starter that does not read any more has no use for it.
         let written =

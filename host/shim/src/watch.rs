@@ -99,7 +99,7 @@ impl Watched {
 }
 
 impl Ended {
-    pub(crate) fn record(&self, started_ns: i64, left_behind: u32) -> ExitRecord {
+    pub(crate) fn record(&self, started_ns: i64, orphans: u32) -> ExitRecord {
         // It was our only child that we waited for, but for those that it left behind.
         let usage = getrusage(UsageWho::RUSAGE_CHILDREN).ok();
         let cpu =
@@ -115,7 +115,7 @@ impl Ended {
             max_rss_bytes: usage
                 .map_or(0, |usage| u64::try_from(usage.max_rss()).unwrap_or(0) * 1024),
             cpu_ns: u64::try_from(cpu).unwrap_or(0) * 1000,
-            left_behind,
+            orphans,
             asked: self.asked,
             doing: self.doing,
         }

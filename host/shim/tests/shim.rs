@@ -63,7 +63,7 @@ fn the_exit_code_is_that_of_the_runtime_and_is_written_down() {
     assert_eq!(run(&record, "exit 7").status.code(), Some(7));
     let written = record.read();
     assert_eq!(
-        (written.code, written.signal, written.killed, written.left_behind),
+        (written.code, written.signal, written.killed, written.orphans),
         (Some(7), None, None, 0)
     );
     assert!(written.ended_ns > written.started_ns && written.max_rss_bytes > 0);
@@ -94,7 +94,7 @@ fn what_a_runtime_leaves_behind_is_ended_even_in_a_session_of_its_own() {
     let output = run(&record, "setsid sleep 1000 >/dev/null 2>&1 & echo $!");
     let left: i32 = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
     assert!(test_kill_process(pid(left)).is_err(), "process {left} still lives");
-    assert!(record.read().left_behind >= 1);
+    assert!(record.read().orphans >= 1);
 }
 
 /// Runs the test `name` of this program below a shim, which kills it. Gives why, and what was said.

@@ -83,7 +83,7 @@ pub(super) struct Pen(Mutex<Points>);
 struct Points {
     last_ns: Option<i64>,
     samples: u64,
-    not_finite: u64,
+    non_finite: u64,
     per_point: u64,
     /// Samples in the last point.
     in_last: u64,
@@ -123,7 +123,7 @@ impl Points {
         self.last_ns = Some(at_ns);
         self.samples += 1;
         if !value.is_finite() {
-            self.not_finite += 1;
+            self.non_finite += 1;
             return;
         }
         if let (Some(min), Some(max)) = (self.min.last_mut(), self.max.last_mut())
@@ -159,13 +159,13 @@ impl Points {
 
     fn curve(&self, source: &Source) -> Option<Curve> {
         let Source { input, topic, path } = source.clone();
-        let Self { samples, not_finite, per_point, at_ns, min, max, .. } = self;
+        let Self { samples, non_finite, per_point, at_ns, min, max, .. } = self;
         (*samples > 0).then(|| Curve {
             input,
             topic,
             path,
             samples: *samples,
-            not_finite: *not_finite,
+            non_finite: *non_finite,
             per_point: *per_point,
             at_ns: at_ns.clone(),
             min: min.clone(),
@@ -220,7 +220,7 @@ mod tests {
             pen.number(at_ns, value);
         }
         let curve = pen.lock().curve(&source()).unwrap();
-        assert_eq!((curve.samples, curve.not_finite, curve.at_ns), (3, 2, vec![3]));
+        assert_eq!((curve.samples, curve.non_finite, curve.at_ns), (3, 2, vec![3]));
         assert_eq!(Pen::default().lock().curve(&source()), None);
     }
 }

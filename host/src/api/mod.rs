@@ -56,7 +56,7 @@ struct State {
     log: Log,
     scratch: Scratch,
     due: Option<Due>,
-    passed_over: u64,
+    backed_off: u64,
 }
 
 impl Session {
@@ -72,8 +72,7 @@ impl Session {
         let fuel = inputs.first().map(|topic| topic.fuel()).unwrap_or_default();
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(limits));
         let scratch = Scratch::new(limits.scratch.bytes(), limits.call_bytes.as_usize());
-        let state =
-            State { inputs, config, now_ns: 0, triggers, log, scratch, due, passed_over: 0 };
+        let state = State { inputs, config, now_ns: 0, triggers, log, scratch, due, backed_off: 0 };
         Self { state: Arc::new(Mutex::new(state)), fuel }
     }
 
@@ -115,12 +114,12 @@ impl Session {
 
     /// Counts a wake that did not happen, because the lambda had faulted again and again.
     pub fn pass_over(&self) {
-        self.lock().passed_over += 1;
+        self.lock().backed_off += 1;
     }
 
     /// Wakes passed over, since the start.
-    pub fn passed_over(&self) -> u64 {
-        self.lock().passed_over
+    pub fn backed_off(&self) -> u64 {
+        self.lock().backed_off
     }
 
     /// When calls of the lambda have to end; none without inputs, where no call takes long.

@@ -106,18 +106,18 @@ pub struct Totals {
     /// Values that the lambda read.
     pub curves: Vec<Curve>,
     /// Fields that it read and that have no curve.
-    pub curves_left_out: u64,
+    pub curves_omitted: u64,
 }
 
 impl Totals {
     /// Of a lambda over `inputs` in this process, with what it read of them.
     pub fn of(inputs: &[Arc<Topic>], curves: &Curves) -> Self {
-        let (curves, curves_left_out) = curves.take();
+        let (curves, curves_omitted) = curves.take();
         Self {
             counts: inputs.iter().map(|topic| topic.counts()).collect(),
             decode_ns: inputs.iter().map(|topic| topic.decode_ns()).sum(),
             curves,
-            curves_left_out,
+            curves_omitted,
         }
     }
 }

@@ -77,7 +77,7 @@ impl Course {
 
     fn wake(&mut self, wake: Wake) -> Result<(), Failure> {
         let at_ns = wake.at_ns();
-        if self.judge.passes_over(&wake) {
+        if self.judge.is_backing_off(&wake) {
             return Ok(());
         }
         let sample = if let Wake::Event(sample) = &wake { Some(sample) } else { None };

@@ -50,9 +50,9 @@ pub(super) struct Watch {
     clock: Clock,
     started: i64,
     reported: i64,
-    wake_up: Spreads,
+    wake_latency: Spreads,
     run: Spreads,
-    hand_out: Spreads,
+    decision_latency: Spreads,
     /// Samples that each input had received at the report before.
     before: Vec<u64>,
     /// Topics after remapping.
@@ -83,12 +83,12 @@ impl Watch {
             log_lines: 0,
             log_dropped: 0,
             triggers_refused: 0,
-            passed_over: 0,
+            backed_off: 0,
             unwritten: 0,
             unsent: 0,
-            wake_up: None,
+            wake_latency: None,
             run: None,
-            hand_out: None,
+            decision_latency: None,
             topics: Vec::new(),
             network: Network::default(),
             recorder: None,
@@ -105,9 +105,9 @@ impl Watch {
             clock,
             started: now,
             reported: now,
-            wake_up: Spreads::new(),
+            wake_latency: Spreads::new(),
             run: Spreads::new(),
-            hand_out: Spreads::new(),
+            decision_latency: Spreads::new(),
             before: vec![0; manifest.inputs.len()],
             wire: wire.collect(),
         }
@@ -119,9 +119,9 @@ impl Watch {
         self.base.triggers += decision.triggers.len() as u64;
         self.base.faults += u64::from(decision.fault.is_some());
         self.base.log_lines += log_lines as u64;
-        self.wake_up.add(times.entered.saturating_sub(times.at));
+        self.wake_latency.add(times.entered.saturating_sub(times.at));
         self.run.add(times.left.saturating_sub(times.entered));
-        self.hand_out.add(times.out.saturating_sub(times.left));
+        self.decision_latency.add(times.out.saturating_sub(times.left));
     }
 
     /// Wakes that ended in a fault.
@@ -136,7 +136,7 @@ impl Watch {
 
     /// How it is now.
     pub(super) fn report(&mut self, around: &Around) -> Live {
-        let spreads = [self.wake_up.take(), self.run.take(), self.hand_out.take()];
+        let spreads = [self.wake_latency.take(), self.run.take(), self.decision_latency.take()];
         self.as_of_now(around, spreads)
     }
 
@@ -144,14 +144,14 @@ impl Watch {
     pub(super) fn ended(mut self, around: &Around) -> Live {
         self.reported = self.started;
         self.before.fill(0);
-        let spreads = [self.wake_up.all(), self.run.all(), self.hand_out.all()];
+        let spreads = [self.wake_latency.all(), self.run.all(), self.decision_latency.all()];
         self.as_of_now(around, spreads)
     }
 
     fn as_of_now(
         &mut self,
         around: &Around,
-        [wake_up, run, hand_out]: [Option<Spread>; 3],
+        [wake_latency, run, decision_latency]: [Option<Spread>; 3],
     ) -> Live {
         let Around { source, health, inputs, schedule, session, unwritten, unsent, recorder } =
             *around;
@@ -184,7 +184,7 @@ impl Watch {
                 skipped: counts.skipped,
                 age_ns: topic.newest_at().map(|at| now.saturating_sub(at)),
                 qos: status.qos,
-                trouble: status.trouble,
+                qos_warnings: status.qos_warnings,
             });
         }
         Live {
@@ -193,13 +193,13 @@ impl Watch {
             missed_ticks: schedule.missed(),
             log_dropped: session.log_dropped(),
             triggers_refused: session.triggers_refused(),
-            passed_over: session.passed_over(),
+            backed_off: session.backed_off(),
             unwritten,
             unsent,
             recorder,
-            wake_up,
+            wake_latency,
             run,
-            hand_out,
+            decision_latency,
             topics,
             network: health.network.clone().unwrap_or_default(),
             rss_bytes: usage::resident(),

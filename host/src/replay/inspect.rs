@@ -173,7 +173,7 @@ impl Look {
             unreadable: None,
             read: 0,
             interval: None,
-            longest_after_ns: None,
+            longest_gap_at_ns: None,
             missing: Some(0),
             largest_bytes: 0,
             bytes: 0,
@@ -208,7 +208,7 @@ impl Look {
             self.intervals.get_or_insert_default().add(interval);
             if interval > self.longest_ns {
                 self.longest_ns = interval;
-                self.seen.longest_after_ns = Some(last);
+                self.seen.longest_gap_at_ns = Some(last);
             }
         }
         self.last_ns = Some(step.at_ns);

@@ -64,7 +64,7 @@ impl Course for Pass<'_> {
     }
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
-        if self.judge.passes_over(&wake) {
+        if self.judge.is_backing_off(&wake) {
             return Ok(true);
         }
         if let Some(scribe) = &mut self.scribe {
@@ -282,7 +282,7 @@ pub(super) fn replay(
         log_lines: pass.log_lines,
         log_dropped: pass.session.log_dropped(),
         triggers_refused: pass.session.triggers_refused(),
-        passed_over: pass.session.passed_over(),
+        backed_off: pass.session.backed_off(),
         start_ns: drive.start_ns().unwrap_or(0),
         end_ns: drive.end_ns().unwrap_or(reached.at_ns.max(drive.start_ns().unwrap_or(0))),
         part,

@@ -65,22 +65,22 @@ impl Gathered {
         config: &[(String, ConfigValue)],
         totals: Totals,
     ) -> Result<(), OutputError> {
-        let Totals { curves, curves_left_out, .. } = totals;
+        let Totals { curves, curves_omitted, .. } = totals;
         let triggered = self.pictures.wakes();
         let (written, failed) = match self.pictures.write(out) {
             Ok(written) => (written, Ok(())),
             // The signals are of use without them.
             Err(error) => ((Vec::new(), triggered), Err(error)),
         };
-        let (pictures, pictures_left_out) = written;
+        let (pictures, pictures_omitted) = written;
         output.signals(&Signals {
             config: config.iter().cloned().collect::<BTreeMap<_, _>>(),
             curves,
-            curves_left_out,
+            curves_omitted,
             run_ns: spread(&self.run),
             fuel: (!self.fuel.is_empty()).then(|| spread(&self.fuel)),
             pictures,
-            pictures_left_out,
+            pictures_omitted,
         })?;
         failed
     }

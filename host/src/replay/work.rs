@@ -60,7 +60,7 @@ impl Course for Pass {
     }
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
-        if !self.judge.passes_over(&wake) {
+        if !self.judge.is_backing_off(&wake) {
             self.judge.judge(wake);
             // It was sent.
             self.session.take_log();

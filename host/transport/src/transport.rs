@@ -57,7 +57,7 @@ pub struct Status {
     /// What is asked for now, in words: `reliable, volatile`.
     pub qos: Option<String>,
     /// What keeps writers from being heard, in whole sentences, at most 16.
-    pub trouble: Vec<String>,
+    pub qos_warnings: Vec<String>,
 }
 
 /// The identity of whoever wrote a sample: 16 bytes, equal for all samples of one writer.

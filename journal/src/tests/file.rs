@@ -15,7 +15,7 @@ fn a_journal_reads_back_whole_with_its_header_and_end() {
     let (read, error) = read_all(&mut reader);
     assert!(error.is_none() && read == entries);
     assert_eq!(reader.end(), Some(&end(3000)));
-    assert_eq!((reader.cut_off(), reader.torn_bytes(), reader.unknown_blocks()), (false, 0, 0));
+    assert_eq!((reader.truncated(), reader.torn_bytes(), reader.unknown_blocks()), (false, 0, 0));
     // The end stays the end.
     assert_eq!(reader.next().unwrap(), None);
 }
@@ -70,7 +70,7 @@ fn a_journal_cut_off_at_any_byte_gives_its_whole_blocks() {
         let (whole, wakes) = *blocks.iter().rev().find(|(len, _)| *len <= cut).unwrap();
         assert!(error.is_none(), "{cut}: {error:?}");
         assert_eq!(read, entries[..wakes], "{cut}");
-        assert!(reader.cut_off() && reader.end().is_none(), "{cut}");
+        assert!(reader.truncated() && reader.end().is_none(), "{cut}");
         assert_eq!(reader.torn_bytes(), (cut - whole) as u64, "{cut}");
     }
 }
@@ -94,7 +94,7 @@ fn zeros_that_a_loss_of_power_left_at_the_end_are_torn_and_no_damage() {
         let mut reader = Reader::open(bytes.as_slice()).unwrap();
         let (read, error) = read_all(&mut reader);
         assert!(error.is_none() && read == entries, "{zeros}: {error:?}");
-        assert_eq!((reader.cut_off(), reader.torn_bytes()), (true, zeros as u64));
+        assert_eq!((reader.truncated(), reader.torn_bytes()), (true, zeros as u64));
         if zeros > HEAD_LEN {
             *bytes.last_mut().unwrap() = 1;
             let (_, error) = read_all(&mut Reader::open(bytes.as_slice()).unwrap());
@@ -164,7 +164,7 @@ fn behind_a_block_that_a_full_disk_tore_nothing_is_written() {
         assert!(writer.finish(&end(0)).is_err());
         let mut reader = Reader::open(torn.as_slice()).unwrap();
         let (read, error) = read_all(&mut reader);
-        assert!(error.is_none() && reader.cut_off());
+        assert!(error.is_none() && reader.truncated());
         assert_eq!(read, entries[..failed]);
     }
 }

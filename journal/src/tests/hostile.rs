@@ -7,7 +7,7 @@ use super::*;
 fn outcome(bytes: &[u8]) -> Result<(Vec<Entry>, bool), JournalError> {
     let mut reader = Reader::open(bytes)?;
     match read_all(&mut reader) {
-        (entries, None) => Ok((entries, reader.cut_off())),
+        (entries, None) => Ok((entries, reader.truncated())),
         (_, Some(error)) => Err(error),
     }
 }
@@ -64,7 +64,7 @@ fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
     assert_eq!((error.help().as_deref(), error.exit()), (Some(help), Exit::Usage));
     // It stays damaged, and is not taken for one that is cut off.
     assert!(matches!(reader.next(), Err(JournalError::Damaged { block: 2, wake: 3, .. })));
-    assert!(!reader.cut_off() && reader.end().is_none());
+    assert!(!reader.truncated() && reader.end().is_none());
 }
 
 #[test]
@@ -144,7 +144,7 @@ fn a_block_of_an_unknown_kind_is_stepped_over_and_counted() {
     let bytes = journal_of(&blocks);
     let mut reader = Reader::open(bytes.as_slice()).unwrap();
     assert_eq!(read_all(&mut reader).0, [entry]);
-    assert_eq!((reader.unknown_blocks(), reader.cut_off()), (2, true));
+    assert_eq!((reader.unknown_blocks(), reader.truncated()), (2, true));
 }
 
 #[test]

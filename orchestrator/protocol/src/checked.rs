@@ -36,7 +36,7 @@ pub struct Need {
     /// Where.
     pub place: Place,
     /// Taken from the start; else as much as this at most.
-    pub at_once: bool,
+    pub preallocated: bool,
 }
 
 /// Where something is kept.

@@ -41,7 +41,7 @@ pub struct RecordedTopicSeen {
     /// Time between neighbours there, by log time.
     pub interval: Option<Spread>,
     /// Log time of the message before the longest of these times, in ns since the epoch.
-    pub longest_after_ns: Option<i64>,
+    pub longest_gap_at_ns: Option<i64>,
     /// Numbers that are missing between those of its messages; `None` where the recorder did not
     /// number them one by one.
     pub missing: Option<u64>,

@@ -34,7 +34,7 @@ pub struct ExitRecord {
     /// CPU time that it and what it started used, in ns.
     pub cpu_ns: u64,
     /// Processes that it left behind, which were killed.
-    pub left_behind: u32,
+    pub orphans: u32,
     /// `gleaner-shim` had been asked to end it. A lambda can ask its own process only, and not the
     /// shim.
     #[serde(default)]
@@ -275,7 +275,7 @@ mod tests {
             out_of_memory: false,
             max_rss_bytes: 1 << 20,
             cpu_ns: 3,
-            left_behind: 0,
+            orphans: 0,
             asked: false,
             doing: None,
         }

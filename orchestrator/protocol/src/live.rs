@@ -38,7 +38,7 @@ pub struct Live {
     /// Triggers over `events_per_minute` of `[limits]`, refused.
     pub triggers_refused: u64,
     /// Wakes that did not happen, since the lambda had faulted again and again.
-    pub passed_over: u64,
+    pub backed_off: u64,
     /// Decisions and log lines that could not be written: the disk failed, or was too slow; and
     /// what native code of the lambda handed on in their place, which is none.
     pub unwritten: u64,
@@ -47,11 +47,11 @@ pub struct Live {
     #[serde(default)]
     pub unsent: u64,
     /// Sample received, or tick due, until the lambda is entered. `None` without wakes.
-    pub wake_up: Option<Spread>,
+    pub wake_latency: Option<Spread>,
     /// Time in the lambda.
     pub run: Option<Spread>,
     /// Lambda left until its decision is out.
-    pub hand_out: Option<Spread>,
+    pub decision_latency: Option<Spread>,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<LiveTopic>,
     /// The network.
@@ -84,7 +84,7 @@ impl Live {
             (&mut self.log_lines, before.log_lines),
             (&mut self.log_dropped, before.log_dropped),
             (&mut self.triggers_refused, before.triggers_refused),
-            (&mut self.passed_over, before.passed_over),
+            (&mut self.backed_off, before.backed_off),
             (&mut self.unwritten, before.unwritten),
             (&mut self.unsent, before.unsent),
             (&mut self.network.socket_drops, before.network.socket_drops),
@@ -167,7 +167,7 @@ pub struct LiveTopic {
     /// What is asked of the writers, in words.
     pub qos: Option<String>,
     /// What keeps writers from being heard, in whole sentences.
-    pub trouble: Vec<String>,
+    pub qos_warnings: Vec<String>,
 }
 
 /// The network, as a process of ours sees it.
@@ -222,7 +222,7 @@ mod tests {
             skipped: count,
             age_ns: Some(5),
             qos: None,
-            trouble: Vec::new(),
+            qos_warnings: Vec::new(),
         };
         Live {
             lambda: "hello".to_owned(),
@@ -239,12 +239,12 @@ mod tests {
             log_lines: count,
             log_dropped: count,
             triggers_refused: count,
-            passed_over: count,
+            backed_off: count,
             unwritten: count,
             unsent: count,
-            wake_up: Some(Spread { n: count, p50_ns: count, p99_ns: count, max_ns: count }),
+            wake_latency: Some(Spread { n: count, p50_ns: count, p99_ns: count, max_ns: count }),
             run: None,
-            hand_out: None,
+            decision_latency: None,
             topics: vec![topic],
             network: Network {
                 socket_drops: count,
@@ -264,7 +264,7 @@ mod tests {
         let both = live(2, Some(3)).after(&live(40, Some(50)));
         let mut expected = live(42, Some(53));
         (expected.restarts, expected.rss_bytes, expected.topics[0].rate_hz) = (2, 2, 2.0);
-        expected.wake_up = live(2, None).wake_up;
+        expected.wake_latency = live(2, None).wake_latency;
         assert_eq!(both, expected);
         assert_eq!(
             live(2, Some(3)).after(&live(40, None)).topics[0].lost,

@@ -61,7 +61,7 @@ recording! {
 
     /// Triggers but for stops, and commands, that opened no window, as the disk had too little
     /// room.
-    held_back => Lost "trigger", "triggers", "without a window: the disk was too full";
+    disk_suppressed => Lost "trigger", "triggers", "without a window: the disk was too full";
 
     /// Triggers of wakes that were refused, as the lambda causes more of them, or more bytes, than
     /// the recorder takes of one.
@@ -91,7 +91,7 @@ recording! {
     not_deleted => Kept "clip", "clips", "not deleted to make room: losses.jsonl says why";
 
     /// Samples that left the preroll for want of bytes before they were too old for any window.
-    pushed_out => Lost "sample", "samples", "pushed out of the preroll too early: preroll_size";
+    evicted_early => Lost "sample", "samples", "pushed out of the preroll too early: preroll_size";
 
     /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless,
     /// unless they are larger than any message of a clip, which is somewhat below 1 GiB.
@@ -169,8 +169,12 @@ mod tests {
 
     #[test]
     fn a_count_is_shown_with_its_cause() {
-        let few =
-            Recording { in_cooldown: 1, pushed_out: 3000, not_deleted: 1, ..Recording::default() };
+        let few = Recording {
+            in_cooldown: 1,
+            evicted_early: 3000,
+            not_deleted: 1,
+            ..Recording::default()
+        };
         let shown = few.by_cause().into_iter().filter(|counted| counted.count > 0);
         assert_eq!(
             shown.map(|counted| counted.in_words()).collect::<Vec<_>>(),

@@ -86,7 +86,7 @@ pub struct Verified {
     pub uncovered_triggers: u64,
     /// The journal has no end: its writer died, or its drive was damaged. What it holds was
     /// compared.
-    pub cut_off: bool,
+    pub truncated: bool,
     /// Duration, in s.
     pub wall_s: f64,
     /// What was not the same around the lambda, such as another version of its engine.
@@ -143,7 +143,7 @@ pub struct Summary {
     /// Triggers over `events_per_minute` of `[limits]`, refused.
     pub triggers_refused: u64,
     /// Wakes that did not happen, since the lambda had faulted again and again.
-    pub passed_over: u64,
+    pub backed_off: u64,
     /// Log time of the drive's first message, in ns since the epoch.
     pub start_ns: i64,
     /// Log time of the drive's last message, in ns since the epoch.
@@ -247,7 +247,7 @@ mod tests {
             log_lines: 3,
             log_dropped: 0,
             triggers_refused: 5,
-            passed_over: 6,
+            backed_off: 6,
             start_ns: 1,
             end_ns: 2,
             part: Part::default(),
@@ -273,7 +273,7 @@ mod tests {
             &concat!(
                 r#"{"report":"summary","lambda":"brake-dark","version":"0.1.0","kind":"wasm","drive":["a.mcap","b"],"#,
                 r#""out":"out","wakes":50,"triggers":2,"faults":0,"skipped":0,"missed_ticks":0,"out_of_order":4,"log_lines":3,"#,
-                r#""log_dropped":0,"triggers_refused":5,"passed_over":6,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
+                r#""log_dropped":0,"triggers_refused":5,"backed_off":6,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
                 r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,
                 "COUNTS,",

@@ -55,7 +55,7 @@ function drawField(page, entries, field, group, isLast) {
 function notes(curve, index) {
   const words = [`${counted(curve.samples, "sample")}`];
   if (curve.per_point > 1) words.push(`least and most of ${curve.per_point} each`);
-  if (curve.not_finite > 0) words.push(`${count(curve.not_finite)} not finite`);
+  if (curve.non_finite > 0) words.push(`${count(curve.non_finite)} not finite`);
   const name = index === null ? "" : `${"AB"[index]}: `;
   return make("span", { class: "dim" }, index === null ? null : swatch(paletteStyle(index)), name + words.join(", "));
 }

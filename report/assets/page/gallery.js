@@ -20,7 +20,7 @@ function galleryCard(run, name, entries) {
     chosen = shown.get(entry) ?? null;
     chosen?.classList.add("chosen");
   });
-  const left = run.totals.pictures_left_out;
+  const left = run.totals.pictures_omitted;
   return card(`${name}Pictures`, `${counted(pictures.length, "picture")} at triggers`, make("div", { class: "gallery" }, pictures),
     left > 0 ? make("p", { class: "more", text: `No picture was kept of ${count(left)} more triggers or clips.` }) : null);
 }

@@ -35,7 +35,7 @@ function timelineCard(page, entries) {
     button("←", "the one before", () => step(-1)), button("→", "the next one", () => step(1)),
     make("button", { text: "All", title: "show all of the drive", on: { click: zoomOut } }));
   const [lanes, curves] = [make("div"), make("div")];
-  const left = page.runs.reduce((sum, run) => sum + run.totals.curves_left_out, 0);
+  const left = page.runs.reduce((sum, run) => sum + run.totals.curves_omitted, 0);
   const hint = make("p", { class: "hint", text: "Drag to zoom, double click for all; ctrl and wheel zoom, shift and wheel move. ← and → go from one to the next. Curves are what the lambda read; where it did not look, there is no line." });
   const none = page.runs.every((run) => run.curves.length === 0)
     ? make("p", { class: "hint", text: page.runs.every((run) => run.config === null)

@@ -200,8 +200,8 @@ fn config_and_cost_are_compared_if_both_tell_them() {
     let signals = |brake: f64, p50: u64| {
         let spread =
             json!({"count": 9, "min": 1, "p50": p50, "p90": 3, "p99": 4, "max": 5, "bins": []});
-        json!({"config": {"brake": brake, "same": 1}, "curves": [], "curves_left_out": 0, "run_ns": spread, "fuel": spread,
-            "pictures": [], "pictures_left_out": 0}).to_string()
+        json!({"config": {"brake": brake, "same": 1}, "curves": [], "curves_omitted": 0, "run_ns": spread, "fuel": spread,
+            "pictures": [], "pictures_omitted": 0}).to_string()
     };
     let (a, b) = (out(&[]), out(&[]));
     a.write("signals.json", signals(-1.4, 2000));

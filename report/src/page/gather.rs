@@ -114,10 +114,10 @@ pub(crate) fn gather(out: &Path, shares: usize, from_ns: Option<i64>) -> Result<
             faults: marks.faults_seen,
             faults_in_no_line: marks.faults_in_no_line,
             clips: clips_seen,
-            pictures_left_out: pictures
+            pictures_omitted: pictures
                 .left_out
-                .saturating_add(signals.as_ref().map_or(0, |signals| signals.pictures_left_out)),
-            curves_left_out: signals.as_ref().map_or(0, |signals| signals.curves_left_out),
+                .saturating_add(signals.as_ref().map_or(0, |signals| signals.pictures_omitted)),
+            curves_omitted: signals.as_ref().map_or(0, |signals| signals.curves_omitted),
             log: log_seen,
         },
         trigger_density: match marks.triggers_seen > marks.triggers.len() as u64 {
@@ -261,7 +261,7 @@ fn curve_shown(curve: &Curve, start_ns: i64) -> CurveShown {
         topic: cut(&curve.topic, 120),
         path: cut(&curve.path, 120),
         samples: curve.samples,
-        not_finite: curve.not_finite,
+        non_finite: curve.non_finite,
         per_point: curve.per_point,
         t: curve
             .at_ns
@@ -299,9 +299,9 @@ fn spreads(told: &RunSummary, signals: Option<&Signals>) -> Vec<SpreadShown> {
     }
     let RunSummary::Live(live) = told else { return Vec::new() };
     let spreads = [
-        ("wake-up", live.wake_up),
+        ("wake-up", live.wake_latency),
         ("time in the lambda", live.run),
-        ("decision handed out", live.hand_out),
+        ("decision handed out", live.decision_latency),
     ];
     let shown = spreads.into_iter().filter_map(|(what, spread)| Some((what, spread?)));
     let shown = shown.map(|(what, spread)| SpreadShown {
@@ -333,7 +333,7 @@ fn facts(told: &RunSummary) -> Vec<Fact> {
             ]
         }
         RunSummary::Live(told) => {
-            let trouble = told.topics.iter().flat_map(|topic| &topic.trouble);
+            let qos_warnings = told.topics.iter().flat_map(|topic| &topic.qos_warnings);
             let facts = [
                 fact("up", format!("{:.1} s", told.up_s)),
                 fact("processor time", format!("{:.1} s", told.cpu_s)),
@@ -342,7 +342,7 @@ fn facts(told: &RunSummary) -> Vec<Fact> {
             ];
             facts
                 .into_iter()
-                .chain(trouble.take(8).map(|why| fact("trouble", visible(why))))
+                .chain(qos_warnings.take(8).map(|why| fact("QoS warning", visible(why))))
                 .collect()
         }
     }

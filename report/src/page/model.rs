@@ -65,8 +65,8 @@ pub(crate) struct Totals {
     /// Faults whose cause is in no line of the table.
     pub(crate) faults_in_no_line: u64,
     pub(crate) clips: u64,
-    pub(crate) pictures_left_out: u64,
-    pub(crate) curves_left_out: u64,
+    pub(crate) pictures_omitted: u64,
+    pub(crate) curves_omitted: u64,
     pub(crate) log: u64,
 }
 
@@ -150,7 +150,7 @@ pub(crate) struct CurveShown {
     pub(crate) topic: String,
     pub(crate) path: String,
     pub(crate) samples: u64,
-    pub(crate) not_finite: u64,
+    pub(crate) non_finite: u64,
     pub(crate) per_point: u64,
     pub(crate) t: Vec<f64>,
     pub(crate) min: Vec<f64>,

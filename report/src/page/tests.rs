@@ -69,7 +69,7 @@ impl Drop for Out {
 pub(crate) fn summary() -> Value {
     json!({
         "lambda": "hello", "version": "0.1.0", "kind": "wasm", "drive": ["a.mcap"], "out": "out", "wakes": 400, "triggers": 2, "faults": 1,
-        "skipped": 0, "missed_ticks": 0, "out_of_order": 0, "log_lines": 1, "log_dropped": 0, "triggers_refused": 0, "passed_over": 0,
+        "skipped": 0, "missed_ticks": 0, "out_of_order": 0, "log_lines": 1, "log_dropped": 0, "triggers_refused": 0, "backed_off": 0,
         "start_ns": START_NS, "end_ns": START_NS + 40_000_000_000_i64, "wall_s": 0.5, "run_s": 0.25, "decode_s": 0.0, "wakes_per_s": 800.0,
         "peak_rss_bytes": 1 << 20, "clips": 0, "clips_replaced": 0, "in_cooldown": 0, "ignored": 0, "damaged": null,
         "topics": [{
@@ -97,11 +97,11 @@ fn signals() -> Value {
     json!({
         "config": {"brake_mps2": -1.4, "name": "x"},
         "curves": [{
-            "input": "imu", "topic": "/imu", "path": "linear_acceleration.x", "samples": 4, "not_finite": 1, "per_point": 2,
+            "input": "imu", "topic": "/imu", "path": "linear_acceleration.x", "samples": 4, "non_finite": 1, "per_point": 2,
             "at_ns": [START_NS, START_NS + 500_000_000], "min": [0.123456789123, -1.0], "max": [0.5, 2.0],
         }],
-        "curves_left_out": 3, "run_ns": spread, "fuel": spread,
-        "pictures": [], "pictures_left_out": 0,
+        "curves_omitted": 3, "run_ns": spread, "fuel": spread,
+        "pictures": [], "pictures_omitted": 0,
     })
 }
 
@@ -419,16 +419,16 @@ fn a_folder_without_results_is_refused_with_a_way_out() {
 fn a_live_run_has_a_report_that_begins_with_what_it_saw_first() {
     let out = Out::new();
     let topic = json!({"name": "imu", "topic": "/imu", "type_name": "sensor_msgs/msg/Imu", "writers": 1, "rate_hz": 100.0, "received": 7,
-        "lost": 2, "malformed": 1, "overwritten": 0, "no_slot": 0, "too_big": 0, "skipped": 0, "age_ns": null, "qos": null, "trouble": ["it is far"]});
+        "lost": 2, "malformed": 1, "overwritten": 0, "no_slot": 0, "too_big": 0, "skipped": 0, "age_ns": null, "qos": null, "qos_warnings": ["it is far"]});
     let recorded = RecordedTopic { no_slot: 8, ..RecordedTopic::default() };
     let recording = RecorderStatus {
-        recording: Recording { held_back: 6, ..Recording::default() },
+        recording: Recording { disk_suppressed: 6, ..Recording::default() },
         topics: vec![recorded],
         ..RecorderStatus::default()
     };
     let live = json!({"lambda": "hello", "version": "0.1.0", "kind": "python", "out": "x", "restarts": 1, "up_s": 3.0, "wakes": 7, "triggers": 1,
-        "faults": 0, "skipped": 0, "missed_ticks": 0, "log_lines": 0, "log_dropped": 0, "triggers_refused": 0, "passed_over": 0,
-        "unwritten": 4, "unsent": 0, "wake_up": null, "run": {"n": 7, "p50_ns": 10, "p99_ns": 20, "max_ns": 30}, "hand_out": null,
+        "faults": 0, "skipped": 0, "missed_ticks": 0, "log_lines": 0, "log_dropped": 0, "triggers_refused": 0, "backed_off": 0,
+        "unwritten": 4, "unsent": 0, "wake_latency": null, "run": {"n": 7, "p50_ns": 10, "p99_ns": 20, "max_ns": 30}, "decision_latency": null,
         "topics": [topic], "network": {"domain": 0, "participants": 1, "buffer_asked": 1, "buffer_granted": 1, "socket_drops": 5},
         "recorder": null, "recording": recording, "rss_bytes": 1, "cpu_s": 0.5});
     out.write("summary.json", live.to_string());

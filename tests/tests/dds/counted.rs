@@ -17,7 +17,7 @@ pub const CASES: &[Case] = &[
     Case {
         name: "what_a_full_disk_held_back_is_in_the_summary_and_in_the_report",
         needs: &[],
-        run: held_back,
+        run: disk_suppressed,
     },
     Case {
         name: "a_recorder_takes_a_lambda_that_its_vehicle_makes_smaller",
@@ -26,21 +26,21 @@ pub const CASES: &[Case] = &[
     },
 ];
 
-fn held_back() -> Result<(), Failed> {
+fn disk_suppressed() -> Result<(), Failed> {
     let out = Folder::new();
     let floor = u64::MAX.to_string();
     let (last, summary) = recorded(out.path(), "", &["--disk-floor", &floor], |status| {
-        status.recording.held_back > 2
+        status.recording.disk_suppressed > 2
     })?;
     // The lambda went on until it was stopped.
-    if summary.recording.held_back < last.recording.held_back {
+    if summary.recording.disk_suppressed < last.recording.disk_suppressed {
         return Err(format!("{:?}, and before {:?}", summary.recording, last.recording).into());
     }
     let reported = Command::new(program("gleaner")).arg("report").arg(out.path()).output()?;
     let page = fs::read_to_string(out.path().join("report.html"))?;
     let row = format!(
         r#"["triggers without a window: the disk was too full",{}]"#,
-        summary.recording.held_back
+        summary.recording.disk_suppressed
     );
     if page.contains(&row) {
         Ok(())

@@ -98,8 +98,8 @@ impl Heard {
         }
         drop(samples);
         let status = dds.status(self.subscription);
-        let Status { lost, malformed, trouble, .. } = &status;
-        if *lost != Some(0) || *malformed != 0 || !trouble.is_empty() {
+        let Status { lost, malformed, qos_warnings, .. } = &status;
+        if *lost != Some(0) || *malformed != 0 || !qos_warnings.is_empty() {
             return Err(format!("all messages arrived, but the status is {status:?}").into());
         }
         Ok(())

@@ -23,7 +23,7 @@ pub fn trials() -> Vec<Trial> {
         Trial::test("a_window_that_outlasts_the_drive_is_short_and_says_so", at_the_end),
         Trial::test("a_preroll_from_before_the_drive_is_short_and_says_so", at_the_begin),
         Trial::test("a_long_recording_goes_on_in_a_next_clip_without_a_gap", rolls_over),
-        Trial::test("what_the_preroll_has_no_room_for_is_counted_and_said", pushed_out),
+        Trial::test("what_the_preroll_has_no_room_for_is_counted_and_said", evicted_early),
         Trial::test("a_preroll_on_disk_gives_the_same_clips", on_disk),
         Trial::test(
             "a_topic_that_the_drive_does_not_have_is_listed_with_no_message",
@@ -207,7 +207,7 @@ fn rolls_over() -> Result<(), Failed> {
     same(&first.short.iter().any(|why| why.contains("next clip")), &true)
 }
 
-fn pushed_out() -> Result<(), Failed> {
+fn evicted_early() -> Result<(), Failed> {
     let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
         manifest
             .replace("[record]", "[record]\npreroll_size = \"1 MiB\"")

@@ -39,17 +39,17 @@ pub fn trials() -> Vec<Trial> {
         trials.push(shared(
             format!("brake_dark_in_{kind}_finds_both_brakings_at_night"),
             "rec_brake_dark.mcap",
-            { move |drive| at(&drive, "examples/brake-dark", kind, &[15.84, 30.25]) },
+            move |drive| at(&drive, "examples/brake-dark", kind, &[15.84, 30.25]),
         ));
         trials.push(shared(
             format!("hello_in_{kind}_finds_six_of_six_brakings"),
             "rec_brake_imu_trip17.mcap",
-            { move |drive| within_truth(&drive, kind) },
+            move |drive| within_truth(&drive, kind),
         ));
         trials.push(shared(
             format!("pixels_in_{kind}_sees_the_recorded_pixels"),
             "rec_raw_image_bgr8_320x180.mcap",
-            { move |drive| pixels(&drive, kind) },
+            move |drive| pixels(&drive, kind),
         ));
     }
     trials.push(shared(

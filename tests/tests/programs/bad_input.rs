@@ -307,7 +307,7 @@ fn went_on(run: &Run) {
         (summary.faults, summary.wakes),
         (run.decisions.len() as u64, run.decisions.len() as u64)
     );
-    assert_eq!(summary.wakes + summary.passed_over, 4170);
+    assert_eq!(summary.wakes + summary.backed_off, 4170);
 }
 
 #[test]

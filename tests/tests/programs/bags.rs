@@ -198,7 +198,7 @@ fn a_journal_of_a_part_of_a_directory_is_verified_as_it_is() {
         verify(&line.iter().map(AsRef::as_ref).collect::<Vec<_>>())
     };
     let verified = again(&[]).verified.expect("it is verified");
-    assert!(verified.wakes > 1000 && verified.wakes < 2000 && !verified.cut_off, "{verified:?}");
+    assert!(verified.wakes > 1000 && verified.wakes < 2000 && !verified.truncated, "{verified:?}");
     assert!(again(&["--from", "6"]).stderr.contains("cannot be used with"));
     // Every file of a directory counts, and so does what no lambda reads.
     let db = rusqlite::Connection::open(bag.join("drive_0.db3")).unwrap();

@@ -34,7 +34,7 @@ fn init_is_run_and_the_memory_of_every_input_counted_in_both_languages() {
         let imu = need("input `imu`").bytes.unwrap();
         assert!((1034 * 4096..1034 * 4300).contains(&imu), "{imu}");
         let preroll = need("recorder: preroll");
-        assert_eq!((preroll.bytes, preroll.at_once), (Some(64 << 20), true));
+        assert_eq!((preroll.bytes, preroll.preallocated), (Some(64 << 20), true));
         assert_eq!((need("clips").bytes, need("clips").place), (None, Place::Disk));
         let rings = checked
             .needs

@@ -87,8 +87,8 @@ fn proved(lambda: &Path, args: &[&str]) -> (u64, u64) {
     let verified =
         again.verified.unwrap_or_else(|| panic!("{} {args:?}: {}", lambda.display(), again.stderr));
     assert_eq!((verified.wakes, verified.triggers), (summary.wakes, summary.triggers));
-    assert_eq!((verified.uncovered, verified.cut_off, verified.notes), (0, false, Vec::new()));
-    (summary.faults, summary.passed_over)
+    assert_eq!((verified.uncovered, verified.truncated, verified.notes), (0, false, Vec::new()));
+    (summary.faults, summary.backed_off)
 }
 
 #[test]
@@ -125,12 +125,12 @@ fn every_fault_happens_again() {
     {
         for behaviour in behaviours {
             let lambda = root().join("tests/lambdas/misbehave").join(kind);
-            let (faults, passed_over) =
+            let (faults, backed_off) =
                 proved(&lambda, &["--set", &format!("behaviour={behaviour}")]);
             assert!(faults > 8, "{behaviour} in {kind} faulted {faults} times");
             assert!(
-                faults + passed_over > 4000,
-                "{behaviour} in {kind} rested in {passed_over} wakes"
+                faults + backed_off > 4000,
+                "{behaviour} in {kind} rested in {backed_off} wakes"
             );
         }
         for behaviour in ["hold", "log_flood", "print"] {
@@ -262,7 +262,7 @@ fn a_journal_whose_writer_died_proves_what_it_holds() {
     let cut = journaled.out.write("cut.journal", &whole[..whole.len() * 9 / 10]);
     let again = verify_drive(&root().join(HELLO), &sample_drive(), &cut, &[]);
     let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
-    assert!(verified.cut_off && verified.wakes > 100 && verified.wakes < 4170, "{verified:?}");
+    assert!(verified.truncated && verified.wakes > 100 && verified.wakes < 4170, "{verified:?}");
 }
 
 #[test]

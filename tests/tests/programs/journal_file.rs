@@ -265,7 +265,7 @@ fn a_journal_of_another_version_or_that_is_cut_off_is_replaced() {
         journaled(&out, &journal, &[]).must_exit(0);
         let again = verify_drive(&hello(), &journal, &[]);
         let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
-        assert!(!verified.cut_off, "{verified:?}");
+        assert!(!verified.truncated, "{verified:?}");
     }
 }
 

@@ -112,8 +112,8 @@ impl Both {
             (summary.log_dropped, summary.triggers_refused)
         );
         assert_eq!(
-            (run.passed_over(), run.missed_ticks()),
-            (summary.passed_over, summary.missed_ticks)
+            (run.backed_off(), run.missed_ticks()),
+            (summary.backed_off, summary.missed_ticks)
         );
         let skipped = summary
             .topics
@@ -237,7 +237,7 @@ fn misbehaviour_has_the_same_consequences() {
         ["error", "panic", "not_a_frame", "huge_label", "too_many_triggers", "nan_score"]
     {
         let run = misbehave(behaviour);
-        assert!(run.faults().count() >= 8 && run.passed_over() > 0, "{behaviour}");
+        assert!(run.faults().count() >= 8 && run.backed_off() > 0, "{behaviour}");
     }
     let run = misbehave("event_then_panic");
     assert_eq!(run.triggers().count(), run.faults().count());

@@ -31,7 +31,7 @@ fn a_python_lambda_that_faults_again_and_again_holds_nothing() {
     // Each sample found room, and each wake ran.
     let imu = &summary.topics[0];
     assert_eq!((imu.received, imu.no_slot), (summary.wakes, 0), "{summary:?}");
-    assert_eq!((summary.skipped, summary.passed_over), (0, 0), "{summary:?}");
+    assert_eq!((summary.skipped, summary.backed_off), (0, 0), "{summary:?}");
 }
 
 #[test]
@@ -66,5 +66,5 @@ fn a_python_lambda_that_takes_more_memory_than_it_may_has_a_fault_with_both_numb
         );
     }
     let summary = run.summary.as_ref().expect("a summary");
-    assert_eq!(summary.passed_over, 0, "there were good wakes between the faults");
+    assert_eq!(summary.backed_off, 0, "there were good wakes between the faults");
 }

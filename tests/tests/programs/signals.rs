@@ -35,7 +35,7 @@ fn a_replay_keeps_what_was_read_and_what_it_cost() {
         let forward = curve(&signals, "linear_acceleration.x");
         assert_eq!((forward.input.as_str(), forward.topic.as_str()), ("imu", "/imu/data"));
         assert_eq!(
-            (forward.samples, forward.not_finite, forward.per_point),
+            (forward.samples, forward.non_finite, forward.per_point),
             (4170, 0, 2),
             "each sample once"
         );
@@ -85,7 +85,7 @@ fn twins_leave_the_same_curves_and_so_does_each_pass() {
     let brake_dark = |kind: &str, args: &[&str]| {
         let (_, _, signals) =
             signals(&format!("examples/brake-dark/{kind}"), &[&BRAKING, args].concat());
-        (signals.curves, signals.curves_left_out)
+        (signals.curves, signals.curves_omitted)
     };
     let (curves, left_out) = brake_dark("rust", &[]);
     assert_eq!((curves.len(), left_out), (2, 0), "{curves:?}");
@@ -111,7 +111,7 @@ fn a_lambda_that_reads_a_thousand_fields_has_curves_of_the_first() {
         serde_json::from_str(&fs::read_to_string(folder.path().join("signals.json")).unwrap())
             .unwrap();
     assert_eq!(
-        (signals.curves.len(), signals.curves_left_out),
+        (signals.curves.len(), signals.curves_omitted),
         (Signals::CURVES_MAX, 5),
         "36 numbers and a text"
     );

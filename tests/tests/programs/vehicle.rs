@@ -111,10 +111,10 @@ fn both_kinds_drop_log_lines_and_refuse_triggers_at_the_same_limits() {
         let all = summary("", "event_then_error");
         assert_eq!((all.triggers, all.triggers_refused), (all.wakes, 0), "{kind}");
         assert!(
-            all.passed_over > 4000 && all.wakes < 30,
+            all.backed_off > 4000 && all.wakes < 30,
             "{kind}: {} wakes, {} passed over",
             all.wakes,
-            all.passed_over
+            all.backed_off
         );
         let few = summary("[limits]\nevents_per_minute = 3\n", "event_then_error");
         assert!((3..=6).contains(&few.triggers), "{kind}: {} triggers", few.triggers);

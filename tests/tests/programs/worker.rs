@@ -78,12 +78,12 @@ fn a_process_that_is_killed_leaves_a_fault_and_all_results_before_it() {
     ];
     let proved = verify(&args);
     let verified = proved.verified.unwrap_or_else(|| panic!("{}", proved.stderr));
-    assert_eq!((proved.exit, verified.wakes, verified.cut_off), (0, 3, true));
+    assert_eq!((proved.exit, verified.wakes, verified.truncated), (0, 3, true));
 }
 
 #[test]
 fn messages_that_a_lambda_forges_end_the_replay_and_are_named() {
-    let done = r#"{"done":{"counts":[],"decode_ns":0,"curves":0,"curves_left_out":0}}"#;
+    let done = r#"{"done":{"counts":[],"decode_ns":0,"curves":0,"curves_omitted":0}}"#;
     let woken = r#"{"woken":{"at_ns":17,"run_ns":1,"call":{"said":[0,0]},"looked":[]}}"#;
     for (message, named) in [
         ("no message", "expected"),

@@ -52,14 +52,14 @@ fn auto_adapts() {
             "no sample comes a second time"
         );
     }
-    let trouble = dds.status(subscription).trouble;
+    let qos_warnings = dds.status(subscription).qos_warnings;
     assert!(
-        trouble
+        qos_warnings
             .iter()
             .any(|line| line.contains("differ") && line.contains("best effort, volatile")),
-        "{trouble:?}"
+        "{qos_warnings:?}"
     );
-    assert!(trouble.iter().any(|line| line.contains("asked for again")), "{trouble:?}");
+    assert!(qos_warnings.iter().any(|line| line.contains("asked for again")), "{qos_warnings:?}");
 }
 
 fn auto_transient_local() {
@@ -121,9 +121,9 @@ fn fixed_does_not_fit() {
     let subscription = dds.subscribe(&spec("/strict", qos), Kept::new()).unwrap();
     let peer = Peer::join(domain);
     let _writer = peer.writer("/strict", false, false);
-    until("trouble", || !dds.status(subscription).trouble.is_empty());
+    until("qos_warnings", || !dds.status(subscription).qos_warnings.is_empty());
     let status = dds.status(subscription);
-    let [line] = status.trouble.as_slice() else { panic!("{:?}", status.trouble) };
+    let [line] = status.qos_warnings.as_slice() else { panic!("{:?}", status.qos_warnings) };
     assert!(
         line.contains(
             "`/strict` offers best effort, volatile, asked for is reliable, volatile: Reliability"
@@ -147,12 +147,14 @@ fn another_type() {
     matched(&other);
     // At once: nobody has looked at its type yet.
     write(&other, b"of the other");
-    let passed_over = "1 sample of `/typed`, of another type, passed over";
-    until("trouble", || dds.status(subscription).trouble.iter().any(|line| line == passed_over));
-    let trouble = dds.status(subscription).trouble;
+    let skipped = "1 sample of `/typed`, of another type, passed over";
+    until("qos_warnings", || {
+        dds.status(subscription).qos_warnings.iter().any(|line| line == skipped)
+    });
+    let qos_warnings = dds.status(subscription).qos_warnings;
     assert!(
-        trouble[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"),
-        "{trouble:?}"
+        qos_warnings[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"),
+        "{qos_warnings:?}"
     );
     sink.mark(&ours, b"of ours.");
     assert!(sink.bytes(1).iter().all(|bytes| bytes == b"of ours."));

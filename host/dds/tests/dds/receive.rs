@@ -58,7 +58,7 @@ fn samples_arrive() {
     let status = dds.status(subscription);
     assert_eq!((status.writers, status.lost, status.malformed), (Some(1), Some(0), 0));
     assert_eq!(
-        (status.qos.as_deref(), status.trouble.as_slice()),
+        (status.qos.as_deref(), status.qos_warnings.as_slice()),
         (Some("reliable, volatile"), [].as_slice())
     );
     drop(writer);

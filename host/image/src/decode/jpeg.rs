@@ -234,7 +234,7 @@ impl<'a> Segments<'a> {
             return Err(damaged(at, "a segment that is shorter than its own length"));
         }
         self.at = at + 1 + len;
-        let body = self.data.get(at + 3..self.at).ok_or_else(|| cut_off(self.data))?;
+        let body = self.data.get(at + 3..self.at).ok_or_else(|| truncated(self.data))?;
         if marker == SCAN {
             self.skip_pixels();
         }
@@ -242,7 +242,7 @@ impl<'a> Segments<'a> {
     }
 
     fn byte(&self, at: usize) -> Result<u8, ImageError> {
-        self.data.get(at).copied().ok_or_else(|| cut_off(self.data))
+        self.data.get(at).copied().ok_or_else(|| truncated(self.data))
     }
 
     /// Moves to the next marker, or the end of the data. In entropy-coded data, 0xff is followed by
@@ -263,7 +263,7 @@ impl<'a> Segments<'a> {
     }
 }
 
-fn cut_off(data: &[u8]) -> ImageError {
+fn truncated(data: &[u8]) -> ImageError {
     ImageError::CutOff { format: Format::Jpeg, len: data.len() }
 }
 

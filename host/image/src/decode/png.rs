@@ -15,7 +15,7 @@ pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 pub(super) fn header(data: &[u8]) -> Result<Header, ImageError> {
     let Some((chunk, _)) = data.get(MAGIC.len()..).and_then(|rest| rest.split_first_chunk::<16>())
     else {
-        return Err(cut_off(data));
+        return Err(truncated(data));
     };
     let [start @ .., w3, w2, w1, w0, h3, h2, h1, h0] = chunk;
     if start != b"\0\0\0\x0dIHDR" {
@@ -38,7 +38,9 @@ pub(super) fn decode(
 ) -> Result<(), ImageError> {
     let &Header { width, height, .. } = header;
     let refused = |source| match source {
-        DecodingError::IoError(error) if error.kind() == ErrorKind::UnexpectedEof => cut_off(data),
+        DecodingError::IoError(error) if error.kind() == ErrorKind::UnexpectedEof => {
+            truncated(data)
+        }
         source => ImageError::Png { width, height, source },
     };
     let mut decoder = Decoder::new_with_limits(Cursor::new(data), Limits { bytes: allowed });
@@ -99,7 +101,7 @@ fn spread<const BYTES: usize>(
     }
 }
 
-fn cut_off(data: &[u8]) -> ImageError {
+fn truncated(data: &[u8]) -> ImageError {
     ImageError::CutOff { format: Format::Png, len: data.len() }
 }
 

@@ -81,23 +81,23 @@ impl Shelf {
         self.clips.retain(|kept| place.folder().join(&kept.file).symlink_metadata().is_ok());
         self.bytes = self.clips.iter().map(|kept| kept.bytes).sum();
         let mut told = Vec::new();
-        let mut passed_over = 0;
-        while self.clips.len() > passed_over + 1
+        let mut skipped = 0;
+        while self.clips.len() > skipped + 1
             && (self.clips.len() as u64 > self.clips_max || self.bytes > self.bytes_max)
         {
             let why = match self.clips.len() as u64 > self.clips_max {
                 true => format!("there may be {} clips", self.clips_max),
                 false => format!("clips may take {} MiB", self.bytes_max >> 20),
             };
-            let kept = &mut self.clips[passed_over];
+            let kept = &mut self.clips[skipped];
             match kept.delete(place, &self.losses, why) {
                 Ok(deleted) => {
                     told.push(deleted);
                     self.bytes -= kept.bytes;
-                    self.clips.remove(passed_over);
+                    self.clips.remove(skipped);
                 }
                 Err(error) => {
-                    passed_over += 1;
+                    skipped += 1;
                     told.extend(kept.stuck(&self.losses, error));
                 }
             }

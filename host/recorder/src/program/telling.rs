@@ -14,7 +14,7 @@ use crate::{Counts, TopicId};
 #[derive(Default)]
 pub(super) struct Said {
     clips: u64,
-    held_back: u64,
+    disk_suppressed: u64,
     at: Option<Instant>,
 }
 
@@ -49,11 +49,15 @@ impl Course {
             return Ok(());
         }
         self.said.at = Some(Instant::now());
-        let held_back = counts.recording.held_back - self.said.held_back;
-        if held_back > 0 {
-            self.said.held_back = counts.recording.held_back;
+        let disk_suppressed = counts.recording.disk_suppressed - self.said.disk_suppressed;
+        if disk_suppressed > 0 {
+            self.said.disk_suppressed = counts.recording.disk_suppressed;
             let why = "the disk had too little room".to_owned();
-            self.say.say(RecorderReport::Loss(Loss::HeldBack { at_ns, triggers: held_back, why }));
+            self.say.say(RecorderReport::Loss(Loss::DiskSuppressed {
+                at_ns,
+                triggers: disk_suppressed,
+                why,
+            }));
         }
         let spread = self.spreads.take();
         let status = RecorderStatus { trigger_to_open: spread, ..self.status(&counts) };
@@ -76,7 +80,7 @@ impl Course {
                 too_big: arrivals.too_big.load(Ordering::Relaxed),
                 malformed: status.malformed,
                 qos: status.qos,
-                trouble: status.trouble,
+                qos_warnings: status.qos_warnings,
             }
         };
         let mut recording = counts.recording;

@@ -132,8 +132,8 @@ impl Recorder {
         source: String,
     ) -> Result<Commanded, RecordError> {
         if self.held.is_some() {
-            self.counts.recording.held_back += 1;
-            return Ok(Commanded::HeldBack);
+            self.counts.recording.disk_suppressed += 1;
+            return Ok(Commanded::DiskSuppressed);
         }
         let commanded = match self.windows.command(lambda.0, trigger.kind, &trigger.label, at_ns) {
             Heard::Opened => {

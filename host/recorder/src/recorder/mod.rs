@@ -244,8 +244,8 @@ impl Recorder {
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
         let in_group = self.write(topic.0, &meta, cdr)?;
-        let Recording { pushed_out, too_big, .. } = &mut self.counts.recording;
-        self.stock.keep(Held::sample(topic.0, &meta, in_group), cdr, pushed_out, too_big)
+        let Recording { evicted_early, too_big, .. } = &mut self.counts.recording;
+        self.stock.keep(Held::sample(topic.0, &meta, in_group), cdr, evicted_early, too_big)
     }
 
     /// Writes a sample to the open clip, if it belongs there. Returns the group in whose clip it is
@@ -302,18 +302,18 @@ impl Recorder {
             draft.wake(lambda.0, number, &self.encoded);
             in_group = draft.group;
         }
-        let Recording { pushed_out, too_big, .. } = &mut self.counts.recording;
+        let Recording { evicted_early, too_big, .. } = &mut self.counts.recording;
         self.stock.keep(
             Held::wake(lambda.0, number, entry.at_ns, in_group),
             &self.encoded,
-            pushed_out,
+            evicted_early,
             too_big,
         )?;
         if entry.triggers.is_empty() {
             return Ok(());
         }
         if self.held.is_some() {
-            self.counts.recording.held_back +=
+            self.counts.recording.disk_suppressed +=
                 entry.triggers.iter().filter(|trigger| trigger.kind != TriggerKind::Stop).count()
                     as u64;
             return Ok(());

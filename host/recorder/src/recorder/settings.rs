@@ -58,7 +58,7 @@ pub enum Commanded {
     /// What it was to start is running, or what it was to stop is not, or too much is.
     Ignored,
     /// Nothing is recorded at present.
-    HeldBack,
+    DiskSuppressed,
 }
 
 /// What is left to do for a recorder that is fed live.

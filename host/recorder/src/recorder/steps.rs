@@ -53,7 +53,7 @@ impl Recorder {
         while self.walk_on(&mut budget)? && self.stock.desk.pen.has_room() {
             let held = self.held.clone();
             if held.is_some() {
-                self.counts.recording.held_back += self.windows.forget_waiting();
+                self.counts.recording.disk_suppressed += self.windows.forget_waiting();
             }
             let Some(step) = self.windows.step() else {
                 // What a full clip has kept for its next one is in that by now.

@@ -136,19 +136,19 @@ pub(super) struct Stock {
 }
 
 impl Stock {
-    /// Keeps an entry. `pushed_out` counts samples that have to go for it, `too_big` is raised if
+    /// Keeps an entry. `evicted_early` counts samples that have to go for it, `too_big` is raised if
     /// it cannot be kept.
     pub(super) fn keep(
         &mut self,
         held: Held,
         bytes: &[u8],
-        pushed_out: &mut u64,
+        evicted_early: &mut u64,
         too_big: &mut u64,
     ) -> Result<(), RecordError> {
         let is_sample = held.source.as_topic().is_some();
         let Stock { preroll, losses, wake_losses, desk, .. } = self;
         let mut gone = |gone: &Held| {
-            *pushed_out += u64::from(gone.source.as_topic().is_some());
+            *evicted_early += u64::from(gone.source.as_topic().is_some());
             if let Some(losses) = losses_of(losses, wake_losses, gone) {
                 losses.overwritten.add(gone.at_ns, gone.group);
             }

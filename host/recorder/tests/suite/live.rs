@@ -242,7 +242,7 @@ fn while_nothing_may_be_recorded_triggers_are_counted_and_the_open_clip_ends() {
         (every(50, 300, 1), &["the disk is full".to_owned()][..])
     );
     assert_eq!((stamps(&scratch, whole, "/a"), whole.short.len()), (every(950, 1500, 1), 0));
-    assert_eq!(recorder.counts().recording.held_back, 1);
+    assert_eq!(recorder.counts().recording.disk_suppressed, 1);
 }
 
 #[test]

@@ -27,8 +27,9 @@ fn cut(store: Store, bytes: u64) -> (Scratch, Clip, u64) {
     }
     recorder.finish(T0 + S * 4).unwrap();
     assert_eq!(recorder.clips().len(), 1);
-    let (clip, pushed_out) = (recorder.clips()[0].clone(), recorder.counts().recording.pushed_out);
-    (scratch, clip, pushed_out)
+    let (clip, evicted_early) =
+        (recorder.clips()[0].clone(), recorder.counts().recording.evicted_early);
+    (scratch, clip, evicted_early)
 }
 
 fn within_bound(recorder: &Recorder) {
@@ -42,7 +43,7 @@ fn within_bound(recorder: &Recorder) {
 #[test]
 fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
     for store in [Store::Ram, Store::Disk] {
-        let (scratch, clip, pushed_out) = cut(store, 50_000);
+        let (scratch, clip, evicted_early) = cut(store, 50_000);
         let topic = &clip.topics[0];
         let overwritten = topic.overwritten.unwrap();
         assert!(overwritten > 600, "50 kB hold some 290 samples of 100 bytes: {overwritten}");
@@ -54,9 +55,9 @@ fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
                 "the preroll was cut by preroll_size: {overwritten} samples of /a pushed out"
             )]
         );
-        assert!(pushed_out > overwritten);
-        let (_scratch, clip, pushed_out) = cut(store, 16 << 20);
-        assert_eq!((clip.topics[0].overwritten, pushed_out, clip.short), (Some(0), 0, vec![]));
+        assert!(evicted_early > overwritten);
+        let (_scratch, clip, evicted_early) = cut(store, 16 << 20);
+        assert_eq!((clip.topics[0].overwritten, evicted_early, clip.short), (Some(0), 0, vec![]));
     }
 }
 

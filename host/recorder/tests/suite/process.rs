@@ -201,17 +201,17 @@ fn a_full_disk_is_said_and_no_clip_is_begun() {
     running.status(|status| status.disk_free.is_some());
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
     let triggers = running.until(|report| match report {
-        RecorderReport::Loss(Loss::HeldBack { triggers, .. }) => Some(triggers),
+        RecorderReport::Loss(Loss::DiskSuppressed { triggers, .. }) => Some(triggers),
         _ => None,
     });
     assert_eq!(triggers, 1);
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
-    assert_eq!((last.recording.held_back, last.recording.clips, ended), (1, 0, Ok(())));
+    assert_eq!((last.recording.disk_suppressed, last.recording.clips, ended), (1, 0, Ok(())));
     assert!(
         fs::read_to_string(scratch.0.join("losses.jsonl"))
             .unwrap()
-            .contains(r#""loss":"held_back""#)
+            .contains(r#""loss":"disk_suppressed""#)
     );
 }
 

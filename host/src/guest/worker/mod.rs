@@ -96,7 +96,7 @@ struct Done {
     counts: Vec<Counts>,
     decode_ns: u64,
     curves: usize,
-    curves_left_out: u64,
+    curves_omitted: u64,
 }
 
 #[cfg(feature = "python")]

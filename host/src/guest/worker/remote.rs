@@ -310,7 +310,7 @@ impl Guest for Remote {
             _ => None,
         })?;
         let no_slot = done.no_slot();
-        let Done { counts, decode_ns, curves: n, curves_left_out } = done;
+        let Done { counts, decode_ns, curves: n, curves_omitted } = done;
         if n > Signals::CURVES_MAX {
             return Err(self.killed(Some("more curves than there can be")));
         }
@@ -337,7 +337,7 @@ impl Guest for Remote {
             return Err(self.killed(Some("counts of samples that cannot be")));
         }
         self.ended_well()?;
-        Ok(Some(Totals { counts, decode_ns, curves, curves_left_out }))
+        Ok(Some(Totals { counts, decode_ns, curves, curves_omitted }))
     }
 }
 

@@ -39,13 +39,8 @@ impl Reports {
 
     /// Sends what is known once the course is over.
     pub fn done(&self, totals: Totals) {
-        let Totals { counts, decode_ns, curves, curves_left_out } = totals;
-        self.send(&Message::Done(Done {
-            counts,
-            decode_ns,
-            curves: curves.len(),
-            curves_left_out,
-        }));
+        let Totals { counts, decode_ns, curves, curves_omitted } = totals;
+        self.send(&Message::Done(Done { counts, decode_ns, curves: curves.len(), curves_omitted }));
         curves.into_iter().for_each(|curve| self.send(&Message::Curve(curve)));
     }
 

@@ -79,7 +79,7 @@ impl Course for Proof<'_> {
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
         let at_ns = wake.at_ns();
-        if self.remake.judge.passes_over(&wake) {
+        if self.remake.judge.is_backing_off(&wake) {
             return Ok(true);
         }
         let Some(entry) = self.claim.next()? else {

@@ -41,7 +41,7 @@ pub(super) fn run(
         true => clip::prove(options, manifest, claim, load)?,
         false => drive::prove(options, manifest, claim, load)?,
     };
-    let (header, cut_off) = (claim.header(), claim.reader().cut_off());
+    let (header, truncated) = (claim.header(), claim.reader().truncated());
     let noted = |what: &str, journal: &str, now: &str| {
         (journal != now).then(|| format!("{what}: {journal} in the journal, {now} now"))
     };
@@ -56,7 +56,7 @@ pub(super) fn run(
         triggers: proved.triggers,
         uncovered: proved.uncovered,
         uncovered_triggers: proved.uncovered_triggers,
-        cut_off,
+        truncated,
         wall_s: started.elapsed().as_secs_f64(),
         notes: notes.into_iter().flatten().chain(claim.limits.iter().cloned()).collect(),
     })

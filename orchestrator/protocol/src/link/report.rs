@@ -62,7 +62,7 @@ pub enum Loss {
         why: String,
     },
     /// Triggers that opened no window, as nothing was recorded.
-    HeldBack {
+    DiskSuppressed {
         /// When, in ns on the clock of the clips.
         at_ns: i64,
         /// How many.
@@ -157,7 +157,7 @@ pub struct CommandStatus {
     /// Writers that are connected now.
     pub writers: Option<usize>,
     /// What keeps writers from being heard, in whole sentences.
-    pub trouble: Vec<String>,
+    pub qos_warnings: Vec<String>,
 }
 
 /// A topic that is recorded. `None` is unknown.
@@ -182,7 +182,7 @@ pub struct RecordedTopic {
     /// What is asked of the writers, in words.
     pub qos: Option<String>,
     /// What keeps writers from being heard, in whole sentences.
-    pub trouble: Vec<String>,
+    pub qos_warnings: Vec<String>,
 }
 
 #[cfg(test)]
@@ -200,7 +200,7 @@ mod tests {
             ..RecordedTopic::default()
         };
         RecorderStatus {
-            recording: Recording { clips: count, held_back: count, ..Recording::default() },
+            recording: Recording { clips: count, disk_suppressed: count, ..Recording::default() },
             commands: Some(CommandStatus {
                 accepted: count,
                 refused: count,
@@ -229,7 +229,7 @@ mod tests {
     fn a_status_reads_back_and_is_flat() {
         let status = RecorderStatus { is_recording: true, ..status(2, &["/a"], None) };
         let json = serde_json::to_value(&status).unwrap();
-        assert_eq!((&json["held_back"], &json["recording"]), (&2.into(), &true.into()));
+        assert_eq!((&json["disk_suppressed"], &json["recording"]), (&2.into(), &true.into()));
         assert_eq!(serde_json::from_value::<RecorderStatus>(json).unwrap(), status);
     }
 }

@@ -201,7 +201,7 @@ impl Commands {
                     CommandError::NotRunning { label }
                 }
             }),
-            Commanded::HeldBack => Some(CommandError::HeldBack),
+            Commanded::DiskSuppressed => Some(CommandError::DiskSuppressed),
         })
     }
 
@@ -239,7 +239,7 @@ impl Commands {
             accepted: self.accepted,
             refused: self.refused + too_many + too_long,
             writers: network.and_then(|status| status.writers),
-            trouble: network.map(|status| status.trouble.clone()).unwrap_or_default(),
+            qos_warnings: network.map(|status| status.qos_warnings.clone()).unwrap_or_default(),
         }
     }
 }

@@ -35,7 +35,7 @@ pub(super) enum CommandError {
     #[error("too many windows wait for their clip")]
     TooMuch,
     #[error("the disk has too little room: nothing is recorded")]
-    HeldBack,
+    DiskSuppressed,
 }
 
 /// What is commanded.
