@@ -19,9 +19,16 @@ def test_a_notebook_runs(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     kept = [cell for cell in notebook.cells if cell.get("outputs") or cell.get("execution_count")]
     assert kept == [], "clear all outputs before you save it"
-    client = nbclient.NotebookClient(notebook, timeout=SECONDS_PER_CELL, resources={"metadata": {"path": str(path.parent)}})
+    client = nbclient.NotebookClient(
+        notebook, timeout=SECONDS_PER_CELL, resources={"metadata": {"path": str(path.parent)}}
+    )
     client.execute()
-    plots = [out for cell in notebook.cells for out in cell.get("outputs", []) if "image/png" in out.get("data", {})]
+    plots = [
+        out
+        for cell in notebook.cells
+        for out in cell.get("outputs", [])
+        if "image/png" in out.get("data", {})
+    ]
     assert len(plots) == 3
 
 

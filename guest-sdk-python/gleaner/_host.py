@@ -61,7 +61,9 @@ def enter_environment() -> None:
     try:
         import numpy  # noqa: F401
     except ImportError as error:
-        way_out = f"{sys.executable} -m pip install numpy, or name another interpreter: GLEANER_PYTHON"
+        way_out = (
+            f"{sys.executable} -m pip install numpy, or name another interpreter: GLEANER_PYTHON"
+        )
         raise LambdaError(f"{error}; {way_out}") from None
 
 
@@ -73,7 +75,10 @@ def numpy_version() -> str:
     own = os.path.dirname(os.path.dirname(os.path.abspath(sys.executable)))
     # Debian's says where the system's packages lie, and not those of an environment.
     python = "python{}.{}".format(*sys.version_info)
-    folders = [os.path.join(own, "lib", python, "site-packages"), *site.getsitepackages([own, sys.base_prefix])]
+    folders = [
+        os.path.join(own, "lib", python, "site-packages"),
+        *site.getsitepackages([own, sys.base_prefix]),
+    ]
     for folder in filter(os.path.isdir, folders):
         for name in sorted(os.listdir(folder)):
             found = re.match(r"numpy-([^-]+?)(?:-py[\d.]+)?\.(?:dist|egg)-info", name)
@@ -126,7 +131,9 @@ def _import(entry: str) -> ModuleType:
     sys.dont_write_bytecode = True
     spec = importlib.util.spec_from_file_location("main", entry)
     if spec is None or spec.loader is None:
-        raise LambdaError(f"`{os.path.basename(entry)}` is no Python file: its name must end with `.py`")
+        raise LambdaError(
+            f"`{os.path.basename(entry)}` is no Python file: its name must end with `.py`"
+        )
     module = importlib.util.module_from_spec(spec)
     sys.modules["main"] = module
     spec.loader.exec_module(module)
@@ -148,7 +155,9 @@ def _place(module: object) -> str:
     about: Dict[str, Any] = getattr(module, "__dict__", {})
     file = about.get("__file__")
     try:
-        return os.path.abspath(str(os.path.dirname(file) if file else next(iter(about.get("__path__", ())))))
+        return os.path.abspath(
+            str(os.path.dirname(file) if file else next(iter(about.get("__path__", ()))))
+        )
     except (KeyError, StopIteration, TypeError):
         # Built in; or a package whose parent is gone.
         return ""
@@ -174,7 +183,9 @@ def _missing(owner: Any, where: str, handler: str) -> str:
     return f"{where} has no `{wanted}`, which `{schedule}` in [schedule] asks for; found {found or 'no handler'}"
 
 
-def attempt(seconds: float, call: Callable[..., object], *arguments: object) -> Tuple[object, Optional[str], str]:
+def attempt(
+    seconds: float, call: Callable[..., object], *arguments: object
+) -> Tuple[object, Optional[str], str]:
     """What ``call`` returns, or the text of what it raises and of which kind that is: even of what asks to leave the process, and
     of a panic in the host's own code, which comes as an exception, too. After so many seconds it raises DeadlineExceeded; 0 is
     for ever."""
@@ -188,7 +199,9 @@ def attempt(seconds: float, call: Callable[..., object], *arguments: object) -> 
         end_call()
 
 
-def _attempt(seconds: float, call: Callable[..., object], *arguments: object) -> Tuple[object, Optional[str], str]:
+def _attempt(
+    seconds: float, call: Callable[..., object], *arguments: object
+) -> Tuple[object, Optional[str], str]:
     try:
         _deadline.arm(seconds)
         result = call(*arguments)

@@ -82,7 +82,9 @@ class Stream:
 
     def make(self) -> None:
         self.lines = Lines(self.name, self.level)
-        self.text = io.TextIOWrapper(self.lines, encoding="utf-8", errors="backslashreplace", line_buffering=True)
+        self.text = io.TextIOWrapper(
+            self.lines, encoding="utf-8", errors="backslashreplace", line_buffering=True
+        )
 
     def is_whole(self) -> bool:
         """Whether no lambda closed it, or put a stream of its own on what is below."""

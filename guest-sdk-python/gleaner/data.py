@@ -279,7 +279,9 @@ class Frame(Protocol):
 
         Raises DataError: ``out-of-range``; ``not-a-frame`` for Bayer encodings."""
 
-    def histogram(self, roi: Roi | tuple[int, int, int, int] | None = None) -> npt.NDArray[np.uint32]:
+    def histogram(
+        self, roi: Roi | tuple[int, int, int, int] | None = None
+    ) -> npt.NDArray[np.uint32]:
         """256 counts of the pixels' luma.
 
         Raises as :meth:`mean_luma`."""

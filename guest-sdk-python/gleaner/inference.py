@@ -77,7 +77,9 @@ class Tensor(Protocol):
     """Numbers in row-major order, on the host."""
 
     @staticmethod
-    def from_values(shape: Sequence[int], values: Sequence[float] | npt.NDArray[np.float32]) -> Tensor:
+    def from_values(
+        shape: Sequence[int], values: Sequence[float] | npt.NDArray[np.float32]
+    ) -> Tensor:
         """Makes a tensor of 32-bit floats.
 
         Raises InferenceError: ``wrong-input`` unless the product of ``shape`` is the number of ``values``."""
@@ -124,4 +126,6 @@ def _hosted() -> Any:
     try:
         return importlib.import_module("_gleaner")
     except ImportError:
-        raise InferenceError("models run on a Gleaner host, and this is none", "no-runtime") from None
+        raise InferenceError(
+            "models run on a Gleaner host, and this is none", "no-runtime"
+        ) from None

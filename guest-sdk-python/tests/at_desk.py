@@ -37,7 +37,9 @@ class AtDesk(Hosted):
         build = self.folder / "build"
         build.mkdir(exist_ok=True)
         (build / "main.py").write_text(textwrap.dedent(source), encoding="utf-8")
-        (build / "lambda.toml").write_text(MANIFEST.format(schedule=schedule, depth=depth), encoding="utf-8")
+        (build / "lambda.toml").write_text(
+            MANIFEST.format(schedule=schedule, depth=depth), encoding="utf-8"
+        )
         drive.write(self.folder / "drive.mcap", images, at_ms)
         try:
             run = replay(build, self.folder / "drive.mcap")

@@ -76,12 +76,22 @@ def write(path: Path, images: List[Image], at_ms: Sequence[int]) -> None:
     """A drive with these images, each at its log time."""
     records = [
         _record(HEADER, _text("ros2") + _text("tests")),
-        _record(SCHEMA, struct.pack("<H", 1) + _text("sensor_msgs/msg/Image") + _text("ros2msg") + _text(DEFINITION)),
-        _record(CHANNEL, struct.pack("<HH", 1, 1) + _text(TOPIC) + _text("cdr") + struct.pack("<I", 0)),
+        _record(
+            SCHEMA,
+            struct.pack("<H", 1)
+            + _text("sensor_msgs/msg/Image")
+            + _text("ros2msg")
+            + _text(DEFINITION),
+        ),
+        _record(
+            CHANNEL, struct.pack("<HH", 1, 1) + _text(TOPIC) + _text("cdr") + struct.pack("<I", 0)
+        ),
     ]
     for n, (image, ms) in enumerate(zip(images, at_ms)):
         at_ns = ms * 1_000_000
-        records.append(_record(MESSAGE, struct.pack("<HIQQ", 1, n + 1, at_ns, at_ns - 5) + image.cdr()))
+        records.append(
+            _record(MESSAGE, struct.pack("<HIQQ", 1, n + 1, at_ns, at_ns - 5) + image.cdr())
+        )
     records += [_record(DATA_END, bytes(4)), _record(FOOTER, bytes(20))]
     path.write_bytes(MAGIC + b"".join(records) + MAGIC)
 

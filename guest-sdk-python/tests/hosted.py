@@ -62,11 +62,26 @@ class Hosted(unittest.TestCase):
         build = self.folder / "build"
         build.mkdir(exist_ok=True)
         (build / "main.py").write_text(textwrap.dedent(source), encoding="utf-8")
-        (build / "lambda.toml").write_text(MANIFEST.format(schedule=schedule, depth=depth), encoding="utf-8")
+        (build / "lambda.toml").write_text(
+            MANIFEST.format(schedule=schedule, depth=depth), encoding="utf-8"
+        )
         self.assertLessEqual(len(images), len(at_ms))
         drive.write(self.folder / "drive.mcap", images, at_ms)
-        arguments = ["gleaner-runtime", "replay", str(self.folder), str(self.folder / "drive.mcap"), "--all"]
-        command = [sys.executable, "-I", "-S", str(home.SDK / "start.py"), self.extension, *arguments]
+        arguments = [
+            "gleaner-runtime",
+            "replay",
+            str(self.folder),
+            str(self.folder / "drive.mcap"),
+            "--all",
+        ]
+        command = [
+            sys.executable,
+            "-I",
+            "-S",
+            str(home.SDK / "start.py"),
+            self.extension,
+            *arguments,
+        ]
         return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
     def replay(
@@ -100,4 +115,8 @@ class Hosted(unittest.TestCase):
 
     def lines(self, name: str) -> List[Dict[str, Any]]:
         path = self.folder / "out" / name
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+        return (
+            [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+            if path.exists()
+            else []
+        )

@@ -43,7 +43,11 @@ class Ticks(AtDesk, test_hosted.Ticks):
 
 class Faults(AtDesk, test_hosted.Faults):
     def test_leaving_the_process_is_a_fault_too(self) -> None:
-        self.assertTrue(self.fault("import sys\ndef on_event(ctx, event): sys.exit(3)").endswith("SystemExit: 3"))
+        self.assertTrue(
+            self.fault("import sys\ndef on_event(ctx, event): sys.exit(3)").endswith(
+                "SystemExit: 3"
+            )
+        )
 
     def test_ctrl_c_ends_the_replay(self) -> None:
         # In the host it ends the process. Here somebody sits before it.
@@ -98,7 +102,10 @@ class Folders(unittest.TestCase):
     def write(self, name: str, files: Dict[str, str]) -> Path:
         """The folder of a lambda with its manifest and these files."""
         folder = self.folder / name
-        for inside, text in {"lambda.toml": MANIFEST.format(schedule=EACH, depth=4), **files}.items():
+        for inside, text in {
+            "lambda.toml": MANIFEST.format(schedule=EACH, depth=4),
+            **files,
+        }.items():
             path = folder / inside
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
@@ -113,16 +120,32 @@ class Folders(unittest.TestCase):
         uses = "from helper import NAME\nimport inner.deep\ndef on_event(ctx, event): ctx.event(NAME + inner.deep.NAME, 0)\n"
         for name in ("a", "b"):
             # The folder `inner` has no `__init__.py`.
-            self.write(name, {"main.py": uses, "helper.py": f"NAME = '{name}'\n", "inner/deep.py": f"NAME = '{name}'\n"})
+            self.write(
+                name,
+                {
+                    "main.py": uses,
+                    "helper.py": f"NAME = '{name}'\n",
+                    "inner/deep.py": f"NAME = '{name}'\n",
+                },
+            )
         before = set(sys.modules)
         for name in ("a", "b", "a"):
             self.assertEqual(self.labels(self.folder / name), [name + name])
-            self.assertEqual({one for one in set(sys.modules) - before if one.startswith(("helper", "inner", "main"))}, set())
+            self.assertEqual(
+                {
+                    one
+                    for one in set(sys.modules) - before
+                    if one.startswith(("helper", "inner", "main"))
+                },
+                set(),
+            )
 
     def test_also_where_folders_are_given_by_links_and_from_beside_them(self) -> None:
         uses = "from helper import NAME\ndef on_event(ctx, event): ctx.event(NAME, 0)\n"
         for name in ("a", "b"):
-            self.write(name, {"main.py": uses, "helper.py": f"NAME = '{name}'\n", "tests/empty.py": ""})
+            self.write(
+                name, {"main.py": uses, "helper.py": f"NAME = '{name}'\n", "tests/empty.py": ""}
+            )
             (self.folder / f"link-{name}").symlink_to(self.folder / name)
         for name in ("a", "b"):
             self.assertEqual(self.labels(self.folder / f"link-{name}"), [name])
@@ -143,7 +166,11 @@ class Folders(unittest.TestCase):
         source = "from gleaner import DataError\ndef on_event(ctx, event):\n"
         source += "    try:\n        ctx.input('gone')\n    except DataError as error:\n        ctx.event(error.kind, 0)\n"
         folder = self.write("new", {"main.py": source})
-        shutil.copytree(home.SDK / "gleaner", folder / ".gleaner/guest-sdk-python/gleaner", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            home.SDK / "gleaner",
+            folder / ".gleaner/guest-sdk-python/gleaner",
+            ignore=shutil.ignore_patterns("__pycache__"),
+        )
         test = """
             import sys
             sys.path[:0] = [".", ".gleaner/guest-sdk-python"]

@@ -23,7 +23,12 @@ from gleaner.testing._session import Scratch, Session, piece
 from gleaner.trigger import TriggerError
 
 MS = 1_000_000
-LIMITS = {"events_per_minute": 12_000, "log_lines": 100, "log_bytes": 400 << 10, "call_bytes": 1 << 20}
+LIMITS = {
+    "events_per_minute": 12_000,
+    "log_lines": 100,
+    "log_bytes": 400 << 10,
+    "call_bytes": 1 << 20,
+}
 REFUSALS = (DataError, ScratchError, TriggerError)
 
 Calls = Dict[str, Callable[..., Any]]
@@ -59,7 +64,9 @@ def arrival(seq: int, size: int) -> Arrival:
 
 class Cases(unittest.TestCase):
     def replay(self, rule: str, start: Callable[[Dict[str, Any]], Calls]) -> None:
-        for case in json.loads((home.CHECKOUT / "rules" / "cases" / f"{rule}.json").read_text(encoding="utf-8")):
+        for case in json.loads(
+            (home.CHECKOUT / "rules" / "cases" / f"{rule}.json").read_text(encoding="utf-8")
+        ):
             if "not in Python" in case:
                 continue
             calls = start(case["given"])
@@ -91,18 +98,26 @@ class Cases(unittest.TestCase):
                 "skipped": lambda: source.skipped,
             }
 
-        self.replay("schedule", lambda given: periodic(given) if "period_ns" in given else event(given))
+        self.replay(
+            "schedule", lambda given: periodic(given) if "period_ns" in given else event(given)
+        )
 
     def test_faults(self) -> None:
         notes = {_replay.MADE_ANEW: "made anew", _replay.RESTS: "rests"}
 
         def start(_: Dict[str, Any]) -> Calls:
             run = _replay._Pass.__new__(_replay._Pass)
-            run._session, run._decisions, run._drive = Session(LIMITS), [], SimpleNamespace(start_ns=0)  # type: ignore[assignment]
+            run._session, run._decisions, run._drive = (
+                Session(LIMITS),
+                [],
+                SimpleNamespace(start_ns=0),
+            )  # type: ignore[assignment]
             run._in_a_row, run._rest_ns, run._rest = 0, 0, (0, 0)
 
             def wake(at_ms: int, faults: bool) -> Any:
-                fault = SimpleNamespace(kind="exception", message="", allowed=None) if faults else None
+                fault = (
+                    SimpleNamespace(kind="exception", message="", allowed=None) if faults else None
+                )
                 run._guest = SimpleNamespace(wake=lambda _: fault)  # type: ignore[assignment]
                 decided, noted = len(run._decisions), len(run._session.lines)
                 run._wake(at_ms * MS, Tick(at_ms * MS, 0))
@@ -168,7 +183,9 @@ class Cases(unittest.TestCase):
                 "put": lambda name, kept: refusal(lambda: scratch.put(name, kept.encode())),
                 "fill": fill,
                 "append": lambda name, kept: refusal(lambda: scratch.append(name, kept.encode())),
-                "get": lambda name, offset, len: refusal(lambda: scratch.get(name, offset, len).decode()),
+                "get": lambda name, offset, len: refusal(
+                    lambda: scratch.get(name, offset, len).decode()
+                ),
                 "remove": lambda name: refusal(lambda: scratch.remove(name)),
                 "entries": scratch.entries,
                 "free": scratch.free,
@@ -197,7 +214,9 @@ class Cases(unittest.TestCase):
                 "hold": hold,
                 "let go": let_go,
                 "shows": shows,
-                "since": lambda at: [it.position for it in ring.newest_while(99, lambda found: found.at_ns > at)],
+                "since": lambda at: [
+                    it.position for it in ring.newest_while(99, lambda found: found.at_ns > at)
+                ],
                 "counts": lambda: [ring.head, ring.overwritten, ring.no_slot, ring.too_big],
             }
 
@@ -215,19 +234,31 @@ class Cases(unittest.TestCase):
                 return most
 
             def value(path: str, sort: str, size: int) -> Any:
-                found = np.zeros(size) if sort == "numbers" else 1 if sort == "one" else values[sort] * size
+                found = (
+                    np.zeros(size)
+                    if sort == "numbers"
+                    else 1
+                    if sort == "one"
+                    else values[sort] * size
+                )
                 source: Any = SimpleNamespace(limits=limits, message=lambda _: None)
-                fields: Any = SimpleNamespace(of=lambda _: SimpleNamespace(text=path, value=lambda _: found))
+                fields: Any = SimpleNamespace(
+                    of=lambda _: SimpleNamespace(text=path, value=lambda _: found)
+                )
                 sample = Sample(source, fields, SimpleNamespace(cell=None))  # type: ignore[arg-type]
                 return refused(lambda: sample.get(path))
 
             def elsewhere(path: str, *inputs: str) -> Any:
-                belongs, asked = (SimpleNamespace(declared=SimpleNamespace(name=name)) for name in inputs)
+                belongs, asked = (
+                    SimpleNamespace(declared=SimpleNamespace(name=name)) for name in inputs
+                )
                 field = Field(belongs, SimpleNamespace(text=path))  # type: ignore[arg-type]
                 return refused(lambda: Fields(asked).of(field))  # type: ignore[arg-type]
 
             def no_number(path: str, type_name: str) -> Any:
-                source: Any = SimpleNamespace(declared=SimpleNamespace(type_name=type_name), message=lambda _: None)
+                source: Any = SimpleNamespace(
+                    declared=SimpleNamespace(type_name=type_name), message=lambda _: None
+                )
                 array = Path(path, (), None, is_array=True)  # type: ignore[arg-type]
                 return refused(lambda: Source.number(source, SimpleNamespace(), array))  # type: ignore[arg-type]
 
@@ -312,7 +343,11 @@ def pixels(given: Dict[str, Any]) -> Calls:
             return ["not-a-frame", str(error).split("; supported are")[0]]
 
     def histogram(shown: _pixels.Picture, roi: Any) -> Iterator[Tuple[int, int]]:
-        return ((level, int(count)) for level, count in enumerate(_pixels.histogram(shown, roi)) if count)
+        return (
+            (level, int(count))
+            for level, count in enumerate(_pixels.histogram(shown, roi))
+            if count
+        )
 
     def made(shown: _pixels.Picture) -> List[Any]:
         return [shown.encoding, shown.data.tobytes().hex()]
@@ -321,7 +356,9 @@ def pixels(given: Dict[str, Any]) -> Calls:
         "mean luma": lambda roi: told("mean luma", lambda shown: _pixels.mean_luma(shown, roi)),
         "histogram": lambda roi: told("histogram", lambda shown: list(histogram(shown, roi))),
         "to gray": lambda: told("grey image", lambda shown: made(_pixels.to_gray(shown))),
-        "resize": lambda *size: told("resize", lambda shown: made(_pixels.resize(shown, *size)), size),
+        "resize": lambda *size: told(
+            "resize", lambda shown: made(_pixels.resize(shown, *size)), size
+        ),
     }
 
 

@@ -19,6 +19,7 @@ import gleaner
 from gleaner import data, inference, log, scratch, trigger
 from gleaner.testing import _context, _data, _frame, _session
 
+
 class Desk:
     """What `gleaner.testing` hands out. There are no models at the desk."""
 
@@ -71,11 +72,15 @@ def camel(name: str) -> str:
 
 def wanted() -> Dict[str, Dict[str, wit.Function]]:
     """The functions of each class, by their names in Python."""
-    functions = {name: function for of in OF_CONTEXT for name, function in INTERFACES[of].functions.items()}
+    functions = {
+        name: function for of in OF_CONTEXT for name, function in INTERFACES[of].functions.items()
+    }
     classes = {"Context": functions, "Scratch": INTERFACES["scratch"].functions}
     for interface in INTERFACES.values():
         classes.update({camel(name): functions for name, functions in interface.resources.items()})
-    return {cls: {snake(name): function for name, function in of.items()} for cls, of in classes.items()}
+    return {
+        cls: {snake(name): function for name, function in of.items()} for cls, of in classes.items()
+    }
 
 
 def members(cls: type) -> Set[str]:
@@ -112,7 +117,9 @@ class Surface(unittest.TestCase):
         self.assertTrue(callable(getattr(cls, name)), f"{cls.__name__}.{name} is a method")
         self.assertEqual(isinstance(given, staticmethod), declared.static, f"{cls.__name__}.{name}")
         names = [name for name, _, _ in parameters(cls, name)]
-        self.assertEqual(names, [snake(name) for name in declared.parameters], f"{cls.__name__}.{name}")
+        self.assertEqual(
+            names, [snake(name) for name in declared.parameters], f"{cls.__name__}.{name}"
+        )
 
     def test_the_package_has_the_names_of_the_wit(self) -> None:
         self.holds(gleaner)
@@ -149,7 +156,10 @@ class Values(unittest.TestCase):
                 with self.subTest(record=name):
                     named_tuple = getattr(gleaner, camel(name))
                     # `class` is a keyword of Python.
-                    self.assertEqual(named_tuple._fields, tuple(f"{f}_" if f == "class" else snake(f) for f in fields))
+                    self.assertEqual(
+                        named_tuple._fields,
+                        tuple(f"{f}_" if f == "class" else snake(f) for f in fields),
+                    )
 
     def test_the_kinds_of_an_error_are_the_cases_of_its_variant(self) -> None:
         for name, cases in self.all("variants"):
@@ -164,7 +174,9 @@ class Values(unittest.TestCase):
                 self.assertEqual(typing.get_args(ENUMS[name]), tuple(map(snake, cases)))
 
     def all(self, kind: str) -> Iterable[Tuple[str, List[str]]]:
-        found = [item for interface in INTERFACES.values() for item in getattr(interface, kind).items()]
+        found = [
+            item for interface in INTERFACES.values() for item in getattr(interface, kind).items()
+        ]
         self.assertTrue(found)
         return found
 

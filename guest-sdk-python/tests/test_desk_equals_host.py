@@ -40,15 +40,32 @@ class Examples(unittest.TestCase):
         """What the host decides in each of its wakes is what the desk decides."""
         extension = home.extension_path()
         with tempfile.TemporaryDirectory() as folder:
-            shutil.copytree(python, Path(folder) / "build", ignore=shutil.ignore_patterns("build", "out", "__pycache__"))
-            command = [sys.executable, "-I", str(home.SDK / "start.py"), extension, "gleaner-runtime", "replay", folder]
+            shutil.copytree(
+                python,
+                Path(folder) / "build",
+                ignore=shutil.ignore_patterns("build", "out", "__pycache__"),
+            )
+            command = [
+                sys.executable,
+                "-I",
+                str(home.SDK / "start.py"),
+                extension,
+                "gleaner-runtime",
+                "replay",
+                folder,
+            ]
             for key, value in config.items():
                 command += ["--set", f"{key}={value}"]
-            ended = subprocess.run([*command, str(SAMPLE), "--all"], capture_output=True, text=True, timeout=300)
+            ended = subprocess.run(
+                [*command, str(SAMPLE), "--all"], capture_output=True, text=True, timeout=300
+            )
             self.assertEqual(ended.returncode, 0, ended.stderr)
             out = Path(folder) / "out"
             lines = (out / "decisions.jsonl").read_text(encoding="utf-8").splitlines()
-            clips = [json.loads(clip) for clip in (out / "clips.jsonl").read_text(encoding="utf-8").splitlines()]
+            clips = [
+                json.loads(clip)
+                for clip in (out / "clips.jsonl").read_text(encoding="utf-8").splitlines()
+            ]
         run = replay(python, SAMPLE, config=config)
         decided = [decision.as_json() for decision in run.decisions]
         self.assertEqual(len(decided), len(lines))
@@ -63,17 +80,22 @@ class Examples(unittest.TestCase):
 
     def test_hello(self) -> None:
         run = self.example("hello", {"brake_mps2": -1.4})
-        self.assertEqual([(round(t.at_s, 2), t.label) for t in run.triggers], [(at, "hard-brake") for at in (4.14, 10.8, 38.22)])
+        self.assertEqual(
+            [(round(t.at_s, 2), t.label) for t in run.triggers],
+            [(at, "hard-brake") for at in (4.14, 10.8, 38.22)],
+        )
 
     def test_imu_fft(self) -> None:
         run = self.example("imu-fft", {"rough": 0.02})
         self.assertGreater(len(run.triggers), 50)
 
-
     def test_what_is_recorded_moves_no_tick(self) -> None:
         ticks = []
         with tempfile.TemporaryDirectory() as folder:
-            for recorded in ('topics = ["/imu/data"]', 'topics = ["/camera/front/compressed", "/imu/data"]'):
+            for recorded in (
+                'topics = ["/imu/data"]',
+                'topics = ["/camera/front/compressed", "/imu/data"]',
+            ):
                 (Path(folder) / "main.py").write_text(TICKS, encoding="utf-8")
                 (Path(folder) / "lambda.toml").write_text(PERIODIC + recorded, encoding="utf-8")
                 run = self.both(Path(folder), {})
@@ -111,7 +133,10 @@ class Pictures(Examples):
     """Another decoder of JPEG makes other pixels, by 3 of 255 at most on this drive."""
 
     def equal(self, ours: Dict[str, Any], theirs: Dict[str, Any], which: str) -> None:
-        lumas = [[trigger["attributes"].pop("luma") for trigger in it["triggers"]] for it in (ours, theirs)]
+        lumas = [
+            [trigger["attributes"].pop("luma") for trigger in it["triggers"]]
+            for it in (ours, theirs)
+        ]
         super().equal(ours, theirs, which)
         for luma, expected in zip(*lumas):
             self.assertAlmostEqual(luma, expected, delta=0.01)
@@ -121,7 +146,10 @@ class Pictures(Examples):
 
     def test_brake_dark(self) -> None:
         run = self.example("brake-dark", {"brake_mps2": -1.4, "dark_luma": 50})
-        self.assertEqual([(round(t.at_s, 1), t.label) for t in run.triggers], [(11.0, "brake-dark"), (38.3, "brake-dark")])
+        self.assertEqual(
+            [(round(t.at_s, 1), t.label) for t in run.triggers],
+            [(11.0, "brake-dark"), (38.3, "brake-dark")],
+        )
 
 
 # Sums of pixels of every kind as attributes, and digests of pictures that were made of them.

@@ -59,16 +59,22 @@ class Loading(Files):
     def test_plain_functions_work_and_init_is_optional(self) -> None:
         entry = self.write("def on_tick(ctx): return 'tick'")
         self.assertEqual(_host.load(entry, "on_tick")(self.ctx)(self.ctx), "tick")
-        entry = self.write("made = []\ndef init(ctx): made.append(ctx)\ndef on_tick(ctx): return made")
+        entry = self.write(
+            "made = []\ndef init(ctx): made.append(ctx)\ndef on_tick(ctx): return made"
+        )
         self.assertEqual(_host.load(entry, "on_tick")(self.ctx)(self.ctx), [self.ctx])
 
     def test_a_lambda_imports_what_lies_beside_it_and_leaves_nothing_there(self) -> None:
         self.write("state = []", "beside.py")
-        entry = self.write("import beside\ndef on_tick(ctx): beside.state.append(1); return len(beside.state)")
+        entry = self.write(
+            "import beside\ndef on_tick(ctx): beside.state.append(1); return len(beside.state)"
+        )
         for _ in range(2):
             handler = _host.load(entry, "on_tick")(self.ctx)
             self.assertEqual(handler(self.ctx), 1, "loaded again, it begins with fresh globals")
-        self.assertEqual(sorted(path.name for path in self.folder.iterdir()), ["beside.py", "main.py"])
+        self.assertEqual(
+            sorted(path.name for path in self.folder.iterdir()), ["beside.py", "main.py"]
+        )
 
     def test_a_missing_handler_is_named_with_what_there_is(self) -> None:
         refusals: Dict[str, str] = {
@@ -84,7 +90,8 @@ class Loading(Files):
     def test_a_file_that_is_no_python_is_refused(self) -> None:
         entry = self.write("", "main.wasm")
         self.assertEqual(
-            self.explained(entry, "on_event"), "`main.wasm` is no Python file: its name must end with `.py`"
+            self.explained(entry, "on_event"),
+            "`main.wasm` is no Python file: its name must end with `.py`",
         )
 
 
@@ -118,7 +125,9 @@ class Telling(Files):
 class AtADesk(unittest.TestCase):
     def test_an_error_says_its_kind_to_programs_and_the_rest_to_people(self) -> None:
         error = DataError("no input `imo`; the manifest has `imu`", "no-such-input")
-        self.assertEqual((str(error), error.kind), ("no input `imo`; the manifest has `imu`", "no-such-input"))
+        self.assertEqual(
+            (str(error), error.kind), ("no input `imo`; the manifest has `imu`", "no-such-input")
+        )
         self.assertIsInstance(error, ValueError)
 
     def test_without_a_host_there_are_no_models(self) -> None:

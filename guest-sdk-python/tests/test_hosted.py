@@ -14,22 +14,33 @@ from hosted import GREY, Hosted
 
 import gleaner
 
+
 class Arrays(Hosted):
     def array_of(self, image: Image, *checks: str) -> None:
         """Holds `checks` on `array`, the pixels of `image`."""
         source = "import numpy as np\ndef on_event(ctx, event):\n    frame = event.as_frame()\n    array = frame.array()\n"
-        lines = [f"    assert {check}, (array.dtype, array.shape, array.strides, array.tolist())\n" for check in checks]
+        lines = [
+            f"    assert {check}, (array.dtype, array.shape, array.strides, array.tolist())\n"
+            for check in checks
+        ]
         self.replay(source + "".join(lines), [image])
 
     def test_colour_has_a_channel_axis(self) -> None:
         image = Image(2, 2, "bgr8", 6, bytes(range(12)))
-        self.array_of(image, "array.dtype == np.uint8", "array.tobytes() == bytes(range(12))", "array.shape == (2, 2, 3)")
+        self.array_of(
+            image,
+            "array.dtype == np.uint8",
+            "array.tobytes() == bytes(range(12))",
+            "array.shape == (2, 2, 3)",
+        )
         image = Image(1, 2, "rgba8", 4, bytes(range(8)))
         self.array_of(image, "array.shape == (2, 1, 4)", "array[1, 0].tolist() == [4, 5, 6, 7]")
 
     def test_padding_behind_rows_is_stepped_over(self) -> None:
         image = Image(2, 2, "rgb8", 8, bytes(range(16)))
-        self.array_of(image, "array.strides == (8, 3, 1)", "array[1].tolist() == [[8, 9, 10], [11, 12, 13]]")
+        self.array_of(
+            image, "array.strides == (8, 3, 1)", "array[1].tolist() == [[8, 9, 10], [11, 12, 13]]"
+        )
 
     def test_grey_and_bayer_have_two_axes(self) -> None:
         self.array_of(GREY, "array.tolist() == [[7, 9]]", "array.dtype == np.uint8")
@@ -38,13 +49,20 @@ class Arrays(Hosted):
     def test_sixteen_bits_keep_their_byte_order(self) -> None:
         self.array_of(Image(2, 1, "mono16", 4, b"\x01\x00\x00\x01"), "array.tolist() == [[1, 256]]")
         image = Image(2, 1, "mono16", 4, b"\x01\x00\x00\x01", big_endian=True)
-        self.array_of(image, "array.tolist() == [[256, 1]]", "array.dtype == np.dtype('>u2')", "(array + 1).sum() == 259")
+        self.array_of(
+            image,
+            "array.tolist() == [[256, 1]]",
+            "array.dtype == np.dtype('>u2')",
+            "(array + 1).sum() == 259",
+        )
         # Behind an odd number of bytes the pixels lie at an odd address.
         image = Image(2, 2, "bayer_gbrg16", 5, bytes([1, 0, 2, 0, 9, 3, 0, 4, 0, 9]))
         self.array_of(image, "array.tolist() == [[1, 2], [3, 4]]", "not array.flags.aligned")
 
     def test_yuv422_has_two_numbers_for_each_pixel(self) -> None:
-        self.array_of(Image(2, 1, "yuv422", 4, b"\x01\x02\x03\x04"), "array.tolist() == [[[1, 2], [3, 4]]]")
+        self.array_of(
+            Image(2, 1, "yuv422", 4, b"\x01\x02\x03\x04"), "array.tolist() == [[[1, 2], [3, 4]]]"
+        )
 
     def test_an_array_cannot_be_written_to(self) -> None:
         source = """
@@ -177,7 +195,10 @@ class Data(Hosted):
             "out of range integral type conversion attempted",
             "Python int too large to convert to C long",
         )
-        self.assertEqual([text for _, text in self.log()], [negative, much] * 4 + [range, range, long] * 4 + [long, long] * 2)
+        self.assertEqual(
+            [text for _, text in self.log()],
+            [negative, much] * 4 + [range, range, long] * 4 + [long, long] * 2,
+        )
 
     def test_configuration_has_the_types_of_the_manifest(self) -> None:
         source = """
@@ -234,17 +255,33 @@ class Triggers(Hosted):
         """
         triggers = self.replay(source, [GREY])[0]["triggers"]
         attributes = {"label": "l", "score": -1, "whole": 3, "flag": True, "a key": 2.5}
-        self.assertEqual(triggers[0], {"kind": "event", "label": "e", "score": 0.5, "attributes": attributes})
+        self.assertEqual(
+            triggers[0], {"kind": "event", "label": "e", "score": 0.5, "attributes": attributes}
+        )
         self.assertIs(triggers[0]["attributes"]["flag"], True)
-        self.assertEqual([(t["kind"], t["label"], t["attributes"]) for t in triggers[1:]], [
-            ("start", "s", {"why": "rain"}),
-            ("stop", "s", {}),
-        ])
+        self.assertEqual(
+            [(t["kind"], t["label"], t["attributes"]) for t in triggers[1:]],
+            [
+                ("start", "s", {"why": "rain"}),
+                ("stop", "s", {}),
+            ],
+        )
 
     def test_an_attribute_of_another_type_is_named(self) -> None:
-        for boxes, name in (("[1, 2]", "list"), ("numpy.zeros(2)", "ndarray"), ("numpy.zeros(0)", "ndarray")):
-            told = self.fault(f"import numpy\ndef on_event(ctx, event): ctx.event('e', 1, boxes={boxes})")
-            self.assertTrue(told.endswith(f"TypeError: attribute `boxes` of `e` is of type `{name}`; give bool, int, float or str"), told)
+        for boxes, name in (
+            ("[1, 2]", "list"),
+            ("numpy.zeros(2)", "ndarray"),
+            ("numpy.zeros(0)", "ndarray"),
+        ):
+            told = self.fault(
+                f"import numpy\ndef on_event(ctx, event): ctx.event('e', 1, boxes={boxes})"
+            )
+            self.assertTrue(
+                told.endswith(
+                    f"TypeError: attribute `boxes` of `e` is of type `{name}`; give bool, int, float or str"
+                ),
+                told,
+            )
 
     def test_there_are_none_outside_of_a_wake(self) -> None:
         source = """
@@ -266,8 +303,13 @@ class Triggers(Hosted):
                     raise RuntimeError("make it anew, in the next wake")
         """
         self.fault(source)
-        labels = [[trigger["label"] for trigger in decision["triggers"]] for decision in self.decisions()]
-        self.assertEqual(labels, [["invalid invalid invalid"], ["invalid invalid invalid invalid invalid invalid"]])
+        labels = [
+            [trigger["label"] for trigger in decision["triggers"]] for decision in self.decisions()
+        ]
+        self.assertEqual(
+            labels,
+            [["invalid invalid invalid"], ["invalid invalid invalid invalid invalid invalid"]],
+        )
 
 
 class Ticks(Hosted):
@@ -280,10 +322,16 @@ class Ticks(Hosted):
 
     def test_the_ticks_of_a_long_gap_are_told_to_the_next_one(self) -> None:
         decisions = self.replay(
-            self.SOURCE, [GREY] * 3, wakes=4, schedule='period = "1ms"', at_ms=[1_000, 200_000, 200_003]
+            self.SOURCE,
+            [GREY] * 3,
+            wakes=4,
+            schedule='period = "1ms"',
+            at_ms=[1_000, 200_000, 200_003],
         )
         # Those at 1,001 ms to 199,999 ms.
-        self.assertEqual([decision["triggers"][0]["score"] for decision in decisions], [198_999.0, 0.0, 0.0, 0.0])
+        self.assertEqual(
+            [decision["triggers"][0]["score"] for decision in decisions], [198_999.0, 0.0, 0.0, 0.0]
+        )
 
 
 class Faults(Hosted):
@@ -311,8 +359,16 @@ class Faults(Hosted):
         self.assertEqual(scores, [11, 12], "a new object, and the module as it was")
 
     def test_leaving_the_process_is_a_fault_too(self) -> None:
-        self.assertTrue(self.fault("import sys\ndef on_event(ctx, event): sys.exit(3)").endswith("SystemExit: 3"))
-        self.assertTrue(self.fault("def on_event(ctx, event): raise KeyboardInterrupt").endswith("KeyboardInterrupt"))
+        self.assertTrue(
+            self.fault("import sys\ndef on_event(ctx, event): sys.exit(3)").endswith(
+                "SystemExit: 3"
+            )
+        )
+        self.assertTrue(
+            self.fault("def on_event(ctx, event): raise KeyboardInterrupt").endswith(
+                "KeyboardInterrupt"
+            )
+        )
 
     def test_a_long_message_keeps_its_end(self) -> None:
         told = self.fault("def on_event(ctx, event): raise RuntimeError('é' * 9000 + ' at last')")
@@ -339,7 +395,9 @@ class Faults(Hosted):
                 event.as_frame().array()
         """
         told = self.fault(source, wake=1)
-        self.assertIn("line 6, in on_event\n    event.as_frame().array()\npyo3_runtime.PanicException: ", told)
+        self.assertIn(
+            "line 6, in on_event\n    event.as_frame().array()\npyo3_runtime.PanicException: ", told
+        )
         self.assertEqual([line for line in self.log() if not line[1].startswith("gleaner: ")], [])
 
     def test_a_thread_left_behind_does_not_keep_the_process(self) -> None:
@@ -365,7 +423,10 @@ class Starting(Hosted):
         (package / "__init__.py").write_text('__version__ = "9.9.9"')
         (package / "_host.py").write_text("")
         told = self.refusal(self.extension, home_folder=self.folder)
-        self.assertIn(f"  cause: the package gleaner is 9.9.9, and {self.extension} is {gleaner.__version__}\n  help:  ", told)
+        self.assertIn(
+            f"  cause: the package gleaner is 9.9.9, and {self.extension} is {gleaner.__version__}\n  help:  ",
+            told,
+        )
 
     def test_an_extension_that_cannot_be_loaded_is_refused(self) -> None:
         told = self.refusal(str(self.folder / "lib_gleaner.so"))

@@ -29,12 +29,26 @@ class Printing(Hosted):
                     print("wake", 2, file=sys.stderr)
         """
         self.replay(source, [GREY])
-        said = [("info", "import"), ("warn", "init"), ("info", "wake 1"), ("debug", "between"), ("warn", "wake 2")]
+        said = [
+            ("info", "import"),
+            ("warn", "init"),
+            ("info", "wake 1"),
+            ("debug", "between"),
+            ("warn", "wake 2"),
+        ]
         self.assertEqual(self.log(), said)
-        self.assertEqual([line["at_ns"] for line in self.lines("log.jsonl")], [0, 0] + [1_000_000_000] * 3)
+        self.assertEqual(
+            [line["at_ns"] for line in self.lines("log.jsonl")], [0, 0] + [1_000_000_000] * 3
+        )
 
     def test_a_line_ends_with_its_newline_or_with_the_call(self) -> None:
-        self.printed("print('a', end=''); print('b'); print('c\\nd\\n\\n  e'); print('f', end='')", "ab", *"cd", "  e", "f")
+        self.printed(
+            "print('a', end=''); print('b'); print('c\\nd\\n\\n  e'); print('f', end='')",
+            "ab",
+            *"cd",
+            "  e",
+            "f",
+        )
         source = "def on_event(ctx, event): print('no newline', end='')"
         self.replay(source, [GREY, GREY])
         self.assertEqual(self.log(), [("info", "no newline")] * 2)
@@ -50,7 +64,10 @@ class Printing(Hosted):
     def test_what_is_printed_is_no_report_and_not_said_twice(self) -> None:
         source = "import os\ndef on_event(ctx, event): print('hello'); os.write(1, b'there\\n')"
         ended = self.start(source, [GREY])
-        self.assertEqual([json.loads(line)["report"] for line in ended.stdout.splitlines()], ["isolation", "summary"])
+        self.assertEqual(
+            [json.loads(line)["report"] for line in ended.stdout.splitlines()],
+            ["isolation", "summary"],
+        )
         self.assertEqual((self.log(), ended.stderr), ([("info", "hello")], "there\n"))
 
     def test_a_fault_is_told_once_and_what_was_printed_before_it_is_kept(self) -> None:
@@ -88,7 +105,9 @@ class Printing(Hosted):
         """
         self.replay(source, [GREY])
         *of_threads, last = self.log()
-        self.assertEqual(sorted(of_threads), [("info", f"thread {n} " + "x" * 500) for n in range(8)])
+        self.assertEqual(
+            sorted(of_threads), [("info", f"thread {n} " + "x" * 500) for n in range(8)]
+        )
         self.assertEqual(last, ("warn", "INFO:root:all of them"))
 
     def test_no_other_process_can_be_started(self) -> None:
@@ -124,10 +143,14 @@ class Printing(Hosted):
     def test_a_lambda_may_take_its_streams_apart(self) -> None:
         for statement, said in {
             "sys.stdout.close(); sys.stderr.close()": [],
-            "sys.stdout = io.TextIOWrapper(sys.stdout.detach(), line_buffering=True); print('a')": [("info", "a")],
+            "sys.stdout = io.TextIOWrapper(sys.stdout.detach(), line_buffering=True); print('a')": [
+                ("info", "a")
+            ],
             "sys.stdout = sys.stderr = None; print('a')": [],
         }.items():
-            self.replay(f"import io, sys\n{statement}\ndef on_event(ctx, event): pass", [GREY, GREY])
+            self.replay(
+                f"import io, sys\n{statement}\ndef on_event(ctx, event): pass", [GREY, GREY]
+            )
             self.assertEqual(self.log(), said, statement)
 
 

@@ -45,7 +45,11 @@ def encoded(form: str, size: Tuple[int, int], mode: str) -> bytes:
 
 def chunk(kind_and_data: bytes) -> bytes:
     """Of a PNG."""
-    return (len(kind_and_data) - 4).to_bytes(4, "big") + kind_and_data + zlib.crc32(kind_and_data).to_bytes(4, "big")
+    return (
+        (len(kind_and_data) - 4).to_bytes(4, "big")
+        + kind_and_data
+        + zlib.crc32(kind_and_data).to_bytes(4, "big")
+    )
 
 
 class Above:
@@ -63,15 +67,25 @@ class Above:
 class Arrays(unittest.TestCase):
     def test_times_and_values_of_arrays_are_those_of_triggers(self) -> None:
         run = replay(Above, imu([0, 2, 0, 0, 3]), manifest=manifest())
-        self.assertEqual([(t.at_s, t.score, t.attributes) for t in run.triggers], [(0.1, 2.0, {"n": 2}), (0.4, 3.0, {"n": 3})])
-        self.assertEqual((len(run.decisions), run.faults, run.start_ns, run.end_ns), (5, [], 0, 400_000_000))
+        self.assertEqual(
+            [(t.at_s, t.score, t.attributes) for t in run.triggers],
+            [(0.1, 2.0, {"n": 2}), (0.4, 3.0, {"n": 3})],
+        )
+        self.assertEqual(
+            (len(run.decisions), run.faults, run.start_ns, run.end_ns), (5, [], 0, 400_000_000)
+        )
         self.assertEqual((run.counts["imu"].received, run.counts["imu"].overwritten), (5, 2))
         times, scores = run.series("above")
         self.assertEqual((times.tolist(), scores.tolist()), ([0.1, 0.4], [2.0, 3.0]))
 
     def test_config_lies_over_the_manifest(self) -> None:
         items = {"limit": {"default": 1.0, "max": 10, "unit": "m/s^2"}}
-        run = replay(Above, imu([0, 2, 0, 0, 3]), manifest=manifest(config=items), config={"limit": np.float32(2.5)})
+        run = replay(
+            Above,
+            imu([0, 2, 0, 0, 3]),
+            manifest=manifest(config=items),
+            config={"limit": np.float32(2.5)},
+        )
         self.assertEqual([t.score for t in run.triggers], [3.0])
         refused: Cases = [
             ({"limt": 1}, "did you mean `limit`"),
@@ -101,12 +115,21 @@ class Arrays(unittest.TestCase):
                 ctx.event(frame.info.encoding, frame.mean_luma(), shape=str(frame.array().shape))
 
         inputs = [{"name": "imu", "topic": "/camera", "type": "sensor_msgs/msg/Image"}]
-        given = {"t": [0, 1], "image": [np.full((2, 3), 7, np.uint8), np.full((4, 5, 3), 9, np.uint8)]}
+        given = {
+            "t": [0, 1],
+            "image": [np.full((2, 3), 7, np.uint8), np.full((4, 5, 3), 9, np.uint8)],
+        }
         run = replay(Lambda, {"/camera": given}, manifest=manifest(input=inputs))
-        self.assertEqual([(t.label, t.score, t.attributes["shape"]) for t in run.triggers],
-                         [("mono8", 7.0, "(2, 3)"), ("rgb8", 9.0, "(4, 5, 3)")])
+        self.assertEqual(
+            [(t.label, t.score, t.attributes["shape"]) for t in run.triggers],
+            [("mono8", 7.0, "(2, 3)"), ("rgb8", 9.0, "(4, 5, 3)")],
+        )
         with self.assertRaisesRegex(ReplayError, "give uint8 of shape"):
-            replay(Lambda, {"/camera": {"t": [0], "image": [np.zeros((2, 3))]}}, manifest=manifest(input=inputs))
+            replay(
+                Lambda,
+                {"/camera": {"t": [0], "image": [np.zeros((2, 3))]}},
+                manifest=manifest(input=inputs),
+            )
 
     def test_compressed_pictures_are_decoded_within_their_room(self) -> None:
         kept: List[Any] = []
@@ -121,31 +144,66 @@ class Arrays(unittest.TestCase):
                 except DataError as error:
                     ctx.event(error.kind, 0.0, why=str(error))
 
-        inputs = [{"name": "imu", "topic": "/camera", "type": "sensor_msgs/msg/CompressedImage", "decoded_size": "600 B"}]
-        small, grey, large = encoded("JPEG", (20, 10), "RGB"), encoded("PNG", (5, 4), "L"), encoded("JPEG", (21, 10), "RGB")
+        inputs = [
+            {
+                "name": "imu",
+                "topic": "/camera",
+                "type": "sensor_msgs/msg/CompressedImage",
+                "decoded_size": "600 B",
+            }
+        ]
+        small, grey, large = (
+            encoded("JPEG", (20, 10), "RGB"),
+            encoded("PNG", (5, 4), "L"),
+            encoded("JPEG", (21, 10), "RGB"),
+        )
         header = b"IHDR" + (60_000).to_bytes(4, "big") * 2 + b"\x08\2\0\0\0"
-        bomb = b"\x89PNG\r\n\x1a\n" + chunk(header) + chunk(b"IDAT" + zlib.compress(b"")) + chunk(b"IEND")
+        bomb = (
+            b"\x89PNG\r\n\x1a\n"
+            + chunk(header)
+            + chunk(b"IDAT" + zlib.compress(b""))
+            + chunk(b"IEND")
+        )
         data = [small, grey, large, bomb, small[:400], b"GIF89a", b"", small, small, small]
-        run = replay(Lambda, {"/camera": {"t": range(len(data)), "data": data}}, manifest=manifest(input=inputs))
+        run = replay(
+            Lambda,
+            {"/camera": {"t": range(len(data)), "data": data}},
+            manifest=manifest(input=inputs),
+        )
         self.assertEqual(run.faults, [])
         found = [(t.label, t.attributes.get("size", t.attributes.get("why"))) for t in run.triggers]
         self.assertEqual(found[:2], [("rgb8", 600), ("rgb8", 60)])
-        self.assertEqual([label for label, _ in found[2:]], ["no-room", "no-room", *["not-a-frame"] * 3, "rgb8", "no-room", "no-room"])
-        self.assertIn("21x10 (630 bytes as rgb8); this input's decoded_size is 600 bytes", str(found[2][1]))
+        self.assertEqual(
+            [label for label, _ in found[2:]],
+            ["no-room", "no-room", *["not-a-frame"] * 3, "rgb8", "no-room", "no-room"],
+        )
+        self.assertIn(
+            "21x10 (630 bytes as rgb8); this input's decoded_size is 600 bytes", str(found[2][1])
+        )
         self.assertIn("every slot for decoded images of `/camera` is held", str(found[-1][1]))
 
     def test_types_of_ones_own_are_defined_by_their_text(self) -> None:
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
-                ctx.event("wheel", event.number("speeds[1]"), name=str(event.get("names")), flag=str(event.get("on")))
+                ctx.event(
+                    "wheel",
+                    event.number("speeds[1]"),
+                    name=str(event.get("names")),
+                    flag=str(event.get("on")),
+                )
 
         inputs = [{"name": "imu", "topic": "/wheels", "type": "car/msg/Wheels"}]
-        arrays = {"/wheels": {"t": [0.0], "speeds": [[1.0, 2.0]], "names": [["a", "b"]], "on": [True]}}
+        arrays = {
+            "/wheels": {"t": [0.0], "speeds": [[1.0, 2.0]], "names": [["a", "b"]], "on": [True]}
+        }
         with self.assertRaisesRegex(ReplayError, "pass types="):
             replay(Lambda, arrays, manifest=manifest(input=inputs))
         types = {"car/msg/Wheels": "float32[] speeds\nstring[] names\nbool on\n"}
         run = replay(Lambda, arrays, manifest=manifest(input=inputs), types=types)
-        self.assertEqual((run.triggers[0].score, run.triggers[0].attributes), (2.0, {"name": "['a', 'b']", "flag": "True"}))
+        self.assertEqual(
+            (run.triggers[0].score, run.triggers[0].attributes),
+            (2.0, {"name": "['a', 'b']", "flag": "True"}),
+        )
 
     def test_topics_are_merged_by_time(self) -> None:
         class Lambda(Above):
@@ -156,11 +214,17 @@ class Arrays(unittest.TestCase):
         speed = {"name": "speed", "topic": "/speed", "type": "geometry_msgs/msg/TwistStamped"}
         declared = manifest(input=[*manifest()["input"], speed])
         arrays = {**imu([0, 0, 0]), "/speed": {"t": [0.05, 0.2], "twist.linear.x": [5, 6]}}
-        self.assertEqual([t.score for t in replay(Lambda, arrays, manifest=declared).triggers], [-1.0, 5.0, 5.0])
+        self.assertEqual(
+            [t.score for t in replay(Lambda, arrays, manifest=declared).triggers], [-1.0, 5.0, 5.0]
+        )
         # Equal times come in the order in which the topics were given; a topic may be left out.
         arrays = {"/speed": arrays["/speed"], IMU: arrays[IMU]}
-        self.assertEqual([t.score for t in replay(Lambda, arrays, manifest=declared).triggers], [-1.0, 5.0, 6.0])
-        self.assertEqual([t.score for t in replay(Lambda, imu([0]), manifest=declared).triggers], [-1.0])
+        self.assertEqual(
+            [t.score for t in replay(Lambda, arrays, manifest=declared).triggers], [-1.0, 5.0, 6.0]
+        )
+        self.assertEqual(
+            [t.score for t in replay(Lambda, imu([0]), manifest=declared).triggers], [-1.0]
+        )
 
     def test_arrays_that_contradict_themselves_are_refused(self) -> None:
         refused: Cases = [
@@ -171,7 +235,10 @@ class Arrays(unittest.TestCase):
             ({"t": [0], "linear_acceleration.zz": [1]}, "has no field `zz`"),
             ({"t": [0], "linear_acceleration": [1]}, "is a whole `geometry_msgs/msg/Vector3`"),
             ({"t": [0, 1], "linear_acceleration.z": [1]}, "has 1 values, and there are 2 times"),
-            ({"t": [0], "orientation_covariance": [[1, 2]]}, "message 0 cannot be made: .* has 9 elements, and 2 were given"),
+            (
+                {"t": [0], "orientation_covariance": [[1, 2]]},
+                "message 0 cannot be made: .* has 9 elements, and 2 were given",
+            ),
             ({"t": [0], "header.stamp.sec": [0.5]}, "is a whole number, and 0.5 is none"),
         ]
         for table, why in refused:
@@ -218,7 +285,9 @@ class Manifests(unittest.TestCase):
             replay("nowhere", imu([0]))
 
     def test_manifests_of_the_checkout_can_be_read(self) -> None:
-        found = sorted(home.CHECKOUT.glob("*/*/*/lambda.toml")) + sorted(home.CHECKOUT.glob("tests/lambdas/*/*/lambda.toml"))
+        found = sorted(home.CHECKOUT.glob("*/*/*/lambda.toml")) + sorted(
+            home.CHECKOUT.glob("tests/lambdas/*/*/lambda.toml")
+        )
         self.assertGreater(len(found), 6)
         for path in found:
             with self.subTest(path=path):
@@ -228,7 +297,10 @@ class Manifests(unittest.TestCase):
 class Lambdas(unittest.TestCase):
     def test_plain_functions_of_a_module_are_a_lambda(self) -> None:
         module = types.ModuleType("plain")
-        exec("def init(ctx): ctx.log('info', 'made')\ndef on_event(ctx, event): ctx.event('e', 1)", module.__dict__)
+        exec(
+            "def init(ctx): ctx.log('info', 'made')\ndef on_event(ctx, event): ctx.event('e', 1)",
+            module.__dict__,
+        )
         run = replay(module, imu([0]), manifest=manifest())
         self.assertEqual((len(run.triggers), [line.message for line in run.log]), (1, ["made"]))
 
@@ -259,13 +331,20 @@ class Lambdas(unittest.TestCase):
         with contextlib.redirect_stdout(said):
             run = replay(Lambda, imu([0]), manifest=manifest(), prints_to_log=False)
         self.assertEqual((said.getvalue(), run.log), ("seen\n", []))
-        self.assertEqual([line.message for line in replay(Lambda, imu([0]), manifest=manifest()).log], ["seen"])
+        self.assertEqual(
+            [line.message for line in replay(Lambda, imu([0]), manifest=manifest()).log], ["seen"]
+        )
 
     def test_scratch_outlives_a_fault(self) -> None:
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
                 ctx.scratch.append("seen", b"x")
-                ctx.event("seen", len(ctx.scratch.get("seen")), free=ctx.scratch.free(), entries=str(ctx.scratch.entries()))
+                ctx.event(
+                    "seen",
+                    len(ctx.scratch.get("seen")),
+                    free=ctx.scratch.free(),
+                    entries=str(ctx.scratch.entries()),
+                )
                 raise RuntimeError("no")
 
         run = replay(Lambda, imu([0, 0, 0]), manifest=manifest(limits={"scratch": "70 B"}))

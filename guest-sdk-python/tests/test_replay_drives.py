@@ -51,7 +51,9 @@ def bag(path: Path, speeds: List[float], storage: StoragePlugin, **compression: 
         connection = writer.add_connection("/speed", SPEED, typestore=STORE)
         vector, twist = STORE.types["geometry_msgs/msg/Vector3"], STORE.types[SPEED]
         for n, speed in enumerate(speeds, 1):
-            message = twist(linear=vector(x=speed, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+            message = twist(
+                linear=vector(x=speed, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0)
+            )
             writer.write(connection, n * 1_000_000_000, STORE.serialize_cdr(message, SPEED))
 
 
@@ -70,8 +72,10 @@ class Drives(unittest.TestCase):
                     path = self.folder / f"{storage.name}-{mode}"
                     bag(path, [3.5, 4.5], storage, mode=mode)
                     run = replay(Speeds, path, manifest=manifest())
-                    self.assertEqual([(t.at_s, t.score, t.attributes) for t in run.triggers],
-                                     [(0.0, 3.5, {"seq": 1}), (1.0, 4.5, {"seq": 2})])
+                    self.assertEqual(
+                        [(t.at_s, t.score, t.attributes) for t in run.triggers],
+                        [(0.0, 3.5, {"seq": 1}), (1.0, 4.5, {"seq": 2})],
+                    )
                     self.assertEqual((run.start_ns, run.end_ns), (1_000_000_000, 2_000_000_000))
 
     def test_several_files_are_one_drive_in_the_order_of_time(self) -> None:
@@ -89,7 +93,15 @@ class Drives(unittest.TestCase):
 
         run = replay(Writers, paths, manifest={**manifest(), "input": [camera]})
         found = [(t.at_ns // 1_000_000, t.label, t.score) for t in run.triggers]
-        self.assertEqual(found, [(1000, "00000000", 1), (1000, "00000001", 1), (2000, "00000001", 2), (3000, "00000000", 2)])
+        self.assertEqual(
+            found,
+            [
+                (1000, "00000000", 1),
+                (1000, "00000001", 1),
+                (2000, "00000001", 2),
+                (3000, "00000000", 2),
+            ],
+        )
 
     def test_a_drive_is_looked_at_without_a_lambda(self) -> None:
         sample = Drive(SAMPLE)
@@ -120,7 +132,10 @@ class Drives(unittest.TestCase):
     def test_what_is_renamed_has_to_be_in_the_manifest(self) -> None:
         path = self.folder / "bag"
         bag(path, [3.5], StoragePlugin.SQLITE3)
-        with self.assertRaisesRegex(ReplayError, "no input has the topic `/velocty` of remap\n.*the manifest has `/speed`, `/other`"):
+        with self.assertRaisesRegex(
+            ReplayError,
+            "no input has the topic `/velocty` of remap\n.*the manifest has `/speed`, `/other`",
+        ):
             given = {**manifest(), "record": {"topics": ["/speed", "/other"]}}
             replay(Speeds, path, manifest=given, remap={"/velocty": "/speed"})
 
@@ -130,27 +145,54 @@ class Drives(unittest.TestCase):
 
         class Both(Speeds):
             def on_event(self, ctx: Context, event: Sample) -> None:
-                ctx.event("seen", event.number("linear.x"), **{name: ctx.input(name).counts().received for name in ctx.inputs()})
+                ctx.event(
+                    "seen",
+                    event.number("linear.x"),
+                    **{name: ctx.input(name).counts().received for name in ctx.inputs()},
+                )
 
-        inputs = [{"name": name, "topic": f"/{name}", "type": SPEED} for name in ("first", "speed", "third")]
+        inputs = [
+            {"name": name, "topic": f"/{name}", "type": SPEED}
+            for name in ("first", "speed", "third")
+        ]
         # Each is a delivery of its own: who is woken sees the inputs before its own, and not yet those behind.
-        run = replay(Both, path, manifest={**manifest(), "input": inputs}, remap={f"/{name}": "/speed" for name in ("first", "third")})
-        self.assertEqual([(t.score, t.attributes) for t in run.triggers],
-                         [(3.5, {"first": 1, "speed": 1, "third": 0}), (4.5, {"first": 2, "speed": 2, "third": 1})])
-        self.assertEqual({name: count.received for name, count in run.counts.items()}, {"first": 2, "speed": 2, "third": 2})
+        run = replay(
+            Both,
+            path,
+            manifest={**manifest(), "input": inputs},
+            remap={f"/{name}": "/speed" for name in ("first", "third")},
+        )
+        self.assertEqual(
+            [(t.score, t.attributes) for t in run.triggers],
+            [
+                (3.5, {"first": 1, "speed": 1, "third": 0}),
+                (4.5, {"first": 2, "speed": 2, "third": 1}),
+            ],
+        )
+        self.assertEqual(
+            {name: count.received for name, count in run.counts.items()},
+            {"first": 2, "speed": 2, "third": 2},
+        )
 
     def test_a_record_of_which_the_drive_has_no_topic_is_refused(self) -> None:
         path = self.folder / "bag"
         bag(path, [3.5], StoragePlugin.SQLITE3)
         record = {**manifest(), "record": {"topics": ["/imu", "/camera"]}}
-        with self.assertRaisesRegex(ReplayError, "none of the topics of \\[record\\]\n.*has `/imu`, `/camera`\n.*the drive has `/speed`; pass remap="):
+        with self.assertRaisesRegex(
+            ReplayError,
+            "none of the topics of \\[record\\]\n.*has `/imu`, `/camera`\n.*the drive has `/speed`; pass remap=",
+        ):
             replay(Speeds, path, manifest=record)
         # Some may be missing, and arrays are a part of a drive.
-        self.assertEqual(len(replay(Speeds, path, manifest=record, remap={"/imu": "/speed"}).windows), 1)
+        self.assertEqual(
+            len(replay(Speeds, path, manifest=record, remap={"/imu": "/speed"}).windows), 1
+        )
         self.assertEqual(len(replay(Speeds, {"/speed": {"t": [0]}}, manifest=record).windows), 1)
 
     def test_an_input_of_another_type_is_refused(self) -> None:
-        with self.assertRaisesRegex(ReplayError, "input `speed` is of type .*\n.*topic `/speed` is of type `geometry_msgs"):
+        with self.assertRaisesRegex(
+            ReplayError, "input `speed` is of type .*\n.*topic `/speed` is of type `geometry_msgs"
+        ):
             path = self.folder / "bag"
             bag(path, [1.0], StoragePlugin.SQLITE3)
             replay(Speeds, path, manifest=manifest(type="sensor_msgs/msg/Imu"))
@@ -159,7 +201,9 @@ class Drives(unittest.TestCase):
         path = self.folder / "bag"
         bag(path, [1.0, 2.0], StoragePlugin.MCAP)
         run = replay(Speeds, path, manifest=manifest(max_size="10 B"))
-        self.assertEqual((run.decisions, run.counts["speed"].too_big, run.counts["speed"].received), ([], 2, 0))
+        self.assertEqual(
+            (run.decisions, run.counts["speed"].too_big, run.counts["speed"].received), ([], 2, 0)
+        )
 
     def test_what_is_no_whole_drive_is_refused_by_its_name(self) -> None:
         cut, other = self.folder / "cut.mcap", self.folder / "other.mcap"
@@ -168,7 +212,10 @@ class Drives(unittest.TestCase):
         empty = self.folder / "empty"
         empty.mkdir()
         for path in (cut, other, empty):
-            with self.subTest(path=path), self.assertRaisesRegex(ReplayError, f"cannot read drive `{path}`\n  cause: ."):
+            with (
+                self.subTest(path=path),
+                self.assertRaisesRegex(ReplayError, f"cannot read drive `{path}`\n  cause: ."),
+            ):
                 replay(HELLO, path)
         with self.assertRaisesRegex(ReplayError, "there is no drive `nowhere.mcap`"):
             replay(HELLO, "nowhere.mcap")
@@ -181,7 +228,10 @@ class Drives(unittest.TestCase):
             writer.write(connection, 2, b"\0\1\0\0" + np.arange(6.0).tobytes())
         run = replay(Speeds, path, manifest=manifest())
         self.assertEqual([decision.fault is not None for decision in run.decisions], [True, False])
-        self.assertIn("a sample of `/speed` contradicts its type `geometry_msgs/msg/Twist`", str(run.faults[0].fault))
+        self.assertIn(
+            "a sample of `/speed` contradicts its type `geometry_msgs/msg/Twist`",
+            str(run.faults[0].fault),
+        )
 
     def test_bytes_that_are_no_cdr_end_the_replay(self) -> None:
         path = self.folder / "bag"

@@ -48,7 +48,9 @@ def bag(path: Path, speed: float, with_definitions: bool) -> None:
     if not with_definitions:
         (file,) = path.glob("*.db3")
         with contextlib.closing(sqlite3.connect(file)) as database:
-            database.executescript("DROP TABLE message_definitions; UPDATE schema SET schema_version = 3;")
+            database.executescript(
+                "DROP TABLE message_definitions; UPDATE schema SET schema_version = 3;"
+            )
 
 
 class Definitions(unittest.TestCase):
@@ -72,9 +74,15 @@ class Definitions(unittest.TestCase):
 
     def test_a_drive_that_has_none_takes_those_that_are_given(self) -> None:
         bag(self.folder / "bag", 3.5, with_definitions=False)
-        with self.assertRaisesRegex(ReplayError, "there is no definition of `car/msg/Wheels`\n.*pass types=.*msg/ beside the lambda"):
+        with self.assertRaisesRegex(
+            ReplayError,
+            "there is no definition of `car/msg/Wheels`\n.*pass types=.*msg/ beside the lambda",
+        ):
             replay(self.lambda_, self.folder / "bag")
-        with self.assertRaisesRegex(ReplayError, "there is no definition of `car/msg/Wheel`\n.*`car/msg/Wheels` refers to it"):
+        with self.assertRaisesRegex(
+            ReplayError,
+            "there is no definition of `car/msg/Wheel`\n.*`car/msg/Wheels` refers to it",
+        ):
             replay(self.lambda_, self.folder / "bag", types={WHEELS: OF_WHEELS})
         types = {WHEELS: OF_WHEELS, "car/msg/Wheel": OF_WHEEL}
         self.assertEqual(self.scores(self.folder / "bag", types=types), [3.5])
@@ -90,7 +98,10 @@ class Definitions(unittest.TestCase):
             for inside in files:
                 (self.lambda_ / inside).unlink()
         self.write({"msg/car/msg/Wheels.msg": "float32 4 ="})
-        with self.assertRaisesRegex(ReplayError, "(?s)cannot use the definition of `car/msg/Wheels`\n.*correct `.*/msg/car/msg/Wheels.msg`"):
+        with self.assertRaisesRegex(
+            ReplayError,
+            "(?s)cannot use the definition of `car/msg/Wheels`\n.*correct `.*/msg/car/msg/Wheels.msg`",
+        ):
             replay(self.lambda_, self.folder / "bag")
         (self.lambda_ / "msg/car/msg/Wheels.msg").write_bytes(b"\xff")
         with self.assertRaisesRegex(ReplayError, "cannot read `.*/msg/car/msg/Wheels.msg`"):
@@ -102,14 +113,18 @@ class Definitions(unittest.TestCase):
         self.assertEqual(self.scores(self.folder / "bag", types={WHEELS: "string other\n"}), [3.5])
 
     def test_what_the_lambda_brings_is_before_what_ros_2_has(self) -> None:
-        self.write({
-            "lambda.toml": MANIFEST.replace(WHEELS, "geometry_msgs/msg/Vector3"),
-            "main.py": "def on_event(ctx, event): ctx.event('speed', event.number('speed'))\n",
-            "msg/geometry_msgs/msg/Vector3.msg": "float32 speed\n",
-        })
+        self.write(
+            {
+                "lambda.toml": MANIFEST.replace(WHEELS, "geometry_msgs/msg/Vector3"),
+                "main.py": "def on_event(ctx, event): ctx.event('speed', event.number('speed'))\n",
+                "msg/geometry_msgs/msg/Vector3.msg": "float32 speed\n",
+            }
+        )
         self.assertEqual(self.scores({"/wheels": {"t": [0], "speed": [2]}}), [2.0])
         # Without its package it stands for no type that ROS 2 has.
-        (self.lambda_ / "msg/geometry_msgs/msg/Vector3.msg").rename(self.lambda_ / "msg/Vector3.msg")
+        (self.lambda_ / "msg/geometry_msgs/msg/Vector3.msg").rename(
+            self.lambda_ / "msg/Vector3.msg"
+        )
         with self.assertRaisesRegex(ReplayError, "has no field `speed`"):
             replay(self.lambda_, {"/wheels": {"t": [0], "speed": [2]}})
 
@@ -137,7 +152,9 @@ class Definitions(unittest.TestCase):
         with self.assertRaisesRegex(ReplayError, "there is no definition of `car/msg/Wheels`"):
             drive.column("/wheels", "wheels[0].speed")
         bag(self.folder / "other", 4.5, with_definitions=True)
-        self.assertEqual(Drive(self.folder / "other").column("/wheels", "wheels[0].speed").values.tolist(), [4.5])
+        self.assertEqual(
+            Drive(self.folder / "other").column("/wheels", "wheels[0].speed").values.tolist(), [4.5]
+        )
 
 
 if __name__ == "__main__":

@@ -29,13 +29,17 @@ class Agree(unittest.TestCase):
         self.addCleanup(case.doCleanups)
         ended = case.start(source, images, **how)
         self.assertIn(ended.returncode, (0, 6), ended.stderr)
-        decisions = [{key: value for key, value in it.items() if key != "run_ns"} for it in case.decisions()]
+        decisions = [
+            {key: value for key, value in it.items() if key != "run_ns"} for it in case.decisions()
+        ]
         for decision in decisions:
             if decision["fault"]:
                 decision["fault"]["message"] = decision["fault"]["message"].splitlines()[-1]
         # Where one that nobody stopped ends is not said by its window but by the drive.
         last_ns = max(decision["at_ns"] for decision in decisions)
-        self.clips = [(clip["from_ns"], min(clip["to_ns"], last_ns)) for clip in case.lines("clips.jsonl")]
+        self.clips = [
+            (clip["from_ns"], min(clip["to_ns"], last_ns)) for clip in case.lines("clips.jsonl")
+        ]
         return decisions, case.lines("log.jsonl")
 
     def scores(self, found: Found) -> List[Optional[float]]:
@@ -54,7 +58,9 @@ class Agree(unittest.TestCase):
                     kept.append(event)
         """
         found = self.both(source, [GREY] * 9, depth=3)
-        self.assertEqual(self.scores(found)[::2], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], "three samples woke nobody")
+        self.assertEqual(
+            self.scores(found)[::2], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], "three samples woke nobody"
+        )
 
     def test_what_is_let_go_makes_room_again(self) -> None:
         source = """
@@ -158,7 +164,17 @@ class Agree(unittest.TestCase):
         self.assertEqual(len(log), 19)
 
     def test_paths_are_refused_in_the_same_words(self) -> None:
-        paths = ["header", "header.stamp", "data[0]", "data.x", "width.x", "width[0]", "a..b", "", "header..x"]
+        paths = [
+            "header",
+            "header.stamp",
+            "data[0]",
+            "data.x",
+            "width.x",
+            "width[0]",
+            "a..b",
+            "",
+            "header..x",
+        ]
         source = f"""
             def on_event(ctx, event):
                 for path in {paths!r} + ["x" * 2000, "header.frame_id", "header.stamp.nanosec", "data"]:

@@ -22,7 +22,9 @@ class Lambda:
         self.next_ns = 0
         kept = any(entry.name == NAME for entry in ctx.scratch.entries())
         # Shape (n, BINS), the one that was seen last at the end.
-        self.known = np.frombuffer(ctx.scratch.get(NAME) if kept else b"", np.float64).reshape(-1, BINS)
+        self.known = np.frombuffer(ctx.scratch.get(NAME) if kept else b"", np.float64).reshape(
+            -1, BINS
+        )
 
     def on_event(self, ctx: Context, event: Sample) -> None:
         # Decoding is what costs; the world does not change ten times a second.

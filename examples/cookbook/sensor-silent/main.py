@@ -31,7 +31,14 @@ class Lambda:
             if quiet_ns < limit_ns:
                 since_ns = self.silent.pop(topic.name, None)
                 if since_ns is not None:
-                    ctx.log("info", f"{topic.ros_topic} is back after {(now - since_ns) / 1e9:.1f} s")
+                    ctx.log(
+                        "info", f"{topic.ros_topic} is back after {(now - since_ns) / 1e9:.1f} s"
+                    )
             elif topic.name not in self.silent:
                 self.silent[topic.name] = heard_ns
-                ctx.event("sensor-silent", quiet_ns / 1e9, topic=topic.ros_topic, received=topic.counts().received)
+                ctx.event(
+                    "sensor-silent",
+                    quiet_ns / 1e9,
+                    topic=topic.ros_topic,
+                    received=topic.counts().received,
+                )

@@ -48,10 +48,18 @@ class Lambda:
         self.offset_mps += max(-self.mismatch_mps, min(self.mismatch_mps, sudden)) / self.ticks
         if abs(sudden) >= self.mismatch_mps and now >= self.rest_until_ns:
             self.rest_until_ns = now + REST_NS
-            ctx.event("speed-mismatch", abs(sudden), wheels_mps=by_wheels, imu_mps=by_imu, offset_mps=self.offset_mps)
+            ctx.event(
+                "speed-mismatch",
+                abs(sudden),
+                wheels_mps=by_wheels,
+                imu_mps=by_imu,
+                offset_mps=self.offset_mps,
+            )
 
 
 def full(window: Column, now: int) -> bool:
     """Whether a window reaches over the second: no sensor began, or broke off, in it."""
     at_ns = window.at_ns
-    return len(at_ns) > 1 and bool(at_ns[0] <= now - SECOND_NS + EDGE_NS and at_ns[-1] >= now - EDGE_NS)
+    return len(at_ns) > 1 and bool(
+        at_ns[0] <= now - SECOND_NS + EDGE_NS and at_ns[-1] >= now - EDGE_NS
+    )

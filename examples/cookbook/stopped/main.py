@@ -20,7 +20,9 @@ class Lambda:
         self.going_mps: float = ctx.config["going_mps"]
         self.after_ns = int(ctx.config["after_s"] * 1e9)
         if self.going_mps <= self.stopped_mps:
-            raise ValueError(f"going_mps is {self.going_mps}; it has to be above stopped_mps, which is {self.stopped_mps}")
+            raise ValueError(
+                f"going_mps is {self.going_mps}; it has to be above stopped_mps, which is {self.stopped_mps}"
+            )
         self.slow_since_ns: int | None = None
         self.recording = any(entry.name == NAME for entry in ctx.scratch.entries())
 

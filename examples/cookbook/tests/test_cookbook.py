@@ -55,7 +55,9 @@ def test_pushes_that_are_too_far_apart_are_no_swerve() -> None:
     t = hundredths(12)
     y = np.where((t > 2) & (t < 3), 4.0, 0.0) - np.where((t > 7) & (t < 8), 4.0, 0.0)
     assert times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}})) == []
-    assert len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}, within_s=10.0))) == 1
+    assert (
+        len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}, within_s=10.0))) == 1
+    )
 
 
 def test_what_is_no_number_makes_no_swerve_of_a_bend() -> None:
@@ -75,7 +77,10 @@ def test_a_car_that_creeps_between_the_limits_stays_stopped() -> None:
     t = hundredths(30)
     v = np.select([t < 5, t < 10, t < 20], [10.0, 0.0, 1.5], 10.0)
     done = run("stopped", {SPEED: {"t": t, "twist.linear.x": v}})
-    assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [("start", 8.0), ("stop", 20.0)]
+    assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [
+        ("start", 8.0),
+        ("stop", 20.0),
+    ]
 
 
 def test_what_is_no_number_is_no_standing() -> None:
@@ -85,14 +90,19 @@ def test_what_is_no_number_is_no_standing() -> None:
 
 def test_a_recording_ends_even_after_a_fault_in_it(tmp_path: Path) -> None:
     for name in ("lambda.toml", "main.py"):
-        (tmp_path / name).write_text((COOKBOOK / "stopped" / name).read_text(encoding="utf-8"), encoding="utf-8")
+        (tmp_path / name).write_text(
+            (COOKBOOK / "stopped" / name).read_text(encoding="utf-8"), encoding="utf-8"
+        )
     with (tmp_path / "main.py").open("a", encoding="utf-8") as main:
         main.write(FAULT_AT_A_QUARTER)
     t = hundredths(20)
     v = np.select([t < 5, t == 10, t < 15], [10.0, 0.25, 0.0], 10.0)
     done = replay(tmp_path, {SPEED: {"t": t, "twist.linear.x": v}})
     assert len(done.faults) == 1
-    assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [("start", 8.0), ("stop", 15.0)]
+    assert [(trigger.kind, round(trigger.at_s, 1)) for trigger in done.triggers] == [
+        ("start", 8.0),
+        ("stop", 15.0),
+    ]
 
 
 # Behind a recipe: a fault where the speed is 0.25 m/s.
@@ -114,10 +124,16 @@ def test_limits_the_wrong_way_round_are_refused() -> None:
 def test_an_imu_that_is_not_level_is_no_mismatch() -> None:
     t = hundredths(30)
     v = 10 + 0.5 * t
-    level = {IMU: {"t": t, "linear_acceleration.x": 0.5 + 0 * t}, SPEED: {"t": t, "twist.linear.x": v}}
+    level = {
+        IMU: {"t": t, "linear_acceleration.x": 0.5 + 0 * t},
+        SPEED: {"t": t, "twist.linear.x": v},
+    }
     tilted = {**level, IMU: {"t": t, "linear_acceleration.x": 1.6 + 0 * t}}
     assert (times(run("speed-mismatch", level)), times(run("speed-mismatch", tilted))) == ([], [])
-    slips = {**tilted, SPEED: {"t": t, "twist.linear.x": v + np.where((t > 20) & (t < 22), 8.0, 0.0)}}
+    slips = {
+        **tilted,
+        SPEED: {"t": t, "twist.linear.x": v + np.where((t > 20) & (t < 22), 8.0, 0.0)},
+    }
     assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
 
 
@@ -125,16 +141,24 @@ def test_a_mismatch_is_found_at_ten_samples_a_second_and_after_what_is_no_number
     t = np.arange(300) / 10 + 0.03 * (np.arange(300) % 2)
     x = 1.6 + 0 * t
     x[:3] = np.nan
-    steady = {IMU: {"t": t, "linear_acceleration.x": x}, SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t}}
+    steady = {
+        IMU: {"t": t, "linear_acceleration.x": x},
+        SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t},
+    }
     assert times(run("speed-mismatch", steady)) == []
-    slips = {**steady, SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t + np.where((t > 20) & (t < 22), 8.0, 0.0)}}
+    slips = {
+        **steady,
+        SPEED: {"t": t, "twist.linear.x": 10 + 0.5 * t + np.where((t > 20) & (t < 22), 8.0, 0.0)},
+    }
     assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
 
 
 def test_a_sensor_that_never_spoke_is_silent() -> None:
     t = hundredths(12)
     done = run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t}})
-    assert [trigger.attributes["topic"] for trigger in done.triggers] == ["/camera/front/compressed"]
+    assert [trigger.attributes["topic"] for trigger in done.triggers] == [
+        "/camera/front/compressed"
+    ]
     assert times(done) == pytest.approx([10.0], abs=0.2)
 
 
@@ -151,7 +175,9 @@ def test_a_picture_is_new_once_and_the_oldest_kind_is_forgotten(tmp_path: Path) 
     def new(greys: list[int]) -> list[float]:
         images = [np.full((36, 64), grey, np.uint8) for grey in greys]
         table = {"t": np.arange(len(greys)), "image": images}
-        return times(replay(COOKBOOK / "novelty", {"/camera/front/compressed": table}, manifest=manifest))
+        return times(
+            replay(COOKBOOK / "novelty", {"/camera/front/compressed": table}, manifest=manifest)
+        )
 
     assert new([10, 200, 10, 200, 10]) == [1]
     # 17 kinds are one more than it knows: the first is forgotten.

@@ -113,7 +113,8 @@ def roughness(signal: Floats, rate: float, weights: Floats) -> tuple[float, floa
     density[[0, -1]] /= 2
     at_hz = np.arange(len(density)) * bin_hz
     score = sum(
-        weight * float(density[(low <= at_hz) & (at_hz < high)].sum()) * bin_hz for low, high, weight in BANDS
+        weight * float(density[(low <= at_hz) & (at_hz < high)].sum()) * bin_hz
+        for low, high, weight in BANDS
     )
     within = np.flatnonzero((PEAK_HZ[0] <= at_hz) & (at_hz <= PEAK_HZ[1]))
     peak_hz = float(at_hz[within[density[within].argmax()]]) if len(within) else 0.0

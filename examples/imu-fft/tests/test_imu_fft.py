@@ -48,14 +48,20 @@ def ends(run: Run, rate_hz: float = 50.0) -> list[int]:
 
 
 # Bins of 256 samples at 50 Hz are 0.1953125 Hz apart; each of these is in one, and so are both neighbours in its band.
-@pytest.mark.parametrize(("hz", "weight"), [(1.171875, 0.2), (4.6875, 0.5), (12.5, 1.0), (23.4375, 0.0)])
+@pytest.mark.parametrize(
+    ("hz", "weight"), [(1.171875, 0.2), (4.6875, 0.5), (12.5, 1.0), (23.4375, 0.0)]
+)
 def test_a_sine_scores_its_mean_square_by_the_weight_of_its_band(hz: float, weight: float) -> None:
     # Of the second sine there is only enough for a score above 0.
     run = shaken(sine(hz, amplitude=3.0, n=600) + sine(12.5, amplitude=1e-3, n=600), window_s=5.0)
     assert ends(run) == [255, 319, 383, 447, 511, 575]
-    assert [trigger.score for trigger in run.triggers] == pytest.approx([weight * 4.5] * 6, abs=0.01)
+    assert [trigger.score for trigger in run.triggers] == pytest.approx(
+        [weight * 4.5] * 6, abs=0.01
+    )
     if weight in (0.2, 0.5):
-        assert [trigger.attributes["peak_hz"] for trigger in run.triggers] == pytest.approx([hz] * 6)
+        assert [trigger.attributes["peak_hz"] for trigger in run.triggers] == pytest.approx(
+            [hz] * 6
+        )
 
 
 def test_a_window_is_complete_every_quarter_of_its_length() -> None:
@@ -86,7 +92,9 @@ def test_a_stamp_that_does_not_rise_begins_anew() -> None:
         assert ends(run) == begun + list(range(at + 63, 200, 16))
 
 
-@pytest.mark.parametrize(("rate_hz", "window_s", "n"), [(50, 1.25, 64), (104, 1.25, 128), (197.5, 5.2, 1024)])
+@pytest.mark.parametrize(
+    ("rate_hz", "window_s", "n"), [(50, 1.25, 64), (104, 1.25, 128), (197.5, 5.2, 1024)]
+)
 def test_the_length_of_a_window_is_a_power_of_two(rate_hz: float, window_s: float, n: int) -> None:
     run = shaken(sine(5.0, 1.0, 2 * n, rate_hz), rate_hz, window_s=window_s)
     assert ends(run, rate_hz) == [n - 1 + hop * n // 4 for hop in range(5)]
@@ -94,7 +102,14 @@ def test_the_length_of_a_window_is_a_power_of_two(rate_hz: float, window_s: floa
 
 def test_of_two_lengths_that_are_as_near_the_larger_one_is_taken() -> None:
     samples = lambda_file().samples
-    assert [samples(wanted) for wanted in (0.0, 23.9, 24.0, 47.9, 48.0, 1e9)] == [16, 16, 32, 32, 64, 4096]
+    assert [samples(wanted) for wanted in (0.0, 23.9, 24.0, 47.9, 48.0, 1e9)] == [
+        16,
+        16,
+        32,
+        32,
+        64,
+        4096,
+    ]
 
 
 def test_what_is_no_number_is_not_rough() -> None:
@@ -114,7 +129,10 @@ def test_the_sample_drive_has_two_rough_stretches() -> None:
 
 def test_regular_roads_score_lower_than_others() -> None:
     with shared("road_surface/accz_50hz_labelled.csv").open(encoding="utf-8") as file:
-        series = [(row["label"], row["acc_z_mps2_semicolon_separated"].split(";")) for row in csv.DictReader(file)]
+        series = [
+            (row["label"], row["acc_z_mps2_semicolon_separated"].split(";"))
+            for row in csv.DictReader(file)
+        ]
     runs = [(label, shaken([float(z) for z in values])) for label, values in series]
     scored = [(label, max(trigger.score or 0.0 for trigger in run.triggers)) for label, run in runs]
     regular = np.array([score for label, score in scored if label == "regular_road"])
@@ -126,7 +144,9 @@ def test_regular_roads_score_lower_than_others() -> None:
 
 def test_scores_rise_with_the_noise_of_the_wheels() -> None:
     run = replay(PYTHON, shared("rec_highway_imu_can_00_30s.mcap"), config=ALL)
-    truth = json.loads(shared("rec_highway_imu_can_00_30s.truth.json").read_text(encoding="utf-8"))["windows"]
+    truth = json.loads(shared("rec_highway_imu_can_00_30s.truth.json").read_text(encoding="utf-8"))[
+        "windows"
+    ]
     wheels = [window["wheel_speed_rms_hp5hz"] for window in truth]
     scores = [nearest(run.triggers, window["end_s"]).score for window in truth]
     assert len(truth) > 50
@@ -135,7 +155,9 @@ def test_scores_rise_with_the_noise_of_the_wheels() -> None:
 
 def test_a_walk_has_the_frequency_of_its_steps() -> None:
     run = replay(PYTHON, shared("rec_sync_gopro_walk.mcap"), config={**ALL, "window_s": 5.2})
-    assert [trigger.attributes["peak_hz"] for trigger in run.triggers] == pytest.approx([1.74] * len(run.triggers), abs=0.1)
+    assert [trigger.attributes["peak_hz"] for trigger in run.triggers] == pytest.approx(
+        [1.74] * len(run.triggers), abs=0.1
+    )
     assert len(run.triggers) >= 4
 
 

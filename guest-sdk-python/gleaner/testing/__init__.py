@@ -18,7 +18,9 @@ the jail; clips, but for their windows; models. ``docs/python.md`` has more. It 
 import sys
 
 if sys.version_info < (3, 10):
-    raise ImportError("gleaner.testing wants Python 3.10 or newer, as rosbags does; lambdas themselves run on 3.9, too")
+    raise ImportError(
+        "gleaner.testing wants Python 3.10 or newer, as rosbags does; lambdas themselves run on 3.9, too"
+    )
 
 from ._drive import Drive
 from ._error import ReplayError, StartError
@@ -27,4 +29,15 @@ from ._run import Decision, Fault, Run
 from ._session import Line
 from ._windows import Moment, Window
 
-__all__ = ["Decision", "Drive", "Fault", "Line", "Moment", "ReplayError", "Run", "StartError", "Window", "replay"]
+__all__ = [
+    "Decision",
+    "Drive",
+    "Fault",
+    "Line",
+    "Moment",
+    "ReplayError",
+    "Run",
+    "StartError",
+    "Window",
+    "replay",
+]

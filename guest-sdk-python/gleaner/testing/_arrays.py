@@ -22,16 +22,29 @@ Table = Mapping[str, Any]
 class Arrays:
     """``tables`` by topic: ``t`` in seconds or ``t_ns`` in ns, and an array for each field by its path."""
 
-    def __init__(self, tables: Mapping[str, Table], more: Definitions, type_names: Mapping[str, str]) -> None:
+    def __init__(
+        self, tables: Mapping[str, Table], more: Definitions, type_names: Mapping[str, str]
+    ) -> None:
         """``type_names`` is the type of each topic, as the lambda's inputs have it. Raises ReplayError."""
         types = gathered(none(), type_names.values(), more)
         self._types = types
         self.topics = dict(type_names)
         for topic in tables:
             if topic not in type_names:
-                raise _wrong(topic, "no input of the lambda has this topic", f"its topics are {quoted(type_names)}")
-        self._tables = {topic: _Messages(topic, type_names[topic], table, types) for topic, table in tables.items()}
-        stamps = [at_ns for messages in self._tables.values() for at_ns in messages.at_ns[:1] + messages.at_ns[-1:]]
+                raise _wrong(
+                    topic,
+                    "no input of the lambda has this topic",
+                    f"its topics are {quoted(type_names)}",
+                )
+        self._tables = {
+            topic: _Messages(topic, type_names[topic], table, types)
+            for topic, table in tables.items()
+        }
+        stamps = [
+            at_ns
+            for messages in self._tables.values()
+            for at_ns in messages.at_ns[:1] + messages.at_ns[-1:]
+        ]
         # Times of arrays are as they were given: they count from 0.
         self.start_ns, self.end_ns = 0, max(stamps, default=0)
         self.begins_ns = min(stamps, default=0)
@@ -50,8 +63,13 @@ class Arrays:
     def deliveries(self, topics: Iterable[str]) -> Iterator[Delivery]:
         """By stamp; equal stamps in the order in which the topics were given."""
         chosen = set(topics)
-        numbered = [(n, table) for n, (topic, table) in enumerate(self._tables.items()) if topic in chosen]
-        merged = heapq.merge(*(table.deliveries(n) for n, table in numbered), key=lambda it: (it[1].arrival.at_ns, it[0]))
+        numbered = [
+            (n, table) for n, (topic, table) in enumerate(self._tables.items()) if topic in chosen
+        ]
+        merged = heapq.merge(
+            *(table.deliveries(n) for n, table in numbered),
+            key=lambda it: (it[1].arrival.at_ns, it[0]),
+        )
         return (delivery for _, delivery in merged)
 
 
@@ -71,7 +89,11 @@ class _Messages:
             except DataError as error:
                 raise _wrong(topic, str(error), "") from None
             if len(values) != len(self.at_ns):
-                raise _wrong(topic, f"`{path}` has {len(values)} values, and there are {len(self.at_ns)} times", "")
+                raise _wrong(
+                    topic,
+                    f"`{path}` has {len(values)} values, and there are {len(self.at_ns)} times",
+                    "",
+                )
 
     def _pictures(self, fields: Dict[str, Any]) -> Dict[str, Any]:
         """``image`` stands for the fields of raw images."""
@@ -79,9 +101,16 @@ class _Messages:
             return fields
         pictures = [np.asarray(picture) for picture in fields.pop("image")]
         for picture in pictures:
-            if picture.dtype != np.uint8 or (picture.ndim, picture.shape[2:]) not in ((2, ()), (3, (3,))):
+            if picture.dtype != np.uint8 or (picture.ndim, picture.shape[2:]) not in (
+                (2, ()),
+                (3, (3,)),
+            ):
                 what = f"an `image` of {picture.dtype} and shape {picture.shape}"
-                raise _wrong(self._topic, what, "give uint8 of shape (height, width), or (height, width, 3) in RGB")
+                raise _wrong(
+                    self._topic,
+                    what,
+                    "give uint8 of shape (height, width), or (height, width, 3) in RGB",
+                )
         return {
             "height": [picture.shape[0] for picture in pictures],
             "width": [picture.shape[1] for picture in pictures],
@@ -108,7 +137,11 @@ class _Messages:
                 _set(message, path, values[n])
             return self._types.encode(message, self._type_name)
         except Exception as error:
-            raise _wrong(self._topic, f"message {n} cannot be made: {error}", "see that values fit their fields") from None
+            raise _wrong(
+                self._topic,
+                f"message {n} cannot be made: {error}",
+                "see that values fit their fields",
+            ) from None
 
 
 def _set(message: Any, path: Path, value: Any) -> None:
@@ -140,13 +173,19 @@ def _array(value: Any, path: Path) -> Any:
         return np.frombuffer(value, dtype=np.uint8).astype(wanted)
     array = np.asarray(value).astype(wanted)
     if path.leaf.length is not None and 0 <= path.leaf.length != len(array):
-        raise ValueError(f"`{path.text}` has {path.leaf.length} elements, and {len(array)} were given")
+        raise ValueError(
+            f"`{path.text}` has {path.leaf.length} elements, and {len(array)} were given"
+        )
     return array
 
 
 def _times(topic: str, table: Table) -> List[int]:
     if ("t" in table) == ("t_ns" in table):
-        raise _wrong(topic, "it needs one of `t` and `t_ns`", "give the time of each message, in seconds or in nanoseconds")
+        raise _wrong(
+            topic,
+            "it needs one of `t` and `t_ns`",
+            "give the time of each message, in seconds or in nanoseconds",
+        )
     if "t_ns" in table:
         at_ns = [int(time) for time in table["t_ns"]]
     else:

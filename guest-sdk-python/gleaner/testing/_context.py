@@ -13,7 +13,9 @@ from ._session import Scratch, Session
 class Context:
     """A lambda that is made anew gets a new one, over the same session."""
 
-    def __init__(self, session: Session, sources: List[Source], config: Mapping[str, Any], scratch: Scratch) -> None:
+    def __init__(
+        self, session: Session, sources: List[Source], config: Mapping[str, Any], scratch: Scratch
+    ) -> None:
         self._session = session
         self._topics = {source.declared.name: Topic(source) for source in sources}
         self._config: Dict[str, Any] = dict(config)
@@ -34,7 +36,10 @@ class Context:
 
     def input(self, name: str) -> Topic:
         if name not in self._topics:
-            raise DataError(f"no input `{str(name)[:64]}`; the manifest has {quoted(self._topics)}", "no-such-input")
+            raise DataError(
+                f"no input `{str(name)[:64]}`; the manifest has {quoted(self._topics)}",
+                "no-such-input",
+            )
         return self._topics[name]
 
     def inputs(self) -> List[str]:

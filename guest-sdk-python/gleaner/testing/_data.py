@@ -20,7 +20,9 @@ SAMPLES_PER_CALL, TEXTS_PER_FIELD, PATH_BYTES, PATHS = 256, 4096, 1024, 256
 class Source:
     """What all of a lambda's objects of one input have together; it lives as long as the replay."""
 
-    def __init__(self, declared: Input, types: Types, limits: Mapping[str, int], pictures: Pictures) -> None:
+    def __init__(
+        self, declared: Input, types: Types, limits: Mapping[str, int], pictures: Pictures
+    ) -> None:
         self.declared, self.types, self.limits, self.pictures = declared, types, limits, pictures
         self.ring = Ring(declared.depth, declared.hold, declared.max_size)
         self.skipped = 0
@@ -37,13 +39,18 @@ class Source:
 
     def malformed(self, why: str) -> DataError:
         declared = self.declared
-        return DataError(f"a sample of `{declared.topic}` contradicts its type `{declared.type_name}`: {why}", "malformed")
+        return DataError(
+            f"a sample of `{declared.topic}` contradicts its type `{declared.type_name}`: {why}",
+            "malformed",
+        )
 
     def number(self, cell: Cell, path: Path) -> float:
         try:
             return path.number(self.message(cell))
         except NotANumber:
-            raise DataError(f"field `{path.text}` of `{self.declared.type_name}` is no number", "wrong-field") from None
+            raise DataError(
+                f"field `{path.text}` of `{self.declared.type_name}` is no number", "wrong-field"
+            ) from None
         except Missing as error:
             raise self.malformed(str(error)) from None
 
@@ -58,7 +65,9 @@ class Source:
         header_ns = None
         if self.is_stamped:
             try:
-                seconds, nanoseconds = stamp_of(self.message(cell), self.declared.type_name, self.types)
+                seconds, nanoseconds = stamp_of(
+                    self.message(cell), self.declared.type_name, self.types
+                )
                 header_ns = seconds * 1_000_000_000 + nanoseconds
             except DataError:
                 pass
@@ -83,7 +92,9 @@ def _path(field: Field, source: Source) -> Path:
     """Raises DataError (``wrong-field``) if it belongs to another input."""
     if source is not field._source:
         belongs, asked = field._source.declared.name, source.declared.name
-        raise DataError(f"field `{field.path}` belongs to input `{belongs}`, not to `{asked}`", "wrong-field")
+        raise DataError(
+            f"field `{field.path}` belongs to input `{belongs}`, not to `{asked}`", "wrong-field"
+        )
     return field._path
 
 
@@ -103,7 +114,10 @@ class Fields:
             if size > PATH_BYTES:
                 why = f"has {size} bytes; a path has {PATH_BYTES} at most"
                 raise DataError(f"field `{cut(path, 64)}` {why}", "wrong-field")
-            field = Field(self._source, compile_path(self._source.types, self._source.declared.type_name, path))
+            field = Field(
+                self._source,
+                compile_path(self._source.types, self._source.declared.type_name, path),
+            )
             # A lambda that makes up paths as it goes must not fill the memory with them.
             if len(self._known) < PATHS:
                 self._known[path] = field
@@ -168,12 +182,19 @@ class Sample:
         return self._cell.arrival.cdr[1] == 0
 
     def cdr(self, offset: int = 0, len: Optional[int] = None) -> bytes:
-        return piece(self._cell.arrival.cdr[4:], offset, None if len is None else u32(len), self._source.limits["call_bytes"])
+        return piece(
+            self._cell.arrival.cdr[4:],
+            offset,
+            None if len is None else u32(len),
+            self._source.limits["call_bytes"],
+        )
 
     def as_frame(self) -> Frame:
         source, cell = self._source, self._cell
         about = (source.identity(cell), source.stamps(cell))
-        return source.pictures.frame(source.declared, lambda: source.message(cell), self._lease, about)
+        return source.pictures.frame(
+            source.declared, lambda: source.message(cell), self._lease, about
+        )
 
     def __repr__(self) -> str:
         return f"<Sample {self.identity.topic} seq {self.identity.seq}, at {self.stamps.at_ns} ns>"

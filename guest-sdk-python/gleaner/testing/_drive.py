@@ -61,7 +61,11 @@ class Drive:
         """Raises ReplayError, which names the nearest topic."""
         if topic not in self.topics:
             near = nearest(topic, self.topics)
-            help = f"did you mean `{near}`?" if near else "pass remap={FROM: TO} if the lambda calls it by another name"
+            help = (
+                f"did you mean `{near}`?"
+                if near
+                else "pass remap={FROM: TO} if the lambda calls it by another name"
+            )
             cause = f"it has no topic `{topic}`; it has {quoted(self.topics)}"
             raise ReplayError(f"cannot use drive `{self._shown}`", cause, help)
         return self.topics[topic]
@@ -76,14 +80,25 @@ class Drive:
         counted: Dict[Tuple[str, Guid], int] = {}
         with _opened(self.paths) as reader:
             chosen = [connection for connection in reader.connections if connection.topic in wanted]
-            files = {id(c.owner): file for file, owner in enumerate(reader.readers) for c in owner.connections}
-            messages = _readable(self._shown, reader.messages(connections=chosen) if chosen else iter(()))
+            files = {
+                id(c.owner): file
+                for file, owner in enumerate(reader.readers)
+                for c in owner.connections
+            }
+            messages = _readable(
+                self._shown, reader.messages(connections=chosen) if chosen else iter(())
+            )
             for at_ns, group in itertools.groupby(messages, key=lambda message: message[1]):
                 # Stable: what one channel has of one instant stays as it lies in the file.
-                ordered = sorted(((files[id(c.owner)], c.id, c, raw) for c, _, raw in group), key=lambda it: it[:2])
+                ordered = sorted(
+                    ((files[id(c.owner)], c.id, c, raw) for c, _, raw in group),
+                    key=lambda it: it[:2],
+                )
                 for file, channel, connection, raw in ordered:
                     writer = _writer(file, channel)
-                    seq = counted[connection.topic, writer] = counted.get((connection.topic, writer), 0) + 1
+                    seq = counted[connection.topic, writer] = (
+                        counted.get((connection.topic, writer), 0) + 1
+                    )
                     data = _checked(self._shown, connection.topic, raw)
                     yield Delivery(connection.topic, Arrival(at_ns, at_ns, writer, seq, data))
 
@@ -112,7 +127,10 @@ def _opened(paths: Sequence[Path]) -> Any:
     shown = ", ".join(map(str, paths))
     missing = [path for path in paths if not path.exists()]
     if missing or not paths:
-        raise ReplayError(f"there is no drive `{missing[0] if missing else ''}`", help="give MCAP files or rosbag2 directories")
+        raise ReplayError(
+            f"there is no drive `{missing[0] if missing else ''}`",
+            help="give MCAP files or rosbag2 directories",
+        )
     try:
         # A directory is a bag of its own; only files are read together.
         return _Reader(AnyReader(paths, default_typestore=none()))
@@ -155,7 +173,10 @@ def _unreadable(shown: str, error: Exception) -> ReplayError:
 def _checked(shown: str, topic: str, raw: Any) -> bytes:
     data = bytes(raw)
     if data[:2] not in (b"\0\0", b"\0\1") or len(data) < 4:
-        raise ReplayError(f"cannot read drive `{shown}`", f"a message of `{topic}` is no CDR: it begins with {data[:4]!r}")
+        raise ReplayError(
+            f"cannot read drive `{shown}`",
+            f"a message of `{topic}` is no CDR: it begins with {data[:4]!r}",
+        )
     return data
 
 

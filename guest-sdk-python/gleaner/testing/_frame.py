@@ -36,7 +36,9 @@ class Budget:
             raise DataError(f"the lambda holds {self.frames_allowed} frames; {why}", "no-room")
         if size > self.bytes:
             why = "drop frames that are not needed, or raise `memory` in [limits]"
-            raise DataError(f"{size} bytes for a new frame, {self.bytes} are left; {why}", "no-room")
+            raise DataError(
+                f"{size} bytes for a new frame, {self.bytes} are left; {why}", "no-room"
+            )
         return Taken(self, size)
 
 
@@ -64,23 +66,36 @@ class Pictures:
     """Room for the images of one input."""
 
     def __init__(self, declared: Input, budget: Budget) -> None:
-        self._slots, self._slot_bytes, self.budget = declared.hold + 1, declared.decoded_size, budget
+        self._slots, self._slot_bytes, self.budget = (
+            declared.hold + 1,
+            declared.decoded_size,
+            budget,
+        )
         self._held: List[weakref.ref[Decoded]] = []
         self._newest: Optional[Tuple[int, Decoded]] = None
 
-    def frame(self, declared: Input, message: Callable[[], Any], lease: Lease, about: About) -> Frame:
+    def frame(
+        self, declared: Input, message: Callable[[], Any], lease: Lease, about: About
+    ) -> Frame:
         """Raises DataError."""
         if declared.type_name not in ("sensor_msgs/msg/Image", COMPRESSED_IMAGE):
-            raise DataError(f"a sample of `{declared.topic}` is no image: its type is `{declared.type_name}`", "not-a-frame")
+            raise DataError(
+                f"a sample of `{declared.topic}` is no image: its type is `{declared.type_name}`",
+                "not-a-frame",
+            )
         given = message()
         taken = self.budget.take(0)
         try:
             if declared.type_name == COMPRESSED_IMAGE:
-                decoded = self._decoded(declared, lease.cell.position, np.asarray(given.data).tobytes())
+                decoded = self._decoded(
+                    declared, lease.cell.position, np.asarray(given.data).tobytes()
+                )
                 return Frame(about, decoded.picture, taken, decoded)
             data = np.asarray(given.data, dtype=np.uint8)
             size = int(given.width), int(given.height)
-            raw = _pixels.picture(*size, str(given.encoding), int(given.step), bool(given.is_bigendian), data)
+            raw = _pixels.picture(
+                *size, str(given.encoding), int(given.step), bool(given.is_bigendian), data
+            )
             return Frame(about, raw, taken, lease)
         except ImageError as error:
             raise _not_a_frame(declared.topic, error) from None
@@ -94,11 +109,15 @@ class Pictures:
         width, height = opened.size
         if 3 * width * height > self._slot_bytes:
             says = f"image says it is {width}x{height} ({_size(3 * width * height)} as rgb8)"
-            raise _too_large(declared, f"{says}; this input's decoded_size is {_size(self._slot_bytes)}")
+            raise _too_large(
+                declared, f"{says}; this input's decoded_size is {_size(self._slot_bytes)}"
+            )
         self._held = [held for held in self._held if held() is not None]
         if len(self._held) >= self._slots:
             why = f"drop frames that are not needed, or raise `hold` of input `{declared.name}`"
-            raise DataError(f"every slot for decoded images of `{declared.topic}` is held; {why}", "no-room")
+            raise DataError(
+                f"every slot for decoded images of `{declared.topic}` is held; {why}", "no-room"
+            )
         decoded = Decoded(_pixels.tight(_rgb(opened), "rgb8"))
         self._held.append(weakref.ref(decoded))
         self._newest = (position, decoded)
@@ -110,7 +129,9 @@ def _open(declared: Input, data: bytes) -> Any:
     from PIL import Image
 
     if not data.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")):
-        raise ImageError(f"data is neither JPEG nor PNG: its {len(data)} bytes start with {list(data[:8])}")
+        raise ImageError(
+            f"data is neither JPEG nor PNG: its {len(data)} bytes start with {list(data[:8])}"
+        )
     try:
         with warnings.catch_warnings():
             # Large, but not too large for Pillow: `decoded_size` decides.
@@ -133,7 +154,9 @@ def _rgb(opened: Any) -> Bytes:
     try:
         return np.asarray(opened.convert("RGB"), dtype=np.uint8)
     except Exception as error:
-        raise ImageError(f"cannot decode the {opened.format} of {opened.width}x{opened.height}: {error}") from None
+        raise ImageError(
+            f"cannot decode the {opened.format} of {opened.width}x{opened.height}: {error}"
+        ) from None
 
 
 def _size(count: int) -> str:
@@ -186,20 +209,31 @@ class Frame:
     def mean_luma(self, roi: Optional[Roi | tuple[int, int, int, int]] = None) -> float:
         return self._ask(lambda: _pixels.mean_luma(self._picture, _roi(roi)))
 
-    def histogram(self, roi: Optional[Roi | tuple[int, int, int, int]] = None) -> npt.NDArray[np.uint32]:
+    def histogram(
+        self, roi: Optional[Roi | tuple[int, int, int, int]] = None
+    ) -> npt.NDArray[np.uint32]:
         return self._ask(lambda: _pixels.histogram(self._picture, _roi(roi)))
 
     def resize(self, width: int, height: int) -> Frame:
         width, height = u32(width), u32(height)
         size = width * height * (1 if self._picture.is_grey else 3)
-        return self._made("resize", (width, height), size, lambda: _pixels.resize(self._picture, width, height))
+        return self._made(
+            "resize", (width, height), size, lambda: _pixels.resize(self._picture, width, height)
+        )
 
     def to_gray(self) -> Frame:
         shown = self._picture
-        return self._made("grey image", None, shown.width * shown.height, lambda: _pixels.to_gray(shown))
+        return self._made(
+            "grey image", None, shown.width * shown.height, lambda: _pixels.to_gray(shown)
+        )
 
     def read(self, offset: int = 0, len: Optional[int] = None) -> bytes:
-        return piece(self._picture.data.tobytes(), offset, None if len is None else u32(len), self._taken.budget.call_bytes)
+        return piece(
+            self._picture.data.tobytes(),
+            offset,
+            None if len is None else u32(len),
+            self._taken.budget.call_bytes,
+        )
 
     def array(self) -> npt.NDArray[Any]:
         return np.asarray(View(self._picture, (self._holds, self._taken)))
@@ -222,7 +256,11 @@ class Frame:
             raise _not_a_frame(self.identity.topic, error) from None
 
     def _made(
-        self, operation: str, size: Optional[Tuple[int, int]], needed: int, make: Callable[[], Picture]
+        self,
+        operation: str,
+        size: Optional[Tuple[int, int]],
+        needed: int,
+        make: Callable[[], Picture],
     ) -> Frame:
         def made() -> Frame:
             # What is asked for is checked before room is taken for it, and that before it is made.

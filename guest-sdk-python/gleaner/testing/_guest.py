@@ -34,8 +34,15 @@ class Fault:
 class Guest:
     """One lambda over one session."""
 
-    def __init__(self, given: Given, manifest: Manifest, session: Session, sources: List[Source]) -> None:
-        self._given, self._manifest, self._session, self._sources = given, manifest, session, sources
+    def __init__(
+        self, given: Given, manifest: Manifest, session: Session, sources: List[Source]
+    ) -> None:
+        self._given, self._manifest, self._session, self._sources = (
+            given,
+            manifest,
+            session,
+            sources,
+        )
         self._scratch = Scratch(session.limits)
         self._make: Optional[Callable[[Context], Callable[..., object]]] = None
         self._live: Optional[Tuple[Context, Callable[..., object]]] = None
@@ -46,7 +53,9 @@ class Guest:
         fault = self._start()
         if fault is not None:
             raised, self._raised = self._raised, None
-            raise StartError(f"cannot start lambda `{self._manifest.name}`", fault.message, fault.kind) from raised
+            raise StartError(
+                f"cannot start lambda `{self._manifest.name}`", fault.message, fault.kind
+            ) from raised
 
     def wake(self, wake: Wake) -> Optional[Fault]:
         if self._live is None:
@@ -63,7 +72,9 @@ class Guest:
             _, fault = self._attempt("", handler, context)
         else:
             source, cell = wake
-            _, fault = self._attempt("", handler, context, sample(context.input(source.declared.name), cell))
+            _, fault = self._attempt(
+                "", handler, context, sample(context.input(source.declared.name), cell)
+            )
         if fault is None:
             self._live = context, handler
         return fault
@@ -82,7 +93,9 @@ class Guest:
 
     def _load(self) -> Any:
         if isinstance(self._given, (str, os.PathLike)):
-            return _host.load(str(folder(self._given).resolve() / self._manifest.entry), self._manifest.handler)
+            return _host.load(
+                str(folder(self._given).resolve() / self._manifest.entry), self._manifest.handler
+            )
         return _host.maker(self._given, self._manifest.handler, _name(self._given))
 
     def _attempt(self, when: str, call: Any, *arguments: Any) -> Tuple[Any, Optional[Fault]]:
@@ -124,7 +137,9 @@ def folder(given: Union[str, "os.PathLike[str]"]) -> Path:
     """Where a lambda lies that was given by its folder, its entry or its manifest."""
     path = Path(given)
     if not path.exists():
-        raise ReplayError(f"there is no lambda `{path}`", help="give its class, its module, or its folder")
+        raise ReplayError(
+            f"there is no lambda `{path}`", help="give its class, its module, or its folder"
+        )
     return path if path.is_dir() else path.parent
 
 
@@ -144,7 +159,10 @@ def manifest_beside(given: Given) -> Path:
         return folder(given) / "lambda.toml"
     beside = home(given)
     if beside is None or not (beside / "lambda.toml").is_file():
-        raise ReplayError(f"no manifest lies beside `{_name(given)}`", help='pass manifest="path/to/lambda.toml", or a dict')
+        raise ReplayError(
+            f"no manifest lies beside `{_name(given)}`",
+            help='pass manifest="path/to/lambda.toml", or a dict',
+        )
     return beside / "lambda.toml"
 
 

@@ -80,7 +80,9 @@ def read(source: Source, config: Mapping[str, Any]) -> Manifest:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ReplayError(f"cannot read manifest `{path}`", str(error), "pass manifest=\"path/to/lambda.toml\"") from None
+        raise ReplayError(
+            f"cannot read manifest `{path}`", str(error), 'pass manifest="path/to/lambda.toml"'
+        ) from None
     return _manifest(str(path), _parsed(path, text), config)
 
 
@@ -97,14 +99,27 @@ def _parsed(path: Path, text: str) -> Mapping[str, Any]:
 
 
 def _manifest(file: str, entries: Mapping[str, Any], overrides: Mapping[str, Any]) -> Manifest:
-    root = Table(file, "the file", entries, ["lambda", "schedule", "input", "model", "record", "limits", "config"])
+    root = Table(
+        file,
+        "the file",
+        entries,
+        ["lambda", "schedule", "input", "model", "record", "limits", "config"],
+    )
     known = ["name", "version", "kind", "entry", "description", "deterministic"]
-    about = Table(file, "[lambda]", root.need("lambda", "[lambda] with name, version, kind and entry"), known)
+    about = Table(
+        file, "[lambda]", root.need("lambda", "[lambda] with name, version, kind and entry"), known
+    )
     inputs = [_input(file, entry) for entry in root.list("input")]
-    for what, values in {"name": [i.name for i in inputs], "topic": [i.topic for i in inputs]}.items():
+    for what, values in {
+        "name": [i.name for i in inputs],
+        "topic": [i.topic for i in inputs],
+    }.items():
         twice = [value for value in values if values.count(value) > 1]
         if twice:
-            raise root.refusal(f"has two [[input]] with the {what} `{twice[0]}`", "keep one [[input]] entry per topic")
+            raise root.refusal(
+                f"has two [[input]] with the {what} `{twice[0]}`",
+                "keep one [[input]] entry per topic",
+            )
     event, backlog, period_ns = _schedule(root, inputs)
     return Manifest(
         name=about.form("name", 'name = "brake-dark"', LAMBDA_NAME, 63),
@@ -121,18 +136,27 @@ def _manifest(file: str, entries: Mapping[str, Any], overrides: Mapping[str, Any
 
 
 def _schedule(root: Table, inputs: List[Input]) -> Tuple[Optional[str], str, int]:
-    entry = root.need("schedule", '[schedule] with event = "<an input\'s name>" or period = "100ms"')
+    entry = root.need(
+        "schedule", '[schedule] with event = "<an input\'s name>" or period = "100ms"'
+    )
     table = Table(root.file, "[schedule]", entry, ["event", "period", "backlog"])
     if ("event" in table) == ("period" in table):
-        raise table.refusal("needs one of `event` and `period`", "a lambda runs on one input or on the clock")
+        raise table.refusal(
+            "needs one of `event` and `period`", "a lambda runs on one input or on the clock"
+        )
     if "period" in table:
         if "backlog" in table:
-            raise table.refusal("has a `backlog` beside `period`", "remove it: missed ticks are counted, never queued")
+            raise table.refusal(
+                "has a `backlog` beside `period`",
+                "remove it: missed ticks are counted, never queued",
+            )
         return None, "each", table.duration("period", (10**6, 0, 3600 * SECOND))
     event = table.text("event", 'event = "<an input\'s name>"')
     woken_by = [one for one in inputs if one.name == event]
     if not woken_by:
-        raise table.refusal(f"names no input: `{event}`", f"the inputs are {quoted(one.name for one in inputs)}")
+        raise table.refusal(
+            f"names no input: `{event}`", f"the inputs are {quoted(one.name for one in inputs)}"
+        )
     default = "latest" if woken_by[0].type_name in LARGE else "each"
     return event, table.choice("backlog", ["each", "latest"], default), 0
 
@@ -172,18 +196,26 @@ def _record(root: Table) -> Optional[Record]:
 
 
 def _limits(root: Table) -> Dict[str, int]:
-    table = Table(root.file, "[limits]", root.entries.get("limits", {}), [key for key, _, _ in LIMITS])
+    table = Table(
+        root.file, "[limits]", root.entries.get("limits", {}), [key for key, _, _ in LIMITS]
+    )
     read = {"number": table.integer, "size": table.size, "duration": table.duration}
     return {key: read[unit](key, bounds) for key, unit, bounds in LIMITS}
 
 
 def _config(root: Table, overrides: Mapping[str, Any]) -> Dict[str, ConfigValue]:
     entries = root.entries.get("config", {})
-    items = Table(root.file, "[config]", entries, list(entries) if isinstance(entries, Mapping) else [])
+    items = Table(
+        root.file, "[config]", entries, list(entries) if isinstance(entries, Mapping) else []
+    )
     for name in overrides:
         if name not in items:
             near = nearest(name, items.entries)
-            help = f"did you mean `{near}`?" if near else f"its config values are {quoted(items.entries)}"
+            help = (
+                f"did you mean `{near}`?"
+                if near
+                else f"its config values are {quoted(items.entries)}"
+            )
             raise ReplayError(f"the lambda has no config value `{name}`", help=help)
     return {name: _item(root.file, name, entry, overrides) for name, entry in items.entries.items()}
 
@@ -193,7 +225,9 @@ def _item(file: str, name: str, entry: Any, overrides: Mapping[str, Any]) -> Con
     table = Table(file, f"`config.{name}`", entry, ["default", "min", "max", "unit", "description"])
     default = table.need("default", "default = 1.0, or another value that says what type it is")
     if not isinstance(default, (bool, int, float, str)) or not _is_finite(default):
-        raise table.refusal("has a `default` of another type", "give a number, a text, or true or false")
+        raise table.refusal(
+            "has a `default` of another type", "give a number, a text, or true or false"
+        )
     value: Any = default if name not in overrides else _same_type(name, default, overrides[name])
     for key in ("min", "max"):
         limit: Any = table.entries.get(key, value)
@@ -209,7 +243,9 @@ def _same_type(name: str, default: ConfigValue, given: Any) -> ConfigValue:
     if type(default) is float and type(plain) is int:
         plain = float(plain)
     if type(plain) is not type(default) or not _is_finite(plain):
-        wanted = {bool: "True or False", int: "a whole number", float: "a number", str: "a text"}[type(default)]
+        wanted = {bool: "True or False", int: "a whole number", float: "a number", str: "a text"}[
+            type(default)
+        ]
         raise ReplayError(f"config value `{name}` cannot be {given!r}", help=f"give {wanted}")
     value: ConfigValue = plain
     return value

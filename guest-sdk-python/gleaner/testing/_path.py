@@ -48,7 +48,9 @@ class Path:
             elif step < len(found):
                 found = found[step]
             else:
-                raise Missing(f"it has {len(found)} elements where `{self.text}` wants element {step}")
+                raise Missing(
+                    f"it has {len(found)} elements where `{self.text}` wants element {step}"
+                )
         return found
 
     def value(self, message: Any) -> Any:
@@ -90,13 +92,19 @@ def compile_path(types: Types, type_name: str, text: str) -> Path:
             if not rest and member.is_primitive and not member.is_wide:
                 return Path(text, tuple(steps), member, is_array=True)
             if not rest or isinstance(rest[0], str):
-                raise _refused(f"field `{name}` of `{text}` is an array; write `{name}[0]` and so on")
+                raise _refused(
+                    f"field `{name}` of `{text}` is an array; write `{name}[0]` and so on"
+                )
             index = int(rest.pop(0))
             if index >= member.length >= 0:
-                raise _refused(f"field `{name}` of `{text}` has {member.length} elements, counted from 0")
+                raise _refused(
+                    f"field `{name}` of `{text}` has {member.length} elements, counted from 0"
+                )
             steps.append(index)
         if member.is_wide:
-            raise _refused(f"`{text}` is or lies behind the wstring `{name}`, whose size on the wire is not defined")
+            raise _refused(
+                f"`{text}` is or lies behind the wstring `{name}`, whose size on the wire is not defined"
+            )
         if member.is_primitive:
             if rest:
                 raise _refused(f"field `{name}` of `{text}` is a single value with nothing inside")

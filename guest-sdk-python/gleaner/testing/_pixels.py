@@ -29,7 +29,13 @@ LAYOUTS = {
 # What ROS calls them now, where that is not the name of the WIT.
 IN_ROS = {"yuv422": "uyvy", "yuv422_yuy2": "yuyv"}
 # Other names that ROS has for some.
-NAMES = {"8UC3": "bgr8", "8UC1": "mono8", "16UC1": "mono16", "uyvy": "yuv422", "yuyv": "yuv422_yuy2"}
+NAMES = {
+    "8UC3": "bgr8",
+    "8UC1": "mono8",
+    "16UC1": "mono16",
+    "uyvy": "yuv422",
+    "yuyv": "yuv422_yuy2",
+}
 # Where red, green and blue are in a pixel.
 COLOURS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
 # Where U, the left Y, V and the right Y are in a pair of pixels.
@@ -59,20 +65,30 @@ class Picture(NamedTuple):
         return self.encoding in ("mono8", "mono16")
 
 
-def picture(width: int, height: int, encoding: str, step: int, big_endian: bool, data: Bytes) -> Picture:
+def picture(
+    width: int, height: int, encoding: str, step: int, big_endian: bool, data: Bytes
+) -> Picture:
     """As the fields of `sensor_msgs/msg/Image` say. Raises ImageError with the numbers that do not fit."""
     name = NAMES.get(encoding, encoding)
     if name not in LAYOUTS:
-        raise ImageError(f"encoding `{encoding[:40]}` is not supported; supported are {', '.join([*LAYOUTS, *NAMES])}")
+        raise ImageError(
+            f"encoding `{encoding[:40]}` is not supported; supported are {', '.join([*LAYOUTS, *NAMES])}"
+        )
     said = IN_ROS.get(name, name)
     for side in (width, height):
         if not 1 <= side <= MAX_SIDE:
-            raise ImageError(f"image says it is {width}x{height}; each side must be 1 to {MAX_SIDE}")
+            raise ImageError(
+                f"image says it is {width}x{height}; each side must be 1 to {MAX_SIDE}"
+            )
     if name in PAIRS and width % 2:
-        raise ImageError(f"image of {said} is {width} pixels wide; two pixels share a colour, so the width must be even")
+        raise ImageError(
+            f"image of {said} is {width} pixels wide; two pixels share a colour, so the width must be even"
+        )
     row = width * LAYOUTS[name][0]
     if step < row:
-        raise ImageError(f"image of {width}x{height} {said} says a row has {step} bytes; it needs {row}")
+        raise ImageError(
+            f"image of {width}x{height} {said} says a row has {step} bytes; it needs {row}"
+        )
     needed = step * (height - 1) + row
     if len(data) < needed:
         raise ImageError(
@@ -106,7 +122,9 @@ def check(shown: Picture, operation: str, size: Optional[Tuple[int, int]] = None
         why = "its pixels have no colour until it is debayered"
         raise ImageError(f"{operation} of a raw image ({shown.encoding}): {why}")
     if size is not None and not all(1 <= side <= MAX_RESIZED_SIDE for side in size):
-        raise RangeError(f"resize to {size[0]}x{size[1]}: each side must be 1 to {MAX_RESIZED_SIDE}")
+        raise RangeError(
+            f"resize to {size[0]}x{size[1]}: each side must be 1 to {MAX_RESIZED_SIDE}"
+        )
 
 
 def mean_luma(shown: Picture, roi: Optional[Tuple[int, int, int, int]]) -> float:
@@ -167,7 +185,9 @@ def _from_yuv(y: Any, u: Any, v: Any) -> Bytes:
     """Factors in 1/65536, rounded to nearest."""
     luma = (y << 16) + (1 << 15)
     channels = [luma + 91_881 * v, luma - 22_554 * u - 46_802 * v, luma + 116_130 * u]
-    return np.stack([np.clip(channel >> 16, 0, 255) for channel in channels], axis=-1).astype(np.uint8)
+    return np.stack([np.clip(channel >> 16, 0, 255) for channel in channels], axis=-1).astype(
+        np.uint8
+    )
 
 
 def resize(shown: Picture, width: int, height: int) -> Picture:
@@ -176,8 +196,14 @@ def resize(shown: Picture, width: int, height: int) -> Picture:
     down, down_total = _weights(shown.height, height)
     across, across_total = _weights(shown.width, width)
     # Sums stay below 2^40, so products of matrices of f64, which numpy computes fast, are exact in any order.
-    planes = [across @ (down @ pixels[..., channel].astype(np.float64)).T for channel in range(pixels.shape[2])]
-    sums, total = np.stack([plane.T for plane in planes], axis=-1).astype(np.int64), down_total * across_total
+    planes = [
+        across @ (down @ pixels[..., channel].astype(np.float64)).T
+        for channel in range(pixels.shape[2])
+    ]
+    sums, total = (
+        np.stack([plane.T for plane in planes], axis=-1).astype(np.int64),
+        down_total * across_total,
+    )
     made = ((sums + total // 2) // total).astype(np.uint8)
     return tight(made[..., 0], "mono8") if shown.is_grey else tight(made, "rgb8")
 

@@ -63,7 +63,10 @@ def replay(
     source = manifest if manifest is not None else manifest_beside(lambda_)
     read = _manifest.read(source, config or {})
     if isinstance(lambda_, (str, os.PathLike)) and read.kind != "python":
-        raise ReplayError(f"lambda `{lambda_}` is of kind `{read.kind}`", help="only lambdas in Python run here; use gleaner replay")
+        raise ReplayError(
+            f"lambda `{lambda_}` is of kind `{read.kind}`",
+            help="only lambdas in Python run here; use gleaner replay",
+        )
     beside = home(lambda_) if isinstance(source, Mapping) else Path(source).parent
     more = Definitions(types or {}, None if beside is None else beside / "msg")
     return _Pass(lambda_, read, drive, dict(remap or {}), more).run(prints_to_log)
@@ -72,7 +75,9 @@ def replay(
 class _Pass:
     """One pass of a lambda over its drive."""
 
-    def __init__(self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], more: Definitions) -> None:
+    def __init__(
+        self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], more: Definitions
+    ) -> None:
         self._given, self._manifest, self._session = given, manifest, Session(manifest.limits)
         _check_remap(remap, manifest)
         names = {one.topic: remap.get(one.topic, one.topic) for one in manifest.inputs}
@@ -96,8 +101,13 @@ class _Pass:
             found = drive.type_of(names[declared.topic])
             if found != declared.type_name:
                 cause = f"topic `{names[declared.topic]}` is of type `{found}`"
-                raise ReplayError(f"input `{declared.name}` is of type `{declared.type_name}`", cause)
-        types, budget = drive.types([declared.type_name for declared in inputs], more), Budget(limits)
+                raise ReplayError(
+                    f"input `{declared.name}` is of type `{declared.type_name}`", cause
+                )
+        types, budget = (
+            drive.types([declared.type_name for declared in inputs], more),
+            Budget(limits),
+        )
         return [Source(declared, types, limits, Pictures(declared, budget)) for declared in inputs]
 
     def run(self, prints_to_log: bool) -> Run:
@@ -147,9 +157,13 @@ class _Pass:
         fault = self._guest.wake(wake)
         run_ns = time.perf_counter_ns() - started
         at_s = (at_ns - self._drive.start_ns) / 1e9
-        triggers = [Moment(at_s, at_ns, it.kind, it.label, it.score, it.attributes) for it in session.end()]
+        triggers = [
+            Moment(at_s, at_ns, it.kind, it.label, it.score, it.attributes) for it in session.end()
+        ]
         told = None if fault is None else Fault(fault.kind, fault.message, None, fault.allowed)
-        self._decisions.append(Decision(at_ns=at_ns, **_cause(wake), triggers=triggers, fault=told, run_ns=run_ns))
+        self._decisions.append(
+            Decision(at_ns=at_ns, **_cause(wake), triggers=triggers, fault=told, run_ns=run_ns)
+        )
         self._count(at_ns, fault is not None)
 
     def _count(self, at_ns: int, faulted: bool) -> None:
@@ -179,26 +193,37 @@ def _check_remap(remap: Mapping[str, str], manifest: Manifest) -> None:
     known.update(dict.fromkeys(manifest.record.topics if manifest.record is not None else []))
     for topic in remap:
         if topic not in known:
-            raise ReplayError(f"no input has the topic `{topic}` of remap", help=f"the manifest has {quoted(known)}")
+            raise ReplayError(
+                f"no input has the topic `{topic}` of remap",
+                help=f"the manifest has {quoted(known)}",
+            )
 
 
-def _check_recorded(drive: Union[Drive, Arrays], manifest: Manifest, remap: Mapping[str, str]) -> None:
+def _check_recorded(
+    drive: Union[Drive, Arrays], manifest: Manifest, remap: Mapping[str, str]
+) -> None:
     """A drive may lack some of the topics of `[record]`; where it has none, nothing would be kept."""
     if manifest.record is None or drive.is_partial:
         return
     topics = [remap.get(topic, topic) for topic in manifest.record.topics]
     if not any(topic in drive.topics for topic in topics):
         help = f"the drive has {quoted(drive.topics)}; pass remap={{FROM: TO}}, or a manifest without [record]"
-        raise ReplayError("the drive has none of the topics of [record]", f"[record] has {quoted(topics)}", help)
+        raise ReplayError(
+            "the drive has none of the topics of [record]", f"[record] has {quoted(topics)}", help
+        )
 
 
-def _drive(given: Any, manifest: Manifest, names: Mapping[str, str], more: Definitions) -> Union[Drive, Arrays]:
+def _drive(
+    given: Any, manifest: Manifest, names: Mapping[str, str], more: Definitions
+) -> Union[Drive, Arrays]:
     if isinstance(given, Drive):
         return given
     if not isinstance(given, Mapping):
         return Drive(given)
     type_names = {names[one.topic]: one.type_name for one in manifest.inputs}
-    woken_by = next((names[one.topic] for one in manifest.inputs if one.name == manifest.event), None)
+    woken_by = next(
+        (names[one.topic] for one in manifest.inputs if one.name == manifest.event), None
+    )
     if woken_by is not None and woken_by not in given:
         cause = f"there are arrays of {quoted(given)}, and the lambda is woken by `{woken_by}`"
         raise ReplayError("nothing would wake the lambda", cause, "give arrays of that topic")

@@ -43,7 +43,10 @@ class Decision:
 
     def as_json(self) -> Dict[str, Any]:
         """The object that ``decisions.jsonl`` has."""
-        triggers = [{"kind": t.kind, "label": t.label, "score": t.score, "attributes": t.attributes} for t in self.triggers]
+        triggers = [
+            {"kind": t.kind, "label": t.label, "score": t.score, "attributes": t.attributes}
+            for t in self.triggers
+        ]
         fault = None if self.fault is None else dict(vars(self.fault))
         return {**vars(self), "triggers": triggers, "fault": fault, "fuel": None}
 
@@ -84,11 +87,19 @@ class Run:
 
     def series(self, label: str) -> Tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Times in s and scores of the events with this label: to be plotted or compared."""
-        events = [trigger for trigger in self.triggers if trigger.kind == "event" and trigger.label == label]
+        events = [
+            trigger
+            for trigger in self.triggers
+            if trigger.kind == "event" and trigger.label == label
+        ]
         scores = [np.nan if event.score is None else event.score for event in events]
-        return np.array([event.at_s for event in events], dtype=np.float64), np.array(scores, dtype=np.float64)
+        return np.array([event.at_s for event in events], dtype=np.float64), np.array(
+            scores, dtype=np.float64
+        )
 
     def __repr__(self) -> str:
         seconds = (self.end_ns - self.start_ns) / 1e9
-        counted = f"{len(self.decisions)} wakes, {len(self.triggers)} triggers, {len(self.faults)} faults"
+        counted = (
+            f"{len(self.decisions)} wakes, {len(self.triggers)} triggers, {len(self.faults)} faults"
+        )
         return f"<Run of {seconds:.1f} s: {counted}>"

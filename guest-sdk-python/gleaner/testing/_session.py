@@ -68,17 +68,22 @@ class Session:
     def resume(self, caused: Optional[List[Caused]]) -> None:
         self._triggers = caused
 
-    def cause(self, kind: str, label: Any, score: Optional[float], attributes: Mapping[str, Any]) -> None:
+    def cause(
+        self, kind: str, label: Any, score: Optional[float], attributes: Mapping[str, Any]
+    ) -> None:
         _must_be_text(label)
         plain = {key: _attribute(label, key, value) for key, value in attributes.items()}
         if self._triggers is None:
-            raise _invalid("triggers belong to a wake: in init, and between two wakes, there are none")
+            raise _invalid(
+                "triggers belong to a wake: in init, and between two wakes, there are none"
+            )
         # Who has used up the minute may still end what was begun.
         if kind != "stop":
             self._check_rate()
         if len(self._triggers) >= PER_WAKE:
             raise TriggerError(
-                f"this wake has caused {PER_WAKE} triggers already; further ones are refused", "too-many"
+                f"this wake has caused {PER_WAKE} triggers already; further ones are refused",
+                "too-many",
             )
         _check(label, score, plain)
         self._triggers.append(Caused(kind, label, score, plain))
@@ -98,12 +103,17 @@ class Session:
         _must_be_text(level)
         _must_be_text(message)
         if level not in LEVELS:
-            raise ValueError("the level of a log line is `error`, `warn`, `info`, `debug` or `trace`")
+            raise ValueError(
+                "the level of a log line is `error`, `warn`, `info`, `debug` or `trace`"
+            )
         message = cut(message, LINE_BYTES)
         size, second = len(message.encode()), self.now_ns // SECOND_NS
         if self._second != second:
             self._second, self._said, self._said_bytes = second, 0, 0
-        if self._said >= self.limits["log_lines"] or self._said_bytes + size > self.limits["log_bytes"]:
+        if (
+            self._said >= self.limits["log_lines"]
+            or self._said_bytes + size > self.limits["log_bytes"]
+        ):
             self.log_dropped += 1
             return
         self._said, self._said_bytes = self._said + 1, self._said_bytes + size
@@ -136,15 +146,25 @@ class Scratch:
     def _keep(self, name: str, given: bytes, in_place: bool) -> None:
         _must_be_text(name)
         if not 1 <= len(name.encode()) <= NAME_BYTES or any(map(_is_control, name)):
-            raise ScratchError(f"`{_visible(name[:NAME_BYTES])}` is no name for scratch; give 1 to 128 bytes without control characters", "wrong-name")
+            raise ScratchError(
+                f"`{_visible(name[:NAME_BYTES])}` is no name for scratch; give 1 to 128 bytes without control characters",
+                "wrong-name",
+            )
         there = self._entries.get(name)
         if there is None and len(self._entries) >= ENTRIES:
-            raise ScratchError(f"there is no room for `{name}` beside {ENTRIES} entries; remove some, or append to one of them", "no-room")
+            raise ScratchError(
+                f"there is no room for `{name}` beside {ENTRIES} entries; remove some, or append to one of them",
+                "no-room",
+            )
         given_back = len(there) if there is not None and in_place else 0
         needed = len(given) + (ENTRY_BYTES + len(name.encode()) if there is None else 0)
         if needed > self.free() + given_back:
-            why = f"`{name}` needs {needed - given_back} bytes of scratch and {self.free()} are free"
-            raise ScratchError(f"{why}; remove entries, or ask for more by `scratch` in [limits]", "no-room")
+            why = (
+                f"`{name}` needs {needed - given_back} bytes of scratch and {self.free()} are free"
+            )
+            raise ScratchError(
+                f"{why}; remove entries, or ask for more by `scratch` in [limits]", "no-room"
+            )
         self._entries[name] = given if in_place or there is None else there + given
         self._used += needed - given_back
 
@@ -159,7 +179,10 @@ class Scratch:
     def _there(self, name: str) -> bytes:
         _must_be_text(name)
         if name not in self._entries:
-            raise ScratchError(f"scratch has no `{_visible(name[:NAME_BYTES])}`; it is empty when the lambda's process starts", "no-such-entry")
+            raise ScratchError(
+                f"scratch has no `{_visible(name[:NAME_BYTES])}`; it is empty when the lambda's process starts",
+                "no-such-entry",
+            )
         return self._entries[name]
 
     def entries(self) -> List[Entry]:
@@ -218,7 +241,9 @@ def _is_control(char: str) -> bool:
 def _visible(name: str) -> str:
     """With its control characters written out, as the host does it."""
     short = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
-    return "".join(short.get(char, f"\\u{{{ord(char):x}}}") if _is_control(char) else char for char in name)
+    return "".join(
+        short.get(char, f"\\u{{{ord(char):x}}}") if _is_control(char) else char for char in name
+    )
 
 
 def _invalid(message: str) -> TriggerError:
@@ -232,9 +257,13 @@ def _check(label: str, score: Optional[float], attributes: Mapping[str, Attribut
     if size > LABEL_BYTES:
         raise _invalid(f"the label has {size} bytes; at most {LABEL_BYTES} are allowed")
     if score is not None and not math.isfinite(score):
-        raise _invalid(f"the score of `{label}` is {'NaN' if math.isnan(score) else score}; it must be finite")
+        raise _invalid(
+            f"the score of `{label}` is {'NaN' if math.isnan(score) else score}; it must be finite"
+        )
     if len(attributes) > ATTRIBUTES:
-        raise _invalid(f"`{label}` has {len(attributes)} attributes; at most {ATTRIBUTES} are allowed")
+        raise _invalid(
+            f"`{label}` has {len(attributes)} attributes; at most {ATTRIBUTES} are allowed"
+        )
     for key, value in attributes.items():
         why = ""
         if not 1 <= len(key.encode()) <= KEY_BYTES:
@@ -266,4 +295,6 @@ def _attribute(label: str, key: str, value: Any) -> AttributeValue:
                 raise OverflowError("int too big to convert")
             return plain
     given = type(value).__name__
-    raise TypeError(f"attribute `{key}` of `{label}` is of type `{given}`; give bool, int, float or str")
+    raise TypeError(
+        f"attribute `{key}` of `{label}` is of type `{given}`; give bool, int, float or str"
+    )

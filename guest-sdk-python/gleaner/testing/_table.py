@@ -61,7 +61,9 @@ class Table:
         """A whole number; ``bounds`` are its minimum, default and maximum."""
         value = self.entries.get(key, bounds[1])
         if isinstance(value, bool) or not isinstance(value, int):
-            raise self.refusal(f"has a `{key}` that is no whole number", f"for example {key} = {bounds[1]}")
+            raise self.refusal(
+                f"has a `{key}` that is no whole number", f"for example {key} = {bounds[1]}"
+            )
         return self._within(key, value, bounds)
 
     def size(self, key: str, bounds: Tuple[int, int, int]) -> int:
@@ -85,11 +87,16 @@ class Table:
 
     def _within(self, key: str, value: int, bounds: Tuple[int, int, int]) -> int:
         if not bounds[0] <= value <= bounds[2]:
-            raise self.refusal(f"has a `{key}` of {value}", f"its range is {bounds[0]} to {bounds[2]}")
+            raise self.refusal(
+                f"has a `{key}` of {value}", f"its range is {bounds[0]} to {bounds[2]}"
+            )
         return value
 
     def list(self, key: str) -> List[Any]:
         value = self.entries.get(key, [])
         if not isinstance(value, list) or len(value) > ITEMS_MAX:
-            raise self.refusal(f"has a `{key}` that is no list of at most {ITEMS_MAX}", "see the README for what it holds")
+            raise self.refusal(
+                f"has a `{key}` that is no list of at most {ITEMS_MAX}",
+                "see the README for what it holds",
+            )
         return value

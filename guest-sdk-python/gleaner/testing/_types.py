@@ -47,14 +47,19 @@ class Types:
         """The fields of a type, in the order of the wire."""
         known = self._members.get(type_name)
         if known is None:
-            known = [_member(name, description) for name, description in self._store.fielddefs[type_name][1]]
+            known = [
+                _member(name, description)
+                for name, description in self._store.fielddefs[type_name][1]
+            ]
             self._members[type_name] = known
         return known
 
     def is_stamped(self, type_name: str) -> bool:
         """Whether messages begin with a stamp: a header, or a time of the name `stamp`."""
         first = self.members(type_name)[0]
-        return first.length is None and (first.element == HEADER or (first.name, first.element) == ("stamp", TIME))
+        return first.length is None and (
+            first.element == HEADER or (first.name, first.element) == ("stamp", TIME)
+        )
 
     def decode(self, cdr: bytes, type_name: str) -> Any:
         """The message in ``cdr``, which begins with the encapsulation. Raises whatever `rosbags` does for one that is none."""
@@ -67,7 +72,9 @@ class Types:
     def blank(self, type_name: str) -> Any:
         """A message in which every number is 0, every text and every sequence empty."""
         members = self.members(type_name)
-        return self._store.types[type_name](**{member.name: self._blank(member) for member in members})
+        return self._store.types[type_name](
+            **{member.name: self._blank(member) for member in members}
+        )
 
     def _blank(self, member: Member) -> Any:
         if member.length is None:
@@ -79,7 +86,9 @@ class Types:
     def _one(self, element: str) -> Any:
         if "/" in element:
             return self.blank(element)
-        return {"string": "", "wstring": "", "bool": False, "float32": 0.0, "float64": 0.0}.get(element, 0)
+        return {"string": "", "wstring": "", "bool": False, "float32": 0.0, "float64": 0.0}.get(
+            element, 0
+        )
 
 
 def dtype(element: str) -> Any:
@@ -143,11 +152,18 @@ def gathered(own: Typestore, wanted: Iterable[str], more: Definitions) -> Types:
         found = own.fielddefs.get(type_name) or more.find(type_name)
         if found is None:
             cause = f"`{root}` refers to it" if root != type_name else ""
-            help = 'pass types={"%s": "the text of its .msg"}, or put its .msg file into msg/ beside the lambda' % type_name
+            help = (
+                'pass types={"%s": "the text of its .msg"}, or put its .msg file into msg/ beside the lambda'
+                % type_name
+            )
             raise ReplayError(f"there is no definition of `{type_name}`", cause, help)
         known[type_name] = found
         elements = [_member(name, description).element for name, description in found[1]]
-        rest += [(element, root) for element in elements if "/" in element and not element.endswith("/wstring")]
+        rest += [
+            (element, root)
+            for element in elements
+            if "/" in element and not element.endswith("/wstring")
+        ]
     for store in (own, _humble()):
         if all(store.fielddefs.get(type_name) is found for type_name, found in known.items()):
             return Types(store)

@@ -36,7 +36,9 @@ class Window(NamedTuple):
     to_ns: int
 
 
-def windows(record: Optional[Record], triggers: Iterable[Moment], start_ns: int, end_ns: int) -> List[Window]:
+def windows(
+    record: Optional[Record], triggers: Iterable[Moment], start_ns: int, end_ns: int
+) -> List[Window]:
     """In the order of time. A recording that nobody stops ends with the drive; clips that are too long would be parted."""
     if record is None:
         return []
