@@ -1,14 +1,14 @@
-//! Instructions of classic BPF, and jumps between them.
+//! Assembles programs of classic BPF: instructions, and jumps between them.
 //!
-//! A conditional jump passes over at most 255 instructions, and none goes back. So the exits that
-//! many places share are built again and again, as islands between them.
+//! A conditional jump skips at most 255 instructions, and none goes back. So the exits that many
+//! jumps share are repeated, as islands between the instructions.
 //!
 //! Source: the kernel's `Documentation/networking/filter.rst` and
 //! `include/uapi/linux/bpf_common.h`.
 
-/// Instructions that the kernel takes.
+/// The most instructions that the kernel accepts.
 pub(super) const MOST: usize = 4096;
-/// Instructions that a conditional jump may pass over.
+/// The most instructions that a conditional jump can skip.
 pub(super) const FAR: usize = 255;
 
 pub(super) const LD_IMM: u16 = 0x00;
@@ -41,7 +41,7 @@ pub(super) const LD_LEN: u16 = 0x80;
 pub(super) const TXA: u16 = 0x87;
 pub(super) const MOD: u16 = 0x94;
 
-/// In memory: how many bytes of the packet pass.
+/// Memory cell: the number of bytes of the packet that pass.
 pub(super) const PASS: u32 = 1;
 
 /// Kinds of submessages that may be empty.
@@ -51,36 +51,36 @@ const INFO_TS: u32 = 0x09;
 /// Instructions of an island, at most.
 pub(super) const ISLAND: usize = 17;
 
-/// Operation, instructions that are passed over if its condition holds and if not, and its number.
+/// Operation, instructions to skip if its condition holds and if not, and its operand.
 pub(super) type Instruction = (u16, u8, u8, u32);
 
-/// Where a conditional jump goes.
+/// The target of a conditional jump.
 #[derive(Copy, Clone, PartialEq, Eq)]
 pub(super) enum To {
-    /// Over so many instructions.
+    /// Skips this many instructions.
     Over(u8),
     /// The packet is dropped.
     Drop,
     /// The submessage has no length.
     Endless,
-    /// The packet is cut off here.
+    /// The packet is truncated here.
     Cut,
     /// The packet ends here.
     End,
-    /// What stands behind the next island looks at the same submessage.
+    /// The code after the next island checks the same submessage.
     Behind,
 }
 
 pub(super) const NEXT: To = To::Over(0);
 
-/// A program, as far as it is written. X is where the walk through a packet is.
+/// A program under construction. X is the offset of the walk through a packet.
 #[derive(Default)]
 pub(super) struct Program {
     code: Vec<Instruction>,
-    /// Jumps to a place of the next island: by instruction, and whether it jumps if the condition
+    /// Jumps to an exit of the next island: instruction, and true if it jumps when the condition
     /// holds.
     exits: Vec<(usize, bool, To)>,
-    /// Jumps to where the program ends.
+    /// Jumps to the end of the program.
     ends: Vec<usize>,
 }
 
@@ -93,7 +93,7 @@ impl Program {
         self.code
     }
 
-    /// Writes an instruction, and answers which it is.
+    /// Appends an instruction and returns its index.
     pub(super) fn put(&mut self, code: u16, k: u32) -> usize {
         self.code.push((code, 0, 0, k));
         self.code.len() - 1
@@ -110,14 +110,14 @@ impl Program {
         }
     }
 
-    /// Lets the unconditional jump `from` go to what is written next.
+    /// Makes the unconditional jump `from` go to the next instruction.
     pub(super) fn land(&mut self, from: usize) {
         self.code[from].3 =
             u32::try_from(self.code.len() - from - 1).expect("a program has 4096 instructions");
     }
 
-    /// Sees to it that all exits reach an island that is written after `instructions` more. Whether
-    /// one is written now.
+    /// Makes sure that all exits reach an island after `instructions` more. Returns true if an
+    /// island is appended now.
     pub(super) fn reach(&mut self, instructions: usize) -> bool {
         let far = self
             .exits
@@ -129,7 +129,7 @@ impl Program {
         far
     }
 
-    /// Cuts the packet off.
+    /// Truncates the packet.
     pub(super) fn cut(&mut self) {
         self.island();
         self.put(TXA, 0);
@@ -138,26 +138,26 @@ impl Program {
         self.ends.push(end);
     }
 
-    /// What is written next is where all ends go.
+    /// Makes all jumps to the end go to the next instruction.
     pub(super) fn end(&mut self) {
         for end in std::mem::take(&mut self.ends) {
             self.land(end);
         }
     }
 
-    /// Where the exits before it go. Whoever comes from before it passes over it.
+    /// Appends the targets of the exits before it. The normal flow jumps over them.
     fn island(&mut self) {
         let over = self.put(JA, 0);
         let drop = self.put(RET, 0);
-        // Without a length, paddings and time stamps are empty, and everything else is the packet's
-        // last.
+        // Without a length, paddings and time stamps are empty, and any other submessage is the
+        // packet's last.
         let endless = self.put(LD_BYTE, 0);
         self.jump(JEQ, PAD, To::Over(4), NEXT);
         self.jump(JEQ, INFO_TS, To::Over(3), To::Over(2));
         let cut = self.put(TXA, 0);
         self.put(ST, PASS);
         let end = self.put(JA, 0);
-        // The walk goes on behind the island, whichever step it came from: steps are alike.
+        // The walk continues after the island from any step: steps are alike.
         self.put(TXA, 0);
         self.put(ADD, 4);
         self.put(TAX, 0);

@@ -1,12 +1,12 @@
-//! The program by which the kernel drops hostile packets before RustDDS sees them: classic BPF.
+//! The classic BPF program with which the kernel drops hostile packets before RustDDS reads them.
 //!
-//! RustDDS reserves and fills what the first fragment of a sample claims to be the sample's size,
-//! up to 4 GiB, whoever sent it. And it writes down each of the numbers that a HEARTBEAT says there
-//! are, or that a GAP says there are not. The program walks the submessages of a packet and drops
-//! it if a fragment claims more than anybody subscribed to, if it has fragments of a participant
-//! that nobody knows, or if it speaks of too many numbers. All else passes. Classic BPF has no
-//! loops, so the walk ends somewhere: there the packet is cut off between two submessages, and what
-//! is reliable comes again.
+//! RustDDS allocates and fills the size that the first fragment of a sample claims, up to 4 GiB,
+//! for any sender. It also records each sequence number that a HEARTBEAT claims to exist, or a GAP
+//! to be missing. The program walks the submessages of a packet and drops it if a fragment claims
+//! more than the largest subscription, if it has fragments of an unknown participant, or if it
+//! covers too many sequence numbers. Everything else passes. Classic BPF has no loops, so the walk
+//! is bounded: at its end the packet is truncated between two submessages, and reliable data is
+//! sent again.
 //!
 //! Sources: DDSI-RTPS 2.3, sections 8.3 and 9.4; the kernel's
 //! `Documentation/networking/filter.rst`.
@@ -15,24 +15,24 @@ use socket2::SockFilter;
 
 use super::bpf::*;
 
-/// The twelve bytes that all endpoints of a participant have in common.
+/// The twelve bytes that the GUIDs of all endpoints of a participant have in common.
 pub(super) type Prefix = [u8; 12];
 
-/// Most participants whose fragments are told from a stranger's. In larger domains nobody is a
-/// stranger.
+/// Most participants that are listed in the program. In larger domains fragments of any participant
+/// pass.
 pub(super) const KNOWN: usize = 64;
-/// Submessages that may be fragments. Cyclone DDS sends at most 47 in a packet, unless it was told
-/// to send smaller ones.
+/// Submessages that may be fragments. Cyclone DDS sends at most 47 in a packet, unless it is
+/// configured to send smaller ones.
 const FRAGMENTS: usize = 56;
-/// Of a machine whose numbers begin with the high byte. They are few, and their packets as well.
+/// Submessages of a big-endian sender. Those are few, and so are their packets.
 const BIG_ENDIAN: usize = 16;
-/// The kernel shows a packet from its UDP header on.
+/// For the filter, a packet begins with its UDP header.
 const UDP: u32 = 8;
 const PREFIX: u32 = UDP + 8;
 const FIRST: u32 = UDP + 20;
 
 const ACKNACK: u32 = 0x06;
-/// Between `ACKNACK` and this one there is HEARTBEAT, with two numbers at the same places.
+/// Between `ACKNACK` and this one is HEARTBEAT, with two numbers at the same offsets.
 const GAP: u32 = 0x08;
 const INFO_SRC: u32 = 0x0c;
 const DATA_FRAG: u32 = 0x16;
@@ -41,22 +41,22 @@ const DATA_FRAG: u32 = 0x16;
 /// lowest two are compared.
 const SPAN: u32 = 16;
 
-/// In memory, besides [`PASS`]: whether there was a fragment.
+/// Memory cell, besides [`PASS`]: 1 if there was a fragment.
 const FRAGMENT: u32 = 0;
-/// In memory, while two numbers are compared: where the walk is, and the first of them.
+/// Memory cells while two numbers are compared: the offset of the walk, and the first number.
 const WALK: u32 = 2;
 const NUMBER: u32 = 3;
 const ALL: u32 = u32::MAX;
 
-/// How a submessage's numbers begin.
+/// The byte order of a submessage.
 #[derive(Copy, Clone, PartialEq, Eq)]
-enum Order {
+enum ByteOrder {
     Low,
     High,
 }
 
-/// A program that drops fragments of samples of more than `largest` bytes and, if `known` is given,
-/// fragments of others.
+/// Builds a program that drops fragments of samples of more than `largest` bytes and, if `known` is
+/// given, fragments of other participants.
 ///
 /// There is a tolerance of at least 64 KiB for what encloses a sample: only the two high bytes are
 /// compared.
@@ -80,29 +80,29 @@ fn assemble(largest: usize, known: Option<&[Prefix]>) -> Vec<Instruction> {
     program.jump(JGT, FIRST, To::Over(1), NEXT);
     program.put(RET, ALL);
     program.put(LDX_IMM, FIRST);
-    // The first submessage tells how the packet's numbers begin.
+    // The first submessage has the byte order of the packet.
     program.put(LD_BYTE_AT, FIRST + 1);
     program.jump(JSET, 1, To::Over(1), NEXT);
     let big_endian = program.put(JA, 0);
 
     for _ in 0..FRAGMENTS {
-        program.step(Order::Low, Some(limit));
+        program.step(ByteOrder::Low, Some(limit));
     }
     let rest = TAIL + known.map_or(0, <[Prefix]>::len) * TAIL_OF_ONE + BIG_ENDIAN * STEP + ISLANDS;
     while program.len() + rest < MOST {
-        program.step(Order::Low, None);
+        program.step(ByteOrder::Low, None);
     }
     program.cut();
     program.land(big_endian);
     for _ in 0..BIG_ENDIAN {
-        program.step(Order::High, Some(limit));
+        program.step(ByteOrder::High, Some(limit));
     }
     program.cut();
     program.tail(known);
     program.code()
 }
 
-/// At most, in instructions. A step behind an island has [`RANGE`] more.
+/// Upper bounds, in instructions. A step after an island has [`RANGE`] more.
 const STEP: usize = 29;
 const RANGE: usize = 29;
 const ISLANDS: usize = BIG_ENDIAN / 5 * (ISLAND + RANGE);
@@ -113,19 +113,19 @@ const TAIL_OF_ONE: usize = 8;
 const SWAP: [(u16, u32); 3] = [(MUL, 0x1_0001), (RSH, 8), (AND, 0xffff)];
 
 impl Program {
-    /// Goes from one submessage, at which X points, to the next; and over a time stamp before the
+    /// Goes from one submessage, at which X points, to the next; also over a time stamp before the
     /// first of them.
     ///
-    /// A load behind the packet's end drops the packet: RustDDS would not take one that is not
-    /// whole, either. Only steps behind an island have room to look at a HEARTBEAT or a GAP: the
-    /// others leave it to the next of those.
-    fn step(&mut self, order: Order, limit: Option<u32>) {
+    /// A load beyond the packet's end drops the packet: RustDDS would not accept an incomplete one,
+    /// either. Only steps after an island have room to check a HEARTBEAT or a GAP: other steps
+    /// leave it to the next one that has.
+    fn step(&mut self, order: ByteOrder, limit: Option<u32>) {
         let has_room = self.reach(STEP);
         // Kind, flags and length.
         self.put(LD_WORD, 0);
         self.jump(
             JEQ,
-            if order == Order::Low { 0x0901_0800 } else { 0x0900_0008 },
+            if order == ByteOrder::Low { 0x0901_0800 } else { 0x0900_0008 },
             NEXT,
             To::Over(4),
         );
@@ -133,12 +133,12 @@ impl Program {
         self.put(ADD, 12);
         self.put(TAX, 0);
         self.put(LD_WORD, 0);
-        // Numbers that begin the other way than the first ones: nobody sends them, and a length
+        // A byte order that differs from the first one: no implementation sends it, and a length
         // would be misread.
-        let (yes, no) = if order == Order::Low { (NEXT, To::Drop) } else { (To::Drop, NEXT) };
+        let (yes, no) = if order == ByteOrder::Low { (NEXT, To::Drop) } else { (To::Drop, NEXT) };
         self.jump(JSET, 0x0001_0000, yes, no);
         self.put(RSH, 24);
-        // It speaks for another participant than the packet's.
+        // It speaks for a participant other than the packet's sender.
         self.jump(JEQ, INFO_SRC, To::Drop, NEXT);
         if has_room {
             self.range(order);
@@ -152,9 +152,9 @@ impl Program {
         }
         self.put(LD_HALF, 2);
         self.jump(JEQ, 0, To::Endless, NEXT);
-        if order == Order::Low {
-            // Swaps the bytes: 256 h + l times 256 is h + 256 l modulo 65535. A length of 65535 no
-            // packet has.
+        if order == ByteOrder::Low {
+            // Swaps the bytes: 256 h + l times 256 is h + 256 l modulo 65535. No packet has a
+            // length of 65535.
             self.put(LSH, 8);
             self.put(MOD, 0xffff);
         }
@@ -165,22 +165,21 @@ impl Program {
         self.jump(JEQ_X, 0, To::End, NEXT);
     }
 
-    /// Drops a HEARTBEAT or a GAP of too many numbers. What it leaves behind is no kind of a
-    /// submessage that is looked at.
-    fn range(&mut self, order: Order) {
+    /// Drops a HEARTBEAT or a GAP of too many numbers. The value that it leaves in A matches no
+    /// kind of submessage that is checked.
+    fn range(&mut self, order: ByteOrder) {
         let (swap, one, [top, first, last]): (&[_], _, _) = match order {
-            Order::Low => (&SWAP, 0x0100_0000, [23, 18, 26]),
-            Order::High => (&[], 1, [20, 16, 24]),
+            ByteOrder::Low => (&SWAP, 0x0100_0000, [23, 18, 26]),
+            ByteOrder::High => (&[], 1, [20, 16, 24]),
         };
         let compare = 15 + 2 * swap.len() as u8;
         self.jump(JGT, GAP, To::Over(compare + 9), NEXT);
         self.jump(JGT, ACKNACK, NEXT, To::Over(compare + 8));
-        // Behind the last number that there is, RustDDS begins anew with the lowest, and would
-        // never end.
+        // After the highest number, RustDDS continues with the lowest, and would never end.
         self.put(LD_BYTE, top);
         self.jump(JEQ, 0, NEXT, To::Drop);
-        // A GAP from 1 on moves a mark, however long it is: a writer says so that all before is not
-        // for a late reader.
+        // A GAP from 1 on moves a mark, at any length: a writer sends it to exclude all earlier
+        // samples for a late reader.
         self.put(LD_BYTE, 0);
         self.jump(JEQ, GAP, NEXT, To::Over(4));
         self.put(LD_WORD, 12);
@@ -202,26 +201,26 @@ impl Program {
             self.put(then.0, then.1);
         }
         self.put(SUB_X, 0);
-        // The first of none is one more than the last.
+        // The first number of an empty range is one more than the last.
         self.put(ADD, 1);
         self.put(LDX_MEM, WALK);
         self.jump(JGT, SPAN + 1, To::Drop, NEXT);
     }
 
-    fn fragment(&mut self, order: Order, limit: u32) {
+    fn fragment(&mut self, order: ByteOrder, limit: u32) {
         let swap: &[(u16, u32)] = match order {
-            // Not as above: a claim of 4 GiB begins with 65535.
-            Order::Low => &SWAP,
-            Order::High => &[],
+            // Unlike above, all 16 bits matter: a claim of 4 GiB begins with 65535.
+            ByteOrder::Low => &SWAP,
+            ByteOrder::High => &[],
         };
         let over = 5 + swap.len();
         self.jump(JEQ, DATA_FRAG, NEXT, To::Over(u8::try_from(over).unwrap_or(0)));
-        // The size of fragments, which RustDDS keeps for all that the writer sends later.
+        // The fragment size, which RustDDS keeps for all later samples of the writer.
         self.put(LD_HALF, 30);
         self.jump(JEQ, 0, To::Drop, NEXT);
         self.put(ST, FRAGMENT);
         // The two high bytes of the sample's size.
-        self.put(LD_HALF, if order == Order::Low { 34 } else { 32 });
+        self.put(LD_HALF, if order == ByteOrder::Low { 34 } else { 32 });
         for (code, k) in swap {
             self.put(*code, *k);
         }

@@ -1,20 +1,20 @@
-//! Keeps RustDDS from announcing a multicast address for samples, since Fast DDS aborts when two of
-//! our readers have the same one.
+//! Keeps RustDDS from announcing a multicast address for samples: Fast DDS aborts when two of our
+//! readers have the same one.
 //!
 //! RustDDS announces the address when a socket could join its group, and has no option against
-//! that. Fast DDS 2.9.0 to 2.10.6, 2.11.0 to 2.14.4 and 3.0.0 to 3.1.2 notes the addresses to which
-//! a writer sends to all of its readers together: the multicast address, once two readers have the
-//! same one. The first HEARTBEAT goes to the second reader alone, at an address that is not noted:
-//! an assertion fails (`OutputTrafficManager::set_statistics_message_data`), or memory behind a
-//! list is changed in builds without assertions. The address of a reader without multicast is
-//! always noted.
+//! that. Fast DDS 2.9.0 to 2.10.6, 2.11.0 to 2.14.4 and 3.0.0 to 3.1.2 records the addresses to
+//! which a writer sends to all of its readers together: the multicast address, once two readers
+//! share it. The first HEARTBEAT goes to the second reader alone, at an address that is not
+//! recorded: an assertion fails (`OutputTrafficManager::set_statistics_message_data`), or memory
+//! beyond a list is changed in builds without assertions. The address of a reader without multicast
+//! is always recorded.
 //!
-//! So the join fails, as it does on an interface without multicast. A filter of system calls sees
+//! So the join is made to fail, as it does on an interface without multicast. A seccomp filter sees
 //! no ports, and without the join of discovery RustDDS would not announce itself by multicast
-//! either. Holding the port would keep others from it. What is left is libc's `setsockopt`, in
-//! which the join ends: it is replaced for the whole program by a function that refuses this one
-//! join while a [`NoJoin`] lives on the thread, and passes on everything else. To be deleted once
-//! RustDDS has an option.
+//! either. Binding the port would keep other programs from it. What remains is libc's `setsockopt`,
+//! with which the join is made: it is replaced for the whole program by a function that refuses
+//! this one join while a [`NoJoin`] lives on the thread, and passes on everything else. To be
+//! deleted once RustDDS has an option.
 
 #![allow(unsafe_code)]
 
@@ -74,23 +74,23 @@ unsafe extern "C" fn setsockopt(
     if answer < 0 { -1 } else { 0 }
 }
 
-/// Whether the socket is to join no group. Then it receives from none.
+/// Returns whether the socket is to join no group. Then it receives from none.
 fn is_refused(socket: c_int) -> bool {
     let refused = REFUSED.get();
     if refused == 0 || socket < 0 {
         return false;
     }
-    // SAFETY: it is not -1, and is only handed to the kernel: if it is not open, the kernel says
-    // so.
+    // SAFETY: it is not -1, and is only passed to the kernel, which returns an error if it is not
+    // open.
     let socket = unsafe { BorrowedFd::borrow_raw(socket) };
     let here =
         rustix::net::getsockname(socket).ok().and_then(|here| SocketAddrV4::try_from(here).ok());
     let is_refused = here.is_some_and(|here| here.port() == refused);
     if is_refused {
-        // Otherwise Linux delivers what is sent to groups that any socket of the machine has
-        // joined. A writer sends to its readers with multicast by multicast and to us by unicast:
-        // each fragment would come twice, and one that comes after its sample is complete takes as
-        // much memory as the whole sample. It fails on no socket of IPv4.
+        // Otherwise Linux delivers datagrams of groups that any socket of the machine has joined. A
+        // writer sends by multicast to readers with multicast and by unicast to us: each fragment
+        // would arrive twice, and a fragment that arrives after its sample is complete takes as
+        // much memory as the whole sample. This call fails on no IPv4 socket.
         let _ = SockRef::from(&socket).set_multicast_all_v4(false);
     }
     is_refused
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn sockets_at_one_port_join_no_group_on_this_thread_while_that_is_asked() {
+    fn sockets_at_the_port_join_no_group_on_this_thread_while_the_guard_lives() {
         let [one, other] = [(); 2].map(|()| UdpSocket::bind("0.0.0.0:0").unwrap());
         let no_join = NoJoin::at(one.local_addr().unwrap().port());
         assert_eq!(join(&one).unwrap_err().kind(), ErrorKind::PermissionDenied);

@@ -1,48 +1,48 @@
 //! Live topics of ROS 2 over DDS.
 //!
-//! [`Dds`] is one participant in a domain. One thread of ours waits for all readers at once and
-//! hands every sample to its sink; RustDDS has two threads more, one for the network and one for
-//! discovery. A subscription with [`Qos::Auto`] asks for what writers offer, as `ros2 bag record`
-//! does: it has no reader until there is a writer.
+//! [`Dds`] is one participant in a domain. One thread of this crate waits for all readers at once
+//! and passes every sample to its sink. RustDDS has two more threads, one for the network and one
+//! for discovery. A subscription with [`Qos::Auto`] requests what writers offer, as `ros2 bag
+//! record` does: it has no reader until there is a writer.
 //!
-//! A sample is copied once: into the sink's memory, if the sink can do so before it knows whose
-//! sample it is. The kernel keeps packets away that would take more memory than anybody subscribed
-//! to. What RustDDS cannot do is told in `docs/dds-limits.md`.
+//! A sample is copied once: into the sink's memory, if the sink can copy before it gets the
+//! sample's metadata. A packet filter in the kernel drops packets that would take more memory than
+//! any subscription needs. The limits of RustDDS are listed in `docs/dds-limits.md`.
 //!
-//! What never happens here: a sink that does more than to copy under a lock of RustDDS; a message
-//! being understood, apart from those of ROS 2's graph and the answers of nodes that are asked for
-//! definitions; a packet sent elsewhere than RustDDS sends it.
+//! Never here: a sink that does more than copy while a lock of RustDDS is held; parsing of
+//! messages, other than those of the ROS 2 graph and type descriptions; a packet sent elsewhere
+//! than RustDDS sends it.
 //!
-//! What RustDDS does not tell: bytes 2 and 3 of a sample's encapsulation, given as zeros, and
-//! samples that are so broken that it drops them itself, which show as lost.
+//! RustDDS does not expose bytes 2 and 3 of a sample's encapsulation (they are given as zeros). It
+//! drops samples that are badly broken by itself; they show as lost.
 //!
 //! [`Qos::Auto`]: gleaner_transport::Qos::Auto
 
 #[cfg(feature = "clap")]
 mod arguments;
-mod ask;
 mod bpf;
-mod day;
-mod feed;
+mod clock_watch;
+mod definitions_cache;
+mod discovery;
 mod filter;
 mod graph;
-mod guard;
+mod graph_message;
 mod joins;
-mod known;
 mod names;
 mod nodes;
-mod offers;
 mod options;
+mod packet_filter;
 mod peers;
-mod presence;
+mod qos;
 mod raw;
 mod receive;
-mod shield;
+mod signal_mask;
 mod sockets;
 mod state;
-mod types;
-mod watch;
-mod wire;
+mod topic_reader;
+mod type_check;
+mod type_query;
+mod watchdog;
 mod writer;
 
 use std::collections::HashSet;
@@ -55,54 +55,54 @@ use tracing::{info, warn};
 
 #[cfg(feature = "clap")]
 pub use arguments::NetworkArgs;
-pub use options::{DdsError, Distro, Options};
-pub use wire::TopicOnWire;
-pub use writer::Writer;
+pub use discovery::DomainTopic;
+pub use options::{DdsError, DdsOptions, Distro};
+pub use writer::TopicWriter;
 
-use feed::Feed;
-use gleaner_base::words::nearest;
+use definitions_cache::DefinitionsCache;
+use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources};
-use gleaner_protocol::Network;
+use gleaner_protocol::NetworkStatus;
 use gleaner_transport::{
     DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Status, Subscription,
     TopicSpec, Transport, TransportError,
 };
-use guard::Guard;
 use joins::NoJoin;
-use known::Known;
-use receive::{Command, Line};
-use shield::Shield;
+use packet_filter::PacketFilter;
+use receive::{ReceiverCommand, ReceiverHandle};
+use signal_mask::SignalMask;
 use sockets::Sockets;
-use state::{State, Told, lock};
-use watch::Watch;
+use state::{ParticipantState, SubscriptionStatus, lock};
+use topic_reader::TopicReader;
+use watchdog::Watchdog;
 
-/// The receive buffer of a socket is to hold four of the largest samples, as far as that is
-/// sensible.
+/// The receive buffer of a socket has room for this many of the largest samples, up to
+/// `MOST_BUFFER`.
 const SAMPLES_IN_BUFFER: usize = 4;
 const MOST_BUFFER: usize = 64 << 20;
-/// What RustDDS asks for by itself.
+/// The size that RustDDS requests by itself.
 const LEAST_BUFFER: usize = 8 << 20;
-/// How long the receive thread may take to end. A sink that has a sample then is not waited for.
-const LAST_WORDS: Duration = Duration::from_secs(5);
+/// Time that the receive thread may take to end. A sink that holds a sample then is not waited for.
+const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The network's and the discovery's.
+/// The threads that RustDDS starts: network and discovery.
 const LIBRARY_THREADS: usize = 2;
 
-/// Held while a participant is made, so that it is known which threads are its own.
+/// Held while a participant is created, so that its threads can be identified.
 static OPENING: Mutex<()> = Mutex::new(());
 
 /// One participant in a domain, and its subscriptions.
 pub struct Dds {
     participant: DomainParticipant,
-    state: Arc<State>,
-    line: Line,
+    state: Arc<ParticipantState>,
+    receiver: ReceiverHandle,
     thread: Option<JoinHandle<()>>,
-    watch: Mutex<Watch>,
+    watchdog: Mutex<Watchdog>,
     domain: u16,
     buffer: (usize, usize),
     /// Topic, type and status of each subscription.
-    subscriptions: Vec<(TopicSpec, Arc<Told>)>,
-    known: Mutex<Known>,
+    subscriptions: Vec<(TopicSpec, Arc<SubscriptionStatus>)>,
+    definitions: Mutex<DefinitionsCache>,
 }
 
 impl Dds {
@@ -110,8 +110,8 @@ impl Dds {
     ///
     /// # Errors
     ///
-    /// [`DdsError`] if it cannot be joined, or if the node's name is none.
-    pub fn open(options: Options) -> Result<Self, DdsError> {
+    /// [`DdsError`] if it cannot be joined, or if the node's name is invalid.
+    pub fn open(options: DdsOptions) -> Result<Self, DdsError> {
         let node = options.checked()?;
         let needed = options.largest.saturating_mul(SAMPLES_IN_BUFFER).min(MOST_BUFFER);
         let asked = needed.max(LEAST_BUFFER);
@@ -126,31 +126,34 @@ impl Dds {
             domain: options.domain,
             source: error.into(),
         };
-        let shield = Shield::up();
+        let signal_mask = SignalMask::block();
         let no_join = NoJoin::at(sockets::port_of_samples(options.domain));
         let participant = builder.build().map_err(join)?;
         drop(no_join);
-        drop(shield);
+        drop(signal_mask);
         let made: HashSet<u32> = sockets::library_threads().difference(&before).copied().collect();
-        // If there are more, somebody else made a participant at the same time, and which are ours
-        // is not known.
+        // If there are more, another participant was created at the same time, and the threads of
+        // this one cannot be identified.
         let threads = if made.len() == LIBRARY_THREADS { made } else { HashSet::new() };
         let sockets = Sockets::of(options.domain, participant.participant_id());
         drop(opening);
-        let state = Arc::new(State::default());
-        let guard = Guard::new(&sockets, peers::prefix(&participant.guid()), &state);
-        let (line, thread) = receive::start(&options, node, &participant, guard, &state)?;
+        let state = Arc::new(ParticipantState::default());
+        let filter = PacketFilter::new(&sockets, peers::prefix(&participant.guid()), &state);
+        let (receiver, thread) = receive::start(&options, node, &participant, filter, &state)?;
         info!(domain = options.domain, node = options.node, "joined");
         Ok(Self {
             participant,
             state,
-            line,
+            receiver,
             thread: Some(thread),
-            watch: Mutex::new(Watch::new(sockets, threads)),
+            watchdog: Mutex::new(Watchdog::new(sockets, threads)),
             domain: options.domain,
             buffer: (asked, granted(asked, needed)),
             subscriptions: Vec::new(),
-            known: Mutex::new(Known::new(Sources::new(&options.messages, &options.prefixes))),
+            definitions: Mutex::new(DefinitionsCache::new(Sources::new(
+                &options.messages,
+                &options.prefixes,
+            ))),
         })
     }
 
@@ -158,19 +161,24 @@ impl Dds {
     ///
     /// # Errors
     ///
-    /// [`DdsError`] if a name is no name in ROS.
-    pub fn writer(&self, topic: &str, type_name: &str, depth: usize) -> Result<Writer, DdsError> {
-        Writer::new(&self.participant, &self.state, &self.line, topic, type_name, depth)
+    /// [`DdsError`] if a name is not valid in ROS 2.
+    pub fn writer(
+        &self,
+        topic: &str,
+        type_name: &str,
+        depth: usize,
+    ) -> Result<TopicWriter, DdsError> {
+        TopicWriter::new(&self.participant, &self.state, &self.receiver, topic, type_name, depth)
     }
 
-    /// Returns how others see this participant in the graph of ROS 2, in words.
+    /// Describes how other nodes see this participant in the ROS 2 graph.
     pub fn graph(&self) -> String {
         self.state.graph().0
     }
 
-    /// The topics of ROS 2 that others write or read, sorted by name; at most 4096.
-    pub fn discovered(&self) -> Vec<TopicOnWire> {
-        wire::topics(&self.participant, None).into_iter().map(|(topic, _)| topic).collect()
+    /// The ROS 2 topics that other participants write or read, sorted by name; at most 4096.
+    pub fn discovered(&self) -> Vec<DomainTopic> {
+        discovery::topics(&self.participant, None).into_iter().map(|(topic, _)| topic).collect()
     }
 
     /// The type of a topic: as it is subscribed, else as others write or read it.
@@ -179,7 +187,7 @@ impl Dds {
             return Ok(spec.type_name.clone());
         }
         let known = self.discovered();
-        // The first is the one that most write; somebody may only read it as something else.
+        // The first has the most writers; another participant may only read it as another type.
         if let Some(found) = known.iter().find(|found| found.topic == topic) {
             return Ok(found.type_name.clone());
         }
@@ -189,7 +197,8 @@ impl Dds {
     }
 }
 
-/// What of `asked` the kernel grants; says so if that is less than `needed`.
+/// Returns the bytes of `asked` that the kernel grants; logs a warning if that is less than
+/// `needed`.
 fn granted(asked: usize, needed: usize) -> usize {
     let granted = sockets::granted(asked).unwrap_or(0);
     if granted < needed {
@@ -204,76 +213,78 @@ fn granted(asked: usize, needed: usize) -> usize {
 
 impl Transport for Dds {
     fn topics(&self) -> Vec<DiscoveredTopic> {
-        let topics = wire::topics(&self.participant, self.state.graph().1);
-        let discovered = |(found, offered_qos): (TopicOnWire, Option<String>)| DiscoveredTopic {
-            definitions_text: lock(&self.known).text(&found.type_name),
+        let topics = discovery::topics(&self.participant, self.state.graph().1);
+        let discovered = |(found, offered_qos): (DomainTopic, Option<String>)| DiscoveredTopic {
+            definitions_text: lock(&self.definitions).text(&found.type_name),
             topic: found.topic,
             type_name: found.type_name,
             messages: None,
             offered_qos,
         };
-        // What somebody only wants to read brings nothing, and may be of another type.
+        // A topic that is only read delivers nothing, and its readers may have another type.
         topics.into_iter().filter(|(found, _)| found.writers > 0).map(discovered).collect()
     }
 
-    /// As for every transport, but a topic that nobody writes yet can be subscribed. Names that ROS
-    /// 2 does not have are [`TransportError::NoSuchTopic`] and [`TransportError::NoDefinitions`].
+    /// As for every transport, but a topic without a writer can be subscribed. Names that are not
+    /// valid in ROS 2 are [`TransportError::NoSuchTopic`] and [`TransportError::NoDefinitions`].
     fn subscribe(
         &mut self,
         spec: &TopicSpec,
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError> {
-        let told = Arc::new(Told::default());
+        let status = Arc::new(SubscriptionStatus::default());
         let index = self.subscriptions.len();
-        let Some(feed) = Feed::new(index, spec, sink, told.clone()) else {
+        let Some(reader) = TopicReader::new(index, spec, sink, status.clone()) else {
             let (topic, type_name) = (names::visible(&spec.topic), names::visible(&spec.type_name));
             return Err(match names::dds_topic(&spec.topic) {
                 Some(_) => TransportError::NoDefinitions { topic, type_name },
                 None => TransportError::NoSuchTopic { topic, known: Vec::new(), nearest: None },
             });
         };
-        self.line.send(Command::Subscribe(Box::new(feed)));
-        self.subscriptions.push((spec.clone(), told));
+        self.receiver.send(ReceiverCommand::Subscribe(Box::new(reader)));
+        self.subscriptions.push((spec.clone(), status));
         Ok(Subscription(index))
     }
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
         let type_name = self.type_of(topic)?;
         let bad = |source| TransportError::BadDefinitions { topic: topic.to_owned(), source };
-        let known = lock(&self.known).parsed(&type_name).map_err(bad)?;
+        let known = lock(&self.definitions).parsed(&type_name).map_err(bad)?;
         known.ok_or_else(|| TransportError::NoDefinitions { topic: topic.to_owned(), type_name })
     }
 
-    /// Asks the node that writes the topic, as far as one question at a time and three for a type
-    /// allow.
+    /// Requests the definitions from a node that writes the topic: one query at a time, and at most
+    /// three for a type.
     fn definitions_may_come(&self, topic: &str) -> bool {
         let type_name = self.type_of(topic);
-        type_name
-            .is_ok_and(|type_name| lock(&self.known).may_come(&type_name, &self.line, &self.state))
+        type_name.is_ok_and(|type_name| {
+            lock(&self.definitions).may_come(&type_name, &self.receiver, &self.state)
+        })
     }
 
     fn status(&self, subscription: Subscription) -> Status {
         self.subscriptions
             .get(subscription.0)
-            .map(|(_, told)| told.status(&self.state))
+            .map(|(_, status)| status.status(&self.state))
             .unwrap_or_default()
     }
 }
 
 impl LiveSource for Dds {
-    /// What is dead is known after ten calls.
+    /// A dead participant is detected after ten calls.
     fn health(&self) -> Health {
         let topics: Vec<String> =
             self.subscriptions.iter().map(|(spec, _)| spec.topic.clone()).collect();
-        let (queues, dead) = lock(&self.watch).look(&self.state, &topics);
+        let (queues, dead) = lock(&self.watchdog).check(&self.state, &topics);
         let ended = self.thread.as_ref().is_none_or(JoinHandle::is_finished);
-        let network = Network {
+        let network = NetworkStatus {
             domain: self.domain,
             participants: self.state.peers().participants(),
-            buffer_asked: self.buffer.0,
+            buffer_requested: self.buffer.0,
             buffer_granted: self.buffer.1,
-            // The kernel counts those for all programs of the network together, so if buffers of
-            // others were full as well, some that count here were filtered.
+            // The kernel counts these for all programs in the network namespace together. If
+            // buffers of other programs were full as well, some of the drops counted here were in
+            // fact filtered.
             socket_drops: queues.drops,
             filtered: queues.filtered,
             unfiltered: self.state.unfiltered(),
@@ -294,7 +305,7 @@ impl LiveSource for Dds {
     }
 }
 
-impl Publisher for Writer {
+impl Publisher for TopicWriter {
     fn publish(&self, cdr: &[u8]) -> Result<(), PublishError> {
         self.write(cdr).map_err(|error| PublishError(error.into()))
     }
@@ -302,17 +313,17 @@ impl Publisher for Writer {
 
 impl Drop for Dds {
     fn drop(&mut self) {
-        self.line.send(Command::Stop);
+        self.receiver.send(ReceiverCommand::Stop);
         let Some(thread) = self.thread.take() else { return };
         let begun = Instant::now();
         while !thread.is_finished() {
-            if begun.elapsed() > LAST_WORDS {
-                warn!("a sink keeps the receive thread; it is left behind");
+            if begun.elapsed() > STOP_TIMEOUT {
+                warn!("receive thread did not stop in time; detached");
                 return;
             }
             std::thread::sleep(Duration::from_millis(1));
         }
-        // What it died of, if it did, was said when it died.
+        // The cause, if it died, was logged at that time.
         drop(thread.join());
     }
 }

@@ -1,19 +1,20 @@
-//! Names of ROS 2 as DDS spells them, and back; names from the wire made fit to be shown.
+//! Converts names between ROS 2 and DDS, and makes names from the network printable.
 
 use ros2_client::{MessageTypeName, Name, NodeName};
 
 /// The longest name that is shown, in bytes. ROS 2's own topics may have 255.
 const LONGEST: usize = 256;
 
-/// `/camera/front` as DDS has it: `rt/camera/front`. `None` if it is no absolute name of a topic.
+/// The DDS name of a topic: `rt/camera/front` for `/camera/front`. `None` if it is not an absolute
+/// topic name.
 pub(super) fn dds_topic(topic: &str) -> Option<String> {
     let name = Name::parse(topic).ok().filter(Name::is_absolute)?;
     let root = NodeName::new("/", "_").ok()?;
     Some(name.to_dds_name("rt", &root, "")).filter(|name| name.len() <= LONGEST)
 }
 
-/// `sensor_msgs/msg/Imu` as DDS has it: `sensor_msgs::msg::dds_::Imu_`. `None` if it is no name of
-/// a message type.
+/// The DDS name of a message type: `sensor_msgs::msg::dds_::Imu_` for `sensor_msgs/msg/Imu`. `None`
+/// if it is not a valid type name.
 pub(super) fn dds_type(type_name: &str) -> Option<String> {
     let (package, name) = type_name.split_once("/msg/").or_else(|| type_name.split_once('/'))?;
     let is_name = |part: &str| {
@@ -24,13 +25,14 @@ pub(super) fn dds_type(type_name: &str) -> Option<String> {
     (is_name(package) && is_name(name)).then(|| MessageTypeName::new(package, name).dds_msg_type())
 }
 
-/// `/camera/front` of `rt/camera/front`; `None` for what is no topic of ROS 2, such as the topics
-/// of its services.
+/// The ROS 2 name of a topic: `/camera/front` for `rt/camera/front`. `None` for other topics, such
+/// as those of services.
 pub(super) fn ros_topic(dds_name: &str) -> Option<&str> {
     dds_name.strip_prefix("rt").filter(|name| name.starts_with('/'))
 }
 
-/// `sensor_msgs/msg/Imu` of `sensor_msgs::msg::dds_::Imu_`; any other type as it is.
+/// The ROS 2 name of a type: `sensor_msgs/msg/Imu` for `sensor_msgs::msg::dds_::Imu_`; any other
+/// type unchanged.
 pub(super) fn ros_type(dds_type: &str) -> String {
     let parts = || {
         let (package, name) = dds_type.split_once("::msg::dds_::")?;
@@ -39,8 +41,8 @@ pub(super) fn ros_type(dds_type: &str) -> String {
     parts().unwrap_or_else(|| dds_type.to_owned())
 }
 
-/// Namespace and name of a node: `/gleaner` and `hello` of `/gleaner/hello`. `None` if they are no
-/// names.
+/// Namespace and name of a node: `/gleaner` and `hello` for `/gleaner/hello`. `None` if they are
+/// not valid names.
 pub(super) fn node(full: &str) -> Option<(String, String)> {
     let (namespace, base) = full.rsplit_once('/')?;
     let name = NodeName::new(if namespace.is_empty() { "/" } else { namespace }, base).ok()?;
@@ -49,8 +51,7 @@ pub(super) fn node(full: &str) -> Option<(String, String)> {
         .then_some((namespace, base))
 }
 
-/// `text`, in which everything that a terminal or a log could take for something else is escaped,
-/// and which is cut where it is too long.
+/// Returns `text` with all characters but printable ASCII escaped, truncated to [`LONGEST`] bytes.
 pub(super) fn visible(text: &str) -> String {
     let mut shown = String::new();
     for character in text.chars() {
@@ -73,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_go_to_dds_and_come_back() {
+    fn names_round_trip_through_dds() {
         assert_eq!(dds_topic("/camera/front").as_deref(), Some("rt/camera/front"));
         assert_eq!(ros_topic("rt/camera/front"), Some("/camera/front"));
         for type_name in ["sensor_msgs/msg/Imu", "sensor_msgs/Imu"] {
@@ -84,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_name_is_none() {
+    fn invalid_names_are_refused() {
         for topic in [
             "",
             "/",
@@ -110,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn services_are_no_topics_and_other_types_stay_as_they_are() {
+    fn services_are_not_topics_and_other_types_are_unchanged() {
         assert_eq!(ros_topic("rq/add_two_intsRequest"), None);
         assert_eq!(ros_topic("rtx/a"), None);
         assert_eq!(ros_topic("ros_discovery_info"), None);
@@ -119,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_names_are_escaped_and_cut() {
+    fn hostile_names_are_escaped_and_truncated() {
         assert_eq!(visible("/imu/data"), "/imu/data");
         assert_eq!(visible("\u{1b}[2J\n"), "\\u{1b}[2J\\u{a}");
         assert_eq!(visible("\u{202e}x"), "\\u{202e}x");

@@ -1,27 +1,27 @@
-//! Which node writes what, as participants say it of themselves in the graph.
+//! Finds the node of a writer, from the graph messages of participants.
 
 use std::collections::HashMap;
 
 use super::Distro;
 use super::filter::Prefix;
-use super::graph::{Node, nodes};
+use super::graph_message::{RemoteNode, nodes};
 use gleaner_messages::Endian;
 use gleaner_transport::Guid;
 
-/// Most participants whose nodes are known, and the longest word of one that is remembered: 4000
-/// endpoints. Who says more is asked nothing.
+/// Most participants whose nodes are kept, and the longest graph message that is kept: 4000
+/// endpoints. A participant with a longer one gets no type queries.
 const MOST: usize = 256;
 const LONGEST: usize = 64 << 10;
 
-/// The nodes of others, of Iron and newer: older ones answer no questions.
+/// The nodes of other participants, of Iron and newer: older ones have no type description service.
 #[derive(Debug, Default)]
-pub(super) struct Nodes(HashMap<Prefix, Vec<Node>>);
+pub(super) struct Nodes(HashMap<Prefix, Vec<RemoteNode>>);
 
 impl Nodes {
-    /// `sender` said `cdr`, which replaces what it said before.
-    pub(super) fn hear(&mut self, sender: Prefix, cdr: &[u8], endian: Endian) {
-        let known = if cdr.len() > LONGEST { None } else { nodes(cdr, endian, Distro::Newer) };
-        match known {
+    /// Takes a graph message of `sender`, which replaces its previous one.
+    pub(super) fn note(&mut self, sender: Prefix, cdr: &[u8], endian: Endian) {
+        let parsed = if cdr.len() > LONGEST { None } else { nodes(cdr, endian, Distro::Newer) };
+        match parsed {
             Some(nodes) if self.0.len() < MOST || self.0.contains_key(&sender) => {
                 drop(self.0.insert(sender, nodes))
             }
@@ -34,7 +34,7 @@ impl Nodes {
         self.0.retain(|participant, _| present.binary_search(participant).is_ok());
     }
 
-    /// The node that has this writer, if its own participant said so.
+    /// The node that has this writer, according to its own participant.
     pub(super) fn writing(&self, writer: Guid) -> Option<&str> {
         let nodes = self.0.get(writer.0.first_chunk::<12>()?)?;
         nodes.iter().find(|node| node.writers.contains(&writer.0)).map(|node| node.name.as_str())
@@ -43,44 +43,47 @@ impl Nodes {
 
 #[cfg(test)]
 mod tests {
-    use super::super::graph::{Entry, encode};
+    use super::super::graph_message::{OwnNode, encode};
     use super::*;
 
-    fn said(name: &str, writer: [u8; 16]) -> Vec<u8> {
+    fn message(name: &str, writer: [u8; 16]) -> Vec<u8> {
         let (namespace, name) = ("/".to_owned(), name.to_owned());
-        encode(&Entry { namespace, name, writers: vec![writer], ..Entry::default() }, Distro::Newer)
+        encode(
+            &OwnNode { namespace, name, writers: vec![writer], ..OwnNode::default() },
+            Distro::Newer,
+        )
     }
 
     #[test]
-    fn a_writer_is_of_the_node_of_which_its_own_participant_said_so_last() {
+    fn a_writer_belongs_to_the_node_that_its_own_participant_named_last() {
         let mut nodes = Nodes::default();
-        nodes.hear([1; 12], &said("camera", [1; 16]), Endian::Little);
+        nodes.note([1; 12], &message("camera", [1; 16]), Endian::Little);
         assert_eq!(nodes.writing(Guid([1; 16])), Some("/camera"));
-        nodes.hear([2; 12], &said("liar", [3; 16]), Endian::Little);
+        nodes.note([2; 12], &message("liar", [3; 16]), Endian::Little);
         assert_eq!(nodes.writing(Guid([3; 16])), None);
-        nodes.hear([1; 12], &said("lens", [1; 16]), Endian::Little);
+        nodes.note([1; 12], &message("lens", [1; 16]), Endian::Little);
         assert_eq!(nodes.writing(Guid([1; 16])), Some("/lens"));
         nodes.keep(&[[2; 12]]);
         assert_eq!(nodes.writing(Guid([1; 16])), None);
     }
 
     #[test]
-    fn no_more_participants_and_no_longer_words_are_remembered_than_anybody_has() {
+    fn participants_and_long_messages_are_bounded() {
         let mut nodes = Nodes::default();
         for n in 0..1000_u16 {
             let mut prefix = [7; 12];
             prefix[..2].copy_from_slice(&n.to_le_bytes());
-            nodes.hear(prefix, &said("node", [7; 16]), Endian::Little);
+            nodes.note(prefix, &message("node", [7; 16]), Endian::Little);
         }
         assert_eq!(nodes.0.len(), MOST);
         let mut nodes = Nodes::default();
-        let many = Entry {
+        let many = OwnNode {
             writers: vec![[1; 16]; LONGEST / 16],
             namespace: "/".into(),
             name: "n".into(),
-            ..Entry::default()
+            ..OwnNode::default()
         };
-        nodes.hear([1; 12], &encode(&many, Distro::Newer), Endian::Little);
+        nodes.note([1; 12], &encode(&many, Distro::Newer), Endian::Little);
         assert_eq!(nodes.0.len(), 0);
     }
 }

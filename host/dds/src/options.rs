@@ -1,4 +1,4 @@
-//! How a domain is joined.
+//! Options for joining a domain.
 
 use std::error::Error;
 use std::net::{IpAddr, Ipv4Addr};
@@ -7,82 +7,82 @@ use std::path::PathBuf;
 use gleaner_transport::Clock;
 use gleaner_transport::clock::time_of_day;
 
-/// The highest domain whose ports exist.
+/// The highest domain that has valid ports.
 const LAST_DOMAIN: u16 = 232;
 const DOMAIN: &str = "ROS_DOMAIN_ID";
 const DOMAINS: &str = "it may be a number from 0 to 232";
-/// The environment is not longer where it means well.
+/// Most entries of `AMENT_PREFIX_PATH` that are read.
 const PREFIXES: usize = 256;
 
-/// A distribution of ROS 2, as far as nodes of others have to know it of us.
+/// A distribution of ROS 2, as far as it changes our messages to other nodes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Distro {
-    /// Humble and older: names of endpoints have 24 bytes in the graph.
+    /// Humble and older: GIDs of endpoints have 24 bytes in the graph.
     Humble,
     /// Iron and newer: 16 bytes.
     Newer,
 }
 
-/// How a domain is joined.
+/// Options for joining a domain.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct DdsOptions {
     /// The domain; `ROS_DOMAIN_ID`.
     pub domain: u16,
     /// Addresses of the interfaces to use; all if empty.
     pub interfaces: Vec<IpAddr>,
-    /// Namespace and name of the node that others see, for example `/gleaner/hello`.
+    /// Namespace and name of our node in the graph, for example `/gleaner/hello`.
     pub node: String,
-    /// The distribution of the others; `None`: found out from what they say.
+    /// The distribution of the other nodes; `None`: detected from their graph messages.
     pub distro: Option<Distro>,
-    /// Bytes of the largest sample, by which socket buffers are sized; 0 if no samples are to be
-    /// received.
+    /// Bytes of the largest sample, which sets the size of socket buffers; 0 if no samples are to
+    /// be received.
     pub largest: usize,
-    /// Folders with message definitions, looked through first.
+    /// Folders with message definitions, searched first.
     pub messages: Vec<PathBuf>,
-    /// Where ROS 2 is installed, looked through last; `AMENT_PREFIX_PATH`.
+    /// Install prefixes of ROS 2, searched last; `AMENT_PREFIX_PATH`.
     pub prefixes: Vec<PathBuf>,
     /// The clock of receive stamps.
     pub clock: Clock,
-    /// What tells the time of day, in ns since 1970. No sample is stamped with it: it is watched,
+    /// Returns the time of day, in ns since 1970. No sample is stamped with it: it is watched,
     /// because RustDDS depends on it.
     pub time_of_day: fn() -> i64,
 }
 
-/// Why DDS does not do what it was asked for.
+/// An error of DDS.
 #[derive(Debug, thiserror::Error)]
 pub enum DdsError {
-    /// No participant.
+    /// The participant cannot be created.
     #[error("cannot join domain {domain}")]
     Join {
         /// The domain.
         domain: u16,
-        /// What the library says.
+        /// The error of RustDDS.
         source: Box<dyn Error + Send + Sync>,
     },
-    /// An environment variable has a value that means nothing.
+    /// An environment variable has an invalid value.
     #[error("{variable} is `{value}`; {wanted}")]
     Setting {
         /// The variable.
         variable: &'static str,
-        /// Its value, made fit to be shown.
+        /// Its value, made printable.
         value: String,
-        /// What it may be.
+        /// The valid values.
         wanted: &'static str,
     },
-    /// What should be a name is none in ROS 2.
+    /// A name is not valid in ROS 2.
     #[error("`{name}` is not {what}")]
     Name {
-        /// The name, made fit to be shown.
+        /// The name, made printable.
         name: String,
-        /// What it should be.
+        /// The expected kind of name.
         what: &'static str,
     },
-    /// No writer.
+    /// The writer cannot be created.
     #[error("cannot write topic `{topic}`")]
     Advertise {
         /// The topic.
         topic: String,
-        /// What the library says.
+        /// The error of RustDDS.
         source: Box<dyn Error + Send + Sync>,
     },
     /// A message was not sent.
@@ -90,12 +90,12 @@ pub enum DdsError {
     Write {
         /// The topic.
         topic: String,
-        /// Why.
+        /// The reason.
         why: String,
     },
 }
 
-impl Options {
+impl DdsOptions {
     /// Domain 0 on all interfaces as `node`, for samples of up to 8 MiB, with the time of day as
     /// clock.
     pub fn new(node: impl Into<String>) -> Self {
@@ -107,7 +107,7 @@ impl Options {
             largest: 8 << 20,
             messages: Vec::new(),
             prefixes: Vec::new(),
-            clock: Clock::of_today(),
+            clock: Clock::from_time_of_day(),
             time_of_day,
         }
     }
@@ -118,20 +118,20 @@ impl Options {
         Self { domain: domain.unwrap_or(self.domain), interfaces, ..self }
     }
 
-    /// As the environment of ROS 2 says: `ROS_DOMAIN_ID`, `ROS_LOCALHOST_ONLY`,
+    /// Reads the environment of ROS 2: `ROS_DOMAIN_ID`, `ROS_LOCALHOST_ONLY`,
     /// `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_DISTRO` and `AMENT_PREFIX_PATH`; otherwise as
-    /// [`Options::new`].
+    /// [`DdsOptions::new`].
     ///
     /// # Errors
     ///
-    /// [`DdsError::Setting`] if a variable has a value that means nothing.
+    /// [`DdsError::Setting`] if a variable has an invalid value.
     pub fn from_env(node: impl Into<String>) -> Result<Self, DdsError> {
         Self::read(node.into(), |variable| {
             std::env::var_os(variable).map(|value| value.to_string_lossy().into_owned())
         })
     }
 
-    /// Namespace and name of the node, if all is as it must be.
+    /// Checks the options; returns the namespace and name of the node.
     pub(super) fn checked(&self) -> Result<(String, String), DdsError> {
         if self.domain > LAST_DOMAIN {
             return Err(setting(DOMAIN, &self.domain.to_string(), DOMAINS));
@@ -153,7 +153,7 @@ impl Options {
             }
             Some("LOCALHOST") => true,
             Some(_) => {
-                let wanted = "Gleaner knows SUBNET, LOCALHOST and SYSTEM_DEFAULT";
+                let wanted = "use SUBNET, LOCALHOST or SYSTEM_DEFAULT";
                 return Err(setting(
                     "ROS_AUTOMATIC_DISCOVERY_RANGE",
                     &range.unwrap_or_default(),
@@ -167,7 +167,7 @@ impl Options {
         options.distro = match variable("ROS_DISTRO").as_deref() {
             Some("foxy" | "galactic" | "humble") => Some(Distro::Humble),
             Some("iron" | "jazzy" | "kilted" | "lyrical" | "rolling") => Some(Distro::Newer),
-            // One that is not known yet is found out as if nothing were said.
+            // An unknown distribution is detected as if the variable were unset.
             _ => None,
         };
         if let Some(value) = variable("AMENT_PREFIX_PATH") {
@@ -178,12 +178,11 @@ impl Options {
     }
 }
 
-/// The domain that the content of `ROS_DOMAIN_ID` means; 0 if there is none. White space around it
-/// means nothing.
+/// Parses the content of `ROS_DOMAIN_ID`; 0 if there is none. White space around it is ignored.
 ///
 /// # Errors
 ///
-/// The content, without that space, if it means no domain.
+/// The trimmed content, if it is not a valid domain.
 fn domain_of(content: Option<&str>) -> Result<u16, &str> {
     match content.map(str::trim) {
         None | Some("") => Ok(0),
@@ -199,8 +198,8 @@ fn setting(variable: &'static str, value: &str, wanted: &'static str) -> DdsErro
 mod tests {
     use super::*;
 
-    fn read(variables: &[(&str, &str)]) -> Result<Options, DdsError> {
-        Options::read("/n".to_owned(), |name| {
+    fn read(variables: &[(&str, &str)]) -> Result<DdsOptions, DdsError> {
+        DdsOptions::read("/n".to_owned(), |name| {
             variables.iter().find(|(known, _)| *known == name).map(|(_, value)| (*value).to_owned())
         })
     }
@@ -212,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn the_environment_of_ros_is_understood() {
+    fn the_environment_of_ros_is_read() {
         let all = [
             ("ROS_DOMAIN_ID", "232"),
             ("ROS_DISTRO", "humble"),
@@ -222,7 +221,7 @@ mod tests {
         assert_eq!((options.domain, options.distro), (232, Some(Distro::Humble)));
         assert_eq!(options.prefixes, [PathBuf::from("/opt/a"), PathBuf::from("/opt/b")]);
         assert_eq!(read(&[("ROS_DISTRO", "jazzy")]).unwrap().distro, Some(Distro::Newer));
-        assert_eq!(read(&[("ROS_DISTRO", "unheard-of")]).unwrap().distro, None);
+        assert_eq!(read(&[("ROS_DISTRO", "unknown")]).unwrap().distro, None);
         for here in [("ROS_LOCALHOST_ONLY", "1"), ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")] {
             assert_eq!(read(&[here]).unwrap().interfaces, [IpAddr::V4(Ipv4Addr::LOCALHOST)]);
         }
@@ -230,8 +229,8 @@ mod tests {
     }
 
     #[test]
-    fn the_domain_is_that_which_all_programs_of_ours_read() {
-        // The same page is the test of `gleaner doctor` and of the player: they cannot share this
+    fn all_programs_read_the_same_domain() {
+        // `gleaner doctor` and the player are tested with the same page: they cannot share this
         // code.
         let page = include_str!("../../../tests/domains.txt");
         for line in page.lines().filter(|line| line.starts_with('|')) {
@@ -242,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_mean_nothing_are_refused_by_name() {
+    fn invalid_values_are_refused_by_name() {
         for domain in ["233", "-1", "one", "1 2", "99999999999"] {
             let error = read(&[("ROS_DOMAIN_ID", domain)]).unwrap_err().to_string();
             assert_eq!(

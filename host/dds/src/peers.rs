@@ -1,4 +1,4 @@
-//! Who else is in the domain, and who is connected to whom of ours.
+//! Tracks the other participants of the domain, and the matches of local endpoints.
 
 use std::collections::{HashMap, HashSet};
 use std::ops::RangeBounds;
@@ -7,25 +7,25 @@ use rustdds::{DomainParticipantStatusEvent as Event, GUID};
 
 use super::filter::Prefix;
 
-/// Most participants, and most endpoints that are connected to one of ours, of which is kept track.
+/// Most participants, and most matches of one local endpoint, that are tracked.
 const MOST: usize = 4096;
 
-/// How the names of all endpoints of `guid`'s participant begin.
+/// The GUID prefix of `guid`'s participant.
 pub(super) fn prefix(guid: &GUID) -> Prefix {
     *guid.to_bytes().first_chunk().expect("12 of 16 bytes")
 }
 
-/// Other participants, and connections of our endpoints to theirs.
+/// Other participants, and the matches of local endpoints with remote ones.
 #[derive(Debug, Default)]
 pub(super) struct Peers {
-    /// Of each, whose DDS it is on: the vendor's number.
+    /// The DDS vendor ID of each.
     participants: HashMap<GUID, [u8; 2]>,
-    /// By endpoint of ours.
+    /// Matches by local endpoint.
     matched: HashMap<GUID, HashSet<GUID>>,
 }
 
 impl Peers {
-    /// Whether what happened changes who offers what.
+    /// Applies an event. Returns whether offers may have changed.
     pub(super) fn note(&mut self, event: &Event) -> bool {
         match event {
             Event::ParticipantDiscovered { dpd } => {
@@ -34,24 +34,24 @@ impl Peers {
                 }
             }
             Event::ParticipantLost { id, .. } => {
-                let theirs = id.range();
-                self.participants.retain(|participant, _| !theirs.contains(participant));
+                let their = id.range();
+                self.participants.retain(|participant, _| !their.contains(participant));
                 self.matched
                     .values_mut()
-                    .for_each(|matched| matched.retain(|guid| !theirs.contains(guid)));
+                    .for_each(|matched| matched.retain(|guid| !their.contains(guid)));
             }
             Event::WriterLost { guid, .. } | Event::ReaderLost { guid, .. } => {
                 for matched in self.matched.values_mut() {
                     matched.remove(guid);
                 }
             }
-            Event::RemoteWriterMatched { local_reader: ours, remote_writer: theirs }
-            | Event::RemoteReaderMatched { local_writer: ours, remote_reader: theirs } => {
-                // Endpoints of ours that RustDDS has for itself are not followed.
+            Event::RemoteWriterMatched { local_reader: own, remote_writer: their }
+            | Event::RemoteReaderMatched { local_writer: own, remote_reader: their } => {
+                // Built-in endpoints of RustDDS are not followed.
                 if let Some(matched) =
-                    self.matched.get_mut(ours).filter(|matched| matched.len() < MOST)
+                    self.matched.get_mut(own).filter(|matched| matched.len() < MOST)
                 {
-                    matched.insert(*theirs);
+                    matched.insert(*their);
                 }
                 return false;
             }
@@ -61,31 +61,30 @@ impl Peers {
         true
     }
 
-    /// Follows an endpoint of ours from now on. To be called before it can be connected.
-    pub(super) fn follow(&mut self, ours: GUID) {
-        self.matched.entry(ours).or_default();
+    /// Starts to track the matches of a local endpoint. To be called before it can be matched.
+    pub(super) fn follow(&mut self, own: GUID) {
+        self.matched.entry(own).or_default();
     }
 
-    pub(super) fn forget(&mut self, ours: GUID) {
-        self.matched.remove(&ours);
+    pub(super) fn forget(&mut self, own: GUID) {
+        self.matched.remove(&own);
     }
 
-    /// How many are connected to an endpoint of ours.
-    pub(super) fn connected(&self, ours: GUID) -> usize {
-        self.matched.get(&ours).map_or(0, HashSet::len)
+    /// Number of matches of a local endpoint.
+    pub(super) fn connected(&self, own: GUID) -> usize {
+        self.matched.get(&own).map_or(0, HashSet::len)
     }
 
     pub(super) fn participants(&self) -> usize {
         self.participants.len()
     }
 
-    /// Whose DDS the participant is on whose endpoints' names begin so: the vendor's number, if it
-    /// is known.
-    pub(super) fn vendor(&self, theirs: Prefix) -> Option<[u8; 2]> {
-        self.participants.iter().find(|(guid, _)| prefix(guid) == theirs).map(|(_, vendor)| *vendor)
+    /// The DDS vendor ID of the participant with this GUID prefix, if known.
+    pub(super) fn vendor(&self, their: Prefix) -> Option<[u8; 2]> {
+        self.participants.iter().find(|(guid, _)| prefix(guid) == their).map(|(_, vendor)| *vendor)
     }
 
-    /// How the names of all endpoints of each participant begin, sorted.
+    /// The GUID prefixes of all participants, sorted.
     pub(super) fn prefixes(&self) -> Vec<Prefix> {
         let mut prefixes: Vec<Prefix> = self.participants.keys().map(prefix).collect();
         prefixes.sort_unstable();

@@ -1,4 +1,4 @@
-//! CDR bytes out of RustDDS and into it, untouched, whatever their type.
+//! Passes CDR bytes of any type out of RustDDS and into it, unchanged.
 
 use std::cell::RefCell;
 use std::convert::Infallible;
@@ -16,24 +16,24 @@ pub(super) type RawReader = no_key::SimpleDataReader<Raw, RawAdapter>;
 /// A writer of any type.
 pub(super) type RawWriter = no_key::DataWriter<Bytes, RawAdapter>;
 
-/// What is known of a sample when its bytes are copied.
+/// A sample at the time its bytes are copied.
 #[derive(Debug)]
 pub(super) struct Raw {
     pub(super) at_ns: i64,
     pub(super) endian: Endian,
-    pub(super) held: Held,
+    pub(super) copied_to: CopiedTo,
 }
 
-/// Who has the bytes of a sample.
+/// The place to which the bytes of a sample were copied.
 #[derive(Debug)]
-pub(super) enum Held {
-    /// The sink, or it has refused them.
+pub(super) enum CopiedTo {
+    /// To the sink, unless the sink refused them.
     Sink,
-    /// The memory that all samples share.
-    Memory,
-    /// Nobody: the sink panicked, with these words.
-    Nobody(String),
-    /// Nobody: it cannot be read, for this reason.
+    /// To the memory that all samples share.
+    SharedMemory,
+    /// Nowhere: the sink panicked, with this text.
+    SinkPanicked(String),
+    /// Nowhere: the sample cannot be read, for this reason.
     Unreadable(String),
 }
 
@@ -65,8 +65,8 @@ impl no_key::SerializerAdapter<Bytes> for RawAdapter {
     }
 }
 
-/// All that have a name. Only the first two are read; of a sample in one of the others, RustDDS
-/// tells whose it is and which, which it does not of a sample in one that is missing here.
+/// All encodings that have a name. Only the first two are read. For a sample in one of the others,
+/// RustDDS gives its writer and number, which it does not for an encoding that is missing here.
 const ENCODINGS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::CDR_LE,
     RepresentationIdentifier::CDR_BE,
@@ -87,7 +87,7 @@ const ENCODINGS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::D_CDR_BE,
 ];
 
-/// Why a sample cannot be read.
+/// The reason why a sample cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Unreadable {
     #[error("no memory for {bytes} bytes")]
@@ -96,11 +96,11 @@ pub(super) enum Unreadable {
     Encoding { encoding: RepresentationIdentifier },
 }
 
-/// Copies a sample: into the sink's memory, if the sink can copy before it knows whose sample it
-/// is; else into memory of ours that all samples share, one after the other.
+/// Copies a sample into the sink's memory, if the sink can copy before it gets the sample's
+/// metadata; else into memory that all samples share, one after the other.
 ///
-/// RustDDS shows the bytes while it holds the lock of the topic, and says who wrote them only
-/// afterwards. What unwound from here would poison that lock and end RustDDS's own thread.
+/// RustDDS gives the bytes while it holds the lock of the topic, and their writer only afterwards.
+/// A panic that unwound from here would poison that lock and end RustDDS's own thread.
 #[derive(Copy, Clone)]
 pub(super) struct CopyInto<'a> {
     pub(super) sink: Option<&'a dyn Sink>,
@@ -122,28 +122,28 @@ impl<'de> no_key::Decode<'de, Raw> for CopyInto<'_> {
             RepresentationIdentifier::CDR_BE => Endian::Big,
             encoding => return Err(Unreadable::Encoding { encoding }),
         };
-        let raw = |held| Ok(Raw { at_ns, endian, held });
+        let raw = |copied_to| Ok(Raw { at_ns, endian, copied_to });
         if let Some(sink) = self.sink {
             match catch_unwind(AssertUnwindSafe(|| sink.copy(bytes))) {
-                Ok(Some(_)) => return raw(Held::Sink),
+                Ok(Some(_)) => return raw(CopiedTo::Sink),
                 Ok(None) => {}
-                Err(panic) => return raw(Held::Nobody(panic_text(&*panic))),
+                Err(panic) => return raw(CopiedTo::SinkPanicked(panic_text(&*panic))),
             }
         }
         let mut memory = self.memory.borrow_mut();
         memory.clear();
         memory.try_reserve(bytes.len()).map_err(|_| Unreadable::NoMemory { bytes: bytes.len() })?;
         memory.extend_from_slice(bytes);
-        raw(Held::Memory)
+        raw(CopiedTo::SharedMemory)
     }
 }
 
-/// Copies a sample, or says in its place why not: with an error RustDDS does not tell whose sample
-/// it was.
+/// Copies a sample, or returns the error in place of it: with an error, RustDDS does not give the
+/// sample's writer.
 #[derive(Copy, Clone)]
-pub(super) struct CopyOrSay<'a>(pub(super) CopyInto<'a>);
+pub(super) struct CopyOrReport<'a>(pub(super) CopyInto<'a>);
 
-impl<'de> no_key::Decode<'de, Raw> for CopyOrSay<'_> {
+impl<'de> no_key::Decode<'de, Raw> for CopyOrReport<'_> {
     type Error = Unreadable;
 
     fn decode_bytes(
@@ -152,21 +152,21 @@ impl<'de> no_key::Decode<'de, Raw> for CopyOrSay<'_> {
         encoding: RepresentationIdentifier,
     ) -> Result<Raw, Unreadable> {
         let unreadable = |why: Unreadable| {
-            let held = Held::Unreadable(why.to_string());
-            Raw { at_ns: self.0.clock.now(), endian: Endian::Little, held }
+            let copied_to = CopiedTo::Unreadable(why.to_string());
+            Raw { at_ns: self.0.clock.now(), endian: Endian::Little, copied_to }
         };
         Ok(self.0.decode_bytes(bytes, encoding).unwrap_or_else(unreadable))
     }
 }
 
-/// Reads and forgets.
+/// Discards a sample.
 #[derive(Copy, Clone)]
-pub(super) struct PassOver;
+pub(super) struct Discard;
 
-impl<'de> no_key::Decode<'de, Raw> for PassOver {
+impl<'de> no_key::Decode<'de, Raw> for Discard {
     type Error = Unreadable;
 
     fn decode_bytes(self, _: &'de [u8], _: RepresentationIdentifier) -> Result<Raw, Unreadable> {
-        Ok(Raw { at_ns: 0, endian: Endian::Little, held: Held::Memory })
+        Ok(Raw { at_ns: 0, endian: Endian::Little, copied_to: CopiedTo::SharedMemory })
     }
 }

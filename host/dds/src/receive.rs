@@ -1,5 +1,5 @@
-//! The receive thread: waits for all readers at once, hands over what came, and looks at who offers
-//! what.
+//! The receive thread: polls all readers, delivers their samples, and follows the offers of
+//! writers.
 
 use std::cell::RefCell;
 use std::io;
@@ -13,14 +13,14 @@ use std::time::{Duration, Instant};
 use mio::{Events, Interest, Poll, Token, Waker};
 use rustdds::{DomainParticipant, DomainParticipantStatusListener, GUID, StatusEvented};
 
-use super::ask::{Ask, Asker};
-use super::day::Day;
-use super::feed::{self, Around, Feed};
-use super::guard::Guard;
-use super::offers::Offer;
-use super::presence::Presence;
-use super::state::{State, panic_text};
-use super::{DdsError, Options, wire};
+use super::clock_watch::ClockWatch;
+use super::graph::GraphNode;
+use super::packet_filter::PacketFilter;
+use super::qos::Offer;
+use super::state::{ParticipantState, panic_text};
+use super::topic_reader::{self, ReceiveContext, TopicReader};
+use super::type_query::{TypeQuerier, TypeQuery};
+use super::{DdsError, DdsOptions, discovery};
 use gleaner_transport::Clock;
 
 const WAKE: Token = Token(0);
@@ -28,33 +28,33 @@ const STATUS: Token = Token(1);
 const GRAPH: Token = Token(2);
 const ANSWER: Token = Token(3);
 
-/// Samples of one topic before it is the next one's turn.
-const TURN: usize = 64;
-/// How often it is looked who offers what: after something changed, and in any case.
-const SOON: Duration = Duration::from_millis(100);
-const ANYWAY: Duration = Duration::from_secs(1);
-/// Memory for samples that is kept, however small they are.
-const KEPT_BYTES: usize = 1 << 20;
+/// Most samples of one topic before the next one's turn.
+const MOST_PER_TURN: usize = 64;
+/// Interval of updates: after a change, and in any case.
+const UPDATE_MIN: Duration = Duration::from_millis(100);
+const UPDATE_MAX: Duration = Duration::from_secs(1);
+/// Shared memory for samples that is always kept.
+const SHARED_BYTES: usize = 1 << 20;
 
-/// What the receive thread is asked to do.
-pub(super) enum Command {
-    Subscribe(Box<Feed>),
+/// A command to the receive thread.
+pub(super) enum ReceiverCommand {
+    Subscribe(Box<TopicReader>),
     Writer(GUID),
     WriterGone(GUID),
-    Ask(Ask),
+    Query(TypeQuery),
     Stop,
 }
 
-/// The way to the receive thread.
+/// A handle to send commands to the receive thread.
 #[derive(Clone)]
-pub(super) struct Line {
-    commands: mpsc::Sender<Command>,
+pub(super) struct ReceiverHandle {
+    commands: mpsc::Sender<ReceiverCommand>,
     waker: Arc<Waker>,
 }
 
-impl Line {
-    /// Tells the thread. If it has ended, nobody is told; `Health` says so.
-    pub(super) fn send(&self, command: Command) {
+impl ReceiverHandle {
+    /// Sends a command. Without effect if the thread has ended, which `Health` reports.
+    pub(super) fn send(&self, command: ReceiverCommand) {
         if self.commands.send(command).is_ok() {
             drop(self.waker.wake());
         }
@@ -63,57 +63,57 @@ impl Line {
 
 struct Receiver {
     poll: Poll,
-    commands: mpsc::Receiver<Command>,
+    commands: mpsc::Receiver<ReceiverCommand>,
     participant: DomainParticipant,
     listener: DomainParticipantStatusListener,
-    feeds: Vec<Feed>,
+    readers: Vec<TopicReader>,
     writers: Vec<GUID>,
-    presence: Presence,
-    asker: Asker,
-    guard: Guard,
-    state: Arc<State>,
+    graph: GraphNode,
+    querier: TypeQuerier,
+    filter: PacketFilter,
+    state: Arc<ParticipantState>,
     memory: RefCell<Vec<u8>>,
     clock: Clock,
-    day: Day,
-    /// Bytes of the largest sample that was announced, whatever is subscribed so far.
+    clock_watch: ClockWatch,
+    /// Bytes of the largest sample in [`DdsOptions::largest`], whatever is subscribed so far.
     largest: usize,
-    /// Something changed since the last look.
+    /// True if something changed since the last update.
     changed: bool,
-    looked: Option<Instant>,
+    updated: Option<Instant>,
 }
 
 /// Starts the thread.
 pub(super) fn start(
-    options: &Options,
+    options: &DdsOptions,
     node: (String, String),
     participant: &DomainParticipant,
-    guard: Guard,
-    state: &Arc<State>,
-) -> Result<(Line, JoinHandle<()>), DdsError> {
+    filter: PacketFilter,
+    state: &Arc<ParticipantState>,
+) -> Result<(ReceiverHandle, JoinHandle<()>), DdsError> {
     let join = |source: io::Error| DdsError::Join { domain: options.domain, source: source.into() };
     let poll = Poll::new().map_err(join)?;
     let waker = Arc::new(Waker::new(poll.registry(), WAKE).map_err(join)?);
     let mut listener = participant.status_listener();
     poll.registry().register(&mut listener, STATUS, Interest::READABLE).map_err(join)?;
-    let presence = Presence::new(options, node, participant, poll.registry(), GRAPH)?;
+    let graph = GraphNode::new(options, node, participant, poll.registry(), GRAPH)?;
     let (commands, receiver) = mpsc::channel();
     let receiver = Receiver {
         poll,
         commands: receiver,
         participant: participant.clone(),
         listener,
-        feeds: Vec::new(),
+        readers: Vec::new(),
         writers: Vec::new(),
-        presence,
-        asker: Asker::default(),
-        guard,
+        graph,
+        querier: TypeQuerier::default(),
+        filter,
         state: state.clone(),
-        memory: RefCell::new(Vec::with_capacity(KEPT_BYTES)),
+        memory: RefCell::new(Vec::with_capacity(SHARED_BYTES)),
         clock: options.clock,
-        day: Day::new(options.time_of_day),
+        clock_watch: ClockWatch::new(options.time_of_day),
         largest: options.largest,
         changed: true,
-        looked: None,
+        updated: None,
     };
     let state = state.clone();
     let body = move || {
@@ -122,17 +122,17 @@ pub(super) fn start(
         }
     };
     let thread = Builder::new().name("gleaner receive".to_owned()).spawn(body).map_err(join)?;
-    Ok((Line { commands, waker }, thread))
+    Ok((ReceiverHandle { commands, waker }, thread))
 }
 
 impl Receiver {
     fn run(mut self) {
         let mut events = Events::with_capacity(256);
         loop {
-            match self.poll.poll(&mut events, Some(self.patience())) {
+            match self.poll.poll(&mut events, Some(self.poll_timeout())) {
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
                 Err(error) => {
-                    return self.state.die(format!("the receive thread cannot wait: {error}"));
+                    return self.state.die(format!("the receive thread cannot poll: {error}"));
                 }
                 Ok(()) => {}
             }
@@ -142,53 +142,53 @@ impl Receiver {
                     STATUS => self.note_events(),
                     GRAPH | ANSWER => self.changed = true,
                     token => {
-                        if let Some(feed) =
-                            feed::index(token).and_then(|index| self.feeds.get_mut(index))
+                        if let Some(reader) =
+                            topic_reader::index(token).and_then(|index| self.readers.get_mut(index))
                         {
-                            feed.ready = true;
+                            reader.ready = true;
                         }
                     }
                 }
             }
-            if !self.obey() {
+            if !self.handle_commands() {
                 break;
             }
             self.take();
             if self.due() {
-                self.look();
+                self.update();
             }
         }
-        let Self { participant, presence, feeds, .. } = self;
-        presence.leave(&participant);
-        drop(feeds);
+        let Self { participant, graph, readers, .. } = self;
+        graph.leave(&participant);
+        drop(readers);
     }
 
     fn due(&self) -> bool {
-        let since = self.looked.map(|looked| looked.elapsed());
-        since.is_none_or(|since| since >= ANYWAY || self.changed && since >= SOON)
+        let since = self.updated.map(|updated| updated.elapsed());
+        since.is_none_or(|since| since >= UPDATE_MAX || self.changed && since >= UPDATE_MIN)
     }
 
-    /// How long nothing needs to be done.
-    fn patience(&self) -> Duration {
-        if self.feeds.iter().any(|feed| feed.ready) {
+    /// Time until the next update is due.
+    fn poll_timeout(&self) -> Duration {
+        if self.readers.iter().any(|reader| reader.ready) {
             return Duration::ZERO;
         }
-        let every = if self.changed { SOON } else { ANYWAY };
-        self.looked.map_or(Duration::ZERO, |looked| every.saturating_sub(looked.elapsed()))
+        let every = if self.changed { UPDATE_MIN } else { UPDATE_MAX };
+        self.updated.map_or(Duration::ZERO, |updated| every.saturating_sub(updated.elapsed()))
     }
 
-    fn obey(&mut self) -> bool {
+    fn handle_commands(&mut self) -> bool {
         while let Ok(command) = self.commands.try_recv() {
             match command {
-                Command::Subscribe(feed) => {
-                    self.feeds.push(*feed);
-                    // A reader at once, not when somebody else happens to change something.
-                    self.looked = None;
+                ReceiverCommand::Subscribe(reader) => {
+                    self.readers.push(*reader);
+                    // Its reader is created at once, not at the next change in the domain.
+                    self.updated = None;
                 }
-                Command::Writer(guid) => self.writers.push(guid),
-                Command::WriterGone(guid) => self.writers.retain(|writer| *writer != guid),
-                Command::Ask(ask) => self.asker.ask(ask),
-                Command::Stop => return false,
+                ReceiverCommand::Writer(guid) => self.writers.push(guid),
+                ReceiverCommand::WriterGone(guid) => self.writers.retain(|writer| *writer != guid),
+                ReceiverCommand::Query(query) => self.querier.start(query),
+                ReceiverCommand::Stop => return false,
             }
             self.changed = true;
         }
@@ -203,66 +203,66 @@ impl Receiver {
     }
 
     fn take(&mut self) {
-        let around = Around {
+        let context = ReceiveContext {
             participant: &self.participant,
             registry: self.poll.registry(),
             state: &self.state,
             memory: &self.memory,
             clock: self.clock,
         };
-        for feed in self.feeds.iter_mut().filter(|feed| feed.ready) {
-            feed.take(&around, TURN);
+        for reader in self.readers.iter_mut().filter(|reader| reader.ready) {
+            reader.take(&context, MOST_PER_TURN);
         }
     }
 
-    fn look(&mut self) {
+    fn update(&mut self) {
         self.changed = false;
-        self.looked = Some(Instant::now());
-        if let Some(back) = self.day.set_back() {
+        self.updated = Some(Instant::now());
+        if let Some(back) = self.clock_watch.set_back() {
             let seconds = (back + 500_000_000) / 1_000_000_000;
             self.state.die(format!(
-                "the time of day was set back by {seconds} s: until it has caught up, nothing of best-effort writers is heard, \
-                 and no participant that is new; a restart cures that"
+                "the time of day was set back by {seconds} s: until it catches up, no samples \
+                 of best-effort writers and no new participants are received; restart the process"
             ));
         }
         let writers = self.participant.discovered_writers();
-        let offers: Vec<Offer> = writers.iter().map(wire::offer).collect();
+        let offers: Vec<Offer> = writers.iter().map(discovery::offer).collect();
         self.note_events();
-        let largest = self.feeds.iter().map(Feed::largest).max().unwrap_or(0);
-        let largest = largest.max(self.largest).max(self.asker.largest());
-        // Before there are readers: fragments of the first sample have to pass. Participants are
-        // told of once; a writer that is known speaks for one that was missed.
+        let largest = self.readers.iter().map(TopicReader::largest).max().unwrap_or(0);
+        let largest = largest.max(self.largest).max(self.querier.largest());
+        // Before readers are created: fragments of the first sample have to pass. Each participant
+        // is announced once; a known writer stands in for a participant that was missed.
         let mut others = self.state.peers().prefixes();
         others.extend(
             offers.iter().map(|offer| *offer.guid.0.first_chunk::<12>().expect("12 of 16 bytes")),
         );
         others.sort_unstable();
         others.dedup();
-        self.guard.update(largest, &others, &self.state);
-        let around = Around {
+        self.filter.update(largest, &others, &self.state);
+        let context = ReceiveContext {
             participant: &self.participant,
             registry: self.poll.registry(),
             state: &self.state,
             memory: &self.memory,
             clock: self.clock,
         };
-        for feed in &mut self.feeds {
-            feed.look(&around, &offers);
-            // RustDDS stops at what is no sample, a writer's leave for instance; what is behind it
-            // is found here.
-            feed.ready = true;
+        for reader in &mut self.readers {
+            reader.update(&context, &offers);
+            // RustDDS stops at a change that is not a sample, such as a writer's leave; samples
+            // after it are found here.
+            reader.ready = true;
         }
-        // What those say who come from now on is heard below, and kept.
-        self.presence.nodes().keep(&others);
-        self.presence.listen(&around);
-        self.asker.look(&around, ANSWER, &writers, self.presence.nodes());
-        // What it waits for is looked at soon.
-        self.changed |= self.asker.is_asking();
-        let readers = self.feeds.iter().filter_map(Feed::guid).collect();
-        self.presence.speak(&around, readers, &self.writers);
-        // One sample of a size that nobody expected shall not be remembered for ever.
+        // Register new participants before reading their graph messages.
+        self.graph.nodes().keep(&others);
+        self.graph.receive(&context);
+        self.querier.poll(&context, ANSWER, &writers, self.graph.nodes());
+        // An open query is polled again soon.
+        self.changed |= self.querier.is_open();
+        let readers = self.readers.iter().filter_map(TopicReader::guid).collect();
+        self.graph.update(&context, readers, &self.writers);
+        // One unexpectedly large sample must not keep its memory for ever.
         let mut memory = self.memory.borrow_mut();
         memory.clear();
-        memory.shrink_to(largest.max(KEPT_BYTES));
+        memory.shrink_to(largest.max(SHARED_BYTES));
     }
 }

@@ -1,4 +1,4 @@
-//! What the kernel knows of our sockets and threads, read from `/proc`.
+//! Reads the state of our sockets and threads from `/proc`.
 
 use std::collections::{HashMap, HashSet};
 use std::fs;
@@ -9,9 +9,10 @@ use std::os::fd::OwnedFd;
 use rustix::net::sockopt;
 use rustix::process::{PidfdFlags, PidfdGetfdFlags, getpid, pidfd_getfd, pidfd_open};
 
-/// How all threads of RustDDS begin their names.
+/// Prefix of the names of all RustDDS threads.
 const LIBRARY: &str = "RustDDS ";
-/// The one that reads the sockets; the kernel keeps 15 bytes of `RustDDS Participant 0 event loop`.
+/// The thread that reads the sockets; the kernel keeps 15 bytes of `RustDDS Participant 0 event
+/// loop`.
 const READS: &str = "RustDDS Partici";
 
 /// The port at which all participants of a domain receive samples by multicast.
@@ -22,23 +23,24 @@ pub(super) fn port_of_samples(domain: u16) -> u16 {
     7401 + 250 * domain
 }
 
-/// The sockets at which a participant listens.
+/// The receive sockets of a participant.
 #[derive(Debug, Default)]
 pub(super) struct Sockets {
     /// Descriptors, by inode.
     open: HashMap<u64, i32>,
-    /// Datagrams for which sockets of this network had had no room before these were opened.
+    /// Datagrams that sockets of this network namespace had dropped for lack of room before these
+    /// were opened.
     full_before: Option<u64>,
 }
 
-/// How the sockets are.
+/// The state of the receive queues.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Queues {
     /// Bytes that wait to be read.
     pub(super) waiting: u64,
-    /// Datagrams for which there was no room.
+    /// Number of datagrams that were dropped for lack of room.
     pub(super) drops: u64,
-    /// Datagrams that the filter did not let pass.
+    /// Number of datagrams that the filter dropped.
     pub(super) filtered: u64,
 }
 
@@ -68,7 +70,7 @@ impl Sockets {
         Queues { waiting, drops: full, filtered: drops - full }
     }
 
-    /// The sockets once more, for what RustDDS has no way to set.
+    /// Duplicates the sockets, to set options for which RustDDS has no interface.
     pub(super) fn duplicates(&self) -> io::Result<Vec<OwnedFd>> {
         let this = pidfd_open(getpid(), PidfdFlags::empty())?;
         let duplicate =
@@ -77,8 +79,8 @@ impl Sockets {
     }
 }
 
-/// Datagrams for which sockets of this network had no room. What one socket dropped is told as one
-/// number only, whether its buffer was full or its filter said so.
+/// Number of datagrams that sockets of this network namespace dropped for lack of room. For one
+/// socket the kernel has one number only, for a full buffer and for its filter together.
 fn full() -> Option<u64> {
     let table = fs::read_to_string("/proc/self/net/snmp").ok()?;
     let mut lines = table.lines().filter_map(|line| line.strip_prefix("Udp:"));
@@ -94,7 +96,7 @@ struct Row {
     drops: u64,
 }
 
-/// The UDP sockets of the network that we are in. RustDDS listens with IPv4 only.
+/// The UDP sockets of our network namespace. RustDDS listens with IPv4 only.
 fn rows() -> Vec<Row> {
     let table = fs::read_to_string("/proc/self/net/udp").unwrap_or_default();
     table.lines().skip(1).filter_map(row).collect()
@@ -111,7 +113,7 @@ fn row(line: &str) -> Option<Row> {
     })
 }
 
-/// The sockets that this process has open: descriptors, by inode.
+/// The open sockets of this process: descriptors, by inode.
 fn inodes() -> HashMap<u64, i32> {
     let Ok(open) = fs::read_dir("/proc/self/fd") else { return HashMap::new() };
     let inode = |entry: fs::DirEntry| {
@@ -122,10 +124,10 @@ fn inodes() -> HashMap<u64, i32> {
     open.flatten().filter_map(inode).collect()
 }
 
-/// Bytes of receive buffer that a socket gets which asks for `asked`.
+/// Returns the receive buffer in bytes that the kernel grants a socket that requests `asked`.
 ///
-/// All sockets of a process get the same for the same, so one of our own tells what the
-/// participant's have. Linux reports twice what it grants.
+/// All sockets of a process get the same for the same request, so a test socket stands for the
+/// participant's. Linux reports twice the granted size.
 pub(super) fn granted(asked: usize) -> Option<usize> {
     let socket = UdpSocket::bind(("127.0.0.1", 0)).ok()?;
     sockopt::set_socket_recv_buffer_size(&socket, asked).ok()?;
@@ -139,13 +141,12 @@ pub(super) fn library_threads() -> HashSet<u32> {
     tasks.flatten().filter_map(id).filter(|id| is_library(*id)).collect()
 }
 
-/// The one of `threads` that is gone, if one is.
+/// Returns one of `threads` that has ended, if any.
 pub(super) fn gone(threads: &HashSet<u32>) -> Option<u32> {
     threads.iter().copied().find(|id| !is_library(*id))
 }
 
-/// The CPU time that those of `threads` have used which read sockets, in ticks of the kernel,
-/// mostly of 10 ms.
+/// CPU time used by those of `threads` that read sockets, in ticks of the kernel, mostly of 10 ms.
 pub(super) fn busy(threads: &HashSet<u32>) -> u64 {
     let used = |thread: &u32| {
         let stat = fs::read_to_string(format!("/proc/self/task/{thread}/stat")).ok()?;
@@ -154,9 +155,9 @@ pub(super) fn busy(threads: &HashSet<u32>) -> u64 {
     threads.iter().filter_map(used).sum()
 }
 
-/// User and system time out of a line of `stat`, if it is of a thread of that name.
+/// Parses user and system time from a line of `stat`, if the thread has this name.
 fn ticks(stat: &str, name: &str) -> Option<u64> {
-    // The name may hold anything, but nothing behind it holds a parenthesis.
+    // The name may contain anything, but nothing after it contains a parenthesis.
     let (front, rest) = stat.rsplit_once(')')?;
     let mut fields = rest.split_ascii_whitespace().skip(11).map(str::parse::<u64>);
     let used = fields.next()?.ok()? + fields.next()?.ok()?;
@@ -188,9 +189,9 @@ mod tests {
     }
 
     #[test]
-    fn a_line_of_the_table_is_understood() {
-        let line = " 3431: 00000000:1CE8 00000000:0000 07 00000000:00001A00 00:00000000 00000000  1000        0 98765 2 \
-                    0000000000000000 42";
+    fn a_line_of_the_table_is_parsed() {
+        let line = " 3431: 00000000:1CE8 00000000:0000 07 00000000:00001A00 00:00000000 00000000  \
+                    1000        0 98765 2 0000000000000000 42";
         let row = row(line).unwrap();
         assert_eq!((row.port, row.waiting, row.inode, row.drops), (7400, 0x1a00, 98765, 42));
         assert!(super::row("sl local_address").is_none());
@@ -198,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn the_time_of_the_thread_that_reads_is_found_in_its_line() {
+    fn the_cpu_time_of_the_reading_thread_is_parsed() {
         let line = |name: &str| {
             format!("77 ({name}) S 1 77 77 0 -1 64 5 0 0 0 130 7 0 0 20 0 9 0 8315 1 2 3")
         };
@@ -212,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn what_waits_in_a_socket_and_what_was_dropped_there_is_seen() {
+    fn waiting_bytes_and_drops_of_a_socket_are_counted() {
         let socket = UdpSocket::bind(("127.0.0.1", 0)).unwrap();
         sockopt::set_socket_recv_buffer_size(&socket, 1).unwrap();
         let sockets = sockets_of(&socket);
@@ -228,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_filter_drops_at_a_duplicate_is_no_full_buffer() {
+    fn drops_of_a_filter_on_a_duplicate_do_not_count_as_a_full_buffer() {
         loop {
             let socket = UdpSocket::bind(("127.0.0.1", 0)).unwrap();
             let sockets = sockets_of(&socket);
@@ -239,8 +240,8 @@ mod tests {
                 socket.send_to(&[0; 1000], socket.local_addr().unwrap()).unwrap();
             }
             let queues = sockets.queues();
-            // Where buffers of others were full meanwhile, the parts cannot be told apart: once
-            // more.
+            // If buffers of other programs were full meanwhile, the parts cannot be separated: try
+            // again.
             if full() == sockets.full_before {
                 assert_eq!(queues, Queues { waiting: 0, drops: 0, filtered: 7 });
                 return;
@@ -256,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_thread_of_the_library_is_known_by_its_name_and_missed_when_it_ends() {
+    fn a_thread_of_the_library_is_found_by_its_name_and_missed_when_it_ends() {
         let (end, ended) = mpsc::channel::<()>();
         let (begun, begins) = mpsc::channel();
         let name = format!("{LIBRARY}test");
@@ -270,7 +271,7 @@ mod tests {
         assert_eq!(gone(&HashSet::from([id])), None);
         drop(end);
         thread.join().unwrap();
-        // The kernel takes the thread away a moment after it was joined.
+        // The kernel removes the thread a moment after it was joined.
         while gone(&HashSet::from([id])).is_none() {
             thread::yield_now();
         }

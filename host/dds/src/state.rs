@@ -1,4 +1,4 @@
-//! What the receive thread tells those who ask.
+//! State that the receive thread shares with the callers of [`Dds`](super::Dds).
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -7,52 +7,52 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use rustdds::GUID;
 use tracing::error;
 
-use super::ask::Outcome;
 use super::peers::Peers;
+use super::type_query::QueryOutcome;
 use super::{Distro, names};
 use gleaner_transport::Status;
 
-/// Of the participant.
+/// State of the participant.
 #[derive(Debug, Default)]
-pub(super) struct State {
+pub(super) struct ParticipantState {
     dead: Mutex<Option<String>>,
     peers: Mutex<Peers>,
     graph: Mutex<(String, Option<Distro>)>,
     unfiltered: Mutex<Option<String>>,
-    /// What became of the question with this ticket.
-    answer: Mutex<Option<(u64, Outcome)>>,
-    /// Samples and events that were handled.
+    /// The outcome of the type query with this ticket.
+    answer: Mutex<Option<(u64, QueryOutcome)>>,
+    /// Number of samples and events that were handled.
     pub(super) handled: AtomicU64,
     /// Odd while a sink may have a sample.
     delivering: AtomicU64,
-    /// The subscription whose sink has it.
+    /// The subscription whose sink has the sample.
     to: AtomicUsize,
 }
 
-/// Of one subscription.
+/// Status of one subscription.
 #[derive(Debug, Default)]
-pub(super) struct Told {
+pub(super) struct SubscriptionStatus {
     pub(super) lost: AtomicU64,
     pub(super) malformed: AtomicU64,
-    pub(super) words: Mutex<Words>,
+    pub(super) text: Mutex<StatusText>,
 }
 
 #[derive(Debug, Default)]
-pub(super) struct Words {
+pub(super) struct StatusText {
     pub(super) reader: Option<GUID>,
     pub(super) qos: Option<String>,
     pub(super) qos_warnings: Vec<String>,
 }
 
-/// A panic elsewhere does not make what is told less true.
+/// Locks `mutex` even after a panic: the state stays valid.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl State {
-    /// Notes why nothing, or nothing of a topic, is handled any more. The first reason stays.
+impl ParticipantState {
+    /// Records why nothing, or nothing of a topic, is handled any more. The first reason stays.
     pub(super) fn die(&self, why: String) {
-        error!(why, "DDS is not received any more");
+        error!(why, "DDS receive failed; no further samples");
         lock(&self.dead).get_or_insert(why);
     }
 
@@ -64,15 +64,15 @@ impl State {
         lock(&self.peers)
     }
 
-    pub(super) fn set_graph(&self, words: String, distro: Option<Distro>) {
-        *lock(&self.graph) = (words, distro);
+    pub(super) fn set_graph(&self, listing: String, distro: Option<Distro>) {
+        *lock(&self.graph) = (listing, distro);
     }
 
     pub(super) fn graph(&self) -> (String, Option<Distro>) {
         lock(&self.graph).clone()
     }
 
-    /// Notes why hostile fragments are not kept away.
+    /// Records why hostile fragments are not filtered.
     pub(super) fn set_unfiltered(&self, why: String) {
         *lock(&self.unfiltered) = Some(why);
     }
@@ -81,55 +81,55 @@ impl State {
         lock(&self.unfiltered).clone()
     }
 
-    pub(super) fn answer(&self, ticket: u64, outcome: Outcome) {
+    pub(super) fn answer(&self, ticket: u64, outcome: QueryOutcome) {
         *lock(&self.answer) = Some((ticket, outcome));
     }
 
-    /// What became of a question, if it is known. Told once.
-    pub(super) fn answered(&self, ticket: u64) -> Option<Outcome> {
+    /// Takes the outcome of a type query, if it is there.
+    pub(super) fn answered(&self, ticket: u64) -> Option<QueryOutcome> {
         lock(&self.answer).take_if(|(of, _)| *of == ticket).map(|(_, outcome)| outcome)
     }
 
-    /// A sink gets a sample, or gives it back.
+    /// Marks that a sink gets a sample, or returns from it.
     pub(super) fn deliver(&self, to: usize) {
         self.to.store(to, Ordering::Relaxed);
         self.delivering.fetch_add(1, Ordering::Release);
     }
 
-    /// Which delivery is going on, and to which subscription.
+    /// The delivery in progress: its number, and the index of the subscription.
     pub(super) fn delivering(&self) -> Option<(u64, usize)> {
         let count = self.delivering.load(Ordering::Acquire);
         (count % 2 == 1).then(|| (count, self.to.load(Ordering::Relaxed)))
     }
 }
 
-impl Told {
-    pub(super) fn status(&self, state: &State) -> Status {
-        let words = lock(&self.words);
+impl SubscriptionStatus {
+    pub(super) fn status(&self, state: &ParticipantState) -> Status {
+        let text = lock(&self.text);
         Status {
-            writers: Some(words.reader.map_or(0, |reader| state.peers().connected(reader))),
+            writers: Some(text.reader.map_or(0, |reader| state.peers().connected(reader))),
             lost: Some(self.lost.load(Ordering::Relaxed)),
             malformed: self.malformed.load(Ordering::Relaxed),
-            qos: words.qos.clone(),
-            qos_warnings: words.qos_warnings.clone(),
+            qos: text.qos.clone(),
+            qos_warnings: text.qos_warnings.clone(),
         }
     }
 }
 
-/// Says each thing once. Of one cause only so many things: what others send must not use up what
-/// there is to say of other causes.
+/// Limits logging to the first occurrence of each message, and to a number of messages per cause,
+/// so that one cause that others control cannot use up the log.
 #[derive(Debug, Default)]
-pub(super) struct Once {
-    said: HashMap<&'static str, HashSet<String>>,
+pub(super) struct OnceLog {
+    logged: HashMap<&'static str, HashSet<String>>,
 }
 
-impl Once {
+impl OnceLog {
     const MOST: usize = 64;
 
-    /// Whether `what` is new among what `cause` had to say, and there is room to remember it.
+    /// Returns whether `what` is new for `cause`, and there is room to remember it.
     pub(super) fn first(&mut self, cause: &'static str, what: &str) -> bool {
-        let said = self.said.entry(cause).or_default();
-        said.len() < Self::MOST && said.insert(what.to_owned())
+        let logged = self.logged.entry(cause).or_default();
+        logged.len() < Self::MOST && logged.insert(what.to_owned())
     }
 }
 
@@ -147,13 +147,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_thing_is_said_once_and_a_flood_of_one_cause_silences_no_other() {
-        let mut once = Once::default();
+    fn each_message_is_logged_once_and_a_flood_of_one_cause_silences_no_other() {
+        let mut once = OnceLog::default();
         assert!(once.first("lost", ""));
         assert!(!once.first("lost", ""));
-        let said =
+        let logged =
             (0..10_000).filter(|n| once.first("another type", &format!("writer {n}"))).count();
-        assert_eq!(said, Once::MOST);
+        assert_eq!(logged, OnceLog::MOST);
         assert!(once.first("malformed", "") && once.first("offers less", "writer 1"));
     }
 }

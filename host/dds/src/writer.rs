@@ -1,4 +1,4 @@
-//! Topics that this process writes.
+//! Writes a topic.
 
 use bytes::Bytes;
 use rustdds::dds::{CreateError, WriteError};
@@ -9,28 +9,28 @@ use std::sync::Arc;
 use super::DdsError;
 use super::names::{dds_topic, dds_type, visible};
 use super::raw::RawWriter;
-use super::receive::{Command, Line};
-use super::state::State;
+use super::receive::{ReceiverCommand, ReceiverHandle};
+use super::state::ParticipantState;
 
-/// How long a write waits for room: whoever writes is about to judge the next sample, and one
-/// reader that has stopped shall not hold that up.
-const PATIENCE: Duration = Duration::ZERO;
-/// Samples that are kept for readers that ask again.
+/// Time that a write waits for room: the caller is about to process the next sample, and one
+/// stalled reader must not delay that.
+const MAX_BLOCKING: Duration = Duration::ZERO;
+/// Samples that are kept for retransmission.
 const DEPTH: std::ops::RangeInclusive<usize> = 1..=65_536;
 
-/// A topic that this process writes.
-pub struct Writer {
+/// A writer of one topic.
+pub struct TopicWriter {
     topic: String,
     writer: RawWriter,
-    state: Arc<State>,
-    line: Line,
+    state: Arc<ParticipantState>,
+    receiver: ReceiverHandle,
 }
 
-impl Writer {
+impl TopicWriter {
     pub(super) fn new(
         participant: &DomainParticipant,
-        state: &Arc<State>,
-        line: &Line,
+        state: &Arc<ParticipantState>,
+        receiver: &ReceiverHandle,
         topic: &str,
         type_name: &str,
         depth: usize,
@@ -42,11 +42,11 @@ impl Writer {
             .ok_or_else(|| name(type_name, "a message type, such as `std_msgs/msg/Empty`"))?;
         let depth = i32::try_from(depth.clamp(*DEPTH.start(), *DEPTH.end())).unwrap_or(i32::MAX);
         let policies = QosPolicyBuilder::new()
-            .reliability(policy::Reliability::Reliable { max_blocking_time: PATIENCE })
+            .reliability(policy::Reliability::Reliable { max_blocking_time: MAX_BLOCKING })
             .durability(policy::Durability::Volatile)
             .history(policy::History::KeepLast { depth })
             .build();
-        // Held, so that nobody can be connected before it is followed who.
+        // Locked, so that no match is missed before the writer is followed.
         let mut peers = state.peers();
         let made = (|| {
             let topic =
@@ -61,8 +61,13 @@ impl Writer {
         })?;
         peers.follow(writer.guid());
         drop(peers);
-        line.send(Command::Writer(writer.guid()));
-        Ok(Self { topic: topic.to_owned(), writer, state: state.clone(), line: line.clone() })
+        receiver.send(ReceiverCommand::Writer(writer.guid()));
+        Ok(Self {
+            topic: topic.to_owned(),
+            writer,
+            state: state.clone(),
+            receiver: receiver.clone(),
+        })
     }
 
     /// Sends a message: little-endian CDR without its four bytes of encapsulation.
@@ -80,7 +85,7 @@ impl Writer {
         sent.map_err(|error| DdsError::Write { topic: self.topic.clone(), why: why(error) })
     }
 
-    /// Readers that are connected now.
+    /// Number of matched readers.
     pub fn readers(&self) -> usize {
         self.state.peers().connected(self.guid())
     }
@@ -90,9 +95,9 @@ impl Writer {
     }
 }
 
-impl Drop for Writer {
+impl Drop for TopicWriter {
     fn drop(&mut self) {
         self.state.peers().forget(self.guid());
-        self.line.send(Command::WriterGone(self.guid()));
+        self.receiver.send(ReceiverCommand::WriterGone(self.guid()));
     }
 }

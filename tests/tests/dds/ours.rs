@@ -3,11 +3,11 @@
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-use gleaner_dds::{Dds, Distro, Options};
+use gleaner_dds::{Dds, DdsOptions, Distro};
 use gleaner_tests::peers::PATIENCE;
 use gleaner_tests::peers::message::Type;
 use gleaner_transport::{
-    Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict,
+    Delivery, Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport,
 };
 use libtest_mimic::Failed;
 
@@ -16,7 +16,7 @@ const LARGEST: usize = 7 << 20;
 
 /// Joins the domain.
 pub fn join(distro: Option<Distro>) -> Result<Dds, Failed> {
-    let mut options = Options::new("/gleaner/tests");
+    let mut options = DdsOptions::new("/gleaner/tests");
     options.largest = LARGEST;
     options.distro = distro;
     Ok(Dds::open(options)?)
@@ -35,10 +35,10 @@ struct Memory {
 }
 
 impl Sink for Memory {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         self.samples.lock().unwrap().push(Sample { meta: *meta, cdr: cdr.to_vec() });
         self.arrived.notify_all();
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 

@@ -1,4 +1,4 @@
-//! What passes through the kernel, and what does not.
+//! Tests of the packet filter on real sockets.
 
 use std::net::UdpSocket;
 
@@ -9,7 +9,7 @@ use super::*;
 const FRIEND: Prefix = *b"a friend....";
 const STRANGER: Prefix = *b"a stranger..";
 const IMAGE: usize = 25 << 20;
-/// Submessages of a packet that pass, where few participants are known, and where many are.
+/// Submessages of a packet that pass, with few and with many known participants.
 const PLAIN: usize = 115;
 const CROWDED: usize = 95;
 
@@ -56,14 +56,14 @@ fn data() -> Vec<u8> {
     submessage(true, 0x15, &[0x16; 24])
 }
 
-/// What of each packet comes through the kernel; 0 bytes if it does not.
+/// The bytes of each packet that the kernel passes; 0 if it drops the packet.
 fn through(largest: usize, known: Option<&[Prefix]>, packets: &[Vec<u8>]) -> Vec<usize> {
     let [here, there] = [(); 2].map(|()| UdpSocket::bind("127.0.0.1:0").unwrap());
     SockRef::from(&here).attach_filter(&program(largest, known)).unwrap();
     let mut bytes = [0; 65_536];
     let mut passed = |packet: &Vec<u8>| {
         there.send_to(packet, here.local_addr().unwrap()).unwrap();
-        // Less than a header passes, and says that nothing came before it.
+        // Less than a header passes, and marks that nothing came before it.
         there.send_to(b"!", here.local_addr().unwrap()).unwrap();
         let length = here.recv(&mut bytes).unwrap();
         if length == 1 {
@@ -82,7 +82,7 @@ fn pass(packets: &[Vec<u8>]) -> Vec<bool> {
 }
 
 #[test]
-fn a_fragment_that_claims_more_than_anybody_asked_for_is_dropped_in_either_byte_order() {
+fn a_fragment_that_claims_more_than_the_limit_is_dropped_in_either_byte_order() {
     let claims = [
         1_u32,
         0xffff,
@@ -171,7 +171,7 @@ fn a_heartbeat_or_a_gap_of_more_than_a_million_numbers_is_dropped_in_either_byte
 }
 
 #[test]
-fn fragments_of_strangers_are_dropped_and_everything_else_of_theirs_passes() {
+fn fragments_of_strangers_are_dropped_and_their_other_packets_pass() {
     let claims =
         [fragment(1000), [stamp(), fragment(1000)].concat(), [data(), fragment(1000)].concat()];
     let packets = claims.map(|claim| packet(STRANGER, &[claim]));
@@ -179,13 +179,13 @@ fn fragments_of_strangers_are_dropped_and_everything_else_of_theirs_passes() {
     assert_eq!(pass(&[packet(STRANGER, &[stamp(), data()]), packet(STRANGER, &[])]), [true; 2]);
     assert!(
         through(IMAGE, None, &packets).iter().all(|passed| *passed > 0),
-        "where nobody is a stranger"
+        "without a list of participants"
     );
     assert_eq!(through(IMAGE, Some(&[]), &[packet(FRIEND, &[fragment(1000)])]), [0]);
 }
 
 #[test]
-fn each_of_as_many_participants_as_can_be_known_is_known() {
+fn fragments_of_every_listed_participant_pass() {
     let known: Vec<Prefix> = (0..KNOWN as u8).map(|n| [n; 12]).collect();
     let packets: Vec<_> = known.iter().map(|prefix| packet(*prefix, &[fragment(1000)])).collect();
     assert!(through(IMAGE, Some(&known), &packets).iter().all(|passed| *passed > 0));
@@ -248,7 +248,7 @@ fn ordinary_packets_pass_whole() {
 }
 
 #[test]
-fn what_nobody_walks_to_the_end_is_cut_between_two_submessages() {
+fn a_long_packet_is_truncated_between_two_submessages() {
     let many = packet(FRIEND, &[data().repeat(1000)]);
     let evil = packet(FRIEND, &[data().repeat(1000), fragment(u32::MAX)]);
     let foreign = packet(STRANGER, &[fragment(1000), data().repeat(1000)]);
@@ -263,7 +263,7 @@ fn what_nobody_walks_to_the_end_is_cut_between_two_submessages() {
 }
 
 #[test]
-fn bytes_that_mean_nothing_harm_nothing() {
+fn random_bytes_are_harmless() {
     let mut state = 1_u64;
     let mut random = move || {
         state =

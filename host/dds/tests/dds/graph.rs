@@ -1,27 +1,27 @@
-//! Our node in the graph of ROS 2, read by a parser that knows nothing of ours.
+//! Tests of our node in the ROS 2 graph, read by an independent parser.
 
-use gleaner_dds::{Dds, Distro, Options};
+use gleaner_dds::{Dds, DdsOptions, Distro};
 use gleaner_transport::{LiveSource, Transport};
 use rustdds::RTPSEntity;
 
 use super::Test;
 use super::peer::{
-    Kept, LittleWriter, Peer, connected, domain, options, policies, spec, take, until, write,
+    KeptSamples, LittleWriter, Peer, connected, domain, options, policies, spec, take, until, write,
 };
 
 pub const TESTS: &[Test] = &[
-    ("nothing_is_said_in_the_graph_before_somebody_is_heard", silent),
-    ("we_are_listed_with_24_bytes_as_nodes_of_humble_are", || listed(Distro::Humble)),
-    ("we_are_listed_with_16_bytes_as_newer_nodes_are", || listed(Distro::Newer)),
-    ("we_withdraw_when_nodes_of_both_kinds_are_heard", both),
-    ("we_stay_out_when_we_were_told_wrong", told_wrong),
+    ("nothing_is_sent_to_the_graph_before_a_node_is_seen", silent),
+    ("we_are_listed_with_24_bytes_among_nodes_of_humble", || listed(Distro::Humble)),
+    ("we_are_listed_with_16_bytes_among_newer_nodes", || listed(Distro::Newer)),
+    ("we_withdraw_when_nodes_of_both_kinds_are_seen", both),
+    ("we_stay_unlisted_when_the_configured_distribution_is_wrong", wrong_distro),
 ];
 
 const TOPIC: &str = "ros_discovery_info";
 const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
 
-/// What a node that has no endpoints says of itself.
-fn said_by_a_node(gid: usize) -> Vec<u8> {
+/// The graph message of a node without endpoints.
+fn message_of_a_node(gid: usize) -> Vec<u8> {
     let mut cdr = vec![9; 16];
     cdr.resize(gid, 0);
     cdr.extend_from_slice(&[1, 0, 0, 0, 2, 0, 0, 0, b'/', 0, 0, 0, 5, 0, 0, 0]);
@@ -33,26 +33,26 @@ fn said_by_a_node(gid: usize) -> Vec<u8> {
 fn announce(peer: &Peer, gid: usize) -> LittleWriter {
     let policies = policies(true, true);
     let writer = peer.writer_of(&peer.topic(TOPIC, TYPE, &policies), &policies);
-    write(&writer, &said_by_a_node(gid));
+    write(&writer, &message_of_a_node(gid));
     writer
 }
 
 #[derive(Debug, PartialEq, Eq)]
-struct Said {
+struct ParsedMessage {
     participant: Vec<u8>,
-    nodes: Vec<Node>,
+    nodes: Vec<ParsedNode>,
 }
 
 #[derive(Debug, PartialEq, Eq)]
-struct Node {
+struct ParsedNode {
     namespace: String,
     name: String,
     readers: Vec<Vec<u8>>,
     writers: Vec<Vec<u8>>,
 }
 
-/// Reads what was said with names of `gid` bytes; everything has to be used up.
-fn understand(cdr: &[u8], gid: usize) -> Option<Said> {
+/// Parses a message with GIDs of `gid` bytes; all bytes have to be used up.
+fn parse(cdr: &[u8], gid: usize) -> Option<ParsedMessage> {
     let mut at = 0;
     let mut bytes = |n: usize, align: usize| {
         at += (align - at % align) % align;
@@ -78,13 +78,13 @@ fn understand(cdr: &[u8], gid: usize) -> Option<Said> {
         }
         let (name, namespace) = (texts.pop()?, texts.pop()?);
         let (writers, readers) = (lists.pop()?, lists.pop()?);
-        nodes.push(Node { namespace, name, readers, writers });
+        nodes.push(ParsedNode { namespace, name, readers, writers });
     }
-    (at == cdr.len()).then_some(Said { participant, nodes })
+    (at == cdr.len()).then_some(ParsedMessage { participant, nodes })
 }
 
 fn open(domain: u16, distro: Option<Distro>) -> Dds {
-    Dds::open(Options { distro, ..options(domain) }).unwrap()
+    Dds::open(DdsOptions { distro, ..options(domain) }).unwrap()
 }
 
 fn silent() {
@@ -95,7 +95,7 @@ fn silent() {
     until("the other participant", || dds.health().network.unwrap().participants == 1);
     let _other = peer.writer("/other", true, false);
     until("the other's topic", || !dds.discovered().is_empty());
-    assert_eq!(dds.graph(), "not listed: no node of ROS 2 was heard yet");
+    assert_eq!(dds.graph(), "not listed: no ROS 2 node seen yet");
     assert_eq!(take(&reader), None);
 }
 
@@ -105,26 +105,28 @@ fn listed(distro: Distro) {
     let mut dds = open(domain, None);
     let peer = Peer::join(domain);
     let reader = peer.reader(TOPIC, TYPE, &policies(true, true));
-    let ours = dds.subscribe(&spec("/imu", gleaner_transport::Qos::Auto), Kept::new()).unwrap();
+    let ours =
+        dds.subscribe(&spec("/imu", gleaner_transport::Qos::Auto), KeptSamples::new()).unwrap();
     let imu = peer.writer("/imu", true, false);
     connected(&dds, ours, 1);
     let out = dds.writer("/out", "std_msgs/msg/String", 5).unwrap();
     let _node = announce(&peer, gid);
 
-    // What was said last: with one reader and one writer.
+    // The last message: with one reader and one writer.
     let own = imu.guid().prefix;
     let mut last = None;
-    until("our word", || {
-        while let Some(said) = take(&reader) {
-            let said = understand(&said, gid).expect("it is understood");
-            last = (said.participant[..12] != imu.guid().to_bytes()[..12])
-                .then_some(said)
+    until("our entry", || {
+        while let Some(message) = take(&reader) {
+            let message = parse(&message, gid).expect("a valid message");
+            last = (message.participant[..12] != imu.guid().to_bytes()[..12])
+                .then_some(message)
                 .or(last.take());
         }
-        last.as_ref().is_some_and(|said| said.nodes.len() == 1 && said.nodes[0].writers.len() == 1)
+        last.as_ref()
+            .is_some_and(|message| message.nodes.len() == 1 && message.nodes[0].writers.len() == 1)
     });
-    let said = last.take().unwrap();
-    let Node { namespace, name, readers, writers } = &said.nodes[0];
+    let message = last.take().unwrap();
+    let ParsedNode { namespace, name, readers, writers } = &message.nodes[0];
     assert_eq!((namespace.as_str(), name.as_str()), ("/gleaner", "test"));
     assert_eq!((readers.len(), writers.len()), (1, 1));
     let found = peer.0.discovered_writers();
@@ -133,16 +135,18 @@ fn listed(distro: Distro) {
     let guid = found.writer_proxy.remote_writer_guid;
     assert_ne!(guid.prefix, own);
     assert_eq!(writers[0][..16], guid.to_bytes());
-    assert_eq!(said.participant[..12], guid.to_bytes()[..12]);
-    assert_eq!(said.participant[12..16], [0, 0, 1, 0xc1]);
-    assert!(writers[0][16..].iter().chain(&said.participant[16..]).all(|byte| *byte == 0));
+    assert_eq!(message.participant[..12], guid.to_bytes()[..12]);
+    assert_eq!(message.participant[12..16], [0, 0, 1, 0xc1]);
+    assert!(writers[0][16..].iter().chain(&message.participant[16..]).all(|byte| *byte == 0));
     assert!(dds.graph().starts_with("listed as `/gleaner/test`"));
 
-    // An endpoint that goes is taken back, and with the participant the node.
+    // An endpoint that goes is withdrawn, and with the participant the node.
     drop(out);
-    until("our next words", || {
-        let said = take(&reader).and_then(|said| understand(&said, gid));
-        said.is_some_and(|said| said.nodes[0].name == "test" && said.nodes[0].writers.is_empty())
+    until("our next entry", || {
+        let message = take(&reader).and_then(|message| parse(&message, gid));
+        message.is_some_and(|message| {
+            message.nodes[0].name == "test" && message.nodes[0].writers.is_empty()
+        })
     });
     drop(dds);
     until("our end", || {
@@ -161,26 +165,27 @@ fn both() {
     let _old = announce(&old, 24);
     until("being listed", || dds.graph().starts_with("listed"));
     let _new = announce(&new, 16);
-    until("staying out", || dds.graph().contains("Humble and nodes of newer"));
-    until("taking it back", || {
-        take(&reader)
-            .is_some_and(|said| understand(&said, 24).is_some_and(|said| said.nodes.is_empty()))
+    until("being unlisted", || dds.graph().contains("Humble and of newer"));
+    until("the withdrawal", || {
+        take(&reader).is_some_and(|message| {
+            parse(&message, 24).is_some_and(|message| message.nodes.is_empty())
+        })
     });
     let ours = |peer: &Peer| {
         let info = peer.0.discovered_writers();
         info.iter().filter(|writer| writer.publication_topic_data.topic_name == TOPIC).count()
     };
-    // Two peers, each of which hears the other.
+    // Two peers, each of which discovers the other.
     until("our writer's end", || ours(&old) <= 2 && ours(&new) <= 2);
 }
 
-fn told_wrong() {
-    for (told, gid) in [(Distro::Humble, 16), (Distro::Newer, 24)] {
+fn wrong_distro() {
+    for (configured, gid) in [(Distro::Humble, 16), (Distro::Newer, 24)] {
         let domain = domain();
-        let dds = open(domain, Some(told));
+        let dds = open(domain, Some(configured));
         until("being listed", || dds.graph().starts_with("listed"));
         let peer = Peer::join(domain);
         let _node = announce(&peer, gid);
-        until("staying out", || dds.graph().starts_with("not listed: ROS_DISTRO says"));
+        until("being unlisted", || dds.graph().starts_with("not listed: ROS_DISTRO is"));
     }
 }

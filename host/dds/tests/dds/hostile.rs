@@ -1,4 +1,4 @@
-//! What somebody may send who means harm, or whose software is broken: packets made by hand.
+//! Tests with handcrafted packets of an attacker or of broken software.
 
 use std::net::UdpSocket;
 
@@ -7,15 +7,15 @@ use gleaner_transport::{LiveSource, Qos, Transport};
 use rustdds::{GUID, RTPSEntity};
 
 use super::Test;
-use super::peer::{Kept, Peer, connected, domain, matched, open, spec, until, write};
+use super::peer::{KeptSamples, Peer, connected, domain, matched, open, spec, until, write};
 
 pub const TESTS: &[Test] = &[
-    ("gaps_in_the_numbers_are_counted_and_late_samples_taken_back", gaps),
-    ("a_sample_that_cannot_be_read_is_malformed_and_not_lost_as_well", malformed),
-    ("a_writer_that_jumps_to_the_last_number_overflows_nothing", last_number),
-    ("thousands_of_broken_packets_stop_nothing", broken),
+    ("gaps_in_sequence_numbers_are_lost_samples_until_they_arrive_late", gaps),
+    ("an_unreadable_sample_counts_as_malformed_but_not_as_lost", malformed),
+    ("a_jump_to_the_last_sequence_number_does_not_overflow", last_number),
+    ("thousands_of_broken_packets_do_not_stop_reception", broken),
     ("fragments_that_claim_gibibytes_take_no_memory_and_are_counted", claims),
-    ("numbers_without_end_in_a_heartbeat_or_a_gap_take_no_memory_and_are_counted", numbers),
+    ("huge_ranges_in_a_heartbeat_or_a_gap_take_no_memory_and_are_counted", numbers),
 ];
 
 /// An RTPS packet of `writer` with one submessage.
@@ -42,7 +42,7 @@ pub fn data(writer: GUID, seq: i64, payload: &[u8], encoding: [u8; 2]) -> Vec<u8
     packet(writer, 0x15, &body)
 }
 
-/// A DATA_FRAG submessage: the first fragment, for all readers, of a sample that is said to have
+/// A DATA_FRAG submessage: the first fragment, for all readers, of a sample that claims to have
 /// `size` bytes.
 fn fragment(writer: GUID, seq: u32, size: u32) -> Vec<u8> {
     let mut body = vec![0, 0, 28, 0, 0, 0, 0, 0];
@@ -55,7 +55,7 @@ fn fragment(writer: GUID, seq: u32, size: u32) -> Vec<u8> {
     packet(writer, 0x16, &body)
 }
 
-/// A HEARTBEAT (7) or a GAP (8) of `numbers`, to all readers, that no other came before.
+/// A HEARTBEAT (7) or a GAP (8) of `numbers`, to all readers, with a new count.
 fn range(writer: GUID, kind: u8, numbers: [u64; 2]) -> Vec<u8> {
     let mut body = vec![0; 4];
     body.extend_from_slice(&writer.to_bytes()[12..]);
@@ -63,25 +63,25 @@ fn range(writer: GUID, kind: u8, numbers: [u64; 2]) -> Vec<u8> {
         body.extend_from_slice(&((number >> 32) as u32).to_le_bytes());
         body.extend_from_slice(&(number as u32).to_le_bytes());
     }
-    // The HEARTBEAT's count; the GAP has no more numbers.
+    // The HEARTBEAT's count; the GAP has no further numbers.
     body.extend_from_slice(&(if kind == 7 { i32::MAX } else { 0 }).to_le_bytes());
     packet(writer, kind, &body)
 }
 
-/// The most memory that this process ever had, in bytes.
+/// Peak memory of this process, in bytes.
 fn most_memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
     line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
 }
 
-/// Datagrams that did not come through.
+/// Number of datagrams that were dropped.
 fn counted(dds: &Dds) -> u64 {
     let network = dds.health().network.unwrap();
     network.filtered + network.socket_drops
 }
 
-/// The port at which the first participant of a domain hears data.
+/// The port at which the first participant of a domain receives data.
 pub fn port(domain: u16) -> u16 {
     7400 + 250 * domain + 11
 }
@@ -89,7 +89,7 @@ pub fn port(domain: u16) -> u16 {
 fn gaps() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/gaps", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/gaps", false, false);
@@ -102,7 +102,7 @@ fn gaps() {
         [(5, 3), (6, 3), (3, 2), (9, 4), (4, 3), (2, 2), (8, 1)].into_iter().enumerate()
     {
         wire.send_to(
-            &data(writer.guid(), seq, b"from a hand", LITTLE),
+            &data(writer.guid(), seq, b"handcrafted", LITTLE),
             ("127.0.0.1", port(domain)),
         )
         .unwrap();
@@ -114,7 +114,7 @@ fn gaps() {
 fn malformed() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/odd", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/odd", false, false);
@@ -123,10 +123,10 @@ fn malformed() {
     write(&writer, b"1...");
     sink.wait(1);
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
-    // PL_CDR and XCDR2; the fourth sample is lost indeed.
+    // PL_CDR and XCDR2; the fourth sample really is lost.
     for (seq, encoding) in [(2, [0, 3]), (3, [0, 7]), (5, LITTLE)] {
         wire.send_to(
-            &data(writer.guid(), seq, b"from a hand.", encoding),
+            &data(writer.guid(), seq, b"handcrafted.", encoding),
             ("127.0.0.1", port(domain)),
         )
         .unwrap();
@@ -140,7 +140,7 @@ fn malformed() {
 fn last_number() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/jump", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let (writer, other) = (peer.writer("/jump", false, false), peer.writer("/jump", false, false));
@@ -160,7 +160,7 @@ fn last_number() {
 fn broken() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/broken", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/broken", true, false);
@@ -177,8 +177,8 @@ fn broken() {
         [0x01, 0x06, 0x07, 0x08, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x13, 0x15, 0x16, 0x80, 0xff];
     for n in 0..3000 {
         let mut bytes = match n % 3 {
-            // Cut anywhere; some bytes changed; and every kind of submessage with bytes that mean
-            // nothing.
+            // Truncated anywhere; some bytes changed; and every kind of submessage with random
+            // bytes.
             0 => whole[..random() % whole.len()].to_vec(),
             1 => whole.clone(),
             _ => packet(
@@ -188,7 +188,7 @@ fn broken() {
             ),
         };
         for _ in 0..3 {
-            // Neither the sender nor what makes it RTPS.
+            // Neither the sender nor the RTPS magic.
             let at = 20 + random() % 200;
             if let Some(byte) = bytes.get_mut(at) {
                 *byte = random() as u8;
@@ -204,7 +204,7 @@ fn broken() {
 fn claims() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/claims", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/claims", true, false);
@@ -235,20 +235,20 @@ fn claims() {
 fn numbers() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/numbers", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/numbers", true, false);
     connected(&dds, subscription, 1);
     sink.mark(&writer, b"before..");
     assert_eq!(dds.health().network.unwrap().unfiltered, None);
-    // The writer of announcements: everybody's reader of them listens to it.
+    // The built-in writer of announcements: every participant's reader of them receives it.
     let mut announcer = writer.guid().to_bytes();
     announcer[12..].copy_from_slice(&[0, 0, 3, 0xc2]);
     let (before, begun) = (most_memory(), counted(&dds));
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     for guid in [writer.guid(), GUID::from_bytes(announcer)] {
-        // Without the filter, some GiB each: enough to be seen, and not the machine's end.
+        // Without the filter, some GiB each: enough to be noticed, without taking down the machine.
         for (kind, numbers) in [(7, [1, 1 << 28]), (8, [1 << 20, 1 << 26])] {
             wire.send_to(&range(guid, kind, numbers), ("127.0.0.1", port(domain))).unwrap();
         }

@@ -1,4 +1,4 @@
-//! Whether a participant lives, and how it ends.
+//! Tests of the health and the shutdown of a participant.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,37 +8,39 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use gleaner_dds::{Dds, Options};
-use gleaner_protocol::Network;
-use gleaner_transport::{Clock, LiveSource, Qos, SampleMeta, Sink, Transport, Verdict};
+use gleaner_dds::{Dds, DdsOptions};
+use gleaner_protocol::NetworkStatus;
+use gleaner_transport::{Clock, Delivery, LiveSource, Qos, SampleMeta, Sink, Transport};
 
 use super::Test;
-use super::peer::{Kept, Peer, connected, domain, matched, open, options, spec, until, write};
+use super::peer::{
+    KeptSamples, Peer, connected, domain, matched, open, options, spec, until, write,
+};
 
-/// While it runs, no other may have threads of the library.
+/// The test that needs to run alone: no other may have threads of the library.
 pub const ALONE: &str =
-    "no_signal_interrupts_the_threads_of_the_library_and_ours_take_them_as_before";
+    "no_signal_interrupts_the_threads_of_rustdds_and_other_threads_are_unchanged";
 
 pub const TESTS: &[Test] = &[
-    ("the_buffer_that_was_granted_is_told", buffer),
+    ("the_granted_buffer_is_reported", buffer),
     (ALONE, signals),
-    ("an_idle_writer_is_no_death_and_a_sink_that_keeps_a_sample_is", stuck),
-    ("a_sink_that_panics_is_death_with_a_name_and_other_topics_go_on", panicking),
-    ("a_participant_that_is_dropped_ends_in_the_middle_of_samples", dropped),
-    ("a_participant_is_not_kept_by_a_sink_that_does_not_come_back", dropped_while_stuck),
-    ("a_time_of_day_that_is_set_back_is_death_with_words", set_back),
-    ("a_node_name_that_is_none_is_refused", bad_node),
+    ("a_sink_that_holds_a_sample_is_death_but_an_idle_writer_is_not", stuck),
+    ("a_sink_that_panics_is_reported_and_other_topics_go_on", panicking),
+    ("a_participant_can_be_dropped_while_samples_arrive", dropped),
+    ("a_participant_can_be_dropped_while_a_sink_is_stuck", dropped_while_stuck),
+    ("a_time_of_day_that_is_set_back_is_reported_as_death", set_back),
+    ("an_invalid_node_name_is_refused", bad_node),
 ];
 
 fn set_back() {
     static BACK_NS: AtomicI64 = AtomicI64::new(0);
-    let time_of_day = || Clock::of_today().now() - BACK_NS.load(Ordering::Relaxed);
+    let time_of_day = || Clock::from_time_of_day().now() - BACK_NS.load(Ordering::Relaxed);
     let domain = domain();
-    let mut dds = Dds::open(Options { time_of_day, ..options(domain) }).unwrap();
-    let sink = Kept::new();
+    let mut dds = Dds::open(DdsOptions { time_of_day, ..options(domain) }).unwrap();
+    let sink = KeptSamples::new();
     dds.subscribe(&spec("/clock", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
-    // Whoever hears this has looked at the clock.
+    // When this arrives, the clock has been checked.
     sink.mark(&peer.writer("/clock", false, false), b"tick");
     assert_eq!(dds.health().dead, None);
     BACK_NS.store(3_600_000_000_000, Ordering::Relaxed);
@@ -49,18 +51,18 @@ fn set_back() {
 
 fn buffer() {
     for (largest, asked) in [(1, 8 << 20), (4 << 20, 16 << 20), (usize::MAX, 64 << 20)] {
-        let dds = Dds::open(Options { largest, ..options(domain()) }).unwrap();
-        let Network { buffer_asked, buffer_granted, .. } = dds.health().network.unwrap();
+        let dds = Dds::open(DdsOptions { largest, ..options(domain()) }).unwrap();
+        let NetworkStatus { buffer_requested, buffer_granted, .. } = dds.health().network.unwrap();
         let limit = std::fs::read_to_string("/proc/sys/net/core/rmem_max")
             .unwrap()
             .trim()
             .parse::<usize>()
             .unwrap();
-        assert_eq!((buffer_asked, buffer_granted), (asked, asked.min(limit)));
+        assert_eq!((buffer_requested, buffer_granted), (asked, asked.min(limit)));
     }
 }
 
-/// RustDDS ends at the first wait that is interrupted.
+/// The threads of RustDDS end at the first wait that is interrupted.
 fn signals() {
     let blocked = |thread: &Path| {
         let status = fs::read_to_string(thread.join("status")).unwrap();
@@ -74,7 +76,7 @@ fn signals() {
     // SIGALRM, SIGTERM, SIGCHLD; SIGSEGV is a thread's own.
     let bits = [14, 15, 17].map(|signal| 1 << (signal - 1)).iter().sum::<u64>();
     let threads = fs::read_dir("/proc/self/task").unwrap().map(|entry| entry.unwrap().path());
-    // Others may end meanwhile; those of this participant run by now, and have their names.
+    // Other threads may end meanwhile; those of this participant run by now, and have their names.
     let name = |thread: &PathBuf| fs::read_to_string(thread.join("comm")).unwrap_or_default();
     let library: Vec<_> = threads.filter(|thread| name(thread).starts_with("RustDDS")).collect();
     assert!(library.len() >= 2, "{library:?}");
@@ -84,7 +86,7 @@ fn signals() {
     }
 }
 
-/// Keeps each sample until it is told to give it back.
+/// A sink that keeps each sample until it is released.
 struct Stuck {
     has: AtomicBool,
     release: Mutex<Receiver<()>>,
@@ -98,10 +100,10 @@ impl Stuck {
 }
 
 impl Sink for Stuck {
-    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
+    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Delivery {
         self.has.store(true, Ordering::SeqCst);
         let _ = self.release.lock().unwrap().recv();
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 
@@ -114,7 +116,7 @@ fn stuck() {
     let writer = peer.writer("/stuck", true, false);
     connected(&dds, subscription, 1);
     matched(&writer);
-    // As often as it takes for the other case; a writer that says nothing is no reason to be dead.
+    // As long as a stuck sink takes to be detected: a silent writer must not count as dead.
     for _ in 0..13 {
         assert_eq!(dds.health().dead, None);
         thread::sleep(Duration::from_secs(1));
@@ -134,7 +136,7 @@ fn stuck() {
 struct Panicking;
 
 impl Sink for Panicking {
-    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
+    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Delivery {
         panic!("this sink was meant to panic")
     }
 }
@@ -142,7 +144,7 @@ impl Sink for Panicking {
 fn panicking() {
     let domain = domain();
     let mut dds = open(domain);
-    let kept = Kept::new();
+    let kept = KeptSamples::new();
     let bad = dds.subscribe(&spec("/bad", Qos::Auto), Arc::new(Panicking)).unwrap();
     let good = dds.subscribe(&spec("/good", Qos::Auto), kept.clone()).unwrap();
     let peer = Peer::join(domain);
@@ -173,23 +175,23 @@ fn dropped() {
                 thread::sleep(Duration::from_micros(100));
             }
         });
-        // Also if this thread panics: the other one would not end.
-        let _end = Raised(&ended);
+        // Also if this thread panics, or the other one would not end.
+        let _end = RaiseOnDrop(&ended);
         for _ in 0..5 {
             let mut dds = open(domain);
-            let sink = Kept::new();
+            let sink = KeptSamples::new();
             dds.subscribe(&spec("/stream", Qos::Auto), sink.clone()).unwrap();
             sink.wait(100);
             drop(dds);
-            assert_eq!(Arc::strong_count(&sink), 1, "nobody has the sink any more");
+            assert_eq!(Arc::strong_count(&sink), 1, "the sink was released");
         }
     });
 }
 
 /// Raises a flag when it is dropped.
-struct Raised<'a>(&'a AtomicBool);
+struct RaiseOnDrop<'a>(&'a AtomicBool);
 
-impl Drop for Raised<'_> {
+impl Drop for RaiseOnDrop<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::SeqCst);
     }
@@ -208,13 +210,13 @@ fn dropped_while_stuck() {
     until("the sample", || sink.has.load(Ordering::SeqCst));
     drop(dds);
     drop(release);
-    until("the end of the thread that was left behind", || Arc::strong_count(&sink) == 1);
+    until("the end of the detached thread", || Arc::strong_count(&sink) == 1);
 }
 
 fn bad_node() {
     for node in ["", "gleaner", "/", "/a b"] {
         let error =
-            Dds::open(Options { node: node.to_owned(), ..options(domain()) }).err().unwrap();
+            Dds::open(DdsOptions { node: node.to_owned(), ..options(domain()) }).err().unwrap();
         assert_eq!(error.to_string(), format!("`{node}` is not a node's namespace and name"));
     }
 }

@@ -1,17 +1,18 @@
-//! The DDS transport against peers in the same process, in a network of their own.
+//! Tests of the DDS transport with peers in the same process, in a network namespace.
 //!
-//! All this runs in a network namespace in which there is nothing but `lo`, so that nothing is sent
-//! elsewhere and nobody else is heard. Where there may be none, every test is skipped and says so.
+//! The namespace has nothing but `lo`, so nothing leaves the machine and no other participant is
+//! received. Where a namespace cannot be created, every test is ignored and its name gives the
+//! reason.
 
-mod apart;
-mod ask;
+mod discovery;
 mod graph;
 mod hostile;
 mod life;
-mod offers;
+mod network_namespace;
 mod peer;
+mod qos;
 mod receive;
-mod wire;
+mod type_query;
 mod write;
 
 use std::process::ExitCode;
@@ -21,25 +22,25 @@ use libtest_mimic::{Arguments, Failed, Trial};
 
 type Test = (&'static str, fn());
 
-/// Held by each test while it runs, and by [`life::ALONE`] alone: that one looks at all threads of
-/// this process.
+/// Held for reading by each test while it runs, and for writing by [`life::ALONE`]: that one checks
+/// all threads of this process.
 static RUNNING: RwLock<()> = RwLock::new(());
 
 fn main() -> ExitCode {
     let arguments = Arguments::from_args();
-    let here = match apart::inside() {
+    let here = match network_namespace::inside() {
         true => Ok(()),
-        false => match apart::rerun() {
+        false => match network_namespace::rerun() {
             Ok(code) => return code,
             Err(why) => Err(why),
         },
     };
     let tests = [
-        ask::TESTS,
+        type_query::TESTS,
         receive::TESTS,
-        offers::TESTS,
+        qos::TESTS,
         graph::TESTS,
-        wire::TESTS,
+        discovery::TESTS,
         write::TESTS,
         hostile::TESTS,
         life::TESTS,

@@ -1,4 +1,4 @@
-//! The other side: a participant of plain RustDDS, and sinks that remember.
+//! Test peers: a participant of plain RustDDS, and sinks that keep samples.
 
 use std::convert::Infallible;
 use std::sync::atomic::{AtomicU16, Ordering};
@@ -7,9 +7,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use gleaner_dds::{Dds, Options};
+use gleaner_dds::{Dds, DdsOptions};
 use gleaner_transport::{
-    Clock, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport, Verdict,
+    Clock, Delivery, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport,
 };
 use rustdds::no_key::{
     DataWriter, Decode, DeserializerAdapter, SerializerAdapter, SimpleDataReader,
@@ -20,8 +20,8 @@ use rustdds::{
     StatusEvented, Topic, TopicKind,
 };
 
-/// How long something may take that happens at all.
-pub const PATIENCE: Duration = Duration::from_secs(60);
+/// Deadline for anything that is expected to happen.
+pub const DEADLINE: Duration = Duration::from_secs(60);
 
 /// A domain that no other test has.
 pub fn domain() -> u16 {
@@ -29,8 +29,13 @@ pub fn domain() -> u16 {
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
-pub fn options(domain: u16) -> Options {
-    Options { domain, largest: 1 << 20, clock: Clock::new(0), ..Options::new("/gleaner/test") }
+pub fn options(domain: u16) -> DdsOptions {
+    DdsOptions {
+        domain,
+        largest: 1 << 20,
+        clock: Clock::new(0),
+        ..DdsOptions::new("/gleaner/test")
+    }
 }
 
 pub fn open(domain: u16) -> Dds {
@@ -46,12 +51,12 @@ pub fn spec(topic: &str, qos: Qos) -> TopicSpec {
 pub fn until(what: &str, mut done: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !done() {
-        assert!(begun.elapsed() < PATIENCE, "{what}: not within {PATIENCE:?}");
+        assert!(begun.elapsed() < DEADLINE, "{what}: not within {DEADLINE:?}");
         thread::sleep(Duration::from_millis(2));
     }
 }
 
-/// Waits for as many writers.
+/// Waits for this number of writers.
 pub fn connected(dds: &Dds, subscription: Subscription, writers: usize) -> Status {
     until("writers", || dds.status(subscription).writers == Some(writers));
     dds.status(subscription)
@@ -116,20 +121,20 @@ impl Peer {
     }
 }
 
-/// What came, if something did.
+/// The next sample, if there is one.
 pub fn take(reader: &SimpleDataReader<Vec<u8>, Little>) -> Option<Vec<u8>> {
     reader.drain_read_notifications();
     reader.try_take_one_with(Whole).unwrap().map(|change| change.into_value())
 }
 
-/// Waits until a writer knows its reader; what it writes before is not for that one.
+/// Waits until a writer is matched; samples written before are not sent to that reader.
 pub fn matched<A: SerializerAdapter<Bytes>>(writer: &DataWriter<Bytes, A>) {
     until("a reader", || {
         matches!(writer.try_recv_status(), Some(DataWriterStatus::PublicationMatched { .. }))
     });
 }
 
-/// Writes what RTPS does not have to fill up: its messages have multiples of four bytes.
+/// Writes a sample of a multiple of four bytes, which RTPS does not pad.
 pub fn write<A: SerializerAdapter<Bytes>>(writer: &DataWriter<Bytes, A>, bytes: &[u8]) {
     assert_eq!(bytes.len() % 4, 0);
     writer.write(Bytes::copy_from_slice(bytes), None).unwrap();
@@ -176,44 +181,43 @@ impl<'de> Decode<'de, Vec<u8>> for Whole {
     }
 }
 
-/// A sink that remembers.
+/// A sink that keeps its samples.
 #[derive(Default)]
-pub struct Kept {
+pub struct KeptSamples {
     samples: Mutex<Vec<(SampleMeta, Vec<u8>)>>,
-    came: Condvar,
+    arrived: Condvar,
 }
 
-impl Sink for Kept {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for KeptSamples {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         self.samples.lock().unwrap().push((*meta, cdr.to_vec()));
-        self.came.notify_all();
-        Verdict::Taken
+        self.arrived.notify_all();
+        Delivery::Taken
     }
 }
 
-impl Kept {
+impl KeptSamples {
     pub fn new() -> Arc<Self> {
         Arc::default()
     }
 
-    /// Waits until there are `count`, and returns all there are.
+    /// Waits for `count` samples, and returns all there are.
     pub fn wait(&self, count: usize) -> Vec<(SampleMeta, Vec<u8>)> {
         let samples = self.samples.lock().unwrap();
         let (samples, late) = self
-            .came
-            .wait_timeout_while(samples, PATIENCE, |samples| samples.len() < count)
+            .arrived
+            .wait_timeout_while(samples, DEADLINE, |samples| samples.len() < count)
             .unwrap();
-        assert!(!late.timed_out(), "{} of {count} samples came", samples.len());
+        assert!(!late.timed_out(), "{} of {count} samples arrived", samples.len());
         samples.clone()
     }
 
-    /// The bytes of all samples there are, when there are `count`.
+    /// Waits for `count` samples, and returns the bytes of all there are.
     pub fn bytes(&self, count: usize) -> Vec<Vec<u8>> {
         self.wait(count).into_iter().map(|(_, bytes)| bytes).collect()
     }
 
-    /// Publishes `mark` until it arrives, which tells that everything from before has arrived or
-    /// never will.
+    /// Publishes `mark` until it arrives: by then everything from before has arrived or never will.
     pub fn mark(&self, writer: &LittleWriter, mark: &[u8]) {
         until("a sample", || {
             write(writer, mark);

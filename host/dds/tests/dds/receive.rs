@@ -1,31 +1,29 @@
-//! Samples on their way to a sink.
+//! Tests of the delivery of samples to a sink.
 
 use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
 use gleaner_messages::Endian;
-use gleaner_transport::{Guid, LiveSource, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Delivery, Guid, LiveSource, Qos, SampleMeta, Sink, TopicSpec, Transport};
 use rustdds::{RTPSEntity, Timestamp};
 
 use super::Test;
 use super::peer::{
-    Big, Kept, Parameters, Peer, connected, domain, matched, open, policies, spec, until, write,
+    Big, KeptSamples, Parameters, Peer, connected, domain, matched, open, policies, spec, until,
+    write,
 };
 
 pub const TESTS: &[Test] = &[
-    ("samples_arrive_whole_with_who_wrote_them_and_when", samples_arrive),
-    ("a_sample_of_many_fragments_arrives_whole", fragments),
-    ("the_first_sample_of_many_fragments_arrives_even_if_nothing_is_sent_again", first_fragments),
+    ("samples_arrive_complete_with_writer_and_time", samples_arrive),
+    ("a_sample_of_many_fragments_arrives_complete", fragments),
+    ("the_first_fragmented_sample_arrives_without_retransmission", first_fragments),
     ("a_sink_that_can_copy_gets_the_bytes_once", copied),
-    (
-        "a_sink_that_panics_while_it_copies_is_death_with_a_name_and_other_topics_go_on",
-        panics_in_copy,
-    ),
-    ("the_byte_order_of_each_sample_is_known", byte_order),
-    ("a_sample_in_an_encoding_that_nobody_reads_is_counted_and_the_next_arrives", malformed),
+    ("a_sink_that_panics_while_it_copies_is_reported_and_other_topics_go_on", panics_in_copy),
+    ("the_byte_order_of_each_sample_is_detected", byte_order),
+    ("a_sample_in_an_unsupported_encoding_is_counted_and_the_next_arrives", malformed),
     ("two_subscriptions_of_a_topic_both_get_every_sample", two_subscriptions),
-    ("names_that_ros_does_not_have_are_refused", bad_names),
-    ("a_writer_that_is_made_anew_a_hundred_times_is_heard_each_time", anew),
+    ("invalid_names_are_refused", bad_names),
+    ("a_writer_that_is_recreated_a_hundred_times_is_received_each_time", recreated),
 ];
 
 const FIXED: Qos = Qos::Fixed { reliable: true, transient_local: false, depth: 10 };
@@ -33,7 +31,7 @@ const FIXED: Qos = Qos::Fixed { reliable: true, transient_local: false, depth: 1
 fn samples_arrive() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/imu/data", FIXED), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/imu/data", true, false);
@@ -68,7 +66,7 @@ fn samples_arrive() {
 fn fragments() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/image", FIXED), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/image", true, false);
@@ -77,7 +75,7 @@ fn fragments() {
     let image: Vec<u8> = (0..1_000_004_u32).map(|n| (n % 251) as u8).collect();
     write(&writer, &image);
     assert!(sink.bytes(1)[0] == image);
-    // Whatever size came before, the next has its own.
+    // The next sample has its own size.
     write(&writer, b"small one...");
     assert_eq!(sink.bytes(2)[1], b"small one...");
 }
@@ -85,7 +83,7 @@ fn fragments() {
 fn first_fragments() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     dds.subscribe(&spec("/image", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/image", false, false);
@@ -94,7 +92,7 @@ fn first_fragments() {
     assert!(sink.bytes(1)[0] == [7; 100_000]);
 }
 
-/// Copies as soon as it is shown something, and refuses what is longer than 8 bytes.
+/// A sink that copies at once, and refuses samples of more than 8 bytes.
 #[derive(Default)]
 struct Copies {
     copied: Mutex<Option<Vec<u8>>>,
@@ -102,13 +100,13 @@ struct Copies {
 }
 
 impl Sink for Copies {
-    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
+    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Delivery {
         unreachable!("it copies")
     }
 
-    fn copy(&self, cdr: &[u8]) -> Option<Verdict> {
+    fn copy(&self, cdr: &[u8]) -> Option<Delivery> {
         let taken = (cdr.len() <= 8).then(|| cdr.to_vec());
-        let verdict = if taken.is_some() { Verdict::Taken } else { Verdict::TooBig };
+        let verdict = if taken.is_some() { Delivery::Taken } else { Delivery::TooBig };
         *self.copied.lock().unwrap() = taken;
         Some(verdict)
     }
@@ -141,11 +139,11 @@ fn copied() {
 struct PanicsInCopy;
 
 impl Sink for PanicsInCopy {
-    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
+    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Delivery {
         unreachable!("it copies")
     }
 
-    fn copy(&self, _: &[u8]) -> Option<Verdict> {
+    fn copy(&self, _: &[u8]) -> Option<Delivery> {
         panic!("this sink was meant to panic")
     }
 }
@@ -153,7 +151,7 @@ impl Sink for PanicsInCopy {
 fn panics_in_copy() {
     let domain = domain();
     let mut dds = open(domain);
-    let (first, second) = (Kept::new(), Kept::new());
+    let (first, second) = (KeptSamples::new(), KeptSamples::new());
     let bad = dds.subscribe(&spec("/both", FIXED), Arc::new(PanicsInCopy)).unwrap();
     let good = dds.subscribe(&spec("/both", FIXED), first.clone()).unwrap();
     dds.subscribe(&spec("/other", FIXED), second.clone()).unwrap();
@@ -161,8 +159,7 @@ fn panics_in_copy() {
     let (writer, other) = (peer.writer("/both", true, false), peer.writer("/other", true, false));
     connected(&dds, bad, 1);
     connected(&dds, good, 1);
-    // The first is also what tells that RustDDS goes on: both read it under the lock of the same
-    // topic.
+    // The first also shows that RustDDS goes on: both read under the lock of the same topic.
     first.mark(&writer, b"1...");
     second.mark(&other, b"2...");
     until("death", || dds.health().dead.is_some());
@@ -174,7 +171,7 @@ fn panics_in_copy() {
 fn byte_order() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/big", FIXED), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let policies = policies(true, false);
@@ -192,7 +189,7 @@ fn byte_order() {
 fn malformed() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/odd", FIXED), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let policies = policies(true, false);
@@ -216,7 +213,7 @@ fn malformed() {
 fn two_subscriptions() {
     let domain = domain();
     let mut dds = open(domain);
-    let (first, second) = (Kept::new(), Kept::new());
+    let (first, second) = (KeptSamples::new(), KeptSamples::new());
     let subscription = dds.subscribe(&spec("/both", FIXED), first.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/both", true, false);
@@ -230,7 +227,7 @@ fn two_subscriptions() {
     (0..20_u8).for_each(|n| write(&writer, &[n; 4]));
     assert_eq!(first.bytes(21).len(), 21);
     let expected: Vec<Vec<u8>> = (0..20).map(|n| vec![n; 4]).collect();
-    assert_eq!(second.bytes(20), expected, "what came before the subscription is not its business");
+    assert_eq!(second.bytes(20), expected, "samples from before the subscription are skipped");
 }
 
 fn bad_names() {
@@ -243,15 +240,15 @@ fn bad_names() {
             type_name: type_name.to_owned(),
             ..spec("/a", FIXED)
         };
-        assert!(dds.subscribe(&names, Kept::new()).is_err(), "{topic} {type_name:?}");
+        assert!(dds.subscribe(&names, KeptSamples::new()).is_err(), "{topic} {type_name:?}");
         assert!(dds.writer(topic, type_name, 1).is_err(), "{topic} {type_name:?}");
     }
 }
 
-fn anew() {
+fn recreated() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/again", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     for round in 0..100_u8 {

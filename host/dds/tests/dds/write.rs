@@ -1,10 +1,10 @@
-//! Topics that we write.
+//! Tests of writers.
 
 use super::Test;
 use super::peer::{Peer, domain, open, policies, take, until};
 
 pub const TESTS: &[Test] = &[
-    ("what_is_written_arrives_as_it_was_and_readers_are_counted", written),
+    ("written_bytes_arrive_unchanged_and_readers_are_counted", written),
     ("a_writer_may_outlive_the_participant", outlives),
 ];
 
@@ -13,7 +13,7 @@ fn written() {
     let dds = open(domain);
     let writer = dds.writer("/event", "std_msgs/msg/String", 50).unwrap();
     assert_eq!(writer.readers(), 0);
-    writer.write(b"nobody hears").unwrap();
+    writer.write(b"no reader...").unwrap();
     let peer = Peer::join(domain);
     let reader = peer.reader("rt/event", "std_msgs::msg::dds_::String_", &policies(true, false));
     until("a reader", || writer.readers() == 1);
@@ -27,17 +27,17 @@ fn written() {
     });
     assert!(
         came.iter().enumerate().all(|(n, bytes)| *bytes == [n as u8; 332]),
-        "in order, as they were"
+        "in order, unchanged"
     );
     drop(reader);
-    until("nobody", || writer.readers() == 0);
+    until("no reader", || writer.readers() == 0);
 }
 
 fn outlives() {
     let dds = open(domain());
     let writer = dds.writer("/event", "std_msgs/msg/String", 10).unwrap();
     drop(dds);
-    // Whether it is taken does not matter; that it comes back does.
-    drop(writer.write(b"nobody hears"));
+    // The result does not matter, but the call must return.
+    drop(writer.write(b"no reader..."));
     assert_eq!(writer.readers(), 0);
 }

@@ -50,7 +50,7 @@ pub(super) struct Args {
 }
 
 /// How the network is joined.
-pub(super) struct Network(dds::Options);
+pub(super) struct Network(dds::DdsOptions);
 
 impl Args {
     pub(super) fn read(self) -> Result<(Options, Network), Failure> {

@@ -1,21 +1,21 @@
-//! What is in the domain.
+//! Tests of the list of topics in a domain.
 
-use gleaner_dds::{Dds, Distro, Options};
+use gleaner_dds::{Dds, DdsOptions, Distro};
 use gleaner_transport::{Qos, Transport, TransportError};
 
 use super::Test;
-use super::peer::{Kept, Little, Peer, domain, open, options, policies, spec, until};
+use super::peer::{KeptSamples, Little, Peer, domain, open, options, policies, spec, until};
 
 pub const TESTS: &[Test] = &[
     ("topics_of_others_are_listed_with_types_definitions_and_offers", listed),
-    ("definitions_are_found_by_the_type_of_a_subscription_or_of_the_wire", definitions),
+    ("definitions_are_found_by_the_type_of_a_subscription_or_of_a_writer", definitions),
     ("hostile_names_are_shown_escaped", hostile_names),
     ("only_the_named_interfaces_are_used_and_samples_still_arrive", interfaces),
 ];
 
 fn listed() {
     let domain = domain();
-    let dds = Dds::open(Options { distro: Some(Distro::Humble), ..options(domain) }).unwrap();
+    let dds = Dds::open(DdsOptions { distro: Some(Distro::Humble), ..options(domain) }).unwrap();
     let peer = Peer::join(domain);
     let _chatter = peer.writer("/chatter", true, false);
     let _strange = peer.writer_of::<Little>(
@@ -37,7 +37,7 @@ fn listed() {
         (chatter.type_name.as_str(), chatter.writers, chatter.readers),
         ("std_msgs/msg/String", 1, 1)
     );
-    until("our part in the graph", || dds.graph().starts_with("listed"));
+    until("our entry in the graph", || dds.graph().starts_with("listed"));
     let topics = dds.topics();
     assert_eq!((topics[0].definitions_text.as_deref(), topics[0].messages), (None, None));
     assert!(topics[1].definitions_text.as_deref().unwrap().contains("string data"));
@@ -50,7 +50,7 @@ fn listed() {
 fn definitions() {
     let domain = domain();
     let mut dds = open(domain);
-    dds.subscribe(&spec("/subscribed", Qos::Auto), Kept::new()).unwrap();
+    dds.subscribe(&spec("/subscribed", Qos::Auto), KeptSamples::new()).unwrap();
     let first = dds.definitions("/subscribed").unwrap();
     assert!(
         std::sync::Arc::ptr_eq(&first, &dds.definitions("/subscribed").unwrap()),
@@ -68,9 +68,9 @@ fn definitions() {
         std::sync::Arc::ptr_eq(&first, &dds.definitions("/chatter").unwrap()),
         "it is the same type"
     );
-    assert!(
-        matches!(dds.definitions("/any"), Err(TransportError::NoDefinitions { type_name, .. }) if type_name == "Shape")
-    );
+    let found = dds.definitions("/any");
+    let Err(TransportError::NoDefinitions { type_name, .. }) = found else { panic!("{found:?}") };
+    assert_eq!(type_name, "Shape");
 }
 
 fn hostile_names() {
@@ -93,8 +93,8 @@ fn hostile_names() {
 fn interfaces() {
     let domain = domain();
     let here = vec![std::net::Ipv4Addr::LOCALHOST.into()];
-    let mut dds = Dds::open(Options { interfaces: here, ..options(domain) }).unwrap();
-    let sink = Kept::new();
+    let mut dds = Dds::open(DdsOptions { interfaces: here, ..options(domain) }).unwrap();
+    let sink = KeptSamples::new();
     dds.subscribe(&spec("/here", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/here", true, false);

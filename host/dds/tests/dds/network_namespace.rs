@@ -1,13 +1,14 @@
-//! A network of our own.
+//! Reruns the tests in a network namespace of their own.
 
 use std::env;
 use std::process::{Command, ExitCode, Stdio};
 
 const INSIDE: &str = "GLEANER_DDS_TESTS_INSIDE";
-/// `lo` is all there is, and takes multicast, too. Then `"$@"`.
-const SCRIPT: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo && exec \"$@\"";
+/// Brings up `lo`, the only interface, with multicast; then runs `"$@"`.
+const SCRIPT: &str = "ip link set lo up && ip link set lo multicast on && \
+                      ip route add 224.0.0.0/4 dev lo && exec \"$@\"";
 
-/// Whether this process is in a network of its own.
+/// Returns whether this process is in a network namespace of its own.
 pub fn inside() -> bool {
     env::var_os(INSIDE).is_some()
 }
@@ -18,11 +19,11 @@ fn unshared() -> Command {
     command
 }
 
-/// Runs this program again in a network of its own.
+/// Runs this program again in a network namespace of its own.
 pub fn rerun() -> Result<ExitCode, String> {
     let may = unshared().arg("true").stdout(Stdio::null()).stderr(Stdio::null()).status();
     if !may.is_ok_and(|status| status.success()) {
-        return Err("no network of our own can be made here".to_owned());
+        return Err("a network namespace cannot be created here".to_owned());
     }
     let program = env::current_exe().map_err(|error| error.to_string())?;
     let status = unshared()

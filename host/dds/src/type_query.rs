@@ -1,13 +1,13 @@
-//! Asking a node of ROS 2 what a message type is: its service `get_type_description`, which nodes
-//! of Iron and newer have.
+//! Requests the definition of a message type from a ROS 2 node, by its service
+//! `get_type_description`, which nodes of Iron and newer have.
 //!
-//! The receive thread asks one question at a time, of one node, and hands the answer over as it
-//! came; who asked reads it. A node is known by the graph, and the type's hash, without which no
-//! node answers, by what the writer announced.
+//! The receive thread sends one query at a time, to one node, and returns the raw answer; the
+//! caller parses it. The node is found by the graph; the type's hash, without which no node
+//! answers, is in the announcement of the writer.
 //!
-//! Which question an answer belongs to is said in two ways: rmw_cyclonedds puts 16 bytes in front
-//! of both, all others name the question beside the answer. The participant's vendor tells which;
-//! where it does not, both are tried in turn.
+//! Request and answer are matched in two ways: rmw_cyclonedds puts a 16-byte header before both,
+//! all others use the related sample identity. The participant's vendor decides; where it is
+//! unknown, both are tried in turn.
 //!
 //! Sources: rmw_cyclonedds_cpp `serdata.cpp`, rmw_fastrtps_shared_cpp `rmw_request.cpp`; OMG RPC
 //! over DDS 1.0, 7.2.4.
@@ -23,21 +23,21 @@ use rustdds::{
     WriteOptionsBuilder, policy,
 };
 
-use super::feed::Around;
 use super::names::{dds_topic, dds_type, visible};
 use super::nodes::Nodes;
-use super::offers::Request;
 use super::peers::prefix;
+use super::qos::Request;
 use super::raw::{CopyInto, RawReader, RawWriter};
+use super::topic_reader::ReceiveContext;
 use gleaner_messages::Endian;
 use gleaner_messages::described::{Header, question};
 use gleaner_transport::Guid;
 
-/// How long a question may take, from looking for somebody to ask until the answer is here.
+/// Time limit of a query, from the search for a node to its answer.
 const LIMIT: Duration = Duration::from_secs(2);
-/// The largest answer. Of ROS 2's own types they stay below 64 KiB.
+/// The largest answer. For ROS 2's own types they stay below 64 KiB.
 const LARGEST: usize = 1 << 20;
-/// Answers that are kept until they are looked at: those to others come, too.
+/// Answers that are queued until they are read: those to other clients arrive, too.
 const KEPT: usize = 16;
 
 const REQUEST: &str = "type_description_interfaces::srv::dds_::GetTypeDescription_Request_";
@@ -46,181 +46,187 @@ const RESPONSE: &str = "type_description_interfaces::srv::dds_::GetTypeDescripti
 const CYCLONE: [u8; 2] = [1, 0x10];
 const OTHERS: [[u8; 2]; 2] = [[1, 0x0f], [1, 1]];
 
-/// A question that somebody has.
+/// A request for the definition of one type.
 #[derive(Clone, Debug)]
-pub(super) struct Ask {
-    /// By which the outcome is told from that of an earlier question.
+pub(super) struct TypeQuery {
+    /// Distinguishes its outcome from that of an earlier query.
     pub(super) ticket: u64,
     pub(super) type_name: String,
-    pub(super) before: Asked,
+    pub(super) before: Attempts,
 }
 
-/// How often something was asked, and how often of those nobody answered.
+/// Number of queries for a type, and how many of them got no answer.
 #[derive(Copy, Clone, Debug, Default)]
-pub(super) struct Asked {
+pub(super) struct Attempts {
     pub(super) times: usize,
-    pub(super) in_vain: usize,
+    pub(super) unanswered: usize,
 }
 
-/// What became of a question.
+/// The outcome of a query.
 #[derive(Debug)]
-pub(super) enum Outcome {
+pub(super) enum QueryOutcome {
     /// A node answered.
     Answer {
         node: String,
-        /// Of the type, as its writer announced it.
+        /// The type's hash, as its writer announced it.
         hash: String,
-        /// Without a header.
+        /// The answer, without a header.
         cdr: Vec<u8>,
         endian: Endian,
     },
-    /// Nobody did.
-    Silence {
+    /// No node answered.
+    Failed {
         why: String,
-        /// Whether it may help to ask again.
-        again: bool,
+        /// True if a retry may help.
+        retry: bool,
     },
 }
 
-/// Asks.
+/// Runs the open query.
 #[derive(Default)]
-pub(super) struct Asker {
-    open: Option<Open>,
+pub(super) struct TypeQuerier {
+    open: Option<OpenQuery>,
 }
 
-struct Open {
-    ask: Ask,
+struct OpenQuery {
+    query: TypeQuery,
     begun: Instant,
-    call: Option<Call>,
-    /// What it waits for.
-    lacks: (String, bool),
+    call: Option<ServiceCall>,
+    /// The reason if the time limit is reached now, and true if a retry may help.
+    missing: (String, bool),
 }
 
-/// One node, asked.
-struct Call {
-    whom: Whom,
+/// The client of one node's service.
+struct ServiceCall {
+    target: QueryTarget,
     writer: RawWriter,
     reader: RawReader,
     sent: Option<(SequenceNumber, Option<Header>)>,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Whom {
+struct QueryTarget {
     node: String,
     hash: String,
     writer: Guid,
 }
 
-impl Asker {
-    /// Asks this from now on, and nothing else.
-    pub(super) fn ask(&mut self, ask: Ask) {
-        let lacks = ("the receive thread was busy".to_owned(), true);
-        self.open = Some(Open { ask, begun: Instant::now(), call: None, lacks });
+impl TypeQuerier {
+    /// Starts `query`, in place of any other.
+    pub(super) fn start(&mut self, query: TypeQuery) {
+        let missing = ("the receive thread was busy".to_owned(), true);
+        self.open = Some(OpenQuery { query, begun: Instant::now(), call: None, missing });
     }
 
-    pub(super) fn is_asking(&self) -> bool {
+    pub(super) fn is_open(&self) -> bool {
         self.open.is_some()
     }
 
     /// Bytes of the largest answer that is expected.
     pub(super) fn largest(&self) -> usize {
-        if self.is_asking() { LARGEST } else { 0 }
+        if self.is_open() { LARGEST } else { 0 }
     }
 
-    /// Goes on with it.
-    pub(super) fn look(
+    /// Continues the open query.
+    pub(super) fn poll(
         &mut self,
-        around: &Around<'_>,
+        context: &ReceiveContext<'_>,
         token: Token,
         writers: &[DiscoveredWriterData],
         nodes: &Nodes,
     ) {
         let Some(open) = &mut self.open else { return };
-        let mut outcome = open.proceed(around, token, writers, nodes);
+        let mut outcome = open.proceed(context, token, writers, nodes);
         if outcome.is_none() && open.begun.elapsed() >= LIMIT {
-            let (why, again) = open.lacks.clone();
-            outcome = Some(Outcome::Silence { why, again });
+            let (why, retry) = open.missing.clone();
+            outcome = Some(QueryOutcome::Failed { why, retry });
         }
         if let Some(outcome) = outcome {
-            around.state.answer(open.ask.ticket, outcome);
+            context.state.answer(open.query.ticket, outcome);
             if let Some(call) = self.open.take().and_then(|open| open.call) {
-                call.give_up(around);
+                call.close(context);
             }
         }
     }
 }
 
-impl Open {
+impl OpenQuery {
     fn proceed(
         &mut self,
-        around: &Around<'_>,
+        context: &ReceiveContext<'_>,
         token: Token,
         writers: &[DiscoveredWriterData],
         nodes: &Nodes,
-    ) -> Option<Outcome> {
+    ) -> Option<QueryOutcome> {
         if self.call.is_none() {
-            match whom(&self.ask, writers, nodes)
-                .and_then(|whom| Call::make(around, token, &self.ask, whom))
+            match target(&self.query, writers, nodes)
+                .and_then(|target| ServiceCall::create(context, token, &self.query, target))
             {
                 Ok(call) => self.call = Some(call),
-                // It may not have been heard of yet.
-                Err(Lack::Yet(why)) => self.lacks = (why, false),
-                Err(Lack::Ever(why)) => return Some(Outcome::Silence { why, again: false }),
+                // It may not be discovered yet.
+                Err(NoTarget::Yet(why)) => self.missing = (why, false),
+                Err(NoTarget::Ever(why)) => {
+                    return Some(QueryOutcome::Failed { why, retry: false });
+                }
             }
         }
         let call = self.call.as_mut()?;
-        let node = visible(&call.whom.node);
+        let node = visible(&call.target.node);
         if call.sent.is_none() {
-            self.lacks =
+            self.missing =
                 (format!("node `{node}` does not offer the service get_type_description"), false);
-            call.send(around, &self.ask)?;
+            call.send(context, &self.query)?;
         }
-        self.lacks = (format!("node `{node}` did not answer within {} s", LIMIT.as_secs()), true);
-        call.take(around).map(|answer| match answer {
+        self.missing = (format!("node `{node}` did not answer within {} s", LIMIT.as_secs()), true);
+        call.take(context).map(|answer| match answer {
             Ok((cdr, endian)) => {
-                Outcome::Answer { node, hash: call.whom.hash.clone(), cdr, endian }
+                QueryOutcome::Answer { node, hash: call.target.hash.clone(), cdr, endian }
             }
-            Err(why) => Outcome::Silence { why: format!("node `{node}`: {why}"), again: true },
+            Err(why) => QueryOutcome::Failed { why: format!("node `{node}`: {why}"), retry: true },
         })
     }
 }
 
-enum Lack {
+enum NoTarget {
     Yet(String),
     Ever(String),
 }
 
-/// Whom to ask: each time another node, if several write the type.
-fn whom(ask: &Ask, writers: &[DiscoveredWriterData], nodes: &Nodes) -> Result<Whom, Lack> {
-    let yet = |why: &str| Lack::Yet(why.to_owned());
+/// Chooses the node: each time another one, if several write the type.
+fn target(
+    query: &TypeQuery,
+    writers: &[DiscoveredWriterData],
+    nodes: &Nodes,
+) -> Result<QueryTarget, NoTarget> {
+    let yet = |why: &str| NoTarget::Yet(why.to_owned());
     let type_name =
-        dds_type(&ask.type_name).ok_or_else(|| Lack::Ever("it is no type of ROS 2".to_owned()))?;
+        dds_type(&query.type_name).ok_or_else(|| NoTarget::Ever("not a ROS 2 type".to_owned()))?;
     let of_type =
         || writers.iter().filter(|writer| writer.publication_topic_data.type_name == type_name);
     if of_type().next().is_none() {
-        return Err(yet("nobody writes it"));
+        return Err(yet("no writer of the type is known"));
     }
     let announced: Vec<_> =
         of_type().filter_map(|writer| Some((writer, type_hash(&writer.user_data)?))).collect();
     if announced.is_empty() {
         let why = "its writers do not announce the type's hash, as nodes of Iron and newer do";
-        return Err(Lack::Ever(why.to_owned()));
+        return Err(NoTarget::Ever(why.to_owned()));
     }
-    let whom = announced.into_iter().filter_map(|(writer, hash)| {
+    let target = announced.into_iter().filter_map(|(writer, hash)| {
         let writer = Guid(writer.writer_proxy.remote_writer_guid.to_bytes());
-        Some(Whom { node: nodes.writing(writer)?.to_owned(), hash, writer })
+        Some(QueryTarget { node: nodes.writing(writer)?.to_owned(), hash, writer })
     });
-    let mut whom: Vec<Whom> = whom.collect();
-    whom.sort_unstable();
-    whom.dedup_by(|a, b| a.node == b.node);
-    match whom.len() {
-        0 => Err(yet("which node writes it is not known: the graph of ROS 2 does not say")),
-        count => Ok(whom.swap_remove(ask.before.times % count)),
+    let mut target: Vec<QueryTarget> = target.collect();
+    target.sort_unstable();
+    target.dedup_by(|a, b| a.node == b.node);
+    match target.len() {
+        0 => Err(yet("the ROS 2 graph does not list the node that writes it")),
+        count => Ok(target.swap_remove(query.before.times % count)),
     }
 }
 
-/// The hash of a writer's type, out of what nodes of Iron and newer announce with a writer:
-/// `typehash=RIHS01_…;`.
+/// Parses the hash of a writer's type from the user data that nodes of Iron and newer announce with
+/// a writer: `typehash=RIHS01_…;`.
 fn type_hash(user_data: &[u8]) -> Option<String> {
     const KEY: &[u8] = b"typehash=";
     const HASH: usize = "RIHS01_".len() + 64;
@@ -230,63 +236,71 @@ fn type_hash(user_data: &[u8]) -> Option<String> {
     digits.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f')).then(|| hash.to_owned())
 }
 
-impl Call {
-    fn make(around: &Around<'_>, token: Token, ask: &Ask, whom: Whom) -> Result<Self, Lack> {
-        let service = dds_topic(&format!("{}/get_type_description", whom.node));
+impl ServiceCall {
+    fn create(
+        context: &ReceiveContext<'_>,
+        token: Token,
+        query: &TypeQuery,
+        target: QueryTarget,
+    ) -> Result<Self, NoTarget> {
+        let service = dds_topic(&format!("{}/get_type_description", target.node));
         let Some(service) = service.as_deref().and_then(|service| service.strip_prefix("rt"))
         else {
-            return Err(Lack::Ever(format!("`{}` is no name of a node", visible(&whom.node))));
+            return Err(NoTarget::Ever(format!(
+                "`{}` is not a valid node name",
+                visible(&target.node)
+            )));
         };
         let ever = |why: String| {
-            Lack::Ever(format!("node `{}` cannot be asked: {why}", visible(&whom.node)))
+            NoTarget::Ever(format!("node `{}` cannot be queried: {why}", visible(&target.node)))
         };
-        // Held, so that nobody can be connected before it is followed who.
-        let mut peers = around.state.peers();
-        let (writer, mut reader) = endpoints(around.participant, service)
+        // Locked, so that no match is missed before the endpoints are followed.
+        let mut peers = context.state.peers();
+        let (writer, mut reader) = endpoints(context.participant, service)
             .map_err(|error| ever(visible(&error.to_string())))?;
         peers.follow(writer.guid());
         peers.follow(reader.guid());
         drop(peers);
-        around
+        context
             .registry
             .register(&mut reader, token, Interest::READABLE)
             .map_err(|error| ever(error.to_string()))?;
         tracing::info!(
-            type_name = ask.type_name,
-            node = visible(&whom.node),
-            hash = whom.hash,
-            "asking for definitions"
+            type_name = query.type_name,
+            node = visible(&target.node),
+            hash = target.hash,
+            "requesting definitions from a node"
         );
-        Ok(Self { whom, writer, reader, sent: None })
+        Ok(Self { target, writer, reader, sent: None })
     }
 
-    /// What is in front of question and answer, if it is on a DDS that wants that.
-    fn header(&self, around: &Around<'_>, ask: &Ask) -> Option<Header> {
+    /// The header of request and answer, if the node's DDS uses one.
+    fn header(&self, context: &ReceiveContext<'_>, query: &TypeQuery) -> Option<Header> {
         let guid = self.writer.guid().to_bytes();
         let vendor =
-            around.state.peers().vendor(prefix(&rustdds::GUID::from_bytes(self.whom.writer.0)));
+            context.state.peers().vendor(prefix(&rustdds::GUID::from_bytes(self.target.writer.0)));
         let with = match vendor {
             Some(CYCLONE) => true,
             Some(vendor) if OTHERS.contains(&vendor) => false,
-            _ => ask.before.in_vain % 2 == 1,
+            _ => query.before.unanswered % 2 == 1,
         };
         let own = *guid.last_chunk::<8>().expect("8 of 16 bytes");
-        with.then(|| Header([u64::from_le_bytes(own), ask.ticket]))
+        with.then(|| Header([u64::from_le_bytes(own), query.ticket]))
     }
 
-    /// Sends the question, as soon as there is somebody at both ends. `None` if there is not.
-    fn send(&mut self, around: &Around<'_>, ask: &Ask) -> Option<()> {
-        let peers = around.state.peers();
+    /// Sends the request once both endpoints are matched. Returns `None` until then.
+    fn send(&mut self, context: &ReceiveContext<'_>, query: &TypeQuery) -> Option<()> {
+        let peers = context.state.peers();
         let here =
             peers.connected(self.writer.guid()) > 0 && peers.connected(self.reader.guid()) > 0;
         drop(peers);
         if !here {
             return None;
         }
-        let header = self.header(around, ask);
-        let question = Bytes::from(question(&ask.type_name, &self.whom.hash, header));
-        // Fast DDS waits for this reader, then, before it answers. The number is that of the
-        // question, which it knows.
+        let header = self.header(context, query);
+        let question = Bytes::from(question(&query.type_name, &self.target.hash, header));
+        // With it, Fast DDS waits for this reader before it answers. The sequence number is that of
+        // the request, which it knows.
         let related = SampleIdentity {
             writer_guid: self.reader.guid(),
             sequence_number: SequenceNumber::UNKNOWN,
@@ -298,20 +312,20 @@ impl Call {
         Some(())
     }
 
-    /// The answer, or why there is none; `None` while there is neither.
-    fn take(&mut self, around: &Around<'_>) -> Option<Result<(Vec<u8>, Endian), String>> {
+    /// Returns the answer or an error; `None` while there is neither.
+    fn take(&mut self, context: &ReceiveContext<'_>) -> Option<Result<(Vec<u8>, Endian), String>> {
         let (sent, header) = self.sent?;
         self.reader.drain_read_notifications();
         for _ in 0..KEPT {
-            let memory = CopyInto { sink: None, memory: around.memory, clock: around.clock };
+            let memory = CopyInto { sink: None, memory: context.memory, clock: context.clock };
             let change = match self.reader.try_take_one_with(memory) {
                 Ok(None) => break,
                 Ok(Some(change)) => change,
-                // Whoever writes to this topic may write anything, and is not who was asked.
+                // Any participant may write to this topic; this is not the answer.
                 Err(_) => continue,
             };
-            let (memory, endian) = (around.memory.borrow(), change.sample.endian);
-            let ours = match header {
+            let (memory, endian) = (context.memory.borrow(), change.sample.endian);
+            let own = match header {
                 Some(header) => Header::split(&memory, endian)
                     .and_then(|(found, cdr)| (found == header).then_some(cdr)),
                 None => change.related_sample_identity().and_then(|to| {
@@ -320,8 +334,8 @@ impl Call {
                         .then_some(memory.as_slice())
                 }),
             };
-            match ours {
-                // Somebody else's.
+            match own {
+                // An answer to another client.
                 None => {}
                 Some(cdr) if cdr.len() > LARGEST => {
                     return Some(Err(format!(
@@ -335,21 +349,21 @@ impl Call {
         None
     }
 
-    fn give_up(mut self, around: &Around<'_>) {
-        drop(around.registry.deregister(&mut self.reader));
-        let mut peers = around.state.peers();
+    fn close(mut self, context: &ReceiveContext<'_>) {
+        drop(context.registry.deregister(&mut self.reader));
+        let mut peers = context.state.peers();
         peers.forget(self.writer.guid());
         peers.forget(self.reader.guid());
     }
 }
 
-/// Writes questions to a service, and reads its answers.
+/// Creates the request writer and the answer reader of a service.
 fn endpoints(
     participant: &DomainParticipant,
     service: &str,
 ) -> Result<(RawWriter, RawReader), CreateError> {
     let policies = QosPolicyBuilder::new()
-        // This is the receive thread: it waits for nobody.
+        // This is the receive thread: it must not block.
         .reliability(policy::Reliability::Reliable { max_blocking_time: rustdds::Duration::ZERO })
         .durability(policy::Durability::Volatile)
         .history(policy::History::KeepLast { depth: 1 })
@@ -373,7 +387,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_hash_is_found_among_what_else_a_writer_announces() {
+    fn a_hash_is_found_among_other_user_data() {
         let hash = format!("RIHS01_{}", "0123456789abcdef".repeat(4));
         for front in [&b""[..], b"\x53\0\0\0", b"clientid=1;typehash;", b"\xff\xfe"] {
             let user_data = [front, b"typehash=", hash.as_bytes(), b";more"].concat();

@@ -1,4 +1,4 @@
-//! What is in the domain, made fit to be shown.
+//! Lists the topics of a domain, with names made printable.
 
 use std::collections::BTreeMap;
 
@@ -7,27 +7,27 @@ use rustdds::{DomainParticipant, RTPSEntity};
 
 use super::Distro;
 use super::names::{ros_topic, ros_type, visible};
-use super::offers::{Offer, as_rosbag2, in_words};
+use super::qos::{Offer, as_rosbag2, describe};
 use gleaner_transport::Guid;
 
-/// Most topics that are shown.
+/// Most topics that are listed.
 const TOPICS: usize = 4096;
-/// Most different qualities of service that are shown of a topic.
+/// Most different qualities of service that are listed for a topic.
 const QUALITIES: usize = 16;
 
-/// A topic of ROS 2 that somebody else writes or reads.
+/// A ROS 2 topic that another participant writes or reads.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct TopicOnWire {
-    /// Absolute name. What is not printable is escaped.
+pub struct DomainTopic {
+    /// Absolute name. Characters that are not printable are escaped.
     pub topic: String,
-    /// `pkg/msg/Type`, or what DDS says if it is no type of ROS 2. What is not printable is
-    /// escaped.
+    /// `pkg/msg/Type`, or the DDS name if it is not a ROS 2 type. Characters that are not printable
+    /// are escaped.
     pub type_name: String,
-    /// Writers of others.
+    /// Writers of other participants.
     pub writers: usize,
-    /// Readers of others.
+    /// Readers of other participants.
     pub readers: usize,
-    /// What the writers offer, in words, each once.
+    /// The distinct QoS offers of the writers, as text.
     pub qos: Vec<String>,
 }
 
@@ -41,21 +41,21 @@ pub(super) fn offer(writer: &DiscoveredWriterData) -> Offer {
     }
 }
 
-/// The topics of others, sorted by name, and of one name by the number of writers, most first; with
-/// what their writers offer as rosbag2 notes it.
+/// The topics of other participants, sorted by name, and under one name by the number of writers,
+/// most first; each with the offers of its writers in the format of rosbag2.
 pub(super) fn topics(
     participant: &DomainParticipant,
     distro: Option<Distro>,
-) -> Vec<(TopicOnWire, Option<String>)> {
-    let ours = participant.guid().prefix;
+) -> Vec<(DomainTopic, Option<String>)> {
+    let own = participant.guid().prefix;
     let writers = participant.discovered_writers();
     let readers = participant.discovered_readers();
     let writers = writers
         .iter()
-        .filter(|writer| writer.writer_proxy.remote_writer_guid.prefix != ours)
+        .filter(|writer| writer.writer_proxy.remote_writer_guid.prefix != own)
         .map(offer);
     let readers =
-        readers.iter().filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != ours);
+        readers.iter().filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != own);
     sorted(writers, readers.map(names), distro)
 }
 
@@ -68,7 +68,7 @@ fn sorted<'a>(
     writers: impl Iterator<Item = Offer>,
     readers: impl Iterator<Item = (&'a str, &'a str)>,
     distro: Option<Distro>,
-) -> Vec<(TopicOnWire, Option<String>)> {
+) -> Vec<(DomainTopic, Option<String>)> {
     let mut found: BTreeMap<(String, String), (Vec<Offer>, usize)> = BTreeMap::new();
     let key = |topic: &str, type_name: &str| {
         Some((visible(ros_topic(topic)?), visible(&ros_type(type_name))))
@@ -88,16 +88,16 @@ fn sorted<'a>(
     let shown =
         |((topic, type_name), (offers, readers)): ((String, String), (Vec<Offer>, usize))| {
             let mut qos: Vec<String> = Vec::new();
-            for words in offers.iter().map(|offer| in_words(&offer.qos)) {
-                if qos.len() < QUALITIES && !qos.contains(&words) {
-                    qos.push(words);
+            for text in offers.iter().map(|offer| describe(&offer.qos)) {
+                if qos.len() < QUALITIES && !qos.contains(&text) {
+                    qos.push(text);
                 }
             }
             let offered = as_rosbag2(&offers.iter().collect::<Vec<_>>(), distro);
-            (TopicOnWire { topic, type_name, writers: offers.len(), readers, qos }, offered)
+            (DomainTopic { topic, type_name, writers: offers.len(), readers, qos }, offered)
         };
     let mut topics: Vec<_> = found.into_iter().map(shown).collect();
-    // Somebody who announces a topic as another type is not to be taken for the one who is meant.
+    // A participant that announces a topic with a wrong type must not displace the real one.
     topics.sort_by(|(one, _), (other, _)| {
         one.topic.cmp(&other.topic).then(other.writers.cmp(&one.writers))
     });
@@ -106,7 +106,7 @@ fn sorted<'a>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::offers::Request;
+    use super::super::qos::Request;
     use super::*;
 
     fn offer(topic: &str, type_name: &str, reliable: bool) -> Offer {
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn topics_are_sorted_and_their_offers_said_once() {
+    fn topics_are_sorted_and_their_offers_are_distinct() {
         let imu = "sensor_msgs::msg::dds_::Imu_";
         let writers =
             [offer("rt/b", imu, true), offer("rt/a", imu, true), offer("rt/a", imu, false)];
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_topic_of_several_types_the_one_that_most_write_comes_first() {
+    fn of_several_types_the_one_with_most_writers_comes_first() {
         let types =
             ["aaa::msg::dds_::X_", "sensor_msgs::msg::dds_::Imu_", "sensor_msgs::msg::dds_::Imu_"];
         let writers = types.map(|type_name| offer("rt/imu", type_name, true));
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn more_topics_than_anybody_has_are_not_kept() {
+    fn the_number_of_topics_is_bounded() {
         let writers = (0..10_000).map(|n| offer(&format!("rt/t{n}"), "x", true));
         assert_eq!(sorted(writers, std::iter::empty(), None).len(), TOPICS);
     }

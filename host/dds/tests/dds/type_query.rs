@@ -1,4 +1,4 @@
-//! Definitions that only the node has which writes the type: asked for at a node of ros2-client.
+//! Tests of definitions that only the node with the writer has: queried at a node of ros2-client.
 
 use std::net::UdpSocket;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use gleaner_dds::{Dds, Options};
+use gleaner_dds::{Dds, DdsOptions};
 use gleaner_messages::FieldPath;
 use gleaner_transport::{LiveSource, Transport, TransportError};
 use ros2_client::qos::{Durability, History, WhenFull};
@@ -23,17 +23,19 @@ use super::Test;
 use super::peer::{Little, Peer, domain, options, policies, take, until, write};
 
 pub const TESTS: &[Test] = &[
-    ("a_node_is_asked_for_definitions_that_nobody_else_has", || answered(ServiceMapping::Enhanced)),
-    ("a_node_that_wants_a_header_is_asked_with_one", || answered(ServiceMapping::Cyclone)),
-    ("a_long_answer_passes_the_filter_although_nothing_large_is_subscribed", long),
-    ("a_node_that_says_no_is_asked_three_times", refused),
-    ("an_answer_that_has_not_the_hash_that_was_announced_is_not_believed", lied),
-    ("a_type_without_a_hash_is_asked_for_nowhere", no_hash),
-    ("a_node_without_the_service_is_given_up", no_service),
-    ("a_type_that_nobody_writes_is_given_up", nobody),
+    ("a_node_provides_definitions_that_are_not_available_locally", || {
+        answered(ServiceMapping::Enhanced)
+    }),
+    ("a_node_that_needs_a_header_gets_one", || answered(ServiceMapping::Cyclone)),
+    ("a_long_answer_passes_the_filter_without_a_large_subscription", long),
+    ("a_node_that_refuses_is_queried_at_most_three_times", refused),
+    ("an_answer_with_another_hash_than_announced_is_rejected", wrong_hash),
+    ("a_type_without_a_hash_is_not_queried", no_hash),
+    ("a_node_without_the_service_gets_no_further_query", no_service),
+    ("a_type_without_a_writer_gets_no_further_query", no_writer),
 ];
 
-/// Worked out with Python's `json` and `hashlib`.
+/// Computed with Python's `json` and `hashlib`.
 const WHEEL: &str = "RIHS01_e02cfbfb2ca59b49ca956f751f81f5f9dc3ec4867dbfe44f53a662fd24cbacff";
 const TYRE: &str = "RIHS01_809c10637226ef205824b02220c1a10979ffd2fc7ea39c73dda560cc539ea50f";
 
@@ -48,21 +50,21 @@ struct Request {
 struct Response {
     successful: bool,
     failure_reason: String,
-    root: Described,
-    referenced: Vec<Described>,
+    root: TypeDescription,
+    referenced: Vec<TypeDescription>,
     /// Type, encoding, text.
     sources: Vec<(String, String, String)>,
     extra: Vec<(String, String)>,
 }
 
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-struct Described {
+struct TypeDescription {
     name: String,
-    fields: Vec<Field>,
+    fields: Vec<FieldDescription>,
 }
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
-struct Field {
+struct FieldDescription {
     name: String,
     kind: u8,
     capacity: u64,
@@ -74,8 +76,8 @@ struct Field {
 impl Message for Request {}
 impl Message for Response {}
 
-fn described(name: &str, fields: &[(&str, u8, &str)]) -> Described {
-    let field = |(name, kind, nested): &(&str, u8, &str)| Field {
+fn described(name: &str, fields: &[(&str, u8, &str)]) -> TypeDescription {
+    let field = |(name, kind, nested): &(&str, u8, &str)| FieldDescription {
         name: (*name).to_owned(),
         kind: *kind,
         capacity: 0,
@@ -83,14 +85,17 @@ fn described(name: &str, fields: &[(&str, u8, &str)]) -> Described {
         nested: (*nested).to_owned(),
         default: String::new(),
     };
-    Described { name: format!("car_msgs/msg/{name}"), fields: fields.iter().map(field).collect() }
+    TypeDescription {
+        name: format!("car_msgs/msg/{name}"),
+        fields: fields.iter().map(field).collect(),
+    }
 }
 
 fn source(name: &str, text: &str) -> (String, String, String) {
     (format!("car_msgs/msg/{name}"), "msg".to_owned(), text.to_owned())
 }
 
-/// What an honest node says of a type.
+/// The correct answer of a node.
 fn honest(request: &Request) -> Response {
     let tyre = described("Tyre", &[("bar", 11, "")]);
     let tyre_source = source("Tyre", "float64 bar\n");
@@ -115,20 +120,20 @@ fn honest(request: &Request) -> Response {
     }
 }
 
-type Say = fn(&Request) -> Response;
+type Respond = fn(&Request) -> Response;
 
 /// A node of ros2-client that writes `/wheel` and `/tyre`.
 struct Car {
     participant: DomainParticipant,
     _node: Node,
     writers: [GUID; 2],
-    asked: Arc<Mutex<Vec<Request>>>,
+    requests: Arc<Mutex<Vec<Request>>>,
     stop: Arc<AtomicBool>,
     serving: Option<JoinHandle<()>>,
 }
 
 impl Car {
-    fn join(domain: u16, service: Option<(ServiceMapping, Say)>) -> Self {
+    fn join(domain: u16, service: Option<(ServiceMapping, Respond)>) -> Self {
         let participant = DomainParticipant::new(domain).unwrap();
         let context = Context::from_domain_participant(participant.clone()).unwrap();
         let name = NodeName::new("/front", "car").unwrap();
@@ -139,17 +144,18 @@ impl Car {
             .reliability_reliable(WhenFull::DEFAULT)
             .durability(Durability::Volatile)
             .history(History::KeepLast { depth: 10 });
-        let (asked, stop) = (Arc::<Mutex<Vec<Request>>>::default(), Arc::<AtomicBool>::default());
-        let serving = service.map(|(mapping, say)| {
+        let (requests, stop) =
+            (Arc::<Mutex<Vec<Request>>>::default(), Arc::<AtomicBool>::default());
+        let serving = service.map(|(mapping, respond)| {
             let name = Name::new("/front/car", "get_type_description").unwrap();
             let ty = ServiceTypeName::new("type_description_interfaces", "GetTypeDescription");
             let server = node
                 .create_server::<Request, Response>(mapping, &name, &ty, qos.clone(), qos.clone())
                 .unwrap();
-            let (asked, stop) = (asked.clone(), stop.clone());
-            thread::spawn(move || serve(&server, say, &asked, &stop))
+            let (requests, stop) = (requests.clone(), stop.clone());
+            thread::spawn(move || serve(&server, respond, &requests, &stop))
         });
-        // Last, so that what follows in discovery is ours to say.
+        // Last, so that the announcements that follow in discovery are sent by the test.
         let writers = ["Wheel", "Tyre"].map(|ty| {
             let topic = Name::new("/", &ty.to_lowercase()).unwrap();
             let topic =
@@ -160,15 +166,15 @@ impl Car {
             std::mem::forget(publisher);
             guid
         });
-        Self { participant, _node: node, writers, asked, stop, serving }
+        Self { participant, _node: node, writers, requests, stop, serving }
     }
 
-    /// Announces the writers once more, with the hashes of their types: RustDDS has no way to say
-    /// them.
+    /// Announces the writers again with the hashes of their types, for which RustDDS has no
+    /// interface.
     fn announce_hashes(&self, dds: &Dds, domain: u16) {
-        both(dds);
+        wait_for_both(dds);
         let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
-        // Numbers that were used are not looked at again. What is said last was heard last.
+        // Sequence numbers that were used are ignored. The last announcement is processed last.
         for seq in 1..60 {
             let (guid, topic, ty, hash) = match seq {
                 50.. => (GUID::default(), "rt/mark", "car_msgs::msg::dds_::Mark_", WHEEL),
@@ -205,24 +211,24 @@ impl Drop for Car {
 
 fn serve(
     server: &Server<Request, Response>,
-    say: Say,
-    asked: &Mutex<Vec<Request>>,
+    respond: Respond,
+    requests: &Mutex<Vec<Request>>,
     stop: &AtomicBool,
 ) {
     while !stop.load(Ordering::Relaxed) {
         match server.receive_request() {
             Ok(Some((id, request))) => {
-                let response = say(&request);
-                asked.lock().unwrap().push(request);
+                let response = respond(&request);
+                requests.lock().unwrap().push(request);
                 server.send_response(id, response).unwrap();
             }
-            // Also what is not meant for this mapping.
+            // Errors include requests that are not for this mapping.
             Ok(None) | Err(_) => thread::sleep(Duration::from_millis(2)),
         }
     }
 }
 
-/// A writer, as discovery announces it: DATA of the writer of publications.
+/// The announcement of a writer: DATA of the built-in publications writer.
 fn announcement(writer: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Vec<u8> {
     let text = |text: &str| {
         let mut value = (text.len() as u32 + 1).to_le_bytes().to_vec();
@@ -254,15 +260,15 @@ fn announcement(writer: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Ve
     super::hostile::packet(writer, 0x15, &body)
 }
 
-fn both(dds: &Dds) {
+fn wait_for_both(dds: &Dds) {
     // A node writes a topic of its own accord, too.
     let found = |name: &str| dds.discovered().iter().any(|topic| topic.topic == name);
     until("both topics", || found("/wheel") && found("/tyre"));
 }
 
-/// Waits as whoever records does: until there are definitions, or none will come.
+/// Waits as a recorder does: until there are definitions, or none will come.
 fn wait(dds: &Dds, topic: &str) -> bool {
-    until("the end of asking", || {
+    until("the end of the query", || {
         dds.definitions(topic).is_ok() || !dds.definitions_may_come(topic)
     });
     let found = dds.definitions(topic);
@@ -277,7 +283,7 @@ fn text(dds: &Dds, topic: &str) -> Option<String> {
 }
 
 fn open(domain: u16) -> Dds {
-    Dds::open(Options { largest: 0, ..options(domain) }).unwrap()
+    Dds::open(DdsOptions { largest: 0, ..options(domain) }).unwrap()
 }
 
 fn answered(mapping: ServiceMapping) {
@@ -286,7 +292,7 @@ fn answered(mapping: ServiceMapping) {
     let car = Car::join(domain, Some((mapping, honest)));
     car.announce_hashes(&dds, domain);
     assert_eq!(text(&dds, "/wheel"), None);
-    // One after the other, whoever asks first.
+    // One after the other, in any order.
     assert!(dds.definitions_may_come("/wheel") && dds.definitions_may_come("/tyre"));
     assert!(wait(&dds, "/tyre") && wait(&dds, "/wheel"));
     let definitions = dds.definitions("/wheel").unwrap();
@@ -297,14 +303,17 @@ fn answered(mapping: ServiceMapping) {
         type_hash: hash.to_owned(),
         include_type_sources: true,
     };
-    // As often as it took, on a slow machine.
-    let mut asked = car.asked.lock().unwrap().clone();
-    asked.sort_by(|a, b| b.type_name.cmp(&a.type_name));
-    asked.dedup();
-    assert_eq!(asked, [request("car_msgs/msg/Wheel", WHEEL), request("car_msgs/msg/Tyre", TYRE)]);
+    // On a slow machine there may be repeated requests.
+    let mut requests = car.requests.lock().unwrap().clone();
+    requests.sort_by(|a, b| b.type_name.cmp(&a.type_name));
+    requests.dedup();
+    assert_eq!(
+        requests,
+        [request("car_msgs/msg/Wheel", WHEEL), request("car_msgs/msg/Tyre", TYRE)]
+    );
 }
 
-/// By plain RustDDS, with a header: see `docs/dds-limits.md` on what happens without.
+/// With plain RustDDS, and with a header: see `docs/dds-limits.md` on the case without.
 fn long() {
     const TEXT: usize = 400_000;
     let domain = domain();
@@ -333,8 +342,8 @@ fn long() {
     let mut answer = honest(&request);
     answer.sources[0].2 += &"# A long story.\n".repeat(TEXT / 16);
     let answer = CDRSerializerAdapter::<Response>::to_bytes(&answer).unwrap();
-    until("the end of asking", || {
-        // With a header there is a number in front of the name's length.
+    until("the end of the query", || {
+        // With a header there is a number before the length of the name.
         if let Some(request) = take(&requests).filter(|request| request[4..8] != *b"car_") {
             let padding = vec![0; answer.len().next_multiple_of(4) - answer.len()];
             write(&replies, &[&request[..16], &answer, &padding].concat());
@@ -348,37 +357,38 @@ fn long() {
 fn refused() {
     let domain = domain();
     let dds = open(domain);
-    let say: Say = |_| Response { failure_reason: "not today".to_owned(), ..Response::default() };
-    let car = Car::join(domain, Some((ServiceMapping::Enhanced, say)));
+    let respond: Respond =
+        |_| Response { failure_reason: "not today".to_owned(), ..Response::default() };
+    let car = Car::join(domain, Some((ServiceMapping::Enhanced, respond)));
     car.announce_hashes(&dds, domain);
     assert!(!wait(&dds, "/wheel"));
-    // On a slow machine, one that answers late may be asked in the other way, which it does not
-    // understand.
-    assert!((1..=3).contains(&car.asked.lock().unwrap().len()), "{:?}", car.asked);
-    assert!(!dds.definitions_may_come("/wheel"), "that was all");
+    // On a slow machine, a node that answers late may be queried with the other mapping, which it
+    // does not support.
+    assert!((1..=3).contains(&car.requests.lock().unwrap().len()), "{:?}", car.requests);
+    assert!(!dds.definitions_may_come("/wheel"), "no further query");
 }
 
-fn lied() {
+fn wrong_hash() {
     let domain = domain();
     let dds = open(domain);
-    let say: Say = |request| {
+    let respond: Respond = |request| {
         let mut response = honest(request);
         response.root.fields.pop();
         response
     };
-    let car = Car::join(domain, Some((ServiceMapping::Enhanced, say)));
+    let car = Car::join(domain, Some((ServiceMapping::Enhanced, respond)));
     car.announce_hashes(&dds, domain);
     assert!(!wait(&dds, "/wheel"));
-    assert!(!car.asked.lock().unwrap().is_empty());
+    assert!(!car.requests.lock().unwrap().is_empty());
 }
 
 fn no_hash() {
     let domain = domain();
     let dds = open(domain);
     let car = Car::join(domain, Some((ServiceMapping::Enhanced, honest)));
-    both(&dds);
+    wait_for_both(&dds);
     assert!(!wait(&dds, "/wheel"));
-    assert!(car.asked.lock().unwrap().is_empty());
+    assert!(car.requests.lock().unwrap().is_empty());
 }
 
 fn no_service() {
@@ -389,13 +399,13 @@ fn no_service() {
     assert!(!wait(&dds, "/wheel"));
 }
 
-fn nobody() {
+fn no_writer() {
     let domain = domain();
     let mut dds = open(domain);
     let spec = gleaner_transport::TopicSpec {
         type_name: "car_msgs/msg/Wheel".to_owned(),
         ..super::peer::spec("/wheel", gleaner_transport::Qos::Auto)
     };
-    dds.subscribe(&spec, super::peer::Kept::new()).unwrap();
+    dds.subscribe(&spec, super::peer::KeptSamples::new()).unwrap();
     assert!(!wait(&dds, "/wheel"));
 }

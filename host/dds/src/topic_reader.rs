@@ -1,4 +1,4 @@
-//! One subscription: its reader, what it asks for, and the way of its samples to the sink.
+//! A subscription: its reader, its requested QoS, and the delivery of its samples to the sink.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -12,60 +12,60 @@ use rustdds::{DomainParticipant, GUID, RTPSEntity, Timestamp, TopicKind};
 use tracing::{info, warn};
 
 use super::names::{dds_topic, dds_type, ros_type, visible};
-use super::offers::{Offer, Request, in_words};
-use super::raw::{CopyInto, CopyOrSay, Held, PassOver, Raw, RawReader};
-use super::state::{Once, State, Told, lock, panic_text};
-use super::types::Types;
+use super::qos::{Offer, Request, describe};
+use super::raw::{CopiedTo, CopyInto, CopyOrReport, Discard, Raw, RawReader};
+use super::state::{OnceLog, ParticipantState, SubscriptionStatus, lock, panic_text};
+use super::type_check::TypeCheck;
 use gleaner_transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
 
-/// What RustDDS may keep of a topic: it frees a sample when newer ones have taken its place, not
-/// when it was taken.
+/// Memory and number of samples that RustDDS may keep for a topic: it frees a sample when newer
+/// ones have taken its place, not when it is taken.
 const KEPT_BYTES: usize = 64 << 20;
 const KEPT: std::ops::RangeInclusive<usize> = 4..=1024;
-/// However long a queue is asked for.
+/// Hard caps on the queue, whatever the subscription requests.
 const MOST_KEPT_BYTES: usize = 1 << 30;
 const MOST_KEPT: usize = 65_536;
-/// Sentences of qos_warnings: those of now, and those of times when it was asked again.
-const TROUBLE: usize = 12;
-const REMEMBERED: usize = 4;
+/// Most warnings in the status, and most past re-subscriptions among them.
+const MOST_WARNINGS: usize = 12;
+const MOST_RESUBSCRIBED: usize = 4;
 
-/// The first token of a reader.
+/// The token of the first reader.
 const FIRST: usize = 16;
 
 /// One subscription.
-pub(super) struct Feed {
+pub(super) struct TopicReader {
     index: usize,
     spec: TopicSpec,
     topic: String,
     type_name: String,
     /// `None` after it panicked.
     sink: Option<Arc<dyn Sink>>,
-    told: Arc<Told>,
+    status: Arc<SubscriptionStatus>,
     reader: Option<RawReader>,
     request: Option<Request>,
-    /// No writer offered this topic at the last look.
-    alone: bool,
-    /// What an earlier reader had read: the samples that RustDDS keeps of a topic are there for a
-    /// new reader, too.
+    /// True if the topic had no writer of the type at the last update.
+    without_writers: bool,
+    /// The sequence numbers that an earlier reader has read: a new reader gets the samples that
+    /// RustDDS keeps for the topic again.
     read_before: Gaps,
     gaps: Gaps,
-    types: Types,
-    asked_again: Vec<String>,
-    once: Once,
-    /// Samples may wait.
+    type_check: TypeCheck,
+    resubscribed: Vec<String>,
+    once: OnceLog,
+    /// True if samples may be waiting.
     pub(super) ready: bool,
 }
 
-/// What all feeds need.
-pub(super) struct Around<'a> {
+/// The parts of the receive thread that all readers need.
+pub(super) struct ReceiveContext<'a> {
     pub(super) participant: &'a DomainParticipant,
     pub(super) registry: &'a Registry,
-    pub(super) state: &'a State,
+    pub(super) state: &'a ParticipantState,
     pub(super) memory: &'a RefCell<Vec<u8>>,
     pub(super) clock: Clock,
 }
 
-/// By which the poll names the reader of a subscription; those before are the receive thread's own.
+/// The mio token of a subscription's reader; lower tokens are the receive thread's own.
 pub(super) fn token(index: usize) -> Token {
     Token(FIRST + index)
 }
@@ -75,7 +75,7 @@ pub(super) fn index(token: Token) -> Option<usize> {
     token.0.checked_sub(FIRST)
 }
 
-/// How many samples RustDDS keeps of a topic.
+/// Number of samples that RustDDS keeps for a topic.
 fn kept(spec: &TopicSpec) -> usize {
     let bytes = spec.max_bytes.max(1);
     let (least, most) = KEPT.into_inner();
@@ -87,13 +87,13 @@ fn kept(spec: &TopicSpec) -> usize {
     asked.min(most_kept).max((KEPT_BYTES / bytes).clamp(least, most))
 }
 
-impl Feed {
-    /// `None` if a name is none in ROS 2.
+impl TopicReader {
+    /// Returns `None` if a name is not valid in ROS 2.
     pub(super) fn new(
         index: usize,
         spec: &TopicSpec,
         sink: Arc<dyn Sink>,
-        told: Arc<Told>,
+        status: Arc<SubscriptionStatus>,
     ) -> Option<Self> {
         Some(Self {
             index,
@@ -101,15 +101,15 @@ impl Feed {
             type_name: dds_type(&spec.type_name)?,
             spec: spec.clone(),
             sink: Some(sink),
-            told,
+            status,
             reader: None,
             request: None,
-            alone: true,
+            without_writers: true,
             read_before: Gaps::default(),
             gaps: Gaps::default(),
-            types: Types::default(),
-            asked_again: Vec::new(),
-            once: Once::default(),
+            type_check: TypeCheck::default(),
+            resubscribed: Vec::new(),
+            once: OnceLog::default(),
             ready: false,
         })
     }
@@ -123,42 +123,46 @@ impl Feed {
         self.reader.as_ref().map(RTPSEntity::guid)
     }
 
-    /// Hands over what has come, at most `most` samples.
-    pub(super) fn take(&mut self, around: &Around<'_>, most: usize) {
+    /// Delivers waiting samples, at most `most`.
+    pub(super) fn take(&mut self, context: &ReceiveContext<'_>, most: usize) {
         self.ready = false;
         // Taken out, so that the reader can be used while the counts change.
         let Some(reader) = self.reader.take() else { return };
-        // Before the samples are looked at: one that comes after the last look has to notify again.
+        // Before the samples are read, so that a sample that arrives after the last read notifies
+        // again.
         reader.drain_read_notifications();
         for taken in 0.. {
             if taken == most {
                 self.ready = true;
                 break;
             }
-            around.state.deliver(self.index);
+            context.state.deliver(self.index);
             let sink = self.sink.as_deref();
-            let change = reader.try_take_one_with(CopyOrSay(CopyInto {
+            let change = reader.try_take_one_with(CopyOrReport(CopyInto {
                 sink,
-                memory: around.memory,
-                clock: around.clock,
+                memory: context.memory,
+                clock: context.clock,
             }));
-            around.state.deliver(self.index);
+            context.state.deliver(self.index);
             match change {
                 Ok(None) => break,
                 Ok(Some(change)) => {
                     let writer = Guid(change.writer_guid.to_bytes());
                     let seq = u64::try_from(i64::from(change.sequence_number)).unwrap_or(0).max(1);
-                    let other =
-                        self.types.is_backing_off(around.participant, writer, &self.type_name);
+                    let other = self.type_check.is_of_another_type(
+                        context.participant,
+                        writer,
+                        &self.type_name,
+                    );
                     if !other && !self.read_before.has(writer, seq) {
                         let publish_ns =
                             change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
-                        self.deliver(around, writer, seq, publish_ns, change.sample);
+                        self.deliver(context, writer, seq, publish_ns, change.sample);
                     }
                 }
                 Err(ReadError::Deserialization { reason }) => self.note_malformed(&reason),
                 Err(error) => {
-                    around.state.die(format!(
+                    context.state.die(format!(
                         "topic `{}` cannot be read: {}",
                         self.spec.topic,
                         visible(&error.to_string())
@@ -167,16 +171,28 @@ impl Feed {
                 }
             }
         }
-        self.told.lost.store(self.gaps.lost(), Relaxed);
+        self.status.lost.store(self.gaps.lost(), Relaxed);
         self.reader = Some(reader);
     }
 
-    fn deliver(&mut self, around: &Around<'_>, writer: Guid, seq: u64, publish_ns: i64, raw: Raw) {
+    fn deliver(
+        &mut self,
+        context: &ReceiveContext<'_>,
+        writer: Guid,
+        seq: u64,
+        publish_ns: i64,
+        raw: Raw,
+    ) {
         let missing = self.gaps.note(writer, seq);
         if missing > 0 && self.once.first("lost", "") {
-            warn!(topic = %self.spec.topic, %writer, missing, "samples were lost on their way; said once, counted further");
+            warn!(
+                topic = %self.spec.topic,
+                %writer,
+                missing,
+                "samples lost in transit (logged once, still counted)"
+            );
         }
-        if let Held::Unreadable(why) = &raw.held {
+        if let CopiedTo::Unreadable(why) = &raw.copied_to {
             return self.note_malformed(why);
         }
         let Some(sink) = &self.sink else { return };
@@ -188,75 +204,75 @@ impl Feed {
             endian: raw.endian,
             options: [0; 2],
         };
-        around.state.deliver(self.index);
-        let delivered = match raw.held {
-            Held::Sink => catch_unwind(AssertUnwindSafe(|| sink.accept(&meta))),
-            Held::Memory => catch_unwind(AssertUnwindSafe(|| {
-                sink.deliver(&meta, &around.memory.borrow());
+        context.state.deliver(self.index);
+        let delivered = match raw.copied_to {
+            CopiedTo::Sink => catch_unwind(AssertUnwindSafe(|| sink.accept(&meta))),
+            CopiedTo::SharedMemory => catch_unwind(AssertUnwindSafe(|| {
+                sink.deliver(&meta, &context.memory.borrow());
             })),
-            Held::Nobody(text) | Held::Unreadable(text) => {
+            CopiedTo::SinkPanicked(text) | CopiedTo::Unreadable(text) => {
                 Err(Box::new(text) as Box<dyn Any + Send>)
             }
         };
-        around.state.deliver(self.index);
-        around.state.handled.fetch_add(1, Relaxed);
+        context.state.deliver(self.index);
+        context.state.handled.fetch_add(1, Relaxed);
         if let Err(panic) = delivered {
             let text = panic_text(&*panic);
-            around.state.die(format!("the sink of topic `{}` panicked: {text}", self.spec.topic));
+            context.state.die(format!("the sink of topic `{}` panicked: {text}", self.spec.topic));
             self.sink = None;
         }
     }
 
     fn note_malformed(&mut self, reason: &str) {
-        self.told.malformed.fetch_add(1, Relaxed);
+        self.status.malformed.fetch_add(1, Relaxed);
         if self.once.first("malformed", "") {
             warn!(topic = %self.spec.topic, reason = visible(reason), "malformed sample");
         }
     }
 
-    /// Looks at what is offered, and asks for what all offer.
-    pub(super) fn look(&mut self, around: &Around<'_>, offers: &[Offer]) {
+    /// Requests the QoS that all current writers offer, and updates the status.
+    pub(super) fn update(&mut self, context: &ReceiveContext<'_>, offers: &[Offer]) {
         let here: Vec<&Offer> = offers.iter().filter(|offer| offer.topic == self.topic).collect();
-        let (ours, others): (Vec<&Offer>, Vec<&Offer>) =
+        let (same, others): (Vec<&Offer>, Vec<&Offer>) =
             here.into_iter().partition(|offer| offer.type_name == self.type_name);
         let wanted = match self.spec.qos {
             Qos::Fixed { reliable, transient_local, .. } => {
                 Some(Request { reliable, transient_local })
             }
-            Qos::Auto if ours.is_empty() => None,
-            Qos::Auto => Some(Request::of_all(ours.iter().copied())),
+            Qos::Auto if same.is_empty() => None,
+            Qos::Auto => Some(Request::of_all(same.iter().copied())),
         };
         if let Some(wanted) = wanted {
             match self.request {
-                None => self.ask(around, wanted),
-                // Asking for more would lose samples for no need, unless there is nobody to lose
-                // them from.
-                Some(now) if now != wanted && (self.alone || !now.within(wanted)) => {
-                    let unheard = ours.iter().find(|offer| !now.within(Request::of_all([**offer])));
-                    self.ask_again(around, now, wanted, unheard.copied());
+                None => self.subscribe(context, wanted),
+                // A stronger request would lose samples needlessly, unless there are no writers.
+                Some(now) if now != wanted && (self.without_writers || !now.within(wanted)) => {
+                    let weaker = same.iter().find(|offer| !now.within(Request::of_all([**offer])));
+                    self.resubscribe(context, now, wanted, weaker.copied());
                 }
                 Some(_) => {}
             }
         }
-        self.alone = ours.is_empty();
-        self.types.note(&ours, &others);
-        let qos_warnings = self.qos_warnings(&ours, &others);
+        self.without_writers = same.is_empty();
+        self.type_check.note(&same, &others);
+        let qos_warnings = self.qos_warnings(&same, &others);
         for (cause, sentence) in &qos_warnings {
             if self.once.first(cause, sentence) {
                 warn!(topic = %self.spec.topic, "{sentence}");
             }
         }
-        let mut words = lock(&self.told.words);
-        words.reader = self.guid();
-        words.qos =
+        let mut text = lock(&self.status.text);
+        text.reader = self.guid();
+        text.qos =
             self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
-        words.qos_warnings = qos_warnings.into_iter().map(|(_, sentence)| sentence).collect();
-        words.qos_warnings.extend_from_slice(&self.asked_again);
-        words.qos_warnings.extend(self.types.qos_warnings(&self.spec.topic));
+        text.qos_warnings = qos_warnings.into_iter().map(|(_, sentence)| sentence).collect();
+        text.qos_warnings.extend_from_slice(&self.resubscribed);
+        text.qos_warnings.extend(self.type_check.warning(&self.spec.topic));
     }
 
-    /// Why writers are not heard, or not as they could be: causes, and sentences.
-    fn qos_warnings(&self, ours: &[&Offer], others: &[&Offer]) -> Vec<(&'static str, String)> {
+    /// Warnings about writers whose samples are not received, or not with the QoS they offer:
+    /// cause, and sentence.
+    fn qos_warnings(&self, same: &[&Offer], others: &[&Offer]) -> Vec<(&'static str, String)> {
         let topic = &self.spec.topic;
         let of_another_type = others.iter().map(|offer| {
             let (found, wanted) = (visible(&ros_type(&offer.type_name)), ros_type(&self.type_name));
@@ -265,81 +281,90 @@ impl Feed {
                 format!("writer {} of `{topic}` sends `{found}`, not `{wanted}`", offer.guid),
             )
         });
-        let mut qos_warnings: Vec<_> = of_another_type.take(TROUBLE / 2).collect();
+        let mut qos_warnings: Vec<_> = of_another_type.take(MOST_WARNINGS / 2).collect();
         let Some(request) = self.request else { return qos_warnings };
         let policies = request.policies(1);
-        for offer in ours {
+        for offer in same {
             if let Some(policy) = offer.qos.compliance_failure_wrt(&policies) {
-                let offered = in_words(&offer.qos);
+                let offered = describe(&offer.qos);
                 let sentence = format!(
-                    "writer {} of `{topic}` offers {offered}, asked for is {request}: {policy:?} does not fit",
+                    "writer {} of `{topic}` offers {offered}, but {request} is requested: \
+                     {policy:?} is incompatible",
                     offer.guid
                 );
                 qos_warnings.push(("offers less", sentence));
             }
         }
-        let most = Request::of_all(ours.first().copied());
-        if let Some(other) = ours.iter().find(|offer| Request::of_all([**offer]) != most)
+        let most = Request::of_all(same.first().copied());
+        if let Some(other) = same.iter().find(|offer| Request::of_all([**offer]) != most)
             && self.spec.qos == Qos::Auto
         {
-            let (a, b) = (in_words(&ours[0].qos), in_words(&other.qos));
-            let (first, second) = (ours[0].guid, other.guid);
+            let (a, b) = (describe(&same[0].qos), describe(&other.qos));
+            let (first, second) = (same[0].guid, other.guid);
             let sentence = format!(
-                "writers of `{topic}` differ, {first} offers {a} and {second} {b}: all are asked for {request}"
+                "writers of `{topic}` differ: {first} offers {a}, {second} offers {b}; \
+                 {request} is requested of all"
             );
             qos_warnings.push(("differ", sentence));
         }
-        qos_warnings.truncate(TROUBLE);
+        qos_warnings.truncate(MOST_WARNINGS);
         qos_warnings
     }
 
-    fn ask_again(
+    fn resubscribe(
         &mut self,
-        around: &Around<'_>,
+        context: &ReceiveContext<'_>,
         now: Request,
         wanted: Request,
         because: Option<&Offer>,
     ) {
         if let Some(offer) = because {
-            let (topic, writer, offered) = (&self.spec.topic, offer.guid, in_words(&offer.qos));
-            warn!(%topic, %writer, offered, asked = %now, asking = %wanted, "a writer offers less: asking again");
-            let sentence = format!(
-                "`{topic}` was asked for again, {wanted} instead of {now}, because of writer {writer}: {offered}"
+            let (topic, writer, offered) = (&self.spec.topic, offer.guid, describe(&offer.qos));
+            warn!(
+                %topic,
+                %writer,
+                offered,
+                before = %now,
+                now = %wanted,
+                "re-subscribing with weaker QoS for a new writer"
             );
-            if self.asked_again.len() == REMEMBERED {
-                self.asked_again.remove(0);
+            let sentence = format!(
+                "`{topic}` was re-subscribed with {wanted} instead of {now}: \
+                 writer {writer} offers {offered}"
+            );
+            if self.resubscribed.len() == MOST_RESUBSCRIBED {
+                self.resubscribed.remove(0);
             }
-            self.asked_again.push(sentence);
+            self.resubscribed.push(sentence);
         }
-        self.ask(around, wanted);
+        self.subscribe(context, wanted);
     }
 
-    /// Makes a reader, and then gives up the one that there was.
-    fn ask(&mut self, around: &Around<'_>, request: Request) {
-        let mut reader = match self.reader_of(around, request) {
+    /// Creates a reader, then removes the old one.
+    fn subscribe(&mut self, context: &ReceiveContext<'_>, request: Request) {
+        let mut reader = match self.create_reader(context, request) {
             Ok(reader) => reader,
-            // Tried again at the next look.
+            // Retried at the next update.
             Err(error) => {
                 if self.once.first("reader", "") {
-                    warn!(topic = %self.spec.topic, error, "no reader; trying again");
+                    warn!(topic = %self.spec.topic, error, "cannot create a reader; retrying");
                 }
                 return;
             }
         };
         if let Err(error) =
-            around.registry.register(&mut reader, token(self.index), Interest::READABLE)
+            context.registry.register(&mut reader, token(self.index), Interest::READABLE)
         {
-            around.state.die(format!("topic `{}` cannot be waited for: {error}", self.spec.topic));
+            context.state.die(format!("topic `{}` cannot be polled: {error}", self.spec.topic));
             return;
         }
         if self.reader.is_some() {
-            self.take(around, MOST_KEPT);
+            self.take(context, MOST_KEPT);
             self.read_before = self.gaps.clone();
-            self.give_up(around);
+            self.remove_reader(context);
         } else if !request.transient_local {
-            // What is kept of the topic from an earlier subscription is none of this one's
-            // business.
-            let mut kept = (0..MOST_KEPT).map(|_| reader.try_take_one_with(PassOver));
+            // Samples cached for an earlier subscription are skipped.
+            let mut kept = (0..MOST_KEPT).map(|_| reader.try_take_one_with(Discard));
             kept.find(|passed| {
                 !matches!(passed, Ok(Some(_)) | Err(ReadError::Deserialization { .. }))
             });
@@ -350,11 +375,15 @@ impl Feed {
         self.ready = true;
     }
 
-    fn reader_of(&self, around: &Around<'_>, request: Request) -> Result<RawReader, String> {
+    fn create_reader(
+        &self,
+        context: &ReceiveContext<'_>,
+        request: Request,
+    ) -> Result<RawReader, String> {
         let policies = request.policies(kept(&self.spec));
         let made = (|| {
-            // The topic first, with its limits: they only ever grow.
-            let participant = around.participant;
+            // The topic first, with its limits: RustDDS only ever raises them.
+            let participant = context.participant;
             let (name, type_name) = (self.topic.clone(), self.type_name.clone());
             let topic = participant.create_topic(name, type_name, &policies, TopicKind::NoKey)?;
             let subscriber = participant.create_subscriber(&policies)?;
@@ -362,15 +391,15 @@ impl Feed {
         })();
         let reader: RawReader =
             made.map_err(|error: rustdds::dds::CreateError| visible(&error.to_string()))?;
-        around.state.peers().follow(reader.guid());
+        context.state.peers().follow(reader.guid());
         Ok(reader)
     }
 
-    fn give_up(&mut self, around: &Around<'_>) {
+    fn remove_reader(&mut self, context: &ReceiveContext<'_>) {
         if let Some(mut reader) = self.reader.take() {
-            // It is gone at once; what the poll thinks of it does not matter any more.
-            drop(around.registry.deregister(&mut reader));
-            around.state.peers().forget(reader.guid());
+            // The reader is dropped anyway; an error of the poll does not matter.
+            drop(context.registry.deregister(&mut reader));
+            context.state.peers().forget(reader.guid());
         }
     }
 }

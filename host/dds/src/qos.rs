@@ -1,4 +1,4 @@
-//! What writers offer, and what is asked of them.
+//! Quality of service: the offers of writers, and the request of a subscription.
 
 use std::fmt::{self, Write as _};
 
@@ -8,30 +8,30 @@ use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 use super::Distro;
 use gleaner_transport::Guid;
 
-/// Most writers whose offers are written down for a recording.
+/// Most writers whose offers are recorded.
 const NOTED: usize = 64;
 
-/// What a subscription asks for.
+/// The policies that a subscription requests.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) struct Request {
     pub(super) reliable: bool,
     pub(super) transient_local: bool,
 }
 
-/// A writer, as it is announced.
+/// A writer, as it was announced.
 #[derive(Clone, Debug)]
 pub(super) struct Offer {
     pub(super) guid: Guid,
-    /// As DDS spells it.
+    /// The DDS name.
     pub(super) topic: String,
-    /// As DDS spells it.
+    /// The DDS name.
     pub(super) type_name: String,
     pub(super) qos: QosPolicies,
 }
 
 impl Request {
-    /// The most that all of `offers` satisfy, as `ros2 bag record` asks: one writer that is not
-    /// reliable, or that keeps nothing for late readers, decides for all.
+    /// The strongest request that all of `offers` satisfy, as in `ros2 bag record`: one writer that
+    /// is not reliable, or that keeps nothing for late readers, decides for all.
     pub(super) fn of_all<'a>(offers: impl IntoIterator<Item = &'a Offer>) -> Self {
         offers.into_iter().fold(Self { reliable: true, transient_local: true }, |all, offer| Self {
             reliable: all.reliable && reliable(&offer.qos),
@@ -39,7 +39,7 @@ impl Request {
         })
     }
 
-    /// Whether everything asked for here is asked for by `other`, too.
+    /// Returns whether `other` requests at least as much.
     pub(super) fn within(self, other: Self) -> bool {
         self.reliable <= other.reliable && self.transient_local <= other.transient_local
     }
@@ -85,8 +85,8 @@ fn transient_local(qos: &QosPolicies) -> bool {
     qos.durability().is_some_and(|durability| durability >= Durability::TransientLocal)
 }
 
-/// What a writer offers, in words.
-pub(super) fn in_words(qos: &QosPolicies) -> String {
+/// Describes the offer of a writer.
+pub(super) fn describe(qos: &QosPolicies) -> String {
     let mut words =
         Request { reliable: reliable(qos), transient_local: transient_local(qos) }.to_string();
     if let Some(Deadline(period)) =
@@ -101,8 +101,8 @@ pub(super) fn in_words(qos: &QosPolicies) -> String {
     words
 }
 
-/// The offers as rosbag2 notes them: with numbers up to Iron, with names after it. What DDS does
-/// not announce, the depth of a writer's history, is said to be unknown.
+/// The offers in the format of rosbag2: with numbers up to Iron, with names after it. The depth of
+/// a writer's history, which DDS does not announce, is given as unknown.
 pub(super) fn as_rosbag2(offers: &[&Offer], distro: Option<Distro>) -> Option<String> {
     let numbers = distro == Some(Distro::Humble);
     let mut yaml = String::new();
@@ -127,7 +127,8 @@ pub(super) fn as_rosbag2(offers: &[&Offer], distro: Option<Distro>) -> Option<St
         let lease = qos.liveliness().map(|liveliness| liveliness.duration());
         let _ = write!(
             yaml,
-            "- history: {history}\n  depth: 0\n  reliability: {reliability}\n  durability: {durability}\n  deadline:\n{}  \
+            "- history: {history}\n  depth: 0\n  reliability: {reliability}\n  \
+             durability: {durability}\n  deadline:\n{}  \
              lifespan:\n{}  liveliness: {liveliness}\n  liveliness_lease_duration:\n{}  \
              avoid_ros_namespace_conventions: false\n",
             period(qos.deadline().map(|deadline| deadline.0)),
@@ -138,8 +139,8 @@ pub(super) fn as_rosbag2(offers: &[&Offer], distro: Option<Distro>) -> Option<St
     (!yaml.is_empty()).then(|| yaml.trim_end().to_owned())
 }
 
-/// ROS 2 writes "without end" as the longest time that 64 bits of nanoseconds hold, cut in seconds
-/// and the rest.
+/// ROS 2 writes an infinite period as the longest time that 64 bits of nanoseconds hold, split in
+/// seconds and the rest.
 fn period(period: Option<Duration>) -> String {
     let endless = i64::MAX;
     let ns = period
@@ -177,7 +178,7 @@ mod tests {
     fn a_writer_that_announces_nothing_has_the_defaults_of_dds() {
         let silent = Offer { qos: QosPolicies::default(), ..offer(false, false) };
         assert_eq!(Request::of_all([&silent]), Request { reliable: true, transient_local: false });
-        assert_eq!(in_words(&silent.qos), "reliable, volatile");
+        assert_eq!(describe(&silent.qos), "reliable, volatile");
     }
 
     #[test]

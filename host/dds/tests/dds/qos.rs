@@ -1,4 +1,4 @@
-//! What writers offer, and what is asked of them.
+//! Tests of offered and requested quality of service.
 
 use std::net::UdpSocket;
 use std::thread;
@@ -9,26 +9,25 @@ use rustdds::RTPSEntity;
 
 use super::Test;
 use super::hostile::{LITTLE, data, port};
-use super::peer::{Kept, Peer, connected, domain, matched, open, policies, spec, until, write};
+use super::peer::{
+    KeptSamples, Peer, connected, domain, matched, open, policies, spec, until, write,
+};
 
 pub const TESTS: &[Test] = &[
-    ("auto_asks_for_what_the_first_writer_offers_and_again_when_another_offers_less", auto_adapts),
-    ("auto_gets_what_a_writer_kept_for_late_readers", auto_transient_local),
-    ("auto_asks_for_more_again_when_all_writers_have_gone", auto_recovers),
-    ("a_fixed_request_that_a_writer_does_not_satisfy_is_trouble_with_names", fixed_does_not_fit),
-    (
-        "a_writer_of_another_type_is_trouble_with_both_types_and_none_of_its_samples_come",
-        another_type,
-    ),
-    ("a_number_that_is_far_ahead_hides_no_sample_from_a_reader_that_asks_again", far_ahead),
+    ("auto_requests_what_the_first_writer_offers_and_less_when_another_offers_less", auto_adapts),
+    ("auto_gets_the_samples_kept_for_late_readers", auto_transient_local),
+    ("auto_requests_more_again_when_all_writers_are_gone", auto_recovers),
+    ("a_fixed_request_that_a_writer_does_not_satisfy_is_a_warning", fixed_does_not_fit),
+    ("a_writer_of_another_type_is_a_warning_and_its_samples_are_skipped", another_type),
+    ("a_sequence_number_far_ahead_hides_no_sample_from_a_new_reader", far_ahead),
 ];
 
 fn auto_adapts() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/mixed", Qos::Auto), sink.clone()).unwrap();
-    assert_eq!(dds.status(subscription).qos, None, "nobody writes yet");
+    assert_eq!(dds.status(subscription).qos, None, "no writer yet");
     let peer = Peer::join(domain);
     let reliable = peer.writer("/mixed", true, false);
     assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("reliable, volatile"));
@@ -49,7 +48,7 @@ fn auto_adapts() {
         assert_eq!(
             samples.iter().filter(|bytes| **bytes == [n; 4]).count(),
             1,
-            "no sample comes a second time"
+            "no sample arrives twice"
         );
     }
     let qos_warnings = dds.status(subscription).qos_warnings;
@@ -59,7 +58,7 @@ fn auto_adapts() {
             .any(|line| line.contains("differ") && line.contains("best effort, volatile")),
         "{qos_warnings:?}"
     );
-    assert!(qos_warnings.iter().any(|line| line.contains("asked for again")), "{qos_warnings:?}");
+    assert!(qos_warnings.iter().any(|line| line.contains("re-subscribed")), "{qos_warnings:?}");
 }
 
 fn auto_transient_local() {
@@ -70,12 +69,12 @@ fn auto_transient_local() {
         write(&writer, &[n; 4]);
     }
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/map", Qos::Auto), sink.clone()).unwrap();
     assert_eq!(sink.bytes(5), (0..5).map(|n| vec![n; 4]).collect::<Vec<_>>());
     assert_eq!(dds.status(subscription).qos.as_deref(), Some("reliable, transient local"));
-    // The same once more for a subscription that comes when RustDDS has these samples already.
-    let late = Kept::new();
+    // The same for a subscription that is made when RustDDS already has these samples.
+    let late = KeptSamples::new();
     dds.subscribe(&spec("/map", Qos::Auto), late.clone()).unwrap();
     assert_eq!(late.bytes(5), (0..5).map(|n| vec![n; 4]).collect::<Vec<_>>());
 }
@@ -83,7 +82,7 @@ fn auto_transient_local() {
 fn auto_recovers() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/driver", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let weak = peer.writer("/driver", false, false);
@@ -93,14 +92,14 @@ fn auto_recovers() {
     assert_eq!(connected(&dds, subscription, 2).qos.as_deref(), Some("best effort, volatile"));
     drop((weak, strong));
     connected(&dds, subscription, 0);
-    // Not before it was seen that all have gone, which nobody tells.
+    // Not before all writers are seen to be gone, for which there is no event.
     let mut strong = None;
-    until("asking for more", || {
+    until("a stronger request", || {
         drop(strong.take());
         connected(&dds, subscription, 0);
         strong = Some(peer.writer("/driver", true, false));
-        // One that comes in the moment in which the reader is made anew is not always seen
-        // (docs/dds-limits.md): then the next one.
+        // A writer that is created in the moment in which the reader is replaced is not always
+        // discovered (docs/dds-limits.md): then the next one is.
         let begun = Instant::now();
         while dds.status(subscription).writers != Some(1)
             && begun.elapsed() < Duration::from_secs(3)
@@ -111,14 +110,14 @@ fn auto_recovers() {
         status.writers == Some(1) && status.qos.as_deref() == Some("reliable, volatile")
     });
     let strong = strong.unwrap();
-    sink.mark(&strong, b"is heard");
+    sink.mark(&strong, b"received");
 }
 
 fn fixed_does_not_fit() {
     let domain = domain();
     let mut dds = open(domain);
     let qos = Qos::Fixed { reliable: true, transient_local: false, depth: 5 };
-    let subscription = dds.subscribe(&spec("/strict", qos), Kept::new()).unwrap();
+    let subscription = dds.subscribe(&spec("/strict", qos), KeptSamples::new()).unwrap();
     let peer = Peer::join(domain);
     let _writer = peer.writer("/strict", false, false);
     until("qos_warnings", || !dds.status(subscription).qos_warnings.is_empty());
@@ -126,7 +125,8 @@ fn fixed_does_not_fit() {
     let [line] = status.qos_warnings.as_slice() else { panic!("{:?}", status.qos_warnings) };
     assert!(
         line.contains(
-            "`/strict` offers best effort, volatile, asked for is reliable, volatile: Reliability"
+            "`/strict` offers best effort, volatile, but reliable, volatile is requested: \
+             Reliability"
         ),
         "{line}"
     );
@@ -136,18 +136,18 @@ fn fixed_does_not_fit() {
 fn another_type() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/typed", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
-    let ours = peer.writer("/typed", true, false);
+    let same = peer.writer("/typed", true, false);
     connected(&dds, subscription, 1);
     let policies = policies(true, false);
     let topic = peer.topic("rt/typed", "sensor_msgs::msg::dds_::Imu_", &policies);
     let other = peer.writer_of::<super::peer::Little>(&topic, &policies);
     matched(&other);
-    // At once: nobody has looked at its type yet.
+    // At once, before its type was looked up.
     write(&other, b"of the other");
-    let skipped = "1 sample of `/typed`, of another type, passed over";
+    let skipped = "1 sample of `/typed` skipped: another type";
     until("qos_warnings", || {
         dds.status(subscription).qos_warnings.iter().any(|line| line == skipped)
     });
@@ -156,14 +156,14 @@ fn another_type() {
         qos_warnings[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"),
         "{qos_warnings:?}"
     );
-    sink.mark(&ours, b"of ours.");
-    assert!(sink.bytes(1).iter().all(|bytes| bytes == b"of ours."));
+    sink.mark(&same, b"correct.");
+    assert!(sink.bytes(1).iter().all(|bytes| bytes == b"correct."));
 }
 
 fn far_ahead() {
     let domain = domain();
     let mut dds = open(domain);
-    let sink = Kept::new();
+    let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/far", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
     let writer = peer.writer("/far", false, true);
@@ -181,5 +181,5 @@ fn far_ahead() {
     let _less = peer.writer("/far", false, false);
     assert_eq!(connected(&dds, subscription, 2).qos.as_deref(), Some("best effort, volatile"));
     sink.mark(&writer, b"near");
-    assert!(sink.bytes(3)[2..].iter().all(|bytes| bytes == b"near"), "nothing comes a second time");
+    assert!(sink.bytes(3)[2..].iter().all(|bytes| bytes == b"near"), "nothing arrives twice");
 }

@@ -1,4 +1,4 @@
-//! Keeps hostile packets away from RustDDS, by a filter on its sockets.
+//! Attaches a filter against hostile packets to the sockets of RustDDS.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -8,43 +8,47 @@ use tracing::warn;
 
 use super::filter::{KNOWN, Prefix, program};
 use super::sockets::Sockets;
-use super::state::State;
+use super::state::ParticipantState;
 
-/// Memory for options of a socket that is enough for a filter.
+/// A limit of socket option memory that is enough for a filter.
 const OPTIONS: &str = "sysctl -w net.core.optmem_max=131072";
 
 /// The filter of a participant's sockets.
-pub(super) struct Guard {
+pub(super) struct PacketFilter {
     sockets: Vec<OwnedFd>,
     own: Prefix,
-    /// What the filter lets pass.
+    /// The current limits of the filter.
     set: Option<(usize, Option<Vec<Prefix>>)>,
 }
 
-impl Guard {
-    /// Attaches a filter that nothing passes which claims more than what discovery needs.
-    pub(super) fn new(sockets: &Sockets, own: Prefix, state: &State) -> Self {
+impl PacketFilter {
+    /// Attaches a filter that passes only what discovery needs.
+    pub(super) fn new(sockets: &Sockets, own: Prefix, state: &ParticipantState) -> Self {
         let duplicates = sockets.duplicates().and_then(|duplicates| match duplicates.is_empty() {
             true => Err(io::Error::other("the participant's sockets were not found")),
             false => Ok(duplicates),
         });
         let sockets = duplicates.unwrap_or_else(|error| {
-            tell(state, &error, "the kernel has to allow `pidfd_getfd`, as Linux 5.6 and newer do");
+            report(
+                state,
+                &error,
+                "the kernel has to allow `pidfd_getfd`, as Linux 5.6 and newer do",
+            );
             Vec::new()
         });
-        let mut guard = Self { sockets, own, set: None };
-        guard.update(0, &[], state);
-        guard
+        let mut filter = Self { sockets, own, set: None };
+        filter.update(0, &[], state);
+        filter
     }
 
-    /// From now on, fragments of samples of up to `largest` bytes pass, of these participants and
-    /// of our own.
-    pub(super) fn update(&mut self, largest: usize, others: &[Prefix], state: &State) {
+    /// Lets fragments of samples of up to `largest` bytes pass, of these participants and of our
+    /// own.
+    pub(super) fn update(&mut self, largest: usize, others: &[Prefix], state: &ParticipantState) {
         if self.sockets.is_empty() {
             return;
         }
-        // Whoever wants to be known announces itself. So if they are too many, nothing is lost by
-        // knowing all.
+        // An attacker can announce itself anyway. So with too many participants, nothing is lost by
+        // passing all.
         let known = (others.len() < KNOWN).then(|| [&[self.own], others].concat());
         let wanted = (largest, known);
         if self.set.as_ref() == Some(&wanted) {
@@ -54,13 +58,13 @@ impl Guard {
         for socket in &self.sockets {
             let socket = SockRef::from(socket);
             let attached = socket.attach_filter(&program).or_else(|_| {
-                // The old one and the new one may be too much together. The first time there is no
-                // old one.
+                // The old and the new filter may exceed the limit together. The first time there is
+                // no old one.
                 drop(socket.detach_filter());
                 socket.attach_filter(&program)
             });
             if let Err(error) = attached {
-                tell(state, &error, OPTIONS);
+                report(state, &error, OPTIONS);
                 self.sockets.clear();
                 return;
             }
@@ -69,7 +73,7 @@ impl Guard {
     }
 }
 
-fn tell(state: &State, error: &io::Error, help: &str) {
+fn report(state: &ParticipantState, error: &io::Error, help: &str) {
     warn!(%error, help, "no filter for hostile fragments: one packet may claim 4 GiB of memory");
     state.set_unfiltered(format!("no filter for hostile fragments: {error}"));
 }
