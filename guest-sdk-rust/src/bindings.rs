@@ -1,5 +1,5 @@
-//! What wit-bindgen generates from `wit/`, in a component. Only this crate's other files use it;
-//! natively `testing::bindings` takes its place.
+//! Bindings that wit-bindgen generates from `wit/` for a component. Only this crate uses them;
+//! natively `testing::bindings` replaces them.
 #![allow(unsafe_code, missing_docs, clippy::undocumented_unsafe_blocks)]
 
 wit_bindgen::generate!({

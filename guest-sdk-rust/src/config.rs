@@ -1,9 +1,9 @@
-//! The lambda's `[config]`, as the deployment set it.
+//! The `[config]` of the lambda, with the values of the deployment.
 
 use crate::bindings;
 use crate::{Error, Result};
 
-/// A value of `[config]`.
+/// Value of a `[config]` entry.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(missing_docs)]
 pub enum ConfigValue {
@@ -13,7 +13,8 @@ pub enum ConfigValue {
     Text(String),
 }
 
-/// The values of `[config]`, by key, in the manifest's order.
+/// Values of `[config]` by key, in the order of the manifest: those that the deployment sets, or
+/// else the defaults.
 ///
 /// ```
 /// use gleaner_sdk::{Config, ConfigValue};
@@ -26,21 +27,21 @@ pub enum ConfigValue {
 pub struct Config(Vec<(String, ConfigValue)>);
 
 impl Config {
-    /// A configuration with these values, for tests.
+    /// Creates a configuration with these values, for tests.
     pub fn new<'a>(values: impl IntoIterator<Item = (&'a str, ConfigValue)>) -> Self {
         Self(values.into_iter().map(|(key, value)| (key.to_owned(), value)).collect())
     }
 
-    /// The value of `key`, if the manifest has it.
+    /// Returns the value of `key`; none if the manifest has no such key.
     pub fn get(&self, key: &str) -> Option<&ConfigValue> {
         self.0.iter().find(|(name, _)| name == key).map(|(_, value)| value)
     }
 
-    /// A number; an integer is taken as one.
+    /// Returns the number at `key`. An integer is converted.
     ///
     /// # Errors
     ///
-    /// If there is no such key, or its value is no number.
+    /// If there is no such key, or its value is not a number.
     pub fn real(&self, key: &str) -> Result<f64> {
         match self.need(key)? {
             ConfigValue::Real(value) => Ok(*value),
@@ -49,11 +50,11 @@ impl Config {
         }
     }
 
-    /// An integer.
+    /// Returns the integer at `key`.
     ///
     /// # Errors
     ///
-    /// If there is no such key, or its value is no integer.
+    /// If there is no such key, or its value is not an integer.
     pub fn integer(&self, key: &str) -> Result<i64> {
         match self.need(key)? {
             ConfigValue::Integer(value) => Ok(*value),
@@ -61,11 +62,11 @@ impl Config {
         }
     }
 
-    /// True or false.
+    /// Returns the boolean at `key`.
     ///
     /// # Errors
     ///
-    /// If there is no such key, or its value is neither.
+    /// If there is no such key, or its value is not a boolean.
     pub fn boolean(&self, key: &str) -> Result<bool> {
         match self.need(key)? {
             ConfigValue::Boolean(value) => Ok(*value),
@@ -73,11 +74,11 @@ impl Config {
         }
     }
 
-    /// A text.
+    /// Returns the text at `key`.
     ///
     /// # Errors
     ///
-    /// If there is no such key, or its value is no text.
+    /// If there is no such key, or its value is not a text.
     pub fn text(&self, key: &str) -> Result<&str> {
         match self.need(key)? {
             ConfigValue::Text(value) => Ok(value),

@@ -5,79 +5,81 @@ pub use crate::bindings::gleaner::lambda::data::Tick;
 pub use crate::bindings::gleaner::lambda::types::{
     Counts, DataError, Encoding, FrameInfo, Guid, Identity, Roi, Stamps, Value,
 };
-use crate::error::answer;
+use crate::error::into_result;
 use crate::{Error, Result};
 
-/// Bytes of one piece in [`Frame::copy_to`]: the size at which copying runs at the speed of memory.
+/// Bytes that [`Frame::copy_to`] reads at a time: copying reaches memory bandwidth at this size.
 const PIECE: usize = 64 << 10;
 
-/// The ring of one `[[input]]`: its newest samples.
+/// The ring of one `[[input]]`: its newest samples, at most `depth`.
 pub struct Topic(wit::Topic);
 
 /// A compiled path into the messages of one topic.
 pub struct Field(wit::Field);
 
-/// One message. It cannot be overwritten until it is dropped.
+/// One message. The ring cannot overwrite it until it is dropped; if a lambda holds too many, the
+/// ring refuses new samples ([`Counts::no_slot`]).
 pub struct Sample(wit::Sample);
 
-/// A sample seen as an image. Its pixels stay with the host unless they are read.
+/// A sample as an image. Its pixels stay in the host until the lambda reads them.
 pub struct Frame(wit::Frame);
 
-/// One field of the newest samples, oldest first.
+/// Values of one field in the newest samples, oldest first. Both lists have the same length.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Column {
     /// [`Stamps::at_ns`] of each sample, in nanoseconds.
     pub at_ns: Vec<i64>,
-    /// The field's values; as many as stamps.
+    /// Value of the field in each sample; true is 1.
     pub values: Vec<f64>,
 }
 
-/// The input of that name.
+/// Returns the input `name` of the manifest.
 ///
 /// # Errors
 ///
-/// If the manifest has no such input; the message lists those it has.
+/// `no-such-input`; the message lists the inputs.
 pub fn input(name: &str) -> Result<Topic> {
-    Ok(Topic(answer(wit::input(name))?))
+    Ok(Topic(into_result(wit::input(name))?))
 }
 
-/// Names of all inputs, in the manifest's order.
+/// Names of all inputs, in the order of the manifest.
 pub fn inputs() -> Vec<String> {
     wit::inputs()
 }
 
-/// Time of this wake in nanoseconds. Virtual in replay.
+/// Time of the current wake in nanoseconds: `at_ns` of its sample or tick. The recorded time in
+/// replay; 0 in the first `init`.
 pub fn now_ns() -> i64 {
     wit::now_ns()
 }
 
 impl Topic {
-    /// The input's name.
+    /// `name` of the input.
     pub fn name(&self) -> String {
         self.0.name()
     }
 
-    /// The ROS topic, such as `/imu/data`.
+    /// Name of the ROS topic, such as `/imu/data`.
     pub fn ros_topic(&self) -> String {
         self.0.ros_topic()
     }
 
-    /// The ROS type, such as `sensor_msgs/msg/Imu`.
+    /// ROS message type, such as `sensor_msgs/msg/Imu`.
     pub fn type_name(&self) -> String {
         self.0.type_name()
     }
 
-    /// Newest sample; none before the first.
+    /// Newest sample; none before the first one.
     pub fn newest(&self) -> Option<Sample> {
         self.0.newest().map(Sample)
     }
 
-    /// The `n` newest samples, oldest first; 256 at most.
+    /// The `n` newest samples, oldest first; fewer if the ring holds fewer. `n` is clamped to 256.
     pub fn last(&self, n: u32) -> impl DoubleEndedIterator<Item = Sample> + ExactSizeIterator {
         self.0.last(n).into_iter().map(Sample)
     }
 
-    /// Samples received later than `since_ns`, oldest first; the newest 256 at most.
+    /// Samples with [`Stamps::at_ns`] later than `since_ns`, oldest first; at most the newest 256.
     pub fn since(
         &self,
         since_ns: i64,
@@ -85,74 +87,78 @@ impl Topic {
         self.0.since(since_ns).into_iter().map(Sample)
     }
 
-    /// What became of the samples since the lambda started.
+    /// Numbers of received and lost samples of this topic since the lambda's process started.
     pub fn counts(&self) -> Counts {
         self.0.counts()
     }
 
-    /// Compiles the path of a field, such as `linear_acceleration.x` or `cov[3]`. Do this in
-    /// `init`.
+    /// Compiles the path of a field, such as `linear_acceleration.x`, `cov[3]` or `fields[2].name`.
+    /// Do this once, in `init`: compiling takes microseconds, reading a compiled field tens of
+    /// nanoseconds.
     ///
     /// # Errors
     ///
-    /// If the type has no such field; the message names the nearest.
+    /// `no-such-field`; the message lists the existing fields and the most similar one.
+    /// `wrong-field` for a path of more than 1,024 bytes.
     pub fn field(&self, path: &str) -> Result<Field> {
-        Ok(Field(answer(self.0.field(path))?))
+        Ok(Field(into_result(self.0.field(path))?))
     }
 
-    /// `field` of the `n` newest samples; 65,536 at most.
+    /// Values of `field` in the `n` newest samples, oldest first. `n` is clamped to 65,536.
     ///
     /// # Errors
     ///
-    /// If the field is no number or of another topic, or a sample is malformed.
+    /// `wrong-field` if the field is not a number or belongs to another topic; `malformed`.
     pub fn column(&self, field: &Field, n: u32) -> Result<Column> {
-        Ok(answer(self.0.column(&field.0, n))?.into())
+        Ok(into_result(self.0.column(&field.0, n))?.into())
     }
 
-    /// `field` of all samples received later than `since_ns`.
+    /// Values of `field` in all samples of the ring with [`Stamps::at_ns`] later than `since_ns`,
+    /// oldest first; at most the newest 65,536.
     ///
     /// # Errors
     ///
     /// As [`Topic::column`].
     pub fn column_since(&self, field: &Field, since_ns: i64) -> Result<Column> {
-        Ok(answer(self.0.column_since(&field.0, since_ns))?.into())
+        Ok(into_result(self.0.column_since(&field.0, since_ns))?.into())
     }
 }
 
 impl Field {
-    /// The path as it was written.
+    /// The path, as the lambda wrote it.
     pub fn path(&self) -> String {
         self.0.path()
     }
 }
 
 impl Sample {
-    /// What makes it different from every other sample.
+    /// Unique identity of the sample: topic, writer and sequence number.
     pub fn identity(&self) -> Identity {
         self.0.identity()
     }
 
-    /// When it came to be, in nanoseconds of three clocks.
+    /// Timestamps of the sample, on three clocks.
     pub fn stamps(&self) -> Stamps {
         self.0.stamps()
     }
 
-    /// Any field.
+    /// Value of a field, of any type.
     ///
     /// # Errors
     ///
-    /// If the field is of another topic, or the sample is malformed.
+    /// `wrong-field` if the field belongs to another topic or exceeds the length that one call can
+    /// return (see [`Value`]; read such a field in pieces with [`cdr`](Self::cdr)); `malformed`.
     pub fn get(&self, field: &Field) -> Result<Value> {
-        answer(self.0.get(&field.0))
+        into_result(self.0.get(&field.0))
     }
 
-    /// A numeric or boolean field.
+    /// Value of a numeric or boolean field, as a 64-bit float; true is 1.
     ///
     /// # Errors
     ///
-    /// As [`Topic::column`].
+    /// `wrong-field` if the field is not a number or belongs to another topic; `malformed`.
     pub fn number(&self, field: &Field) -> Result<f64> {
-        answer(self.0.number(&field.0))
+        into_result(self.0.number(&field.0))
     }
 
     /// Size of the message in bytes, without the CDR encapsulation header.
@@ -160,88 +166,101 @@ impl Sample {
         self.0.size()
     }
 
-    /// Whether the message is big-endian CDR.
+    /// True if the message is big-endian CDR.
     pub fn big_endian(&self) -> bool {
         self.0.big_endian()
     }
 
-    /// Raw CDR bytes from `offset`, `len` at most; 1 MiB at most.
+    /// Raw CDR bytes without the encapsulation header: at most `len`, from `offset`. Clamped to the
+    /// message and to 1 MiB.
     pub fn cdr(&self, offset: u64, len: u32) -> Vec<u8> {
         self.0.cdr(offset, len)
     }
 
-    /// The message as an image; JPEG and PNG are decoded by the host, once for each sample.
+    /// The message as an image. Accepts `sensor_msgs/msg/Image`, and
+    /// `sensor_msgs/msg/CompressedImage` in JPEG or PNG, which this call decodes to rgb8, once for
+    /// each sample.
     ///
     /// # Errors
     ///
-    /// If it is no image that can be read, or there is no room for it.
+    /// `not-a-frame`; `no-room` if the decoded image exceeds `decoded_size`, all slots for decoded
+    /// images are held, or the lambda holds as many frames as `frames` in `[limits]` allows;
+    /// `malformed`.
     pub fn as_frame(&self) -> Result<Frame> {
-        Ok(Frame(answer(self.0.as_frame())?))
+        Ok(Frame(into_result(self.0.as_frame())?))
     }
 }
 
 impl Frame {
-    /// The shape.
+    /// Size and pixel layout of the frame.
     pub fn info(&self) -> FrameInfo {
         self.0.info()
     }
 
-    /// Identity of the sample behind it.
+    /// Identity of the sample that the frame comes from, also after [`resize`](Self::resize) and
+    /// [`to_gray`](Self::to_gray).
     pub fn identity(&self) -> Identity {
         self.0.identity()
     }
 
-    /// Stamps of the sample behind it.
+    /// Timestamps of the sample that the frame comes from.
     pub fn stamps(&self) -> Stamps {
         self.0.stamps()
     }
 
-    /// Mean luma, 0 to 255, of the whole frame or of a region.
+    /// Mean luma (ITU-R BT.601), 0 to 255, of the whole frame or of `roi`. Computed with integers,
+    /// so the result is the same on every CPU.
     ///
     /// # Errors
     ///
-    /// For a region outside the frame, and for Bayer encodings.
+    /// `out-of-range` if `roi` has no pixel in the frame; `not-a-frame` for Bayer encodings.
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64> {
-        answer(self.0.mean_luma(roi))
+        into_result(self.0.mean_luma(roi))
     }
 
-    /// Counts of the 256 luma levels.
+    /// Number of pixels at each of the 256 luma levels, luma rounded down; the luma of a 16-bit
+    /// pixel is its high byte.
     ///
     /// # Errors
     ///
     /// As [`Frame::mean_luma`].
     pub fn histogram(&self, roi: Option<Roi>) -> Result<Vec<u32>> {
-        answer(self.0.histogram(roi))
+        into_result(self.0.histogram(roi))
     }
 
-    /// A new frame of that size, each side 1 to 16,384 pixels.
+    /// A new frame of `width` by `height` pixels, each 1 to 16,384: rgb8, or mono8 if the encoding
+    /// is grey. A new pixel is the mean of the area that it covers where the frame shrinks, and a
+    /// linear interpolation where it grows.
     ///
     /// # Errors
     ///
-    /// For sizes out of range, and if there is no room.
+    /// `out-of-range`; `no-room` if the frames that the lambda created would together exceed
+    /// `memory` in `[limits]`, or the lambda holds as many frames as `frames` allows; `not-a-frame`
+    /// for Bayer encodings.
     pub fn resize(&self, width: u32, height: u32) -> Result<Frame> {
-        Ok(Frame(answer(self.0.resize(width, height))?))
+        Ok(Frame(into_result(self.0.resize(width, height))?))
     }
 
     /// A new mono8 frame of the same size.
     ///
     /// # Errors
     ///
-    /// If there is no room, and for Bayer encodings.
+    /// `no-room`, as [`resize`](Self::resize); `not-a-frame` for Bayer encodings.
     pub fn to_gray(&self) -> Result<Frame> {
-        Ok(Frame(answer(self.0.to_gray())?))
+        Ok(Frame(into_result(self.0.to_gray())?))
     }
 
-    /// Pixel bytes from `offset`, `len` at most; 1 MiB at most.
+    /// Pixel bytes: at most `len`, from `offset`. Clamped to the frame and to 1 MiB. Reading in
+    /// pieces of 64 KiB is fastest.
     pub fn read(&self, offset: u64, len: u32) -> Vec<u8> {
         self.0.read(offset, len)
     }
 
-    /// Copies all pixel bytes into `out`, in pieces.
+    /// Copies all pixel bytes to `out`, in pieces of 64 KiB.
     ///
     /// # Errors
     ///
-    /// If `out` is not as long as `info().size`.
+    /// If the length of `out` is not `info().size`.
     pub fn copy_to(&self, out: &mut [u8]) -> Result<()> {
         let size = self.info().size;
         if out.len() as u64 != size {
@@ -258,7 +277,7 @@ impl Frame {
         Ok(())
     }
 
-    /// The rows of pixels from top to bottom, without the padding between them.
+    /// Pixel bytes of each row from top to bottom, without padding.
     pub fn rows(&self) -> impl Iterator<Item = Vec<u8>> {
         let FrameInfo { width, height, step, encoding, .. } = self.info();
         let row_bytes = width * bytes_per_pixel(encoding);
@@ -266,7 +285,7 @@ impl Frame {
     }
 }
 
-/// The encoding's name in ROS.
+/// ROS name of an encoding.
 ///
 /// ```
 /// use gleaner_sdk::data::{Encoding, encoding_name};
@@ -293,7 +312,7 @@ pub fn encoding_name(encoding: Encoding) -> &'static str {
     }
 }
 
-/// Bytes that one pixel takes.
+/// Number of bytes per pixel.
 pub fn bytes_per_pixel(encoding: Encoding) -> u32 {
     match encoding {
         Encoding::Rgb8 | Encoding::Bgr8 => 3,
@@ -314,12 +333,12 @@ pub fn bytes_per_pixel(encoding: Encoding) -> u32 {
 }
 
 impl Column {
-    /// How many values there are.
+    /// Number of values.
     pub fn len(&self) -> usize {
         self.values.len()
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.values.is_empty()
     }
@@ -336,7 +355,7 @@ impl Column {
         (!self.is_empty()).then(|| self.values.iter().sum::<f64>() / self.len() as f64)
     }
 
-    /// Stamps and values, oldest first.
+    /// Pairs of stamp (in nanoseconds) and value, oldest first.
     pub fn iter(&self) -> impl DoubleEndedIterator<Item = (i64, f64)> + '_ {
         self.at_ns.iter().copied().zip(self.values.iter().copied())
     }

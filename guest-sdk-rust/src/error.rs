@@ -1,4 +1,4 @@
-//! One error for everything that a lambda may meet.
+//! The error type of all calls in a lambda.
 
 use std::fmt;
 
@@ -7,24 +7,25 @@ use crate::bindings::gleaner::lambda::scratch::ScratchError;
 use crate::bindings::gleaner::lambda::trigger::TriggerError;
 use crate::bindings::gleaner::lambda::types::DataError;
 
-/// A message that ends the wake as a fault, or `init` with a refusal.
+/// An error message. Returned from a handler, it makes the wake a fault; returned from the first
+/// `init`, it ends the start.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Error {
     kind: Option<&'static str>,
     message: String,
 }
 
-/// What the methods of a lambda return.
+/// Result of the calls to the host and of the methods of a lambda.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
-    /// An error that says `message`.
+    /// Creates an error with this message.
     pub fn new(message: impl Into<String>) -> Self {
         Self { kind: None, message: message.into() }
     }
 
-    /// Which refusal of the host it was, as the WIT names it, such as `no-room`; none for other
-    /// errors.
+    /// Case of the WIT variant with which the host refused a call, such as `no-room`; none for
+    /// other errors.
     pub fn kind(&self) -> Option<&'static str> {
         self.kind
     }
@@ -36,8 +37,8 @@ impl fmt::Display for Error {
     }
 }
 
-/// Any error of Rust becomes one with `?`, its causes behind it. (`Error` itself is none, or this
-/// would overlap.)
+/// Converts any Rust error with `?`; the causes are appended to the message. (`Error` itself does
+/// not implement `std::error::Error`, since the two implementations of `From` would overlap.)
 impl<E: std::error::Error> From<E> for Error {
     fn from(error: E) -> Self {
         let mut message = error.to_string();
@@ -50,22 +51,22 @@ impl<E: std::error::Error> From<E> for Error {
     }
 }
 
-/// A refusal of the host: the name of its case in the WIT, and its message.
-pub(crate) trait Refusal {
-    fn said(self) -> (&'static str, String);
+/// An error of the bindings: the name of its case in the WIT, and its message.
+pub(crate) trait HostError {
+    fn into_parts(self) -> (&'static str, String);
 }
 
-/// An answer of the host as a result of this crate. What wit-bindgen makes of a refusal prints as
-/// code, not as words.
-pub(crate) fn answer<T>(answer: std::result::Result<T, impl Refusal>) -> Result<T> {
-    answer.map_err(|refusal| {
-        let (kind, message) = refusal.said();
+/// Converts a result of the bindings. The errors that wit-bindgen generates print as code, so only
+/// their case and message are kept.
+pub(crate) fn into_result<T>(result: std::result::Result<T, impl HostError>) -> Result<T> {
+    result.map_err(|error| {
+        let (kind, message) = error.into_parts();
         Error { kind: Some(kind), message }
     })
 }
 
-impl Refusal for DataError {
-    fn said(self) -> (&'static str, String) {
+impl HostError for DataError {
+    fn into_parts(self) -> (&'static str, String) {
         match self {
             Self::NoSuchInput(message) => ("no-such-input", message),
             Self::NoSuchField(message) => ("no-such-field", message),
@@ -78,8 +79,8 @@ impl Refusal for DataError {
     }
 }
 
-impl Refusal for TriggerError {
-    fn said(self) -> (&'static str, String) {
+impl HostError for TriggerError {
+    fn into_parts(self) -> (&'static str, String) {
         match self {
             Self::Invalid(message) => ("invalid", message),
             Self::TooMany(message) => ("too-many", message),
@@ -87,8 +88,8 @@ impl Refusal for TriggerError {
     }
 }
 
-impl Refusal for ScratchError {
-    fn said(self) -> (&'static str, String) {
+impl HostError for ScratchError {
+    fn into_parts(self) -> (&'static str, String) {
         match self {
             Self::NoRoom(message) => ("no-room", message),
             Self::NoSuchEntry(message) => ("no-such-entry", message),
@@ -97,8 +98,8 @@ impl Refusal for ScratchError {
     }
 }
 
-impl Refusal for InferenceError {
-    fn said(self) -> (&'static str, String) {
+impl HostError for InferenceError {
+    fn into_parts(self) -> (&'static str, String) {
         match self {
             Self::NoRuntime(message) => ("no-runtime", message),
             Self::NoSuchModel(message) => ("no-such-model", message),
@@ -113,8 +114,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_refusal_keeps_its_kind_and_its_words() {
-        let error = answer::<()>(Err(DataError::NoRoom("no slot is free".to_owned()))).unwrap_err();
+    fn a_host_error_keeps_its_kind_and_message() {
+        let error =
+            into_result::<()>(Err(DataError::NoRoom("no slot is free".to_owned()))).unwrap_err();
         assert_eq!(
             (error.kind(), error.to_string()),
             (Some("no-room"), "no slot is free".to_owned())
@@ -122,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn any_error_of_rust_becomes_one() {
+    fn any_rust_error_is_converted() {
         let parse = || -> Result<i32> { Ok("x".parse::<i32>()?) };
         let error = parse().unwrap_err();
         assert_eq!(

@@ -1,35 +1,35 @@
-//! Models on the host: `gleaner:lambda/inference`.
+//! Models that run in the host: `gleaner:lambda/inference`.
 
 use crate::Result;
 use crate::bindings::gleaner::lambda::inference as wit;
 pub use crate::bindings::gleaner::lambda::inference::{DetectOptions, Detection, InferenceError};
 pub use crate::bindings::gleaner::lambda::types::Preprocess;
 use crate::data::Frame;
-use crate::error::answer;
+use crate::error::into_result;
 
-/// Numbers in row-major order, on the host.
+/// An array of numbers in row-major order, kept in the host.
 pub struct Tensor(wit::Tensor);
 
 /// A loaded `[[model]]`.
 pub struct Model(wit::Model);
 
 impl Tensor {
-    /// A tensor of 32-bit floats; the product of `shape` is the length of `values`.
+    /// Creates a tensor of 32-bit floats.
     ///
     /// # Errors
     ///
-    /// If it is not, or this host has no model runtime.
+    /// `wrong-input` unless the product of `shape` is the length of `values`; `no-runtime`.
     pub fn from_values(shape: &[u32], values: &[f32]) -> Result<Self> {
-        Ok(Self(answer(wit::Tensor::from_values(shape, values))?))
+        Ok(Self(into_result(wit::Tensor::from_values(shape, values))?))
     }
 
-    /// A tensor [1, 3, height, width] from a frame.
+    /// Creates a tensor of shape [1, 3, height, width] from a frame.
     ///
     /// # Errors
     ///
-    /// If the frame cannot be read, or this host has no model runtime.
+    /// `wrong-input` for Bayer encodings and sizes out of range; `no-runtime`.
     pub fn from_frame(frame: &Frame, how: Preprocess) -> Result<Self> {
-        Ok(Self(answer(wit::Tensor::from_frame(frame.handle(), how))?))
+        Ok(Self(into_result(wit::Tensor::from_frame(frame.handle(), how))?))
     }
 
     /// Length of each dimension.
@@ -37,38 +37,39 @@ impl Tensor {
         self.0.shape()
     }
 
-    /// Values from `offset`, `len` at most; 262,144 at most.
+    /// Values: at most `len`, from `offset`. Clamped to the tensor and to 262,144 values.
     pub fn read(&self, offset: u64, len: u32) -> Vec<f32> {
         self.0.read(offset, len)
     }
 }
 
 impl Model {
-    /// Opens the model of that name. Do this in `init`.
+    /// Opens the model `name` of the manifest. Do this in `init`.
     ///
     /// # Errors
     ///
-    /// If the manifest has no such model, or this host has no model runtime.
+    /// `no-such-model`; `failed` if the model cannot be loaded; `no-runtime`.
     pub fn open(name: &str) -> Result<Self> {
-        Ok(Self(answer(wit::Model::open(name))?))
+        Ok(Self(into_result(wit::Model::open(name))?))
     }
 
-    /// Runs the model.
+    /// Runs the model once.
     ///
     /// # Errors
     ///
-    /// If number, shape or type of `inputs` do not fit, or the model fails.
+    /// `wrong-input` if the number, shapes or types of `inputs` do not fit; `failed`.
     pub fn run(&self, inputs: &[&Tensor]) -> Result<Vec<Tensor>> {
         let inputs = inputs.iter().map(|tensor| &tensor.0).collect::<Vec<_>>();
-        Ok(answer(self.0.run(&inputs))?.into_iter().map(Tensor).collect())
+        Ok(into_result(self.0.run(&inputs))?.into_iter().map(Tensor).collect())
     }
 
-    /// Finds objects in a frame, without its pixels entering the lambda.
+    /// Finds objects in a frame; returns them by score, highest first. The pixels are not copied
+    /// into the lambda.
     ///
     /// # Errors
     ///
-    /// If the model is no detector, or fails.
+    /// `wrong-input` if the model is not a detector; `failed`.
     pub fn detect(&self, frame: &Frame, options: &DetectOptions) -> Result<Vec<Detection>> {
-        answer(self.0.detect(frame.handle(), options))
+        into_result(self.0.detect(frame.handle(), options))
     }
 }

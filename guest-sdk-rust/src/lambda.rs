@@ -1,4 +1,4 @@
-//! The trait that a lambda implements, and how it becomes a component.
+//! The trait that a lambda implements, and its export as a component.
 
 use std::cell::RefCell;
 
@@ -7,20 +7,21 @@ use crate::bindings::{ConfigEntry, Guest};
 use crate::data::{Sample, Tick};
 use crate::{Config, Error, Result};
 
-/// A lambda. The methods are called by the host, one at a time.
+/// A lambda. The host calls its methods, one at a time.
 ///
-/// An `Err` or a panic is a fault of that wake: it stands in the decision, and the lambda starts
-/// afresh with [`Lambda::init`] at the next wake.
+/// An `Err` or a panic is a fault of that wake. The decision contains it, and before the next wake
+/// the host calls [`Lambda::init`] of a fresh instance.
 pub trait Lambda: Sized + 'static {
-    /// Makes the lambda. Find inputs and compile fields here: it is called once, and wakes are
-    /// many.
+    /// Creates the lambda, before the first wake and again after a fault. Look up inputs and
+    /// compile fields here.
     ///
     /// # Errors
     ///
-    /// An error ends the start with its message.
+    /// An error before the first wake ends the lambda with that message; a later one is a fault of
+    /// the wake.
     fn init(config: &Config) -> Result<Self>;
 
-    /// A new sample arrived on the input that `[schedule] event` names.
+    /// Called for each new sample on the input that `[schedule] event` names.
     ///
     /// # Errors
     ///
@@ -30,7 +31,7 @@ pub trait Lambda: Sized + 'static {
         Err(Error::new("the schedule has an event, but the lambda has no `on_event`"))
     }
 
-    /// The period of `[schedule] period` is over.
+    /// Called at the end of each `[schedule] period`.
     ///
     /// # Errors
     ///
@@ -41,11 +42,11 @@ pub trait Lambda: Sized + 'static {
     }
 }
 
-/// Holds the one lambda of a component between wakes. Used by [`lambda!`](crate::lambda!).
+/// Keeps the one lambda of a component between wakes. Used by [`lambda!`](crate::lambda!).
 #[doc(hidden)]
 pub trait Instance: Lambda {
-    /// The place where it is held.
-    fn held<R>(run: impl FnOnce(&RefCell<Option<Self>>) -> R) -> R;
+    /// Calls `run` with the cell that holds the lambda.
+    fn with_instance<R>(run: impl FnOnce(&RefCell<Option<Self>>) -> R) -> R;
 }
 
 #[doc(hidden)]
@@ -54,14 +55,14 @@ pub struct Exported<T>(std::marker::PhantomData<T>);
 impl<T: Instance> Guest for Exported<T> {
     fn init(config: Vec<ConfigEntry>) -> std::result::Result<(), String> {
         let lambda = T::init(&Config::from(config)).map_err(|error| error.to_string())?;
-        T::held(|held| held.replace(Some(lambda)));
+        T::with_instance(|instance| instance.replace(Some(lambda)));
         Ok(())
     }
 
     fn on_wake(wake: Wake) -> std::result::Result<(), String> {
-        T::held(|held| {
-            let mut held = held.borrow_mut();
-            let lambda = held.as_mut().ok_or("woken before init")?;
+        T::with_instance(|instance| {
+            let mut instance = instance.borrow_mut();
+            let lambda = instance.as_mut().ok_or("woken before init")?;
             match wake {
                 Wake::Event(sample) => lambda.on_event(sample.into()),
                 Wake::Tick(tick) => lambda.on_tick(tick),
@@ -71,14 +72,15 @@ impl<T: Instance> Guest for Exported<T> {
     }
 }
 
-/// Exports a [`Lambda`] as the component's own. Call it once, at the end of the crate.
+/// Exports a [`Lambda`] as the lambda of this component. Use it once, at the end of the crate.
 #[macro_export]
 macro_rules! lambda {
     ($lambda:ty) => {
         impl $crate::Instance for $lambda {
-            fn held<R>(run: impl FnOnce(&::std::cell::RefCell<Option<Self>>) -> R) -> R {
+            fn with_instance<R>(run: impl FnOnce(&::std::cell::RefCell<Option<Self>>) -> R) -> R {
                 ::std::thread_local! {
-                    static LAMBDA: ::std::cell::RefCell<Option<$lambda>> = const { ::std::cell::RefCell::new(None) };
+                    static LAMBDA: ::std::cell::RefCell<Option<$lambda>> =
+                        const { ::std::cell::RefCell::new(None) };
                 }
                 LAMBDA.with(run)
             }

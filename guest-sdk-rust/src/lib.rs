@@ -1,4 +1,4 @@
-//! Write Gleaner lambdas in Rust.
+//! Gleaner's SDK for lambdas in Rust.
 //!
 //! A lambda is a type that implements [`Lambda`], exported once with [`lambda!`], in a crate of
 //! type `cdylib`:
@@ -31,14 +31,16 @@
 //! gleaner_sdk::lambda!(Dip);
 //! ```
 //!
-//! The functions of this crate reach the host on the vehicle and in replay. Natively, in `cargo
-//! test`, [`testing`] has a fake host that keeps the same rules; called outside of it they panic.
-//! Judgement in plain functions over plain numbers needs neither, and is tested as any Rust code.
+//! On the vehicle and in replay, the functions of this crate call the host. In `cargo test`,
+//! [`testing`] provides a fake host with the same rules; outside of it, the functions panic. Keep
+//! detection rules in plain functions over plain numbers: they need no host, and any unit test can
+//! call them.
 //!
-//! [`kernels`] are such functions, for pixels and signals.
+//! [`kernels`] has such functions, for pixels and signals.
 //!
-//! What each call costs and refuses is written in the WIT package `gleaner:lambda`, under the same
-//! five names as the modules here.
+//! The WIT package `gleaner:lambda` documents each call with its cost, limits and errors, in five
+//! interfaces with the names of the modules here. The errors are the names of its cases, which
+//! [`Error::kind`] returns.
 
 #[cfg(target_family = "wasm")]
 #[doc(hidden)]

@@ -1,35 +1,36 @@
-//! Lines for people: `gleaner:lambda/log`. At most 100 in one second; the rest is dropped and
-//! counted.
+//! Log lines for people: `gleaner:lambda/log`. In one second of the lambda's time the host accepts
+//! `log_lines` lines and `log_bytes` bytes, as set in `[limits]`: by default 100 lines and 400 KiB.
+//! It drops and counts further lines.
 
 use crate::bindings::gleaner::lambda::log as wit;
 pub use crate::bindings::gleaner::lambda::log::Level;
 
-/// Writes one line; it is cut at 4,096 bytes.
+/// Writes one line. `message` is truncated to 4,096 bytes, at a character boundary.
 pub fn log(level: Level, message: &str) {
     wit::log(level, message);
 }
 
-/// Someone must act.
+/// Logs a line that requires action.
 pub fn error(message: &str) {
     log(Level::Error, message);
 }
 
-/// Data or time was lost.
+/// Logs a loss of data or time.
 pub fn warn(message: &str) {
     log(Level::Warn, message);
 }
 
-/// A state changed.
+/// Logs a change of state.
 pub fn info(message: &str) {
     log(Level::Info, message);
 }
 
-/// For the lambda's author.
+/// Logs a line for the lambda's author.
 pub fn debug(message: &str) {
     log(Level::Debug, message);
 }
 
-/// For the lambda's author, in detail.
+/// Logs a detail for the lambda's author.
 pub fn trace(message: &str) {
     log(Level::Trace, message);
 }

@@ -1,54 +1,59 @@
-//! Bytes that the host keeps by name, beyond a fault of the lambda: `gleaner:lambda/scratch`.
+//! Named byte strings that the host keeps for the lambda, also across its faults:
+//! `gleaner:lambda/scratch`.
+//!
+//! The size is `scratch` in `[limits]`, 0 by default. The scratch memory is empty when the lambda's
+//! process starts.
 
 use crate::Result;
 use crate::bindings::gleaner::lambda::scratch as wit;
 pub use crate::bindings::gleaner::lambda::scratch::{Entry, ScratchError};
-use crate::error::answer;
+use crate::error::into_result;
 
-/// Keeps `bytes` under a name, in place of what was there.
+/// Stores `bytes` under a name; replaces an existing entry.
 ///
 /// # Errors
 ///
-/// `no-room` beyond `scratch` of `[limits]` or 1,024 entries; `wrong-name`. Nothing has changed
-/// then.
+/// `no-room` if the entries would exceed `scratch` in `[limits]`, or there are 1,024 entries
+/// already; `wrong-name` unless the name has 1 to 128 bytes and no control characters. The call has
+/// no effect then.
 pub fn put(name: &str, bytes: &[u8]) -> Result<()> {
-    answer(wit::put(name, bytes))
+    into_result(wit::put(name, bytes))
 }
 
-/// Keeps `bytes` behind what is there already under that name, if anything is.
+/// Appends `bytes` to the entry of that name; creates a missing one.
 ///
 /// # Errors
 ///
 /// As [`put`].
 pub fn append(name: &str, bytes: &[u8]) -> Result<()> {
-    answer(wit::append(name, bytes))
+    into_result(wit::append(name, bytes))
 }
 
-/// Bytes from `offset`, `len` at most; clamped to what is there, and to `call_bytes` of `[limits]`,
-/// 1 MiB by default.
+/// Bytes of an entry: at most `len`, from `offset`. Clamped to the entry and to `call_bytes` in
+/// `[limits]`, 1 MiB by default.
 ///
 /// # Errors
 ///
 /// `no-such-entry`.
 pub fn get(name: &str, offset: u64, len: u32) -> Result<Vec<u8>> {
-    answer(wit::get(name, offset, len))
+    into_result(wit::get(name, offset, len))
 }
 
-/// Forgets what is kept under a name.
+/// Deletes an entry.
 ///
 /// # Errors
 ///
 /// `no-such-entry`.
 pub fn remove(name: &str) -> Result<()> {
-    answer(wit::remove(name))
+    into_result(wit::remove(name))
 }
 
-/// Everything that is kept, in the order of the names' bytes.
+/// All entries, sorted by the bytes of their names.
 pub fn entries() -> Vec<Entry> {
     wit::entries()
 }
 
-/// Bytes for which there is room. An entry takes its length, the length of its name and 64 bytes.
+/// Free space in bytes. An entry takes the length of its value and of its name, and 64 bytes.
 pub fn free() -> u64 {
     wit::free()
 }

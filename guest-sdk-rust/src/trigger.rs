@@ -1,70 +1,76 @@
-//! What a lambda causes: `gleaner:lambda/trigger`.
+//! Actions that a lambda takes in a wake: `gleaner:lambda/trigger`.
+//!
+//! A trigger is effective from the moment of the call, even if the same wake faults later. In
+//! `init` all triggers are refused.
 
 use crate::Result;
 use crate::bindings::gleaner::lambda::trigger as wit;
 pub use crate::bindings::gleaner::lambda::trigger::TriggerError;
-use crate::error::answer;
+use crate::error::into_result;
 
-/// Something worth keeping happened. `score` says how strongly, in a unit that the lambda
-/// documents.
+/// Builds an event, which opens the `[record]` window around the sample or tick of this wake.
+/// `score` is the strength of the event, in a unit that the lambda documents.
 ///
-/// Nothing happens before [`Event::send`].
-#[must_use = "an event counts once it is sent"]
-pub fn event(label: &str, score: f64) -> Event<'_> {
-    Event { label, score, attributes: Vec::new() }
+/// [`EventBuilder::send`] reports it.
+#[must_use = "an event has no effect until `send`"]
+pub fn event(label: &str, score: f64) -> EventBuilder<'_> {
+    EventBuilder { label, score, attributes: Vec::new() }
 }
 
-/// Starts a recording that lasts until [`stop`] with the same label.
+/// Builds the start of a recording that lasts until [`stop`] is called with the same label.
 ///
-/// Nothing happens before [`Start::send`].
-#[must_use = "a recording starts once this is sent"]
-pub fn start(label: &str) -> Start<'_> {
-    Start { label, attributes: Vec::new() }
+/// [`StartBuilder::send`] starts it.
+#[must_use = "a recording does not start until `send`"]
+pub fn start(label: &str) -> StartBuilder<'_> {
+    StartBuilder { label, attributes: Vec::new() }
 }
 
-/// Ends the recording that [`start`] began.
+/// Ends the recording that [`start`] began with the same label.
 ///
 /// # Errors
 ///
-/// As [`Start::send`].
+/// As [`StartBuilder::send`].
 pub fn stop(label: &str) -> Result<()> {
-    answer(wit::stop(label))
+    into_result(wit::stop(label))
 }
 
-/// An event being described.
-pub struct Event<'a> {
+/// An event that has not been sent.
+pub struct EventBuilder<'a> {
     label: &'a str,
     score: f64,
     attributes: Vec<wit::Attribute>,
 }
 
-impl Event<'_> {
-    /// Adds a named fact that travels into the clip; 16 at most.
-    pub fn with(mut self, key: &str, value: impl Into<Value>) -> Self {
+impl EventBuilder<'_> {
+    /// Adds a named value that is stored with the trigger in the clip; at most 16.
+    pub fn with(mut self, key: &str, value: impl Into<AttributeValue>) -> Self {
         self.attributes.push(attribute(key, value));
         self
     }
 
-    /// Causes the event.
+    /// Reports the event.
     ///
     /// # Errors
     ///
-    /// If the label is empty or over 128 bytes, a number is not finite, a key is given twice, this
-    /// wake has caused 16 triggers, or there is no wake, as in `init`. Nothing is caused then.
+    /// `invalid` outside of a wake, as in `init`; if the label is empty or over 128 bytes; if the
+    /// score or a value is not finite; if a key is empty, over 64 bytes or given twice; for a text
+    /// of over 1,024 bytes; for more than 16 attributes. `too-many` for more than 16 triggers in
+    /// one wake, or more in a minute than `events_per_minute` in `[limits]`. The call has no effect
+    /// then.
     pub fn send(self) -> Result<()> {
-        answer(wit::event(self.label, self.score, &self.attributes))
+        into_result(wit::event(self.label, self.score, &self.attributes))
     }
 }
 
-/// The start of a recording, being described.
-pub struct Start<'a> {
+/// The start of a recording that has not been sent.
+pub struct StartBuilder<'a> {
     label: &'a str,
     attributes: Vec<wit::Attribute>,
 }
 
-impl Start<'_> {
-    /// Adds a named fact that travels into the clip; 16 at most.
-    pub fn with(mut self, key: &str, value: impl Into<Value>) -> Self {
+impl StartBuilder<'_> {
+    /// Adds a named value that is stored with the trigger in the clip; at most 16.
+    pub fn with(mut self, key: &str, value: impl Into<AttributeValue>) -> Self {
         self.attributes.push(attribute(key, value));
         self
     }
@@ -73,38 +79,38 @@ impl Start<'_> {
     ///
     /// # Errors
     ///
-    /// As [`Event::send`].
+    /// As [`EventBuilder::send`].
     pub fn send(self) -> Result<()> {
-        answer(wit::start(self.label, &self.attributes))
+        into_result(wit::start(self.label, &self.attributes))
     }
 }
 
-fn attribute(key: &str, value: impl Into<Value>) -> wit::Attribute {
+fn attribute(key: &str, value: impl Into<AttributeValue>) -> wit::Attribute {
     wit::Attribute { key: key.to_owned(), value: value.into().0 }
 }
 
-/// Value of an attribute; made from `bool`, `i64`, `f64` and `&str`.
-pub struct Value(wit::AttributeValue);
+/// Value of an attribute; converted from `bool`, `i64`, `f64` and `&str`.
+pub struct AttributeValue(wit::AttributeValue);
 
-impl From<bool> for Value {
+impl From<bool> for AttributeValue {
     fn from(value: bool) -> Self {
         Self(wit::AttributeValue::Boolean(value))
     }
 }
 
-impl From<i64> for Value {
+impl From<i64> for AttributeValue {
     fn from(value: i64) -> Self {
         Self(wit::AttributeValue::Signed(value))
     }
 }
 
-impl From<f64> for Value {
+impl From<f64> for AttributeValue {
     fn from(value: f64) -> Self {
         Self(wit::AttributeValue::Real(value))
     }
 }
 
-impl From<&str> for Value {
+impl From<&str> for AttributeValue {
     fn from(value: &str) -> Self {
         Self(wit::AttributeValue::Text(value.to_owned()))
     }

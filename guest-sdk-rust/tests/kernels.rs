@@ -1,5 +1,5 @@
-//! Kernels against the host's operations on frames: equal, bit for bit, for every layout of the
-//! pixels.
+//! Compares kernels with the host's operations on frames: results are equal, bit for bit, for every
+//! pixel layout.
 
 use gleaner_rules::pixels::{self, Encoding as HostEncoding, Roi as HostRoi, View, ops};
 use gleaner_sdk::data::{Encoding, Roi};
@@ -8,7 +8,7 @@ use gleaner_sdk::kernels::{self, Image, downscale, histogram, luma, mean};
 const ENCODINGS: [(Encoding, &str); 3] =
     [(Encoding::Rgb8, "rgb8"), (Encoding::Bgr8, "bgr8"), (Encoding::Mono8, "mono8")];
 
-/// Numbers that look random and are the same in every run.
+/// Pseudo-random numbers, the same in every run.
 struct Noise(u64);
 
 impl Noise {
@@ -18,24 +18,24 @@ impl Noise {
         (self.0 >> 33) as u32
     }
 
-    /// From 1 to `most`.
+    /// Returns a number from 1 to `most`.
     fn up_to(&mut self, most: u32) -> u32 {
         1 + self.next() % most
     }
 }
 
 /// The same pixels for kernels and for the host.
-struct Pixels {
+struct TestPixels {
     width: u32,
     height: u32,
     step: u32,
     data: Vec<u8>,
 }
 
-impl Pixels {
+impl TestPixels {
     fn new(noise: &mut Noise, width: u32, height: u32) -> Self {
         let step = 3 * width + [0, noise.next() % 9][noise.next() as usize % 2];
-        // Of few levels sometimes, of one side sometimes: sums that are large, counts that are.
+        // Sometimes few levels, sometimes only high ones, for large counts and large sums.
         let (mask, floor) = (
             [0xff, 0xff, 0x81, 0x00][noise.next() as usize % 4],
             [0, 0xfe][noise.next() as usize % 2],
@@ -62,7 +62,7 @@ impl Pixels {
     }
 }
 
-/// Odd sizes, tails of every length, and a row longer than the longest block of sums.
+/// Odd sizes, remainders of every length, and a row longer than the longest block of sums.
 fn sizes(noise: &mut Noise) -> Vec<(u32, u32)> {
     let random = (0..150).map(|_| (noise.up_to(140), noise.up_to(20))).collect::<Vec<_>>();
     [random, vec![(1, 1), (32, 1), (33, 2), (512, 2), (513, 1), (9000, 2)]].concat()
@@ -72,7 +72,7 @@ fn sizes(noise: &mut Noise) -> Vec<(u32, u32)> {
 fn means_histograms_and_grey_images_are_those_of_the_host() {
     let mut noise = Noise(1);
     for (width, height) in sizes(&mut noise) {
-        let pixels = Pixels::new(&mut noise, width, height);
+        let pixels = TestPixels::new(&mut noise, width, height);
         let [x, y] = [width, height].map(|side| noise.next() % side);
         let [across, down] = [width, height].map(|side| noise.up_to(side));
         pixels.each(|image, view, what| {
@@ -82,11 +82,11 @@ fn means_histograms_and_grey_images_are_those_of_the_host() {
                 ops::histogram(&view, None).unwrap(),
                 "{what}"
             );
-            let mut ours = vec![0; (width * height) as usize];
-            let mut theirs = ours.clone();
-            luma::to_gray(&image, &mut ours).unwrap();
-            ops::to_gray(&view, &mut theirs).unwrap();
-            assert_eq!(ours, theirs, "{what}");
+            let mut by_kernel = vec![0; (width * height) as usize];
+            let mut by_host = by_kernel.clone();
+            luma::to_gray(&image, &mut by_kernel).unwrap();
+            ops::to_gray(&view, &mut by_host).unwrap();
+            assert_eq!(by_kernel, by_host, "{what}");
 
             let part = image.part(Roi { x, y, width: across, height: down }).unwrap();
             let roi = Some(HostRoi { x, y, width: across, height: down });
@@ -108,7 +108,7 @@ fn means_histograms_and_grey_images_are_those_of_the_host() {
 fn the_mean_of_colours_is_that_of_each_pixel() {
     let mut noise = Noise(2);
     for (width, height) in sizes(&mut noise) {
-        let pixels = Pixels::new(&mut noise, width, height);
+        let pixels = TestPixels::new(&mut noise, width, height);
         let mut sums = [0_u32; 3];
         for row in pixels.data.chunks(pixels.step as usize) {
             for pixel in row[..3 * width as usize].chunks(3) {
@@ -122,26 +122,27 @@ fn the_mean_of_colours_is_that_of_each_pixel() {
 }
 
 #[test]
-fn smaller_images_are_those_of_the_host() {
+fn downscaled_images_are_those_of_the_host() {
     let mut noise = Noise(3);
     for (width, height) in sizes(&mut noise) {
-        let pixels = Pixels::new(&mut noise, width, height);
+        let pixels = TestPixels::new(&mut noise, width, height);
         let (to_width, to_height) = match noise.next() % 3 {
             0 => (width, noise.up_to(height)),
             1 => (width.div_ceil(2), height.div_ceil(3)),
             _ => (noise.up_to(width), noise.up_to(height)),
         };
         pixels.each(|image, view, what| {
-            let mut ours = vec![0; downscale::downscaled(&image, to_width, to_height).unwrap()];
-            let mut theirs = vec![0; ops::resized(&view, to_width, to_height).unwrap().1];
-            downscale::downscale(&image, to_width, to_height, &mut ours).unwrap();
-            ops::resize(&view, to_width, to_height, &mut theirs).unwrap();
-            assert_eq!(ours, theirs, "{what} to {to_width}x{to_height}");
+            let mut by_kernel =
+                vec![0; downscale::downscaled(&image, to_width, to_height).unwrap()];
+            let mut by_host = vec![0; ops::resized(&view, to_width, to_height).unwrap().1];
+            downscale::downscale(&image, to_width, to_height, &mut by_kernel).unwrap();
+            ops::resize(&view, to_width, to_height, &mut by_host).unwrap();
+            assert_eq!(by_kernel, by_host, "{what} to {to_width}x{to_height}");
         });
     }
 }
 
 #[test]
-fn an_image_is_as_large_as_one_of_the_host() {
+fn the_maximum_size_of_an_image_is_that_of_the_host() {
     assert_eq!(kernels::MAX_SIDE, pixels::MAX_SIDE);
 }

@@ -1,5 +1,5 @@
-//! The fake host keeps the host's rules. What these are is tested in `gleaner-rules`; here is what
-//! a lambda's author sees of them.
+//! Tests that the fake host follows the rules of the host. `gleaner-rules` tests the rules
+//! themselves; these tests cover their effects on a lambda.
 
 mod testing {
     pub mod frames;

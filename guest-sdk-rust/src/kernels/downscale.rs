@@ -1,16 +1,16 @@
-//! An image in fewer pixels.
+//! Downscales images.
 //!
-//! Each axis by itself: cut the axis of `from` pixels into `from * to` pieces, then an old pixel is
-//! `to` of them and a new one `from`, and the weight of an old pixel in a new one is the number of
-//! pieces that they share. So a result is an exact fraction, rounded once.
+//! Each axis is scaled by itself. Divide the axis of `from` pixels into `from * to` pieces: an old
+//! pixel has `to` of them, a new one `from`, and the weight of an old pixel in a new one is the
+//! number of pieces that they share. So the result is an exact fraction, rounded once.
 
 use super::{Colours, Image, ImageError};
 
-/// Bytes of a row that are weighed in one turn.
+/// Bytes of a row that one iteration of the loop weights.
 const TURN: usize = 64;
 
-/// Bytes that [`downscale`] of `image` to `width` x `height` writes: three for each pixel of a
-/// coloured image, one of a grey one.
+/// Number of bytes that [`downscale`] of `image` to `width` x `height` writes: three per pixel of a
+/// coloured image, one per pixel of a grey one.
 ///
 /// # Errors
 ///
@@ -26,12 +26,12 @@ pub fn downscaled(image: &Image<'_>, width: u32, height: u32) -> Result<usize, I
     Ok(width as usize * height as usize * image.pixel())
 }
 
-/// Writes the image in `width` x `height` pixels to `out`, without padding: rgb8 of a coloured
-/// image (also of bgr8), mono8 of a grey one. It is what [`Frame::resize`](crate::Frame::resize)
-/// makes, byte for byte, where no side grows.
+/// Writes the image in `width` x `height` pixels to `out`, without padding: rgb8 for a coloured
+/// image (also bgr8), mono8 for a grey one. The bytes equal those of
+/// [`Frame::resize`](crate::Frame::resize) where no side grows.
 ///
-/// A new pixel is the mean of the area that it covers, exact and rounded to nearest (a half goes
-/// up). Takes memory of 4 bytes for each byte in a row of the old image.
+/// A new pixel is the mean of the area that it covers, computed exactly and rounded to nearest
+/// (halves up). Allocates 4 bytes for each byte in a row of the old image.
 ///
 /// # Errors
 ///
@@ -48,7 +48,7 @@ pub fn downscale(
     }
     let across = Axis::new(image.width(), width);
     let down = Axis::new(image.height(), height);
-    let rounded = Rounded::to(u64::from(down.from) * u64::from(across.from));
+    let rounded = RoundedDivision::to(u64::from(down.from) * u64::from(across.from));
     let mut columns = vec![0_u32; image.width * image.pixel()];
     for (y, line) in (0..height).zip(out.chunks_exact_mut(width as usize * image.pixel())) {
         let taps = down.taps(y);
@@ -67,8 +67,8 @@ pub fn downscale(
     Ok(())
 }
 
-/// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no
-/// sum reaches 2^24; checked arithmetic would not become a vector's.
+/// Adds `row`, times `weight`, to `columns`. The weights of a column add up to less than 2^16, so
+/// no sum reaches 2^24. Checked arithmetic would prevent vectorisation.
 fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
     let add =
         |sum: &mut u32, byte: &u8| *sum = sum.wrapping_add(weight.wrapping_mul(u32::from(*byte)));
@@ -84,11 +84,11 @@ fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
     }
 }
 
-/// Writes a row of pixels of `N` bytes from `columns`, in the order that `arrange` gives them.
+/// Writes a row of pixels of `N` bytes from `columns`; `arrange` reorders the bytes of a pixel.
 fn blend<const N: usize>(
     columns: &[u32],
     across: Axis,
-    rounded: Rounded,
+    rounded: RoundedDivision,
     line: &mut [u8],
     arrange: impl Fn([u8; N]) -> [u8; N],
 ) {
@@ -134,7 +134,7 @@ impl Axis {
         Self { from: from / divisor, to: to / divisor }
     }
 
-    /// What new pixel `at` is made of; `from` is the sum of all weights. No product is larger than
+    /// Returns the old pixels in new pixel `at`; their weights add up to `from`. No product exceeds
     /// the square of [`MAX_SIDE`](super::MAX_SIDE), which fits a `u32`.
     fn taps(self, at: u32) -> Taps {
         let Self { from, to } = self;
@@ -156,13 +156,14 @@ impl Axis {
 
 /// Division of a sum of weighted bytes by the sum of weights, rounded to nearest.
 #[derive(Clone, Copy)]
-struct Rounded {
+struct RoundedDivision {
     total: u64,
-    /// 2^[`SHIFT`](Self::SHIFT) / `total`, rounded up, where a product with it is exact enough.
+    /// 2^[`SHIFT`](Self::SHIFT) / `total`, rounded up; none if a product with it is not exact
+    /// enough.
     factor: Option<u64>,
 }
 
-impl Rounded {
+impl RoundedDivision {
     const SHIFT: u32 = 55;
 
     /// A sum and half of `total` are below 256 * total. The factor is too large by less than 1,
@@ -189,7 +190,7 @@ mod tests {
     use crate::data::Encoding;
 
     #[test]
-    fn a_product_divides_as_a_division_does() {
+    fn multiplication_by_the_factor_equals_division() {
         for total in [
             1,
             2,
@@ -203,7 +204,7 @@ mod tests {
             (1 << 23) + 1,
             4_294_836_225,
         ] {
-            let rounded = Rounded::to(total);
+            let rounded = RoundedDivision::to(total);
             for level in 0..=255 {
                 // Around the places where the result changes.
                 let edge = level * total + total.div_ceil(2);
@@ -227,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn blue_and_red_change_places() {
+    fn blue_and_red_are_swapped_for_bgr8() {
         let image = Image::new(1, 1, 3, Encoding::Bgr8, &[1, 2, 3]).unwrap();
         let mut out = [0; 3];
         downscale(&image, 1, 1, &mut out).unwrap();
@@ -235,13 +236,13 @@ mod tests {
     }
 
     #[test]
-    fn growing_and_wrong_places_are_refused() {
+    fn larger_sizes_and_outputs_of_another_length_are_refused() {
         let image = Image::new(2, 1, 2, Encoding::Mono8, &[1, 2]).unwrap();
         let refused = |width, height, out| {
             downscale(&image, width, height, &mut vec![0; out]).unwrap_err().to_string()
         };
         assert!(refused(3, 1, 3).starts_with("2x1 pixels cannot become 3x1"));
         assert!(refused(0, 1, 0).starts_with("2x1 pixels cannot become 0x1"));
-        assert_eq!(refused(1, 1, 2), "the result takes 1 bytes; the place for it has 2");
+        assert_eq!(refused(1, 1, 2), "the result takes 1 bytes; the output has 2");
     }
 }

@@ -1,4 +1,4 @@
-//! How the power of a signal is spread over frequencies. Needs the feature `fft`.
+//! Power spectral density of signals. Needs the feature `fft`.
 
 use std::f64::consts::TAU;
 use std::fmt;
@@ -8,40 +8,43 @@ use rustfft::num_complex::Complex;
 use rustfft::num_traits::Float;
 use rustfft::{Fft, FftNum, FftPlanner};
 
-/// Most samples of one spectrum.
+/// Maximum number of samples of one spectrum.
 pub const MAX_SAMPLES: usize = 65_536;
 
-/// Complex numbers that are handled in a turn of a loop.
+/// Complex numbers that one iteration of a loop handles.
 const TURN: usize = 8;
 
-/// `f32` or `f64`: half the bytes and twice the speed, or sixteen digits.
+/// `f32` or `f64`. `f32` takes half the bytes and time; `f64` has sixteen digits.
 pub trait Real: FftNum + Float {}
 
 impl Real for f32 {}
 impl Real for f64 {}
 
-/// The power spectral density of signals of one length, planned once: make it in `init`.
+/// Computes the power spectral density of signals of one length. Create it once, in `init`.
 ///
-/// Per signal `x` of `n` samples, oldest first, at `rate_hz`, with the periodic Hann window `w[j] =
-/// (1 - cos(2 pi j / n)) / 2`:
+/// For a signal `x` of `n` samples, oldest first, sampled at `rate_hz`, with the periodic Hann
+/// window `w[j] = (1 - cos(2 pi j / n)) / 2`:
 ///
 /// ```text
-/// density[k] = c[k] |sum over j of w[j] x[j] exp(-2 pi i j k / n)|^2 / (rate_hz * sum over j of w[j]^2)
+/// density[k] = c[k] |sum over j of w[j] x[j] exp(-2 pi i j k / n)|^2
+///              / (rate_hz * sum over j of w[j]^2)
 /// ```
 ///
 /// for the bins `k` of 0 to `n / 2`, which lie at `k * rate_hz / n`; `c` is 1 for the first and the
-/// last bin and 2 for those between, which stand for negative frequencies as well. Its unit is that
-/// of the signal, squared, per Hz: (m/s²)²/Hz of an acceleration. The mean is not taken out: it is
-/// in the first bin and, by the window, half as much in the second.
+/// last bin and 2 for the others, which also stand for the negative frequencies. The unit is that
+/// of the signal, squared, per Hz: (m/s²)²/Hz for an acceleration. The mean is not removed: it is
+/// in the first bin and, because of the window, half as much in the second.
 ///
-/// On one machine and in every component it gives the same bits again. A component and a native
-/// test agree to the last few bits only: sine and cosine come from other libraries.
+/// The result is the same bit for bit in every component, and on one machine. A component and a
+/// native test differ in the last bits: their sine and cosine come from different libraries.
 ///
 /// ```
 /// use gleaner_sdk::kernels::fft::{Spectrum, band_power};
 ///
 /// // A sine of 50 Hz and amplitude 2 has a mean square of 2.
-/// let sine = (0..128).map(|j| 2.0 * (std::f64::consts::TAU * 50.0 * f64::from(j) / 400.0).sin()).collect::<Vec<_>>();
+/// let turn = std::f64::consts::TAU;
+/// let sine =
+///     (0..128).map(|j| 2.0 * (turn * 50.0 * f64::from(j) / 400.0).sin()).collect::<Vec<_>>();
 /// let mut spectrum = Spectrum::hann(128, 400.0).unwrap();
 /// let mut density = vec![0.0; spectrum.bins()];
 /// spectrum.density(&sine, &mut density).unwrap();
@@ -52,20 +55,20 @@ impl Real for f64 {}
 /// Source: P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra"
 /// (1967), for a single segment.
 pub struct Spectrum<T: Real> {
-    /// Of half the length: two samples are one complex number.
+    /// A transform of half the length: two samples are one complex number.
     fft: Arc<dyn Fft<T>>,
     window: Vec<T>,
     /// exp(-2 pi i k / n) for each bin up to the middle.
     turns: Vec<Complex<T>>,
     packed: Vec<Complex<T>>,
     scratch: Vec<Complex<T>>,
-    /// For bins between the first and the last.
+    /// Factor for the bins between the first and the last.
     scale: T,
     bin_hz: f64,
 }
 
 impl<T: Real> Spectrum<T> {
-    /// Plans for signals of `samples` samples, taken `rate_hz` times a second.
+    /// Prepares for signals of `samples` samples at `rate_hz`, with a Hann window.
     ///
     /// # Errors
     ///
@@ -86,8 +89,8 @@ impl<T: Real> Spectrum<T> {
             let (sine, cosine) = (TAU * k as f64 / n).sin_cos();
             Complex::new(real(cosine), real(-sine))
         };
-        // `untangle` leaves each amplitude twice as large as it is, and a bin between stands for
-        // two.
+        // The amplitudes of `untangle` are twice the true ones, and a bin between the first and the
+        // last stands for two.
         let energy = window.iter().map(|weight| weight * weight).sum::<f64>();
         Ok(Self {
             window: window.into_iter().map(real).collect(),
@@ -100,12 +103,12 @@ impl<T: Real> Spectrum<T> {
         })
     }
 
-    /// Samples of a signal.
+    /// Number of samples of a signal.
     pub fn samples(&self) -> usize {
         self.window.len()
     }
 
-    /// Bins of a density: half the samples, and one.
+    /// Number of bins of a density: half the number of samples, plus one.
     pub fn bins(&self) -> usize {
         self.packed.len() + 1
     }
@@ -115,13 +118,13 @@ impl<T: Real> Spectrum<T> {
         self.bin_hz
     }
 
-    /// Writes the density of `signal`, one of [`samples`](Self::samples), oldest first, to
-    /// `density`, which has [`bins`](Self::bins). Takes no memory. A NaN or an infinity in the
-    /// signal makes bins NaN.
+    /// Writes the density of `signal`, which has [`samples`](Self::samples) values, oldest first,
+    /// to `density`, which has [`bins`](Self::bins) values. Allocates no memory. A NaN or an
+    /// infinity in the signal makes bins NaN.
     ///
     /// # Errors
     ///
-    /// [`SpectrumError::Signal`] or [`SpectrumError::Density`] for another length.
+    /// [`SpectrumError::Signal`] or [`SpectrumError::Density`] if a length is different.
     pub fn density(&mut self, signal: &[T], density: &mut [T]) -> Result<(), SpectrumError> {
         let (needed, found) = (self.samples(), signal.len());
         if found != needed {
@@ -137,7 +140,7 @@ impl<T: Real> Spectrum<T> {
         Ok(())
     }
 
-    /// Even samples become real parts, odd ones imaginary parts.
+    /// Applies the window. Even samples become real parts, odd ones imaginary parts.
     fn pack(&mut self, signal: &[T]) {
         let (signal, window) = (signal.as_chunks::<2>().0, self.window.as_chunks::<2>().0);
         let pair = |[even, odd]: [T; 2], [a, b]: [T; 2]| Complex::new(even * a, odd * b);
@@ -153,7 +156,7 @@ impl<T: Real> Spectrum<T> {
         }
     }
 
-    /// From the transform of the packed signal to the density of the signal itself.
+    /// Computes the density of the signal from the transform of the packed signal.
     ///
     /// With Z the former, E = Z[k] + conj(Z[h - k]) is twice the transform of the even samples and
     /// O = -i (Z[k] - conj(Z[h - k])) twice that of the odd ones; E + turns[k] O is then twice that
@@ -161,12 +164,13 @@ impl<T: Real> Spectrum<T> {
     fn untangle(&self, density: &mut [T]) {
         let half = self.packed.len();
         let first = self.packed[0];
-        // The first and the last bin are real, and stand for themselves alone: half the scale, of
+        // The first and the last bin are real, and stand for one frequency only: half the scale, of
         // the square of twice the sum.
         let two = T::one() + T::one();
         density[0] = two * self.scale * (first.re + first.im) * (first.re + first.im);
         density[half] = two * self.scale * (first.re - first.im) * (first.re - first.im);
-        // Bins k and h - k together; the one in the middle of an even number is its own partner.
+        // Bins k and h - k are computed together; the middle bin of an even number is its own
+        // partner.
         let scale = self.scale;
         let both = |ahead: Complex<T>, back: Complex<T>, turn: Complex<T>| {
             let (even, odd) = (ahead + back.conj(), ahead - back.conj());
@@ -202,9 +206,9 @@ impl<T: Real> Spectrum<T> {
     }
 }
 
-/// Power between `low_hz` and `high_hz`: the sum of the bins of `density` from `low_hz` on and
-/// below `high_hz`, times their distance `bin_hz`. In the unit of the signal, squared: a sine of
-/// amplitude a, well inside, has a² / 2. Bands that touch share no bin.
+/// Power between `low_hz` and `high_hz`: the sum of the bins of `density` from `low_hz` (inclusive)
+/// to `high_hz` (exclusive), times their distance `bin_hz`. The unit is that of the signal,
+/// squared: a sine of amplitude a well inside the band has a² / 2. Adjacent bands share no bin.
 ///
 /// Source: Parseval's theorem.
 pub fn band_power<T: Real>(density: &[T], bin_hz: f64, low_hz: f64, high_hz: f64) -> T {
@@ -215,12 +219,12 @@ pub fn band_power<T: Real>(density: &[T], bin_hz: f64, low_hz: f64, high_hz: f64
     within.fold(T::zero(), |sum, (_, power)| sum + *power) * real(bin_hz)
 }
 
-/// Rounded to the nearest `T`.
+/// Rounds to the nearest `T`.
 fn real<T: Real>(value: f64) -> T {
     T::from_f64(value).expect("f32 and f64 are made from any f64")
 }
 
-/// Why there is no spectrum.
+/// Reason why a spectrum cannot be computed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[allow(missing_docs)]
 pub enum SpectrumError {
@@ -236,15 +240,17 @@ impl fmt::Display for SpectrumError {
             Self::Samples { samples } => {
                 write!(
                     f,
-                    "a spectrum of {samples} samples; their number is even, and from 4 to {MAX_SAMPLES}"
+                    "a spectrum of {samples} samples; use an even number from 4 to {MAX_SAMPLES}"
                 )
             }
-            Self::Rate { rate_hz } => write!(f, "a rate of {rate_hz} Hz; it is finite and above 0"),
+            Self::Rate { rate_hz } => {
+                write!(f, "a rate of {rate_hz} Hz; it must be finite and above 0")
+            }
             Self::Signal { needed, found } => {
                 write!(f, "the spectrum is of {needed} samples; the signal has {found}")
             }
             Self::Density { needed, found } => {
-                write!(f, "the density has {needed} bins; the place for it has {found}")
+                write!(f, "the density has {needed} bins; the output has {found}")
             }
         }
     }
@@ -265,7 +271,7 @@ mod tests {
         std::iter::repeat_with(next).take(count).collect()
     }
 
-    /// By the definition, term by term.
+    /// Computes the density by its definition, term by term.
     fn defined(signal: &[f64], rate_hz: f64) -> Vec<f64> {
         let n = signal.len();
         let window = |j: usize| (std::f64::consts::PI * j as f64 / n as f64).sin().powi(2);
@@ -292,19 +298,19 @@ mod tests {
     }
 
     #[test]
-    fn every_bin_is_what_the_definition_says() {
+    fn every_bin_agrees_with_the_definition() {
         for samples in [4, 6, 8, 10, 30, 64, 128, 250, 256, 1000, 1024] {
             let signal = noise(samples);
-            let (ours, expected) = (density(&signal, 104.0), defined(&signal, 104.0));
+            let (found, expected) = (density(&signal, 104.0), defined(&signal, 104.0));
             let single = signal.iter().map(|x| *x as f32).collect::<Vec<_>>();
             let single = density(&single, 104.0);
             let largest = expected.iter().copied().fold(0.0, f64::max);
             for (bin, expected) in expected.iter().enumerate() {
-                let off = (ours[bin] - expected).abs() / largest;
+                let off = (found[bin] - expected).abs() / largest;
                 assert!(
                     off < 1e-13,
                     "{samples} samples, bin {bin}: {} is not {expected}",
-                    ours[bin]
+                    found[bin]
                 );
                 let off = (f64::from(single[bin]) - expected).abs() / largest;
                 assert!(
@@ -328,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bin_belongs_to_one_of_two_bands_that_touch() {
+    fn a_bin_belongs_to_one_of_two_adjacent_bands() {
         let flat = [1.0; 9];
         assert_eq!(band_power(&flat, 2.0, 2.0, 6.0), 4.0);
         assert_eq!(band_power(&flat, 2.0, 6.0, 100.0), 12.0);
@@ -336,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn a_signal_that_was_judged_before_leaves_nothing_behind() {
+    fn a_previous_signal_does_not_change_the_result() {
         let mut spectrum = Spectrum::hann(64, 100.0).unwrap();
         let (mut first, mut second) = ([0.0; 33], [0.0; 33]);
         spectrum.density(&noise(64), &mut first).unwrap();
@@ -347,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_planned_or_does_not_fit_is_refused() {
+    fn unsupported_sizes_rates_and_lengths_are_refused() {
         let refused = |samples, rate_hz| {
             Spectrum::<f64>::hann(samples, rate_hz).err().map(|error| error.to_string())
         };
@@ -365,6 +371,6 @@ mod tests {
         let error = spectrum.density(&[0.0_f32; 63], &mut [0.0; 33]).unwrap_err();
         assert_eq!(error.to_string(), "the spectrum is of 64 samples; the signal has 63");
         let error = spectrum.density(&[0.0_f32; 64], &mut [0.0; 32]).unwrap_err();
-        assert_eq!(error.to_string(), "the density has 33 bins; the place for it has 32");
+        assert_eq!(error.to_string(), "the density has 33 bins; the output has 32");
     }
 }

@@ -1,19 +1,19 @@
-//! How many pixels have which grey level.
+//! Histograms of grey levels.
 
 use super::luma::grey;
 use super::{Colours, Image};
 
-/// Pixels whose grey levels are made at a time.
+/// Pixels whose grey levels are computed at a time.
 const PIECE: usize = 512;
 
-/// Levels that are counted in a turn.
+/// Levels that one iteration of the loop counts.
 const TURN: usize = 32;
 
-/// Tables that are counted in by turns: one that has just been written to is slow to read.
+/// Number of tables, which are used in turn: reading a counter right after writing it is slow.
 const TABLES: usize = 4;
 
-/// How many pixels have each grey level: what [`Frame::histogram`](crate::Frame::histogram) says,
-/// with the levels of [`to_gray`](super::luma::to_gray).
+/// Number of pixels at each grey level of [`to_gray`](super::luma::to_gray). Equal to
+/// [`Frame::histogram`](crate::Frame::histogram).
 pub fn histogram(image: &Image<'_>) -> [u32; 256] {
     // 65,535^2 pixels of one level still fit a `u32`.
     let mut tables = [[0_u32; 256]; TABLES];

@@ -1,26 +1,26 @@
-//! How bright pixels are.
+//! Luma of pixels.
 
 use std::hint::black_box;
 
 use super::{Colours, Image, ImageError};
 
-/// Byte positions that are summed side by side: whole pixels of 1 and 3 bytes, and whole vectors of
-/// 16.
+/// Byte positions that are summed in parallel: a multiple of 1, 3 (bytes of a pixel) and 16 (bytes
+/// of a vector).
 const LANES: usize = 48;
 
-/// Bytes that are summed in a turn of the loop: four for each lane. An array of arrays, so that the
-/// distance of each vector from the first stands in the instruction that loads it.
+/// Bytes that one iteration of the loop sums: four for each lane. An array of arrays, so that the
+/// offset of each vector is an immediate of its load instruction.
 type Turn = [[u8; LANES]; 4];
 
-/// Turns after which sums of 16 bits must be emptied: 64 * 4 * 255 = 65,280.
+/// Iterations after which the 16-bit sums must be emptied: 64 * 4 * 255 = 65,280.
 const TURNS: usize = 64;
 
-/// Pixels of one turn in [`grey`].
+/// Pixels of one iteration in [`grey`].
 const PIXELS: usize = 32;
 
-/// Mean luma, 0 to 255: what [`Frame::mean_luma`](crate::Frame::mean_luma) says, bit for bit.
+/// Mean luma, 0 to 255. Equal to [`Frame::mean_luma`](crate::Frame::mean_luma), bit for bit.
 ///
-/// Luma is (299 R + 587 G + 114 B) / 1000, and the value itself for mono8. The sums are exact and
+/// Luma is (299 R + 587 G + 114 B) / 1000, or the value itself for mono8. The sums are exact, and
 /// divided once.
 ///
 /// Source: luma weights of ITU-R BT.601.
@@ -35,11 +35,12 @@ pub fn mean_luma(image: &Image<'_>) -> f64 {
     sum as f64 / (scale * image.width as u64 * image.height as u64) as f64
 }
 
-/// Sum of each byte of a pixel over the image, in their order; of a grey one, the first alone.
+/// Sum of each byte of a pixel over the image, in the order of the bytes; for a grey image only the
+/// first is used.
 pub(super) fn sums(image: &Image<'_>) -> [u64; 3] {
     let mut lanes = [0; LANES];
     if image.step == image.width * image.pixel() {
-        // Without padding all rows are one, and sums are emptied less often.
+        // Without padding, all rows are one block, and the sums are emptied less often.
         add_bytes(&image.data[..image.step * image.height], &mut lanes);
     } else {
         image.rows().for_each(|row| add_bytes(row, &mut lanes));
@@ -65,19 +66,19 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
     }
 }
 
-/// Sums of at most [`TURNS`] turns. By itself, since together with what surrounds it the compiler
-/// finds no vectors in it.
+/// Sums of at most [`TURNS`] blocks. Not inlined, since the compiler does not vectorise it inside
+/// of its caller.
 ///
-/// Two bytes at a time are a number of 16 bits: the upper bytes are summed, and the whole numbers.
-/// What the upper bytes make of the latter is taken off at the end; modulo 2^16, since that sum
-/// wraps. A checked addition would not become a vector's.
+/// Two bytes at a time are read as a 16-bit number. The upper bytes and the whole numbers are
+/// summed; at the end the share of the upper bytes is subtracted from the latter, modulo 2^16,
+/// since that sum wraps. A checked addition would prevent vectorisation.
 #[inline(never)]
 fn short_sums(turns: &[Turn]) -> [u16; LANES] {
     let mut whole = [0_u16; LANES / 2];
     let mut upper = [0_u16; LANES / 2];
     for turn in turns {
-        // Or some compilers sum over turns instead, and gather single bytes for that. It changes no
-        // result.
+        // Without this, some compilers sum over the blocks instead, and gather single bytes for
+        // that. It does not change the result.
         let turn = black_box(turn);
         for group in turn {
             for (lane, bytes) in group.as_chunks::<2>().0.iter().enumerate() {
@@ -93,8 +94,8 @@ fn short_sums(turns: &[Turn]) -> [u16; LANES] {
     })
 }
 
-/// Writes the image as mono8 to `out`, without padding, width * height bytes: what
-/// [`Frame::to_gray`](crate::Frame::to_gray) makes, byte for byte. A grey level is the luma of
+/// Writes the image as mono8 to `out`, width * height bytes without padding. Equal to
+/// [`Frame::to_gray`](crate::Frame::to_gray), byte for byte. A grey level is the luma of
 /// [`mean_luma`], rounded down.
 ///
 /// # Errors
@@ -111,7 +112,7 @@ pub fn to_gray(image: &Image<'_>, out: &mut [u8]) -> Result<(), ImageError> {
     Ok(())
 }
 
-/// Writes the grey level of each pixel in `row` to `levels`, which has a byte for each.
+/// Writes the grey level of each pixel in `row` to `levels`, one byte per pixel.
 pub(super) fn grey(colours: Colours, row: &[u8], levels: &mut [u8]) {
     match colours {
         Colours::Grey => levels.copy_from_slice(row),
@@ -136,8 +137,9 @@ fn weigh<const RED: usize, const BLUE: usize>(row: &[u8], levels: &mut [u8]) {
 /// (299 R + 587 G + 114 B) / 1000, rounded down.
 fn luma_of(red: u8, green: u8, blue: u8) -> u8 {
     let thousandths = 299 * u32::from(red) + 587 * u32::from(green) + 114 * u32::from(blue);
-    // A division by 8 and one by 125, as vectors have none: 33,555 / 2^22 exceeds 1 / 125 by so
-    // little that no quotient of numbers up to 255,000 / 8 changes. No product reaches 2^31.
+    // Divides by 8 and then by 125, without the division that vectors lack: 33,555 / 2^22 exceeds
+    // 1 / 125 by so little that no quotient of numbers up to 255,000 / 8 changes. No product
+    // reaches 2^31.
     (((thousandths >> 3) * 33_555) >> 22) as u8
 }
 
@@ -146,7 +148,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_sum_of_weights_is_divided_as_by_division() {
+    fn multiplication_and_shift_equal_division_for_every_sum() {
         for thousandths in 0..=255_000_u32 {
             assert_eq!(((thousandths >> 3) * 33_555) >> 22, thousandths / 1000);
         }
@@ -155,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn white_does_not_overflow_however_long_a_row_is() {
+    fn white_does_not_overflow_in_the_longest_row() {
         use crate::data::Encoding;
         for encoding in [Encoding::Mono8, Encoding::Rgb8] {
             let white = vec![255; 3 * 65_535];
@@ -165,9 +167,9 @@ mod tests {
     }
 
     #[test]
-    fn a_place_of_another_size_is_refused() {
+    fn an_output_of_another_size_is_refused() {
         let image = Image::new(2, 1, 2, crate::data::Encoding::Mono8, &[1, 2]).unwrap();
         let refused = to_gray(&image, &mut [0; 3]).unwrap_err();
-        assert_eq!(refused.to_string(), "the result takes 2 bytes; the place for it has 3");
+        assert_eq!(refused.to_string(), "the result takes 2 bytes; the output has 3");
     }
 }

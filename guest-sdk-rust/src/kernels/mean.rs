@@ -1,21 +1,21 @@
-//! Means.
+//! Mean values.
 
 use super::luma::sums;
 use super::{Colours, Image};
 
-/// Sums that are kept side by side.
+/// Number of parallel sums.
 const LANES: usize = 16;
 
-/// Values that are added in a turn of the loop: to keep the sums while fuel and deadline are looked
-/// at takes as long as to add 16.
+/// Values that one iteration of the loop adds: saving the sums for the check of fuel and deadline
+/// takes as long as 16 additions.
 const TURN: usize = 8 * LANES;
 
-/// Arithmetic mean of `values`, of any number type that fits an `f64`; none if there are none. In
-/// the unit of the values.
+/// Arithmetic mean of `values`, of any number type that fits an `f64`, in the unit of the values;
+/// none if there are none.
 ///
-/// Sixteen sums are kept side by side and added up in a fixed order, so the result is equal on
-/// every machine; it may differ in its last bits from a sum from left to right, such as
-/// [`Column::mean`](crate::Column::mean), and is the more exact one.
+/// Sixteen parallel sums are added up in a fixed order, so the result is the same on every machine.
+/// It may differ in its last bits from a sum from left to right, such as
+/// [`Column::mean`](crate::Column::mean), and is more exact.
 pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
     let (turns, rest) = values.as_chunks::<TURN>();
     let mut lanes = long_sums(turns);
@@ -27,8 +27,8 @@ pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
     (!values.is_empty()).then(|| lanes.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Sums of every sixteenth value. By itself, since together with what surrounds it the compiler
-/// finds no vectors in it.
+/// Sums of every sixteenth value. Not inlined, since the compiler does not vectorise it inside of
+/// its caller.
 #[inline(never)]
 fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
     let mut lanes = [0.0_f64; LANES];
@@ -42,8 +42,8 @@ fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
     lanes
 }
 
-/// Mean of red, green and blue, each 0 to 255; of a mono8 image, three times that of its grey. The
-/// sums are exact.
+/// Means of red, green and blue, each 0 to 255; for a mono8 image, three times the mean grey level.
+/// The sums are exact.
 pub fn mean_rgb(image: &Image<'_>) -> [f64; 3] {
     let count = (image.width * image.height) as f64;
     let [first, second, third] = sums(image).map(|sum| sum as f64 / count);
@@ -60,7 +60,7 @@ mod tests {
     use crate::data::Encoding;
 
     #[test]
-    fn the_mean_is_that_of_all_values_whatever_their_number() {
+    fn the_mean_includes_all_values_for_any_count() {
         for count in 1..300_i32 {
             // 1 + 2 + ... + n = n (n + 1) / 2
             let expected = Some(f64::from(count + 1) / 2.0);
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_are_told_apart() {
+    fn colours_are_in_the_order_of_the_encoding() {
         let pixels = [1, 2, 3, 5, 6, 7];
         let image = |encoding| Image::new(2, 1, 6, encoding, &pixels).unwrap();
         assert_eq!(mean_rgb(&image(Encoding::Rgb8)), [3.0, 4.0, 5.0]);

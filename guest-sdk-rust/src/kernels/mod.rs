@@ -1,17 +1,17 @@
-//! Arithmetic on pixels and signals inside of a lambda.
+//! Computes with pixels and signals inside of a lambda.
 //!
-//! Each kernel is a plain function over slices, tested natively as any Rust code. The same source
-//! becomes vector instructions of 128 bits in a component, which `gleaner build` compiles with
-//! `simd128`, and on the machine it is tested on. Loops handle 64 bytes and more at a time: fuel
-//! and deadline are checked once for each turn, so that this costs little.
+//! Each kernel is a plain function over slices that native tests can call. The compiler vectorises
+//! the same source to 128-bit instructions, in a component (`gleaner build` compiles with
+//! `simd128`) and natively. One iteration of a loop handles 64 bytes or more: fuel and deadline are
+//! checked once per iteration, so that the check costs little.
 //!
-//! Kernels on pixels compute in integers and give, bit for bit, what the operation of the same name
-//! on a [`Frame`](crate::Frame) gives. Ask the frame first: the host reads its pixels where they
-//! are, while a kernel needs them copied into the lambda. Kernels are for pixels that the lambda
-//! has anyway, or has changed. `docs/kernels.md` says what each way costs.
+//! Kernels on pixels compute with integers. Their results equal those of the operation of the same
+//! name on a [`Frame`](crate::Frame), bit for bit. Prefer the operation on the frame: the host
+//! reads the pixels in place, while a kernel needs a copy of them in the lambda. Use kernels for
+//! pixels that the lambda has copied anyway, or has changed. `docs/kernels.md` compares the costs.
 //!
-//! Never: a call to the host; memory taken in a loop, except where a function says so; pixels other
-//! than rgb8, bgr8 and mono8.
+//! Kernels never call the host, and allocate memory only where documented. They read rgb8, bgr8 and
+//! mono8 only.
 
 pub mod downscale;
 #[cfg(feature = "fft")]
@@ -24,10 +24,10 @@ use std::fmt;
 
 use crate::data::{Encoding, FrameInfo, Roi, bytes_per_pixel, encoding_name};
 
-/// Largest width and height of an image, in pixels; as the host's.
+/// Maximum width and height of an image, in pixels; the same as in the host.
 pub const MAX_SIDE: u32 = 65_535;
 
-/// Pixels that lie in the lambda's memory, once their size has been checked.
+/// An image in the memory of the lambda, with a validated size.
 ///
 /// ```
 /// use gleaner_sdk::data::Encoding;
@@ -46,7 +46,7 @@ pub struct Image<'a> {
     data: &'a [u8],
 }
 
-/// What the bytes of a pixel are.
+/// Channels of a pixel, in the order of its bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Colours {
     Grey,
@@ -55,15 +55,14 @@ enum Colours {
 }
 
 impl<'a> Image<'a> {
-    /// The image of `width` x `height` pixels in `data`, where a row starts every `step` bytes.
-    /// Bytes behind a row and behind the image are ignored; those behind the last row may be
-    /// missing.
+    /// Creates an image of `width` x `height` pixels over `data`; a row starts every `step` bytes.
+    /// Padding after a row and bytes after the image are ignored; the last row needs no padding.
     ///
     /// # Errors
     ///
     /// [`ImageError::Encoding`] unless the pixels are rgb8, bgr8 or mono8; [`ImageError::Size`] if
-    /// a side is 0 or above [`MAX_SIDE`]; [`ImageError::Step`] and [`ImageError::Data`] if rows or
-    /// image do not fit.
+    /// a side is 0 or above [`MAX_SIDE`]; [`ImageError::Step`] if `step` is too small for a row;
+    /// [`ImageError::Data`] if `data` is too short.
     pub fn new(
         width: u32,
         height: u32,
@@ -92,8 +91,8 @@ impl<'a> Image<'a> {
         Ok(Self { width, height, step, colours, data })
     }
 
-    /// The pixels of a frame in `data`, as [`Frame::copy_to`](crate::Frame::copy_to) has put them
-    /// there.
+    /// Creates an image over the pixels of a frame that [`Frame::copy_to`](crate::Frame::copy_to)
+    /// copied to `data`.
     ///
     /// # Errors
     ///
@@ -102,7 +101,7 @@ impl<'a> Image<'a> {
         Self::new(info.width, info.height, info.step, info.encoding, data)
     }
 
-    /// The part of the image in `roi`, clipped to it as the host does.
+    /// The part of the image in `roi`, which is clipped to the image, as in the host.
     ///
     /// # Errors
     ///
@@ -125,17 +124,17 @@ impl<'a> Image<'a> {
         })
     }
 
-    /// Pixels in a row, 1 to [`MAX_SIDE`].
+    /// Width in pixels, 1 to [`MAX_SIDE`].
     pub fn width(&self) -> u32 {
         self.width as u32
     }
 
-    /// Rows, 1 to [`MAX_SIDE`].
+    /// Height in pixels, 1 to [`MAX_SIDE`].
     pub fn height(&self) -> u32 {
         self.height as u32
     }
 
-    /// Bytes of a pixel: 1 or 3.
+    /// Bytes per pixel: 1 or 3.
     fn pixel(&self) -> usize {
         if self.colours == Colours::Grey { 1 } else { 3 }
     }
@@ -145,14 +144,14 @@ impl<'a> Image<'a> {
         self.rows_from(0)
     }
 
-    /// The rows from row `first` on, without padding.
+    /// The rows from row `first` to the last, without padding.
     fn rows_from(&self, first: usize) -> impl Iterator<Item = &'a [u8]> + use<'a> {
         let row = self.width * self.pixel();
         self.data.chunks(self.step).take(self.height).skip(first).map(move |whole| &whole[..row])
     }
 }
 
-/// Why bytes are no image, or an image cannot become another.
+/// Reason why bytes are not an image, or an image cannot be converted.
 #[derive(Clone, Copy, Debug)]
 #[allow(missing_docs)]
 pub enum ImageError {
@@ -170,29 +169,33 @@ impl fmt::Display for ImageError {
         match self {
             Self::Encoding { name } => write!(
                 f,
-                "kernels read rgb8, bgr8 and mono8, not {name}; the operations of a frame read it, and its `to_gray` and `resize` \
-                 make one that kernels read"
+                "kernels read rgb8, bgr8 and mono8, not {name}; use the operations of a frame, or \
+                 its `to_gray` or `resize` for a frame that kernels can read"
             ),
             Self::Size { width, height } => {
-                write!(f, "an image of {width}x{height} pixels; each side has 1 to {MAX_SIDE}")
+                write!(f, "an image of {width}x{height} pixels; each side must be 1 to {MAX_SIDE}")
             }
             Self::Step { step, needed } => {
                 write!(f, "a row takes {needed} bytes, but one starts every {step}")
             }
-            Self::Data { needed } => write!(f, "the image takes {needed} bytes, there are fewer"),
+            Self::Data { needed } => {
+                write!(f, "the image takes {needed} bytes; the data has fewer")
+            }
             Self::Roi { roi, width, height } => {
                 let Roi { x, y, width: across, height: down } = roi;
                 write!(
                     f,
-                    "no pixel of the image of {width}x{height} is in the region of {across}x{down} at ({x}, {y})"
+                    "no pixel of the image of {width}x{height} is in the region of \
+                     {across}x{down} at ({x}, {y})"
                 )
             }
             Self::Output { needed, found } => {
-                write!(f, "the result takes {needed} bytes; the place for it has {found}")
+                write!(f, "the result takes {needed} bytes; the output has {found}")
             }
             Self::ResizeTo { from, to } => write!(
                 f,
-                "{}x{} pixels cannot become {}x{}: each side has 1 pixel at least and no more than before",
+                "{}x{} pixels cannot become {}x{}: each side must be at least 1 pixel and not \
+                 larger than before",
                 from.0, from.1, to.0, to.1
             ),
         }
@@ -206,7 +209,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_does_not_fit_is_refused_with_its_numbers() {
+    fn images_that_do_not_fit_are_refused_with_their_numbers() {
         let refused = |width, height, step, encoding, bytes| {
             Image::new(width, height, step, encoding, &vec![0; bytes]).unwrap_err().to_string()
         };
@@ -216,7 +219,7 @@ mod tests {
         );
         assert_eq!(
             refused(2, 2, 8, Encoding::Bgr8, 13),
-            "the image takes 14 bytes, there are fewer"
+            "the image takes 14 bytes; the data has fewer"
         );
         assert!(refused(65_536, 1, 65_536, Encoding::Mono8, 65_536).contains("65536x1 pixels"));
         assert!(refused(0, 1, 0, Encoding::Mono8, 0).contains("0x1 pixels"));
@@ -228,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn a_last_row_needs_no_padding_and_a_part_begins_anywhere() {
+    fn the_last_row_needs_no_padding_and_a_part_starts_anywhere() {
         let data = [1, 2, 3, 0, 4, 5, 6];
         let image = Image::new(3, 2, 4, Encoding::Mono8, &data).unwrap();
         assert_eq!(image.rows().collect::<Vec<_>>(), [[1, 2, 3], [4, 5, 6]]);

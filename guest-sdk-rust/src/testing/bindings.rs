@@ -1,9 +1,9 @@
-//! What stands natively where wit-bindgen's code stands in a component: the same names, over the
-//! fake host beside this file.
+//! Native replacement of the bindings that wit-bindgen generates for a component: the same names,
+//! over the fake host in this folder.
 //!
 //! The SDK is written against both, so a name that is missing in one of them fails a build.
 
-/// The interfaces, as wit-bindgen puts them.
+/// The interfaces, in the modules in which wit-bindgen puts them.
 pub(crate) mod gleaner {
     pub(crate) mod lambda {
         pub(crate) use crate::testing::{data, inference, log, scratch, trigger, types};
@@ -12,14 +12,14 @@ pub(crate) mod gleaner {
 
 use self::gleaner::lambda::data::Wake;
 
-/// One value of `[config]`, by its name.
+/// One entry of `[config]`.
 #[derive(Clone, Debug)]
 pub struct ConfigEntry {
     pub(crate) key: String,
     pub(crate) value: ConfigValue,
 }
 
-/// The value itself.
+/// Value of a `[config]` entry.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(missing_docs)]
 pub enum ConfigValue {
@@ -29,14 +29,14 @@ pub enum ConfigValue {
     Text(String),
 }
 
-/// What a component exports.
+/// Functions that a component exports.
 #[allow(missing_docs, clippy::missing_errors_doc)]
 pub trait Guest {
     fn init(config: Vec<ConfigEntry>) -> Result<(), String>;
     fn on_wake(wake: Wake) -> Result<(), String>;
 }
 
-/// Natively nobody looks for exports; that they could be made is checked.
+/// Checks that the type can be exported; natively nothing is exported.
 #[doc(hidden)]
 #[macro_export]
 macro_rules! __export_lambda_natively {

@@ -1,5 +1,5 @@
-//! `gleaner:lambda/data`: samples and fields, as a lambda reads them. Every number that it passes
-//! is clamped here.
+//! Implements `gleaner:lambda/data`: samples and fields, as a lambda reads them. Clamps every
+//! number that a lambda passes.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -8,33 +8,33 @@ pub use gleaner_rules::schedule::Tick;
 use gleaner_rules::{refused, ring};
 
 pub(crate) use super::frame::Frame;
-use super::frame::Images;
+use super::frame::FramePool;
 use super::manifest::{Input, Limits};
 use super::message::{ENCAPSULATION, Message};
-use super::path::{Found, Missing, Path, known};
+use super::path::{FieldPath, FieldRef, MissingField, known};
 use super::ring::{Cell, Ring};
-use super::session::{Handle, Handles, current};
+use super::session::{Handle, HandleCounter, current};
 use super::types::{Column, Counts, DataError, Identity, Stamps, Value};
 
-type Answer<T> = Result<T, DataError>;
+type CallResult<T> = Result<T, DataError>;
 
-/// Why the lambda runs.
+/// Cause of a wake.
 pub enum Wake {
     /// A new sample on the input that `[schedule] event` names.
     Event(Sample),
-    /// The period is over.
+    /// The end of a `[schedule] period`.
     Tick(Tick),
 }
 
-pub(crate) fn input(name: &str) -> Answer<Topic> {
+pub(crate) fn input(name: &str) -> CallResult<Topic> {
     let session = current();
-    session.passed(name.len());
+    session.check_bytes(name.len());
     let found = session.inputs.iter().find(|source| source.declared.name == name);
     let source = found.cloned().ok_or_else(|| {
         let names = session.inputs.iter().map(|source| source.declared.name.as_str());
         DataError::NoSuchInput(refused::no_such_input(name, names))
     })?;
-    let handle = source.handles.hand_out();
+    let handle = source.handles.acquire();
     Ok(Topic { source, _handle: handle })
 }
 
@@ -46,49 +46,49 @@ pub(crate) fn now_ns() -> i64 {
     current().lock().now_ns
 }
 
-/// What all handles of one input share; it lives as long as the run.
-pub(crate) struct Source {
+/// State that all handles of one input share, for the whole run.
+pub(crate) struct InputState {
     pub(super) declared: Input,
     pub(super) limits: Limits,
-    pub(super) handles: Arc<Handles>,
-    pub(super) images: Images,
-    /// What stands where a message does not say otherwise, if a test gave that.
+    pub(super) handles: Arc<HandleCounter>,
+    pub(super) frame_pool: FramePool,
+    /// Default fields of the input's messages, if the test set them.
     pub(super) blank: Option<Message>,
-    state: Mutex<Arrived>,
+    state: Mutex<InputBuffer>,
 }
 
-/// What has come so far.
-pub(super) struct Arrived {
+/// Samples received so far.
+pub(super) struct InputBuffer {
     pub(super) ring: Ring,
     pub(super) skipped: u64,
     pub(super) seq: u64,
 }
 
-impl Source {
+impl InputState {
     pub(super) fn new(
         declared: Input,
         limits: Limits,
-        handles: Arc<Handles>,
-        images: Images,
+        handles: Arc<HandleCounter>,
+        frame_pool: FramePool,
         blank: Option<Message>,
     ) -> Arc<Self> {
         let ring = Ring::new(declared.depth, declared.hold, declared.max_size);
-        let state = Mutex::new(Arrived { ring, skipped: 0, seq: 0 });
-        Arc::new(Self { declared, limits, handles, images, blank, state })
+        let state = Mutex::new(InputBuffer { ring, skipped: 0, seq: 0 });
+        Arc::new(Self { declared, limits, handles, frame_pool, blank, state })
     }
 
-    pub(super) fn lock(&self) -> MutexGuard<'_, Arrived> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, InputBuffer> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(super) fn counts(&self) -> Counts {
-        let Arrived { ring: arrived, skipped, .. } = &*self.lock();
+        let InputBuffer { ring: arrived, skipped, .. } = &*self.lock();
         let ring::Counts { received, overwritten, no_slot, too_big } = arrived.counts();
         Counts { received, lost: None, overwritten, no_slot, too_big, skipped: *skipped }
     }
 
     pub(super) fn sample(self: &Arc<Self>, cell: Arc<Cell>) -> Sample {
-        Sample { source: Arc::clone(self), cell, _handle: self.handles.hand_out() }
+        Sample { source: Arc::clone(self), cell, _handle: self.handles.acquire() }
     }
 
     fn malformed(&self, why: &str) -> DataError {
@@ -99,19 +99,19 @@ impl Source {
         ))
     }
 
-    fn find<'a>(&self, path: &Path, message: &'a Message) -> Answer<Found<'a>> {
+    fn find<'a>(&self, path: &FieldPath, message: &'a Message) -> CallResult<FieldRef<'a>> {
         path.find(&message.fields).map_err(|missing| match missing {
-            Missing::Element(why) => self.malformed(&why),
-            Missing::Field(known) => {
+            MissingField::Element(why) => self.malformed(&why),
+            MissingField::Field(known) => {
                 let (topic, text) = (&self.declared.topic, &path.text);
                 DataError::NoSuchField(format!(
-                    "a message that the test gave to `{topic}` has no field `{text}`{known}"
+                    "a message that the test delivered to `{topic}` has no field `{text}`{known}"
                 ))
             }
         })
     }
 
-    fn number(&self, path: &Path, cell: &Cell) -> Answer<f64> {
+    fn number(&self, path: &FieldPath, cell: &Cell) -> CallResult<f64> {
         let found = self.find(path, &cell.sample.message)?;
         found
             .number()
@@ -138,20 +138,20 @@ impl Source {
 
 /// The ring of one `[[input]]`.
 pub struct Topic {
-    source: Arc<Source>,
+    source: Arc<InputState>,
     _handle: Handle,
 }
 
 /// A path into the messages of one topic.
 pub struct Field {
-    source: Arc<Source>,
-    path: Path,
+    source: Arc<InputState>,
+    path: FieldPath,
     _handle: Handle,
 }
 
-/// One message; holds its cell of the ring.
+/// One message; keeps its cell of the ring.
 pub struct Sample {
-    pub(super) source: Arc<Source>,
+    pub(super) source: Arc<InputState>,
     pub(super) cell: Arc<Cell>,
     _handle: Handle,
 }
@@ -193,32 +193,28 @@ impl Topic {
         self.source.counts()
     }
 
-    pub(crate) fn field(&self, path: &str) -> Answer<Field> {
+    pub(crate) fn field(&self, path: &str) -> CallResult<Field> {
         clamps::path(path)?;
-        let path =
-            Path::new(path).map_err(|malformed| DataError::NoSuchField(malformed.to_string()))?;
+        let path = FieldPath::new(path)
+            .map_err(|malformed| DataError::NoSuchField(malformed.to_string()))?;
         if let Some(blank) = &self.source.blank
-            && let Err(Missing::Field(known)) = path.find(&blank.fields)
+            && let Err(MissingField::Field(known)) = path.find(&blank.fields)
         {
             let type_name = &self.source.declared.type_name;
             let why = format!(
-                "type `{type_name}`, as the test has it, has no field `{}`{known}",
+                "type `{type_name}`, as the test defines it, has no field `{}`{known}",
                 path.text
             );
             return Err(DataError::NoSuchField(why));
         }
-        Ok(Field {
-            source: Arc::clone(&self.source),
-            path,
-            _handle: self.source.handles.hand_out(),
-        })
+        Ok(Field { source: Arc::clone(&self.source), path, _handle: self.source.handles.acquire() })
     }
 
-    pub(crate) fn column(&self, field: &Field, n: u32) -> Answer<Column> {
+    pub(crate) fn column(&self, field: &Field, n: u32) -> CallResult<Column> {
         self.read_column(field, n as usize, |_| true)
     }
 
-    pub(crate) fn column_since(&self, field: &Field, since_ns: i64) -> Answer<Column> {
+    pub(crate) fn column_since(&self, field: &Field, since_ns: i64) -> CallResult<Column> {
         self.read_column(field, usize::MAX, |at_ns| at_ns > since_ns)
     }
 
@@ -227,12 +223,13 @@ impl Topic {
         field: &Field,
         most: usize,
         keep: impl Fn(i64) -> bool,
-    ) -> Answer<Column> {
+    ) -> CallResult<Column> {
         let source = &self.source;
         let path = field.of(source)?;
         let most = most.min(source.limits.per_call.items);
         let cells = source.lock().ring.newest_while(most, |arrival| keep(arrival.at_ns));
-        let values = cells.iter().map(|cell| source.number(path, cell)).collect::<Answer<_>>()?;
+        let values =
+            cells.iter().map(|cell| source.number(path, cell)).collect::<CallResult<_>>()?;
         Ok(Column { at_ns: cells.iter().map(|cell| cell.sample.at_ns).collect(), values })
     }
 }
@@ -242,7 +239,7 @@ impl Field {
         self.path.text.clone()
     }
 
-    fn of(&self, source: &Arc<Source>) -> Answer<&Path> {
+    fn of(&self, source: &Arc<InputState>) -> CallResult<&FieldPath> {
         if Arc::ptr_eq(&self.source, source) {
             return Ok(&self.path);
         }
@@ -264,7 +261,7 @@ impl Sample {
         self.source.stamps(&self.cell)
     }
 
-    pub(crate) fn get(&self, field: &Field) -> Answer<Value> {
+    pub(crate) fn get(&self, field: &Field) -> CallResult<Value> {
         let path = field.of(&self.source)?;
         let found = self.source.find(path, &self.cell.sample.message)?;
         let length = match found.value() {
@@ -280,7 +277,7 @@ impl Sample {
         Ok(found.value().clone())
     }
 
-    pub(crate) fn number(&self, field: &Field) -> Answer<f64> {
+    pub(crate) fn number(&self, field: &Field) -> CallResult<f64> {
         self.source.number(field.of(&self.source)?, &self.cell)
     }
 
@@ -297,7 +294,7 @@ impl Sample {
         bytes[self.source.limits.per_call.piece(bytes.len(), offset, len)].to_vec()
     }
 
-    pub(crate) fn as_frame(&self) -> Answer<Frame> {
+    pub(crate) fn as_frame(&self) -> CallResult<Frame> {
         Frame::of(self)
     }
 
@@ -309,24 +306,28 @@ impl Sample {
     ///
     /// # Panics
     ///
-    /// If the test gave none: there is no honest answer, and no refusal in the interface.
+    /// If the test set no bytes: no value would be right, and the interface has no error for it.
     fn encapsulated(&self) -> &[u8] {
         self.cell.sample.message.cdr.as_deref().unwrap_or_else(|| {
             let topic = &self.source.declared.topic;
-            panic!("a message that the test gave to `{topic}` has no bytes; give them with `Message::cdr`")
+            panic!(
+                "a message that the test delivered to `{topic}` has no bytes; set them with \
+                 `Message::cdr`"
+            )
         })
     }
 
     /// A field of an image.
-    pub(super) fn need<'a>(&'a self, path: &str) -> Answer<&'a Value> {
+    pub(super) fn need<'a>(&'a self, path: &str) -> CallResult<&'a Value> {
         let fields = &self.cell.sample.message.fields;
-        let why =
-            || format!("it has no `{path}`{}; make it with `Message::image`", known(path, fields));
+        let why = || {
+            format!("it has no `{path}`{}; create it with `Message::image`", known(path, fields))
+        };
         fields.get(path).ok_or_else(|| self.source.malformed(&why()))
     }
 
-    pub(super) fn wrong_sort(&self, path: &str) -> DataError {
+    pub(super) fn wrong_type(&self, path: &str) -> DataError {
         self.source
-            .malformed(&format!("`{path}` is of another sort; make it with `Message::image`"))
+            .malformed(&format!("`{path}` has another type; create it with `Message::image`"))
     }
 }

@@ -1,28 +1,29 @@
-//! What came of a wake.
+//! The outcome of a wake.
 
 pub use gleaner_rules::triggers::{AttributeValue, Kind as TriggerKind};
 
-/// The outcome of one wake: what a line of `decisions.jsonl` says of it, but for the digits of the
-/// writer, fuel and time.
+/// The outcome of one wake: the fields of a line of `decisions.jsonl`, without the writer, fuel and
+/// time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decision {
     /// Time of the sample or tick that woke the lambda, in nanoseconds.
     pub at_ns: i64,
-    /// What woke it.
+    /// Cause of the wake.
     pub cause: Cause,
-    /// The input that woke it; none for a tick.
+    /// Name of the input whose sample woke the lambda; none for a tick.
     pub input: Option<String>,
     /// Topic of the waking sample; none for a tick.
     pub topic: Option<String>,
-    /// Number of the waking sample; none for a tick.
+    /// Sequence number of the waking sample; none for a tick.
     pub seq: Option<u64>,
-    /// What the lambda caused, in the order in which it did.
+    /// Triggers of the wake, in the order of the calls.
     pub triggers: Vec<Trigger>,
-    /// Why the wake ended early, if it did. Triggers that came before the fault still count.
+    /// The fault that ended the wake early; none if it completed. Triggers before the fault still
+    /// count.
     pub fault: Option<Fault>,
 }
 
-/// What woke a lambda.
+/// Cause of a wake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cause {
     /// A sample on the input that `[schedule] event` names.
@@ -36,37 +37,37 @@ pub enum Cause {
 pub struct Trigger {
     /// Time of its wake, in nanoseconds.
     pub at_ns: i64,
-    /// What the recorder does about it.
+    /// Kind of action: an event, or the start or stop of a recording.
     pub kind: TriggerKind,
-    /// The lambda's word for what it saw.
+    /// Label that the lambda gave.
     pub label: String,
-    /// How strongly, in the unit that the lambda documents; none unless it is an event.
+    /// Strength of the event, in the unit that the lambda documents; none for `start` and `stop`.
     pub score: Option<f64>,
-    /// Named facts, in the order in which the lambda gave them.
+    /// Attributes, in the order in which the lambda added them.
     pub attributes: Vec<(String, AttributeValue)>,
 }
 
 impl Trigger {
-    /// The fact of that name, if the lambda gave it.
+    /// Returns the attribute `key`; none if the lambda did not add it.
     pub fn attribute(&self, key: &str) -> Option<&AttributeValue> {
         self.attributes.iter().find(|(given, _)| given == key).map(|(_, value)| value)
     }
 }
 
-/// Why a wake ended early.
+/// An error that ended a wake early.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Fault {
     /// The cause, for programs.
     pub kind: FaultKind,
     /// The cause, for people.
     pub message: String,
-    /// What the lambda used, in the unit of the limit that it passed.
+    /// Amount that the lambda used, in the unit of the exceeded limit.
     pub used: Option<u64>,
-    /// What it was allowed, in the same unit.
+    /// The limit, in the same unit.
     pub allowed: Option<u64>,
 }
 
-/// The causes of a fault that there are natively.
+/// Kind of a fault; natively there are fewer kinds than in the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum FaultKind {
@@ -74,6 +75,6 @@ pub enum FaultKind {
     Exception,
     /// The lambda panicked.
     Trap,
-    /// It held more handles, or passed more bytes in one call, than `[limits]` allow.
+    /// The lambda held more handles, or passed more bytes in one call, than `[limits]` allows.
     HostCall,
 }

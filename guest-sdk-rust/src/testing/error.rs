@@ -1,9 +1,9 @@
-//! What a test cannot ask of the fake host, in words for its author.
+//! The error of the fake host: invalid input of a test.
 
 use std::fmt;
 
-/// A manifest, config value, message or lambda that cannot be used: what, why, and the way out. It
-/// prints alike with `{}` and `{:?}`, so that `unwrap` shows it as it is.
+/// A manifest, config value, message or lambda that cannot be used. The message names the object,
+/// the cause and the way out. `{}` and `{:?}` print the same text, so `unwrap` shows it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Error {
     what: String,
@@ -12,7 +12,7 @@ pub struct Error {
 }
 
 impl Error {
-    /// `cause` and `help` may be empty.
+    /// Creates an error; `cause` and `help` may be empty.
     pub(super) fn new(
         what: impl Into<String>,
         cause: impl Into<String>,
@@ -42,10 +42,9 @@ impl fmt::Debug for Error {
 
 impl std::error::Error for Error {}
 
-/// The one of `known` that `word` was most likely meant to be.
+/// Returns the name in `known` that is most similar to `word`, if one is similar enough.
 pub(super) fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
-    // The distance takes time in proportion to both lengths, and nobody misspells a name with a
-    // page of text.
+    // The distance takes time in proportion to both lengths, and no misspelt name is a page long.
     if word.len() > 64 {
         return None;
     }
@@ -58,7 +57,7 @@ pub(super) fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) 
     near.map(|(_, candidate)| candidate)
 }
 
-/// Letters to insert, take away or change. Source: Wagner and Fischer, The String-to-String
+/// Number of letters to insert, remove or change. Source: Wagner and Fischer, The String-to-String
 /// Correction Problem, 1974.
 fn distance(from: &str, to: &str) -> usize {
     let to = to.chars().collect::<Vec<_>>();
@@ -80,14 +79,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_nearest_name_is_found_and_a_far_one_is_not() {
+    fn a_similar_name_is_found_and_a_different_one_is_not() {
         assert_eq!(distance("kitten", "sitting"), 3);
         assert_eq!(nearest("dept", ["name", "depth", "topic"]), Some("depth"));
         assert_eq!(nearest("camera", ["name", "depth"]), None);
     }
 
     #[test]
-    fn an_error_says_what_why_and_the_way_out_also_in_unwrap() {
+    fn an_error_prints_object_cause_and_help_also_in_unwrap() {
         let error = Error::new("cannot do it", "no time", "wait");
         assert_eq!(format!("{error:?}"), "cannot do it\n  cause: no time\n  help:  wait");
         assert_eq!(Error::new("cannot do it", "", "").to_string(), "cannot do it");

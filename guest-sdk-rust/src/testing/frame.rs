@@ -1,4 +1,4 @@
-//! A sample seen as an image: its pixels, and the room for those that are decoded or made.
+//! A sample as an image: its pixels, and the memory limits of decoded and created frames.
 
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
@@ -7,46 +7,51 @@ use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 use gleaner_rules::pixels::{self as rules, Bayer, PixelError, PixelErrorKind, View, ops};
 use gleaner_rules::refused;
 
-use super::data::{Sample, Source};
+use super::data::{InputState, Sample};
 use super::manifest::Input;
-use super::message::Picture;
+use super::message::ImageData;
 use super::ring::Cell;
 use super::session::Handle;
 use super::types::{DataError, Encoding, FrameInfo, Identity, Roi, Stamps, Value};
 use crate::data::{bytes_per_pixel, encoding_name};
 
-type Answer<T> = Result<T, DataError>;
+type CallResult<T> = Result<T, DataError>;
 
-/// Room for the images of one input.
-pub(super) struct Images {
+/// Limits and decoded images of one input.
+pub(super) struct FramePool {
     budget: Budget,
     slots: usize,
     slot_bytes: u64,
-    decoded: Mutex<Decoded>,
+    decoded: Mutex<DecodedSlots>,
 }
 
-/// Slots of decoded images.
+/// Slots for decoded images.
 #[derive(Default)]
-struct Decoded {
-    held: Vec<Weak<Slot>>,
-    /// The newest, so that each is decoded once.
-    newest: Option<(u64, Arc<Slot>)>,
+struct DecodedSlots {
+    held: Vec<Weak<DecodedImage>>,
+    /// The newest image and its position, so that each is decoded once.
+    newest: Option<(u64, Arc<DecodedImage>)>,
 }
 
-struct Slot(Arc<[u8]>);
+struct DecodedImage(Arc<[u8]>);
 
-impl Images {
+impl FramePool {
     pub(super) fn new(declared: &Input, budget: Budget) -> Self {
         let (slots, slot_bytes) = (declared.hold + 1, declared.decoded_size);
         Self { budget, slots, slot_bytes, decoded: Mutex::default() }
     }
 
-    fn slot(&self, declared: &Input, position: u64, picture: &Picture) -> Answer<Arc<Slot>> {
+    fn slot(
+        &self,
+        declared: &Input,
+        position: u64,
+        picture: &ImageData,
+    ) -> CallResult<Arc<DecodedImage>> {
         let decoded = &mut *self.decoded.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, slot)) = decoded.newest.as_ref().filter(|(at, _)| *at == position) {
             return Ok(Arc::clone(slot));
         }
-        // The older image's slot may be the one that is needed now.
+        // Release the previous image first: its slot may be needed now.
         decoded.newest = None;
         let (topic, width, height) = (&declared.topic, picture.width, picture.height);
         let needed = 3 * u64::from(width) * u64::from(height);
@@ -59,33 +64,33 @@ impl Images {
         if decoded.held.len() >= self.slots {
             return Err(DataError::NoRoom(refused::no_slot(topic, &declared.name)));
         }
-        let slot = Arc::new(Slot(Arc::clone(&picture.data)));
+        let slot = Arc::new(DecodedImage(Arc::clone(&picture.data)));
         decoded.held.push(Arc::downgrade(&slot));
         decoded.newest = Some((position, Arc::clone(&slot)));
         Ok(slot)
     }
 }
 
-/// A sample seen as an image. Holds its pixels until dropped.
+/// A sample as an image. Keeps its pixels until dropped.
 pub struct Frame {
-    source: Arc<Source>,
+    source: Arc<InputState>,
     identity: Identity,
     stamps: Stamps,
     info: FrameInfo,
-    pixels: Pixels,
+    pixels: PixelData,
     _taken: Taken,
     _handle: Handle,
 }
 
-enum Pixels {
-    /// In the message, which stays in its cell.
+enum PixelData {
+    /// Pixels of the message, which stays in its cell.
     Message(Arc<Cell>),
-    Decoded(Arc<Slot>),
+    Decoded(Arc<DecodedImage>),
     Made(Vec<u8>),
 }
 
 impl Frame {
-    pub(super) fn of(sample: &Sample) -> Answer<Self> {
+    pub(super) fn of(sample: &Sample) -> CallResult<Self> {
         let source = Arc::clone(&sample.source);
         let Input { topic, type_name, .. } = &source.declared;
         let is_compressed = match type_name.as_str() {
@@ -95,21 +100,21 @@ impl Frame {
                 return Err(DataError::NotAFrame(refused::no_image_type(topic, type_name)));
             }
         };
-        let taken = source.images.budget.take(0)?;
+        let taken = source.frame_pool.budget.take(0)?;
         let (info, pixels) = match is_compressed {
             true => decoded(sample)?,
-            false => (raw(sample)?, Pixels::Message(Arc::clone(&sample.cell))),
+            false => (raw(sample)?, PixelData::Message(Arc::clone(&sample.cell))),
         };
         Ok(Self::new((source, sample.identity(), sample.stamps()), info, pixels, taken))
     }
 
     fn new(
-        (source, identity, stamps): (Arc<Source>, Identity, Stamps),
+        (source, identity, stamps): (Arc<InputState>, Identity, Stamps),
         info: FrameInfo,
-        pixels: Pixels,
+        pixels: PixelData,
         taken: Taken,
     ) -> Self {
-        let handle = source.handles.hand_out();
+        let handle = source.handles.acquire();
         Self { source, identity, stamps, info, pixels, _taken: taken, _handle: handle }
     }
 
@@ -125,42 +130,42 @@ impl Frame {
         self.stamps
     }
 
-    pub(crate) fn mean_luma(&self, roi: Option<Roi>) -> Answer<f64> {
+    pub(crate) fn mean_luma(&self, roi: Option<Roi>) -> CallResult<f64> {
         ops::mean_luma(&self.view()?, roi.map(region)).map_err(|error| self.refused(error))
     }
 
-    pub(crate) fn histogram(&self, roi: Option<Roi>) -> Answer<Vec<u32>> {
+    pub(crate) fn histogram(&self, roi: Option<Roi>) -> CallResult<Vec<u32>> {
         ops::histogram(&self.view()?, roi.map(region))
             .map(Vec::from)
             .map_err(|error| self.refused(error))
     }
 
-    pub(crate) fn resize(&self, width: u32, height: u32) -> Answer<Self> {
+    pub(crate) fn resize(&self, width: u32, height: u32) -> CallResult<Self> {
         let view = self.view()?;
         let (encoding, _) =
             ops::resized(&view, width, height).map_err(|error| self.refused(error))?;
         self.made((width, height), encoding, |out| ops::resize(&view, width, height, out).map(drop))
     }
 
-    pub(crate) fn to_gray(&self) -> Answer<Self> {
+    pub(crate) fn to_gray(&self) -> CallResult<Self> {
         let view = self.view()?;
         self.made((self.info.width, self.info.height), rules::Encoding::Mono8, |out| {
             ops::to_gray(&view, out)
         })
     }
 
-    /// Room is taken before anything is made.
+    /// Creates a frame. Memory is taken from the budget before the pixels are allocated.
     fn made(
         &self,
         (width, height): (u32, u32),
         encoding: rules::Encoding,
         fill: impl FnOnce(&mut [u8]) -> Result<(), PixelError>,
-    ) -> Answer<Self> {
+    ) -> CallResult<Self> {
         let info = tight(width, height, of_rules(encoding));
-        let taken = self.source.images.budget.take(info.size as usize)?;
+        let taken = self.source.frame_pool.budget.take(info.size as usize)?;
         let mut pixels = vec![0; info.size as usize];
         fill(&mut pixels).map_err(|error| self.refused(error))?;
-        let pixels = Pixels::Made(pixels);
+        let pixels = PixelData::Made(pixels);
         let about = (Arc::clone(&self.source), self.identity(), self.stamps);
         Ok(Self::new(about, info, pixels, taken))
     }
@@ -172,9 +177,9 @@ impl Frame {
 
     fn bytes(&self) -> &[u8] {
         let whole: &[u8] = match &self.pixels {
-            Pixels::Made(bytes) => bytes,
-            Pixels::Decoded(slot) => &slot.0,
-            Pixels::Message(cell) => match cell.sample.message.fields.get("data") {
+            PixelData::Made(bytes) => bytes,
+            PixelData::Decoded(slot) => &slot.0,
+            PixelData::Message(cell) => match cell.sample.message.fields.get("data") {
                 Some(Value::Bytes(bytes)) => bytes,
                 _ => &[],
             },
@@ -182,7 +187,7 @@ impl Frame {
         &whole[..(self.info.size as usize).min(whole.len())]
     }
 
-    fn view(&self) -> Answer<View<'_>> {
+    fn view(&self) -> CallResult<View<'_>> {
         let FrameInfo { width, height, encoding, step, big_endian, .. } = self.info;
         View::new(width, height, step, by_rules(encoding), big_endian, self.bytes())
             .map_err(|error| self.refused(error))
@@ -211,7 +216,7 @@ fn region(Roi { x, y, width, height }: Roi) -> rules::Roi {
 }
 
 fn by_rules(encoding: Encoding) -> rules::Encoding {
-    rules::Encoding::from_ros(encoding_name(encoding)).expect("ROS has each of these names")
+    rules::Encoding::from_ros(encoding_name(encoding)).expect("each name is one of ROS")
 }
 
 fn of_rules(encoding: rules::Encoding) -> Encoding {
@@ -241,8 +246,8 @@ fn tight(width: u32, height: u32, encoding: Encoding) -> FrameInfo {
     FrameInfo { width, height, encoding, step, big_endian: false, size }
 }
 
-/// The pixels of a `sensor_msgs/msg/Image`, by its fields.
-fn raw(sample: &Sample) -> Answer<FrameInfo> {
+/// Layout of a `sensor_msgs/msg/Image`, from its fields.
+fn raw(sample: &Sample) -> CallResult<FrameInfo> {
     let number = |path: &str| {
         let number = match sample.need(path)? {
             Value::Boolean(value) => Some(u64::from(*value)),
@@ -250,12 +255,12 @@ fn raw(sample: &Sample) -> Answer<FrameInfo> {
             Value::Signed(value) => u64::try_from(*value).ok(),
             _ => None,
         };
-        number.and_then(|number| u32::try_from(number).ok()).ok_or_else(|| sample.wrong_sort(path))
+        number.and_then(|number| u32::try_from(number).ok()).ok_or_else(|| sample.wrong_type(path))
     };
     let Value::Text(encoding) = sample.need("encoding")? else {
-        return Err(sample.wrong_sort("encoding"));
+        return Err(sample.wrong_type("encoding"));
     };
-    let Value::Bytes(data) = sample.need("data")? else { return Err(sample.wrong_sort("data")) };
+    let Value::Bytes(data) = sample.need("data")? else { return Err(sample.wrong_type("data")) };
     let (width, height) = (number("width")?, number("height")?);
     let (step, big_endian) = (number("step")?, number("is_bigendian")? != 0);
     let view = rules::Encoding::from_ros(encoding)
@@ -265,13 +270,14 @@ fn raw(sample: &Sample) -> Answer<FrameInfo> {
     Ok(FrameInfo { width, height, encoding, step, big_endian, size })
 }
 
-/// The pixels that stand for a JPEG or PNG.
-fn decoded(sample: &Sample) -> Answer<(FrameInfo, Pixels)> {
+/// Pixels that the test set in place of a JPEG or PNG.
+fn decoded(sample: &Sample) -> CallResult<(FrameInfo, PixelData)> {
     let source = &sample.source;
     let Some(picture) = &sample.cell.sample.message.picture else {
-        let why = "nobody here decodes JPEG or PNG; make the message with `Message::image`, of the pixels";
+        let why = "JPEG and PNG are not decoded here; create the message with `Message::image`, \
+                   from pixels";
         return Err(DataError::NotAFrame(refused::not_a_frame(&source.declared.topic, why)));
     };
-    let slot = source.images.slot(&source.declared, sample.cell.position, picture)?;
-    Ok((tight(picture.width, picture.height, picture.encoding), Pixels::Decoded(slot)))
+    let slot = source.frame_pool.slot(&source.declared, sample.cell.position, picture)?;
+    Ok((tight(picture.width, picture.height, picture.encoding), PixelData::Decoded(slot)))
 }

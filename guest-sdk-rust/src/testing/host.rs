@@ -1,4 +1,4 @@
-//! The fake host before it runs: a manifest, and what a test lays over it.
+//! Configures the fake host: a manifest, and the settings of a test.
 
 use std::sync::Arc;
 
@@ -7,20 +7,20 @@ use gleaner_rules::names::IMAGE;
 use gleaner_rules::schedule::Backlog;
 use gleaner_rules::text::quoted;
 
-use super::data::Source;
+use super::data::InputState;
 use super::error::Error;
-use super::frame::Images;
-use super::manifest::{self, Manifest, When};
+use super::frame::FramePool;
+use super::manifest::{self, Manifest, ScheduleSpec};
 use super::message::Message;
 use super::run::Run;
-use super::schedule::{Input, Schedule};
-use super::session::{Handles, Session};
+use super::schedule::{EventInput, Schedule};
+use super::session::{HandleCounter, Session};
 use crate::bindings::ConfigValue;
 use crate::{Config, Lambda};
 
-/// A host that is about to load a lambda.
+/// A fake host, configured to load a lambda.
 #[derive(Clone, Debug)]
-#[must_use = "a host runs nothing before `load`"]
+#[must_use = "a host has no effect until `load`"]
 pub struct Host {
     manifest: String,
     set: Vec<(String, ConfigValue)>,
@@ -28,47 +28,47 @@ pub struct Host {
 }
 
 impl Host {
-    /// A host for the lambda with this `lambda.toml`, usually `include_str!("../lambda.toml")`. It
-    /// is read by [`load`](Self::load).
+    /// Creates a host for the lambda with this `lambda.toml`, usually
+    /// `include_str!("../lambda.toml")`. [`load`](Self::load) parses it.
     pub fn from_manifest(text: &str) -> Self {
         Self { manifest: text.to_owned(), set: Vec::new(), blanks: Vec::new() }
     }
 
-    /// Sets a value of `[config]`, as `gleaner replay --set` does: of the type of its default, and
-    /// within its range.
+    /// Sets a value of `[config]`, as `gleaner replay --set` does. It must have the type of the
+    /// default and be within the range.
     pub fn set(mut self, key: &str, value: impl Into<Setting>) -> Self {
         self.set.push((key.to_owned(), value.into().0));
         self
     }
 
-    /// Says which fields messages of an input have, and what stands there where a message does not
-    /// say otherwise.
+    /// Defines the fields of an input's messages, with default values for messages that do not set
+    /// them.
     ///
-    /// Then a lambda that asks `init` for another field is refused there, as on a vehicle, and a
-    /// message with another field is an error. Without it, a field counts as missing only once it
-    /// is read from a message that has not got it.
+    /// With it, `init` cannot compile any other field, as on a vehicle, and a message with another
+    /// field is an error. Without it, a missing field is an error only when the lambda reads it
+    /// from a message that does not have it.
     pub fn blank(mut self, input: &str, message: Message) -> Self {
         self.blanks.push((input.to_owned(), message));
         self
     }
 
-    /// Reads the manifest, and runs `init`.
+    /// Parses the manifest and runs `init`.
     ///
     /// # Errors
     ///
-    /// If the manifest or a setting cannot be used, or `init` fails or panics.
+    /// If the manifest or a setting is invalid, or `init` fails or panics.
     pub fn load<L: Lambda>(self) -> Result<Run<L>, Error> {
         let manifest = manifest::read(&self.manifest)?;
         let config = Config::from(manifest.config(&self.set)?);
-        let handles = Handles::new(&manifest.limits);
+        let handles = HandleCounter::new(&manifest.limits);
         let inputs = self.inputs(&manifest, &handles)?;
         let session = Session::new(manifest.limits, inputs);
         let schedule = match &manifest.schedule {
-            When::Period(period_ns) => Schedule::periodic(*period_ns),
-            When::Event(name) => {
+            ScheduleSpec::Period(period_ns) => Schedule::periodic(*period_ns),
+            ScheduleSpec::Event(name) => {
                 let woken_by = session.inputs.iter().find(|source| source.declared.name == *name);
                 Schedule::event(
-                    Input(Arc::clone(woken_by.expect("the manifest was checked"))),
+                    EventInput(Arc::clone(woken_by.expect("the manifest was checked"))),
                     Backlog::Each,
                 )
             }
@@ -79,8 +79,8 @@ impl Host {
     fn inputs(
         &self,
         manifest: &Manifest,
-        handles: &Arc<Handles>,
-    ) -> Result<Vec<Arc<Source>>, Error> {
+        handles: &Arc<HandleCounter>,
+    ) -> Result<Vec<Arc<InputState>>, Error> {
         let names = || manifest.inputs.iter().map(|input| input.name.as_str());
         if let Some((asked, _)) =
             self.blanks.iter().find(|(asked, _)| names().all(|name| name != asked))
@@ -94,18 +94,24 @@ impl Host {
             let blank = blank.map(|(_, message)| {
                 let mut message = message.clone();
                 if declared.type_name == IMAGE {
-                    message.spread_picture();
+                    message.set_image_fields();
                 }
                 message
             });
-            let images = Images::new(declared, budget.clone());
-            Source::new(declared.clone(), manifest.limits, Arc::clone(handles), images, blank)
+            let frame_pool = FramePool::new(declared, budget.clone());
+            InputState::new(
+                declared.clone(),
+                manifest.limits,
+                Arc::clone(handles),
+                frame_pool,
+                blank,
+            )
         };
         Ok(manifest.inputs.iter().map(source).collect())
     }
 }
 
-/// A value for [`Host::set`]; made from `bool`, `i32`, `i64`, `f64` and `&str`.
+/// A value for [`Host::set`]; converted from `bool`, `i32`, `i64`, `f64` and `&str`.
 #[derive(Clone, Debug)]
 pub struct Setting(ConfigValue);
 

@@ -1,57 +1,57 @@
-//! `gleaner:lambda/inference`. As hosts are built today, there is no model runtime: every call says
-//! so.
+//! Implements `gleaner:lambda/inference`. As in current builds of the host, there is no model
+//! runtime: every call returns `no-runtime`.
 
 use super::data::Frame;
 use super::session::current;
 use super::types::{Preprocess, refusal};
 
-/// Why a model could not be opened or run.
+/// Reason why a model cannot be opened or run.
 #[derive(Clone, Debug)]
 pub enum InferenceError {
     /// This host was built without a model runtime.
     NoRuntime(String),
-    /// No `[[model]]` of that name.
+    /// The manifest has no `[[model]]` of that name.
     NoSuchModel(String),
-    /// Shape, type or number of tensors does not fit the model.
+    /// Shapes, types or number of the tensors do not fit the model.
     WrongInput(String),
-    /// The model ran and failed.
+    /// The model failed to load or to run.
     Failed(String),
 }
 
 refusal!(InferenceError);
 
-/// What `detect` found, in pixels of the frame.
+/// An object that `detect` found, in pixels of the frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Detection {
-    /// Index of the class, as the model counts them.
+    /// Class index of the model.
     pub class: u32,
-    /// 0 to 1.
+    /// Confidence, 0 to 1.
     pub score: f32,
     /// Left edge.
     pub x: f32,
     /// Upper edge.
     pub y: f32,
-    /// Above 0.
+    /// Width, above 0.
     pub width: f32,
-    /// Above 0.
+    /// Height, above 0.
     pub height: f32,
 }
 
-/// What `detect` is asked for.
+/// Options of `detect`.
 #[derive(Clone, Debug)]
 pub struct DetectOptions {
-    /// Classes wanted; empty for all.
+    /// Classes to return; empty for all.
     pub classes: Vec<u32>,
-    /// Detections below are dropped, 0 to 1.
+    /// Detections with a lower score are dropped, 0 to 1.
     pub min_score: f32,
-    /// Overlap (intersection over union) above which the weaker of two detections is dropped, 0 to
-    /// 1.
+    /// Overlap (intersection over union), 0 to 1, above which the detection with the lower score is
+    /// dropped.
     pub max_iou: f32,
-    /// At most so many, strongest first; clamped to 1,024.
+    /// Maximum number of detections, highest score first; clamped to 1,024.
     pub max_count: u32,
 }
 
-/// Numbers on the host. Cannot be made in this build.
+/// An array of numbers in the host. Cannot be created in this build.
 #[derive(Debug)]
 pub enum Tensor {}
 
@@ -59,19 +59,19 @@ pub enum Tensor {}
 #[derive(Debug)]
 pub enum Model {}
 
-type Answer<T> = Result<T, InferenceError>;
+type CallResult<T> = Result<T, InferenceError>;
 
-fn no_runtime<T>() -> Answer<T> {
+fn no_runtime<T>() -> CallResult<T> {
     Err(InferenceError::NoRuntime("no model runtime in this build".to_owned()))
 }
 
 impl Tensor {
-    pub(crate) fn from_values(shape: &[u32], values: &[f32]) -> Answer<Self> {
-        current().passed(size_of_val(shape) + size_of_val(values));
+    pub(crate) fn from_values(shape: &[u32], values: &[f32]) -> CallResult<Self> {
+        current().check_bytes(size_of_val(shape) + size_of_val(values));
         no_runtime()
     }
 
-    pub(crate) fn from_frame(_frame: &Frame, _how: Preprocess) -> Answer<Self> {
+    pub(crate) fn from_frame(_frame: &Frame, _how: Preprocess) -> CallResult<Self> {
         no_runtime()
     }
 
@@ -85,12 +85,12 @@ impl Tensor {
 }
 
 impl Model {
-    pub(crate) fn open(name: &str) -> Answer<Self> {
-        current().passed(name.len());
+    pub(crate) fn open(name: &str) -> CallResult<Self> {
+        current().check_bytes(name.len());
         no_runtime()
     }
 
-    pub(crate) fn run(&self, _inputs: &[&Tensor]) -> Answer<Vec<Tensor>> {
+    pub(crate) fn run(&self, _inputs: &[&Tensor]) -> CallResult<Vec<Tensor>> {
         match *self {}
     }
 
@@ -98,7 +98,7 @@ impl Model {
         &self,
         _frame: &Frame,
         _options: &DetectOptions,
-    ) -> Answer<Vec<Detection>> {
+    ) -> CallResult<Vec<Detection>> {
         match *self {}
     }
 }

@@ -1,12 +1,12 @@
-//! `gleaner:lambda/log`: lines are cut, and what is over the limits of a second is dropped and
-//! counted.
+//! Implements `gleaner:lambda/log`: truncates lines, and drops and counts those over the limits of
+//! a second.
 
 use gleaner_rules::log::{Rate, line};
 
 use super::manifest::Limits;
 use super::session::current;
 
-/// How much a line matters.
+/// Severity of a log line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Level {
     /// Someone must act.
@@ -23,18 +23,18 @@ pub enum Level {
 
 /// One line of the log.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Line {
-    /// Time of the wake that wrote it, in nanoseconds; 0 before the first.
+pub struct LogLine {
+    /// Time of the wake that wrote it, in nanoseconds; 0 before the first wake.
     pub at_ns: i64,
-    /// How much it matters.
+    /// Severity of the line.
     pub level: Level,
-    /// The text, 4,096 bytes at most.
+    /// The text, at most 4,096 bytes.
     pub message: String,
 }
 
 pub(crate) fn log(level: Level, message: &str) {
     let session = current();
-    session.passed(message.len());
+    session.check_bytes(message.len());
     let mut state = session.lock();
     let at_ns = state.now_ns;
     state.log.write(at_ns, level, message);
@@ -42,7 +42,7 @@ pub(crate) fn log(level: Level, message: &str) {
 
 /// All lines of a run.
 pub(super) struct Log {
-    pub(super) lines: Vec<Line>,
+    pub(super) lines: Vec<LogLine>,
     rate: Rate,
 }
 
@@ -58,14 +58,14 @@ impl Log {
     fn write(&mut self, at_ns: i64, level: Level, message: &str) {
         let message = line(message);
         if self.rate.keeps(at_ns, message) {
-            self.lines.push(Line { at_ns, level, message: message.to_owned() });
+            self.lines.push(LogLine { at_ns, level, message: message.to_owned() });
         }
     }
 
-    /// The host says something.
+    /// Writes a line of the host itself.
     pub(super) fn note(&mut self, at_ns: i64, text: &'static str) {
         if self.rate.notes(at_ns, text) {
-            self.lines.push(Line { at_ns, level: Level::Warn, message: text.to_owned() });
+            self.lines.push(LogLine { at_ns, level: Level::Warn, message: text.to_owned() });
         }
     }
 }

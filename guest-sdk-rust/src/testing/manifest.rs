@@ -1,5 +1,5 @@
-//! `lambda.toml`, as far as the fake host needs it. `gleaner build` reads all of it, and is
-//! stricter in places.
+//! Parses the parts of `lambda.toml` that the fake host needs. `gleaner build` parses all of it,
+//! and is stricter in places.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -29,14 +29,14 @@ pub(super) struct Input {
     pub(super) depth: usize,
     pub(super) hold: usize,
     pub(super) max_size: usize,
-    /// 0 where nothing is decoded.
+    /// 0 unless the input has compressed images.
     pub(super) decoded_size: u64,
 }
 
-/// Those of `[limits]` that hold natively.
+/// The values of `[limits]` that apply natively.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
-    /// Bytes of frames that are made.
+    /// Total bytes of the frames that the lambda creates.
     pub(super) memory: usize,
     pub(super) handles: u64,
     pub(super) frames: usize,
@@ -47,35 +47,35 @@ pub(super) struct Limits {
     pub(super) events_per_minute: u64,
 }
 
-/// A manifest that was checked.
+/// A validated manifest.
 #[derive(Debug)]
 pub(super) struct Manifest {
     pub(super) name: String,
-    pub(super) schedule: When,
+    pub(super) schedule: ScheduleSpec,
     pub(super) inputs: Vec<Input>,
     pub(super) limits: Limits,
-    items: Vec<Item>,
+    items: Vec<ConfigItem>,
 }
 
-/// When the lambda runs.
+/// The `[schedule]`.
 #[derive(Clone, Debug)]
-pub(super) enum When {
-    /// On each sample of the input of that name.
+pub(super) enum ScheduleSpec {
+    /// A wake for each sample of the input of that name.
     Event(String),
-    /// Every so many nanoseconds.
+    /// A wake after each period, in nanoseconds.
     Period(i64),
 }
 
-/// One value of `[config]`.
+/// One entry of `[config]`.
 #[derive(Debug)]
-struct Item {
+struct ConfigItem {
     name: String,
     default: ConfigValue,
     min: Option<f64>,
     max: Option<f64>,
 }
 
-/// Reads the text of a manifest.
+/// Parses the text of a manifest.
 pub(super) fn read(text: &str) -> Result<Manifest> {
     let entries = text.parse::<toml::Table>();
     let entries = entries.map_err(|error| {
@@ -119,7 +119,7 @@ fn unique<'a>(what: &str, names: impl Iterator<Item = &'a String>) -> Result<()>
     })
 }
 
-fn schedule(root: &Table, inputs: &[Input]) -> Result<When> {
+fn schedule(root: &Table, inputs: &[Input]) -> Result<ScheduleSpec> {
     let example = "[schedule] with event = \"<an input's name>\" or period = \"100ms\"";
     let table =
         Table::new("[schedule]", root.need("schedule", example)?, &["event", "period", "backlog"])?;
@@ -134,10 +134,10 @@ fn schedule(root: &Table, inputs: &[Input]) -> Result<When> {
                     &format!("the inputs are {names}"),
                 ));
             }
-            Ok(When::Event(event))
+            Ok(ScheduleSpec::Event(event))
         }
         (None, Some(_)) if backlog.is_none() => {
-            Ok(When::Period(table.duration("period", (MS, 0, 3600 * SECOND))? as i64))
+            Ok(ScheduleSpec::Period(table.duration("period", (MS, 0, 3600 * SECOND))? as i64))
         }
         (None, Some(_)) => {
             Err(table
@@ -179,7 +179,7 @@ fn limits(root: &Table) -> Result<Limits> {
     let known: Vec<&str> = LIMITS.iter().map(|(key, ..)| *key).collect();
     let empty = Value::Table(toml::Table::new());
     let table = Table::new("[limits]", root.get("limits").unwrap_or(&empty), &known)?;
-    // Those without meaning here are checked nevertheless.
+    // Limits without effect here are validated, too.
     let read = |&(key, unit, bounds): &(&'static str, &str, Bounds)| {
         let value = match unit {
             "size" => table.size(key, bounds),
@@ -201,15 +201,15 @@ fn limits(root: &Table) -> Result<Limits> {
     })
 }
 
-fn items(root: &Table) -> Result<Vec<Item>> {
+fn items(root: &Table) -> Result<Vec<ConfigItem>> {
     let Some(value) = root.get("config") else { return Ok(Vec::new()) };
-    let entries = value
-        .as_table()
-        .ok_or_else(|| root.refusal("has a `config` that is no table", "see the README"))?;
+    let entries = value.as_table().ok_or_else(|| {
+        root.refusal("has a `config` that is no table", "see docs/manifest.md for its keys")
+    })?;
     entries.iter().map(|(name, value)| item(name, value)).collect()
 }
 
-fn item(name: &str, value: &Value) -> Result<Item> {
+fn item(name: &str, value: &Value) -> Result<ConfigItem> {
     let title = format!("`config.{name}`");
     let plain = toml::Table::from_iter([("default".to_owned(), value.clone())]);
     let entries = value.as_table().unwrap_or(&plain);
@@ -238,12 +238,13 @@ fn item(name: &str, value: &Value) -> Result<Item> {
             "give numbers of one type",
         )),
     };
-    let item = Item { name: name.to_owned(), min: limit("min")?, max: limit("max")?, default };
+    let item =
+        ConfigItem { name: name.to_owned(), min: limit("min")?, max: limit("max")?, default };
     item.within(&item.default)?;
     Ok(item)
 }
 
-impl Item {
+impl ConfigItem {
     fn within(&self, value: &ConfigValue) -> Result<()> {
         let number = match value {
             ConfigValue::Integer(value) => *value as f64,
@@ -265,7 +266,7 @@ impl Item {
         }
     }
 
-    /// `given` as a value of the type of the default; a whole number also serves as a number.
+    /// Converts `given` to the type of the default; a whole number is accepted for a number.
     fn set(&self, given: &ConfigValue) -> Result<ConfigValue> {
         let value = match (&self.default, given) {
             (ConfigValue::Real(_), ConfigValue::Integer(given)) => ConfigValue::Real(*given as f64),
@@ -292,7 +293,7 @@ impl Item {
 }
 
 impl Manifest {
-    /// `[config]` with the values of a test laid over it.
+    /// `[config]` with the values that the test sets in place of the defaults.
     pub(super) fn config(&self, set: &[(String, ConfigValue)]) -> Result<Vec<ConfigEntry>> {
         let names = || self.items.iter().map(|item| item.name.as_str());
         if let Some((key, _)) = set.iter().find(|(key, _)| names().all(|name| name != key)) {
@@ -301,7 +302,7 @@ impl Manifest {
                 nearest(key, names()).map_or_else(many, |near| format!("did you mean `{near}`?"));
             return Err(Error::new(format!("the lambda has no config value `{key}`"), "", help));
         }
-        let value = |item: &Item| {
+        let value = |item: &ConfigItem| {
             let given = set.iter().rev().find(|(key, _)| *key == item.name);
             given.map_or_else(|| Ok(item.default.clone()), |(_, given)| item.set(given))
         };

@@ -1,4 +1,4 @@
-//! A message as a test makes it: fields by their paths, bytes, or a picture.
+//! Messages that a test creates: fields by their paths, bytes, or an image.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::types::{Encoding, Value};
 use crate::data::{bytes_per_pixel, encoding_name};
 
-/// One message, by what a test gives of it.
+/// One message of a test.
 ///
 /// ```
 /// use gleaner_sdk::testing::Message;
@@ -19,22 +19,21 @@ use crate::data::{bytes_per_pixel, encoding_name};
 ///     .stamped(1_500_000_000);
 /// ```
 ///
-/// A lambda reads the fields that are given, and no others: nobody here knows the type. What stands
-/// for the rest may be said once for all messages of an input, by
-/// [`Host::blank`](super::Host::blank).
+/// A lambda can read only the fields that the test sets: message types are not known here. Default
+/// values of all messages of an input can be set with [`Host::blank`](super::Host::blank).
 #[derive(Clone, Default)]
 pub struct Message {
     pub(super) fields: BTreeMap<String, Value>,
-    /// With its encapsulation.
+    /// CDR bytes with the encapsulation header.
     pub(super) cdr: Option<Vec<u8>>,
-    pub(super) picture: Option<Picture>,
+    pub(super) picture: Option<ImageData>,
     pub(super) publish_ns: Option<i64>,
     pub(super) seq: Option<u64>,
 }
 
-/// Pixels in rows without padding.
+/// Pixels of an image, in rows without padding.
 #[derive(Clone)]
-pub(super) struct Picture {
+pub(super) struct ImageData {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) encoding: Encoding,
@@ -42,57 +41,57 @@ pub(super) struct Picture {
 }
 
 impl Message {
-    /// A message of which nothing is given yet.
+    /// Creates a message without fields.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// An image of `width` x `height` pixels, rows from top to bottom without padding.
+    /// Creates an image of `width` x `height` pixels: rows from top to bottom, without padding.
     ///
-    /// On an input of `sensor_msgs/msg/Image` it is that message, with the fields `height`,
-    /// `width`, `encoding`, `is_bigendian`, `step` and `data`, which [`with`](Self::with) may still
-    /// change. On one of `sensor_msgs/msg/CompressedImage` it is what the host makes of a JPEG or
+    /// On an input of type `sensor_msgs/msg/Image`, it sets the fields `height`, `width`,
+    /// `encoding`, `is_bigendian`, `step` and `data`, which [`with`](Self::with) can override. On
+    /// an input of type `sensor_msgs/msg/CompressedImage`, it is the image decoded from a JPEG or
     /// PNG, so `encoding` must be rgb8.
     pub fn image(width: u32, height: u32, encoding: Encoding, pixels: impl Into<Vec<u8>>) -> Self {
         let pixels: Vec<u8> = pixels.into();
-        let picture = Picture { width, height, encoding, data: pixels.into() };
+        let picture = ImageData { width, height, encoding, data: pixels.into() };
         Self { picture: Some(picture), ..Self::default() }
     }
 
-    /// Gives the field at `path`, as a lambda would write it, such as `linear_acceleration.x` or
-    /// `fields[2].name`. An array is given as a whole; a lambda may ask for it, and for its
-    /// elements.
+    /// Sets the field at `path`, as a lambda writes it, such as `linear_acceleration.x` or
+    /// `fields[2].name`. Set an array as a whole; a lambda can read it and its elements.
     ///
-    /// A lambda that asks for [`Value`](crate::data::Value) gets the sort that is given here: `i32`
-    /// and such are signed, `u32` and such unsigned.
+    /// The lambda gets a [`Value`](crate::data::Value) of the type that is set here: signed for
+    /// signed integers such as `i32`, unsigned for those such as `u32`.
     pub fn with(mut self, path: &str, value: impl Into<FieldValue>) -> Self {
         self.fields.insert(path.to_owned(), value.into().0);
         self
     }
 
-    /// Gives `header.stamp`, in nanoseconds: the fields `header.stamp.sec` and
-    /// `header.stamp.nanosec`, and with them [`Stamps::header_ns`](crate::data::Stamps::header_ns).
+    /// Sets `header.stamp`, in nanoseconds: the fields `header.stamp.sec` and
+    /// `header.stamp.nanosec`, and thereby [`Stamps::header_ns`](crate::data::Stamps::header_ns).
     pub fn stamped(self, header_ns: i64) -> Self {
         let (sec, nanosec) = (header_ns.div_euclid(SECOND_NS), header_ns.rem_euclid(SECOND_NS));
         self.with(STAMP[0], sec).with(STAMP[1], nanosec as u64)
     }
 
-    /// Gives the bytes for [`Sample::cdr`](crate::Sample::cdr) and
-    /// [`Sample::size`](crate::Sample::size): CDR with its encapsulation, four bytes of which the
-    /// second says the byte order, as drives have it. No field is read from it.
+    /// Sets the bytes for [`Sample::cdr`](crate::Sample::cdr) and
+    /// [`Sample::size`](crate::Sample::size): CDR with its encapsulation header of four bytes, the
+    /// second of which is the byte order. No field is read from the bytes.
     pub fn cdr(mut self, bytes: impl Into<Vec<u8>>) -> Self {
         self.cdr = Some(bytes.into());
         self
     }
 
-    /// When the writer published it, in nanoseconds; else the time at which it is delivered.
+    /// Sets the time of publication, in nanoseconds; the default is the time of delivery.
     pub fn published(mut self, publish_ns: i64) -> Self {
         self.publish_ns = Some(publish_ns);
         self
     }
 
-    /// Its number, for gaps; else one more than that of the message before, from 1. A message with
-    /// the same or a smaller number than that is refused.
+    /// Sets the sequence number, for example to create a gap; the default is one more than that of
+    /// the previous message, from 1. A number that is not above that of the previous message is
+    /// refused.
     pub fn numbered(mut self, seq: u64) -> Self {
         self.seq = Some(seq);
         self
@@ -107,10 +106,9 @@ impl Message {
         whole(STAMP[0])?.checked_mul(SECOND_NS)?.checked_add(whole(STAMP[1])?)
     }
 
-    /// Gives the fields that stand for the picture in a `sensor_msgs/msg/Image`, unless they are
-    /// given.
-    pub(super) fn spread_picture(&mut self) {
-        let Some(Picture { width, height, encoding, data }) = self.picture.take() else { return };
+    /// Sets those fields of a `sensor_msgs/msg/Image` that the test did not set, from the image.
+    pub(super) fn set_image_fields(&mut self) {
+        let Some(ImageData { width, height, encoding, data }) = self.picture.take() else { return };
         let step = u64::from(width) * u64::from(bytes_per_pixel(encoding));
         let fields = [
             ("height", Value::Unsigned(height.into())),
@@ -125,7 +123,7 @@ impl Message {
         }
     }
 
-    /// A size that the message has at least: that of its CDR, or of what is surely in it.
+    /// Lower bound of the message size: the length of its CDR, or of its texts and bytes.
     pub(super) fn bytes_at_least(&self) -> usize {
         let bytes = |value: &Value| match value {
             Value::Text(text) => text.len(),
@@ -138,7 +136,7 @@ impl Message {
     }
 }
 
-/// Bytes before the message.
+/// Bytes of the CDR encapsulation header, before the message.
 pub(super) const ENCAPSULATION: usize = 4;
 
 const SECOND_NS: i64 = 1_000_000_000;
@@ -150,7 +148,7 @@ impl fmt::Debug for Message {
     }
 }
 
-/// What a field of a [`Message`] holds; made from numbers, `bool`, texts, and arrays of numbers,
+/// Value of a field of a [`Message`]; converted from numbers, `bool`, texts, and arrays of numbers,
 /// bytes or texts.
 #[derive(Clone, Debug)]
 pub struct FieldValue(Value);

@@ -19,7 +19,8 @@
 //! #
 //! #     fn on_event(&mut self, _sample: Sample) -> Result<()> {
 //! #         let recent = self.imu.column(&self.forward, 50)?;
-//! #         if let Some(mean) = recent.mean().filter(|mean| recent.len() == 50 && *mean < self.brake_mps2) {
+//! #         let full = recent.len() == 50;
+//! #         if let Some(mean) = recent.mean().filter(|mean| full && *mean < self.brake_mps2) {
 //! #             event("dip", -mean).send()?;
 //! #         }
 //! #         Ok(())
@@ -42,18 +43,18 @@
 //! # Ok::<(), gleaner_sdk::testing::Error>(())
 //! ```
 //!
-//! The lambda is the same source; only what it calls is another. The rules are those of the host:
-//! rings with `depth` and `hold`, schedules, columns, what is clamped and refused and in which
-//! words, operations on pixels to the last bit, limits of triggers, log, scratch, frames, handles
-//! and bytes of a call, faults and the lambda made anew after one, rests. Most of them are the
-//! host's own code, in `gleaner-rules`.
+//! The source of the lambda is unchanged. The fake host follows the rules of the real one: rings
+//! with `depth` and `hold`, schedules, columns, clamping, errors and their texts, operations on
+//! pixels to the last bit, limits of triggers, log, scratch, frames, handles and bytes per call,
+//! faults with a fresh instance after each, and back-off. Most of these rules are the host's own
+//! code, in `gleaner-rules`.
 //!
-//! Not here: fuel, time and memory, but for pixels of frames that are made; decoders of JPEG and
-//! PNG; definitions of messages, so that a message has the fields that the test gives; clips;
-//! models. `docs/rust.md` says what follows from that.
+//! Not included: fuel, time and memory, except for pixels of frames that the lambda creates;
+//! decoders of JPEG and PNG; message definitions, so a message has only the fields that the test
+//! sets; clips; models. See `docs/rust.md` for the consequences.
 //!
-//! It exists natively only, so use it in `#[cfg(test)]`. A call of the SDK while no lambda runs
-//! panics, and says what to do.
+//! The module exists natively only, so use it in `#[cfg(test)]`. A call of the SDK while no lambda
+//! runs panics with a message that names the way out.
 
 #[doc(hidden)]
 pub mod bindings;
@@ -80,6 +81,6 @@ pub(crate) mod types;
 pub use decision::{AttributeValue, Cause, Decision, Fault, FaultKind, Trigger, TriggerKind};
 pub use error::Error;
 pub use host::{Host, Setting};
-pub use log::Line;
+pub use log::LogLine;
 pub use message::{FieldValue, Message};
 pub use run::Run;

@@ -1,4 +1,4 @@
-//! Paths of fields, such as `a.b[3].c`, and what they find in messages of a test.
+//! Resolves field paths, such as `a.b[3].c`, in the messages of a test.
 
 use std::collections::BTreeMap;
 
@@ -8,30 +8,30 @@ use gleaner_rules::text::quoted;
 use super::error::nearest;
 use super::types::Value;
 
-/// A path of the right form. Which fields there are, only messages say.
-pub(super) struct Path {
+/// A path with valid syntax. Only a message shows whether the field exists.
+pub(super) struct FieldPath {
     pub(super) text: String,
-    /// Of `a.b[3]`: `a.b`, and 3.
+    /// Array and index if the path ends with an index: for `a.b[3]`, `a.b` and 3.
     element: Option<(String, usize)>,
 }
 
-/// What stands at a path.
-pub(super) enum Found<'a> {
+/// The value at a path.
+pub(super) enum FieldRef<'a> {
     Whole(&'a Value),
     /// One element of an array.
     Element(Value),
 }
 
-/// Why nothing does.
-pub(super) enum Missing {
-    /// The message has no such field; the names of those it has.
+/// Reason why there is no value at a path.
+pub(super) enum MissingField {
+    /// The message has no such field. The text lists its fields.
     Field(String),
-    /// Its array is too short.
+    /// The array is too short.
     Element(String),
 }
 
-impl Path {
-    /// The message says where `text` goes wrong.
+impl FieldPath {
+    /// Parses a path. The error names the position of the mistake.
     pub(super) fn new(text: &str) -> Result<Self, Malformed> {
         let element = match segments(text)?.last() {
             Some(Segment::Index(index)) => {
@@ -45,14 +45,14 @@ impl Path {
     pub(super) fn find<'a>(
         &self,
         fields: &'a BTreeMap<String, Value>,
-    ) -> Result<Found<'a>, Missing> {
+    ) -> Result<FieldRef<'a>, MissingField> {
         if let Some(value) = fields.get(&self.text) {
-            return Ok(Found::Whole(value));
+            return Ok(FieldRef::Whole(value));
         }
         let array =
             self.element.as_ref().and_then(|(array, index)| Some((fields.get(array)?, *index)));
         let Some((array, index)) = array else {
-            return Err(Missing::Field(known(&self.text, fields)));
+            return Err(MissingField::Field(known(&self.text, fields)));
         };
         let (len, element) = match array {
             Value::Numbers(numbers) => {
@@ -62,19 +62,19 @@ impl Path {
                 (bytes.len(), bytes.get(index).map(|byte| Value::Unsigned((*byte).into())))
             }
             Value::Texts(texts) => (texts.len(), texts.get(index).cloned().map(Value::Text)),
-            _ => return Err(Missing::Field(known(&self.text, fields))),
+            _ => return Err(MissingField::Field(known(&self.text, fields))),
         };
         let why = || {
-            Missing::Element(format!(
+            MissingField::Element(format!(
                 "it has {len} elements where `{}` wants element {index}",
                 self.text
             ))
         };
-        element.map(Found::Element).ok_or_else(why)
+        element.map(FieldRef::Element).ok_or_else(why)
     }
 }
 
-impl Found<'_> {
+impl FieldRef<'_> {
     pub(super) fn value(&self) -> &Value {
         match self {
             Self::Whole(value) => value,
@@ -82,7 +82,7 @@ impl Found<'_> {
         }
     }
 
-    /// As a 64-bit float, if it is a number; true is 1.
+    /// The value as a 64-bit float; true is 1. None if it is not a number.
     pub(super) fn number(&self) -> Option<f64> {
         match self.value() {
             Value::Boolean(value) => Some(f64::from(u8::from(*value))),
@@ -94,7 +94,7 @@ impl Found<'_> {
     }
 }
 
-/// What would have been right, for the end of a message.
+/// End of an error message: the most similar field, and all fields.
 pub(super) fn known(path: &str, fields: &BTreeMap<String, Value>) -> String {
     let near = nearest(path, fields.keys().map(String::as_str));
     let hint = near.map_or(String::new(), |near| format!("; did you mean `{near}`?"));
@@ -106,22 +106,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_element_is_found_in_its_array_unless_it_is_given_itself() {
+    fn an_element_is_found_in_its_array_unless_it_is_set_itself() {
         let fields = BTreeMap::from([
             ("cov".to_owned(), Value::Numbers(vec![1.0, 2.0])),
             ("cov[1]".to_owned(), Value::Real(9.0)),
             ("raw".to_owned(), Value::Bytes(vec![7])),
         ]);
         let number = |path: &str| {
-            Path::new(path).unwrap().find(&fields).ok().and_then(|found| found.number())
+            FieldPath::new(path).unwrap().find(&fields).ok().and_then(|found| found.number())
         };
         assert_eq!(
             [number("cov[0]"), number("cov[1]"), number("raw[0]")],
             [Some(1.0), Some(9.0), Some(7.0)]
         );
-        let missing = |path: &str| match Path::new(path).unwrap().find(&fields) {
-            Err(Missing::Field(why)) => why,
-            Err(Missing::Element(why)) => why,
+        let missing = |path: &str| match FieldPath::new(path).unwrap().find(&fields) {
+            Err(MissingField::Field(why)) => why,
+            Err(MissingField::Element(why)) => why,
             Ok(_) => panic!("{path} was found"),
         };
         assert_eq!(missing("cov[2]"), "it has 2 elements where `cov[2]` wants element 2");

@@ -1,4 +1,4 @@
-//! What is in a ring of `gleaner_rules::ring`: messages of a test.
+//! Rings of messages, over `gleaner_rules::ring`.
 
 use gleaner_rules::ring as rules;
 
@@ -8,7 +8,7 @@ use super::types::Guid;
 pub(super) type Ring = rules::Ring<Arrival>;
 pub(super) type Cell = rules::Cell<Arrival>;
 
-/// One message, on its way into a ring.
+/// One received message, as it enters a ring.
 pub(crate) struct Arrival {
     pub(super) at_ns: i64,
     pub(super) publish_ns: i64,

@@ -1,4 +1,4 @@
-//! A lambda in the fake host: messages are delivered to it, and what it decides is kept.
+//! Runs a lambda in the fake host: delivers messages and collects the decisions.
 
 use std::sync::Arc;
 
@@ -6,10 +6,10 @@ use gleaner_rules::faults::Faults;
 use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 use gleaner_rules::text::quoted;
 
-use super::data::{Source, Tick};
+use super::data::{InputState, Tick};
 use super::decision::{Cause, Decision, Fault, Trigger};
 use super::error::Error;
-use super::log::Line;
+use super::log::LogLine;
 use super::message::{ENCAPSULATION, Message};
 use super::path::known;
 use super::ring::{Arrival, Cell};
@@ -19,9 +19,9 @@ use super::types::{Counts, Encoding, Guid, Value};
 use crate::data::Sample;
 use crate::{Config, Lambda};
 
-/// A lambda that was loaded, and all that came of it so far.
+/// A loaded lambda with its decisions, log and counts so far.
 ///
-/// Time is what the test says: that of the messages, in nanoseconds.
+/// The test sets the time: that of the messages, in nanoseconds.
 pub struct Run<L: Lambda> {
     config: Config,
     session: Arc<Session>,
@@ -33,9 +33,9 @@ pub struct Run<L: Lambda> {
     faults: Faults,
 }
 
-/// Why the lambda runs.
-enum Due {
-    Event(Arc<Source>, Arc<Cell>),
+/// A wake that is due.
+enum DueWake {
+    Event(Arc<InputState>, Arc<Cell>),
     Tick(Tick),
 }
 
@@ -56,14 +56,14 @@ impl<L: Lambda> Run<L> {
         }
     }
 
-    /// Delivers a message to an input at `at_ns`, and runs the lambda as its schedule says: first
-    /// the ticks that were due before, then once for the message, if it wakes the lambda. Returns
-    /// what was decided in these wakes.
+    /// Delivers a message to an input at `at_ns`, and runs the lambda by its schedule: first the
+    /// ticks that were due before, then once for the message, if it wakes the lambda. Returns the
+    /// decisions of these wakes.
     ///
     /// # Errors
     ///
-    /// If there is no such input, time would go back, or the message cannot be one of this input.
-    /// Nothing has happened then. A fault of the lambda is no error: it stands in its decision.
+    /// If there is no such input, time would go back, or the message does not fit the input. The
+    /// call has no effect then. A fault of the lambda is not an error: the decision contains it.
     pub fn deliver(
         &mut self,
         input: &str,
@@ -86,11 +86,11 @@ impl<L: Lambda> Run<L> {
         let before = source.lock().seq;
         let seq = message.seq.unwrap_or(before + 1);
         if seq <= before {
-            let cause = format!("the message before has the number {before}");
+            let cause = format!("the previous message has the number {before}");
             return Err(Error::new(
-                format!("message {seq} of input `{input}` comes too late"),
+                format!("message {seq} of input `{input}` is out of order"),
                 cause,
-                "let numbers rise",
+                "increase the numbers",
             ));
         }
         self.now_ns = Some(at_ns);
@@ -101,7 +101,7 @@ impl<L: Lambda> Run<L> {
             let arrived = &mut *source.lock();
             arrived.seq = seq;
             let writer = Guid {
-                high: u64::from(u32::from_be_bytes(*b"desk")) << 32,
+                high: u64::from(u32::from_be_bytes(*b"test")) << 32,
                 low: (number as u64) << 32,
             };
             let (publish_ns, bytes) =
@@ -109,14 +109,14 @@ impl<L: Lambda> Run<L> {
             arrived.ring.push(Arrival { at_ns, publish_ns, writer, seq, message }, bytes);
         }
         while let Some((source, cell)) = self.schedule.next_event() {
-            self.wake(cell.sample.at_ns, Due::Event(source, cell));
+            self.wake(cell.sample.at_ns, DueWake::Event(source, cell));
         }
         Ok(&self.decisions[decided..])
     }
 
-    /// Lets time pass up to `at_ns` without a message: ticks run that are due until then, that
-    /// instant included. Returns what was decided in them. The first tick is due a period after the
-    /// first message, or the first call of this.
+    /// Advances time to `at_ns` without a message, and runs the ticks that are due up to and
+    /// including that instant. Returns their decisions. The first tick is due a period after the
+    /// first message or the first call of this method.
     ///
     /// # Errors
     ///
@@ -131,29 +131,29 @@ impl<L: Lambda> Run<L> {
         Ok(&self.decisions[decided..])
     }
 
-    /// One decision for each wake so far.
+    /// The decisions so far, one for each wake.
     pub fn decisions(&self) -> &[Decision] {
         &self.decisions
     }
 
-    /// What was triggered so far, in all wakes.
+    /// The triggers so far, of all wakes.
     pub fn triggers(&self) -> impl Iterator<Item = &Trigger> {
         self.decisions.iter().flat_map(|decision| &decision.triggers)
     }
 
-    /// The faults so far. A test that expects none asks for this, or a lambda that never got
-    /// further passes it.
+    /// The faults so far. Check it in every test that expects none: without the check, a lambda
+    /// that faults in each wake passes.
     pub fn faults(&self) -> impl Iterator<Item = &Fault> {
         self.decisions.iter().filter_map(|decision| decision.fault.as_ref())
     }
 
-    /// What was logged so far, and what the host noted. What a lambda prints is not in it: it is
-    /// the test's own output.
-    pub fn log(&self) -> Vec<Line> {
+    /// The log lines so far, of the lambda and of the host. Printed text is not included: it goes
+    /// to the output of the test.
+    pub fn log(&self) -> Vec<LogLine> {
         self.session.lock().log.lines.clone()
     }
 
-    /// What became of the samples of an input; none if there is no such input.
+    /// Numbers of received and lost samples of an input; none if there is no such input.
     pub fn counts(&self, input: &str) -> Option<Counts> {
         self.session
             .inputs
@@ -162,27 +162,27 @@ impl<L: Lambda> Run<L> {
             .map(|source| source.counts())
     }
 
-    /// The lambda itself; none after a fault, until the next wake makes it anew.
+    /// The lambda; none after a fault, until the next wake creates a fresh instance.
     pub fn lambda(&self) -> Option<&L> {
         self.lambda.as_ref()
     }
 
-    /// Log lines dropped by the limits of a second.
+    /// Number of log lines dropped by the limits per second.
     pub fn log_dropped(&self) -> u64 {
         self.session.lock().log.dropped()
     }
 
-    /// Triggers refused by `events_per_minute`.
+    /// Number of triggers refused by `events_per_minute`.
     pub fn triggers_refused(&self) -> u64 {
         self.session.lock().triggers.refused()
     }
 
-    /// Wakes passed over since the lambda had faulted again and again.
+    /// Number of wakes skipped during back-off, after repeated faults.
     pub fn backed_off(&self) -> u64 {
         self.session.lock().backed_off
     }
 
-    /// Ticks that were due and did not happen.
+    /// Number of ticks that were due and did not happen.
     pub fn missed_ticks(&self) -> u64 {
         self.schedule.missed()
     }
@@ -203,18 +203,19 @@ impl<L: Lambda> Run<L> {
 
     fn ticks(&mut self, now_ns: i64) {
         while let Some(tick) = self.schedule.next_tick(now_ns) {
-            self.wake(tick.at_ns, Due::Tick(tick));
+            self.wake(tick.at_ns, DueWake::Tick(tick));
         }
     }
 
     fn init(&mut self) -> Result<(), Fault> {
         let (session, config) = (Arc::clone(&self.session), &self.config);
-        self.lambda = Some(session.aside(|| attempt(&session, "in init: ", || L::init(config)))?);
+        self.lambda =
+            Some(session.without_triggers(|| attempt(&session, "in init: ", || L::init(config)))?);
         Ok(())
     }
 
-    /// From cause to decision. What a lambda triggers before it faults still counts.
-    fn wake(&mut self, at_ns: i64, due: Due) {
+    /// Runs one wake and adds its decision. Triggers before a fault still count.
+    fn wake(&mut self, at_ns: i64, due: DueWake) {
         if self.faults.rests(at_ns) {
             self.session.lock().backed_off += 1;
             return;
@@ -236,21 +237,21 @@ impl<L: Lambda> Run<L> {
         self.decisions.push(decision);
     }
 
-    fn run(&mut self, due: Due) -> Result<(), Fault> {
+    fn run(&mut self, due: DueWake) -> Result<(), Fault> {
         if self.lambda.is_none() {
             self.init()?;
         }
         let session = Arc::clone(&self.session);
-        let lambda = self.lambda.as_mut().expect("it was there, or has just been made");
+        let lambda = self.lambda.as_mut().expect("it existed, or `init` has just created it");
         let ran = attempt(&session, "", || match due {
-            Due::Event(source, cell) => lambda.on_event(Sample::from(source.sample(cell))),
-            Due::Tick(tick) => lambda.on_tick(tick),
+            DueWake::Event(source, cell) => lambda.on_event(Sample::from(source.sample(cell))),
+            DueWake::Tick(tick) => lambda.on_tick(tick),
         });
         if ran.is_err() {
-            // Its handles are given back. A component ends without dropping anything; what its
-            // `drop` does is lost there, too.
+            // Drop it to release its handles. A component ends without running `drop`, so what
+            // `drop` does here has no effect either.
             let lambda = self.lambda.take();
-            let _ = session.aside(|| dropped(&session, lambda));
+            let _ = session.without_triggers(|| dropped(&session, lambda));
         }
         ran
     }
@@ -263,7 +264,7 @@ impl<L: Lambda> Drop for Run<L> {
     }
 }
 
-/// Drops a lambda where it may still call its host.
+/// Drops a lambda while it can still call the host.
 fn dropped<L>(session: &Arc<Session>, lambda: Option<L>) -> Result<(), Fault> {
     attempt(session, "", || {
         drop(lambda);
@@ -271,10 +272,10 @@ fn dropped<L>(session: &Arc<Session>, lambda: Option<L>) -> Result<(), Fault> {
     })
 }
 
-fn cause(at_ns: i64, due: &Due) -> Decision {
+fn cause(at_ns: i64, due: &DueWake) -> Decision {
     let (triggers, fault) = (Vec::new(), None);
     match due {
-        Due::Tick(_) => Decision {
+        DueWake::Tick(_) => Decision {
             at_ns,
             cause: Cause::Tick,
             input: None,
@@ -283,7 +284,7 @@ fn cause(at_ns: i64, due: &Due) -> Decision {
             triggers,
             fault,
         },
-        Due::Event(source, cell) => Decision {
+        DueWake::Event(source, cell) => Decision {
             at_ns,
             cause: Cause::Event,
             input: Some(source.declared.name.clone()),
@@ -295,9 +296,9 @@ fn cause(at_ns: i64, due: &Due) -> Decision {
     }
 }
 
-/// The message as it comes to an input: over its blank, and with the fields that stand for a
-/// picture.
-fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
+/// Validates a message and completes it: with the fields of its image, and the defaults of the
+/// input.
+fn checked(source: &InputState, mut message: Message) -> Result<Message, Error> {
     let (name, type_name) = (&source.declared.name, source.declared.type_name.as_str());
     let refuse = |cause: String, help: &str| {
         Err(Error::new(format!("cannot deliver a message to input `{name}`"), cause, help))
@@ -305,12 +306,12 @@ fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
     if message.cdr.as_ref().is_some_and(|cdr| cdr.len() < ENCAPSULATION) {
         return refuse(
             "its CDR is too short".to_owned(),
-            "give it with its encapsulation, four bytes before the message",
+            "add the encapsulation header, four bytes before the message",
         );
     }
     if let Some(picture) = &message.picture {
         match type_name {
-            IMAGE => message.spread_picture(),
+            IMAGE => message.set_image_fields(),
             COMPRESSED_IMAGE => {
                 let needed = 3 * u64::from(picture.width) * u64::from(picture.height);
                 let found = picture.data.len() as u64;
@@ -323,15 +324,12 @@ fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
                         "{cause}; it has {found} of {}",
                         crate::data::encoding_name(picture.encoding)
                     );
-                    return refuse(
-                        cause,
-                        "give what the host makes of JPEG and PNG: rgb8, without padding",
-                    );
+                    return refuse(cause, "set the decoded image: rgb8, without padding");
                 }
             }
             _ => {
                 let help =
-                    format!("an image goes to an input of `{IMAGE}` or `{COMPRESSED_IMAGE}`");
+                    format!("deliver an image to an input of `{IMAGE}` or `{COMPRESSED_IMAGE}`");
                 return refuse(
                     format!("it is an image, and the input is of type `{type_name}`"),
                     &help,
@@ -349,9 +347,8 @@ fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
             );
         };
         if !fit(value, usual) {
-            let cause =
-                format!("its field `{path}` is of another sort than that of the blank message");
-            return refuse(cause, "give both alike");
+            let cause = format!("its field `{path}` has another type than in the blank message");
+            return refuse(cause, "use the same type in both");
         }
     }
     for (path, usual) in &blank.fields {
@@ -360,7 +357,7 @@ fn checked(source: &Source, mut message: Message) -> Result<Message, Error> {
     Ok(message)
 }
 
-/// Whether `value` is of the sort of `usual`; a number is made one of its sort, if it keeps its
+/// Returns whether `value` has the type of `usual`. Converts a number to that type if it keeps its
 /// value.
 fn fit(value: &mut Value, usual: &Value) -> bool {
     let made = match (&*value, usual) {

@@ -1,20 +1,20 @@
-//! When a lambda runs, by `gleaner_rules::schedule` over the rings of a run.
+//! Schedules the wakes of a run, by `gleaner_rules::schedule` over its rings.
 
 use std::sync::Arc;
 
 use gleaner_rules::schedule::{self as rules, Ring};
 
-use super::data::Source;
+use super::data::InputState;
 use super::ring::Cell;
 
-pub(super) type Schedule = rules::Schedule<Input>;
+pub(super) type Schedule = rules::Schedule<EventInput>;
 
-/// The input whose messages wake the lambda. They wait for it, so that `latest` and `each` are the
-/// same here.
-pub(super) struct Input(pub(super) Arc<Source>);
+/// The input whose messages wake the lambda. Each message waits for the lambda, so the backlogs
+/// `latest` and `each` are the same here.
+pub(super) struct EventInput(pub(super) Arc<InputState>);
 
-impl Ring for Input {
-    type Sample = (Arc<Source>, Arc<Cell>);
+impl Ring for EventInput {
+    type Sample = (Arc<InputState>, Arc<Cell>);
 
     fn head(&self) -> u64 {
         self.0.lock().ring.counts().received

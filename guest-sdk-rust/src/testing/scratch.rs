@@ -1,5 +1,5 @@
-//! `gleaner:lambda/scratch`: what is kept by name, within `scratch` of `[limits]`, beyond faults of
-//! the lambda.
+//! Implements `gleaner:lambda/scratch`: named entries within `scratch` in `[limits]`, kept across
+//! faults of the lambda.
 
 pub use gleaner_rules::scratch::Entry;
 use gleaner_rules::scratch::ScratchError as Refused;
@@ -7,42 +7,43 @@ use gleaner_rules::scratch::ScratchError as Refused;
 use super::session::current;
 use super::types::refusal;
 
-/// Why something was not kept or not found. Nothing has changed then.
+/// Reason why a call was refused. The call had no effect. Each message names the entry, the cause
+/// and the way out.
 #[derive(Clone, Debug)]
 pub enum ScratchError {
-    /// It would take more than `scratch` of `[limits]`, or there are 1,024 entries already.
+    /// The entries would exceed `scratch` in `[limits]`, or there are 1,024 entries already.
     NoRoom(String),
-    /// Nothing has that name.
+    /// There is no entry of that name.
     NoSuchEntry(String),
-    /// A name has 1 to 128 bytes and no control characters.
+    /// The name is not 1 to 128 bytes long, or has control characters.
     WrongName(String),
 }
 
 refusal!(ScratchError);
 
-type Answer<T> = Result<T, ScratchError>;
+type CallResult<T> = Result<T, ScratchError>;
 
-pub(crate) fn put(name: &str, bytes: &[u8]) -> Answer<()> {
+pub(crate) fn put(name: &str, bytes: &[u8]) -> CallResult<()> {
     let session = current();
-    session.passed(name.len() + bytes.len());
+    session.check_bytes(name.len() + bytes.len());
     session.lock().scratch.put(name, bytes).map_err(refused)
 }
 
-pub(crate) fn append(name: &str, bytes: &[u8]) -> Answer<()> {
+pub(crate) fn append(name: &str, bytes: &[u8]) -> CallResult<()> {
     let session = current();
-    session.passed(name.len() + bytes.len());
+    session.check_bytes(name.len() + bytes.len());
     session.lock().scratch.append(name, bytes).map_err(refused)
 }
 
-pub(crate) fn get(name: &str, offset: u64, len: u32) -> Answer<Vec<u8>> {
+pub(crate) fn get(name: &str, offset: u64, len: u32) -> CallResult<Vec<u8>> {
     let session = current();
-    session.passed(name.len());
+    session.check_bytes(name.len());
     session.lock().scratch.get(name, offset, len.into()).map_err(refused)
 }
 
-pub(crate) fn remove(name: &str) -> Answer<()> {
+pub(crate) fn remove(name: &str) -> CallResult<()> {
     let session = current();
-    session.passed(name.len());
+    session.check_bytes(name.len());
     session.lock().scratch.remove(name).map_err(refused)
 }
 

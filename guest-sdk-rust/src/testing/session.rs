@@ -1,5 +1,5 @@
-//! What one lambda sees and causes for as long as a run lasts, and how the functions of the SDK
-//! find it.
+//! The session of a run: its inputs, triggers, log and scratch memory, and the thread-local through
+//! which the functions of the SDK reach it.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -13,19 +13,19 @@ use gleaner_rules::scratch::Scratch;
 use gleaner_rules::triggers::Triggers;
 use gleaner_rules::units::size_in_words;
 
-use super::data::Source;
+use super::data::InputState;
 use super::decision::{Fault, FaultKind, Trigger};
 use super::log::Log;
 use super::manifest::Limits;
 
-/// The session of a run: a lambda that is made anew finds it as it was.
+/// The session of a run. It survives faults: a fresh instance of the lambda finds it unchanged.
 pub(crate) struct Session {
     limits: Limits,
-    pub(super) inputs: Vec<Arc<Source>>,
-    state: Mutex<State>,
+    pub(super) inputs: Vec<Arc<InputState>>,
+    state: Mutex<SessionState>,
 }
 
-pub(super) struct State {
+pub(super) struct SessionState {
     pub(super) now_ns: i64,
     pub(super) triggers: Triggers<Trigger>,
     pub(super) log: Log,
@@ -34,21 +34,21 @@ pub(super) struct State {
 }
 
 impl Session {
-    pub(super) fn new(limits: Limits, inputs: Vec<Arc<Source>>) -> Arc<Self> {
+    pub(super) fn new(limits: Limits, inputs: Vec<Arc<InputState>>) -> Arc<Self> {
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(&limits));
         let scratch = Scratch::new(limits.scratch, limits.per_call.bytes);
-        let state = Mutex::new(State { now_ns: 0, triggers, log, scratch, backed_off: 0 });
+        let state = Mutex::new(SessionState { now_ns: 0, triggers, log, scratch, backed_off: 0 });
         Arc::new(Self { limits, inputs, state })
     }
 
-    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
-        // A lambda that panics in a call leaves nothing half done.
+    pub(super) fn lock(&self) -> MutexGuard<'_, SessionState> {
+        // A lambda that panics in a call leaves the state consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The lambda passes so many bytes in one call. More than `call_bytes` of `[limits]` end it, as
-    /// they end a component.
-    pub(super) fn passed(&self, bytes: usize) {
+    /// Ends the lambda if it passes more bytes in one call than `call_bytes` in `[limits]`, as the
+    /// host ends a component.
+    pub(super) fn check_bytes(&self, bytes: usize) {
         let allowed = self.limits.per_call.bytes;
         if bytes > allowed {
             let what = "too much data is being copied between the host and the guest";
@@ -62,9 +62,9 @@ impl Session {
         }
     }
 
-    /// Runs an `init`, or drops a lambda: in the middle of a wake maybe, but no part of it. It can
-    /// cause nothing.
-    pub(super) fn aside<R>(&self, run: impl FnOnce() -> R) -> R {
+    /// Runs `init` or drops a lambda, possibly in the middle of a wake, of which it is not a part:
+    /// triggers are refused.
+    pub(super) fn without_triggers<R>(&self, run: impl FnOnce() -> R) -> R {
         let triggers = self.lock().triggers.suspend();
         let result = run();
         self.lock().triggers.resume(triggers);
@@ -77,22 +77,23 @@ thread_local! {
     static CURRENT: RefCell<Option<Arc<Session>>> = const { RefCell::new(None) };
 }
 
-/// The session of the lambda that calls.
+/// The session of the calling lambda.
 ///
 /// # Panics
 ///
-/// If none runs on this thread.
+/// If no lambda runs on this thread.
 pub(super) fn current() -> Arc<Session> {
     CURRENT.with_borrow(Clone::clone).unwrap_or_else(|| {
         panic!(
-            "no host is running here: natively, calls of gleaner_sdk reach the fake host of gleaner_sdk::testing, and only while \
-             it runs a lambda; load the lambda with testing::Host, or keep what is tested in functions that call no host"
+            "no host is running on this thread: natively, gleaner_sdk calls the fake host of \
+             gleaner_sdk::testing, and only while it runs a lambda; load the lambda with \
+             testing::Host, or test functions that do not call the host"
         )
     })
 }
 
-/// Calls code of the lambda over `session`. An error is a fault, and so is a panic; both are said
-/// with `when` before them.
+/// Calls code of the lambda in `session`. An error or a panic is a fault, whose message begins with
+/// `when`.
 pub(super) fn attempt<R>(
     session: &Arc<Session>,
     when: &str,
@@ -114,38 +115,38 @@ pub(super) fn attempt<R>(
         Ok(Err(error)) => Err(plain(FaultKind::Exception, &error.to_string())),
         Err(panic) => Err(match panic.downcast::<Fault>() {
             Ok(fault) => Fault { message: format!("{when}{}", fault.message), ..*fault },
-            Err(panic) => plain(FaultKind::Trap, &format!("panicked: {}", said(&*panic))),
+            Err(panic) => plain(FaultKind::Trap, &format!("panicked: {}", panic_text(&*panic))),
         }),
     }
 }
 
-/// Ends the lambda from within a call. It is no panic, so no hook prints it.
+/// Ends the lambda from within a call. The panic hook does not run, so nothing is printed.
 fn end(fault: Fault) -> ! {
     resume_unwind(Box::new(fault))
 }
 
-fn said(panic: &(dyn Any + Send)) -> &str {
+fn panic_text(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str))
-        .unwrap_or("it did not say why")
+        .unwrap_or("the panic has no message")
 }
 
-/// How many samples, frames, fields and topics a lambda may hold, and holds.
-pub(crate) struct Handles {
+/// Counts the samples, frames, fields and topics that a lambda holds, up to a limit.
+pub(crate) struct HandleCounter {
     held: AtomicU64,
     allowed: u64,
 }
 
-/// One of them, given back when dropped.
-pub(crate) struct Handle(Arc<Handles>);
+/// One held object, counted until dropped.
+pub(crate) struct Handle(Arc<HandleCounter>);
 
-impl Handles {
+impl HandleCounter {
     pub(super) fn new(limits: &Limits) -> Arc<Self> {
         Arc::new(Self { held: AtomicU64::new(0), allowed: limits.handles })
     }
 
-    /// One more; the lambda ends where it has as many as it may.
-    pub(super) fn hand_out(self: &Arc<Self>) -> Handle {
+    /// Counts one more object. Ends the lambda if it would exceed the limit.
+    pub(super) fn acquire(self: &Arc<Self>) -> Handle {
         let held = self.held.fetch_add(1, Ordering::Relaxed);
         let handle = Handle(Arc::clone(self));
         let allowed = self.allowed;

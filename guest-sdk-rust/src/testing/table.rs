@@ -1,5 +1,5 @@
-//! One table of a `lambda.toml`, whose keys are known: each is read as what it should be, or
-//! refused by its name.
+//! Parses one table of a `lambda.toml`: refuses unknown keys, and reads each key with its type and
+//! bounds.
 
 use gleaner_rules::text::quoted;
 use gleaner_rules::units;
@@ -13,9 +13,9 @@ type Result<T> = std::result::Result<T, Error>;
 pub(super) type Bounds = (u64, u64, u64);
 
 const ITEMS_MAX: usize = 256;
-const SEE: &str = "Gleaner's README says what it holds";
+const SEE: &str = "see docs/manifest.md for its keys";
 
-/// `title` is how it is written, such as `[schedule]`.
+/// A table; `title` is its name in the file, such as `[schedule]`.
 pub(super) struct Table<'a> {
     title: String,
     pub(super) entries: &'a Entries,
@@ -50,7 +50,7 @@ impl<'a> Table<'a> {
             .ok_or_else(|| self.refusal(&format!("has no `{key}`"), &format!("add {example}")))
     }
 
-    /// A text that `is_right`.
+    /// Reads a text that satisfies `is_right`.
     pub(super) fn text(
         &self,
         key: &str,
@@ -87,7 +87,7 @@ impl<'a> Table<'a> {
         self.within(key, u64::try_from(whole).ok(), value, bounds)
     }
 
-    /// Bytes.
+    /// Reads a size in bytes.
     pub(super) fn size(&self, key: &str, bounds: Bounds) -> Result<u64> {
         match self.get(key) {
             None => Ok(bounds.1),
@@ -102,7 +102,7 @@ impl<'a> Table<'a> {
         }
     }
 
-    /// Nanoseconds.
+    /// Reads a duration in nanoseconds.
     pub(super) fn duration(&self, key: &str, bounds: Bounds) -> Result<u64> {
         let Some(value) = self.get(key) else { return Ok(bounds.1) };
         let ns = value.as_str().and_then(units::duration);
@@ -135,7 +135,7 @@ impl<'a> Table<'a> {
     }
 }
 
-/// A value in a message.
+/// Formats a value for an error message.
 fn shown(value: &Value) -> String {
     match value {
         Value::String(text) => format!("\"{}\"", text.chars().take(64).collect::<String>()),

@@ -1,4 +1,4 @@
-//! `gleaner:lambda/trigger`: what a lambda causes, checked and counted by
+//! Implements `gleaner:lambda/trigger`: actions of a lambda, checked and counted by
 //! `gleaner_rules::triggers`.
 
 pub use gleaner_rules::triggers::{Attribute, AttributeValue};
@@ -8,33 +8,34 @@ use super::decision::Trigger;
 use super::session::current;
 use super::types::refusal;
 
-/// The call is refused and had no effect. The message names the limit.
+/// Reason why a call was refused. The call had no effect. The message names the limit.
 #[derive(Clone, Debug)]
 pub enum TriggerError {
-    /// No wake; label empty or over 128 bytes; score or value not finite; key empty, over 64 bytes
-    /// or given twice; text over 1,024 bytes; more than 16 attributes.
+    /// Called outside of a wake; label empty or over 128 bytes; score or value not finite; key
+    /// empty, over 64 bytes or given twice; text over 1,024 bytes; more than 16 attributes.
     Invalid(String),
-    /// More than 16 triggers in one wake, or more than `events_per_minute` of `[limits]`.
+    /// More than 16 triggers in one wake, or more in a minute than `events_per_minute` in
+    /// `[limits]`.
     TooMany(String),
 }
 
 refusal!(TriggerError);
 
-type Answer = Result<(), TriggerError>;
+type CallResult = Result<(), TriggerError>;
 
-pub(crate) fn event(label: &str, score: f64, attributes: &[Attribute]) -> Answer {
+pub(crate) fn event(label: &str, score: f64, attributes: &[Attribute]) -> CallResult {
     cause(Kind::Event, label, Some(score), attributes)
 }
 
-pub(crate) fn start(label: &str, attributes: &[Attribute]) -> Answer {
+pub(crate) fn start(label: &str, attributes: &[Attribute]) -> CallResult {
     cause(Kind::Start, label, None, attributes)
 }
 
-pub(crate) fn stop(label: &str) -> Answer {
+pub(crate) fn stop(label: &str) -> CallResult {
     cause(Kind::Stop, label, None, &[])
 }
 
-fn cause(kind: Kind, label: &str, score: Option<f64>, attributes: &[Attribute]) -> Answer {
+fn cause(kind: Kind, label: &str, score: Option<f64>, attributes: &[Attribute]) -> CallResult {
     let session = current();
     let text = |value: &AttributeValue| {
         if let AttributeValue::Text(text) = value { text.len() } else { 0 }
@@ -43,7 +44,7 @@ fn cause(kind: Kind, label: &str, score: Option<f64>, attributes: &[Attribute]) 
         .iter()
         .map(|attribute| attribute.key.len() + text(&attribute.value))
         .sum::<usize>();
-    session.passed(label.len() + texts);
+    session.check_bytes(label.len() + texts);
     let state = &mut *session.lock();
     let at_ns = state.now_ns;
     let caused =

@@ -1,6 +1,6 @@
-//! `gleaner:lambda/types`: plain values, with the fields and derives that wit-bindgen gives them.
+//! Data types of `gleaner:lambda/types`, with the fields and derives that wit-bindgen generates.
 
-/// Who sent a sample: the 16 bytes of a DDS writer GUID, as two big-endian halves.
+/// Sender of a sample: the 16 bytes of the DDS writer's GUID, as two big-endian halves.
 #[derive(Clone, Copy, Debug)]
 #[allow(missing_docs)]
 pub struct Guid {
@@ -8,47 +8,48 @@ pub struct Guid {
     pub low: u64,
 }
 
-/// What makes a sample different from every other one.
+/// Unique identity of a sample.
 #[derive(Clone, Debug)]
 pub struct Identity {
-    /// ROS topic name as the manifest gives it, such as `/imu/data`.
+    /// Name of the ROS topic in the manifest, such as `/imu/data`.
     pub topic: String,
-    /// Who sent it.
+    /// GUID of the writer.
     pub writer: Guid,
-    /// Rises strictly for each writer; gaps are samples that were lost on the way.
+    /// Sequence number, strictly increasing for each writer; a gap means lost samples.
     pub seq: u64,
 }
 
-/// When a sample came to be, in nanoseconds. The three clocks may differ: compare like with like.
+/// Timestamps of a sample in nanoseconds, on three clocks. The clocks may differ, so compare only
+/// stamps of the same clock.
 #[derive(Clone, Copy, Debug)]
 pub struct Stamps {
-    /// When the vehicle received it: the clock that orders samples, wakes and clips. In replay: the
-    /// log time.
+    /// Time of reception on the vehicle; in replay, the log time. Samples, wakes and clips are
+    /// ordered by this clock.
     pub at_ns: i64,
-    /// When the writer published it, by the writer's clock.
+    /// Time of publication, on the writer's clock.
     pub publish_ns: i64,
-    /// `header.stamp` of the message, where its type starts with a `std_msgs/msg/Header`.
+    /// `header.stamp` of the message; none unless it has one.
     pub header_ns: Option<i64>,
 }
 
-/// What became of the samples of one topic since the lambda started.
+/// Numbers of received and lost samples of one topic since the lambda's process started.
 #[derive(Clone, Copy, Debug)]
 pub struct Counts {
     /// Samples that entered the ring.
     pub received: u64,
-    /// Samples known to be lost before they reached this process; none where nobody can know.
+    /// Samples that were lost before they reached this process; always none here.
     pub lost: Option<u64>,
-    /// Samples that left the ring to make room for newer ones.
+    /// Samples that newer ones replaced in the ring.
     pub overwritten: u64,
-    /// Samples refused because every cell was held.
+    /// Samples that the ring refused because the lambda held every cell.
     pub no_slot: u64,
-    /// Samples refused because they exceed the input's `max_size`.
+    /// Samples that the ring refused because they exceed `max_size` of the input.
     pub too_big: u64,
     /// Samples that should have woken the lambda and did not.
     pub skipped: u64,
 }
 
-/// One field of a message. A longer one than stands here is refused, never cut.
+/// Value of one field of a message. A longer value is refused, never truncated.
 #[derive(Clone, Debug)]
 #[allow(missing_docs)]
 pub enum Value {
@@ -66,7 +67,7 @@ pub enum Value {
     Texts(Vec<String>),
 }
 
-/// Newest values of one field, oldest first. Both lists have the same length.
+/// Values of one field in the newest samples, oldest first. Both lists have the same length.
 #[derive(Clone, Debug)]
 #[allow(missing_docs)]
 pub struct Column {
@@ -74,7 +75,7 @@ pub struct Column {
     pub values: Vec<f64>,
 }
 
-/// Pixel layout of a frame. Named as in ROS `sensor_msgs/image_encodings`.
+/// Pixel layout of a frame, named as in ROS `sensor_msgs/image_encodings`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[allow(missing_docs)]
 pub enum Encoding {
@@ -84,11 +85,11 @@ pub enum Encoding {
     Bgra8,
     Mono8,
     Mono16,
-    /// ROS `yuv422`: U Y V Y, two bytes a pixel.
+    /// ROS `yuv422`: U Y V Y, two bytes per pixel.
     Yuv422,
-    /// ROS `yuv422_yuy2`: Y U Y V, two bytes a pixel.
+    /// ROS `yuv422_yuy2`: Y U Y V, two bytes per pixel.
     Yuv422Yuy2,
-    /// The Bayer patterns are given raw: the host neither reads nor converts their colours.
+    /// Bayer patterns are raw: the host does not convert their colours.
     BayerRggb8,
     BayerBggr8,
     BayerGbrg8,
@@ -99,24 +100,24 @@ pub enum Encoding {
     BayerGrbg16,
 }
 
-/// Shape of a frame.
+/// Size and pixel layout of a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct FrameInfo {
-    /// Pixels, 1 to 65,535.
+    /// Width in pixels, 1 to 65,535.
     pub width: u32,
-    /// Pixels, 1 to 65,535.
+    /// Height in pixels, 1 to 65,535.
     pub height: u32,
     /// Layout of a pixel.
     pub encoding: Encoding,
-    /// Bytes from one row to the next; at least `width` times the bytes of a pixel.
+    /// Bytes from the start of one row to the next; at least `width` times the bytes per pixel.
     pub step: u32,
-    /// Byte order of the 16-bit encodings.
+    /// Byte order of 16-bit encodings: true if the high byte comes first.
     pub big_endian: bool,
-    /// Bytes of pixel data: `step * (height - 1)` plus the last row.
+    /// Bytes of pixel data: `step * (height - 1)` plus the bytes of the last row.
     pub size: u64,
 }
 
-/// Region of interest in pixels; clipped to the frame, and refused if nothing is left.
+/// Region of interest in pixels. It is clipped to the frame, and refused if no pixel is left.
 #[derive(Clone, Copy, Debug)]
 #[allow(missing_docs)]
 pub struct Roi {
@@ -126,18 +127,18 @@ pub struct Roi {
     pub height: u32,
 }
 
-/// How a frame becomes the input of a model.
+/// Conversion of a frame to the input tensor of a model.
 #[derive(Clone, Copy, Debug)]
 pub struct Preprocess {
     /// Width of the tensor in pixels, 1 to 8,192.
     pub width: u32,
     /// Height of the tensor in pixels, 1 to 8,192.
     pub height: u32,
-    /// Keep the aspect ratio and fill the rest with `fill`; otherwise stretch.
+    /// True to keep the aspect ratio and fill the rest with `fill`; false to stretch.
     pub letterbox: bool,
-    /// Grey level 0 to 255 of the filled border; 114 is usual.
+    /// Grey level of the filled border, 0 to 255; 114 is usual.
     pub fill: u8,
-    /// Channel order of the tensor: blue first if true, else red first.
+    /// Channel order of the tensor: true for blue first, false for red first.
     pub bgr: bool,
     /// Each channel becomes `(value - mean) * scale`, with `value` from 0 to 255.
     pub mean: (f32, f32, f32),
@@ -145,27 +146,27 @@ pub struct Preprocess {
     pub scale: (f32, f32, f32),
 }
 
-/// Why a read of data failed. Each message names the thing, the cause and the way out.
+/// Reason why data cannot be read. Each message names the object, the cause and the way out.
 #[derive(Clone, Debug)]
 pub enum DataError {
-    /// No `[[input]]` of that name.
+    /// The manifest has no `[[input]]` of that name.
     NoSuchInput(String),
-    /// The message type has no such field, or the field is not a value.
+    /// The message type has no such field, or the path names a whole message.
     NoSuchField(String),
-    /// The field is no number, is too long, or belongs to another topic.
+    /// The field is not a number, is too long, or belongs to another topic.
     WrongField(String),
-    /// The sample's bytes contradict its type.
+    /// The bytes of the sample contradict its type.
     Malformed(String),
-    /// The sample is no image, or an image that the host cannot read.
+    /// The sample is not an image, or an image that the host cannot read.
     NotAFrame(String),
-    /// The image is larger than the input's `decoded_size`, every decoded slot is held, or the
-    /// frames that the lambda made take all of `memory` in `[limits]`.
+    /// The image exceeds `decoded_size` of the input, all slots for decoded images are held, or the
+    /// frames of the lambda reach `memory` or `frames` in `[limits]`.
     NoRoom(String),
-    /// A region, size or offset is out of range.
+    /// A region or size is out of range.
     OutOfRange(String),
 }
 
-/// As wit-bindgen does it: a refusal prints as code, and is an error of Rust.
+/// Implements `Display` and `Error` as wit-bindgen does: an error prints as code.
 macro_rules! refusal {
     ($name:ty) => {
         impl std::fmt::Display for $name {

@@ -12,7 +12,7 @@ fn pixels(frame: Frame) -> (u32, u32, Encoding, Vec<u8>) {
 }
 
 #[test]
-fn operations_reach_the_pixels_and_refuse_by_kind() {
+fn operations_read_the_pixels_and_errors_have_a_kind() {
     let mut run = on_event(camera(false, ""), |sample| {
         let frame = sample.as_frame()?;
         let right = Some(Roi { x: 1, y: 0, width: 9, height: 9 });
@@ -29,7 +29,7 @@ fn operations_reach_the_pixels_and_refuse_by_kind() {
             pixels(frame.resize(1, 2)?),
             (1, 2, Encoding::Rgb8, vec![128, 128, 0, 5, 10, 143])
         );
-        // With the padding of a row between two, and without that behind the last.
+        // Includes the padding between two rows, but not that after the last row.
         assert_eq!((frame.info().size, frame.read(5, 4)), (14, vec![0, 99, 99, 0]));
         let outside = frame.mean_luma(Some(Roi { x: 2, y: 0, width: 1, height: 1 }));
         for refused in [outside.map(drop), frame.resize(0, 1).map(drop)] {
@@ -51,7 +51,7 @@ fn operations_reach_the_pixels_and_refuse_by_kind() {
 }
 
 #[test]
-fn pictures_that_contradict_themselves_are_refused_in_the_hosts_words() {
+fn inconsistent_images_are_refused_with_the_message_of_the_host() {
     let mut run = on_event(camera(false, ""), |sample| sample.as_frame().map(drop));
     for (n, (width, height, step, name, bytes, why)) in (0..).zip([
         (4, 2, 11, "rgb8", 99, "image of 4x2 rgb8 says a row has 11 bytes; it needs 12"),
@@ -70,7 +70,7 @@ fn pictures_that_contradict_themselves_are_refused_in_the_hosts_words() {
 }
 
 #[test]
-fn decoded_pictures_have_slots_and_a_size_and_each_is_decoded_once() {
+fn decoded_images_are_limited_by_slots_and_size_and_each_is_decoded_once() {
     let mut run = on_event(camera(true, "decoded_size = \"300 B\"\nhold = 1"), |sample| {
         let frames = [sample.as_frame()?, sample.as_frame()?];
         assert!(frames.iter().all(|frame| frame.info().encoding == Encoding::Rgb8));
@@ -90,7 +90,12 @@ fn decoded_pictures_have_slots_and_a_size_and_each_is_decoded_once() {
     );
     let jpeg = run.deliver("camera", 2, Message::new().with("data", vec![0xff_u8, 0xd8])).unwrap();
     assert!(
-        jpeg[0].fault.as_ref().unwrap().message.contains("make the message with `Message::image`")
+        jpeg[0]
+            .fault
+            .as_ref()
+            .unwrap()
+            .message
+            .contains("create the message with `Message::image`")
     );
     for (message, wanted) in [
         (Message::image(2, 2, Encoding::Mono8, vec![0; 4]), "it has 4 of mono8"),
@@ -105,7 +110,7 @@ fn decoded_pictures_have_slots_and_a_size_and_each_is_decoded_once() {
 }
 
 #[test]
-fn frames_and_their_bytes_are_bounded_and_given_back() {
+fn frames_and_their_bytes_are_limited_and_released() {
     let mut run = on_event(camera(false, "[limits]\nframes = 3\nmemory = \"1 MiB\""), |sample| {
         let refused =
             |result: Result<Frame>| result.err().map(|error| (error.kind(), error.to_string()));

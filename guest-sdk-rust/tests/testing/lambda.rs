@@ -1,4 +1,4 @@
-//! A lambda that does what a test says, in `init` and in each wake.
+//! A lambda whose `init` and handlers are closures of a test.
 
 use std::cell::RefCell;
 
@@ -8,7 +8,7 @@ use gleaner_sdk::{Config, Lambda, Result, Sample, Tick};
 type OnEvent = Box<dyn FnMut(Sample) -> Result<()>>;
 type OnTick = Box<dyn FnMut(Tick) -> Result<()>>;
 
-/// What is called in a wake.
+/// Handler of a wake.
 pub enum Handler {
     Event(OnEvent),
     Tick(OnTick),
@@ -20,9 +20,9 @@ thread_local! {
     static MAKE: RefCell<Option<Make>> = const { RefCell::new(None) };
 }
 
-pub struct Told(Handler);
+pub struct TestLambda(Handler);
 
-impl Lambda for Told {
+impl Lambda for TestLambda {
     fn init(config: &Config) -> Result<Self> {
         MAKE.with_borrow_mut(|make| Ok(Self(make.as_mut().expect("`load` was used")(config)?)))
     }
@@ -38,35 +38,38 @@ impl Lambda for Told {
     }
 }
 
-/// Loads a lambda of which `init` is `make`.
+/// Loads a lambda with `make` as its `init`.
 pub fn load(
     host: Host,
     make: impl FnMut(&Config) -> Result<Handler> + 'static,
-) -> std::result::Result<Run<Told>, gleaner_sdk::testing::Error> {
+) -> std::result::Result<Run<TestLambda>, gleaner_sdk::testing::Error> {
     MAKE.set(Some(Box::new(make)));
     host.load()
 }
 
-/// A lambda that does this in each wake; it keeps nothing.
-pub fn on_event(host: Host, handler: impl Fn(Sample) -> Result<()> + Copy + 'static) -> Run<Told> {
+/// Loads a lambda that calls `handler` in each wake; it has no state.
+pub fn on_event(
+    host: Host,
+    handler: impl Fn(Sample) -> Result<()> + Copy + 'static,
+) -> Run<TestLambda> {
     load(host, move |_| Ok(Handler::Event(Box::new(handler)))).unwrap()
 }
 
-/// A manifest that begins with a usual lambda, and goes on with `rest`.
+/// A manifest with a valid `[lambda]`, followed by `rest`.
 pub fn manifest(rest: &str) -> String {
-    let lambda =
-        "[lambda]\nname = \"told\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"told.wasm\"\n";
+    let lambda = "[lambda]\nname = \"probe\"\nversion = \"0.1.0\"\nkind = \"wasm\"\n\
+                  entry = \"probe.wasm\"\n";
     format!("{lambda}{rest}")
 }
 
-/// Woken by an IMU, with these further keys of its input, and `rest` behind.
+/// A host whose lambda is woken by an IMU; `keys` are further keys of the input, `rest` follows it.
 pub fn imu(keys: &str, rest: &str) -> Host {
     let input =
         "[[input]]\nname = \"imu\"\ntopic = \"/imu/data\"\ntype = \"sensor_msgs/msg/Imu\"\n";
     Host::from_manifest(&manifest(&format!("[schedule]\nevent = \"imu\"\n{input}{keys}\n{rest}")))
 }
 
-/// Woken by a camera with raw pictures or, if `compressed`, others.
+/// A host whose lambda is woken by a camera with raw images or, if `compressed`, compressed ones.
 pub fn camera(compressed: bool, rest: &str) -> Host {
     let kind = if compressed { "CompressedImage" } else { "Image" };
     let input = format!(

@@ -9,7 +9,7 @@ fn get(sample: &Sample, path: &str) -> Result<Value> {
 }
 
 #[test]
-fn fields_are_what_the_test_gave_and_stamps_too() {
+fn fields_and_stamps_are_those_that_the_test_set() {
     let mut run = on_event(imu("", ""), |sample| {
         assert!(matches!(get(&sample, "a")?, Value::Real(-4.0)));
         assert!(matches!(get(&sample, "b")?, Value::Signed(-4)));
@@ -47,7 +47,7 @@ fn fields_are_what_the_test_gave_and_stamps_too() {
 }
 
 #[test]
-fn a_field_that_a_message_has_not_got_is_refused_by_name_when_it_is_read() {
+fn reading_a_missing_field_is_refused_by_name() {
     let mut run = on_event(imu("", ""), |sample| {
         let imu = input("imu")?;
         let error = sample.number(&imu.field("linear_aceleration.x")?).unwrap_err();
@@ -67,7 +67,7 @@ fn a_field_that_a_message_has_not_got_is_refused_by_name_when_it_is_read() {
 }
 
 #[test]
-fn a_blank_message_says_which_fields_there_are_and_what_stands_in_them() {
+fn a_blank_message_defines_the_fields_and_their_defaults() {
     let blank = Message::new().with("x", 0.0).with("y", 5.0).with("name", "");
     let mut run = on_event(imu("", "").blank("imu", blank), |sample| {
         let imu = input("imu")?;
@@ -82,7 +82,7 @@ fn a_blank_message_says_which_fields_there_are_and_what_stands_in_them() {
         assert_eq!(error.kind(), Some("wrong-field"));
         Ok(())
     });
-    // A whole number serves as a number.
+    // A whole number is accepted for a number.
     run.deliver("imu", 0, Message::new().with("x", 2)).unwrap();
     assert_eq!(run.faults().next(), None);
     for (message, wanted) in [
@@ -90,10 +90,7 @@ fn a_blank_message_says_which_fields_there_are_and_what_stands_in_them() {
             Message::new().with("xx", 2.0),
             "`xx` is not in the blank message of this input; did you mean `x`?",
         ),
-        (
-            Message::new().with("name", 2.0),
-            "`name` is of another sort than that of the blank message",
-        ),
+        (Message::new().with("name", 2.0), "`name` has another type than in the blank message"),
     ] {
         let refused = run.deliver("imu", 1, message).unwrap_err().to_string();
         assert!(refused.contains(wanted), "{refused}");
@@ -102,7 +99,7 @@ fn a_blank_message_says_which_fields_there_are_and_what_stands_in_them() {
 }
 
 #[test]
-fn bytes_that_nobody_gave_are_asked_for_in_a_fault() {
+fn reading_bytes_that_the_test_did_not_set_is_a_fault_that_asks_for_them() {
     let mut run = on_event(imu("", ""), |sample| {
         sample.cdr(0, 1);
         Ok(())
@@ -110,7 +107,7 @@ fn bytes_that_nobody_gave_are_asked_for_in_a_fault() {
     run.deliver("imu", 0, Message::new()).unwrap();
     let fault = run.faults().next().unwrap();
     assert_eq!(fault.kind, FaultKind::Trap);
-    assert!(fault.message.contains("give them with `Message::cdr`"), "{fault:?}");
+    assert!(fault.message.contains("set them with `Message::cdr`"), "{fault:?}");
 }
 
 #[test]

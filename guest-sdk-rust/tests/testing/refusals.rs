@@ -1,7 +1,7 @@
 use gleaner_sdk::testing::{FaultKind, Host, Message};
 use gleaner_sdk::{Error, event, input, log, scratch, stop};
 
-use super::lambda::{Told, imu, manifest, on_event};
+use super::lambda::{TestLambda, imu, manifest, on_event};
 
 #[test]
 fn triggers_are_checked_and_counted() {
@@ -30,7 +30,7 @@ fn triggers_are_checked_and_counted() {
         Ok(())
     });
     assert_eq!(run.deliver("imu", 0, Message::new()).unwrap()[0].triggers.len(), 16);
-    // Two more in this minute, and then an error of the lambda's own making.
+    // Two more in this minute; the next one is refused, and the lambda returns the error.
     let decision = &run.deliver("imu", 1, Message::new()).unwrap()[0];
     assert_eq!(decision.triggers.len(), 2);
     assert!(
@@ -42,7 +42,7 @@ fn triggers_are_checked_and_counted() {
 }
 
 #[test]
-fn who_has_used_up_the_minute_may_still_stop() {
+fn stop_is_accepted_after_the_limit_per_minute() {
     let mut run = on_event(imu("", "[limits]\nevents_per_minute = 1"), |_| {
         event("x", 1.0).send()?;
         stop("x")
@@ -52,7 +52,7 @@ fn who_has_used_up_the_minute_may_still_stop() {
 }
 
 #[test]
-fn a_flood_of_lines_is_dropped_and_counted_and_long_ones_are_cut() {
+fn lines_over_the_limit_are_dropped_and_counted_and_long_ones_are_truncated() {
     let mut run = on_event(imu("", "[limits]\nlog_lines = 3"), |_| {
         log::info(&"é".repeat(3000));
         (0..4).for_each(|n| log::debug(&format!("line {n}")));
@@ -69,14 +69,14 @@ fn a_flood_of_lines_is_dropped_and_counted_and_long_ones_are_cut() {
 }
 
 #[test]
-fn scratch_is_kept_by_name_within_its_grant() {
+fn scratch_keeps_entries_by_name_within_its_size() {
     let mut run = on_event(imu("", "[limits]\nscratch = \"1 KiB\""), |sample| {
         let kind = |error: Error| error.kind();
         if sample.identity().seq == 1 {
             assert_eq!(scratch::get("a", 0, 1).map_err(kind).unwrap_err(), Some("no-such-entry"));
             scratch::append("a", &[1, 2])?;
             scratch::append("a", &[3])?;
-            return Err(Error::new("it outlives this"));
+            return Err(Error::new("the entry survives this"));
         }
         assert_eq!(scratch::get("a", 1, 99)?, [2, 3]);
         assert_eq!(scratch::free(), 1024 - (64 + 1 + 3));
@@ -86,7 +86,7 @@ fn scratch_is_kept_by_name_within_its_grant() {
             why.to_string().contains("`b` needs 965 bytes of scratch and 956 are free"),
             "{why}"
         );
-        // What is replaced is given back.
+        // The size of a replaced entry is free again.
         scratch::put("a", &[0; 959])?;
         assert_eq!(
             scratch::put("bad\u{7}name", &[]).map_err(kind).unwrap_err(),
@@ -104,7 +104,7 @@ fn scratch_is_kept_by_name_within_its_grant() {
     run.deliver("imu", 0, Message::new()).unwrap();
     run.deliver("imu", 1, Message::new()).unwrap();
     let faults = run.faults().map(|fault| fault.message.as_str()).collect::<Vec<_>>();
-    assert_eq!(faults, ["it outlives this"]);
+    assert_eq!(faults, ["the entry survives this"]);
 }
 
 #[test]
@@ -124,15 +124,15 @@ fn more_handles_or_bytes_than_the_limits_allow_end_the_wake() {
 }
 
 #[test]
-fn a_call_without_a_host_says_what_to_do() {
+fn a_call_without_a_host_panics_with_the_way_out() {
     let panic = std::panic::catch_unwind(|| event("x", 1.0).send()).unwrap_err();
-    let said = panic.downcast_ref::<&str>().copied().map(str::to_owned);
-    let said = said.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap();
-    assert!(said.contains("load the lambda with testing::Host"), "{said}");
+    let message = panic.downcast_ref::<&str>().copied().map(str::to_owned);
+    let message = message.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap();
+    assert!(message.contains("load the lambda with testing::Host"), "{message}");
 }
 
 #[test]
-fn manifests_and_settings_that_cannot_be_used_are_refused_with_a_way_out() {
+fn invalid_manifests_and_settings_are_refused_with_a_way_out() {
     let schedule = "[schedule]\nperiod = \"100ms\"\n";
     let input = "[[input]]\nname = \"a\"\ntopic = \"/a\"\ntype = \"a/msg/A\"\n";
     for (rest, wanted) in [
@@ -159,14 +159,17 @@ fn manifests_and_settings_that_cannot_be_used_are_refused_with_a_way_out() {
         (&format!("{schedule}[config]\nx = [1]\n"), "has a `default` of another type"),
         ("x = ", "it is no TOML"),
     ] {
-        let error =
-            Host::from_manifest(&manifest(rest)).load::<Told>().err().expect(rest).to_string();
+        let error = Host::from_manifest(&manifest(rest))
+            .load::<TestLambda>()
+            .err()
+            .expect(rest)
+            .to_string();
         assert!(error.contains(wanted), "{rest}: {error}");
     }
     let python = manifest(schedule).replace("\"wasm\"", "\"python\"");
     assert!(
         Host::from_manifest(&python)
-            .load::<Told>()
+            .load::<TestLambda>()
             .err()
             .unwrap()
             .to_string()
@@ -182,7 +185,7 @@ fn manifests_and_settings_that_cannot_be_used_are_refused_with_a_way_out() {
         (host().set("rate", f64::NAN), "give a finite number"),
         (host().blank("imo", Message::new()), "no input `imo` for a blank message"),
     ] {
-        let error = host.load::<Told>().err().unwrap().to_string();
+        let error = host.load::<TestLambda>().err().unwrap().to_string();
         assert!(error.contains(wanted), "{error}");
     }
 }

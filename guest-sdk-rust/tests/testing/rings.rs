@@ -8,7 +8,7 @@ fn x(value: f64) -> Message {
 }
 
 #[test]
-fn a_lambda_sees_as_many_samples_as_the_ring_is_deep_oldest_first() {
+fn a_lambda_reads_at_most_depth_samples_oldest_first() {
     let mut run = on_event(imu("depth = 3", ""), |sample| {
         let imu = input("imu")?;
         let x = imu.field("x")?;
@@ -33,8 +33,9 @@ fn a_lambda_sees_as_many_samples_as_the_ring_is_deep_oldest_first() {
 }
 
 #[test]
-fn samples_that_are_held_stay_and_new_ones_are_refused_where_no_cell_is_free() {
-    // Room for 2 + 1 + 1: once the lambda holds four, nothing enters, and nothing wakes it.
+fn held_samples_stay_and_new_ones_are_refused_if_no_cell_is_free() {
+    // There are 2 + 1 + 1 cells: once the lambda holds four, the ring refuses samples, so none
+    // wakes the lambda.
     let mut run = load(imu("depth = 2\nhold = 1", ""), |_| {
         let mut held = Vec::new();
         Ok(Handler::Event(Box::new(move |sample| {
@@ -54,7 +55,7 @@ fn samples_that_are_held_stay_and_new_ones_are_refused_where_no_cell_is_free() {
 }
 
 #[test]
-fn a_fault_gives_back_what_the_lambda_held() {
+fn a_fault_releases_the_samples_that_the_lambda_held() {
     let mut run = load(imu("depth = 2\nhold = 1", ""), |_| {
         let mut held = Vec::new();
         Ok(Handler::Event(Box::new(move |sample| {
@@ -70,7 +71,7 @@ fn a_fault_gives_back_what_the_lambda_held() {
 }
 
 #[test]
-fn too_large_a_message_is_counted_and_wakes_nobody() {
+fn a_message_that_is_too_large_is_counted_and_wakes_no_lambda() {
     let mut run = on_event(imu("max_size = \"8 B\"", ""), |_| Ok(()));
     assert!(run.deliver("imu", 1, Message::new().cdr(vec![0; 4 + 9])).unwrap().is_empty());
     assert!(

@@ -3,11 +3,11 @@ use std::rc::Rc;
 use gleaner_sdk::testing::{Cause, FaultKind, Host, Message, Run};
 use gleaner_sdk::{Error, event, input, now_ns};
 
-use super::lambda::{Handler, Told, imu, load, manifest, on_event};
+use super::lambda::{Handler, TestLambda, imu, load, manifest, on_event};
 
 const MS: i64 = 1_000_000;
 
-fn ticking() -> Run<Told> {
+fn ticking() -> Run<TestLambda> {
     let imu = "[[input]]\nname = \"imu\"\ntopic = \"/imu/data\"\ntype = \"sensor_msgs/msg/Imu\"\n";
     let host = Host::from_manifest(&manifest(&format!("[schedule]\nperiod = \"100ms\"\n{imu}")));
     load(host, |_| {
@@ -21,12 +21,12 @@ fn ticking() -> Run<Told> {
     .unwrap()
 }
 
-fn at_ms(run: &Run<Told>) -> Vec<i64> {
+fn at_ms(run: &Run<TestLambda>) -> Vec<i64> {
     run.decisions().iter().map(|decision| decision.at_ns / MS).collect()
 }
 
 #[test]
-fn ticks_come_before_the_message_that_is_later_and_after_the_one_of_the_same_instant() {
+fn ticks_run_before_a_later_message_and_after_one_of_the_same_instant() {
     let mut run = ticking();
     for at in [1000, 1100, 1350] {
         run.deliver("imu", at * MS, Message::new()).unwrap();
@@ -43,12 +43,12 @@ fn ticks_come_before_the_message_that_is_later_and_after_the_one_of_the_same_ins
 }
 
 #[test]
-fn time_passes_without_messages_and_a_long_gap_is_missed() {
+fn time_advances_without_messages_and_the_ticks_of_a_long_gap_are_missed() {
     let mut run = ticking();
     run.pass_to(0).unwrap();
     run.pass_to(300 * MS).unwrap();
     assert_eq!(at_ms(&run), [100, 200, 300]);
-    // 100,001 ticks and more are not made up for.
+    // More than 100,000 missed ticks are counted, not run.
     assert!(run.pass_to(20_000_000 * MS).unwrap().is_empty());
     assert_eq!(run.missed_ticks(), 199_997);
     let late = run.pass_to(20_000_100 * MS).unwrap();
@@ -57,7 +57,7 @@ fn time_passes_without_messages_and_a_long_gap_is_missed() {
 }
 
 #[test]
-fn what_is_triggered_before_a_fault_counts_and_the_lambda_is_made_anew() {
+fn triggers_before_a_fault_count_and_the_next_wake_has_a_fresh_instance() {
     let mut inits = 0;
     let mut run = load(imu("", ""), move |_| {
         inits += 1;
@@ -87,25 +87,27 @@ fn what_is_triggered_before_a_fault_counts_and_the_lambda_is_made_anew() {
 }
 
 #[test]
-fn after_eight_faults_in_a_row_the_lambda_rests() {
+fn after_eight_faults_in_a_row_the_lambda_backs_off() {
     let mut run = on_event(imu("", ""), |_| Err(Error::new("again")));
     for n in 0..40 {
         run.deliver("imu", n * 10 * MS, Message::new()).unwrap();
     }
-    // The eighth is at 70 ms, the next at 170, and then the rest is twice as long.
+    // The eighth fault is at 70 ms, the next at 170 ms; then the back-off doubles.
     assert_eq!(at_ms(&run), [0, 10, 20, 30, 40, 50, 60, 70, 170, 370]);
     assert_eq!(run.backed_off(), 30);
     assert!(run.log().iter().any(|line| line.message.contains("faulted 8 times in a row")));
 }
 
 #[test]
-fn a_fault_in_init_is_the_error_of_loading_and_later_the_fault_of_a_wake() {
+fn an_error_in_init_fails_the_load_and_later_the_wake() {
     let refused =
         load(imu("", ""), |_| event("early", 1.0).send().map(|()| unreachable!())).err().unwrap();
-    let said = refused.to_string();
+    let message = refused.to_string();
     assert!(
-        said.starts_with("cannot start lambda `told`\n  cause: in init: triggers belong to a wake"),
-        "{said}"
+        message.starts_with(
+            "cannot start lambda `probe`\n  cause: in init: triggers belong to a wake"
+        ),
+        "{message}"
     );
     let mut inits = 0;
     let mut run = load(imu("", ""), move |_| {
@@ -124,13 +126,13 @@ fn a_fault_in_init_is_the_error_of_loading_and_later_the_fault_of_a_wake() {
 }
 
 #[test]
-fn what_cannot_be_delivered_is_an_error_and_changes_nothing() {
+fn an_invalid_delivery_is_an_error_without_effect() {
     let mut run = on_event(imu("", ""), |_| Ok(()));
     run.deliver("imu", 10, Message::new().numbered(5)).unwrap();
     for (input, at_ns, message, wanted) in [
         ("imo", 10, Message::new(), "the manifest has `imu`"),
         ("imu", 9, Message::new(), "time cannot go back to 9 ns"),
-        ("imu", 10, Message::new().numbered(5), "the message before has the number 5"),
+        ("imu", 10, Message::new().numbered(5), "the previous message has the number 5"),
         ("imu", 10, Message::new().cdr([0; 3]), "its CDR is too short"),
         (
             "imu",
@@ -151,20 +153,21 @@ fn what_cannot_be_delivered_is_an_error_and_changes_nothing() {
 }
 
 #[test]
-fn two_runs_on_one_thread_know_nothing_of_each_other() {
+fn two_runs_on_one_thread_are_independent() {
     let seen =
         || on_event(imu("", ""), |_| event("seen", input("imu")?.counts().received as f64).send());
     let (mut a, mut b) = (seen(), seen());
     a.deliver("imu", 5, Message::new()).unwrap();
     b.deliver("imu", 1, Message::new()).unwrap();
     a.deliver("imu", 6, Message::new()).unwrap();
-    let scores =
-        |run: &Run<Told>| run.triggers().map(|trigger| trigger.score.unwrap()).collect::<Vec<_>>();
+    let scores = |run: &Run<TestLambda>| {
+        run.triggers().map(|trigger| trigger.score.unwrap()).collect::<Vec<_>>()
+    };
     assert_eq!((scores(&a), scores(&b)), (vec![1.0, 2.0], vec![1.0]));
 }
 
 #[test]
-fn a_lambda_is_dropped_where_it_may_still_call_its_host() {
+fn a_lambda_can_call_the_host_while_it_is_dropped() {
     struct Last(Rc<()>);
     impl Drop for Last {
         fn drop(&mut self) {
