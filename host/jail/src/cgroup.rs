@@ -1,10 +1,9 @@
-//! A control group of its own for each runtime, where a supervisor was given a part of the tree
+//! Creates a control group for each runtime, where the supervisor was delegated a part of the tree
 //! (`Delegate=yes` of systemd).
 //!
 //! It bounds what no limit of a single process can: memory and number of all processes of a lambda
-//! together, with everything that the kernel keeps for them. Version 2 only. The rule of the kernel
-//! is that processes live in leaves: the supervisor itself must not live in the folder that it
-//! hands to us.
+//! together, including the kernel's memory for them. Version 2 only. The kernel allows processes in
+//! leaves only: the supervisor itself must not live in the delegated folder.
 
 use std::fs::{self, OpenOptions};
 use std::io;
@@ -13,42 +12,42 @@ use std::process::Command;
 
 use gleaner_protocol::Layer;
 
-use crate::enter;
+use crate::cgroup_join;
 
 /// The name of this layer.
 pub const NAME: &str = "control group";
 
-/// The environment variable with the folder of a runtime's group, for [`fit`].
+/// The environment variable with the folder of a runtime's group, for [`limit_memory`].
 pub const CGROUP_ENV: &str = "GLEANER_CGROUP";
 
 const MEMORY_MAX: &str = "memory.max";
 const TASKS_MAX: &str = "pids.max";
 
-/// What a group may take.
+/// Limits of a group.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Bounds {
-    /// Bytes of memory, page cache included, if they are bounded from the start.
+pub struct CgroupLimits {
+    /// Bytes of memory, page cache included, if bounded from the start.
     pub memory: Option<u64>,
     /// Processes and threads.
     pub tasks: u64,
 }
 
-/// A group, until it is removed.
+/// A control group, removed when dropped.
 #[derive(Debug)]
 pub struct Group {
     folder: PathBuf,
-    /// What the kernel had killed in one of the same name, before this was made.
+    /// OOM kills in an earlier group of the same name.
     killed_before: u64,
 }
 
 impl Group {
-    /// Makes the group `name` in `tree`, a folder of a cgroup 2 file system that was delegated to
-    /// this user.
+    /// Creates the group `name` in `tree`, a folder of a cgroup v2 file system that was delegated
+    /// to this user.
     ///
     /// # Errors
     ///
-    /// A sentence: what is missing, and who can give it.
-    pub fn make(tree: &Path, name: &str, bounds: Bounds) -> Result<Self, String> {
+    /// A sentence that names what is missing, and who can provide it.
+    pub fn create(tree: &Path, name: &str, bounds: CgroupLimits) -> Result<Self, String> {
         let cannot = |what: &str, error: io::Error| {
             format!("cannot {what} in `{}`: {error}", tree.display())
         };
@@ -66,12 +65,13 @@ impl Group {
             ));
         }
         fs::write(tree.join("cgroup.subtree_control"), "+memory +pids")
-            .map_err(|error| cannot("hand on the controllers", error))?;
+            .map_err(|error| cannot("enable the controllers", error))?;
         let folder = tree.join(name);
         match fs::create_dir(&folder) {
-            // Left by one that was killed; a group that still has processes refuses us below.
+            // A killed runtime left it behind. If it still has processes, writing the limits fails
+            // below.
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
-                return Err(cannot("make a group", error));
+                return Err(cannot("create a group", error));
             }
             _ => {}
         }
@@ -79,15 +79,15 @@ impl Group {
         let group = Self { folder, killed_before };
         let bounds = [
             (MEMORY_MAX, bounds.memory.map_or_else(|| "max".to_owned(), |bytes| bytes.to_string())),
-            // Else memory beyond the bound would go to disk instead of being refused.
+            // Without it, memory beyond the bound would be swapped out instead of being refused.
             ("memory.swap.max", "0".to_owned()),
-            // All of a lambda's processes, or none: half of it is of no use.
+            // Kill all of a lambda's processes or none: a part of them is useless.
             ("memory.oom.group", "1".to_owned()),
             (TASKS_MAX, bounds.tasks.to_string()),
         ];
         for (file, value) in bounds {
             match fs::write(group.folder.join(file), value) {
-                // A kernel without swap has no file for it.
+                // A kernel without swap does not have this file.
                 Err(error)
                     if file == "memory.swap.max" && error.kind() == io::ErrorKind::NotFound => {}
                 Err(error) => return Err(cannot(&format!("write {name}/{file}"), error)),
@@ -97,35 +97,35 @@ impl Group {
         Ok(group)
     }
 
-    /// Has what `command` starts be in it from its first instruction on; if it cannot be, it does
-    /// not start. It is told of its group, for [`fit`].
+    /// Makes the child of `command` join the group before its first instruction; if that fails, the
+    /// child does not start. The child finds its group in [`CGROUP_ENV`], for [`limit_memory`].
     ///
     /// # Errors
     ///
     /// Those of opening the group's list of processes.
-    pub fn holds(&self, command: &mut Command) -> io::Result<()> {
+    pub fn attach(&self, command: &mut Command) -> io::Result<()> {
         let processes = OpenOptions::new().write(true).open(self.folder.join("cgroup.procs"))?;
-        enter::before_program(command.env(CGROUP_ENV, &self.folder), processes);
+        cgroup_join::before_exec(command.env(CGROUP_ENV, &self.folder), processes);
         Ok(())
     }
 
-    /// How often the kernel killed a process of it, for want of memory.
+    /// Number of processes of the group that the kernel killed because the group was out of memory.
     pub fn killed_for_memory(&self) -> u64 {
         killed_for_memory(&self.folder).saturating_sub(self.killed_before)
     }
 
-    /// What holds, for people.
+    /// The state of the layer, as text for users.
     pub fn layer(&self) -> Layer {
         layer(&self.folder)
     }
 }
 
-/// Bounds the memory of the group of this process by `bytes`, unless its bound is smaller: for a
-/// runtime that knows what its lambda may take, before the lambda is in it. Gives the layer; `None`
-/// without a group.
-pub fn fit(bytes: u64) -> Option<Layer> {
+/// Bounds the memory of this process's group by `bytes`, unless its bound is smaller. A runtime
+/// calls this once it has read its lambda's limits, before the lambda is loaded. Returns the layer;
+/// `None` without a group.
+pub fn limit_memory(bytes: u64) -> Option<Layer> {
     let folder = PathBuf::from(std::env::var_os(CGROUP_ENV)?);
-    Some(fit_in(&folder, bytes).unwrap_or_else(|error| {
+    Some(limit_memory_in(&folder, bytes).unwrap_or_else(|error| {
         let why = format!(
             "cannot bound the memory of `{}` by {} MiB: {error}",
             folder.display(),
@@ -135,7 +135,7 @@ pub fn fit(bytes: u64) -> Option<Layer> {
     }))
 }
 
-fn fit_in(folder: &Path, bytes: u64) -> io::Result<Layer> {
+fn limit_memory_in(folder: &Path, bytes: u64) -> io::Result<Layer> {
     let file = folder.join(MEMORY_MAX);
     let bound =
         fs::read_to_string(&file)?.trim().parse().map_or(bytes, |bound: u64| bound.min(bytes));
@@ -161,8 +161,8 @@ fn killed_for_memory(folder: &Path) -> u64 {
 
 impl Drop for Group {
     fn drop(&mut self) {
-        // All of its processes have ended. Where one has not, the folder stays, and the next of its
-        // name takes it over.
+        // All of its processes have ended. If one has not, the folder stays, and the next group of
+        // this name reuses it.
         let _ = fs::remove_dir(&self.folder);
     }
 }
@@ -171,10 +171,9 @@ impl Drop for Group {
 mod tests {
     use super::*;
 
-    const BOUNDS: Bounds = Bounds { memory: Some(64 << 20), tasks: 32 };
+    const BOUNDS: CgroupLimits = CgroupLimits { memory: Some(64 << 20), tasks: 32 };
 
-    /// A folder that looks as one that was delegated. The kernel's behaviour behind it is not
-    /// there.
+    /// A folder that looks like a delegated one, without the kernel's behaviour.
     struct Tree(PathBuf);
 
     impl Tree {
@@ -198,25 +197,25 @@ mod tests {
     }
 
     #[test]
-    fn a_group_is_bounded_before_a_process_is_in_it() {
+    fn a_group_is_bounded_before_a_process_joins_it() {
         let tree = Tree::with("cpu memory pids\n", "bounded");
-        let group = Group::make(&tree.0, "brake-dark", BOUNDS).unwrap();
+        let group = Group::create(&tree.0, "brake-dark", BOUNDS).unwrap();
         assert_eq!(tree.text("cgroup.subtree_control"), "+memory +pids");
         assert_eq!(tree.text("brake-dark/memory.max"), "67108864");
         assert_eq!(tree.text("brake-dark/memory.oom.group"), "1");
         assert_eq!(tree.text("brake-dark/pids.max"), "32");
         let mut program = Command::new("/bin/true");
-        let missing = group.holds(&mut program).unwrap_err();
+        let missing = group.attach(&mut program).unwrap_err();
         assert_eq!(missing.kind(), io::ErrorKind::NotFound);
         fs::write(tree.0.join("brake-dark/cgroup.procs"), "").unwrap();
-        group.holds(&mut program).unwrap();
+        group.attach(&mut program).unwrap();
         assert!(program.status().unwrap().success());
-        // As a process names itself.
+        // A process joins by writing 0.
         assert_eq!(tree.text("brake-dark/cgroup.procs"), "0");
     }
 
     #[test]
-    fn what_was_killed_in_an_earlier_group_does_not_count() {
+    fn processes_killed_in_an_earlier_group_are_not_counted() {
         let tree = Tree::with("memory pids\n", "again");
         let events = |count: u32| {
             let text = format!("low 0\noom 3\noom_kill {count}\n");
@@ -224,33 +223,33 @@ mod tests {
         };
         fs::create_dir(tree.0.join("x")).unwrap();
         events(2);
-        let group = Group::make(&tree.0, "x", BOUNDS).unwrap();
+        let group = Group::create(&tree.0, "x", BOUNDS).unwrap();
         assert_eq!(group.killed_for_memory(), 0);
         events(3);
         assert_eq!(group.killed_for_memory(), 1);
     }
 
     #[test]
-    fn a_bound_follows_what_is_needed_and_never_grows() {
+    fn a_bound_can_be_lowered_and_never_grows() {
         let tree = Tree::with("memory pids\n", "fits");
-        let group = Group::make(&tree.0, "x", Bounds { memory: None, tasks: 9 }).unwrap();
+        let group = Group::create(&tree.0, "x", CgroupLimits { memory: None, tasks: 9 }).unwrap();
         assert_eq!(tree.text("x/memory.max"), "max");
-        let note = |bytes| fit_in(&group.folder, bytes).unwrap().note;
+        let note = |bytes| limit_memory_in(&group.folder, bytes).unwrap().note;
         assert!(note(96 << 20).ends_with("x`: 96 MiB, 9 tasks"), "{}", note(96 << 20));
         assert_eq!(tree.text("x/memory.max"), (96 << 20).to_string());
         assert!(note(97 << 20).ends_with("x`: 96 MiB, 9 tasks"), "{}", note(97 << 20));
-        assert!(fit_in(&tree.0.join("gone"), 1).is_err());
+        assert!(limit_memory_in(&tree.0.join("gone"), 1).is_err());
     }
 
     #[test]
-    fn what_was_not_delegated_is_named() {
+    fn an_error_names_the_controllers_that_were_not_delegated() {
         let tree = Tree::with("cpu pids\n", "missing");
-        let why = Group::make(&tree.0, "x", BOUNDS).unwrap_err();
+        let why = Group::create(&tree.0, "x", BOUNDS).unwrap_err();
         assert!(
             why.contains("has no controller for memory; delegate it: Delegate=memory pids"),
             "{why}"
         );
-        let why = Group::make(&tree.0.join("nowhere"), "x", BOUNDS).unwrap_err();
+        let why = Group::create(&tree.0.join("nowhere"), "x", BOUNDS).unwrap_err();
         assert!(why.contains("cannot read cgroup.controllers"), "{why}");
     }
 }

@@ -1,17 +1,17 @@
 //! The sandbox of a compiler, which runs code of a lambda's author: build scripts and macros.
 //!
-//! It has to start programs, and to change modes and dates of what it writes, so that less can be
-//! taken from it than from a lambda's process. It is not started without all of this: the user who
-//! requests it does not trust that code.
+//! A compiler has to start programs, and to change modes and dates of what it writes, so this
+//! sandbox is weaker than that of a lambda's process. The compiler is not started unless every
+//! layer holds: the user who requests the sandbox does not trust that code.
 
 use gleaner_protocol::{Holds, Layer};
 
-use crate::alone::{NEW_SOCKETS, SOCKETS, pairs_only};
-use crate::filter::{Refused, install};
-use crate::{JailError, Paths, files, never, tried};
+use crate::filter::{DeniedCalls, install};
+use crate::sandbox_filter::{NEW_SOCKETS, SOCKETS, pairs_only};
+use crate::{JailError, Paths, base_filter, files, self_test};
 
-/// Files of other processes, owners and attributes of files, which Landlock leaves alone, and
-/// memory that outlives a process.
+/// Calls on files of other processes, on owners and attributes of files, which Landlock does not
+/// restrict, and on memory that outlives a process.
 const CALLS: &[i64] = &[
     libc::SYS_pidfd_getfd,
     libc::SYS_fchown,
@@ -35,7 +35,7 @@ const CALLS: &[i64] = &[
     libc::SYS_ioprio_set,
 ];
 
-/// Limits and schedules of processes, of which each may set its own.
+/// Limits and scheduling of processes; each process may set its own.
 const OF_PROCESSES: &[i64] = &[
     libc::SYS_prlimit64,
     libc::SYS_sched_setaffinity,
@@ -51,25 +51,28 @@ const CALLS_HERE: &[i64] = &[];
 /// Requests of `ioctl` that insert input into a terminal.
 const TYPING: [u64; 2] = [libc::TIOCSTI, 0x541C];
 
-/// From now on this process, and what it starts, can open only `paths` and the system's programs
-/// and libraries, and no socket.
+/// Restricts this process and its descendants to `paths` and the system's programs and libraries,
+/// without sockets.
 ///
 /// # Errors
 ///
-/// The first layer that does not hold here as a whole.
+/// The first layer that does not fully hold on this machine.
 pub fn enter(paths: &Paths) -> Result<(), Layer> {
-    let mut layers = never::forbid();
+    let mut layers = base_filter::apply();
     layers.push(files::confine(paths));
     layers.push(match filter() {
-        Ok(()) => Layer::yes(SOCKETS, "seccomp: no new ones, no connections"),
-        Err(error) => Layer::no(SOCKETS, error.told()),
+        Ok(()) => Layer::yes(SOCKETS, "seccomp: no new sockets, no connections"),
+        Err(error) => Layer::no(SOCKETS, error.chain()),
     });
-    tried::tried(layers).into_iter().find(|layer| layer.holds != Holds::Yes).map_or(Ok(()), Err)
+    self_test::verify(layers)
+        .into_iter()
+        .find(|layer| layer.holds != Holds::Yes)
+        .map_or(Ok(()), Err)
 }
 
 fn filter() -> Result<(), JailError> {
     let mut refused =
-        pairs_only(Refused::default()).calls(NEW_SOCKETS).calls(CALLS).calls(CALLS_HERE);
+        pairs_only(DeniedCalls::default()).calls(NEW_SOCKETS).calls(CALLS).calls(CALLS_HERE);
     for call in OF_PROCESSES {
         refused = refused.unless(*call, 0, 0);
     }

@@ -1,5 +1,5 @@
-//! Which files can be opened: Landlock, for this thread and what it starts. TCP, signals and
-//! abstract sockets go with it.
+//! Restricts the files that a process can open, and TCP, signals and abstract sockets, by Landlock,
+//! for this thread and its descendants.
 
 use std::path::{Path, PathBuf};
 
@@ -14,11 +14,11 @@ use crate::JailError;
 /// The name of this layer.
 pub const NAME: &str = "files";
 
-/// The newest rules that are used. Older kernels leave some out, and the layer says so.
+/// The newest version of the rules in use. Older kernels lack some, and the layer names these.
 const RULES: ABI = ABI::V6;
 
-/// Programs and libraries, and what they read to begin: nothing in them is somebody's secret. Not
-/// `/etc`, but for what the loader and the calendar need, and not `/usr/local/etc`, where installed
+/// Programs, libraries and their start-up files: none of them holds secrets. Without `/etc`, but
+/// for the files of the loader and of the calendar, and without `/usr/local/etc`, where installed
 /// programs keep tokens.
 const SYSTEM: [&str; 24] = [
     "/usr/bin",
@@ -46,24 +46,25 @@ const SYSTEM: [&str; 24] = [
     "/sys/class/net",
     "/sys/devices/virtual/net",
 ];
-/// Devices that everybody may use. Who may write to that of zeros could share it as memory, which
-/// no limit counts.
+/// Devices for every user. Only for reading: a process that can write to `/dev/zero` could share it
+/// as memory, which no limit counts.
 const DEVICES: [&str; 4] = ["/dev/zero", "/dev/full", "/dev/random", "/dev/urandom"];
 const NOTHING: [&str; 1] = ["/dev/null"];
 
-/// What may be opened, beside the system's programs and libraries. What does not exist is left out.
+/// Paths that may be opened, beside the system's programs and libraries. Those that do not exist
+/// are skipped.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Paths {
-    /// Files, and folders with all below them, that may be read and run.
+    /// Files, and folders with everything below them, that may be read and run.
     pub read: Vec<PathBuf>,
     /// Files and folders that may be read and written.
     pub write: Vec<PathBuf>,
 }
 
 impl Paths {
-    /// Adds what the interpreter `program` needs: of its own folder, and of the one that it was
-    /// made from, programs and libraries. Of an environment only what lies in it: whoever made it
-    /// may have put links there that lead to anything.
+    /// Adds the programs and libraries of the interpreter `program`: of its own folder, and of the
+    /// one that it was created from. Of a virtual environment only real paths inside it are added:
+    /// its author may have put links there that lead to anything.
     pub fn interpreter(&mut self, program: &Path) {
         self.read.extend(
             parts_of(program)
@@ -71,15 +72,15 @@ impl Paths {
                 .filter(|(prefix, part)| part.starts_with(prefix))
                 .map(|it| it.1),
         );
-        // What the system's own interpreters link to is theirs to say.
+        // The links of the system's own interpreters are trusted.
         let real = program.canonicalize().ok();
         self.read
             .extend(real.as_deref().map(parts_of).unwrap_or_default().into_iter().map(|it| it.1));
     }
 }
 
-/// Of the environment around the interpreter `program`: its real folder, with each real path of
-/// what is needed of it.
+/// Returns the real folder of the environment around the interpreter `program`, with each real path
+/// that is needed of it.
 fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
     let Some(prefix) =
         program.parent().and_then(Path::parent).and_then(|prefix| prefix.canonicalize().ok())
@@ -92,21 +93,21 @@ fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
     real.map(|part| (prefix.clone(), part)).collect()
 }
 
-/// From now on this thread, and what it starts, can open only `paths` and the system's programs and
+/// Restricts this thread and its descendants to opening `paths` and the system's programs and
 /// libraries.
 pub fn confine(paths: &Paths) -> Layer {
     match restrict(paths) {
         Ok(layer) => layer,
-        Err(error) => Layer::no(NAME, error.told()),
+        Err(error) => Layer::no(NAME, error.chain()),
     }
 }
 
-/// From now on this thread, and what it starts, can change only `paths`; what it can read stays as
-/// it is. None if that changes nothing that is to be told.
+/// Restricts this thread and its descendants to changing `paths`; what they can read stays as it
+/// is. Returns a layer only if that failed.
 pub fn confine_writes(paths: &[PathBuf]) -> Option<Layer> {
     let restricted = restrict_writes(paths);
     restricted.err().map(|error| {
-        Layer::partly(NAME, format!("the results can still be changed: {}", error.told()))
+        Layer::partly(NAME, format!("the results can still be changed: {}", error.chain()))
     })
 }
 
@@ -144,15 +145,14 @@ fn restrict(paths: &Paths) -> Result<Layer, JailError> {
         (RulesetStatus::NotEnforced, _) => {
             Layer::no(NAME, "Landlock is not switched on; add it to the kernel's parameter lsm=")
         }
-        (RulesetStatus::FullyEnforced, _) => Layer::yes(
-            NAME,
-            "Landlock: only what belongs to the lambda; no TCP, no signals to others",
-        ),
+        (RulesetStatus::FullyEnforced, _) => {
+            Layer::yes(NAME, "Landlock: only the lambda's files; no TCP, no signals to others")
+        }
         (RulesetStatus::PartiallyEnforced, LandlockStatus::Available { effective_abi, .. }) => {
             let abi = effective_abi as i32;
             let lacks = [
                 (2, "renaming across folders"),
-                (3, "cutting files"),
+                (3, "truncating files"),
                 (4, "TCP"),
                 (5, "devices"),
                 (6, "signals"),
@@ -162,13 +162,13 @@ fn restrict(paths: &Paths) -> Result<Layer, JailError> {
             Layer::partly(
                 NAME,
                 format!(
-                    "Landlock {abi}: only what belongs to the lambda; not watched: {}",
+                    "Landlock {abi}: only the lambda's files; not restricted: {}",
                     lacks.join(", ")
                 ),
             )
         }
         (RulesetStatus::PartiallyEnforced, _) => {
-            Layer::partly(NAME, "Landlock: some rules are not known to this kernel")
+            Layer::partly(NAME, "Landlock: this kernel lacks some rules")
         }
     })
 }
@@ -205,19 +205,19 @@ mod tests {
             assert!(paths.write.is_empty());
             paths.read
         };
-        let ours = [venv.join("bin"), venv.join("lib")];
-        let theirs = [real.join("bin"), real.join("lib")];
+        let in_venv = [venv.join("bin"), venv.join("lib")];
+        let in_base = [real.join("bin"), real.join("lib")];
         // As `python3 -m venv` makes it.
         symlink("lib", venv.join("lib64")).unwrap();
-        assert_eq!(paths(), [&ours[..], &[venv.join("lib")], &theirs].concat());
+        assert_eq!(paths(), [&in_venv[..], &[venv.join("lib")], &in_base].concat());
         fs::remove_file(venv.join("lib64")).unwrap();
-        // As somebody makes it who wants to read what is not theirs.
+        // As an author makes it who wants to read other files.
         symlink("/", venv.join("lib64")).unwrap();
         symlink(folder.join("secret/key"), venv.join("pyvenv.cfg")).unwrap();
-        assert_eq!(paths(), [&ours[..], &theirs].concat());
+        assert_eq!(paths(), [&in_venv[..], &in_base].concat());
         fs::remove_dir(venv.join("lib")).unwrap();
         symlink(folder.join("secret"), venv.join("lib")).unwrap();
-        assert_eq!(paths(), [&ours[..1], &theirs].concat());
+        assert_eq!(paths(), [&in_venv[..1], &in_base].concat());
         fs::remove_dir_all(&folder).unwrap();
     }
 }

@@ -1,4 +1,4 @@
-//! From a list of system calls to a filter in the kernel that refuses them.
+//! Compiles a list of system calls into a seccomp filter that refuses them.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -11,7 +11,7 @@ use seccompiler::{
 
 use crate::JailError;
 
-/// On x86-64 a call can also be made by the numbers of the x32 ABI, which have this bit.
+/// Bit of the numbers of the x32 ABI, by which a call can also be made on x86-64.
 #[cfg(target_arch = "x86_64")]
 const X32: i64 = 0x4000_0000;
 /// Calls that have numbers of their own in the x32 ABI.
@@ -20,9 +20,9 @@ const X32_OWN: std::ops::RangeInclusive<i64> = 512..=547;
 
 /// Calls to refuse.
 #[derive(Default)]
-pub(crate) struct Refused(BTreeMap<i64, Vec<SeccompRule>>);
+pub(crate) struct DeniedCalls(BTreeMap<i64, Vec<SeccompRule>>);
 
-impl Refused {
+impl DeniedCalls {
     /// Refuses `calls`, whatever their arguments.
     pub(crate) fn calls(mut self, calls: &[i64]) -> Self {
         for call in calls {
@@ -53,8 +53,8 @@ impl Refused {
     }
 
     fn when(self, call: i64, index: u8, operator: SeccompCmpOp, value: u64) -> Self {
-        // Flags, process numbers and requests are `int`s: the kernel looks at the lower half only,
-        // and so must we.
+        // Flags, process numbers and requests are `int`s: the kernel reads the lower half only, and
+        // so must the filter.
         self.of_width(call, index, SeccompCmpArgLen::Dword, operator, value)
     }
 
@@ -76,13 +76,13 @@ impl Refused {
         self.0.entry(call).or_default().extend(rules);
     }
 
-    /// Says that there is no `clone3`: a filter cannot read its flags, which are in memory, and
-    /// libraries take `clone` instead.
+    /// Returns a filter that answers `clone3` with ENOSYS: a filter cannot read its flags, which
+    /// are in memory, and libraries fall back to `clone`.
     pub(crate) fn no_clone3() -> Result<BpfProgram, JailError> {
         Self::default().calls(&[libc::SYS_clone3]).filter(libc::ENOSYS)
     }
 
-    /// The filter, which answers refused calls with `errno`.
+    /// Returns the filter, which answers refused calls with `errno`.
     pub(crate) fn filter(mut self, errno: i32) -> Result<BpfProgram, JailError> {
         let machine = std::env::consts::ARCH;
         let target: TargetArch = machine.try_into().map_err(|_| JailError::Machine(machine))?;
@@ -93,15 +93,15 @@ impl Refused {
         filter.try_into().map_err(JailError::Build)
     }
 
-    /// The same calls by other numbers. Calls of another machine, such as 32-bit ones, end the
-    /// process anyway.
+    /// Refuses the same calls by their other numbers. Calls of another architecture, such as 32-bit
+    /// ones, end the process anyway.
     #[cfg(target_arch = "x86_64")]
     fn refuse_other_numbers(&mut self) {
         let twins: Vec<_> =
             self.0.iter().map(|(call, rules)| (call | X32, rules.clone())).collect();
         self.0.extend(twins);
         for call in X32_OWN {
-            // Old kernels take them without the bit, too.
+            // Old kernels accept these numbers without the bit, too.
             self.0.insert(call, Vec::new());
             self.0.insert(call | X32, Vec::new());
         }
@@ -111,16 +111,16 @@ impl Refused {
     fn refuse_other_numbers(&mut self) {}
 }
 
-/// Installs `filter` for this thread and all that it starts.
+/// Installs `filter` for this thread and its descendants.
 pub(crate) fn install(filter: &BpfProgram) -> Result<(), JailError> {
     seccompiler::apply_filter(filter).map_err(JailError::Install)
 }
 
-/// Installs `filter` for all threads of this process and all that they start. [`JailError::Loose`]
-/// where filters are known to work here and one of the threads cannot have it, since it has others
-/// than this one.
+/// Installs `filter` for all threads of this process and their descendants. Fails with
+/// [`JailError::ExistingThread`] where filters work on this system, but a thread cannot get this
+/// one, since its filters differ from those of this thread.
 pub(crate) fn install_everywhere(filter: &BpfProgram) -> Result<(), JailError> {
     let works = matches!(secure_computing_mode(), Ok(SecureComputingMode::Filter));
-    let error = if works { JailError::Loose } else { JailError::Install };
+    let error = if works { JailError::ExistingThread } else { JailError::Install };
     seccompiler::apply_filter_all_threads(filter).map_err(error)
 }

@@ -1,58 +1,56 @@
-//! What keeps a process from what it has no business with, as far as a process without privileges
-//! can have that.
+//! Sandboxes a process: seccomp, Landlock, rlimits, cgroups, as far as an unprivileged process can.
 //!
-//! Nothing here can be taken back, and all of it holds for what the process starts. In the order in
-//! which a runtime comes by it:
+//! Nothing here can be undone, and all of it holds for descendants of the process. In the order in
+//! which a runtime gets it:
 //!
-//! 1. [`never`](mod@never), by `gleaner-shim`, before the runtime exists: no new privileges, no
-//!    calls that no lambda's process ever needs.
-//! 2. [`files`], before the first foreign code is loaded: only the files that were named can be
-//!    opened; no TCP.
-//! 3. [`alone`], once sockets and files are open: no further ones, no new processes, no signals to
-//!    others.
-//! 4. [`memory`], with it: so much more than there is now.
+//! 1. [`base_filter`], by `gleaner-shim`, before the runtime exists: no new privileges, no calls
+//!    that no lambda's process ever needs.
+//! 2. [`files`], before untrusted code is loaded: only named files can be opened; no TCP.
+//! 3. [`sandbox_filter`], once sockets and files are open: no further ones, no new processes, no
+//!    signals to other processes.
+//! 4. [`memory`], with it: a cap on further memory growth.
 //!
 //! A compiler of a lambda whose author is not trusted enters [`compiler`] instead.
 //!
-//! [`tried`] then tries what should be impossible: a layer counts as one that holds only if it was
-//! seen to. [`cgroup`] is the supervisor's side, for memory and processes that a lambda starts.
-//! What is missing on a system is said and not fatal: a lambda runs with the layers that are there,
-//! and everybody can read which these are. What the system has and something in the process keeps
-//! away is fatal.
+//! [`self_test`] then tries what should be denied: a layer counts only if it was seen to deny it.
+//! [`cgroup`] is the supervisor's side, for memory and processes that a lambda starts. A layer that
+//! the system lacks is reported and not fatal: a lambda runs with the layers that exist, and users
+//! can read which these are. A layer that the system has but that something in the process prevents
+//! is fatal.
 
-pub mod alone;
+pub mod base_filter;
 pub mod cgroup;
+mod cgroup_join;
 pub mod compiler;
-mod enter;
 pub mod files;
 mod filter;
 pub mod memory;
-pub mod never;
-pub mod tried;
+pub mod sandbox_filter;
+pub mod self_test;
 
 pub use files::Paths;
 
-/// Why a layer is not there, though the system has it.
+/// Reasons why a layer is missing although the system has it.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum JailError {
-    #[error("cannot build the filter of system calls")]
+    #[error("cannot build the seccomp filter")]
     Build(#[source] seccompiler::BackendError),
-    #[error("cannot install the filter of system calls")]
+    #[error("cannot install the seccomp filter")]
     Install(#[source] seccompiler::Error),
-    #[error("a thread that began before the lambda cannot be shut in")]
-    Loose(#[source] seccompiler::Error),
-    #[error("there is no filter of system calls for {0}")]
+    #[error("cannot apply the seccomp filter to an existing thread")]
+    ExistingThread(#[source] seccompiler::Error),
+    #[error("no seccomp filter exists for the architecture {0}")]
     Machine(&'static str),
-    #[error("cannot confine the files")]
+    #[error("cannot restrict the files")]
     Files(#[from] landlock::RulesetError),
     #[error("cannot limit {what}")]
     Limit { what: &'static str, source: std::io::Error },
 }
 
 impl JailError {
-    /// All of the chain, in one line.
-    pub fn told(&self) -> String {
+    /// The error and its causes, in one line.
+    pub fn chain(&self) -> String {
         let mut text = self.to_string();
         let mut source = std::error::Error::source(self);
         while let Some(cause) = source {

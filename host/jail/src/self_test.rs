@@ -1,4 +1,4 @@
-//! Whether a layer holds, found out by trying what it should refuse.
+//! Verifies the layers: tries the actions that each of them should deny.
 
 use std::fs::File;
 use std::io;
@@ -8,32 +8,32 @@ use std::process::Command;
 
 use gleaner_protocol::{Holds, Layer};
 
-use crate::{alone, files, never};
+use crate::{base_filter, files, sandbox_filter};
 
-/// Tries what each of `layers` should refuse to this process, and says of those that did not refuse
-/// it that they do not hold.
-pub fn tried(mut layers: Vec<Layer>) -> Vec<Layer> {
+/// Tries in this process what each of `layers` should deny, and marks those that do not as not
+/// holding.
+pub fn verify(mut layers: Vec<Layer>) -> Vec<Layer> {
     for layer in &mut layers {
         if layer.holds == Holds::No {
             continue;
         }
         let refused = match layer.name.as_str() {
             files::NAME => refused(&File::open("/etc/passwd")),
-            alone::SOCKETS => refused(&UdpSocket::bind("127.0.0.1:0")),
-            alone::PROCESSES => refused(&Command::new("/bin/true").spawn()),
-            never::NAME => refused(&enter_no_namespace()),
+            sandbox_filter::SOCKETS => refused(&UdpSocket::bind("127.0.0.1:0")),
+            sandbox_filter::PROCESSES => refused(&Command::new("/bin/true").spawn()),
+            base_filter::NAME => refused(&enter_no_namespace()),
             _ => continue,
         };
         if !refused {
             layer.holds = Holds::No;
-            layer.note = format!("was set up ({}), and does not hold", layer.note);
+            layer.note = format!("set up ({}), but does not hold", layer.note);
         }
     }
     layers
 }
 
-/// Asks for the namespace that a file stands for, of one that stands for none: without the filter
-/// that is said to be no use.
+/// Tries to join the namespace of a file that has none. Without the filter the call fails with
+/// another error.
 fn enter_no_namespace() -> io::Result<()> {
     let nothing = File::open("/dev/null")?;
     Ok(rustix::thread::move_into_link_name_space(nothing.as_fd(), None)?)

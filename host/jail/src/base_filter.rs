@@ -1,5 +1,5 @@
-//! What no lambda's process ever needs: looking into other processes, changing the system, becoming
-//! somebody else.
+//! The base layer: denies what no lambda's process ever needs, such as access to other processes,
+//! changes to the system and changes of user.
 
 use gleaner_protocol::Layer;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -9,12 +9,12 @@ use rustix::thread::{
 };
 
 use crate::JailError;
-use crate::filter::{Refused, install};
+use crate::filter::{DeniedCalls, install};
 
 /// The name of this layer.
 pub const NAME: &str = "system calls";
 
-/// Flags of `clone` that make namespaces, in which a process would have new powers.
+/// Flags of `clone` that create namespaces, in which a process would gain privileges.
 const NAMESPACES: [i32; 7] = [
     libc::CLONE_NEWNS,
     libc::CLONE_NEWCGROUP,
@@ -25,7 +25,7 @@ const NAMESPACES: [i32; 7] = [
     libc::CLONE_NEWNET,
 ];
 
-// Younger than libc's lists, with the same numbers on every machine.
+// Newer than the lists of `libc`; the numbers are the same on every architecture.
 const QUOTACTL_FD: i64 = 443;
 const PROCESS_MRELEASE: i64 = 448;
 const OPEN_TREE_ATTR: i64 = 467;
@@ -107,14 +107,20 @@ const MACHINE_CALLS: &[i64] =
 #[cfg(not(target_arch = "x86_64"))]
 const MACHINE_CALLS: &[i64] = &[];
 
-/// Refuses all of that to this process, and to what it starts. Says what holds.
-pub fn forbid() -> Vec<Layer> {
-    vec![privileges(), powers(), core_dumps(), open_files(), calls()]
+/// Applies these limits to this process and its descendants. Returns the layers that hold.
+pub fn apply() -> Vec<Layer> {
+    vec![
+        no_new_privileges(),
+        drop_capabilities(),
+        no_core_files(),
+        limit_open_files(),
+        deny_calls(),
+    ]
 }
 
-/// What root has, or who was given a part of it. Files stay as they are: in a container root often
-/// writes into a folder of somebody else, and which files there are at all is for Landlock to say.
-fn powers() -> Layer {
+/// Drops the capabilities of root, and of users who were granted some. Those on files are kept: in
+/// a container root often writes into folders of other users, and Landlock restricts the files.
+fn drop_capabilities() -> Layer {
     const NAME: &str = "capabilities";
     const KEPT: CapabilitySet = CapabilitySet::DAC_OVERRIDE.union(CapabilitySet::DAC_READ_SEARCH);
     let given_up = || {
@@ -123,8 +129,8 @@ fn powers() -> Layer {
             return Ok(had.permitted);
         }
         for power in CapabilitySet::all().difference(KEPT).iter() {
-            // One that is not known here is not there either; without leave to do this,
-            // no_new_privs keeps them from coming back.
+            // A capability that this kernel lacks cannot be dropped. Where dropping is not
+            // permitted, no_new_privs keeps the capability from coming back.
             let _ = remove_capability_from_bounding_set(power);
         }
         let (effective, permitted) = (had.effective & KEPT, had.permitted & KEPT);
@@ -145,7 +151,7 @@ fn powers() -> Layer {
     }
 }
 
-fn privileges() -> Layer {
+fn no_new_privileges() -> Layer {
     const NAME: &str = "new privileges";
     match rustix::thread::set_no_new_privs(true) {
         Ok(()) => Layer::yes(NAME, "no_new_privs: programs with the setuid bit give none"),
@@ -153,8 +159,8 @@ fn privileges() -> Layer {
     }
 }
 
-/// What a lambda saw is not for whoever may read core files.
-fn core_dumps() -> Layer {
+/// Disables core files, which other users may read: they contain the data that a lambda processed.
+fn no_core_files() -> Layer {
     const NAME: &str = "core files";
     match setrlimit(Resource::Core, Rlimit { current: Some(0), maximum: Some(0) }) {
         Ok(()) => Layer::yes(NAME, "none are written"),
@@ -162,8 +168,8 @@ fn core_dumps() -> Layer {
     }
 }
 
-/// Descriptors are memory of the kernel, which no other limit counts.
-fn open_files() -> Layer {
+/// Limits open files: each descriptor takes kernel memory, which no other limit counts.
+fn limit_open_files() -> Layer {
     const NAME: &str = "open files";
     const MOST: u64 = 4096;
     match limit_files(MOST) {
@@ -172,14 +178,14 @@ fn open_files() -> Layer {
     }
 }
 
-/// From now on this process can open only `more` files beyond those that it has. Where its own
-/// cannot be counted, the limit stays.
-pub(crate) fn open_files_beyond(more: u64) {
+/// Limits this process to `more` open files beyond those that it has. Where these cannot be
+/// counted, the limit stays.
+pub(crate) fn limit_open_files_beyond(more: u64) {
     let highest = std::fs::read_dir("/proc/self/fd").ok().and_then(|open| {
         open.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse::<u64>().ok()).max()
     });
     if let Some(highest) = highest {
-        // It can only become smaller, which is never refused.
+        // Lowering a limit is never refused.
         let _ = limit_files(highest.saturating_add(more));
     }
 }
@@ -192,22 +198,22 @@ fn limit_files(most: u64) -> rustix::io::Result<u64> {
     Ok(most)
 }
 
-fn calls() -> Layer {
+fn deny_calls() -> Layer {
     match install_both() {
         Ok(()) => Layer::yes(
             NAME,
             "seccomp: other processes' memory, namespaces, mounts, keys, modules, time, users",
         ),
-        Err(error) => Layer::no(NAME, error.told()),
+        Err(error) => Layer::no(NAME, error.chain()),
     }
 }
 
 fn install_both() -> Result<(), JailError> {
-    let mut refused = Refused::default().calls(CALLS).calls(MACHINE_CALLS);
+    let mut refused = DeniedCalls::default().calls(CALLS).calls(MACHINE_CALLS);
     for flag in NAMESPACES {
         let flag = u64::from(flag.unsigned_abs());
         refused = refused.bits(libc::SYS_clone, 0, flag, flag);
     }
-    install(&Refused::no_clone3()?)?;
+    install(&DeniedCalls::no_clone3()?)?;
     install(&refused.filter(libc::EPERM)?)
 }
