@@ -1,4 +1,4 @@
-//! A compiler in the place of a runtime: while a lambda is built, code of its author runs, in build
+//! Runs a compiler in the place of a runtime: a build runs code of the lambda's author, in build
 //! scripts and macros.
 
 use std::ffi::OsStr;
@@ -12,25 +12,23 @@ use gleaner_vitals::Pulse;
 
 use crate::environment;
 use crate::signals::Signals;
-use crate::watch::Watched;
-use crate::{Args, end_alike, orphans};
+use crate::watch::RunningProcess;
+use crate::{Args, exit_like, orphans};
 
-/// How long a build may take.
+/// Longest time that a build may take.
 const LONGEST: Duration = Duration::from_secs(24 * 3600);
 
-/// Starts the program where it can read what is named and the system, and write only what is named,
-/// and waits for its end.
+/// Runs the program sandboxed: it can read the named paths and the system, and write only the named
+/// paths. Waits for its end.
 ///
-/// It starts itself for that, and the second process is the one that is sandboxed and becomes the
-/// program: so the code of the lambda's author can neither read the environment of the first, nor
-/// end it.
+/// The shim starts itself for that: the second process is sandboxed and becomes the program, so the
+/// author's code can neither read the environment of the first nor end it.
 pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
     let cannot =
         |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
-    orphans::adopt()
-        .map_err(|error| cannot("cannot adopt what a compiler leaves behind", &error))?;
+    orphans::adopt().map_err(|error| cannot("cannot adopt the orphans of a compiler", &error))?;
     let (pulse, page) =
-        Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
+        Pulse::create().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
     pulse.alive(LONGEST);
     drop(page);
     let shim =
@@ -40,18 +38,18 @@ pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
     for (flag, paths) in [("--read", &args.read), ("--write", &args.write)] {
         command.args(paths.iter().flat_map(|path| [OsStr::new(flag), path.as_os_str()]));
     }
-    command.arg("--").args(&args.program).env_clear().envs(environment::of_compiler());
+    command.arg("--").args(&args.program).env_clear().envs(environment::for_compiler());
     let child = command
         .spawn()
         .map_err(|error| cannot(&format!("cannot start `{}`", shim.display()), &error))?;
-    let ended = Watched { child, pulse, signals, group: None }.until_its_end();
+    let ended = RunningProcess { child, pulse, signals, group: None }.wait();
     let ended = ended.map_err(|error| cannot("cannot watch over the compiler", &error))?;
-    // What still runs could change what was built, while it is copied.
-    let orphans = orphans::end();
-    Ok(end_alike(&ended.record(crate::signals::time_of_day_ns(), orphans)))
+    // A process that still runs could change the output while it is copied.
+    let orphans = orphans::kill_all();
+    Ok(exit_like(&ended.record(crate::signals::time_of_day_ns(), orphans)))
 }
 
-/// Enters the sandbox, and becomes the program. Returns only errors.
+/// Enters the sandbox and becomes the program. Returns only on errors.
 pub(crate) fn enter(args: &Args) -> Failure {
     let paths = Paths { read: args.read.clone(), write: args.write.clone() };
     if let Err(layer) = compiler::enter(&paths) {
@@ -59,8 +57,9 @@ pub(crate) fn enter(args: &Args) -> Failure {
             "this machine cannot sandbox a compiler: `{}` does not hold ({})",
             layer.name, layer.note
         );
-        return Failure::new(Exit::Denied, message)
-            .with_help("build on a kernel that has it (Landlock with signals: Linux 6.12), or, if you trust the lambda's author, without --sandboxed");
+        let help = "build on a kernel that has it (Landlock with signals: Linux 6.12), or, if you \
+                    trust the lambda's author, without --sandboxed";
+        return Failure::new(Exit::Denied, message).with_help(help);
     }
     let (program, arguments) = args.program.split_first().expect("clap asks for a program");
     let error = Command::new(program).args(arguments).exec();

@@ -1,10 +1,10 @@
-//! The part of our environment that a runtime is given. What else is in it, such as somebody's
-//! keys, is not for a lambda.
+//! The part of the shim's environment that is passed to a runtime. The rest, such as a user's
+//! credentials, is not for a lambda.
 
 use std::env;
 use std::ffi::{OsStr, OsString};
 
-/// Variables by name.
+/// Variables with these names.
 const NAMES: [&str; 14] = [
     "PATH",
     "HOME",
@@ -22,8 +22,8 @@ const NAMES: [&str; 14] = [
     "NO_COLOR",
 ];
 
-/// Those of CUDA and of NVIDIA's containers, by name: services of the same maker have keys under
-/// names that begin like these.
+/// Variables of CUDA and of NVIDIA's containers, by full name: credentials of NVIDIA's services
+/// have names with the same prefixes.
 const CUDA: [&str; 16] = [
     "CUDA_VISIBLE_DEVICES",
     "CUDA_DEVICE_ORDER",
@@ -43,23 +43,23 @@ const CUDA: [&str; 16] = [
     "NVIDIA_TF32_OVERRIDE",
 ];
 
-/// Variables by how their names begin or end.
+/// Prefixes and suffixes of further names.
 const BEGINNINGS: [&str; 6] = ["GLEANER_", "ROS_", "LC_", "PYENV", "ORT_", "OPENCV_"];
 const ENDINGS: [&str; 1] = ["_NUM_THREADS"];
 
-/// What stands in the name of a secret, however it begins. Letters of either case are the same.
+/// Parts of names that mean a secret, whatever the prefix, in upper or lower case.
 const SECRETS: [&str; 6] = ["KEY", "TOKEN", "SECRET", "PASSWORD", "PASSWD", "CREDENTIAL"];
 
-/// Variables of cargo and of rustc, by how their names begin.
+/// Prefixes of the names of variables of cargo and rustc.
 const COMPILER: [&str; 2] = ["CARGO_", "RUST"];
 
-/// What a runtime is given.
-pub(crate) fn handed_on() -> impl Iterator<Item = (OsString, OsString)> {
-    env::vars_os().filter(|(name, _)| is_handed_on(name))
+/// Returns the environment of a runtime.
+pub(crate) fn for_runtime() -> impl Iterator<Item = (OsString, OsString)> {
+    env::vars_os().filter(|(name, _)| is_for_runtime(name))
 }
 
 /// Returns the environment of a compiler.
-pub(crate) fn of_compiler() -> impl Iterator<Item = (OsString, OsString)> {
+pub(crate) fn for_compiler() -> impl Iterator<Item = (OsString, OsString)> {
     env::vars_os().filter(|(name, _)| is_of_compiler(name))
 }
 
@@ -75,7 +75,7 @@ fn is_secret(name: &str) -> bool {
     SECRETS.iter().any(|secret| capitals.contains(secret))
 }
 
-fn is_handed_on(name: &OsStr) -> bool {
+fn is_for_runtime(name: &OsStr) -> bool {
     let Some(name) = name.to_str().filter(|name| !is_secret(name)) else { return false };
     NAMES.contains(&name)
         || CUDA.contains(&name)
@@ -88,19 +88,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keys_of_others_stay_here() {
+    fn credentials_are_not_passed_on() {
         for name in ["AWS_SECRET_ACCESS_KEY", "SSH_AUTH_SOCK", "PATHS", "XGLEANER_", "LD_PRELOAD"] {
-            assert!(!is_handed_on(OsStr::new(name)), "{name}");
+            assert!(!is_for_runtime(OsStr::new(name)), "{name}");
         }
         for name in
             ["PATH", "ROS_DOMAIN_ID", "OMP_NUM_THREADS", "GLEANER_PYTHON", "CUDA_VISIBLE_DEVICES"]
         {
-            assert!(is_handed_on(OsStr::new(name)), "{name}");
+            assert!(is_for_runtime(OsStr::new(name)), "{name}");
         }
     }
 
     #[test]
-    fn a_compiler_gets_its_own_and_no_secrets() {
+    fn a_compiler_gets_its_own_variables_and_no_secrets() {
         for name in [
             "PATH",
             "CARGO_HOME",
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_secret_stays_here_however_its_name_begins() {
+    fn a_secret_is_not_passed_on_whatever_its_prefix() {
         for name in [
             "NVIDIA_API_KEY",
             "NVIDIA_NGC",
@@ -137,7 +137,7 @@ mod tests {
             "ORT_CREDENTIALS",
             "KEY_NUM_THREADS",
         ] {
-            assert!(!is_handed_on(OsStr::new(name)), "{name}");
+            assert!(!is_for_runtime(OsStr::new(name)), "{name}");
         }
     }
 }

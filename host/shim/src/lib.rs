@@ -1,22 +1,21 @@
-//! `gleaner-shim [OPTIONS] -- PROGRAM ARGUMENTS...`: the parent of every runtime, whoever wants it
-//! started.
+//! `gleaner-shim [OPTIONS] -- PROGRAM ARGUMENTS...`: the parent of every runtime.
 //!
-//! It takes from itself, and so from the runtime, what no lambda's process needs; hands on a small
-//! part of its environment; kills the runtime when it does not come back from a lambda in time, is
-//! stopped, or takes more memory or threads than it may; ends what the runtime left behind; and
-//! writes down how it ended. Its own exit is that of the runtime. The thread that does so allocates
-//! next to nothing, and looks ten times a second.
+//! It drops its own privileges, and so the runtime's, as far as no lambda's process needs them;
+//! passes on a small part of its environment; kills the runtime when it misses the deadline of a
+//! call, is stopped, or takes too much memory or too many threads; kills the processes that the
+//! runtime leaves behind; and writes the exit record. It exits as the runtime did. The thread that
+//! does this allocates next to nothing, and checks ten times a second.
 //!
-//! With `--results` a second thread writes the files of the lambda's results, so that the process
-//! of the lambda can write none.
+//! With `--results` a second thread writes the result files of the lambda, so that the lambda's
+//! process cannot write any.
 //!
-//! It lives as long as its runtime, even if whoever started it goes away; with `--starter` it then
-//! asks the runtime to end.
+//! It lives as long as its runtime, even if its starter ends; with `--starter` it then asks the
+//! runtime to end.
 
 mod compiler;
 mod environment;
+mod health_check;
 mod lines;
-mod look;
 mod orphans;
 mod results;
 mod signals;
@@ -29,62 +28,65 @@ use std::time::Duration;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
-use gleaner_jail::cgroup::{Bounds, Group};
-use gleaner_jail::{Paths, alone, cgroup, files, memory, never, tried};
+use gleaner_jail::cgroup::{CgroupLimits, Group};
+use gleaner_jail::{Paths, base_filter, cgroup, files, memory, sandbox_filter, self_test};
 use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, RESULTS_ENV};
-use gleaner_vitals::{PULSE_ENV, Pulse, hand_on};
+use gleaner_vitals::{PULSE_ENV, Pulse, make_inheritable};
 
 use self::results::Results;
 use self::signals::Signals;
-use self::watch::Watched;
+use self::watch::RunningProcess;
 
-/// How long a runtime may take until it gives a sign of life; compiling alone may take minutes on a
-/// small machine.
+/// Longest time until a runtime's first sign of life; compiling alone may take minutes on a small
+/// machine.
 const START: Duration = Duration::from_secs(900);
 
-/// The name of the layer that is this program.
+/// The name of the layer that this program implements.
 const HARD_DEADLINE: &str = "hard deadline";
 
-/// Starts a runtime in its jail, and watches over it.
+/// Starts a runtime in its jail, and watches it.
 #[derive(Parser)]
 #[command(name = "gleaner-shim", version)]
 struct Args {
-    /// Write down here how it ended; `-` is for standard output, as the last line.
+    /// Write the exit record to this file; `-` writes it to standard output, as the last line.
     #[arg(long, value_name = "FILE")]
     exit_record: Option<PathBuf>,
     /// Write the results of a live lambda into this folder.
     #[arg(long, value_name = "DIR")]
     results: Option<PathBuf>,
-    /// Add them to those that are there, of an earlier process of the same run.
+    /// Append the results to those of an earlier process of the same run.
     #[arg(long, requires = "results")]
     again: bool,
-    /// Ask it to end when this process dies, which started this shim.
+    /// Ask the runtime to end when this process dies, which must be the parent of the shim.
     #[arg(long, value_name = "PID")]
     starter: Option<u32>,
-    /// Give it a control group of its own in this folder, which was delegated to this user.
+    /// Create a control group for the runtime in this folder, which was delegated to this user.
     #[arg(long, value_name = "DIR")]
     cgroup: Option<PathBuf>,
-    /// Most memory of the control group, in bytes; a runtime makes it as small as its lambda
-    /// allows.
+    /// Memory limit of the control group, in bytes; a runtime lowers it to what its lambda needs.
     #[arg(long, value_name = "BYTES")]
     cgroup_memory: Option<u64>,
-    /// Most processes and threads of the control group.
+    /// Limit of processes and threads of the control group.
     #[arg(long, value_name = "N", default_value_t = 512)]
     cgroup_tasks: u64,
-    /// Start nothing: set up every layer here, try each, and write what holds, as JSON.
+    /// Start nothing: set up every layer in this process, verify each, and print them as JSON.
     #[arg(long, conflicts_with = "program")]
     layers: bool,
-    /// Start a compiler instead of a runtime, without sockets; refused where a layer of its jail
-    /// does not hold.
-    #[arg(long, requires = "write", conflicts_with_all = ["exit_record", "cgroup", "cgroup_memory", "layers"])]
+    /// Start a compiler instead of a runtime, without sockets; refused if a layer of its jail does
+    /// not hold.
+    #[arg(
+        long,
+        requires = "write",
+        conflicts_with_all = ["exit_record", "cgroup", "cgroup_memory", "layers"]
+    )]
     compiler: bool,
-    /// What a compiler may read beside the system's programs and libraries.
+    /// Path that a compiler may read, beside the system's programs and libraries.
     #[arg(long, value_name = "PATH", requires = "compiler")]
     read: Vec<PathBuf>,
-    /// What a compiler may read and write.
+    /// Path that a compiler may read and write.
     #[arg(long, value_name = "PATH", requires = "compiler")]
     write: Vec<PathBuf>,
-    /// Be the compiler's own process.
+    /// Run as the compiler's own process.
     #[arg(long, hide = true, requires = "compiler")]
     inside: bool,
     /// The runtime and its arguments.
@@ -92,10 +94,10 @@ struct Args {
     program: Vec<OsString>,
 }
 
-/// `main` of `gleaner-shim`.
+/// Runs the program `gleaner-shim`.
 pub fn main() -> ExitCode {
     let args = Args::parse();
-    // Files that the starter happened to have open are none of the lambda's.
+    // Files that the starter happens to have open must not reach the lambda.
     let closed = gleaner_vitals::close_on_exec().map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot close files of the starter", &error)
     });
@@ -116,74 +118,76 @@ pub fn main() -> ExitCode {
 fn run(args: &Args) -> Result<ExitCode, Failure> {
     let cannot =
         |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
-    let signals = Signals::hear().map_err(|error| cannot("cannot listen for signals", &error))?;
+    let signals =
+        Signals::register().map_err(|error| cannot("cannot register for signals", &error))?;
     if let Some(starter) = args.starter {
         end_with(starter)?;
     }
     if args.compiler {
         return compiler::run(args, signals);
     }
-    orphans::adopt()
-        .map_err(|error| cannot("cannot adopt what a runtime leaves behind", &error))?;
+    orphans::adopt().map_err(|error| cannot("cannot adopt the orphans of a runtime", &error))?;
     let (pulse, page) =
-        Pulse::make().map_err(|error| cannot("cannot make a page for the pulse", &error))?;
-    // Finding an interpreter, compiling, discovery: until the first word of its own.
+        Pulse::create().map_err(|error| cannot("cannot create the pulse page", &error))?;
+    // The runtime then finds an interpreter, compiles and discovers, before its first sign of life.
     pulse.alive(START);
-    let number = hand_on(&page).map_err(|error| cannot("cannot hand on the pulse", &error))?;
-    let mut layers = never::forbid();
+    let number =
+        make_inheritable(&page).map_err(|error| cannot("cannot pass on the pulse page", &error))?;
+    let mut layers = base_filter::apply();
     layers.push(hard_deadline());
-    let (group, layer) = own_group(args);
+    let (group, layer) = create_cgroup(args);
     layers.push(layer);
     let layers = serde_json::to_string(&layers).expect("layers are plain data");
-    let (program, arguments) = args.program.split_first().expect("clap asks for a program");
+    let (program, arguments) = args.program.split_first().expect("clap requires a program");
     let mut command = Command::new(program);
     command
         .args(arguments)
         .env_clear()
-        .envs(environment::handed_on())
+        .envs(environment::for_runtime())
         .env_remove(cgroup::CGROUP_ENV);
     command.env(PULSE_ENV, number).env(LAYERS_ENV, layers).env_remove(RESULTS_ENV);
     if let Some(path) = args.exit_record.as_ref().filter(|path| path.as_os_str() != "-") {
-        // Else the end of an earlier one could be taken for that of this one. Mostly there is none.
+        // Otherwise the record of an earlier runtime could be taken for this one's. Mostly there is
+        // none.
         let _ = std::fs::remove_file(path);
     }
-    let begun = args
+    let started = args
         .results
         .as_ref()
         .map(|folder| Results::begin(folder, args.again, &pulse))
         .transpose()?;
-    let (results, pipe) = begun.unzip();
+    let (results, pipe) = started.unzip();
     if let Some(pipe) = &pipe {
         command.env(
             RESULTS_ENV,
-            hand_on(pipe).map_err(|error| cannot("cannot hand on the results' pipe", &error))?,
+            make_inheritable(pipe)
+                .map_err(|error| cannot("cannot pass on the pipe for results", &error))?,
         );
     }
     let started_ns = signals::time_of_day_ns();
     if let Some(group) = &group {
         group
-            .holds(&mut command)
-            .map_err(|error| cannot("cannot have the runtime in its control group", &error))?;
+            .attach(&mut command)
+            .map_err(|error| cannot("cannot attach the runtime to its control group", &error))?;
     }
     let child = command.spawn().map_err(|error| {
         let program = program.to_string_lossy();
         Failure::caused_by(Exit::Internal, format!("cannot start `{program}`"), &error)
     })?;
     drop((page, pipe));
-    let watched = Watched { child, pulse, signals, group };
-    let ended =
-        watched.until_its_end().map_err(|error| cannot("cannot watch over the runtime", &error))?;
-    let orphans = orphans::end();
+    let watched = RunningProcess { child, pulse, signals, group };
+    let ended = watched.wait().map_err(|error| cannot("cannot watch the runtime", &error))?;
+    let orphans = orphans::kill_all();
     if orphans > 0 {
-        eprintln!("gleaner-shim: ended {orphans} processes that the runtime had left behind");
+        eprintln!("gleaner-shim: killed {orphans} processes that the runtime left behind");
     }
     let record = ended.record(started_ns, orphans);
     if let Some(path) = &args.exit_record {
-        // A starter that does not read any more has no use for it.
+        // A starter that has stopped reading does not need the record.
         let written =
             if path.as_os_str() == "-" { record.print().or(Ok(())) } else { record.write(path) };
         if let Err(error) = written {
-            // How it ended is more important than that this is not written.
+            // The runtime's exit is more important than this failure.
             eprintln!("gleaner-shim: cannot write `{}`: {error}", path.display());
         }
     }
@@ -193,17 +197,17 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         Err(failure) if record.is_in_order() => Err(failure),
         Err(failure) => {
             eprintln!("{failure}");
-            Ok(end_alike(&record))
+            Ok(exit_like(&record))
         }
-        Ok(()) => Ok(end_alike(&record)),
+        Ok(()) => Ok(exit_like(&record)),
     }
 }
 
-/// Requests SIGTERM for when `starter` dies. The kernel sends it once, so an earlier death is
+/// Requests SIGTERM for the death of `starter`. The kernel sends it once, so an earlier death is
 /// checked here.
 fn end_with(starter: u32) -> Result<(), Failure> {
     use rustix::process::{Signal, getppid, set_parent_process_death_signal};
-    let cannot = "cannot be told of the starter's death";
+    let cannot = "cannot request a signal for the starter's death";
     set_parent_process_death_signal(Some(Signal::TERM)).map_err(|error| {
         Failure::caused_by(Exit::Internal, cannot, &std::io::Error::from(error))
     })?;
@@ -211,7 +215,8 @@ fn end_with(starter: u32) -> Result<(), Failure> {
     if parent == Some(starter) {
         return Ok(());
     }
-    let help = "it has ended meanwhile; else give `--starter` the number of the process that starts gleaner-shim";
+    let help = "it may have ended; otherwise give `--starter` the number of the process that \
+                starts gleaner-shim";
     Err(Failure::new(
         Exit::Internal,
         format!("process {starter} is not the parent of gleaner-shim"),
@@ -220,8 +225,8 @@ fn end_with(starter: u32) -> Result<(), Failure> {
 }
 
 /// Ends this process as the runtime ended.
-fn end_alike(record: &ExitRecord) -> ExitCode {
-    // Where the lambda could be made to fit, the user should read how, whichever of us ended it.
+fn exit_like(record: &ExitRecord) -> ExitCode {
+    // If the user can make the lambda fit, explain it, whichever process ended it.
     let help = match &record.killed {
         Some(killed) => Some(killed.help()),
         None => record.out_of_memory.then_some("keep less, or raise `memory` in [limits]"),
@@ -239,16 +244,16 @@ fn end_alike(record: &ExitRecord) -> ExitCode {
 }
 
 fn hard_deadline() -> Layer {
-    Layer::yes(HARD_DEADLINE, "gleaner-shim kills what does not come back")
+    Layer::yes(HARD_DEADLINE, "gleaner-shim kills a runtime that misses its deadline")
 }
 
-/// The control group that was asked for, and what there is to say of it.
-fn own_group(args: &Args) -> (Option<Group>, Layer) {
+/// Creates the control group that was requested; returns its layer, too.
+fn create_cgroup(args: &Args) -> (Option<Group>, Layer) {
     let Some(tree) = &args.cgroup else {
         return (None, Layer::no(cgroup::NAME, "none was delegated: --cgroup DIR"));
     };
-    let bounds = Bounds { memory: args.cgroup_memory, tasks: args.cgroup_tasks };
-    match Group::make(tree, &format!("gleaner-{}", std::process::id()), bounds) {
+    let bounds = CgroupLimits { memory: args.cgroup_memory, tasks: args.cgroup_tasks };
+    match Group::create(tree, &format!("gleaner-{}", std::process::id()), bounds) {
         Ok(group) => {
             let layer = group.layer();
             (Some(group), layer)
@@ -257,21 +262,19 @@ fn own_group(args: &Args) -> (Option<Group>, Layer) {
     }
 }
 
-/// What holds on this machine: each layer is set up in this process, and tried.
+/// Prints the layers that hold on this machine: each is set up in this process and verified.
 fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
-    let mut layers = never::forbid();
-    let cannot_watch = |error: std::io::Error| {
-        Layer::no(HARD_DEADLINE, format!("there is no page to watch: {error}"))
-    };
-    layers.push(Pulse::make().map_or_else(cannot_watch, |_| hard_deadline()));
-    layers.push(own_group(args).1);
+    let mut layers = base_filter::apply();
+    let cannot_watch =
+        |error: std::io::Error| Layer::no(HARD_DEADLINE, format!("no pulse page: {error}"));
+    layers.push(Pulse::create().map_or_else(cannot_watch, |_| hard_deadline()));
+    layers.push(create_cgroup(args).1);
     layers.push(files::confine(&Paths::default()));
-    layers.push(alone::before_interpreter(true));
+    layers.push(sandbox_filter::apply_before_interpreter(true));
     layers.push(memory::limit(64 << 20));
-    let cannot =
-        |error| Failure::caused_by(Exit::Internal, "cannot try what would hold a lambda", &error);
-    layers.extend(alone::stay(true).map_err(cannot)?);
-    let layers = tried::tried(layers);
+    let cannot = |error| Failure::caused_by(Exit::Internal, "cannot set up the layers", &error);
+    layers.extend(sandbox_filter::apply(true).map_err(cannot)?);
+    let layers = self_test::verify(layers);
     println!("{}", serde_json::to_string(&layers).expect("layers are plain data"));
     Ok(ExitCode::SUCCESS)
 }

@@ -1,4 +1,4 @@
-//! Processes that a runtime started and did not end: they become ours when it ends, and are killed.
+//! Kills the processes that a runtime started and did not end: the shim adopts them.
 
 use std::fs;
 use std::io;
@@ -7,14 +7,15 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, WaitOptions, getpid, kill_process, set_child_subreaper, wait};
 
-/// From now on children of our children that lose their parent are ours.
+/// Makes this process adopt its descendants that lose their parent.
 pub(crate) fn adopt() -> io::Result<()> {
     Ok(set_child_subreaper(Some(getpid()))?)
 }
 
-/// Kills all processes below this one, and what these leave in turn. Gives their number.
-pub(crate) fn end() -> u32 {
-    // Whoever starts processes faster than they are killed must not keep us for ever.
+/// Kills all descendants of this process, repeatedly, as they may leave children. Returns their
+/// number.
+pub(crate) fn kill_all() -> u32 {
+    // A process that forks faster than it is killed must not keep the shim for ever.
     let until = Instant::now() + Duration::from_secs(5);
     let mut ended = 0;
     loop {
@@ -32,8 +33,8 @@ pub(crate) fn end() -> u32 {
     }
 }
 
-/// Our children, from the list that the kernel keeps for each thread: the first one starts and
-/// adopts them.
+/// Returns the children of this process, from the kernel's list of its first thread, which starts
+/// and adopts them.
 fn children() -> Vec<Pid> {
     let list = fs::read_to_string(format!("/proc/self/task/{}/children", std::process::id()))
         .unwrap_or_default();

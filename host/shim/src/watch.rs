@@ -1,4 +1,4 @@
-//! From the start of a runtime to its end.
+//! Watches a runtime from its start to its end.
 
 use std::io;
 use std::os::unix::process::ExitStatusExt;
@@ -6,73 +6,73 @@ use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
 
 use gleaner_jail::cgroup::Group;
-use gleaner_protocol::{Doing, ExitRecord, Killed, UNTIL_KILLED};
+use gleaner_protocol::{ExitRecord, Killed, Phase, SHUTDOWN_TIMEOUT};
 use gleaner_vitals::Pulse;
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open};
 
-use crate::look::Look;
+use crate::health_check::HealthCheck;
 use crate::signals::{Signals, time_of_day_ns};
 
-/// How long to wait for the end of what was killed, before it is killed again.
+/// Time to wait for the end of a killed process before it is killed again.
 const UNTIL_GONE: Duration = Duration::from_millis(100);
 
 /// A runtime that has been started.
-pub(crate) struct Watched {
+pub(crate) struct RunningProcess {
     pub(crate) child: Child,
     pub(crate) pulse: Pulse,
     pub(crate) signals: Signals,
     pub(crate) group: Option<Group>,
 }
 
-/// How a runtime ended.
-pub(crate) struct Ended {
+/// The end of a runtime, and its circumstances.
+pub(crate) struct ProcessEnd {
     pid: u32,
     status: ExitStatus,
     killed: Option<Killed>,
     out_of_memory: bool,
     asked: bool,
-    doing: Option<Doing>,
-    /// Removed last: what was left behind is still in it.
+    phase: Option<Phase>,
+    /// Dropped last: orphans are still in the group.
     _group: Option<Group>,
 }
 
-impl Watched {
-    /// Waits for the end, passes on signals, and kills what is overdue.
-    pub(crate) fn until_its_end(mut self) -> io::Result<Ended> {
+impl RunningProcess {
+    /// Waits for the end, forwards signals, and kills an overdue runtime.
+    pub(crate) fn wait(mut self) -> io::Result<ProcessEnd> {
         let pid = Pid::from_child(&self.child);
         let process = pidfd_open(pid, PidfdFlags::empty())?;
         let mut killed = None;
-        let mut look = Look::at(self.child.id());
+        let mut health = HealthCheck::of(self.child.id());
         let mut asked: Option<Instant> = None;
         loop {
-            let patience = match look.again(&self.pulse) {
+            let timeout = match health.check(&self.pulse) {
                 Ok(why) => {
                     killed = killed.or(Some(why));
                     kill_process(pid, Signal::KILL)?;
                     UNTIL_GONE
                 }
-                Err(patience) => patience,
+                Err(timeout) => timeout,
             };
-            if asked.is_some_and(|asked| asked.elapsed() >= UNTIL_KILLED) {
+            if asked.is_some_and(|asked| asked.elapsed() >= SHUTDOWN_TIMEOUT) {
                 kill_process(pid, Signal::KILL)?;
             }
-            let patience = Timespec {
-                tv_sec: patience.as_secs().cast_signed(),
-                tv_nsec: i64::from(patience.subsec_nanos()),
+            let timeout = Timespec {
+                tv_sec: timeout.as_secs().cast_signed(),
+                tv_nsec: i64::from(timeout.subsec_nanos()),
             };
-            let mut heard = [
+            let mut ready = [
                 PollFd::new(&process, PollFlags::IN),
                 PollFd::from_borrowed_fd(self.signals.bell(), PollFlags::IN),
             ];
-            match poll(&mut heard, Some(&patience)) {
+            match poll(&mut ready, Some(&timeout)) {
                 Ok(_) | Err(rustix::io::Errno::INTR) => {}
                 Err(error) => return Err(error.into()),
             }
             for signal in self.signals.take() {
-                // One that has just ended is not there to be told, which is as good.
+                // The process may just have ended, which makes no difference.
                 let _ = kill_process(pid, signal);
                 asked = asked.or(Some(Instant::now()));
             }
@@ -80,17 +80,17 @@ impl Watched {
                 let full = status.signal() == Some(Signal::ABORT.as_raw()) && self.pulse.was_full();
                 let out_of_memory =
                     full || self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
-                // It may have come back, or ended by itself, just before it was killed.
+                // It may have returned, or ended by itself, just before it was killed.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
                 let pid = self.child.id();
-                let (asked, doing) = (asked.is_some(), Some(self.pulse.doing()));
-                return Ok(Ended {
+                let (asked, phase) = (asked.is_some(), Some(self.pulse.phase()));
+                return Ok(ProcessEnd {
                     pid,
                     status,
                     killed,
                     out_of_memory,
                     asked,
-                    doing,
+                    phase,
                     _group: self.group,
                 });
             }
@@ -98,9 +98,9 @@ impl Watched {
     }
 }
 
-impl Ended {
+impl ProcessEnd {
     pub(crate) fn record(&self, started_ns: i64, orphans: u32) -> ExitRecord {
-        // It was our only child that we waited for, but for those that it left behind.
+        // It was the only child that was waited for, but for its own orphans.
         let usage = getrusage(UsageWho::RUSAGE_CHILDREN).ok();
         let cpu =
             usage.map_or(0, |usage| (usage.user_time() + usage.system_time()).num_microseconds());
@@ -116,8 +116,8 @@ impl Ended {
                 .map_or(0, |usage| u64::try_from(usage.max_rss()).unwrap_or(0) * 1024),
             cpu_ns: u64::try_from(cpu).unwrap_or(0) * 1000,
             orphans,
-            asked: self.asked,
-            doing: self.doing,
+            end_requested: self.asked,
+            phase: self.phase,
         }
     }
 }

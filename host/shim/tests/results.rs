@@ -1,32 +1,32 @@
-//! Results of a live lambda, written by the shim: small programs stand for a runtime, and write
-//! into the pipe whatever they like.
+//! Tests the results of a live lambda that the shim writes: small programs stand for a runtime, and
+//! write arbitrary bytes into the pipe.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use gleaner_lambda::{Decision, FaultKind, LogLine, PAGE_BYTES};
-use gleaner_protocol::{Live, Report};
+use gleaner_lambda::{Decision, FaultKind, LogLine, RESULT_ITEM_MAX};
+use gleaner_protocol::{LiveStatus, Report};
 use rustix::process::{Pid, Signal, kill_process};
 
 const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
 
-/// What a script begins with: `page TEXT` writes one, `woken` the first one, `log N` a line of the
-/// log, `tick N` a decision without a trigger. `asked` has the script asked to end, by its shim.
-const PAGES: &str = r#"
-page() { printf '%s\n' "$1" > "/proc/self/fd/$GLEANER_RESULTS"; }
-log() { page '{"log":{"at_ns":'$1',"level":"info","message":"m"}}'; }
-tick() { page '{"decision":{"at_ns":'$1',"cause":"tick","triggers":[],"run_ns":1}}'; }
-woken() { page '{"woken":{"cause":"event","input":"camera","topic":"/camera"}}'; }
+/// Functions for scripts: `item TEXT` writes a item, `woken` the first one, `log N` a line of the
+/// log, `tick N` a decision without a trigger. `asked` makes the shim ask the script to end.
+const ITEMS: &str = r#"
+item() { printf '%s\n' "$1" > "/proc/self/fd/$GLEANER_RESULTS"; }
+log() { item '{"log":{"at_ns":'$1',"level":"info","message":"m"}}'; }
+tick() { item '{"decision":{"at_ns":'$1',"cause":"tick","triggers":[],"run_ns":1}}'; }
+woken() { item '{"woken":{"cause":"event","input":"camera","topic":"/camera"}}'; }
 asked() { local is=; trap 'is=1' TERM; kill -TERM $PPID; until [ "$is" ]; do sleep 0.01; done; }
-last() { page '{"last":{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,"up_s":1.0,"wakes":2,"triggers":0,"faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,"unwritten":5,"topics":[],"network":{"domain":0,"participants":0,"buffer_asked":0,"buffer_granted":0,"socket_drops":0,"filtered":0},"rss_bytes":0,"cpu_s":0.0}}'; }
+last() { item '{"last":{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,"up_s":1.0,"wakes":2,"triggers":0,"faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,"unwritten":5,"topics":[],"network":{"domain":0,"participants":0,"buffer_requested":0,"buffer_granted":0,"socket_drops":0,"filtered":0},"rss_bytes":0,"cpu_s":0.0}}'; }
 "#;
 
-/// A folder for one test, removed with it.
-struct Folder(PathBuf);
+/// A folder for one test, removed when dropped.
+struct ResultsFolder(PathBuf);
 
-impl Folder {
+impl ResultsFolder {
     fn of(test: &str) -> Self {
         let path = std::env::temp_dir()
             .join(format!("gleaner-shim-results-{}-{test}", std::process::id()));
@@ -43,14 +43,14 @@ impl Folder {
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
     }
 
-    /// The times of the lines of the log.
+    /// Times of the lines of the log.
     fn logged(&self) -> Vec<i64> {
         let text = fs::read_to_string(self.out().join("log.jsonl")).unwrap();
         text.lines().map(|line| serde_json::from_str::<LogLine>(line).unwrap().at_ns).collect()
     }
 }
 
-impl Drop for Folder {
+impl Drop for ResultsFolder {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
     }
@@ -58,17 +58,17 @@ impl Drop for Folder {
 
 fn shim(out: &Path, script: &str) -> Command {
     let mut shim = Command::new(SHIM);
-    shim.arg("--results").arg(out).args(["--", "bash", "-c", &format!("{PAGES}{script}")]);
+    shim.arg("--results").arg(out).args(["--", "bash", "-c", &format!("{ITEMS}{script}")]);
     shim
 }
 
 /// Runs `script` to its end.
-fn run(folder: &Folder, script: &str) -> Output {
+fn run(folder: &ResultsFolder, script: &str) -> Output {
     shim(&folder.out(), script).output().unwrap()
 }
 
 /// Starts `script`, and waits for its first line.
-fn start(folder: &Folder, script: &str) -> Child {
+fn start(folder: &ResultsFolder, script: &str) -> Child {
     let mut shim = shim(&folder.out(), script);
     let mut child =
         shim.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -81,7 +81,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// How the shim reports a decision to its starter.
+/// Decisions that the shim reported to its starter.
 fn reported(output: &Output) -> Vec<Decision> {
     let text = String::from_utf8_lossy(&output.stdout);
     let reports = text.lines().filter_map(|line| serde_json::from_str(line).ok());
@@ -93,8 +93,8 @@ fn reported(output: &Output) -> Vec<Decision> {
 }
 
 #[test]
-fn what_a_killed_runtime_left_in_the_pipe_is_written_and_so_is_the_wake_that_ended_with_it() {
-    let folder = Folder::of("killed");
+fn items_of_a_killed_runtime_are_written_and_so_is_the_wake_in_progress() {
+    let folder = ResultsFolder::of("killed");
     let output = run(
         &folder,
         "woken; for n in $(seq 200); do tick $n; log $n; done; printf '{\"rep'; kill -KILL $$",
@@ -120,27 +120,27 @@ fn what_a_killed_runtime_left_in_the_pipe_is_written_and_so_is_the_wake_that_end
 
 #[test]
 fn a_runtime_that_was_asked_to_end_or_never_entered_its_lambda_has_lost_no_wake() {
-    let folder = Folder::of("asked");
+    let folder = ResultsFolder::of("asked");
     let shim = start(&folder, "woken; tick 1; echo; read -r line");
     kill_process(Pid::from_raw(i32::try_from(shim.id()).unwrap()).unwrap(), Signal::TERM).unwrap();
     let output = shim.wait_with_output().unwrap();
     assert_eq!(folder.decisions().len(), 1, "{}", stderr(&output));
-    let folder = Folder::of("not-entered");
+    let folder = ResultsFolder::of("not-entered");
     fs::create_dir(folder.out()).unwrap();
     fs::write(folder.out().join("log.jsonl"), "of an earlier run").unwrap();
     let output = run(&folder, "log 1; kill -SEGV $$");
     assert!(
-        stderr(&output).contains("another one comes first") && reported(&output).is_empty(),
+        stderr(&output).contains("the first item must be `woken`") && reported(&output).is_empty(),
         "{}",
         stderr(&output)
     );
-    // Its results have not begun, so that those of the run before are still there.
+    // Its results have not begun, so those of the earlier run are still there.
     assert_eq!(fs::read_to_string(folder.out().join("log.jsonl")).unwrap(), "of an earlier run");
 }
 
 #[test]
-fn what_is_no_page_is_counted_and_named_once_and_what_comes_after_it_is_written() {
-    let folder = Folder::of("garbage");
+fn invalid_items_are_counted_and_logged_once_and_later_ones_are_written() {
+    let folder = ResultsFolder::of("garbage");
     let garbage = [
         "x",
         "{}",
@@ -152,32 +152,34 @@ fn what_is_no_page_is_counted_and_named_once_and_what_comes_after_it_is_written(
         r#"{"last":{}}"#,
         r#"{"woken":{"cause":"tick"}}"#,
     ];
-    let pages: String = garbage.iter().map(|page| format!("page '{page}'\n")).collect();
+    let items: String = garbage.iter().map(|item| format!("item '{item}'\n")).collect();
     let pipe = "\"/proc/self/fd/$GLEANER_RESULTS\"";
     let script = format!(
-        "woken\n{pages}printf '\\377\\376\\n' > {pipe}; head -c {} /dev/zero > {pipe}; page; tick 7; log 8; last; printf half > {pipe}; asked",
-        3 * PAGE_BYTES
+        "woken\n{items}printf '\\377\\376\\n' > {pipe}; head -c {} /dev/zero > {pipe}; item; \
+         tick 7; log 8; last; printf half > {pipe}; asked",
+        3 * RESULT_ITEM_MAX
     );
     let output = run(&folder, &script);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let at: Vec<_> = folder.decisions().iter().map(|decision| decision.at_ns).collect();
     assert_eq!((at, folder.logged()), (vec![7], vec![8]));
-    let summary: Live =
+    let summary: LiveStatus =
         serde_json::from_slice(&fs::read(folder.out().join("summary.json")).unwrap()).unwrap();
-    // What the runtime counted itself, one that is no text, one that is too long, and a half.
+    // The runtime's own count, a line that is not text, one that is too long, and an unfinished
+    // one.
     assert_eq!(summary.unwritten, 5 + garbage.len() as u64 + 3);
-    let said = stderr(&output);
-    assert_eq!(said.matches("is no page of results").count(), 1, "{said}");
-    assert!(!said.contains('\u{1b}'), "{said:?}");
+    let stderr_text = stderr(&output);
+    assert_eq!(stderr_text.matches("invalid result item").count(), 1, "{stderr_text}");
+    assert!(!stderr_text.contains('\u{1b}'), "{stderr_text:?}");
 }
 
 #[test]
-fn an_endless_line_takes_no_memory_and_does_not_keep_the_shim_from_what_follows() {
-    let folder = Folder::of("endless");
+fn an_endless_line_takes_no_memory_and_later_lines_are_written() {
+    let folder = ResultsFolder::of("endless");
     let pipe = "\"/proc/self/fd/$GLEANER_RESULTS\"";
     let mut shim = start(
         &folder,
-        &format!("woken; head -c 50000000 /dev/zero > {pipe}; page; tick 7; echo; read -r line"),
+        &format!("woken; head -c 50000000 /dev/zero > {pipe}; item; tick 7; echo; read -r line"),
     );
     let status = fs::read_to_string(format!("/proc/{}/status", shim.id())).unwrap();
     let most = status
@@ -193,27 +195,27 @@ fn an_endless_line_takes_no_memory_and_does_not_keep_the_shim_from_what_follows(
 }
 
 #[test]
-fn a_flood_does_not_keep_a_runtime_that_hangs_from_being_ended() {
-    let folder = Folder::of("flood");
+fn a_flood_does_not_keep_a_hanging_runtime_alive() {
+    let folder = ResultsFolder::of("flood");
     let pipe = "/proc/self/fd/$GLEANER_RESULTS";
     let shim = start(
         &folder,
         &format!("woken; yes | head -n 100000 > {pipe}; (exec yes > {pipe}) & echo; read -r line"),
     );
     kill_process(Pid::from_raw(i32::try_from(shim.id()).unwrap()).unwrap(), Signal::TERM).unwrap();
-    // `yes` is left behind, and ended.
+    // `yes` is an orphan, and is killed.
     let output = shim.wait_with_output().unwrap();
-    assert!(stderr(&output).contains("is no page of results"), "{}", stderr(&output));
+    assert!(stderr(&output).contains("invalid result item"), "{}", stderr(&output));
 }
 
 #[test]
-fn results_begin_again_or_go_on_as_the_starter_says() {
-    let folder = Folder::of("again");
+fn results_are_replaced_or_appended_as_requested() {
+    let folder = ResultsFolder::of("again");
     let run = |script: &str, again: bool| {
         let mut shim = Command::new(SHIM);
         shim.arg("--results").arg(folder.out()).args(again.then_some("--again"));
         assert!(
-            shim.args(["--", "bash", "-c", &format!("{PAGES}woken; {script}")])
+            shim.args(["--", "bash", "-c", &format!("{ITEMS}woken; {script}")])
                 .output()
                 .unwrap()
                 .status
@@ -226,39 +228,40 @@ fn results_begin_again_or_go_on_as_the_starter_says() {
     assert_eq!(run("log 3", false), [3]);
 }
 
-/// A file that may have no more bytes refuses them, as a full disk does; until it is cut.
+/// A file at its size limit refuses bytes, like a full disk, until it is truncated.
 #[test]
-fn what_a_full_disk_refuses_is_counted_and_what_comes_later_is_written_again() {
-    let folder = Folder::of("full");
-    let said = folder.0.join("stderr");
+fn lines_that_a_full_disk_refuses_are_counted_and_later_ones_are_written() {
+    let folder = ResultsFolder::of("full");
+    let stderr_text = folder.0.join("stderr");
     let script = format!(
-        "woken; until grep -q 'tried again' {said}; do for n in {{1..200}}; do log 1; done; done; : > {out}/log.jsonl; \
-         until grep -q 'written again' {said}; do log 2; done; asked",
-        said = said.display(),
+        "woken; until grep -q 'are retried' {stderr_text}; do for n in {{1..200}}; do \
+         log 1; done; done; : > {out}/log.jsonl; \
+         until grep -q 'written again' {stderr_text}; do log 2; done; asked",
+        stderr_text = stderr_text.display(),
         out = folder.out().display()
     );
     let output = Command::new("bash")
         .args(["-c", "trap '' XFSZ; ulimit -f 256; exec \"$@\"", "bash", SHIM, "--results"])
         .arg(folder.out())
-        .args(["--", "bash", "-c", &format!("{PAGES}{script}")])
-        .stderr(fs::File::create(&said).unwrap())
+        .args(["--", "bash", "-c", &format!("{ITEMS}{script}")])
+        .stderr(fs::File::create(&stderr_text).unwrap())
         .output()
         .unwrap();
-    let said = fs::read_to_string(&said).unwrap();
-    // The runtime ended well, and does not know that something is missing.
-    assert_eq!(output.status.code(), Some(1), "{said}");
+    let stderr_text = fs::read_to_string(&stderr_text).unwrap();
+    // The runtime ended without errors, and does not know that something is missing.
+    assert_eq!(output.status.code(), Some(1), "{stderr_text}");
     assert!(
-        said.contains("results are written again")
-            && said.contains("log.jsonl")
-            && said.contains("make room"),
-        "{said}"
+        stderr_text.contains("results are written again")
+            && stderr_text.contains("log.jsonl")
+            && stderr_text.contains("make room"),
+        "{stderr_text}"
     );
     assert!(folder.logged().ends_with(&[2]));
 }
 
 #[test]
-fn results_that_cannot_begin_are_an_error_before_anything_is_started() {
-    let folder = Folder::of("link");
+fn results_that_cannot_be_opened_are_an_error_before_the_program_starts() {
+    let folder = ResultsFolder::of("link");
     fs::create_dir(folder.out()).unwrap();
     let precious = folder.0.join("precious");
     fs::write(&precious, "precious").unwrap();
@@ -276,8 +279,8 @@ fn results_that_cannot_begin_are_an_error_before_anything_is_started() {
 }
 
 #[test]
-fn after_a_shim_that_was_killed_the_next_goes_on_with_whole_lines() {
-    let folder = Folder::of("killed-shim");
+fn after_a_killed_shim_the_next_one_appends_whole_lines() {
+    let folder = ResultsFolder::of("killed-shim");
     let mut killed =
         start(&folder, "woken; (while :; do log 1; tick 2; done) & echo; read -r line");
     while fs::metadata(folder.out().join("log.jsonl")).is_ok_and(|log| log.len() < 10_000) {
@@ -285,14 +288,14 @@ fn after_a_shim_that_was_killed_the_next_goes_on_with_whole_lines() {
     }
     killed.kill().unwrap();
     killed.wait().unwrap();
-    // The system may have taken only a part of the last line: the kill ended the write.
+    // The system may have written only a part of the last line: the kill ended the write.
     let mut next = Command::new(SHIM);
     next.arg("--results").arg(folder.out()).args([
         "--again",
         "--",
         "bash",
         "-c",
-        &format!("{PAGES}woken; log 7"),
+        &format!("{ITEMS}woken; log 7"),
     ]);
     assert!(next.output().unwrap().status.success());
     let logged = folder.logged();
