@@ -1,24 +1,25 @@
-//! How a process of ours is doing, and what it says of itself: the same for the runtime and for the
-//! recorder.
+//! Reports the state of a process, in the same way for the runtime and the recorder.
 //!
-//! - [`hand_on`], [`inherited`], [`close_on_exec`]: open files that the shim hands to its runtime.
-//! - [`log`]: lines for people, on standard error.
-//! - [`own`]: memory of our own code in a process that a lambda shares.
-//! - [`Pulse`]: what it does, and since when, for the shim that ends it if it does not come back.
-//! - [`Spreads`], [`Durations`]: how long things take, in bounded memory.
+//! - [`make_inheritable`], [`inherited`], [`close_on_exec`]: open files that the shim passes to its
+//!   runtime.
+//! - [`log`]: log lines for users, on standard error.
+//! - [`own`]: memory of Gleaner's code in a process that it shares with a lambda.
+//! - [`Pulse`]: the current activity and its start, for the shim, which kills a process that does
+//!   not return.
+//! - [`IntervalDurations`], [`Durations`]: statistics of durations, in bounded memory.
 //! - [`start`]: the stream of reports, and the request to stop.
 //! - [`usage`]: memory and CPU time.
 //!
-//! What never happens here: what is reported to whoever started us is `gleaner_protocol`'s.
+//! The reports to the starter are in `gleaner_protocol`.
 
-mod handed_on;
+mod durations;
+mod inherited_file;
 pub mod log;
 pub mod own;
 mod pulse;
-mod spread;
 pub mod start;
 pub mod usage;
 
-pub use handed_on::{close_on_exec, hand_on, inherited};
+pub use durations::{Durations, IntervalDurations};
+pub use inherited_file::{close_on_exec, inherited, make_inheritable};
 pub use pulse::{Busy, PULSE_ENV, Pulse, Share};
-pub use spread::{Durations, Spreads};

@@ -1,4 +1,4 @@
-//! Log lines for people, as errors are: `warning: ring full input=imu`.
+//! Formats log lines for users, like errors: `warning: ring full input=imu`.
 
 use std::fmt;
 use std::io;
@@ -11,25 +11,27 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt;
 
-/// Has log lines go to standard error from now on; `GLEANER_LOG` says which, and else it is
-/// warnings.
-pub fn prepare() {
+/// Sends log lines to standard error. `GLEANER_LOG` is the filter; the default is `warn`.
+pub fn init() {
     let wanted = std::env::var("GLEANER_LOG").unwrap_or_else(|_| "warn".to_owned());
-    // Not `EnvFilter`, which also filters by spans and values, of which we have none: that takes a
+    // Not `EnvFilter`: it also filters by spans and values, which Gleaner does not use, and needs a
     // library for regular expressions.
     let filter = wanted.parse().unwrap_or_else(|error| {
-        eprintln!("warning: GLEANER_LOG=`{wanted}` is no filter, `warn` is used: {error}");
+        eprintln!("warning: GLEANER_LOG=`{wanted}` is not a filter; using `warn`: {error}");
         Targets::new().with_default(Level::WARN)
     });
-    let lines = layer().with_ansi(false).event_format(Plain).with_writer(|| Says(io::stderr()));
-    // Fails only where a subscriber is set already, which then stays.
+    let lines = layer()
+        .with_ansi(false)
+        .event_format(PlainFormat)
+        .with_writer(|| StderrWriter(io::stderr()));
+    // Fails only if a subscriber is set already, which then stays.
     let _ = tracing_subscriber::registry().with(lines).with(filter).try_init();
 }
 
-/// Standard error, which nobody may read any more: the library would panic about that.
-struct Says(io::Stderr);
+/// Standard error whose errors are ignored: without a reader the library would panic.
+struct StderrWriter(io::Stderr);
 
-impl io::Write for Says {
+impl io::Write for StderrWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let _ = self.0.write_all(bytes);
         Ok(bytes.len())
@@ -40,10 +42,10 @@ impl io::Write for Says {
     }
 }
 
-/// One line for people, as errors are: `warning: ring full input=imu`.
-struct Plain;
+/// Formats an event as one line for users.
+struct PlainFormat;
 
-impl<S, N> FormatEvent<S, N> for Plain
+impl<S, N> FormatEvent<S, N> for PlainFormat
 where
     S: Subscriber + for<'a> LookupSpan<'a>,
     N: for<'a> FormatFields<'a> + 'static,
@@ -55,7 +57,8 @@ where
         event: &Event<'_>,
     ) -> fmt::Result {
         let level = match *event.metadata().level() {
-            Level::ERROR => "trouble",
+            // Not "error": lines that begin with `error: ` are failures that end a program.
+            Level::ERROR => "critical",
             Level::WARN => "warning",
             Level::INFO => "info",
             Level::DEBUG => "debug",

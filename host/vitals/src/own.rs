@@ -1,48 +1,48 @@
-//! Memory of our own code in a process that it shares with a lambda. The allocator of our code
-//! counts here, so that the lambda is charged for the rest of the process and for nothing else.
+//! Counts the memory of Gleaner's own code in a process that it shares with a lambda. The allocator
+//! of that code counts here, so that the lambda is charged for the rest of the process only.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use crate::Pulse;
 
-/// From this size on the system's allocator maps each block by itself, and returns it to the system
+/// Size from which the system's allocator maps each block by itself, and returns it to the system
 /// when it is freed.
 pub const LARGE_BYTES: usize = 128 << 10;
 
 static LARGE: AtomicU64 = AtomicU64::new(0);
 static SMALL: AtomicU64 = AtomicU64::new(0);
-/// The most that small blocks took: the allocator keeps what they leave.
-static SMALL_MOST: AtomicU64 = AtomicU64::new(0);
+/// Peak of the small blocks: the allocator keeps the memory of freed ones.
+static SMALL_PEAK: AtomicU64 = AtomicU64::new(0);
 
-/// Counts a block of `bytes` that was allocated.
+/// Counts an allocated block of `bytes`.
 pub fn allocated(bytes: usize) {
-    let taken = taken(bytes);
+    let size = block_bytes(bytes);
     if bytes >= LARGE_BYTES {
-        LARGE.fetch_add(taken, Relaxed);
-        // A message that the network puts together may come in the middle of a wake, and must not
-        // count as the lambda's.
-        Pulse::tell_own();
+        LARGE.fetch_add(size, Relaxed);
+        // A message that the network reassembles may arrive during a wake, and must not count as
+        // the lambda's memory.
+        Pulse::publish_own();
         return;
     }
-    let now = SMALL.fetch_add(taken, Relaxed) + taken;
-    if now > SMALL_MOST.load(Relaxed) {
-        SMALL_MOST.fetch_max(now, Relaxed);
+    let now = SMALL.fetch_add(size, Relaxed) + size;
+    if now > SMALL_PEAK.load(Relaxed) {
+        SMALL_PEAK.fetch_max(now, Relaxed);
     }
 }
 
-/// Counts a block of `bytes` that was freed.
+/// Counts a freed block of `bytes`.
 pub fn freed(bytes: usize) {
     let counter = if bytes >= LARGE_BYTES { &LARGE } else { &SMALL };
-    counter.fetch_sub(taken(bytes), Relaxed);
+    counter.fetch_sub(block_bytes(bytes), Relaxed);
 }
 
-/// Memory that our own code has, in bytes, as far as its allocator counts.
+/// Returns the memory of Gleaner's own code, in bytes, as far as its allocator counts.
 pub fn held() -> u64 {
-    LARGE.load(Relaxed) + SMALL_MOST.load(Relaxed)
+    LARGE.load(Relaxed) + SMALL_PEAK.load(Relaxed)
 }
 
-/// Bytes that a block takes with its header.
-fn taken(bytes: usize) -> u64 {
+/// Returns the size of a block with its header, in bytes.
+fn block_bytes(bytes: usize) -> u64 {
     let step = if bytes >= LARGE_BYTES { 4096 } else { 16 };
     (bytes as u64 + 16).next_multiple_of(step)
 }
@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn large_blocks_count_while_they_live_and_small_ones_at_their_most() {
+    fn large_blocks_count_while_they_live_and_small_ones_at_their_peak() {
         let before = held();
         allocated(1 << 20);
         assert_eq!(held() - before, (1 << 20) + 4096);

@@ -1,4 +1,4 @@
-//! What a process of ours does when it starts, before anything of others runs in it.
+//! Prepares a Gleaner process when it starts, before foreign code runs in it.
 
 use std::fs::File;
 use std::io;
@@ -9,20 +9,21 @@ use rustix::io::fcntl_dupfd_cloexec;
 use rustix::stdio::{dup2_stdout, stdout};
 use signal_hook::consts::SIGTERM;
 
-/// What was standard output, for reports. What a library writes there by itself goes to standard
-/// error from now on; what a lambda prints is in its log.
+/// Returns the original standard output, for reports. From now on, libraries that print to standard
+/// output print to standard error; the output of a lambda is in its log.
 ///
 /// # Errors
 ///
 /// Those of the system.
 pub fn reports() -> io::Result<File> {
-    // Not for processes that a lambda starts: whoever reads the reports waits for their end.
+    // Processes that a lambda starts must not inherit it: the reader of the reports waits until all
+    // copies are closed.
     let reports = fcntl_dupfd_cloexec(stdout(), 3)?;
     dup2_stdout(io::stderr())?;
     Ok(File::from(reports))
 }
 
-/// Raised by SIGTERM from now on. SIGINT is for whoever started us, who then sends the other.
+/// Returns a flag that SIGTERM sets. SIGINT is handled by the starter, which then sends SIGTERM.
 ///
 /// # Errors
 ///

@@ -1,41 +1,41 @@
-//! What a process takes, as the system tells it.
+//! Reads the resource usage of a process from the system.
 
 use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::FileExt;
 
-/// Resident memory of this process, in bytes; 0 where the system does not tell.
+/// Returns the resident memory of this process, in bytes; 0 if unknown.
 pub fn resident() -> u64 {
-    told("VmRSS:")
+    status_bytes("VmRSS:")
 }
 
-/// The most that it was so far.
-pub fn most_resident() -> u64 {
-    told("VmHWM:")
+/// Returns the peak of the resident memory of this process, in bytes; 0 if unknown.
+pub fn peak_resident() -> u64 {
+    status_bytes("VmHWM:")
 }
 
-/// CPU time of all threads of this process, in s.
+/// Returns the CPU time of all threads of this process, in s.
 pub fn cpu_seconds() -> f64 {
     let used = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
     used.tv_sec as f64 + used.tv_nsec as f64 / 1e9
 }
 
-/// A process as `/proc` shows it.
+/// State of a process, from `/proc`.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Process {
-    /// A signal has stopped it.
+pub struct ProcessUsage {
+    /// Set if the process is stopped by a signal.
     pub is_stopped: bool,
-    /// Its threads.
+    /// Number of threads.
     pub threads: u64,
-    /// Memory that is its own: private pages, in RAM or swapped out, and page tables, in bytes.
-    /// Pages of files count for nobody, and shared memory is refused to a lambda.
+    /// Private memory: pages in RAM or swapped out, and page tables, in bytes. Pages of files are
+    /// not counted, and shared memory is denied to a lambda.
     pub held: u64,
 }
 
-impl Process {
-    /// The process `pid`, or this one. None where the system does not show it.
-    pub fn seen(pid: Option<u32>) -> Option<Self> {
-        Self::parse(&fs::read_to_string(of(pid, "status")).ok()?)
+impl ProcessUsage {
+    /// Reads the state of process `pid`, or of this one. `None` if the system does not show it.
+    pub fn of(pid: Option<u32>) -> Option<Self> {
+        Self::parse(&fs::read_to_string(proc_path(pid, "status")).ok()?)
     }
 
     fn parse(status: &str) -> Option<Self> {
@@ -57,20 +57,20 @@ impl Process {
     }
 }
 
-/// The most private writable memory that process `pid` may map, in bytes: its own limit, which it
-/// cannot raise. None if it has none.
+/// Returns the limit of private writable memory of process `pid`, in bytes, which the process
+/// cannot raise. `None` without a limit.
 pub fn data_limit(pid: u32) -> Option<u64> {
-    let limits = fs::read_to_string(of(Some(pid), "limits")).ok()?;
+    let limits = fs::read_to_string(proc_path(Some(pid), "limits")).ok()?;
     let line = limits.lines().find_map(|line| line.strip_prefix("Max data size"))?;
     line.split_whitespace().nth(1)?.parse().ok()
 }
 
-/// Private pages of this process in RAM: most of [`Process::held`], for a tenth of its time.
+/// Private pages of this process in RAM: most of [`ProcessUsage::held`], in a tenth of the time.
 #[derive(Debug)]
 pub struct PrivatePages(File);
 
 impl PrivatePages {
-    /// Opens the list of this process.
+    /// Opens the counters of this process.
     ///
     /// # Errors
     ///
@@ -79,8 +79,8 @@ impl PrivatePages {
         File::open("/proc/self/statm").map(Self)
     }
 
-    /// Their size, in bytes. None if the list cannot be read any more: a lambda in this process may
-    /// have closed it.
+    /// Returns their size, in bytes. `None` if the file cannot be read any more: a lambda in this
+    /// process may have closed it.
     pub fn bytes(&self) -> Option<u64> {
         let mut text = [0; 128];
         let length = self.0.read_at(&mut text, 0).ok()?;
@@ -92,17 +92,17 @@ impl PrivatePages {
     }
 }
 
-fn of(pid: Option<u32>, file: &str) -> String {
+fn proc_path(pid: Option<u32>, file: &str) -> String {
     pid.map_or_else(|| format!("/proc/self/{file}"), |pid| format!("/proc/{pid}/{file}"))
 }
 
-/// A line of `/proc/self/status`, in bytes.
-fn told(name: &str) -> u64 {
-    let status = fs::read_to_string(of(None, "status")).unwrap_or_default();
+/// Returns a value of `/proc/self/status`, in bytes.
+fn status_bytes(name: &str) -> u64 {
+    let status = fs::read_to_string(proc_path(None, "status")).unwrap_or_default();
     status.lines().find_map(|line| line.strip_prefix(name)).and_then(kib).unwrap_or(0)
 }
 
-/// A number of KiB, in bytes.
+/// Parses a number of KiB; returns bytes.
 fn kib(value: &str) -> Option<u64> {
     value.trim().strip_suffix(" kB")?.parse::<u64>().ok()?.checked_mul(1024)
 }
@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn a_process_has_memory_and_uses_time() {
-        assert!(resident() > 0 && most_resident() >= resident() / 2);
+        assert!(resident() > 0 && peak_resident() >= resident() / 2);
         let before = cpu_seconds();
         while cpu_seconds() == before {
             std::hint::black_box(resident());
@@ -125,11 +125,11 @@ mod tests {
     fn memory_that_is_written_to_is_held() {
         const BYTES: u64 = 32 << 20;
         let pages = PrivatePages::open().unwrap();
-        let before = (pages.bytes().unwrap(), Process::seen(None).unwrap());
+        let before = (pages.bytes().unwrap(), ProcessUsage::of(None).unwrap());
         assert!(!before.1.is_stopped && before.1.threads > 0, "{before:?}");
         let taken = std::hint::black_box(vec![1_u8; BYTES as usize]);
-        let after = (pages.bytes().unwrap(), Process::seen(Some(std::process::id())).unwrap());
-        // Other tests run beside this one, and the kernel counts in pieces.
+        let after = (pages.bytes().unwrap(), ProcessUsage::of(Some(std::process::id())).unwrap());
+        // Other tests run at the same time, and the kernel counts in batches.
         let about = |more: u64| more.abs_diff(BYTES) < BYTES / 4;
         assert!(
             about(after.0 - before.0) && about(after.1.held - before.1.held),
@@ -141,13 +141,14 @@ mod tests {
 
     #[test]
     fn a_process_is_read_from_its_lines() {
-        let status = "Name:\tx\nState:\tT (stopped)\nRssAnon:\t 10 kB\nRssFile:\t 99 kB\nRssShmem:\t 9 kB\n\
-                      VmPTE:\t 2 kB\nVmSwap:\t 1 kB\nHugetlbPages:\t 4 kB\nThreads:\t3\n";
+        let status = "Name:\tx\nState:\tT (stopped)\nRssAnon:\t 10 kB\nRssFile:\t 99 kB\n\
+                      RssShmem:\t 9 kB\nVmPTE:\t 2 kB\nVmSwap:\t 1 kB\nHugetlbPages:\t 4 kB\n\
+                      Threads:\t3\n";
         assert_eq!(
-            Process::parse(status),
-            Some(Process { is_stopped: true, threads: 3, held: 17 * 1024 })
+            ProcessUsage::parse(status),
+            Some(ProcessUsage { is_stopped: true, threads: 3, held: 17 * 1024 })
         );
-        // One that has ended has no memory.
-        assert_eq!(Process::parse("Name:\tx\nState:\tZ (zombie)\nThreads:\t1\n"), None);
+        // A process that has ended has no memory.
+        assert_eq!(ProcessUsage::parse("Name:\tx\nState:\tZ (zombie)\nThreads:\t1\n"), None);
     }
 }

@@ -1,5 +1,5 @@
-//! Open files that a process hands to the program that it starts; their numbers stand in
-//! environment variables.
+//! Passes open files to a program that a process starts; environment variables name their
+//! descriptors.
 #![allow(unsafe_code)]
 
 use std::io;
@@ -7,24 +7,24 @@ use std::os::fd::{AsFd, AsRawFd, FromRawFd, OwnedFd};
 
 use rustix::io::{FdFlags, fcntl_getfd, fcntl_setfd};
 
-/// Has `file` survive `exec`; returns the value for its environment variable.
+/// Makes `file` survive `exec`; returns the value for its environment variable.
 ///
 /// # Errors
 ///
 /// Those of `fcntl`.
-pub fn hand_on(file: impl AsFd) -> io::Result<String> {
+pub fn make_inheritable(file: impl AsFd) -> io::Result<String> {
     fcntl_setfd(&file, fcntl_getfd(&file)? - FdFlags::CLOEXEC)?;
     Ok(file.as_fd().as_raw_fd().to_string())
 }
 
-/// Has all open files but the standard streams close on `exec`, those included that the starter of
-/// this process had open by chance.
+/// Makes all open files but the standard streams close on `exec`, including those that the starter
+/// of this process happened to have open.
 ///
 /// # Errors
 ///
-/// If the system can neither do that at once nor list them.
+/// If the system can neither do that in one call nor list the files.
 pub fn close_on_exec() -> io::Result<()> {
-    // SAFETY: it changes a flag of files that are open, and no memory.
+    // SAFETY: the call changes flags of open files, and no memory.
     if unsafe {
         libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC)
     } == 0
@@ -35,33 +35,33 @@ pub fn close_on_exec() -> io::Result<()> {
     for entry in std::fs::read_dir("/proc/self/fd")? {
         let number = entry?.file_name().to_str().and_then(|name| name.parse::<i32>().ok());
         if let Some(number) = number.filter(|number| *number > 2) {
-            // SAFETY: as above; a number that is not open any more is an error, which does not
-            // matter.
+            // SAFETY: as above; an error for a number that is not open any more does not matter.
             let _ = unsafe { libc::fcntl(number, libc::F_SETFD, libc::FD_CLOEXEC) };
         }
     }
     Ok(())
 }
 
-/// The open file that the environment variable `name` gives the number of, which `exec` closes;
-/// `None` without that variable.
+/// Returns the open file with the number in the environment variable `name`, as a copy that `exec`
+/// closes; `None` without that variable.
 ///
 /// # Errors
 ///
-/// If the variable is set and gives the number of no open file, or that of a standard stream.
+/// If the variable is set and does not have the number of an open file, or has that of a standard
+/// stream.
 pub fn inherited(name: &str) -> io::Result<Option<OwnedFd>> {
     let Some(number) = std::env::var_os(name) else { return Ok(None) };
     let wrong = || {
-        io::Error::new(io::ErrorKind::InvalidInput, format!("{name} is the number of no open file"))
+        io::Error::new(io::ErrorKind::InvalidInput, format!("{name} does not name an open file"))
     };
     let number: i32 =
         number.to_str().and_then(|text| text.parse().ok()).filter(|n| *n > 2).ok_or_else(wrong)?;
-    // SAFETY: `dup` of a number that is no open file fails and does nothing else, and what it gives
-    // is ours alone.
+    // SAFETY: `dup` of a number that is not open fails without effect, and only this code has the
+    // number that it returns.
     let copy = unsafe { libc::fcntl(number, libc::F_DUPFD_CLOEXEC, 3) };
     if copy < 0 {
         return Err(wrong());
     }
-    // SAFETY: the number was made a line above and no other code has it.
+    // SAFETY: the number was created above, and no other code has it.
     Ok(Some(unsafe { OwnedFd::from_raw_fd(copy) }))
 }
