@@ -1,48 +1,47 @@
-//! Losses that sequence numbers tell of.
+//! Counts losses by gaps in the sequence numbers of writers.
 
 use std::collections::VecDeque;
 
 use crate::transport::Guid;
 
-/// Writers that are followed at a time. When one more comes, the one that was silent for longest is
-/// forgotten.
-const WRITERS: usize = 256;
-/// Gaps of a writer that a late sample may still fill. The oldest gaps are final when there are
-/// more.
-const OPEN: usize = 64;
+/// Number of writers tracked at a time. One more replaces the one that was silent for longest.
+const MAX_WRITERS: usize = 256;
+/// Number of gaps of a writer that a late sample may still fill. Beyond it, the oldest gaps are
+/// final.
+const OPEN_GAPS: usize = 64;
 
-/// Counts the samples that are missing between those that came, writer by writer.
+/// Counts the samples that are missing between the received ones, for each writer.
 ///
-/// A writer's first sample says where its numbers begin: what it sent before is no loss. A sample
-/// that comes late, as networks may cause without any fault, takes its loss back. A writer that
-/// starts again has another [`Guid`].
+/// A writer's first sample sets the beginning of its numbers: earlier ones are not lost. A late
+/// sample, as networks cause without any fault, reverts its loss. A restarted writer has another
+/// [`Guid`].
 #[derive(Clone, Debug, Default)]
 pub struct Gaps {
-    writers: Vec<Writer>,
-    /// Samples noted, by which it is known who was silent for longest.
+    writers: Vec<TrackedWriter>,
+    /// Number of samples noted; serves to find the writer that was silent for longest.
     noted: u64,
     lost: u64,
 }
 
 #[derive(Clone, Debug)]
-struct Writer {
+struct TrackedWriter {
     guid: Guid,
-    /// The number that comes next; `None` when there is none after the last.
+    /// The expected number; `None` after the last one.
     next: Option<u64>,
-    /// First and last number of each gap that is not filled, oldest first.
+    /// First and last number of each unfilled gap, oldest first.
     open: VecDeque<(u64, u64)>,
-    heard: u64,
+    last_noted: u64,
 }
 
 impl Gaps {
-    /// A sample came. Returns how many are missing just before it.
+    /// Notes a received sample. Returns the number of samples missing just before it.
     pub fn note(&mut self, writer: Guid, seq: u64) -> u64 {
         self.noted += 1;
         let Some(found) = self.writers.iter_mut().find(|known| known.guid == writer) else {
-            self.follow(writer, seq);
+            self.track(writer, seq);
             return 0;
         };
-        found.heard = self.noted;
+        found.last_noted = self.noted;
         let Some(next) = found.next.filter(|next| *next <= seq) else {
             self.lost = self.lost.saturating_sub(u64::from(found.fill(seq)));
             return 0;
@@ -51,7 +50,7 @@ impl Gaps {
         let missing = seq - next;
         if missing > 0 {
             found.open.push_back((next, seq - 1));
-            if found.open.len() > OPEN {
+            if found.open.len() > OPEN_GAPS {
                 found.open.pop_front();
             }
             self.lost = self.lost.saturating_add(missing);
@@ -59,13 +58,13 @@ impl Gaps {
         missing
     }
 
-    /// How many are missing in all.
+    /// Returns the number of missing samples of all writers.
     pub fn lost(&self) -> u64 {
         self.lost
     }
 
-    /// Whether that sample came, or is older than what is known: it is neither the next, nor in a
-    /// gap that may be filled.
+    /// Returns whether this sample was received, or is older than the tracked ones: it is neither a
+    /// next one nor in an open gap.
     pub fn has(&self, writer: Guid, seq: u64) -> bool {
         let known = self.writers.iter().find(|known| known.guid == writer);
         known.is_some_and(|known| {
@@ -74,24 +73,24 @@ impl Gaps {
         })
     }
 
-    fn follow(&mut self, guid: Guid, seq: u64) {
-        if self.writers.len() >= WRITERS
-            && let Some(silent) =
-                (0..self.writers.len()).min_by_key(|index| self.writers[*index].heard)
+    fn track(&mut self, guid: Guid, seq: u64) {
+        if self.writers.len() >= MAX_WRITERS
+            && let Some(oldest) =
+                (0..self.writers.len()).min_by_key(|index| self.writers[*index].last_noted)
         {
-            self.writers.swap_remove(silent);
+            self.writers.swap_remove(oldest);
         }
-        self.writers.push(Writer {
+        self.writers.push(TrackedWriter {
             guid,
             next: seq.checked_add(1),
             open: VecDeque::new(),
-            heard: self.noted,
+            last_noted: self.noted,
         });
     }
 }
 
-impl Writer {
-    /// Whether `seq` was missing until now.
+impl TrackedWriter {
+    /// Returns whether `seq` was missing until now, and fills its gap.
     fn fill(&mut self, seq: u64) -> bool {
         let Some(index) =
             self.open.iter().position(|(first, last)| (*first..=*last).contains(&seq))
@@ -106,8 +105,8 @@ impl Writer {
             (false, false) => {
                 self.open[index].1 = seq - 1;
                 self.open.insert(index + 1, (seq + 1, last));
-                // The bound holds for gaps that are split, too.
-                if self.open.len() > OPEN {
+                // The limit holds for gaps that are split, too.
+                if self.open.len() > OPEN_GAPS {
                     self.open.pop_front();
                 }
             }
@@ -137,13 +136,13 @@ mod tests {
     }
 
     #[test]
-    fn what_was_sent_before_the_first_sample_is_no_loss() {
+    fn samples_before_the_first_received_one_are_not_lost() {
         assert_eq!(lost_after(&[1000, 1001]), 0);
         assert_eq!(lost_after(&[1000, 1002]), 1);
     }
 
     #[test]
-    fn a_late_sample_takes_its_loss_back_once() {
+    fn a_late_sample_reverts_its_loss_once() {
         assert_eq!(lost_after(&[1, 5]), 3);
         assert_eq!(lost_after(&[1, 5, 3]), 2);
         assert_eq!(lost_after(&[1, 5, 3, 3]), 2);
@@ -156,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn what_came_is_told_from_what_is_missing() {
+    fn received_samples_differ_from_missing_ones() {
         let mut gaps = Gaps::default();
         for seq in [5, 6, 9, u64::MAX, 7] {
             gaps.note(guid(1), seq);
@@ -167,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn writers_are_counted_apart_and_a_new_one_starts_anew() {
+    fn writers_are_counted_separately_and_a_new_one_starts_at_its_first_sample() {
         let mut gaps = Gaps::default();
         for (writer, seq, missing) in
             [(1, 1, 0), (2, 100, 0), (1, 3, 1), (2, 101, 0), (3, 1, 0), (2, 104, 2)]
@@ -189,16 +188,16 @@ mod tests {
     }
 
     #[test]
-    fn the_writer_that_was_silent_for_longest_is_forgotten_first() {
+    fn the_writer_that_was_silent_for_longest_is_replaced_first() {
         let mut gaps = Gaps::default();
-        for writer in 0..WRITERS as u16 {
+        for writer in 0..MAX_WRITERS as u16 {
             gaps.note(guid(writer), 1);
         }
         gaps.note(guid(0), 2);
         gaps.note(guid(9999), 1);
-        assert_eq!(gaps.note(guid(0), 4), 1, "it spoke last but one");
+        assert_eq!(gaps.note(guid(0), 4), 1, "it was the last but one to send");
         assert_eq!(gaps.note(guid(1), 4), 0, "it is new again");
-        assert_eq!(gaps.writers.len(), WRITERS);
+        assert_eq!(gaps.writers.len(), MAX_WRITERS);
     }
 
     #[test]
@@ -215,27 +214,27 @@ mod tests {
         for n in 0..10_000 {
             gaps.note(guid(2), 1 + 1_000 * (n % 3) + n);
         }
-        assert!(gaps.writers.iter().all(|writer| writer.open.len() <= OPEN));
+        assert!(gaps.writers.iter().all(|writer| writer.open.len() <= OPEN_GAPS));
     }
 
-    /// What a writer's numbers mean if one may remember all of them.
+    /// A model that remembers all numbers of a writer.
     #[derive(Default)]
     struct Naive {
         first: Option<u64>,
-        came: BTreeSet<u64>,
+        received: BTreeSet<u64>,
     }
 
     impl Naive {
         fn note(&mut self, seq: u64) {
             let first = *self.first.get_or_insert(seq);
             if seq >= first {
-                self.came.insert(seq);
+                self.received.insert(seq);
             }
         }
 
         fn lost(&self) -> u64 {
-            match (self.first, self.came.last()) {
-                (Some(first), Some(last)) => last - first + 1 - self.came.len() as u64,
+            match (self.first, self.received.last()) {
+                (Some(first), Some(last)) => last - first + 1 - self.received.len() as u64,
                 _ => 0,
             }
         }
@@ -252,7 +251,8 @@ mod tests {
         };
         for _ in 0..300 {
             let (mut gaps, mut naive) = (Gaps::default(), [Naive::default(), Naive::default()]);
-            // Numbers within a window that moves on: few enough gaps to be remembered all.
+            // The numbers are in a window that moves on, so that the number of gaps stays below the
+            // limit.
             for step in 0..500 {
                 let (writer, seq) = (random(2) as usize, 1 + step / 4 + random(40));
                 gaps.note(guid(writer as u16), seq);

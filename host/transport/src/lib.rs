@@ -1,9 +1,8 @@
-//! Where samples come from: the [`Transport`] trait, what every live source of samples has, and
-//! [`loopback`], an in-process transport for tests and benches. Drives and DDS are crates of their
-//! own.
+//! Sources of samples: the [`Transport`] trait, the common part of live sources, and [`loopback`],
+//! an in-process transport for tests and benches. Drives and DDS are crates of their own.
 //!
-//! What never happens here: waking a lambda, holding a sample, decoding pixels. A transport hands
-//! the CDR bytes of each sample to a [`Sink`] and forgets them.
+//! A transport passes the CDR bytes of each sample to a [`Sink`] and keeps nothing. It never wakes
+//! a lambda, stores a sample or decodes pixels.
 
 pub mod clock;
 mod gaps;
@@ -15,6 +14,6 @@ pub use clock::Clock;
 pub use gaps::Gaps;
 pub use live::{Health, LiveSource, PublishError, Publisher};
 pub use transport::{
-    DiscoveredTopic, Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport,
-    TransportError, Verdict, same_type,
+    Delivery, DiscoveredTopic, Guid, Qos, ReceptionStatus, SampleMeta, Sink, Subscription,
+    TopicSpec, Transport, TransportError, same_type,
 };

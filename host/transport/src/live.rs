@@ -1,19 +1,18 @@
-//! What every live source of samples has beside [`Transport`]: a health, and topics that this
-//! process publishes.
+//! The interface of live sources beyond [`Transport`]: health, and topics that this process
+//! publishes.
 
 use gleaner_base::{Exit, Explain};
-use gleaner_protocol::Network;
+use gleaner_protocol::NetworkStatus;
 
 use crate::Transport;
 
-/// A source whose samples come while time passes.
+/// A source whose samples arrive in real time.
 pub trait LiveSource: Transport + Send {
-    /// Returns the state of the source. Cheap enough for once a second, which is how often it is
-    /// called.
+    /// Returns the state of the source. It is called once a second, and must be cheap.
     fn health(&self) -> Health;
 
-    /// Opens `topic`, whose messages are of `type_name`, to publish on it. A reader that is slow
-    /// finds the `depth` newest messages.
+    /// Opens `topic` of type `type_name` for publishing. Slow readers find the `depth` newest
+    /// messages.
     ///
     /// # Errors
     ///
@@ -37,7 +36,7 @@ pub trait Publisher: Send {
     fn publish(&self, cdr: &[u8]) -> Result<(), PublishError>;
 }
 
-/// Why a topic cannot be published, or a message was not sent.
+/// A failure to open a topic for publishing, or to send a message.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub struct PublishError(pub Box<dyn std::error::Error + Send + Sync>);
@@ -51,8 +50,9 @@ impl Explain for PublishError {
 /// The state of a live source.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Health {
-    /// The network below; `None` where there is none.
-    pub network: Option<Network>,
-    /// Why nothing, or nothing of a topic, is handled any more; `None` while all is well.
+    /// State of the network below; `None` without one.
+    pub network: Option<NetworkStatus>,
+    /// The reason why the source, or one of its topics, delivers no further samples; `None` while
+    /// it works.
     pub dead: Option<String>,
 }

@@ -1,34 +1,34 @@
-//! An in-process transport: what is published is delivered at once, on the publisher's thread.
+//! An in-process transport, for tests and benches: a published sample is delivered at once, on the
+//! publisher's thread.
 //!
-//! For tests and benches. It keeps nothing: a sample published before a subscription is gone.
+//! It keeps no samples: one that is published before a subscription is lost.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
-use gleaner_base::words::nearest;
+use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Endian};
 
 use crate::clock::Clock;
 use crate::live::{Health, LiveSource, PublishError, Publisher};
 use crate::transport::{
-    DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError,
-    Verdict, same_type,
+    Delivery, DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport,
+    TransportError, same_type,
 };
 
-/// The in-process transport. Clones are the same transport: one publishes, another one is
-/// subscribed.
+/// The in-process transport. Clones share it: one publishes, another one subscribes.
 #[derive(Clone, Default)]
-pub struct Loopback(Arc<Mutex<Topics>>);
+pub struct Loopback(Arc<Mutex<LoopbackState>>);
 
 #[derive(Default)]
-struct Topics {
-    topics: BTreeMap<String, Topic>,
+struct LoopbackState {
+    topics: BTreeMap<String, LoopbackTopic>,
     subscriptions: usize,
     dead: Option<String>,
 }
 
-struct Topic {
+struct LoopbackTopic {
     type_name: String,
     text: Option<Arc<str>>,
     sinks: Vec<Arc<dyn Sink>>,
@@ -37,15 +37,15 @@ struct Topic {
 }
 
 impl Loopback {
-    /// A transport without topics.
+    /// Creates a transport without topics.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Adds a topic; an empty `definitions_text` means that there is none. Replaces a topic of the
-    /// same name, with its subscriptions.
+    /// Adds a topic; an empty `definitions_text` means none. Replaces a topic of the same name,
+    /// with its subscriptions.
     pub fn add_topic(&self, topic: &str, type_name: &str, definitions_text: &str) {
-        let added = Topic {
+        let added = LoopbackTopic {
             type_name: type_name.to_owned(),
             text: (!definitions_text.trim().is_empty()).then(|| definitions_text.into()),
             sinks: Vec::new(),
@@ -55,8 +55,8 @@ impl Loopback {
         self.lock().topics.insert(topic.to_owned(), added);
     }
 
-    /// Delivers one sample to every subscription of `topic`, in the order of subscribing, and
-    /// returns the verdict of the last one; `None` if nobody has subscribed.
+    /// Delivers a sample to every subscription of `topic`, in the order of subscribing. Returns the
+    /// result of the last one; `None` without subscriptions.
     ///
     /// # Errors
     ///
@@ -66,8 +66,8 @@ impl Loopback {
         topic: &str,
         meta: &SampleMeta,
         cdr: &[u8],
-    ) -> Result<Option<Verdict>, TransportError> {
-        // Not held while samples are delivered: a sink may publish in turn.
+    ) -> Result<Option<Delivery>, TransportError> {
+        // Not locked during delivery: a sink may publish in turn.
         let sinks = {
             let mut topics = self.lock();
             match topics.topics.get_mut(topic) {
@@ -78,25 +78,25 @@ impl Loopback {
                 None => return Err(topics.no_such(topic)),
             }
         };
-        let mut verdict = None;
+        let mut delivery = None;
         for sink in sinks {
-            verdict = Some(sink.deliver(meta, cdr));
+            delivery = Some(sink.deliver(meta, cdr));
         }
-        Ok(verdict)
+        Ok(delivery)
     }
 
-    /// From now on [`LiveSource::health`] says that nothing is handled any more, because of `why`.
-    pub fn die(&self, why: &str) {
+    /// Makes [`LiveSource::health`] report a failure, with the reason `why`.
+    pub fn fail(&self, why: &str) {
         self.lock().dead = Some(why.to_owned());
     }
 
-    fn lock(&self) -> MutexGuard<'_, Topics> {
+    fn lock(&self) -> MutexGuard<'_, LoopbackState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Topics {
-    fn get(&self, topic: &str) -> Result<&Topic, TransportError> {
+impl LoopbackState {
+    fn get(&self, topic: &str) -> Result<&LoopbackTopic, TransportError> {
         self.topics.get(topic).ok_or_else(|| self.no_such(topic))
     }
 
@@ -111,7 +111,7 @@ impl Topics {
 
 impl Transport for Loopback {
     fn topics(&self) -> Vec<DiscoveredTopic> {
-        let discovered = |(name, topic): (&String, &Topic)| DiscoveredTopic {
+        let discovered = |(name, topic): (&String, &LoopbackTopic)| DiscoveredTopic {
             topic: name.clone(),
             type_name: topic.type_name.clone(),
             definitions_text: topic.text.clone(),
@@ -159,7 +159,7 @@ impl Transport for Loopback {
     }
 }
 
-/// What it publishes is stamped by the clock of the day, and numbered from 1.
+/// Published samples are stamped by the time of day, and numbered from 1.
 impl LiveSource for Loopback {
     fn health(&self) -> Health {
         Health { network: None, dead: self.lock().dead.clone() }
@@ -172,25 +172,25 @@ impl LiveSource for Loopback {
         _depth: usize,
     ) -> Result<Box<dyn Publisher>, PublishError> {
         self.lock().get(topic).map_err(|error| PublishError(error.into()))?;
-        let published = Published {
+        let published = LoopbackPublisher {
             loopback: self.clone(),
             topic: topic.to_owned(),
-            clock: Clock::of_today(),
+            clock: Clock::from_time_of_day(),
             messages: AtomicU64::new(0),
         };
         Ok(Box::new(published))
     }
 }
 
-/// A topic of a loopback that is published.
-struct Published {
+/// Publishes one topic of a loopback.
+struct LoopbackPublisher {
     loopback: Loopback,
     topic: String,
     clock: Clock,
     messages: AtomicU64,
 }
 
-impl Publisher for Published {
+impl Publisher for LoopbackPublisher {
     fn publish(&self, cdr: &[u8]) -> Result<(), PublishError> {
         let at_ns = self.clock.now();
         let seq = self.messages.fetch_add(1, Ordering::Relaxed) + 1;

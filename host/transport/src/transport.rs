@@ -1,71 +1,69 @@
-//! The trait every source of samples implements, and what it hands over.
+//! The trait that every source of samples implements, with its arguments and results.
 
 use std::fmt;
 use std::sync::Arc;
 
-use gleaner_base::words::hint;
+use gleaner_base::text::hint;
 use gleaner_messages::{Definitions, Endian, MessageError, SourcesError};
 
-/// One topic that a caller wants to receive.
+/// A topic that a caller wants to receive.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TopicSpec {
     /// Absolute topic name, for example `/imu/data`.
     pub topic: String,
     /// Message type, `pkg/msg/Type` or `pkg/Type`; the two spellings are equal.
     pub type_name: String,
-    /// How many samples a live transport may hold back before it drops the oldest. A replay is
-    /// pulled and holds none.
+    /// Number of samples that a live transport may queue before it drops the oldest. A replay is
+    /// pulled and queues none.
     pub queue: usize,
-    /// The largest sample, in bytes of CDR, that the sink will take. A live transport sizes its
-    /// buffers by it; the sink alone decides and answers [`Verdict::TooBig`]. A larger sample that
-    /// is packed is not unpacked to its end, and not shown to the sink: it is told by
-    /// [`Sink::too_big`].
+    /// The largest sample that the sink will take, in bytes of CDR. A live transport sizes its
+    /// buffers by it; the sink alone decides and returns [`Delivery::TooBig`]. A larger compressed
+    /// sample is not unpacked to its end, and not passed to the sink: [`Sink::too_big`] reports it.
     pub max_bytes: usize,
-    /// How a live transport asks for it.
+    /// The QoS that a live transport requests.
     pub qos: Qos,
 }
 
-/// The quality of service that a subscription asks for. A replay delivers what it has.
+/// The quality of service that a subscription requests. A replay delivers what it has.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub enum Qos {
-    /// What the writers offer.
+    /// The QoS that the writers offer.
     #[default]
     Auto,
-    /// Exactly this.
+    /// Exactly this QoS.
     Fixed {
-        /// Whether lost samples are sent again.
+        /// Set if lost samples are to be sent again.
         reliable: bool,
-        /// Whether samples from before the subscription are wanted, as far as writers keep them.
+        /// Set if samples from before the subscription are requested, as far as writers keep them.
         transient_local: bool,
-        /// Samples that DDS keeps until we take them.
+        /// Number of samples that DDS keeps until they are taken.
         depth: usize,
     },
 }
 
-/// How a subscription is doing.
+/// State of a subscription.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Status {
-    /// Writers that are connected now; `None` where there are none, as in a replay. One that was
-    /// killed counts until the time is over for which it said that it would be heard from, with ROS
-    /// 2 often 10 to 20 s.
+pub struct ReceptionStatus {
+    /// Number of connected writers; `None` where there are none, as in a replay. A killed writer
+    /// counts until its lease expires, with ROS 2 often after 10 to 20 s.
     pub writers: Option<usize>,
-    /// Samples that were lost on their way to us, as far as gaps in their numbers tell; `None` if
-    /// nothing tells.
+    /// Number of samples lost in transit, according to gaps in their sequence numbers; `None` if
+    /// unknown.
     pub lost: Option<u64>,
-    /// Samples that could not be read at all.
+    /// Number of samples that could not be parsed.
     pub malformed: u64,
-    /// What is asked for now, in words: `reliable, volatile`.
+    /// The requested QoS, as text: `reliable, volatile`.
     pub qos: Option<String>,
-    /// What keeps writers from being heard, in whole sentences, at most 16.
+    /// Reasons why samples of writers are not received, in whole sentences, at most 16.
     pub qos_warnings: Vec<String>,
 }
 
-/// The identity of whoever wrote a sample: 16 bytes, equal for all samples of one writer.
+/// The identity of a writer: 16 bytes, equal for all of its samples.
 #[derive(Copy, Clone, PartialEq, Eq, Hash, Debug, Default, PartialOrd, Ord)]
 pub struct Guid(pub [u8; 16]);
 
 impl Guid {
-    /// The identity that `text` spells as [`fmt::Display`] does: exactly 32 lower-case hex digits.
+    /// Parses the form that [`fmt::Display`] prints: exactly 32 lower-case hex digits.
     pub fn from_hex(text: &str) -> Option<Self> {
         let digit = |byte: u8| match byte {
             b'0'..=b'9' => Some(byte - b'0'),
@@ -89,30 +87,31 @@ impl fmt::Display for Guid {
     }
 }
 
-/// What is known of a sample besides its bytes.
+/// Metadata of a sample.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct SampleMeta {
-    /// The clock that orders everything, in ns. Replay: log time. Live: receive time.
+    /// Time by the clock that orders all samples, in ns. Replay: log time. Live: receive time.
     pub at_ns: i64,
-    /// When the writer published the sample, in ns of the writer's clock.
+    /// Time of publication, in ns of the writer's clock.
     pub publish_ns: i64,
-    /// Who wrote it.
+    /// The writer.
     pub writer: Guid,
-    /// Strictly increasing per writer, at least 1. A gap is a loss before us.
+    /// Sequence number: strictly increasing for each writer, at least 1. A gap is a loss before
+    /// this transport.
     pub seq: u64,
     /// Byte order of the CDR payload.
     pub endian: Endian,
-    /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Nothing reads them; with
-    /// them a recorder can write the message again as it was, byte for byte.
+    /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Unused, but with them a
+    /// recorder can write the original message byte for byte.
     pub options: [u8; 2],
 }
 
-/// What a sink did with a sample.
+/// The result of delivering a sample to a sink.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
-pub enum Verdict {
-    /// Copied and held.
+pub enum Delivery {
+    /// Copied and kept.
     Taken,
-    /// Dropped: no free memory to hold it.
+    /// Dropped: no free slot.
     NoSlot,
     /// Dropped: larger than the sink's limit.
     TooBig,
@@ -123,97 +122,97 @@ pub trait Sink: Send + Sync {
     /// Takes one sample; `cdr` is the payload without the four bytes of encapsulation.
     ///
     /// Runs on the transport's thread: one copy, no lock that a lambda can hold, never blocks.
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict;
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery;
 
-    /// A sample was passed over that is larger than [`TopicSpec::max_bytes`]: it has at least `len`
-    /// bytes of CDR. The verdict is [`Verdict::TooBig`]; whoever counts what it refuses counts it
-    /// here.
+    /// Reports a sample that was skipped, since it is larger than [`TopicSpec::max_bytes`]: it has
+    /// at least `len` bytes of CDR. Its result is [`Delivery::TooBig`]; a sink that counts refusals
+    /// counts it here.
     fn too_big(&self, _meta: &SampleMeta, _len: usize) {}
 
-    /// Copies one sample, where a transport shows its bytes before it knows whose they are. `None`,
-    /// as here: the sink wants both at once, so the transport makes a copy of its own for
+    /// Copies a sample whose metadata the transport does not know yet. Returns `None`, as by
+    /// default, if the sink needs both at once: then the transport makes its own copy for
     /// [`deliver`](Self::deliver).
     ///
-    /// It may run under a lock of the transport: memory is copied, and nothing else is done.
-    fn copy(&self, _cdr: &[u8]) -> Option<Verdict> {
+    /// It may run under a lock of the transport, so it only copies memory.
+    fn copy(&self, _cdr: &[u8]) -> Option<Delivery> {
         None
     }
 
-    /// What the last [`copy`](Self::copy) took or refused was this sample. One that is copied and
-    /// never accepted was none: the next copy takes its place.
+    /// Accepts the last [`copy`](Self::copy), taken or refused, as this sample. A copy that is
+    /// never accepted is replaced by the next.
     fn accept(&self, _meta: &SampleMeta) {}
 }
 
-/// A topic that a transport knows of.
+/// A topic of a source.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DiscoveredTopic {
     /// Absolute topic name.
     pub topic: String,
     /// Message type as the source spells it.
     pub type_name: String,
-    /// ros2msg text of the type and all it refers to, where the source carries it.
+    /// ros2msg text of the type and all types it refers to, if the source carries it.
     pub definitions_text: Option<Arc<str>>,
-    /// How many messages the source holds, where it says.
+    /// Number of messages in the source, if known.
     pub messages: Option<u64>,
-    /// The quality of service that the topic's writers offered, as rosbag2 notes it: YAML under the
-    /// key `offered_qos_profiles`, at most 64 KiB. `None` where the source does not carry it.
+    /// The QoS that the topic's writers offered, as rosbag2 writes it: YAML under the key
+    /// `offered_qos_profiles`, at most 64 KiB. `None` if the source does not carry it.
     pub offered_qos: Option<String>,
 }
 
-/// Names one successful [`Transport::subscribe`]: 0 for the first of a transport, then counting up.
+/// Identifies one successful [`Transport::subscribe`]: 0 for the first of a transport, then
+/// counting up.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Subscription(pub usize);
 
 /// A source of samples. Object safe and synchronous.
 pub trait Transport {
-    /// The topics known now, sorted by name. A live transport may learn of more later, and may know
-    /// one of several types: the one that most write comes first.
+    /// Returns the topics known now, sorted by name. A live transport may discover more later. Of
+    /// several types of a topic, the one with the most writers comes first.
     fn topics(&self) -> Vec<DiscoveredTopic>;
 
-    /// Sends each sample of a topic to `sink` from now on. A topic may be subscribed several times;
+    /// Sends each further sample of a topic to `sink`. A topic may be subscribed several times;
     /// every subscription gets every sample, in the order of subscribing.
     ///
     /// # Errors
     ///
-    /// [`TransportError`] if the topic does not exist, has another type or an encoding that we do
-    /// not read, or if the transport can take no more subscriptions.
+    /// [`TransportError`] if the topic does not exist, has another type or an unsupported encoding,
+    /// or if the transport can take no more subscriptions.
     fn subscribe(
         &mut self,
         spec: &TopicSpec,
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError>;
 
-    /// The parsed message definitions of a topic, shared by all who ask.
+    /// Returns the parsed message definitions of a topic, shared by all callers.
     ///
     /// # Errors
     ///
     /// [`TransportError`] if there is no such topic, or its definitions are missing or malformed.
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError>;
 
-    /// Whether it is worth while to ask soon once more for the definitions of a topic that has
-    /// none. A live transport asks whoever writes the topic, which takes at most some seconds; this
-    /// sets it going.
+    /// Returns whether the definitions of a topic that has none may become available soon. A live
+    /// transport then queries the topic's writers, which takes some seconds at most.
     fn definitions_may_come(&self, _topic: &str) -> bool {
         false
     }
 
-    /// How a subscription is doing.
-    fn status(&self, _subscription: Subscription) -> Status {
-        Status::default()
+    /// Returns the state of a subscription.
+    fn status(&self, _subscription: Subscription) -> ReceptionStatus {
+        ReceptionStatus::default()
     }
 }
 
-/// Why a topic cannot be had.
+/// Reasons why a topic cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum TransportError {
-    /// The source has no topic of that name.
+    /// The source has no topic of this name.
     #[error("no topic `{topic}`{}; there are: {}", hint(nearest), list(known))]
     NoSuchTopic {
-        /// The name asked for.
+        /// The requested name.
         topic: String,
-        /// The topics there are, sorted.
+        /// The topics of the source, sorted.
         known: Vec<String>,
-        /// The closest of them, if one is close.
+        /// The most similar name, if one is similar.
         nearest: Option<String>,
     },
     /// The topic carries another type.
@@ -221,21 +220,21 @@ pub enum TransportError {
     WrongType {
         /// The topic.
         topic: String,
-        /// The type asked for.
+        /// The requested type.
         wanted: String,
-        /// The type it has.
+        /// The type of the topic.
         found: String,
     },
-    /// The topic is written in an encoding that we do not read.
+    /// The topic has an unsupported encoding.
     #[error("topic `{topic}` has {what} `{found}`; only `{wanted}` can be read")]
     Encoding {
         /// The topic.
         topic: String,
-        /// Which encoding: "message encoding" or "schema encoding".
+        /// The encoding that is meant: "message encoding" or "schema encoding".
         what: &'static str,
-        /// What the source uses.
+        /// The encoding of the source.
         found: String,
-        /// What we read.
+        /// The supported encoding.
         wanted: &'static str,
     },
     /// The source does not carry the definitions of this topic's type.
@@ -246,24 +245,23 @@ pub enum TransportError {
         /// Its type.
         type_name: String,
     },
-    /// The definitions that the source carries cannot be used.
+    /// The definitions that the source carries are invalid.
     #[error("the message definitions of topic `{topic}` cannot be used")]
     BadDefinitions {
         /// The topic.
         topic: String,
-        /// What is wrong with them.
+        /// The cause.
         source: MessageError,
     },
-    /// The definitions that were found for this topic's type, since the source does not carry them,
-    /// cannot be used.
+    /// The source does not carry definitions, and those that were found elsewhere are invalid.
     #[error("the message definitions of topic `{topic}` cannot be used")]
     UnusableDefinitions {
         /// The topic.
         topic: String,
-        /// What is wrong with them.
+        /// The cause.
         source: Box<SourcesError>,
     },
-    /// Replay: subscriptions are made before the first step.
+    /// The replay has begun: subscriptions are made before the first step.
     #[error("topic `{topic}` was subscribed after the replay started")]
     AlreadyStarted {
         /// The topic.
@@ -271,7 +269,7 @@ pub enum TransportError {
     },
 }
 
-/// Most topics that are named in an error.
+/// Maximum number of topics named in an error.
 const NAMED: usize = 20;
 
 fn list(names: &[String]) -> String {
@@ -284,7 +282,7 @@ fn list(names: &[String]) -> String {
     }
 }
 
-/// Whether two message type names mean the same type: `pkg/msg/Type` equals `pkg/Type`.
+/// Returns whether two message type names mean the same type: `pkg/msg/Type` equals `pkg/Type`.
 pub fn same_type(a: &str, b: &str) -> bool {
     gleaner_messages::short_name(a) == gleaner_messages::short_name(b)
 }
@@ -324,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_topics_a_missing_one_names_some() {
+    fn the_error_for_a_missing_topic_names_some_of_many() {
         let known = (0..1000).map(|n| format!("/t{n:03}")).collect();
         let error = TransportError::NoSuchTopic { topic: "/imu".to_owned(), known, nearest: None }
             .to_string();

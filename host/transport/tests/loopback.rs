@@ -1,4 +1,4 @@
-//! The in-process transport.
+//! Tests the in-process transport.
 
 #[path = "../../drives/tests/suite/support.rs"]
 mod support;
@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use gleaner_messages::Endian;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta, Subscription, Transport, TransportError, Verdict};
+use gleaner_transport::{Delivery, Guid, SampleMeta, Subscription, Transport, TransportError};
 
 use support::{Memory, TEXT, TYPE, spec};
 
@@ -23,22 +23,22 @@ fn meta(at_ns: i64) -> SampleMeta {
 }
 
 #[test]
-fn what_is_published_reaches_every_subscription() {
+fn a_published_sample_reaches_every_subscription() {
     let mut loopback = Loopback::new();
     loopback.add_topic("/a", TYPE, TEXT);
     assert_eq!(loopback.publish("/a", &meta(0), &[0; 8]).unwrap(), None);
     let memory = Arc::new(Memory::default());
     assert_eq!(loopback.subscribe(&spec("/a"), memory.clone()).unwrap(), Subscription(0));
     assert_eq!(loopback.subscribe(&spec("/a"), memory.clone()).unwrap(), Subscription(1));
-    let verdict = loopback.publish("/a", &meta(5), &9i64.to_le_bytes()).unwrap();
-    assert_eq!(verdict, Some(Verdict::Taken));
+    let delivery = loopback.publish("/a", &meta(5), &9i64.to_le_bytes()).unwrap();
+    assert_eq!(delivery, Some(Delivery::Taken));
     assert_eq!(memory.values(), [(5, 9), (5, 9)]);
     assert_eq!(loopback.topics()[0].messages, Some(2));
     assert_eq!(loopback.definitions("/a").unwrap().type_name(), TYPE);
 }
 
 #[test]
-fn refusals_name_what_was_wrong() {
+fn an_error_names_its_cause() {
     let mut loopback = Loopback::new();
     loopback.add_topic("/a", "other/Type", "");
     let memory = Arc::new(Memory::default());
