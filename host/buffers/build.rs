@@ -1,5 +1,4 @@
-//! Tells rustc that `--cfg loom` is known here: `[lints] workspace = true` leaves no room for it in
-//! Cargo.toml.
+//! Declares `--cfg loom` to rustc: `[lints] workspace = true` excludes declaring it in Cargo.toml.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");

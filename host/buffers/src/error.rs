@@ -1,21 +1,21 @@
-//! Why a pool or a ring cannot be built, and why a draft is refused. Written by hand: this crate
-//! depends on std only.
+//! Errors of building a pool or a ring, and of drafting a slot. Written by hand: this crate depends
+//! on std only.
 
 use std::{error::Error, fmt};
 
-/// A pool or a ring that cannot be built as asked.
+/// A pool or a ring that cannot be built as requested.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PoolError {
     /// A pool has 1 to 2^31 - 1 slots.
     SlotCount {
-        /// Slots asked for.
+        /// Requested number of slots.
         slots: usize,
     },
     /// Slots of this size and number do not fit the address space.
     TooLarge {
-        /// Slots asked for.
+        /// Requested number of slots.
         slots: usize,
-        /// Bytes asked for in each.
+        /// Requested bytes in each.
         slot_bytes: usize,
     },
     /// The region is smaller than [`Pool::bytes_needed`](crate::Pool::bytes_needed).
@@ -30,14 +30,14 @@ pub enum PoolError {
         /// Address at which it starts.
         address: usize,
     },
-    /// The allocator has no such block.
+    /// The allocator returned no memory.
     OutOfMemory {
-        /// Bytes asked for.
+        /// Requested bytes.
         bytes: usize,
     },
     /// A ring shows at least one sample, and at most as many as its pool has slots.
     Depth {
-        /// Depth asked for.
+        /// Requested depth.
         depth: usize,
         /// Slots of the pool.
         slots: usize,
@@ -57,7 +57,7 @@ impl fmt::Display for PoolError {
                 write!(f, "pool needs a region of {needed} bytes; it was given {given} bytes")
             }
             Self::RegionUnaligned { address } => {
-                write!(f, "region starts at {address:#x}, which is no multiple of 64")
+                write!(f, "region starts at {address:#x}, which is not a multiple of 64")
             }
             Self::OutOfMemory { bytes } => write!(f, "cannot allocate a region of {bytes} bytes"),
             Self::Depth { depth, slots } => {
@@ -72,12 +72,12 @@ impl fmt::Display for PoolError {
 
 impl Error for PoolError {}
 
-/// Why there is no slot for a sample.
+/// Reasons why there is no slot for a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refusal {
+pub enum DraftError {
     /// The sample is larger than a slot.
     TooBig {
-        /// Bytes asked for.
+        /// Requested bytes.
         len: usize,
         /// Bytes in a slot.
         max: usize,
@@ -86,7 +86,7 @@ pub enum Refusal {
     NoSlot,
 }
 
-impl fmt::Display for Refusal {
+impl fmt::Display for DraftError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::TooBig { len, max } => {
@@ -97,4 +97,4 @@ impl fmt::Display for Refusal {
     }
 }
 
-impl Error for Refusal {}
+impl Error for DraftError {}

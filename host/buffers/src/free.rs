@@ -1,7 +1,7 @@
-//! Which slots are free: one bit each.
+//! The set of free slots, with one bit for each.
 //!
-//! A bit means "free now", whatever happened to the slot before. Nothing can be confused with its
-//! own past, as a linked free list can be (ABA), and a look at 512 slots is 8 loads.
+//! A bit means "free now", whatever happened to the slot before: unlike a linked free list, it is
+//! immune to ABA. A scan of 512 slots is 8 loads.
 
 use crate::sync::{AtomicU64, Ordering};
 
@@ -10,7 +10,7 @@ pub(crate) struct FreeSet {
 }
 
 impl FreeSet {
-    /// The set of all of 0..`slots`.
+    /// Creates the set of all of 0..`slots`.
     pub(crate) fn full(slots: u32) -> Self {
         let word = |first| match slots - first {
             64.. => u64::MAX,
@@ -19,10 +19,10 @@ impl FreeSet {
         Self { words: (0..slots).step_by(64).map(|first| AtomicU64::new(word(first))).collect() }
     }
 
-    /// Takes a slot out, the lowest one seen. Everything that was done to it before
-    /// [`give`](Self::give) is visible.
+    /// Takes the lowest free slot that it sees. All accesses before its [`give`](Self::give) are
+    /// visible.
     ///
-    /// May answer `None` although a slot is free, if others take and give at the same time.
+    /// May return `None` although a slot is free, if other threads take and give at the same time.
     pub(crate) fn take(&self) -> Option<u32> {
         for (word, first) in self.words.iter().zip((0..).step_by(64)) {
             let mut seen = word.load(Ordering::Relaxed);
@@ -39,7 +39,7 @@ impl FreeSet {
         None
     }
 
-    /// Puts back a slot that [`take`](Self::take) has given out.
+    /// Returns a slot that [`take`](Self::take) took.
     pub(crate) fn give(&self, index: u32) {
         let before = self.words[index as usize / 64].fetch_or(1 << (index % 64), Ordering::Release);
         debug_assert_eq!(before & (1 << (index % 64)), 0, "slot {index} freed twice");
@@ -56,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_slot_is_given_out_once() {
+    fn every_slot_is_taken_once() {
         for slots in [1, 63, 64, 65, 128, 130] {
             let free = FreeSet::full(slots);
             assert_eq!(free.count(), slots as usize);
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slot_given_back_is_given_out_again() {
+    fn a_returned_slot_is_taken_again() {
         let free = FreeSet::full(70);
         while free.take().is_some() {}
         free.give(66);

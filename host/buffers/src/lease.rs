@@ -1,4 +1,4 @@
-//! The two handles on one slot: a draft, which its owner writes, and a lease, which many read.
+//! The two handles on a slot: a draft, which its owner writes, and a lease, which many read.
 #![allow(unsafe_code)]
 
 use std::{
@@ -10,14 +10,14 @@ use std::{
 
 use crate::{
     HEADROOM,
-    pool::{MOST_HOLDS, Seal, Slots, Stamp},
+    pool::{MAX_HOLDS, RingStamp, Seal, Slots},
     sync::{Arc, Ordering},
 };
 
-/// A slot to fill, owned by one: the bytes are a `&mut [u8]` of exactly the length asked for.
+/// A slot to fill, with one owner: the bytes are a `&mut [u8]` of exactly the requested length.
 ///
-/// They hold what the slot's last sample left there: write all of them, or
-/// [`truncate`](Self::truncate). Dropping the draft gives the slot back.
+/// They still hold the slot's last sample: write all of them, or [`truncate`](Self::truncate).
+/// Dropping the draft frees the slot.
 pub struct Draft<M> {
     slots: Arc<Slots<M>>,
     index: u32,
@@ -27,8 +27,8 @@ pub struct Draft<M> {
 impl<M> Draft<M> {
     /// # Safety
     ///
-    /// The slot is out of the free set, its count is 0, and no other draft is of it: it is the
-    /// caller's, who hands it over. `len <= slot_bytes`.
+    /// The slot is out of the free set, its count is 0, and there is no other draft of it: the
+    /// caller owns it, and passes it on. `len <= slot_bytes`.
     pub(crate) unsafe fn new(slots: Arc<Slots<M>>, index: u32, len: usize) -> Self {
         let mut draft = Self { slots, index, len };
         draft.headroom_mut().fill(0);
@@ -39,12 +39,12 @@ impl<M> Draft<M> {
         Arc::ptr_eq(&self.slots, slots)
     }
 
-    /// Keeps the first `len` bytes; does nothing if there are no more.
+    /// Truncates the draft to `len` bytes; does nothing if it is not longer.
     pub fn truncate(&mut self, len: usize) {
         self.len = self.len.min(len);
     }
 
-    /// The bytes in front of the sample; 0 in a new draft.
+    /// Returns the bytes in front of the sample; 0 in a new draft.
     pub fn headroom_mut(&mut self) -> &mut [u8; HEADROOM] {
         let payload = self.slots.payload(self.index);
         // SAFETY: the bytes before each payload belong to its slot, the slot to this draft, and the
@@ -52,31 +52,33 @@ impl<M> Draft<M> {
         unsafe { payload.sub(HEADROOM).cast().as_mut() }
     }
 
-    /// Ends writing and starts reading.
+    /// Turns the draft into a lease on the sample.
     pub fn seal(self, meta: M) -> Lease<M> {
         let (slots, index) = self.sealed(None, meta);
-        // SAFETY: `sealed` left us the one hold.
+        // SAFETY: `sealed` left one hold, which goes to the lease.
         unsafe { Lease::new(slots, index) }
     }
 
-    /// Seals the sample for a ring, which from now on owns the one hold on the slot of this index.
-    pub(crate) fn into_hold(self, stamp: Stamp, meta: M) -> u32 {
+    /// Seals the sample for a ring, which takes over the one hold on the slot of the returned
+    /// index.
+    pub(crate) fn into_hold(self, stamp: RingStamp, meta: M) -> u32 {
         self.sealed(Some(stamp), meta).1
     }
 
-    /// Raises the count to 1; that hold is the caller's.
-    fn sealed(self, stamp: Option<Stamp>, meta: M) -> (Arc<Slots<M>>, u32) {
+    /// Raises the count to 1; the caller owns that hold.
+    fn sealed(self, stamp: Option<RingStamp>, meta: M) -> (Arc<Slots<M>>, u32) {
         let draft = ManuallyDrop::new(self);
         let (index, len) = (draft.index, draft.len);
         // SAFETY: moves the field out of a draft that is never dropped.
         let slots = unsafe { ptr::read(&draft.slots) };
         let slot = slots.slot(index);
         slot.seal.with_mut(|seal| {
-            // SAFETY: the count is 0 and the slot was this draft's, so nobody else looks at the
+            // SAFETY: the count is 0 and the slot is this draft's, so no other thread accesses the
             // seal.
             unsafe { (*seal).write(Seal { len, stamp, meta }) };
         });
-        // Release pairs with `pin`: who sees the count above 0 sees the seal and the bytes.
+        // Release pairs with `pin`: a thread that sees the count above 0 sees the seal and the
+        // bytes.
         slot.count.store(1, Ordering::Release);
         (slots, index)
     }
@@ -113,10 +115,10 @@ impl<M> fmt::Debug for Draft<M> {
     }
 }
 
-/// A read-only hold on a sealed sample, whose bytes never change while it lives.
+/// A read-only hold on a sealed sample, whose bytes do not change while it lives.
 ///
-/// Clones are further holds; the last one to go frees the slot. More than 2^31 holds at once, which
-/// takes leaked leases, abort the process, as they do for `Arc`.
+/// Clones are further holds; dropping the last one frees the slot. More than 2^31 holds at once,
+/// which takes leaked leases, abort the process, as for `Arc`.
 pub struct Lease<M> {
     slots: Arc<Slots<M>>,
     index: u32,
@@ -125,37 +127,37 @@ pub struct Lease<M> {
 impl<M> Lease<M> {
     /// # Safety
     ///
-    /// The caller owns a hold on the slot, and hands it over.
+    /// The caller owns a hold on the slot, and passes it on.
     pub(crate) unsafe fn new(slots: Arc<Slots<M>>, index: u32) -> Self {
         Self { slots, index }
     }
 
-    /// What the sample carries besides its bytes.
+    /// Returns the metadata of the sample.
     pub fn meta(&self) -> &M {
         &self.seal().meta
     }
 
-    /// Where the sample stands in the ring that published it; `None` if none did.
+    /// Returns the sample's position in the ring that published it; `None` without a ring.
     pub fn position(&self) -> Option<u64> {
         self.stamp().map(|stamp| stamp.position)
     }
 
-    pub(crate) fn stamp(&self) -> Option<Stamp> {
+    pub(crate) fn stamp(&self) -> Option<RingStamp> {
         self.seal().stamp
     }
 
-    /// The [`HEADROOM`] bytes and the sample as one slice.
+    /// Returns the [`HEADROOM`] bytes and the sample as one slice.
     pub fn with_headroom(&self) -> &[u8] {
         let payload = self.slots.payload(self.index);
-        // SAFETY: the headroom and the `len` bytes after it are one initialised stretch of the
-        // region, and our hold keeps writers away until `self` is dropped.
+        // SAFETY: the headroom and the `len` bytes after it are one initialised part of the region,
+        // and the hold of `self` keeps writers away until it is dropped.
         unsafe { slice::from_raw_parts(payload.sub(HEADROOM).as_ptr(), HEADROOM + self.seal().len) }
     }
 
     fn seal(&self) -> &Seal<M> {
         let seal = &self.slots.slot(self.index).seal;
-        // SAFETY: our hold keeps the count above 0: the seal is initialised, visible to us since we
-        // saw that count, and nobody writes to it until `self` is dropped.
+        // SAFETY: the hold of `self` keeps the count above 0: the seal is initialised, visible
+        // since that count was read, and not written to until `self` is dropped.
         seal.with(|seal| unsafe { (*seal).assume_init_ref() })
     }
 }
@@ -170,9 +172,9 @@ impl<M> Deref for Lease<M> {
 
 impl<M> Clone for Lease<M> {
     fn clone(&self) -> Self {
-        // Relaxed: our own hold keeps the slot as it is, and hands on what we see.
+        // Relaxed: the hold of `self` keeps the slot as it is, and its view of it is passed on.
         let before = self.slots.slot(self.index).count.fetch_add(1, Ordering::Relaxed);
-        if before >= MOST_HOLDS {
+        if before >= MAX_HOLDS {
             process::abort();
         }
         Self { slots: Arc::clone(&self.slots), index: self.index }
@@ -181,7 +183,7 @@ impl<M> Clone for Lease<M> {
 
 impl<M> Drop for Lease<M> {
     fn drop(&mut self) {
-        // SAFETY: a lease owns one hold, and ends here.
+        // SAFETY: a lease owns one hold, which ends here.
         unsafe { self.slots.release(self.index) }
     }
 }

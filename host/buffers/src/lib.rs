@@ -1,9 +1,9 @@
 //! Pre-faulted slots, counted leases on them, and rings that show the newest of them.
 //!
-//! A [`Pool`] cuts a [`Region`] into slots of one size. [`Pool::draft`] hands out a free slot as a
+//! A [`Pool`] cuts a [`Region`] into slots of one size. [`Pool::draft`] returns a free slot as a
 //! [`Draft`], which one owner fills; sealing turns it into a [`Lease`], which many may read and
-//! none may change. A ring over a pool ([`ring`]) numbers what its one [`RingWriter`] publishes 0,
-//! 1, 2, ... and shows the newest `depth` of it to any number of [`RingReader`]s on any thread.
+//! none may change. A ring over a pool ([`ring`]) numbers the samples of its one [`RingWriter`] 0,
+//! 1, 2, ... and shows the newest `depth` of them to any number of [`RingReader`]s on any thread.
 //!
 //! A sample that a reader holds keeps its bytes until the last lease on it is dropped, even after
 //! it has left the ring, and after the ring and the pool are gone. Every sample that a ring loses
@@ -30,10 +30,10 @@
 //!
 //! A ring of depth `d` whose readers hold at most `p` leases never refuses a draft, and never gives
 //! up a sample early, if it has `d + 1 + p` slots to itself. A reader inside a call counts as one
-//! lease. With fewer slots the writer takes back the oldest sample that nobody holds; that may be
+//! lease. With fewer slots the writer takes back the oldest sample without a lease; that may be
 //! the newest one, so that a reader can find the ring empty for as long as the draft takes to fill.
 //!
-//! # What never happens here
+//! # Progress
 //!
 //! Nothing blocks, and nothing is allocated after construction, except that a caller's `Vec` may
 //! grow. Publishing and evicting are wait-free. Drafting is lock-free: it repeats a step only if
@@ -52,7 +52,7 @@ mod region;
 mod ring;
 mod sync;
 
-pub use error::{PoolError, Refusal};
+pub use error::{DraftError, PoolError};
 pub use lease::{Draft, Lease};
 pub use pool::{HEADROOM, Pool};
 pub use region::{HeapRegion, Region};

@@ -1,15 +1,15 @@
-//! Slots of one size, and the count on each.
+//! Slots of one size, and a count for each.
 //!
-//! The count says who may do what. At 0 the slot is free, or one [`Draft`] owns it, and nobody else
-//! looks at its bytes. Above 0 it is sealed, and nobody writes: each [`Lease`] holds 1, and the
-//! ring that shows it holds 1. Only sealing raises the count from 0; whoever lowers it to 0 owns
-//! the slot, and frees it or drafts it again.
+//! The count controls access. At 0 the slot is free, or one [`Draft`] owns it, and no other code
+//! reads its bytes. Above 0 it is sealed and not written: each [`Lease`] holds 1, and the ring that
+//! shows it holds 1. Only sealing raises the count from 0; the holder that lowers it to 0 owns the
+//! slot, and frees it or drafts it again.
 #![allow(unsafe_code)]
 
 use std::{fmt, mem::MaybeUninit, ptr::NonNull};
 
 use crate::{
-    Draft, Lease, PoolError, Refusal, Region,
+    Draft, DraftError, Lease, PoolError, Region,
     free::FreeSet,
     sync::{Arc, AtomicU32, AtomicU64, Ordering, UnsafeCell},
 };
@@ -21,13 +21,12 @@ pub const HEADROOM: usize = 4;
 /// Alignment of each payload: a cache line, and any vector type.
 const LINE: usize = 64;
 
-/// Far below the wrap of the count, far above what anyone holds: only leaked leases get here.
-pub(crate) const MOST_HOLDS: u32 = u32::MAX / 2;
+/// Far below the overflow of the count and far above real use: only leaked leases get here.
+pub(crate) const MAX_HOLDS: u32 = u32::MAX / 2;
 
 /// Slots of one size over one region. Clones are handles to the same slots.
 ///
-/// `M` is what a sample carries besides its bytes: stamps, writer, encoding. Leases keep the pool
-/// alive.
+/// `M` is the metadata of a sample: time stamps, writer, encoding. Leases keep the pool alive.
 pub struct Pool<M>(Arc<Slots<M>>);
 
 pub(crate) struct Slots<M> {
@@ -37,9 +36,9 @@ pub(crate) struct Slots<M> {
     slot_bytes: usize,
     slots: Box<[Slot<M>]>,
     pub(crate) free: FreeSet,
-    /// Rings built over this pool so far: the source of their identities.
+    /// Number of rings built over this pool so far: the source of their identities.
     rings: AtomicU64,
-    /// Keeps the memory behind `first`.
+    /// Owns the memory behind `first`.
     _region: Box<dyn Region>,
 }
 
@@ -51,20 +50,20 @@ pub(crate) struct Slot<M> {
 
 pub(crate) struct Seal<M> {
     pub(crate) len: usize,
-    pub(crate) stamp: Option<Stamp>,
+    pub(crate) stamp: Option<RingStamp>,
     pub(crate) meta: M,
 }
 
-/// Which ring published a sample, and as which. Rings share a pool, so a position alone could be a
-/// stranger's.
+/// The ring that published a sample, and the sample's position in it. Rings share a pool, so a
+/// position alone could be that of another ring's sample.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Stamp {
+pub(crate) struct RingStamp {
     pub(crate) ring: u64,
     pub(crate) position: u64,
 }
 
 // SAFETY: the bytes and the seal of a slot are written by the one owner of its draft, and read by
-// others only after they saw its count above 0 (see the head of this file). `M` is moved in on one
+// other threads only after they saw its count above 0 (see the module docs). `M` is moved in on one
 // thread and shared from there.
 unsafe impl<M: Send + Sync> Send for Slots<M> {}
 // SAFETY: as above.
@@ -75,7 +74,7 @@ impl<M> Slots<M> {
         &self.slots[index as usize]
     }
 
-    /// First payload byte of a slot; the headroom lies before it.
+    /// Returns the first payload byte of a slot; the headroom is before it.
     pub(crate) fn payload(&self, index: u32) -> NonNull<u8> {
         assert!((index as usize) < self.slots.len());
         // SAFETY: `Pool::new` checked that the region holds `slots` strides after `first`, and
@@ -83,14 +82,14 @@ impl<M> Slots<M> {
         unsafe { self.first.add(index as usize * self.stride) }
     }
 
-    /// Gives up one hold; the last one frees the slot.
+    /// Releases one hold; the last one frees the slot.
     ///
     /// # Safety
     ///
     /// The caller owns a hold on the slot, and loses it here.
     pub(crate) unsafe fn release(&self, index: u32) {
-        // Release: what we read comes before any later write. Acquire, for the last one: what the
-        // others read, too.
+        // Release: reads by this thread come before any later write. Acquire, for the last hold: so
+        // do the reads of the other holders.
         if self.slot(index).count.fetch_sub(1, Ordering::AcqRel) == 1 {
             self.free.give(index);
         }
@@ -98,7 +97,7 @@ impl<M> Slots<M> {
 }
 
 impl<M: Copy + Send + Sync + 'static> Pool<M> {
-    /// A pool of `slots` slots, each for samples of up to `slot_bytes` bytes, all free.
+    /// Creates a pool of `slots` free slots, each for samples of up to `slot_bytes` bytes.
     ///
     /// # Errors
     ///
@@ -117,7 +116,7 @@ impl<M: Copy + Send + Sync + 'static> Pool<M> {
         if given < needed {
             return Err(PoolError::RegionTooSmall { needed, given });
         }
-        // Boxed before its address is taken: from here on it stays where it is.
+        // Boxed before its address is taken: from here on it is not moved.
         let region: Box<dyn Region> = Box::new(region);
         let address = region.base().as_ptr() as usize;
         if !address.is_multiple_of(LINE) {
@@ -137,7 +136,8 @@ impl<M: Copy + Send + Sync + 'static> Pool<M> {
         })))
     }
 
-    /// Size in bytes of the region for such a pool; `None` if no region can be that large.
+    /// Returns the size of the region for such a pool, in bytes; `None` if no region can be that
+    /// large.
     ///
     /// Every payload starts at a multiple of 64, with its headroom in the padding before it.
     pub fn bytes_needed(slots: usize, slot_bytes: usize) -> Option<usize> {
@@ -146,71 +146,74 @@ impl<M: Copy + Send + Sync + 'static> Pool<M> {
     }
 }
 
-/// Bytes from one payload to the next: itself and the headroom of the next one, rounded up to
-/// [`LINE`].
+/// Returns the bytes from one payload to the next: itself and the headroom of the next one, rounded
+/// up to [`LINE`].
 fn stride(slot_bytes: usize) -> Option<usize> {
     slot_bytes.checked_add(HEADROOM)?.checked_next_multiple_of(LINE)
 }
 
 impl<M> Pool<M> {
-    /// A free slot, cut to `len` bytes.
+    /// Returns a free slot, with `len` bytes.
     ///
     /// # Errors
     ///
-    /// [`Refusal::TooBig`] if `len` exceeds [`slot_bytes`](Self::slot_bytes); [`Refusal::NoSlot`]
-    /// if none is free. A slot that is freed while others draft may be missed.
-    pub fn draft(&self, len: usize) -> Result<Draft<M>, Refusal> {
+    /// [`DraftError::TooBig`] if `len` exceeds [`slot_bytes`](Self::slot_bytes);
+    /// [`DraftError::NoSlot`] if none is free. A slot that is freed while other threads draft may
+    /// be missed.
+    pub fn draft(&self, len: usize) -> Result<Draft<M>, DraftError> {
         let max = self.0.slot_bytes;
         if len > max {
-            return Err(Refusal::TooBig { len, max });
+            return Err(DraftError::TooBig { len, max });
         }
-        let index = self.0.free.take().ok_or(Refusal::NoSlot)?;
-        // SAFETY: out of the free set, the slot is ours alone, and `len <= slot_bytes`.
+        let index = self.0.free.take().ok_or(DraftError::NoSlot)?;
+        // SAFETY: the slot was taken out of the free set, so this call owns it, and `len <=
+        // slot_bytes`.
         Ok(unsafe { Draft::new(Arc::clone(&self.0), index, len) })
     }
 
-    /// Number of slots.
+    /// Returns the number of slots.
     pub fn slots(&self) -> usize {
         self.0.slots.len()
     }
 
-    /// Bytes that a slot holds, headroom not included.
+    /// Returns the bytes that a slot holds, without headroom.
     pub fn slot_bytes(&self) -> usize {
         self.0.slot_bytes
     }
 
-    /// Slots that nobody holds: exact while nothing else uses the pool, else out of date at once.
+    /// Returns the number of free slots: exact while no other thread uses the pool, otherwise
+    /// outdated at once.
     pub fn free(&self) -> usize {
         self.0.free.count()
     }
 
-    /// An identity for a new ring over this pool.
+    /// Returns an identity for a new ring over this pool.
     pub(crate) fn next_ring(&self) -> u64 {
         self.0.rings.fetch_add(1, Ordering::Relaxed)
     }
 
-    pub(crate) fn made(&self, draft: &Draft<M>) -> bool {
+    pub(crate) fn owns(&self, draft: &Draft<M>) -> bool {
         draft.is_of(&self.0)
     }
 
-    /// A lease on a slot, if it is sealed and carries `stamp`.
+    /// Returns a lease on a slot, if it is sealed and has `stamp`.
     ///
-    /// If this answers `None`, then all that was done before the slot lost that stamp is visible to
-    /// the caller.
-    pub(crate) fn pin(&self, index: u32, stamp: Stamp) -> Option<Lease<M>> {
-        let one_more = |count| (1..MOST_HOLDS).contains(&count).then_some(count + 1);
+    /// If it returns `None`, then all accesses before the slot lost that stamp are visible to the
+    /// caller.
+    pub(crate) fn pin(&self, index: u32, stamp: RingStamp) -> Option<Lease<M>> {
+        let one_more = |count| (1..MAX_HOLDS).contains(&count).then_some(count + 1);
         let count = &self.0.slot(index).count;
         // Acquire on success pairs with `Draft::sealed`; on failure, with what brought the count to
         // 0: `release` or `reclaim`.
         count.fetch_update(Ordering::Acquire, Ordering::Acquire, one_more).ok()?;
-        // SAFETY: we have just raised the count from above 0, and hand that hold over.
+        // SAFETY: the count was raised from above 0, and that hold goes to the lease.
         let lease = unsafe { Lease::new(Arc::clone(&self.0), index) };
-        // The slot may have been sealed anew since the caller learnt its index. Then we held a
-        // stranger's sample for a moment, and drop it here.
+        // The slot may have been sealed again after the caller read its index. Then the lease is on
+        // another sample, and is dropped here.
         (lease.stamp() == Some(stamp)).then_some(lease)
     }
 
-    /// Gives up a hold that [`Draft::into_hold`] has left.
+    /// Releases a hold that [`Draft::into_hold`] has left.
     ///
     /// # Safety
     ///
@@ -224,13 +227,13 @@ impl<M> Pool<M> {
     ///
     /// # Safety
     ///
-    /// The caller owns that hold, and loses it if a draft comes back. `len <= slot_bytes`.
+    /// The caller owns that hold, and loses it if a draft is returned. `len <= slot_bytes`.
     pub(crate) unsafe fn reclaim(&self, index: u32, len: usize) -> Option<Draft<M>> {
         let count = &self.0.slot(index).count;
-        // Acquire pairs with `release`: what former holders read comes before what the draft's
-        // owner writes. Release pairs with a `pin` that fails.
+        // Acquire pairs with `release`: reads of former holders come before writes of the draft's
+        // owner. Release pairs with a `pin` that fails.
         count.compare_exchange(1, 0, Ordering::AcqRel, Ordering::Relaxed).ok()?;
-        // SAFETY: the count is 0 and we brought it there, so the slot is ours alone; the caller
+        // SAFETY: the count is 0 and was lowered here, so this call owns the slot; the caller
         // checked `len`.
         Some(unsafe { Draft::new(Arc::clone(&self.0), index, len) })
     }
@@ -259,7 +262,7 @@ mod tests {
 
     struct Shifted(HeapRegion);
 
-    // SAFETY: all but the first byte of a region that keeps the same promises.
+    // SAFETY: all but the first byte of a region that fulfils the same promises.
     unsafe impl Region for Shifted {
         fn base(&self) -> NonNull<u8> {
             // SAFETY: the test's region has more than one byte.
@@ -272,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_region_that_starts_off_a_line_is_refused() {
+    fn an_unaligned_region_is_refused() {
         let region = Shifted(HeapRegion::zeroed(4096).unwrap());
         let address = region.base().as_ptr() as usize;
         let refused = Pool::<()>::new(region, 1, 1).unwrap_err();

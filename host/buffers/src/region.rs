@@ -1,4 +1,4 @@
-//! Memory that a pool is built over, owned by one value, and the heap as its first kind.
+//! The memory that a pool is built over, owned by one value, and the heap as its first kind.
 #![allow(unsafe_code)]
 
 use std::{
@@ -8,25 +8,25 @@ use std::{
 
 use crate::PoolError;
 
-/// The smallest page of the platforms we run on: touching more often than needed costs little, less
-/// often a fault.
+/// The smallest page of the supported platforms. Touching memory more often than needed costs
+/// little, less often a page fault.
 const PAGE: usize = 4096;
 
 /// A block of memory for a pool.
 ///
 /// # Safety
 ///
-/// For as long as the value lives, wherever it is moved: both methods give the same answer each
+/// For as long as the value lives, even if it is moved: both methods return the same value each
 /// time; the `len` bytes from `base` are initialised and valid for reads and writes from any
-/// thread; and nothing but the pool reads or writes them.
+/// thread; and only the pool reads or writes them.
 #[expect(
     clippy::len_without_is_empty,
-    reason = "a pool asks only whether the region is large enough"
+    reason = "a pool only checks that the region is large enough"
 )]
 pub unsafe trait Region: Send + Sync + 'static {
-    /// Its first byte.
+    /// Returns its first byte.
     fn base(&self) -> NonNull<u8>;
-    /// Its size in bytes.
+    /// Returns its size in bytes.
     fn len(&self) -> usize;
 }
 
@@ -38,8 +38,8 @@ pub struct HeapRegion {
 }
 
 impl HeapRegion {
-    /// `len` bytes of 0, at least 1, every page of which has been written to, so that no later
-    /// write faults one in.
+    /// Allocates `len` zeroed bytes, at least 1. Every page has been written to, so that no later
+    /// write causes a page fault.
     ///
     /// # Errors
     ///
@@ -50,17 +50,16 @@ impl HeapRegion {
         // SAFETY: the size of `layout` is at least 1.
         let base = NonNull::new(unsafe { alloc_zeroed(layout) }).ok_or(refused)?;
         for offset in (0..layout.size()).step_by(PAGE) {
-            // Volatile, because a compiler may turn a plain write of 0 to zeroed memory into
-            // nothing. SAFETY: `offset` is below the size of the block that we have just been
-            // given.
+            // Volatile, because a compiler may remove a plain write of 0 to zeroed memory. SAFETY:
+            // `offset` is below the size of the block allocated above.
             unsafe { base.add(offset).write_volatile(0) };
         }
         Ok(Self { base, layout })
     }
 }
 
-// SAFETY: the block is allocated zeroed, stays where it is until drop, and no other code of ours
-// reads or writes it.
+// SAFETY: the block is allocated zeroed, is not moved until drop, and only the pool reads or writes
+// it.
 unsafe impl Region for HeapRegion {
     fn base(&self) -> NonNull<u8> {
         self.base

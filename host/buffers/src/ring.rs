@@ -1,26 +1,26 @@
-//! The newest samples of one writer, by position.
+//! Keeps the newest samples of one writer, by position.
 //!
 //! A ring of depth `d` has `d + 1` places. A place names a slot on which the ring owns one hold, or
-//! none. The writer fills the spare place, then raises `head`, and only then empties the place of
-//! the sample that leaves. A reader that misses the newest sample therefore sees a higher `head`,
-//! or knows that the sample was evicted.
+//! is empty. The writer fills the spare place, then raises `head`, and only then empties the place
+//! of the sample that leaves. A reader that misses the newest sample therefore sees a higher
+//! `head`, or knows that the sample was evicted.
 #![allow(unsafe_code)]
 
 use std::{error::Error, fmt};
 
 use crate::{
-    Draft, Lease, Pool, PoolError, Refusal,
-    pool::Stamp,
+    Draft, DraftError, Lease, Pool, PoolError,
+    pool::RingStamp,
     sync::{Arc, AtomicU32, AtomicU64, Ordering},
 };
 
 /// A place without a slot. Pools have fewer than 2^31 slots.
 const EMPTY: u32 = u32::MAX;
 
-/// A ring that shows the newest `depth` samples, over slots of `pool`.
+/// Creates a ring that shows the newest `depth` samples, over slots of `pool`.
 ///
-/// Rings may share a pool; each evicts only its own samples. See the crate's page for how many
-/// slots are enough.
+/// Rings may share a pool; each evicts only its own samples. The crate docs state how many slots
+/// are enough.
 ///
 /// # Errors
 ///
@@ -30,7 +30,7 @@ pub fn ring<M>(pool: Pool<M>, depth: usize) -> Result<(RingWriter<M>, RingReader
     if depth == 0 || depth > slots {
         return Err(PoolError::Depth { depth, slots });
     }
-    let shared = Arc::new(Shared {
+    let shared = Arc::new(RingState {
         id: pool.next_ring(),
         pool,
         places: (0..=depth).map(|_| AtomicU32::new(EMPTY)).collect(),
@@ -43,7 +43,7 @@ pub fn ring<M>(pool: Pool<M>, depth: usize) -> Result<(RingWriter<M>, RingReader
     Ok((writer, RingReader(shared)))
 }
 
-/// What a ring has received and lost since it was built. No count ever falls.
+/// Numbers of samples that a ring has received and lost since it was built. They never decrease.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RingCounts {
     /// Samples published.
@@ -56,7 +56,8 @@ pub struct RingCounts {
     pub too_big: u64,
 }
 
-/// A draft of another pool than the ring's: it is handed back, and nothing was published.
+/// The error for a draft of another pool than the ring's: it is returned, and nothing was
+/// published.
 pub struct ForeignDraft<M>(pub Draft<M>);
 
 impl<M> fmt::Debug for ForeignDraft<M> {
@@ -73,10 +74,10 @@ impl<M> fmt::Display for ForeignDraft<M> {
 
 impl<M> Error for ForeignDraft<M> {}
 
-struct Shared<M> {
+struct RingState<M> {
     id: u64,
     pool: Pool<M>,
-    /// Changed by the one writer only, and after it by drop.
+    /// Changed by the one writer only, and on drop.
     places: Box<[AtomicU32]>,
     /// Number of samples published. Changed by the writer only, as are the counts.
     head: AtomicU64,
@@ -85,7 +86,7 @@ struct Shared<M> {
     too_big: AtomicU64,
 }
 
-impl<M> Shared<M> {
+impl<M> RingState<M> {
     fn depth(&self) -> u64 {
         self.places.len() as u64 - 1
     }
@@ -94,70 +95,71 @@ impl<M> Shared<M> {
         &self.places[(position % self.places.len() as u64) as usize]
     }
 
-    /// The sample of a position below a `head` that the caller has loaded, if it is still there.
+    /// Returns the sample at a position below a `head` that the caller has loaded, if it is still
+    /// there.
     fn at(&self, position: u64) -> Option<Lease<M>> {
         // That load of `head` shows the place as it was filled, or later. Acquire shows why the
         // sample left: see `newest_at`.
         let index = self.place(position).load(Ordering::Acquire);
-        let stamp = Stamp { ring: self.id, position };
+        let stamp = RingStamp { ring: self.id, position };
         (index != EMPTY).then(|| self.pool.pin(index, stamp))?
     }
 
-    /// Counts a sample that has left. Release, so that who sees the count sees the `head` that it
-    /// belongs to.
+    /// Counts a sample that has left. Release: a thread that sees the count also sees the matching
+    /// `head`.
     fn count_overwritten(&self) {
         self.overwritten.fetch_add(1, Ordering::Release);
     }
 }
 
-impl<M> Drop for Shared<M> {
+impl<M> Drop for RingState<M> {
     fn drop(&mut self) {
         for place in &self.places {
             let index = place.load(Ordering::Relaxed);
             if index != EMPTY {
-                // SAFETY: a place that is not empty stands for one hold, and nobody uses the places
-                // any more.
+                // SAFETY: a place that is not empty stands for one hold, and no other code uses the
+                // places any more.
                 unsafe { self.pool.release(index) };
             }
         }
     }
 }
 
-/// The writing end of a ring. There is one, so every method that writes takes `&mut self`.
+/// The writing end of a ring. There is only one, so every method that writes takes `&mut self`.
 ///
 /// Samples stay readable after it is dropped.
 pub struct RingWriter<M> {
-    shared: Arc<Shared<M>>,
+    shared: Arc<RingState<M>>,
     /// The writer's own copy of the shared `head`.
     head: u64,
 }
 
 impl<M> RingWriter<M> {
-    /// A slot for the next sample, `len` bytes: a free one, else that of the oldest sample which
-    /// nobody holds.
+    /// Drafts a slot of `len` bytes for the next sample: a free one, otherwise that of the oldest
+    /// sample without a lease.
     ///
-    /// A sample evicted in this way is counted and gone, even if the draft is dropped.
+    /// A sample evicted in this way is counted and lost, even if the draft is dropped.
     ///
     /// # Errors
     ///
-    /// [`Refusal::TooBig`] and, if none is free and all samples of this ring are held,
-    /// [`Refusal::NoSlot`]; both are counted. A reader that looks at a sample holds it for an
-    /// instant.
-    pub fn draft(&mut self, len: usize) -> Result<Draft<M>, Refusal> {
-        let drafted = self.shared.pool.draft(len).or_else(|refusal| match refusal {
-            Refusal::NoSlot => self.evict(len).ok_or(refusal),
-            Refusal::TooBig { .. } => Err(refusal),
+    /// [`DraftError::TooBig`] and, if no slot is free and all samples of this ring are held,
+    /// [`DraftError::NoSlot`]; both are counted. A reader holds a sample for an instant while it
+    /// looks for it.
+    pub fn draft(&mut self, len: usize) -> Result<Draft<M>, DraftError> {
+        let drafted = self.shared.pool.draft(len).or_else(|error| match error {
+            DraftError::NoSlot => self.evict(len).ok_or(error),
+            DraftError::TooBig { .. } => Err(error),
         });
         let counter = match drafted {
             Ok(_) => return drafted,
-            Err(Refusal::NoSlot) => &self.shared.no_slot,
-            Err(Refusal::TooBig { .. }) => &self.shared.too_big,
+            Err(DraftError::NoSlot) => &self.shared.no_slot,
+            Err(DraftError::TooBig { .. }) => &self.shared.too_big,
         };
         counter.fetch_add(1, Ordering::Relaxed);
         drafted
     }
 
-    /// Drafts the slot of the oldest sample of this ring that nobody holds.
+    /// Drafts the slot of the oldest sample of this ring without a lease.
     fn evict(&mut self, len: usize) -> Option<Draft<M>> {
         let ring = &*self.shared;
         for position in self.head.saturating_sub(ring.depth())..self.head {
@@ -166,7 +168,7 @@ impl<M> RingWriter<M> {
             if index == EMPTY {
                 continue;
             }
-            // SAFETY: a place that is not empty stands for one hold, we are the only writer, and
+            // SAFETY: a place that is not empty stands for one hold, there is no other writer, and
             // the place is emptied as soon as that hold is gone. `Pool::draft` has checked `len`.
             if let Some(draft) = unsafe { ring.pool.reclaim(index, len) } {
                 place.store(EMPTY, Ordering::Release);
@@ -177,7 +179,7 @@ impl<M> RingWriter<M> {
         None
     }
 
-    /// Shows a sample to the readers, and answers its position: 0, 1, 2, ...
+    /// Publishes a sample to the readers, and returns its position: 0, 1, 2, ...
     ///
     /// The sample `depth` positions before it leaves the ring, and is counted unless it was evicted
     /// before. Its slot returns to the pool with the last lease on it.
@@ -187,20 +189,21 @@ impl<M> RingWriter<M> {
     /// [`ForeignDraft`] if the draft is of another pool.
     pub fn publish(&mut self, draft: Draft<M>, meta: M) -> Result<u64, ForeignDraft<M>> {
         let ring = &*self.shared;
-        if !ring.pool.made(&draft) {
+        if !ring.pool.owns(&draft) {
             return Err(ForeignDraft(draft));
         }
         let position = self.head;
-        let stamp = Stamp { ring: ring.id, position };
+        let stamp = RingStamp { ring: ring.id, position };
         let index = draft.into_hold(stamp, meta);
         // The spare place: its last sample left when `position - 1` was published. Release pairs
-        // with `at`: a reader that still looks for that sample, and finds this one, also finds the
-        // `head` of then.
+        // with `at`: a reader that looks for that sample and finds this one also sees the `head` of
+        // that time.
         ring.place(position).store(index, Ordering::Release);
         self.head = position + 1;
         ring.head.store(self.head, Ordering::Release);
         if let Some(leaving) = position.checked_sub(ring.depth()) {
-            // Release pairs with `at`: who finds the place empty also finds the `head` of now.
+            // Release pairs with `at`: a reader that finds the place empty also sees the current
+            // `head`.
             let index = ring.place(leaving).swap(EMPTY, Ordering::Release);
             if index != EMPTY {
                 // SAFETY: the place stood for one hold, and has just been emptied.
@@ -222,38 +225,37 @@ impl<M> fmt::Debug for RingWriter<M> {
 }
 
 /// A reading end of a ring; clones read the same ring, each from any thread.
-pub struct RingReader<M>(Arc<Shared<M>>);
+pub struct RingReader<M>(Arc<RingState<M>>);
 
 impl<M> RingReader<M> {
-    /// Number of samples published so far: the position that the next one will have.
+    /// Returns the number of samples published so far: the position of the next one.
     pub fn head(&self) -> u64 {
         self.0.head.load(Ordering::Acquire)
     }
 
-    /// Number of samples that the ring shows at most.
+    /// Returns the maximum number of samples in the ring.
     pub fn depth(&self) -> usize {
         self.0.places.len() - 1
     }
 
-    /// The sample at `position`; `None` if it has left the ring, or is not published yet.
+    /// Returns the sample at `position`; `None` if it has left the ring, or is not published yet.
     pub fn get(&self, position: u64) -> Option<Lease<M>> {
         let age = self.head().checked_sub(position)?;
         (1..=self.0.depth()).contains(&age).then(|| self.0.at(position))?
     }
 
-    /// The newest sample; `None` only if there was a moment during the call at which the ring
-    /// showed none.
+    /// Returns the newest sample; `None` only if the ring was empty at some moment during the call.
     ///
-    /// A sample that leaves while we look for it either was evicted, and then the one before it is
-    /// the newest, or was followed by others; then we see a higher `head` and start there. Each new
-    /// start is paid for by a sample that was published during the call, and at most `depth` looks
-    /// lie between two, so the call ends unless the writer is forever as fast as the few
-    /// instructions of one look.
+    /// A sample that leaves during the call either was evicted, and then the one before it is the
+    /// newest, or was followed by others; then `head` is higher and the search restarts there. Each
+    /// restart takes a sample that was published during the call, and between two restarts there
+    /// are at most `depth` steps. So the call ends unless the writer is forever as fast as the few
+    /// instructions of a step.
     pub fn newest(&self) -> Option<Lease<M>> {
         self.newest_before(u64::MAX)
     }
 
-    /// As [`RingReader::newest`], of the samples at positions below `end`.
+    /// As [`RingReader::newest`], among the samples at positions below `end`.
     pub fn newest_before(&self, end: u64) -> Option<Lease<M>> {
         self.newest_at(end).map(|(lease, _)| lease)
     }
@@ -266,9 +268,9 @@ impl<M> RingReader<M> {
             if let Some(lease) = self.0.at(position) {
                 return Some((lease, position));
             }
-            // Place or count told us, by an Acquire load, that the sample is gone. What the writer
-            // did before it took the sample away is therefore visible: a publication that replaced
-            // it, or went before its eviction, had raised `head`, and this load sees it.
+            // The place or the count showed, by an Acquire load, that the sample is gone. So all
+            // that the writer did before is visible: a publication that replaced the sample, or
+            // preceded its eviction, raised `head`, and this load sees it.
             let now = self.head().min(end);
             back = if now == head { back + 1 } else { 1 };
             head = now;
@@ -278,12 +280,12 @@ impl<M> RingReader<M> {
 
     /// Fills `out` with the newest `n` samples, fewer if the ring has fewer, oldest first.
     ///
-    /// Samples that leave the ring during the call may be missing, the newest one never is.
+    /// Samples that leave the ring during the call may be missing, but never the newest one.
     pub fn last(&self, n: usize, out: &mut Vec<Lease<M>>) {
         self.newest_while(n, |_| true, out);
     }
 
-    /// As [`RingReader::last`], of the samples at positions below `end`.
+    /// As [`RingReader::last`], among the samples at positions below `end`.
     pub fn last_before(&self, end: u64, n: usize, out: &mut Vec<Lease<M>>) {
         self.newest_while_before(end, n, |_| true, out);
     }
@@ -291,12 +293,12 @@ impl<M> RingReader<M> {
     /// Fills `out` with the newest samples, at most `max`, back to the first one that `keep`
     /// refuses; oldest first.
     ///
-    /// Positions that were evicted are passed over. `keep` is asked newest first.
+    /// Evicted positions are skipped. `keep` is called newest first.
     pub fn newest_while(&self, max: usize, keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
         self.newest_while_before(u64::MAX, max, keep, out);
     }
 
-    /// As [`RingReader::newest_while`], of the samples at positions below `end`.
+    /// As [`RingReader::newest_while`], among the samples at positions below `end`.
     pub fn newest_while_before(
         &self,
         end: u64,
@@ -319,7 +321,7 @@ impl<M> RingReader<M> {
         out.reverse();
     }
 
-    /// What the ring has received and lost.
+    /// Returns the counts of received and lost samples.
     pub fn counts(&self) -> RingCounts {
         // First `overwritten`, then `received`, so that the difference is never negative.
         let overwritten = self.0.overwritten.load(Ordering::Acquire);

@@ -1,4 +1,4 @@
-//! The one place that chooses between std and loom.
+//! Chooses between the atomics of std and of loom.
 
 #[cfg(loom)]
 pub(crate) use loom::{
@@ -12,7 +12,7 @@ pub(crate) use std::sync::{
     atomic::{AtomicU32, AtomicU64, Ordering},
 };
 
-/// std's cell behind loom's interface, which reports each access to the model.
+/// The cell of std with the interface of loom's, which reports each access to the model.
 #[cfg(not(loom))]
 pub(crate) struct UnsafeCell<T>(std::cell::UnsafeCell<T>);
 

@@ -1,5 +1,4 @@
-//! What a ring shows, by the calls and answers of `rules/cases`: this ring gives them without a
-//! lock.
+//! Checks that a ring gives the answers of `rules/cases`, without a lock.
 #![cfg(not(loom))]
 
 use std::collections::BTreeMap;
@@ -8,7 +7,7 @@ use gleaner_buffers::{HeapRegion, Pool, RingCounts, ring};
 use serde_json::{Value, json};
 
 #[test]
-fn a_ring_answers_as_the_rules_have_it() {
+fn a_ring_answers_as_in_the_cases_of_the_rules() {
     let cases: Vec<Value> =
         serde_json::from_str(include_str!("../../../rules/cases/ring.json")).unwrap();
     for case in &cases {
@@ -25,7 +24,7 @@ fn a_ring_answers_as_the_rules_have_it() {
             let answer = match call[0].as_str().unwrap() {
                 "push" => {
                     if let Ok(draft) = writer.draft(given as usize) {
-                        // A sample is its own time.
+                        // A sample's time is its position.
                         writer.publish(draft, reader.head() as i64).unwrap();
                     }
                     Value::Null

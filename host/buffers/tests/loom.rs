@@ -1,10 +1,10 @@
-//! The steps that race, in every order with up to three preemptions.
+//! Tests the racing steps, in every order with up to three preemptions.
 //!
 //! Run with `RUSTFLAGS="--cfg loom" LOOM_MAX_PREEMPTIONS=3 cargo test --release --test loom`.
 //!
-//! Loom runs the first thread as far as it gets, and looks back from what the others do. It can
-//! overlook that a load may come after another thread's load and store, so the writer is always the
-//! first thread, and readers the others.
+//! Loom runs the first thread as far as possible, and explores the steps of the others from there.
+//! It can miss that a load comes after another thread's load and store, so the writer is always the
+//! first thread.
 #![cfg(loom)]
 
 use gleaner_buffers::{HeapRegion, Lease, Pool, RingReader, RingWriter, ring};
@@ -15,7 +15,7 @@ fn pool(slots: usize) -> Pool<u64> {
     Pool::new(HeapRegion::zeroed(bytes).unwrap(), slots, 8).unwrap()
 }
 
-/// Publishes `value` as bytes and as meta; false if there was no slot.
+/// Publishes `value` as bytes and as metadata; returns false if there was no slot.
 fn publish(writer: &mut RingWriter<u64>, value: u64) -> bool {
     let Ok(mut draft) = writer.draft(8) else {
         return false;
@@ -25,7 +25,7 @@ fn publish(writer: &mut RingWriter<u64>, value: u64) -> bool {
     true
 }
 
-/// Reads a sample twice, with steps in between at which others may run.
+/// Reads a sample twice, with steps in between at which other threads may run.
 fn value(lease: &Lease<u64>) -> u64 {
     let value = *lease.meta();
     assert_eq!(**lease, value.to_le_bytes());
@@ -64,8 +64,8 @@ fn newest_never_misses_although_its_place_holds_a_slot_used_for_the_first_time()
     loom::model(|| {
         let (mut writer, reader) = ring(pool(3), 1).unwrap();
         publish(&mut writer, 0);
-        // Pinned, its slot does not come back: 2 goes to the place of 0, but to a slot that no
-        // reader has met.
+        // A pinned slot is not reused: 2 goes to the place of 0, but to a slot that no reader has
+        // seen.
         let pinned = reader.get(0).unwrap();
         let reading = thread::spawn(move || drop(reader.newest().unwrap()));
         assert!(publish(&mut writer, 1));
@@ -76,7 +76,7 @@ fn newest_never_misses_although_its_place_holds_a_slot_used_for_the_first_time()
 }
 
 #[test]
-fn what_head_announces_can_be_read() {
+fn a_position_below_head_can_be_read() {
     loom::model(|| {
         let (mut writer, reader) = ring(pool(3), 2).unwrap();
         let reading = thread::spawn(move || {
@@ -112,7 +112,7 @@ fn a_sample_is_either_pinned_or_evicted() {
 }
 
 #[test]
-fn a_sample_evicted_after_a_newer_one_came_does_not_hide_the_newer_one() {
+fn evicting_a_sample_does_not_hide_a_newer_one() {
     loom::model(|| {
         let (mut writer, reader) = ring(pool(3), 3).unwrap();
         publish(&mut writer, 0);
@@ -131,7 +131,7 @@ fn a_sample_evicted_after_a_newer_one_came_does_not_hide_the_newer_one() {
 }
 
 #[test]
-fn a_slot_is_released_once_and_drafted_by_one() {
+fn a_slot_is_released_once_and_has_one_draft() {
     fn draft_one(pool: &Pool<u64>, value: u64) {
         let Ok(mut draft) = pool.draft(8) else { return };
         draft.copy_from_slice(&value.to_le_bytes());
@@ -158,7 +158,7 @@ fn a_slot_is_released_once_and_drafted_by_one() {
 }
 
 #[test]
-fn a_reader_never_takes_a_sample_of_another_ring_for_its_own() {
+fn a_reader_never_returns_a_sample_of_another_ring() {
     loom::model(|| {
         let pool = pool(1);
         let (mut ours, reader) = ring(pool.clone(), 1).unwrap();
@@ -168,8 +168,8 @@ fn a_reader_never_takes_a_sample_of_another_ring_for_its_own() {
             let seen = reader.get(0).map(|lease| value(&lease));
             assert!(seen.is_none_or(|value| value == 7));
         });
-        // Evicts ours at position 0, frees the slot, and publishes in it at position 0 of the other
-        // ring.
+        // Evicts the sample of this ring at position 0, frees the slot, and publishes in it at
+        // position 0 of the other ring.
         drop(ours.draft(8));
         publish(&mut others, 8);
         reading.join().unwrap();
@@ -177,7 +177,7 @@ fn a_reader_never_takes_a_sample_of_another_ring_for_its_own() {
 }
 
 #[test]
-fn a_reader_never_takes_a_later_sample_for_the_one_it_asked_for() {
+fn a_reader_never_returns_a_later_sample_than_requested() {
     loom::model(|| {
         let (mut writer, reader) = ring(pool(2), 1).unwrap();
         publish(&mut writer, 0);

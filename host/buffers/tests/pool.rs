@@ -1,7 +1,9 @@
-//! Pools, drafts and leases through the public interface.
+//! Tests pools, drafts and leases through the public interface.
 #![cfg(not(loom))]
 
-use gleaner_buffers::{Draft, HeapRegion, Lease, Pool, PoolError, Refusal, RingReader, RingWriter};
+use gleaner_buffers::{
+    Draft, DraftError, HeapRegion, Lease, Pool, PoolError, RingReader, RingWriter,
+};
 
 fn pool(slots: usize, slot_bytes: usize) -> Pool<u32> {
     let bytes = Pool::<u32>::bytes_needed(slots, slot_bytes).unwrap();
@@ -15,7 +17,7 @@ fn sealed(pool: &Pool<u32>, bytes: &[u8], meta: u32) -> Lease<u32> {
 }
 
 #[test]
-fn a_draft_has_the_length_asked_for_and_may_be_cut_shorter() {
+fn a_draft_has_the_requested_length_and_can_be_truncated() {
     let pool = pool(1, 8);
     let mut draft = pool.draft(8).unwrap();
     draft.copy_from_slice(b"12345678");
@@ -26,18 +28,18 @@ fn a_draft_has_the_length_asked_for_and_may_be_cut_shorter() {
 }
 
 #[test]
-fn a_dropped_draft_gives_its_slot_back() {
+fn a_dropped_draft_frees_its_slot() {
     let pool = pool(1, 8);
     let draft = pool.draft(1).unwrap();
     assert_eq!(pool.free(), 0);
-    assert_eq!(pool.draft(1).unwrap_err(), Refusal::NoSlot);
+    assert_eq!(pool.draft(1).unwrap_err(), DraftError::NoSlot);
     drop(draft);
     assert_eq!(pool.free(), 1);
     assert!(pool.draft(1).is_ok());
 }
 
 #[test]
-fn the_last_lease_gives_the_slot_back() {
+fn the_last_lease_frees_the_slot() {
     let pool = pool(2, 8);
     let first = sealed(&pool, b"abc", 7);
     let second = first.clone();
@@ -57,9 +59,9 @@ fn a_lease_outlives_its_pool() {
 
 #[test]
 fn a_sample_larger_than_a_slot_is_refused_with_both_sizes() {
-    let refusal = pool(1, 8).draft(9).unwrap_err();
-    assert_eq!(refusal, Refusal::TooBig { len: 9, max: 8 });
-    assert_eq!(refusal.to_string(), "sample of 9 bytes; a slot holds 8 bytes");
+    let error = pool(1, 8).draft(9).unwrap_err();
+    assert_eq!(error, DraftError::TooBig { len: 9, max: 8 });
+    assert_eq!(error.to_string(), "sample of 9 bytes; a slot holds 8 bytes");
 }
 
 #[test]
@@ -94,13 +96,13 @@ fn full_slots_and_headrooms_do_not_overlap() {
 #[test]
 fn a_region_one_byte_short_is_refused_with_both_sizes() {
     let needed = Pool::<()>::bytes_needed(3, 100).unwrap();
-    // A line for the first headroom, and 104 bytes rounded up to two lines for each slot.
+    // A cache line for the first headroom, and 104 bytes rounded up to two lines for each slot.
     assert_eq!(needed, 64 + 3 * 128);
     let region = HeapRegion::zeroed(needed - 1).unwrap();
-    let refused = Pool::<()>::new(region, 3, 100).unwrap_err();
+    let error = Pool::<()>::new(region, 3, 100).unwrap_err();
     let given = needed - 1;
-    assert_eq!(refused, PoolError::RegionTooSmall { needed, given });
-    assert_eq!(refused.to_string(), "pool needs a region of 448 bytes; it was given 447 bytes");
+    assert_eq!(error, PoolError::RegionTooSmall { needed, given });
+    assert_eq!(error.to_string(), "pool needs a region of 448 bytes; it was given 447 bytes");
 }
 
 #[test]
@@ -108,8 +110,8 @@ fn sizes_that_overflow_are_refused() {
     let most = usize::MAX;
     for (slots, slot_bytes) in [(1, most), (1, most - 3), (1, most / 2), (1 << 30, most >> 30)] {
         let region = HeapRegion::zeroed(64).unwrap();
-        let refused = Pool::<()>::new(region, slots, slot_bytes).unwrap_err();
-        assert_eq!(refused, PoolError::TooLarge { slots, slot_bytes });
+        let error = Pool::<()>::new(region, slots, slot_bytes).unwrap_err();
+        assert_eq!(error, PoolError::TooLarge { slots, slot_bytes });
         assert_eq!(Pool::<()>::bytes_needed(slots, slot_bytes), None);
     }
 }
@@ -118,8 +120,8 @@ fn sizes_that_overflow_are_refused() {
 fn a_pool_of_no_slots_or_too_many_is_refused() {
     for slots in [0, 1 << 31, usize::MAX] {
         let region = HeapRegion::zeroed(64).unwrap();
-        let refused = Pool::<()>::new(region, slots, 1).unwrap_err();
-        assert_eq!(refused, PoolError::SlotCount { slots });
+        let error = Pool::<()>::new(region, slots, 1).unwrap_err();
+        assert_eq!(error, PoolError::SlotCount { slots });
     }
 }
 

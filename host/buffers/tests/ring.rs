@@ -1,8 +1,8 @@
-//! Rings through the public interface, one thread at a time.
+//! Tests rings through the public interface, one thread at a time.
 #![cfg(not(loom))]
 
 use gleaner_buffers::{
-    HeapRegion, Lease, Pool, PoolError, Refusal, RingCounts, RingReader, RingWriter, ring,
+    DraftError, HeapRegion, Lease, Pool, PoolError, RingCounts, RingReader, RingWriter, ring,
 };
 
 fn pool(slots: usize) -> Pool<u64> {
@@ -10,7 +10,7 @@ fn pool(slots: usize) -> Pool<u64> {
     Pool::new(HeapRegion::zeroed(bytes).unwrap(), slots, 8).unwrap()
 }
 
-/// A ring whose samples carry their position, as bytes and as meta.
+/// Creates a ring whose samples contain their position, as bytes and as metadata.
 fn ring_of(slots: usize, depth: usize) -> (RingWriter<u64>, RingReader<u64>) {
     ring(pool(slots), depth).unwrap()
 }
@@ -72,7 +72,7 @@ fn a_full_ring_drops_its_oldest_sample() {
 }
 
 #[test]
-fn the_last_n_come_oldest_first_and_replace_what_was_in_the_vec() {
+fn the_last_n_are_oldest_first_and_replace_the_content_of_the_vec() {
     let (mut writer, reader) = ring_of(5, 4);
     for sample in 0..6 {
         publish(&mut writer, sample);
@@ -162,8 +162,8 @@ fn when_every_sample_is_pinned_a_draft_is_refused_and_counted() {
     publish(&mut writer, 1);
     let mut pinned = Vec::new();
     reader.last(2, &mut pinned);
-    assert_eq!(writer.draft(8).unwrap_err(), Refusal::NoSlot);
-    assert_eq!(writer.draft(8).unwrap_err(), Refusal::NoSlot);
+    assert_eq!(writer.draft(8).unwrap_err(), DraftError::NoSlot);
+    assert_eq!(writer.draft(8).unwrap_err(), DraftError::NoSlot);
     assert_eq!(reader.counts().no_slot, 2);
     assert_eq!(reader.counts().overwritten, 0);
     pinned.remove(0);
@@ -175,8 +175,8 @@ fn when_every_sample_is_pinned_a_draft_is_refused_and_counted() {
 fn a_sample_too_big_is_refused_and_counted_and_evicts_nothing() {
     let (mut writer, reader) = ring_of(1, 1);
     publish(&mut writer, 0);
-    let refusal = Refusal::TooBig { len: 9, max: 8 };
-    assert_eq!(writer.draft(9).unwrap_err(), refusal);
+    let error = DraftError::TooBig { len: 9, max: 8 };
+    assert_eq!(writer.draft(9).unwrap_err(), error);
     assert_eq!(last(&reader, 1), [0]);
     let expected = RingCounts { received: 1, too_big: 1, ..RingCounts::default() };
     assert_eq!(reader.counts(), expected);
@@ -189,13 +189,13 @@ fn a_ring_evicts_only_its_own_samples() {
     let (mut other, other_reader) = ring(pool, 1).unwrap();
     publish(&mut full, 0);
     publish(&mut full, 1);
-    assert_eq!(other.draft(8).unwrap_err(), Refusal::NoSlot);
+    assert_eq!(other.draft(8).unwrap_err(), DraftError::NoSlot);
     assert_eq!(last(&full_reader, 2), [0, 1]);
     assert_eq!(other_reader.counts().no_slot, 1);
 }
 
 #[test]
-fn a_draft_of_the_rings_pool_can_be_published_and_one_of_another_pool_comes_back() {
+fn a_draft_of_another_pool_is_returned_and_not_published() {
     let pool_a = pool(2);
     let (mut writer, reader) = ring(pool_a.clone(), 1).unwrap();
     assert_eq!(writer.publish(pool_a.draft(0).unwrap(), 0).unwrap(), 0);
@@ -217,7 +217,7 @@ fn samples_outlive_the_writer_and_leases_outlive_ring_and_pool() {
     let lease = reader.newest().unwrap();
     assert_eq!(last(&reader, 2), [0, 1]);
     drop(reader);
-    assert_eq!(pool.free(), 2, "a ring that is gone holds nothing");
+    assert_eq!(pool.free(), 2, "a dropped ring holds nothing");
     drop(pool);
     assert_eq!(value(&lease), 1);
 }
@@ -225,13 +225,13 @@ fn samples_outlive_the_writer_and_leases_outlive_ring_and_pool() {
 #[test]
 fn a_depth_of_zero_or_beyond_the_pool_is_refused() {
     for depth in [0, 3, usize::MAX] {
-        let refused = ring(pool(2), depth).unwrap_err();
-        assert_eq!(refused, PoolError::Depth { depth, slots: 2 });
+        let error = ring(pool(2), depth).unwrap_err();
+        assert_eq!(error, PoolError::Depth { depth, slots: 2 });
     }
 }
 
 #[test]
-fn a_reader_can_be_kept_from_what_came_after_a_position() {
+fn a_reader_can_be_limited_to_samples_before_a_position() {
     let (mut writer, reader) = ring_of(6, 4);
     for sample in 0..5 {
         publish(&mut writer, sample);
@@ -245,7 +245,7 @@ fn a_reader_can_be_kept_from_what_came_after_a_position() {
     assert_eq!(before(4, 2), [2, 3]);
     assert_eq!(before(9, 2), [3, 4]);
     assert_eq!(reader.newest_before(4).as_ref().map(value), Some(3));
-    // What has left the ring does not come back.
+    // A sample that has left the ring does not come back.
     assert!(
         before(1, 9).is_empty()
             && reader.newest_before(1).is_none()

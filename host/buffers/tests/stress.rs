@@ -1,5 +1,5 @@
-//! Rings on real threads: what readers see is whole, in order, and accounted for. Bounded by
-//! counts, not by time.
+//! Tests rings on real threads: readers see whole samples, in order, and all are counted. Bounded
+//! by counts, not by time.
 #![cfg(not(loom))]
 
 use std::{
@@ -7,12 +7,12 @@ use std::{
     thread,
 };
 
-use gleaner_buffers::{HeapRegion, Lease, Pool, Refusal, RingReader, RingWriter, ring};
+use gleaner_buffers::{DraftError, HeapRegion, Lease, Pool, RingReader, RingWriter, ring};
 
 const SAMPLES: u64 = if cfg!(miri) { 60 } else { 100_000 };
 const SLOT_BYTES: usize = 96;
 
-/// What a sample must contain: its ring, and its position in it.
+/// Expected content of a sample: its ring, and its position in it.
 #[derive(Clone, Copy)]
 struct Meta {
     ring: u64,
@@ -49,15 +49,14 @@ fn write_all(mut writer: RingWriter<Meta>, ring: u64) -> u64 {
                 assert_eq!(writer.publish(draft, meta).unwrap(), position);
                 position += 1;
             }
-            Err(Refusal::NoSlot) => refused += 1,
-            Err(refusal) => panic!("{refusal}"),
+            Err(DraftError::NoSlot) => refused += 1,
+            Err(error) => panic!("{error}"),
         }
     }
     refused
 }
 
-/// Reads until `writers` is 0, holding up to three samples; `turn` sets readers apart from each
-/// other.
+/// Reads until `writers` is 0, holding up to three samples; `turn` makes readers differ.
 fn read_all(reader: &RingReader<Meta>, ring: u64, turn: u64, writers: &AtomicUsize) {
     let mut held: Vec<Lease<Meta>> = Vec::new();
     let mut batch = Vec::new();
@@ -94,7 +93,7 @@ fn read_all(reader: &RingReader<Meta>, ring: u64, turn: u64, writers: &AtomicUsi
     }
 }
 
-/// Two rings on one pool, two readers each.
+/// Runs two rings on one pool, with two readers each.
 fn stress(slots: usize, depth: usize) {
     let bytes = Pool::<Meta>::bytes_needed(slots, SLOT_BYTES).unwrap();
     let region = HeapRegion::zeroed(bytes).unwrap();
@@ -132,7 +131,7 @@ fn readers_see_whole_samples_in_order_when_slots_are_scarce() {
 }
 
 #[test]
-fn a_ring_with_enough_slots_is_never_found_empty_and_refuses_nothing() {
+fn a_ring_with_enough_slots_is_never_empty_and_refuses_no_draft() {
     // Depth, one draft, and one pin for each reader.
     let slots = 1 + 1 + 2;
     let bytes = Pool::<u64>::bytes_needed(slots, 8).unwrap();
