@@ -1,28 +1,28 @@
-//! Why an image cannot be read, in the words that a user sees.
+//! Errors of reading an image, worded for users.
 
 use gleaner_rules::pixels::{PixelError, PixelErrorKind};
 use gleaner_rules::refused;
 use gleaner_rules::text::Rounded;
 
-use super::{Format, Header};
+use super::{Format, ImageHeader};
 
-/// An image, or a request about one, that makes no sense or costs too much.
+/// An image, or a request about one, that is invalid or too expensive.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ImageError {
-    /// Pixels that are no image, an operation on them without a result, or one that the caller
-    /// ended.
+    /// Pixels that are not an image, an operation on them without a result, or one that the caller
+    /// stopped.
     #[error(transparent)]
     Pixels(#[from] PixelError),
-    /// Bytes that are no image file.
+    /// Bytes that are not an image file.
     #[error("data is neither JPEG nor PNG: its {len} bytes start with {start:02x?}")]
     NotAnImage {
-        /// Bytes that are there.
+        /// Number of bytes.
         len: usize,
         /// The first eight of them.
         start: Vec<u8>,
     },
-    /// A file which is small, of an image which is not.
+    /// A small file of a huge image.
     #[error("{}", refused::too_many_pixels((*width, *height), *needed, *allowed as u64))]
     Bomb {
         /// Pixels per row.
@@ -35,9 +35,13 @@ pub enum ImageError {
         allowed: usize,
     },
     /// A file whose decoder would need far more memory than its pixels.
-    #[error("{format} of {width}x{height} needs {} to decode, besides its pixels; {} is allowed", Rounded::up(*needed), Rounded::down(*allowed as u64))]
+    #[error(
+        "{format} of {width}x{height} needs {} to decode, besides its pixels; {} is allowed",
+        Rounded::up(*needed),
+        Rounded::down(*allowed as u64)
+    )]
     WorkingMemory {
-        /// What the file is.
+        /// Format of the file.
         format: Format,
         /// Pixels per row.
         width: u32,
@@ -45,67 +49,67 @@ pub enum ImageError {
         height: u32,
         /// Bytes that the decoder would allocate.
         needed: u64,
-        /// Bytes that it may.
+        /// Bytes allowed.
         allowed: usize,
     },
-    /// The bytes are not those whose header was read.
-    #[error("{found} where a {expected} was announced")]
+    /// The header does not match the bytes.
+    #[error("{found} where a {expected} was expected")]
     OtherImage {
-        /// The header that the caller brought.
-        expected: Header,
+        /// The header that the caller passed.
+        expected: ImageHeader,
         /// The header of the bytes.
-        found: Header,
+        found: ImageHeader,
     },
-    /// The file stops in the middle.
-    #[error("{format} is cut off: its {len} bytes end before the image does")]
-    CutOff {
-        /// What the file is.
+    /// The file is truncated.
+    #[error("{format} is truncated: its {len} bytes end before the image does")]
+    Truncated {
+        /// Format of the file.
         format: Format,
-        /// Bytes that are there.
+        /// Number of bytes.
         len: usize,
     },
     /// A kind of file that cameras do not send.
     #[error("{format} is {what}, which is not supported")]
     Unsupported {
-        /// What the file is.
+        /// Format of the file.
         format: Format,
         /// The kind.
         what: &'static str,
     },
-    /// A file that breaks the rules of its format.
+    /// A file that violates its format.
     #[error("{format} is damaged at byte {at}: {what}")]
     Damaged {
-        /// What the file is.
+        /// Format of the file.
         format: Format,
-        /// Where.
+        /// Offset of the damage.
         at: usize,
-        /// What is wrong.
+        /// The violation.
         what: &'static str,
     },
-    /// The JPEG decoder gave up.
+    /// The JPEG decoder failed.
     #[error("cannot decode the JPEG of {width}x{height}")]
     Jpeg {
         /// Pixels per row.
         width: u32,
         /// Rows.
         height: u32,
-        /// Why.
+        /// The cause.
         source: zune_jpeg::errors::DecodeErrors,
     },
-    /// The PNG decoder gave up.
+    /// The PNG decoder failed.
     #[error("cannot decode the PNG of {width}x{height}")]
     Png {
         /// Pixels per row.
         width: u32,
         /// Rows.
         height: u32,
-        /// Why.
+        /// The cause.
         source: png::DecodingError,
     },
 }
 
 impl ImageError {
-    /// The kind: each error has to say which it is.
+    /// Returns the kind; listed without a wildcard, so that each new error is classified.
     pub fn kind(&self) -> PixelErrorKind {
         match self {
             Self::Pixels(error) => error.kind(),
@@ -113,7 +117,7 @@ impl ImageError {
             | Self::Bomb { .. }
             | Self::WorkingMemory { .. }
             | Self::OtherImage { .. }
-            | Self::CutOff { .. }
+            | Self::Truncated { .. }
             | Self::Unsupported { .. }
             | Self::Damaged { .. }
             | Self::Jpeg { .. }

@@ -1,14 +1,14 @@
-//! JPEG: the structure of a file is checked here, the pixels come from `zune-jpeg`.
+//! Decodes JPEG: checks the structure of the file; `zune-jpeg` decodes the pixels.
 //!
-//! A decoder of photographs is lenient: it makes a picture of half a file. A judge of frames must
-//! not be, so we walk through all markers first. That also bounds the time: a sequential image has
-//! one scan, a progressive one has at most [`MAX_SCANS`].
+//! A decoder of photographs is lenient: it returns a picture for half a file. Lambdas that judge
+//! frames need errors, so all markers are checked first. That also bounds the time: a sequential
+//! image has one scan, a progressive one has at most [`MAX_SCANS`].
 //!
-//! Compared with libjpeg-turbo on files of every subsampling, `zune-jpeg` 0.5.15 silently makes
-//! wrong pictures of two rare kinds: components in scans of their own (sequential), and luma that
-//! is coarser than chroma. Both are refused here. On x86-64, its vector and scalar code made the
-//! same bytes of 85 photographs and of 60,000 damaged files, so its vector code stays on. NEON,
-//! emulated, made the bytes of x86-64 and of its own scalar code of 16,000 files, most of them
+//! Compared with libjpeg-turbo on files of every subsampling, `zune-jpeg` 0.5.15 silently decodes
+//! two rare kinds wrong: components in scans of their own (sequential), and luma that is coarser
+//! than chroma. Both are refused here. On x86-64, its vector and scalar code returned the same
+//! bytes for 85 photographs and for 60,000 damaged files, so its vector code stays on. NEON,
+//! emulated, returned the bytes of x86-64 and of its own scalar code for 16,000 files, most of them
 //! damaged, of every subsampling.
 
 use std::cell::Cell;
@@ -18,31 +18,31 @@ use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
-use super::paced::Paced;
-use super::{Format, Header};
+use super::paced::PacedReader;
+use super::{Format, ImageHeader};
 use crate::error::ImageError;
 
 /// Start of image, and the start of the marker that must follow.
 pub(super) const MAGIC: [u8; 3] = [0xff, 0xd8, 0xff];
 
-/// Scans of a progressive image that we decode. Encoders write about ten.
+/// Maximum number of scans of a progressive image. Encoders write about ten.
 const MAX_SCANS: usize = 64;
 
-/// The header of `data`, which starts with [`MAGIC`].
-pub(super) fn header(data: &[u8]) -> Result<Header, ImageError> {
+/// Returns the header of `data`, which starts with [`MAGIC`].
+pub(super) fn header(data: &[u8]) -> Result<ImageHeader, ImageError> {
     Ok(frame(data)?.header())
 }
 
-/// Decodes `data` into `out`, all black and as long as `header` says, with at most `allowed` bytes
-/// of further memory.
+/// Decodes `data` into `out`, which is black and has the length that `header` requires, with at
+/// most `allowed` bytes of further memory.
 pub(super) fn decode(
     data: &[u8],
-    header: &Header,
+    header: &ImageHeader,
     allowed: usize,
     out: &mut [u8],
     pace: &Pace<'_>,
 ) -> Result<(), ImageError> {
-    let &Header { format, width, height } = header;
+    let &ImageHeader { format, width, height } = header;
     let needed = frame(data)?.working_memory();
     if needed > allowed as u64 {
         return Err(ImageError::WorkingMemory { format, width, height, needed, allowed });
@@ -59,38 +59,40 @@ pub(super) fn decode(
         .set_max_height(height as usize)
         .jpeg_set_max_scans(MAX_SCANS)
         .jpeg_set_out_colorspace(ColorSpace::RGB);
-    let mut decoder = JpegDecoder::new_with_options(Paced::new(data, pace, &stopped), options);
+    let mut decoder =
+        JpegDecoder::new_with_options(PacedReader::new(data, pace, &stopped), options);
     decoder.decode_headers().map_err(refused)?;
-    // Its reading of the header and ours must be the same.
+    // Both parsers must read the same header.
     if decoder.output_buffer_size() != Some(out.len()) {
-        return Err(damaged(0, "its header can be read in two ways"));
+        return Err(damaged(0, "its header is ambiguous"));
     }
     decoder.decode_into(out).map_err(refused)?;
-    // It makes up the end of some files whose bytes end early.
+    // The decoder fills in the end of some truncated files.
     if stopped.get() { Err(PixelError::Stopped.into()) } else { Ok(()) }
 }
 
-/// What the frame header (SOF) says.
+/// Content of the frame header (SOF).
 #[derive(Debug, Clone, Copy)]
-struct Frame {
+struct FrameHeader {
     width: u32,
     height: u32,
     progressive: bool,
     /// 1 or 3.
     components: usize,
     /// Horizontal and vertical sampling factors, 1, 2 or 4: of luma, then of both kinds of chroma,
-    /// where they are not larger.
+    /// which must not be larger.
     sampling: [(u8, u8); 3],
 }
 
-impl Frame {
-    fn header(&self) -> Header {
-        Header { format: Format::Jpeg, width: self.width, height: self.height }
+impl FrameHeader {
+    fn header(&self) -> ImageHeader {
+        ImageHeader { format: Format::Jpeg, width: self.width, height: self.height }
     }
 
-    /// Bytes that `zune-jpeg` 0.5 allocates at most: two for each coefficient of a progressive
-    /// image, and rows of blocks in several states of upsampling, which are, read off its source,
-    /// at most 35 values of two bytes for each sample of a row of luma and component.
+    /// Returns the maximum that `zune-jpeg` 0.5 allocates, in bytes: two for each coefficient of a
+    /// progressive image, and rows of blocks in several states of upsampling. According to its
+    /// source, these are at most 35 values of two bytes for each sample of a row of luma and
+    /// component.
     fn working_memory(&self) -> u64 {
         let sampling = &self.sampling[..self.components];
         let (wide, high) = (u64::from(sampling[0].0), u64::from(sampling[0].1));
@@ -103,9 +105,9 @@ impl Frame {
     }
 }
 
-/// Reads up to the frame header of `data`.
-fn frame(data: &[u8]) -> Result<Frame, ImageError> {
-    let mut segments = Segments::of(data);
+/// Parses `data` up to its frame header.
+fn frame(data: &[u8]) -> Result<FrameHeader, ImageError> {
+    let mut segments = JpegSegments::of(data);
     loop {
         let segment = segments.next()?;
         match segment.marker {
@@ -118,7 +120,7 @@ fn frame(data: &[u8]) -> Result<Frame, ImageError> {
     }
 }
 
-/// Refuses the kinds of JPEG that cameras do not send, by the marker that announces them.
+/// Refuses the kinds of JPEG that cameras do not send, by their markers.
 fn supported(marker: u8) -> Result<(), ImageError> {
     let what = match marker {
         0xc3 | 0xc7 | 0xcb | 0xcf => "lossless",
@@ -130,8 +132,8 @@ fn supported(marker: u8) -> Result<(), ImageError> {
     Err(unsupported(what))
 }
 
-/// The content of a frame header.
-fn frame_of(segment: &Segment<'_>) -> Result<Frame, ImageError> {
+/// Parses a frame header.
+fn frame_of(segment: &JpegSegment<'_>) -> Result<FrameHeader, ImageError> {
     let &[precision, h1, h0, w1, w0, components, ref parts @ ..] = segment.body else {
         return Err(damaged(segment.at, "a frame header that is too short"));
     };
@@ -158,13 +160,13 @@ fn frame_of(segment: &Segment<'_>) -> Result<Frame, ImageError> {
     if !known(luma) || !known(chroma) || other != chroma || finer {
         return Err(unsupported("subsampled in a way that cameras do not use"));
     }
-    Ok(Frame { width, height, progressive: segment.marker == 0xc2, components, sampling })
+    Ok(FrameHeader { width, height, progressive: segment.marker == 0xc2, components, sampling })
 }
 
-/// Walks through all of `data`: one frame header, then its scans, then the end.
+/// Checks all of `data`: one frame header, then its scans, then the end.
 fn check_structure(data: &[u8]) -> Result<(), ImageError> {
-    let mut segments = Segments::of(data);
-    let mut frame: Option<Frame> = None;
+    let mut segments = JpegSegments::of(data);
+    let mut frame: Option<FrameHeader> = None;
     let mut scans = 0;
     loop {
         let segment = segments.next()?;
@@ -195,27 +197,27 @@ const SCAN: u8 = 0xda;
 const END: u8 = 0xd9;
 
 /// A marker with its content; for [`SCAN`], the content of its header.
-struct Segment<'a> {
+struct JpegSegment<'a> {
     marker: u8,
     at: usize,
     body: &'a [u8],
 }
 
-/// Walks from marker to marker, over entropy-coded data too.
-struct Segments<'a> {
+/// Iterates over the markers, also across entropy-coded data.
+struct JpegSegments<'a> {
     data: &'a [u8],
     at: usize,
 }
 
-impl<'a> Segments<'a> {
-    /// `data` starts with [`MAGIC`].
+impl<'a> JpegSegments<'a> {
+    /// Starts at the first marker of `data`, which starts with [`MAGIC`].
     fn of(data: &'a [u8]) -> Self {
         Self { data, at: 2 }
     }
 
-    fn next(&mut self) -> Result<Segment<'a>, ImageError> {
+    fn next(&mut self) -> Result<JpegSegment<'a>, ImageError> {
         if self.byte(self.at)? != 0xff {
-            return Err(damaged(self.at, "no marker where one must be"));
+            return Err(damaged(self.at, "no marker where one is required"));
         }
         // Any number of fill bytes may precede a marker.
         let mut at = self.at + 1;
@@ -224,7 +226,7 @@ impl<'a> Segments<'a> {
         }
         let marker = self.byte(at)?;
         if marker == END {
-            return Ok(Segment { marker, at, body: &[] });
+            return Ok(JpegSegment { marker, at, body: &[] });
         }
         if matches!(marker, 0x00 | 0x01 | 0xd0..=0xd8) {
             return Err(damaged(at, "a marker without content between segments"));
@@ -238,7 +240,7 @@ impl<'a> Segments<'a> {
         if marker == SCAN {
             self.skip_pixels();
         }
-        Ok(Segment { marker, at, body })
+        Ok(JpegSegment { marker, at, body })
     }
 
     fn byte(&self, at: usize) -> Result<u8, ImageError> {
@@ -264,7 +266,7 @@ impl<'a> Segments<'a> {
 }
 
 fn truncated(data: &[u8]) -> ImageError {
-    ImageError::CutOff { format: Format::Jpeg, len: data.len() }
+    ImageError::Truncated { format: Format::Jpeg, len: data.len() }
 }
 
 fn damaged(at: usize, what: &'static str) -> ImageError {

@@ -1,11 +1,11 @@
-//! JPEG and PNG bytes become rgb8.
+//! Decodes JPEG and PNG bytes to rgb8.
 //!
-//! Inside: what a file is and how large its image claims to be ([`probe`]), by its first bytes
-//! alone, and the decoding into memory of the caller ([`decode_rgb8`]). The pixels are worked out
-//! by `zune-jpeg` and `png`; what this room adds is the price, which is known before it is paid.
+//! [`probe`] finds the format and the size that the header claims, from the first bytes alone;
+//! [`decode_rgb8`] decodes into memory of the caller. `zune-jpeg` and `png` decode the pixels; this
+//! module adds a cost that is known in advance.
 //!
-//! Never: an allocation before the size has been compared with the caller's limit; a file that is
-//! cut off passed as a whole image; pixels of an earlier image left in the output.
+//! Nothing is allocated before the size is compared with the caller's limit, a truncated file never
+//! passes as a whole image, and no pixels of an earlier image stay in the output.
 
 mod jpeg;
 mod paced;
@@ -19,7 +19,7 @@ use std::fmt;
 
 use super::{ImageError, Pace, PixelError};
 
-/// What the bytes of a file are.
+/// Format of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// JPEG (ITU-T T.81), baseline or progressive.
@@ -37,10 +37,10 @@ impl fmt::Display for Format {
     }
 }
 
-/// What a file says of its image.
+/// Content of the header of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Header {
-    /// What the bytes are.
+pub struct ImageHeader {
+    /// Format of the file.
     pub format: Format,
     /// Pixels per row, 1 to [`MAX_SIDE`](super::MAX_SIDE).
     pub width: u32,
@@ -48,8 +48,8 @@ pub struct Header {
     pub height: u32,
 }
 
-impl Header {
-    /// Bytes of the image as rgb8, or `None` where this machine cannot count them.
+impl ImageHeader {
+    /// Returns the bytes of the image as rgb8; `None` if this machine cannot count them.
     pub fn rgb8_len(&self) -> Option<usize> {
         usize::try_from(self.width)
             .ok()?
@@ -58,64 +58,63 @@ impl Header {
     }
 }
 
-impl fmt::Display for Header {
+impl fmt::Display for ImageHeader {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} of {}x{}", self.format, self.width, self.height)
     }
 }
 
-/// What `data` is, by its magic bytes and its header. Nothing is allocated or decoded.
+/// Returns the header of `data`, by its magic bytes. Allocates and decodes nothing.
 ///
 /// # Errors
 ///
 /// [`ImageError::NotAnImage`] for other bytes, [`PixelError::Size`] for an image without pixels,
 /// [`ImageError::Unsupported`] for a kind of JPEG that cameras do not send, and
-/// [`ImageError::CutOff`] or [`ImageError::Damaged`] if there is no readable header.
-pub fn probe(data: &[u8]) -> Result<Header, ImageError> {
+/// [`ImageError::Truncated`] or [`ImageError::Damaged`] if there is no readable header.
+pub fn probe(data: &[u8]) -> Result<ImageHeader, ImageError> {
     match format_of(data)? {
         Format::Jpeg => jpeg::header(data),
         Format::Png => png::header(data),
     }
 }
 
-/// Decodes `data`, whose header [`probe`] gave, into `out`: rows from the top, without padding,
-/// [`Header::rgb8_len`] bytes. Grey becomes equal red, green and blue; alpha is dropped; 16 bit
-/// values keep their high byte.
+/// Decodes `data`, whose header [`probe`] returned, into `out`: rows from the top, without padding,
+/// [`ImageHeader::rgb8_len`] bytes. Grey becomes equal red, green and blue; alpha is dropped; 16
+/// bit values keep their high byte.
 ///
-/// `max_bytes` is what an image of this input may have as rgb8, its `decoded_size`. It also bounds
-/// what the decoder allocates while it runs: 4 MiB plus four times `max_bytes`, and copies of the
-/// file's own metadata.
+/// `max_bytes` is the limit for an image of this input as rgb8, its `decoded_size`. It also bounds
+/// the allocations of the decoder: 4 MiB plus four times `max_bytes`, and copies of the file's own
+/// metadata.
 ///
-/// A JPEG has no checksum: bytes that were changed on the way can decode to a wrong picture. So can
-/// one whose camera wrote the end too early: the rest is then made up. A PNG whose pixels were
-/// changed is refused. After an error the content of `out` means nothing.
+/// A JPEG has no checksum: changed bytes can decode to a wrong picture. So can a file whose camera
+/// wrote the end too early: the rest is then made up. A PNG whose pixels were changed is refused.
+/// After an error the content of `out` is undefined.
 ///
 /// # Errors
 ///
 /// [`ImageError::Bomb`] if the image is larger than `max_bytes`, before any memory is touched;
 /// [`ImageError::WorkingMemory`] if the decoder would need too much; [`PixelError::Output`] if
 /// `out` has another length; [`ImageError::OtherImage`] if `header` is not that of `data`;
-/// [`ImageError::CutOff`], [`ImageError::Damaged`], [`ImageError::Unsupported`],
-/// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken, or not of a kind that we
-/// read.
+/// [`ImageError::Truncated`], [`ImageError::Damaged`], [`ImageError::Unsupported`],
+/// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken or unsupported.
 pub fn decode_rgb8(
     data: &[u8],
-    header: &Header,
+    header: &ImageHeader,
     max_bytes: usize,
     out: &mut [u8],
 ) -> Result<(), ImageError> {
     decode_rgb8_paced(data, header, max_bytes, out, &Pace::new(&|| true))
 }
 
-/// As [`decode_rgb8`], for a caller that may want it to end early. The last step of a progressive
-/// JPEG, from coefficients to pixels, is one piece.
+/// As [`decode_rgb8`], for a caller that may want to stop it. The last step of a progressive JPEG,
+/// from coefficients to pixels, cannot be stopped.
 ///
 /// # Errors
 ///
 /// As [`decode_rgb8`], and [`PixelError::Stopped`].
 pub fn decode_rgb8_paced(
     data: &[u8],
-    header: &Header,
+    header: &ImageHeader,
     max_bytes: usize,
     out: &mut [u8],
     pace: &Pace<'_>,
@@ -124,7 +123,7 @@ pub fn decode_rgb8_paced(
     if found != *header {
         return Err(ImageError::OtherImage { expected: *header, found });
     }
-    let Header { format, width, height } = found;
+    let ImageHeader { format, width, height } = found;
     let needed = match found.rgb8_len() {
         Some(needed) if needed <= max_bytes => needed,
         _ => {
@@ -136,7 +135,7 @@ pub fn decode_rgb8_paced(
         return Err(PixelError::Output { operation: "decoding", needed, found: out.len() }.into());
     }
     let allowed = max_bytes.saturating_mul(4).saturating_add(4 << 20);
-    // What a broken file leaves unwritten is black, not a piece of whatever was here before.
+    // Pixels that a broken file does not write are black, not earlier content.
     out.fill(0);
     match format {
         Format::Jpeg => jpeg::decode(data, &found, allowed, out, pace),
@@ -144,7 +143,7 @@ pub fn decode_rgb8_paced(
     }
 }
 
-/// The format of `data` by its magic bytes.
+/// Returns the format of `data` by its magic bytes.
 fn format_of(data: &[u8]) -> Result<Format, ImageError> {
     if data.starts_with(&jpeg::MAGIC) {
         Ok(Format::Jpeg)

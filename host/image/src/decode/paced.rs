@@ -1,23 +1,22 @@
-//! The bytes of a JPEG for its decoder, which end when the caller wants it to stop.
+//! A reader of JPEG bytes for the decoder, which fails when the caller wants to stop.
 
 use std::cell::Cell;
 
 use gleaner_rules::pixels::Pace;
 use zune_core::bytestream::{ZByteIoError, ZByteReaderTrait, ZCursor, ZSeekFrom};
 
-/// Work on a byte of a JPEG, in bytes of other work: it becomes a dozen bytes of pixels or more,
+/// Cost of a byte of a JPEG, in bytes of other work: it becomes a dozen bytes of pixels or more,
 /// each of which takes some time.
 const WEIGHT: usize = 64;
 
-/// Reads `data`, and fails from the moment on at which `pace` wants the decoder to stop; `stopped`
-/// keeps that.
-pub(super) struct Paced<'a> {
+/// Reads `data`, and fails once `pace` requests the decoder to stop; `stopped` records that.
+pub(super) struct PacedReader<'a> {
     data: ZCursor<&'a [u8]>,
     pace: &'a Pace<'a>,
     stopped: &'a Cell<bool>,
 }
 
-impl<'a> Paced<'a> {
+impl<'a> PacedReader<'a> {
     pub(super) fn new(data: &'a [u8], pace: &'a Pace<'a>, stopped: &'a Cell<bool>) -> Self {
         Self { data: ZCursor::new(data), pace, stopped }
     }
@@ -31,7 +30,7 @@ impl<'a> Paced<'a> {
     }
 }
 
-impl ZByteReaderTrait for Paced<'_> {
+impl ZByteReaderTrait for PacedReader<'_> {
     fn read_byte_no_error(&mut self) -> u8 {
         self.data.read_byte_no_error()
     }
@@ -58,7 +57,7 @@ impl ZByteReaderTrait for Paced<'_> {
         self.data.z_seek(from)
     }
 
-    /// The decoder looks for the end after each byte that it reads by itself.
+    /// The decoder checks for the end after each byte that it reads by itself.
     fn is_eof(&mut self) -> Result<bool, ZByteIoError> {
         self.go_on(1)?;
         self.data.is_eof()

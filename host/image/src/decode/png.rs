@@ -1,42 +1,43 @@
-//! PNG: rows come from the crate `png` one by one and become rgb8.
+//! Decodes PNG: the crate `png` returns rows one by one, which become rgb8.
 
 use std::io::{Cursor, ErrorKind};
 
 use gleaner_rules::pixels::{Pace, check_size};
 use png::{ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformations};
 
-use super::{Format, Header};
+use super::{Format, ImageHeader};
 use crate::error::ImageError;
 
-/// The signature of PNG.
+/// Signature of PNG.
 pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 
-/// The header of `data`, which starts with [`MAGIC`].
-pub(super) fn header(data: &[u8]) -> Result<Header, ImageError> {
+/// Returns the header of `data`, which starts with [`MAGIC`].
+pub(super) fn header(data: &[u8]) -> Result<ImageHeader, ImageError> {
     let Some((chunk, _)) = data.get(MAGIC.len()..).and_then(|rest| rest.split_first_chunk::<16>())
     else {
         return Err(truncated(data));
     };
     let [start @ .., w3, w2, w1, w0, h3, h2, h1, h0] = chunk;
     if start != b"\0\0\0\x0dIHDR" {
-        return Err(damaged(MAGIC.len(), "no header where one must be"));
+        return Err(damaged(MAGIC.len(), "no header where one is required"));
     }
     let width = u32::from_be_bytes([*w3, *w2, *w1, *w0]);
     let height = u32::from_be_bytes([*h3, *h2, *h1, *h0]);
     check_size(width, height)?;
-    Ok(Header { format: Format::Png, width, height })
+    Ok(ImageHeader { format: Format::Png, width, height })
 }
 
-/// Decodes `data` into `out`, as long as `header` says, with at most `allowed` bytes of memory for
-/// chunks. The decoder holds a few rows of at most 8 bytes per pixel, so it needs no more.
+/// Decodes `data` into `out`, which has the length that `header` requires, with at most `allowed`
+/// bytes of memory for chunks. The decoder holds a few rows of at most 8 bytes per pixel, so it
+/// needs no more.
 pub(super) fn decode(
     data: &[u8],
-    header: &Header,
+    header: &ImageHeader,
     allowed: usize,
     out: &mut [u8],
     pace: &Pace<'_>,
 ) -> Result<(), ImageError> {
-    let &Header { width, height, .. } = header;
+    let &ImageHeader { width, height, .. } = header;
     let refused = |source| match source {
         DecodingError::IoError(error) if error.kind() == ErrorKind::UnexpectedEof => {
             truncated(data)
@@ -44,17 +45,17 @@ pub(super) fn decode(
         source => ImageError::Png { width, height, source },
     };
     let mut decoder = Decoder::new_with_limits(Cursor::new(data), Limits { bytes: allowed });
-    // To 8 bits, and from a palette to its colours.
+    // 8 bits per value, and colours instead of palette indices.
     decoder.set_transformations(Transformations::normalize_to_color8());
     decoder.set_ignore_text_chunk(true);
     decoder.set_ignore_iccp_chunk(true);
     let mut reader = decoder.read_info().map_err(refused)?;
     let (color, _) = reader.output_color_type();
     let stride = 3 * width as usize;
-    // Its reading of the header and ours must be the same.
+    // Both parsers must read the same header.
     let len = match reader.output_line_size(width) {
         Some(len) if reader.info().size() == (width, height) => len,
-        _ => return Err(damaged(MAGIC.len(), "its header can be read in two ways")),
+        _ => return Err(damaged(MAGIC.len(), "its header is ambiguous")),
     };
     let mut line = vec![0; len];
     let mut rgb = vec![0; stride];
@@ -76,11 +77,11 @@ pub(super) fn decode(
             }
         }
     }
-    // The checksums of the last chunks count too.
+    // The checksums of the last chunks are checked, too.
     reader.finish().map_err(refused)
 }
 
-/// Writes the pixels of `line`, of 8 bits per value, to `rgb`.
+/// Converts the pixels of `line`, with 8 bits per value, to `rgb`.
 fn to_rgb(color: ColorType, line: &[u8], rgb: &mut [u8]) {
     match color {
         ColorType::Grayscale => spread::<1>(line, rgb, |pixel| [pixel[0]; 3]),
@@ -90,7 +91,7 @@ fn to_rgb(color: ColorType, line: &[u8], rgb: &mut [u8]) {
     }
 }
 
-/// Writes the colour of each pixel of `BYTES` bytes.
+/// Converts each pixel of `BYTES` bytes by `colour`.
 fn spread<const BYTES: usize>(
     line: &[u8],
     rgb: &mut [u8],
@@ -102,7 +103,7 @@ fn spread<const BYTES: usize>(
 }
 
 fn truncated(data: &[u8]) -> ImageError {
-    ImageError::CutOff { format: Format::Png, len: data.len() }
+    ImageError::Truncated { format: Format::Png, len: data.len() }
 }
 
 fn damaged(at: usize, what: &'static str) -> ImageError {
@@ -120,7 +121,7 @@ mod tests {
     use crate::decode::tests::{assert_close, decoded};
     use crate::decode::{decode_rgb8, probe};
 
-    /// A PNG of `WIDTH` x `HEIGHT` pixels.
+    /// Encodes a PNG of `WIDTH` x `HEIGHT` pixels.
     fn png(
         color: ColorType,
         depth: BitDepth,
@@ -183,7 +184,7 @@ mod tests {
         ];
         for (color, depth, data, expected) in cases {
             let file = png(color, depth, None, &data);
-            let header = Header { format: Format::Png, width: WIDTH, height: HEIGHT };
+            let header = ImageHeader { format: Format::Png, width: WIDTH, height: HEIGHT };
             assert_eq!(probe(&file).unwrap(), header);
             assert_close(&decoded(&file).unwrap(), 0, expected);
         }
@@ -201,18 +202,18 @@ mod tests {
     }
 
     #[test]
-    fn an_interlaced_png_is_put_together() {
+    fn an_interlaced_png_is_decoded() {
         assert_close(&decoded(&samples::INTERLACED).unwrap(), 0, colour);
     }
 
     #[test]
-    fn a_png_cut_off_anywhere_is_refused() {
+    fn a_png_truncated_anywhere_is_refused() {
         for file in
             [&png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour)), &samples::INTERLACED[..]]
         {
             for len in 0..file.len() {
                 let error = decoded(&file[..len]).unwrap_err();
-                let expected = if len < 8 { "NotAnImage" } else { "CutOff" };
+                let expected = if len < 8 { "NotAnImage" } else { "Truncated" };
                 assert!(format!("{error:?}").starts_with(expected), "{len}: {error:?}");
             }
         }

@@ -1,4 +1,4 @@
-//! Our own tiny files. The JPEGs are written by Pillow (libjpeg-turbo) at quality 90, so that the
+//! Tiny image files. The JPEGs were written by Pillow (libjpeg-turbo) at quality 90, so that the
 //! decoder is tested against another implementation. Colour images are 24x16 pixels of [`colour`].
 
 /// Width of the images, in pixels.
@@ -7,7 +7,7 @@ pub(super) const WIDTH: u32 = 24;
 /// Height of the images, in pixels.
 pub(super) const HEIGHT: u32 = 16;
 
-/// The colour of a pixel before it was encoded.
+/// Returns the colour of a pixel before encoding.
 pub(super) fn colour(x: usize, y: usize) -> [u8; 3] {
     [80 + 4 * x, 60 + 5 * y, 200 - 3 * x - 2 * y].map(|value| value as u8)
 }

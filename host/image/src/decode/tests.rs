@@ -1,30 +1,30 @@
-//! What becomes of whole, broken and hostile files.
+//! Tests the results of whole, broken and hostile files.
 
 use super::samples::{self, HEIGHT, WIDTH, colour};
 use super::*;
 
-/// The pixels of `data`, by the two steps that the host takes.
+/// Decodes `data` in the two steps that the host takes.
 pub(super) fn decoded(data: &[u8]) -> Result<Vec<u8>, ImageError> {
     let header = probe(data)?;
     let len = header.rgb8_len().unwrap();
-    // Full of something, so that pixels which are not written are seen.
+    // Filled, so that pixels which are not written are noticed.
     let mut out = vec![0xaa; len];
     decode_rgb8(data, &header, len, &mut out)?;
     Ok(out)
 }
 
-/// Every pixel of `rgb` is within `tolerance` of what `expected` says for it.
+/// Checks that every pixel of `rgb` is within `tolerance` of its `expected` value.
 pub(super) fn assert_close(rgb: &[u8], tolerance: u8, expected: impl Fn(usize, usize) -> [u8; 3]) {
     for (at, pixel) in rgb.chunks(3).enumerate() {
         let (x, y) = (at % WIDTH as usize, at / WIDTH as usize);
-        for (ours, theirs) in pixel.iter().zip(expected(x, y)) {
-            assert!(ours.abs_diff(theirs) <= tolerance, "({x}, {y}): {ours}, not {theirs}");
+        for (found, wanted) in pixel.iter().zip(expected(x, y)) {
+            assert!(found.abs_diff(wanted) <= tolerance, "({x}, {y}): {found}, not {wanted}");
         }
     }
 }
 
 #[test]
-fn decoding_stops_when_its_caller_wants_that() {
+fn decoding_stops_when_its_caller_requests_it() {
     for file in
         [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY, &samples::INTERLACED]
     {
@@ -44,11 +44,11 @@ fn decoding_stops_when_its_caller_wants_that() {
 }
 
 #[test]
-fn a_jpeg_gives_back_the_colours_that_went_in() {
+fn a_jpeg_decodes_to_the_encoded_colours() {
     for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
-        let header = Header { format: Format::Jpeg, width: WIDTH, height: HEIGHT };
+        let header = ImageHeader { format: Format::Jpeg, width: WIDTH, height: HEIGHT };
         assert_eq!(probe(file).unwrap(), header);
-        // Pillow reads them back with errors of up to 6, and differs from us by up to 2.
+        // Pillow decodes them with errors of up to 6, and differs from this decoder by up to 2.
         assert_close(&decoded(file).unwrap(), 8, colour);
     }
 }
@@ -67,33 +67,33 @@ fn a_jpeg_for_print_is_refused() {
 }
 
 #[test]
-fn a_jpeg_cut_off_anywhere_is_refused() {
+fn a_jpeg_truncated_anywhere_is_refused() {
     for file in [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY] {
         for len in 0..file.len() {
             let error = decoded(&file[..len]).unwrap_err();
-            let expected = if len < 3 { "NotAnImage" } else { "CutOff" };
+            let expected = if len < 3 { "NotAnImage" } else { "Truncated" };
             assert!(format!("{error:?}").starts_with(expected), "{len}: {error:?}");
         }
     }
     assert_eq!(
         decoded(&samples::BASELINE[..300]).unwrap_err().to_string(),
-        "JPEG is cut off: its 300 bytes end before the image does"
+        "JPEG is truncated: its 300 bytes end before the image does"
     );
 }
 
 #[test]
-fn bytes_behind_the_end_of_a_jpeg_do_not_matter() {
+fn bytes_after_the_end_of_a_jpeg_are_ignored() {
     let mut padded = samples::BASELINE.to_vec();
     padded.extend([0; 100]);
     assert_eq!(decoded(&padded).unwrap(), decoded(&samples::BASELINE).unwrap());
 }
 
-/// Where the first marker `marker` of a JPEG is.
+/// Returns the position of the first marker `marker` of a JPEG.
 fn first(file: &[u8], marker: u8) -> usize {
     file.windows(2).position(|pair| pair == [0xff, marker]).unwrap()
 }
 
-/// `file` with `replacement` for the bytes behind the first marker `marker`.
+/// Returns `file` with `replacement` for the bytes after the first marker `marker`.
 fn patched(file: &[u8], marker: u8, replacement: &[u8]) -> Vec<u8> {
     let at = first(file, marker) + 2;
     let mut file = file.to_vec();
@@ -123,7 +123,7 @@ fn a_bomb_for_the_decoder_itself_is_refused() {
 }
 
 #[test]
-fn a_limit_that_is_just_enough_is_enough() {
+fn a_limit_of_exactly_the_size_is_sufficient() {
     let header = probe(&samples::BASELINE).unwrap();
     let len = header.rgb8_len().unwrap();
     let mut out = vec![0; len];
@@ -136,12 +136,12 @@ fn a_limit_that_is_just_enough_is_enough() {
 }
 
 #[test]
-fn the_header_must_be_that_of_the_data_and_the_place_that_of_the_header() {
+fn the_header_must_match_the_data_and_the_output_length_the_header() {
     let header = probe(&samples::GREY).unwrap();
-    let other = Header { width: 23, ..header };
+    let other = ImageHeader { width: 23, ..header };
     assert_eq!(
         decode_rgb8(&samples::GREY, &other, 9_999, &mut [0; 1104]).unwrap_err().to_string(),
-        "JPEG of 24x16 where a JPEG of 23x16 was announced"
+        "JPEG of 24x16 where a JPEG of 23x16 was expected"
     );
     assert_eq!(
         decode_rgb8(&samples::GREY, &header, 9_999, &mut [0; 1151]).unwrap_err().to_string(),
@@ -170,8 +170,8 @@ fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
 }
 
 #[test]
-fn a_jpeg_with_scans_without_end_is_refused() {
-    // The scans of an image, again and again: cheap to send, dear to decode.
+fn a_jpeg_with_endless_scans_is_refused() {
+    // The scans of an image, repeated: cheap to send, expensive to decode.
     for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
         let (start, scans) = file[..file.len() - 2].split_at(first(file, 0xda));
         let mut endless = start.to_vec();
@@ -195,7 +195,7 @@ fn a_jpeg_without_pixels_is_refused() {
 }
 
 #[test]
-fn kinds_of_jpeg_that_the_decoder_gets_wrong_are_refused() {
+fn kinds_of_jpeg_that_the_decoder_decodes_wrong_are_refused() {
     let one_of_three = patched(&samples::BASELINE, 0xda, &[0, 8, 1, 1, 0, 0, 63, 0]);
     assert_eq!(
         decoded(&one_of_three).unwrap_err().to_string(),
@@ -228,7 +228,7 @@ fn other_bytes_are_refused_by_their_start() {
 }
 
 #[test]
-fn no_mutation_of_a_file_leads_to_a_panic() {
+fn no_mutation_of_a_file_causes_a_panic() {
     let files = [
         samples::BASELINE.to_vec(),
         samples::PROGRESSIVE.to_vec(),
