@@ -2,7 +2,7 @@ use std::error::Error;
 use std::fmt;
 
 use crate::Exit;
-use crate::words::visible;
+use crate::text::visible;
 
 /// An error that knows the way out of it. The error enum of a room implements this next to its
 /// messages.

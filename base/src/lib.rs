@@ -4,23 +4,23 @@
 //!
 //! Nothing here knows what a lambda is.
 
+mod atomic_write;
 mod exit;
 mod failure;
-pub mod own_file;
-mod pieces;
+mod line_pieces;
 mod plain_file;
+pub mod safe_file;
 #[cfg(test)]
-mod scratch;
+mod test_folder;
+pub mod text;
 mod time;
 pub mod units;
-mod whole;
-pub mod words;
 
+pub use atomic_write::write_atomically;
 pub use exit::Exit;
 pub use failure::{Explain, Failure, chain};
-pub use pieces::{Piece, each_piece};
+pub use line_pieces::{LinePiece, each_piece};
 pub use plain_file::{NotPlain, PlainFile};
+pub use text::{excerpt, grouped, hex, visible};
 pub use time::nanoseconds;
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};
-pub use whole::write_whole;
-pub use words::{excerpt, grouped, hex, visible};

@@ -207,7 +207,7 @@ mod tests {
     use rustix::fs::{CWD, FileType, Mode, mknodat};
 
     use super::*;
-    use crate::scratch::Scratch;
+    use crate::test_folder::TestFolder;
 
     const MOST: ByteSize = ByteSize::new(10);
 
@@ -222,7 +222,7 @@ mod tests {
 
     #[test]
     fn a_link_may_lead_to_a_file_in_the_folder_and_to_no_other() {
-        let scratch = Scratch::new();
+        let scratch = TestFolder::new();
         let (folder, secret) = (scratch.path("lambda"), scratch.write("secret", "secret"));
         scratch.write("lambda/part/a.py", "a");
         let links = [
@@ -250,7 +250,7 @@ mod tests {
 
     #[test]
     fn a_folder_may_itself_be_named_by_a_link() {
-        let scratch = Scratch::new();
+        let scratch = TestFolder::new();
         scratch.write("lambda/a.py", "a");
         symlink("lambda", scratch.path("link")).unwrap();
         assert_eq!(text(PlainFile::inside(&scratch.path("link"), Path::new("a.py"), MOST)), "a");
@@ -258,7 +258,7 @@ mod tests {
 
     #[test]
     fn what_is_no_file_is_neither_waited_for_nor_opened() {
-        let scratch = Scratch::new();
+        let scratch = TestFolder::new();
         let (pipe, socket, folder) =
             (scratch.path("pipe"), scratch.path("socket"), scratch.path("folder"));
         mknodat(CWD, &pipe, FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
@@ -282,7 +282,7 @@ mod tests {
 
     #[test]
     fn a_result_is_no_link_and_a_named_file_may_be_one() {
-        let scratch = Scratch::new();
+        let scratch = TestFolder::new();
         let link = scratch.path("link");
         symlink(scratch.write("log.jsonl", "x"), &link).unwrap();
         assert_eq!(why(PlainFile::result(&link, MOST)), NotPlain::Link);
@@ -291,7 +291,7 @@ mod tests {
 
     #[test]
     fn a_file_without_an_end_is_refused_before_it_is_read() {
-        let scratch = Scratch::new();
+        let scratch = TestFolder::new();
         let sparse = scratch.write("sparse", "");
         File::options().write(true).open(&sparse).unwrap().set_len(1 << 40).unwrap();
         let error = PlainFile::named(&sparse, ByteSize::mib(16)).unwrap_err();
@@ -301,7 +301,7 @@ mod tests {
 
     #[test]
     fn a_file_that_grows_is_read_up_to_the_bound() {
-        let scratch = Scratch::new();
+        let scratch = TestFolder::new();
         let path = scratch.write("file", "0123456789");
         let open = || PlainFile::named(&path, MOST).unwrap();
         let (whole, mut copied, mut pieces) = (open(), open(), open());

@@ -1,10 +1,10 @@
 use serde_json::{Map, Value};
 
-use super::before::{
+use super::entry::{InputView, JournalEntry, LogDigest, WakeSource};
+use super::number::{take, unfold};
+use super::previous::{
     Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen,
 };
-use super::entry::{Entry, Said, Seen, Woken};
-use super::number::{take, unfold};
 use super::{ATTRIBUTES_MAX, FAULTS, TRIGGERS_MAX};
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
@@ -73,7 +73,7 @@ impl Decoder {
     ///
     /// [`Malformed`]; what is left of `bytes` then has no meaning, and neither have wakes that were
     /// written relative to this one.
-    pub fn decode(&mut self, bytes: &mut &[u8]) -> Result<Entry> {
+    pub fn decode(&mut self, bytes: &mut &[u8]) -> Result<JournalEntry> {
         let before = &self.before;
         let [flags] = array(bytes)?;
         if flags & flag::RESERVED != 0 {
@@ -93,8 +93,8 @@ impl Decoder {
             before.inputs.iter().map(|before| input(before, bytes)).collect::<Result<_>>()?;
         let triggers = if flags & flag::TRIGGERS != 0 { triggers(bytes)? } else { Vec::new() };
         let fault = if flags & flag::FAULT != 0 { Some(fault(bytes)?) } else { None };
-        let log = if flags & flag::LOG != 0 { said(bytes)? } else { Said::default() };
-        let entry = Entry { at_ns, cause, seen, triggers, fault, fuel, log };
+        let log = if flags & flag::LOG != 0 { said(bytes)? } else { LogDigest::default() };
+        let entry = JournalEntry { at_ns, cause, seen, triggers, fault, fuel, log };
         self.before.note(&entry);
         Ok(entry)
     }
@@ -130,23 +130,23 @@ fn text(bytes: &mut &[u8]) -> Result<String> {
     Ok(text.to_owned())
 }
 
-fn cause(flags: u8, before: &Before, bytes: &mut &[u8]) -> Result<Woken> {
+fn cause(flags: u8, before: &Before, bytes: &mut &[u8]) -> Result<WakeSource> {
     let (writer_follows, number_follows) = (flags & flag::WRITER != 0, flags & flag::NUMBER != 0);
     if flags & flag::TICK != 0 {
         if writer_follows {
             return Err(Malformed::Unknown { what: "flags", value: flags });
         }
-        return Ok(Woken::Tick { missed: if number_follows { number(bytes)? } else { 0 } });
+        return Ok(WakeSource::Tick { missed: if number_follows { number(bytes)? } else { 0 } });
     }
     let writer = if writer_follows { array(bytes)? } else { before.woken_by.0 };
     let expected = before.expected_seq(!writer_follows);
-    Ok(Woken::Sample {
+    Ok(WakeSource::Sample {
         writer,
         seq: if number_follows { difference(bytes, expected)? } else { expected },
     })
 }
 
-fn input(before: &InputBefore, bytes: &mut &[u8]) -> Result<Seen> {
+fn input(before: &InputBefore, bytes: &mut &[u8]) -> Result<InputView> {
     let [set] = array(bytes)?;
     let mut new = u64::from(set & seen::NEW);
     if set & seen::NEW == seen::NEW {
@@ -168,7 +168,7 @@ fn input(before: &InputBefore, bytes: &mut &[u8]) -> Result<Seen> {
         },
     };
     let reach = if set & seen::REACH != 0 { number(bytes)? } else { before.reach };
-    Ok(Seen { new, digest, newest, reach })
+    Ok(InputView { new, digest, newest, reach })
 }
 
 fn triggers(bytes: &mut &[u8]) -> Result<Vec<Trigger>> {
@@ -218,7 +218,7 @@ fn fault(bytes: &mut &[u8]) -> Result<Fault> {
     Ok(Fault { kind: *kind, message, used, allowed })
 }
 
-fn said(bytes: &mut &[u8]) -> Result<Said> {
+fn said(bytes: &mut &[u8]) -> Result<LogDigest> {
     let lines = u32::try_from(number(bytes)?).map_err(|_| Malformed::Number)?;
-    Ok(Said { lines, digest: u32::from_le_bytes(array(bytes)?) })
+    Ok(LogDigest { lines, digest: u32::from_le_bytes(array(bytes)?) })
 }

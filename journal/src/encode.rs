@@ -1,9 +1,9 @@
-use super::before::{
-    Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen,
-};
-use super::entry::{Entry, Seen, Woken};
+use super::entry::{InputView, JournalEntry, WakeSource};
 use super::fault_code;
 use super::number::{fold, put};
+use super::previous::{
+    Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen,
+};
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
 /// Writes wakes, each relative to the one before. It allocates nothing for a wake without triggers.
@@ -29,7 +29,7 @@ impl Encoder {
     /// # Panics
     ///
     /// If `entry` has not as many inputs as were named in [`new`](Self::new).
-    pub fn encode(&mut self, entry: &Entry, out: &mut Vec<u8>) {
+    pub fn encode(&mut self, entry: &JournalEntry, out: &mut Vec<u8>) {
         assert_eq!(entry.seen.len(), self.before.inputs.len(), "a wake of another lambda");
         let before = &self.before;
         let flags = out.len();
@@ -73,14 +73,14 @@ fn put_text(text: &str, out: &mut Vec<u8>) {
     out.extend_from_slice(text.as_bytes());
 }
 
-fn cause(cause: &Woken, before: &Before, out: &mut Vec<u8>) -> u8 {
+fn cause(cause: &WakeSource, before: &Before, out: &mut Vec<u8>) -> u8 {
     match *cause {
-        Woken::Tick { missed: 0 } => flag::TICK,
-        Woken::Tick { missed } => {
+        WakeSource::Tick { missed: 0 } => flag::TICK,
+        WakeSource::Tick { missed } => {
             put(missed, out);
             flag::TICK | flag::NUMBER
         }
-        Woken::Sample { writer, seq } => {
+        WakeSource::Sample { writer, seq } => {
             let mut set = 0;
             let same_writer = writer == before.woken_by.0;
             if !same_writer {
@@ -97,7 +97,7 @@ fn cause(cause: &Woken, before: &Before, out: &mut Vec<u8>) -> u8 {
     }
 }
 
-fn input(now: &Seen, before: &InputBefore, out: &mut Vec<u8>) {
+fn input(now: &InputView, before: &InputBefore, out: &mut Vec<u8>) {
     let first = out.len();
     out.push(0);
     let mut set = seen::NEW;

@@ -2,18 +2,18 @@ use serde_json::Value;
 
 use super::header::{Difference, JournalInput};
 use super::{FAULTS, fault_code};
-use gleaner_base::words::{excerpt, hex};
+use gleaner_base::text::{excerpt, hex};
 use gleaner_lambda::{Fault, Trigger};
 
 /// One wake: what the lambda saw, and what it decided.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Entry {
+pub struct JournalEntry {
     /// Stamp of the sample or tick, in ns.
     pub at_ns: i64,
     /// What woke the lambda.
-    pub cause: Woken,
+    pub cause: WakeSource,
     /// What had arrived: one for each input, in the order of the header.
-    pub seen: Vec<Seen>,
+    pub seen: Vec<InputView>,
     /// What the lambda caused, in the order in which it did.
     pub triggers: Vec<Trigger>,
     /// Why the wake ended early, if it did.
@@ -21,12 +21,12 @@ pub struct Entry {
     /// Fuel that the wake burnt; `None` for Python, which has none.
     pub fuel: Option<u64>,
     /// What it wrote to its log.
-    pub log: Said,
+    pub log: LogDigest,
 }
 
 /// What woke a lambda.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Woken {
+pub enum WakeSource {
     /// A sample of the input that its schedule names.
     Sample {
         /// GUID of the sample's writer.
@@ -43,7 +43,7 @@ pub enum Woken {
 
 /// What a lambda could see of one input in a wake, and what of it it looked at.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Seen {
+pub struct InputView {
     /// Samples that arrived since the wake before, those included that found no room in the ring.
     pub new: u64,
     /// Wrapping sum of the digests of those that entered the ring, see `docs/journal.md`; 0 if
@@ -57,14 +57,14 @@ pub struct Seen {
 
 /// What a lambda wrote to its log in one wake.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Said {
+pub struct LogDigest {
     /// How many lines.
     pub lines: u32,
     /// CRC-32 over them; 0 if there are none.
     pub digest: u32,
 }
 
-impl Entry {
+impl JournalEntry {
     /// The first difference between the wake in the journal and the same wake made again `now`;
     /// `None` if the lambda saw the same and decided the same, bit for bit.
     ///
@@ -72,7 +72,7 @@ impl Entry {
     /// a number: without `writers`, samples are compared as far as a clip keeps them.
     pub fn differs_from(
         &self,
-        now: &Entry,
+        now: &JournalEntry,
         inputs: &[JournalInput],
         writers: bool,
     ) -> Option<Difference> {
@@ -119,9 +119,11 @@ impl Entry {
 
     fn cause_in_words(&self, writers: bool) -> String {
         match self.cause {
-            Woken::Sample { writer, seq } => format!("sample {}", identity((writer, seq), writers)),
-            Woken::Tick { missed: 0 } => "a tick".to_owned(),
-            Woken::Tick { missed } => format!("a tick after {missed} missed ones"),
+            WakeSource::Sample { writer, seq } => {
+                format!("sample {}", identity((writer, seq), writers))
+            }
+            WakeSource::Tick { missed: 0 } => "a tick".to_owned(),
+            WakeSource::Tick { missed } => format!("a tick after {missed} missed ones"),
         }
     }
 }
@@ -133,13 +135,19 @@ fn in_words(inputs: &[JournalInput], index: usize) -> String {
     }
 }
 
-fn seen_differs(journal: &Seen, now: &Seen, input: &str, writers: bool) -> Option<Difference> {
+fn seen_differs(
+    journal: &InputView,
+    now: &InputView,
+    input: &str,
+    writers: bool,
+) -> Option<Difference> {
     // In every wake, for every input: nothing is put into words unless it differs.
     if journal == now {
         return None;
     }
-    let newest =
-        |seen: &Seen| seen.newest.map_or("none".to_owned(), |newest| identity(newest, writers));
+    let newest = |seen: &InputView| {
+        seen.newest.map_or("none".to_owned(), |newest| identity(newest, writers))
+    };
     Difference::of(format!("number of new samples of {input}"), journal.new, now.new)
         .or_else(|| {
             Difference::of(format!("newest sample of {input}"), newest(journal), newest(now))

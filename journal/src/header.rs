@@ -3,14 +3,14 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use gleaner_base::words::{excerpt, visible};
-use gleaner_lambda::manifest::{Kind, Limits};
+use gleaner_base::text::{excerpt, visible};
+use gleaner_lambda::manifest::{LambdaKind, Limits};
 
 /// What made the decisions of a journal: its first block, as JSON.
 ///
 /// A newer writer may add keys; a reader ignores those that it does not know.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Header {
+pub struct JournalHeader {
     /// Version of gleaner that wrote it.
     pub gleaner: String,
     /// What the lambda ran on, for example `wasmtime 48.0.8` or `Python 3.12.3, numpy 2.1.0`.
@@ -22,7 +22,7 @@ pub struct Header {
     /// Version of the lambda.
     pub version: String,
     /// What kind of lambda it is.
-    pub kind: Kind,
+    pub kind: LambdaKind,
     /// The files of its build folder, by path.
     pub files: Vec<FileDigest>,
     /// Its models.
@@ -45,8 +45,8 @@ pub struct Header {
     /// What the times are, for example `log time of the drive`.
     pub clock: String,
     /// What was replayed of the drive.
-    #[serde(default, skip_serializing_if = "Part::is_all")]
-    pub part: Part,
+    #[serde(default, skip_serializing_if = "TimeRange::is_all")]
+    pub part: TimeRange,
     /// Wakes that came before the first in here: 0, unless this is the part of a journal that a
     /// clip holds.
     pub wakes_before: u64,
@@ -54,17 +54,17 @@ pub struct Header {
 
 /// The samples of a drive between two times, by their log time in ns since 1970.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Part {
+pub struct TimeRange {
     /// The first time that belongs to it; `None` for the start of the drive.
     pub from_ns: Option<i64>,
     /// The first time that does not belong to it any more; `None` for the end of the drive.
     pub to_ns: Option<i64>,
 }
 
-impl Part {
+impl TimeRange {
     /// Whether it is the whole drive.
     pub fn is_all(&self) -> bool {
-        *self == Part::default()
+        *self == TimeRange::default()
     }
 
     fn in_words(self) -> String {
@@ -100,7 +100,7 @@ pub struct JournalInput {
 
 /// The last block of a journal whose writer came to its end, as JSON.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct End {
+pub struct JournalEnd {
     /// How often the lambda ran.
     pub wakes: u64,
     /// Samples that arrived in all, for each input.
@@ -148,13 +148,13 @@ impl Difference {
     }
 }
 
-impl Header {
+impl JournalHeader {
     /// The most telling difference between what wrote this journal and what would run `now`; `None`
     /// if a decision that differs is then the fault of neither build, config nor inputs.
     ///
     /// `gleaner`, `engine`, `machine` and `wakes_before` are not compared: a decision should not
     /// depend on them.
-    pub fn differs_from(&self, now: &Header) -> Option<Difference> {
+    pub fn differs_from(&self, now: &JournalHeader) -> Option<Difference> {
         Difference::of("lambda", &self.lambda, &now.lambda)
             .or_else(|| Difference::of("version of the lambda", &self.version, &now.version))
             .or_else(|| Difference::of("kind of the lambda", self.kind.as_str(), now.kind.as_str()))

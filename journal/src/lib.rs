@@ -7,7 +7,6 @@
 //! the file. `docs/journal.md` describes the bytes for readers in other languages. Nothing here
 //! knows where a journal lies, or runs a lambda.
 
-mod before;
 mod block;
 mod decode;
 mod encode;
@@ -15,6 +14,7 @@ mod entry;
 mod error;
 mod header;
 mod number;
+mod previous;
 mod read;
 #[cfg(test)]
 mod tests;
@@ -22,11 +22,13 @@ mod write;
 
 pub use decode::{Decoder, Malformed};
 pub use encode::Encoder;
-pub use entry::{Entry, Said, Seen, Woken};
+pub use entry::{InputView, JournalEntry, LogDigest, WakeSource};
 pub use error::{Damage, JournalError};
-pub use header::{Difference, DriveDigest, End, FileDigest, Header, JournalInput, Part};
-pub use read::Reader;
-pub use write::Writer;
+pub use header::{
+    Difference, DriveDigest, FileDigest, JournalEnd, JournalHeader, JournalInput, TimeRange,
+};
+pub use read::JournalReader;
+pub use write::JournalWriter;
 
 use gleaner_lambda::FaultKind;
 

@@ -4,16 +4,16 @@ use serde::de::DeserializeOwned;
 
 use super::block::{HEAD_LEN, Head, MAGIC, PAYLOAD_MAX, PREAMBLE_LEN, kind};
 use super::decode::Decoder;
-use super::entry::Entry;
+use super::entry::JournalEntry;
 use super::error::{Damage, JournalError};
-use super::header::{End, Header};
+use super::header::{JournalEnd, JournalHeader};
 use super::number::take;
 use super::{INPUTS_MAX, VERSION};
 
 /// Reads a journal block by block, and never holds more than one.
-pub struct Reader<R: Read> {
+pub struct JournalReader<R: Read> {
     source: Source<R>,
-    header: Header,
+    header: JournalHeader,
     decoder: Decoder,
     /// The payload of the block of wakes at hand.
     block: Vec<u8>,
@@ -24,7 +24,7 @@ pub struct Reader<R: Read> {
     /// Index of the next wake.
     wake: u64,
     at: Place,
-    end: Option<End>,
+    end: Option<JournalEnd>,
     unknown_blocks: u64,
     state: State,
 }
@@ -54,13 +54,13 @@ enum State {
     Failed(Option<(Place, Damage)>),
 }
 
-impl<R: Read> Reader<R> {
+impl<R: Read> JournalReader<R> {
     /// Opens a journal: reads its header.
     ///
     /// # Errors
     ///
     /// [`JournalError`], if this is none, is of another version, or its header cannot be read.
-    pub fn open(bytes: R) -> Result<Reader<R>, JournalError> {
+    pub fn open(bytes: R) -> Result<JournalReader<R>, JournalError> {
         let mut source = Source { bytes, offset: 0, blocks: 0 };
         source.preamble()?;
         let at = Place { offset: source.offset, ..Place::default() };
@@ -73,7 +73,7 @@ impl<R: Read> Reader<R> {
         if kind != kind::HEADER {
             return Err(at.damaged(Damage::NotAHeader { kind }));
         }
-        let header: Header = json(&payload).map_err(|why| at.damaged(why))?;
+        let header: JournalHeader = json(&payload).map_err(|why| at.damaged(why))?;
         let inputs = header.inputs.len();
         if inputs > INPUTS_MAX {
             return Err(at.damaged(Damage::Inputs { found: inputs }));
@@ -81,7 +81,7 @@ impl<R: Read> Reader<R> {
         if header.event_input.is_some_and(|event| event >= inputs) {
             return Err(at.damaged(Damage::EventInput));
         }
-        Ok(Reader {
+        Ok(JournalReader {
             source,
             header,
             decoder: Decoder::new(inputs),
@@ -97,7 +97,7 @@ impl<R: Read> Reader<R> {
     }
 
     /// What made the decisions.
-    pub fn header(&self) -> &Header {
+    pub fn header(&self) -> &JournalHeader {
         &self.header
     }
 
@@ -108,7 +108,7 @@ impl<R: Read> Reader<R> {
     ///
     /// [`JournalError::Damaged`] or [`JournalError::Read`]; nothing is read behind either.
     #[allow(clippy::should_implement_trait)]
-    pub fn next(&mut self) -> Result<Option<Entry>, JournalError> {
+    pub fn next(&mut self) -> Result<Option<JournalEntry>, JournalError> {
         loop {
             match &self.state {
                 State::Reading => {}
@@ -138,7 +138,7 @@ impl<R: Read> Reader<R> {
     }
 
     /// What the writer said at its end; `None` before it was read, or if the journal is cut off.
-    pub fn end(&self) -> Option<&End> {
+    pub fn end(&self) -> Option<&JournalEnd> {
         self.end.as_ref()
     }
 
@@ -157,7 +157,7 @@ impl<R: Read> Reader<R> {
         self.unknown_blocks
     }
 
-    fn decode(&mut self) -> Result<Entry, Stop> {
+    fn decode(&mut self) -> Result<JournalEntry, Stop> {
         let mut rest = &self.block[self.read..];
         let entry = self.decoder.decode(&mut rest).map_err(Damage::Wake)?;
         let unread = rest.len();

@@ -4,8 +4,8 @@ use serde::Serialize;
 
 use super::block::{HEAD_LEN, Head, MAGIC, PAYLOAD_MAX, PREAMBLE_LEN, kind};
 use super::encode::Encoder;
-use super::entry::Entry;
-use super::header::{End, Header};
+use super::entry::JournalEntry;
+use super::header::{JournalEnd, JournalHeader};
 use super::number::{NUMBER_MAX, put};
 use super::{ATTRIBUTES_MAX, INPUTS_MAX, TRIGGERS_MAX, VERSION};
 
@@ -24,7 +24,7 @@ const ROOM: usize = HEAD_LEN + NUMBER_MAX;
 ///
 /// Wakes wait in a block until it is full or [`flush`](Self::flush) is called. A writer that is
 /// dropped without [`finish`](Self::finish) loses those, and leaves a journal that is cut off.
-pub struct Writer<W: Write> {
+pub struct JournalWriter<W: Write> {
     out: W,
     encoder: Encoder,
     inputs: usize,
@@ -36,13 +36,13 @@ pub struct Writer<W: Write> {
     failed: bool,
 }
 
-impl<W: Write> Writer<W> {
+impl<W: Write> JournalWriter<W> {
     /// Begins a journal: writes its header.
     ///
     /// # Errors
     ///
     /// Those of `out`, and [`io::ErrorKind::InvalidInput`] for a header that no reader would take.
-    pub fn begin(out: W, header: &Header) -> io::Result<Writer<W>> {
+    pub fn begin(out: W, header: &JournalHeader) -> io::Result<JournalWriter<W>> {
         let inputs = header.inputs.len();
         if inputs > INPUTS_MAX || header.event_input.is_some_and(|event| event >= inputs) {
             return Err(refused(
@@ -52,7 +52,8 @@ impl<W: Write> Writer<W> {
         let mut block = Vec::with_capacity(ROOM + 2 * CLOSE_AT);
         block.resize(ROOM, 0);
         let encoder = Encoder::new(inputs);
-        let mut writer = Writer { out, encoder, inputs, block, wakes: 0, blocks: 0, failed: false };
+        let mut writer =
+            JournalWriter { out, encoder, inputs, block, wakes: 0, blocks: 0, failed: false };
         let mut bytes = Vec::with_capacity(PREAMBLE_LEN);
         bytes.extend_from_slice(&MAGIC);
         bytes.extend_from_slice(&VERSION.to_le_bytes());
@@ -68,7 +69,7 @@ impl<W: Write> Writer<W> {
     /// Those of `out`; after one, every further call fails, since the last block may be torn.
     /// [`io::ErrorKind::InvalidInput`] for a wake that no reader would take: it is left out, and
     /// the next one may follow.
-    pub fn wake(&mut self, entry: &Entry) -> io::Result<()> {
+    pub fn wake(&mut self, entry: &JournalEntry) -> io::Result<()> {
         self.usable()?;
         self.fits(entry)?;
         let before = self.block.len();
@@ -105,7 +106,7 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Those of `out`.
-    pub fn finish(mut self, end: &End) -> io::Result<W> {
+    pub fn finish(mut self, end: &JournalEnd) -> io::Result<W> {
         self.usable()?;
         self.write_wakes()?;
         self.write_json(kind::END, end, Vec::new())?;
@@ -126,7 +127,7 @@ impl<W: Write> Writer<W> {
         }
     }
 
-    fn fits(&self, entry: &Entry) -> io::Result<()> {
+    fn fits(&self, entry: &JournalEntry) -> io::Result<()> {
         if entry.seen.len() != self.inputs {
             return Err(refused("a wake has not the inputs of the header"));
         }

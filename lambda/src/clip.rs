@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::manifest::Kind;
+use crate::manifest::LambdaKind;
 use crate::{Trigger, TriggerKind};
 
 /// One clip that was written: one line of `clips.jsonl`.
@@ -38,7 +38,7 @@ pub struct Clip {
     /// What was recorded, and what of it is missing.
     pub topics: Vec<ClipTopic>,
     /// Why it holds less than was asked for, in words; empty if it holds all.
-    pub short: Vec<String>,
+    pub incomplete: Vec<String>,
     /// How it was saved, if the recorder died while it wrote it.
     pub recovered: Option<Recovered>,
 }
@@ -57,7 +57,7 @@ pub struct ClipLambda {
     /// Its version.
     pub version: String,
     /// What kind of lambda it is.
-    pub kind: Kind,
+    pub kind: LambdaKind,
     /// SHA-256 over the digests of its files, in hexadecimal digits.
     pub digest: String,
     /// How many of its windows the clip holds.
@@ -147,7 +147,7 @@ pub struct Recovered {
     /// Bytes behind the last whole chunk, which were thrown away.
     pub lost_bytes: u64,
     /// What happened and what is missing, in words.
-    pub what: String,
+    pub note: String,
 }
 
 #[cfg(test)]
@@ -172,7 +172,7 @@ mod tests {
             lambdas: vec![ClipLambda {
                 name: "hello".to_owned(),
                 version: "0.1.0".to_owned(),
-                kind: Kind::Wasm,
+                kind: LambdaKind::Wasm,
                 digest: "00ff".to_owned(),
                 windows: 2,
             }],
@@ -187,8 +187,8 @@ mod tests {
                 overwritten: Some(1),
                 too_big: Some(0),
             }],
-            short: vec!["the drive ended 2.1 s before the window did".to_owned()],
-            recovered: Some(Recovered { lost_bytes: 5, what: "the recorder died".to_owned() }),
+            incomplete: vec!["the drive ended 2.1 s before the window did".to_owned()],
+            recovered: Some(Recovered { lost_bytes: 5, note: "the recorder died".to_owned() }),
         }
     }
 
@@ -203,8 +203,8 @@ mod tests {
                 r#""kind":"wasm","digest":"00ff","windows":2}],"triggers":3,"moments":[{"lambda":"hello","#,
                 r#""kind":"event","label":"hard-brake","score":0.5,"attributes":{},"at_ns":6000}],"topics":[{"topic":"/imu/data","#,
                 r#""type_name":"sensor_msgs/msg/Imu","messages":7,"received":8,"lost":null,"overwritten":1,"#,
-                r#""too_big":0}],"short":["the drive ended 2.1 s before the window did"],"#,
-                r#""recovered":{"lost_bytes":5,"what":"the recorder died"}}"#
+                r#""too_big":0}],"incomplete":["the drive ended 2.1 s before the window did"],"#,
+                r#""recovered":{"lost_bytes":5,"note":"the recorder died"}}"#
             )
         );
         assert_eq!(serde_json::from_str::<Clip>(&line).unwrap(), clip());

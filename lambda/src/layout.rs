@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use crate::{Manifest, ManifestError, Sources};
-use gleaner_base::words::shell_word;
+use gleaner_base::text::shell_word;
 use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile};
 
 /// Longest file of a build. No model is longer: ONNX is protobuf, whose messages end at 2 GiB.
@@ -254,17 +254,17 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::scratch::Scratch;
+    use crate::test_folder::TestFolder;
 
     /// A lambda's folder with these files, each of a second more than the one before.
-    fn lambda(kind: &str, files: &[&str]) -> Scratch {
+    fn lambda(kind: &str, files: &[&str]) -> TestFolder {
         let entry = if kind == "python" { "main.py" } else { "x.wasm" };
         let manifest = format!(
             "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\nschedule.period = '1s'\n\
              [[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n",
             "0".repeat(64)
         );
-        let dir = Scratch::new();
+        let dir = TestFolder::new();
         for (age, file) in files.iter().enumerate() {
             dir.write(file, if file.ends_with("lambda.toml") { &manifest } else { "" });
             let time = SystemTime::UNIX_EPOCH + Duration::from_secs(1000 + age as u64);
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[track_caller]
-    fn is_older_than(dir: &Scratch, source: &str) {
+    fn is_older_than(dir: &TestFolder, source: &str) {
         let error = BuildDir::check_fresh(dir.root()).unwrap_err();
         let shown = dir.root().display();
         assert_eq!(

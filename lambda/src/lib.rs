@@ -10,11 +10,11 @@ mod log_line;
 pub mod manifest;
 mod output;
 pub mod results;
-#[cfg(test)]
-#[path = "../../base/src/scratch.rs"]
-mod scratch;
 pub mod signals;
 mod sources;
+#[cfg(test)]
+#[path = "../../base/src/test_folder.rs"]
+mod test_folder;
 mod vehicle;
 
 pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
@@ -25,6 +25,6 @@ pub use layout::{BuildDir, LayoutError};
 pub use log_line::{LogLevel, LogLine};
 pub use manifest::{Manifest, ManifestError};
 pub use output::{LOCK, Output, OutputError, RESULTS};
-pub use results::PAGE_BYTES;
+pub use results::RESULT_ITEM_MAX;
 pub use sources::{SOURCE_MAX, Sources};
 pub use vehicle::Vehicle;

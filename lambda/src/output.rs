@@ -10,9 +10,9 @@ use serde::Serialize;
 
 use crate::results::LINES_MAX;
 use crate::signals::Signals;
-use crate::{Decision, LogLine, PAGE_BYTES};
-use gleaner_base::own_file::{self, InTheWay};
-use gleaner_base::{Exit, Explain, write_whole};
+use crate::{Decision, LogLine, RESULT_ITEM_MAX};
+use gleaner_base::safe_file::{self, UnsafePath};
+use gleaner_base::{Exit, Explain, write_atomically};
 
 /// What a run did, as a whole; there once it has ended.
 const SUMMARY: &str = "summary.json";
@@ -46,8 +46,8 @@ pub struct OutputError {
 impl Explain for OutputError {
     fn help(&self) -> Option<String> {
         let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
-        Some(match (InTheWay::of(&self.source), folder) {
-            (Some(_), _) => InTheWay::HELP.to_owned(),
+        Some(match (UnsafePath::of(&self.source), folder) {
+            (Some(_), _) => UnsafePath::HELP.to_owned(),
             // A folder of results is created; that of a journal is not.
             (None, Some(folder)) if self.source.kind() == io::ErrorKind::NotFound => {
                 format!(
@@ -166,7 +166,7 @@ impl Output {
         let path = self.folder.join(SUMMARY);
         let mut text = serde_json::to_vec_pretty(summary).expect("a summary is plain data");
         text.push(b'\n');
-        write_whole(&path, &text).map_err(|source| OutputError { path, source })
+        write_atomically(&path, &text).map_err(|source| OutputError { path, source })
     }
 
     /// Adds what the lambda read.
@@ -177,7 +177,7 @@ impl Output {
     pub fn signals(&self, signals: &Signals) -> Result<(), OutputError> {
         let path = self.folder.join(SIGNALS);
         let text = serde_json::to_vec(signals).expect("signals are plain data, and finite");
-        write_whole(&path, &text).map_err(|source| OutputError { path, source })
+        write_atomically(&path, &text).map_err(|source| OutputError { path, source })
     }
 }
 
@@ -201,8 +201,8 @@ const PENDING_BYTES: usize = 64 << 10;
 impl Lines {
     fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
         let begun =
-            if again { end_in_a_whole_line(&path) } else { own_file::anew(&path).map(drop) };
-        let opened = begun.and_then(|()| own_file::append(&path));
+            if again { end_in_a_whole_line(&path) } else { safe_file::create(&path).map(drop) };
+        let opened = begun.and_then(|()| safe_file::append(&path));
         match opened {
             Ok(file) => {
                 Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None })
@@ -252,7 +252,7 @@ impl Lines {
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 renamed => renamed?,
             }
-            self.file = own_file::append(&self.path)?;
+            self.file = safe_file::append(&self.path)?;
         }
         Ok(())
     }
@@ -260,14 +260,14 @@ impl Lines {
 
 /// Cuts off the part of a line that a process left when it was killed while it wrote.
 fn end_in_a_whole_line(path: &Path) -> io::Result<()> {
-    let file = own_file::write(path)?;
+    let file = safe_file::write(path)?;
     let len = file.metadata()?.len();
-    let start = len.saturating_sub(PAGE_BYTES as u64);
+    let start = len.saturating_sub(RESULT_ITEM_MAX as u64);
     let mut tail = vec![0; 1];
     if len == 0 || (file.read_exact_at(&mut tail, len - 1).is_ok() && tail == *b"\n") {
         return Ok(());
     }
-    tail.resize(usize::try_from(len - start).unwrap_or(PAGE_BYTES), 0);
+    tail.resize(usize::try_from(len - start).unwrap_or(RESULT_ITEM_MAX), 0);
     file.read_exact_at(&mut tail, start)?;
     match tail.iter().rposition(|byte| *byte == b'\n') {
         Some(end) => file.set_len(start + end as u64 + 1),
@@ -281,7 +281,7 @@ fn end_in_a_whole_line(path: &Path) -> io::Result<()> {
 mod tests {
     use super::*;
     use crate::LogLevel;
-    use crate::scratch::Scratch;
+    use crate::test_folder::TestFolder;
 
     fn said(folder: &Path, name: &str) -> Vec<i64> {
         let text = fs::read_to_string(folder.join(name)).unwrap_or_default();
@@ -312,7 +312,7 @@ mod tests {
             .into_iter()
             .flat_map(|name| put.map(|put| (name, put)));
         for (name, (put, why)) in cases {
-            let folder = Scratch::new();
+            let folder = TestFolder::new();
             let (precious, path) = (folder.path("precious"), folder.path(name));
             fs::write(&precious, "precious").unwrap();
             put(&precious, &path);
@@ -343,7 +343,7 @@ mod tests {
 
     #[test]
     fn what_no_program_would_read_is_not_written_and_counted() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let mut output = Output::create(folder.root(), true).unwrap();
         let log = File::options().write(true).open(folder.path("log.jsonl")).unwrap();
         log.set_len(LINES_MAX.bytes() - 10).unwrap();
@@ -356,7 +356,7 @@ mod tests {
 
     #[test]
     fn a_log_that_was_replaced_by_a_link_goes_on_in_a_file_of_its_own() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let mut output = Output::create(folder.root(), true).unwrap().with_log_of(100);
         let line = LogLine { at_ns: 1, level: LogLevel::Info, message: "x".repeat(200) };
         output.log(std::slice::from_ref(&line)).unwrap();
@@ -373,7 +373,7 @@ mod tests {
 
     #[test]
     fn a_long_log_keeps_its_newest_lines_and_those_of_the_file_before() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let mut output = Output::create(folder.root(), true).unwrap().with_log_of(1000);
         let line = |at_ns| LogLine { at_ns, level: LogLevel::Info, message: "x".repeat(100) };
         for at_ns in 0..100 {
@@ -391,7 +391,7 @@ mod tests {
     }
     #[test]
     fn a_part_of_a_line_that_a_killed_process_left_is_cut_off_and_whole_lines_stay() {
-        let long = "x".repeat(PAGE_BYTES);
+        let long = "x".repeat(RESULT_ITEM_MAX);
         let cases = [
             (String::new(), String::new()),
             ("{\"at_ns\"".to_owned(), String::new()),
@@ -400,7 +400,7 @@ mod tests {
             (format!("1\n{long}"), format!("1\n{long}\n")),
         ];
         for (before, after) in cases {
-            let folder = Scratch::new();
+            let folder = TestFolder::new();
             for name in ["decisions.jsonl", "log.jsonl"] {
                 folder.write(name, &before);
             }

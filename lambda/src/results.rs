@@ -29,4 +29,4 @@ pub const PICTURE_MAX: ByteSize = ByteSize::mib(1);
 
 /// Longest page, in bytes, with its line break. A decision with all triggers and attributes that
 /// are allowed, each byte of them escaped, has 1.7 MB.
-pub const PAGE_BYTES: usize = 2 << 20;
+pub const RESULT_ITEM_MAX: usize = 2 << 20;

@@ -21,12 +21,12 @@ pub struct Signals {
     /// Fields that it looked up beyond [`Signals::CURVES_MAX`]: no curve was kept of them.
     pub curves_omitted: u64,
     /// Time in the lambda for each wake, in ns.
-    pub run_ns: Spread,
+    pub run_ns: Distribution,
     /// Fuel of each wake; none in Python, which has no fuel.
-    pub fuel: Option<Spread>,
+    pub fuel: Option<Distribution>,
     /// What a camera saw at wakes that triggered: [`Signals::PICTURES_MAX`] at most, spread over
     /// all of them.
-    pub pictures: Vec<Picture>,
+    pub pictures: Vec<TriggerPicture>,
     /// Wakes that triggered and have no picture, since there were more of them, or no image.
     pub pictures_omitted: u64,
 }
@@ -67,7 +67,7 @@ pub struct Curve {
 
 /// How a number of each wake is spread, to three digits, rounded down.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Spread {
+pub struct Distribution {
     /// Wakes that had it.
     pub count: u64,
     /// Least.
@@ -97,7 +97,7 @@ pub struct Bin {
 
 /// What a camera saw when a lambda triggered.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Picture {
+pub struct TriggerPicture {
     /// Time of the wake that triggered, in ns since the epoch of the drive.
     pub at_ns: i64,
     /// Topic of the camera.

@@ -3,7 +3,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::manifest::Kind;
+use crate::manifest::LambdaKind;
 use crate::{LayoutError, Manifest};
 use gleaner_base::{ByteSize, NotPlain};
 
@@ -45,7 +45,7 @@ impl Sources {
         let mut sources = Sources { copied: models.collect(), compiled: BTreeSet::new() };
         sources.copied.extend(files(dir, "msg", |_| true, |file| has_extension(file, "msg"))?);
         match manifest.lambda.kind {
-            Kind::Python => {
+            LambdaKind::Python => {
                 sources.copied.insert(manifest.lambda.entry.as_path().to_owned());
                 let is_of_the_lambda =
                     |folder: &Path| !LEFT_OUT.iter().any(|left_out| folder == Path::new(left_out));
@@ -53,7 +53,7 @@ impl Sources {
                     .copied
                     .extend(files(dir, "", is_of_the_lambda, |file| has_extension(file, "py"))?);
             }
-            Kind::Wasm => {
+            LambdaKind::Wasm => {
                 sources.compiled.extend(["Cargo.toml", "build.rs"].map(PathBuf::from));
                 sources.compiled.extend(files(dir, "src", |_| true, |_| true)?);
             }
@@ -122,9 +122,9 @@ fn has_extension(file: &Path, wanted: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scratch::Scratch;
+    use crate::test_folder::TestFolder;
 
-    fn sources(dir: &Scratch, kind: &str, entry: &str) -> [Vec<String>; 2] {
+    fn sources(dir: &TestFolder, kind: &str, entry: &str) -> [Vec<String>; 2] {
         let manifest = format!(
             "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\nschedule.period = '1s'\n\
              [[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n",
@@ -137,8 +137,8 @@ mod tests {
     }
 
     /// A folder that could belong to a lambda of either kind.
-    fn folder() -> Scratch {
-        let dir = Scratch::new();
+    fn folder() -> TestFolder {
+        let dir = TestFolder::new();
         for file in [
             ".hidden.py",
             ".venv/lib/y.py",
@@ -190,7 +190,7 @@ mod tests {
 
     #[test]
     fn a_folder_of_sources_that_leads_elsewhere_is_refused_by_name() {
-        let (dir, elsewhere) = (Scratch::new(), folder());
+        let (dir, elsewhere) = (TestFolder::new(), folder());
         for (name, kind) in [("msg", "python"), ("src", "wasm")] {
             std::os::unix::fs::symlink(elsewhere.root(), dir.path(name)).unwrap();
             let manifest = format!(

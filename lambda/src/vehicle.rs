@@ -51,8 +51,8 @@ mod tests {
             (vehicle.limits.fuel, vehicle.limits.memory),
             (10_000_000, gleaner_base::ByteSize::mib(32))
         );
-        assert_eq!(vehicle.limits.deadline, Limits::MOST.deadline);
-        assert_eq!(Vehicle::parse("", "vehicle.toml").unwrap().limits, Limits::MOST);
+        assert_eq!(vehicle.limits.deadline, Limits::MAX.deadline);
+        assert_eq!(Vehicle::parse("", "vehicle.toml").unwrap().limits, Limits::MAX);
     }
 
     #[test]

@@ -9,8 +9,8 @@ mod error;
 mod places;
 mod python;
 #[cfg(test)]
-#[path = "../../../base/src/scratch.rs"]
-mod scratch;
+#[path = "../../../base/src/test_folder.rs"]
+mod test_folder;
 
 use std::env;
 use std::path::{self, Path, PathBuf};

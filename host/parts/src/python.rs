@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use super::{Looked, PartsError};
-use gleaner_base::words::excerpt;
+use gleaner_base::text::excerpt;
 use gleaner_base::{ByteSize, NotPlain, PlainFile};
 
 /// Prints the version and the path of the interpreter itself: `python3` is often a script that

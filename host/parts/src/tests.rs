@@ -1,7 +1,7 @@
 use std::sync::{Mutex, PoisonError};
 
 use super::*;
-use crate::scratch::Scratch;
+use crate::test_folder::TestFolder;
 use gleaner_base::{Exit, Explain};
 
 /// Linux refuses to start a file that is open for writing anywhere, be it in the child that another
@@ -9,7 +9,7 @@ use gleaner_base::{Exit, Explain};
 static TURN: Mutex<()> = Mutex::new(());
 
 /// A program that answers the probe as Python of this version would.
-fn python(dir: &Scratch, relative: &str, version: &str) -> PathBuf {
+fn python(dir: &TestFolder, relative: &str, version: &str) -> PathBuf {
     let path = dir.path(relative);
     dir.write_program(
         relative,
@@ -18,8 +18,8 @@ fn python(dir: &Scratch, relative: &str, version: &str) -> PathBuf {
 }
 
 /// An installation with `bin/gleaner` and everything else in `lib/gleaner`.
-fn installation() -> Scratch {
-    let dir = Scratch::new();
+fn installation() -> TestFolder {
+    let dir = TestFolder::new();
     dir.write_program("bin/gleaner", "");
     dir.write_program("lib/gleaner/gleaner-runtime", "");
     dir.write("lib/gleaner/lib_gleaner.so", "");
@@ -29,8 +29,8 @@ fn installation() -> Scratch {
 }
 
 /// A checkout after `cargo build --release`.
-fn checkout() -> Scratch {
-    let dir = Scratch::new();
+fn checkout() -> TestFolder {
+    let dir = TestFolder::new();
     dir.write("Cargo.toml", "");
     dir.write("guest-sdk-python/start.py", "");
     dir.write("guest-sdk-python/gleaner/__init__.py", "");
@@ -139,7 +139,7 @@ fn the_python_that_the_user_wants_comes_before_those_of_lambda_and_checkout() {
 }
 
 /// A virtual environment in the folder `lambda`, as `python3 -m venv` makes it of `program`.
-fn environment(dir: &Scratch, program: &std::path::Path) {
+fn environment(dir: &TestFolder, program: &std::path::Path) {
     let home = program.parent().unwrap().display();
     dir.write("lambda/.venv/pyvenv.cfg", &format!("home = {home}\n"));
     let link = dir.path("lambda/.venv/bin/python3");
@@ -264,7 +264,7 @@ fn the_pythons_of_path_are_tried_last_and_newest_first() {
 #[test]
 fn without_a_python_that_runs_each_candidate_is_named_with_its_fault() {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-    let dir = Scratch::new();
+    let dir = TestFolder::new();
     let old = python(&dir, "old", "3 8");
     let silent = dir.write_program("silent", "#!/bin/sh\nexit 3\n");
     let split = dir.write_program(

@@ -9,7 +9,7 @@ fn said(difference: Option<Difference>, what: &str, journal: &str, now: &str) {
     assert_eq!(difference, Some(sides));
 }
 
-fn with(change: impl FnOnce(&mut Header)) -> Option<Difference> {
+fn with(change: impl FnOnce(&mut JournalHeader)) -> Option<Difference> {
     let mut now = header(2);
     change(&mut now);
     header(2).differs_from(&now)
@@ -29,7 +29,7 @@ fn what_a_decision_should_not_depend_on_is_no_difference_of_a_header() {
 
 #[test]
 fn the_most_telling_difference_of_a_header_comes_first() {
-    type Case = (fn(&mut Header), [&'static str; 3]);
+    type Case = (fn(&mut JournalHeader), [&'static str; 3]);
     let changes: [Case; 10] = [
         (|now| now.clock = "system".to_owned(), ["clock", "log time of the drive", "system"]),
         (|now| now.remaps.clear(), ["remapped topics", "/in0 is /wire0", "none"]),
@@ -112,13 +112,13 @@ fn digests_that_begin_alike_are_shown_whole() {
     );
 }
 
-fn entry() -> Entry {
-    Entry {
+fn entry() -> JournalEntry {
+    JournalEntry {
         at_ns: 10,
-        cause: Woken::Sample { writer: [0xab; 16], seq: (1 << 32) + 7 },
+        cause: WakeSource::Sample { writer: [0xab; 16], seq: (1 << 32) + 7 },
         seen: vec![
-            Seen { new: 1, digest: 0x1a, newest: Some(([0xab; 16], 7)), reach: 2 },
-            Seen::default(),
+            InputView { new: 1, digest: 0x1a, newest: Some(([0xab; 16], 7)), reach: 2 },
+            InputView::default(),
         ],
         triggers: vec![Trigger {
             kind: TriggerKind::Event,
@@ -128,11 +128,11 @@ fn entry() -> Entry {
         }],
         fault: None,
         fuel: Some(5),
-        log: Said { lines: 1, digest: 2 },
+        log: LogDigest { lines: 1, digest: 2 },
     }
 }
 
-fn changed(change: impl FnOnce(&mut Entry)) -> Option<Difference> {
+fn changed(change: impl FnOnce(&mut JournalEntry)) -> Option<Difference> {
     let mut now = entry();
     change(&mut now);
     entry().differs_from(&now, &header(2).inputs, true)
@@ -141,7 +141,7 @@ fn changed(change: impl FnOnce(&mut Entry)) -> Option<Difference> {
 #[test]
 fn equal_wakes_do_not_differ() {
     assert_eq!(changed(|_| ()), None);
-    let plain = Entry { triggers: Vec::new(), ..entry() };
+    let plain = JournalEntry { triggers: Vec::new(), ..entry() };
     assert_eq!(plain.differs_from(&plain.clone(), &[], true), None);
 }
 
@@ -151,16 +151,16 @@ fn what_woke_the_lambda_is_compared_with_the_writer() {
     let writer = "ab".repeat(16);
     let journal = format!("sample 4294967303 of writer {writer}");
     let cause = "what woke the lambda";
-    said(changed(|now| now.cause = Woken::Tick { missed: 0 }), cause, &journal, "a tick");
+    said(changed(|now| now.cause = WakeSource::Tick { missed: 0 }), cause, &journal, "a tick");
     said(
-        changed(|now| now.cause = Woken::Tick { missed: 3 }),
+        changed(|now| now.cause = WakeSource::Tick { missed: 3 }),
         cause,
         &journal,
         "a tick after 3 missed ones",
     );
     let now = format!("sample 4294967304 of writer {writer}");
     said(
-        changed(|now| now.cause = Woken::Sample { writer: [0xab; 16], seq: (1 << 32) + 8 }),
+        changed(|now| now.cause = WakeSource::Sample { writer: [0xab; 16], seq: (1 << 32) + 8 }),
         cause,
         &journal,
         &now,
@@ -170,11 +170,11 @@ fn what_woke_the_lambda_is_compared_with_the_writer() {
 #[test]
 fn samples_of_a_clip_are_compared_without_what_a_clip_does_not_keep() {
     let mut now = entry();
-    now.cause = Woken::Sample { writer: [1; 16], seq: 7 };
+    now.cause = WakeSource::Sample { writer: [1; 16], seq: 7 };
     now.seen[0].newest = Some(([1; 16], 7 + (5 << 32)));
     assert_eq!(entry().differs_from(&now, &[], false), None);
     assert!(entry().differs_from(&now, &[], true).is_some());
-    now.cause = Woken::Sample { writer: [1; 16], seq: 8 };
+    now.cause = WakeSource::Sample { writer: [1; 16], seq: 8 };
     said(entry().differs_from(&now, &[], false), "what woke the lambda", "sample 7", "sample 8");
 }
 

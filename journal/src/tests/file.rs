@@ -10,7 +10,7 @@ fn a_journal_reads_back_whole_with_its_header_and_end() {
     let entries: Vec<_> = (0..3000).map(|_| any_entry(&mut random, 2)).collect();
     let header = header(2);
     let bytes = journal(&header, &entries, usize::MAX);
-    let mut reader = Reader::open(bytes.as_slice()).unwrap();
+    let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
     assert_eq!((reader.header(), reader.end()), (&header, None));
     let (read, error) = read_all(&mut reader);
     assert!(error.is_none() && read == entries);
@@ -37,7 +37,7 @@ fn a_reader_takes_bytes_as_they_come() {
     }
     let entries = usual_entries(2, 50);
     let bytes = journal(&header(2), &entries, 7);
-    let mut reader = Reader::open(Drip(&bytes, false)).unwrap();
+    let mut reader = JournalReader::open(Drip(&bytes, false)).unwrap();
     assert_eq!(read_all(&mut reader).0, entries);
 }
 
@@ -45,7 +45,7 @@ fn a_reader_takes_bytes_as_they_come() {
 fn a_journal_cut_off_at_any_byte_gives_its_whole_blocks() {
     let entries = usual_entries(2, 12);
     let header = header(2);
-    let mut writer = Writer::begin(Vec::new(), &header).unwrap();
+    let mut writer = JournalWriter::begin(Vec::new(), &header).unwrap();
     let header_len = writer_len(&mut writer);
     // The length after each block, and the wakes up to there.
     let mut blocks = vec![(header_len, 0)];
@@ -57,7 +57,7 @@ fn a_journal_cut_off_at_any_byte_gives_its_whole_blocks() {
     }
     let bytes = writer.finish(&end(12)).unwrap();
     for cut in 0..bytes.len() {
-        let opened = Reader::open(&bytes[..cut]);
+        let opened = JournalReader::open(&bytes[..cut]);
         if cut < header_len {
             assert!(
                 matches!(opened, Err(JournalError::NoHeader { bytes }) if bytes == cut as u64),
@@ -76,7 +76,7 @@ fn a_journal_cut_off_at_any_byte_gives_its_whole_blocks() {
 }
 
 /// What a writer has written so far.
-fn writer_len(writer: &mut Writer<Vec<u8>>) -> usize {
+fn writer_len(writer: &mut JournalWriter<Vec<u8>>) -> usize {
     writer.flush().unwrap();
     writer.written().len()
 }
@@ -84,20 +84,20 @@ fn writer_len(writer: &mut Writer<Vec<u8>>) -> usize {
 #[test]
 fn zeros_that_a_loss_of_power_left_at_the_end_are_torn_and_no_damage() {
     let entries = usual_entries(1, 4);
-    let mut writer = Writer::begin(Vec::new(), &header(1)).unwrap();
+    let mut writer = JournalWriter::begin(Vec::new(), &header(1)).unwrap();
     entries.iter().for_each(|entry| writer.wake(entry).unwrap());
     writer.flush().unwrap();
     let whole = writer.written().clone();
     for zeros in [1, HEAD_LEN, 4096, 10_000] {
         let mut bytes = whole.clone();
         bytes.resize(whole.len() + zeros, 0);
-        let mut reader = Reader::open(bytes.as_slice()).unwrap();
+        let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
         let (read, error) = read_all(&mut reader);
         assert!(error.is_none() && read == entries, "{zeros}: {error:?}");
         assert_eq!((reader.truncated(), reader.torn_bytes()), (true, zeros as u64));
         if zeros > HEAD_LEN {
             *bytes.last_mut().unwrap() = 1;
-            let (_, error) = read_all(&mut Reader::open(bytes.as_slice()).unwrap());
+            let (_, error) = read_all(&mut JournalReader::open(bytes.as_slice()).unwrap());
             assert!(
                 matches!(error, Some(JournalError::Damaged { why: Damage::Head, .. })),
                 "{zeros}"
@@ -153,7 +153,7 @@ fn behind_a_block_that_a_full_disk_tore_nothing_is_written() {
     let begin = journal(&header(1), &[], 1).len();
     for room in [begin, begin + 1, begin + 20, begin + 60] {
         let disk = FullDisk { room, bytes: Vec::new() };
-        let mut writer = Writer::begin(disk, &header(1)).unwrap();
+        let mut writer = JournalWriter::begin(disk, &header(1)).unwrap();
         let failed = entries
             .iter()
             .position(|entry| writer.wake(entry).and_then(|()| writer.flush()).is_err())
@@ -162,7 +162,7 @@ fn behind_a_block_that_a_full_disk_tore_nothing_is_written() {
         assert!(writer.wake(&entries[0]).is_err() && writer.flush().is_err());
         assert_eq!(writer.written().bytes, torn);
         assert!(writer.finish(&end(0)).is_err());
-        let mut reader = Reader::open(torn.as_slice()).unwrap();
+        let mut reader = JournalReader::open(torn.as_slice()).unwrap();
         let (read, error) = read_all(&mut reader);
         assert!(error.is_none() && reader.truncated());
         assert_eq!(read, entries[..failed]);
@@ -172,7 +172,7 @@ fn behind_a_block_that_a_full_disk_tore_nothing_is_written() {
 #[test]
 fn a_wake_that_no_reader_would_take_is_refused_and_the_next_one_is_not() {
     let entries = usual_entries(1, 3);
-    let mut writer = Writer::begin(Vec::new(), &header(1)).unwrap();
+    let mut writer = JournalWriter::begin(Vec::new(), &header(1)).unwrap();
     writer.wake(&entries[0]).unwrap();
     let trigger = any_trigger(&mut Random(5));
     let long = Map::from_iter([("x".to_owned(), json!("y".repeat(ATTRIBUTES_MAX)))]);
@@ -182,20 +182,20 @@ fn a_wake_that_no_reader_would_take_is_refused_and_the_next_one_is_not() {
         vec![Trigger { score: Some(f64::NAN), ..trigger.clone() }],
     ];
     for triggers in triggers {
-        let error = writer.wake(&Entry { triggers, ..entries[1].clone() }).unwrap_err();
+        let error = writer.wake(&JournalEntry { triggers, ..entries[1].clone() }).unwrap_err();
         assert_eq!(error.kind(), io::ErrorKind::InvalidInput);
     }
     let message = "m".repeat(3 << 20);
     let fault = Fault { kind: gleaner_lambda::FaultKind::Trap, message, used: None, allowed: None };
     for refused in [
-        Entry { fault: Some(fault), ..entries[1].clone() },
-        Entry { seen: vec![Seen::default(); 2], ..entries[1].clone() },
+        JournalEntry { fault: Some(fault), ..entries[1].clone() },
+        JournalEntry { seen: vec![InputView::default(); 2], ..entries[1].clone() },
     ] {
         assert_eq!(writer.wake(&refused).unwrap_err().kind(), io::ErrorKind::InvalidInput);
     }
     writer.wake(&entries[2]).unwrap();
     let bytes = writer.finish(&end(2)).unwrap();
-    let (read, error) = read_all(&mut Reader::open(bytes.as_slice()).unwrap());
+    let (read, error) = read_all(&mut JournalReader::open(bytes.as_slice()).unwrap());
     assert!(error.is_none());
     assert_eq!(read, [entries[0].clone(), entries[2].clone()]);
 }
@@ -216,19 +216,21 @@ fn the_largest_wake_that_the_host_allows_fits() {
     entries[1].triggers = vec![trigger; 16];
     entries[1].fault = Some(fault);
     let bytes = journal(&header(1), &entries, usize::MAX);
-    let (read, error) = read_all(&mut Reader::open(bytes.as_slice()).unwrap());
+    let (read, error) = read_all(&mut JournalReader::open(bytes.as_slice()).unwrap());
     assert!(error.is_none() && read == entries, "{error:?}");
 }
 
 #[test]
 fn a_header_that_no_reader_would_take_is_not_begun() {
-    let begin = |header: &Header| Writer::begin(Vec::new(), header).err().map(|error| error.kind());
+    let begin = |header: &JournalHeader| {
+        JournalWriter::begin(Vec::new(), header).err().map(|error| error.kind())
+    };
     assert_eq!(begin(&header(INPUTS_MAX)), None);
     assert_eq!(begin(&header(INPUTS_MAX + 1)), Some(io::ErrorKind::InvalidInput));
     assert_eq!(
-        begin(&Header { event_input: Some(2), ..header(2) }),
+        begin(&JournalHeader { event_input: Some(2), ..header(2) }),
         Some(io::ErrorKind::InvalidInput)
     );
-    let long = Header { engine: "x".repeat(3 << 20), ..header(2) };
+    let long = JournalHeader { engine: "x".repeat(3 << 20), ..header(2) };
     assert_eq!(begin(&long), Some(io::ErrorKind::InvalidInput));
 }

@@ -4,8 +4,8 @@
 use super::*;
 
 /// What reading all of `bytes` ends with.
-fn outcome(bytes: &[u8]) -> Result<(Vec<Entry>, bool), JournalError> {
-    let mut reader = Reader::open(bytes)?;
+fn outcome(bytes: &[u8]) -> Result<(Vec<JournalEntry>, bool), JournalError> {
+    let mut reader = JournalReader::open(bytes)?;
     match read_all(&mut reader) {
         (entries, None) => Ok((entries, reader.truncated())),
         (_, Some(error)) => Err(error),
@@ -48,7 +48,7 @@ fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
         at += HEAD_LEN + head(&bytes, at);
     }
     bytes[at + HEAD_LEN + 4] ^= 1;
-    let mut reader = Reader::open(bytes.as_slice()).unwrap();
+    let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
     let (read, error) = read_all(&mut reader);
     assert_eq!(read, entries[..3]);
     let error = error.unwrap();
@@ -113,9 +113,9 @@ fn blocks_that_no_writer_writes_are_refused_though_their_checksums_are_right() {
     assert_eq!(why(&[first.clone(), end.clone(), end]), Damage::AfterEnd);
     assert!(matches!(why(&[first.clone(), (kind::END, b"{}".to_vec())]), Damage::Json(_)));
     assert!(matches!(why(&[(kind::HEADER, b"[".repeat(100_000))]), Damage::Json(_)));
-    let many = Header { inputs: vec![header.inputs[0].clone(); 257], ..header.clone() };
+    let many = JournalHeader { inputs: vec![header.inputs[0].clone(); 257], ..header.clone() };
     assert_eq!(why(&[header_block(&many)]), Damage::Inputs { found: 257 });
-    let nowhere = Header { event_input: Some(1), ..header };
+    let nowhere = JournalHeader { event_input: Some(1), ..header };
     assert_eq!(why(&[header_block(&nowhere)]), Damage::EventInput);
     let wakes = |payload: &[u8]| why(&[first.clone(), (kind::WAKES, payload.to_vec())]);
     assert_eq!(wakes(&[]), Damage::Wake(Malformed::Short));
@@ -130,7 +130,7 @@ fn blocks_that_no_writer_writes_are_refused_though_their_checksums_are_right() {
 fn a_journal_that_goes_on_behind_its_end_has_none() {
     let end = (kind::END, serde_json::to_vec(&end(0)).unwrap());
     let bytes = journal_of(&[header_block(&header(1)), end.clone(), end]);
-    let mut reader = Reader::open(bytes.as_slice()).unwrap();
+    let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
     assert!(reader.next().is_err() && reader.end().is_none());
 }
 
@@ -142,7 +142,7 @@ fn a_block_of_an_unknown_kind_is_stepped_over_and_counted() {
     let blocks =
         [header_block(&header(1)), (200, vec![1, 2, 3]), (kind::WAKES, payload), (0, Vec::new())];
     let bytes = journal_of(&blocks);
-    let mut reader = Reader::open(bytes.as_slice()).unwrap();
+    let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
     assert_eq!(read_all(&mut reader).0, [entry]);
     assert_eq!((reader.unknown_blocks(), reader.truncated()), (2, true));
 }
@@ -152,7 +152,7 @@ fn keys_of_a_newer_header_are_ignored() {
     let mut json = serde_json::to_value(header(1)).unwrap();
     json.as_object_mut().unwrap().insert("mood".to_owned(), json!({"x": [1]}));
     let bytes = journal_of(&[(kind::HEADER, serde_json::to_vec(&json).unwrap())]);
-    assert_eq!(Reader::open(bytes.as_slice()).unwrap().header(), &header(1));
+    assert_eq!(JournalReader::open(bytes.as_slice()).unwrap().header(), &header(1));
 }
 
 #[test]
@@ -200,7 +200,7 @@ fn what_cannot_be_read_stays_unreadable() {
         }
     }
     let bytes = journal_of(&[header_block(&header(1))]);
-    let mut reader = Reader::open(Broken(bytes, 0)).unwrap();
+    let mut reader = JournalReader::open(Broken(bytes, 0)).unwrap();
     for _ in 0..2 {
         let error = reader.next().unwrap_err();
         assert!(matches!(error, JournalError::Read { .. }));

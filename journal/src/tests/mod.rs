@@ -5,7 +5,7 @@ use serde_json::{Map, json};
 use super::block::{HEAD_LEN, Head, MAGIC, PREAMBLE_LEN, kind};
 use super::*;
 use gleaner_base::{Exit, Explain};
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
 mod differences;
@@ -39,19 +39,19 @@ impl Random {
     }
 }
 
-fn header(inputs: usize) -> Header {
+fn header(inputs: usize) -> JournalHeader {
     let file = |path: &str| FileDigest {
         path: path.to_owned(),
         bytes: 7,
         sha256: "0123456789abcdef".repeat(4),
     };
-    Header {
+    JournalHeader {
         gleaner: "0.1.0".to_owned(),
         engine: "wasmtime 48.0.8".to_owned(),
         machine: "x86_64".to_owned(),
         lambda: "brake-dark".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: Kind::Wasm,
+        kind: LambdaKind::Wasm,
         files: vec![file("brake_dark.wasm"), file("lambda.toml")],
         models: vec![file("models/d.onnx")],
         manifest: String::new(),
@@ -76,19 +76,19 @@ fn header(inputs: usize) -> Header {
     }
 }
 
-fn end(wakes: usize) -> End {
-    End { wakes: wakes as u64, samples: vec![5, 6], drives: Vec::new() }
+fn end(wakes: usize) -> JournalEnd {
+    JournalEnd { wakes: wakes as u64, samples: vec![5, 6], drives: Vec::new() }
 }
 
 /// Anything that an entry can be.
-fn any_entry(random: &mut Random, inputs: usize) -> Entry {
+fn any_entry(random: &mut Random, inputs: usize) -> JournalEntry {
     let writer = |random: &mut Random| [random.below(3) as u8; 16];
     let cause = match random.one_in(3) {
-        true => Woken::Tick { missed: if random.one_in(2) { 0 } else { random.number() } },
-        false => Woken::Sample { writer: writer(random), seq: random.number() },
+        true => WakeSource::Tick { missed: if random.one_in(2) { 0 } else { random.number() } },
+        false => WakeSource::Sample { writer: writer(random), seq: random.number() },
     };
     let seen = (0..inputs)
-        .map(|_| Seen {
+        .map(|_| InputView {
             new: random.number(),
             digest: if random.one_in(4) { 0 } else { random.next() as u32 },
             newest: (!random.one_in(4)).then(|| (writer(random), random.number())),
@@ -103,11 +103,11 @@ fn any_entry(random: &mut Random, inputs: usize) -> Entry {
         allowed: random.one_in(2).then(|| random.number()),
     });
     let log = match random.one_in(4) {
-        true => Said { lines: random.number() as u32, digest: random.next() as u32 },
-        false => Said::default(),
+        true => LogDigest { lines: random.number() as u32, digest: random.next() as u32 },
+        false => LogDigest::default(),
     };
     let fuel = random.one_in(2).then(|| random.number());
-    Entry { at_ns: random.number() as i64, cause, seen, triggers, fault, fuel, log }
+    JournalEntry { at_ns: random.number() as i64, cause, seen, triggers, fault, fuel, log }
 }
 
 fn any_trigger(random: &mut Random) -> Trigger {
@@ -133,7 +133,7 @@ fn any_trigger(random: &mut Random) -> Trigger {
 
 /// Wakes of a lambda with one or two inputs as they are in a drive: a camera at 10 Hz or an IMU at
 /// 100 Hz wakes it.
-fn usual_entries(inputs: usize, n: usize) -> Vec<Entry> {
+fn usual_entries(inputs: usize, n: usize) -> Vec<JournalEntry> {
     let mut random = Random(7);
     let mut seq = 100;
     let mut imu = 5000;
@@ -142,7 +142,7 @@ fn usual_entries(inputs: usize, n: usize) -> Vec<Entry> {
         .map(|index| {
             let jitter_ns = random.below(1_000_000) as i64;
             seq += 1;
-            let mut seen = vec![Seen {
+            let mut seen = vec![InputView {
                 new: 1,
                 digest: random.next() as u32 | 1,
                 newest: Some(([7; 16], seq)),
@@ -151,29 +151,29 @@ fn usual_entries(inputs: usize, n: usize) -> Vec<Entry> {
             if inputs == 2 {
                 let new = 9 + random.below(3);
                 imu += new;
-                seen.push(Seen {
+                seen.push(InputView {
                     new,
                     digest: random.next() as u32 | 1,
                     newest: Some(([8; 16], imu)),
                     reach: 200,
                 });
             }
-            Entry {
+            JournalEntry {
                 at_ns: 1_533_199_000_000_000_000 + index as i64 * step_ns + jitter_ns,
-                cause: Woken::Sample { writer: [7; 16], seq },
+                cause: WakeSource::Sample { writer: [7; 16], seq },
                 seen,
                 triggers: Vec::new(),
                 fault: None,
                 fuel: Some(250_000 + random.below(20_000)),
-                log: Said::default(),
+                log: LogDigest::default(),
             }
         })
         .collect()
 }
 
 /// A whole journal with a block for every `per_block` wakes.
-fn journal(header: &Header, entries: &[Entry], per_block: usize) -> Vec<u8> {
-    let mut writer = Writer::begin(Vec::new(), header).unwrap();
+fn journal(header: &JournalHeader, entries: &[JournalEntry], per_block: usize) -> Vec<u8> {
+    let mut writer = JournalWriter::begin(Vec::new(), header).unwrap();
     for (index, entry) in entries.iter().enumerate() {
         writer.wake(entry).unwrap();
         if (index + 1) % per_block == 0 {
@@ -184,7 +184,9 @@ fn journal(header: &Header, entries: &[Entry], per_block: usize) -> Vec<u8> {
 }
 
 /// All wakes of a journal, and the error that ended it, if one did.
-fn read_all<R: std::io::Read>(reader: &mut Reader<R>) -> (Vec<Entry>, Option<JournalError>) {
+fn read_all<R: std::io::Read>(
+    reader: &mut JournalReader<R>,
+) -> (Vec<JournalEntry>, Option<JournalError>) {
     let mut entries = Vec::new();
     loop {
         match reader.next() {
@@ -209,6 +211,6 @@ fn journal_of(blocks: &[(u8, Vec<u8>)]) -> Vec<u8> {
     bytes
 }
 
-fn header_block(header: &Header) -> (u8, Vec<u8>) {
+fn header_block(header: &JournalHeader) -> (u8, Vec<u8>) {
     (kind::HEADER, serde_json::to_vec(header).unwrap())
 }

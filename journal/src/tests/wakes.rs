@@ -55,14 +55,14 @@ fn a_usual_wake_takes_few_bytes() {
 
 #[test]
 fn a_tick_without_new_samples_takes_a_byte_for_itself_one_for_its_time_and_one_for_each_input() {
-    let tick = |at_ns| Entry {
+    let tick = |at_ns| JournalEntry {
         at_ns,
-        cause: Woken::Tick { missed: 0 },
-        seen: vec![Seen { newest: Some(([1; 16], 5)), ..Seen::default() }; 3],
+        cause: WakeSource::Tick { missed: 0 },
+        seen: vec![InputView { newest: Some(([1; 16], 5)), ..InputView::default() }; 3],
         triggers: Vec::new(),
         fault: None,
         fuel: None,
-        log: Said::default(),
+        log: LogDigest::default(),
     };
     let (mut encoder, mut bytes) = (Encoder::new(3), Vec::new());
     for n in 0..2 {
@@ -75,10 +75,10 @@ fn a_tick_without_new_samples_takes_a_byte_for_itself_one_for_its_time_and_one_f
 
 #[test]
 fn a_wake_is_laid_out_as_the_documentation_says() {
-    let entry = Entry {
+    let entry = JournalEntry {
         at_ns: 5,
-        cause: Woken::Sample { writer: [0xaa; 16], seq: 3 },
-        seen: vec![Seen {
+        cause: WakeSource::Sample { writer: [0xaa; 16], seq: 3 },
+        seen: vec![InputView {
             new: 40,
             digest: 0x0403_0201,
             newest: Some(([0xbb; 16], 300)),
@@ -97,7 +97,7 @@ fn a_wake_is_laid_out_as_the_documentation_says() {
             allowed: Some(9),
         }),
         fuel: Some(64),
-        log: Said { lines: 2, digest: 0x0807_0605 },
+        log: LogDigest { lines: 2, digest: 0x0807_0605 },
     };
     let mut expected = vec![0b0111_1110, 10];
     expected.extend([0xaa; 16]);
@@ -117,14 +117,19 @@ fn a_wake_is_laid_out_as_the_documentation_says() {
 
 #[test]
 fn numbers_at_the_ends_of_their_range_do_not_overflow() {
-    let entry = |at_ns, number| Entry {
+    let entry = |at_ns, number| JournalEntry {
         at_ns,
-        cause: Woken::Sample { writer: [0; 16], seq: number },
-        seen: vec![Seen { new: number, digest: 1, newest: Some(([0; 16], number)), reach: number }],
+        cause: WakeSource::Sample { writer: [0; 16], seq: number },
+        seen: vec![InputView {
+            new: number,
+            digest: 1,
+            newest: Some(([0; 16], number)),
+            reach: number,
+        }],
         triggers: Vec::new(),
         fault: None,
         fuel: Some(number),
-        log: Said { lines: u32::MAX, digest: 0 },
+        log: LogDigest { lines: u32::MAX, digest: 0 },
     };
     let ends =
         [(i64::MIN, 0), (i64::MAX, u64::MAX), (i64::MIN, u64::MAX), (i64::MAX, 1), (-1, 1 << 63)];

@@ -3,7 +3,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{ItemName, Manifest};
-use gleaner_base::words::{excerpt, list, nearest};
+use gleaner_base::text::{excerpt, list, nearest};
 use gleaner_base::{Exit, Explain};
 
 /// `[config]`: a value that a deployment or `--set` may change.
@@ -12,15 +12,15 @@ use gleaner_base::{Exit, Explain};
 pub struct ConfigItem {
     /// Its name.
     pub name: ItemName,
-    /// Its value unless someone changes it. The type of this value is the type of the item.
+    /// Default value. Its type is the type of the key.
     pub default: ConfigValue,
-    /// Smallest value, of the default's type; only numbers have one.
+    /// Smallest value, of the default's type; numbers only.
     pub min: Option<ConfigValue>,
-    /// Largest value, of the default's type; only numbers have one.
+    /// Largest value, of the default's type; numbers only.
     pub max: Option<ConfigValue>,
-    /// Its unit, for people.
+    /// Unit, for the reader.
     pub unit: Option<String>,
-    /// What it does, for people.
+    /// Meaning, for the reader.
     pub description: Option<String>,
 }
 

@@ -4,12 +4,12 @@ use std::path::PathBuf;
 
 use super::ByteSize;
 use super::bounds::INPUTS_MEMORY_MAX;
-use gleaner_base::words::list;
+use gleaner_base::text::list;
 use gleaner_base::{Exit, Explain, NotPlain};
 
 /// A key in a manifest, as a user finds it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Place {
+pub struct KeyLocation {
     /// The manifest, as it was named.
     pub file: String,
     /// The line, from 1.
@@ -18,7 +18,7 @@ pub struct Place {
     pub key: String,
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for KeyLocation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}, line {}: `{}`", self.file, self.line, self.key)
     }
@@ -108,7 +108,7 @@ pub enum ManifestError {
     #[error("{at} is {found}")]
     WrongType {
         /// The key.
-        at: Box<Place>,
+        at: Box<KeyLocation>,
         /// The type it has.
         found: &'static str,
         /// What it should be.
@@ -118,7 +118,7 @@ pub enum ManifestError {
     #[error("{at} is `{text}`, which is no {what}")]
     WrongForm {
         /// The key.
-        at: Box<Place>,
+        at: Box<KeyLocation>,
         /// Its value.
         text: String,
         /// What it should be.
@@ -130,7 +130,7 @@ pub enum ManifestError {
     #[error("{at} is `{text}`, not {}", list(choices, "or"))]
     NoChoice {
         /// The key.
-        at: Box<Place>,
+        at: Box<KeyLocation>,
         /// Its value.
         text: String,
         /// The words.
@@ -142,7 +142,7 @@ pub enum ManifestError {
     #[error("{at} is {value}, below the minimum of {min}")]
     TooSmall {
         /// The key.
-        at: Box<Place>,
+        at: Box<KeyLocation>,
         /// Its value.
         value: String,
         /// The smallest value.
@@ -154,7 +154,7 @@ pub enum ManifestError {
     #[error("{at} is {value}, above the maximum of {max}")]
     TooLarge {
         /// The key.
-        at: Box<Place>,
+        at: Box<KeyLocation>,
         /// Its value.
         value: String,
         /// The smallest value, if there is one.
@@ -182,7 +182,7 @@ pub enum ManifestError {
     #[error("{at} is `{name}`, which is the name of no input")]
     NoSuchInput {
         /// The key.
-        at: Box<Place>,
+        at: Box<KeyLocation>,
         /// The name.
         name: String,
         /// The input that it resembles.
@@ -208,7 +208,7 @@ pub enum ManifestError {
     #[error("{at} {why}")]
     Misplaced {
         /// The key.
-        at: Box<Place>,
+        at: Box<KeyLocation>,
         /// What does not fit.
         why: String,
         /// What to write.

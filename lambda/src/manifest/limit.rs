@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::bounds::Bounds;
-use super::table::Table;
+use super::table::TomlTable;
 use super::{ByteSize, ManifestError, format_duration};
 use gleaner_base::grouped;
 
@@ -13,7 +13,7 @@ pub(super) trait Unit: Copy + Ord {
     const NAME: &'static str;
 
     /// Reads the value of `key`, which is its default where the table does not have the key.
-    fn read(table: &Table, key: &str, bounds: &Bounds<Self>) -> Result<Self, ManifestError>;
+    fn read(table: &TomlTable, key: &str, bounds: &Bounds<Self>) -> Result<Self, ManifestError>;
 
     /// Returns the value as it would be written in the file, without quotes.
     fn in_words(self) -> String;
@@ -28,7 +28,7 @@ pub(super) trait Unit: Copy + Ord {
 impl Unit for u64 {
     const NAME: &'static str = "number";
 
-    fn read(table: &Table, key: &str, bounds: &Bounds<u64>) -> Result<u64, ManifestError> {
+    fn read(table: &TomlTable, key: &str, bounds: &Bounds<u64>) -> Result<u64, ManifestError> {
         table.integer(key, bounds)
     }
 
@@ -49,7 +49,7 @@ impl Unit for ByteSize {
     const NAME: &'static str = "size";
 
     fn read(
-        table: &Table,
+        table: &TomlTable,
         key: &str,
         bounds: &Bounds<ByteSize>,
     ) -> Result<ByteSize, ManifestError> {
@@ -73,7 +73,7 @@ impl Unit for Duration {
     const NAME: &'static str = "duration";
 
     fn read(
-        table: &Table,
+        table: &TomlTable,
         key: &str,
         bounds: &Bounds<Duration>,
     ) -> Result<Duration, ManifestError> {

@@ -25,7 +25,7 @@ mod types;
 mod value;
 
 pub use config::{ConfigError, ConfigItem, ConfigSet, ConfigValue};
-pub use error::{InputMemory, ManifestError, Place};
+pub use error::{InputMemory, KeyLocation, ManifestError};
 pub use generated::{GENERATED, Generated};
 use gleaner_base::{ByteSize, UnitError, format_duration, parse_duration};
 pub use limits::{Limits, Tightened};
@@ -34,8 +34,8 @@ pub use names::{
 };
 pub use reference::reference;
 pub use types::{
-    Backlog, Durability, Input, Kind, Lambda, Manifest, Model, Qos, Record, Reliability, Schedule,
-    Store,
+    Backlog, Durability, InputSpec, LambdaKind, LambdaSection, Manifest, ModelSpec, Qos,
+    RecordSpec, Reliability, ScheduleSpec, Store,
 };
 
 use std::io;

@@ -7,13 +7,13 @@ use super::error::{InputMemory, ManifestError};
 use super::read_config;
 use super::read_limits;
 use super::syntax;
-use super::table::{Document, Table};
-use super::value::Value;
+use super::table::{Document, TomlTable};
+use super::value::TomlValue;
 use super::{
-    Backlog, ByteSize, Durability, Input, Kind, Lambda, Limits, Manifest, Model, Qos, Record,
-    Reliability, Schedule, Store, TopicName, TypeName,
+    Backlog, ByteSize, Durability, InputSpec, LambdaKind, LambdaSection, Limits, Manifest,
+    ModelSpec, Qos, RecordSpec, Reliability, ScheduleSpec, Store, TopicName, TypeName,
 };
-use gleaner_base::words::{excerpt, nearest};
+use gleaner_base::text::{excerpt, nearest};
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
@@ -22,7 +22,7 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
     let entries =
         DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
     let known = &["lambda", "schedule", "input", "model", "record", "limits", "config"];
-    let root = Table::root(document, entries.get_ref(), known)?;
+    let root = TomlTable::root(document, entries.get_ref(), known)?;
     let needed = |table: &'static str, example: &'static str| {
         root.get(table).ok_or_else(|| ManifestError::MissingTable {
             file: document.file.to_owned(),
@@ -48,15 +48,15 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
     })
 }
 
-fn lambda(value: &Value) -> Result<Lambda> {
+fn lambda(value: &TomlValue) -> Result<LambdaSection> {
     let table = value
         .table("[lambda]", &["name", "version", "kind", "entry", "description", "deterministic"])?;
-    let lambda = Lambda {
+    let lambda = LambdaSection {
         name: table.need("name", "name = \"brake-dark\"")?.parse()?,
         version: table.need("version", "version = \"0.1.0\"")?.parse()?,
         kind: table
             .need("kind", "kind = \"wasm\" or kind = \"python\"")?
-            .choice(&[("wasm", Kind::Wasm), ("python", Kind::Python)])?,
+            .choice(&[("wasm", LambdaKind::Wasm), ("python", LambdaKind::Python)])?,
         entry: table
             .need("entry", "entry = \"brake_dark.wasm\", or entry = \"main.py\" for Python")?
             .parse()?,
@@ -64,7 +64,7 @@ fn lambda(value: &Value) -> Result<Lambda> {
         deterministic: table.flag("deterministic")?,
     };
     match table.get("deterministic") {
-        Some(value) if lambda.kind == Kind::Python => Err(value.misplaced(
+        Some(value) if lambda.kind == LambdaKind::Python => Err(value.misplaced(
             "has no meaning with kind = \"python\"",
             "remove it: Python's numbers are those of the machine",
         )),
@@ -72,7 +72,7 @@ fn lambda(value: &Value) -> Result<Lambda> {
     }
 }
 
-fn schedule(value: &Value, inputs: &[Input]) -> Result<Schedule> {
+fn schedule(value: &TomlValue, inputs: &[InputSpec]) -> Result<ScheduleSpec> {
     let table = value.table("[schedule]", &["event", "period", "backlog"])?;
     match (table.get("event"), table.get("period")) {
         (Some(event), None) => {
@@ -83,14 +83,14 @@ fn schedule(value: &Value, inputs: &[Input]) -> Result<Schedule> {
                 &[("each", Backlog::Each), ("latest", Backlog::Latest)],
                 default,
             )?;
-            Ok(Schedule::Event { input: input.name.clone(), backlog })
+            Ok(ScheduleSpec::Event { input: input.name.clone(), backlog })
         }
         (None, Some(period)) => match table.get("backlog") {
             Some(backlog) => Err(backlog.misplaced(
                 "has no meaning with `period`",
                 "remove it: missed ticks are counted, never queued",
             )),
-            None => Ok(Schedule::Periodic { period: period.duration(&bounds::PERIOD)? }),
+            None => Ok(ScheduleSpec::Periodic { period: period.duration(&bounds::PERIOD)? }),
         },
         (Some(event), Some(period)) => {
             let (_, second) =
@@ -107,7 +107,7 @@ fn schedule(value: &Value, inputs: &[Input]) -> Result<Schedule> {
     }
 }
 
-fn event_input<'i>(event: &Value, inputs: &'i [Input]) -> Result<&'i Input> {
+fn event_input<'i>(event: &TomlValue, inputs: &'i [InputSpec]) -> Result<&'i InputSpec> {
     let name = event.text()?;
     inputs.iter().find(|input| input.name == name).ok_or_else(|| {
         let names = || inputs.iter().map(|input| input.name.as_str());
@@ -120,7 +120,7 @@ fn event_input<'i>(event: &Value, inputs: &'i [Input]) -> Result<&'i Input> {
     })
 }
 
-fn inputs(document: &Document, root: &Table) -> Result<Vec<Input>> {
+fn inputs(document: &Document, root: &TomlTable) -> Result<Vec<InputSpec>> {
     let known = &["name", "topic", "type", "depth", "max_size", "decoded_size", "hold", "qos"];
     let mut names = Unique::new(document, "input", "give each [[input]] a name of its own");
     let mut topics = Unique::new(document, "topic", "keep one [[input]] entry per topic");
@@ -147,7 +147,7 @@ fn inputs(document: &Document, root: &Table) -> Result<Vec<Input>> {
     Ok(inputs)
 }
 
-fn input(table: &Table, name: &Value, topic: &Value) -> Result<Input> {
+fn input(table: &TomlTable, name: &TomlValue, topic: &TomlValue) -> Result<InputSpec> {
     let type_name: TypeName = table.need("type", "type = \"sensor_msgs/msg/Imu\"")?.parse()?;
     let (depth, hold, max_size) = if type_name.is_large() {
         (bounds::DEPTH_LARGE, bounds::HOLD_LARGE, bounds::MAX_SIZE_LARGE)
@@ -166,7 +166,7 @@ fn input(table: &Table, name: &Value, topic: &Value) -> Result<Input> {
         }
         _ => None,
     };
-    Ok(Input {
+    Ok(InputSpec {
         name: name.parse()?,
         topic: topic.parse()?,
         depth: count(table.integer("depth", &depth)?),
@@ -178,7 +178,7 @@ fn input(table: &Table, name: &Value, topic: &Value) -> Result<Input> {
     })
 }
 
-fn qos(value: &Value) -> Result<Qos> {
+fn qos(value: &TomlValue) -> Result<Qos> {
     let wanted = "\"auto\", or a table such as { reliability = \"reliable\", durability = \"volatile\", depth = 10 }";
     if value.raw().is_str() {
         return value.choice(&[("auto", Qos::Auto)]);
@@ -202,14 +202,14 @@ fn qos(value: &Value) -> Result<Qos> {
     })
 }
 
-fn models(document: &Document, root: &Table) -> Result<Vec<Model>> {
+fn models(document: &Document, root: &TomlTable) -> Result<Vec<ModelSpec>> {
     let mut names = Unique::new(document, "model", "give each [[model]] a name of its own");
     let mut models = Vec::new();
     for table in
         root.tables("model", &["name", "file", "sha256", "layout", "providers", "threads"])?
     {
         let name = table.need("name", "name = \"detector\"")?;
-        let model = Model {
+        let model = ModelSpec {
             name: name.parse()?,
             file: table.need("file", "file = \"models/detector.onnx\"")?.parse()?,
             sha256: table
@@ -228,12 +228,12 @@ fn models(document: &Document, root: &Table) -> Result<Vec<Model>> {
     Ok(models)
 }
 
-fn providers(value: &Value) -> Result<Vec<String>> {
+fn providers(value: &TomlValue) -> Result<Vec<String>> {
     let items = value.items("an array of texts, for example [\"cuda\", \"cpu\"]")?;
     items.iter().map(|item| item.text().map(str::to_owned)).collect()
 }
 
-fn record(document: &Document, value: &Value) -> Result<Record> {
+fn record(document: &Document, value: &TomlValue) -> Result<RecordSpec> {
     let known =
         &["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
     let table = value.table("[record]", known)?;
@@ -253,7 +253,7 @@ fn record(document: &Document, value: &Value) -> Result<Record> {
         Store::Ram => bounds::PREROLL_SIZE_RAM,
         Store::Disk => bounds::PREROLL_SIZE_DISK,
     };
-    Ok(Record {
+    Ok(RecordSpec {
         topics,
         preroll: table.duration("preroll", &bounds::ROLL)?,
         postroll: table.duration("postroll", &bounds::ROLL)?,
@@ -282,7 +282,7 @@ impl<'a> Unique<'a> {
         Unique { document, what, way_out, seen: Vec::new() }
     }
 
-    fn add(&mut self, name: &str, value: &Value) -> Result<()> {
+    fn add(&mut self, name: &str, value: &TomlValue) -> Result<()> {
         if let Some((_, first)) = self.seen.iter().find(|(seen, _)| seen == name) {
             return Err(ManifestError::Twice {
                 what: self.what,

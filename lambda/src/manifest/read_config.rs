@@ -4,14 +4,14 @@ use toml::de::DeValue;
 
 use super::bounds::ITEMS_MAX;
 use super::error::ManifestError;
-use super::table::Table;
-use super::value::Value;
+use super::table::TomlTable;
+use super::value::TomlValue;
 use super::{ConfigItem, ConfigValue};
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
 /// The items of `[config]`, in the order of the file.
-pub(super) fn items(value: &Value) -> Result<Vec<ConfigItem>> {
+pub(super) fn items(value: &TomlValue) -> Result<Vec<ConfigItem>> {
     let entries = value.open_table("[config]")?.entries();
     if entries.len() > ITEMS_MAX {
         let why = format!("has {} keys, above the maximum of {ITEMS_MAX}", entries.len());
@@ -20,7 +20,7 @@ pub(super) fn items(value: &Value) -> Result<Vec<ConfigItem>> {
     entries.iter().map(item).collect()
 }
 
-fn item(entry: &Value) -> Result<ConfigItem> {
+fn item(entry: &TomlValue) -> Result<ConfigItem> {
     let name = entry.parse_key()?;
     if !entry.raw().is_table() {
         let default = scalar(
@@ -65,10 +65,10 @@ fn item(entry: &Value) -> Result<ConfigItem> {
 
 /// The limit `key` of an item, as a value of the type of `default`.
 fn limit<'a>(
-    table: &Table<'a>,
+    table: &TomlTable<'a>,
     key: &str,
     default: &ConfigValue,
-) -> Result<Option<(Value<'a>, ConfigValue)>> {
+) -> Result<Option<(TomlValue<'a>, ConfigValue)>> {
     let Some(value) = table.get(key) else {
         return Ok(None);
     };
@@ -89,7 +89,7 @@ fn limit<'a>(
     Ok(Some((value, limit)))
 }
 
-fn scalar(value: &Value, wanted: &str) -> Result<ConfigValue> {
+fn scalar(value: &TomlValue, wanted: &str) -> Result<ConfigValue> {
     match value.raw() {
         DeValue::String(text) => Ok(ConfigValue::Text(text.to_string())),
         DeValue::Boolean(truth) => Ok(ConfigValue::Bool(*truth)),

@@ -18,16 +18,56 @@ use gleaner_base::grouped;
 /// Where the types are that a manifest becomes.
 const SOURCES: [&str; 2] = [include_str!("types.rs"), include_str!("config.rs")];
 
-const BEGIN: &str = "\
-# The manifest
+const BEGIN: &str = r##"# The manifest
 
-Every key of `lambda.toml`, made of the types that it is read into: `cargo xtask bless` writes this page, and a test compares it. Unknown keys are
-refused with their line and the nearest known one, numbers out of their range with the range. [limits.md](limits.md) says what
-happens beyond a limit; [errors.md](errors.md) what a refusal looks like.
+`lambda.toml`, in the folder of a lambda, declares when the lambda wakes, which topics it reads, what its clips contain,
+what it may use, and which settings it has. Only `[lambda]` and `[schedule]` are required.
 
-A *size* is a whole number and its unit, as in `\"2 MiB\"`: B, KiB, MiB, GiB. A *duration* is a number and its unit, as in `\"50ms\"` or
-`\"1.5s\"`: us, ms, s, min, h. *Images and clouds* are inputs of `sensor_msgs/msg/Image`, `CompressedImage` and `PointCloud2`.
-";
+```toml
+[lambda]
+name = "brake-dark"
+version = "0.1.0"
+kind = "wasm"                   # a component, written in Rust; or "python"
+entry = "brake_dark.wasm"       # or "main.py"
+description = "hard braking in the dark"
+
+[schedule]
+event = "camera"                # samples of this input wake the lambda; or period = "100ms"
+backlog = "latest"              # only the newest sample; or "each", in order
+
+[[input]]                       # one table for each topic
+name = "camera"
+topic = "/camera/front/compressed"
+type = "sensor_msgs/msg/CompressedImage"
+max_size = "2 MiB"              # largest message
+
+[[input]]
+name = "imu"
+topic = "/imu/data"
+type = "sensor_msgs/msg/Imu"
+depth = 512                     # newest samples that the lambda can read
+
+[record]                        # without this table, no clips
+topics = ["/camera/front/compressed", "/imu/data", "/vehicle/speed"]    # inputs or not
+preroll = "5s"                  # from 5 s before a trigger
+postroll = "5s"                 # until 5 s after it
+
+[limits]                        # without this table, the defaults
+memory = "32 MiB"
+
+[config]                        # settings that the code reads, and `--set` changes
+brake_mps2 = { default = -3.0, unit = "m/s^2", description = "mean forward acceleration below this is braking" }
+dark_luma = { default = 50.0, min = 0, max = 255, description = "mean grey below this is dark" }
+```
+
+- A *size* is a whole number and a unit: `"2 MiB"`; B, KiB, MiB, GiB.
+- A *duration* is a number and a unit: `"50ms"`, `"1.5s"`; us, ms, s, min, h.
+- *Images and clouds* are inputs of `sensor_msgs/msg/Image`, `CompressedImage` and `PointCloud2`.
+- An unknown key is refused with its line and the nearest known key, a number out of range with the range
+  ([errors.md](errors.md)). What happens beyond a limit: [limits.md](limits.md).
+
+<!-- `cargo xtask bless` writes this page from the types in `lambda/src/manifest`. -->
+"##;
 
 /// A table of the manifest.
 pub(super) struct Section {
@@ -55,7 +95,7 @@ impl Key {
     }
 
     fn needed(self) -> Key {
-        self.default("*needed*")
+        self.default("*required*")
     }
 
     fn default(mut self, default: &str) -> Key {
@@ -108,49 +148,52 @@ pub fn reference() -> String {
 
 fn lambda() -> Section {
     let keys = vec![
-        Key::new("name", "Lambda", "name", rule::<LambdaName>()).needed(),
-        Key::new("version", "Lambda", "version", rule::<Version>()).needed(),
-        Key::new("kind", "Lambda", "kind", "`\"wasm\"`, `\"python\"`").needed(),
-        Key::new("entry", "Lambda", "entry", rule::<RelativePath>()).needed(),
-        Key::new("description", "Lambda", "description", "text"),
-        Key::new("deterministic", "Lambda", "deterministic", "`true`, `false`").default("`false`"),
+        Key::new("name", "LambdaSection", "name", rule::<LambdaName>()).needed(),
+        Key::new("version", "LambdaSection", "version", rule::<Version>()).needed(),
+        Key::new("kind", "LambdaSection", "kind", "`\"wasm\"`, `\"python\"`").needed(),
+        Key::new("entry", "LambdaSection", "entry", rule::<RelativePath>()).needed(),
+        Key::new("description", "LambdaSection", "description", "text"),
+        Key::new("deterministic", "LambdaSection", "deterministic", "`true`, `false`")
+            .default("`false`"),
     ];
-    Section { title: "[lambda]", note: "What it is. Needed.".to_owned(), keys }
+    Section { title: "[lambda]", note: "Identity and code. Required.".to_owned(), keys }
 }
 
 fn schedule() -> Section {
     let keys = vec![
-        Key::new("event", "Schedule", "input", "name of an input"),
-        Key::new("period", "Schedule", "period", "duration").within(bounds::PERIOD, duration),
-        Key::new("backlog", "Schedule", "backlog", "`\"each\"`, `\"latest\"`")
+        Key::new("event", "ScheduleSpec", "input", "name of an input"),
+        Key::new("period", "ScheduleSpec", "period", "duration").within(bounds::PERIOD, duration),
+        Key::new("backlog", "ScheduleSpec", "backlog", "`\"each\"`, `\"latest\"`")
             .default("`\"each\"`; of images and clouds `\"latest\"`"),
     ];
-    let note = "When it runs. Needed, with either `event` or `period`; `backlog` belongs to `event`. *Each* sample wakes the lambda in order, as far \
-                as the ring reaches; or the *latest* does, and the others are counted as skipped.";
+    let note = "When the lambda runs. Required, with either `event` or `period`; `backlog` goes with `event`.\n\
+                With `\"each\"`, every sample wakes the lambda, in order, as far back as `depth` reaches.\n\
+                With `\"latest\"`, only the newest one does, and the others are counted as skipped.";
     Section { title: "[schedule]", note: note.to_owned(), keys }
 }
 
 fn input() -> Section {
     let keys = vec![
-        Key::new("name", "Input", "name", rule::<ItemName>()).needed(),
-        Key::new("topic", "Input", "topic", rule::<TopicName>()).needed(),
-        Key::new("type", "Input", "type_name", rule::<TypeName>()).needed(),
-        Key::new("depth", "Input", "depth", "number")
+        Key::new("name", "InputSpec", "name", rule::<ItemName>()).needed(),
+        Key::new("topic", "InputSpec", "topic", rule::<TopicName>()).needed(),
+        Key::new("type", "InputSpec", "type_name", rule::<TypeName>()).needed(),
+        Key::new("depth", "InputSpec", "depth", "number")
             .bounded(&bounds::DEPTH_SMALL, number)
             .or_large(&bounds::DEPTH_LARGE, number),
-        Key::new("max_size", "Input", "max_size", "size")
+        Key::new("max_size", "InputSpec", "max_size", "size")
             .bounded(&bounds::MAX_SIZE_SMALL, size)
             .or_large(&bounds::MAX_SIZE_LARGE, size),
-        Key::new("decoded_size", "Input", "decoded_size", "size")
+        Key::new("decoded_size", "InputSpec", "decoded_size", "size")
             .bounded(&bounds::DECODED_SIZE, size),
-        Key::new("hold", "Input", "hold", "number")
+        Key::new("hold", "InputSpec", "hold", "number")
             .bounded(&bounds::HOLD_SMALL, number)
             .or_large(&bounds::HOLD_LARGE, number),
-        Key::new("qos", "Input", "qos", "`\"auto\"`, or the table below").default("`\"auto\"`"),
+        Key::new("qos", "InputSpec", "qos", "`\"auto\"`, or the table below").default("`\"auto\"`"),
     ];
     let note = format!(
-        "A topic that the lambda sees; any number of them, each with a name and a topic of its own. Their memory is taken before the first sample, {} \
-         at most for all: (`depth` + `hold` + 1) × `max_size`, and of compressed images (`hold` + 1) × `decoded_size`.",
+        "A topic that the lambda reads; any number of them, each with its own name and topic.\n\
+         Memory is allocated before the first sample, {} at most for all inputs:\n\
+         (`depth` + `hold` + 1) × `max_size`, and for compressed images (`hold` + 1) × `decoded_size`.",
         bounds::INPUTS_MEMORY_MAX
     );
     Section { title: "[[input]]", note, keys }
@@ -164,12 +207,12 @@ fn qos() -> Section {
             .default("`\"volatile\"`"),
         Key::new("depth", "Qos", "depth", "number").bounded(&bounds::QOS_DEPTH, number),
     ];
-    let note = "`qos = { ... }` of an input, for live topics: exactly this is asked for.";
+    let note = "`qos = { ... }` of an input requests exactly this profile for a live topic.";
     Section { title: "qos", note: note.to_owned(), keys }
 }
 
 fn record() -> Section {
-    let key = |name, form: &str| Key::new(name, "Record", name, form);
+    let key = |name, form: &str| Key::new(name, "RecordSpec", name, form);
     let mut preroll_size = key("preroll_size", "size").bounded(&bounds::PREROLL_SIZE_RAM, size);
     let disk = bounds::PREROLL_SIZE_DISK;
     let _ = write!(preroll_size.default, "; on disk {}", size(disk.default));
@@ -183,7 +226,7 @@ fn record() -> Section {
         key("store", "`\"ram\"`, `\"disk\"`").default("`\"ram\"`"),
         preroll_size,
     ];
-    let note = "What a clip holds, which a trigger cuts ([clips.md](clips.md)). Without it there are none.";
+    let note = "The clip that a trigger cuts ([clips.md](clips.md)). Without this table, there are no clips.";
     Section { title: "[record]", note: note.to_owned(), keys }
 }
 
@@ -196,7 +239,7 @@ fn limits() -> Section {
     let keys = Limits::table().into_iter().map(key).collect();
     Section {
         title: "[limits]",
-        note: "What it may use. A vehicle can make each smaller.".to_owned(),
+        note: "What the lambda may use. A vehicle can lower each limit.".to_owned(),
         keys,
     }
 }
@@ -209,23 +252,23 @@ fn config() -> Section {
         Key::new("unit", "ConfigItem", "unit", "text"),
         Key::new("description", "ConfigItem", "description", "text"),
     ];
-    let note = "Values that the lambda asks for by name, and that `--set` changes: `key = value`, or `key = { ... }` with what follows. Names are those of the \
-                author.";
+    let note = "Settings that the code reads by name and `--set` changes. The author chooses the names:\n\
+                `key = value`, or `key = { ... }` with these keys.";
     Section { title: "[config]", note: note.to_owned(), keys }
 }
 
 fn model() -> Section {
     let keys = vec![
-        Key::new("name", "Model", "name", rule::<ItemName>()).needed(),
-        Key::new("file", "Model", "file", rule::<RelativePath>()).needed(),
-        Key::new("sha256", "Model", "sha256", rule::<Sha256>()).needed(),
-        Key::new("layout", "Model", "layout", "text"),
-        Key::new("providers", "Model", "providers", "list of texts").default("empty"),
-        Key::new("threads", "Model", "threads", "number").within(bounds::THREADS, number),
+        Key::new("name", "ModelSpec", "name", rule::<ItemName>()).needed(),
+        Key::new("file", "ModelSpec", "file", rule::<RelativePath>()).needed(),
+        Key::new("sha256", "ModelSpec", "sha256", rule::<Sha256>()).needed(),
+        Key::new("layout", "ModelSpec", "layout", "text"),
+        Key::new("providers", "ModelSpec", "providers", "list of texts").default("empty"),
+        Key::new("threads", "ModelSpec", "threads", "number").within(bounds::THREADS, number),
     ];
     Section {
         title: "[[model]]",
-        note: "Read and checked now, used once there are models.".to_owned(),
+        note: "Checked, but not used yet: models are being built.".to_owned(),
         keys,
     }
 }

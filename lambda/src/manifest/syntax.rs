@@ -2,7 +2,7 @@ use toml::de::Error as TomlError;
 
 use super::error::ManifestError;
 use super::table::Document;
-use gleaner_base::words::excerpt;
+use gleaner_base::text::excerpt;
 
 /// What a user should see of an error of the TOML parser.
 pub(super) fn explain(document: &Document, error: &TomlError) -> ManifestError {

@@ -1,6 +1,6 @@
 //! Walks a TOML document and remembers where everything stands, so that a refusal can say it.
 //!
-//! A [`Table`] is made with the keys that it may have and refuses all others; a [`Value`] is read
+//! A [`TomlTable`] is made with the keys that it may have and refuses all others; a [`TomlValue`] is read
 //! as what it should be. Neither knows what a lambda is.
 
 use std::time::Duration;
@@ -10,8 +10,8 @@ use toml::de::DeTable;
 use super::ByteSize;
 use super::bounds::Bounds;
 use super::error::ManifestError;
-use super::value::Value;
-use gleaner_base::words::{excerpt, nearest};
+use super::value::TomlValue;
+use gleaner_base::text::{excerpt, nearest};
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
@@ -29,7 +29,7 @@ impl Document<'_> {
 }
 
 /// A table all of whose keys are known.
-pub(super) struct Table<'a> {
+pub(super) struct TomlTable<'a> {
     pub(super) document: &'a Document<'a>,
     /// The path of its keys, for example `schedule`; empty at the top.
     pub(super) path: String,
@@ -39,19 +39,19 @@ pub(super) struct Table<'a> {
     pub(super) entries: &'a DeTable<'a>,
 }
 
-impl<'a> Table<'a> {
+impl<'a> TomlTable<'a> {
     /// The document itself.
     pub(super) fn root(
         document: &'a Document<'a>,
         entries: &'a DeTable<'a>,
         known: &'static [&'static str],
-    ) -> Result<Table<'a>> {
-        Table { document, path: String::new(), title: String::new(), offset: 0, entries }
+    ) -> Result<TomlTable<'a>> {
+        TomlTable { document, path: String::new(), title: String::new(), offset: 0, entries }
             .knowing(known)
     }
 
     /// The same table, if it has no key but these.
-    pub(super) fn knowing(self, known: &'static [&'static str]) -> Result<Table<'a>> {
+    pub(super) fn knowing(self, known: &'static [&'static str]) -> Result<TomlTable<'a>> {
         let Some(value) = self.entries().into_iter().find(|value| !known.contains(&value.name))
         else {
             return Ok(self);
@@ -71,7 +71,7 @@ impl<'a> Table<'a> {
     }
 
     /// All values, in the order of the file.
-    pub(super) fn entries(&self) -> Vec<Value<'a>> {
+    pub(super) fn entries(&self) -> Vec<TomlValue<'a>> {
         let mut values: Vec<_> =
             self.entries.keys().filter_map(|key| self.get(key.get_ref())).collect();
         values.sort_by_key(|value| value.offset);
@@ -82,10 +82,10 @@ impl<'a> Table<'a> {
         self.document.line(self.offset)
     }
 
-    pub(super) fn get(&self, key: &str) -> Option<Value<'a>> {
+    pub(super) fn get(&self, key: &str) -> Option<TomlValue<'a>> {
         let (name, value) = self.entries.get_key_value(key)?;
         let separator = if self.path.is_empty() { "" } else { "." };
-        Some(Value {
+        Some(TomlValue {
             document: self.document,
             name: name.get_ref(),
             path: format!("{}{separator}{}", self.path, excerpt(name.get_ref())),
@@ -95,7 +95,7 @@ impl<'a> Table<'a> {
     }
 
     /// A value that must be there; `example` is what to write if it is not.
-    pub(super) fn need(&self, key: &'static str, example: &'static str) -> Result<Value<'a>> {
+    pub(super) fn need(&self, key: &'static str, example: &'static str) -> Result<TomlValue<'a>> {
         self.get(key).ok_or_else(|| ManifestError::MissingKey {
             file: self.document.file.to_owned(),
             line: self.line(),
@@ -110,7 +110,7 @@ impl<'a> Table<'a> {
         &self,
         key: &str,
         known: &'static [&'static str],
-    ) -> Result<Vec<Table<'a>>> {
+    ) -> Result<Vec<TomlTable<'a>>> {
         let Some(value) = self.get(key) else {
             return Ok(Vec::new());
         };

@@ -13,18 +13,18 @@ use super::{
 #[non_exhaustive]
 pub struct Manifest {
     /// `[lambda]`: what it is.
-    pub lambda: Lambda,
+    pub lambda: LambdaSection,
     /// `[schedule]`: when it runs.
-    pub schedule: Schedule,
+    pub schedule: ScheduleSpec,
     /// `[[input]]`, in the order of the file. Names and topics are unique; an event schedule names
     /// one of them.
     #[serde(rename = "input")]
-    pub inputs: Vec<Input>,
+    pub inputs: Vec<InputSpec>,
     /// `[[model]]`, in the order of the file, with unique names.
     #[serde(rename = "model")]
-    pub models: Vec<Model>,
+    pub models: Vec<ModelSpec>,
     /// `[record]`: the clip that an event trigger opens; `None` if the lambda records nothing.
-    pub record: Option<Record>,
+    pub record: Option<RecordSpec>,
     /// `[limits]`: what it may use.
     pub limits: Limits,
     /// `[config]`, in the order of the file.
@@ -34,19 +34,18 @@ pub struct Manifest {
 /// `[lambda]`: what it is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
-pub struct Lambda {
-    /// Its name, unique in a fleet.
+pub struct LambdaSection {
+    /// Name, unique in a fleet.
     pub name: LambdaName,
-    /// Its version.
+    /// Version.
     pub version: Version,
-    /// The language it is hosted as.
-    pub kind: Kind,
-    /// What is loaded, relative to the build folder: a component, or the Python file with the
-    /// lambda.
+    /// Kind of code: a WebAssembly component, or Python.
+    pub kind: LambdaKind,
+    /// File to load, relative to the build folder: the component, or the Python file.
     pub entry: RelativePath,
-    /// One line for people.
+    /// One-line description.
     pub description: Option<String>,
-    /// Of a component: whether every NaN that it computes has the same bits on every CPU.
+    /// True to give every NaN of a component the same bits on every CPU, at a cost in speed.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub deterministic: bool,
 }
@@ -54,19 +53,19 @@ pub struct Lambda {
 /// The kinds of lambda.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Kind {
+pub enum LambdaKind {
     /// A WebAssembly component.
     Wasm,
     /// A Python file.
     Python,
 }
 
-impl Kind {
+impl LambdaKind {
     /// The word of the file: `wasm` or `python`.
     pub fn as_str(self) -> &'static str {
         match self {
-            Kind::Wasm => "wasm",
-            Kind::Python => "python",
+            LambdaKind::Wasm => "wasm",
+            LambdaKind::Python => "python",
         }
     }
 }
@@ -74,13 +73,13 @@ impl Kind {
 /// `[schedule]`: when a lambda runs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
-pub enum Schedule {
+pub enum ScheduleSpec {
     /// On samples of one input.
     Event {
-        /// The name of that input.
+        /// Input whose samples wake the lambda.
         #[serde(rename = "event")]
         input: ItemName,
-        /// What happens to samples that arrive during a wake.
+        /// Handling of samples that arrive during a wake.
         backlog: Backlog,
     },
     /// On the clock.
@@ -104,27 +103,27 @@ pub enum Backlog {
 /// `[[input]]`: one topic that the lambda sees.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
-pub struct Input {
-    /// The lambda's word for it.
+pub struct InputSpec {
+    /// Name by which the code looks up the input.
     pub name: ItemName,
-    /// The topic, before remapping.
+    /// Topic name, before remapping.
     pub topic: TopicName,
-    /// The message type.
+    /// Message type.
     #[serde(rename = "type")]
     pub type_name: TypeName,
-    /// How many samples the ring shows.
+    /// Number of newest samples that the lambda can read.
     pub depth: usize,
-    /// Largest sample that is accepted, as CDR.
+    /// Largest accepted sample, as CDR.
     pub max_size: ByteSize,
-    /// Largest image after decoding to rgb8; only compressed images have it.
+    /// Largest image after decoding to rgb8; compressed images only.
     pub decoded_size: Option<ByteSize>,
-    /// How many samples the lambda may hold on to beyond those that the ring shows.
+    /// Number of samples that the lambda may keep beyond those of `depth`.
     pub hold: usize,
-    /// How the topic is subscribed.
+    /// Quality of service of the subscription.
     pub qos: Qos,
 }
 
-impl Input {
+impl InputSpec {
     /// How many slots the samples of this input need: those in the ring, those held, and the one
     /// being written.
     pub fn slots(&self) -> usize {
@@ -154,11 +153,11 @@ pub enum Qos {
     /// Exactly this. Keys that the table leaves out have the values of ROS 2's default profile.
     #[serde(untagged)]
     Fixed {
-        /// Whether lost samples are sent again.
+        /// Retransmission of lost samples.
         reliability: Reliability,
-        /// Whether late subscribers get earlier samples.
+        /// Delivery of earlier samples to late subscribers.
         durability: Durability,
-        /// The history that DDS keeps.
+        /// History depth of DDS.
         depth: usize,
     },
 }
@@ -186,42 +185,41 @@ pub enum Durability {
 /// `[[model]]`: a file with a neural network.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
-pub struct Model {
-    /// The lambda's word for it.
+pub struct ModelSpec {
+    /// Name by which the code looks up the model.
     pub name: ItemName,
-    /// The file, relative to the build folder.
+    /// Model file, relative to the build folder.
     pub file: RelativePath,
-    /// What the file must hash to.
+    /// SHA-256 of the file.
     pub sha256: Sha256,
-    /// How its outputs are laid out, for example `yolov8`; `None` leaves them as tensors.
+    /// Layout of the outputs, for example `yolov8`; without it they stay tensors.
     pub layout: Option<String>,
-    /// Execution providers in the order in which they are tried; empty leaves the choice to the
-    /// vehicle.
+    /// Execution providers in order of preference; if empty, the vehicle chooses.
     pub providers: Vec<String>,
-    /// Threads that one run may use; `None` leaves the choice to the vehicle.
+    /// Threads that one run may use; without it, the vehicle chooses.
     pub threads: Option<usize>,
 }
 
 /// `[record]`: the clip that an event trigger opens.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
-pub struct Record {
-    /// What the clip holds: at least one topic, each once; they need not be inputs.
+pub struct RecordSpec {
+    /// Topics in the clip: at least one, each once; they need not be inputs.
     pub topics: Vec<TopicName>,
-    /// How far the clip reaches back from the anchor.
+    /// Time before the anchor that the clip covers.
     #[serde(rename = "preroll_ns", serialize_with = "nanoseconds")]
     pub preroll: Duration,
-    /// How far the clip reaches beyond the anchor.
+    /// Time after the anchor that the clip covers.
     #[serde(rename = "postroll_ns", serialize_with = "nanoseconds")]
     pub postroll: Duration,
-    /// Where the preroll waits.
+    /// Storage of the preroll.
     pub store: Store,
-    /// The most that waits there; beyond it the oldest goes, and is counted.
+    /// Size of the preroll; beyond it, the oldest samples are evicted and counted.
     pub preroll_size: ByteSize,
-    /// How long after a trigger the next ones open no new window.
+    /// Time after a trigger during which further triggers open no window.
     #[serde(rename = "cooldown_ns", serialize_with = "nanoseconds")]
     pub cooldown: Duration,
-    /// The longest clip; what is longer goes on in a next one.
+    /// Longest clip; a longer recording continues in the next clip.
     #[serde(rename = "max_length_ns", serialize_with = "nanoseconds")]
     pub max_length: Duration,
 }
@@ -238,15 +236,15 @@ pub enum Store {
 
 impl Manifest {
     /// The input of this name.
-    pub fn input(&self, name: &str) -> Option<&Input> {
+    pub fn input(&self, name: &str) -> Option<&InputSpec> {
         self.inputs.iter().find(|input| input.name == name)
     }
 
     /// The input whose samples wake the lambda; `None` if the clock does.
-    pub fn event_input(&self) -> Option<&Input> {
+    pub fn event_input(&self) -> Option<&InputSpec> {
         match &self.schedule {
-            Schedule::Event { input, .. } => self.input(input.as_str()),
-            Schedule::Periodic { .. } => None,
+            ScheduleSpec::Event { input, .. } => self.input(input.as_str()),
+            ScheduleSpec::Periodic { .. } => None,
         }
     }
 

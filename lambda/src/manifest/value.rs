@@ -9,16 +9,16 @@ use toml::Spanned;
 use toml::de::DeValue;
 
 use super::bounds::ITEMS_MAX;
-use super::error::{ManifestError, Place};
-use super::table::{Document, Table};
+use super::error::{KeyLocation, ManifestError};
+use super::table::{Document, TomlTable};
 use super::{ByteSize, NameError, UnitError, format_duration, parse_duration};
-use gleaner_base::words::{excerpt, nearest};
+use gleaner_base::text::{excerpt, nearest};
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
 /// A value and the key it belongs to.
 #[derive(Clone)]
-pub(super) struct Value<'a> {
+pub(super) struct TomlValue<'a> {
     pub(super) document: &'a Document<'a>,
     /// The last part of its path, as it is in the file.
     pub(super) name: &'a str,
@@ -27,13 +27,13 @@ pub(super) struct Value<'a> {
     pub(super) value: &'a DeValue<'a>,
 }
 
-impl<'a> Value<'a> {
+impl<'a> TomlValue<'a> {
     pub(super) fn line(&self) -> usize {
         self.document.line(self.offset)
     }
 
-    pub(super) fn place(&self) -> Box<Place> {
-        Box::new(Place {
+    pub(super) fn place(&self) -> Box<KeyLocation> {
+        Box::new(KeyLocation {
             file: self.document.file.to_owned(),
             line: self.line(),
             key: self.path.clone(),
@@ -78,17 +78,21 @@ impl<'a> Value<'a> {
     }
 
     /// The table that this is. `title` is how it is written.
-    pub(super) fn table(&self, title: &str, known: &'static [&'static str]) -> Result<Table<'a>> {
+    pub(super) fn table(
+        &self,
+        title: &str,
+        known: &'static [&'static str],
+    ) -> Result<TomlTable<'a>> {
         self.open_table(title)?.knowing(known)
     }
 
     /// A table whose keys the author chooses.
-    pub(super) fn open_table(&self, title: &str) -> Result<Table<'a>> {
+    pub(super) fn open_table(&self, title: &str) -> Result<TomlTable<'a>> {
         let DeValue::Table(entries) = self.value else {
             return Err(self.wrong_type("a table"));
         };
         let title = title.to_owned();
-        Ok(Table {
+        Ok(TomlTable {
             document: self.document,
             path: self.path.clone(),
             title,
@@ -98,7 +102,7 @@ impl<'a> Value<'a> {
     }
 
     /// The elements of an array, each with its own line.
-    pub(super) fn items(&self, wanted: &str) -> Result<Vec<Value<'a>>> {
+    pub(super) fn items(&self, wanted: &str) -> Result<Vec<TomlValue<'a>>> {
         let DeValue::Array(items) = self.value else {
             return Err(self.wrong_type(wanted));
         };
@@ -106,7 +110,7 @@ impl<'a> Value<'a> {
             let why = format!("has {} entries, above the maximum of {ITEMS_MAX}", items.len());
             return Err(self.misplaced(why, format!("keep {ITEMS_MAX} or fewer")));
         }
-        let item = |item: &'a Spanned<DeValue<'a>>| Value {
+        let item = |item: &'a Spanned<DeValue<'a>>| TomlValue {
             offset: item.span().start,
             value: item.get_ref(),
             ..self.clone()

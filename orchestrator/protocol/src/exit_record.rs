@@ -4,11 +4,11 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use gleaner_base::{Exit, own_file, write_whole};
+use gleaner_base::{Exit, safe_file, write_atomically};
 
 /// How long a runtime may take for its end once it was asked for it; then `gleaner-shim` kills it.
 /// Who started both waits longer.
-pub const UNTIL_KILLED: Duration = Duration::from_secs(30);
+pub const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if
 /// it was not there at that time.
@@ -38,17 +38,17 @@ pub struct ExitRecord {
     /// `gleaner-shim` had been asked to end it. A lambda can ask its own process only, and not the
     /// shim.
     #[serde(default)]
-    pub asked: bool,
+    pub end_requested: bool,
     /// What it was doing when it ended, if it reported that.
     #[serde(default)]
-    pub doing: Option<Doing>,
+    pub phase: Option<Phase>,
 }
 
 /// What a runtime was doing when `gleaner-shim` killed it, and why.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Killed {
     /// What it did.
-    pub doing: Doing,
+    pub phase: Phase,
     /// How long it had been at it, or had been stopped, in ns.
     pub ran_ns: u64,
     /// How long that may take before it is killed, in ns.
@@ -57,16 +57,16 @@ pub struct Killed {
     pub at_ns: i64,
     /// The limit that it exceeded.
     #[serde(default)]
-    pub why: Why,
+    pub reason: KillReason,
 }
 
 /// The limit of a process that was killed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Why {
+pub enum KillReason {
     /// It did not come back in time.
     #[default]
-    Late,
+    Overdue,
     /// A signal had stopped it.
     Stopped,
     /// It kept more memory than it may, in bytes.
@@ -89,22 +89,22 @@ pub enum Why {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u32)]
-pub enum Doing {
+pub enum Phase {
     /// It looks after itself between two wakes.
-    Rounds = 0,
+    Housekeeping = 0,
     /// The lambda's `init` runs.
     Init = 1,
     /// The lambda is awake.
     Wake = 2,
 }
 
-impl Doing {
+impl Phase {
     /// From its number; what is unknown counts as `Rounds`.
     pub fn from_number(number: u32) -> Self {
         match number {
             1 => Self::Init,
             2 => Self::Wake,
-            _ => Self::Rounds,
+            _ => Self::Housekeeping,
         }
     }
 }
@@ -113,19 +113,19 @@ impl Killed {
     /// A sentence for people, without what was killed.
     pub fn sentence(&self) -> String {
         let (ran, allowed) = (self.ran_ns as f64 / 1e9, self.allowed_ns as f64 / 1e9);
-        let what = match (self.why, self.doing) {
-            (Why::Late, Doing::Rounds) => "gave no sign of life",
-            (Why::Late, Doing::Init) => "was in its init",
-            (Why::Late, Doing::Wake) => "was in one wake",
-            (Why::Stopped, _) => "was stopped by a signal",
-            (Why::Memory { used, allowed }, _) => {
+        let what = match (self.reason, self.phase) {
+            (KillReason::Overdue, Phase::Housekeeping) => "gave no sign of life",
+            (KillReason::Overdue, Phase::Init) => "was in its init",
+            (KillReason::Overdue, Phase::Wake) => "was in one wake",
+            (KillReason::Stopped, _) => "was stopped by a signal",
+            (KillReason::Memory { used, allowed }, _) => {
                 let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
                 let (used, allowed) = (mib(used), mib(allowed));
                 return format!(
                     "needed more memory than it may have: {used:.1} MiB, of {allowed:.1} MiB"
                 );
             }
-            (Why::Threads { used, allowed }, _) => {
+            (KillReason::Threads { used, allowed }, _) => {
                 return format!("had {used} threads, and may have {allowed}");
             }
         };
@@ -134,35 +134,37 @@ impl Killed {
 
     /// The way out.
     pub fn help(&self) -> &'static str {
-        match (self.why, self.doing) {
-            (Why::Late, Doing::Wake) => {
+        match (self.reason, self.phase) {
+            (KillReason::Overdue, Phase::Wake) => {
                 "do less in one wake, or raise `deadline` in [limits]: a process is killed after twice that and 0.35 s; \
                  in a replay, after 100 times that, or a minute if that is longer"
             }
-            (Why::Late, Doing::Init) => {
+            (KillReason::Overdue, Phase::Init) => {
                 "do less in `init`, or raise `init_deadline` in [limits]: a process is killed after twice that and \
                  0.35 s; in a replay, after 10 times that, or a minute if that is longer"
             }
-            (Why::Late, Doing::Rounds) => {
+            (KillReason::Overdue, Phase::Housekeeping) => {
                 "no wake ran, so no deadline is too short: look for threads or native code of the lambda that keep its \
                  process busy, and for a disk that does not answer"
             }
-            (Why::Stopped, _) => {
+            (KillReason::Stopped, _) => {
                 "a lambda must not stop its own process, as SIGSTOP does; if it was stopped by hand, go on"
             }
-            (Why::Memory { .. }, _) => {
+            (KillReason::Memory { .. }, _) => {
                 "keep less, or raise `memory` in [limits]; what native code has taken and not freed stays taken when \
                  the lambda is made again"
             }
-            (Why::Threads { .. }, _) => "start fewer threads, and join those that are done",
+            (KillReason::Threads { .. }, _) => "start fewer threads, and join those that are done",
         }
     }
 
     /// What was used and what is allowed, in the unit of the limit: bytes, threads, or ns.
     pub fn used_and_allowed(&self) -> (u64, u64) {
-        match self.why {
-            Why::Late | Why::Stopped => (self.ran_ns, self.allowed_ns),
-            Why::Memory { used, allowed } | Why::Threads { used, allowed } => (used, allowed),
+        match self.reason {
+            KillReason::Overdue | KillReason::Stopped => (self.ran_ns, self.allowed_ns),
+            KillReason::Memory { used, allowed } | KillReason::Threads { used, allowed } => {
+                (used, allowed)
+            }
         }
     }
 }
@@ -180,15 +182,15 @@ impl ExitRecord {
     /// Returns whether the lambda caused the end. Without a request, an end within a call into the
     /// lambda counts as caused by it, and so does an exit code of success: our own failures come
     /// between two calls and have their own exit codes.
-    pub fn is_the_lambdas(&self) -> bool {
+    pub fn is_caused_by_lambda(&self) -> bool {
         let is_ours = |code| {
             Exit::from_code(code)
                 .is_some_and(|exit| !matches!(exit, Exit::Ok | Exit::LambdaFaulted))
         };
-        let is_within = matches!(self.doing, Some(Doing::Init | Doing::Wake));
+        let is_within = matches!(self.phase, Some(Phase::Init | Phase::Wake));
         self.killed.is_some()
             || self.out_of_memory
-            || !self.asked && (is_within || !self.code.is_some_and(is_ours))
+            || !self.end_requested && (is_within || !self.code.is_some_and(is_ours))
     }
 
     /// Whether it ended by itself with an exit code of a run that was completed.
@@ -224,7 +226,7 @@ impl ExitRecord {
     pub fn write(&self, path: &Path) -> io::Result<()> {
         let mut text = serde_json::to_vec_pretty(self).expect("a record is plain data");
         text.push(b'\n');
-        write_whole(path, &text)
+        write_atomically(path, &text)
     }
 
     /// Prints it as the last line of standard output, where its process may have left a part of a
@@ -245,7 +247,7 @@ impl ExitRecord {
     /// Those of the file system; [`io::ErrorKind::InvalidData`] if it is no record.
     pub fn read(path: &Path) -> io::Result<Self> {
         let mut text = Vec::new();
-        own_file::read(path)?.take(RECORD_MAX).read_to_end(&mut text)?;
+        safe_file::read(path)?.take(RECORD_MAX).read_to_end(&mut text)?;
         serde_json::from_slice(&text)
             .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
     }
@@ -256,7 +258,7 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::scratch::Scratch;
+    use crate::test_folder::TestFolder;
 
     fn record() -> ExitRecord {
         ExitRecord {
@@ -266,66 +268,69 @@ mod tests {
             code: None,
             signal: Some(9),
             killed: Some(Killed {
-                doing: Doing::Wake,
+                phase: Phase::Wake,
                 ran_ns: 350_000_000,
                 allowed_ns: 350_000_000,
                 at_ns: 5,
-                why: Why::Late,
+                reason: KillReason::Overdue,
             }),
             out_of_memory: false,
             max_rss_bytes: 1 << 20,
             cpu_ns: 3,
             orphans: 0,
-            asked: false,
-            doing: None,
+            end_requested: false,
+            phase: None,
         }
     }
 
     #[test]
     fn a_record_of_an_earlier_version_is_read_as_one_of_a_late_process_that_was_not_asked() {
         let mut json = serde_json::to_value(record()).unwrap();
-        json.as_object_mut().unwrap().remove("asked");
-        json["killed"].as_object_mut().unwrap().remove("why");
+        json.as_object_mut().unwrap().remove("end_requested");
+        json["killed"].as_object_mut().unwrap().remove("reason");
         assert_eq!(serde_json::from_value::<ExitRecord>(json).unwrap(), record());
     }
 
     #[test]
     fn a_process_that_ends_unasked_as_if_asked_was_ended_by_its_lambda() {
         let ended = ExitRecord { killed: None, signal: None, code: Some(0), ..record() };
-        assert!(ended.is_the_lambdas());
+        assert!(ended.is_caused_by_lambda());
         assert!(
-            ExitRecord { code: Some(6), ..ended.clone() }.is_the_lambdas(),
+            ExitRecord { code: Some(6), ..ended.clone() }.is_caused_by_lambda(),
             "it had faulted before"
         );
-        assert!(!ExitRecord { asked: true, ..ended.clone() }.is_the_lambdas());
+        assert!(!ExitRecord { end_requested: true, ..ended.clone() }.is_caused_by_lambda());
         assert!(
-            !ExitRecord { code: Some(5), ..ended.clone() }.is_the_lambdas(),
+            !ExitRecord { code: Some(5), ..ended.clone() }.is_caused_by_lambda(),
             "our programs have said why"
         );
-        assert!(ExitRecord { asked: true, killed: record().killed, ..ended }.is_the_lambdas());
+        assert!(
+            ExitRecord { end_requested: true, killed: record().killed, ..ended }
+                .is_caused_by_lambda()
+        );
     }
 
     #[test]
     fn help_fits_the_limit_that_was_exceeded() {
-        let killed = |why, doing| Killed { why, doing, ..record().killed.unwrap() };
-        let memory = killed(Why::Memory { used: 96 << 20, allowed: 64 << 20 }, Doing::Wake);
+        let killed = |reason, phase| Killed { reason, phase, ..record().killed.unwrap() };
+        let memory = killed(KillReason::Memory { used: 96 << 20, allowed: 64 << 20 }, Phase::Wake);
         assert_eq!(memory.sentence(), "needed more memory than it may have: 96.0 MiB, of 64.0 MiB");
         assert_eq!(memory.used_and_allowed(), (96 << 20, 64 << 20));
-        for (why, doing, word) in [
-            (Why::Late, Doing::Wake, "raise `deadline`"),
-            (Why::Late, Doing::Init, "raise `init_deadline`"),
-            (Why::Late, Doing::Rounds, "no wake ran"),
-            (Why::Stopped, Doing::Wake, "SIGSTOP"),
-            (memory.why, Doing::Wake, "raise `memory`"),
-            (Why::Threads { used: 600, allowed: 512 }, Doing::Wake, "fewer threads"),
+        for (reason, phase, word) in [
+            (KillReason::Overdue, Phase::Wake, "raise `deadline`"),
+            (KillReason::Overdue, Phase::Init, "raise `init_deadline`"),
+            (KillReason::Overdue, Phase::Housekeeping, "no wake ran"),
+            (KillReason::Stopped, Phase::Wake, "SIGSTOP"),
+            (memory.reason, Phase::Wake, "raise `memory`"),
+            (KillReason::Threads { used: 600, allowed: 512 }, Phase::Wake, "fewer threads"),
         ] {
-            assert!(killed(why, doing).help().contains(word), "{why:?} {doing:?}");
+            assert!(killed(reason, phase).help().contains(word), "{reason:?} {phase:?}");
         }
     }
 
     #[test]
     fn what_was_written_is_read_again_and_replaces_what_was_there() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let path = folder.path("exit.json");
         record().write(&path).unwrap();
         let second = ExitRecord { killed: None, code: Some(0), signal: None, ..record() };
@@ -336,7 +341,7 @@ mod tests {
 
     #[test]
     fn what_is_no_record_is_refused() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let path = folder.path("exit.json");
         fs::write(&path, "{\"pid\": -1}").unwrap();
         assert_eq!(ExitRecord::read(&path).unwrap_err().kind(), io::ErrorKind::InvalidData);

@@ -4,27 +4,27 @@
 //! Nothing here runs a lambda or listens on a socket. Programs talk to each other through these
 //! types; they never link each other.
 
-mod checked;
-mod drive_seen;
+mod check_report;
+mod drive_info;
 mod drive_time;
 mod exit_record;
 mod isolation;
 pub mod link;
-mod live;
-mod page;
+mod live_status;
 mod recording;
 mod report;
+mod result_item;
 #[cfg(test)]
-#[path = "../../../base/src/scratch.rs"]
-mod scratch;
+#[path = "../../../base/src/test_folder.rs"]
+mod test_folder;
 mod undecided;
 
-pub use checked::{Checked, Need, Place};
-pub use drive_seen::{DriveSeen, Picture, RecordedTopicSeen};
+pub use check_report::{CheckReport, Need, NeedPlace};
+pub use drive_info::{DriveInfo, DriveTopicInfo, PictureInfo};
 pub use drive_time::{DriveTime, DriveTimeError};
-pub use exit_record::{Doing, ExitRecord, Killed, UNTIL_KILLED, Why};
+pub use exit_record::{ExitRecord, KillReason, Killed, Phase, SHUTDOWN_TIMEOUT};
 pub use isolation::{Holds, LAYERS_ENV, Layer};
-pub use live::{Live, LiveTopic, Network, Spread, ToRecorder};
-pub use page::{Page, RESULTS_ENV, WokenBy};
-pub use recording::{Counted, Outcome, Recording};
-pub use report::{Report, Round, Summary, TopicReport, TopicSeen, Verified};
+pub use live_status::{DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus};
+pub use recording::{LossCount, LossOutcome, RecordingCounts};
+pub use report::{ReplaySummary, Report, Round, TopicInfo, TopicReport, Verified};
+pub use result_item::{RESULTS_ENV, ResultItem, WokenBy};

@@ -14,21 +14,21 @@ macro_rules! recording {
         /// file, missing counts are 0.
         #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
         #[serde(default)]
-        pub struct Recording {
+        pub struct RecordingCounts {
             $($(#[doc = $meaning])+ pub $key: u64,)+
         }
 
-        impl Recording {
+        impl RecordingCounts {
             /// Adds what another recorder counted.
-            pub fn add(&mut self, other: &Recording) {
+            pub fn add(&mut self, other: &RecordingCounts) {
                 $(self.$key = self.$key.saturating_add(other.$key);)+
             }
 
             /// Each count of something that is missing, by its cause; also those that are 0.
-            pub fn by_cause(&self) -> Vec<Counted> {
+            pub fn by_cause(&self) -> Vec<LossCount> {
                 let mut all = Vec::new();
-                $($(all.push(Counted {
-                    outcome: Outcome::$outcome,
+                $($(all.push(LossCount {
+                    outcome: LossOutcome::$outcome,
                     count: self.$key,
                     label: concat!($many, " ", $why),
                     thing: if self.$key == 1 { $one } else { $many },
@@ -109,7 +109,7 @@ recording! {
 
 /// What came of something that is counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Outcome {
+pub enum LossOutcome {
     /// It opened no window, as the manifest wants it.
     NoWindow,
     /// It is lost.
@@ -120,9 +120,9 @@ pub enum Outcome {
 
 /// A count of something that is missing, and why.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Counted {
+pub struct LossCount {
     /// What came of it.
-    pub outcome: Outcome,
+    pub outcome: LossOutcome,
     /// How many.
     pub count: u64,
     /// What is counted, with its cause: for a table.
@@ -131,15 +131,15 @@ pub struct Counted {
     why: &'static str,
 }
 
-impl Counted {
+impl LossCount {
     /// Returns the count in words, for example `no window: 2 triggers, within the cooldown of
     /// another`.
     pub fn in_words(&self) -> String {
-        let Counted { outcome, count, thing, why, .. } = self;
+        let LossCount { outcome, count, thing, why, .. } = self;
         let outcome = match outcome {
-            Outcome::NoWindow => "no window",
-            Outcome::Lost => "lost",
-            Outcome::Kept => "kept",
+            LossOutcome::NoWindow => "no window",
+            LossOutcome::Lost => "lost",
+            LossOutcome::Kept => "kept",
         };
         format!("{outcome}: {} {thing}, {why}", grouped(count))
     }
@@ -151,11 +151,11 @@ mod tests {
 
     #[test]
     fn each_count_is_added_and_shown_by_itself() {
-        let all = serde_json::to_value(Recording::default()).unwrap();
+        let all = serde_json::to_value(RecordingCounts::default()).unwrap();
         let mut shown = 0;
         for key in all.as_object().unwrap().keys() {
             let text = format!(r#"{{"{key}":2000,"of a newer version":"x"}}"#);
-            let one: Recording = serde_json::from_str(&text).unwrap();
+            let one: RecordingCounts = serde_json::from_str(&text).unwrap();
             let mut sum = one;
             sum.add(&one);
             assert_eq!(serde_json::to_value(sum).unwrap()[key], 4000, "{key}");
@@ -164,16 +164,16 @@ mod tests {
             assert_eq!(counted.is_empty(), ["clips", "windows"].contains(&key.as_str()), "{key}");
             shown += counted.len();
         }
-        assert_eq!(shown, Recording::default().by_cause().len());
+        assert_eq!(shown, RecordingCounts::default().by_cause().len());
     }
 
     #[test]
     fn a_count_is_shown_with_its_cause() {
-        let few = Recording {
+        let few = RecordingCounts {
             in_cooldown: 1,
             evicted_early: 3000,
             not_deleted: 1,
-            ..Recording::default()
+            ..RecordingCounts::default()
         };
         let shown = few.by_cause().into_iter().filter(|counted| counted.count > 0);
         assert_eq!(

@@ -2,10 +2,10 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Checked, DriveSeen, Layer, Live, Recording};
-use gleaner_journal::Part;
+use crate::{CheckReport, DriveInfo, Layer, LiveStatus, RecordingCounts};
+use gleaner_journal::TimeRange;
 use gleaner_lambda::Decision;
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 
 /// One line of JSON that `gleaner-runtime` writes on its standard output for the program that
 /// started it.
@@ -26,7 +26,7 @@ pub enum Report {
     /// Sent after each pass over the drive, where a replay makes several.
     Round(Round),
     /// Sent once, last.
-    Summary(Box<Summary>),
+    Summary(Box<ReplaySummary>),
     /// Sent once, before the lambda is entered for the first time.
     Isolation {
         /// The layers around its process, and whether they hold here.
@@ -38,18 +38,18 @@ pub enum Report {
     /// here; all are in the file.
     Decision(Box<Decision>),
     /// Live: sent once a second.
-    Live(Box<Live>),
+    Live(Box<LiveStatus>),
     /// Live: sent once, last.
-    Ended(Box<Live>),
+    Ended(Box<LiveStatus>),
     /// Sent once, last: the topics that are there.
     Topics {
         /// By name.
-        topics: Vec<TopicSeen>,
+        topics: Vec<TopicInfo>,
     },
     /// Sent once, last: a lambda was checked.
-    Checked(Box<Checked>),
+    Checked(Box<CheckReport>),
     /// Sent once, last: what is in a recorded drive.
-    Drive(DriveSeen),
+    Drive(DriveInfo),
     /// Sent once, last, instead of a summary: a journal was compared, and every decision was the
     /// same.
     Verified(Verified),
@@ -57,7 +57,7 @@ pub enum Report {
 
 /// A topic of the network.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct TopicSeen {
+pub struct TopicInfo {
     /// Its absolute name.
     pub topic: String,
     /// Its type, for example `sensor_msgs/msg/Imu`.
@@ -112,13 +112,13 @@ pub struct Round {
 
 /// What a replay did, as a whole.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Summary {
+pub struct ReplaySummary {
     /// Name of the lambda.
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
     /// What kind of lambda it is.
-    pub kind: Kind,
+    pub kind: LambdaKind,
     /// The drive: MCAP files and rosbag2 directories, as they were named.
     pub drive: Vec<PathBuf>,
     /// Where the results were written.
@@ -149,8 +149,8 @@ pub struct Summary {
     /// Log time of the drive's last message, in ns since the epoch.
     pub end_ns: i64,
     /// What was replayed of it.
-    #[serde(default, skip_serializing_if = "Part::is_all")]
-    pub part: Part,
+    #[serde(default, skip_serializing_if = "TimeRange::is_all")]
+    pub part: TimeRange,
     /// Duration of the replay, in s.
     pub wall_s: f64,
     /// Time in the lambda, in s.
@@ -166,7 +166,7 @@ pub struct Summary {
     /// What was recorded, and what was not; `clips.jsonl` has a line for each clip, and for those
     /// that were recovered.
     #[serde(flatten)]
-    pub recording: Recording,
+    pub recording: RecordingCounts,
     /// Clips of an earlier replay that were deleted from the same folder.
     pub clips_replaced: u64,
     /// What is wrong with the drive, if it is damaged; the results end there.
@@ -232,10 +232,10 @@ mod tests {
             no_slot: 0,
             too_big: 0,
         };
-        let summary = Summary {
+        let summary = ReplaySummary {
             lambda: "brake-dark".to_owned(),
             version: "0.1.0".to_owned(),
-            kind: Kind::Wasm,
+            kind: LambdaKind::Wasm,
             drive: vec!["a.mcap".into(), "b".into()],
             out: "out".into(),
             wakes: 50,
@@ -250,14 +250,14 @@ mod tests {
             backed_off: 6,
             start_ns: 1,
             end_ns: 2,
-            part: Part::default(),
+            part: TimeRange::default(),
             wall_s: 0.25,
             run_s: 0.125,
             decode_s: 0.0,
             wakes_per_s: 200.0,
             peak_rss_bytes: 1 << 20,
             topics: vec![topic],
-            recording: Recording { clips: 2, in_cooldown: 3, ..Recording::default() },
+            recording: RecordingCounts { clips: 2, in_cooldown: 3, ..RecordingCounts::default() },
             clips_replaced: 1,
             damaged: None,
             stopped: None,

@@ -1,18 +1,18 @@
-use crate::{Doing, ExitRecord, WokenBy};
+use crate::{ExitRecord, Phase, WokenBy};
 use gleaner_lambda::{Decision, Fault, FaultKind};
 
 impl ExitRecord {
     /// Returns the decision of the wake in which the process of a lambda ended: a fault of kind
     /// `killed`. None if the end was requested, or if something around the lambda failed.
     pub fn undecided(&self, woken_by: WokenBy) -> Option<Decision> {
-        if !self.is_the_lambdas() {
+        if !self.is_caused_by_lambda() {
             return None;
         }
         let why = self
             .sentence()
             .unwrap_or_else(|| "ended by itself without a request, with exit code 0".to_owned());
         let amounts = self.killed.map(|killed| killed.used_and_allowed());
-        let wake = self.killed.filter(|killed| killed.doing == Doing::Wake);
+        let wake = self.killed.filter(|killed| killed.phase == Phase::Wake);
         let fault = Fault {
             kind: FaultKind::Killed,
             message: format!("the lambda's process {why}"),

@@ -1,9 +1,9 @@
-// Light and dark. Canvases are drawn in colours of the style sheet, so they are drawn again when those change.
+// Light and dark themes. Canvases use colours of the style sheet, and are redrawn when the theme changes.
 
 const PALETTE = 8;
 const themeListeners = [];
 
-/** Asked for once in each theme: plots need them thousands of times. */
+/** Colours of the current theme, cached: plots need them thousands of times. */
 const colours = new Map();
 
 /** The colour `name` of the style sheet. */
@@ -12,17 +12,17 @@ function colour(name) {
   return colours.get(name);
 }
 
-/** The colour of the `index`th thing. */
+/** The palette colour `index`. */
 function paletteColour(index) {
   return colour(`c${index % PALETTE}`);
 }
 
-/** The same for an element of the page, which changes with the theme by itself. */
+/** The same as a CSS value, which follows the theme. */
 function paletteStyle(index) {
   return `var(--c${index % PALETTE})`;
 }
 
-/** `text`, a colour as `#rrggbb`, with an opacity. */
+/** The colour `text`, `#rrggbb`, with an opacity. */
 function faded(text, opacity) {
   const [red, green, blue] = [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16));
   return `rgba(${red}, ${green}, ${blue}, ${opacity})`;
@@ -39,7 +39,7 @@ function applyTheme() {
   themeListeners.forEach((listener) => listener());
 }
 
-/** A button that goes from light to dark and back. */
+/** A button that switches the theme. */
 function themeButton() {
   const toggle = () => {
     chosenTheme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
@@ -48,7 +48,7 @@ function themeButton() {
   return make("button", { class: "theme", title: "light or dark", "aria-label": "light or dark", text: "◐", on: { click: toggle } });
 }
 
-/** Follows the system until the button is used; paper is light. */
+/** Follows the theme of the system until the button is used. Prints are light. */
 function followSystem() {
   const print = (is) => () => { printing = is; applyTheme(); };
   systemIsDark.addEventListener("change", applyTheme);

@@ -1,18 +1,18 @@
-// What the lambda read, a plot for each field, grouped by input.
+// The fields that the lambda read: a plot for each, grouped by input.
 
 const CURVE_PX = 76;
-/** What the numbers of the axis of time take: the last plot of a group has them. */
+/** Height of the time axis, which only the last plot of a group has. */
 const AXIS_PX = 22;
-/** Time between neighbours, over what is usual, from which on nothing is drawn between them: nobody looked there. */
+/** Gaps longer than this many median intervals are not drawn over: the lambda did not read the field there. */
 const GAP = 8;
 
-/** The curves of all runs; those of one field are together: `{ input, topic, path, of: [{ run, index, curve }] }`. */
+/** The curves of all runs by field: `{ input, topic, path, curves: [{ run, index, curve }] }`. */
 function fieldsOf(page) {
   const fields = new Map();
   page.runs.forEach((run, index) => run.curves.forEach((curve) => {
     const key = JSON.stringify([curve.input, curve.topic, curve.path]);
-    if (!fields.has(key)) fields.set(key, { input: curve.input, topic: curve.topic, path: curve.path, of: [] });
-    fields.get(key).of.push({ run, index, curve });
+    if (!fields.has(key)) fields.set(key, { input: curve.input, topic: curve.topic, path: curve.path, curves: [] });
+    fields.get(key).curves.push({ run, index, curve });
   }));
   return [...fields.values()];
 }
@@ -34,7 +34,7 @@ function drawCurves(page, entries, place) {
 function drawField(page, entries, field, group, isLast) {
   const several = page.runs.length > 1;
   const value = make("span", { class: "value dim" });
-  const caption = make("div", { class: "caption" }, make("b", { text: field.path }), ...field.of.map(({ index, curve }) => notes(curve, several ? index : null)), value);
+  const caption = make("div", { class: "caption" }, make("b", { text: field.path }), ...field.curves.map(({ index, curve }) => notes(curve, several ? index : null)), value);
   const place = group.appendChild(make("div"));
   group.insertBefore(caption, place);
 
@@ -51,22 +51,22 @@ function drawField(page, entries, field, group, isLast) {
   addPlot(options, data, place);
 }
 
-/** How often the field was read, and what of it is in no point. */
+/** Number of samples, samples per point and non-finite values. */
 function notes(curve, index) {
   const words = [`${counted(curve.samples, "sample")}`];
-  if (curve.per_point > 1) words.push(`least and most of ${curve.per_point} each`);
+  if (curve.per_point > 1) words.push(`min and max of ${curve.per_point} per point`);
   if (curve.non_finite > 0) words.push(`${count(curve.non_finite)} not finite`);
   const name = index === null ? "" : `${"AB"[index]}: `;
   return make("span", { class: "dim" }, index === null ? null : swatch(paletteStyle(index)), name + words.join(", "));
 }
 
-/** The points of one curve, with a hole where nobody looked for long. */
+/** The points of one curve, with gaps where the field was not read. */
 function withGaps({ t, min, max }) {
   const steps = t.slice(1).map((time, at) => time - t[at]).filter((step) => step > 0).sort((a, b) => a - b);
-  const usual = steps[Math.floor(steps.length / 2)] ?? Infinity;
+  const median = steps[Math.floor(steps.length / 2)] ?? Infinity;
   const points = { t: [], min: [], max: [] };
   t.forEach((time, at) => {
-    if (at > 0 && time - t[at - 1] > GAP * usual) {
+    if (at > 0 && time - t[at - 1] > GAP * median) {
       points.t.push((time + t[at - 1]) / 2);
       points.min.push(null);
       points.max.push(null);
@@ -78,10 +78,10 @@ function withGaps({ t, min, max }) {
   return points;
 }
 
-/** A field as uPlot takes it: one line, or two with what is between them filled, for each run. */
+/** Data for uPlot: for each run one line, or a filled band between two lines. */
 function drawn(field, page) {
   const [series, bands, tables] = [[{}], [], []];
-  field.of.forEach(({ index, curve }) => {
+  field.curves.forEach(({ index, curve }) => {
     const stroke = () => paletteColour(page.runs.length > 1 ? index : 0);
     const line = { stroke, width: 1.25, points: { size: 4, fill: stroke } };
     const points = withGaps(curve);
@@ -94,18 +94,18 @@ function drawn(field, page) {
     }
     tables.push(isBand ? [points.t, points.max, points.min] : [points.t, points.min]);
   });
-  // Two runs need not have read at the same times; a hole is kept, a time that only the other one has is passed over.
+  // Two runs may have read at different times: gaps are kept, times that only the other run has are skipped.
   const data = tables.length === 1 ? tables[0] : uPlot.join(tables, tables.map((one) => one.map(() => 2)));
   if (tables.length > 1) series.slice(1).forEach((one) => { one.spanGaps = false; });
   return { data, series, bands };
 }
 
-/** What the field was at the pointer. */
+/** The value of the field at the pointer. */
 function valueAt(plot, field, several) {
   const { left } = plot.cursor;
   if (left === undefined || left < 0) return "";
   const t = plot.posToVal(left, "x");
-  const words = field.of.map(({ index, curve }) => {
+  const words = field.curves.map(({ index, curve }) => {
     const at = nearest(curve.t, t);
     if (at < 0) return "";
     const [least, most] = [curve.min[at], curve.max[at] ?? curve.min[at]];
@@ -115,7 +115,7 @@ function valueAt(plot, field, several) {
   return words.filter(Boolean).join("   ");
 }
 
-/** The place in `times` that is nearest to `t`; -1 if there is none. */
+/** The index in `times` nearest to `t`; -1 if `times` is empty. */
 function nearest(times, t) {
   let [low, high] = [0, times.length - 1];
   while (low < high) {
@@ -136,7 +136,7 @@ function drawClips(plot, entries) {
   }
 }
 
-/** A line at each trigger, and one at what is chosen. */
+/** Draws a line at each trigger and one at the chosen entry. */
 function drawMarks(plot, entries) {
   const { ctx, bbox } = plot;
   const drawn = new Set();

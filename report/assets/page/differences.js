@@ -1,28 +1,28 @@
-// What differs between two runs, as tables.
+// Tables of the differences between two runs.
 
 function differenceCard(page, entries) {
   const { diff } = page;
   if (!diff) return null;
-  const verdict = diff.same ? make("p", { class: "good", text: "Every decision is the same." }) : null;
-  const tally = ([what, one]) => ({ what, ...one });
+  const verdict = diff.identical ? make("p", { class: "good", text: "All decisions are identical." }) : null;
+  const row = ([what, counts]) => ({ what, ...counts });
   const counts = table([
     { title: "", of: (row) => make("b", { text: row.what }) },
-    ...["same", "gone", "new", "changed"].map((word) => ({ title: word, number: true, of: (row) => count(row[word]) })),
-  ], [["triggers", diff.triggers], ["faults", diff.faults]].map(tally));
+    ...["identical", "removed", "added", "changed"].map((word) => ({ title: word, number: true, of: (row) => count(row[word]) })),
+  ], [["triggers", diff.triggers], ["faults", diff.faults]].map(row));
   const columns = [
     { title: "time", number: true, of: ({ difference }) => seconds(difference.t) },
-    { title: "", of: (entry) => make("span", {}, swatch(entryStyle(entry)), entry.is) },
-    { title: "what", of: ({ difference }) => make("b", { text: difference.of === "fault" ? `fault: ${plain(difference.label)}` : difference.label }) },
+    { title: "", of: (entry) => make("span", {}, swatch(entryStyle(entry)), entry.change) },
+    { title: "what", of: ({ difference }) => make("b", { text: difference.kind === "fault" ? `fault: ${plain(difference.label)}` : difference.label }) },
     { title: "before → after", text: true, of: ({ difference }) => difference.detail },
     { title: "topic", of: ({ difference }) => make("code", { text: difference.topic ?? "" }) },
   ];
   const rows = entries.filter((entry) => entry.kind === "difference");
-  return card("Decisions that differ", "gone: only in A; new: only in B", verdict, counts,
+  return card("Decisions that differ", "removed: only in A; added: only in B", verdict, counts,
     rows.length > 0 ? table(columns, rows, choose) : null,
-    more(rows.length, rows.length + diff.left_out, "differences", "the files decisions.jsonl of both"));
+    more(rows.length, rows.length + diff.omitted, "differences", "the files decisions.jsonl of both"));
 }
 
-/** Config, counts and costs that are not alike. */
+/** Config, counts and costs that differ. */
 function changeCard(page) {
   const { diff } = page;
   if (!diff) return null;
@@ -39,5 +39,5 @@ function changeCard(page) {
     { title: "B", number: true, of: ([, , b]) => b },
     { title: "", number: true, of: ([, , , by]) => by },
   ];
-  return card("What else differs", null, table(columns, rows));
+  return card("Other differences", null, table(columns, rows));
 }

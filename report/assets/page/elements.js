@@ -1,13 +1,13 @@
-// Elements of the page. Text from files comes in as text and never as HTML.
+// Builds elements of the page. Text from files is inserted as text, never as HTML.
 
-/** An element `tag` with `given` (its class, title, text, what it does on events; all else are attributes) and `children`. */
+/** An element `tag` with `children` and with `given`: class, text, event handlers in `on`, other keys are attributes. */
 function make(tag, given = {}, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(given)) {
     if (value === undefined || value === null || value === false) continue;
     if (key === "class") element.className = value;
     else if (key === "text") element.textContent = value;
-    else if (key === "on") for (const [event, does] of Object.entries(value)) element.addEventListener(event, does);
+    else if (key === "on") for (const [event, handler] of Object.entries(value)) element.addEventListener(event, handler);
     else element.setAttribute(key, value === true ? "" : value);
   }
   element.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
@@ -27,13 +27,13 @@ function swatch(colour) {
   return square;
 }
 
-/** The pairs of `list` as a list of terms; pairs without a value are left out. */
+/** A definition list of the pairs in `list` that have a value. */
 function terms(list) {
   const known = list.filter(([, value]) => value !== null && value !== undefined && value !== "");
   return make("dl", {}, known.flatMap(([term, value]) => [make("dt", { text: term }), make("dd", {}, value)]));
 }
 
-/** A table. `columns` are `{ title, number, text, of(row) }`; `at(row)` gives what a click on a row goes to. */
+/** A table. `columns` are `{ title, number, text, of(row) }`; `at(row)`, if given, is called when a row is clicked. */
 function table(columns, rows, at) {
   const kind = (column) => (column.number ? "number" : column.text ? "text" : null);
   const head = make("tr", {}, columns.map((column) => make("th", { class: kind(column), text: column.title })));
@@ -47,7 +47,7 @@ function table(columns, rows, at) {
   return make("div", { class: "scroll" }, make("table", {}, make("thead", {}, head), make("tbody", {}, body)));
 }
 
-/** A line below a list that says how much is not in it; nothing if nothing is missing. */
+/** A note below an incomplete list with the number of missing items; null if the list is complete. */
 function more(shown, total, what, where) {
   if (total <= shown) return null;
   return make("p", { class: "more", text: `${count(total - shown)} more ${what} are not on this page; all are in ${where}.` });

@@ -1,4 +1,4 @@
-// What cameras saw at the triggers.
+// Camera pictures at the triggers.
 
 function galleryCard(run, name, entries) {
   if (run.pictures.length === 0) return null;
@@ -6,7 +6,7 @@ function galleryCard(run, name, entries) {
   const pictures = run.pictures.map((picture, at) => {
     const of = entries.filter((entry) => entry.run === run && entry.mark?.pictures?.includes(at));
     const [first] = of;
-    const title = first ? first.title + (of.length > 1 ? ` and ${count(of.length - 1)} more` : "") : picture.of;
+    const title = first ? first.title + (of.length > 1 ? ` and ${count(of.length - 1)} more` : "") : picture.source;
     const score = first && first.score !== null ? `${number(first.score)} · ` : "";
     const button = make("button", { title: pictureWords(picture), on: { click: () => (first ? choose(first) : goTo(picture.t)) } },
       make("img", { src: picture.src, alt: title, loading: "lazy" }),
@@ -22,5 +22,5 @@ function galleryCard(run, name, entries) {
   });
   const left = run.totals.pictures_omitted;
   return card(`${name}Pictures`, `${counted(pictures.length, "picture")} at triggers`, make("div", { class: "gallery" }, pictures),
-    left > 0 ? make("p", { class: "more", text: `No picture was kept of ${count(left)} more triggers or clips.` }) : null);
+    left > 0 ? make("p", { class: "more", text: `Pictures of ${count(left)} more triggers or clips are omitted.` }) : null);
 }

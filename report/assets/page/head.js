@@ -1,4 +1,4 @@
-// The head of the page: which lambda, over what, with which result, at one glance.
+// The head of the page: lambda, drive, and results at a glance.
 
 function drawHead(page, place) {
   const [run] = page.runs;
@@ -24,7 +24,7 @@ function badges(run) {
   return words.map((word) => make("span", { class: "badge", text: word }));
 }
 
-/** Which drive, which part of it, and where the results are. */
+/** The drive, the part of it, and the result folder. */
 function origin(run) {
   const drive = run.is_live ? "live topics" : run.drive.join(", ");
   const part = run.is_part ? `, only ${seconds(run.from)} to ${seconds(run.to)}` : "";
@@ -36,17 +36,17 @@ function origin(run) {
 function tiles(run) {
   const { wakes, triggers, faults } = run.counts;
   const clips = run.totals.clips;
-  const time = run.spreads.find((spread) => spread.what === "time in the lambda");
+  const time = run.spreads.find((spread) => spread.what === "run time");
   const fuel = run.spreads.find((spread) => spread.unit === "fuel");
-  const half = (spread) => spread.marks.find(([word]) => word === "half")[1];
+  const median = (spread) => spread.quantiles.find(([name]) => name === "p50")[1];
   const all = [
     tile(count(wakes), "wakes"),
     tile(count(triggers), triggers === 1 ? "trigger" : "triggers", triggers > 0 ? "good" : null),
     tile(count(clips), clips === 1 ? "clip" : "clips"),
     tile(count(faults), faults === 1 ? "fault" : "faults", faults > 0 ? "bad" : null),
     lossTile(run),
-    time && time.count > 0 ? tile(nanoseconds(half(time)), "a wake, median") : null,
-    fuel && fuel.count > 0 ? tile(count(half(fuel)), "fuel, median") : null,
+    time && time.count > 0 ? tile(nanoseconds(median(time)), "run time, p50") : null,
+    fuel && fuel.count > 0 ? tile(count(median(fuel)), "fuel, p50") : null,
   ];
   return make("div", { class: "tiles" }, all);
 }
@@ -55,7 +55,7 @@ function tile(value, what, kind) {
   return make("div", { class: "tile" }, make("b", { class: kind, text: value }), make("span", { text: what }));
 }
 
-/** Samples that were lost, as far as anybody knows. */
+/** Number of lost samples, as far as it is known. */
 function lossTile(run) {
   const lost = run.topics.reduce((sum, topic) => sum + lostOf(topic), 0);
   const unknown = run.topics.filter((topic) => topic.lost === null).length;
@@ -63,12 +63,12 @@ function lossTile(run) {
   return tile(count(lost), unknown > 0 ? `samples lost; unknown of ${counted(unknown, "topic")}` : "samples lost", lost > 0 ? "warn" : null);
 }
 
-/** Samples of a topic that are known to be lost. */
+/** Number of samples of a topic that are known to be lost. */
 function lostOf(topic) {
   return (topic.lost ?? 0) + topic.no_slot + topic.too_big + (topic.malformed ?? 0);
 }
 
-/** The config that held, and what the run took. */
+/** The config of the run, and its cost. */
 function chips(run) {
   const chip = (what, value) => make("span", {}, make("span", { text: what }), value);
   const config = run.config
@@ -87,7 +87,7 @@ function banners(page) {
     if (run.stopped) all.push(banner("banner bad", `${name}The lambda's process ended before the drive did; the results end there. `, run.stopped));
     run.notes.forEach((note) => all.push(banner("banner", "", name + note)));
     const { shown, total } = { shown: run.triggers.length, total: run.totals.triggers };
-    if (shown < total) all.push(banner("banner", "", `${name}${count(shown)} of ${count(total)} triggers are on this page with all that is known of them; bars on the time line show where the others are. All are in decisions.jsonl.`));
+    if (shown < total) all.push(banner("banner", "", `${name}${count(shown)} of ${count(total)} triggers are on this page with details; bars on the time line show where the others are. All are in decisions.jsonl.`));
   });
   return all;
 }

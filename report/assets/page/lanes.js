@@ -1,7 +1,7 @@
-// The lanes above the curves: triggers by label, faults, clips, and what differs.
+// The lanes above the curves: triggers by label, faults, clips and differences.
 
 const LANE_PX = 24;
-/** Labels with a lane of their own; the rarer ones share one. */
+/** Maximum number of lanes for labels; the rarest labels share one. */
 const LANES_MAX = 8;
 const HIT_PX = 7;
 
@@ -40,7 +40,7 @@ function labelLanes(run, triggers) {
 /** The colour of an entry. */
 function entryColour(entry) {
   if (entry.kind === "fault") return colour("bad");
-  if (entry.kind === "difference") return colour({ gone: "bad", new: "good", changed: "warn" }[entry.is]);
+  if (entry.kind === "difference") return colour({ removed: "bad", added: "good", changed: "warn" }[entry.change]);
   return paletteColour(entry.colour);
 }
 
@@ -87,7 +87,7 @@ function entryTitle(entry) {
   return `${entry.title}${score}, ${time}`;
 }
 
-/** Every other lane on a faint ground. */
+/** Shades every other lane. */
 function drawGround(plot, lanes) {
   const { ctx, bbox } = plot;
   const step = bbox.height / lanes.length;
@@ -108,8 +108,8 @@ function drawLane(plot, lane, at, count) {
   for (const entry of lane.items) {
     if ((entry.to ?? entry.t) < timeline.view[0] || entry.t > timeline.view[1] || entry === timeline.chosen) continue;
     const x = Math.round(plot.valToPos(entry.t, "x", true));
-    const key = `${x} ${entry.colour} ${entry.is}`;
-    // Thousands may stand on one pixel.
+    const key = `${x} ${entry.colour} ${entry.change}`;
+    // Thousands may share one pixel.
     if (!entry.to && drawn.has(key)) continue;
     drawn.add(key);
     drawEntry(plot, entry, x, middle, step);
@@ -118,7 +118,7 @@ function drawLane(plot, lane, at, count) {
   ctx.restore();
 }
 
-/** Where there are more than the page lists: bars, darker where more of them are. */
+/** Draws density bars for incomplete lists, darker where there are more entries. */
 function drawDense(plot, lane, middle, step) {
   const most = Math.max(1, ...lane.dense.map((bin) => bin.count));
   for (const bin of lane.dense) {
@@ -152,9 +152,9 @@ function drawEntry(plot, entry, x, middle, step) {
     ctx.stroke();
     return;
   }
-  if (entry.kind === "difference") return drawDifference(ctx, entry.is, x, middle, tall);
+  if (entry.kind === "difference") return drawDifference(ctx, entry.change, x, middle, tall);
   ctx.fillRect(x - 1.5 * unit, middle - tall, 3 * unit, 2 * tall);
-  // A recording that begins or ends points to where it is.
+  // The start or stop of a recording points into it.
   const way = { start: 1, stop: -1 }[entry.mark?.kind];
   if (!way) return;
   ctx.beginPath();
@@ -164,18 +164,18 @@ function drawEntry(plot, entry, x, middle, step) {
   ctx.fill();
 }
 
-/** Told apart by more than colour: hollow is gone, full is new, and a lozenge is what changed. */
-function drawDifference(ctx, is, x, middle, size) {
+/** Distinguished by more than colour: a ring is removed, a disc is added, a diamond is changed. */
+function drawDifference(ctx, change, x, middle, size) {
   ctx.lineWidth = 1.6 * devicePixelRatio;
   ctx.beginPath();
-  if (is === "changed") [[0, -1], [1, 0], [0, 1], [-1, 0]].forEach(([right, down]) => ctx.lineTo(x + right * size, middle + down * size));
+  if (change === "changed") [[0, -1], [1, 0], [0, 1], [-1, 0]].forEach(([right, down]) => ctx.lineTo(x + right * size, middle + down * size));
   else ctx.arc(x, middle, size * 0.75, 0, 2 * Math.PI);
   ctx.closePath();
-  if (is === "gone") ctx.stroke();
+  if (change === "removed") ctx.stroke();
   else ctx.fill();
 }
 
-/** The entry at this place of the plot, in CSS pixels; the nearest of several. */
+/** The entry nearest to (x, y), in CSS pixels of the plot; null if none is near. */
 function entryAt(plot, lanes, x, y) {
   const lane = lanes[Math.floor(y / (plot.over.clientHeight / lanes.length))];
   let [nearest, least] = [null, HIT_PX];

@@ -1,8 +1,8 @@
-// How the cost of a wake is spread: as many wakes as took so long, over a logarithmic scale.
+// Histograms of the cost of a wake, on logarithmic scales.
 
 const SPREAD_PX = 190;
 
-/** A card for each thing that was measured; two runs share one. */
+/** A card for each measured quantity; two runs share it. */
 function spreadCards(page) {
   const names = [...new Set(page.runs.flatMap((run) => run.spreads.map((spread) => spread.what)))];
   return names.map((what) => {
@@ -13,12 +13,12 @@ function spreadCards(page) {
 
 function spreadCard(what, of, several) {
   const title = `${what[0].toUpperCase()}${what.slice(1)} per wake`;
-  if (of.length === 0) return card(title, null, make("p", { class: "dim", text: "No wake." }));
+  if (of.length === 0) return card(title, null, make("p", { class: "dim", text: "No wakes." }));
   const place = make("div");
   const columns = [
     ...(several ? [{ title: "", of: ({ index }) => make("span", {}, swatch(paletteStyle(index)), "AB"[index]) }] : []),
     { title: "wakes", number: true, of: ({ spread }) => count(spread.count) },
-    ...of[0].spread.marks.map(([word], at) => ({ title: word, number: true, of: ({ spread }) => amount(spread.marks[at]?.[1] ?? 0, spread.unit) })),
+    ...of[0].spread.quantiles.map(([name], at) => ({ title: name, number: true, of: ({ spread }) => amount(spread.quantiles[at]?.[1] ?? 0, spread.unit) })),
   ];
   const section = card(title, null, place, table(columns, of));
   const drawn = of.filter(({ spread }) => spread.bins.length > 0);
@@ -29,7 +29,7 @@ function spreadCard(what, of, several) {
 function drawSpread(of, place, several) {
   const { unit } = of[0].spread;
   const bins = of.flatMap(({ spread }) => spread.bins);
-  // Zero has no place on a logarithmic scale: it stands at the left end.
+  // Zero is drawn at the left end, since a logarithmic scale has no zero.
   const least = Math.max(1, Math.min(...bins.map(([from]) => from)));
   const most = Math.max(least * 2, ...bins.map(([, to]) => to));
   const tallest = Math.max(...bins.map(([, , wakes]) => wakes));
@@ -52,7 +52,7 @@ function drawSpread(of, place, several) {
   keepWidth(new uPlot(options, [[least, most], [null, null]], place), place);
 }
 
-/** Round numbers from `least` to `most`, as many as can be read: those of 1, 2, 5, or only powers of ten. */
+/** Ticks from `least` to `most`: 1, 2 and 5 times powers of ten, or only powers of ten if there are many. */
 function roundBetween(least, most) {
   const digits = Math.log10(most / least) > 2.5 ? [1] : [1, 2, 5];
   const numbers = [];
@@ -76,14 +76,14 @@ function drawBins(plot, { index, spread }, several, least) {
   ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`;
   ctx.textAlign = "center";
   let before = -Infinity;
-  for (const [word, value] of spread.marks) {
+  for (const [name, value] of spread.quantiles) {
     const x = plot.valToPos(Math.max(value, least), "x", true);
     ctx.fillStyle = several ? tone : colour("ink");
     ctx.fillRect(x, bbox.top, Math.max(1, devicePixelRatio / 1.5), bbox.height);
-    const wide = ctx.measureText(word).width;
+    const wide = ctx.measureText(name).width;
     if (several || x - wide / 2 < before + 6) continue;
     before = x + wide / 2;
-    ctx.fillText(word, x, bbox.top - 4 * devicePixelRatio);
+    ctx.fillText(name, x, bbox.top - 4 * devicePixelRatio);
   }
   ctx.restore();
 }

@@ -1,4 +1,4 @@
-// One time for all plots: what is in view, where the pointer is, and what is chosen.
+// The state that all plots share: visible range, pointer and chosen entry.
 
 const LEFT = 92;
 const RIGHT = 12;
@@ -6,20 +6,20 @@ const SHORTEST_S = 0.002;
 const NEAR_S = 10;
 
 const timeline = {
-  /** All there is to see, in s. */
+  /** Whole range, in s. */
   all: [0, 1],
   view: [0, 1],
   plots: [],
-  /** What can be chosen one after another, by time: `{ t, run, kind, ... }`. */
+  /** Entries for the arrow keys, by time: `{ t, run, kind, ... }`. */
   entries: [],
-  /** What they are called: `trigger`. */
-  what: "trigger",
+  /** Their kind: `trigger`, `fault` or `difference`. */
+  kind: "trigger",
   chosen: null,
   choiceListeners: [],
   hoverListeners: [],
 };
 
-/** Shows from `from` to `to`, as far as there is anything. */
+/** Shows `from` to `to`, within the whole range. */
 function zoom(from, to) {
   const [first, last] = timeline.all;
   const span = Math.min(Math.max(to - from, SHORTEST_S), last - first);
@@ -32,13 +32,13 @@ function zoomOut() {
   zoom(...timeline.all);
 }
 
-/** Moves `t` into the middle, and near unless it is near already. */
+/** Centres `t`, and zooms in to at most 2 * `NEAR_S`. */
 function goTo(t) {
   const span = Math.min(timeline.view[1] - timeline.view[0], 2 * NEAR_S);
   zoom(t - span / 2, t + span / 2);
 }
 
-/** Chooses an entry, and goes near it: all that shows one is told. `null` chooses none. */
+/** Chooses an entry, centres it and notifies the listeners. `null` clears the choice. */
 function choose(entry) {
   if (entry) goTo((entry.t + (entry.to ?? entry.t)) / 2);
   point(entry);
@@ -51,7 +51,7 @@ function point(entry) {
   timeline.choiceListeners.forEach((listener) => listener(entry));
 }
 
-/** Chooses the next one, or the one before: from the chosen one, else from the middle of the view. */
+/** Chooses the next or previous entry, from the chosen one, else from the edge of the view. */
 function step(by) {
   const marks = timeline.entries;
   if (marks.length === 0) return;
@@ -62,7 +62,7 @@ function step(by) {
   choose(next ?? (by > 0 ? marks[marks.length - 1] : marks[0]));
 }
 
-/** What all plots over time have alike. */
+/** Common options of all plots over time. */
 function timePlot({ height, series, scales, axes, hooks = {}, bands }) {
   const font = "11px system-ui, sans-serif";
   const grid = { stroke: () => colour("faint"), width: 1 };
@@ -98,7 +98,7 @@ function timePlot({ height, series, scales, axes, hooks = {}, bands }) {
   };
 }
 
-/** Puts a plot into `place`, as wide as that is, now and later. */
+/** Adds a plot to `place` and keeps its width. */
 function addPlot(options, data, place) {
   const plot = new uPlot({ ...options, width: Math.max(place.clientWidth, 300) }, data, place);
   timeline.plots.push(plot);
@@ -117,7 +117,7 @@ function addPlot(options, data, place) {
   return plot;
 }
 
-/** Keeps `plot` as wide as `place`, and in the colours of the theme. */
+/** Keeps `plot` as wide as `place`, and redraws it when the theme changes. */
 function keepWidth(plot, place) {
   const fit = () => {
     const width = Math.floor(place.clientWidth);

@@ -91,8 +91,8 @@ fn refused_below(more: &str, message: &str, help: &str) {
 fn the_example_of_the_design_is_read_whole() {
     let manifest = Manifest::parse(BRAKE_DARK, "lambda.toml").unwrap();
     assert_eq!(manifest.lambda.name, "brake-dark");
-    assert_eq!(manifest.lambda.kind, Kind::Wasm);
-    let event = Schedule::Event { input: "camera".parse().unwrap(), backlog: Backlog::Latest };
+    assert_eq!(manifest.lambda.kind, LambdaKind::Wasm);
+    let event = ScheduleSpec::Event { input: "camera".parse().unwrap(), backlog: Backlog::Latest };
     assert_eq!(manifest.schedule, event);
 
     let camera = manifest.event_input().unwrap();
@@ -123,7 +123,7 @@ fn the_example_of_the_design_is_read_whole() {
 #[test]
 fn a_periodic_lambda_needs_no_input_and_every_limit_has_a_default() {
     let manifest = Manifest::parse(TICKER, "lambda.toml").unwrap();
-    assert_eq!(manifest.schedule, Schedule::Periodic { period: Duration::from_millis(100) });
+    assert_eq!(manifest.schedule, ScheduleSpec::Periodic { period: Duration::from_millis(100) });
     assert_eq!(manifest.event_input(), None);
     assert_eq!(manifest.limits.fuel, 50_000_000);
     assert_eq!(manifest.limits.deadline, Duration::from_millis(50));
@@ -180,7 +180,7 @@ fn the_backlog_is_each_for_small_samples_and_latest_for_large_ones() {
         let manifest = Manifest::parse(&text, "lambda.toml").unwrap();
         assert_eq!(
             manifest.schedule,
-            Schedule::Event { input: "x".parse().unwrap(), backlog },
+            ScheduleSpec::Event { input: "x".parse().unwrap(), backlog },
             "{type_name}"
         );
         assert_eq!(manifest.inputs[0].depth, depth, "{type_name}");

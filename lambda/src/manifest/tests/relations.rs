@@ -1,7 +1,7 @@
 //! Refusals that take more than one key, or a file.
 
 use super::*;
-use crate::scratch::Scratch;
+use crate::test_folder::TestFolder;
 
 #[test]
 fn what_may_come_once_is_refused_with_both_lines() {
@@ -137,7 +137,7 @@ fn no_cut_of_a_manifest_makes_the_reader_panic() {
 
 #[test]
 fn a_manifest_is_loaded_from_its_folder_and_named_by_its_path() {
-    let dir = Scratch::new();
+    let dir = TestFolder::new();
     let path = dir.write("lambda.toml", TICKER);
     assert_eq!(
         Manifest::load(dir.root()).unwrap(),
@@ -153,7 +153,7 @@ fn a_manifest_is_loaded_from_its_folder_and_named_by_its_path() {
 
 #[test]
 fn a_file_that_cannot_be_a_manifest_is_refused() {
-    let dir = Scratch::new();
+    let dir = TestFolder::new();
     let path = dir.path("lambda.toml");
     let refused = |message: String, help: &str| {
         let error = Manifest::load(dir.root()).unwrap_err();

@@ -26,7 +26,7 @@ const SOCKETS: usize = 16;
 
 /// A lambda that the recorder is to hear.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Add {
+pub struct AddLambda {
     /// Its folder. The manifest in its `build/` says its name and what it records, not the lambda's
     /// process.
     pub lambda: PathBuf,
@@ -39,19 +39,19 @@ pub struct Add {
 
 /// The starter's end.
 #[derive(Debug)]
-pub struct Control {
+pub struct ControlClient {
     socket: UnixStream,
 }
 
-impl Control {
+impl ControlClient {
     /// A new connection, and what becomes the recorder's standard input.
     ///
     /// # Errors
     ///
     /// What the system says: too many open files.
-    pub fn pair() -> io::Result<(Control, OwnedFd)> {
+    pub fn pair() -> io::Result<(ControlClient, OwnedFd)> {
         let (ours, theirs) = UnixStream::pair()?;
-        Ok((Control { socket: ours }, theirs.into()))
+        Ok((ControlClient { socket: ours }, theirs.into()))
     }
 
     /// Has the recorder hear a lambda; returns the socket that the lambda's process is to be given.
@@ -60,7 +60,7 @@ impl Control {
     ///
     /// [`LinkError::Gone`] if the recorder has ended, [`LinkError::Socket`] if there are too many
     /// open files.
-    pub fn add(&mut self, add: &Add) -> Result<OwnedFd, LinkError> {
+    pub fn add(&mut self, add: &AddLambda) -> Result<OwnedFd, LinkError> {
         let failed = |source| LinkError::Socket { who: RECORDER, source };
         let (ours, theirs) = UnixStream::pair().map_err(failed)?;
         let payload = serde_json::to_vec(add).map_err(|error| failed(error.into()))?;
@@ -112,25 +112,25 @@ impl Control {
 
 /// What the starter wants.
 #[derive(Debug)]
-pub enum Order {
+pub enum ControlMessage {
     /// A lambda, and its socket.
-    Add(Add, OwnedFd),
+    Add(AddLambda, OwnedFd),
     /// Complete what is open, and end.
     Stop,
 }
 
 /// The recorder's end.
 #[derive(Debug)]
-pub struct Controlled {
+pub struct ControlServer {
     from: BufReader<Receiver>,
     payload: Vec<u8>,
 }
 
-impl Controlled {
+impl ControlServer {
     /// Over this socket, which is the recorder's standard input.
-    pub fn new(socket: OwnedFd) -> Controlled {
+    pub fn new(socket: OwnedFd) -> ControlServer {
         let receiver = Receiver { socket, received: VecDeque::new() };
-        Controlled { from: BufReader::new(receiver), payload: Vec::new() }
+        ControlServer { from: BufReader::new(receiver), payload: Vec::new() }
     }
 
     /// The next order; waits for it. `None` when the starter has ended.
@@ -138,16 +138,16 @@ impl Controlled {
     /// # Errors
     ///
     /// [`LinkError`] names the frame that makes no sense; nothing can be read after it.
-    pub fn order(&mut self) -> Result<Option<Order>, LinkError> {
+    pub fn order(&mut self) -> Result<Option<ControlMessage>, LinkError> {
         match frame::read(&mut self.from, &mut self.payload, STARTER)? {
             None => Ok(None),
-            Some(tag::STOP) => Ok(Some(Order::Stop)),
+            Some(tag::STOP) => Ok(Some(ControlMessage::Stop)),
             Some(tag::ADD) => {
                 let add = serde_json::from_slice(&self.payload).map_err(|error| {
                     LinkError::Malformed { who: STARTER, frame: "add", why: error.to_string() }
                 })?;
                 let socket = self.from.get_mut().received.pop_front().ok_or(LinkError::NoSocket)?;
-                Ok(Some(Order::Add(add, socket)))
+                Ok(Some(ControlMessage::Add(add, socket)))
             }
             Some(tag) => Err(LinkError::Unknown { who: STARTER, tag }),
         }

@@ -48,7 +48,7 @@ pub enum LinkError {
     },
     /// A frame comes where another one is due.
     #[error("frame `{frame}` from {who} comes where `{due}` is due")]
-    Order {
+    Unexpected {
         /// Whose frame it is.
         who: &'static str,
         /// Its name.

@@ -6,25 +6,25 @@
 //! say nothing for another.
 //!
 //! - `frame`: a length, a tag, a payload; never longer than [`FRAME_MAX`].
-//! - `control`: from the starter to the recorder: [`Control`] and [`Controlled`].
-//! - `sending`: from a lambda's process to the recorder, without ever waiting for it:
+//! - `control`: from the starter to the recorder: [`ControlClient`] and [`ControlServer`].
+//! - `client`: from a lambda's process to the recorder, without ever waiting for it:
 //!   [`RecorderLink`].
-//! - `hearing`: the recorder's end of that: [`LambdaLink`].
+//! - `server`: the recorder's end of that: [`LambdaLink`].
 //! - `report`: what the recorder says to its starter, as lines of JSON on its standard output.
 
+mod client;
 mod control;
 mod error;
 mod frame;
-mod hearing;
 mod queue;
 mod report;
-mod sending;
+mod server;
 #[cfg(test)]
 mod tests;
 
-pub use control::{Add, Control, Controlled, Order};
+pub use client::{RecorderLink, RecorderMessage};
+pub use control::{AddLambda, ControlClient, ControlMessage, ControlServer};
 pub use error::LinkError;
 pub use frame::FRAME_MAX;
-pub use hearing::{Answers, Heard, LambdaLink};
 pub use report::{CommandStatus, Loss, RecordedTopic, RecorderReport, RecorderStatus};
-pub use sending::{RecorderLink, Said};
+pub use server::{LambdaLink, LambdaMessage, LambdaReplies};

@@ -2,8 +2,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::live::add;
-use crate::{Network, Recording, Spread};
+use crate::live_status::add;
+use crate::{DurationStats, NetworkStatus, RecordingCounts};
 use gleaner_lambda::Clip;
 
 /// One line of JSON that `gleaner-recorder` writes on its standard output for the program that
@@ -40,7 +40,7 @@ pub enum Loss {
         /// Its length.
         bytes: u64,
         /// Why, in words.
-        why: String,
+        reason: String,
     },
     /// A clip that should have been deleted to make room, and could not be: it is still there,
     /// whole or without its thumbnail, though a line before may say that it was deleted.
@@ -52,14 +52,14 @@ pub enum Loss {
         /// Its length.
         bytes: u64,
         /// Why, in words.
-        why: String,
+        reason: String,
     },
     /// A clip could not be written. What there is of it is recovered by the next recorder.
     Failed {
         /// When, in ns on the clock of the clips.
         at_ns: i64,
         /// Why, in words.
-        why: String,
+        reason: String,
     },
     /// Triggers that opened no window, as nothing was recorded.
     DiskSuppressed {
@@ -68,7 +68,7 @@ pub enum Loss {
         /// How many.
         triggers: u64,
         /// Why, in words.
-        why: String,
+        reason: String,
     },
 }
 
@@ -80,7 +80,7 @@ pub struct RecorderStatus {
     pub lambdas: usize,
     /// What it counted.
     #[serde(flatten)]
-    pub recording: Recording,
+    pub recording: RecordingCounts,
     /// Whether a clip is open.
     #[serde(rename = "recording")]
     pub is_recording: bool,
@@ -91,14 +91,14 @@ pub struct RecorderStatus {
     /// Bytes on their way to the disk.
     pub in_flight: u64,
     /// From a decision with triggers to the opening of its windows. `None` without such.
-    pub trigger_to_open: Option<Spread>,
+    pub trigger_to_open: Option<DurationStats>,
     /// Commands; `None` where none are heard.
     #[serde(default)]
     pub commands: Option<CommandStatus>,
     /// Topics that are recorded.
     pub topics: Vec<RecordedTopic>,
     /// The network; `None` where there is none.
-    pub network: Option<Network>,
+    pub network: Option<NetworkStatus>,
     /// Bytes that are free on the disk of the clips.
     pub disk_free: Option<u64>,
     /// Resident memory, in bytes.
@@ -200,14 +200,22 @@ mod tests {
             ..RecordedTopic::default()
         };
         RecorderStatus {
-            recording: Recording { clips: count, disk_suppressed: count, ..Recording::default() },
+            recording: RecordingCounts {
+                clips: count,
+                disk_suppressed: count,
+                ..RecordingCounts::default()
+            },
             commands: Some(CommandStatus {
                 accepted: count,
                 refused: count,
                 ..CommandStatus::default()
             }),
             topics: topics.iter().map(topic).collect(),
-            network: Some(Network { socket_drops: count, filtered: count, ..Network::default() }),
+            network: Some(NetworkStatus {
+                socket_drops: count,
+                filtered: count,
+                ..NetworkStatus::default()
+            }),
             ..RecorderStatus::default()
         }
     }

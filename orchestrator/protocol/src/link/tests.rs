@@ -8,26 +8,28 @@ use std::time::Duration;
 
 use super::frame::{self, tag};
 use super::*;
-use gleaner_journal::{Entry, Header, JournalInput, Said as Lines, Seen, Woken};
-use gleaner_lambda::manifest::{Kind, Limits};
+use gleaner_journal::{
+    InputView, JournalEntry, JournalHeader, JournalInput, LogDigest, WakeSource,
+};
+use gleaner_lambda::manifest::{LambdaKind, Limits};
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-fn header(lambda: &str) -> Header {
+fn header(lambda: &str) -> JournalHeader {
     let input = JournalInput {
         name: "imu".to_owned(),
         topic: "/imu".to_owned(),
         wire_topic: "/imu".to_owned(),
         type_name: "sensor_msgs/msg/Imu".to_owned(),
     };
-    Header {
+    JournalHeader {
         gleaner: "0.1.0".to_owned(),
         engine: "none".to_owned(),
         machine: "x".to_owned(),
         lambda: lambda.to_owned(),
         version: "0.1.0".to_owned(),
-        kind: Kind::Wasm,
+        kind: LambdaKind::Wasm,
         files: Vec::new(),
         models: Vec::new(),
         manifest: String::new(),
@@ -42,33 +44,33 @@ fn header(lambda: &str) -> Header {
     }
 }
 
-fn entry(at_ns: i64, label: Option<&str>) -> Entry {
+fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
     let trigger = |label: &str| Trigger {
         kind: TriggerKind::Event,
         label: label.to_owned(),
         score: Some(0.5),
         attributes: serde_json::Map::new(),
     };
-    Entry {
+    JournalEntry {
         at_ns,
-        cause: Woken::Sample { writer: [7; 16], seq: at_ns as u64 },
-        seen: vec![Seen { new: 1, digest: 5, newest: Some(([7; 16], 1)), reach: 2 }],
+        cause: WakeSource::Sample { writer: [7; 16], seq: at_ns as u64 },
+        seen: vec![InputView { new: 1, digest: 5, newest: Some(([7; 16], 1)), reach: 2 }],
         triggers: label.map(trigger).into_iter().collect(),
         fault: None,
         fuel: Some(9),
-        log: Lines::default(),
+        log: LogDigest::default(),
     }
 }
 
 /// A lambda's end, and the recorder's.
-fn connected() -> (RecorderLink, LambdaLink, Answers) {
+fn connected() -> (RecorderLink, LambdaLink, LambdaReplies) {
     let (ours, theirs) = UnixStream::pair().unwrap();
     let (link, answers) = LambdaLink::new(theirs.into()).unwrap();
     (RecorderLink::new(ours.into()), link, answers)
 }
 
-fn add(lambda: &str) -> Add {
-    Add {
+fn add(lambda: &str) -> AddLambda {
+    AddLambda {
         lambda: lambda.into(),
         remaps: vec![("/imu".to_owned(), "/imu/data".to_owned())],
         most: Limits::DEFAULT,
@@ -77,13 +79,13 @@ fn add(lambda: &str) -> Add {
 
 #[test]
 fn each_lambda_is_announced_with_a_socket_of_its_own() {
-    let (mut control, stdin) = Control::pair().unwrap();
-    let mut controlled = Controlled::new(stdin);
+    let (mut control, stdin) = ControlClient::pair().unwrap();
+    let mut controlled = ControlServer::new(stdin);
     let lambdas = ["first", "second", "third"].map(|name| (name, control.add(&add(name)).unwrap()));
     control.stop().unwrap();
     drop(control);
     for (name, theirs) in lambdas {
-        let Some(Order::Add(order, ours)) = controlled.order().unwrap() else { panic!() };
+        let Some(ControlMessage::Add(order, ours)) = controlled.order().unwrap() else { panic!() };
         assert_eq!(order, add(name));
         // What is written at one end comes out at the other, and not elsewhere.
         UnixStream::from(theirs).write_all(name.as_bytes()).unwrap();
@@ -91,13 +93,13 @@ fn each_lambda_is_announced_with_a_socket_of_its_own() {
         UnixStream::from(ours).read_to_string(&mut read).unwrap();
         assert_eq!(read, name);
     }
-    assert!(matches!(controlled.order(), Ok(Some(Order::Stop))));
+    assert!(matches!(controlled.order(), Ok(Some(ControlMessage::Stop))));
     assert!(matches!(controlled.order(), Ok(None)), "the starter has ended");
 }
 
 #[test]
 fn a_recorder_that_has_ended_is_an_error_and_no_signal() {
-    let (mut control, stdin) = Control::pair().unwrap();
+    let (mut control, stdin) = ControlClient::pair().unwrap();
     drop(stdin);
     assert!(matches!(control.add(&add("x")), Err(LinkError::Gone { who: "the recorder" })));
     assert!(matches!(control.stop(), Err(LinkError::Gone { .. })));
@@ -111,11 +113,13 @@ fn a_recorder_that_has_ended_is_an_error_and_no_signal() {
 fn wakes_arrive_as_they_were_sent() {
     let (mut lambda, mut link, mut answers) = connected();
     let recorder = thread::spawn(move || {
-        let Some(Heard::Hello(said)) = link.hear().unwrap() else { panic!() };
+        let Some(LambdaMessage::Hello(said)) = link.hear().unwrap() else { panic!() };
         assert_eq!(*said, header("hello"));
         answers.ready();
         let mut heard = Vec::new();
-        while let Some(Heard::Wake { entry, decided_ns, missing: 0, .. }) = link.hear().unwrap() {
+        while let Some(LambdaMessage::Wake { entry, decided_ns, missing: 0, .. }) =
+            link.hear().unwrap()
+        {
             if !entry.triggers.is_empty() {
                 answers.opened(decided_ns as u64 + 1);
             }
@@ -136,8 +140,8 @@ fn wakes_arrive_as_they_were_sent() {
         said.extend(lambda.poll().unwrap());
         thread::yield_now();
     }
-    assert_eq!(said[3], Said::Opened { wait_ns: 91 });
-    assert_eq!(lambda.bye(PATIENCE), crate::ToRecorder::default());
+    assert_eq!(said[3], RecorderMessage::Opened { wait_ns: 91 });
+    assert_eq!(lambda.bye(PATIENCE), crate::LinkLosses::default());
     assert_eq!(recorder.join().unwrap(), sent);
 }
 
@@ -160,7 +164,7 @@ fn only_what_is_urgent_goes_at_once_and_the_order_stays() {
         at += 1;
         entry(at, label)
     };
-    let wake = |lambda: &mut RecorderLink, entry: Entry| lambda.wake(&entry, 0).unwrap();
+    let wake = |lambda: &mut RecorderLink, entry: JournalEntry| lambda.wake(&entry, 0).unwrap();
     for _ in 0..3 {
         wake(&mut lambda, next(None));
     }
@@ -172,7 +176,7 @@ fn only_what_is_urgent_goes_at_once_and_the_order_stays() {
     assert!(bytes_come() > 0, "a trigger goes at once");
     wake(&mut lambda, next(None));
     let fault = Fault { kind: FaultKind::Trap, message: "x".to_owned(), used: None, allowed: None };
-    wake(&mut lambda, Entry { fault: Some(fault), ..next(None) });
+    wake(&mut lambda, JournalEntry { fault: Some(fault), ..next(None) });
     assert!(bytes_come() > 0, "and so does a fault");
     let mut waited = 0;
     while bytes_come() == 0 {
@@ -182,21 +186,21 @@ fn only_what_is_urgent_goes_at_once_and_the_order_stays() {
     assert!((100..1000).contains(&waited), "16 KiB go together: {waited}");
     wake(&mut lambda, next(None));
     assert_eq!(bytes_come(), 0);
-    assert_eq!(lambda.bye(PATIENCE), crate::ToRecorder::default());
+    assert_eq!(lambda.bye(PATIENCE), crate::LinkLosses::default());
     assert!(bytes_come() > 0);
     // All of them, in their order, and then the end.
     let (mut writer, reader) = UnixStream::pair().unwrap();
     let (mut link, _answers) = LambdaLink::new(reader.into()).unwrap();
     let writer = thread::spawn(move || writer.write_all(&came).unwrap());
-    assert!(matches!(link.hear(), Ok(Some(Heard::Hello(_)))));
+    assert!(matches!(link.hear(), Ok(Some(LambdaMessage::Hello(_)))));
     for due in 1..=at {
         let heard = link.hear().unwrap();
         assert!(
-            matches!(&heard, Some(Heard::Wake { entry, missing: 0, .. }) if entry.at_ns == due),
+            matches!(&heard, Some(LambdaMessage::Wake { entry, missing: 0, .. }) if entry.at_ns == due),
             "{due}: {heard:?}"
         );
     }
-    assert!(matches!(link.hear(), Ok(Some(Heard::Bye))));
+    assert!(matches!(link.hear(), Ok(Some(LambdaMessage::Bye))));
     writer.join().unwrap();
 }
 
@@ -212,9 +216,9 @@ fn a_recorder_that_does_not_read_costs_wakes_and_no_time() {
     let dropped = lambda.dropped();
     assert!(dropped.wakes_dropped > 0 && dropped.triggers_lost == 0, "{dropped:?}");
     let lambda = thread::spawn(move || lambda.bye(PATIENCE));
-    assert!(matches!(link.hear(), Ok(Some(Heard::Hello(_)))));
+    assert!(matches!(link.hear(), Ok(Some(LambdaMessage::Hello(_)))));
     let (mut next, mut triggers, mut lost) = (0, 0, 0);
-    while let Some(Heard::Wake { entry, missing, .. }) = link.hear().unwrap() {
+    while let Some(LambdaMessage::Wake { entry, missing, .. }) = link.hear().unwrap() {
         next += i64::from(missing);
         lost += u64::from(missing);
         assert_eq!(entry.at_ns, next, "what is missing is said where it is");
@@ -290,7 +294,7 @@ fn nonsense_is_refused_by_name() {
     let claims = [&u32::MAX.to_le_bytes()[..], &[tag::HELLO]].concat();
     assert!(said(&[claims]).contains("has 4294967295 bytes, above the maximum of 2097152"));
     assert_eq!(said(&[hello()[..20].to_vec()]), "the lambda has ended, or closed the connection");
-    let outside = Header { event_input: Some(1), ..header("x") };
+    let outside = JournalHeader { event_input: Some(1), ..header("x") };
     let outside = frame::whole(tag::HELLO, &serde_json::to_vec(&outside).unwrap());
     assert!(said(&[outside]).contains("inputs"));
 }
@@ -320,7 +324,7 @@ fn a_starter_that_talks_nonsense_is_refused_by_name() {
         let (mut ours, theirs) = UnixStream::pair().unwrap();
         ours.write_all(bytes).unwrap();
         drop(ours);
-        Controlled::new(OwnedFd::from(theirs)).order().unwrap_err().to_string()
+        ControlServer::new(OwnedFd::from(theirs)).order().unwrap_err().to_string()
     };
     let add = serde_json::to_vec(&add("x")).unwrap();
     assert_eq!(said(&frame::whole(tag::ADD, &add)), "frame `add` came without a socket");
@@ -338,12 +342,12 @@ fn reports_are_lines_that_name_themselves() {
         at_ns: 5,
         file: "clips/a.mcap".into(),
         bytes: 9,
-        why: "--clips-max 3".to_owned(),
+        reason: "--clips-max 3".to_owned(),
     });
     let line = serde_json::to_string(&loss).unwrap();
     assert_eq!(
         line,
-        r#"{"recorder":"loss","loss":"deleted","at_ns":5,"file":"clips/a.mcap","bytes":9,"why":"--clips-max 3"}"#
+        r#"{"recorder":"loss","loss":"deleted","at_ns":5,"file":"clips/a.mcap","bytes":9,"reason":"--clips-max 3"}"#
     );
     assert_eq!(serde_json::from_str::<RecorderReport>(&line).unwrap(), loss);
     let status = RecorderReport::Status(Box::default());
@@ -381,8 +385,9 @@ fn a_recorder_that_talks_nonsense_is_refused_by_name() {
 
 #[test]
 fn an_order_that_no_frame_holds_is_not_sent() {
-    let (mut control, stdin) = Control::pair().unwrap();
-    let long = Add { lambda: "x".repeat(FRAME_MAX).into(), remaps: Vec::new(), most: Limits::MOST };
+    let (mut control, stdin) = ControlClient::pair().unwrap();
+    let long =
+        AddLambda { lambda: "x".repeat(FRAME_MAX).into(), remaps: Vec::new(), most: Limits::MAX };
     let refused = control.add(&long).unwrap_err();
     assert!(
         matches!(refused, LinkError::TooLong { who: "the starter", frame: "add", bytes } if bytes > FRAME_MAX as u64),
@@ -390,5 +395,5 @@ fn an_order_that_no_frame_holds_is_not_sent() {
     );
     // Nothing of it went over, so that what follows is understood.
     control.stop().unwrap();
-    assert!(matches!(Controlled::new(stdin).order(), Ok(Some(Order::Stop))));
+    assert!(matches!(ControlServer::new(stdin).order(), Ok(Some(ControlMessage::Stop))));
 }

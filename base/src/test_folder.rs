@@ -7,12 +7,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-pub(crate) struct Scratch {
+pub(crate) struct TestFolder {
     root: PathBuf,
 }
 
-impl Scratch {
-    pub(crate) fn new() -> Scratch {
+impl TestFolder {
+    pub(crate) fn new() -> TestFolder {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name = format!(
             "gleaner-test-{}-{}",
@@ -22,7 +22,7 @@ impl Scratch {
         let root = std::env::temp_dir().join(name);
         fs::create_dir(&root).unwrap();
         // Without links, so that it compares equal to what programs find out about themselves.
-        Scratch { root: root.canonicalize().unwrap() }
+        TestFolder { root: root.canonicalize().unwrap() }
     }
 
     pub(crate) fn root(&self) -> &Path {
@@ -51,7 +51,7 @@ impl Scratch {
     }
 }
 
-impl Drop for Scratch {
+impl Drop for TestFolder {
     fn drop(&mut self) {
         // A folder left behind disturbs nobody; a panic while another one unwinds would.
         let _ = fs::remove_dir_all(&self.root);

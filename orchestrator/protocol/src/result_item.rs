@@ -1,7 +1,7 @@
 use serde::{Deserialize, Serialize};
 
-use crate::Live;
-use gleaner_lambda::manifest::{Manifest, Schedule};
+use crate::LiveStatus;
+use gleaner_lambda::manifest::{Manifest, ScheduleSpec};
 use gleaner_lambda::{Cause, Decision, LogLine};
 
 /// The environment variable with the number of the pipe by which a live lambda's process hands
@@ -12,7 +12,7 @@ pub const RESULTS_ENV: &str = "GLEANER_RESULTS";
 /// line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Page {
+pub enum ResultItem {
     /// Sent once, first, before the lambda is entered.
     Woken(WokenBy),
     /// A decision, to be kept.
@@ -20,7 +20,7 @@ pub enum Page {
     /// A line of the log.
     Log(LogLine),
     /// Sent once, last: the summary. Its `unwritten` lacks what the shim could not write.
-    Last(Box<Live>),
+    Last(Box<LiveStatus>),
 }
 
 /// What wakes a lambda: of a wake that ended with its process, more is not known.
@@ -37,7 +37,7 @@ pub struct WokenBy {
 impl WokenBy {
     /// By the schedule of `manifest`.
     pub fn schedule_of(manifest: &Manifest) -> Self {
-        let Schedule::Event { input: name, .. } = &manifest.schedule else {
+        let ScheduleSpec::Event { input: name, .. } = &manifest.schedule else {
             return Self { cause: Cause::Tick, input: None, topic: None };
         };
         let input = manifest.inputs.iter().find(|input| input.name == *name);

@@ -28,8 +28,8 @@ pub fn hint(nearest: &Option<String>) -> String {
 }
 
 /// `` `a` ``, `` `a` and `b` ``, `` `a`, `b` and `c` `` with `and` or another last word.
-pub fn list<W: AsRef<str>>(words: &[W], last: &str) -> String {
-    let quoted: Vec<String> = words.iter().map(|word| format!("`{}`", word.as_ref())).collect();
+pub fn list<W: AsRef<str>>(text: &[W], last: &str) -> String {
+    let quoted: Vec<String> = text.iter().map(|word| format!("`{}`", word.as_ref())).collect();
     match quoted.split_last() {
         Some((end, rest)) if !rest.is_empty() => format!("{} {last} {end}", rest.join(", ")),
         _ => quoted.concat(),

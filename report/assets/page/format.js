@@ -1,4 +1,4 @@
-// Numbers and times as people read them.
+// Formats numbers and times.
 
 const wholeNumbers = new Intl.NumberFormat("en");
 
@@ -12,7 +12,7 @@ function counted(number, word) {
   return `${count(number)} ${word}${number === 1 ? "" : "s"}`;
 }
 
-/** Four significant digits, without a tail of zeros. */
+/** Four significant digits, without trailing zeros. */
 function number(value) {
   if (value === null || value === undefined) return "–";
   if (value === 0) return "0";
@@ -26,7 +26,7 @@ function seconds(t) {
   return `${t.toFixed(3)} s`;
 }
 
-/** The date at `t` s after the start of the drive of `run`, in UTC. Clocks that count from zero have none worth reading. */
+/** The UTC date at `t` s after the start of the drive of `run`; empty for clocks that count from zero. */
 function date(run, t) {
   const moment = new Date(run.start_ms + t * 1000);
   const isDate = run.start_ms > 1e11 && !Number.isNaN(moment.getTime());
@@ -55,12 +55,12 @@ function amount(value, unit) {
   return unit === "ns" ? nanoseconds(value) : count(value);
 }
 
-/** The word of a file, as people write it: `host_call` is `host call`. */
+/** A name of a file without underscores: `host_call` is `host call`. */
 function plain(word) {
   return word.replaceAll("_", " ");
 }
 
-/** A count that nobody may know: unknown is never 0. */
+/** A count that may be unknown, which is never shown as 0. */
 function known(value) {
   return value === null || value === undefined ? make("span", { class: "dim", text: "unknown" }) : count(value);
 }

@@ -9,7 +9,7 @@ use rustix::net::{SendFlags, send};
 
 use super::LinkError;
 use super::frame::{self, tag};
-use gleaner_journal::{Decoder, Entry, Header, INPUTS_MAX};
+use gleaner_journal::{Decoder, INPUTS_MAX, JournalEntry, JournalHeader};
 
 const LAMBDA: &str = "the lambda";
 
@@ -18,13 +18,13 @@ const WHY_MAX: usize = 2 << 10;
 
 /// What a lambda's process says.
 #[derive(Debug)]
-pub enum Heard {
+pub enum LambdaMessage {
     /// What it is. First, once.
-    Hello(Box<Header>),
+    Hello(Box<JournalHeader>),
     /// It was woken.
     Wake {
         /// The wake.
-        entry: Box<Entry>,
+        entry: Box<JournalEntry>,
         /// When it was decided, in ns of `CLOCK_MONOTONIC`.
         decided_ns: i64,
         /// Wakes that are missing before it.
@@ -46,7 +46,7 @@ pub struct LambdaLink {
 
 /// Answers to one lambda's process, without ever waiting for it.
 #[derive(Debug)]
-pub struct Answers {
+pub struct LambdaReplies {
     socket: UnixStream,
     /// The rest of a frame that is partly sent.
     rest: Vec<u8>,
@@ -58,9 +58,9 @@ impl LambdaLink {
     /// # Errors
     ///
     /// What the system says: too many open files.
-    pub fn new(socket: OwnedFd) -> io::Result<(LambdaLink, Answers)> {
+    pub fn new(socket: OwnedFd) -> io::Result<(LambdaLink, LambdaReplies)> {
         let socket = UnixStream::from(socket);
-        let answers = Answers { socket: socket.try_clone()?, rest: Vec::new() };
+        let answers = LambdaReplies { socket: socket.try_clone()?, rest: Vec::new() };
         Ok((
             LambdaLink { from: BufReader::new(socket), payload: Vec::new(), decoder: None },
             answers,
@@ -72,14 +72,14 @@ impl LambdaLink {
     /// # Errors
     ///
     /// [`LinkError`] names the frame that makes no sense; nothing can be read after it.
-    pub fn hear(&mut self) -> Result<Option<Heard>, LinkError> {
+    pub fn hear(&mut self) -> Result<Option<LambdaMessage>, LinkError> {
         let Some(tag) = frame::read(&mut self.from, &mut self.payload, LAMBDA)? else {
             return Ok(None);
         };
         let malformed = |frame, why| LinkError::Malformed { who: LAMBDA, frame, why };
         match (tag, &mut self.decoder) {
             (tag::HELLO, None) => {
-                let header: Header = serde_json::from_slice(&self.payload)
+                let header: JournalHeader = serde_json::from_slice(&self.payload)
                     .map_err(|error| malformed("hello", error.to_string()))?;
                 let inputs = header.inputs.len();
                 if inputs > INPUTS_MAX || header.event_input.is_some_and(|event| event >= inputs) {
@@ -89,7 +89,7 @@ impl LambdaLink {
                     ));
                 }
                 self.decoder = Some(Decoder::new(inputs));
-                Ok(Some(Heard::Hello(Box::new(header))))
+                Ok(Some(LambdaMessage::Hello(Box::new(header))))
             }
             (tag::WAKE, Some(decoder)) => {
                 let bytes = self.payload.len();
@@ -106,26 +106,26 @@ impl LambdaLink {
                 if !rest.is_empty() {
                     return Err(malformed("wake", format!("{} bytes follow the wake", rest.len())));
                 }
-                Ok(Some(Heard::Wake {
+                Ok(Some(LambdaMessage::Wake {
                     entry: Box::new(entry),
                     decided_ns: i64::from_le_bytes(*decided),
                     missing: u32::from_le_bytes(*missing),
                     bytes,
                 }))
             }
-            (tag::BYE, Some(_)) => Ok(Some(Heard::Bye)),
+            (tag::BYE, Some(_)) => Ok(Some(LambdaMessage::Bye)),
             (tag::HELLO, Some(_)) => {
-                Err(LinkError::Order { who: LAMBDA, frame: "hello", due: "wake" })
+                Err(LinkError::Unexpected { who: LAMBDA, frame: "hello", due: "wake" })
             }
             (tag::WAKE | tag::BYE, None) => {
-                Err(LinkError::Order { who: LAMBDA, frame: frame::name(tag), due: "hello" })
+                Err(LinkError::Unexpected { who: LAMBDA, frame: frame::name(tag), due: "hello" })
             }
             (tag, _) => Err(LinkError::Unknown { who: LAMBDA, tag }),
         }
     }
 }
 
-impl Answers {
+impl LambdaReplies {
     /// The lambda is heard from now on.
     pub fn ready(&mut self) {
         self.send(tag::READY, &[]);

@@ -7,14 +7,14 @@ const PIECE_MAX: u64 = 8192;
 
 /// A line, or a part of one that is longer than 8 KiB.
 #[derive(Debug)]
-pub struct Piece<'a> {
+pub struct LinePiece<'a> {
     /// Its bytes, with the end of the line if it has it.
     pub bytes: &'a [u8],
     /// It is the first of its line.
     pub begins_line: bool,
 }
 
-impl Piece<'_> {
+impl LinePiece<'_> {
     /// Whether it begins as a [`Failure`](crate::Failure) does. A lambda and its libraries may
     /// write that, too.
     pub fn is_failure(&self) -> bool {
@@ -24,11 +24,11 @@ impl Piece<'_> {
 
 /// Gives `take` all that `from` has, to its end. A line is cut into pieces rather than held whole,
 /// however long it is. Returns whether the last line has its end.
-pub fn each_piece(from: impl Read, mut take: impl FnMut(Piece<'_>)) -> bool {
+pub fn each_piece(from: impl Read, mut take: impl FnMut(LinePiece<'_>)) -> bool {
     let mut from = BufReader::new(from);
     let (mut bytes, mut begins_line) = (Vec::new(), true);
     while matches!((&mut from).take(PIECE_MAX).read_until(b'\n', &mut bytes), Ok(1..)) {
-        take(Piece { bytes: &bytes, begins_line });
+        take(LinePiece { bytes: &bytes, begins_line });
         begins_line = bytes.ends_with(b"\n");
         bytes.clear();
     }

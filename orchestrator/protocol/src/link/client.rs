@@ -11,8 +11,8 @@ use rustix::net::{RecvFlags, SendFlags, recv, send};
 use super::LinkError;
 use super::frame::{self, HEAD, tag};
 use super::queue::Queue;
-use crate::ToRecorder;
-use gleaner_journal::{Encoder, Entry, Header};
+use crate::LinkLosses;
+use gleaner_journal::{Encoder, JournalEntry, JournalHeader};
 
 const RECORDER: &str = "the recorder";
 
@@ -28,7 +28,7 @@ const READ: usize = 4 << 10;
 
 /// What the recorder says.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Said {
+pub enum RecorderMessage {
     /// It hears the lambda.
     Ready,
     /// It does not, or not any more.
@@ -84,7 +84,7 @@ impl RecorderLink {
     ///
     /// [`LinkError::Refused`] if the recorder was told of another lambda, [`LinkError::Silent`] if
     /// it does not answer, and [`LinkError::Gone`] if it has ended.
-    pub fn hello(&mut self, header: &Header, patience: Duration) -> Result<(), LinkError> {
+    pub fn hello(&mut self, header: &JournalHeader, patience: Duration) -> Result<(), LinkError> {
         let until = Instant::now() + patience;
         let failed = |source: io::Error| LinkError::Socket { who: RECORDER, source };
         let payload = serde_json::to_vec(header).map_err(|error| failed(error.into()))?;
@@ -101,7 +101,7 @@ impl RecorderLink {
             // It may have said why before it went.
             let _ = self.read(RecvFlags::DONTWAIT);
             return match self.next_said() {
-                Ok(Some(Said::Refused(why))) => Err(LinkError::Refused { why }),
+                Ok(Some(RecorderMessage::Refused(why))) => Err(LinkError::Refused { why }),
                 _ => Err(error),
             };
         }
@@ -113,9 +113,9 @@ impl RecorderLink {
             self.socket.set_read_timeout(Some(rest)).map_err(failed)?;
             self.read(RecvFlags::empty())?;
             match self.next_said()? {
-                Some(Said::Ready) => return Ok(()),
-                Some(Said::Refused(why)) => return Err(LinkError::Refused { why }),
-                Some(Said::Opened { .. }) | None => {}
+                Some(RecorderMessage::Ready) => return Ok(()),
+                Some(RecorderMessage::Refused(why)) => return Err(LinkError::Refused { why }),
+                Some(RecorderMessage::Opened { .. }) | None => {}
             }
         }
     }
@@ -133,7 +133,11 @@ impl RecorderLink {
     /// # Errors
     ///
     /// [`LinkError::Gone`] if something was to be sent, and the recorder has ended.
-    pub fn wake(&mut self, entry: &Entry, decided_monotonic_ns: i64) -> Result<(), LinkError> {
+    pub fn wake(
+        &mut self,
+        entry: &JournalEntry,
+        decided_monotonic_ns: i64,
+    ) -> Result<(), LinkError> {
         let mut bytes = std::mem::take(&mut self.frame);
         frame::open(tag::WAKE, &mut bytes);
         bytes.extend_from_slice(&decided_monotonic_ns.to_le_bytes());
@@ -157,7 +161,7 @@ impl RecorderLink {
     /// # Errors
     ///
     /// [`LinkError::Gone`] if it has ended; [`LinkError`] if it says what makes no sense.
-    pub fn poll(&mut self) -> Result<Vec<Said>, LinkError> {
+    pub fn poll(&mut self) -> Result<Vec<RecorderMessage>, LinkError> {
         self.flush()?;
         self.read(RecvFlags::DONTWAIT)?;
         let mut all = Vec::new();
@@ -168,8 +172,8 @@ impl RecorderLink {
     }
 
     /// Wakes and triggers that could not be told.
-    pub fn dropped(&self) -> ToRecorder {
-        ToRecorder {
+    pub fn dropped(&self) -> LinkLosses {
+        LinkLosses {
             wakes_dropped: self.queue.wakes_dropped,
             triggers_lost: self.queue.triggers_lost,
         }
@@ -177,7 +181,7 @@ impl RecorderLink {
 
     /// Says that nothing more comes, after all that waits, but gives up after `patience`. Returns
     /// what could not be told.
-    pub fn bye(mut self, patience: Duration) -> ToRecorder {
+    pub fn bye(mut self, patience: Duration) -> LinkLosses {
         let until = Instant::now() + patience;
         while let Some(next) = self.queue.next().map(<[u8]>::to_vec) {
             if self.send_until(&next, until, patience).is_err() {
@@ -241,7 +245,7 @@ impl RecorderLink {
     }
 
     /// The next whole frame of those that came.
-    fn next_said(&mut self) -> Result<Option<Said>, LinkError> {
+    fn next_said(&mut self) -> Result<Option<RecorderMessage>, LinkError> {
         let Some(bytes) = self.heard.first_chunk::<HEAD>() else { return Ok(None) };
         let (tag, len) = frame::head(*bytes, RECORDER)?;
         if len > READ {
@@ -250,15 +254,17 @@ impl RecorderLink {
         }
         let Some(payload) = self.heard.get(HEAD..HEAD + len) else { return Ok(None) };
         let said = match tag {
-            tag::READY => Said::Ready,
-            tag::REFUSED => Said::Refused(gleaner_base::visible(&String::from_utf8_lossy(payload))),
+            tag::READY => RecorderMessage::Ready,
+            tag::REFUSED => {
+                RecorderMessage::Refused(gleaner_base::visible(&String::from_utf8_lossy(payload)))
+            }
             tag::OPENED => {
                 let wait = payload.try_into().map_err(|_| LinkError::Malformed {
                     who: RECORDER,
                     frame: "opened",
                     why: format!("it has {len} bytes instead of 8"),
                 })?;
-                Said::Opened { wait_ns: u64::from_le_bytes(wait) }
+                RecorderMessage::Opened { wait_ns: u64::from_le_bytes(wait) }
             }
             tag => return Err(LinkError::Unknown { who: RECORDER, tag }),
         };

@@ -1,7 +1,7 @@
 //! What a wake is written relative to: the wake before it. Writer and reader follow the same rules,
 //! which stand here.
 
-use super::entry::{Entry, Woken};
+use super::entry::{JournalEntry, WakeSource};
 
 /// The wake before, as far as the next one is written relative to it.
 pub(super) struct Before {
@@ -56,10 +56,10 @@ impl Before {
     }
 
     /// `entry` was written or read.
-    pub(super) fn note(&mut self, entry: &Entry) {
+    pub(super) fn note(&mut self, entry: &JournalEntry) {
         self.step_ns = self.at_ns.map_or(0, |before| entry.at_ns.wrapping_sub(before));
         self.at_ns = Some(entry.at_ns);
-        if let Woken::Sample { writer, seq } = entry.cause {
+        if let WakeSource::Sample { writer, seq } = entry.cause {
             self.woken_by = (writer, seq);
         }
         self.fuel = entry.fuel.unwrap_or(self.fuel);

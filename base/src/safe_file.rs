@@ -16,7 +16,7 @@ use crate::{Exit, Failure};
 /// Why something that has the name of a file or folder of ours is none. It is the cause in an
 /// [`io::Error`].
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum InTheWay {
+pub enum UnsafePath {
     /// A symbolic link.
     #[error("it is a link")]
     Link,
@@ -31,7 +31,7 @@ pub enum InTheWay {
     OtherNames,
 }
 
-impl InTheWay {
+impl UnsafePath {
     /// The way out.
     pub const HELP: &str = "remove it, or choose another folder: --out DIR";
 
@@ -45,7 +45,7 @@ impl InTheWay {
 ///
 /// # Errors
 ///
-/// [`InTheWay`] if it is no file of ours; those of the file system.
+/// [`UnsafePath`] if it is no file of ours; those of the file system.
 pub fn append(path: &Path) -> io::Result<File> {
     own(path, File::options().append(true).create(true))
 }
@@ -73,8 +73,8 @@ pub fn edit(path: &Path) -> io::Result<File> {
 ///
 /// # Errors
 ///
-/// [`InTheWay`] if it is a folder; those of the file system.
-pub fn anew(path: &Path) -> io::Result<File> {
+/// [`UnsafePath`] if it is a folder; those of the file system.
+pub fn create(path: &Path) -> io::Result<File> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             return Err(in_the_way(path, error));
@@ -88,7 +88,7 @@ pub fn anew(path: &Path) -> io::Result<File> {
 ///
 /// # Errors
 ///
-/// [`InTheWay`] if it is a link or no file; those of the file system.
+/// [`UnsafePath`] if it is a link or no file; those of the file system.
 pub fn read(path: &Path) -> io::Result<File> {
     open(path, File::options().read(true), OFlags::NOFOLLOW).map(|(file, _)| file)
 }
@@ -97,7 +97,7 @@ pub fn read(path: &Path) -> io::Result<File> {
 ///
 /// # Errors
 ///
-/// [`InTheWay`] if it is no file; those of the file system.
+/// [`UnsafePath`] if it is no file; those of the file system.
 pub fn read_named(path: &Path) -> io::Result<File> {
     open(path, File::options().read(true), OFlags::empty()).map(|(file, _)| file)
 }
@@ -107,7 +107,7 @@ pub fn read_named(path: &Path) -> io::Result<File> {
 ///
 /// # Errors
 ///
-/// [`InTheWay`] if it is something else; those of the file system.
+/// [`UnsafePath`] if it is something else; those of the file system.
 pub fn folder(path: &Path) -> io::Result<()> {
     if let Some(parent) = path.parent() {
         fs::create_dir_all(parent)?;
@@ -119,8 +119,8 @@ pub fn folder(path: &Path) -> io::Result<()> {
     let found = fs::symlink_metadata(path)?.file_type();
     match (found.is_dir(), found.is_symlink()) {
         (true, _) => Ok(()),
-        (_, true) => Err(io::Error::other(InTheWay::Link)),
-        _ => Err(io::Error::other(InTheWay::NoFolder)),
+        (_, true) => Err(io::Error::other(UnsafePath::Link)),
+        _ => Err(io::Error::other(UnsafePath::NoFolder)),
     }
 }
 
@@ -130,7 +130,7 @@ pub fn folder(path: &Path) -> io::Result<()> {
 /// # Errors
 ///
 /// A failure that names the link.
-pub fn real_place(folder: &Path, lambda: &Path) -> Result<(), Failure> {
+pub fn refuse_linked(folder: &Path, lambda: &Path) -> Result<(), Failure> {
     let within =
         folder.ancestors().take_while(|path| folder.starts_with(lambda) && *path != lambda);
     let Some(link) = within.filter(|path| path.is_symlink()).last() else { return Ok(()) };
@@ -142,7 +142,7 @@ pub fn real_place(folder: &Path, lambda: &Path) -> Result<(), Failure> {
 fn own(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
     let (file, found) = open(path, options, OFlags::NOFOLLOW)?;
     if found.nlink() > 1 {
-        return Err(io::Error::other(InTheWay::OtherNames));
+        return Err(io::Error::other(UnsafePath::OtherNames));
     }
     Ok(file)
 }
@@ -153,14 +153,14 @@ fn open(path: &Path, options: &mut OpenOptions, flags: OFlags) -> io::Result<(Fi
     let opened = options.custom_flags(flags.bits().cast_signed()).open(path);
     let file = opened.map_err(|error| in_the_way(path, error))?;
     let found = file.metadata()?;
-    if found.is_file() { Ok((file, found)) } else { Err(io::Error::other(InTheWay::NoFile)) }
+    if found.is_file() { Ok((file, found)) } else { Err(io::Error::other(UnsafePath::NoFile)) }
 }
 
 /// Why `path` could not be opened or removed, in words if that is due to what it is.
 fn in_the_way(path: &Path, error: io::Error) -> io::Error {
     match fs::symlink_metadata(path).map(|found| found.file_type()) {
-        Ok(found) if found.is_symlink() => io::Error::other(InTheWay::Link),
-        Ok(found) if !found.is_file() => io::Error::other(InTheWay::NoFile),
+        Ok(found) if found.is_symlink() => io::Error::other(UnsafePath::Link),
+        Ok(found) if !found.is_file() => io::Error::other(UnsafePath::NoFile),
         _ => error,
     }
 }
@@ -175,24 +175,24 @@ mod tests {
     use rustix::fs::{CWD, FileType, Mode, mknodat};
 
     use super::*;
-    use crate::scratch::Scratch;
+    use crate::test_folder::TestFolder;
 
     /// What opens a file that is there, or makes it.
     const OPEN: [fn(&Path) -> io::Result<File>; 4] = [append, write, edit, read];
 
-    fn pipe(folder: &Scratch) -> PathBuf {
+    fn pipe(folder: &TestFolder) -> PathBuf {
         let path = folder.path("pipe");
         mknodat(CWD, &path, FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
         path
     }
 
-    fn why<T>(opened: io::Result<T>) -> Option<InTheWay> {
-        InTheWay::of(&opened.err().unwrap())
+    fn why<T>(opened: io::Result<T>) -> Option<UnsafePath> {
+        UnsafePath::of(&opened.err().unwrap())
     }
 
     #[test]
     fn a_file_is_made_and_added_to_and_begun_anew() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let path = folder.path("log.jsonl");
         assert_eq!(edit(&path).unwrap_err().kind(), io::ErrorKind::NotFound);
         assert_eq!(read(&path).unwrap_err().kind(), io::ErrorKind::NotFound);
@@ -202,21 +202,21 @@ mod tests {
         let mut text = String::new();
         read(&path).unwrap().read_to_string(&mut text).unwrap();
         assert_eq!(text, "ONE two");
-        anew(&path).unwrap();
+        create(&path).unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), "");
     }
 
     #[test]
     fn a_link_is_not_followed_whether_it_leads_anywhere_or_not() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let precious = folder.write("precious", "precious");
         for target in [precious.clone(), folder.path("nothing")] {
             let link = folder.path("link");
             symlink(&target, &link).unwrap();
             for open in OPEN {
-                assert_eq!(why(open(&link)), Some(InTheWay::Link));
+                assert_eq!(why(open(&link)), Some(UnsafePath::Link));
             }
-            anew(&link).unwrap().write_all(b"new").unwrap();
+            create(&link).unwrap().write_all(b"new").unwrap();
             fs::remove_file(&link).unwrap();
         }
         assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
@@ -225,37 +225,37 @@ mod tests {
 
     #[test]
     fn a_file_with_another_name_is_not_written_to() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let precious = folder.write("precious", "precious");
         let path = folder.path("log.jsonl");
         fs::hard_link(&precious, &path).unwrap();
         for open in [append, write, edit] {
-            assert_eq!(why(open(&path)), Some(InTheWay::OtherNames));
+            assert_eq!(why(open(&path)), Some(UnsafePath::OtherNames));
         }
-        anew(&path).unwrap().write_all(b"new").unwrap();
+        create(&path).unwrap().write_all(b"new").unwrap();
         assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
     }
 
     #[test]
     fn what_is_no_file_is_said_and_not_waited_for() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let (pipe, socket, inner) = (pipe(&folder), folder.path("socket"), folder.path("folder"));
         let _listener = UnixListener::bind(&socket).unwrap();
         fs::create_dir(&inner).unwrap();
         for path in [pipe.as_path(), &socket, &inner, Path::new("/dev/null")] {
             for open in OPEN {
-                assert_eq!(why(open(path)), Some(InTheWay::NoFile), "{}", path.display());
+                assert_eq!(why(open(path)), Some(UnsafePath::NoFile), "{}", path.display());
             }
-            assert_eq!(why(read_named(path)), Some(InTheWay::NoFile), "{}", path.display());
+            assert_eq!(why(read_named(path)), Some(UnsafePath::NoFile), "{}", path.display());
         }
-        assert_eq!(why(anew(&inner)), Some(InTheWay::NoFile));
-        anew(&pipe).unwrap();
+        assert_eq!(why(create(&inner)), Some(UnsafePath::NoFile));
+        create(&pipe).unwrap();
         assert!(pipe.is_file());
     }
 
     #[test]
     fn what_a_user_has_named_may_be_a_link() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let link = folder.path("link");
         symlink(folder.write("drive.journal", "x"), &link).unwrap();
         read_named(&link).unwrap();
@@ -263,13 +263,13 @@ mod tests {
 
     #[test]
     fn results_are_no_way_out_of_the_lambdas_folder() {
-        let (lambda, elsewhere) = (Scratch::new(), Scratch::new());
+        let (lambda, elsewhere) = (TestFolder::new(), TestFolder::new());
         let live = lambda.path("live");
-        real_place(&live, lambda.root()).unwrap();
-        real_place(elsewhere.root(), lambda.root()).unwrap();
+        refuse_linked(&live, lambda.root()).unwrap();
+        refuse_linked(elsewhere.root(), lambda.root()).unwrap();
         symlink(elsewhere.root(), &live).unwrap();
         for out in [live.clone(), live.join("more")] {
-            let failure = real_place(&out, lambda.root()).unwrap_err().to_string();
+            let failure = refuse_linked(&out, lambda.root()).unwrap_err().to_string();
             assert!(failure.contains("live` is a link in the lambda's own folder"), "{failure}");
             assert!(failure.contains("--out DIR"), "{failure}");
         }
@@ -277,13 +277,13 @@ mod tests {
 
     #[test]
     fn a_folder_is_made_with_those_above_it_and_is_no_link() {
-        let folder_of_all = Scratch::new();
+        let folder_of_all = TestFolder::new();
         let clips = folder_of_all.path("out/clips");
         folder(&clips).unwrap();
         folder(&clips).unwrap();
         let link = folder_of_all.path("out/link");
         symlink(&clips, &link).unwrap();
-        assert_eq!(why(folder(&link)), Some(InTheWay::Link));
-        assert_eq!(why(folder(&folder_of_all.write("file", ""))), Some(InTheWay::NoFolder));
+        assert_eq!(why(folder(&link)), Some(UnsafePath::Link));
+        assert_eq!(why(folder(&folder_of_all.write("file", ""))), Some(UnsafePath::NoFolder));
     }
 }

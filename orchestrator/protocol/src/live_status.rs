@@ -3,18 +3,18 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::link::RecorderStatus;
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 
 /// How a lambda is doing on live topics. Counts are since its start; spreads are since the report
 /// before, and in the last report since the start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Live {
+pub struct LiveStatus {
     /// Name of the lambda.
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
     /// What kind of lambda it is.
-    pub kind: Kind,
+    pub kind: LambdaKind,
     /// Where its results are written.
     pub out: PathBuf,
     /// How often its process was started again before.
@@ -47,17 +47,17 @@ pub struct Live {
     #[serde(default)]
     pub unsent: u64,
     /// Sample received, or tick due, until the lambda is entered. `None` without wakes.
-    pub wake_latency: Option<Spread>,
+    pub wake_latency: Option<DurationStats>,
     /// Time in the lambda.
-    pub run: Option<Spread>,
+    pub run_time: Option<DurationStats>,
     /// Lambda left until its decision is out.
-    pub decision_latency: Option<Spread>,
+    pub decision_latency: Option<DurationStats>,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<LiveTopic>,
     /// The network.
-    pub network: Network,
+    pub network: NetworkStatus,
     /// What became of the wakes on their way to the recorder; `None` without one.
-    pub recorder: Option<ToRecorder>,
+    pub recorder_link: Option<LinkLosses>,
     /// What the recorders of the run counted, in `summary.json` only: whoever starts them adds it.
     /// `None` without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -68,11 +68,11 @@ pub struct Live {
     pub cpu_s: f64,
 }
 
-impl Live {
+impl LiveStatus {
     /// With what was counted of `before`, an earlier process of the same lambda. Spreads, rates,
     /// and what is true of an instant stay those of this one.
     #[must_use]
-    pub fn after(mut self, before: &Live) -> Live {
+    pub fn after(mut self, before: &LiveStatus) -> LiveStatus {
         self.up_s += before.up_s;
         self.cpu_s += before.cpu_s;
         let counts = [
@@ -107,7 +107,7 @@ impl Live {
                 (&mut topic.skipped, before.skipped),
             ]);
         }
-        if let (Some(now), Some(before)) = (&mut self.recorder, &before.recorder) {
+        if let (Some(now), Some(before)) = (&mut self.recorder_link, &before.recorder_link) {
             add([
                 (&mut now.wakes_dropped, before.wakes_dropped),
                 (&mut now.triggers_lost, before.triggers_lost),
@@ -123,7 +123,7 @@ pub(crate) fn add<const N: usize>(counts: [(&mut u64, u64); N]) {
 
 /// How long something took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Spread {
+pub struct DurationStats {
     /// How often.
     pub n: u64,
     /// Median, in ns.
@@ -172,13 +172,13 @@ pub struct LiveTopic {
 
 /// The network, as a process of ours sees it.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Network {
+pub struct NetworkStatus {
     /// The domain of DDS.
     pub domain: u16,
     /// Other participants that are known.
     pub participants: usize,
     /// Bytes of socket buffer that were asked for.
-    pub buffer_asked: usize,
+    pub buffer_requested: usize,
     /// Bytes that the system granted.
     pub buffer_granted: usize,
     /// Datagrams that the system dropped because a buffer was full.
@@ -194,7 +194,7 @@ pub struct Network {
 
 /// What became of wakes on their way to the recorder.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ToRecorder {
+pub struct LinkLosses {
     /// Wakes without a trigger that were left out because the recorder was too slow: clips say how
     /// many they lack.
     pub wakes_dropped: u64,
@@ -206,7 +206,7 @@ pub struct ToRecorder {
 mod tests {
     use super::*;
 
-    fn live(count: u64, lost: Option<u64>) -> Live {
+    fn live(count: u64, lost: Option<u64>) -> LiveStatus {
         let topic = LiveTopic {
             name: "imu".to_owned(),
             topic: "/imu".to_owned(),
@@ -224,10 +224,10 @@ mod tests {
             qos: None,
             qos_warnings: Vec::new(),
         };
-        Live {
+        LiveStatus {
             lambda: "hello".to_owned(),
             version: "0.1.0".to_owned(),
-            kind: Kind::Wasm,
+            kind: LambdaKind::Wasm,
             out: PathBuf::from("out"),
             restarts: count as u32,
             up_s: count as f64,
@@ -242,17 +242,22 @@ mod tests {
             backed_off: count,
             unwritten: count,
             unsent: count,
-            wake_latency: Some(Spread { n: count, p50_ns: count, p99_ns: count, max_ns: count }),
-            run: None,
+            wake_latency: Some(DurationStats {
+                n: count,
+                p50_ns: count,
+                p99_ns: count,
+                max_ns: count,
+            }),
+            run_time: None,
             decision_latency: None,
             topics: vec![topic],
-            network: Network {
+            network: NetworkStatus {
                 socket_drops: count,
                 filtered: count,
                 participants: 3,
-                ..Network::default()
+                ..NetworkStatus::default()
             },
-            recorder: Some(ToRecorder { wakes_dropped: count, triggers_lost: count }),
+            recorder_link: Some(LinkLosses { wakes_dropped: count, triggers_lost: count }),
             recording: None,
             rss_bytes: count,
             cpu_s: count as f64,

@@ -1,10 +1,10 @@
 use serde::{Deserialize, Serialize};
 
-use crate::Spread;
+use crate::DurationStats;
 
 /// What is in a recorded drive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct DriveSeen {
+pub struct DriveInfo {
     /// Log time of its first message, in ns since the epoch; `None` if there is none.
     pub start_ns: Option<i64>,
     /// Log time of its last message, in ns since the epoch.
@@ -17,7 +17,7 @@ pub struct DriveSeen {
     /// Why it was not read to its end, if it is damaged.
     pub damaged: Option<String>,
     /// By name.
-    pub topics: Vec<RecordedTopicSeen>,
+    pub topics: Vec<DriveTopicInfo>,
     /// Topics beyond those, which were not looked at.
     #[serde(default)]
     pub skipped: u64,
@@ -25,7 +25,7 @@ pub struct DriveSeen {
 
 /// A topic of a drive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct RecordedTopicSeen {
+pub struct DriveTopicInfo {
     /// Its absolute name.
     pub topic: String,
     /// Its type, for example `sensor_msgs/msg/Imu`.
@@ -37,9 +37,9 @@ pub struct RecordedTopicSeen {
     /// Why it cannot be read, if it cannot.
     pub unreadable: Option<String>,
     /// Messages in what was read of the drive.
-    pub read: u64,
+    pub messages_read: u64,
     /// Time between neighbours there, by log time.
-    pub interval: Option<Spread>,
+    pub interval: Option<DurationStats>,
     /// Log time of the message before the longest of these times, in ns since the epoch.
     pub longest_gap_at_ns: Option<i64>,
     /// Numbers that are missing between those of its messages; `None` where the recorder did not
@@ -50,12 +50,12 @@ pub struct RecordedTopicSeen {
     /// Bytes of all messages there.
     pub bytes: u64,
     /// Of a topic with pictures: the first one, for example `jpeg 1280x720` or `bgr8 320x180`.
-    pub picture: Option<Picture>,
+    pub picture: Option<PictureInfo>,
 }
 
 /// The shape of a picture.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Picture {
+pub struct PictureInfo {
     /// Its encoding in words.
     pub encoding: String,
     /// Pixels.

@@ -2,7 +2,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 
-use crate::own_file;
+use crate::safe_file;
 
 /// Writes `content` to the file `path` by way of one beside it, so that whatever happens there is
 /// the former file or this one, whole. After an error, the one beside it is removed: on a full
@@ -11,11 +11,11 @@ use crate::own_file;
 /// # Errors
 ///
 /// Those of the file system.
-pub fn write_whole(path: &Path, content: &[u8]) -> io::Result<()> {
+pub fn write_atomically(path: &Path, content: &[u8]) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
     let part = Path::new(&part);
-    let mut file = own_file::anew(part)?;
+    let mut file = safe_file::create(part)?;
     let written = file
         .write_all(content)
         .and_then(|()| file.sync_all())
@@ -31,16 +31,16 @@ pub fn write_whole(path: &Path, content: &[u8]) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scratch::Scratch;
+    use crate::test_folder::TestFolder;
 
     #[test]
     fn what_was_there_is_replaced_and_a_link_in_the_way_is_not_followed() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let (path, part) = (folder.path("summary.json"), folder.path("summary.json.part"));
         let elsewhere = folder.write("elsewhere", "precious");
         folder.write("summary.json", "former");
         std::os::unix::fs::symlink(&elsewhere, &part).unwrap();
-        write_whole(&path, b"new").unwrap();
+        write_atomically(&path, b"new").unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), "new");
         assert_eq!(fs::read_to_string(&elsewhere).unwrap(), "precious");
         assert!(!part.exists());
@@ -48,10 +48,10 @@ mod tests {
 
     #[test]
     fn nothing_is_left_of_what_cannot_take_its_place() {
-        let folder = Scratch::new();
+        let folder = TestFolder::new();
         let path = folder.path("report.html");
         fs::create_dir(&path).unwrap();
-        write_whole(&path, b"new").unwrap_err();
+        write_atomically(&path, b"new").unwrap_err();
         assert!(path.is_dir() && !folder.path("report.html.part").exists());
     }
 }

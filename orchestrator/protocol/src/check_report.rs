@@ -1,17 +1,17 @@
 use serde::{Deserialize, Serialize};
 
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 
 /// What was found out about a built lambda without any sample: it could be loaded, it fits the
 /// interface, and its `init` returned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Checked {
+pub struct CheckReport {
     /// Name of the lambda.
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
     /// What kind of lambda it is.
-    pub kind: Kind,
+    pub kind: LambdaKind,
     /// What runs it, with its version.
     pub engine: String,
     /// How long `init` took, in ms; `None` if it was not run.
@@ -34,7 +34,7 @@ pub struct Need {
     /// Bytes; `None` where nothing of the lambda's own bounds it.
     pub bytes: Option<u64>,
     /// Where.
-    pub place: Place,
+    pub place: NeedPlace,
     /// Taken from the start; else as much as this at most.
     pub preallocated: bool,
 }
@@ -43,7 +43,7 @@ pub struct Need {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[allow(missing_docs)]
-pub enum Place {
+pub enum NeedPlace {
     Memory,
     Disk,
 }
