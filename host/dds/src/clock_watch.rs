@@ -1,4 +1,6 @@
-//! Detects that the time of day was set back, which RustDDS cannot cope with.
+//! Detects that the time of day was set back, which RustDDS cannot cope with: it orders samples of
+//! best-effort writers by the time of arrival (`src/structure/dds_cache.rs`,
+//! `get_changes_in_range_best_effort`).
 
 use gleaner_transport::clock::monotonic;
 
