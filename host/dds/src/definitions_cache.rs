@@ -12,7 +12,7 @@ use super::receive::{ReceiverCommand, ReceiverHandle};
 use super::state::ParticipantState;
 use super::type_query::{Attempts, QueryOutcome, TypeQuery};
 use gleaner_base::chain;
-use gleaner_messages::described::Described;
+use gleaner_messages::type_description::DescribedDefinitions;
 use gleaner_messages::{Definitions, MessageError, Sources, SourcesError};
 
 /// Most queries for one type.
@@ -116,8 +116,8 @@ impl DefinitionsCache {
                 CachedType::Missing { attempts, settled: !retry }
             }
             QueryOutcome::Answer { node, hash, cdr, endian } => {
-                match Described::read(type_name, &hash, &cdr, endian) {
-                    Ok(Described { text, without_texts }) => {
+                match DescribedDefinitions::read(type_name, &hash, &cdr, endian) {
+                    Ok(DescribedDefinitions { text, without_texts }) => {
                         let comments = without_texts
                             .map_or("as their author wrote them".to_owned(), |why| visible(&why));
                         info!(

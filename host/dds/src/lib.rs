@@ -64,8 +64,8 @@ use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::NetworkStatus;
 use gleaner_transport::{
-    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Status, Subscription,
-    TopicSpec, Transport, TransportError,
+    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, ReceptionStatus, Sink,
+    Subscription, TopicSpec, Transport, TransportError,
 };
 use joins::NoJoin;
 use packet_filter::PacketFilter;
@@ -262,7 +262,7 @@ impl Transport for Dds {
         })
     }
 
-    fn status(&self, subscription: Subscription) -> Status {
+    fn status(&self, subscription: Subscription) -> ReceptionStatus {
         self.subscriptions
             .get(subscription.0)
             .map(|(_, status)| status.status(&self.state))

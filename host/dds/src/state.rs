@@ -10,7 +10,7 @@ use tracing::error;
 use super::peers::Peers;
 use super::type_query::QueryOutcome;
 use super::{Distro, names};
-use gleaner_transport::Status;
+use gleaner_transport::ReceptionStatus;
 
 /// State of the participant.
 #[derive(Debug, Default)]
@@ -104,9 +104,9 @@ impl ParticipantState {
 }
 
 impl SubscriptionStatus {
-    pub(super) fn status(&self, state: &ParticipantState) -> Status {
+    pub(super) fn status(&self, state: &ParticipantState) -> ReceptionStatus {
         let text = lock(&self.text);
-        Status {
+        ReceptionStatus {
             writers: Some(text.reader.map_or(0, |reader| state.peers().connected(reader))),
             lost: Some(self.lost.load(Ordering::Relaxed)),
             malformed: self.malformed.load(Ordering::Relaxed),

@@ -30,7 +30,7 @@ use super::qos::Request;
 use super::raw::{CopyInto, RawReader, RawWriter};
 use super::topic_reader::ReceiveContext;
 use gleaner_messages::Endian;
-use gleaner_messages::described::{Header, question};
+use gleaner_messages::type_description::{RequestHeader, request};
 use gleaner_transport::Guid;
 
 /// Time limit of a query, from the search for a node to its answer.
@@ -298,7 +298,7 @@ impl ServiceCall {
             return None;
         }
         let header = self.header(context, query);
-        let question = Bytes::from(question(&query.type_name, &self.target.hash, header));
+        let question = Bytes::from(request(&query.type_name, &self.target.hash, header));
         // With it, Fast DDS waits for this reader before it answers. The sequence number is that of
         // the request, which it knows.
         let related = SampleIdentity {
@@ -326,7 +326,7 @@ impl ServiceCall {
             };
             let (memory, endian) = (context.memory.borrow(), change.sample.endian);
             let own = match header {
-                Some(header) => Header::split(&memory, endian)
+                Some(header) => RequestHeader::split(&memory, endian)
                     .and_then(|(found, cdr)| (found == header).then_some(cdr)),
                 None => change.related_sample_identity().and_then(|to| {
                     let guids = [self.reader.guid(), self.writer.guid()];

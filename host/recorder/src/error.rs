@@ -5,7 +5,7 @@ use std::error::Error;
 use std::io;
 use std::path::PathBuf;
 
-use gleaner_base::own_file::InTheWay;
+use gleaner_base::safe_file::UnsafePath;
 use gleaner_base::{Exit, Explain};
 use gleaner_drives::ReplayError;
 use gleaner_transport::TransportError;
@@ -197,7 +197,7 @@ impl RecordError {
 
     /// Whether something that is no file or folder of ours has the name of one.
     fn is_in_the_way(&self) -> bool {
-        self.io().any(|error| InTheWay::of(error).is_some())
+        self.io().any(|error| UnsafePath::of(error).is_some())
     }
 
     /// The errors of the file system in the chain of causes.
@@ -225,7 +225,7 @@ impl Explain for RecordError {
             (_, Some(io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem)) => {
                 "choose a folder that you may write to: --out DIR"
             }
-            _ if self.is_in_the_way() => InTheWay::HELP,
+            _ if self.is_in_the_way() => UnsafePath::HELP,
             _ => return None,
         };
         Some(help.to_owned())

@@ -33,9 +33,12 @@ mod window;
 
 pub use digest::lambda_digest;
 pub use error::RecordError;
-pub use file::{Earlier, Folder, LossList, MESSAGE_MAX, Stated, Topic, Untrue};
+pub use file::{
+    ClipStatements, EarlierClips, FalseStatement, LossList, MESSAGE_MAX, RecordingFolder,
+    TopicSchema,
+};
 pub use recorder::{
-    Commanded, Counts, LambdaId, Member, Recorder, Settings, TOPICS_MAX, TopicId, Work,
+    Commanded, LambdaId, LambdaSpec, Recorder, RecorderCounts, Settings, TOPICS_MAX, TopicId, Work,
 };
 pub use thumbnail::{is_image, thumbnail};
 

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use gleaner_dds::{Dds, DdsOptions};
 use gleaner_transport::{
-    Clock, Delivery, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport,
+    Clock, Delivery, Qos, ReceptionStatus, SampleMeta, Sink, Subscription, TopicSpec, Transport,
 };
 use rustdds::no_key::{
     DataWriter, Decode, DeserializerAdapter, SerializerAdapter, SimpleDataReader,
@@ -57,7 +57,7 @@ pub fn until(what: &str, mut done: impl FnMut() -> bool) {
 }
 
 /// Waits for this number of writers.
-pub fn connected(dds: &Dds, subscription: Subscription, writers: usize) -> Status {
+pub fn connected(dds: &Dds, subscription: Subscription, writers: usize) -> ReceptionStatus {
     until("writers", || dds.status(subscription).writers == Some(writers));
     dds.status(subscription)
 }

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::Path;
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 
 use super::recover::Pause;
 use crate::error::RecordError;
@@ -49,7 +49,7 @@ pub(super) fn write_with(
     folder: &Path,
     fill: impl FnOnce(&mut File) -> io::Result<()>,
 ) -> Result<(), RecordError> {
-    let mut file = own_file::anew(part)
+    let mut file = safe_file::create(part)
         .map_err(|source| RecordError::Create { path: part.to_owned(), source })?;
     fill(&mut file).map_err(|source| RecordError::Write { path: part.to_owned(), source })?;
     file.sync_all().map_err(|source| RecordError::Sync { path: part.to_owned(), source })?;
@@ -61,7 +61,7 @@ pub(super) fn write_with(
 /// where it was had failed.
 pub(super) fn copy(from: &Path, to: &Path, pause: &mut Pause) -> Result<(), RecordError> {
     let cannot_write = |source| RecordError::Write { path: to.to_owned(), source };
-    let source = own_file::read(from)
+    let source = safe_file::read(from)
         .map_err(|source| RecordError::Read { path: from.to_owned(), source })?;
     let copy = step("copy", to).and_then(|()| File::create_new(to));
     let mut copy = copy.map_err(|source| RecordError::Create { path: to.to_owned(), source })?;

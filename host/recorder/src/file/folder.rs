@@ -5,35 +5,35 @@ use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 use tracing::warn;
 
-use super::list::{List, Listed};
+use super::clip_dir::{CLIPS, ClipDir, PART};
+use super::list::{ClipList, ListedClip};
 use super::losses::LossList;
-use super::place::{CLIPS, PART, Place};
 use super::recover::Recovery;
-use super::shelf::Shelf;
-use super::unfinished::Unfinished;
-use super::{About, replaced};
+use super::retention::Retention;
+use super::unfinished::UnfinishedClip;
+use super::{ClipHeader, replaced};
 use crate::error::RecordError;
 
-/// The clips that are listed in a [`Folder`], which stays held. Who starts anew replaces them once
+/// The clips that are listed in a [`RecordingFolder`], which stays held. Who starts anew replaces them once
 /// nothing is in the way, and then a recorder has the folder already.
-pub struct Earlier {
-    place: Arc<Place>,
+pub struct EarlierClips {
+    dir: Arc<ClipDir>,
 }
 
 /// A folder of clips with their list, held by one process at a time.
-pub struct Folder {
-    pub(super) place: Arc<Place>,
-    shelf: Option<Shelf>,
+pub struct RecordingFolder {
+    pub(super) dir: Arc<ClipDir>,
+    retention: Option<Retention>,
     losses: Arc<LossList>,
     left: Recovery,
 }
 
-impl Folder {
+impl RecordingFolder {
     /// Opens the folder `out`, which is made if there is none, and takes it for this process.
     /// Whatever an earlier process left unfinished is completed first: the clips that came back by
     /// that are returned, and listed already. What cannot be completed, for example because the
@@ -61,23 +61,23 @@ impl Folder {
         Ok((folder, found))
     }
 
-    /// As [`Folder::open`], but what an earlier process left is not completed yet: the thread of
+    /// As [`RecordingFolder::open`], but what an earlier process left is not completed yet: the thread of
     /// [`crate::Recorder::live`] does that while it records.
     ///
     /// # Errors
     ///
-    /// As for [`Folder::open`].
+    /// As for [`RecordingFolder::open`].
     pub fn hold(out: &Path) -> Result<Self, RecordError> {
         let clips = out.join(CLIPS);
-        own_file::folder(&clips)
+        safe_file::folder(&clips)
             .map_err(|source| RecordError::Create { path: clips.clone(), source })?;
         let lock = lock(&clips, out)?;
-        let list = List::of(out);
+        let list = ClipList::of(out);
         replaced::complete(&clips, &list)?;
         let taken: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
-        let place = Arc::new(Place::new(clips, list, taken, lock));
-        let left = Recovery::of(&place)?;
-        Ok(Self { place, shelf: None, losses: Arc::new(LossList::of(out)), left })
+        let dir = Arc::new(ClipDir::new(clips, list, taken, lock));
+        let left = Recovery::of(&dir)?;
+        Ok(Self { dir, retention: None, losses: Arc::new(LossList::of(out)), left })
     }
 
     /// What an earlier process left, for whoever completes it.
@@ -85,7 +85,7 @@ impl Folder {
         std::mem::take(&mut self.left)
     }
 
-    /// As [`Earlier::replace`].
+    /// As [`EarlierClips::replace`].
     ///
     /// # Errors
     ///
@@ -95,8 +95,8 @@ impl Folder {
     }
 
     /// The clips that are listed in it.
-    pub fn earlier(&self) -> Earlier {
-        Earlier { place: Arc::clone(&self.place) }
+    pub fn earlier(&self) -> EarlierClips {
+        EarlierClips { dir: Arc::clone(&self.dir) }
     }
 
     /// From now on there are at most so many clips, or so many bytes of them: of more, the oldest
@@ -112,8 +112,9 @@ impl Folder {
         clips: Option<u64>,
         bytes: Option<u64>,
     ) -> Result<Vec<Loss>, RecordError> {
-        let shelf = Shelf::new(&self.place, self.losses(), self.place.list().read()?, clips, bytes);
-        Ok(self.shelf.insert(shelf).make_room(&self.place))
+        let retention =
+            Retention::new(&self.dir, self.losses(), self.dir.list().read()?, clips, bytes);
+        Ok(self.retention.insert(retention).make_room(&self.dir))
     }
 
     /// `losses.jsonl`.
@@ -124,21 +125,25 @@ impl Folder {
     /// A clip was finished: makes room, if there is a bound. What went for it, and what should have
     /// and could not.
     pub(crate) fn added(&mut self, clip: &Clip) -> Vec<Loss> {
-        self.shelf.as_mut().map_or(Vec::new(), |shelf| shelf.add(&self.place, clip))
+        self.retention.as_mut().map_or(Vec::new(), |retention| retention.add(&self.dir, clip))
     }
 
-    /// Begins a clip named `stem`, or `stem-2`, `stem-3` and so on if there is one.
+    /// Begins a clip named `base`, or `base-2`, `base-3` and so on if there is one.
     ///
     /// # Errors
     ///
     /// [`RecordError`] if its file cannot be made or written.
-    pub(crate) fn begin(&mut self, stem: &str, about: &About) -> Result<Unfinished, RecordError> {
-        let name = self.place.free_name(stem);
-        Unfinished::create(Arc::clone(&self.place), name, PART, Some(about))
+    pub(crate) fn begin(
+        &mut self,
+        base: &str,
+        clip_header: &ClipHeader,
+    ) -> Result<UnfinishedClip, RecordError> {
+        let name = self.dir.free_name(base);
+        UnfinishedClip::create(Arc::clone(&self.dir), name, PART, Some(clip_header))
     }
 }
 
-impl Earlier {
+impl EarlierClips {
     /// Starts anew with the clips in `keep`: deletes the others that are listed, with their
     /// thumbnails, and says how many clips these were. Lines of the list that name no clip of ours
     /// stay.
@@ -149,26 +154,25 @@ impl Earlier {
     ///
     /// [`RecordError`] if the list cannot be written, and nothing is deleted then.
     pub fn replace(&self, keep: &[Clip]) -> Result<u64, RecordError> {
-        let place = &self.place;
+        let dir = &self.dir;
         let kept: HashSet<PathBuf> = keep.iter().map(|clip| clip.file.clone()).collect();
         let is_kept =
-            |listed: &Listed| kept.contains(Path::new(CLIPS).join(&listed.file).as_path());
-        let (listed, doomed): (Vec<_>, Vec<_>) =
-            place.list().read()?.into_iter().partition(is_kept);
+            |listed: &ListedClip| kept.contains(Path::new(CLIPS).join(&listed.file).as_path());
+        let (listed, doomed): (Vec<_>, Vec<_>) = dir.list().read()?.into_iter().partition(is_kept);
         // The list never names a clip that is gone, and what it does not name any more is noted
         // before: else the next start would find whole clips that no list names, and list them as
         // results of another replay.
-        replaced::note(place.folder(), &doomed)?;
-        place.list().replace(keep)?;
-        let deleted = replaced::complete(place.folder(), place.list())?;
-        place.take_only(listed.into_iter().map(|listed| listed.file).collect());
+        replaced::note(dir.folder(), &doomed)?;
+        dir.list().replace(keep)?;
+        let deleted = replaced::complete(dir.folder(), dir.list())?;
+        dir.take_only(listed.into_iter().map(|listed| listed.file).collect());
         Ok(deleted)
     }
 }
 
 fn lock(clips: &Path, out: &Path) -> Result<File, RecordError> {
     let path = clips.join(".lock");
-    let file = own_file::write(&path)
+    let file = safe_file::write(&path)
         .map_err(|source| RecordError::Create { path: path.clone(), source })?;
     match file.try_lock() {
         Ok(()) => Ok(file),

@@ -4,49 +4,49 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Component, Path, PathBuf};
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 use gleaner_lambda::Clip;
 use serde::Deserialize;
 use tracing::warn;
 
+use super::clip_dir::{CLIP, CLIPS, JPG};
 use super::durable;
-use super::place::{CLIP, CLIPS, JPG};
 use crate::error::RecordError;
 
 /// Longer lines are not ours. One of ours has some KB; at most 13 MB: 1,024 topics, whose names and
-/// types of 256 KiB may stand in it and in six texts of `short`, six bytes for each if they are
+/// types of 256 KiB may stand in it and in six texts of `incomplete`, six bytes for each if they are
 /// control characters, and 100 moments of some 3 KB.
 const LINE_MAX: u64 = 16 << 20;
 
 /// The list of clips.
-pub(super) struct List {
+pub(super) struct ClipList {
     path: PathBuf,
     folder: PathBuf,
 }
 
 /// What a line says of the files of a clip; whatever else it says is left alone.
 #[derive(Deserialize)]
-struct Line {
+struct ListLine {
     file: PathBuf,
     thumbnail: Option<PathBuf>,
 }
 
 /// File names of a listed clip, in the folder of clips.
-pub(super) struct Listed {
+pub(super) struct ListedClip {
     pub(super) file: String,
     pub(super) thumbnail: Option<String>,
 }
 
-impl List {
+impl ClipList {
     /// The list in `folder`, which may not exist yet.
     pub(super) fn of(folder: &Path) -> Self {
         Self { path: folder.join("clips.jsonl"), folder: folder.to_owned() }
     }
 
     /// What the list names. A line that was torn when its writer died is cut off.
-    pub(super) fn read(&self) -> Result<Vec<Listed>, RecordError> {
+    pub(super) fn read(&self) -> Result<Vec<ListedClip>, RecordError> {
         let failed = |source| RecordError::List { path: self.path.clone(), source };
-        let file = match own_file::edit(&self.path) {
+        let file = match safe_file::edit(&self.path) {
             Ok(file) => file,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             Err(error) => return Err(failed(error)),
@@ -63,7 +63,7 @@ impl List {
     pub(super) fn append(&self, clip: &Clip) -> Result<(), RecordError> {
         let failed = |source| RecordError::List { path: self.path.clone(), source };
         let is_new = !self.path.exists();
-        let mut file = own_file::append(&self.path).map_err(failed)?;
+        let mut file = safe_file::append(&self.path).map_err(failed)?;
         let before = file.metadata().map_err(failed)?.len();
         durable::step("append", &self.path).map_err(failed)?;
         if let Err(error) = file.write_all(&line(clip)).and_then(|()| file.sync_all()) {
@@ -83,7 +83,7 @@ impl List {
             &self.folder,
             |file| {
                 let mut new = BufWriter::new(file);
-                match own_file::read(&self.path) {
+                match safe_file::read(&self.path) {
                     Ok(old) => {
                         read_lines(&old, |foreign| new.write_all(foreign))?;
                     }
@@ -109,7 +109,7 @@ fn line(clip: &Clip) -> Vec<u8> {
 pub(super) fn read_lines(
     file: &File,
     mut foreign: impl FnMut(&[u8]) -> io::Result<()>,
-) -> io::Result<(Vec<Listed>, u64, u64)> {
+) -> io::Result<(Vec<ListedClip>, u64, u64)> {
     let mut reader = BufReader::new(file);
     let mut listed = Vec::new();
     let (mut at, mut whole, mut malformed) = (0, 0, 0_u64);
@@ -129,7 +129,7 @@ pub(super) fn read_lines(
             continue;
         }
         whole = at;
-        match serde_json::from_slice::<Line>(&line).ok().filter(|_| !too_long).and_then(names) {
+        match serde_json::from_slice::<ListLine>(&line).ok().filter(|_| !too_long).and_then(names) {
             Some(names) => listed.push(names),
             None => {
                 malformed += 1;
@@ -144,14 +144,14 @@ pub(super) fn read_lines(
     Ok((listed, whole, at))
 }
 
-fn names(line: Line) -> Option<Listed> {
+fn names(line: ListLine) -> Option<ListedClip> {
     let thumbnail = line.thumbnail.and_then(|path| plain_name(&path, JPG));
-    Some(Listed { file: plain_name(&line.file, CLIP)?, thumbnail })
+    Some(ListedClip { file: plain_name(&line.file, CLIP)?, thumbnail })
 }
 
 /// The file name of `path` if it is `clips/NAME` with that ending and nothing else: what a list
 /// says is deleted, and nobody but us may say so of other files.
-pub(super) fn plain_name(path: &Path, ending: &str) -> Option<String> {
+pub(super) fn plain_name(path: &Path, suffix: &str) -> Option<String> {
     let mut components = path.components();
     let (folder, name) = (components.next()?, components.next()?);
     let (Component::Normal(folder), Component::Normal(name), None) =
@@ -160,8 +160,8 @@ pub(super) fn plain_name(path: &Path, ending: &str) -> Option<String> {
         return None;
     };
     let fits = |name: &&str| {
-        name.ends_with(ending)
-            && name.len() > ending.len()
+        name.ends_with(suffix)
+            && name.len() > suffix.len()
             && name.len() <= 255
             && !name.contains('\0')
     };

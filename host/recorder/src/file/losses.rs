@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 use gleaner_protocol::link::Loss;
 
 use crate::error::RecordError;
@@ -34,7 +34,7 @@ impl LossList {
         let mut line = serde_json::to_vec(loss).expect("a loss is plain data");
         line.push(b'\n');
         let _turn = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut file = own_file::append(&self.path).map_err(failed)?;
+        let mut file = safe_file::append(&self.path).map_err(failed)?;
         let before = file.metadata().map_err(failed)?.len();
         file.write_all(&line).and_then(|()| file.sync_data()).map_err(|error| {
             // A torn line would swallow the next one.

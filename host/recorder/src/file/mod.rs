@@ -18,20 +18,20 @@
 //! nothing; what it cannot finish stays for the next start.
 //!
 //! Never: a file touched that this program did not write; a clip that was acknowledged deleted
-//! other than by [`Earlier::replace`], or that nobody fetched other than by
-//! [`Folder::keep_at_most`].
+//! other than by [`EarlierClips::replace`], or that nobody fetched other than by
+//! [`RecordingFolder::keep_at_most`].
 
+mod clip_dir;
+mod clip_records;
 mod durable;
-mod ending;
 mod folder;
 mod list;
 mod losses;
-mod part;
-mod place;
+mod origin;
 mod read;
 mod recover;
 mod replaced;
-mod shelf;
+mod retention;
 mod sink;
 mod stated;
 #[cfg(test)]
@@ -41,17 +41,17 @@ mod written;
 
 use std::sync::Arc;
 
-use gleaner_journal::Header;
+use gleaner_journal::JournalHeader;
 use gleaner_lambda::{ClipLambda, Moment};
 
-pub(crate) use ending::CONTINUES;
-pub use folder::{Earlier, Folder};
+pub(crate) use clip_dir::names;
+pub(crate) use clip_records::CONTINUES;
+pub use folder::{EarlierClips, RecordingFolder};
 pub use losses::LossList;
-pub(crate) use place::names;
 pub(crate) use recover::Recovery;
-pub use stated::{Stated, Untrue};
+pub use stated::{ClipStatements, FalseStatement};
 pub use unfinished::MESSAGE_MAX;
-pub(crate) use unfinished::Unfinished;
+pub(crate) use unfinished::UnfinishedClip;
 
 use crate::error::RecordError;
 
@@ -65,7 +65,7 @@ const DEFINITIONS_MAX: usize = 8 << 20;
 /// What is known when a clip begins. It stands in front of the messages, so that a recovered clip
 /// still says what it is.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct About {
+pub(crate) struct ClipHeader {
     /// What the stamps are, for example "log time of the drive".
     pub clock: String,
     /// Begin of the window that opened the clip, in ns.
@@ -78,7 +78,7 @@ pub(crate) struct About {
 
 /// A topic that is recorded.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Topic {
+pub struct TopicSchema {
     /// Absolute topic name.
     pub name: String,
     /// Message type, as `pkg/msg/Type`.
@@ -89,16 +89,16 @@ pub struct Topic {
     pub offered_qos: Option<String>,
 }
 
-impl Topic {
+impl TopicSchema {
     /// Whether a clip has room for what a topic says of itself. The fields of the file are larger;
     /// but what a file says of its topics is held by all who read it.
     pub(crate) fn check(&self) -> Result<(), RecordError> {
         let definitions = self.definitions.as_deref().map_or(0, str::len);
-        let about = definitions + self.offered_qos.as_deref().map_or(0, str::len);
+        let clip_header = definitions + self.offered_qos.as_deref().map_or(0, str::len);
         let parts = [
             ("name", self.name.len(), NAME_MAX),
             ("type name", self.type_name.len(), NAME_MAX),
-            ("definitions and quality of service", about, DEFINITIONS_MAX),
+            ("definitions and quality of service", clip_header, DEFINITIONS_MAX),
         ];
         match parts.into_iter().find(|(_, bytes, most)| bytes > most) {
             None => Ok(()),
@@ -112,7 +112,7 @@ impl Topic {
 
 /// What is known when a clip ends.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Ending {
+pub(crate) struct ClipTrailer {
     /// Begin of what was asked for, in ns.
     pub from_ns: i64,
     /// End of what was asked for, inclusive, in ns.
@@ -121,7 +121,7 @@ pub(crate) struct Ending {
     pub lambdas: Vec<ClipLambda>,
     /// What the journals of these lambdas say of them, in the same order; empty where nobody knows.
     /// Two of them may have one name: a lambda that was started again.
-    pub headers: Vec<Arc<Header>>,
+    pub headers: Vec<Arc<JournalHeader>>,
     /// Triggers within it.
     pub triggers: u64,
     /// These triggers, or as many of them as were kept.
@@ -129,7 +129,7 @@ pub(crate) struct Ending {
     /// What is known of its topics. How many messages were written is counted here, not there.
     pub topics: Vec<TopicCounts>,
     /// Why it holds less than was asked for, in words.
-    pub short: Vec<String>,
+    pub incomplete: Vec<String>,
     /// A JPEG.
     pub thumbnail: Option<Vec<u8>>,
     /// For each lambda its part of the journal.

@@ -5,12 +5,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_drives::{Damage, Limits, Place, Replay, ReplayError, read_extras};
 use gleaner_lambda::Clip;
-use gleaner_transport::{SampleMeta, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Delivery, SampleMeta, TopicSpec, Transport};
 
-use super::ending::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};
+use super::clip_records::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};
 use super::recover::Pause;
 use super::written::Written;
-use super::{About, Topic};
+use super::{ClipHeader, TopicSchema};
 use crate::error::RecordError;
 
 /// The largest chunk: one message of any size that a lambda may ask for.
@@ -19,22 +19,22 @@ const LIMITS: Limits = Limits { chunk_bytes: 1 << 30, open_bytes: 1 << 30, unpac
 const EXTRAS_BYTES: u64 = 1 << 30;
 
 /// Where a file ends early, and why.
-pub(super) struct End {
+pub(super) struct EarlyEnd {
     pub(super) at: u64,
     pub(super) why: Damage,
 }
 
 /// A clip that is read.
-struct Reading {
+struct ClipReader {
     replay: Replay,
-    held: Arc<Held>,
-    topics: Vec<Topic>,
+    last: Arc<LastMessage>,
+    topics: Vec<TopicSchema>,
 }
 
-impl Reading {
-    fn open(path: &Path, limits: Limits) -> Result<Reading, RecordError> {
+impl ClipReader {
+    fn open(path: &Path, limits: Limits) -> Result<ClipReader, RecordError> {
         let mut replay = Replay::open_with(&[path.to_owned()], limits).map_err(unreadable(path))?;
-        let held = Arc::new(Held::default());
+        let last = Arc::new(LastMessage::default());
         let mut topics = Vec::new();
         for found in replay.topics() {
             let spec = TopicSpec {
@@ -45,19 +45,19 @@ impl Reading {
                 qos: Default::default(),
             };
             replay
-                .subscribe(&spec, Arc::clone(&held) as Arc<dyn gleaner_transport::Sink>)
+                .subscribe(&spec, Arc::clone(&last) as Arc<dyn gleaner_transport::Sink>)
                 .map_err(|source| RecordError::Topic {
                     path: path.to_owned(),
                     source: Box::new(source),
                 })?;
-            topics.push(Topic {
+            topics.push(TopicSchema {
                 name: spec.topic,
                 type_name: spec.type_name,
                 definitions: found.definitions_text,
                 offered_qos: found.offered_qos,
             });
         }
-        Ok(Reading { replay, held, topics })
+        Ok(ClipReader { replay, last, topics })
     }
 
     /// Gives the next message, with the index of its topic, to `act`; `None` at the end.
@@ -66,7 +66,7 @@ impl Reading {
         act: impl FnOnce(usize, &SampleMeta, &[u8]) -> T,
     ) -> Result<Option<T>, ReplayError> {
         Ok(self.replay.step()?.map(|step| {
-            let cdr = self.held.0.lock().unwrap_or_else(PoisonError::into_inner);
+            let cdr = self.last.0.lock().unwrap_or_else(PoisonError::into_inner);
             act(step.subscription.0, &step.meta, &cdr)
         }))
     }
@@ -76,16 +76,16 @@ impl Reading {
 /// to the damage that it returns.
 pub(super) fn each_message(
     path: &Path,
-    mut act: impl FnMut(&Topic, &SampleMeta, &[u8]) -> Result<(), RecordError>,
-) -> Result<Option<End>, RecordError> {
-    let mut reading = Reading::open(path, LIMITS)?;
-    let topics = std::mem::take(&mut reading.topics);
+    mut act: impl FnMut(&TopicSchema, &SampleMeta, &[u8]) -> Result<(), RecordError>,
+) -> Result<Option<EarlyEnd>, RecordError> {
+    let mut reader = ClipReader::open(path, LIMITS)?;
+    let topics = std::mem::take(&mut reader.topics);
     loop {
-        match reading.next(|topic, meta, cdr| act(&topics[topic], meta, cdr)) {
+        match reader.next(|topic, meta, cdr| act(&topics[topic], meta, cdr)) {
             Ok(Some(done)) => done?,
             Ok(None) => return Ok(None),
             Err(ReplayError::Damaged { at: Place::Byte(at), what, .. }) => {
-                return Ok(Some(End { at, why: what }));
+                return Ok(Some(EarlyEnd { at, why: what }));
             }
             Err(error) => return Err(unreadable(path)(error)),
         }
@@ -95,12 +95,12 @@ pub(super) fn each_message(
 /// The messages of the clip `path`, counted. It may come from anywhere: its chunks are bounded as
 /// those of a drive.
 pub(super) fn written(path: &Path) -> Result<Written, RecordError> {
-    let mut reading = Reading::open(path, Limits::default())?;
+    let mut reader = ClipReader::open(path, Limits::default())?;
     let mut written = Written::default();
-    for topic in &reading.topics {
+    for topic in &reader.topics {
         written.add_topic(topic);
     }
-    while reading
+    while reader
         .next(|topic, meta, cdr| written.count(topic, meta, cdr))
         .map_err(unreadable(path))?
         .is_some()
@@ -114,14 +114,14 @@ fn unreadable(path: &Path) -> impl Fn(ReplayError) -> RecordError + '_ {
 
 /// The message that was delivered last.
 #[derive(Default)]
-struct Held(Mutex<Vec<u8>>);
+struct LastMessage(Mutex<Vec<u8>>);
 
-impl gleaner_transport::Sink for Held {
-    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Verdict {
-        let mut held = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        held.clear();
-        held.extend_from_slice(cdr);
-        Verdict::Taken
+impl gleaner_transport::Sink for LastMessage {
+    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Delivery {
+        let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        last.clear();
+        last.extend_from_slice(cdr);
+        Delivery::Taken
     }
 }
 
@@ -139,7 +139,7 @@ pub(super) fn whole(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, Reco
 }
 
 /// What the clip `path` says of its begin; `None` if that cannot be read.
-pub(super) fn about(path: &Path) -> Option<About> {
+pub(super) fn clip_header(path: &Path) -> Option<ClipHeader> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
     extras
         .metadata

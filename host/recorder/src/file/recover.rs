@@ -10,23 +10,23 @@ use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 use gleaner_drives::Damage;
 use gleaner_lambda::{Clip, Recovered};
 use tracing::{info, warn};
 
-use super::part::{Origin, origin};
-use super::place::{AGAIN, CLIP, CLIPS, JPG, JPG_PART, PART, Place, names};
-use super::read::{self, End};
-use super::unfinished::{CHUNK_SPAN_NS, Saved, Unfinished};
-use super::{Ending, durable};
+use super::clip_dir::{AGAIN, CLIP, CLIPS, ClipDir, JPG, JPG_PART, PART, names};
+use super::origin::{Origin, origin};
+use super::read::{self, EarlyEnd};
+use super::unfinished::{CHUNK_SPAN_NS, Saved, UnfinishedClip};
+use super::{ClipTrailer, durable};
 use crate::error::RecordError;
 
 /// What an earlier process left in a folder. It is found before this one writes there, and
 /// completed one by one.
 #[derive(Default)]
 pub(crate) struct Recovery {
-    place: Option<Arc<Place>>,
+    dir: Option<Arc<ClipDir>>,
     left: VecDeque<(&'static str, String)>,
 }
 
@@ -35,13 +35,13 @@ pub(crate) struct Recovery {
 pub(super) type Pause<'a> = dyn FnMut() -> Result<(), RecordError> + 'a;
 
 impl Recovery {
-    /// What is left in the folder of `place`.
-    pub(super) fn of(place: &Arc<Place>) -> Result<Recovery, RecordError> {
+    /// What is left in the folder of `dir`.
+    pub(super) fn of(dir: &Arc<ClipDir>) -> Result<Recovery, RecordError> {
         let mut left = VecDeque::new();
-        for ending in [AGAIN, PART, CLIP] {
-            left.extend(files(place.folder(), ending)?.into_iter().map(|name| (ending, name)));
+        for suffix in [AGAIN, PART, CLIP] {
+            left.extend(files(dir.folder(), suffix)?.into_iter().map(|name| (suffix, name)));
         }
-        Ok(Recovery { place: Some(Arc::clone(place)), left })
+        Ok(Recovery { dir: Some(Arc::clone(dir)), left })
     }
 
     /// The next clip that came back, which is listed, or why one did not: that is left as it is,
@@ -51,22 +51,22 @@ impl Recovery {
         &mut self,
         go_on: &mut dyn FnMut() -> bool,
     ) -> Option<Result<Clip, RecordError>> {
-        let place = self.place.as_ref()?;
+        let dir = self.dir.as_ref()?;
         while go_on() {
-            let (ending, name) = self.left.pop_front()?;
+            let (suffix, name) = self.left.pop_front()?;
             let mut pause = || match go_on() {
                 true => Ok(()),
                 // Nobody is told of it.
                 false => Err(RecordError::Read {
-                    path: place.path(&name, ending),
+                    path: dir.path(&name, suffix),
                     source: io::ErrorKind::Interrupted.into(),
                 }),
             };
-            let came = match ending {
-                AGAIN => discard_copy(place, &name).map(|()| None),
-                PART => recover(place, &name, &mut pause),
-                _ if place.is_taken(&format!("{name}{CLIP}")) => Ok(None),
-                _ => list(place, &name, &mut pause),
+            let came = match suffix {
+                AGAIN => discard_copy(dir, &name).map(|()| None),
+                PART => recover(dir, &name, &mut pause),
+                _ if dir.is_taken(&format!("{name}{CLIP}")) => Ok(None),
+                _ => list(dir, &name, &mut pause),
             };
             match came {
                 Ok(None) => {}
@@ -80,7 +80,7 @@ impl Recovery {
 
 /// The files in `folder` that end so, without the ending, sorted. What has another name, or is no
 /// file, is not ours.
-fn files(folder: &Path, ending: &str) -> Result<Vec<String>, RecordError> {
+fn files(folder: &Path, suffix: &str) -> Result<Vec<String>, RecordError> {
     let cannot_read = |source| RecordError::Read { path: folder.to_owned(), source };
     let mut names = Vec::new();
     for entry in fs::read_dir(folder).map_err(cannot_read)? {
@@ -88,7 +88,7 @@ fn files(folder: &Path, ending: &str) -> Result<Vec<String>, RecordError> {
         if !entry.file_type().is_ok_and(|kind| kind.is_file()) {
             continue;
         }
-        if let Some(name) = entry.file_name().to_str().and_then(|name| name.strip_suffix(ending)) {
+        if let Some(name) = entry.file_name().to_str().and_then(|name| name.strip_suffix(suffix)) {
             names.push(name.to_owned());
         }
     }
@@ -97,8 +97,8 @@ fn files(folder: &Path, ending: &str) -> Result<Vec<String>, RecordError> {
 }
 
 /// Removes the copy that a recovery had begun; what it was copied from is still there.
-fn discard_copy(place: &Place, name: &str) -> Result<(), RecordError> {
-    let path = place.path(name, AGAIN);
+fn discard_copy(dir: &ClipDir, name: &str) -> Result<(), RecordError> {
+    let path = dir.path(name, AGAIN);
     match origin(&path).map_err(|source| RecordError::Read { path: path.clone(), source })? {
         Origin::Foreign => {
             warn!(path = %path.display(), "file is not of this program, left alone");
@@ -109,15 +109,15 @@ fn discard_copy(place: &Place, name: &str) -> Result<(), RecordError> {
 }
 
 /// Makes a clip of the unfinished clip `name`, if there is anything in it, and lists it.
-fn recover(place: &Arc<Place>, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
-    let part = place.path(name, PART);
-    let recovered = attempt(place, name, &part, pause);
+fn recover(dir: &Arc<ClipDir>, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
+    let part = dir.path(name, PART);
+    let recovered = attempt(dir, name, &part, pause);
     recovered.map_err(|source| RecordError::Recover { path: part, source: Box::new(source) })
 }
 
 /// Lists the clip `name`, which has its name and no line, if it is one of ours and whole.
-fn list(place: &Place, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
-    let path = place.path(name, CLIP);
+fn list(dir: &ClipDir, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
+    let path = dir.path(name, CLIP);
     match origin(&path) {
         Ok(Origin::Ours) => {}
         Ok(_) => return Ok(None),
@@ -133,8 +133,8 @@ fn list(place: &Place, name: &str, pause: &mut Pause) -> Result<Option<Clip>, Re
             // Whoever gave it its name may have died, or its disk lost its power, before the name
             // was on the disk.
             durable::sync_file(&path)?;
-            durable::sync_folder(place.folder())?;
-            add(place, name, clip).map(Some)
+            durable::sync_folder(dir.folder())?;
+            add(dir, name, clip).map(Some)
         }
         Ok(None) => {
             warn!(path = %path.display(), "clip is damaged and not listed, left alone");
@@ -157,7 +157,7 @@ fn is_own_name(name: &str, clip: &Clip) -> bool {
 }
 
 fn attempt(
-    place: &Arc<Place>,
+    dir: &Arc<ClipDir>,
     name: &str,
     part: &Path,
     pause: &mut Pause,
@@ -167,31 +167,31 @@ fn attempt(
             warn!(path = %part.display(), "file is not of this program, left alone");
             return Ok(None);
         }
-        Origin::Nothing => return discard(place, name).map(|()| None),
+        Origin::Nothing => return discard(dir, name).map(|()| None),
         Origin::Ours => {}
     }
     // What an earlier attempt wrote, and did not complete.
-    durable::remove(&place.path(name, AGAIN))?;
-    if was_saved(place, name, part)? {
+    durable::remove(&dir.path(name, AGAIN))?;
+    if was_saved(dir, name, part)? {
         // It is listed, or will be, by its own name, which may not be on the disk yet.
-        durable::sync_folder(place.folder())?;
-        durable::remove(&place.path(name, JPG_PART))?;
+        durable::sync_folder(dir.folder())?;
+        durable::remove(&dir.path(name, JPG_PART))?;
         durable::remove(part)?;
         return Ok(None);
     }
     match read::whole(part, pause)? {
         // It died just before the rename.
-        Some(clip) => adopt(place, name, part, clip, pause).map(Some),
-        None => save(place, name, part, pause),
+        Some(clip) => adopt(dir, name, part, clip, pause).map(Some),
+        None => save(dir, name, part, pause),
     }
 }
 
 /// Whether an earlier attempt got as far as a whole clip: one that says so, or a copy of the
 /// unfinished file.
-fn was_saved(place: &Place, name: &str, part: &Path) -> Result<bool, RecordError> {
+fn was_saved(dir: &ClipDir, name: &str, part: &Path) -> Result<bool, RecordError> {
     let from = format!("{name}{PART}");
     for path in names(name)
-        .map(|name| place.path(&name, CLIP))
+        .map(|name| dir.path(&name, CLIP))
         .take_while(|path| path.symlink_metadata().is_ok())
     {
         if !path.symlink_metadata().is_ok_and(|found| found.is_file()) {
@@ -210,7 +210,7 @@ fn was_saved(place: &Place, name: &str, part: &Path) -> Result<bool, RecordError
 
 /// Whether two files have the same content.
 fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
-    let (one, other) = (own_file::read(one)?, own_file::read(other)?);
+    let (one, other) = (safe_file::read(one)?, safe_file::read(other)?);
     if one.metadata()?.len() != other.metadata()?.len() {
         return Ok(false);
     }
@@ -232,11 +232,11 @@ fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
 /// The name for the clip of the unfinished file `name`: its own, as it was free when the file was
 /// begun, unless somebody has put another file there since. No clip that is begun meanwhile gets
 /// it.
-fn name_for(place: &Place, name: &str) -> String {
+fn name_for(dir: &ClipDir, name: &str) -> String {
     let is_free =
-        |name: &String| !place.exists(name, CLIP) && !place.is_taken(&format!("{name}{CLIP}"));
+        |name: &String| !dir.exists(name, CLIP) && !dir.is_taken(&format!("{name}{CLIP}"));
     let free = names(name).find(is_free).expect("numbers do not end before the files do");
-    place.take(&free);
+    dir.take(&free);
     free
 }
 
@@ -246,14 +246,14 @@ fn name_for(place: &Place, name: &str) -> String {
 /// its pages are on the disk, and to sync it again would prove nothing: only bytes that are written
 /// anew are known to arrive.
 fn adopt(
-    place: &Place,
+    dir: &ClipDir,
     name: &str,
     part: &Path,
     clip: Clip,
     pause: &mut Pause,
 ) -> Result<Clip, RecordError> {
-    let free = name_for(place, name);
-    let again = place.path(name, AGAIN);
+    let free = name_for(dir, name);
+    let again = dir.path(name, AGAIN);
     if let Err(error) = durable::copy(part, &again, pause) {
         // On a full disk, its room is wanted.
         durable::remove(&again)?;
@@ -261,38 +261,38 @@ fn adopt(
     }
     if free != name {
         // It belongs to no clip now.
-        durable::remove(&place.path(name, JPG))?;
+        durable::remove(&dir.path(name, JPG))?;
     }
-    durable::rename(&again, &place.path(&free, CLIP), place.folder())?;
-    let clip = add(place, &free, clip)?;
-    durable::remove(&place.path(name, JPG_PART))?;
+    durable::rename(&again, &dir.path(&free, CLIP), dir.folder())?;
+    let clip = add(dir, &free, clip)?;
+    durable::remove(&dir.path(name, JPG_PART))?;
     durable::remove(part)?;
     Ok(clip)
 }
 
 /// Lists a whole clip whose line is that of its own record.
-fn add(place: &Place, name: &str, mut clip: Clip) -> Result<Clip, RecordError> {
-    let path = place.path(name, CLIP);
+fn add(dir: &ClipDir, name: &str, mut clip: Clip) -> Result<Clip, RecordError> {
+    let path = dir.path(name, CLIP);
     let metadata =
         fs::metadata(&path).map_err(|source| RecordError::Read { path: path.clone(), source })?;
     clip.file = format!("{CLIPS}/{name}{CLIP}").into();
-    clip.thumbnail = place.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
+    clip.thumbnail = dir.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
     clip.bytes = metadata.len();
     // It is a result of the process that died, and not of the one that finds it.
-    let what = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
-    clip.recovered.get_or_insert(Recovered { lost_bytes: 0, what });
-    place.add(name, &clip)?;
+    let note = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
+    clip.recovered.get_or_insert(Recovered { lost_bytes: 0, note });
+    dir.add(name, &clip)?;
     info!(path = %path.display(), "clip was whole but not listed, now it is");
     Ok(clip)
 }
 
 /// Removes an unfinished clip without a message. Nothing that was acknowledged is lost by that.
-fn discard(place: &Place, name: &str) -> Result<(), RecordError> {
-    durable::remove(&place.path(name, JPG_PART))?;
-    if !place.exists(name, CLIP) {
-        durable::remove(&place.path(name, JPG))?;
+fn discard(dir: &ClipDir, name: &str) -> Result<(), RecordError> {
+    durable::remove(&dir.path(name, JPG_PART))?;
+    if !dir.exists(name, CLIP) {
+        durable::remove(&dir.path(name, JPG))?;
     }
-    let part = place.path(name, PART);
+    let part = dir.path(name, PART);
     let bytes = fs::metadata(&part).map_or(0, |metadata| metadata.len());
     warn!(path = %part.display(), bytes, "unfinished clip has no message, removed");
     durable::remove(&part).map(drop)
@@ -300,28 +300,28 @@ fn discard(place: &Place, name: &str) -> Result<(), RecordError> {
 
 /// Copies the messages of `part` into a clip of their own.
 fn save(
-    place: &Arc<Place>,
+    dir: &Arc<ClipDir>,
     name: &str,
     part: &Path,
     pause: &mut Pause,
 ) -> Result<Option<Clip>, RecordError> {
-    let again = place.path(name, AGAIN);
-    let saved = copy(place, name, part, pause);
+    let again = dir.path(name, AGAIN);
+    let saved = copy(dir, name, part, pause);
     if saved.as_ref().is_ok_and(Option::is_some) {
-        durable::remove(&place.path(name, JPG_PART))?;
+        durable::remove(&dir.path(name, JPG_PART))?;
         durable::remove(part)?;
         return saved;
     }
     // A copy that did not come to its end; on a full disk, its room is wanted.
     durable::remove(&again)?;
     if saved.is_ok() {
-        discard(place, name)?;
+        discard(dir, name)?;
     }
     saved
 }
 
 fn copy(
-    place: &Arc<Place>,
+    dir: &Arc<ClipDir>,
     name: &str,
     part: &Path,
     pause: &mut Pause,
@@ -329,9 +329,10 @@ fn copy(
     let len = fs::metadata(part)
         .map_err(|source| RecordError::Read { path: part.to_owned(), source })?
         .len();
-    let about = read::about(part);
-    let free = name_for(place, name);
-    let mut clip = Unfinished::create(Arc::clone(place), name.to_owned(), AGAIN, about.as_ref())?;
+    let clip_header = read::clip_header(part);
+    let free = name_for(dir, name);
+    let mut clip =
+        UnfinishedClip::create(Arc::clone(dir), name.to_owned(), AGAIN, clip_header.as_ref())?;
     let end = read::each_message(part, |topic, meta, cdr| {
         pause()?;
         clip.message(topic, meta, cdr)
@@ -339,30 +340,30 @@ fn copy(
     let Some((first_ns, last_ns)) = clip.span() else {
         return Ok(None);
     };
-    let from_ns = about.as_ref().map_or(first_ns, |about| about.from_ns);
+    let from_ns = clip_header.as_ref().map_or(first_ns, |clip_header| clip_header.from_ns);
     if free != name {
         // It belongs to no clip now.
-        durable::remove(&place.path(name, JPG))?;
+        durable::remove(&dir.path(name, JPG))?;
     }
-    let has_thumbnail = place.exists(&free, JPG);
-    let what = what(end.as_ref(), last_ns.saturating_sub(from_ns), has_thumbnail);
-    let ending = Ending {
+    let has_thumbnail = dir.exists(&free, JPG);
+    let note = note(end.as_ref(), last_ns.saturating_sub(from_ns), has_thumbnail);
+    let suffix = ClipTrailer {
         from_ns,
         to_ns: last_ns,
-        triggers: u64::from(about.is_some()),
-        moments: about.iter().map(|about| about.moment.clone()).collect(),
-        lambdas: about.map(|about| about.lambdas).unwrap_or_default(),
-        short: vec![what.clone()],
-        ..Ending::default()
+        triggers: u64::from(clip_header.is_some()),
+        moments: clip_header.iter().map(|clip_header| clip_header.moment.clone()).collect(),
+        lambdas: clip_header.map(|clip_header| clip_header.lambdas).unwrap_or_default(),
+        incomplete: vec![note.clone()],
+        ..ClipTrailer::default()
     };
     let lost_bytes = end.map_or(0, |end| len.saturating_sub(end.at));
     warn!(path = %part.display(), messages = clip.messages(), lost_bytes, "unfinished clip of a dead recorder saved");
-    let saved = Saved { recovered: Recovered { lost_bytes, what }, from: format!("{name}{PART}") };
-    clip.close(ending, &free, Some(saved)).map(Some)
+    let saved = Saved { recovered: Recovered { lost_bytes, note }, from: format!("{name}{PART}") };
+    clip.close(suffix, &free, Some(saved)).map(Some)
 }
 
-/// What happened and what is missing, for a person.
-fn what(end: Option<&End>, kept_ns: i64, has_thumbnail: bool) -> String {
+/// Returns what happened and what is missing, for a person.
+fn note(end: Option<&EarlyEnd>, kept_ns: i64, has_thumbnail: bool) -> String {
     let kept = kept_ns.max(0) as f64 / 1e9;
     let most = CHUNK_SPAN_NS / 1_000_000_000;
     let also = if has_thumbnail { "so is the journal" } else { "so are journal and thumbnail" };

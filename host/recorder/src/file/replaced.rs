@@ -6,12 +6,12 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 use tracing::warn;
 
+use super::clip_dir::CLIPS;
 use super::durable;
-use super::list::{List, Listed, read_lines};
-use super::place::CLIPS;
+use super::list::{ClipList, ListedClip, read_lines};
 use crate::error::RecordError;
 
 const NOTE: &str = ".replaced";
@@ -19,7 +19,7 @@ const NOTE: &str = ".replaced";
 const NOTE_PART: &str = ".replaced.part";
 
 /// Notes in the folder of clips that these go.
-pub(super) fn note(folder: &Path, doomed: &[Listed]) -> Result<(), RecordError> {
+pub(super) fn note(folder: &Path, doomed: &[ListedClip]) -> Result<(), RecordError> {
     if doomed.is_empty() {
         return Ok(());
     }
@@ -28,7 +28,7 @@ pub(super) fn note(folder: &Path, doomed: &[Listed]) -> Result<(), RecordError> 
 }
 
 /// A line as the list has it, as far as it names files.
-fn line(Listed { file, thumbnail }: &Listed) -> Vec<u8> {
+fn line(ListedClip { file, thumbnail }: &ListedClip) -> Vec<u8> {
     let path = |name: &String| format!("{CLIPS}/{name}");
     let line = serde_json::json!({ "file": path(file), "thumbnail": thumbnail.as_ref().map(path) });
     format!("{line}\n").into_bytes()
@@ -36,12 +36,12 @@ fn line(Listed { file, thumbnail }: &Listed) -> Vec<u8> {
 
 /// Deletes the noted clips, and returns how many these were. Clips that the list names stay: the
 /// process died before it wrote the list.
-pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
+pub(super) fn complete(folder: &Path, list: &ClipList) -> Result<u64, RecordError> {
     // A process that died while it wrote the note had changed nothing else.
     let _ = fs::remove_file(folder.join(NOTE_PART));
     let path = folder.join(NOTE);
     let cannot_read = |source| RecordError::Read { path: path.clone(), source };
-    let noted = match own_file::read(&path) {
+    let noted = match safe_file::read(&path) {
         Ok(noted) => noted,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
         Err(error) => return Err(cannot_read(error)),
@@ -50,7 +50,7 @@ pub(super) fn complete(folder: &Path, list: &List) -> Result<u64, RecordError> {
     let listed: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
     let (mut deleted, mut left) = (0, Vec::new());
     for doomed in doomed.into_iter().filter(|doomed| !listed.contains(&doomed.file)) {
-        let Listed { file, thumbnail } = &doomed;
+        let ListedClip { file, thumbnail } = &doomed;
         // The thumbnail first: one without its clip would belong to nothing.
         let thumbnail = thumbnail
             .as_ref()

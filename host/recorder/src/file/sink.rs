@@ -10,14 +10,14 @@ const BUFFER: usize = 64 << 10;
 
 /// A file that only grows, and that nothing more is written to once a write has failed: behind a
 /// torn record nothing could be read.
-pub(super) struct Sink {
+pub(super) struct FileSink {
     file: File,
     buffer: Vec<u8>,
     position: Arc<AtomicU64>,
     failed: bool,
 }
 
-impl Sink {
+impl FileSink {
     /// A sink that writes to the new file `file`.
     pub(super) fn new(file: File) -> Self {
         Self { file, buffer: Vec::with_capacity(BUFFER), position: Arc::default(), failed: false }
@@ -57,7 +57,7 @@ impl Sink {
     }
 }
 
-impl Write for Sink {
+impl Write for FileSink {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.check()?;
         if self.buffer.len() + bytes.len() > BUFFER {
@@ -78,7 +78,7 @@ impl Write for Sink {
     }
 }
 
-impl Seek for Sink {
+impl Seek for FileSink {
     /// The writer asks where it is, and never goes elsewhere.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         match to {

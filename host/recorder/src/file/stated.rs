@@ -10,17 +10,17 @@ use std::path::Path;
 
 use gleaner_base::{excerpt, visible};
 use gleaner_drives::{Attachment, Extras};
-use gleaner_journal::Header;
+use gleaner_journal::JournalHeader;
 use gleaner_lambda::{Clip, ClipLambda, ClipTopic, Moment};
 
-use super::ending::{
+use super::clip_dir::{CLIP, CLIPS, JPG, names};
+use super::clip_records::{
     self, BEGIN, CLIP_RECORD, CONTINUES, DECISION_RECORD, LAMBDA_RECORD, LINE, THUMBNAIL,
     TOPIC_RECORD, json,
 };
 use super::list::plain_name;
-use super::place::{CLIP, CLIPS, JPG, names};
 use super::written::Written;
-use super::{About, read};
+use super::{ClipHeader, read};
 use crate::error::RecordError;
 use crate::{LAMBDAS_MAX, lambda_digest};
 
@@ -36,7 +36,7 @@ const IN_COMMON: usize = 24;
 
 /// A statement of a clip that the rest of the clip contradicts.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Untrue {
+pub struct FalseStatement {
     /// The record and the key.
     pub what: String,
     /// The statement.
@@ -45,7 +45,7 @@ pub struct Untrue {
     pub found: String,
 }
 
-impl Untrue {
+impl FalseStatement {
     fn new(what: impl Into<String>, stated: &str, found: &str) -> Self {
         // Of two texts that begin alike, the begin shows nothing.
         let alike = stated.bytes().zip(found.bytes()).take_while(|(a, b)| a == b).count();
@@ -68,25 +68,25 @@ impl Untrue {
 
 /// The statements of a finished clip about itself.
 #[derive(Debug)]
-pub struct Stated {
+pub struct ClipStatements {
     clip: Clip,
     moments: Vec<Moment>,
     topics: BTreeMap<String, Values>,
 }
 
-impl Stated {
+impl ClipStatements {
     /// Reads the records of a clip that holds the journal with this header, and compares them with
     /// each other, with the header and with the attachments.
     ///
     /// # Errors
     ///
-    /// The first [`Untrue`] statement: a record or an attachment that is missing, doubled or of
+    /// The first [`FalseStatement`] statement: a record or an attachment that is missing, doubled or of
     /// another kind, a value that is not as recorders write it, or that contradicts the rest.
-    pub fn read(extras: &Extras, header: &Header) -> Result<Self, Untrue> {
+    pub fn read(extras: &Extras, header: &JournalHeader) -> Result<Self, FalseStatement> {
         if let Some((name, _)) =
             extras.metadata.iter().find(|(name, _)| !RECORDS.contains(&name.as_str()))
         {
-            return Err(Untrue::new(
+            return Err(FalseStatement::new(
                 format!("record `{}`", excerpt(name)),
                 "is there",
                 "no recorder writes it",
@@ -97,7 +97,7 @@ impl Stated {
         };
         let only = |of: &'static str| match records(of).collect::<Vec<_>>()[..] {
             [values] => Ok(values),
-            ref found => Err(Untrue::count(format!("record {of}"), found.len(), 1)),
+            ref found => Err(FalseStatement::count(format!("record {of}"), found.len(), 1)),
         };
         let clip = clip(only(CLIP_RECORD)?, &extras.attachments, header)?;
         lambdas(&records(LAMBDA_RECORD).collect::<Vec<_>>(), &clip, header)?;
@@ -124,16 +124,16 @@ impl Stated {
     /// # Errors
     ///
     /// [`RecordError::Unreadable`] and [`RecordError::Topic`] if the messages cannot be read.
-    pub fn contradicted(&self, path: &Path) -> Result<Option<Untrue>, RecordError> {
+    pub fn contradicted(&self, path: &Path) -> Result<Option<FalseStatement>, RecordError> {
         let written = read::written(path)?;
         Ok(self.compare(&written).err())
     }
 
-    fn compare(&self, written: &Written) -> Result<(), Untrue> {
+    fn compare(&self, written: &Written) -> Result<(), FalseStatement> {
         if let Some(found) =
             written.topics().iter().find(|found| !self.topics.contains_key(&found.name))
         {
-            return Err(Untrue::count(
+            return Err(FalseStatement::count(
                 format!("record {TOPIC_RECORD} of `{}`", excerpt(&found.name)),
                 0,
                 1,
@@ -153,7 +153,7 @@ impl Stated {
                 received: received(),
                 ..topic.clone()
             };
-            let (_, expected) = ending::topic(&is, found);
+            let (_, expected) = clip_records::topic(&is, found);
             let name = excerpt(&topic.topic);
             same(
                 &format!("record {TOPIC_RECORD} of `{name}`"),
@@ -161,7 +161,7 @@ impl Stated {
                 &expected,
             )?;
             let what = format!("{LINE} of record {CLIP_RECORD}, topic `{name}`");
-            same(&what, &ending::topic(topic, found).1, &expected)?;
+            same(&what, &clip_records::topic(topic, found).1, &expected)?;
         }
         let (first_ns, last_ns) = written.span.unzip();
         let stamp = |ns: Option<i64>| ns.map_or("none".to_owned(), |ns| ns.to_string());
@@ -169,12 +169,12 @@ impl Stated {
             [("first_ns", self.clip.first_ns, first_ns), ("last_ns", self.clip.last_ns, last_ns)]
         {
             if stated != found {
-                return Err(Untrue::new(in_clip(key), &stamp(stated), &stamp(found)));
+                return Err(FalseStatement::new(in_clip(key), &stamp(stated), &stamp(found)));
             }
         }
         let is_late = first_ns.is_some_and(|first_ns| first_ns < self.clip.from_ns);
         if is_late {
-            return Err(Untrue::new(
+            return Err(FalseStatement::new(
                 in_clip("from_ns"),
                 &self.clip.from_ns.to_string(),
                 &stamp(first_ns),
@@ -182,7 +182,7 @@ impl Stated {
         }
         let is_early = last_ns.is_some_and(|last_ns| last_ns > self.clip.to_ns);
         if is_early {
-            return Err(Untrue::new(
+            return Err(FalseStatement::new(
                 in_clip("to_ns"),
                 &self.clip.to_ns.to_string(),
                 &stamp(last_ns),
@@ -197,19 +197,19 @@ fn in_clip(key: &str) -> String {
 }
 
 /// The program that wrote a clip, by the header of a journal that the same program wrote.
-fn library(header: &Header) -> String {
+fn library(header: &JournalHeader) -> String {
     format!("gleaner {}", header.gleaner)
 }
 
 /// Refuses the values of a record that are not those `expected`.
-fn same(record: &str, stated: &Values, expected: &Values) -> Result<(), Untrue> {
+fn same(record: &str, stated: &Values, expected: &Values) -> Result<(), FalseStatement> {
     let value = |of: &Values, key: &str| of.get(key).cloned();
     let keys = stated.keys().chain(expected.keys().filter(|key| !stated.contains_key(*key)));
     for key in keys {
         let (stated, expected) = (value(stated, key), value(expected, key));
         if stated != expected {
             let text = |value: Option<String>| value.unwrap_or_else(|| "not there".to_owned());
-            return Err(Untrue::new(
+            return Err(FalseStatement::new(
                 format!("`{}` of {record}", excerpt(key)),
                 &text(stated),
                 &text(expected),
@@ -219,48 +219,57 @@ fn same(record: &str, stated: &Values, expected: &Values) -> Result<(), Untrue> 
     Ok(())
 }
 
-fn malformed(record: &str, key: &str, values: &Values) -> Untrue {
+fn malformed(record: &str, key: &str, values: &Values) -> FalseStatement {
     let stated = values.get(key).map_or("not there", String::as_str);
-    Untrue::new(format!("`{key}` of record {record}"), stated, "a value as recorders write it")
+    FalseStatement::new(
+        format!("`{key}` of record {record}"),
+        stated,
+        "a value as recorders write it",
+    )
 }
 
 /// The clip, by its line.
-fn clip(values: &Values, attachments: &[Attachment], header: &Header) -> Result<Clip, Untrue> {
+fn clip(
+    values: &Values,
+    attachments: &[Attachment],
+    header: &JournalHeader,
+) -> Result<Clip, FalseStatement> {
     let line = values.get(LINE).map_or("", String::as_str);
-    let of_line = |expected: &str| Untrue::new(in_clip(LINE), line, expected);
+    let of_line = |expected: &str| FalseStatement::new(in_clip(LINE), line, expected);
     let clip = serde_json::from_str::<Clip>(line).map_err(|error| of_line(&error.to_string()))?;
     if json(&clip) != line {
         return Err(of_line(&json(&clip)));
     }
-    let stem =
+    let base =
         plain_name(&clip.file, CLIP).and_then(|name| name.strip_suffix(CLIP).map(str::to_owned));
-    let stem = stem.ok_or_else(|| {
-        Untrue::new(in_clip("file"), &clip.file.to_string_lossy(), "clips/NAME.mcap")
+    let base = base.ok_or_else(|| {
+        FalseStatement::new(in_clip("file"), &clip.file.to_string_lossy(), "clips/NAME.mcap")
     })?;
     let thumbnail = attachments.iter().find(|attachment| attachment.name == THUMBNAIL);
-    let picture = thumbnail.map(|_| format!("{CLIPS}/{stem}{JPG}"));
+    let picture = thumbnail.map(|_| format!("{CLIPS}/{base}{JPG}"));
     let stated = clip.thumbnail.as_ref().map(|path| path.to_string_lossy().into_owned());
     if stated != picture {
         let text = |path: Option<String>| path.unwrap_or_else(|| "none".to_owned());
         let what =
             format!("`thumbnail` in {LINE} of record {CLIP_RECORD}, by attachment `{THUMBNAIL}`");
-        return Err(Untrue::new(what, &text(stated), &text(picture)));
+        return Err(FalseStatement::new(what, &text(stated), &text(picture)));
     }
     if clip.bytes != 0 {
-        return Err(Untrue::new(
+        return Err(FalseStatement::new(
             format!("`bytes` in {LINE} of record {CLIP_RECORD}"),
             &clip.bytes.to_string(),
             "0",
         ));
     }
     let picture = thumbnail.map(|attachment| attachment.data.as_slice());
-    let (_, expected) = ending::about_clip(&clip, &header.clock, &library(header), picture, None);
+    let (_, expected) =
+        clip_records::about_clip(&clip, &header.clock, &library(header), picture, None);
     same(&format!("record {CLIP_RECORD}"), values, &expected)?;
     Ok(clip)
 }
 
 /// Refuses attachments other than one journal of each lambda, and one thumbnail.
-fn attachments(attachments: &[Attachment], clip: &Clip) -> Result<(), Untrue> {
+fn attachments(attachments: &[Attachment], clip: &Clip) -> Result<(), FalseStatement> {
     let mut known = BTreeSet::from([THUMBNAIL.to_owned()]);
     for lambda in &clip.lambdas {
         // A lambda that was started again has another journal.
@@ -271,18 +280,18 @@ fn attachments(attachments: &[Attachment], clip: &Clip) -> Result<(), Untrue> {
     for attachment in attachments {
         let what = || format!("attachment `{}`", excerpt(&attachment.name));
         if !known.contains(&attachment.name) {
-            return Err(Untrue::new(what(), "is there", "no recorder writes it"));
+            return Err(FalseStatement::new(what(), "is there", "no recorder writes it"));
         }
         if !found.insert(attachment.name.as_str()) {
-            return Err(Untrue::count(what(), 2, 1));
+            return Err(FalseStatement::count(what(), 2, 1));
         }
     }
     Ok(())
 }
 
-fn lambdas(records: &[&Values], clip: &Clip, header: &Header) -> Result<(), Untrue> {
+fn lambdas(records: &[&Values], clip: &Clip, header: &JournalHeader) -> Result<(), FalseStatement> {
     if records.len() != clip.lambdas.len() {
-        return Err(Untrue::count(
+        return Err(FalseStatement::count(
             format!("record {LAMBDA_RECORD}"),
             records.len(),
             clip.lambdas.len(),
@@ -290,7 +299,7 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &Header) -> Result<(), Untr
     }
     if clip.lambdas.len() > LAMBDAS_MAX {
         let what = format!("number of lambdas in {LINE} of record {CLIP_RECORD}");
-        return Err(Untrue::new(
+        return Err(FalseStatement::new(
             what,
             &clip.lambdas.len().to_string(),
             &format!("{LAMBDAS_MAX} at most"),
@@ -298,7 +307,7 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &Header) -> Result<(), Untr
     }
     if !clip.lambdas.iter().any(|of| of.name == header.lambda) {
         let stated = clip.lambdas.iter().map(|of| of.name.as_str()).collect::<Vec<_>>().join(", ");
-        return Err(Untrue::new(
+        return Err(FalseStatement::new(
             format!("lambdas in {LINE} of record {CLIP_RECORD}"),
             &stated,
             &header.lambda,
@@ -310,7 +319,7 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &Header) -> Result<(), Untr
             true => (by_header(of, header), Some(header)),
             false => (of.clone(), None),
         };
-        let (_, mut expected) = ending::lambda(&is, header);
+        let (_, mut expected) = clip_records::lambda(&is, header);
         if header.is_none() {
             // The journal of this one leads nowhere else.
             for (key, value) in &mut expected {
@@ -322,27 +331,27 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &Header) -> Result<(), Untr
         }
         same(&record, values, &expected)?;
         let what = format!("{LINE} of record {CLIP_RECORD}, lambda `{}`", excerpt(&of.name));
-        same(&what, &ending::lambda(of, header).1, &ending::lambda(&is, header).1)?;
+        same(&what, &clip_records::lambda(of, header).1, &clip_records::lambda(&is, header).1)?;
     }
     Ok(())
 }
 
-fn by_header(of: &ClipLambda, header: &Header) -> ClipLambda {
+fn by_header(of: &ClipLambda, header: &JournalHeader) -> ClipLambda {
     let digest = lambda_digest(&header.files);
     ClipLambda { version: header.version.clone(), kind: header.kind, digest, ..of.clone() }
 }
 
-fn moment(values: &Values) -> Result<Moment, Untrue> {
-    let moment =
-        ending::read_decision(values).map_err(|key| malformed(DECISION_RECORD, key, values))?;
+fn moment(values: &Values) -> Result<Moment, FalseStatement> {
+    let moment = clip_records::read_decision(values)
+        .map_err(|key| malformed(DECISION_RECORD, key, values))?;
     let record = format!("record {DECISION_RECORD} at {} ns", moment.at_ns);
-    same(&record, values, &ending::decision(&moment).1)?;
+    same(&record, values, &clip_records::decision(&moment).1)?;
     Ok(moment)
 }
 
 /// Compares the decisions with the line, which has the first of them. Their number is compared with
 /// the journal later.
-fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), Untrue> {
+fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), FalseStatement> {
     let kept = &moments[..moments.len().min(Clip::MOMENTS_MAX)];
     let of_line = format!("moments in {LINE} of record {CLIP_RECORD}");
     for (index, (record, line)) in kept.iter().zip(&clip.moments).enumerate() {
@@ -351,15 +360,19 @@ fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), Untrue> {
                 "`{key}` of record {DECISION_RECORD} number {}, by the {of_line}",
                 index + 1
             );
-            return Err(Untrue::new(what, &record, &line));
+            return Err(FalseStatement::new(what, &record, &line));
         }
     }
     if kept.len() != clip.moments.len() {
         let what = format!("number of records {DECISION_RECORD}, by the {of_line}");
-        return Err(Untrue::new(what, &kept.len().to_string(), &clip.moments.len().to_string()));
+        return Err(FalseStatement::new(
+            what,
+            &kept.len().to_string(),
+            &clip.moments.len().to_string(),
+        ));
     }
     if (moments.len() as u64) > clip.triggers {
-        return Err(Untrue::new(
+        return Err(FalseStatement::new(
             in_clip("triggers"),
             &clip.triggers.to_string(),
             &moments.len().to_string(),
@@ -369,7 +382,7 @@ fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), Untrue> {
         moments.iter().find(|moment| !(clip.from_ns..=clip.to_ns).contains(&moment.at_ns));
     outside.map_or(Ok(()), |moment| {
         let window = format!("{} to {}", clip.from_ns, clip.to_ns);
-        Err(Untrue::new(
+        Err(FalseStatement::new(
             format!("`at_ns` of record {DECISION_RECORD}"),
             &moment.at_ns.to_string(),
             &window,
@@ -379,10 +392,16 @@ fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), Untrue> {
 
 /// Compares the record in front of the messages: later windows may have added lambdas and windows
 /// since.
-fn begin(values: &Values, clip: &Clip, moments: &[Moment], header: &Header) -> Result<(), Untrue> {
-    let about = ending::read_begin(values).map_err(|key| malformed(BEGIN, key, values))?;
-    let is = About { clock: header.clock.clone(), from_ns: clip.from_ns, ..about };
-    same(&format!("record {BEGIN}"), values, &ending::begin(&is, &library(header)).1)?;
+fn begin(
+    values: &Values,
+    clip: &Clip,
+    moments: &[Moment],
+    header: &JournalHeader,
+) -> Result<(), FalseStatement> {
+    let clip_header =
+        clip_records::read_begin(values).map_err(|key| malformed(BEGIN, key, values))?;
+    let is = ClipHeader { clock: header.clock.clone(), from_ns: clip.from_ns, ..clip_header };
+    same(&format!("record {BEGIN}"), values, &clip_records::begin(&is, &library(header)).1)?;
     let was_there = |of: &ClipLambda| {
         clip.lambdas.iter().any(|now| {
             of.windows <= now.windows && *of == ClipLambda { windows: of.windows, ..now.clone() }
@@ -395,47 +414,47 @@ fn begin(values: &Values, clip: &Clip, moments: &[Moment], header: &Header) -> R
         .enumerate()
         .find_map(|(n, of)| (n >= most || !was_there(of)).then_some(of))
     {
-        return Err(Untrue::new(
+        return Err(FalseStatement::new(
             format!("`lambdas` of record {BEGIN}"),
             &json(of),
             &json(&clip.lambdas),
         ));
     }
     let opening = json(&is.moment);
-    let is_of_another_clip = clip.short.iter().any(|why| why == CONTINUES);
+    let is_of_another_clip = clip.incomplete.iter().any(|why| why == CONTINUES);
     let is_among_them = || moments.iter().any(|moment| json(moment) == opening);
     if is_of_another_clip || (moments.len() as u64) < clip.triggers || is_among_them() {
         return Ok(());
     }
     let first = moments.first().map_or("none".to_owned(), json);
-    Err(Untrue::new(format!("`moment` of record {BEGIN}"), &opening, &first))
+    Err(FalseStatement::new(format!("`moment` of record {BEGIN}"), &opening, &first))
 }
 
 /// Returns the records of the topics: one for each topic of the line.
 fn topics<'a>(
     records: impl Iterator<Item = &'a Values>,
     clip: &Clip,
-) -> Result<BTreeMap<String, Values>, Untrue> {
+) -> Result<BTreeMap<String, Values>, FalseStatement> {
     let what = |topic: &str| format!("record {TOPIC_RECORD} of `{}`", excerpt(topic));
     let mut topics = BTreeMap::new();
     for values in records {
         let topic = values.get("topic").ok_or_else(|| malformed(TOPIC_RECORD, "topic", values))?;
         if topics.insert(topic.clone(), values.clone()).is_some() {
-            return Err(Untrue::count(what(topic), 2, 1));
+            return Err(FalseStatement::count(what(topic), 2, 1));
         }
     }
     let mut named = BTreeSet::new();
     for of in &clip.topics {
         if !named.insert(of.topic.as_str()) {
             let what = format!("topic `{}` in {LINE} of record {CLIP_RECORD}", excerpt(&of.topic));
-            return Err(Untrue::count(what, 2, 1));
+            return Err(FalseStatement::count(what, 2, 1));
         }
         if !topics.contains_key(&of.topic) {
-            return Err(Untrue::count(what(&of.topic), 0, 1));
+            return Err(FalseStatement::count(what(&of.topic), 0, 1));
         }
     }
     match topics.keys().find(|topic| !named.contains(topic.as_str())) {
-        Some(topic) => Err(Untrue::count(what(topic), 1, 0)),
+        Some(topic) => Err(FalseStatement::count(what(topic), 1, 0)),
         None => Ok(topics),
     }
 }

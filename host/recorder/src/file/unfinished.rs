@@ -11,12 +11,12 @@ use gleaner_transport::{Guid, SampleMeta};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 
+use super::clip_dir::{CLIP, CLIPS, ClipDir, JPG, JPG_PART};
+use super::clip_records::{self, THUMBNAIL};
 use super::durable;
-use super::ending::{self, THUMBNAIL};
-use super::place::{CLIP, CLIPS, JPG, JPG_PART, Place};
-use super::sink::Sink;
+use super::sink::FileSink;
 use super::written::{Written, encapsulation, stamp};
-use super::{About, Ending, Topic};
+use super::{ClipHeader, ClipTrailer, TopicSchema};
 use crate::error::RecordError;
 
 /// On the example drive (JPEG, IMU, speed) zstd at level 1 leaves 0.74 of the bytes at 590 MB/s,
@@ -38,13 +38,13 @@ pub const MESSAGE_MAX: usize = 960 << 20;
 pub(super) const METADATA_MAX: usize = 64 << 20;
 
 /// A clip that is being written. Unless it is finished, its file stays unfinished, for
-/// [`super::Folder::open`] to recover.
-pub(crate) struct Unfinished {
-    place: Arc<Place>,
+/// [`super::RecordingFolder::open`] to recover.
+pub(crate) struct UnfinishedClip {
+    dir: Arc<ClipDir>,
     name: String,
     path: PathBuf,
     /// `None` once it is finished or given up.
-    writer: Option<Writer<Sink>>,
+    writer: Option<Writer<FileSink>>,
     clock: String,
     channels: Channels,
     chunk: Option<Chunk>,
@@ -76,7 +76,7 @@ struct TopicChannels {
 }
 
 /// Where messages of a topic go.
-struct Channel {
+struct ClipChannel {
     /// Index in [`Written::topics`].
     index: usize,
     id: u16,
@@ -91,42 +91,45 @@ pub(super) struct Saved {
     pub(super) from: String,
 }
 
-impl Unfinished {
+impl UnfinishedClip {
     /// Begins the clip `name`, in a file with this ending, which must not exist yet.
     pub(super) fn create(
-        place: Arc<Place>,
+        dir: Arc<ClipDir>,
         name: String,
-        ending: &str,
-        about: Option<&About>,
+        trailer: &str,
+        clip_header: Option<&ClipHeader>,
     ) -> Result<Self, RecordError> {
-        let path = place.path(&name, ending);
+        let path = dir.path(&name, trailer);
         let file = OpenOptions::new().write(true).create_new(true).open(&path);
         let file = file.map_err(|source| RecordError::Create { path: path.clone(), source })?;
-        Self::begin(place, name, path, Sink::new(file), about)
+        Self::begin(dir, name, path, FileSink::new(file), clip_header)
     }
 
     pub(super) fn begin(
-        place: Arc<Place>,
+        dir: Arc<ClipDir>,
         name: String,
         path: PathBuf,
-        sink: Sink,
-        about: Option<&About>,
+        sink: FileSink,
+        clip_header: Option<&ClipHeader>,
     ) -> Result<Self, RecordError> {
         let closed_bytes = sink.position();
         let writer = options().create(sink).map_err(|error| cannot_write(&path, error))?;
         let mut clip = Self {
-            place,
+            dir,
             name,
             path,
             writer: Some(writer),
-            clock: about.map_or_else(|| "unknown".to_owned(), |about| about.clock.clone()),
+            clock: clip_header
+                .map_or_else(|| "unknown".to_owned(), |clip_header| clip_header.clock.clone()),
             channels: Channels::default(),
             chunk: None,
             closed_bytes,
             frame: Vec::new(),
             written: Written::default(),
         };
-        if let Some((name, metadata)) = about.map(|about| ending::begin(about, ending::LIBRARY)) {
+        if let Some((name, metadata)) =
+            clip_header.map(|clip_header| clip_records::begin(clip_header, clip_records::LIBRARY))
+        {
             clip.metadata(name, metadata)?;
         }
         clip.flush()?;
@@ -142,7 +145,7 @@ impl Unfinished {
     /// when the folder is opened again.
     pub fn message(
         &mut self,
-        topic: &Topic,
+        topic: &TopicSchema,
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
@@ -150,7 +153,7 @@ impl Unfinished {
         if self.chunk.is_some_and(|chunk| chunk.is_closed_by(meta.at_ns)) {
             self.flush()?;
         }
-        let Channel { index, id: channel_id, new_bytes } =
+        let ClipChannel { index, id: channel_id, new_bytes } =
             self.channel(topic, Some(meta.writer))?;
         let mut frame = std::mem::take(&mut self.frame);
         frame.clear();
@@ -180,8 +183,8 @@ impl Unfinished {
     ///
     /// # Errors
     ///
-    /// As [`Unfinished::message`].
-    pub fn declare(&mut self, topic: &Topic) -> Result<(), RecordError> {
+    /// As [`UnfinishedClip::message`].
+    pub fn declare(&mut self, topic: &TopicSchema) -> Result<(), RecordError> {
         if self.channels.by_topic.contains_key(&topic.name) {
             return Ok(());
         }
@@ -195,7 +198,7 @@ impl Unfinished {
     ///
     /// # Errors
     ///
-    /// As [`Unfinished::message`].
+    /// As [`UnfinishedClip::message`].
     pub fn flush(&mut self) -> Result<(), RecordError> {
         self.chunk = None;
         self.with_writer(Writer::flush)?;
@@ -208,47 +211,47 @@ impl Unfinished {
     /// # Errors
     ///
     /// [`RecordError`]; what was written is then recovered when the folder is opened again.
-    pub fn finish(self, ending: Ending) -> Result<Clip, RecordError> {
+    pub fn finish(self, trailer: ClipTrailer) -> Result<Clip, RecordError> {
         let name = self.name.clone();
-        self.close(ending, &name, None)
+        self.close(trailer, &name, None)
     }
 
-    /// As [`Unfinished::finish`], under the name `name`.
+    /// As [`UnfinishedClip::finish`], under the name `name`.
     pub(super) fn close(
         mut self,
-        ending: Ending,
+        trailer: ClipTrailer,
         name: &str,
         saved: Option<Saved>,
     ) -> Result<Clip, RecordError> {
-        let place = Arc::clone(&self.place);
+        let dir = Arc::clone(&self.dir);
         // Before the footer: the clip of a whole unfinished file then has its thumbnail.
-        if let Some(jpeg) = &ending.thumbnail {
-            durable::write(
-                &place.path(name, JPG_PART),
-                &place.path(name, JPG),
-                place.folder(),
-                jpeg,
-            )?;
+        if let Some(jpeg) = &trailer.thumbnail {
+            durable::write(&dir.path(name, JPG_PART), &dir.path(name, JPG), dir.folder(), jpeg)?;
         }
-        let thumbnail = place.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
-        let mut clip =
-            ending::clip(&ending, &self.written, format!("{CLIPS}/{name}{CLIP}").into(), thumbnail);
+        let thumbnail = dir.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
+        let mut clip = clip_records::clip(
+            &trailer,
+            &self.written,
+            format!("{CLIPS}/{name}{CLIP}").into(),
+            thumbnail,
+        );
         clip.recovered = saved.as_ref().map(|saved| saved.recovered.clone());
         let from = saved.as_ref().map(|saved| saved.from.as_str());
         let written = std::mem::take(&mut self.written);
-        for (name, metadata) in ending::records(&ending, &clip, &written, &self.clock, from) {
+        for (name, metadata) in clip_records::records(&trailer, &clip, &written, &self.clock, from)
+        {
             self.metadata(name, metadata)?;
         }
-        for (lambda, journal) in ending.journals {
+        for (lambda, journal) in trailer.journals {
             self.attach(
                 format!("journal/{lambda}.journal"),
                 "application/octet-stream",
                 journal,
-                ending.to_ns,
+                trailer.to_ns,
             )?;
         }
-        if let Some(jpeg) = ending.thumbnail {
-            self.attach(THUMBNAIL.to_owned(), "image/jpeg", jpeg, ending.to_ns)?;
+        if let Some(jpeg) = trailer.thumbnail {
+            self.attach(THUMBNAIL.to_owned(), "image/jpeg", jpeg, trailer.to_ns)?;
         }
         self.with_writer(|writer| writer.finish().map(drop))?;
         let cannot_sync = |source| RecordError::Sync { path: self.path.clone(), source };
@@ -262,8 +265,8 @@ impl Unfinished {
             .into_file()
             .map_err(|source| RecordError::Write { path: self.path.clone(), source })?;
         file.sync_all().map_err(cannot_sync)?;
-        durable::rename(&self.path, &place.path(name, CLIP), place.folder())?;
-        place.add(name, &clip)?;
+        durable::rename(&self.path, &dir.path(name, CLIP), dir.folder())?;
+        dir.add(name, &clip)?;
         Ok(clip)
     }
 
@@ -316,12 +319,16 @@ impl Unfinished {
     }
 
     /// The channel for messages of the topic by this writer, or by none that is named.
-    fn channel(&mut self, topic: &Topic, writer: Option<Guid>) -> Result<Channel, RecordError> {
+    fn channel(
+        &mut self,
+        topic: &TopicSchema,
+        writer: Option<Guid>,
+    ) -> Result<ClipChannel, RecordError> {
         let is_full = self.channels.count >= CHANNELS_MAX;
         let mut key = writer;
         if let Some(known) = self.channels.by_topic.get(&topic.name) {
             let of = |key| {
-                known.by_writer.get(&key).map(|id| Channel {
+                known.by_writer.get(&key).map(|id| ClipChannel {
                     index: known.index,
                     id: *id,
                     new_bytes: 0,
@@ -358,12 +365,12 @@ impl Unfinished {
         });
         known.by_writer.insert(key, id);
         self.channels.count += 1;
-        Ok(Channel { index: known.index, id, new_bytes: new_bytes as u64 })
+        Ok(ClipChannel { index: known.index, id, new_bytes: new_bytes as u64 })
     }
 
     fn with_writer<T>(
         &mut self,
-        act: impl FnOnce(&mut Writer<Sink>) -> Result<T, McapError>,
+        act: impl FnOnce(&mut Writer<FileSink>) -> Result<T, McapError>,
     ) -> Result<T, RecordError> {
         let writer =
             self.writer.as_mut().expect("nothing takes the writer before its clip is closed");
@@ -371,7 +378,7 @@ impl Unfinished {
     }
 }
 
-impl Drop for Unfinished {
+impl Drop for UnfinishedClip {
     fn drop(&mut self) {
         // Left alone, the writer would add a footer, and the file would pass for a whole one.
         if let Some(writer) = self.writer.take() {
@@ -390,7 +397,7 @@ impl Chunk {
 fn options() -> WriteOptions {
     WriteOptions::new()
         .profile("ros2")
-        .library(ending::LIBRARY)
+        .library(clip_records::LIBRARY)
         .compression(COMPRESSION)
         .compression_level(1)
         // No threads: this one has the time.

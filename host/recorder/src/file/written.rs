@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use gleaner_messages::Endian;
 use gleaner_transport::SampleMeta;
 
-use super::Topic;
+use super::TopicSchema;
 
 /// A topic of a clip.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -38,7 +38,7 @@ pub(super) struct Written {
 
 impl Written {
     /// Adds a topic, which is not there yet; returns its index.
-    pub(super) fn add_topic(&mut self, topic: &Topic) -> usize {
+    pub(super) fn add_topic(&mut self, topic: &TopicSchema) -> usize {
         // Readers trim them.
         let definitions =
             topic.definitions.as_deref().map(str::trim).filter(|text| !text.is_empty());
@@ -129,7 +129,7 @@ mod tests {
         let mut written = Written::default();
         for (name, text) in [("/a", "float64 x"), ("/b", "\nfloat64 x\n"), ("/c", " \n")] {
             let (name, definitions) = (name.to_owned(), Some(text.into()));
-            written.add_topic(&Topic {
+            written.add_topic(&TopicSchema {
                 name,
                 type_name: "T".to_owned(),
                 definitions,
@@ -142,7 +142,7 @@ mod tests {
 
     fn checksum_of(messages: &[(i64, &[u8])]) -> String {
         let mut written = Written::default();
-        let imu = Topic {
+        let imu = TopicSchema {
             name: "/imu".to_owned(),
             type_name: "T".to_owned(),
             definitions: None,

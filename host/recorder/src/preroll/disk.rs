@@ -10,10 +10,10 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 use tracing::warn;
 
-use super::{Held, Place};
+use super::{EntryId, EntryMeta};
 use crate::RecordError;
 
 /// What an entry costs in the index.
@@ -53,7 +53,7 @@ pub(super) struct Disk {
 }
 
 struct Indexed {
-    held: Held,
+    held: EntryMeta,
     offset: u64,
 }
 
@@ -82,7 +82,7 @@ impl Disk {
             shrinks: false,
             was_full: false,
         };
-        own_file::folder(&disk.folder).map_err(failed(&disk.folder))?;
+        safe_file::folder(&disk.folder).map_err(failed(&disk.folder))?;
         for entry in fs::read_dir(&disk.folder).map_err(failed(&disk.folder))? {
             let path = entry.map_err(failed(&disk.folder))?.path();
             if is_chunk(&path) {
@@ -95,9 +95,9 @@ impl Disk {
     /// On a full disk the oldest go for it as well; where that does not help, it goes itself.
     pub(super) fn push(
         &mut self,
-        held: &Held,
+        held: &EntryMeta,
         bytes: &[u8],
-        gone: &mut dyn FnMut(&Held),
+        gone: &mut dyn FnMut(&EntryMeta),
     ) -> Result<bool, RecordError> {
         loop {
             match self.add(held, bytes, gone) {
@@ -121,9 +121,9 @@ impl Disk {
     /// As [`push`](Self::push), but a full disk is an error, after which nothing has changed.
     pub(super) fn add(
         &mut self,
-        held: &Held,
+        held: &EntryMeta,
         bytes: &[u8],
-        gone: &mut dyn FnMut(&Held),
+        gone: &mut dyn FnMut(&EntryMeta),
     ) -> Result<bool, RecordError> {
         if !self.fits(bytes.len()) {
             return Ok(false);
@@ -180,7 +180,7 @@ impl Disk {
     }
 
     /// Deletes the oldest chunk; what is left of its entries goes with it.
-    fn drop_oldest(&mut self, gone: &mut dyn FnMut(&Held)) -> Result<(), RecordError> {
+    fn drop_oldest(&mut self, gone: &mut dyn FnMut(&EntryMeta)) -> Result<(), RecordError> {
         let Some(chunk) = self.chunks.pop_front() else { return Ok(()) };
         let end = match self.chunks.front() {
             Some(next) => next.first,
@@ -200,7 +200,7 @@ impl Disk {
         fs::remove_file(&path).map_err(failed(&path))
     }
 
-    fn pop(&mut self) -> Option<Held> {
+    fn pop(&mut self) -> Option<EntryMeta> {
         let entry = self.index.pop_front()?;
         self.first += 1;
         self.bytes -= INDEXED;
@@ -210,7 +210,7 @@ impl Disk {
     pub(super) fn trim(
         &mut self,
         before: i64,
-        aged: &mut dyn FnMut(&Held),
+        aged: &mut dyn FnMut(&EntryMeta),
     ) -> Result<(), RecordError> {
         while self.index.front().is_some_and(|entry| entry.held.at_ns < before) {
             if let Some(held) = self.pop() {
@@ -240,24 +240,24 @@ impl Disk {
         self.index.len() as u64
     }
 
-    pub(super) fn newest(&self) -> Option<Place> {
-        self.entries().checked_sub(1).map(|last| Place(self.first + last))
+    pub(super) fn newest(&self) -> Option<EntryId> {
+        self.entries().checked_sub(1).map(|last| EntryId(self.first + last))
     }
 
-    pub(super) fn oldest(&self) -> Option<Place> {
-        (!self.index.is_empty()).then_some(Place(self.first))
+    pub(super) fn oldest(&self) -> Option<EntryId> {
+        (!self.index.is_empty()).then_some(EntryId(self.first))
     }
 
-    pub(super) fn after(&self, place: Place) -> Option<Place> {
+    pub(super) fn after(&self, place: EntryId) -> Option<EntryId> {
         let next = place.0 + 1;
-        (next < self.first + self.index.len() as u64).then_some(Place(next))
+        (next < self.first + self.index.len() as u64).then_some(EntryId(next))
     }
 
-    pub(super) fn held(&self, place: Place) -> Held {
+    pub(super) fn held(&self, place: EntryId) -> EntryMeta {
         self.entry(place).held
     }
 
-    pub(super) fn bytes(&mut self, place: Place) -> Result<&[u8], RecordError> {
+    pub(super) fn bytes(&mut self, place: EntryId) -> Result<&[u8], RecordError> {
         let Indexed { held, offset } = *self.entry(place);
         let len = held.len as usize;
         let chunk = &self.chunks[self.chunks.partition_point(|chunk| chunk.first <= place.0) - 1];
@@ -273,7 +273,7 @@ impl Disk {
         }
         let (number, path) = (chunk.number, path_of(&self.folder, chunk.number));
         if self.reader.as_ref().is_none_or(|(open, _)| *open != number) {
-            self.reader = Some((number, own_file::read(&path).map_err(failed(&path))?));
+            self.reader = Some((number, safe_file::read(&path).map_err(failed(&path))?));
         }
         self.buffer.resize(len, 0);
         if let Some((_, file)) = &self.reader {
@@ -282,7 +282,7 @@ impl Disk {
         Ok(&self.buffer)
     }
 
-    pub(super) fn mark(&mut self, place: Place, group: u64) {
+    pub(super) fn mark(&mut self, place: EntryId, group: u64) {
         let index = (place.0 - self.first) as usize;
         self.index[index].held.group = group;
     }
@@ -291,7 +291,7 @@ impl Disk {
         self.bytes
     }
 
-    fn entry(&self, place: Place) -> &Indexed {
+    fn entry(&self, place: EntryId) -> &Indexed {
         &self.index[(place.0 - self.first) as usize]
     }
 
@@ -318,7 +318,7 @@ fn begin(path: &Path) -> io::Result<File> {
     if fs::read_link(path).is_ok_and(|full| full == Path::new("/dev/full")) {
         return File::create(path);
     }
-    own_file::anew(path)
+    safe_file::create(path)
 }
 
 fn path_of(folder: &Path, number: u64) -> PathBuf {

@@ -25,21 +25,21 @@ pub const OVERHEAD: usize = 64;
 
 /// Where an entry comes from: a topic, or the wakes of a lambda.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Source(u32);
+pub struct EntrySource(u32);
 
 /// The bit that tells wakes from topics.
 const WAKES: u32 = 1 << 31;
 
-impl Source {
+impl EntrySource {
     /// A topic, by its number.
-    pub fn topic(index: usize) -> Source {
+    pub fn topic(index: usize) -> EntrySource {
         // Topics and lambdas are counted in hundreds.
-        Source(u32::try_from(index).unwrap_or(WAKES - 1) & !WAKES)
+        EntrySource(u32::try_from(index).unwrap_or(WAKES - 1) & !WAKES)
     }
 
     /// The wakes of a lambda, by its number.
-    pub fn wakes(lambda: usize) -> Source {
-        Source(Source::topic(lambda).0 | WAKES)
+    pub fn wakes(lambda: usize) -> EntrySource {
+        EntrySource(EntrySource::topic(lambda).0 | WAKES)
     }
 
     /// The number of the lambda, if these are wakes.
@@ -55,9 +55,9 @@ impl Source {
 
 /// What is known of an entry besides its bytes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Held {
+pub struct EntryMeta {
     /// Where it comes from.
-    pub source: Source,
+    pub source: EntrySource,
     /// Length of its bytes.
     pub len: u32,
     /// The stamp that windows go by.
@@ -76,11 +76,11 @@ pub struct Held {
     pub is_big_endian: bool,
 }
 
-impl Held {
+impl EntryMeta {
     /// A sample of a topic.
-    pub fn sample(topic: usize, meta: &SampleMeta, group: u64) -> Held {
-        Held {
-            source: Source::topic(topic),
+    pub fn sample(topic: usize, meta: &SampleMeta, group: u64) -> EntryMeta {
+        EntryMeta {
+            source: EntrySource::topic(topic),
             len: 0,
             at_ns: meta.at_ns,
             publish_ns: meta.publish_ns,
@@ -93,9 +93,9 @@ impl Held {
     }
 
     /// A wake of a lambda, the `number`-th from 0.
-    pub fn wake(lambda: usize, number: u64, at_ns: i64, group: u64) -> Held {
-        Held {
-            source: Source::wakes(lambda),
+    pub fn wake(lambda: usize, number: u64, at_ns: i64, group: u64) -> EntryMeta {
+        EntryMeta {
+            source: EntrySource::wakes(lambda),
             len: 0,
             at_ns,
             publish_ns: 0,
@@ -122,33 +122,33 @@ impl Held {
 
 /// Names an entry until the store changes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Place(u64);
+pub struct EntryId(u64);
 
-/// An entry that a walk from the oldest on has come to. Unlike a [`Place`] it may be kept while the
+/// An entry that a walk from the oldest on has come to. Unlike a [`EntryId`] it may be kept while the
 /// store changes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Walked {
-    place: Place,
+    place: EntryId,
     /// How many entries ever came before it.
     number: u64,
 }
 
 impl Walked {
     /// Where it is, until the store changes.
-    pub fn place(self) -> Place {
+    pub fn place(self) -> EntryId {
         self.place
     }
 }
 
 /// The store.
 pub struct Preroll {
-    kind: Kind,
+    kind: PrerollStore,
     highest: u64,
     /// Entries that have gone: the number of the oldest one that is held.
     gone: u64,
 }
 
-enum Kind {
+enum PrerollStore {
     Ram(Ram),
     Disk(Disk),
 }
@@ -170,9 +170,11 @@ impl Preroll {
         let kind = match store {
             Store::Ram => {
                 let ram = Ram::new(usize::try_from(bytes).unwrap_or(usize::MAX), prefault);
-                Kind::Ram(ram.map_err(|source| RecordError::PrerollMemory { bytes, source })?)
+                PrerollStore::Ram(
+                    ram.map_err(|source| RecordError::PrerollMemory { bytes, source })?,
+                )
             }
-            Store::Disk => Kind::Disk(Disk::open(folder, bytes)?),
+            Store::Disk => PrerollStore::Disk(Disk::open(folder, bytes)?),
         };
         Ok(Preroll { kind, highest: 0, gone: 0 })
     }
@@ -190,7 +192,7 @@ impl Preroll {
         folder: PathBuf,
         prefault: bool,
     ) -> Result<bool, RecordError> {
-        if let Kind::Disk(disk) = &mut self.kind {
+        if let PrerollStore::Disk(disk) = &mut self.kind {
             disk.grow(bytes);
             return Ok(false);
         }
@@ -200,9 +202,9 @@ impl Preroll {
             let held = self.held(walked.place());
             let bytes = self.bytes(walked.place())?;
             match &mut new.kind {
-                Kind::Ram(_) => new.push(held, bytes, &mut |_| {})?,
+                PrerollStore::Ram(_) => new.push(held, bytes, &mut |_| {})?,
                 // On a full disk it stays where it is.
-                Kind::Disk(disk) => disk.add(&held, bytes, &mut |_| {})?,
+                PrerollStore::Disk(disk) => disk.add(&held, bytes, &mut |_| {})?,
             };
             next = self.next(next);
         }
@@ -218,20 +220,20 @@ impl Preroll {
     /// [`RecordError::Preroll`] if the disk fails.
     pub fn push(
         &mut self,
-        held: Held,
+        held: EntryMeta,
         bytes: &[u8],
-        gone: &mut dyn FnMut(&Held),
+        gone: &mut dyn FnMut(&EntryMeta),
     ) -> Result<bool, RecordError> {
         let Ok(len) = u32::try_from(bytes.len()) else { return Ok(false) };
-        let held = Held { len, ..held };
+        let held = EntryMeta { len, ..held };
         let count = &mut self.gone;
-        let mut gone = |held: &Held| {
+        let mut gone = |held: &EntryMeta| {
             *count += 1;
             gone(held);
         };
         let taken = match &mut self.kind {
-            Kind::Ram(ram) => ram.push(&held, bytes, &mut gone),
-            Kind::Disk(disk) => disk.push(&held, bytes, &mut gone)?,
+            PrerollStore::Ram(ram) => ram.push(&held, bytes, &mut gone),
+            PrerollStore::Disk(disk) => disk.push(&held, bytes, &mut gone)?,
         };
         self.highest = self.highest.max(self.bytes_held());
         Ok(taken)
@@ -240,7 +242,7 @@ impl Preroll {
     /// Whether it gets smaller with what comes, as its disk has too little room. In memory that
     /// changes nothing.
     pub fn shrink(&mut self, shrinks: bool) {
-        if let Kind::Disk(disk) = &mut self.kind {
+        if let PrerollStore::Disk(disk) = &mut self.kind {
             disk.shrink(shrinks);
         }
     }
@@ -250,18 +252,22 @@ impl Preroll {
     /// # Errors
     ///
     /// [`RecordError::Preroll`] if the disk fails.
-    pub fn trim(&mut self, before: i64, aged: &mut dyn FnMut(&Held)) -> Result<(), RecordError> {
+    pub fn trim(
+        &mut self,
+        before: i64,
+        aged: &mut dyn FnMut(&EntryMeta),
+    ) -> Result<(), RecordError> {
         let count = &mut self.gone;
-        let mut aged = |held: &Held| {
+        let mut aged = |held: &EntryMeta| {
             *count += 1;
             aged(held);
         };
         match &mut self.kind {
-            Kind::Ram(ram) => {
+            PrerollStore::Ram(ram) => {
                 ram.trim(before, &mut aged);
                 Ok(())
             }
-            Kind::Disk(disk) => disk.trim(before, &mut aged),
+            PrerollStore::Disk(disk) => disk.trim(before, &mut aged),
         }
     }
 
@@ -278,46 +284,46 @@ impl Preroll {
     /// The entry that came last.
     pub fn newest(&self) -> Option<Walked> {
         let (place, entries) = match &self.kind {
-            Kind::Ram(ram) => (ram.newest()?, ram.entries()),
-            Kind::Disk(disk) => (disk.newest()?, disk.entries()),
+            PrerollStore::Ram(ram) => (ram.newest()?, ram.entries()),
+            PrerollStore::Disk(disk) => (disk.newest()?, disk.entries()),
         };
         Some(Walked { place, number: (self.gone + entries).saturating_sub(1) })
     }
 
     /// Where an entry is, unless it has gone.
-    pub fn find(&self, walked: Walked) -> Option<Place> {
+    pub fn find(&self, walked: Walked) -> Option<EntryId> {
         (walked.number >= self.gone).then_some(walked.place)
     }
 
     /// Whether an entry of `len` bytes has room here, once others have gone for it.
     pub fn fits(&self, len: usize) -> bool {
         match &self.kind {
-            Kind::Ram(ram) => ram.fits(len),
-            Kind::Disk(disk) => disk.fits(len),
+            PrerollStore::Ram(ram) => ram.fits(len),
+            PrerollStore::Disk(disk) => disk.fits(len),
         }
     }
 
     /// The oldest entry.
-    fn oldest(&self) -> Option<Place> {
+    fn oldest(&self) -> Option<EntryId> {
         match &self.kind {
-            Kind::Ram(ram) => ram.oldest(),
-            Kind::Disk(disk) => disk.oldest(),
+            PrerollStore::Ram(ram) => ram.oldest(),
+            PrerollStore::Disk(disk) => disk.oldest(),
         }
     }
 
     /// The entry that came after this one.
-    fn after(&self, place: Place) -> Option<Place> {
+    fn after(&self, place: EntryId) -> Option<EntryId> {
         match &self.kind {
-            Kind::Ram(ram) => ram.after(place),
-            Kind::Disk(disk) => disk.after(place),
+            PrerollStore::Ram(ram) => ram.after(place),
+            PrerollStore::Disk(disk) => disk.after(place),
         }
     }
 
     /// What is known of an entry.
-    pub fn held(&self, place: Place) -> Held {
+    pub fn held(&self, place: EntryId) -> EntryMeta {
         match &self.kind {
-            Kind::Ram(ram) => ram.held(place),
-            Kind::Disk(disk) => disk.held(place),
+            PrerollStore::Ram(ram) => ram.held(place),
+            PrerollStore::Disk(disk) => disk.held(place),
         }
     }
 
@@ -326,26 +332,26 @@ impl Preroll {
     /// # Errors
     ///
     /// [`RecordError::Preroll`] if the disk fails.
-    pub fn bytes(&mut self, place: Place) -> Result<&[u8], RecordError> {
+    pub fn bytes(&mut self, place: EntryId) -> Result<&[u8], RecordError> {
         match &mut self.kind {
-            Kind::Ram(ram) => Ok(ram.bytes(place)),
-            Kind::Disk(disk) => disk.bytes(place),
+            PrerollStore::Ram(ram) => Ok(ram.bytes(place)),
+            PrerollStore::Disk(disk) => disk.bytes(place),
         }
     }
 
     /// Remembers that an entry is in the clips of a group of windows.
-    pub fn mark(&mut self, place: Place, group: u64) {
+    pub fn mark(&mut self, place: EntryId, group: u64) {
         match &mut self.kind {
-            Kind::Ram(ram) => ram.mark(place, group),
-            Kind::Disk(disk) => disk.mark(place, group),
+            PrerollStore::Ram(ram) => ram.mark(place, group),
+            PrerollStore::Disk(disk) => disk.mark(place, group),
         }
     }
 
     /// Bytes held now, the overhead of entries included.
     pub fn bytes_held(&self) -> u64 {
         match &self.kind {
-            Kind::Ram(ram) => ram.bytes_held(),
-            Kind::Disk(disk) => disk.bytes_held(),
+            PrerollStore::Ram(ram) => ram.bytes_held(),
+            PrerollStore::Disk(disk) => disk.bytes_held(),
         }
     }
 

@@ -4,7 +4,7 @@
 use std::collections::TryReserveError;
 use std::hint::black_box;
 
-use super::{Held, OVERHEAD, Place, Source};
+use super::{EntryId, EntryMeta, EntrySource, OVERHEAD};
 
 /// Entries begin at multiples of this.
 const ALIGN: usize = 8;
@@ -42,7 +42,12 @@ impl Ram {
         Ok(Ram { arena, head: 0, tail: 0, newest: 0, wrapped: None, entries: 0, bytes: 0 })
     }
 
-    pub(super) fn push(&mut self, held: &Held, bytes: &[u8], gone: &mut dyn FnMut(&Held)) -> bool {
+    pub(super) fn push(
+        &mut self,
+        held: &EntryMeta,
+        bytes: &[u8],
+        gone: &mut dyn FnMut(&EntryMeta),
+    ) -> bool {
         if !self.fits(bytes.len()) {
             return false;
         }
@@ -84,8 +89,8 @@ impl Ram {
 
     /// Takes out the oldest entry, of which there is one: a store without entries has room for all
     /// that fits into it.
-    fn pop(&mut self) -> Held {
-        let held = self.held(Place(self.head as u64));
+    fn pop(&mut self) -> EntryMeta {
+        let held = self.held(EntryId(self.head as u64));
         let size = size(held.len as usize);
         self.head += size;
         self.entries -= 1;
@@ -96,7 +101,7 @@ impl Ram {
         held
     }
 
-    pub(super) fn trim(&mut self, before: i64, aged: &mut dyn FnMut(&Held)) {
+    pub(super) fn trim(&mut self, before: i64, aged: &mut dyn FnMut(&EntryMeta)) {
         while self.entries > 0 && self.at_ns(self.head) < before {
             aged(&self.pop());
         }
@@ -110,33 +115,33 @@ impl Ram {
         self.entries as u64
     }
 
-    pub(super) fn newest(&self) -> Option<Place> {
-        (self.entries > 0).then_some(Place(self.newest as u64))
+    pub(super) fn newest(&self) -> Option<EntryId> {
+        (self.entries > 0).then_some(EntryId(self.newest as u64))
     }
 
-    pub(super) fn oldest(&self) -> Option<Place> {
-        (self.entries > 0).then_some(Place(self.head as u64))
+    pub(super) fn oldest(&self) -> Option<EntryId> {
+        (self.entries > 0).then_some(EntryId(self.head as u64))
     }
 
-    pub(super) fn after(&self, place: Place) -> Option<Place> {
+    pub(super) fn after(&self, place: EntryId) -> Option<EntryId> {
         let at = place.0 as usize;
         let end = at + size(u32_at(&self.arena, at + LEN) as usize);
         if self.wrapped == Some(end) && at >= self.head {
-            return Some(Place(0));
+            return Some(EntryId(0));
         }
-        (end != self.tail).then_some(Place(end as u64))
+        (end != self.tail).then_some(EntryId(end as u64))
     }
 
-    pub(super) fn held(&self, place: Place) -> Held {
+    pub(super) fn held(&self, place: EntryId) -> EntryMeta {
         read_head(&self.arena[place.0 as usize..][..OVERHEAD])
     }
 
-    pub(super) fn bytes(&self, place: Place) -> &[u8] {
+    pub(super) fn bytes(&self, place: EntryId) -> &[u8] {
         let at = place.0 as usize;
         &self.arena[at + OVERHEAD..][..u32_at(&self.arena, at + LEN) as usize]
     }
 
-    pub(super) fn mark(&mut self, place: Place, group: u64) {
+    pub(super) fn mark(&mut self, place: EntryId, group: u64) {
         self.arena[place.0 as usize + GROUP..][..8].copy_from_slice(&group.to_le_bytes());
     }
 
@@ -165,7 +170,7 @@ const LEN: usize = 52;
 const OPTIONS: usize = 56;
 const BIG: usize = 58;
 
-fn write_head(head: &mut [u8], held: &Held) {
+fn write_head(head: &mut [u8], held: &EntryMeta) {
     head[AT..][..8].copy_from_slice(&held.at_ns.to_le_bytes());
     head[PUBLISH..][..8].copy_from_slice(&held.publish_ns.to_le_bytes());
     head[SEQ..][..8].copy_from_slice(&held.seq.to_le_bytes());
@@ -177,14 +182,14 @@ fn write_head(head: &mut [u8], held: &Held) {
     head[BIG] = u8::from(held.is_big_endian);
 }
 
-fn read_head(head: &[u8]) -> Held {
-    Held {
+fn read_head(head: &[u8]) -> EntryMeta {
+    EntryMeta {
         at_ns: i64::from_le_bytes(bytes_at(head, AT)),
         publish_ns: i64::from_le_bytes(bytes_at(head, PUBLISH)),
         seq: u64::from_le_bytes(bytes_at(head, SEQ)),
         group: u64::from_le_bytes(bytes_at(head, GROUP)),
         writer: bytes_at(head, WRITER),
-        source: Source(u32_at(head, SOURCE)),
+        source: EntrySource(u32_at(head, SOURCE)),
         len: u32_at(head, LEN),
         options: bytes_at(head, OPTIONS),
         is_big_endian: head[BIG] != 0,

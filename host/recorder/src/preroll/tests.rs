@@ -2,7 +2,7 @@ use std::fs;
 
 use super::*;
 
-fn held(topic: usize, at: i64) -> Held {
+fn held(topic: usize, at: i64) -> EntryMeta {
     let meta = SampleMeta {
         at_ns: at,
         publish_ns: at - 1,
@@ -11,7 +11,7 @@ fn held(topic: usize, at: i64) -> Held {
         endian: if at % 2 == 0 { Endian::Little } else { Endian::Big },
         options: [0, at as u8],
     };
-    Held::sample(topic, &meta, 0)
+    EntryMeta::sample(topic, &meta, 0)
 }
 
 /// Bytes that can be told apart, of a length that differs from sample to sample.
@@ -20,7 +20,7 @@ fn payload(at: i64, most: u64) -> Vec<u8> {
     (0..len).map(|n| (n as i64 * 7 + at) as u8).collect()
 }
 
-fn everything(preroll: &mut Preroll) -> Vec<(Held, Vec<u8>)> {
+fn everything(preroll: &mut Preroll) -> Vec<(EntryMeta, Vec<u8>)> {
     let mut all = Vec::new();
     let mut next = preroll.next(None);
     while let Some(walked) = next {
@@ -61,7 +61,10 @@ fn what_goes_in_comes_out_in_order_and_the_bound_is_never_passed() {
                     assert_eq!(stamps, (first..=at).collect::<Vec<_>>());
                     for (found, bytes) in all {
                         assert_eq!(bytes, payload(found.at_ns, most));
-                        assert_eq!(found, Held { len: bytes.len() as u32, ..held(3, found.at_ns) });
+                        assert_eq!(
+                            found,
+                            EntryMeta { len: bytes.len() as u32, ..held(3, found.at_ns) }
+                        );
                     }
                 }
             }

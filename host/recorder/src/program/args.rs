@@ -9,7 +9,7 @@ use gleaner_dds::{Dds, NetworkArgs};
 use gleaner_lambda::manifest::TopicName;
 use gleaner_transport::{Clock, LiveSource};
 
-use super::Options;
+use super::RecorderOptions;
 
 /// Records for lambdas from live topics of ROS 2. Lambdas come over standard input, which is a
 /// socket of the starter; reports, a JSON object a line, go to standard output.
@@ -50,10 +50,10 @@ pub(super) struct Args {
 }
 
 /// How the network is joined.
-pub(super) struct Network(dds::DdsOptions);
+pub(super) struct NetworkOptions(dds::DdsOptions);
 
 impl Args {
-    pub(super) fn read(self) -> Result<(Options, Network), Failure> {
+    pub(super) fn read(self) -> Result<(RecorderOptions, NetworkOptions), Failure> {
         let usage = |error: &dds::DdsError| {
             Failure::caused_by(Exit::Usage, "cannot use the network", error)
         };
@@ -62,7 +62,7 @@ impl Args {
         network.largest = self.largest.unwrap_or(network.largest);
         network.messages = self.messages;
         network.clock = self.clock_offset.map_or(network.clock, Clock::new);
-        let options = Options {
+        let options = RecorderOptions {
             out: self.out,
             clock: network.clock,
             preroll_bytes: self.preroll_memory,
@@ -71,11 +71,11 @@ impl Args {
             bytes_max: self.bytes_max,
             commands: self.commands.map(|topic| topic.to_string()),
         };
-        Ok((options, Network(network)))
+        Ok((options, NetworkOptions(network)))
     }
 }
 
-impl Network {
+impl NetworkOptions {
     pub(super) fn open(self) -> Result<Box<dyn LiveSource>, Failure> {
         let dds = Dds::open(self.0).map_err(|error| {
             Failure::caused_by(Exit::Unreachable, "cannot join the network", &error)

@@ -3,24 +3,24 @@
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Instant;
 
-use gleaner_journal::Entry;
-use gleaner_lambda::manifest::Record;
-use gleaner_protocol::Recording;
-use gleaner_protocol::link::Answers;
-use gleaner_vitals::Spreads;
+use gleaner_journal::JournalEntry;
+use gleaner_lambda::manifest::RecordSpec;
+use gleaner_protocol::RecordingCounts;
+use gleaner_protocol::link::LambdaReplies;
+use gleaner_vitals::IntervalDurations;
 use tracing::warn;
 
-use super::allowance::Allowance;
-use super::hear::Spoken;
-use crate::{LambdaId, Member, RecordError, Recorder, TopicId, lambda_digest};
+use super::connections::LambdaEvent;
+use super::rate_limit::RateLimit;
+use crate::{LambdaId, LambdaSpec, RecordError, Recorder, TopicId, lambda_digest};
 
 /// What of one lambda is heard before it is the next one's turn.
-const TURN: usize = 16;
+const MOST_PER_TURN: usize = 16;
 
 /// Triggers per second that a lambda may cause, and at once.
-const TRIGGERS: Allowance = Allowance::of(200.0, 1000.0);
+const TRIGGERS: RateLimit = RateLimit::of(200.0, 1000.0);
 /// Bytes of wakes per second that a lambda may fill the preroll with, and at once.
-const BYTES: Allowance = Allowance::of(1048576.0, 4194304.0);
+const BYTES: RateLimit = RateLimit::of(1048576.0, 4194304.0);
 
 /// How far a wake's stamp may lie behind the clock, and ahead of it: it is the stamp of a sample or
 /// of a tick.
@@ -28,24 +28,24 @@ const BEHIND_NS: i64 = 60_000_000_000;
 const AHEAD_NS: i64 = 1_000_000_000;
 
 /// A lambda that is heard, or will be.
-pub(super) struct Lambda {
+pub(super) struct ConnectedLambda {
     pub(super) name: String,
-    rules: Record,
+    rules: RecordSpec,
     topics: Vec<TopicId>,
-    spoken: Receiver<Spoken>,
-    answers: Answers,
+    inbox: Receiver<LambdaEvent>,
+    replies: LambdaReplies,
     /// Once it has said what it is.
     id: Option<LambdaId>,
-    triggers: Allowance,
-    bytes: Allowance,
+    triggers: RateLimit,
+    bytes: RateLimit,
     /// What was refused is said once.
     is_warned: bool,
 }
 
 /// What came of listening.
 #[derive(Copy, Clone, Debug, Default)]
-pub(super) struct Listened {
-    pub(super) heard: bool,
+pub(super) struct PollResult {
+    pub(super) is_busy: bool,
     /// It has said what it is.
     pub(super) is_new: Option<LambdaId>,
     /// It is not recorded for: that was said, to it and in the log.
@@ -53,23 +53,23 @@ pub(super) struct Listened {
     /// Nothing more is heard of it.
     pub(super) is_gone: bool,
     /// Wakes that are not recorded, and triggers of such.
-    pub(super) counted: Recording,
+    pub(super) counted: RecordingCounts,
 }
 
-impl Lambda {
+impl ConnectedLambda {
     pub(super) fn new(
         name: String,
-        rules: Record,
+        rules: RecordSpec,
         topics: Vec<TopicId>,
-        spoken: Receiver<Spoken>,
-        answers: Answers,
-    ) -> Lambda {
-        Lambda {
+        inbox: Receiver<LambdaEvent>,
+        replies: LambdaReplies,
+    ) -> ConnectedLambda {
+        ConnectedLambda {
             name,
             rules,
             topics,
-            spoken,
-            answers,
+            inbox,
+            replies,
             id: None,
             triggers: TRIGGERS,
             bytes: BYTES,
@@ -78,85 +78,94 @@ impl Lambda {
     }
 
     /// Hears what it has said, up to its turn.
-    pub(super) fn listen(
+    pub(super) fn poll(
         &mut self,
         recorder: &mut Recorder,
         now_ns: i64,
         monotonic_ns: impl Fn() -> i64,
-        spreads: &mut Spreads,
-    ) -> Result<Listened, RecordError> {
-        let mut listened = Listened::default();
-        for _ in 0..TURN {
-            let said = match self.spoken.try_recv() {
-                Ok(said) => said,
+        spreads: &mut IntervalDurations,
+    ) -> Result<PollResult, RecordError> {
+        let mut polled = PollResult::default();
+        for _ in 0..MOST_PER_TURN {
+            let event = match self.inbox.try_recv() {
+                Ok(event) => event,
                 Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => Spoken::Gone(None),
+                Err(TryRecvError::Disconnected) => LambdaEvent::Closed(None),
             };
-            listened.heard = true;
-            match said {
-                Spoken::Hello(header) => {
+            polled.is_busy = true;
+            match event {
+                LambdaEvent::Hello(header) => {
                     let digest = lambda_digest(&header.files);
                     let (rules, topics) = (self.rules.clone(), self.topics.clone());
-                    match recorder.try_add_lambda(Member { header: *header, rules, digest, topics })
-                    {
+                    match recorder.try_add_lambda(LambdaSpec {
+                        header: *header,
+                        rules,
+                        digest,
+                        topics,
+                    }) {
                         Ok(id) => {
                             self.id = Some(id);
-                            listened.is_new = Some(id);
-                            self.answers.ready();
+                            polled.is_new = Some(id);
+                            self.replies.ready();
                         }
                         Err(why) => {
                             let error = &why as &dyn std::error::Error;
                             warn!(lambda = %self.name, error, "a lambda cannot be recorded for");
-                            self.answers.refused(&why.to_string());
-                            (listened.is_refused, listened.is_gone) = (true, true);
+                            self.replies.refused(&why.to_string());
+                            (polled.is_refused, polled.is_gone) = (true, true);
                         }
                     }
                 }
-                Spoken::Another(why) => {
+                LambdaEvent::Mismatch(why) => {
                     warn!(lambda = %self.name, %why, "a lambda is not what the starter said");
-                    self.answers.refused(&why);
-                    (listened.is_refused, listened.is_gone) = (true, true);
+                    self.replies.refused(&why);
+                    (polled.is_refused, polled.is_gone) = (true, true);
                 }
-                Spoken::Wake { entry, decided_ns, missing, bytes } => {
+                LambdaEvent::Wake { entry, decided_ns, missing, bytes } => {
                     let Some(id) = self.id else { continue };
                     if missing > 0 {
                         recorder.lost_wakes(id, entry.at_ns, missing.into());
-                        listened.counted.wakes_lost += u64::from(missing);
+                        polled.counted.wakes_lost += u64::from(missing);
                     }
                     if let Some(refused) = self.refused(&entry, bytes, now_ns) {
                         recorder.lost_wakes(id, entry.at_ns.clamp(0, now_ns.max(0)), 1);
-                        listened.counted.add(&refused);
+                        polled.counted.add(&refused);
                         continue;
                     }
                     recorder.wake(id, &entry)?;
                     if !entry.triggers.is_empty() {
                         let wait_ns = monotonic_ns().saturating_sub(decided_ns);
                         spreads.add(wait_ns);
-                        self.answers.opened(u64::try_from(wait_ns).unwrap_or(0));
+                        self.replies.opened(u64::try_from(wait_ns).unwrap_or(0));
                     }
                 }
-                Spoken::Gone(why) => {
+                LambdaEvent::Closed(why) => {
                     if let Some(why) = why {
                         let error = &why as &dyn std::error::Error;
                         warn!(lambda = %self.name, error, "a lambda is not heard any more");
                     }
-                    listened.is_gone = true;
+                    polled.is_gone = true;
                 }
             }
-            if listened.is_gone {
-                self.answers.close();
+            if polled.is_gone {
+                self.replies.close();
                 if let Some(id) = self.id {
                     recorder.end_lambda(id, now_ns)?;
                 }
                 break;
             }
         }
-        Ok(listened)
+        Ok(polled)
     }
 
     /// Counts a wake that an honest host would not send, and its triggers: a lambda cannot fill
     /// what all share.
-    fn refused(&mut self, entry: &Entry, bytes: usize, now_ns: i64) -> Option<Recording> {
+    fn refused(
+        &mut self,
+        entry: &JournalEntry,
+        bytes: usize,
+        now_ns: i64,
+    ) -> Option<RecordingCounts> {
         let now = Instant::now();
         let is_now = (now_ns.saturating_sub(BEHIND_NS)..=now_ns.saturating_add(AHEAD_NS))
             .contains(&entry.at_ns);
@@ -170,15 +179,15 @@ impl Lambda {
             warn!(lambda = %self.name, is_now, "wakes of a lambda are not recorded: too many, or of another time");
         }
         Some(match is_now {
-            true => Recording {
+            true => RecordingCounts {
                 wakes_over_rate: 1,
                 triggers_over_rate: triggers,
-                ..Recording::default()
+                ..RecordingCounts::default()
             },
-            false => Recording {
+            false => RecordingCounts {
                 wakes_misstamped: 1,
                 triggers_misstamped: triggers,
-                ..Recording::default()
+                ..RecordingCounts::default()
             },
         })
     }

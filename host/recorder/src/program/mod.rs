@@ -18,17 +18,17 @@
 //! What never happens here: a lambda's code; a lambda that speaks for another; a sample that is
 //! kept waiting for a file.
 
-mod allowance;
-mod announce;
 mod args;
 mod commands;
-mod course;
-mod hear;
+mod connections;
+mod event_loop;
 mod lambdas;
-mod say;
+mod rate_limit;
+mod register;
+mod report_writer;
 mod staging;
-mod telling;
-mod watch;
+mod status;
+mod topic_watch;
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -43,11 +43,11 @@ use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
 
 use args::Args;
-pub use course::run;
+pub use event_loop::run;
 
 /// How the process records.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct RecorderOptions {
     /// The folder of clips and their list.
     pub out: PathBuf,
     /// The clock of samples and wakes.
@@ -66,7 +66,7 @@ pub struct Options {
 
 /// `main` of `gleaner-recorder`.
 pub fn main() -> ExitCode {
-    gleaner_vitals::log::prepare();
+    gleaner_vitals::log::init();
     match start(Args::parse()) {
         Ok(()) => Exit::Ok.into(),
         Err(failure) => {

@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Thread;
 
-use gleaner_transport::{SampleMeta, Sink, Verdict};
+use gleaner_transport::{Delivery, SampleMeta, Sink};
 
 use crate::TopicId;
 
@@ -83,7 +83,7 @@ struct Filling {
 /// A sample whose bytes are the last ones of the block, or that was refused.
 struct Copied {
     topic: TopicId,
-    verdict: Verdict,
+    delivery: Delivery,
     /// Where its bytes begin; they go to the end of the block.
     at: usize,
     /// Whether the loop has come for the block once since.
@@ -102,7 +102,7 @@ impl Staging {
     pub(super) fn exchange(&self, mut empty: Block) -> Result<Block, Block> {
         let mut filling = self.filling();
         let Filling { block: Some(block), copied } = &mut *filling else { return Err(empty) };
-        if let Some(copied) = copied.as_mut().filter(|copied| copied.verdict == Verdict::Taken) {
+        if let Some(copied) = copied.as_mut().filter(|copied| copied.delivery == Delivery::Taken) {
             if !copied.is_awaited {
                 copied.is_awaited = true;
                 return Err(empty);
@@ -121,40 +121,40 @@ impl Staging {
     }
 
     /// The one copy.
-    fn fill(&self, topic: TopicId, cdr: &[u8]) -> Verdict {
+    fn fill(&self, topic: TopicId, cdr: &[u8]) -> Delivery {
         let mut filling = self.filling();
         let unaccepted = filling.copied.take();
         // All samples come from one thread, so nobody else is copying.
-        let Some(mut block) = filling.block.take() else { return Verdict::NoSlot };
+        let Some(mut block) = filling.block.take() else { return Delivery::NoSlot };
         drop(filling);
         // One that was never accepted was nobody's.
         if let Some(copied) = unaccepted {
             block.bytes.truncate(copied.at);
         }
         let (at, room) = (block.bytes.len(), block.bytes.capacity());
-        let verdict = match () {
-            () if cdr.len() > room => Verdict::TooBig,
-            () if cdr.len() > room - at || block.samples.len() == SAMPLES => Verdict::NoSlot,
-            () => Verdict::Taken,
+        let delivery = match () {
+            () if cdr.len() > room => Delivery::TooBig,
+            () if cdr.len() > room - at || block.samples.len() == SAMPLES => Delivery::NoSlot,
+            () => Delivery::Taken,
         };
-        if verdict == Verdict::Taken {
+        if delivery == Delivery::Taken {
             block.bytes.extend_from_slice(cdr);
         }
         let mut filling = self.filling();
         filling.block = Some(block);
-        filling.copied = Some(Copied { topic, verdict, at, is_awaited: false });
-        verdict
+        filling.copied = Some(Copied { topic, delivery, at, is_awaited: false });
+        delivery
     }
 
     /// What was copied last is this sample of `topic`; what became of it.
-    fn accept(&self, topic: TopicId, meta: &SampleMeta) -> Option<Verdict> {
+    fn accept(&self, topic: TopicId, meta: &SampleMeta) -> Option<Delivery> {
         let mut filling = self.filling();
         let copied = filling.copied.take_if(|copied| copied.topic == topic)?;
         let block = filling.block.as_mut()?;
         // A sample without room is still known to have been there. If there is no room even for
         // that, its number will be missing.
         if block.samples.len() < SAMPLES {
-            let bytes = (copied.verdict == Verdict::Taken)
+            let bytes = (copied.delivery == Delivery::Taken)
                 .then(|| (copied.at, block.bytes.len() - copied.at));
             block.samples.push(Staged { topic, meta: *meta, bytes });
         }
@@ -163,7 +163,7 @@ impl Staging {
         if is_late {
             self.reader.unpark();
         }
-        Some(copied.verdict)
+        Some(copied.delivery)
     }
 
     fn filling(&self) -> MutexGuard<'_, Filling> {
@@ -180,28 +180,28 @@ pub(super) struct Arrivals {
 }
 
 /// Takes the samples of one topic.
-pub(super) struct Lane {
+pub(super) struct TopicSink {
     pub(super) topic: TopicId,
     pub(super) staging: Arc<Staging>,
     pub(super) arrivals: Arc<Arrivals>,
 }
 
-impl Sink for Lane {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        let verdict = self.staging.fill(self.topic, cdr);
+impl Sink for TopicSink {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
+        let delivery = self.staging.fill(self.topic, cdr);
         self.accept(meta);
-        verdict
+        delivery
     }
 
-    fn copy(&self, cdr: &[u8]) -> Option<Verdict> {
+    fn copy(&self, cdr: &[u8]) -> Option<Delivery> {
         Some(self.staging.fill(self.topic, cdr))
     }
 
     fn accept(&self, meta: &SampleMeta) {
         let arrivals = match self.staging.accept(self.topic, meta) {
-            Some(Verdict::Taken) => &self.arrivals.received,
-            Some(Verdict::NoSlot) => &self.arrivals.no_slot,
-            Some(Verdict::TooBig) => &self.arrivals.too_big,
+            Some(Delivery::Taken) => &self.arrivals.received,
+            Some(Delivery::NoSlot) => &self.arrivals.no_slot,
+            Some(Delivery::TooBig) => &self.arrivals.too_big,
             None => return,
         };
         arrivals.fetch_add(1, Ordering::Relaxed);
@@ -211,14 +211,14 @@ impl Sink for Lane {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::support::{Scratch, meta, topic};
+    use crate::support::{TestDir, meta, topic};
 
     /// Room for 100 bytes, and the sinks of two topics.
-    fn lanes() -> (Arc<Staging>, [Lane; 2]) {
-        let scratch = Scratch::new();
+    fn lanes() -> (Arc<Staging>, [TopicSink; 2]) {
+        let scratch = TestDir::new();
         let mut recorder = scratch.recorder(|_| {});
         let staging = Staging::new(100, std::thread::current());
-        let lanes = ["/a", "/b"].map(|name| Lane {
+        let lanes = ["/a", "/b"].map(|name| TopicSink {
             topic: recorder.add_topic(topic(name)).unwrap(),
             staging: Arc::clone(&staging),
             arrivals: Arc::default(),
@@ -227,25 +227,25 @@ mod tests {
     }
 
     /// Topic, number and bytes of what waits; `None` for what found no room.
-    type Came = (TopicId, u64, Option<Vec<u8>>);
+    type StagedEntry = (TopicId, u64, Option<Vec<u8>>);
 
-    fn came(block: &Block) -> Vec<Came> {
+    fn came(block: &Block) -> Vec<StagedEntry> {
         let came = |(staged, cdr): (Staged, &[u8])| {
             (staged.topic, staged.meta.seq, staged.bytes.map(|_| cdr.to_vec()))
         };
         (0..).map_while(|index| block.get(index).map(came)).collect()
     }
 
-    fn take(staging: &Staging) -> Vec<Came> {
+    fn take(staging: &Staging) -> Vec<StagedEntry> {
         came(&staging.exchange(Block::new(100)).ok().expect("nothing is being copied"))
     }
 
     #[test]
     fn what_is_copied_comes_once_it_is_accepted() {
         let (staging, [a, b]) = lanes();
-        assert_eq!(a.copy(b"first"), Some(Verdict::Taken));
+        assert_eq!(a.copy(b"first"), Some(Delivery::Taken));
         a.accept(&meta(1, 1));
-        assert_eq!(b.deliver(&meta(2, 2), b"second"), Verdict::Taken);
+        assert_eq!(b.deliver(&meta(2, 2), b"second"), Delivery::Taken);
         a.accept(&meta(3, 3));
         b.accept(&meta(3, 3));
         let expected =
@@ -259,13 +259,13 @@ mod tests {
         let (staging, [a, b]) = lanes();
         b.deliver(&meta(1, 1), b"before");
         for _ in 0..10 {
-            assert_eq!(a.copy(&[7; 60]), Some(Verdict::Taken));
+            assert_eq!(a.copy(&[7; 60]), Some(Delivery::Taken));
         }
         let empty =
             staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
         let block = staging.exchange(empty).ok().expect("or never");
         assert_eq!(came(&block), [(b.topic, 1, Some(b"before".to_vec()))]);
-        assert_eq!(b.deliver(&meta(2, 2), &[8; 100]), Verdict::Taken, "its room is free again");
+        assert_eq!(b.deliver(&meta(2, 2), &[8; 100]), Delivery::Taken, "its room is free again");
         a.accept(&meta(3, 3));
         assert_eq!(take(&staging), [(b.topic, 2, Some(vec![8; 100]))]);
     }
@@ -303,18 +303,18 @@ mod tests {
     #[test]
     fn what_finds_no_room_is_counted_and_known_to_have_been_there() {
         let (staging, [a, b]) = lanes();
-        assert_eq!(a.copy(&[0; 101]), Some(Verdict::TooBig));
+        assert_eq!(a.copy(&[0; 101]), Some(Delivery::TooBig));
         a.accept(&meta(1, 1));
-        assert_eq!(a.copy(&[1; 60]), Some(Verdict::Taken));
+        assert_eq!(a.copy(&[1; 60]), Some(Delivery::Taken));
         a.accept(&meta(2, 2));
-        assert_eq!(b.copy(&[2; 60]), Some(Verdict::NoSlot));
+        assert_eq!(b.copy(&[2; 60]), Some(Delivery::NoSlot));
         b.accept(&meta(3, 3));
         assert_eq!(
             take(&staging),
             [(a.topic, 1, None), (a.topic, 2, Some(vec![1; 60])), (b.topic, 3, None)]
         );
-        let counts = |lane: &Lane| {
-            let Arrivals { received, no_slot, too_big } = &*lane.arrivals;
+        let counts = |sink: &TopicSink| {
+            let Arrivals { received, no_slot, too_big } = &*sink.arrivals;
             [received, no_slot, too_big].map(|count| count.load(Ordering::Relaxed))
         };
         assert_eq!((counts(&a), counts(&b)), ([1, 0, 1], [0, 1, 0]));

@@ -4,7 +4,7 @@ use crate::file::MESSAGE_MAX;
 
 /// Bounds that only tests change.
 #[derive(Copy, Clone, Debug)]
-pub(super) struct Limits {
+pub(super) struct RecorderLimits {
     /// The longest message.
     pub(super) message_bytes: usize,
     /// Most triggers that a clip lists; it counts all.
@@ -18,9 +18,9 @@ pub(super) struct Limits {
     pub(super) waiting: usize,
 }
 
-impl Default for Limits {
-    fn default() -> Limits {
-        Limits {
+impl Default for RecorderLimits {
+    fn default() -> RecorderLimits {
+        RecorderLimits {
             message_bytes: MESSAGE_MAX,
             moments: 10_000,
             part_bytes: 64 << 20,

@@ -9,13 +9,13 @@ use gleaner_lambda::{Clip, Moment, Trigger};
 use gleaner_protocol::link::Loss;
 use gleaner_transport::SampleMeta;
 
+use super::backfill::Budget;
+use super::clip_writer::{ClipOutcome, ClipWriter};
 use super::finished::KEPT;
-use super::pen::{Outcome, Pen};
-use super::walk::Budget;
 use super::{Commanded, LambdaId, Recorder, Settings, TopicId, Work};
 use crate::RecordError;
-use crate::file::{Folder, Topic};
-use crate::window::Heard;
+use crate::file::{RecordingFolder, TopicSchema};
+use crate::window::TriggerOutcome;
 
 /// How much later than its stamp a wake may come: a lambda's process sends them together, see
 /// [`gleaner_protocol::link::RecorderLink::wake`]. Clips wait for them.
@@ -34,13 +34,13 @@ impl Recorder {
     /// A recorder without topics and lambdas, that is fed while it happens. A thread writes its
     /// clips; at most 16 MiB and one message are on their way to it, and the preroll holds what has
     /// to wait. Gaps in the numbers of samples are losses. What an earlier process left in a folder
-    /// of [`Folder::hold`] is recovered by that thread, between what it has to write.
+    /// of [`RecordingFolder::hold`] is recovered by that thread, between what it has to write.
     ///
     /// # Errors
     ///
     /// [`RecordError::Preroll`] as for [`Recorder::new`], and [`RecordError::Thread`].
-    pub fn live(folder: Folder, settings: Settings) -> Result<Recorder, RecordError> {
-        let mut recorder = Recorder::with(Pen::there(folder)?, settings, true)?;
+    pub fn live(folder: RecordingFolder, settings: Settings) -> Result<Recorder, RecordError> {
+        let mut recorder = Recorder::with(ClipWriter::background(folder)?, settings, true)?;
         recorder.windows.set_grace(nanoseconds(GRACE));
         Ok(recorder)
     }
@@ -55,13 +55,13 @@ impl Recorder {
     /// That a clip could not be written is no such error: see [`Recorder::take_failures`].
     pub fn work(&mut self) -> Result<Work, RecordError> {
         let mut outcomes = Vec::new();
-        self.stock.desk.pen.poll(&mut outcomes)?;
+        self.state.context.writer.poll(&mut outcomes)?;
         self.note(outcomes);
         self.run_within(Budget::STEP)?;
         if self.is_settled() {
             return Ok(Work::Done);
         }
-        Ok(if self.stock.desk.pen.has_room() { Work::More } else { Work::Wait })
+        Ok(if self.state.context.writer.has_room() { Work::More } else { Work::Wait })
     }
 
     /// Why clips could not be written since this was asked last; the first of them, 16 at most.
@@ -83,7 +83,7 @@ impl Recorder {
 
     /// Whether a clip is open.
     pub fn is_recording(&self) -> bool {
-        self.draft.is_some()
+        self.open_clip.is_some()
     }
 
     /// A topic that was missing is there.
@@ -92,14 +92,15 @@ impl Recorder {
     ///
     /// [`RecordError::LongTopic`] if a clip has no room for what it says of itself: it stays
     /// missing.
-    pub fn found_topic(&mut self, id: TopicId, topic: Topic) -> Result<(), RecordError> {
+    pub fn found_topic(&mut self, id: TopicId, topic: TopicSchema) -> Result<(), RecordError> {
         topic.check()?;
         let now = self.now;
-        let lane = &mut self.stock.desk.lanes[id.0];
-        if lane.is_missing {
+        let topic_state = &mut self.state.context.topics[id.0];
+        if topic_state.is_missing {
             // Messages and windows know it by the name under which it was wanted.
-            lane.topic = Arc::new(Topic { name: lane.topic.name.clone(), ..topic });
-            (lane.is_missing, lane.found_at) = (false, now);
+            topic_state.topic =
+                Arc::new(TopicSchema { name: topic_state.topic.name.clone(), ..topic });
+            (topic_state.is_missing, topic_state.found_at) = (false, now);
         }
         Ok(())
     }
@@ -107,14 +108,14 @@ impl Recorder {
     /// So many wakes of a lambda were lost before they came here; the next one to come is of this
     /// stamp.
     pub fn lost_wakes(&mut self, lambda: LambdaId, at_ns: i64, count: u64) {
-        self.stock.desk.crews[lambda.0].wakes += count;
-        self.stock.wake_losses[lambda.0].lost.add_some(at_ns, 0, count);
+        self.state.context.lambdas[lambda.0].wakes += count;
+        self.state.wake_losses[lambda.0].lost.add_some(at_ns, 0, count);
     }
 
     /// A sample came as far as here, and there was no room for it.
     pub fn lost_sample(&mut self, topic: TopicId, meta: &SampleMeta) {
-        self.stock.note_gap(topic.0, meta);
-        self.stock.losses[topic.0].lost.add(meta.at_ns, 0);
+        self.state.note_gap(topic.0, meta);
+        self.state.losses[topic.0].lost.add(meta.at_ns, 0);
     }
 
     /// Somebody commands what `lambda` could trigger; `source` says who, in words. It is no wake:
@@ -136,12 +137,15 @@ impl Recorder {
             return Ok(Commanded::DiskSuppressed);
         }
         let commanded = match self.windows.command(lambda.0, trigger.kind, &trigger.label, at_ns) {
-            Heard::Opened => {
+            TriggerOutcome::Opened => {
                 self.counts.recording.windows += 1;
                 Commanded::Opened
             }
-            Heard::Stopped => Commanded::Stopped,
-            Heard::InCooldown | Heard::Ignored | Heard::TooManyStarted | Heard::TooManyWaiting => {
+            TriggerOutcome::Stopped => Commanded::Stopped,
+            TriggerOutcome::InCooldown
+            | TriggerOutcome::Ignored
+            | TriggerOutcome::TooManyStarted
+            | TriggerOutcome::TooManyWaiting => {
                 return Ok(Commanded::Ignored);
             }
         };
@@ -159,10 +163,10 @@ impl Recorder {
     /// [`RecordError`] if the disk fails.
     pub fn end_lambda(&mut self, lambda: LambdaId, at_ns: i64) -> Result<(), RecordError> {
         if self.windows.end(lambda.0, at_ns)
-            && let Some(draft) = &mut self.draft
-            && !draft.ended.contains(&lambda.0)
+            && let Some(open_clip) = &mut self.open_clip
+            && !open_clip.ended.contains(&lambda.0)
         {
-            draft.ended.push(lambda.0);
+            open_clip.ended.push(lambda.0);
         }
         self.run()
     }
@@ -175,7 +179,7 @@ impl Recorder {
     /// [`RecordError`] if the disk fails.
     pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
         self.held = why.map(Arc::from);
-        self.stock.preroll.shrink(why.is_some());
+        self.state.preroll.shrink(why.is_some());
         // What is open ends at once.
         self.windows.set_grace(if why.is_some() { 0 } else { nanoseconds(GRACE) });
         self.run()
@@ -198,15 +202,15 @@ impl Recorder {
             return Ok(());
         }
         let bytes = bytes.max(self.counts.preroll_bound);
-        if self.stock.preroll.grow(store, bytes, folder.join("preroll"), *prefault)? {
-            if let Some(walk) = &mut self.walk {
-                walk.restart();
+        if self.state.preroll.grow(store, bytes, folder.join("preroll"), *prefault)? {
+            if let Some(backfill) = &mut self.backfill {
+                backfill.restart();
             }
             if let Some(behind) = &mut self.behind {
                 *behind = None;
             }
-            if let Some(draft) = &mut self.draft {
-                draft.settled = None;
+            if let Some(open_clip) = &mut self.open_clip {
+                open_clip.settled = None;
             }
         }
         self.counts.preroll_bound = bytes;
@@ -232,7 +236,7 @@ impl Recorder {
 
     /// Waits until everything is written.
     pub(super) fn drain(&mut self) -> Result<(), RecordError> {
-        while !self.stock.desk.pen.is_idle() {
+        while !self.state.context.writer.is_idle() {
             self.wait()?;
         }
         Ok(())
@@ -240,7 +244,7 @@ impl Recorder {
 
     fn wait(&mut self) -> Result<(), RecordError> {
         let mut outcomes = Vec::new();
-        self.stock.desk.pen.wait(&mut outcomes)?;
+        self.state.context.writer.wait(&mut outcomes)?;
         self.note(outcomes);
         Ok(())
     }
@@ -253,18 +257,18 @@ impl Recorder {
         self.finished.deleted.truncate(KEPT);
     }
 
-    fn note(&mut self, outcomes: Vec<Outcome>) {
+    fn note(&mut self, outcomes: Vec<ClipOutcome>) {
         for outcome in outcomes {
             match outcome {
-                Outcome::Finished(clip, deleted) => {
+                ClipOutcome::Finished(clip, deleted) => {
                     self.finished.add(Some(*clip));
                     self.note_deleted(deleted);
                 }
-                Outcome::Recovered(clip, deleted) => {
+                ClipOutcome::Recovered(clip, deleted) => {
                     self.finished.recovered.push(*clip);
                     self.note_deleted(deleted);
                 }
-                Outcome::Failed(error) => {
+                ClipOutcome::Failed(error) => {
                     self.counts.recording.failed += 1;
                     self.finished.fail(error);
                 }

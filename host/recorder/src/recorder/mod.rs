@@ -1,44 +1,44 @@
 //! The recorder: samples and wakes go in, clips come out.
 
-mod draft;
+mod backfill;
+mod clip_name;
+mod clip_writer;
 mod finished;
 mod limits;
 mod live;
-mod pen;
+mod open_clip;
 mod settings;
-mod stem;
+mod state;
 mod steps;
-mod stock;
 #[cfg(test)]
 mod tests;
 mod waiting;
-mod walk;
 
 use std::sync::Arc;
 
 use gleaner_base::nanoseconds;
-use gleaner_journal::{Encoder, Entry};
+use gleaner_journal::{Encoder, JournalEntry};
 use gleaner_lambda::{Clip, Moment, TriggerKind};
-use gleaner_protocol::Recording;
+use gleaner_protocol::RecordingCounts;
 use gleaner_transport::{Gaps, SampleMeta};
 
-use crate::file::{Folder, Topic};
-use crate::preroll::{Held, Losses, Preroll, Walked};
-use crate::window::{Heard, Rules, Windows};
+use crate::file::{RecordingFolder, TopicSchema};
+use crate::preroll::{EntryMeta, Losses, Preroll, Walked};
+use crate::window::{TriggerOutcome, WindowRules, Windows};
 use crate::{LAMBDAS_MAX, RecordError};
-use draft::Draft;
+use backfill::Backfill;
+use clip_writer::ClipWriter;
 use finished::Finished;
-use limits::Limits;
-use pen::Pen;
-use steps::Stray;
-use stock::{Crew, Desk, Lane, Stock};
-use waiting::Waiting;
-use walk::Walk;
+use limits::RecorderLimits;
+use open_clip::OpenClip;
+use state::{ClipContext, RecordedLambda, RecorderState, TopicState};
+use steps::LateClip;
+use waiting::WaitingTriggers;
 
 #[cfg(feature = "program")]
 pub(crate) use live::counted;
-pub use settings::{Commanded, Counts, LambdaId, Settings, TopicId, Work};
-pub use stock::Member;
+pub use settings::{Commanded, LambdaId, RecorderCounts, Settings, TopicId, Work};
+pub use state::LambdaSpec;
 
 /// Most topics of one recorder. A vehicle has some hundreds. Of each, the stamps of some thousand
 /// lost samples are kept: 100 KiB.
@@ -57,17 +57,17 @@ const NAMES_MAX: usize = 256 << 10;
 /// [`work`](Self::work), which is to be called in between.
 ///
 /// After an error a recorder is of no use: drop it. What it has written is recovered by the next
-/// [`Folder::open`].
+/// [`RecordingFolder::open`].
 pub struct Recorder {
     windows: Windows,
-    stock: Stock,
-    draft: Option<Draft>,
-    /// A clip of windows before those of `draft`.
-    stray: Option<Stray>,
-    /// What brings `stray`, or else `draft`, up to what is held. Nothing is decided while it is
+    state: RecorderState,
+    open_clip: Option<OpenClip>,
+    /// A clip of windows before those of `open_clip`.
+    late_clip: Option<LateClip>,
+    /// What brings `late_clip`, or else `open_clip`, up to what is held. Nothing is decided while it is
     /// under way.
-    walk: Option<Walk>,
-    /// Messages after this one came while they could not be written to `draft`.
+    backfill: Option<Backfill>,
+    /// Messages after this one came while they could not be written to `open_clip`.
     behind: Option<Option<Walked>>,
     /// Why nothing is to be recorded for now.
     held: Option<Arc<str>>,
@@ -76,7 +76,7 @@ pub struct Recorder {
     now: Option<i64>,
     max_length_ns: i64,
     finished: Finished,
-    counts: Counts,
+    counts: RecorderCounts,
     /// Where a wake is encoded.
     encoded: Vec<u8>,
     settings: Settings,
@@ -88,43 +88,47 @@ impl Recorder {
     /// # Errors
     ///
     /// [`RecordError::Preroll`] if the preroll is on disk and has no place there.
-    pub fn new(folder: Folder, settings: Settings) -> Result<Recorder, RecordError> {
-        Recorder::with(Pen::here(folder), settings, false)
+    pub fn new(folder: RecordingFolder, settings: Settings) -> Result<Recorder, RecordError> {
+        Recorder::with(ClipWriter::inline(folder), settings, false)
     }
 
-    fn with(pen: Pen, settings: Settings, is_live: bool) -> Result<Recorder, RecordError> {
+    fn with(
+        writer: ClipWriter,
+        settings: Settings,
+        is_live: bool,
+    ) -> Result<Recorder, RecordError> {
         let Settings { store, preroll_bytes, prefault, .. } = settings;
         let preroll =
             Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
         let max_length_ns = nanoseconds(settings.max_length).max(1);
         Ok(Recorder {
             windows: Windows::new(max_length_ns),
-            stock: Stock {
+            state: RecorderState {
                 preroll,
                 losses: Vec::new(),
                 wake_losses: Vec::new(),
-                waiting: Waiting::default(),
-                desk: Desk {
-                    pen,
+                waiting: WaitingTriggers::default(),
+                context: ClipContext {
+                    writer,
                     clips: 0,
                     clock: settings.clock.clone(),
-                    limits: Limits::default(),
+                    limits: RecorderLimits::default(),
                     is_live,
-                    lanes: Vec::new(),
-                    crews: Vec::new(),
+                    topics: Vec::new(),
+                    lambdas: Vec::new(),
                 },
                 began_at: 0,
             },
-            draft: None,
-            stray: None,
-            walk: None,
+            open_clip: None,
+            late_clip: None,
+            backfill: None,
             behind: None,
             held: None,
             groups: 0,
             now: None,
             max_length_ns,
             finished: Finished::default(),
-            counts: Counts { preroll_bound: preroll_bytes, ..Counts::default() },
+            counts: RecorderCounts { preroll_bound: preroll_bytes, ..RecorderCounts::default() },
             encoded: Vec::new(),
             settings,
         })
@@ -137,8 +141,8 @@ impl Recorder {
     /// [`RecordError::TooManyTopics`] beyond [`TOPICS_MAX`]; [`RecordError::LongTopic`] and
     /// [`RecordError::LongNames`] if a clip has no room for what it says of itself, or all
     /// together.
-    pub fn add_topic(&mut self, topic: Topic) -> Result<TopicId, RecordError> {
-        self.add_lane(topic, false)
+    pub fn add_topic(&mut self, topic: TopicSchema) -> Result<TopicId, RecordError> {
+        self.add_topic_state(topic, false)
     }
 
     /// Adds a topic that is wanted but not there: clips list it with no messages and no type.
@@ -147,32 +151,40 @@ impl Recorder {
     ///
     /// As [`Recorder::add_topic`].
     pub fn add_missing_topic(&mut self, name: &str) -> Result<TopicId, RecordError> {
-        let topic = Topic {
+        let topic = TopicSchema {
             name: name.to_owned(),
             type_name: String::new(),
             definitions: None,
             offered_qos: None,
         };
-        self.add_lane(topic, true)
+        self.add_topic_state(topic, true)
     }
 
-    fn add_lane(&mut self, topic: Topic, is_missing: bool) -> Result<TopicId, RecordError> {
-        let lanes = &mut self.stock.desk.lanes;
-        if let Some(found) = lanes.iter().position(|lane| lane.topic.name == topic.name) {
+    fn add_topic_state(
+        &mut self,
+        topic: TopicSchema,
+        is_missing: bool,
+    ) -> Result<TopicId, RecordError> {
+        let topics = &mut self.state.context.topics;
+        if let Some(found) =
+            topics.iter().position(|topic_state| topic_state.topic.name == topic.name)
+        {
             return Ok(TopicId(found));
         }
-        if lanes.len() == TOPICS_MAX {
+        if topics.len() == TOPICS_MAX {
             return Err(RecordError::TooManyTopics { most: TOPICS_MAX });
         }
         topic.check()?;
-        let names = |topic: &Topic| topic.name.len() + topic.type_name.len();
-        if lanes.iter().map(|lane| names(&lane.topic)).sum::<usize>() + names(&topic) > NAMES_MAX {
+        let names = |topic: &TopicSchema| topic.name.len() + topic.type_name.len();
+        if topics.iter().map(|topic_state| names(&topic_state.topic)).sum::<usize>() + names(&topic)
+            > NAMES_MAX
+        {
             return Err(RecordError::LongNames { most: NAMES_MAX });
         }
         let (topic, lambdas, gaps) = (Arc::new(topic), Vec::new(), Gaps::default());
-        lanes.push(Lane { topic, is_missing, found_at: None, lambdas, gaps });
-        self.stock.losses.push(Losses::default());
-        Ok(TopicId(lanes.len() - 1))
+        topics.push(TopicState { topic, is_missing, found_at: None, lambdas, gaps });
+        self.state.losses.push(Losses::default());
+        Ok(TopicId(topics.len() - 1))
     }
 
     /// Adds a lambda that records, before its first wake.
@@ -180,7 +192,7 @@ impl Recorder {
     /// # Panics
     ///
     /// Beyond 1024 lambdas, which a replay never has; [`Recorder::try_add_lambda`] says so instead.
-    pub fn add_lambda(&mut self, member: Member) -> LambdaId {
+    pub fn add_lambda(&mut self, member: LambdaSpec) -> LambdaId {
         self.try_add_lambda(member).expect("few lambdas are added without asking")
     }
 
@@ -189,31 +201,31 @@ impl Recorder {
     /// # Errors
     ///
     /// [`RecordError::TooManyLambdas`] beyond 1024.
-    pub fn try_add_lambda(&mut self, member: Member) -> Result<LambdaId, RecordError> {
-        if self.stock.desk.crews.len() == LAMBDAS_MAX {
+    pub fn try_add_lambda(&mut self, member: LambdaSpec) -> Result<LambdaId, RecordError> {
+        if self.state.context.lambdas.len() == LAMBDAS_MAX {
             return Err(RecordError::TooManyLambdas { most: LAMBDAS_MAX });
         }
-        let lambda = self.windows.add(Rules {
+        let lambda = self.windows.add(WindowRules {
             preroll_ns: nanoseconds(member.rules.preroll),
             postroll_ns: nanoseconds(member.rules.postroll),
             cooldown_ns: nanoseconds(member.rules.cooldown),
         });
         for topic in &member.topics {
-            let lambdas = &mut self.stock.desk.lanes[topic.0].lambdas;
+            let lambdas = &mut self.state.context.topics[topic.0].lambdas;
             if !lambdas.contains(&lambda) {
                 lambdas.push(lambda);
             }
         }
-        let Member { header, digest, topics, .. } = member;
+        let LambdaSpec { header, digest, topics, .. } = member;
         let encoder = Encoder::new(header.inputs.len());
-        self.stock.desk.crews.push(Crew {
+        self.state.context.lambdas.push(RecordedLambda {
             header: Arc::new(header),
             digest,
             topics,
             encoder,
             wakes: 0,
         });
-        self.stock.wake_losses.push(Losses::default());
+        self.state.wake_losses.push(Losses::default());
         Ok(LambdaId(lambda))
     }
 
@@ -232,45 +244,45 @@ impl Recorder {
             self.counts.recording.before_1970 += 1;
             return Ok(());
         }
-        if self.stock.desk.lanes[topic.0].is_missing {
+        if self.state.context.topics[topic.0].is_missing {
             self.counts.recording.topic_unknown += 1;
             return Ok(());
         }
         self.counts.out_of_order += u64::from(self.now.is_some_and(|now| meta.at_ns < now));
-        if self.stock.desk.is_live {
-            self.stock.note_gap(topic.0, meta);
+        if self.state.context.is_live {
+            self.state.note_gap(topic.0, meta);
         }
         self.pass(meta.at_ns)?;
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
         let in_group = self.write(topic.0, &meta, cdr)?;
-        let Recording { evicted_early, too_big, .. } = &mut self.counts.recording;
-        self.stock.keep(Held::sample(topic.0, &meta, in_group), cdr, evicted_early, too_big)
+        let RecordingCounts { evicted_early, too_big, .. } = &mut self.counts.recording;
+        self.state.keep(EntryMeta::sample(topic.0, &meta, in_group), cdr, evicted_early, too_big)
     }
 
     /// Writes a sample to the open clip, if it belongs there. Returns the group in whose clip it is
     /// then.
     fn write(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) -> Result<u64, RecordError> {
         let is_prompt = self.is_prompt(meta.at_ns);
-        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else {
+        let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) else {
             return Ok(0);
         };
-        let Stock { preroll, desk, .. } = &mut self.stock;
-        if !desk.covers(group, topic, meta.at_ns) {
+        let RecorderState { preroll, context, .. } = &mut self.state;
+        if !context.covers(group, topic, meta.at_ns) {
             return Ok(0);
         }
-        if cdr.len() > desk.limits.message_bytes {
-            draft.refuse(topic);
-        } else if is_prompt || !preroll.fits(cdr.len()) && desk.pen.has_room() {
-            draft.message(desk, group, topic, meta, cdr)?;
+        if cdr.len() > context.limits.message_bytes {
+            open_clip.refuse(topic);
+        } else if is_prompt || !preroll.fits(cdr.len()) && context.writer.has_room() {
+            open_clip.message(context, group, topic, meta, cdr)?;
         } else {
             // It is counted as too big if it cannot be kept; else a walk comes by.
-            if self.walk.is_none() || self.stray.is_some() {
+            if self.backfill.is_none() || self.late_clip.is_some() {
                 self.behind.get_or_insert_with(|| preroll.newest());
             }
             return Ok(0);
         }
-        Ok(draft.group)
+        Ok(open_clip.group)
     }
 
     /// A lambda was woken: keeps the wake for its journal, and does what its triggers ask for.
@@ -281,30 +293,30 @@ impl Recorder {
     /// # Errors
     ///
     /// [`RecordError`] if the disk fails.
-    pub fn wake(&mut self, lambda: LambdaId, entry: &Entry) -> Result<(), RecordError> {
-        let crew = &mut self.stock.desk.crews[lambda.0];
-        let number = crew.wakes;
-        crew.wakes += 1;
+    pub fn wake(&mut self, lambda: LambdaId, entry: &JournalEntry) -> Result<(), RecordError> {
+        let recorded = &mut self.state.context.lambdas[lambda.0];
+        let number = recorded.wakes;
+        recorded.wakes += 1;
         if entry.at_ns < 0 {
             self.counts.recording.before_1970 += 1;
             return Ok(());
         }
         self.encoded.clear();
-        crew.encoder.reset();
-        crew.encoder.encode(entry, &mut self.encoded);
-        if !self.stock.desk.is_live {
+        recorded.encoder.reset();
+        recorded.encoder.encode(entry, &mut self.encoded);
+        if !self.state.context.is_live {
             self.pass(entry.at_ns)?;
         }
         let mut in_group = 0;
-        if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open())
+        if let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open())
             && (group.begin..=group.to.min(self.windows.limit())).contains(&entry.at_ns)
         {
-            draft.wake(lambda.0, number, &self.encoded);
-            in_group = draft.group;
+            open_clip.wake(lambda.0, number, &self.encoded);
+            in_group = open_clip.group;
         }
-        let Recording { evicted_early, too_big, .. } = &mut self.counts.recording;
-        self.stock.keep(
-            Held::wake(lambda.0, number, entry.at_ns, in_group),
+        let RecordingCounts { evicted_early, too_big, .. } = &mut self.counts.recording;
+        self.state.keep(
+            EntryMeta::wake(lambda.0, number, entry.at_ns, in_group),
             &self.encoded,
             evicted_early,
             too_big,
@@ -320,12 +332,12 @@ impl Recorder {
         }
         for trigger in &entry.triggers {
             match self.windows.trigger(lambda.0, trigger.kind, &trigger.label, entry.at_ns) {
-                Heard::Opened => self.counts.recording.windows += 1,
-                Heard::InCooldown => self.counts.recording.in_cooldown += 1,
-                Heard::Ignored => self.counts.recording.ignored += 1,
-                Heard::TooManyStarted => self.counts.recording.too_many_started += 1,
-                Heard::TooManyWaiting => self.counts.recording.too_many_waiting += 1,
-                Heard::Stopped => {}
+                TriggerOutcome::Opened => self.counts.recording.windows += 1,
+                TriggerOutcome::InCooldown => self.counts.recording.in_cooldown += 1,
+                TriggerOutcome::Ignored => self.counts.recording.ignored += 1,
+                TriggerOutcome::TooManyStarted => self.counts.recording.too_many_started += 1,
+                TriggerOutcome::TooManyWaiting => self.counts.recording.too_many_waiting += 1,
+                TriggerOutcome::Stopped => {}
             }
             self.await_clip(lambda, Moment::of(self.name_of(lambda), trigger, entry.at_ns));
         }
@@ -333,20 +345,20 @@ impl Recorder {
     }
 
     fn name_of(&self, lambda: LambdaId) -> &str {
-        &self.stock.desk.crews[lambda.0].header.lambda
+        &self.state.context.lambdas[lambda.0].header.lambda
     }
 
     /// A moment waits for the clip that it belongs to.
     fn await_clip(&mut self, lambda: LambdaId, moment: Moment) {
-        let most = self.stock.desk.limits.waiting;
-        self.stock.waiting.push(lambda.0, moment, &self.windows, most);
+        let most = self.state.context.limits.waiting;
+        self.state.waiting.push(lambda.0, moment, &self.windows, most);
     }
 
     /// Does what triggers ask for.
     fn act(&mut self) -> Result<(), RecordError> {
         self.run()?;
-        if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) {
-            self.stock.gather(draft, group, self.windows.limit());
+        if let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) {
+            self.state.gather(open_clip, group, self.windows.limit());
         }
         Ok(())
     }
@@ -367,13 +379,13 @@ impl Recorder {
     }
 
     /// What was done so far.
-    pub fn counts(&self) -> Counts {
-        let preroll = &self.stock.preroll;
-        Counts {
-            recording: Recording { clips: self.finished.count, ..self.counts.recording },
+    pub fn counts(&self) -> RecorderCounts {
+        let preroll = &self.state.preroll;
+        RecorderCounts {
+            recording: RecordingCounts { clips: self.finished.count, ..self.counts.recording },
             preroll_bytes: preroll.bytes_held(),
             preroll_highest: preroll.bytes_highest(),
-            in_flight: self.stock.desk.pen.in_flight() as u64,
+            in_flight: self.state.context.writer.in_flight() as u64,
             ..self.counts
         }
     }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use gleaner_lambda::manifest::Store;
-use gleaner_protocol::Recording;
+use gleaner_protocol::RecordingCounts;
 
 /// How a recorder works.
 #[derive(Clone, Debug)]
@@ -33,9 +33,9 @@ pub struct LambdaId(pub(super) usize);
 
 /// What a recorder has done so far.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
-pub struct Counts {
+pub struct RecorderCounts {
     /// What is reported.
-    pub recording: Recording,
+    pub recording: RecordingCounts,
     /// Samples older than one that came before them. They are recorded where windows cover them.
     pub out_of_order: u64,
     /// Bytes that the preroll holds.

@@ -3,14 +3,14 @@
 use std::sync::Arc;
 
 use super::Recorder;
-use super::draft::{Close, Draft};
-use super::walk::{Budget, Walk};
+use super::backfill::{Backfill, Budget};
+use super::open_clip::{CloseReason, OpenClip};
 use crate::RecordError;
-use crate::window::{Group, Step, Window};
+use crate::window::{Group, Window, WindowStep};
 
 /// A clip of windows that lie before the one that is open. All of it is in the past.
-pub(super) struct Stray {
-    draft: Draft,
+pub(super) struct LateClip {
+    open_clip: OpenClip,
     group: Group,
     limit: i64,
 }
@@ -19,38 +19,38 @@ impl Recorder {
     /// Lets time pass. What is due is done before anything is given up for its age: it may need it.
     pub(super) fn pass(&mut self, now: i64) -> Result<(), RecordError> {
         if self.now.is_none() {
-            self.stock.began_at = now;
+            self.state.began_at = now;
         }
         self.now = self.now.max(Some(now));
         self.windows.pass(now);
         self.run()?;
-        if self.is_settled() { self.stock.trim(self.windows.horizon()) } else { Ok(()) }
+        if self.is_settled() { self.state.trim(self.windows.horizon()) } else { Ok(()) }
     }
 
     /// Does all that is to be done; live, what takes long is left to [`Recorder::work`].
     pub(super) fn run(&mut self) -> Result<(), RecordError> {
-        self.run_within(if self.stock.desk.is_live { Budget::NONE } else { Budget::ALL })
+        self.run_within(if self.state.context.is_live { Budget::NONE } else { Budget::ALL })
     }
 
     /// Whether a sample of this stamp may be written to the open clip when it comes. While the clip
     /// is being brought up to what is held, or is full, it waits its turn in the preroll, so that a
     /// file is in the order in which things came.
     pub(super) fn is_prompt(&self, at_ns: i64) -> bool {
-        !self.stock.desk.is_live
+        !self.state.context.is_live
             || self.behind.is_none()
-                && (self.walk.is_none() || self.stray.is_some())
+                && (self.backfill.is_none() || self.late_clip.is_some())
                 && at_ns <= self.windows.limit()
-                && self.stock.desk.pen.has_room()
+                && self.state.context.writer.has_room()
     }
 
     /// Whether all is decided that can be.
     pub(super) fn is_settled(&self) -> bool {
-        self.walk.is_none() && self.behind.is_none() && self.stock.desk.pen.has_room()
+        self.backfill.is_none() && self.behind.is_none() && self.state.context.writer.has_room()
     }
 
     /// Does what is to be done, with walks as far as `budget` reaches.
     pub(super) fn run_within(&mut self, mut budget: Budget) -> Result<(), RecordError> {
-        while self.walk_on(&mut budget)? && self.stock.desk.pen.has_room() {
+        while self.continue_backfill(&mut budget)? && self.state.context.writer.has_room() {
             let held = self.held.clone();
             if held.is_some() {
                 self.counts.recording.disk_suppressed += self.windows.forget_waiting();
@@ -61,48 +61,53 @@ impl Recorder {
                     && let Some(group) = self.windows.close()
                 {
                     let end = self.now.unwrap_or(group.from);
-                    self.complete(&group, Close::Early(end, why))?;
+                    self.complete(&group, CloseReason::Early(end, why))?;
                 }
                 break;
             };
             match step {
-                Step::Begin(windows) => self.begin(windows)?,
-                Step::Join { windows, fresh_from: Some(from) } => self.settle(windows, from)?,
+                WindowStep::Begin(windows) => self.begin(windows)?,
+                WindowStep::Join { windows, fresh_from: Some(from) } => {
+                    self.settle(windows, from)?
+                }
                 // It covers nothing new so far, and its trigger is gathered by whoever brought it.
-                Step::Join { .. } => {}
-                Step::Roll { boundary, before } => self.roll(boundary, &before)?,
-                Step::Finish(group) => self.complete(&group, Close::Complete)?,
-                Step::Stray(windows, group) => self.begin_stray(windows, *group)?,
+                WindowStep::Join { .. } => {}
+                WindowStep::Roll { boundary, before } => self.roll(boundary, &before)?,
+                WindowStep::Finish(group) => self.complete(&group, CloseReason::Complete)?,
+                WindowStep::Late(windows, group) => self.begin_late_clip(windows, *group)?,
             }
         }
         Ok(())
     }
 
     /// Goes on with what is under way; `true` once nothing is.
-    fn walk_on(&mut self, budget: &mut Budget) -> Result<bool, RecordError> {
+    fn continue_backfill(&mut self, budget: &mut Budget) -> Result<bool, RecordError> {
         loop {
-            let Some(mut walk) = self.walk.take() else {
-                match self.behind.take().filter(|_| self.draft.is_some()) {
-                    Some(last) => self.walk = Some(Walk::from(last, self.windows.limit())),
+            let Some(mut backfill) = self.backfill.take() else {
+                match self.behind.take().filter(|_| self.open_clip.is_some()) {
+                    Some(last) => self.backfill = Some(Backfill::from(last, self.windows.limit())),
                     None => return Ok(true),
                 }
                 continue;
             };
-            let is_done = match (&mut self.stray, &mut self.draft, self.windows.open()) {
-                (Some(stray), ..) => {
-                    self.stock.walk(&mut walk, &mut stray.draft, &stray.group, budget)?
-                }
-                (None, Some(draft), Some(group)) => {
-                    self.stock.walk(&mut walk, draft, group, budget)?
+            let is_done = match (&mut self.late_clip, &mut self.open_clip, self.windows.open()) {
+                (Some(late_clip), ..) => self.state.backfill(
+                    &mut backfill,
+                    &mut late_clip.open_clip,
+                    &late_clip.group,
+                    budget,
+                )?,
+                (None, Some(open_clip), Some(group)) => {
+                    self.state.backfill(&mut backfill, open_clip, group, budget)?
                 }
                 _ => true,
             };
             if !is_done {
-                self.walk = Some(walk);
+                self.backfill = Some(backfill);
                 return Ok(false);
             }
-            if let Some(stray) = self.stray.take() {
-                self.end_stray(stray)?;
+            if let Some(late_clip) = self.late_clip.take() {
+                self.end_late_clip(late_clip)?;
             }
         }
     }
@@ -110,34 +115,35 @@ impl Recorder {
     fn begin(&mut self, windows: Vec<Window>) -> Result<(), RecordError> {
         if let Some(group) = self.windows.open() {
             self.groups += 1;
-            let opening = self.stock.opening(group);
-            self.draft = Some(Draft::new(self.groups, opening, group, &mut self.stock.desk));
+            let opening = self.state.opening(group);
+            self.open_clip =
+                Some(OpenClip::new(self.groups, opening, group, &mut self.state.context));
         }
         self.settle(windows, i64::MIN)
     }
 
     fn settle(&mut self, windows: Vec<Window>, fresh_from: i64) -> Result<(), RecordError> {
-        if let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) {
-            let walk =
-                self.stock.settle(draft, group, windows, self.windows.limit(), fresh_from)?;
-            self.walk = Some(walk);
+        if let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) {
+            let backfill =
+                self.state.settle(open_clip, group, windows, self.windows.limit(), fresh_from)?;
+            self.backfill = Some(backfill);
         }
         Ok(())
     }
 
     /// Goes on in a next clip.
     fn roll(&mut self, boundary: i64, before: &Group) -> Result<(), RecordError> {
-        let (Some(draft), Some(group)) = (&mut self.draft, self.windows.open()) else {
+        let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) else {
             return Ok(());
         };
-        if !draft.is_empty() {
-            let next = draft.next(group, &mut self.stock.desk);
-            let full = std::mem::replace(draft, next);
-            self.finished.add(self.stock.finish(full, before, Close::Full(boundary))?);
+        if !open_clip.is_empty() {
+            let next = open_clip.next(group, &mut self.state.context);
+            let full = std::mem::replace(open_clip, next);
+            self.finished.add(self.state.finish(full, before, CloseReason::Full(boundary))?);
         }
         // Where nothing came for longer than a clip may be, no clips are made of it.
         if self.now.is_none_or(|now| now > self.windows.limit()) {
-            let until = self.stock.earliest(draft, group).or(self.now).unwrap_or(boundary);
+            let until = self.state.earliest(open_clip, group).or(self.now).unwrap_or(boundary);
             if until > self.windows.limit() {
                 self.windows.slide(until);
             }
@@ -145,45 +151,51 @@ impl Recorder {
         self.settle(Vec::new(), i64::MIN)
     }
 
-    pub(super) fn complete(&mut self, group: &Group, close: Close) -> Result<(), RecordError> {
-        if let Some(draft) = self.draft.take() {
+    pub(super) fn complete(
+        &mut self,
+        group: &Group,
+        close: CloseReason,
+    ) -> Result<(), RecordError> {
+        if let Some(open_clip) = self.open_clip.take() {
             // The clip before promised that more would come; where nothing did, there is no clip of
             // nothing.
-            if draft.continues && draft.is_empty() && draft.triggers == 0 {
-                return self.stock.desk.pen.forget(draft.clip);
+            if open_clip.continues && open_clip.is_empty() && open_clip.triggers == 0 {
+                return self.state.context.writer.forget(open_clip.clip);
             }
-            self.finished.add(self.stock.finish(draft, group, close)?);
+            self.finished.add(self.state.finish(open_clip, group, close)?);
         }
         Ok(())
     }
 
-    fn begin_stray(&mut self, windows: Vec<Window>, group: Group) -> Result<(), RecordError> {
+    fn begin_late_clip(&mut self, windows: Vec<Window>, group: Group) -> Result<(), RecordError> {
         self.groups += 1;
-        let opening = self.stock.opening(&group);
-        let mut draft = Draft::new(self.groups, opening, &group, &mut self.stock.desk);
+        let opening = self.state.opening(&group);
+        let mut open_clip = OpenClip::new(self.groups, opening, &group, &mut self.state.context);
         let limit = group.from.saturating_add(self.max_length_ns);
-        self.walk = Some(self.stock.settle(&mut draft, &group, windows, limit, i64::MIN)?);
-        self.stray = Some(Stray { draft, group, limit });
+        self.backfill =
+            Some(self.state.settle(&mut open_clip, &group, windows, limit, i64::MIN)?);
+        self.late_clip = Some(LateClip { open_clip, group, limit });
         Ok(())
     }
 
     /// A stray clip has what is held of it: completes it, or goes on in a next one.
-    fn end_stray(&mut self, stray: Stray) -> Result<(), RecordError> {
-        let Stray { mut draft, mut group, limit: boundary } = stray;
+    fn end_late_clip(&mut self, late_clip: LateClip) -> Result<(), RecordError> {
+        let LateClip { mut open_clip, mut group, limit: boundary } = late_clip;
         if group.to <= boundary {
-            self.finished.add(self.stock.finish(draft, &group, Close::Complete)?);
+            self.finished.add(self.state.finish(open_clip, &group, CloseReason::Complete)?);
             return Ok(());
         }
         let before = group.clone();
         group.roll(boundary);
-        if !draft.is_empty() {
-            let next = draft.next(&group, &mut self.stock.desk);
-            let full = std::mem::replace(&mut draft, next);
-            self.finished.add(self.stock.finish(full, &before, Close::Full(boundary))?);
+        if !open_clip.is_empty() {
+            let next = open_clip.next(&group, &mut self.state.context);
+            let full = std::mem::replace(&mut open_clip, next);
+            self.finished.add(self.state.finish(full, &before, CloseReason::Full(boundary))?);
         }
         let limit = group.from.saturating_add(self.max_length_ns);
-        self.walk = Some(self.stock.settle(&mut draft, &group, Vec::new(), limit, i64::MIN)?);
-        self.stray = Some(Stray { draft, group, limit });
+        self.backfill =
+            Some(self.state.settle(&mut open_clip, &group, Vec::new(), limit, i64::MIN)?);
+        self.late_clip = Some(LateClip { open_clip, group, limit });
         Ok(())
     }
 
@@ -194,17 +206,17 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn finish(&mut self, end_ns: i64) -> Result<(), RecordError> {
-        self.stock.desk.pen.end_recovery();
+        self.state.context.writer.end_recovery();
         self.windows.set_grace(0);
         self.pass(end_ns.max(0))?;
         let end = self.now.unwrap_or(end_ns);
-        let is_live = self.stock.desk.is_live;
+        let is_live = self.state.context.is_live;
         self.settle_all()?;
         while let Some(group) = self.windows.close() {
             let why = || Arc::from("the recording was stopped before the window ended");
             self.complete(
                 &group,
-                if is_live { Close::Early(end, why()) } else { Close::EndOfDrive(end) },
+                if is_live { CloseReason::Early(end, why()) } else { CloseReason::EndOfDrive(end) },
             )?;
             self.run()?;
             self.settle_all()?;

@@ -7,12 +7,12 @@ use crate::support::*;
 
 /// A recorder of one topic and one lambda, with these limits.
 fn recorder(
-    scratch: &Scratch,
+    scratch: &TestDir,
     rolls_ms: (i64, i64, i64),
-    limits: Limits,
+    limits: RecorderLimits,
 ) -> (Recorder, TopicId, LambdaId) {
     let mut recorder = scratch.recorder(|_| {});
-    recorder.stock.desk.limits = limits;
+    recorder.state.context.limits = limits;
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", rolls_ms, &[a]));
     (recorder, a, lambda)
@@ -24,9 +24,12 @@ fn wake(recorder: &mut Recorder, lambda: LambdaId, ms: i64) {
 
 #[test]
 fn a_journal_that_is_too_long_has_no_hole_and_says_what_is_missing() {
-    let scratch = Scratch::new();
-    let (mut recorder, a, lambda) =
-        recorder(&scratch, (100, 50, 0), Limits { part_bytes: 1 << 10, ..Limits::default() });
+    let scratch = TestDir::new();
+    let (mut recorder, a, lambda) = recorder(
+        &scratch,
+        (100, 50, 0),
+        RecorderLimits { part_bytes: 1 << 10, ..RecorderLimits::default() },
+    );
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
     (100..140).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
@@ -38,21 +41,22 @@ fn a_journal_that_is_too_long_has_no_hole_and_says_what_is_missing() {
     assert_eq!(wakes, (0..kept).map(|n| T0 + (100 + n) * MS).collect::<Vec<_>>());
     let short =
         format!("the journal of hello lacks the last {} wakes: longer than 0 MiB", 40 - kept);
-    assert!(clip.short.contains(&short), "{:?}", clip.short);
+    assert!(clip.incomplete.contains(&short), "{:?}", clip.incomplete);
 }
 
 #[test]
 fn the_journals_of_a_clip_are_bounded_together_and_each_says_what_it_lacks() {
-    let scratch = Scratch::new();
-    let limits = Limits { part_bytes: 2 << 10, parts_bytes: 3 << 10, ..Limits::default() };
+    let scratch = TestDir::new();
+    let limits =
+        RecorderLimits { part_bytes: 2 << 10, parts_bytes: 3 << 10, ..RecorderLimits::default() };
     let (mut recorder, a, first) = recorder(&scratch, (100, 50, 0), limits);
     let second = recorder.add_lambda(member("second", (100, 50, 0), &[a]));
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
     (100..140).for_each(|ms| {
         [first, second].into_iter().for_each(|lambda| wake(&mut recorder, lambda, ms))
     });
-    let draft = recorder.draft.as_ref().unwrap();
-    assert!(draft.journal_bytes() <= 3 << 10);
+    let open_clip = recorder.open_clip.as_ref().unwrap();
+    assert!(open_clip.journal_bytes() <= 3 << 10);
     recorder.finish(T0 + S).unwrap();
     let clip = &recorder.clips()[0];
     let mut lacking = 0;
@@ -66,16 +70,19 @@ fn the_journals_of_a_clip_are_bounded_together_and_each_says_what_it_lacks() {
             "the journal of {name} lacks the last {} wakes: the journals of all are longer than 0 MiB",
             40 - kept
         );
-        assert!(clip.short.contains(&short), "{:?}", clip.short);
+        assert!(clip.incomplete.contains(&short), "{:?}", clip.incomplete);
     }
     assert!(lacking > 40);
 }
 
 #[test]
 fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
-    let scratch = Scratch::new();
-    let (mut recorder, a, lambda) =
-        recorder(&scratch, (100, 50, 0), Limits { moments: 150, ..Limits::default() });
+    let scratch = TestDir::new();
+    let (mut recorder, a, lambda) = recorder(
+        &scratch,
+        (100, 50, 0),
+        RecorderLimits { moments: 150, ..RecorderLimits::default() },
+    );
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
     (100..300).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
@@ -88,14 +95,14 @@ fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
     let said = ["name", "engine", "gleaner", "config", "models", "digest", "windows"]
         .map(|key| lambda[key].as_str());
     assert_eq!(said, ["hello", "Python", "0.1.0", "{}", "", "d1e5", "200"]);
-    assert_eq!(Limits::default().moments, 10_000);
+    assert_eq!(RecorderLimits::default().moments, 10_000);
 }
 
 #[test]
 fn triggers_that_wait_in_too_great_numbers_are_counted_in_the_clip_that_they_are_in() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
-    recorder.stock.desk.limits.waiting = 20;
+    recorder.state.context.limits.waiting = 20;
     let a = recorder.add_topic(topic("/a")).unwrap();
     let noisy = recorder.add_lambda(member("noisy", (5, 0, 0), &[a]));
     // Its preroll holds each clip open for long, so that the windows of the other wait.
@@ -108,35 +115,41 @@ fn triggers_that_wait_in_too_great_numbers_are_counted_in_the_clip_that_they_are
     let told: Vec<_> = recorder
         .clips()
         .iter()
-        .map(|clip| (clip.triggers, clip.moments.len(), clip.short.len()))
+        .map(|clip| (clip.triggers, clip.moments.len(), clip.incomplete.len()))
         .collect();
     let [first, second, third] = told[..] else { panic!("{told:?}") };
     assert_eq!((first.0, third.0), (1, 1));
-    assert_eq!((second.0, second.2), (200, 0), "{:?}", recorder.clips()[1].short);
+    assert_eq!((second.0, second.2), (200, 0), "{:?}", recorder.clips()[1].incomplete);
     assert!(second.1 >= 20);
 }
 
 #[test]
 fn a_clip_says_so_if_nobody_knows_how_many_triggers_are_in_it() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     // In the cooldown, triggers open no window; the next window reaches back over some of them.
-    let (mut recorder, a, lambda) =
-        recorder(&scratch, (50, 0, 200), Limits { waiting: 10, ..Limits::default() });
+    let (mut recorder, a, lambda) = recorder(
+        &scratch,
+        (50, 0, 200),
+        RecorderLimits { waiting: 10, ..RecorderLimits::default() },
+    );
     drive(&mut recorder, &[a], (0, 1, 1), &[]);
     (100..=300).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
     let [first, second] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
     let said = "there are more triggers of hello than are counted: too many waited for their clip";
-    assert_eq!((first.triggers, first.short.iter().any(|short| short == said)), (1, false));
+    assert_eq!((first.triggers, first.incomplete.iter().any(|short| short == said)), (1, false));
     assert!((10..51).contains(&second.triggers), "{}", second.triggers);
-    assert!(second.short.iter().any(|short| short == said), "{:?}", second.short);
+    assert!(second.incomplete.iter().any(|short| short == said), "{:?}", second.incomplete);
 }
 
 #[test]
 fn a_message_that_no_clip_can_hold_is_counted_by_the_clip_that_wants_it() {
-    let scratch = Scratch::new();
-    let (mut recorder, a, lambda) =
-        recorder(&scratch, (100, 100, 0), Limits { message_bytes: 10, ..Limits::default() });
+    let scratch = TestDir::new();
+    let (mut recorder, a, lambda) = recorder(
+        &scratch,
+        (100, 100, 0),
+        RecorderLimits { message_bytes: 10, ..RecorderLimits::default() },
+    );
     for (ms, bytes) in [(50, 11), (60, 10)] {
         recorder.sample(a, &meta(T0 + ms * MS, 1), &[7; 20][..bytes]).unwrap();
     }
@@ -150,29 +163,29 @@ fn a_message_that_no_clip_can_hold_is_counted_by_the_clip_that_wants_it() {
     assert_eq!((topic.messages, topic.received, topic.too_big), (2, Some(4), Some(2)));
     assert_eq!(recorder.counts().recording.too_big, 3);
     let said = "1 sample of /a larger than 0 MiB: no clip holds such";
-    assert!(clip.short.iter().any(|short| short == said), "{:?}", clip.short);
+    assert!(clip.incomplete.iter().any(|short| short == said), "{:?}", clip.incomplete);
 }
 
 /// Each sample and each wake is looked at once or a few times, not as often as there are triggers.
 #[test]
 fn a_lambda_that_triggers_in_every_wake_looks_only_at_what_is_new() {
     for late_ms in [0, 7] {
-        let scratch = Scratch::new();
-        let (mut recorder, a, lambda) = recorder(&scratch, (1000, 0, 0), Limits::default());
+        let scratch = TestDir::new();
+        let (mut recorder, a, lambda) = recorder(&scratch, (1000, 0, 0), RecorderLimits::default());
         drive(&mut recorder, &[a], (0, 1000, 1), &[]);
         for ms in 1000..1500 {
             recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &ms.to_le_bytes()).unwrap();
             wake(&mut recorder, lambda, ms - late_ms);
             // Were it looked at again, it would be written again.
-            let oldest = recorder.stock.preroll.next(None).unwrap().place();
-            recorder.stock.preroll.mark(oldest, 0);
-            let settled = recorder.draft.as_ref().unwrap().settled.unwrap();
+            let oldest = recorder.state.preroll.next(None).unwrap().place();
+            recorder.state.preroll.mark(oldest, 0);
+            let settled = recorder.open_clip.as_ref().unwrap().settled.unwrap();
             assert_eq!(settled.newest, T0 + (ms - late_ms) * MS);
             let mut left = 0;
-            let mut next = recorder.stock.preroll.next(Some(settled.last));
+            let mut next = recorder.state.preroll.next(Some(settled.last));
             while let Some(walked) = next {
                 left += 1;
-                next = recorder.stock.preroll.next(Some(walked));
+                next = recorder.state.preroll.next(Some(walked));
             }
             assert!(left <= 3 * late_ms, "{left} entries are looked at again");
         }
@@ -186,8 +199,8 @@ fn a_lambda_that_triggers_in_every_wake_looks_only_at_what_is_new() {
 /// What the clips of a random drive hold: late triggers, samples out of order, windows that reach
 /// back by different lengths. With `forgets`, everything is looked at in every wake.
 fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
-    let mut random = Random(seed);
-    let scratch = Scratch::new();
+    let mut random = SeededRandom(seed);
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let rolls = [(random.below(8), 0), (random.below(300), random.below(20))];
@@ -197,8 +210,8 @@ fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
         let at = ms - random.below(3) * random.below(5);
         recorder.sample(a, &meta(T0 + at * MS, ms as u64), b"x").unwrap();
         for (lambda, rarely) in lambdas.iter().zip([6, 40]) {
-            if let (true, Some(draft)) = (forgets, &mut recorder.draft) {
-                draft.settled = None;
+            if let (true, Some(open_clip)) = (forgets, &mut recorder.open_clip) {
+                open_clip.settled = None;
             }
             if random.below(rarely) == 0 {
                 wake(&mut recorder, *lambda, ms - random.below(2) * random.below(20));
@@ -225,12 +238,12 @@ fn looking_only_at_what_is_new_misses_nothing() {
 
 #[test]
 fn a_topic_that_says_too_much_of_itself_is_refused() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let long = "x".repeat(64 << 10);
-    let named = Topic { name: long.clone(), ..topic("/a") };
-    let typed = Topic { type_name: long.clone(), ..topic("/a") };
-    let defined = Topic { definitions: Some("#".repeat(9 << 20).into()), ..topic("/a") };
+    let named = TopicSchema { name: long.clone(), ..topic("/a") };
+    let typed = TopicSchema { type_name: long.clone(), ..topic("/a") };
+    let defined = TopicSchema { definitions: Some("#".repeat(9 << 20).into()), ..topic("/a") };
     for (topic, what) in
         [(named, "name"), (typed, "type name"), (defined, "definitions and quality of service")]
     {
@@ -247,8 +260,8 @@ fn a_topic_that_says_too_much_of_itself_is_refused() {
 
 #[test]
 fn a_start_that_lasts_keeps_being_settled() {
-    let scratch = Scratch::new();
-    let (mut recorder, a, lambda) = recorder(&scratch, (50, 0, 0), Limits::default());
+    let scratch = TestDir::new();
+    let (mut recorder, a, lambda) = recorder(&scratch, (50, 0, 0), RecorderLimits::default());
     let second = recorder.add_lambda(member("second", (90, 0, 0), &[a]));
     let wakes: [(_, _, &[_]); 3] =
         [(200, lambda, &[Start]), (210, second, &[Event]), (205, second, &[])];

@@ -9,21 +9,21 @@ use crate::window::{Group, Windows};
 
 /// Triggers in order of their wakes.
 #[derive(Debug, Default)]
-pub(super) struct Waiting {
+pub(super) struct WaitingTriggers {
     moments: VecDeque<(usize, Moment)>,
     /// By lambda: those that there was no room for. Of them, only this is known.
-    untold: BTreeMap<usize, Untold>,
+    counted: BTreeMap<usize, CountedTriggers>,
 }
 
 /// Triggers of one lambda that are only counted.
 #[derive(Copy, Clone, Debug)]
-struct Untold {
+struct CountedTriggers {
     from: i64,
     to: i64,
     count: u64,
 }
 
-impl Waiting {
+impl WaitingTriggers {
     /// A trigger came. At most `most` wait: of more, the oldest that no window wants yet goes, or
     /// else the new one.
     pub(super) fn push(&mut self, lambda: usize, moment: Moment, windows: &Windows, most: usize) {
@@ -31,7 +31,7 @@ impl Waiting {
         while self.moments.front().is_some_and(|(_, moment)| moment.at_ns < horizon) {
             self.moments.pop_front();
         }
-        self.untold.retain(|_, untold| untold.to >= horizon);
+        self.counted.retain(|_, counted| counted.to >= horizon);
         if self.moments.len() < most {
             self.moments.push_back((lambda, moment));
             return;
@@ -51,9 +51,13 @@ impl Waiting {
             }
             None => (lambda, moment.at_ns),
         };
-        let untold = self.untold.entry(whose).or_insert(Untold { from: at, to: at, count: 0 });
-        *untold =
-            Untold { from: untold.from.min(at), to: untold.to.max(at), count: untold.count + 1 };
+        let counted =
+            self.counted.entry(whose).or_insert(CountedTriggers { from: at, to: at, count: 0 });
+        *counted = CountedTriggers {
+            from: counted.from.min(at),
+            to: counted.to.max(at),
+            count: counted.count + 1,
+        };
     }
 
     /// The trigger of `lambda` at `at_ns`, if it waits.
@@ -76,11 +80,11 @@ impl Waiting {
             }
         }
         let mut count = 0;
-        self.untold.retain(|lambda, untold| {
+        self.counted.retain(|lambda, counted| {
             // Not those of the clip before, if this one continues it.
-            let is_inside = group.from <= untold.from && untold.to <= *inside.end();
+            let is_inside = group.from <= counted.from && counted.to <= *inside.end();
             let is_taken = is_inside && group.lambdas.contains(lambda);
-            count += if is_taken { untold.count } else { 0 };
+            count += if is_taken { counted.count } else { 0 };
             !is_taken
         });
         count
@@ -90,12 +94,13 @@ impl Waiting {
     /// taken: they were only counted, and some of them lie outside.
     pub(super) fn uncertain(&self, group: &Group, limit: i64) -> Vec<usize> {
         let inside = inside(group, limit);
-        let overlaps =
-            |untold: &Untold| untold.from <= *inside.end() && *inside.start() <= untold.to;
+        let overlaps = |counted: &CountedTriggers| {
+            counted.from <= *inside.end() && *inside.start() <= counted.to
+        };
         let uncertain = self
-            .untold
+            .counted
             .iter()
-            .filter(|(lambda, untold)| group.lambdas.contains(lambda) && overlaps(untold));
+            .filter(|(lambda, counted)| group.lambdas.contains(lambda) && overlaps(counted));
         uncertain.map(|(lambda, _)| *lambda).collect()
     }
 }

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 
 use gleaner_lambda::TriggerKind;
 
-use super::{Group, Rules, Window};
+use super::{Group, Window, WindowRules};
 
 /// What became of a trigger.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Heard {
+pub enum TriggerOutcome {
     /// It opened a window.
     Opened,
     /// It ended the window that a start had opened.
@@ -25,7 +25,7 @@ pub enum Heard {
 
 /// Who triggers in the name of a lambda.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum By {
+enum TriggeredBy {
     Lambda,
     /// Somebody outside, who has nothing to do with what the lambda started, nor with its cooldown.
     Command,
@@ -33,7 +33,7 @@ enum By {
 
 /// What is to be done next.
 #[derive(Debug, PartialEq, Eq)]
-pub enum Step {
+pub enum WindowStep {
     /// A clip begins, with these windows; [`Windows::open`] has their group.
     Begin(Vec<Window>),
     /// These windows have joined the open clip.
@@ -56,13 +56,13 @@ pub enum Step {
     Finish(Box<Group>),
     /// A trigger came so late that its windows lie before the open clip: a clip that is made at
     /// once.
-    Stray(Vec<Window>, Box<Group>),
+    Late(Vec<Window>, Box<Group>),
 }
 
 /// The windows of all lambdas.
 #[derive(Debug)]
 pub struct Windows {
-    lambdas: Vec<Lambda>,
+    lambdas: Vec<WindowLambda>,
     longest_preroll_ns: i64,
     max_length_ns: i64,
     /// How long nothing is ended for good, as wakes may come late.
@@ -75,13 +75,13 @@ pub struct Windows {
 }
 
 #[derive(Debug)]
-struct Lambda {
-    rules: Rules,
+struct WindowLambda {
+    rules: WindowRules,
     /// Anchor of the last trigger that opened a window.
     opened_at: Option<i64>,
     /// Recordings that were started and not stopped, by their labels. Together they are one window:
     /// it lasts until the last stop.
-    started: BTreeSet<(By, String)>,
+    started: BTreeSet<(TriggeredBy, String)>,
 }
 
 /// Recordings of one lambda that may run at once, by their labels; and as many that commands
@@ -110,9 +110,9 @@ impl Windows {
     }
 
     /// Adds a lambda; they are numbered from 0.
-    pub fn add(&mut self, rules: Rules) -> usize {
+    pub fn add(&mut self, rules: WindowRules) -> usize {
         self.longest_preroll_ns = self.longest_preroll_ns.max(rules.preroll_ns);
-        self.lambdas.push(Lambda { rules, opened_at: None, started: BTreeSet::new() });
+        self.lambdas.push(WindowLambda { rules, opened_at: None, started: BTreeSet::new() });
         self.lambdas.len() - 1
     }
 
@@ -162,49 +162,61 @@ impl Windows {
 
     /// Lambda `lambda` triggered in a wake at `anchor`. A stop ends the recording that was started
     /// with the same label.
-    pub fn trigger(&mut self, lambda: usize, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
-        self.hear(lambda, By::Lambda, kind, label, anchor)
+    pub fn trigger(
+        &mut self,
+        lambda: usize,
+        kind: TriggerKind,
+        label: &str,
+        anchor: i64,
+    ) -> TriggerOutcome {
+        self.apply(lambda, TriggeredBy::Lambda, kind, label, anchor)
     }
 
     /// Somebody commands at `anchor` what `lambda` could trigger. A stop ends only what a command
     /// started.
-    pub fn command(&mut self, lambda: usize, kind: TriggerKind, label: &str, anchor: i64) -> Heard {
-        self.hear(lambda, By::Command, kind, label, anchor)
-    }
-
-    fn hear(
+    pub fn command(
         &mut self,
         lambda: usize,
-        by: By,
         kind: TriggerKind,
         label: &str,
         anchor: i64,
-    ) -> Heard {
-        let Some(state) = self.lambdas.get_mut(lambda) else { return Heard::Ignored };
+    ) -> TriggerOutcome {
+        self.apply(lambda, TriggeredBy::Command, kind, label, anchor)
+    }
+
+    fn apply(
+        &mut self,
+        lambda: usize,
+        by: TriggeredBy,
+        kind: TriggerKind,
+        label: &str,
+        anchor: i64,
+    ) -> TriggerOutcome {
+        let Some(state) = self.lambdas.get_mut(lambda) else { return TriggerOutcome::Ignored };
         let (rules, label) = (state.rules, (by, label.to_owned()));
         match kind {
-            TriggerKind::Start if state.started.contains(&label) => return Heard::Ignored,
+            TriggerKind::Start if state.started.contains(&label) => return TriggerOutcome::Ignored,
             TriggerKind::Start if state.started_by(by) >= STARTED_MAX => {
-                return Heard::TooManyStarted;
+                return TriggerOutcome::TooManyStarted;
             }
-            TriggerKind::Stop if !state.started.remove(&label) => return Heard::Ignored,
+            TriggerKind::Stop if !state.started.remove(&label) => return TriggerOutcome::Ignored,
             TriggerKind::Stop => {
                 if state.started.is_empty() {
                     self.stop(lambda, anchor.saturating_add(rules.postroll_ns));
                 }
-                return Heard::Stopped;
+                return TriggerOutcome::Stopped;
             }
             TriggerKind::Event | TriggerKind::Start if self.pending.len() >= WAITING_MAX => {
-                return Heard::TooManyWaiting;
+                return TriggerOutcome::TooManyWaiting;
             }
             TriggerKind::Event | TriggerKind::Start => {}
         }
-        if by == By::Lambda {
+        if by == TriggeredBy::Lambda {
             if state
                 .opened_at
                 .is_some_and(|last| last.abs_diff(anchor) < rules.cooldown_ns.unsigned_abs())
             {
-                return Heard::InCooldown;
+                return TriggerOutcome::InCooldown;
             }
             state.opened_at = Some(anchor);
         }
@@ -212,7 +224,7 @@ impl Windows {
             let is_covered = !state.started.is_empty();
             state.started.insert(label);
             if is_covered {
-                return Heard::Opened;
+                return TriggerOutcome::Opened;
             }
         }
         let to = (kind == TriggerKind::Event).then(|| anchor.saturating_add(rules.postroll_ns));
@@ -223,7 +235,7 @@ impl Windows {
             to,
             windows: 1,
         });
-        Heard::Opened
+        TriggerOutcome::Opened
     }
 
     /// Joins overlapping windows of one lambda, so that a lambda that triggers in every wake does
@@ -260,13 +272,13 @@ impl Windows {
     }
 
     /// What is to be done next; `None` until time passes or a trigger comes.
-    pub fn step(&mut self) -> Option<Step> {
+    pub fn step(&mut self) -> Option<WindowStep> {
         let (horizon, due) = (self.horizon(), self.now.saturating_sub(self.grace_ns));
         let Some(open) = &mut self.open else {
             let first = (0..self.pending.len()).min_by_key(|index| self.pending[*index].from)?;
             let windows = take_group(&mut self.pending, first);
             self.open = Group::new(&windows, horizon);
-            return Some(Step::Begin(windows));
+            return Some(WindowStep::Begin(windows));
         };
         if !self.pending.is_empty() {
             let mut fresh_from = None;
@@ -282,7 +294,7 @@ impl Windows {
                 joined.push(window);
             }
             if !joined.is_empty() {
-                return Some(Step::Join { windows: joined, fresh_from });
+                return Some(WindowStep::Join { windows: joined, fresh_from });
             }
             if let Some(index) = self
                 .pending
@@ -291,17 +303,17 @@ impl Windows {
             {
                 let windows = take_group(&mut self.pending, index);
                 let group = Group::new(&windows, horizon)?;
-                return Some(Step::Stray(windows, Box::new(group)));
+                return Some(WindowStep::Late(windows, Box::new(group)));
             }
         }
         let limit = open.from.saturating_add(self.max_length_ns);
         if limit < due && limit < open.to {
             let before = Box::new(open.clone());
             open.roll(limit);
-            return Some(Step::Roll { boundary: limit, before });
+            return Some(WindowStep::Roll { boundary: limit, before });
         }
         if due > open.to.saturating_add(self.longest_preroll_ns) {
-            return self.open.take().map(|group| Step::Finish(Box::new(group)));
+            return self.open.take().map(|group| WindowStep::Finish(Box::new(group)));
         }
         None
     }
@@ -318,11 +330,11 @@ impl Windows {
     /// that was nothing.
     pub fn end(&mut self, lambda: usize, at: i64) -> bool {
         let Some(state) =
-            self.lambdas.get_mut(lambda).filter(|state| state.started_by(By::Lambda) > 0)
+            self.lambdas.get_mut(lambda).filter(|state| state.started_by(TriggeredBy::Lambda) > 0)
         else {
             return false;
         };
-        state.started.retain(|(by, _)| *by != By::Lambda);
+        state.started.retain(|(by, _)| *by != TriggeredBy::Lambda);
         if state.started.is_empty() {
             let to = at.saturating_add(state.rules.postroll_ns);
             self.stop(lambda, to);
@@ -352,8 +364,8 @@ impl Windows {
     }
 }
 
-impl Lambda {
-    fn started_by(&self, by: By) -> usize {
+impl WindowLambda {
+    fn started_by(&self, by: TriggeredBy) -> usize {
         self.started.iter().filter(|(whose, _)| *whose == by).count()
     }
 }

@@ -17,11 +17,11 @@ mod machine;
 pub use group::Group;
 #[cfg(test)]
 use machine::STARTED_MAX;
-pub use machine::{Heard, Step, Windows};
+pub use machine::{TriggerOutcome, WindowStep, Windows};
 
 /// What one lambda's `[record]` says of its windows, in ns.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Rules {
+pub struct WindowRules {
     /// How far a window reaches back from its anchor.
     pub preroll_ns: i64,
     /// How far it reaches beyond.

@@ -3,9 +3,9 @@ use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 use super::*;
 
 /// Numbers that look random and are the same in each run (SplitMix64).
-struct Random(u64);
+struct SeededRandom(u64);
 
-impl Random {
+impl SeededRandom {
     fn below(&mut self, n: u64) -> i64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
@@ -15,13 +15,13 @@ impl Random {
     }
 }
 
-fn rules(preroll_ns: i64, postroll_ns: i64, cooldown_ns: i64) -> Rules {
-    Rules { preroll_ns, postroll_ns, cooldown_ns }
+fn rules(preroll_ns: i64, postroll_ns: i64, cooldown_ns: i64) -> WindowRules {
+    WindowRules { preroll_ns, postroll_ns, cooldown_ns }
 }
 
 const LONG: i64 = i64::MAX / 4;
 
-fn machine(max_length_ns: i64, rules: &[Rules]) -> Windows {
+fn machine(max_length_ns: i64, rules: &[WindowRules]) -> Windows {
     let mut windows = Windows::new(max_length_ns);
     rules.iter().for_each(|rules| {
         windows.add(*rules);
@@ -34,8 +34,8 @@ fn drain(windows: &mut Windows) -> Vec<Group> {
     let mut finished = Vec::new();
     while let Some(step) = windows.step() {
         match step {
-            Step::Finish(group) | Step::Stray(_, group) => finished.push(*group),
-            Step::Begin(_) | Step::Join { .. } | Step::Roll { .. } => {}
+            WindowStep::Finish(group) | WindowStep::Late(_, group) => finished.push(*group),
+            WindowStep::Begin(_) | WindowStep::Join { .. } | WindowStep::Roll { .. } => {}
         }
     }
     finished
@@ -81,7 +81,7 @@ fn a_start_lasts_until_its_stop_and_others_are_ignored() {
     assert_eq!(groups(&mut windows, &triggers), [(5, 502)]);
     let mut windows = machine(LONG, &[rules(5, 2, 0)]);
     let heard = triggers.map(|(at, kind)| windows.trigger(0, kind, "x", at));
-    use Heard::{Ignored, Opened, Stopped};
+    use TriggerOutcome::{Ignored, Opened, Stopped};
     assert_eq!(heard, [Ignored, Opened, Ignored, Opened, Stopped, Ignored]);
 }
 
@@ -95,16 +95,16 @@ fn the_end_of_an_event_may_be_later_than_the_stop() {
 fn a_cooldown_keeps_windows_shut_for_as_long_as_it_says() {
     let mut windows = machine(LONG, &[rules(1, 1, 10)]);
     let heard = [0, 9, 10, 19, 25].map(|at| windows.trigger(0, Event, "x", at));
-    use Heard::{InCooldown, Opened};
+    use TriggerOutcome::{InCooldown, Opened};
     assert_eq!(heard, [Opened, InCooldown, Opened, InCooldown, Opened]);
     assert_eq!(windows.trigger(0, Start, "x", 30), InCooldown);
-    assert_eq!(windows.trigger(0, Stop, "x", 31), Heard::Ignored);
+    assert_eq!(windows.trigger(0, Stop, "x", 31), TriggerOutcome::Ignored);
 }
 
 #[test]
 fn a_late_trigger_without_a_cooldown_opens_its_window() {
     let mut windows = machine(LONG, &[rules(1, 1, 0)]);
-    assert_eq!([20, 10].map(|at| windows.trigger(0, Event, "x", at)), [Heard::Opened; 2]);
+    assert_eq!([20, 10].map(|at| windows.trigger(0, Event, "x", at)), [TriggerOutcome::Opened; 2]);
 }
 
 #[test]
@@ -166,7 +166,7 @@ fn a_long_clip_is_cut_without_a_gap() {
     for now in 51..400 {
         windows.pass(now);
         while let Some(step) = windows.step() {
-            let Step::Roll { boundary, before } = step else { panic!("{step:?}") };
+            let WindowStep::Roll { boundary, before } = step else { panic!("{step:?}") };
             assert_eq!((now, before.from + 100), (boundary + 1, boundary));
             assert_eq!(
                 windows.open().map(|group| (group.from, group.windows(0))),
@@ -195,7 +195,7 @@ fn extreme_times_do_not_overflow() {
 type Plain = (usize, i64, i64);
 
 /// The model: all windows at once, then those that hang together. No state, no order of arrival.
-fn model(rules: &[Rules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Plain>> {
+fn model(rules: &[WindowRules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Plain>> {
     let mut windows: Vec<Plain> = Vec::new();
     for (lambda, rules) in rules.iter().enumerate() {
         let mut opened_at = None;
@@ -236,7 +236,7 @@ fn model(rules: &[Rules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Pla
 #[test]
 fn random_triggers_make_the_groups_of_the_model() {
     for seed in 0..3_000 {
-        let mut random = Random(seed);
+        let mut random = SeededRandom(seed);
         let lambdas = 1 + random.below(3) as usize;
         let mut roll = || [0, random.below(5), random.below(40)][random.below(3) as usize];
         let rules: Vec<_> = (0..lambdas).map(|_| rules(roll(), roll(), roll())).collect();
@@ -246,8 +246,8 @@ fn random_triggers_make_the_groups_of_the_model() {
         let mut act = |windows: &mut Windows| {
             while let Some(step) = windows.step() {
                 match step {
-                    Step::Finish(group) => finished.push(*group),
-                    Step::Begin(new) | Step::Join { windows: new, .. } => {
+                    WindowStep::Finish(group) => finished.push(*group),
+                    WindowStep::Begin(new) | WindowStep::Join { windows: new, .. } => {
                         assert!(
                             new.iter().all(|window| window.from >= trimmed),
                             "what it needs is gone: {seed}"
@@ -308,38 +308,38 @@ fn random_triggers_make_the_groups_of_the_model() {
 #[test]
 fn a_stop_ends_the_recording_of_its_label_and_the_clip_lasts_until_the_last() {
     let mut windows = Windows::new(1_000_000);
-    windows.add(Rules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
+    windows.add(WindowRules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
     windows.pass(100);
-    assert_eq!(windows.trigger(0, Start, "a", 100), Heard::Opened);
-    assert!(matches!(windows.step(), Some(Step::Begin(_))));
-    assert_eq!(windows.trigger(0, Start, "b", 110), Heard::Opened);
-    assert_eq!(windows.trigger(0, Start, "b", 111), Heard::Ignored);
-    assert_eq!(windows.trigger(0, Stop, "c", 112), Heard::Ignored);
-    assert_eq!(windows.trigger(0, Stop, "a", 120), Heard::Stopped);
+    assert_eq!(windows.trigger(0, Start, "a", 100), TriggerOutcome::Opened);
+    assert!(matches!(windows.step(), Some(WindowStep::Begin(_))));
+    assert_eq!(windows.trigger(0, Start, "b", 110), TriggerOutcome::Opened);
+    assert_eq!(windows.trigger(0, Start, "b", 111), TriggerOutcome::Ignored);
+    assert_eq!(windows.trigger(0, Stop, "c", 112), TriggerOutcome::Ignored);
+    assert_eq!(windows.trigger(0, Stop, "a", 120), TriggerOutcome::Stopped);
     assert!(windows.open().is_some_and(Group::waits_for_stop));
-    assert_eq!(windows.trigger(0, Stop, "b", 130), Heard::Stopped);
+    assert_eq!(windows.trigger(0, Stop, "b", 130), TriggerOutcome::Stopped);
     assert_eq!(windows.open().map(|group| (group.from, group.to)), Some((95, 135)));
 }
 
 #[test]
 fn a_lambda_that_starts_ever_new_recordings_is_heard_up_to_a_bound() {
     let mut windows = Windows::new(1_000_000);
-    windows.add(Rules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
+    windows.add(WindowRules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
     let heard = (0..STARTED_MAX + 1)
         .map(|n| windows.trigger(0, Start, &n.to_string(), 100))
         .collect::<Vec<_>>();
-    assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
-    assert_eq!(heard.last(), Some(&Heard::TooManyStarted));
+    assert_eq!(heard.iter().filter(|heard| **heard == TriggerOutcome::Opened).count(), STARTED_MAX);
+    assert_eq!(heard.last(), Some(&TriggerOutcome::TooManyStarted));
 }
 
 #[test]
 fn more_windows_than_may_wait_are_refused_as_that() {
     let mut windows = machine(LONG, &[rules(0, 0, 0)]);
     let heard: Vec<_> = (0..4097).map(|n| windows.trigger(0, Event, "x", 10 * n)).collect();
-    assert!(heard[..4096].iter().all(|heard| *heard == Heard::Opened));
+    assert!(heard[..4096].iter().all(|heard| *heard == TriggerOutcome::Opened));
     assert_eq!(
         (heard[4096], windows.trigger(0, Start, "y", 100_000)),
-        (Heard::TooManyWaiting, Heard::TooManyWaiting)
+        (TriggerOutcome::TooManyWaiting, TriggerOutcome::TooManyWaiting)
     );
     assert_eq!(windows.forget_waiting(), 4096);
 }
@@ -362,14 +362,14 @@ fn what_comes_late_is_waited_for_before_anything_is_ended() {
     windows.trigger(0, Start, "x", 2000);
     windows.pass(2090 + 30);
     assert!(
-        matches!(windows.step(), Some(Step::Begin(_))) && windows.step().is_none(),
+        matches!(windows.step(), Some(WindowStep::Begin(_))) && windows.step().is_none(),
         "it is full, and waits"
     );
     windows.pass(2091 + 30);
-    assert!(matches!(windows.step(), Some(Step::Roll { boundary: 2090, .. })));
+    assert!(matches!(windows.step(), Some(WindowStep::Roll { boundary: 2090, .. })));
     // A stray is one that nothing can join any more.
     windows.trigger(1, Event, "x", 2091 - 102);
-    assert!(windows.step().is_some_and(|step| matches!(step, Step::Stray(..))));
+    assert!(windows.step().is_some_and(|step| matches!(step, WindowStep::Late(..))));
     windows.set_grace(i64::MAX / 2);
     windows.trigger(1, Event, "x", 2091 - 102);
     assert_eq!(windows.step(), None);
@@ -379,23 +379,23 @@ fn what_comes_late_is_waited_for_before_anything_is_ended() {
 fn commands_and_triggers_end_only_what_is_their_own() {
     let mut windows = machine(1_000_000, &[rules(10, 10, 1000)]);
     windows.pass(100);
-    assert_eq!(windows.trigger(0, Event, "x", 100), Heard::Opened);
+    assert_eq!(windows.trigger(0, Event, "x", 100), TriggerOutcome::Opened);
     let heard = [0, 1, 2].map(|at| windows.command(0, Event, "x", 100 + at));
-    assert_eq!(heard, [Heard::Opened; 3], "a cooldown is the lambda's");
-    assert_eq!(windows.trigger(0, Event, "x", 103), Heard::InCooldown);
-    assert_eq!(windows.command(0, Start, "a", 105), Heard::Opened);
-    assert_eq!(windows.command(0, Start, "a", 106), Heard::Ignored);
-    assert_eq!(windows.trigger(0, Stop, "a", 107), Heard::Ignored);
-    assert_eq!(windows.trigger(0, Start, "a", 1200), Heard::Opened);
-    assert_eq!(windows.command(0, Stop, "a", 1300), Heard::Stopped);
-    assert_eq!(windows.command(0, Stop, "a", 1301), Heard::Ignored);
+    assert_eq!(heard, [TriggerOutcome::Opened; 3], "a cooldown is the lambda's");
+    assert_eq!(windows.trigger(0, Event, "x", 103), TriggerOutcome::InCooldown);
+    assert_eq!(windows.command(0, Start, "a", 105), TriggerOutcome::Opened);
+    assert_eq!(windows.command(0, Start, "a", 106), TriggerOutcome::Ignored);
+    assert_eq!(windows.trigger(0, Stop, "a", 107), TriggerOutcome::Ignored);
+    assert_eq!(windows.trigger(0, Start, "a", 1200), TriggerOutcome::Opened);
+    assert_eq!(windows.command(0, Stop, "a", 1300), TriggerOutcome::Stopped);
+    assert_eq!(windows.command(0, Stop, "a", 1301), TriggerOutcome::Ignored);
     drain(&mut windows);
     assert!(windows.open().unwrap().waits_for_stop(), "the lambda's goes on");
-    assert_eq!(windows.command(0, Start, "b", 1310), Heard::Opened);
+    assert_eq!(windows.command(0, Start, "b", 1310), TriggerOutcome::Opened);
     assert!(windows.end(0, 1400));
     assert!(windows.open().unwrap().waits_for_stop(), "a command's outlives the lambda");
     assert!(!windows.end(0, 1401));
-    assert_eq!(windows.command(0, Stop, "b", 1500), Heard::Stopped);
+    assert_eq!(windows.command(0, Stop, "b", 1500), TriggerOutcome::Stopped);
     windows.pass(LONG);
     assert_eq!(
         drain(&mut windows).iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(),
@@ -412,5 +412,5 @@ fn a_lambda_that_starts_too_much_keeps_no_command_from_starting() {
     let heard = (0..STARTED_MAX + 1)
         .map(|n| windows.command(0, Start, &n.to_string(), 100))
         .collect::<Vec<_>>();
-    assert_eq!(heard.iter().filter(|heard| **heard == Heard::Opened).count(), STARTED_MAX);
+    assert_eq!(heard.iter().filter(|heard| **heard == TriggerOutcome::Opened).count(), STARTED_MAX);
 }

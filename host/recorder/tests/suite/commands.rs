@@ -7,33 +7,33 @@ use crate::running::*;
 use crate::support::*;
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_lambda::{Clip, TriggerKind};
-use gleaner_protocol::Recording;
+use gleaner_protocol::RecordingCounts;
 use gleaner_protocol::link::{CommandStatus, RecorderLink};
-use gleaner_transport::Verdict;
+use gleaner_transport::Delivery;
 
 const TOPIC: &str = "/gleaner/commands";
 /// The writer that `meta` names, in hexadecimal digits.
 const SOURCE: &str = "command on /gleaner/commands by 07070707070707070707070707070707";
 
 /// A process that hears commands, with a sensor on `/a`.
-struct Commanded {
+struct CommandedRun {
     running: Running,
-    network: Network,
+    network: FakeNetwork,
     _sensor: Sensor,
 }
 
-impl Commanded {
-    fn start(scratch: &Scratch) -> Commanded {
-        let network = Network::default();
+impl CommandedRun {
+    fn start(scratch: &TestDir) -> CommandedRun {
+        let network = FakeNetwork::default();
         network.add("/a");
         network.add_texts(TOPIC);
         let running =
             Running::start(scratch, &network, |options| options.commands = Some(TOPIC.to_owned()));
         let sensor = Sensor::start(&network, running.clock);
-        Commanded { running, network, _sensor: sensor }
+        CommandedRun { running, network, _sensor: sensor }
     }
 
-    fn join(&mut self, scratch: &Scratch, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
+    fn join(&mut self, scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
         let (folder, header) = lambda(scratch, name, rolls_ms);
         let mut link = RecorderLink::new(self.running.control.add(&add(&folder)).unwrap());
         link.hello(&header, PATIENCE).unwrap();
@@ -41,7 +41,7 @@ impl Commanded {
     }
 
     /// Says something; once somebody listens.
-    fn say(&self, text: impl AsRef<[u8]>) -> (i64, Verdict) {
+    fn say(&self, text: impl AsRef<[u8]>) -> (i64, Delivery) {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let at = self.running.clock.now();
@@ -78,8 +78,8 @@ fn moments(clip: &Clip) -> Vec<(&str, TriggerKind, &str, Option<&str>)> {
 
 #[test]
 fn an_event_by_command_records_as_the_lambda_would_and_stands_in_no_journal() {
-    let scratch = Scratch::new();
-    let mut commanded = Commanded::start(&scratch);
+    let scratch = TestDir::new();
+    let mut commanded = CommandedRun::start(&scratch);
     let mut link = commanded.join(&scratch, "first", (5000, 100));
     received(&mut commanded.running, 300);
     // The only lambda needs no name. The stamp of this wake lies in the window.
@@ -108,8 +108,8 @@ fn an_event_by_command_records_as_the_lambda_would_and_stands_in_no_journal() {
 
 #[test]
 fn a_stop_ends_what_a_command_started_and_nothing_else() {
-    let scratch = Scratch::new();
-    let mut commanded = Commanded::start(&scratch);
+    let scratch = TestDir::new();
+    let mut commanded = CommandedRun::start(&scratch);
     let mut first = commanded.join(&scratch, "first", (0, 0));
     let second = commanded.join(&scratch, "second", (0, 0));
     received(&mut commanded.running, 50);
@@ -139,42 +139,42 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
             ("second", TriggerKind::Stop, "here", source)
         ]
     );
-    assert_eq!(clip.short, ["first ended before it said stop"]);
+    assert_eq!(clip.incomplete, ["first ended before it said stop"]);
     commanded.accepted_and_refused(2, 2);
     commanded.end();
 }
 
 #[test]
 fn too_many_too_long_and_senseless_commands_are_counted_and_do_nothing() {
-    let scratch = Scratch::new();
-    let mut commanded = Commanded::start(&scratch);
+    let scratch = TestDir::new();
+    let mut commanded = CommandedRun::start(&scratch);
     let long = format!(r#"{{"command": "event", "label": "x"}}{}"#, " ".repeat(4096));
-    assert_eq!(commanded.say(&long).1, Verdict::TooBig);
+    assert_eq!(commanded.say(&long).1, Delivery::TooBig);
     for text in [
         "",
         "{\"command\": \"event\", \"label\": \"\u{1b}[2J\", \"lambda\": \"\u{7}\"}",
         "{\"command\":\"x\"}",
     ] {
-        assert_eq!(commanded.say(text).1, Verdict::Taken);
+        assert_eq!(commanded.say(text).1, Delivery::Taken);
     }
     commanded.say([0xff; 100]);
     commanded.accepted_and_refused(0, 5);
     let verdicts: Vec<_> =
         (0..10_000).map(|_| commanded.say(r#"{"command":"event","label":"x"}"#).1).collect();
-    let taken = verdicts.iter().filter(|verdict| **verdict == Verdict::Taken).count();
+    let taken = verdicts.iter().filter(|verdict| **verdict == Delivery::Taken).count();
     assert!(taken < 100, "at most five at once, and one each second: {taken}");
     commanded.accepted_and_refused(0, 5 + 10_000);
     let last = {
         commanded.running.control.stop().unwrap();
         commanded.running.ended().0
     };
-    assert_eq!(last.recording, Recording::default());
+    assert_eq!(last.recording, RecordingCounts::default());
 }
 
 #[test]
 fn nobody_commands_where_nobody_asked_for_it() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     network.add("/a");
     network.add_texts(TOPIC);
     let mut running = Running::start(&scratch, &network, |_| {});

@@ -12,7 +12,7 @@ use gleaner_lambda::Clip;
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_lambda::manifest::Store;
 use gleaner_protocol::link::Loss;
-use gleaner_recorder::{Folder, RecordError};
+use gleaner_recorder::{RecordError, RecordingFolder};
 
 const PRECIOUS: &str = "precious, and without a newline at its end";
 
@@ -21,7 +21,7 @@ fn pipe(path: &Path) {
 }
 
 /// A file that nobody may touch.
-fn precious(scratch: &Scratch) -> PathBuf {
+fn precious(scratch: &TestDir) -> PathBuf {
     let path = scratch.0.join("precious");
     fs::write(&path, PRECIOUS).unwrap();
     path
@@ -50,7 +50,7 @@ fn assert_refused(error: RecordError, path: &Path, why: &str) {
     assert_eq!(failure.exit, Exit::Internal);
 }
 
-fn one_clip(scratch: &Scratch, store: Store) -> Result<Vec<Clip>, RecordError> {
+fn one_clip(scratch: &TestDir, store: Store) -> Result<Vec<Clip>, RecordError> {
     let mut recorder = scratch.recorder(|settings| settings.store = store);
     let topics = [recorder.add_topic(topic("/a")).unwrap()];
     let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &topics));
@@ -68,12 +68,12 @@ fn one_clip(scratch: &Scratch, store: Store) -> Result<Vec<Clip>, RecordError> {
 fn a_list_or_a_lock_that_is_no_file_of_ours_is_refused() {
     for name in ["clips.jsonl", "clips/.lock"] {
         for (put, why) in IN_THE_WAY {
-            let scratch = Scratch::new();
+            let scratch = TestDir::new();
             let precious = precious(&scratch);
             let path = scratch.0.join(name);
             fs::create_dir(scratch.0.join("clips")).unwrap();
             put(&precious, &path);
-            assert_refused(Folder::open(&scratch.0).err().unwrap(), &path, why);
+            assert_refused(RecordingFolder::open(&scratch.0).err().unwrap(), &path, why);
             assert!(is_untouched(&precious), "{name}: {why}");
             assert!(!precious.with_extension("nothing").exists());
         }
@@ -83,9 +83,9 @@ fn a_list_or_a_lock_that_is_no_file_of_ours_is_refused() {
 #[test]
 fn a_list_that_is_replaced_while_the_recorder_runs_is_not_written_to() {
     for (put, why) in IN_THE_WAY {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let precious = precious(&scratch);
-        let (mut folder, _) = Folder::open(&scratch.0).unwrap();
+        let (mut folder, _) = RecordingFolder::open(&scratch.0).unwrap();
         let path = scratch.0.join("clips.jsonl");
         put(&precious, &path);
         assert_refused(folder.replace(&[]).err().unwrap(), &path, why);
@@ -96,16 +96,16 @@ fn a_list_that_is_replaced_while_the_recorder_runs_is_not_written_to() {
 #[test]
 fn losses_are_noted_in_a_file_of_ours_only() {
     for (put, why) in IN_THE_WAY {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let precious = precious(&scratch);
-        let (folder, _) = Folder::open(&scratch.0).unwrap();
+        let (folder, _) = RecordingFolder::open(&scratch.0).unwrap();
         let path = scratch.0.join("losses.jsonl");
         put(&precious, &path);
         let loss = Loss::NotDeleted {
             at_ns: 0,
             file: "clips/a.mcap".into(),
             bytes: 1,
-            why: "why".to_owned(),
+            reason: "why".to_owned(),
         };
         assert_refused(folder.losses().note(&loss).err().unwrap(), &path, why);
         assert!(is_untouched(&precious), "{why}");
@@ -114,13 +114,13 @@ fn losses_are_noted_in_a_file_of_ours_only() {
 
 #[test]
 fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
-    let (scratch, elsewhere) = (Scratch::new(), Scratch::new());
+    let (scratch, elsewhere) = (TestDir::new(), TestDir::new());
     let clips = scratch.0.join("clips");
     symlink(&elsewhere.0, &clips).unwrap();
-    assert_refused(Folder::open(&scratch.0).err().unwrap(), &clips, "it is a link");
+    assert_refused(RecordingFolder::open(&scratch.0).err().unwrap(), &clips, "it is a link");
     fs::remove_file(&clips).unwrap();
     fs::write(&clips, "").unwrap();
-    assert_refused(Folder::open(&scratch.0).err().unwrap(), &clips, "it is no folder");
+    assert_refused(RecordingFolder::open(&scratch.0).err().unwrap(), &clips, "it is no folder");
     fs::remove_file(&clips).unwrap();
     let preroll = scratch.0.join("preroll");
     fs::write(elsewhere.0.join("0.chunk"), PRECIOUS).unwrap();
@@ -133,9 +133,10 @@ fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
         clock: "log time of the drive".to_owned(),
         prefault: false,
     };
-    let refused = gleaner_recorder::Recorder::new(Folder::open(&scratch.0).unwrap().0, settings)
-        .err()
-        .unwrap();
+    let refused =
+        gleaner_recorder::Recorder::new(RecordingFolder::open(&scratch.0).unwrap().0, settings)
+            .err()
+            .unwrap();
     assert_refused(refused, &preroll, "it is a link");
     assert!(is_untouched(&elsewhere.0.join("0.chunk")));
     assert_eq!(fs::read_dir(&elsewhere.0).unwrap().count(), 1, "nothing was made there");
@@ -145,7 +146,7 @@ fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
 fn what_has_the_names_of_unfinished_files_loses_them_and_nothing_else() {
     // A clip begins by a name that nobody has, and a list and the preroll by new files.
     for (put, why) in IN_THE_WAY {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let precious = precious(&scratch);
         fs::create_dir_all(scratch.0.join("clips")).unwrap();
         let stem = "clips/hello-20180802T083452.000Z";
@@ -154,7 +155,7 @@ fn what_has_the_names_of_unfinished_files_loses_them_and_nothing_else() {
         {
             put(&precious, &scratch.0.join(name));
         }
-        Folder::open(&scratch.0).unwrap().0.replace(&[]).unwrap();
+        RecordingFolder::open(&scratch.0).unwrap().0.replace(&[]).unwrap();
         let clips = one_clip(&scratch, Store::Disk).unwrap();
         assert_eq!(clips.len(), 1, "{why}");
         assert!(clips[0].file.to_str().unwrap().starts_with(stem), "{:?}", clips[0].file);
@@ -166,7 +167,7 @@ fn what_has_the_names_of_unfinished_files_loses_them_and_nothing_else() {
 
 #[test]
 fn a_pipe_that_is_named_like_a_clip_is_not_waited_for() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     {
         let mut recorder = scratch.recorder(|_| {});
         let topics = [recorder.add_topic(topic("/a")).unwrap()];
@@ -178,7 +179,7 @@ fn a_pipe_that_is_named_like_a_clip_is_not_waited_for() {
         || fs::read_dir(scratch.0.join("clips")).unwrap().map(|entry| entry.unwrap().path());
     let part = parts().find(|path| path.to_str().unwrap().ends_with(".mcap.part")).unwrap();
     pipe(&part.with_extension(""));
-    let (_, found) = Folder::open(&scratch.0).unwrap();
+    let (_, found) = RecordingFolder::open(&scratch.0).unwrap();
     assert_eq!(found.len(), 1);
     assert!(found[0].file.to_str().unwrap().ends_with("-2.mcap"), "{:?}", found[0].file);
 }

@@ -13,8 +13,8 @@ use crate::running::*;
 use crate::support::*;
 use gleaner_lambda::Clip;
 use gleaner_lambda::TriggerKind::Event;
-use gleaner_protocol::link::{Control, RecorderLink, RecorderReport};
-use gleaner_recorder::Folder;
+use gleaner_protocol::link::{ControlClient, RecorderLink, RecorderReport};
+use gleaner_recorder::RecordingFolder;
 use gleaner_recorder::program::run;
 use gleaner_transport::{Clock, LiveSource};
 
@@ -27,10 +27,10 @@ const KILLS: u64 = 10;
 #[ignore = "started by what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill"]
 fn child() {
     let Some(out) = std::env::var_os("GLEANER_TEST_OUT") else { return };
-    let scratch = std::mem::ManuallyDrop::new(Scratch(out.into()));
-    let (network, clock) = (Network::default(), Clock::of_today());
+    let scratch = std::mem::ManuallyDrop::new(TestDir(out.into()));
+    let (network, clock) = (FakeNetwork::default(), Clock::from_time_of_day());
     network.add("/a");
-    let (mut control, stdin) = Control::pair().unwrap();
+    let (mut control, stdin) = ControlClient::pair().unwrap();
     let (feed, options) = (network.clone(), options(&scratch.0, clock));
     // What is in a file was written, whenever the kill comes.
     let reports = File::create(scratch.0.join("reports.jsonl")).unwrap();
@@ -73,7 +73,7 @@ fn in_whole_chunks(part: &Path) -> Vec<u32> {
     messages.map_while(Result::ok).map(|message| message.sequence).collect()
 }
 
-fn numbers(scratch: &Scratch, clip: &Clip) -> Vec<u32> {
+fn numbers(scratch: &TestDir, clip: &Clip) -> Vec<u32> {
     scratch.messages(clip).into_iter().map(|(_, _, seq, _)| seq).collect()
 }
 
@@ -89,10 +89,10 @@ fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
         KILLS
     };
     let kills = std::env::var("GLEANER_KILLS").map_or(usual, |kills| kills.parse().unwrap());
-    let mut random = Random(5);
+    let mut random = SeededRandom(5);
     let (mut reported, mut saved, mut saved_messages) = (0, 0, 0);
     for kill in 0..kills {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let mut child = Command::new(std::env::current_exe().unwrap())
             .args(["--exact", "kills::child", "--ignored"])
             .env("GLEANER_TEST_OUT", &scratch.0)
@@ -117,7 +117,7 @@ fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
             .filter(|path| path.extension().is_some_and(|end| end == "part"))
             .map(|path| in_whole_chunks(&path))
             .collect();
-        let (_folder, recovered) = Folder::open(&scratch.0).unwrap();
+        let (_folder, recovered) = RecordingFolder::open(&scratch.0).unwrap();
         let listed = fs::read_to_string(scratch.0.join("clips.jsonl")).unwrap_or_default();
         let listed: Vec<Clip> =
             listed.lines().map(|line| serde_json::from_str(line).unwrap()).collect();

@@ -5,12 +5,12 @@ use std::time::Duration;
 use crate::support::*;
 use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 use gleaner_lambda::manifest::Store;
-use gleaner_recorder::{Folder, LambdaId, Recorder, Settings, TopicId};
+use gleaner_recorder::{LambdaId, Recorder, RecordingFolder, Settings, TopicId};
 
 /// With one topic and a lambda that keeps nothing from before a trigger, so that nothing waits for
 /// longer than it must.
 fn recorder(
-    scratch: &Scratch,
+    scratch: &TestDir,
     postroll_ms: i64,
     max_length_ms: u64,
 ) -> (Recorder, TopicId, LambdaId) {
@@ -22,7 +22,8 @@ fn recorder(
         clock: "monotonic".to_owned(),
         prefault: false,
     };
-    let mut recorder = Recorder::live(Folder::open(&scratch.0).unwrap().0, settings).unwrap();
+    let mut recorder =
+        Recorder::live(RecordingFolder::open(&scratch.0).unwrap().0, settings).unwrap();
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (0, postroll_ms, 0), &[a]));
     (recorder, a, lambda)
@@ -54,14 +55,14 @@ fn late_drive(
 
 #[test]
 fn wakes_that_come_late_are_in_the_journals_of_their_clips() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut recorder, a, lambda) = recorder(&scratch, 150, 600_000);
     late_drive(&mut recorder, a, lambda, 1500, &[(310, Event), (800, Event)]);
     recorder.finish(T0 + 1500 * MS).unwrap();
     let clips = recorder.clips();
     assert_eq!(clips.len(), 2);
     for (clip, from) in clips.iter().zip([310, 800]) {
-        assert_eq!(clip.short, [""; 0]);
+        assert_eq!(clip.incomplete, [""; 0]);
         assert_eq!((clip.topics[0].lost, clip.topics[0].received), (Some(0), Some(151)));
         assert_eq!(stamps(&scratch, clip, "/a"), every(from, from + 150, 1));
         let wakes: Vec<_> =
@@ -73,7 +74,7 @@ fn wakes_that_come_late_are_in_the_journals_of_their_clips() {
 
 #[test]
 fn clips_that_go_on_share_out_wakes_that_come_late() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut recorder, a, lambda) = recorder(&scratch, 0, 300);
     late_drive(&mut recorder, a, lambda, 2000, &[(250, Start), (1490, Stop)]);
     recorder.finish(T0 + 2000 * MS).unwrap();
@@ -95,7 +96,7 @@ fn clips_that_go_on_share_out_wakes_that_come_late() {
 #[test]
 fn a_full_clip_that_waits_for_wakes_loses_nothing_when_everything_ends() {
     for is_held in [true, false] {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let (mut recorder, a, lambda) = recorder(&scratch, 0, 300);
         // It is full at 400, and waits until 600.
         late_drive(&mut recorder, a, lambda, 500, &[(100, Start)]);
@@ -116,6 +117,6 @@ fn a_full_clip_that_waits_for_wakes_loses_nothing_when_everything_ends() {
         } else {
             "the recording was stopped before the window ended"
         };
-        assert_eq!(rest.short, ["continues the clip before", why]);
+        assert_eq!(rest.incomplete, ["continues the clip before", why]);
     }
 }

@@ -5,12 +5,12 @@ use std::time::Duration;
 use crate::support::*;
 use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 use gleaner_lambda::manifest::Store;
-use gleaner_recorder::{Folder, Recorder, Settings, Work};
+use gleaner_recorder::{Recorder, RecordingFolder, Settings, Work};
 use gleaner_transport::{Guid, SampleMeta};
 
 const EVENT: &[TriggerKind] = &[Event];
 
-fn live(scratch: &Scratch, change: impl FnOnce(&mut Settings)) -> Recorder {
+fn live(scratch: &TestDir, change: impl FnOnce(&mut Settings)) -> Recorder {
     let mut settings = Settings {
         store: Store::Ram,
         preroll_bytes: 16 << 20,
@@ -20,14 +20,14 @@ fn live(scratch: &Scratch, change: impl FnOnce(&mut Settings)) -> Recorder {
         prefault: true,
     };
     change(&mut settings);
-    Recorder::live(Folder::open(&scratch.0).unwrap().0, settings).unwrap()
+    Recorder::live(RecordingFolder::open(&scratch.0).unwrap().0, settings).unwrap()
 }
 
 /// What the clips of a random drive hold, each by itself. Triggers come at once; `work` is done as
 /// often as chance has it.
 fn random_drive(seed: u64, is_live: bool) -> Vec<Vec<(String, i64, u32)>> {
-    let (mut random, mut pace) = (Random(seed), Random(seed + 1000));
-    let scratch = Scratch::new();
+    let (mut random, mut pace) = (SeededRandom(seed), SeededRandom(seed + 1000));
+    let scratch = TestDir::new();
     let store = |settings: &mut Settings| {
         settings.store = if seed.is_multiple_of(2) { Store::Ram } else { Store::Disk }
     };
@@ -83,7 +83,7 @@ fn clips_are_those_of_a_drive_whenever_the_work_is_done() {
 #[test]
 fn clips_that_go_on_hold_everything_once_whenever_the_work_is_done() {
     for every in [1, 7, 60] {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let mut recorder =
             live(&scratch, |settings| settings.max_length = Duration::from_millis(100));
         let a = recorder.add_topic(topic("/a")).unwrap();
@@ -109,11 +109,11 @@ fn clips_that_go_on_hold_everything_once_whenever_the_work_is_done() {
 
 #[test]
 fn little_is_on_its_way_to_the_disk_however_fast_samples_come() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 256 << 20);
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (1000, 1000, 0), &[a]));
-    let mut noise = Random(1);
+    let mut noise = SeededRandom(1);
     let bytes: Vec<u8> = (0..1 << 20).map(|_| noise.below(256) as u8).collect();
     let mut highest = 0;
     for ms in 0..200 {
@@ -132,7 +132,7 @@ fn little_is_on_its_way_to_the_disk_however_fast_samples_come() {
     let clip = &recorder.clips()[0];
     assert_eq!(stamps(&scratch, clip, "/a"), (0..200).collect::<Vec<_>>());
     assert_eq!(
-        clip.short,
+        clip.incomplete,
         [
             "the preroll begins 0.9 s late: nothing was recorded before",
             "the recording was stopped before the window ended"
@@ -142,7 +142,7 @@ fn little_is_on_its_way_to_the_disk_however_fast_samples_come() {
 
 #[test]
 fn what_has_to_go_before_it_is_written_is_counted() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 50_000);
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (100, 1000, 0), &[a]));
@@ -163,7 +163,7 @@ fn what_has_to_go_before_it_is_written_is_counted() {
 
 #[test]
 fn gaps_in_numbers_are_losses_of_the_clip_that_they_are_in() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let late = recorder.add_missing_topic("/late").unwrap();
@@ -215,13 +215,13 @@ fn gaps_in_numbers_are_losses_of_the_clip_that_they_are_in() {
         "/late was found 0.1 s after the clip begins",
         "the journal of hello lacks 3 wakes: lost on the way to the recorder",
     ];
-    assert_eq!(clip.short, expected);
+    assert_eq!(clip.incomplete, expected);
     assert_eq!(scratch.journal(clip, "hello").0.wakes_before, 3);
 }
 
 #[test]
 fn while_nothing_may_be_recorded_triggers_are_counted_and_the_open_clip_ends() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (50, 500, 0), &[a]));
@@ -238,16 +238,16 @@ fn while_nothing_may_be_recorded_triggers_are_counted_and_the_open_clip_ends() {
     recorder.finish(T0 + 2 * S).unwrap();
     let [early, whole] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
     assert_eq!(
-        (stamps(&scratch, early, "/a"), early.short.as_slice()),
+        (stamps(&scratch, early, "/a"), early.incomplete.as_slice()),
         (every(50, 300, 1), &["the disk is full".to_owned()][..])
     );
-    assert_eq!((stamps(&scratch, whole, "/a"), whole.short.len()), (every(950, 1500, 1), 0));
+    assert_eq!((stamps(&scratch, whole, "/a"), whole.incomplete.len()), (every(950, 1500, 1), 0));
     assert_eq!(recorder.counts().recording.disk_suppressed, 1);
 }
 
 #[test]
 fn a_lambda_that_ends_stops_what_it_started() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (0, 50, 0), &[a]));
@@ -263,12 +263,12 @@ fn a_lambda_that_ends_stops_what_it_started() {
     recorder.finish(T0 + S).unwrap();
     let clip = &recorder.clips()[0];
     assert_eq!(stamps(&scratch, clip, "/a"), every(100, 350, 1));
-    assert_eq!(clip.short, ["hello ended before it said stop"]);
+    assert_eq!(clip.incomplete, ["hello ended before it said stop"]);
 }
 
 #[test]
 fn a_clip_that_cannot_be_written_is_told_and_the_next_one_can() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (0, 50, 0), &[a]));
@@ -298,7 +298,7 @@ fn a_clip_that_cannot_be_written_is_told_and_the_next_one_can() {
 #[test]
 fn a_preroll_that_grows_keeps_what_it_holds() {
     for store in [Store::Ram, Store::Disk] {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 30_000);
         let a = recorder.add_topic(topic("/a")).unwrap();
         let lambda = recorder.add_lambda(member("hello", (1000, 300, 0), &[a]));
@@ -322,8 +322,8 @@ fn a_preroll_that_grows_keeps_what_it_holds() {
 
 #[test]
 fn the_oldest_clips_make_room_and_each_is_named() {
-    let scratch = Scratch::new();
-    let (mut folder, _) = Folder::open(&scratch.0).unwrap();
+    let scratch = TestDir::new();
+    let (mut folder, _) = RecordingFolder::open(&scratch.0).unwrap();
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
     let settings = Settings {
         store: Store::Ram,
@@ -357,8 +357,8 @@ fn the_oldest_clips_make_room_and_each_is_named() {
 
 #[test]
 fn a_clip_that_was_fetched_leaves_its_room_to_others() {
-    let scratch = Scratch::new();
-    let (folder, _) = Folder::open(&scratch.0).unwrap();
+    let scratch = TestDir::new();
+    let (folder, _) = RecordingFolder::open(&scratch.0).unwrap();
     let settings = Settings {
         store: Store::Ram,
         preroll_bytes: 1 << 20,
@@ -382,7 +382,7 @@ fn a_clip_that_was_fetched_leaves_its_room_to_others() {
     let [oldest, second, third] = &files[..] else { panic!("{files:?}") };
     std::fs::remove_file(second).unwrap();
     // Two are left, and two there may be.
-    let (mut folder, _) = Folder::open(&scratch.0).unwrap();
+    let (mut folder, _) = RecordingFolder::open(&scratch.0).unwrap();
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
     std::fs::remove_file(third).unwrap();
     let mut recorder = Recorder::live(folder, settings).unwrap();

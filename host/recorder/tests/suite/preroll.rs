@@ -12,8 +12,8 @@ use gleaner_recorder::{RecordError, Recorder};
 const EVENT: &[TriggerKind] = &[Event];
 
 /// 100 bytes each ms on `/a` with a window of 1 s before 2000 ms, in a store of `bytes`.
-fn cut(store: Store, bytes: u64) -> (Scratch, Clip, u64) {
-    let scratch = Scratch::new();
+fn cut(store: Store, bytes: u64) -> (TestDir, Clip, u64) {
+    let scratch = TestDir::new();
     let mut recorder =
         scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, bytes));
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -50,20 +50,23 @@ fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
         assert_eq!((topic.received, topic.messages + overwritten), (Some(1101), 1101));
         assert_eq!(scratch.contents(&clip).len() as u64, topic.messages);
         assert_eq!(
-            clip.short,
+            clip.incomplete,
             [format!(
                 "the preroll was cut by preroll_size: {overwritten} samples of /a pushed out"
             )]
         );
         assert!(evicted_early > overwritten);
         let (_scratch, clip, evicted_early) = cut(store, 16 << 20);
-        assert_eq!((clip.topics[0].overwritten, evicted_early, clip.short), (Some(0), 0, vec![]));
+        assert_eq!(
+            (clip.topics[0].overwritten, evicted_early, clip.incomplete),
+            (Some(0), 0, vec![])
+        );
     }
 }
 
 #[test]
 fn what_nobody_can_count_is_said_to_be_unknown() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 10_000);
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (6000, 0, 0), &[a]));
@@ -75,16 +78,16 @@ fn what_nobody_can_count_is_said_to_be_unknown() {
         (None, None, Some(0))
     );
     assert!(
-        clip.short.iter().any(|short| short.ends_with("more than were counted")),
+        clip.incomplete.iter().any(|short| short.ends_with("more than were counted")),
         "{:?}",
-        clip.short
+        clip.incomplete
     );
 }
 
 #[test]
 fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
     for store in [Store::Ram, Store::Disk] {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let mut recorder =
             scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, 5_000));
         let a = recorder.add_topic(topic("/a")).unwrap();
@@ -101,14 +104,14 @@ fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
         let clip = &recorder.clips()[0];
         assert_eq!(stamps(&scratch, clip, "/a"), [0, 200, 300]);
         assert_eq!((clip.topics[0].too_big, clip.topics[0].received), (Some(1), Some(4)));
-        assert_eq!(clip.short, ["1 sample of /a did not fit into the preroll: preroll_size"]);
+        assert_eq!(clip.incomplete, ["1 sample of /a did not fit into the preroll: preroll_size"]);
         assert_eq!(recorder.counts().recording.too_big, 2);
     }
 }
 
 #[test]
 fn wakes_that_were_pushed_out_are_missing_from_the_journal_and_said() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 3_000);
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (1000, 0, 0), &[a]));
@@ -127,12 +130,12 @@ fn wakes_that_were_pushed_out_are_missing_from_the_journal_and_said() {
         "the journal of hello lacks {} wakes: pushed out of the preroll",
         header.wakes_before
     );
-    assert!(clip.short.contains(&said), "{:?}", clip.short);
+    assert!(clip.incomplete.contains(&said), "{:?}", clip.incomplete);
 }
 
 #[test]
 fn a_preroll_on_disk_is_deleted_in_the_end_and_its_failure_is_named() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.store = Store::Disk);
     let a = recorder.add_topic(topic("/a")).unwrap();
     recorder.sample(a, &meta(T0, 1), b"x").unwrap();

@@ -12,15 +12,15 @@ use crate::support::*;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{
-    Control, LinkError, Loss, RecorderLink, RecorderReport, RecorderStatus, Said,
+    ControlClient, LinkError, Loss, RecorderLink, RecorderMessage, RecorderReport, RecorderStatus,
 };
-use gleaner_recorder::program::{Options, run};
+use gleaner_recorder::program::{RecorderOptions, run};
 use gleaner_transport::{Clock, LiveSource};
 
 #[test]
 fn two_lambdas_record_and_neither_speaks_for_the_other() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     network.add("/a");
     let mut running = Running::start(&scratch, &network, |_| {});
     let clock = running.clock;
@@ -48,7 +48,7 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     while opened.is_empty() && Instant::now() < deadline {
         opened = one.poll().unwrap();
     }
-    assert!(matches!(opened[..], [Said::Opened { .. }]), "{opened:?}");
+    assert!(matches!(opened[..], [RecorderMessage::Opened { .. }]), "{opened:?}");
     let clip = running.clip();
     assert_eq!(
         clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(),
@@ -90,8 +90,8 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
 #[test]
 fn a_recording_that_is_stopped_keeps_what_it_has() {
     for how in ["stop", "the starter's end", "SIGTERM"] {
-        let scratch = Scratch::new();
-        let network = Network::default();
+        let scratch = TestDir::new();
+        let network = FakeNetwork::default();
         let mut running = Running::start(&scratch, &network, |_| {});
         let (folder, header) = lambda(&scratch, "first", (100, 60_000));
         let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
@@ -105,13 +105,14 @@ fn a_recording_that_is_stopped_keeps_what_it_has() {
         match how {
             "stop" => running.control.stop().unwrap(),
             "SIGTERM" => running.stop.store(true, Ordering::Relaxed),
-            _ => running.control = Control::pair().unwrap().0,
+            _ => running.control = ControlClient::pair().unwrap().0,
         }
         let clip = running.clip();
         assert!(
-            clip.short.contains(&"the recording was stopped before the window ended".to_owned()),
+            clip.incomplete
+                .contains(&"the recording was stopped before the window ended".to_owned()),
             "{:?}",
-            clip.short
+            clip.incomplete
         );
         assert!(!scratch.messages(&clip).is_empty());
         assert_eq!(running.ended().1, Ok(()), "{how}");
@@ -120,8 +121,8 @@ fn a_recording_that_is_stopped_keeps_what_it_has() {
 
 #[test]
 fn what_a_hostile_lambda_says_costs_nobody_else() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     network.add("/a");
     let mut running = Running::start(&scratch, &network, |_| {});
     let clock = running.clock;
@@ -165,8 +166,8 @@ fn what_a_hostile_lambda_says_costs_nobody_else() {
 
 #[test]
 fn the_limits_of_a_vehicle_hold_for_what_the_recorder_reads_of_a_manifest() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     let mut running = Running::start(&scratch, &network, |_| {});
     let (folder, as_in_manifest) = lambda(&scratch, "first", (10, 10));
     let mut on_vehicle = as_in_manifest.clone();
@@ -190,8 +191,8 @@ fn the_limits_of_a_vehicle_hold_for_what_the_recorder_reads_of_a_manifest() {
 
 #[test]
 fn a_full_disk_is_said_and_no_clip_is_begun() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     network.add("/a");
     let mut running = Running::start(&scratch, &network, |options| options.disk_floor = u64::MAX);
     let (folder, header) = lambda(&scratch, "first", (10, 10));
@@ -216,7 +217,7 @@ fn a_full_disk_is_said_and_no_clip_is_begun() {
 }
 
 /// A clip whose recorder died.
-fn unfinished(scratch: &Scratch) {
+fn unfinished(scratch: &TestDir) {
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("dead", (500, 500, 0), &[a]));
@@ -225,8 +226,8 @@ fn unfinished(scratch: &Scratch) {
 
 #[test]
 fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and_stays() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     network.add("/a");
     unfinished(&scratch);
     let find = |ending: &str| {
@@ -240,7 +241,7 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
     fs::create_dir(&in_the_way).unwrap();
     let mut running = Running::start(&scratch, &network, |_| {});
     let why = running.until(|report| match report {
-        RecorderReport::Loss(Loss::Failed { why, .. }) => Some(why),
+        RecorderReport::Loss(Loss::Failed { reason, .. }) => Some(reason),
         _ => None,
     });
     assert!(
@@ -278,8 +279,8 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
 
 #[test]
 fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     network.add("/a");
     let mut running = Running::start(&scratch, &network, |_| {});
     let (folder, header) = lambda(&scratch, "first", (100, 60_000));
@@ -289,7 +290,7 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     received(&mut running, 10);
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
     running.status(|status| status.is_recording);
-    network.loopback.die("its thread is gone");
+    network.loopback.fail("its thread is gone");
     running.clip();
     let failure = running.ended().1.unwrap_err();
     assert_eq!(
@@ -300,8 +301,8 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
 
 #[test]
 fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_expects() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     let mut running = Running::start(&scratch, &network, |_| {});
     let mut links = Vec::new();
     for (name, max_size) in [("first", "64 KiB"), ("second", "3 MiB"), ("third", "1 MiB")] {
@@ -328,8 +329,8 @@ fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_e
 
 #[test]
 fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     network.add_other("/a", "aaa/msg/X");
     network.add_other("/b", "aaa/msg/X");
     let mut running = Running::start(&scratch, &network, |_| {});
@@ -358,8 +359,8 @@ fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
 
 #[test]
 fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
-    let scratch = Scratch::new();
-    let network = Network::default();
+    let scratch = TestDir::new();
+    let network = FakeNetwork::default();
     let mut running =
         Running::start(&scratch, &network, |options| options.preroll_bytes = Some(1 << 20));
     let (folder, header) = lambda(&scratch, "one", (10, 10));
@@ -384,10 +385,12 @@ fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
 #[test]
 fn a_preroll_that_no_memory_holds_is_an_error_in_words() {
     for bytes in [u64::MAX, 1 << 60] {
-        let scratch = Scratch::new();
-        let options =
-            Options { preroll_bytes: Some(bytes), ..options(&scratch.0, Clock::of_today()) };
-        let (_control, stdin) = Control::pair().unwrap();
+        let scratch = TestDir::new();
+        let options = RecorderOptions {
+            preroll_bytes: Some(bytes),
+            ..options(&scratch.0, Clock::from_time_of_day())
+        };
+        let (_control, stdin) = ControlClient::pair().unwrap();
         let (_reader, writer) = std::io::pipe().unwrap();
         let never =
             || -> Result<Box<dyn LiveSource>, Failure> { panic!("the network is joined later") };

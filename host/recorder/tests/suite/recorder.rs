@@ -5,14 +5,14 @@ use std::time::Duration;
 use crate::support::*;
 use gleaner_base::Explain;
 use gleaner_lambda::TriggerKind::{Event, Start, Stop};
-use gleaner_protocol::Recording;
-use gleaner_recorder::{Folder, RecordError, TOPICS_MAX};
+use gleaner_protocol::RecordingCounts;
+use gleaner_recorder::{RecordError, RecordingFolder, TOPICS_MAX};
 
 const EVENT: &[gleaner_lambda::TriggerKind] = &[Event];
 
 #[test]
 fn a_clip_holds_exactly_its_window_and_says_what_it_is() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let gone = recorder.add_missing_topic("/gone").unwrap();
@@ -44,17 +44,17 @@ fn a_clip_holds_exactly_its_window_and_says_what_it_is() {
         (missing.topic.as_str(), &missing.type_name, missing.received),
         ("/gone", &None, Some(0))
     );
-    assert_eq!(clip.short, Vec::<String>::new());
+    assert_eq!(clip.incomplete, Vec::<String>::new());
     let (header, wakes) = scratch.journal(clip, "hello");
     assert_eq!((header.wakes_before, wakes), (1, vec![T0 + 1136 * MS, T0 + 1200 * MS]));
     let counts = recorder.counts();
-    let expected = Recording { clips: 1, windows: 1, ..Recording::default() };
+    let expected = RecordingCounts { clips: 1, windows: 1, ..RecordingCounts::default() };
     assert_eq!((counts.recording, counts.out_of_order), (expected, 0));
 }
 
 #[test]
 fn messages_are_written_byte_for_byte() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[a]));
@@ -75,7 +75,7 @@ fn messages_are_written_byte_for_byte() {
 
 #[test]
 fn lambdas_share_a_clip_each_with_its_own_topics() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let topics = ["/a", "/b", "/both"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let [a, b, both] = topics;
@@ -109,7 +109,7 @@ fn lambdas_share_a_clip_each_with_its_own_topics() {
 #[test]
 fn a_late_trigger_makes_the_clip_that_a_prompt_one_would_have_made() {
     let made = |late_ms: i64| {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let mut recorder = scratch.recorder(|_| {});
         let a = recorder.add_topic(topic("/a")).unwrap();
         let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[a]));
@@ -123,17 +123,17 @@ fn a_late_trigger_makes_the_clip_that_a_prompt_one_would_have_made() {
     let (prompt, _) = made(1);
     for late in [100, 299, 300, 301, 1400] {
         let (contents, clip) = made(late);
-        assert_eq!((contents == prompt, clip.short), (true, vec![]), "{late} ms late");
+        assert_eq!((contents == prompt, clip.incomplete), (true, vec![]), "{late} ms late");
     }
     let (contents, clip) = made(1700);
     assert!(contents.len() < prompt.len());
-    assert_eq!(clip.short, ["a trigger came late: samples of /a had left the preroll"]);
+    assert_eq!(clip.incomplete, ["a trigger came late: samples of /a had left the preroll"]);
     assert_eq!(clip.topics[0].received, None, "nobody knows what was there");
 }
 
 #[test]
 fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.max_length = Duration::from_secs(1));
     let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let [a, b] = topics;
@@ -151,9 +151,14 @@ fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
     assert_eq!(clips.len(), 6);
     for (index, clip) in clips.iter().enumerate() {
         let (first, last) = (index == 0, index + 1 == clips.len());
-        assert_eq!(clip.short.contains(&"continues the clip before".to_owned()), !first, "{index}");
         assert_eq!(
-            clip.short.contains(&"continues in the next clip, if anything more came".to_owned()),
+            clip.incomplete.contains(&"continues the clip before".to_owned()),
+            !first,
+            "{index}"
+        );
+        assert_eq!(
+            clip.incomplete
+                .contains(&"continues in the next clip, if anything more came".to_owned()),
             !last,
             "{index}"
         );
@@ -168,7 +173,7 @@ fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
 
 #[test]
 fn a_jump_in_time_makes_no_clips_of_nothing() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.max_length = Duration::from_secs(1));
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (100, 0, 0), &[a]));
@@ -185,7 +190,7 @@ fn a_jump_in_time_makes_no_clips_of_nothing() {
 
 #[test]
 fn what_is_open_at_the_end_of_the_drive_says_so() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let event = recorder.add_lambda(member("event", (5000, 5000, 0), &[a]));
@@ -197,24 +202,24 @@ fn what_is_open_at_the_end_of_the_drive_says_so() {
         "the drive ended 2.1 s before the window did",
     ];
     assert_eq!(
-        (clip.short.as_slice(), clip.to_ns),
+        (clip.incomplete.as_slice(), clip.to_ns),
         (expected.map(str::to_owned).as_slice(), T0 + 8100 * MS)
     );
 
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let start = recorder.add_lambda(member("start", (100, 0, 0), &[a]));
     drive(&mut recorder, &[a], (0, 1000, 10), &[(500, start, &[Start])]);
     recorder.finish(T0 + 1500 * MS).unwrap();
     let [clip] = recorder.clips() else { panic!() };
-    assert_eq!(clip.short, ["the drive ended before the lambda said stop"]);
+    assert_eq!(clip.incomplete, ["the drive ended before the lambda said stop"]);
     assert_eq!((clip.to_ns, clip.topics[0].messages), (T0 + 1500 * MS, 60));
 }
 
 #[test]
 fn what_is_before_1970_or_out_of_order_is_counted() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let missing = recorder.add_missing_topic("/gone").unwrap();
@@ -237,7 +242,7 @@ fn what_is_before_1970_or_out_of_order_is_counted() {
 
 #[test]
 fn a_recorder_has_an_end_of_topics() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     for index in 0..TOPICS_MAX {
         recorder.add_topic(topic(&format!("/t{index}"))).unwrap();
@@ -249,7 +254,7 @@ fn a_recorder_has_an_end_of_topics() {
 
 #[test]
 fn the_names_of_all_topics_have_an_end_before_a_line_of_the_list_has() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let name = |index: usize| format!("/t{index:03}{}", "x".repeat(1000));
     let refused =
@@ -277,7 +282,7 @@ fn image(grey: u8) -> Vec<u8> {
 #[test]
 fn the_picture_is_that_of_the_trigger() {
     let picture = |anchor_ms: i64| {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let mut recorder = scratch.recorder(|_| {});
         let camera = recorder.add_topic(topic("/camera")).unwrap();
         let lambda = recorder.add_lambda(member("hello", (500, 500, 0), &[camera]));
@@ -303,7 +308,7 @@ fn the_picture_is_that_of_the_trigger() {
 
 #[test]
 fn the_picture_is_in_the_clip() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let topics = ["/a", "/camera"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let lambda = recorder.add_lambda(member("hello", (100, 100, 0), &topics));
@@ -320,7 +325,7 @@ fn the_picture_is_in_the_clip() {
 
 #[test]
 fn a_topic_that_was_silent_has_a_channel_and_a_missing_one_has_none() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let topics = ["/a", "/silent", "/other"].map(|name| recorder.add_topic(topic(name)).unwrap());
     let gone = recorder.add_missing_topic("/gone").unwrap();
@@ -336,20 +341,20 @@ fn a_topic_that_was_silent_has_a_channel_and_a_missing_one_has_none() {
 
 #[test]
 fn a_recorder_that_dies_leaves_what_it_has_written() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", (500, 500, 0), &[a]));
     drive(&mut recorder, &[a], (0, 3000, 10), &[(2000, lambda, &[Start])]);
     drop(recorder);
-    let (_folder, recovered) = Folder::open(&scratch.0).unwrap();
+    let (_folder, recovered) = RecordingFolder::open(&scratch.0).unwrap();
     assert_eq!((recovered.len(), recovered[0].lambdas[0].name.as_str()), (1, "hello"));
     assert!(recovered[0].recovered.is_some());
 }
 
 #[test]
 fn a_lambda_that_was_started_again_within_a_clip_is_told_from_itself() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambdas = [1, 2].map(|limit| {

@@ -21,7 +21,7 @@ struct Plan {
 const TOPICS: [&str; 4] = ["/a", "/b", "/c", "/d"];
 
 fn plan(seed: u64) -> Plan {
-    let mut random = Random(seed);
+    let mut random = SeededRandom(seed);
     let lambdas = 1 + random.below(3);
     let lambdas = (0..lambdas)
         .map(|_| {
@@ -115,7 +115,7 @@ fn expected(plan: &Plan) -> Vec<Contents> {
 
 /// What the recorder's clips hold, and why each is short.
 fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, Vec<String>)> {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let mut recorder =
         scratch.recorder(|settings| (settings.store, settings.max_length) = (store, max_length));
     let topics = TOPICS.map(|name| recorder.add_topic(topic(name)).unwrap());
@@ -151,7 +151,7 @@ fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, V
             );
         }
         assert!(counted.is_empty(), "a topic that the clip does not list: {counted:?}");
-        (contents, clip.short.clone())
+        (contents, clip.incomplete.clone())
     });
     clips.collect()
 }

@@ -3,20 +3,20 @@ use std::io::Write;
 
 use gleaner_protocol::link::Loss;
 
-use super::super::Folder;
+use super::super::RecordingFolder;
 use super::super::durable::steps;
 use super::*;
 use crate::error::RecordError;
 
-fn record(folder: &mut Folder, stem: &str) -> Clip {
-    let mut clip = folder.begin(stem, &about()).unwrap();
+fn record(folder: &mut RecordingFolder, base: &str) -> Clip {
+    let mut clip = folder.begin(base, &clip_header()).unwrap();
     add(&mut clip, 0, 6);
-    clip.finish(ending()).unwrap()
+    clip.finish(trailer()).unwrap()
 }
 
 #[test]
 fn a_name_is_given_once() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let files = [record(&mut folder, "a"), record(&mut folder, "a"), record(&mut folder, "../a")]
         .map(|clip| clip.file);
@@ -32,19 +32,19 @@ fn a_name_is_given_once() {
 
 #[test]
 fn a_folder_is_held_by_one_recorder_until_its_last_clip_is_closed() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let clip = folder.begin("a", &about()).unwrap();
+    let clip = folder.begin("a", &clip_header()).unwrap();
     drop(folder);
-    let error = Folder::open(&scratch.0).err().expect("it is held");
+    let error = RecordingFolder::open(&scratch.0).err().expect("it is held");
     assert!(matches!(&error, RecordError::Busy { folder } if *folder == scratch.0), "{error:?}");
-    clip.finish(ending()).unwrap();
+    clip.finish(trailer()).unwrap();
     assert!(scratch.open().1.is_empty());
 }
 
 #[test]
 fn a_torn_last_line_is_cut_off_and_its_clip_listed_again() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let clips = [record(&mut folder, "a"), record(&mut folder, "b")];
     drop(folder);
@@ -66,7 +66,7 @@ fn a_torn_last_line_is_cut_off_and_its_clip_listed_again() {
 
 #[test]
 fn a_whole_clip_that_is_damaged_or_of_somebody_else_is_not_listed() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     record(&mut folder, "a");
     drop(folder);
@@ -82,7 +82,7 @@ fn a_whole_clip_that_is_damaged_or_of_somebody_else_is_not_listed() {
 
 #[test]
 fn files_of_others_are_left_alone() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     record(&mut folder, "a");
     drop(folder);
@@ -111,9 +111,9 @@ fn files_of_others_are_left_alone() {
 
 #[test]
 fn replacing_keeps_what_is_to_be_kept() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let [_, keep, _] = ["a", "b", "c"].map(|stem| record(&mut folder, stem));
+    let [_, keep, _] = ["a", "b", "c"].map(|base| record(&mut folder, base));
     assert_eq!(folder.replace(std::slice::from_ref(&keep)).unwrap(), 2);
     assert_eq!(scratch.listed(), std::slice::from_ref(&keep));
     assert_eq!(scratch.files(), ["b.jpg", "b.mcap"]);
@@ -128,9 +128,9 @@ fn replacing_keeps_what_is_to_be_kept() {
 fn a_replacement_that_dies_at_any_step_is_completed_or_never_begun() {
     let mut died = 0;
     for last in 0.. {
-        let scratch = Scratch::new();
+        let scratch = TestDir::new();
         let (mut folder, _) = scratch.open();
-        let [a, keep, c] = ["a", "b", "c"].map(|stem| record(&mut folder, stem));
+        let [a, keep, c] = ["a", "b", "c"].map(|base| record(&mut folder, base));
         steps::restart(last);
         let replaced = folder.replace(std::slice::from_ref(&keep));
         steps::restart(usize::MAX);
@@ -170,7 +170,7 @@ fn a_replacement_that_dies_at_any_step_is_completed_or_never_begun() {
 
 #[test]
 fn a_note_of_others_deletes_no_more_than_a_list_does() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let clip = record(&mut folder, "a");
     drop(folder);
@@ -189,9 +189,9 @@ fn a_note_of_others_deletes_no_more_than_a_list_does() {
 
 #[test]
 fn lines_that_are_not_ours_stay_whatever_is_replaced() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let [a, _] = ["a", "b"].map(|stem| record(&mut folder, stem));
+    let [a, _] = ["a", "b"].map(|base| record(&mut folder, base));
     let list = scratch.path("clips.jsonl");
     let ours = fs::read_to_string(&list).unwrap();
     let (first, second) = ours.trim_end().split_once('\n').unwrap();
@@ -222,28 +222,32 @@ fn lines_that_are_not_ours_stay_whatever_is_replaced() {
 
 #[test]
 fn the_longest_line_of_ours_is_read_again() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     // No character takes more room in JSON than a control character.
     let name = |n: u64| format!("{}{n:04}", "\u{1}".repeat(1020));
-    let topic =
-        |n: u64| Topic { name: name(n), type_name: name(n), definitions: None, offered_qos: None };
+    let topic = |n: u64| TopicSchema {
+        name: name(n),
+        type_name: name(n),
+        definitions: None,
+        offered_qos: None,
+    };
     assert!(topic(1).check().is_ok());
     let counts =
         |n| TopicCounts { topic: name(n), type_name: Some(name(n)), ..TopicCounts::default() };
     let attributes =
         || Some(serde_json::Map::from_iter([("text".to_owned(), "y".repeat(2000).into())]));
-    let long = Ending {
+    let long = ClipTrailer {
         topics: (0..256).map(counts).collect(),
-        short: (0..4 * 256)
+        incomplete: (0..4 * 256)
             .map(|n| format!("there is less of {}: for a reason of many words", name(n)))
             .collect(),
         moments: (0..200)
             .map(|n| Moment { label: "\u{1}".repeat(128), attributes: attributes(), ..moment(n) })
             .collect(),
-        ..ending()
+        ..trailer()
     };
-    let clip = folder.begin("a", &about()).unwrap().finish(long).unwrap();
+    let clip = folder.begin("a", &clip_header()).unwrap().finish(long).unwrap();
     let len = fs::metadata(scratch.path("clips.jsonl")).unwrap().len();
     assert!((5 << 20..12 << 20).contains(&len), "{len} bytes");
     assert_eq!(scratch.listed(), std::slice::from_ref(&clip));
@@ -255,7 +259,7 @@ fn the_longest_line_of_ours_is_read_again() {
 
 #[test]
 fn a_hostile_list_deletes_nothing_outside() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let clip = record(&mut folder, "a");
     let victims =
@@ -293,11 +297,11 @@ fn a_hostile_list_deletes_nothing_outside() {
 
 #[test]
 fn a_clip_that_cannot_be_deleted_is_told_once_and_the_next_one_goes_for_it() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
-    let mut added = |stem: &str| {
-        let clip = record(&mut folder, stem);
+    let mut added = |base: &str| {
+        let clip = record(&mut folder, base);
         folder.added(&clip)
     };
     assert!(added("a").is_empty() && added("b").is_empty());
@@ -306,11 +310,12 @@ fn a_clip_that_cannot_be_deleted_is_told_once_and_the_next_one_goes_for_it() {
     fs::rename(&stuck, &aside).unwrap();
     fs::create_dir(&stuck).unwrap();
     let told = added("c");
-    let [Loss::NotDeleted { file, why, .. }, Loss::Deleted { file: gone, .. }] = &told[..] else {
+    let [Loss::NotDeleted { file, reason, .. }, Loss::Deleted { file: gone, .. }] = &told[..]
+    else {
         panic!("{told:?}")
     };
     assert_eq!((file.to_str(), gone.to_str()), (Some("clips/a.mcap"), Some("clips/b.mcap")));
-    assert!(why.contains("cannot remove") && why.contains("a.mcap"), "{why}");
+    assert!(reason.contains("cannot remove") && reason.contains("a.mcap"), "{reason}");
     assert!(
         scratch.files().contains(&"c.mcap".to_owned())
             && !scratch.files().contains(&"b.mcap".to_owned())

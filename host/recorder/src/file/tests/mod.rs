@@ -8,17 +8,17 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{Clip, ClipLambda, Moment, Recovered, TriggerKind};
 use gleaner_messages::Endian;
 use gleaner_transport::{Guid, SampleMeta};
 
-use super::{About, Ending, Folder, Topic, TopicCounts, Unfinished};
+use super::{ClipHeader, ClipTrailer, RecordingFolder, TopicCounts, TopicSchema, UnfinishedClip};
 
 /// A folder for one test, removed when the test ends.
-struct Scratch(PathBuf);
+struct TestDir(PathBuf);
 
-impl Scratch {
+impl TestDir {
     fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name = format!(
@@ -35,8 +35,8 @@ impl Scratch {
         self.0.join(relative)
     }
 
-    fn open(&self) -> (Folder, Vec<Clip>) {
-        Folder::open(&self.0).unwrap()
+    fn open(&self) -> (RecordingFolder, Vec<Clip>) {
+        RecordingFolder::open(&self.0).unwrap()
     }
 
     /// The clips that the list names.
@@ -55,7 +55,7 @@ impl Scratch {
     }
 }
 
-impl Drop for Scratch {
+impl Drop for TestDir {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
     }
@@ -65,7 +65,7 @@ const SECOND: i64 = 1_000_000_000;
 
 fn lambda() -> ClipLambda {
     let (name, version, digest) = ("hello".to_owned(), "0.1.0".to_owned(), "ab".repeat(32));
-    ClipLambda { name, version, kind: Kind::Wasm, digest, windows: 1 }
+    ClipLambda { name, version, kind: LambdaKind::Wasm, digest, windows: 1 }
 }
 
 fn moment(at_ns: i64) -> Moment {
@@ -81,13 +81,13 @@ fn moment(at_ns: i64) -> Moment {
     }
 }
 
-fn about() -> About {
+fn clip_header() -> ClipHeader {
     let clock = "log time of the drive".to_owned();
-    About { clock, from_ns: 10 * SECOND, lambdas: vec![lambda()], moment: moment(12 * SECOND) }
+    ClipHeader { clock, from_ns: 10 * SECOND, lambdas: vec![lambda()], moment: moment(12 * SECOND) }
 }
 
-fn imu() -> Topic {
-    Topic {
+fn imu() -> TopicSchema {
+    TopicSchema {
         name: "/imu/data".to_owned(),
         type_name: "sensor_msgs/msg/Imu".to_owned(),
         definitions: Some("float64 x".into()),
@@ -95,9 +95,9 @@ fn imu() -> Topic {
     }
 }
 
-fn camera() -> Topic {
+fn camera() -> TopicSchema {
     let (name, type_name) = ("/camera".to_owned(), "sensor_msgs/msg/Image".to_owned());
-    Topic { name, type_name, definitions: None, offered_qos: None }
+    TopicSchema { name, type_name, definitions: None, offered_qos: None }
 }
 
 fn meta(at_ns: i64, seq: u64) -> SampleMeta {
@@ -117,8 +117,8 @@ fn payload(n: u64) -> Vec<u8> {
     [&n.to_le_bytes()[..], &[n as u8; 13]].concat()
 }
 
-fn ending() -> Ending {
-    Ending {
+fn trailer() -> ClipTrailer {
+    ClipTrailer {
         from_ns: 10 * SECOND,
         to_ns: 20 * SECOND,
         lambdas: vec![lambda()],
@@ -135,7 +135,7 @@ fn ending() -> Ending {
             },
             TopicCounts { topic: "/gone".to_owned(), received: Some(0), ..TopicCounts::default() },
         ],
-        short: vec!["the drive ended 2.1 s before the window did".to_owned()],
+        incomplete: vec!["the drive ended 2.1 s before the window did".to_owned()],
         thumbnail: Some(b"a picture".to_vec()),
         journals: vec![("hello".to_owned(), b"a journal".to_vec())],
         headers: Vec::new(),
@@ -144,12 +144,12 @@ fn ending() -> Ending {
 
 /// The clip as the next start lists it, if its recorder died before.
 fn unlisted(clip: &Clip) -> Clip {
-    let what = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
-    Clip { recovered: Some(Recovered { lost_bytes: 0, what }), ..clip.clone() }
+    let note = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
+    Clip { recovered: Some(Recovered { lost_bytes: 0, note }), ..clip.clone() }
 }
 
 /// Adds messages `from..to` of the IMU, four a second from second 10 on.
-fn add(clip: &mut Unfinished, from: u64, to: u64) {
+fn add(clip: &mut UnfinishedClip, from: u64, to: u64) {
     for n in from..to {
         clip.message(&imu(), &meta(stamp(n), n + 1), &payload(n)).unwrap();
     }
@@ -160,7 +160,7 @@ fn stamp(n: u64) -> i64 {
 }
 
 /// What a replay of `path` delivers, in its order; it must be a whole file.
-fn replayed(path: &Path) -> Vec<(Topic, SampleMeta, Vec<u8>)> {
+fn replayed(path: &Path) -> Vec<(TopicSchema, SampleMeta, Vec<u8>)> {
     let mut all = Vec::new();
     let end = super::read::each_message(path, |topic, meta, cdr| {
         all.push((topic.clone(), *meta, cdr.to_vec()));
@@ -172,7 +172,7 @@ fn replayed(path: &Path) -> Vec<(Topic, SampleMeta, Vec<u8>)> {
 
 /// The numbers of the messages in `path`, as [`add`] wrote them.
 fn numbers(path: &Path) -> Vec<u64> {
-    let number = |(_, meta, cdr): (Topic, SampleMeta, Vec<u8>)| {
+    let number = |(_, meta, cdr): (TopicSchema, SampleMeta, Vec<u8>)| {
         let n = u64::from_le_bytes(*cdr.first_chunk().unwrap());
         assert_eq!((cdr, meta.at_ns, meta.seq), (payload(n), stamp(n), n + 1));
         n

@@ -1,26 +1,26 @@
 use std::fs;
 use std::path::Path;
 
-use super::super::Unfinished;
+use super::super::UnfinishedClip;
+use super::super::clip_dir::{AGAIN, CLIP, PART};
 use super::super::durable::steps;
-use super::super::place::{AGAIN, CLIP, PART};
 use super::*;
 use crate::error::RecordError;
 
 /// The bytes of an unfinished clip of `messages` messages, some of them in a chunk that was not
 /// closed.
 fn part(messages: u64) -> Vec<u8> {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     add(&mut clip, 0, messages);
     drop(clip);
     fs::read(scratch.path("clips/a.mcap.part")).unwrap()
 }
 
 /// A folder in which a recorder died that had written `part`.
-fn died(part: &[u8]) -> Scratch {
-    let scratch = Scratch::new();
+fn died(part: &[u8]) -> TestDir {
+    let scratch = TestDir::new();
     fs::create_dir(scratch.path("clips")).unwrap();
     fs::write(scratch.path("clips/a.mcap.part"), part).unwrap();
     scratch
@@ -69,11 +69,11 @@ fn a_recovered_clip_says_what_it_was_and_what_is_missing() {
     let recovered = clip.recovered.as_ref().unwrap();
     assert_eq!(recovered.lost_bytes, 3);
     assert_eq!(
-        recovered.what,
+        recovered.note,
         "the recorder died; messages after 2.250 s of the window are lost, at most 1 s of them unless the power failed; \
          so are journal and thumbnail"
     );
-    assert_eq!(clip.short, std::slice::from_ref(&recovered.what));
+    assert_eq!(clip.incomplete, std::slice::from_ref(&recovered.note));
     let messages = replayed(&scratch.path("clips/a.mcap"));
     assert_eq!((&messages[0].0, messages[0].1.writer), (&imu(), meta(0, 1).writer));
 }
@@ -122,11 +122,11 @@ fn a_byte_flipped_anywhere_never_gives_a_broken_clip() {
 /// is.
 #[test]
 fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
-    let source = Scratch::new();
+    let source = TestDir::new();
     let (mut folder, _) = source.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     add(&mut clip, 0, 6);
-    let finished = clip.finish(ending()).unwrap();
+    let finished = clip.finish(trailer()).unwrap();
     let whole = fs::read(source.path("clips/a.mcap")).unwrap();
     for len in (0..whole.len()).step_by(7).chain([whole.len()]) {
         let scratch = died(&whole[..len]);
@@ -149,12 +149,12 @@ fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
 
 /// A folder in which a recorder died that had finished a clip and not renamed it, the clip as it is
 /// listed then, and its bytes.
-fn died_before_the_name() -> (Scratch, Clip, Vec<u8>) {
-    let source = Scratch::new();
+fn died_before_the_name() -> (TestDir, Clip, Vec<u8>) {
+    let source = TestDir::new();
     let (mut folder, _) = source.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     add(&mut clip, 0, 6);
-    let finished = clip.finish(ending()).unwrap();
+    let finished = clip.finish(trailer()).unwrap();
     let whole = fs::read(source.path("clips/a.mcap")).unwrap();
     let scratch = died(&whole);
     fs::write(scratch.path("clips/a.jpg"), b"a picture").unwrap();
@@ -194,7 +194,7 @@ fn a_finished_file_is_recovered_once_though_its_recovery_dies_at_every_step() {
         let mut is_done = false;
         for _ in 0..2 {
             steps::restart(last);
-            let mut recovery = Folder::hold(&scratch.0).unwrap().take_left();
+            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_left();
             is_done = std::iter::from_fn(|| recovery.next(&mut || true)).all(|came| came.is_ok());
         }
         steps::restart(usize::MAX);
@@ -281,10 +281,10 @@ fn an_unfinished_clip_without_content_is_removed_and_one_of_somebody_else_is_not
 
 #[test]
 fn several_unfinished_clips_are_recovered_in_the_order_of_their_names() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut open: Vec<Unfinished> =
-        ["b", "a", "b"].map(|stem| folder.begin(stem, &about()).unwrap()).into();
+    let mut open: Vec<UnfinishedClip> =
+        ["b", "a", "b"].map(|base| folder.begin(base, &clip_header()).unwrap()).into();
     for clip in &mut open {
         add(clip, 0, 8);
     }
@@ -301,7 +301,7 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_keeps_nobody_fr
     // What no file is cannot be removed as one.
     fs::create_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
     for _ in 0..2 {
-        let mut recovery = Folder::hold(&scratch.0).unwrap().take_left();
+        let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_left();
         let why = recovery.next(&mut || true).unwrap().unwrap_err();
         assert!(
             matches!(&why, RecordError::Recover { path, .. } if path.ends_with("clips/a.mcap.part")),
@@ -313,9 +313,9 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_keeps_nobody_fr
         found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(),
         ["clips/b.mcap"]
     );
-    let mut next = folder.begin("a", &about()).unwrap();
+    let mut next = folder.begin("a", &clip_header()).unwrap();
     add(&mut next, 0, 6);
-    assert_eq!(next.finish(ending()).unwrap().file, Path::new("clips/a-2.mcap"));
+    assert_eq!(next.finish(trailer()).unwrap().file, Path::new("clips/a-2.mcap"));
     drop(folder);
     assert_eq!(fs::read(scratch.path("clips/a.mcap.part")).unwrap(), part(14));
     fs::remove_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
@@ -334,7 +334,7 @@ fn a_recovery_that_is_ended_at_any_moment_leaves_what_it_was_to_recover() {
         let mut ended = 0;
         for moments in 0.. {
             let scratch = died(&left);
-            let mut recovery = Folder::hold(&scratch.0).unwrap().take_left();
+            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_left();
             let mut asked = 0;
             let came = recovery.next(&mut || {
                 asked += 1;
@@ -357,15 +357,15 @@ fn a_recovery_that_is_ended_at_any_moment_leaves_what_it_was_to_recover() {
 #[test]
 fn clips_are_begun_and_finished_while_another_is_recovered() {
     let scratch = died(&part(14));
-    let mut folder = Folder::hold(&scratch.0).unwrap();
+    let mut folder = RecordingFolder::hold(&scratch.0).unwrap();
     // Somebody's file has the name of what is recovered.
     fs::write(scratch.path("clips/a.mcap"), b"not a clip").unwrap();
     let mut recovery = folder.take_left();
     let mut clips = 0;
     let came = recovery.next(&mut || {
-        let mut clip = folder.begin("a", &about()).unwrap();
+        let mut clip = folder.begin("a", &clip_header()).unwrap();
         add(&mut clip, 0, 6);
-        clip.finish(ending()).unwrap();
+        clip.finish(trailer()).unwrap();
         clips += 1;
         true
     });

@@ -7,10 +7,10 @@ use gleaner_lambda::Clip;
 use gleaner_messages::Endian;
 use gleaner_transport::{Guid, SampleMeta, Transport};
 
-use super::super::place::PART;
-use super::super::sink::Sink;
+use super::super::clip_dir::PART;
+use super::super::sink::FileSink;
 use super::super::unfinished::METADATA_MAX;
-use super::super::{Ending, MESSAGE_MAX, Unfinished};
+use super::super::{ClipTrailer, MESSAGE_MAX, UnfinishedClip};
 use super::*;
 use crate::error::RecordError;
 
@@ -33,10 +33,10 @@ fn named<'a>(
 
 #[test]
 fn a_clip_reads_back_byte_for_byte() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, found) = scratch.open();
     assert!(found.is_empty());
-    let mut clip = folder.begin("hello-1", &about()).unwrap();
+    let mut clip = folder.begin("hello-1", &clip_header()).unwrap();
     let other = Guid(*b"a second writer!");
     let messages = [
         (imu(), meta(10 * SECOND, 1), payload(1)),
@@ -51,7 +51,7 @@ fn a_clip_reads_back_byte_for_byte() {
     for (topic, meta, cdr) in &messages {
         clip.message(topic, meta, cdr).unwrap();
     }
-    let clip = clip.finish(ending()).unwrap();
+    let clip = clip.finish(trailer()).unwrap();
     let path = scratch.path("clips/hello-1.mcap");
     let file = fs::read(&path).unwrap();
     assert_eq!(clip.bytes, file.len() as u64);
@@ -92,12 +92,12 @@ fn a_clip_reads_back_byte_for_byte() {
 
 #[test]
 fn a_clip_says_what_it_is() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut writing = folder.begin("hello-1", &about()).unwrap();
+    let mut writing = folder.begin("hello-1", &clip_header()).unwrap();
     add(&mut writing, 0, 8);
     writing.message(&camera(), &meta(12 * SECOND, 1), &[1]).unwrap();
-    let clip = writing.finish(ending()).unwrap();
+    let clip = writing.finish(trailer()).unwrap();
     assert_eq!(scratch.listed(), std::slice::from_ref(&clip));
     assert_eq!(scratch.files(), ["hello-1.jpg", "hello-1.mcap"]);
     assert_eq!(fs::read(scratch.path("clips/hello-1.jpg")).unwrap(), b"a picture");
@@ -118,10 +118,10 @@ fn a_clip_says_what_it_is() {
     let records = metadata(&file);
     assert_eq!(records[0].0, "gleaner.begin");
     assert_eq!(records[0].1["clock"], "log time of the drive");
-    let about = named(&records, "gleaner.clip").next().unwrap();
-    assert_eq!(about["short"], "the drive ended 2.1 s before the window did");
-    assert_eq!(about["file"], "clips/hello-1.mcap");
-    let line: Clip = serde_json::from_str(&about["line"]).unwrap();
+    let clip_header = named(&records, "gleaner.clip").next().unwrap();
+    assert_eq!(clip_header["incomplete"], "the drive ended 2.1 s before the window did");
+    assert_eq!(clip_header["file"], "clips/hello-1.mcap");
+    let line: Clip = serde_json::from_str(&clip_header["line"]).unwrap();
     assert_eq!(Clip { bytes: clip.bytes, ..line }, clip);
     let topics: Vec<_> = named(&records, "gleaner.topic").collect();
     assert_eq!((topics[0]["topic"].as_str(), topics[0]["lost"].as_str()), ("/imu/data", "unknown"));
@@ -150,13 +150,13 @@ fn a_clip_says_what_it_is() {
 
 #[test]
 fn the_line_of_a_clip_keeps_a_hundred_moments_and_the_file_all() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let moments = (0..300).map(moment).collect();
     let clip = folder
-        .begin("many", &about())
+        .begin("many", &clip_header())
         .unwrap()
-        .finish(Ending { moments, triggers: 500, ..ending() })
+        .finish(ClipTrailer { moments, triggers: 500, ..trailer() })
         .unwrap();
     assert_eq!((clip.moments.len(), clip.triggers), (Clip::MOMENTS_MAX, 500));
     let records = metadata(&fs::read(scratch.path("clips/many.mcap")).unwrap());
@@ -165,7 +165,7 @@ fn the_line_of_a_clip_keeps_a_hundred_moments_and_the_file_all() {
 
 #[test]
 fn a_clip_says_of_a_lambda_what_its_journal_says() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let mut header = crate::support::member("hello", (1, 1, 1), &[]).header;
     header.config.insert("limit".to_owned(), 3.into());
@@ -173,11 +173,11 @@ fn a_clip_says_of_a_lambda_what_its_journal_says() {
         |path: &str| FileDigest { path: path.to_owned(), bytes: 5, sha256: "ff".to_owned() };
     header.models = vec![model("a.onnx"), model("b.onnx")];
     folder
-        .begin("a", &about())
+        .begin("a", &clip_header())
         .unwrap()
-        .finish(Ending { headers: vec![header.into()], ..ending() })
+        .finish(ClipTrailer { headers: vec![header.into()], ..trailer() })
         .unwrap();
-    folder.begin("b", &about()).unwrap().finish(ending()).unwrap();
+    folder.begin("b", &clip_header()).unwrap().finish(trailer()).unwrap();
     let of = |name: &str| {
         let records = metadata(&fs::read(scratch.path(name)).unwrap());
         let of: Vec<_> = named(&records, "gleaner.lambda").cloned().collect();
@@ -191,15 +191,15 @@ fn a_clip_says_of_a_lambda_what_its_journal_says() {
 
 #[test]
 fn a_topic_without_a_message_has_a_channel_all_the_same() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     add(&mut clip, 0, 3);
-    let large = Topic { definitions: Some("#".repeat(1 << 20).into()), ..camera() };
-    for topic in [imu(), large.clone(), Topic { name: "/second".to_owned(), ..imu() }] {
+    let large = TopicSchema { definitions: Some("#".repeat(1 << 20).into()), ..camera() };
+    for topic in [imu(), large.clone(), TopicSchema { name: "/second".to_owned(), ..imu() }] {
         clip.declare(&topic).unwrap();
     }
-    let clip = clip.finish(ending()).unwrap();
+    let clip = clip.finish(trailer()).unwrap();
     assert_eq!(clip.topics.iter().map(|topic| topic.messages).collect::<Vec<_>>(), [3, 0, 0, 0]);
     let path = scratch.path("clips/a.mcap");
     let file = fs::read(&path).unwrap();
@@ -226,32 +226,33 @@ fn a_topic_without_a_message_has_a_channel_all_the_same() {
 
 #[test]
 fn what_a_clip_cannot_hold_is_refused_and_harms_nothing() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     // Zeros that nobody touches take no memory.
     let huge = vec![0; MESSAGE_MAX + 1];
     let error = clip.message(&imu(), &meta(stamp(0), 1), &huge).unwrap_err();
     assert!(matches!(&error, RecordError::TooLarge { what: "a message", .. }), "{error:?}");
     add(&mut clip, 0, 3);
-    assert_eq!(clip.finish(ending()).unwrap().topics[0].messages, 3);
+    assert_eq!(clip.finish(trailer()).unwrap().topics[0].messages, 3);
     let header = |bytes: usize| {
         let mut header = crate::support::member("hello", (1, 1, 1), &[]).header;
         header.config.insert("text".to_owned(), "x".repeat(bytes).into());
-        Ending { headers: vec![header.into()], ..ending() }
+        ClipTrailer { headers: vec![header.into()], ..trailer() }
     };
-    folder.begin("b", &about()).unwrap().finish(header(1 << 20)).unwrap();
-    let error = folder.begin("c", &about()).unwrap().finish(header(METADATA_MAX)).unwrap_err();
+    folder.begin("b", &clip_header()).unwrap().finish(header(1 << 20)).unwrap();
+    let error =
+        folder.begin("c", &clip_header()).unwrap().finish(header(METADATA_MAX)).unwrap_err();
     assert!(matches!(&error, RecordError::TooLarge { what: "a metadata record", .. }), "{error:?}");
 }
 
 #[test]
 fn a_chunk_spans_a_second_at_most() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     add(&mut clip, 0, 41);
-    clip.finish(ending()).unwrap();
+    clip.finish(trailer()).unwrap();
     let file = fs::read(scratch.path("clips/a.mcap")).unwrap();
     let chunks = mcap::Summary::read(&file).unwrap().unwrap().chunk_indexes;
     // Five messages fit in a second, both ends included.
@@ -265,26 +266,26 @@ fn a_chunk_spans_a_second_at_most() {
 
 #[test]
 fn stamps_before_the_epoch_become_its_begin() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     clip.message(&imu(), &SampleMeta { publish_ns: -5, ..meta(3, 1) }, &[]).unwrap();
-    clip.finish(ending()).unwrap();
+    clip.finish(trailer()).unwrap();
     assert_eq!(replayed(&scratch.path("clips/a.mcap"))[0].1.publish_ns, 0);
 }
 
 #[test]
 fn more_writers_than_channels_share_one_and_no_message_is_lost() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
-    let mut clip = folder.begin("a", &about()).unwrap();
+    let mut clip = folder.begin("a", &clip_header()).unwrap();
     let writers = super::super::unfinished::CHANNELS_MAX as u64 + 3;
     for n in 0..writers {
         let mut writer = Guid([0; 16]);
         writer.0[..8].copy_from_slice(&n.to_le_bytes());
         clip.message(&imu(), &SampleMeta { writer, ..meta(10 * SECOND, 1) }, &payload(n)).unwrap();
     }
-    assert_eq!(clip.finish(ending()).unwrap().topics[0].messages, writers);
+    assert_eq!(clip.finish(trailer()).unwrap().topics[0].messages, writers);
     let file = fs::read(scratch.path("clips/a.mcap")).unwrap();
     let channels = mcap::Summary::read(&file).unwrap().unwrap().channels;
     let nameless: Vec<_> =
@@ -297,12 +298,13 @@ fn more_writers_than_channels_share_one_and_no_message_is_lost() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_full_disk_is_named_and_nothing_follows_it() {
-    let scratch = Scratch::new();
+    let scratch = TestDir::new();
     let (folder, _) = scratch.open();
     let path = scratch.path("clips/a.mcap.part");
-    let full = || Sink::new(OpenOptions::new().write(true).open("/dev/full").unwrap());
-    let place = std::sync::Arc::clone(&folder.place);
-    let begun = Unfinished::begin(place, "a".to_owned(), path.clone(), full(), Some(&about()));
+    let full = || FileSink::new(OpenOptions::new().write(true).open("/dev/full").unwrap());
+    let dir = std::sync::Arc::clone(&folder.dir);
+    let begun =
+        UnfinishedClip::begin(dir, "a".to_owned(), path.clone(), full(), Some(&clip_header()));
     let error = begun.err().expect("the disk is full");
     assert!(
         matches!(&error, RecordError::Write { path: named, .. } if *named == path),

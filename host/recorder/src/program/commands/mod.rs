@@ -8,7 +8,7 @@
 //!
 //! - `order`: what one message says.
 
-mod order;
+mod request;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -20,29 +20,29 @@ use std::time::{Duration, Instant};
 use gleaner_base::visible;
 use gleaner_lambda::TriggerKind;
 use gleaner_protocol::link::CommandStatus;
-use gleaner_transport::{SampleMeta, Sink, Status, Verdict};
+use gleaner_transport::{Delivery, ReceptionStatus, SampleMeta, Sink};
 use tracing::warn;
 
-use super::allowance::Allowance;
+use super::rate_limit::RateLimit;
 use crate::{Commanded, LambdaId, RecordError, Recorder};
-pub(super) use order::MESSAGE_MAX;
-use order::{CommandError, Order};
+pub(super) use request::MESSAGE_MAX;
+use request::{CommandError, CommandRequest};
 
 /// The type of the topic.
 pub(super) const TYPE: &str = "std_msgs/msg/String";
 /// Messages per second that are read, and at once.
-const ALLOWED: Allowance = Allowance::of(1.0, 5.0);
+const ALLOWED: RateLimit = RateLimit::of(1.0, 5.0);
 /// Messages that wait for the loop: more than may come at once.
 const WAITING: usize = 8;
 /// Messages that the network keeps until they are taken.
 pub(super) const QUEUE: usize = 16;
 /// How often it is said how many were not read.
-const AGAIN: Duration = Duration::from_secs(10);
+const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 /// Characters of what is said of a refusal: a message may say what it likes, but not as much.
 const WHY_MAX: usize = 200;
 
 /// A message that is to be read.
-struct Message {
+struct CommandMessage {
     meta: SampleMeta,
     cdr: Vec<u8>,
 }
@@ -61,35 +61,37 @@ impl Unread {
 }
 
 /// Takes the messages of the topic.
-struct Ear {
-    allowed: Mutex<Allowance>,
-    messages: SyncSender<Message>,
+struct CommandSink {
+    allowed: Mutex<RateLimit>,
+    messages: SyncSender<CommandMessage>,
     unread: Arc<Unread>,
     reader: Thread,
 }
 
-impl Sink for Ear {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for CommandSink {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         if cdr.len() > MESSAGE_MAX {
             self.unread.too_long.fetch_add(1, Ordering::Relaxed);
-            return Verdict::TooBig;
+            return Delivery::TooBig;
         }
         // Only the transport's thread is here.
         let may =
             self.allowed.lock().unwrap_or_else(PoisonError::into_inner).take(1.0, Instant::now());
-        if !may || self.messages.try_send(Message { meta: *meta, cdr: cdr.to_vec() }).is_err() {
+        if !may
+            || self.messages.try_send(CommandMessage { meta: *meta, cdr: cdr.to_vec() }).is_err()
+        {
             self.unread.too_many.fetch_add(1, Ordering::Relaxed);
-            return Verdict::NoSlot;
+            return Delivery::NoSlot;
         }
         self.reader.unpark();
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 
 /// Obeys commands.
 pub(super) struct Commands {
     topic: String,
-    messages: Receiver<Message>,
+    messages: Receiver<CommandMessage>,
     unread: Arc<Unread>,
     /// The newest of each name, also after its end: an operator need not wait for a lambda that is
     /// being started again.
@@ -100,7 +102,7 @@ pub(super) struct Commands {
     accepted: u64,
     refused: u64,
     /// What was said of messages that nobody read, and when.
-    said: ((u64, u64), Option<Instant>),
+    reported: ((u64, u64), Option<Instant>),
 }
 
 impl Commands {
@@ -108,7 +110,7 @@ impl Commands {
     pub(super) fn new(topic: String, reader: Thread) -> (Commands, Arc<dyn Sink>) {
         let (sender, messages) = sync_channel(WAITING);
         let unread = Arc::<Unread>::default();
-        let ear = Ear {
+        let sink = CommandSink {
             allowed: Mutex::new(ALLOWED),
             messages: sender,
             unread: Arc::clone(&unread),
@@ -122,9 +124,9 @@ impl Commands {
             running: BTreeMap::new(),
             accepted: 0,
             refused: 0,
-            said: ((0, 0), None),
+            reported: ((0, 0), None),
         };
-        (commands, Arc::new(ear))
+        (commands, Arc::new(sink))
     }
 
     /// A lambda is there.
@@ -138,15 +140,15 @@ impl Commands {
     }
 
     /// Obeys those that came; `true` if there were any.
-    pub(super) fn obey(&mut self, recorder: &mut Recorder) -> Result<bool, RecordError> {
-        let mut heard = false;
+    pub(super) fn handle(&mut self, recorder: &mut Recorder) -> Result<bool, RecordError> {
+        let mut any = false;
         // Those that come meanwhile are for the next time.
         for _ in 0..WAITING {
-            let Ok(Message { meta, cdr }) = self.messages.try_recv() else { break };
-            heard = true;
+            let Ok(CommandMessage { meta, cdr }) = self.messages.try_recv() else { break };
+            any = true;
             let source = format!("command on {} by {}", self.topic, meta.writer);
-            let refused = match Order::read(&cdr, meta.endian) {
-                Ok(order) => self.carry_out(order, meta.at_ns, source.clone(), recorder)?,
+            let refused = match CommandRequest::read(&cdr, meta.endian) {
+                Ok(order) => self.execute(order, meta.at_ns, source.clone(), recorder)?,
                 Err(why) => Some(why),
             };
             match refused {
@@ -154,23 +156,23 @@ impl Commands {
                 Some(why) => {
                     self.refused += 1;
                     // There are no more of them than messages are read.
-                    warn!(%source, why = in_words(&why), "a command is refused");
+                    warn!(%source, why = describe(&why), "a command is refused");
                 }
             }
         }
-        self.say_unread();
-        Ok(heard)
+        self.report_unread();
+        Ok(any)
     }
 
     /// Why not, if it is refused.
-    fn carry_out(
+    fn execute(
         &mut self,
-        Order { lambda, trigger }: Order,
+        CommandRequest { lambda, trigger }: CommandRequest,
         at_ns: i64,
         source: String,
         recorder: &mut Recorder,
     ) -> Result<Option<CommandError>, RecordError> {
-        let (name, mut id) = match self.whose(lambda) {
+        let (name, mut id) = match self.addressee(lambda) {
             Ok(found) => found,
             Err(why) => return Ok(Some(why)),
         };
@@ -205,7 +207,7 @@ impl Commands {
         })
     }
 
-    fn whose(&self, lambda: Option<String>) -> Result<(String, LambdaId), CommandError> {
+    fn addressee(&self, lambda: Option<String>) -> Result<(String, LambdaId), CommandError> {
         let known = self.lambdas.len();
         match lambda {
             Some(name) => match self.lambdas.get(&name) {
@@ -221,18 +223,18 @@ impl Commands {
         }
     }
 
-    fn say_unread(&mut self) {
-        let (unread, said) = (self.unread.counts(), self.said);
-        if unread == said.0 || said.1.is_some_and(|at| at.elapsed() < AGAIN) {
+    fn report_unread(&mut self) {
+        let (unread, reported) = (self.unread.counts(), self.reported);
+        if unread == reported.0 || reported.1.is_some_and(|at| at.elapsed() < REPORT_INTERVAL) {
             return;
         }
-        self.said = (unread, Some(Instant::now()));
-        let (too_many, too_long) = (unread.0 - said.0.0, unread.1 - said.0.1);
+        self.reported = (unread, Some(Instant::now()));
+        let (too_many, too_long) = (unread.0 - reported.0.0, unread.1 - reported.0.1);
         warn!(topic = %self.topic, too_many, too_long, "commands are refused unread");
     }
 
     /// What came of them.
-    pub(super) fn status(&self, network: Option<&Status>) -> CommandStatus {
+    pub(super) fn status(&self, network: Option<&ReceptionStatus>) -> CommandStatus {
         let (too_many, too_long) = self.unread.counts();
         CommandStatus {
             topic: self.topic.clone(),
@@ -245,7 +247,7 @@ impl Commands {
 }
 
 /// An error with its cause, fit for a log.
-fn in_words(error: &CommandError) -> String {
+fn describe(error: &CommandError) -> String {
     let cause =
         std::error::Error::source(error).map(|cause| format!(": {cause}")).unwrap_or_default();
     visible(&format!("{error}{cause}")).chars().take(WHY_MAX).collect()

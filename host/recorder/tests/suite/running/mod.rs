@@ -12,26 +12,26 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use gleaner_base::{Failure, hex};
-use gleaner_journal::{FileDigest, Header};
+use gleaner_journal::{FileDigest, JournalHeader};
 use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::Limits;
 use gleaner_messages::Definitions;
-use gleaner_protocol::link::{Add, Control, RecorderReport, RecorderStatus};
-use gleaner_recorder::program::{Options, run};
+use gleaner_protocol::link::{AddLambda, ControlClient, RecorderReport, RecorderStatus};
+use gleaner_recorder::program::{RecorderOptions, run};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{
-    Clock, DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink, Subscription,
-    TopicSpec, Transport, TransportError, Verdict,
+    Clock, Delivery, DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink,
+    Subscription, TopicSpec, Transport, TransportError,
 };
 use sha2::{Digest, Sha256};
 
-use crate::support::{Scratch, member, meta};
+use crate::support::{TestDir, member, meta};
 
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A loopback that the test feeds while the process listens.
 #[derive(Clone, Default)]
-pub struct Network {
+pub struct FakeNetwork {
     pub loopback: Loopback,
     /// What was subscribed.
     pub specs: Arc<Mutex<Vec<TopicSpec>>>,
@@ -39,7 +39,7 @@ pub struct Network {
     others: Arc<Mutex<Vec<DiscoveredTopic>>>,
 }
 
-impl Network {
+impl FakeNetwork {
     pub fn add(&self, topic: &str) {
         self.loopback.add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
     }
@@ -63,7 +63,7 @@ impl Network {
     }
 
     /// Whether anybody takes what is published.
-    pub fn publish_text(&self, topic: &str, at_ns: i64, text: &[u8]) -> Option<Verdict> {
+    pub fn publish_text(&self, topic: &str, at_ns: i64, text: &[u8]) -> Option<Delivery> {
         self.loopback.publish(topic, &meta(at_ns, 1), &cdr(text)).unwrap()
     }
 
@@ -72,7 +72,7 @@ impl Network {
     }
 }
 
-impl Transport for Network {
+impl Transport for FakeNetwork {
     fn topics(&self) -> Vec<DiscoveredTopic> {
         let mut topics = self.others.lock().unwrap().clone();
         topics.extend(self.loopback.topics());
@@ -93,7 +93,7 @@ impl Transport for Network {
     }
 }
 
-impl LiveSource for Network {
+impl LiveSource for FakeNetwork {
     fn health(&self) -> Health {
         self.loopback.health()
     }
@@ -110,15 +110,15 @@ impl LiveSource for Network {
 
 /// A process, but for the process.
 pub struct Running {
-    pub control: Control,
+    pub control: ControlClient,
     reports: BufReader<PipeReader>,
     thread: JoinHandle<Result<(), Failure>>,
     pub stop: Arc<AtomicBool>,
     pub clock: Clock,
 }
 
-pub fn options(out: &Path, clock: Clock) -> Options {
-    Options {
+pub fn options(out: &Path, clock: Clock) -> RecorderOptions {
+    RecorderOptions {
         out: out.to_owned(),
         clock,
         preroll_bytes: None,
@@ -131,14 +131,14 @@ pub fn options(out: &Path, clock: Clock) -> Options {
 
 impl Running {
     pub fn start(
-        scratch: &Scratch,
-        network: &Network,
-        change: impl FnOnce(&mut Options),
+        scratch: &TestDir,
+        network: &FakeNetwork,
+        change: impl FnOnce(&mut RecorderOptions),
     ) -> Running {
-        let clock = Clock::of_today();
+        let clock = Clock::from_time_of_day();
         let mut options = options(&scratch.0, clock);
         change(&mut options);
-        let (control, stdin) = Control::pair().unwrap();
+        let (control, stdin) = ControlClient::pair().unwrap();
         let (reader, writer) = std::io::pipe().unwrap();
         let (stop, network) = (Arc::<AtomicBool>::default(), network.clone());
         let for_thread = Arc::clone(&stop);
@@ -191,7 +191,7 @@ impl Running {
 }
 
 /// A built lambda that records `/a`, and the header of its journal.
-pub fn lambda(scratch: &Scratch, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, Header) {
+pub fn lambda(scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, JournalHeader) {
     let text = format!(
         "[lambda]\nname = \"{name}\"\nversion = \"1.2.3\"\nkind = \"python\"\nentry = \"main.py\"\n[schedule]\nevent = \"numbers\"\n\
          [[input]]\nname = \"numbers\"\ntopic = \"/a\"\ntype = \"test_msgs/msg/Number\"\n\
@@ -206,10 +206,10 @@ pub fn lambda(scratch: &Scratch, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, 
 }
 
 /// The header of a lambda with this manifest.
-pub fn with_manifest(header: Header, text: &str) -> Header {
+pub fn with_manifest(header: JournalHeader, text: &str) -> JournalHeader {
     let sha256 = hex(&Sha256::digest(text));
     let manifest = FileDigest { path: "lambda.toml".to_owned(), bytes: text.len() as u64, sha256 };
-    Header { files: vec![manifest], ..header }
+    JournalHeader { files: vec![manifest], ..header }
 }
 
 /// A `std_msgs/msg/String`.
@@ -217,8 +217,8 @@ pub fn cdr(text: &[u8]) -> Vec<u8> {
     [&(text.len() as u32 + 1).to_le_bytes()[..], text, &[0]].concat()
 }
 
-pub fn add(folder: &Path) -> Add {
-    Add { lambda: folder.to_owned(), remaps: Vec::new(), most: Limits::MOST }
+pub fn add(folder: &Path) -> AddLambda {
+    AddLambda { lambda: folder.to_owned(), remaps: Vec::new(), most: Limits::MAX }
 }
 
 pub fn monotonic(clock: Clock) -> i64 {
@@ -234,7 +234,7 @@ pub struct Sensor {
 }
 
 impl Sensor {
-    pub fn start(network: &Network, clock: Clock) -> Sensor {
+    pub fn start(network: &FakeNetwork, clock: Clock) -> Sensor {
         let (stop, network) = (Arc::<AtomicBool>::default(), network.clone());
         let stopped = Arc::clone(&stop);
         let published = Arc::<Mutex<Vec<_>>>::default();

@@ -8,11 +8,15 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use gleaner_journal::{Entry, Header, JournalInput, Reader, Said, Seen, Woken};
-use gleaner_lambda::manifest::{Kind, Manifest, Store};
+use gleaner_journal::{
+    InputView, JournalEntry, JournalHeader, JournalInput, JournalReader, LogDigest, WakeSource,
+};
+use gleaner_lambda::manifest::{LambdaKind, Manifest, Store};
 use gleaner_lambda::{Clip, Trigger, TriggerKind};
 use gleaner_messages::Endian;
-use gleaner_recorder::{Folder, LambdaId, Member, Recorder, Settings, Topic, TopicId};
+use gleaner_recorder::{
+    LambdaId, LambdaSpec, Recorder, RecordingFolder, Settings, TopicId, TopicSchema,
+};
 use gleaner_transport::{Guid, SampleMeta};
 
 pub const MS: i64 = 1_000_000;
@@ -21,9 +25,9 @@ pub const S: i64 = 1_000 * MS;
 pub const T0: i64 = 1_533_198_891 * S;
 
 /// A folder for one test, removed when the test ends.
-pub struct Scratch(pub PathBuf);
+pub struct TestDir(pub PathBuf);
 
-impl Scratch {
+impl TestDir {
     pub fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name = format!("core-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
@@ -42,11 +46,11 @@ impl Scratch {
             prefault: false,
         };
         settings(&mut given);
-        Recorder::new(Folder::open(&self.0).unwrap().0, given).unwrap()
+        Recorder::new(RecordingFolder::open(&self.0).unwrap().0, given).unwrap()
     }
 
     /// The messages of a clip in the order of its file.
-    pub fn messages(&self, clip: &Clip) -> Vec<Message> {
+    pub fn messages(&self, clip: &Clip) -> Vec<ClipMessage> {
         let bytes = fs::read(self.0.join(&clip.file)).unwrap();
         mcap::MessageStream::new(&bytes)
             .unwrap()
@@ -100,9 +104,9 @@ impl Scratch {
     }
 
     /// The journal of a lambda in a clip: its header, and the stamps of its wakes.
-    pub fn journal(&self, clip: &Clip, lambda: &str) -> (Header, Vec<i64>) {
+    pub fn journal(&self, clip: &Clip, lambda: &str) -> (JournalHeader, Vec<i64>) {
         let bytes = &self.attachments(clip)[&format!("journal/{lambda}.journal")];
-        let mut reader = Reader::open(bytes.as_slice()).unwrap();
+        let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
         let header = reader.header().clone();
         let mut stamps = Vec::new();
         while let Some(entry) = reader.next().unwrap() {
@@ -113,19 +117,19 @@ impl Scratch {
     }
 }
 
-impl Drop for Scratch {
+impl Drop for TestDir {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
     }
 }
 
 /// Topic, stamp, number and bytes.
-pub type Message = (String, i64, u32, Vec<u8>);
+pub type ClipMessage = (String, i64, u32, Vec<u8>);
 
-pub fn topic(name: &str) -> Topic {
+pub fn topic(name: &str) -> TopicSchema {
     let type_name =
         if name.starts_with("/camera") { "sensor_msgs/msg/Image" } else { "test_msgs/msg/Number" };
-    Topic {
+    TopicSchema {
         name: name.to_owned(),
         type_name: type_name.to_owned(),
         definitions: Some("int64 value\n".into()),
@@ -134,7 +138,7 @@ pub fn topic(name: &str) -> Topic {
 }
 
 /// A lambda that records, with windows in ms.
-pub fn member(name: &str, rolls_ms: (i64, i64, i64), topics: &[TopicId]) -> Member {
+pub fn member(name: &str, rolls_ms: (i64, i64, i64), topics: &[TopicId]) -> LambdaSpec {
     let (preroll, postroll, cooldown) = rolls_ms;
     let text = format!(
         r#"
@@ -163,13 +167,13 @@ cooldown = "{cooldown}ms"
         wire_topic: "/a".to_owned(),
         type_name: "test_msgs/msg/Number".to_owned(),
     };
-    let header = Header {
+    let header = JournalHeader {
         gleaner: "0.1.0".to_owned(),
         engine: "Python".to_owned(),
         machine: "x".to_owned(),
         lambda: name.to_owned(),
         version: "1.2.3".to_owned(),
-        kind: Kind::Python,
+        kind: LambdaKind::Python,
         files: Vec::new(),
         models: Vec::new(),
         manifest: String::new(),
@@ -182,7 +186,7 @@ cooldown = "{cooldown}ms"
         wakes_before: 0,
         limits: Default::default(),
     };
-    Member { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
+    LambdaSpec { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
 }
 
 pub fn meta(at_ns: i64, seq: u64) -> SampleMeta {
@@ -196,21 +200,21 @@ pub fn meta(at_ns: i64, seq: u64) -> SampleMeta {
     }
 }
 
-pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> Entry {
+pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> JournalEntry {
     let trigger = |kind: &TriggerKind| Trigger {
         kind: *kind,
         label: "here".to_owned(),
         score: Some(0.5),
         attributes: serde_json::Map::new(),
     };
-    Entry {
+    JournalEntry {
         at_ns,
-        cause: Woken::Tick { missed: 0 },
-        seen: vec![Seen::default()],
+        cause: WakeSource::Tick { missed: 0 },
+        seen: vec![InputView::default()],
         triggers: kinds.iter().map(trigger).collect(),
         fault: None,
         fuel: None,
-        log: Said::default(),
+        log: LogDigest::default(),
     }
 }
 
@@ -235,7 +239,7 @@ pub fn drive(
 }
 
 /// The stamps of a topic's messages in a clip, in ms after [`T0`].
-pub fn stamps(scratch: &Scratch, clip: &Clip, topic: &str) -> Vec<i64> {
+pub fn stamps(scratch: &TestDir, clip: &Clip, topic: &str) -> Vec<i64> {
     let contents = scratch.contents(clip);
     contents.iter().filter(|(name, _, _)| name == topic).map(|(_, at, _)| (at - T0) / MS).collect()
 }
@@ -246,9 +250,9 @@ pub fn every(from: i64, to: i64, every: i64) -> Vec<i64> {
 }
 
 /// Numbers that look random and are the same in each run (SplitMix64).
-pub struct Random(pub u64);
+pub struct SeededRandom(pub u64);
 
-impl Random {
+impl SeededRandom {
     pub fn below(&mut self, n: u64) -> i64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;

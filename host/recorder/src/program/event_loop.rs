@@ -12,22 +12,22 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::Store;
-use gleaner_protocol::Recording;
+use gleaner_protocol::RecordingCounts;
 use gleaner_protocol::link::RecorderReport;
 use gleaner_transport::{Clock, LiveSource};
-use gleaner_vitals::Spreads;
+use gleaner_vitals::IntervalDurations;
 use tracing::{error, warn};
 
-use super::Options;
+use super::RecorderOptions;
 use super::commands::Commands;
-use super::hear::{Event, starter};
-use super::lambdas::Lambda;
-use super::say::Say;
-use super::staging::{Block, Lane, Staging};
-use super::telling::Said;
-use super::watch::{Beat, Seen, Want, Wanted, Watch};
+use super::connections::{LoopEvent, starter};
+use super::lambdas::ConnectedLambda;
+use super::report_writer::ReportWriter;
+use super::staging::{Block, Staging, TopicSink};
+use super::status::LastReported;
+use super::topic_watch::{RequestKind, SystemHealth, TopicRequest, TopicWatch, WatchEvent};
 use crate::recorder::counted;
-use crate::{Folder, Recorder, Settings, TopicId, Work};
+use crate::{Recorder, RecordingFolder, Settings, TopicId, Work};
 
 /// Events that wait for the loop.
 const EVENTS: usize = 256;
@@ -35,15 +35,15 @@ const EVENTS: usize = 256;
 const SAMPLES_TURN: usize = 64;
 const BYTES_TURN: usize = 256 << 10;
 /// How long nobody looks for samples, if nothing else happens.
-const LOOK: Duration = Duration::from_millis(5);
+const IDLE_WAIT: Duration = Duration::from_millis(5);
 /// And for the thread that writes, if that is behind.
-const BEHIND: Duration = Duration::from_millis(1);
+const WRITER_WAIT: Duration = Duration::from_millis(1);
 /// A sample is stamped before it is staged: time passes for the recorder only when all up to then
 /// must have come.
 const MARGIN_NS: i64 = 100_000_000;
 /// How long the last words of lambdas may take, and the last sample.
-const LAST_WORDS: Duration = Duration::from_secs(1);
-const LAST_LOOK: Duration = Duration::from_millis(2);
+const FINISH_TIMEOUT: Duration = Duration::from_secs(1);
+const FINISH_POLL: Duration = Duration::from_millis(2);
 /// Room for staged samples: twice as much is taken.
 pub(super) const STAGING: std::ops::RangeInclusive<usize> = 8 << 20..=256 << 20;
 /// Room on the disk above the floor from which on clips are begun again.
@@ -56,7 +56,7 @@ const SLACK: u64 = 64 << 20;
 /// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead:
 /// whoever started this starts it again.
 pub fn run(
-    options: Options,
+    options: RecorderOptions,
     source: impl FnOnce() -> Result<Box<dyn LiveSource>, Failure>,
     control: OwnedFd,
     reports: File,
@@ -64,8 +64,8 @@ pub fn run(
 ) -> Result<(), Failure> {
     let internal =
         |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
-    let mut folder = Folder::hold(&options.out)?;
-    let mut say = Say::start(reports, folder.losses()).map_err(internal)?;
+    let mut folder = RecordingFolder::hold(&options.out)?;
+    let mut reports = ReportWriter::start(reports, folder.losses()).map_err(internal)?;
     // Before anything is recovered, which takes room.
     let mut deleted = Vec::new();
     if options.clips_max.is_some() || options.bytes_max.is_some() {
@@ -82,11 +82,11 @@ pub fn run(
     let mut recorder = Recorder::live(folder, settings)?;
     recorder.advance(options.clock.now())?;
     let (events, inbox) = sync_channel(EVENTS);
-    let (wants, wanted) = sync_channel(EVENTS);
+    let (requests, requested) = sync_channel(EVENTS);
     let reader = thread::current();
-    let watch = Watch {
+    let watch = TopicWatch {
         source: source()?,
-        wants: wanted,
+        requests: requested,
         events: events.clone(),
         reader: reader.clone(),
         out: options.out.clone(),
@@ -96,12 +96,17 @@ pub fn run(
     starter(control, events, reader.clone()).map_err(internal)?;
     let commands = options.commands.clone().map(|name| {
         let (commands, sink) = Commands::new(name.clone(), reader.clone());
-        let _ = wants.send(Want { what: Wanted::Commands, name, type_name: None, sink });
+        let _ = requests.send(TopicRequest {
+            what: RequestKind::Commands,
+            name,
+            type_name: None,
+            sink,
+        });
         commands
     });
-    say.say(RecorderReport::Ready);
+    reports.send(RecorderReport::Ready);
     let (gone, stuck) = counted(&deleted);
-    let mut course = Course {
+    let mut recorder_loop = RecorderLoop {
         recorder,
         clock: options.clock,
         staging: Staging::new(*STAGING.start(), reader),
@@ -109,26 +114,30 @@ pub fn run(
         at: 0,
         room: *STAGING.start(),
         inbox,
-        wants,
+        requests,
         commands,
         lambdas: Vec::new(),
         topics: BTreeMap::new(),
-        asked: BTreeMap::new(),
-        said: Said::default(),
-        beat: Beat::default(),
-        spreads: Spreads::new(),
-        counted: Recording { deleted: gone, not_deleted: stuck, ..Recording::default() },
+        shares: BTreeMap::new(),
+        reported: LastReported::default(),
+        health: SystemHealth::default(),
+        spreads: IntervalDurations::new(),
+        counted: RecordingCounts {
+            deleted: gone,
+            not_deleted: stuck,
+            ..RecordingCounts::default()
+        },
         is_ending: false,
         options,
         stop,
-        say,
+        reports,
     };
-    deleted.into_iter().for_each(|loss| course.say.say(RecorderReport::Loss(loss)));
-    let ended = course.turns();
-    let last = course.last_words();
+    deleted.into_iter().for_each(|loss| recorder_loop.reports.send(RecorderReport::Loss(loss)));
+    let ended = recorder_loop.run();
+    let last = recorder_loop.final_status();
     // A watch that waits for room in the inbox would never end.
-    drop((course.wants, course.inbox));
-    course.say.end(RecorderReport::Ended(Box::new(last)));
+    drop((recorder_loop.requests, recorder_loop.inbox));
+    recorder_loop.reports.end(RecorderReport::Ended(Box::new(last)));
     // It ends by itself, and with it the network.
     let _ = watch.join();
     ended
@@ -136,7 +145,7 @@ pub fn run(
 
 /// What came of samples.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-enum Came {
+enum SampleTurn {
     /// There may be more.
     More,
     /// Nothing.
@@ -146,13 +155,13 @@ enum Came {
 }
 
 /// A topic that is recorded.
-pub(super) struct Recorded {
+pub(super) struct TopicEntry {
     pub(super) name: String,
     pub(super) type_name: Option<String>,
-    pub(super) lane: Arc<Lane>,
+    pub(super) sink: Arc<TopicSink>,
 }
 
-pub(super) struct Course {
+pub(super) struct RecorderLoop {
     pub(super) recorder: Recorder,
     pub(super) clock: Clock,
     pub(super) staging: Arc<Staging>,
@@ -161,37 +170,37 @@ pub(super) struct Course {
     at: usize,
     /// How much room there is to be.
     pub(super) room: usize,
-    inbox: Receiver<Event>,
-    pub(super) wants: SyncSender<Want>,
+    inbox: Receiver<LoopEvent>,
+    pub(super) requests: SyncSender<TopicRequest>,
     pub(super) commands: Option<Commands>,
-    pub(super) lambdas: Vec<Lambda>,
-    pub(super) topics: BTreeMap<TopicId, Recorded>,
+    pub(super) lambdas: Vec<ConnectedLambda>,
+    pub(super) topics: BTreeMap<TopicId, TopicEntry>,
     /// By lambda: what it asks of the preroll, and bytes that it expects in a second.
-    pub(super) asked: BTreeMap<String, (Store, u64, usize)>,
-    pub(super) said: Said,
-    pub(super) beat: Beat,
-    pub(super) spreads: Spreads,
+    pub(super) shares: BTreeMap<String, (Store, u64, usize)>,
+    pub(super) reported: LastReported,
+    pub(super) health: SystemHealth,
+    pub(super) spreads: IntervalDurations,
     /// What is counted here: lambdas and wakes that are refused, and clips that were deleted before
     /// anything was recorded. The recorder counts the rest.
-    pub(super) counted: Recording,
+    pub(super) counted: RecordingCounts,
     is_ending: bool,
-    pub(super) options: Options,
+    pub(super) options: RecorderOptions,
     stop: Arc<AtomicBool>,
-    pub(super) say: Say,
+    pub(super) reports: ReportWriter,
 }
 
-impl Course {
-    fn turns(&mut self) -> Result<(), Failure> {
+impl RecorderLoop {
+    fn run(&mut self) -> Result<(), Failure> {
         loop {
             let mut is_busy = self.events()?;
-            is_busy |= self.listen()?;
+            is_busy |= self.poll_lambdas()?;
             if let Some(commands) = &mut self.commands {
-                is_busy |= commands.obey(&mut self.recorder)?;
+                is_busy |= commands.handle(&mut self.recorder)?;
             }
-            is_busy |= self.samples(SAMPLES_TURN)? == Came::More;
+            is_busy |= self.samples(SAMPLES_TURN)? == SampleTurn::More;
             let work = self.recorder.work()?;
-            self.tell(false)?;
-            if let Some(why) = self.beat.health.dead.take() {
+            self.report(false)?;
+            if let Some(why) = self.health.source.dead.take() {
                 self.finish()?;
                 return Err(Failure {
                     causes: vec![why],
@@ -202,21 +211,21 @@ impl Course {
                 return self.finish();
             }
             if !is_busy && work != Work::More {
-                thread::park_timeout(if work == Work::Wait { BEHIND } else { LOOK });
+                thread::park_timeout(if work == Work::Wait { WRITER_WAIT } else { IDLE_WAIT });
             }
         }
     }
 
     /// Hears the starter and the watch.
     fn events(&mut self) -> Result<bool, Failure> {
-        let mut heard = false;
+        let mut is_busy = false;
         while let Ok(event) = self.inbox.try_recv() {
-            heard = true;
+            is_busy = true;
             match event {
-                Event::Announced(announced) => self.announce(*announced)?,
-                Event::Refused => self.counted.lambdas_refused += 1,
-                Event::Stop => self.is_ending = true,
-                Event::Seen(Seen::Found { topic, of }) => {
+                LoopEvent::Registered(registration) => self.register(*registration)?,
+                LoopEvent::Refused => self.counted.lambdas_refused += 1,
+                LoopEvent::Stop => self.is_ending = true,
+                LoopEvent::Watch(WatchEvent::Found { topic, of }) => {
                     let type_name = of.type_name.clone();
                     match (self.recorder.found_topic(topic, of), self.topics.get_mut(&topic)) {
                         (Ok(()), Some(recorded)) => recorded.type_name = Some(type_name),
@@ -229,18 +238,18 @@ impl Course {
                         }
                     }
                 }
-                Event::Seen(Seen::Pulse(beat)) => {
-                    self.beat = *beat;
-                    self.look_at_disk()?;
+                LoopEvent::Watch(WatchEvent::Health(health)) => {
+                    self.health = *health;
+                    self.check_disk()?;
                 }
             }
         }
-        Ok(heard)
+        Ok(is_busy)
     }
 
     /// Below the floor no clip is begun, and the open one ends.
-    fn look_at_disk(&mut self) -> Result<(), Failure> {
-        let (Some(free), floor) = (self.beat.disk_free, self.options.disk_floor) else {
+    fn check_disk(&mut self) -> Result<(), Failure> {
+        let (Some(free), floor) = (self.health.disk_free, self.options.disk_floor) else {
             return Ok(());
         };
         let is_held = self.recorder.is_held();
@@ -258,39 +267,35 @@ impl Course {
         Ok(())
     }
 
-    fn listen(&mut self) -> Result<bool, Failure> {
-        let mut heard = false;
+    fn poll_lambdas(&mut self) -> Result<bool, Failure> {
+        let mut is_busy = false;
         let mut index = 0;
         while index < self.lambdas.len() {
             let (now, clock) = (self.clock.now(), self.clock);
             let monotonic = || clock.monotonic(clock.now());
-            let listened = self.lambdas[index].listen(
-                &mut self.recorder,
-                now,
-                monotonic,
-                &mut self.spreads,
-            )?;
-            heard |= listened.heard;
-            self.counted.lambdas_refused += u64::from(listened.is_refused);
-            self.counted.add(&listened.counted);
-            if let (Some(commands), Some(id)) = (&mut self.commands, listened.is_new) {
+            let polled =
+                self.lambdas[index].poll(&mut self.recorder, now, monotonic, &mut self.spreads)?;
+            is_busy |= polled.is_busy;
+            self.counted.lambdas_refused += u64::from(polled.is_refused);
+            self.counted.add(&polled.counted);
+            if let (Some(commands), Some(id)) = (&mut self.commands, polled.is_new) {
                 commands.add(&self.lambdas[index].name, id);
             }
-            if listened.is_gone {
+            if polled.is_gone {
                 self.lambdas.swap_remove(index);
             } else {
                 index += 1;
             }
         }
-        Ok(heard)
+        Ok(is_busy)
     }
 
     /// Takes some of the samples that came.
-    fn samples(&mut self, most: usize) -> Result<Came, Failure> {
+    fn samples(&mut self, most: usize) -> Result<SampleTurn, Failure> {
         let (mut samples, mut bytes) = (0, 0);
         while let Some((staged, cdr)) = self.block.get(self.at) {
             if samples == most || bytes >= BYTES_TURN {
-                return Ok(Came::More);
+                return Ok(SampleTurn::More);
             }
             match staged.bytes {
                 Some(_) => self.recorder.sample(staged.topic, &staged.meta, cdr)?,
@@ -310,40 +315,40 @@ impl Course {
             Err(empty) => {
                 // Time passes only once it is known what came.
                 self.block = empty;
-                return Ok(Came::Copying);
+                return Ok(SampleTurn::Copying);
             }
         }
         if self.block.get(0).is_none() {
             self.recorder.advance(now.saturating_sub(MARGIN_NS))?;
-            return Ok(Came::Nothing);
+            return Ok(SampleTurn::Nothing);
         }
         // A topic is told before its first sample.
         self.events()?;
-        Ok(Came::More)
+        Ok(SampleTurn::More)
     }
 
     /// Takes what has come, and completes what is open.
     fn finish(&mut self) -> Result<(), Failure> {
         // Their processes have ended, or will: what they said before is still on its way.
-        let until = Instant::now() + LAST_WORDS;
+        let until = Instant::now() + FINISH_TIMEOUT;
         while !self.lambdas.is_empty() && Instant::now() < until {
-            if !self.listen()? {
-                thread::park_timeout(LAST_LOOK);
+            if !self.poll_lambdas()? {
+                thread::park_timeout(FINISH_POLL);
             }
         }
         let end = self.clock.now();
-        let until = Instant::now() + LAST_WORDS;
+        let until = Instant::now() + FINISH_TIMEOUT;
         // Three blocks at most: what comes in another is later than the end.
         let mut blocks = 0;
         while blocks < 4 {
             match self.samples(usize::MAX)? {
-                Came::More => blocks += u32::from(self.at == 0),
+                SampleTurn::More => blocks += u32::from(self.at == 0),
                 // No sample takes as long to copy.
-                Came::Copying if Instant::now() < until => thread::park_timeout(LAST_LOOK),
-                Came::Copying | Came::Nothing => break,
+                SampleTurn::Copying if Instant::now() < until => thread::park_timeout(FINISH_POLL),
+                SampleTurn::Copying | SampleTurn::Nothing => break,
             }
         }
         self.recorder.finish(end)?;
-        self.tell(true)
+        self.report(true)
     }
 }

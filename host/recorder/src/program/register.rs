@@ -6,11 +6,11 @@ use gleaner_base::Failure;
 use gleaner_lambda::manifest::Store;
 use tracing::warn;
 
-use super::course::{Course, Recorded, STAGING};
-use super::hear::Announced;
-use super::lambdas::Lambda;
-use super::staging::Lane;
-use super::watch::{Largest, Want, Wanted};
+use super::connections::Registration;
+use super::event_loop::{RecorderLoop, STAGING, TopicEntry};
+use super::lambdas::ConnectedLambda;
+use super::staging::TopicSink;
+use super::topic_watch::{LargestSample, RequestKind, TopicRequest};
 use crate::{RecordError, TopicId};
 
 /// Lambdas that are heard at a time. Each has a thread.
@@ -19,16 +19,16 @@ const LAMBDAS: usize = 256;
 /// goes.
 const USUAL_BYTES: usize = 8 << 20;
 
-impl Course {
+impl RecorderLoop {
     /// A lambda will come: its topics are wanted from now on, so that there is a preroll when it
     /// does.
-    pub(super) fn announce(&mut self, announced: Announced) -> Result<(), Failure> {
-        let Announced { manifest, remaps, spoken, mut answers } = announced;
+    pub(super) fn register(&mut self, registration: Registration) -> Result<(), Failure> {
+        let Registration { manifest, remaps, inbox, mut replies } = registration;
         let Some(rules) = manifest.record.clone() else { return Ok(()) };
         let name = manifest.lambda.name.to_string();
         if self.lambdas.len() == LAMBDAS {
             warn!(lambda = %name, most = LAMBDAS, "too many lambdas at a time: not recorded for");
-            answers.refused(&format!("it hears at most {LAMBDAS} lambdas at a time"));
+            replies.refused(&format!("it hears at most {LAMBDAS} lambdas at a time"));
             self.counted.lambdas_refused += 1;
             return Ok(());
         }
@@ -41,14 +41,17 @@ impl Course {
             let max_bytes = input.map(|input| input.max_size.as_usize());
             largest = largest.max(max_bytes.unwrap_or(USUAL_BYTES));
             let type_name = input.map(|input| input.type_name.to_string());
-            match self.want(remapped.unwrap_or(wanted.as_str()), type_name, Largest::of(max_bytes))
-            {
+            match self.request_topic(
+                remapped.unwrap_or(wanted.as_str()),
+                type_name,
+                LargestSample::of(max_bytes),
+            ) {
                 Ok(topic) if !topics.contains(&topic) => topics.push(topic),
                 Ok(_) => {}
                 Err(error) => {
                     let why = error.to_string();
                     warn!(lambda = %name, topic = %wanted, %why, "a lambda cannot be recorded for");
-                    answers.refused(&why);
+                    replies.refused(&why);
                     self.counted.lambdas_refused += 1;
                     return Ok(());
                 }
@@ -56,39 +59,39 @@ impl Course {
         }
         let seconds = rules.preroll.as_secs_f64().max(1.0);
         let per_s = (rules.preroll_size.bytes() as f64 / seconds) as usize;
-        self.asked.insert(name.clone(), (rules.store, rules.preroll_size.bytes(), per_s));
+        self.shares.insert(name.clone(), (rules.store, rules.preroll_size.bytes(), per_s));
         let per_s: usize =
-            self.asked.values().map(|(_, _, per_s)| *per_s).fold(0, usize::saturating_add);
+            self.shares.values().map(|(_, _, per_s)| *per_s).fold(0, usize::saturating_add);
         let wanted = largest.saturating_add(per_s).clamp(*STAGING.start(), *STAGING.end());
         self.room = self.room.max(wanted);
         if let Err(error) = self.grow_preroll() {
             // The others go on with what they have.
-            self.asked.remove(&name);
+            self.shares.remove(&name);
             let why = Failure::from(error).to_string();
             warn!(lambda = %name, %why, "a lambda cannot be recorded for");
-            answers.refused(&why);
+            replies.refused(&why);
             self.counted.lambdas_refused += 1;
             return Ok(());
         }
         self.recorder.grow_length(rules.max_length);
-        self.lambdas.push(Lambda::new(name, rules, topics, spoken, answers));
+        self.lambdas.push(ConnectedLambda::new(name, rules, topics, inbox, replies));
         Ok(())
     }
 
     /// As much preroll as all lambdas ask for.
     fn grow_preroll(&mut self) -> Result<(), RecordError> {
-        let store = if self.asked.values().any(|asked| asked.0 == Store::Disk) {
+        let store = if self.shares.values().any(|shares| shares.0 == Store::Disk) {
             Store::Disk
         } else {
             Store::Ram
         };
-        let bytes = self.asked.values().map(|asked| asked.1).fold(0, u64::saturating_add);
+        let bytes = self.shares.values().map(|shares| shares.1).fold(0, u64::saturating_add);
         match self.options.preroll_bytes {
             // What is given is memory.
             Some(given) if store == Store::Ram => {
                 if given < bytes {
                     warn!(
-                        asked = bytes,
+                        shares = bytes,
                         given, "lambdas ask for more preroll than the recorder was given"
                     );
                 }
@@ -98,24 +101,25 @@ impl Course {
         }
     }
 
-    fn want(
+    fn request_topic(
         &mut self,
         name: &str,
         type_name: Option<String>,
-        largest: Largest,
+        largest: LargestSample,
     ) -> Result<TopicId, RecordError> {
         let topic = self.recorder.add_missing_topic(name)?;
         let recorded = self.topics.entry(topic).or_insert_with(|| {
-            let lane = Lane { topic, staging: Arc::clone(&self.staging), arrivals: Arc::default() };
-            Recorded { name: name.to_owned(), type_name: None, lane: Arc::new(lane) }
+            let sink =
+                TopicSink { topic, staging: Arc::clone(&self.staging), arrivals: Arc::default() };
+            TopicEntry { name: name.to_owned(), type_name: None, sink: Arc::new(sink) }
         });
         // The watch takes them as they come.
-        let what = Wanted::Recorded { topic, largest };
-        let _ = self.wants.send(Want {
+        let what = RequestKind::TopicEntry { topic, largest };
+        let _ = self.requests.send(TopicRequest {
             what,
             name: name.to_owned(),
             type_name,
-            sink: recorded.lane.clone(),
+            sink: recorded.sink.clone(),
         });
         Ok(topic)
     }

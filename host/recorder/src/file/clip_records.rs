@@ -6,11 +6,11 @@ use std::fmt::Display;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use gleaner_journal::{FileDigest, Header};
+use gleaner_journal::{FileDigest, JournalHeader};
 use gleaner_lambda::{Clip, ClipLambda, ClipTopic, Moment};
 
 use super::written::{Written, WrittenTopic, crc32};
-use super::{About, Ending};
+use super::{ClipHeader, ClipTrailer};
 
 /// The program that writes clips, as their header names it.
 pub(super) const LIBRARY: &str = concat!("gleaner ", env!("CARGO_PKG_VERSION"));
@@ -31,17 +31,17 @@ pub(super) const LINE: &str = "line";
 /// Key of [`CLIP_RECORD`]: the unfinished file that a recovered clip was saved from.
 const RECOVERED_FROM: &str = "recovered_from";
 
-/// In `short`: the clip before has the messages before.
+/// In `incomplete`: the clip before has the messages before.
 pub(crate) const CONTINUES: &str = "continues the clip before";
 
 const UNKNOWN: &str = "unknown";
 
 /// A metadata record.
-pub(super) type Record = (String, BTreeMap<String, String>);
+pub(super) type MetadataRecord = (String, BTreeMap<String, String>);
 
 /// The line of a clip, but for its length.
 pub(super) fn clip(
-    ending: &Ending,
+    trailer: &ClipTrailer,
     written: &Written,
     file: PathBuf,
     thumbnail: Option<PathBuf>,
@@ -50,24 +50,24 @@ pub(super) fn clip(
         file,
         thumbnail,
         bytes: 0,
-        from_ns: ending.from_ns,
-        to_ns: ending.to_ns,
+        from_ns: trailer.from_ns,
+        to_ns: trailer.to_ns,
         first_ns: written.span.map(|span| span.0),
         last_ns: written.span.map(|span| span.1),
-        lambdas: ending.lambdas.clone(),
-        triggers: ending.triggers,
-        moments: ending.moments.iter().take(Clip::MOMENTS_MAX).cloned().collect(),
-        topics: topics(ending, written),
-        short: ending.short.clone(),
+        lambdas: trailer.lambdas.clone(),
+        triggers: trailer.triggers,
+        moments: trailer.moments.iter().take(Clip::MOMENTS_MAX).cloned().collect(),
+        topics: topics(trailer, written),
+        incomplete: trailer.incomplete.clone(),
         recovered: None,
     }
 }
 
 /// The topics that the recorder names, then those that it forgot: their messages are in the file
 /// all the same.
-fn topics(ending: &Ending, written: &Written) -> Vec<ClipTopic> {
+fn topics(trailer: &ClipTrailer, written: &Written) -> Vec<ClipTopic> {
     let mut topics = Vec::new();
-    for counts in &ending.topics {
+    for counts in &trailer.topics {
         let found = written.topic(&counts.topic);
         topics.push(ClipTopic {
             topic: counts.topic.clone(),
@@ -82,7 +82,7 @@ fn topics(ending: &Ending, written: &Written) -> Vec<ClipTopic> {
             too_big: counts.too_big,
         });
     }
-    let named: HashSet<&str> = ending.topics.iter().map(|counts| counts.topic.as_str()).collect();
+    let named: HashSet<&str> = trailer.topics.iter().map(|counts| counts.topic.as_str()).collect();
     for found in written.topics().iter().filter(|found| !named.contains(found.name.as_str())) {
         topics.push(ClipTopic {
             topic: found.name.clone(),
@@ -98,20 +98,20 @@ fn topics(ending: &Ending, written: &Written) -> Vec<ClipTopic> {
 }
 
 /// The record in front of the messages, of a clip that `library` writes.
-pub(super) fn begin(about: &About, library: &str) -> Record {
+pub(super) fn begin(clip_header: &ClipHeader, library: &str) -> MetadataRecord {
     let metadata = pairs([
-        ("clock", about.clock.clone()),
-        ("from_ns", about.from_ns.to_string()),
-        ("lambdas", json(&about.lambdas)),
+        ("clock", clip_header.clock.clone()),
+        ("from_ns", clip_header.from_ns.to_string()),
+        ("lambdas", json(&clip_header.lambdas)),
         ("library", library.to_owned()),
-        ("moment", json(&about.moment)),
+        ("moment", json(&clip_header.moment)),
     ]);
     (BEGIN.to_owned(), metadata)
 }
 
 /// Reads a record of [`begin`]; the key that is malformed if it is.
-pub(super) fn read_begin(metadata: &BTreeMap<String, String>) -> Result<About, &'static str> {
-    Ok(About {
+pub(super) fn read_begin(metadata: &BTreeMap<String, String>) -> Result<ClipHeader, &'static str> {
+    Ok(ClipHeader {
         clock: value(metadata, "clock")?.clone(),
         from_ns: value(metadata, "from_ns")?.parse().map_err(|_| "from_ns")?,
         lambdas: serde_json::from_str(value(metadata, "lambdas")?).map_err(|_| "lambdas")?,
@@ -131,18 +131,18 @@ pub(super) fn read_recovered_from(metadata: &BTreeMap<String, String>) -> Option
 
 /// The records behind the messages.
 pub(super) fn records<'a>(
-    ending: &'a Ending,
+    trailer: &'a ClipTrailer,
     clip: &'a Clip,
     written: &'a Written,
     clock: &str,
     recovered_from: Option<&str>,
-) -> impl Iterator<Item = Record> + 'a {
-    let header = |index: usize| ending.headers.get(index).map(Arc::as_ref);
+) -> impl Iterator<Item = MetadataRecord> + 'a {
+    let header = |index: usize| trailer.headers.get(index).map(Arc::as_ref);
     let lambdas = clip.lambdas.iter().enumerate().map(move |(index, of)| lambda(of, header(index)));
-    std::iter::once(about_clip(clip, clock, LIBRARY, ending.thumbnail.as_deref(), recovered_from))
+    std::iter::once(about_clip(clip, clock, LIBRARY, trailer.thumbnail.as_deref(), recovered_from))
         .chain(clip.topics.iter().map(|of| topic(of, written.topic(&of.topic))))
         .chain(lambdas)
-        .chain(ending.moments.iter().map(decision))
+        .chain(trailer.moments.iter().map(decision))
 }
 
 /// The record of the clip as a whole.
@@ -152,7 +152,7 @@ pub(super) fn about_clip(
     library: &str,
     thumbnail: Option<&[u8]>,
     recovered_from: Option<&str>,
-) -> Record {
+) -> MetadataRecord {
     let mut metadata = pairs([
         ("clock", clock.to_owned()),
         ("file", clip.file.display().to_string()),
@@ -161,13 +161,13 @@ pub(super) fn about_clip(
         ("last_ns", known(clip.last_ns)),
         ("library", library.to_owned()),
         (LINE, json(clip)),
-        ("short", clip.short.join("; ")),
+        ("incomplete", clip.incomplete.join("; ")),
         ("thumbnail", known(thumbnail.map(crc32))),
         ("to_ns", clip.to_ns.to_string()),
         ("triggers", clip.triggers.to_string()),
     ]);
     if let Some(recovered) = &clip.recovered {
-        metadata.insert("recovered".to_owned(), recovered.what.clone());
+        metadata.insert("recovered".to_owned(), recovered.note.clone());
         metadata.insert("recovered_lost_bytes".to_owned(), recovered.lost_bytes.to_string());
     }
     if let Some(from) = recovered_from {
@@ -177,7 +177,7 @@ pub(super) fn about_clip(
 }
 
 /// The record of a topic; `found` is its content.
-pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> Record {
+pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> MetadataRecord {
     let metadata = pairs([
         (
             "checksum",
@@ -196,7 +196,7 @@ pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> Record {
 }
 
 /// The record of a lambda, with the header of its journal.
-pub(super) fn lambda(lambda: &ClipLambda, header: Option<&Header>) -> Record {
+pub(super) fn lambda(lambda: &ClipLambda, header: Option<&JournalHeader>) -> MetadataRecord {
     let model = |model: &FileDigest| format!("{}={}", model.path, model.sha256);
     let metadata = pairs([
         ("config", known(header.map(|header| json(&header.config)))),
@@ -218,7 +218,7 @@ pub(super) fn lambda(lambda: &ClipLambda, header: Option<&Header>) -> Record {
 }
 
 /// The record of a trigger or a command.
-pub(super) fn decision(moment: &Moment) -> Record {
+pub(super) fn decision(moment: &Moment) -> MetadataRecord {
     let mut metadata = pairs([
         ("at_ns", moment.at_ns.to_string()),
         ("kind", moment.kind.as_str().to_owned()),

@@ -3,29 +3,29 @@
 
 use std::sync::Arc;
 
-use gleaner_journal::{Encoder, Header};
-use gleaner_lambda::manifest::Record;
+use gleaner_journal::{Encoder, JournalHeader};
+use gleaner_lambda::manifest::RecordSpec;
 use gleaner_lambda::{Clip, ClipLambda, Moment};
 
 use gleaner_transport::{Gaps, SampleMeta};
 
-use super::draft::{Close, Draft};
-use super::limits::Limits;
-use super::pen::Pen;
-use super::waiting::Waiting;
+use super::clip_writer::ClipWriter;
+use super::limits::RecorderLimits;
+use super::open_clip::{CloseReason, OpenClip};
+use super::waiting::WaitingTriggers;
 use crate::RecordError;
-use crate::file::Topic;
-use crate::preroll::{Held, Losses, Preroll, Walked};
+use crate::file::TopicSchema;
+use crate::preroll::{EntryMeta, Losses, Preroll, Walked};
 use crate::thumbnail::is_image;
 use crate::window::{Group, Window};
 
 /// A lambda that records.
 #[derive(Clone, Debug)]
-pub struct Member {
+pub struct LambdaSpec {
     /// What it is, as its journal says it.
-    pub header: Header,
+    pub header: JournalHeader,
     /// Its `[record]`.
-    pub rules: Record,
+    pub rules: RecordSpec,
     /// SHA-256 over the digests of its files, in hexadecimal digits.
     pub digest: String,
     /// What its clips hold, in the order of `[record]`.
@@ -34,8 +34,8 @@ pub struct Member {
 
 /// A topic, and who records it.
 #[derive(Debug)]
-pub(super) struct Lane {
-    pub(super) topic: Arc<Topic>,
+pub(super) struct TopicState {
+    pub(super) topic: Arc<TopicSchema>,
     pub(super) is_missing: bool,
     /// When it was found, if that was later than it was wanted.
     pub(super) found_at: Option<i64>,
@@ -44,17 +44,17 @@ pub(super) struct Lane {
     pub(super) gaps: Gaps,
 }
 
-impl Lane {
+impl TopicState {
     pub(super) fn is_image(&self) -> bool {
         !self.is_missing && is_image(&self.topic.type_name)
     }
 }
 
 /// One lambda, its windows aside.
-pub(super) struct Crew {
+pub(super) struct RecordedLambda {
     /// Clips share it.
-    pub(super) header: Arc<Header>,
-    /// As in [`Member`].
+    pub(super) header: Arc<JournalHeader>,
+    /// As in [`LambdaSpec`].
     pub(super) digest: String,
     pub(super) topics: Vec<super::TopicId>,
     pub(super) encoder: Encoder,
@@ -62,19 +62,19 @@ pub(super) struct Crew {
 }
 
 /// What every clip is written with.
-pub(super) struct Desk {
-    pub(super) pen: Pen,
+pub(super) struct ClipContext {
+    pub(super) writer: ClipWriter,
     /// Clips so far; each has its number.
     pub(super) clips: u64,
     pub(super) clock: String,
-    pub(super) limits: Limits,
+    pub(super) limits: RecorderLimits,
     /// Whether samples come as they are made, so that gaps in their numbers are losses.
     pub(super) is_live: bool,
-    pub(super) lanes: Vec<Lane>,
-    pub(super) crews: Vec<Crew>,
+    pub(super) topics: Vec<TopicState>,
+    pub(super) lambdas: Vec<RecordedLambda>,
 }
 
-impl Desk {
+impl ClipContext {
     /// The number of a new clip.
     pub(super) fn next_clip(&mut self) -> u64 {
         self.clips += 1;
@@ -83,13 +83,13 @@ impl Desk {
 
     /// Whether a window of a lambda that records this topic contains `at`.
     pub(super) fn covers(&self, group: &Group, topic: usize, at: i64) -> bool {
-        self.lanes[topic].lambdas.iter().any(|lambda| group.covers(*lambda, at))
+        self.topics[topic].lambdas.iter().any(|lambda| group.covers(*lambda, at))
     }
 
     /// The topics of the lambdas of a clip, each once, in their order.
     pub(super) fn topics_of(&self, group: &Group) -> Vec<usize> {
         let mut topics = Vec::new();
-        for topic in group.lambdas.iter().flat_map(|lambda| &self.crews[*lambda].topics) {
+        for topic in group.lambdas.iter().flat_map(|lambda| &self.lambdas[*lambda].topics) {
             if !topics.contains(&topic.0) {
                 topics.push(topic.0);
             }
@@ -100,7 +100,7 @@ impl Desk {
     /// The lambdas of a clip.
     pub(super) fn lambdas_of(&self, group: &Group) -> Vec<ClipLambda> {
         let lambda = |lambda: &usize| {
-            let Crew { header, digest, .. } = &self.crews[*lambda];
+            let RecordedLambda { header, digest, .. } = &self.lambdas[*lambda];
             ClipLambda {
                 name: header.lambda.clone(),
                 version: header.version.clone(),
@@ -123,38 +123,38 @@ pub(super) struct Settled {
 }
 
 /// Everything that clips are made from.
-pub(super) struct Stock {
+pub(super) struct RecorderState {
     pub(super) preroll: Preroll,
     /// By topic.
     pub(super) losses: Vec<Losses>,
     /// By lambda.
     pub(super) wake_losses: Vec<Losses>,
-    pub(super) waiting: Waiting,
-    pub(super) desk: Desk,
+    pub(super) waiting: WaitingTriggers,
+    pub(super) context: ClipContext,
     /// When the recorder first heard of anything.
     pub(super) began_at: i64,
 }
 
-impl Stock {
+impl RecorderState {
     /// Keeps an entry. `evicted_early` counts samples that have to go for it, `too_big` is raised if
     /// it cannot be kept.
     pub(super) fn keep(
         &mut self,
-        held: Held,
+        held: EntryMeta,
         bytes: &[u8],
         evicted_early: &mut u64,
         too_big: &mut u64,
     ) -> Result<(), RecordError> {
         let is_sample = held.source.as_topic().is_some();
-        let Stock { preroll, losses, wake_losses, desk, .. } = self;
-        let mut gone = |gone: &Held| {
+        let RecorderState { preroll, losses, wake_losses, context, .. } = self;
+        let mut gone = |gone: &EntryMeta| {
             *evicted_early += u64::from(gone.source.as_topic().is_some());
             if let Some(losses) = losses_of(losses, wake_losses, gone) {
                 losses.overwritten.add(gone.at_ns, gone.group);
             }
         };
         // What no clip can hold need not wait for one.
-        let fits = !is_sample || bytes.len() <= desk.limits.message_bytes;
+        let fits = !is_sample || bytes.len() <= context.limits.message_bytes;
         if fits && preroll.push(held, bytes, &mut gone)? {
             return Ok(());
         }
@@ -167,7 +167,7 @@ impl Stock {
 
     /// Counts what the number of a sample tells of samples before it.
     pub(super) fn note_gap(&mut self, topic: usize, meta: &SampleMeta) {
-        let gaps = &mut self.desk.lanes[topic].gaps;
+        let gaps = &mut self.context.topics[topic].gaps;
         let before = gaps.lost();
         let missing = gaps.note(meta.writer, meta.seq);
         let lost = &mut self.losses[topic].lost;
@@ -180,7 +180,7 @@ impl Stock {
 
     /// Gives up what is older than `before`.
     pub(super) fn trim(&mut self, before: i64) -> Result<(), RecordError> {
-        let Stock { preroll, losses, wake_losses, .. } = self;
+        let RecorderState { preroll, losses, wake_losses, .. } = self;
         preroll.trim(before, &mut |held| {
             if let Some(losses) = losses_of(losses, wake_losses, held) {
                 losses.aged.add(held.at_ns, held.group);
@@ -189,23 +189,29 @@ impl Stock {
     }
 
     /// Whether an entry belongs into a clip that ends at `limit` at the latest, and is not in it.
-    pub(super) fn wants(&self, draft: &Draft, group: &Group, held: &Held, limit: i64) -> bool {
-        if held.group == draft.group || held.at_ns > limit {
+    pub(super) fn wants(
+        &self,
+        open_clip: &OpenClip,
+        group: &Group,
+        held: &EntryMeta,
+        limit: i64,
+    ) -> bool {
+        if held.group == open_clip.group || held.at_ns > limit {
             return false;
         }
         match held.source.as_topic() {
-            Some(topic) => self.desk.covers(group, topic, held.at_ns),
+            Some(topic) => self.context.covers(group, topic, held.at_ns),
             None => (group.begin..=group.to).contains(&held.at_ns),
         }
     }
 
     /// The stamp of the earliest sample that is covered, but in none of the clips of the group.
-    pub(super) fn earliest(&self, draft: &Draft, group: &Group) -> Option<i64> {
+    pub(super) fn earliest(&self, open_clip: &OpenClip, group: &Group) -> Option<i64> {
         let mut earliest = None;
         let mut next = self.preroll.next(None);
         while let Some(place) = next.map(Walked::place) {
             let held = self.preroll.held(place);
-            if held.source.as_topic().is_some() && self.wants(draft, group, &held, i64::MAX) {
+            if held.source.as_topic().is_some() && self.wants(open_clip, group, &held, i64::MAX) {
                 earliest = Some(earliest.map_or(held.at_ns, |at: i64| at.min(held.at_ns)));
             }
             next = self.preroll.next(next);
@@ -214,41 +220,41 @@ impl Stock {
     }
 
     /// The triggers within the clip.
-    pub(super) fn gather(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
-        let untold = self.waiting.take(group, limit, |moment| draft.moment(moment));
-        draft.triggers += untold;
+    pub(super) fn gather(&mut self, open_clip: &mut OpenClip, group: &Group, limit: i64) {
+        let counted = self.waiting.take(group, limit, |moment| open_clip.moment(moment));
+        open_clip.triggers += counted;
     }
 
     /// Completes a clip, which is returned if it is written already.
     pub(super) fn finish(
         &mut self,
-        mut draft: Draft,
+        mut open_clip: OpenClip,
         group: &Group,
-        close: Close,
+        close: CloseReason,
     ) -> Result<Option<Clip>, RecordError> {
-        let limit = if let Close::Full(boundary) = close { boundary } else { i64::MAX };
-        draft.uncertain = self.waiting.uncertain(group, limit);
-        if self.desk.is_live {
-            self.count_lost(&mut draft, group, limit);
+        let limit = if let CloseReason::Full(boundary) = close { boundary } else { i64::MAX };
+        open_clip.uncertain = self.waiting.uncertain(group, limit);
+        if self.context.is_live {
+            self.count_lost(&mut open_clip, group, limit);
         }
-        draft.finish(&mut self.desk, group, &close)
+        open_clip.finish(&mut self.context, group, &close)
     }
 
     /// What did not even come here.
-    fn count_lost(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
-        let (number, from) = (draft.group, draft.from(group));
-        for topic in self.desk.topics_of(group) {
-            let desk = &self.desk;
+    fn count_lost(&mut self, open_clip: &mut OpenClip, group: &Group, limit: i64) {
+        let (number, from) = (open_clip.group, open_clip.from(group));
+        for topic in self.context.topics_of(group) {
+            let context = &self.context;
             let lost = &mut self.losses[topic].lost;
             let is_known = !lost.is_unknown(from, number)
-                && desk.lanes[topic].found_at.is_none_or(|at| at <= from);
-            let count = lost.count(number, |at| at <= limit && desk.covers(group, topic, at));
-            draft.tally(topic).lost = is_known.then_some(count);
+                && context.topics[topic].found_at.is_none_or(|at| at <= from);
+            let count = lost.count(number, |at| at <= limit && context.covers(group, topic, at));
+            open_clip.tally(topic).lost = is_known.then_some(count);
         }
         let inside = group.begin..=group.to.min(limit);
         for lambda in &group.lambdas {
             let count = self.wake_losses[*lambda].lost.count(number, |at| inside.contains(&at));
-            draft.wakes_unheard(*lambda, count);
+            open_clip.wakes_undelivered(*lambda, count);
         }
     }
 
@@ -256,7 +262,7 @@ impl Stock {
     pub(super) fn opening(&self, group: &Group) -> Moment {
         let (lambda, at_ns) = group.first;
         self.waiting.find(lambda, at_ns).cloned().unwrap_or_else(|| Moment {
-            lambda: self.desk.crews[lambda].header.lambda.clone(),
+            lambda: self.context.lambdas[lambda].header.lambda.clone(),
             kind: gleaner_lambda::TriggerKind::Event,
             label: String::new(),
             score: None,
@@ -267,12 +273,13 @@ impl Stock {
     }
 
     /// What a window asks for and nobody can give.
-    pub(super) fn reach_back(&mut self, draft: &mut Draft, window: &Window) {
-        draft.begins_late_ns = draft.begins_late_ns.max(self.began_at.saturating_sub(window.from));
-        let number = draft.group;
-        for topic in &self.desk.crews[window.lambda].topics {
+    pub(super) fn reach_back(&mut self, open_clip: &mut OpenClip, window: &Window) {
+        open_clip.begins_late_ns =
+            open_clip.begins_late_ns.max(self.began_at.saturating_sub(window.from));
+        let number = open_clip.group;
+        for topic in &self.context.lambdas[window.lambda].topics {
             let losses = &self.losses[topic.0];
-            let tally = draft.tally(topic.0);
+            let tally = open_clip.tally(topic.0);
             tally.is_aged |= losses.aged.hides(window.from, number);
             if losses.overwritten.is_unknown(window.from, number) {
                 tally.overwritten = None;
@@ -283,15 +290,15 @@ impl Stock {
         }
     }
 
-    pub(super) fn count_losses(&mut self, draft: &mut Draft, group: &Group, limit: i64) {
-        let number = draft.group;
-        for topic in self.desk.topics_of(group) {
-            let desk = &self.desk;
-            let covered = |at: i64| at <= limit && desk.covers(group, topic, at);
+    pub(super) fn count_losses(&mut self, open_clip: &mut OpenClip, group: &Group, limit: i64) {
+        let number = open_clip.group;
+        for topic in self.context.topics_of(group) {
+            let context = &self.context;
+            let covered = |at: i64| at <= limit && context.covers(group, topic, at);
             let losses = &mut self.losses[topic];
             let (overwritten, too_big) =
                 (losses.overwritten.count(number, covered), losses.too_big.count(number, covered));
-            let tally = draft.tally(topic);
+            let tally = open_clip.tally(topic);
             tally.overwritten = tally.overwritten.map(|count| count + overwritten);
             tally.too_big = tally.too_big.map(|count| count + too_big);
         }
@@ -300,7 +307,7 @@ impl Stock {
             let covered = |at: i64| inside.contains(&at);
             let lost =
                 losses.overwritten.count(number, covered) + losses.too_big.count(number, covered);
-            draft.lose_wakes(lambda, lost);
+            open_clip.lose_wakes(lambda, lost);
         }
     }
 }
@@ -308,7 +315,7 @@ impl Stock {
 fn losses_of<'a>(
     topics: &'a mut [Losses],
     wakes: &'a mut [Losses],
-    held: &Held,
+    held: &EntryMeta,
 ) -> Option<&'a mut Losses> {
     match held.source.lambda() {
         Some(lambda) => wakes.get_mut(lambda),

@@ -7,76 +7,80 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{Builder, Thread};
 
 use gleaner_base::{Exit, Failure, hex};
-use gleaner_journal::{Entry, Header};
+use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::{BuildDir, Manifest};
-use gleaner_protocol::link::{Add, Answers, Controlled, Heard, LambdaLink, LinkError, Order};
+use gleaner_protocol::link::{
+    AddLambda, ControlMessage, ControlServer, LambdaLink, LambdaMessage, LambdaReplies, LinkError,
+};
 use sha2::{Digest, Sha256};
 use tracing::warn;
 
-use super::watch::Seen;
+use super::topic_watch::WatchEvent;
 
 /// What one lambda said waits for the loop, up to this; then its socket waits, and then the
 /// lambda's own queue.
-const SPOKEN: usize = 64;
+const INBOX: usize = 64;
 
 /// What the loop hears beside samples and lambdas.
-pub(super) enum Event {
+pub(super) enum LoopEvent {
     /// A lambda will come.
-    Announced(Box<Announced>),
+    Registered(Box<Registration>),
     /// One was announced, and refused; it was said why.
     Refused,
     /// It is to end: the starter said so, or has ended, or speaks nonsense.
     Stop,
     /// From the watch.
-    Seen(Seen),
+    Watch(WatchEvent),
 }
 
 /// A lambda that will come, and how it is heard.
-pub(super) struct Announced {
+pub(super) struct Registration {
     pub(super) manifest: Manifest,
     pub(super) remaps: Vec<(String, String)>,
-    pub(super) spoken: Receiver<Spoken>,
-    pub(super) answers: Answers,
+    pub(super) inbox: Receiver<LambdaEvent>,
+    pub(super) replies: LambdaReplies,
 }
 
 /// What a lambda said.
-pub(super) enum Spoken {
+pub(super) enum LambdaEvent {
     /// What it is: what was announced.
-    Hello(Box<Header>),
+    Hello(Box<JournalHeader>),
     /// It is something else.
-    Another(String),
+    Mismatch(String),
     Wake {
-        entry: Box<Entry>,
+        entry: Box<JournalEntry>,
         decided_ns: i64,
         missing: u32,
         bytes: usize,
     },
     /// Nothing more comes.
-    Gone(Option<LinkError>),
+    Closed(Option<LinkError>),
 }
 
 /// Hears the starter until it ends.
 pub(super) fn starter(
     control: OwnedFd,
-    events: SyncSender<Event>,
+    events: SyncSender<LoopEvent>,
     reader: Thread,
 ) -> io::Result<()> {
     Builder::new().name("starter".to_owned()).spawn(move || {
-        let mut control = Controlled::new(control);
+        let mut control = ControlServer::new(control);
         loop {
             let event = match control.order() {
-                Ok(Some(Order::Add(add, socket))) => announced(add, socket, &reader)
-                    .map_or(Event::Refused, |announced| Event::Announced(Box::new(announced))),
-                Ok(Some(Order::Stop) | None) => Event::Stop,
+                Ok(Some(ControlMessage::Add(add, socket))) => register(add, socket, &reader)
+                    .map_or(LoopEvent::Refused, |registration| {
+                        LoopEvent::Registered(Box::new(registration))
+                    }),
+                Ok(Some(ControlMessage::Stop) | None) => LoopEvent::Stop,
                 Err(error) => {
                     warn!(
                         error = &error as &dyn std::error::Error,
                         "the starter cannot be understood"
                     );
-                    Event::Stop
+                    LoopEvent::Stop
                 }
             };
-            let is_last = matches!(event, Event::Stop);
+            let is_last = matches!(event, LoopEvent::Stop);
             if events.send(event).is_err() || is_last {
                 return reader.unpark();
             }
@@ -86,9 +90,9 @@ pub(super) fn starter(
     Ok(())
 }
 
-fn announced(add: Add, socket: OwnedFd, reader: &Thread) -> Option<Announced> {
+fn register(add: AddLambda, socket: OwnedFd, reader: &Thread) -> Option<Registration> {
     let lambda = add.lambda.display().to_string();
-    let (link, mut answers) = match LambdaLink::new(socket) {
+    let (link, mut replies) = match LambdaLink::new(socket) {
         Ok(both) => both,
         Err(error) => {
             warn!(%lambda, %error, "a lambda's socket cannot be used");
@@ -99,38 +103,45 @@ fn announced(add: Add, socket: OwnedFd, reader: &Thread) -> Option<Announced> {
         Ok(loaded) => loaded,
         Err(failure) => {
             warn!(%lambda, %failure, "a lambda cannot be recorded for");
-            answers.refused(&failure.message);
+            replies.refused(&failure.message);
             return None;
         }
     };
-    let expected = Expected { manifest: manifest.clone(), digest, remaps: add.remaps.clone() };
-    let (sender, spoken) = sync_channel(SPOKEN);
+    let expected =
+        ExpectedLambda { manifest: manifest.clone(), digest, remaps: add.remaps.clone() };
+    let (sender, inbox) = sync_channel(INBOX);
     let reader = reader.clone();
     let name = format!("hear {}", manifest.lambda.name);
-    let heard = Builder::new().name(name).spawn(move || hear(link, &expected, &sender, &reader));
-    if let Err(error) = heard {
+    let started =
+        Builder::new().name(name).spawn(move || read_link(link, &expected, &sender, &reader));
+    if let Err(error) = started {
         warn!(%lambda, %error, "a lambda cannot be heard");
-        answers.refused("the recorder has no thread for it");
+        replies.refused("the recorder has no thread for it");
         return None;
     }
-    Some(Announced { manifest, remaps: add.remaps, spoken, answers })
+    Some(Registration { manifest, remaps: add.remaps, inbox, replies })
 }
 
-fn hear(mut link: LambdaLink, expected: &Expected, spoken: &SyncSender<Spoken>, reader: &Thread) {
+fn read_link(
+    mut link: LambdaLink,
+    expected: &ExpectedLambda,
+    inbox: &SyncSender<LambdaEvent>,
+    reader: &Thread,
+) {
     loop {
-        let said = match link.hear() {
-            Ok(Some(Heard::Hello(header))) => match expected.differs(&header) {
-                None => Spoken::Hello(header),
-                Some(why) => Spoken::Another(why),
+        let event = match link.hear() {
+            Ok(Some(LambdaMessage::Hello(header))) => match expected.differs(&header) {
+                None => LambdaEvent::Hello(header),
+                Some(why) => LambdaEvent::Mismatch(why),
             },
-            Ok(Some(Heard::Wake { entry, decided_ns, missing, bytes })) => {
-                Spoken::Wake { entry, decided_ns, missing, bytes }
+            Ok(Some(LambdaMessage::Wake { entry, decided_ns, missing, bytes })) => {
+                LambdaEvent::Wake { entry, decided_ns, missing, bytes }
             }
-            Ok(Some(Heard::Bye) | None) => Spoken::Gone(None),
-            Err(error) => Spoken::Gone(Some(error)),
+            Ok(Some(LambdaMessage::Bye) | None) => LambdaEvent::Closed(None),
+            Err(error) => LambdaEvent::Closed(Some(error)),
         };
-        let is_last = matches!(said, Spoken::Gone(_) | Spoken::Another(_));
-        if spoken.send(said).is_err() || is_last {
+        let is_last = matches!(event, LambdaEvent::Closed(_) | LambdaEvent::Mismatch(_));
+        if inbox.send(event).is_err() || is_last {
             return reader.unpark();
         }
         reader.unpark();
@@ -138,16 +149,16 @@ fn hear(mut link: LambdaLink, expected: &Expected, spoken: &SyncSender<Spoken>, 
 }
 
 /// What the starter said that a lambda is.
-struct Expected {
+struct ExpectedLambda {
     manifest: Manifest,
     /// Of its `lambda.toml`, in hexadecimal digits.
     digest: String,
     remaps: Vec<(String, String)>,
 }
 
-impl Expected {
+impl ExpectedLambda {
     /// In which way `header` is of another lambda.
-    fn differs(&self, header: &Header) -> Option<String> {
+    fn differs(&self, header: &JournalHeader) -> Option<String> {
         let lambda = &self.manifest.lambda;
         let text = |what: &str, wanted: &str, found: &str| {
             (wanted != found)
@@ -179,7 +190,7 @@ impl Expected {
 
 /// The manifest of a build with the limits that it gets on this vehicle, and its digest: of the
 /// same bytes.
-fn load(add: &Add) -> Result<(Manifest, String), Failure> {
+fn load(add: &AddLambda) -> Result<(Manifest, String), Failure> {
     let build = BuildDir::of(&add.lambda);
     let text = Manifest::read(build.path())?;
     let mut manifest = Manifest::parse(&text, build.manifest_path())?;

@@ -7,69 +7,70 @@ use gleaner_base::Failure;
 use gleaner_protocol::link::{Loss, RecordedTopic, RecorderReport, RecorderStatus};
 use tracing::{error, warn};
 
-use super::course::{Course, Recorded};
-use crate::{Counts, TopicId};
+use super::event_loop::{RecorderLoop, TopicEntry};
+use crate::{RecorderCounts, TopicId};
 
 /// What was told of the counts.
 #[derive(Default)]
-pub(super) struct Said {
+pub(super) struct LastReported {
     clips: u64,
     disk_suppressed: u64,
     at: Option<Instant>,
 }
 
-impl Course {
+impl RecorderLoop {
     /// Tells what is new.
-    pub(super) fn tell(&mut self, is_last: bool) -> Result<(), Failure> {
+    pub(super) fn report(&mut self, is_last: bool) -> Result<(), Failure> {
         let counts = self.recorder.counts();
-        let new = usize::try_from(counts.recording.clips - self.said.clips).unwrap_or(usize::MAX);
+        let new =
+            usize::try_from(counts.recording.clips - self.reported.clips).unwrap_or(usize::MAX);
         let clips = self.recorder.clips();
         for clip in &clips[clips.len().saturating_sub(new)..] {
-            self.say.say(RecorderReport::Clip(Box::new(clip.clone())));
+            self.reports.send(RecorderReport::Clip(Box::new(clip.clone())));
         }
-        self.said.clips = counts.recording.clips;
+        self.reported.clips = counts.recording.clips;
         for clip in self.recorder.take_recovered() {
             warn!(clip = %clip.file.display(), "recovered a clip of an earlier recorder, which did not end well");
-            self.say.say(RecorderReport::Recovered(Box::new(clip)));
+            self.reports.send(RecorderReport::Recovered(Box::new(clip)));
         }
         let at_ns = self.clock.now();
         for error in self.recorder.take_failures() {
             let failure = Failure::from(error);
             error!(%failure, "a clip could not be written");
-            let why = std::iter::once(failure.message)
+            let reason = std::iter::once(failure.message)
                 .chain(failure.causes)
                 .collect::<Vec<_>>()
                 .join(": ");
-            self.say.say(RecorderReport::Loss(Loss::Failed { at_ns, why }));
+            self.reports.send(RecorderReport::Loss(Loss::Failed { at_ns, reason }));
         }
         for loss in self.recorder.take_deleted() {
-            self.say.say(RecorderReport::Loss(loss));
+            self.reports.send(RecorderReport::Loss(loss));
         }
-        if !is_last && self.said.at.is_some_and(|at| at.elapsed() < Duration::from_secs(1)) {
+        if !is_last && self.reported.at.is_some_and(|at| at.elapsed() < Duration::from_secs(1)) {
             return Ok(());
         }
-        self.said.at = Some(Instant::now());
-        let disk_suppressed = counts.recording.disk_suppressed - self.said.disk_suppressed;
+        self.reported.at = Some(Instant::now());
+        let disk_suppressed = counts.recording.disk_suppressed - self.reported.disk_suppressed;
         if disk_suppressed > 0 {
-            self.said.disk_suppressed = counts.recording.disk_suppressed;
-            let why = "the disk had too little room".to_owned();
-            self.say.say(RecorderReport::Loss(Loss::DiskSuppressed {
+            self.reported.disk_suppressed = counts.recording.disk_suppressed;
+            let reason = "the disk had too little room".to_owned();
+            self.reports.send(RecorderReport::Loss(Loss::DiskSuppressed {
                 at_ns,
                 triggers: disk_suppressed,
-                why,
+                reason,
             }));
         }
         let spread = self.spreads.take();
         let status = RecorderStatus { trigger_to_open: spread, ..self.status(&counts) };
-        self.say.say(RecorderReport::Status(Box::new(status)));
+        self.reports.send(RecorderReport::Status(Box::new(status)));
         Ok(())
     }
 
-    fn status(&self, counts: &Counts) -> RecorderStatus {
-        let topic = |(id, of): (&TopicId, &Recorded)| {
-            let known = self.beat.topics.iter().find(|(known, _)| known == id);
+    fn status(&self, counts: &RecorderCounts) -> RecorderStatus {
+        let topic = |(id, of): (&TopicId, &TopicEntry)| {
+            let known = self.health.topics.iter().find(|(known, _)| known == id);
             let status = known.map(|(_, status)| status.clone()).unwrap_or_default();
-            let arrivals = &of.lane.arrivals;
+            let arrivals = &of.sink.arrivals;
             RecordedTopic {
                 topic: of.name.clone(),
                 type_name: of.type_name.clone(),
@@ -96,17 +97,17 @@ impl Course {
             commands: self
                 .commands
                 .as_ref()
-                .map(|commands| commands.status(self.beat.commands.as_ref())),
+                .map(|commands| commands.status(self.health.commands.as_ref())),
             topics: self.topics.iter().map(topic).collect(),
-            network: self.beat.health.network.clone(),
-            disk_free: self.beat.disk_free,
-            rss_bytes: self.beat.rss_bytes,
-            cpu_s: self.beat.cpu_s,
+            network: self.health.source.network.clone(),
+            disk_free: self.health.disk_free,
+            rss_bytes: self.health.rss_bytes,
+            cpu_s: self.health.cpu_s,
         }
     }
 
     /// The last status.
-    pub(super) fn last_words(&mut self) -> RecorderStatus {
+    pub(super) fn final_status(&mut self) -> RecorderStatus {
         let counts = self.recorder.counts();
         RecorderStatus { trigger_to_open: self.spreads.all(), ..self.status(&counts) }
     }

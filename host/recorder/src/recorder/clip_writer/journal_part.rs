@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::io;
 
-use gleaner_journal::{Decoder, End, Header, Writer};
+use gleaner_journal::{Decoder, JournalEnd, JournalHeader, JournalWriter};
 
 /// What a wake takes beside its bytes, about.
 const OVERHEAD: usize = 64;
@@ -13,7 +13,7 @@ const OVERHEAD: usize = 64;
 /// If there is no room for all, the last ones go: what a journal holds follows each other, so that
 /// it can be made again wake by wake.
 #[derive(Debug, Default)]
-pub(in crate::recorder) struct Part {
+pub(in crate::recorder) struct JournalPart {
     /// By their numbers.
     wakes: BTreeMap<u64, Box<[u8]>>,
     bytes: usize,
@@ -22,7 +22,7 @@ pub(in crate::recorder) struct Part {
     cut: u64,
 }
 
-impl Part {
+impl JournalPart {
     /// Adds a wake, of which there is none with this number, if all of them take at most `most`
     /// bytes.
     pub(in crate::recorder) fn push(&mut self, number: u64, encoded: &[u8], most: usize) {
@@ -71,20 +71,20 @@ impl Part {
     }
 
     /// A journal of these wakes; `None` if there are none.
-    pub(in crate::recorder) fn write(self, header: &Header) -> Option<io::Result<Vec<u8>>> {
+    pub(in crate::recorder) fn write(self, header: &JournalHeader) -> Option<io::Result<Vec<u8>>> {
         let (first, _) = self.wakes.first_key_value()?;
-        let header = Header { wakes_before: *first, ..header.clone() };
+        let header = JournalHeader { wakes_before: *first, ..header.clone() };
         Some(self.journal(&header))
     }
 
-    fn journal(&self, header: &Header) -> io::Result<Vec<u8>> {
+    fn journal(&self, header: &JournalHeader) -> io::Result<Vec<u8>> {
         let mut decoder = Decoder::new(header.inputs.len());
-        let mut writer = Writer::begin(Vec::new(), header)?;
+        let mut writer = JournalWriter::begin(Vec::new(), header)?;
         for encoded in self.wakes.values() {
             decoder.reset();
             writer.wake(&decoder.decode(&mut &encoded[..]).map_err(io::Error::other)?)?;
         }
-        writer.finish(&End {
+        writer.finish(&JournalEnd {
             wakes: self.wakes.len() as u64,
             samples: Vec::new(),
             drives: Vec::new(),
@@ -99,7 +99,7 @@ mod tests {
     /// The numbers that a part of at most `most` bytes keeps of wakes of 36 bytes, and how many it
     /// cuts off.
     fn kept(numbers: impl IntoIterator<Item = u64>, most: usize) -> (Vec<u64>, u64) {
-        let mut part = Part::default();
+        let mut part = JournalPart::default();
         for number in numbers {
             // One is longer than the room that is left, while those after it would fit again.
             let len = if number == 7 { 400 } else { 36 };
@@ -119,7 +119,7 @@ mod tests {
     #[test]
     fn a_journal_with_holes_is_its_longest_run() {
         let run = |numbers: &[u64]| {
-            let mut part = Part::default();
+            let mut part = JournalPart::default();
             numbers.iter().for_each(|number| part.push(*number, b"wake", 1 << 20));
             (part.keep_run(), part.wakes.into_keys().collect::<Vec<_>>())
         };

@@ -9,10 +9,10 @@ use std::time::{Duration, Instant};
 
 use gleaner_transport::SampleMeta;
 
-use super::Outcome;
-use super::scribe::{Last, Scribe};
+use super::ClipOutcome;
+use super::clip_files::{ClipCompletion, ClipFiles};
 use crate::RecordError;
-use crate::file::{About, Topic};
+use crate::file::{ClipHeader, TopicSchema};
 
 /// Messages are handed over when they have so many bytes together.
 const BATCH: usize = 1 << 20;
@@ -27,32 +27,34 @@ const SPARE: usize = 16;
 const RECOVERY: Duration = Duration::from_secs(5);
 
 /// What the thread is to do.
-enum Job {
-    Begin(u64, String, Box<About>),
+enum WriterJob {
+    Begin(u64, String, Box<ClipHeader>),
     Images(u64, usize),
     Image(Batch),
     Messages(Batch),
     Forget(u64),
-    Finish(Box<Last>),
+    Finish(Box<ClipCompletion>),
 }
 
-impl Job {
+impl WriterJob {
     /// Whose job it is.
     fn clip(&self) -> u64 {
         match self {
-            Job::Begin(clip, ..) | Job::Images(clip, _) | Job::Forget(clip) => *clip,
-            Job::Image(batch) | Job::Messages(batch) => batch.clip,
-            Job::Finish(last) => last.clip,
+            WriterJob::Begin(clip, ..) | WriterJob::Images(clip, _) | WriterJob::Forget(clip) => {
+                *clip
+            }
+            WriterJob::Image(batch) | WriterJob::Messages(batch) => batch.clip,
+            WriterJob::Finish(completion) => completion.clip,
         }
     }
 }
 
 /// What came of a job.
-enum Done {
+enum JobResult {
     Nothing,
     /// This is empty now, and may be used again.
     Messages(Batch),
-    Clip(Outcome),
+    Clip(ClipOutcome),
     /// Nothing is left to recover, or it is left for another process.
     Recovery,
 }
@@ -62,20 +64,20 @@ enum Done {
 struct Batch {
     clip: u64,
     bytes: Vec<u8>,
-    messages: Vec<Message>,
+    messages: Vec<BatchMessage>,
 }
 
-struct Message {
+struct BatchMessage {
     topic: usize,
-    of: Arc<Topic>,
+    of: Arc<TopicSchema>,
     meta: SampleMeta,
     len: usize,
 }
 
 impl Batch {
-    fn push(&mut self, topic: usize, of: &Arc<Topic>, meta: &SampleMeta, cdr: &[u8]) {
+    fn push(&mut self, topic: usize, of: &Arc<TopicSchema>, meta: &SampleMeta, cdr: &[u8]) {
         self.bytes.extend_from_slice(cdr);
-        self.messages.push(Message { topic, of: Arc::clone(of), meta: *meta, len: cdr.len() });
+        self.messages.push(BatchMessage { topic, of: Arc::clone(of), meta: *meta, len: cdr.len() });
     }
 
     fn cost(&self) -> usize {
@@ -84,7 +86,7 @@ impl Batch {
 
     fn each(
         &self,
-        mut act: impl FnMut(&Message, &[u8]) -> Result<(), RecordError>,
+        mut act: impl FnMut(&BatchMessage, &[u8]) -> Result<(), RecordError>,
     ) -> Result<(), RecordError> {
         let mut at = 0;
         for message in &self.messages {
@@ -101,11 +103,11 @@ impl Batch {
 }
 
 /// The thread, seen from those who record.
-pub(in crate::recorder) struct Thread {
+pub(in crate::recorder) struct WriterThread {
     /// `None` once it is to end.
-    jobs: Option<Sender<(usize, Job)>>,
+    jobs: Option<Sender<(usize, WriterJob)>>,
     /// Of each job what it was counted as, and what came of it.
-    done: Receiver<(usize, Done)>,
+    done: Receiver<(usize, JobResult)>,
     handle: Option<JoinHandle<()>>,
     batch: Batch,
     in_flight: usize,
@@ -115,8 +117,8 @@ pub(in crate::recorder) struct Thread {
     until: Arc<OnceLock<Instant>>,
 }
 
-impl Thread {
-    pub(super) fn start(scribe: Scribe) -> Result<Thread, RecordError> {
+impl WriterThread {
+    pub(super) fn start(files: ClipFiles) -> Result<WriterThread, RecordError> {
         // Neither queue has a bound of its own: what is in them is counted, and nothing is added
         // beyond what a pen has room for.
         let ((jobs, inbox), (outbox, done)) = (channel(), channel());
@@ -125,11 +127,11 @@ impl Thread {
         let handle = Builder::new()
             .name("clips".to_owned())
             .spawn(move || {
-                Writing { scribe, failed: Vec::new(), done: outbox }.run(&inbox, &given_up)
+                WriterLoop { files, failed: Vec::new(), done: outbox }.run(&inbox, &given_up)
             })
             .map_err(|source| RecordError::Thread { source })?;
         let (batch, spare) = (Batch::default(), Vec::new());
-        Ok(Thread {
+        Ok(WriterThread {
             jobs: Some(jobs),
             done,
             handle: Some(handle),
@@ -153,34 +155,34 @@ impl Thread {
     pub(super) fn begin(
         &mut self,
         clip: u64,
-        stem: String,
-        about: About,
+        clip_name: String,
+        clip_header: ClipHeader,
     ) -> Result<(), RecordError> {
-        self.send(Job::Begin(clip, stem, Box::new(about)), JOB)
+        self.send(WriterJob::Begin(clip, clip_name, Box::new(clip_header)), JOB)
     }
 
     pub(super) fn images(&mut self, clip: u64, topic: usize) -> Result<(), RecordError> {
-        self.send(Job::Images(clip, topic), JOB)
+        self.send(WriterJob::Images(clip, topic), JOB)
     }
 
     pub(super) fn image(
         &mut self,
         clip: u64,
-        of: &Arc<Topic>,
+        of: &Arc<TopicSchema>,
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
         let mut batch = Batch { clip, ..Batch::default() };
         batch.push(0, of, meta, cdr);
         let cost = batch.cost();
-        self.send(Job::Image(batch), cost)
+        self.send(WriterJob::Image(batch), cost)
     }
 
     pub(super) fn message(
         &mut self,
         clip: u64,
         topic: usize,
-        of: &Arc<Topic>,
+        of: &Arc<TopicSchema>,
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
@@ -193,19 +195,19 @@ impl Thread {
     }
 
     pub(super) fn forget(&mut self, clip: u64) -> Result<(), RecordError> {
-        self.send(Job::Forget(clip), JOB)
+        self.send(WriterJob::Forget(clip), JOB)
     }
 
-    pub(super) fn finish(&mut self, last: Last) -> Result<(), RecordError> {
-        let cost = JOB + last.journals.iter().map(|(_, _, part)| part.bytes()).sum::<usize>();
-        self.send(Job::Finish(Box::new(last)), cost)
+    pub(super) fn finish(&mut self, completion: ClipCompletion) -> Result<(), RecordError> {
+        let cost = JOB + completion.journals.iter().map(|(_, _, part)| part.bytes()).sum::<usize>();
+        self.send(WriterJob::Finish(Box::new(completion)), cost)
     }
 
     pub(super) fn in_flight(&self) -> usize {
         self.in_flight + self.batch.cost()
     }
 
-    pub(super) fn poll(&mut self, outcomes: &mut Vec<Outcome>) -> Result<(), RecordError> {
+    pub(super) fn poll(&mut self, outcomes: &mut Vec<ClipOutcome>) -> Result<(), RecordError> {
         loop {
             match self.done.try_recv() {
                 Ok(done) => self.note(done, outcomes),
@@ -217,7 +219,7 @@ impl Thread {
         if self.in_flight == 0 { self.hand_over() } else { Ok(()) }
     }
 
-    pub(super) fn wait(&mut self, outcomes: &mut Vec<Outcome>) -> Result<(), RecordError> {
+    pub(super) fn wait(&mut self, outcomes: &mut Vec<ClipOutcome>) -> Result<(), RecordError> {
         self.hand_over()?;
         if self.in_flight > 0 || self.is_recovering {
             let done = self.done.recv().map_err(|_| gone())?;
@@ -226,18 +228,18 @@ impl Thread {
         self.poll(outcomes)
     }
 
-    fn note(&mut self, (cost, done): (usize, Done), outcomes: &mut Vec<Outcome>) {
+    fn note(&mut self, (cost, done): (usize, JobResult), outcomes: &mut Vec<ClipOutcome>) {
         self.in_flight -= cost;
         match done {
             // One that held a large message would keep its memory for nothing.
-            Done::Messages(batch)
+            JobResult::Messages(batch)
                 if self.spare.len() < SPARE && batch.bytes.capacity() <= 2 * BATCH =>
             {
                 self.spare.push(batch);
             }
-            Done::Clip(outcome) => outcomes.push(outcome),
-            Done::Recovery => self.is_recovering = false,
-            Done::Messages(_) | Done::Nothing => {}
+            JobResult::Clip(outcome) => outcomes.push(outcome),
+            JobResult::Recovery => self.is_recovering = false,
+            JobResult::Messages(_) | JobResult::Nothing => {}
         }
     }
 
@@ -248,23 +250,23 @@ impl Thread {
         }
         let batch = std::mem::replace(&mut self.batch, self.spare.pop().unwrap_or_default());
         self.batch.clip = batch.clip;
-        self.give(batch.cost(), Job::Messages(batch))
+        self.give(batch.cost(), WriterJob::Messages(batch))
     }
 
     /// Hands over a job, behind the messages that came before it.
-    fn send(&mut self, job: Job, cost: usize) -> Result<(), RecordError> {
+    fn send(&mut self, job: WriterJob, cost: usize) -> Result<(), RecordError> {
         self.hand_over()?;
         self.give(cost, job)
     }
 
-    fn give(&mut self, cost: usize, job: Job) -> Result<(), RecordError> {
+    fn give(&mut self, cost: usize, job: WriterJob) -> Result<(), RecordError> {
         self.in_flight += cost;
         let jobs = self.jobs.as_ref().ok_or_else(gone)?;
         jobs.send((cost, job)).map_err(|_| gone())
     }
 }
 
-impl Drop for Thread {
+impl Drop for WriterThread {
     /// Waits for what is under way; a clip that is not finished stays for recovery.
     fn drop(&mut self) {
         self.jobs = None;
@@ -280,17 +282,17 @@ fn gone() -> RecordError {
 }
 
 /// What the thread has in hand.
-struct Writing {
-    scribe: Scribe,
+struct WriterLoop {
+    files: ClipFiles,
     /// Clips that failed: what else is said of them is left out. Each goes with its end.
     failed: Vec<u64>,
-    done: Sender<(usize, Done)>,
+    done: Sender<(usize, JobResult)>,
 }
 
-impl Writing {
+impl WriterLoop {
     /// What the thread does until it is told nothing more. Jobs do not wait for what is recovered.
-    fn run(mut self, jobs: &Receiver<(usize, Job)>, until: &OnceLock<Instant>) {
-        let mut recovery = self.scribe.take_left();
+    fn run(mut self, jobs: &Receiver<(usize, WriterJob)>, until: &OnceLock<Instant>) {
+        let mut recovery = self.files.take_left();
         while let Some(came) = recovery.next(&mut || {
             let is_heard =
                 std::iter::from_fn(|| jobs.try_recv().ok()).all(|(cost, job)| self.job(cost, job));
@@ -298,16 +300,16 @@ impl Writing {
         }) {
             let outcome = match came {
                 Ok(clip) => {
-                    let deleted = self.scribe.make_room(&clip);
-                    Outcome::Recovered(Box::new(clip), deleted)
+                    let deleted = self.files.make_room(&clip);
+                    ClipOutcome::Recovered(Box::new(clip), deleted)
                 }
-                Err(error) => Outcome::Failed(error),
+                Err(error) => ClipOutcome::Failed(error),
             };
-            if self.done.send((0, Done::Clip(outcome))).is_err() {
+            if self.done.send((0, JobResult::Clip(outcome))).is_err() {
                 return;
             }
         }
-        let _ = self.done.send((0, Done::Recovery));
+        let _ = self.done.send((0, JobResult::Recovery));
         for (cost, job) in jobs {
             if !self.job(cost, job) {
                 return;
@@ -316,35 +318,37 @@ impl Writing {
     }
 
     /// Does a job; `false` if nobody wants to know any more.
-    fn job(&mut self, cost: usize, job: Job) -> bool {
+    fn job(&mut self, cost: usize, job: WriterJob) -> bool {
         let clip = job.clip();
         let came = match job {
-            Job::Forget(_) => {
-                self.scribe.forget(clip);
+            WriterJob::Forget(_) => {
+                self.files.forget(clip);
                 self.failed.retain(|failed| *failed != clip);
-                Done::Nothing
+                JobResult::Nothing
             }
-            Job::Finish(_) if self.failed.contains(&clip) => {
+            WriterJob::Finish(_) if self.failed.contains(&clip) => {
                 self.failed.retain(|failed| *failed != clip);
-                Done::Nothing
+                JobResult::Nothing
             }
-            Job::Finish(last) => Done::Clip(match self.scribe.finish(*last) {
-                Ok(clip) => {
-                    let deleted = self.scribe.make_room(&clip);
-                    Outcome::Finished(Box::new(clip), deleted)
-                }
-                Err(error) => {
-                    self.scribe.forget(clip);
-                    Outcome::Failed(error)
-                }
-            }),
-            _ if self.failed.contains(&clip) => Done::Nothing,
-            job => match act(&mut self.scribe, job) {
+            WriterJob::Finish(completion) => {
+                JobResult::Clip(match self.files.finish(*completion) {
+                    Ok(clip) => {
+                        let deleted = self.files.make_room(&clip);
+                        ClipOutcome::Finished(Box::new(clip), deleted)
+                    }
+                    Err(error) => {
+                        self.files.forget(clip);
+                        ClipOutcome::Failed(error)
+                    }
+                })
+            }
+            _ if self.failed.contains(&clip) => JobResult::Nothing,
+            job => match act(&mut self.files, job) {
                 Ok(came) => came,
                 Err(error) => {
-                    self.scribe.forget(clip);
+                    self.files.forget(clip);
                     self.failed.push(clip);
-                    Done::Clip(Outcome::Failed(error))
+                    JobResult::Clip(ClipOutcome::Failed(error))
                 }
             },
         };
@@ -352,24 +356,26 @@ impl Writing {
     }
 }
 
-fn act(scribe: &mut Scribe, job: Job) -> Result<Done, RecordError> {
+fn act(files: &mut ClipFiles, job: WriterJob) -> Result<JobResult, RecordError> {
     match job {
-        Job::Begin(clip, stem, about) => scribe.begin(clip, &stem, &about)?,
-        Job::Images(clip, topic) => scribe.images(clip, topic),
-        Job::Image(batch) => batch.each(|message, cdr| {
-            scribe.image(batch.clip, &message.of, &message.meta, cdr);
+        WriterJob::Begin(clip, clip_name, clip_header) => {
+            files.begin(clip, &clip_name, &clip_header)?
+        }
+        WriterJob::Images(clip, topic) => files.images(clip, topic),
+        WriterJob::Image(batch) => batch.each(|message, cdr| {
+            files.image(batch.clip, &message.of, &message.meta, cdr);
             Ok(())
         })?,
-        Job::Messages(mut batch) => {
+        WriterJob::Messages(mut batch) => {
             let clip = batch.clip;
-            batch.each(|Message { topic, of, meta, .. }, cdr| {
-                scribe.message(clip, *topic, of, meta, cdr)
+            batch.each(|BatchMessage { topic, of, meta, .. }, cdr| {
+                files.message(clip, *topic, of, meta, cdr)
             })?;
             batch.clear();
-            return Ok(Done::Messages(batch));
+            return Ok(JobResult::Messages(batch));
         }
         // Their outcome is not that of a step.
-        Job::Forget(_) | Job::Finish(_) => {}
+        WriterJob::Forget(_) | WriterJob::Finish(_) => {}
     }
-    Ok(Done::Nothing)
+    Ok(JobResult::Nothing)
 }

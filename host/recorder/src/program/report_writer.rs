@@ -21,33 +21,33 @@ const WAITING: usize = 1024;
 const PATIENCE: Duration = Duration::from_secs(2);
 
 /// Says things without waiting.
-pub(super) struct Say {
+pub(super) struct ReportWriter {
     reports: SyncSender<RecorderReport>,
     losses: SyncSender<Loss>,
     /// Nothing comes over it; it closes when both threads have ended.
     ended: Receiver<()>,
     /// Reports for which there was no room. Clips and losses stand in their lists all the same.
-    left_out: u64,
+    dropped: u64,
 }
 
-impl Say {
-    pub(super) fn start(to: File, list: Arc<LossList>) -> std::io::Result<Say> {
-        let (reports, said) = sync_channel(WAITING);
+impl ReportWriter {
+    pub(super) fn start(to: File, list: Arc<LossList>) -> std::io::Result<ReportWriter> {
+        let (reports, inbox) = sync_channel(WAITING);
         let (losses, lost) = sync_channel(WAITING);
         let (ends, ended) = sync_channel::<()>(1);
         let notes_end = ends.clone();
         Builder::new().name("reports".to_owned()).spawn(move || {
-            write(to, &said);
+            write(to, &inbox);
             drop(ends);
         })?;
         Builder::new().name("losses".to_owned()).spawn(move || {
             note(&list, &lost);
             drop(notes_end);
         })?;
-        Ok(Say { reports, losses, ended, left_out: 0 })
+        Ok(ReportWriter { reports, losses, ended, dropped: 0 })
     }
 
-    pub(super) fn say(&mut self, report: RecorderReport) {
+    pub(super) fn send(&mut self, report: RecorderReport) {
         if let RecorderReport::Loss(loss) = &report
             // Noted already, by whoever deletes: before.
             && !matches!(loss, Loss::Deleted { .. } | Loss::NotDeleted { .. })
@@ -58,8 +58,8 @@ impl Say {
         match self.reports.try_send(report) {
             Ok(()) | Err(TrySendError::Disconnected(_)) => {}
             Err(TrySendError::Full(_)) => {
-                self.left_out += 1;
-                if self.left_out == 1 {
+                self.dropped += 1;
+                if self.dropped == 1 {
                     warn!("the starter does not read reports: some are left out");
                 }
             }
@@ -69,12 +69,12 @@ impl Say {
     /// Says the last thing, and waits until all is said and noted; not for a starter that does not
     /// read.
     pub(super) fn end(mut self, report: RecorderReport) {
-        self.say(report);
-        let Say { reports, losses, ended, left_out } = self;
+        self.send(report);
+        let ReportWriter { reports, losses, ended, dropped } = self;
         drop((reports, losses));
         let _ = ended.recv_timeout(PATIENCE);
-        if left_out > 0 {
-            warn!(left_out, "reports were left out, as the starter did not read them");
+        if dropped > 0 {
+            warn!(dropped, "reports were left out, as the starter did not read them");
         }
     }
 }
@@ -105,20 +105,21 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
-    use crate::Folder;
-    use crate::support::Scratch;
+    use crate::RecordingFolder;
+    use crate::support::TestDir;
 
     #[test]
     fn a_loss_is_noted_though_the_starter_reads_nothing() {
-        let scratch = Scratch::new();
-        let (folder, _) = Folder::open(&scratch.0).unwrap();
+        let scratch = TestDir::new();
+        let (folder, _) = RecordingFolder::open(&scratch.0).unwrap();
         let (reader, writer) = std::io::pipe().unwrap();
-        let mut say = Say::start(File::from(OwnedFd::from(writer)), folder.losses()).unwrap();
+        let mut reports =
+            ReportWriter::start(File::from(OwnedFd::from(writer)), folder.losses()).unwrap();
         // The pipe holds 64 KiB; the queue is full some time after it is.
-        while say.left_out == 0 {
-            say.say(RecorderReport::Status(Box::default()));
+        while reports.dropped == 0 {
+            reports.send(RecorderReport::Status(Box::default()));
         }
-        say.say(RecorderReport::Loss(Loss::Failed { at_ns: 7, why: "x".to_owned() }));
+        reports.send(RecorderReport::Loss(Loss::Failed { at_ns: 7, reason: "x".to_owned() }));
         let noted = || std::fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap_or_default();
         let deadline = Instant::now() + Duration::from_secs(60);
         while !noted().ends_with('\n') {
@@ -127,12 +128,12 @@ mod tests {
         }
         assert_eq!(noted(), "{\"loss\":\"failed\",\"at_ns\":7,\"why\":\"x\"}\n");
         // The loss itself may have found a place that was just made.
-        assert!(say.left_out >= 1);
+        assert!(reports.dropped >= 1);
         // A starter that reads again has every report that waited.
         let reading = std::thread::spawn(move || {
             BufReader::new(reader).lines().map_while(Result::ok).count()
         });
-        drop(say);
+        drop(reports);
         assert!(reading.join().unwrap() >= WAITING);
     }
 }

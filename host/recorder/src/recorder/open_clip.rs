@@ -5,18 +5,18 @@ use std::sync::Arc;
 use gleaner_lambda::{Clip, Moment};
 use gleaner_transport::SampleMeta;
 
-use super::limits::Limits;
-use super::pen::Last;
-use super::pen::part::Part;
-use super::stem::stem;
-use super::stock::{Desk, Settled};
+use super::clip_name::clip_name;
+use super::clip_writer::ClipCompletion;
+use super::clip_writer::journal_part::JournalPart;
+use super::limits::RecorderLimits;
+use super::state::{ClipContext, Settled};
 use crate::RecordError;
-use crate::file::{About, CONTINUES, Ending, TopicCounts, names};
+use crate::file::{CONTINUES, ClipHeader, ClipTrailer, TopicCounts, names};
 use crate::window::Group;
 
 /// What one topic has in a clip, and what it has not.
 #[derive(Clone, Debug)]
-pub(super) struct Tally {
+pub(super) struct TopicTally {
     pub(super) messages: u64,
     /// `None` if nobody knows.
     pub(super) overwritten: Option<u64>,
@@ -29,9 +29,9 @@ pub(super) struct Tally {
     pub(super) is_aged: bool,
 }
 
-impl Default for Tally {
-    fn default() -> Tally {
-        Tally {
+impl Default for TopicTally {
+    fn default() -> TopicTally {
+        TopicTally {
             messages: 0,
             overwritten: Some(0),
             too_big: Some(0),
@@ -44,7 +44,7 @@ impl Default for Tally {
 
 /// How a clip comes to its end.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Close {
+pub(super) enum CloseReason {
     /// No window is open any more.
     Complete,
     /// It is full: the next one goes on after this instant.
@@ -56,7 +56,7 @@ pub(super) enum Close {
 }
 
 /// A clip that is being written.
-pub(super) struct Draft {
+pub(super) struct OpenClip {
     /// The group of windows that it belongs to. What is in one of its clips bears this number.
     pub(super) group: u64,
     /// Its own number.
@@ -73,7 +73,7 @@ pub(super) struct Draft {
     pub(super) uncertain: Vec<usize>,
     /// Lambdas that ended while they recorded.
     pub(super) ended: Vec<usize>,
-    limits: Limits,
+    limits: RecorderLimits,
     /// The trigger that names it.
     opening: Moment,
     from: i64,
@@ -81,10 +81,10 @@ pub(super) struct Draft {
     is_begun: bool,
     messages: u64,
     /// By topic.
-    tallies: Vec<Tally>,
+    tallies: Vec<TopicTally>,
     moments: Vec<Moment>,
     /// By lambda; those without windows in the clip are thrown away at its end.
-    parts: Vec<Part>,
+    parts: Vec<JournalPart>,
     /// What they take together, about.
     parts_bytes: usize,
     /// Lambdas whose part is short because there was no room for all together.
@@ -92,15 +92,20 @@ pub(super) struct Draft {
     /// Pushed out of the preroll.
     wakes_lost: Vec<u64>,
     /// Lost on their way to the recorder.
-    wakes_unheard: Vec<u64>,
+    wakes_undelivered: Vec<u64>,
 }
 
-impl Draft {
+impl OpenClip {
     /// An empty clip of `group`.
-    pub(super) fn new(number: u64, opening: Moment, group: &Group, desk: &mut Desk) -> Draft {
-        Draft {
+    pub(super) fn new(
+        number: u64,
+        opening: Moment,
+        group: &Group,
+        context: &mut ClipContext,
+    ) -> OpenClip {
+        OpenClip {
             group: number,
-            clip: desk.next_clip(),
+            clip: context.next_clip(),
             continues: false,
             begins_late_ns: 0,
             triggers: 0,
@@ -108,7 +113,7 @@ impl Draft {
             settled: None,
             uncertain: Vec::new(),
             ended: Vec::new(),
-            limits: desk.limits,
+            limits: context.limits,
             opening,
             from: group.from,
             is_begun: false,
@@ -119,13 +124,16 @@ impl Draft {
             parts_bytes: 0,
             crowded: Vec::new(),
             wakes_lost: Vec::new(),
-            wakes_unheard: Vec::new(),
+            wakes_undelivered: Vec::new(),
         }
     }
 
     /// The clip that goes on after this one.
-    pub(super) fn next(&self, group: &Group, desk: &mut Desk) -> Draft {
-        Draft { continues: true, ..Draft::new(self.group, self.opening.clone(), group, desk) }
+    pub(super) fn next(&self, group: &Group, context: &mut ClipContext) -> OpenClip {
+        OpenClip {
+            continues: true,
+            ..OpenClip::new(self.group, self.opening.clone(), group, context)
+        }
     }
 
     /// Where it begins.
@@ -138,7 +146,7 @@ impl Draft {
         self.messages == 0
     }
 
-    pub(super) fn tally(&mut self, topic: usize) -> &mut Tally {
+    pub(super) fn tally(&mut self, topic: usize) -> &mut TopicTally {
         at(&mut self.tallies, topic)
     }
 
@@ -152,34 +160,34 @@ impl Draft {
     /// Writes a message.
     pub(super) fn message(
         &mut self,
-        desk: &mut Desk,
+        context: &mut ClipContext,
         group: &Group,
         topic: usize,
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
-        if let Some((stem, about)) = self.begin(desk, group) {
-            desk.pen.begin(self.clip, stem, about)?;
+        if let Some((clip_name, clip_header)) = self.begin(context, group) {
+            context.writer.begin(self.clip, clip_name, clip_header)?;
         }
-        desk.pen.message(self.clip, topic, &desk.lanes[topic].topic, meta, cdr)?;
+        context.writer.message(self.clip, topic, &context.topics[topic].topic, meta, cdr)?;
         self.messages += 1;
         self.tally(topic).messages += 1;
         Ok(())
     }
 
     /// What its file begins with, which is made when it is first needed.
-    fn begin(&mut self, desk: &Desk, group: &Group) -> Option<(String, About)> {
+    fn begin(&mut self, context: &ClipContext, group: &Group) -> Option<(String, ClipHeader)> {
         if self.is_begun {
             return None;
         }
         self.is_begun = true;
-        let about = About {
-            clock: desk.clock.clone(),
+        let clip_header = ClipHeader {
+            clock: context.clock.clone(),
             from_ns: self.from(group),
-            lambdas: desk.lambdas_of(group),
+            lambdas: context.lambdas_of(group),
             moment: self.opening.clone(),
         };
-        Some((stem(&self.opening.lambda, self.opening.at_ns), about))
+        Some((clip_name(&self.opening.lambda, self.opening.at_ns), clip_header))
     }
 
     /// Keeps a wake for the lambda's journal.
@@ -198,7 +206,7 @@ impl Draft {
     /// What it keeps of journals in memory, about.
     #[cfg(test)]
     pub(super) fn journal_bytes(&self) -> usize {
-        self.parts.iter().map(Part::bytes).sum()
+        self.parts.iter().map(JournalPart::bytes).sum()
     }
 
     /// Counts wakes that the preroll does not have any more.
@@ -207,8 +215,8 @@ impl Draft {
     }
 
     /// Counts wakes that were lost before they came here.
-    pub(super) fn wakes_unheard(&mut self, lambda: usize, count: u64) {
-        *at(&mut self.wakes_unheard, lambda) += count;
+    pub(super) fn wakes_undelivered(&mut self, lambda: usize, count: u64) {
+        *at(&mut self.wakes_undelivered, lambda) += count;
     }
 
     /// Keeps a trigger.
@@ -222,59 +230,72 @@ impl Draft {
     /// Completes the file; returns the clip if that is done already.
     pub(super) fn finish(
         mut self,
-        desk: &mut Desk,
+        context: &mut ClipContext,
         group: &Group,
-        close: &Close,
+        close: &CloseReason,
     ) -> Result<Option<Clip>, RecordError> {
-        let topics = self.topics(desk, group);
-        let begin = self.begin(desk, group);
-        let there = topics.iter().map(|topic| &desk.lanes[*topic]).filter(|lane| !lane.is_missing);
-        let declared = there.map(|lane| Arc::clone(&lane.topic)).collect();
-        let mut ending = Ending {
+        let topics = self.topics(context, group);
+        let begin = self.begin(context, group);
+        let there = topics
+            .iter()
+            .map(|topic| &context.topics[*topic])
+            .filter(|topic_state| !topic_state.is_missing);
+        let declared = there.map(|topic_state| Arc::clone(&topic_state.topic)).collect();
+        let mut trailer = ClipTrailer {
             from_ns: self.from(group),
             to_ns: match close {
-                Close::Full(boundary) => *boundary,
-                Close::EndOfDrive(end) | Close::Early(end, _) if group.waits_for_stop() => {
+                CloseReason::Full(boundary) => *boundary,
+                CloseReason::EndOfDrive(end) | CloseReason::Early(end, _)
+                    if group.waits_for_stop() =>
+                {
                     (*end).max(group.from)
                 }
-                Close::Complete | Close::EndOfDrive(_) | Close::Early(..) => group.to,
+                CloseReason::Complete | CloseReason::EndOfDrive(_) | CloseReason::Early(..) => {
+                    group.to
+                }
             },
-            lambdas: desk.lambdas_of(group),
+            lambdas: context.lambdas_of(group),
             triggers: self.triggers,
-            ..Ending::default()
+            ..ClipTrailer::default()
         };
-        self.say_ends(group, close, &mut ending.short);
-        let name = |lambda: &usize| &desk.crews[*lambda].header.lambda;
-        ending.short.extend(
+        self.note_ends(group, close, &mut trailer.incomplete);
+        let name = |lambda: &usize| &context.lambdas[*lambda].header.lambda;
+        trailer.incomplete.extend(
             self.ended.iter().map(|lambda| format!("{} ended before it said stop", name(lambda))),
         );
-        ending.short.extend(self.uncertain.iter().map(|lambda| {
+        trailer.incomplete.extend(self.uncertain.iter().map(|lambda| {
             let name = name(lambda);
             format!(
                 "there are more triggers of {name} than are counted: too many waited for their clip"
             )
         }));
         for topic in topics {
-            ending.topics.push(self.counts(desk, topic, group, &mut ending.short));
+            trailer.topics.push(self.counts(context, topic, group, &mut trailer.incomplete));
         }
         let mut journals: Vec<(String, _, _)> = Vec::new();
         for lambda in &group.lambdas {
-            let header = &desk.crews[*lambda].header;
-            ending.headers.push(Arc::clone(header));
-            let part = self.part(*lambda, &header.lambda, &mut ending.short);
+            let header = &context.lambdas[*lambda].header;
+            trailer.headers.push(Arc::clone(header));
+            let part = self.part(*lambda, &header.lambda, &mut trailer.incomplete);
             // A lambda that was started again is another one of the same name.
             let mut names = names(&header.lambda);
             let name = names.find(|name| !journals.iter().any(|(taken, ..)| taken == name));
             journals.push((name.unwrap_or_default(), Arc::clone(header), part));
         }
-        ending.moments = self.moments;
-        desk.pen.finish(Last { clip: self.clip, begin, ending, topics: declared, journals })
+        trailer.moments = self.moments;
+        context.writer.finish(ClipCompletion {
+            clip: self.clip,
+            begin,
+            trailer,
+            topics: declared,
+            journals,
+        })
     }
 
     /// The topics of its lambdas; and those of which it holds late messages, for a lambda whose
     /// windows ended before it.
-    fn topics(&self, desk: &Desk, group: &Group) -> Vec<usize> {
-        let mut topics = desk.topics_of(group);
+    fn topics(&self, context: &ClipContext, group: &Group) -> Vec<usize> {
+        let mut topics = context.topics_of(group);
         let written = self
             .tallies
             .iter()
@@ -290,7 +311,7 @@ impl Draft {
     }
 
     /// Why the clip does not begin and end where its windows do.
-    fn say_ends(&self, group: &Group, close: &Close, short: &mut Vec<String>) {
+    fn note_ends(&self, group: &Group, close: &CloseReason, short: &mut Vec<String>) {
         if self.continues {
             short.push(CONTINUES.to_owned());
         }
@@ -299,32 +320,32 @@ impl Draft {
             short.push(format!("the preroll begins {late} late: nothing was recorded before"));
         }
         match close {
-            Close::Full(_) => {
+            CloseReason::Full(_) => {
                 short.push("continues in the next clip, if anything more came".to_owned())
             }
-            Close::EndOfDrive(_) if group.waits_for_stop() => {
+            CloseReason::EndOfDrive(_) if group.waits_for_stop() => {
                 short.push("the drive ended before the lambda said stop".to_owned());
             }
-            Close::EndOfDrive(end) if *end < group.to => {
+            CloseReason::EndOfDrive(end) if *end < group.to => {
                 let early = seconds(group.to.saturating_sub(*end));
                 short.push(format!("the drive ended {early} before the window did"));
             }
-            Close::Early(end, why) if *end < group.to => short.push(why.to_string()),
-            Close::EndOfDrive(_) | Close::Early(..) | Close::Complete => {}
+            CloseReason::Early(end, why) if *end < group.to => short.push(why.to_string()),
+            CloseReason::EndOfDrive(_) | CloseReason::Early(..) | CloseReason::Complete => {}
         }
     }
 
     fn counts(
         &mut self,
-        desk: &Desk,
+        context: &ClipContext,
         topic: usize,
         group: &Group,
         short: &mut Vec<String>,
     ) -> TopicCounts {
-        let Tally { messages, overwritten, too_big, lost, huge, is_aged } =
+        let TopicTally { messages, overwritten, too_big, lost, huge, is_aged } =
             self.tally(topic).clone();
-        let lane = &desk.lanes[topic];
-        let name = &lane.topic.name;
+        let topic_state = &context.topics[topic];
+        let name = &topic_state.topic.name;
         match overwritten {
             Some(0) => {}
             Some(count) => {
@@ -359,8 +380,10 @@ impl Draft {
         if is_aged {
             short.push(format!("a trigger came late: samples of {name} had left the preroll"));
         }
-        if let Some(late) =
-            lane.found_at.map(|at| at.saturating_sub(self.from(group))).filter(|late| *late > 0)
+        if let Some(late) = topic_state
+            .found_at
+            .map(|at| at.saturating_sub(self.from(group)))
+            .filter(|late| *late > 0)
         {
             short.push(format!("{name} was found {} after the clip begins", seconds(late)));
         }
@@ -370,7 +393,7 @@ impl Draft {
         let received = || Some(messages + overwritten? + too_big?);
         TopicCounts {
             topic: name.clone(),
-            type_name: (!lane.is_missing).then(|| lane.topic.type_name.clone()),
+            type_name: (!topic_state.is_missing).then(|| topic_state.topic.type_name.clone()),
             received: if is_aged { None } else { received() },
             lost,
             overwritten,
@@ -379,11 +402,11 @@ impl Draft {
     }
 
     /// The wakes of a lambda, and what is missing of them.
-    fn part(&mut self, lambda: usize, name: &str, short: &mut Vec<String>) -> Part {
+    fn part(&mut self, lambda: usize, name: &str, short: &mut Vec<String>) -> JournalPart {
         let mut part = std::mem::take(at(&mut self.parts, lambda));
-        let unheard = *at(&mut self.wakes_unheard, lambda);
-        if unheard > 0 {
-            let wakes = plural(unheard, "wake");
+        let undelivered = *at(&mut self.wakes_undelivered, lambda);
+        if undelivered > 0 {
+            let wakes = plural(undelivered, "wake");
             short.push(format!(
                 "the journal of {name} lacks {wakes}: lost on the way to the recorder"
             ));

@@ -3,7 +3,7 @@
 const DAY_S: i64 = 86_400;
 
 /// The lambda that triggered, and when, in UTC to the millisecond.
-pub(super) fn stem(lambda: &str, at_ns: i64) -> String {
+pub(super) fn clip_name(lambda: &str, at_ns: i64) -> String {
     let (seconds, nanoseconds) = (at_ns.div_euclid(1_000_000_000), at_ns.rem_euclid(1_000_000_000));
     let (year, month, day) = date(seconds.div_euclid(DAY_S));
     let second = seconds.rem_euclid(DAY_S);
@@ -38,9 +38,9 @@ mod tests {
 
     #[test]
     fn a_clip_is_called_after_its_lambda_and_moment() {
-        assert_eq!(stem("hello", 1_533_198_891_136_999_999), "hello-20180802T083451.136Z");
-        assert_eq!(stem("x", 0), "x-19700101T000000.000Z");
-        assert_eq!(stem("x", i64::MAX), "x-22620411T234716.854Z");
+        assert_eq!(clip_name("hello", 1_533_198_891_136_999_999), "hello-20180802T083451.136Z");
+        assert_eq!(clip_name("x", 0), "x-19700101T000000.000Z");
+        assert_eq!(clip_name("x", i64::MAX), "x-22620411T234716.854Z");
     }
 
     #[test]

@@ -10,22 +10,22 @@ use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 use tracing::{error, warn};
 
+use super::clip_dir::{CLIPS, ClipDir};
 use super::durable;
-use super::list::Listed;
+use super::list::ListedClip;
 use super::losses::LossList;
-use super::place::{CLIPS, Place};
 use crate::error::RecordError;
 
 /// The clips that are there, oldest first, and how many there may be.
-pub(super) struct Shelf {
+pub(super) struct Retention {
     clips_max: u64,
     bytes_max: u64,
-    clips: VecDeque<Kept>,
+    clips: VecDeque<StoredClip>,
     bytes: u64,
     losses: Arc<LossList>,
 }
 
-struct Kept {
+struct StoredClip {
     file: String,
     thumbnail: Option<String>,
     bytes: u64,
@@ -33,93 +33,99 @@ struct Kept {
     is_stuck: bool,
 }
 
-impl Shelf {
+impl Retention {
     /// Over the clips that are listed. One that is not there was fetched.
     pub(super) fn new(
-        place: &Place,
+        dir: &ClipDir,
         losses: Arc<LossList>,
-        listed: Vec<Listed>,
+        listed: Vec<ListedClip>,
         clips_max: Option<u64>,
         bytes_max: Option<u64>,
-    ) -> Shelf {
+    ) -> Retention {
         let (clips_max, bytes_max) = (clips_max.unwrap_or(u64::MAX), bytes_max.unwrap_or(u64::MAX));
-        let mut shelf = Shelf { clips_max, bytes_max, clips: VecDeque::new(), bytes: 0, losses };
-        for Listed { file, thumbnail } in listed {
-            let bytes = place
+        let mut retention =
+            Retention { clips_max, bytes_max, clips: VecDeque::new(), bytes: 0, losses };
+        for ListedClip { file, thumbnail } in listed {
+            let bytes = dir
                 .folder()
                 .join(&file)
                 .symlink_metadata()
                 .ok()
                 .filter(|metadata| metadata.is_file());
             if let Some(bytes) = bytes.map(|metadata| metadata.len()) {
-                shelf.push(Kept { file, thumbnail, bytes, is_stuck: false });
+                retention.push(StoredClip { file, thumbnail, bytes, is_stuck: false });
             }
         }
-        shelf
+        retention
     }
 
-    fn push(&mut self, kept: Kept) {
+    fn push(&mut self, kept: StoredClip) {
         self.bytes += kept.bytes;
         self.clips.push_back(kept);
     }
 
     /// Adds a clip that is whole now; deletes the oldest until the others have room. The newest
     /// stays in any case.
-    pub(super) fn add(&mut self, place: &Place, clip: &Clip) -> Vec<Loss> {
+    pub(super) fn add(&mut self, dir: &ClipDir, clip: &Clip) -> Vec<Loss> {
         let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         let (file, thumbnail) = (name(&clip.file), clip.thumbnail.as_deref().and_then(name));
         if let Some(file) = file {
-            self.push(Kept { file, thumbnail, bytes: clip.bytes, is_stuck: false });
+            self.push(StoredClip { file, thumbnail, bytes: clip.bytes, is_stuck: false });
         }
-        self.make_room(place)
+        self.make_room(dir)
     }
 
     /// Deletes the oldest until the others have room. What cannot be deleted is passed over, and
     /// tried again the next time.
-    pub(super) fn make_room(&mut self, place: &Place) -> Vec<Loss> {
+    pub(super) fn make_room(&mut self, dir: &ClipDir) -> Vec<Loss> {
         // Those that somebody has fetched take no room any more.
-        self.clips.retain(|kept| place.folder().join(&kept.file).symlink_metadata().is_ok());
+        self.clips.retain(|kept| dir.folder().join(&kept.file).symlink_metadata().is_ok());
         self.bytes = self.clips.iter().map(|kept| kept.bytes).sum();
-        let mut told = Vec::new();
+        let mut losses_now = Vec::new();
         let mut skipped = 0;
         while self.clips.len() > skipped + 1
             && (self.clips.len() as u64 > self.clips_max || self.bytes > self.bytes_max)
         {
-            let why = match self.clips.len() as u64 > self.clips_max {
+            let reason = match self.clips.len() as u64 > self.clips_max {
                 true => format!("there may be {} clips", self.clips_max),
                 false => format!("clips may take {} MiB", self.bytes_max >> 20),
             };
             let kept = &mut self.clips[skipped];
-            match kept.delete(place, &self.losses, why) {
+            match kept.delete(dir, &self.losses, reason) {
                 Ok(deleted) => {
-                    told.push(deleted);
+                    losses_now.push(deleted);
                     self.bytes -= kept.bytes;
                     self.clips.remove(skipped);
                 }
                 Err(error) => {
                     skipped += 1;
-                    told.extend(kept.stuck(&self.losses, error));
+                    losses_now.extend(kept.stuck(&self.losses, error));
                 }
             }
         }
-        told
+        losses_now
     }
 }
 
-impl Kept {
+impl StoredClip {
     fn path(&self) -> PathBuf {
         PathBuf::from(CLIPS).join(&self.file)
     }
 
-    /// Deletes it, because of `why`. What is lost is told before it is.
-    fn delete(&self, place: &Place, losses: &LossList, why: String) -> Result<Loss, RecordError> {
-        warn!(clip = %self.file, %why, "oldest clip is deleted, nobody has fetched it");
-        let deleted = Loss::Deleted { at_ns: now(), file: self.path(), bytes: self.bytes, why };
+    /// Deletes it, because of `reason`. What is lost is told before it is.
+    fn delete(
+        &self,
+        dir: &ClipDir,
+        losses: &LossList,
+        reason: String,
+    ) -> Result<Loss, RecordError> {
+        warn!(clip = %self.file, %reason, "oldest clip is deleted, nobody has fetched it");
+        let deleted = Loss::Deleted { at_ns: now(), file: self.path(), bytes: self.bytes, reason };
         losses.note(&deleted)?;
         if let Some(thumbnail) = &self.thumbnail {
-            durable::remove(&place.folder().join(thumbnail))?;
+            durable::remove(&dir.folder().join(thumbnail))?;
         }
-        durable::remove(&place.folder().join(&self.file))?;
+        durable::remove(&dir.folder().join(&self.file))?;
         Ok(deleted)
     }
 
@@ -130,9 +136,9 @@ impl Kept {
         }
         let failure = Failure::from(error);
         error!(clip = %self.file, %failure, "a clip cannot be deleted to make room, and stays");
-        let why =
+        let reason =
             std::iter::once(failure.message).chain(failure.causes).collect::<Vec<_>>().join(": ");
-        let loss = Loss::NotDeleted { at_ns: now(), file: self.path(), bytes: self.bytes, why };
+        let loss = Loss::NotDeleted { at_ns: now(), file: self.path(), bytes: self.bytes, reason };
         if let Err(error) = losses.note(&loss) {
             error!(error = &error as &dyn std::error::Error, "cannot note a loss");
         }

@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use gleaner_lambda::Clip;
 
-use super::list::List;
+use super::list::ClipList;
 use crate::error::RecordError;
 
 /// The folder of the clips, within that of the list.
@@ -27,17 +27,17 @@ pub(super) const JPG_PART: &str = ".jpg.part";
 const STEM_MAX: usize = 160;
 
 /// The folder, as an unfinished clip shares it. Its lock is held as long as one of them lives.
-pub(super) struct Place {
+pub(super) struct ClipDir {
     folder: PathBuf,
-    list: List,
+    list: ClipList,
     /// File names that the list holds or will: none is given twice, even after its clip was fetched
     /// and deleted.
     taken: Mutex<HashSet<String>>,
     _lock: File,
 }
 
-impl Place {
-    pub(super) fn new(folder: PathBuf, list: List, taken: HashSet<String>, lock: File) -> Self {
+impl ClipDir {
+    pub(super) fn new(folder: PathBuf, list: ClipList, taken: HashSet<String>, lock: File) -> Self {
         Self { folder, list, taken: Mutex::new(taken), _lock: lock }
     }
 
@@ -46,16 +46,16 @@ impl Place {
         &self.folder
     }
 
-    pub(super) fn list(&self) -> &List {
+    pub(super) fn list(&self) -> &ClipList {
         &self.list
     }
 
-    pub(super) fn path(&self, name: &str, ending: &str) -> PathBuf {
-        self.folder.join(format!("{name}{ending}"))
+    pub(super) fn path(&self, name: &str, suffix: &str) -> PathBuf {
+        self.folder.join(format!("{name}{suffix}"))
     }
 
-    pub(super) fn exists(&self, name: &str, ending: &str) -> bool {
-        self.path(name, ending).symlink_metadata().is_ok()
+    pub(super) fn exists(&self, name: &str, suffix: &str) -> bool {
+        self.path(name, suffix).symlink_metadata().is_ok()
     }
 
     /// Adds a whole clip to the list.
@@ -79,12 +79,12 @@ impl Place {
         *self.taken() = files;
     }
 
-    /// A name that no file has: `stem`, or the first of `stem-2`, `stem-3` and so on.
-    pub(super) fn free_name(&self, stem: &str) -> String {
-        let stem = plain(stem);
-        names(&stem)
+    /// A name that no file has: `base`, or the first of `base-2`, `base-3` and so on.
+    pub(super) fn free_name(&self, base: &str) -> String {
+        let base = plain(base);
+        names(&base)
             .find(|name| {
-                let is_file = |ending: &&str| self.exists(name, ending);
+                let is_file = |suffix: &&str| self.exists(name, suffix);
                 ![CLIP, PART, AGAIN, JPG, JPG_PART].iter().any(is_file)
                     && !self.is_taken(&format!("{name}{CLIP}"))
             })
@@ -96,16 +96,16 @@ impl Place {
     }
 }
 
-/// `stem`, `stem-2`, `stem-3` and so on.
-pub(crate) fn names(stem: &str) -> impl Iterator<Item = String> + '_ {
-    (1_u64..).map(move |n| if n == 1 { stem.to_owned() } else { format!("{stem}-{n}") })
+/// `base`, `base-2`, `base-3` and so on.
+pub(crate) fn names(base: &str) -> impl Iterator<Item = String> + '_ {
+    (1_u64..).map(move |n| if n == 1 { base.to_owned() } else { format!("{base}-{n}") })
 }
 
-/// `stem` as the begin of a file name on any system.
-fn plain(stem: &str) -> String {
+/// `base` as the begin of a file name on any system.
+fn plain(base: &str) -> String {
     let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
     let name: String =
-        stem.chars().map(|c| if allowed(c) { c } else { '-' }).take(STEM_MAX).collect();
+        base.chars().map(|c| if allowed(c) { c } else { '-' }).take(STEM_MAX).collect();
     match name.trim_start_matches('.') {
         "" => "clip".to_owned(),
         name => name.to_owned(),

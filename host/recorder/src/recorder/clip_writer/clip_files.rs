@@ -2,64 +2,66 @@
 
 use std::sync::Arc;
 
-use gleaner_journal::Header;
+use gleaner_journal::JournalHeader;
 use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 use gleaner_transport::SampleMeta;
 
-use super::part::Part;
+use super::journal_part::JournalPart;
 use crate::RecordError;
-use crate::file::{About, Ending, Folder, Recovery, Topic, Unfinished};
+use crate::file::{
+    ClipHeader, ClipTrailer, RecordingFolder, Recovery, TopicSchema, UnfinishedClip,
+};
 use crate::thumbnail::thumbnail;
 
 /// Images that are tried until one can be read. Each costs some milliseconds.
 const TRIES: u32 = 8;
 
 /// A clip that comes to its end.
-pub(in crate::recorder) struct Last {
+pub(in crate::recorder) struct ClipCompletion {
     pub(in crate::recorder) clip: u64,
     /// Where its file begins, if no message of it came.
-    pub(in crate::recorder) begin: Option<(String, About)>,
-    pub(in crate::recorder) ending: Ending,
+    pub(in crate::recorder) begin: Option<(String, ClipHeader)>,
+    pub(in crate::recorder) trailer: ClipTrailer,
     /// Topics that have a channel even if no message came.
-    pub(in crate::recorder) topics: Vec<Arc<Topic>>,
+    pub(in crate::recorder) topics: Vec<Arc<TopicSchema>>,
     /// Of each lambda: the name of its journal, and what is in it.
-    pub(in crate::recorder) journals: Vec<(String, Arc<Header>, Part)>,
+    pub(in crate::recorder) journals: Vec<(String, Arc<JournalHeader>, JournalPart)>,
 }
 
 /// Writes clips into a folder. Several may be open.
-pub(in crate::recorder) struct Scribe {
-    folder: Folder,
-    sheets: Vec<Sheet>,
+pub(in crate::recorder) struct ClipFiles {
+    folder: RecordingFolder,
+    open: Vec<OpenFile>,
 }
 
 /// A clip that is open.
 #[derive(Default)]
-struct Sheet {
+struct OpenFile {
     clip: u64,
-    file: Option<Unfinished>,
+    file: Option<UnfinishedClip>,
     /// The topic that its picture is made from, once it has one with images.
     images: Option<usize>,
     jpeg: Option<Vec<u8>>,
     tried: u32,
 }
 
-impl Sheet {
-    fn try_image(&mut self, topic: &Topic, meta: &SampleMeta, cdr: &[u8]) {
+impl OpenFile {
+    fn try_image(&mut self, topic: &TopicSchema, meta: &SampleMeta, cdr: &[u8]) {
         if self.jpeg.is_none() && self.tried < TRIES {
             self.tried += 1;
             self.jpeg = thumbnail(&topic.type_name, cdr, meta.endian);
         }
     }
 
-    fn file(&mut self) -> &mut Unfinished {
+    fn file(&mut self) -> &mut UnfinishedClip {
         self.file.as_mut().expect("a clip is begun before anything is written to it")
     }
 }
 
-impl Scribe {
-    pub(super) fn new(folder: Folder) -> Scribe {
-        Scribe { folder, sheets: Vec::new() }
+impl ClipFiles {
+    pub(super) fn new(folder: RecordingFolder) -> ClipFiles {
+        ClipFiles { folder, open: Vec::new() }
     }
 
     /// What an earlier process left in the folder.
@@ -67,34 +69,35 @@ impl Scribe {
         self.folder.take_left()
     }
 
-    fn sheet(&mut self, clip: u64) -> &mut Sheet {
-        let index = self.sheets.iter().position(|sheet| sheet.clip == clip).unwrap_or_else(|| {
-            self.sheets.push(Sheet { clip, ..Sheet::default() });
-            self.sheets.len() - 1
-        });
-        &mut self.sheets[index]
+    fn open_file(&mut self, clip: u64) -> &mut OpenFile {
+        let index =
+            self.open.iter().position(|open_file| open_file.clip == clip).unwrap_or_else(|| {
+                self.open.push(OpenFile { clip, ..OpenFile::default() });
+                self.open.len() - 1
+            });
+        &mut self.open[index]
     }
 
     /// Makes the file of a clip.
     pub(super) fn begin(
         &mut self,
         clip: u64,
-        stem: &str,
-        about: &About,
+        clip_name: &str,
+        clip_header: &ClipHeader,
     ) -> Result<(), RecordError> {
-        let file = self.folder.begin(stem, about)?;
-        self.sheet(clip).file = Some(file);
+        let file = self.folder.begin(clip_name, clip_header)?;
+        self.open_file(clip).file = Some(file);
         Ok(())
     }
 
     /// From now on the picture is made from the messages of this topic.
     pub(super) fn images(&mut self, clip: u64, topic: usize) {
-        self.sheet(clip).images = Some(topic);
+        self.open_file(clip).images = Some(topic);
     }
 
     /// Makes the picture from this message, if it can be.
-    pub(super) fn image(&mut self, clip: u64, of: &Topic, meta: &SampleMeta, cdr: &[u8]) {
-        self.sheet(clip).try_image(of, meta, cdr);
+    pub(super) fn image(&mut self, clip: u64, of: &TopicSchema, meta: &SampleMeta, cdr: &[u8]) {
+        self.open_file(clip).try_image(of, meta, cdr);
     }
 
     /// Writes a message.
@@ -102,47 +105,48 @@ impl Scribe {
         &mut self,
         clip: u64,
         topic: usize,
-        of: &Topic,
+        of: &TopicSchema,
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
-        let sheet = self.sheet(clip);
-        if sheet.images == Some(topic) {
-            sheet.try_image(of, meta, cdr);
+        let open_file = self.open_file(clip);
+        if open_file.images == Some(topic) {
+            open_file.try_image(of, meta, cdr);
         }
-        sheet.file().message(of, meta, cdr)
+        open_file.file().message(of, meta, cdr)
     }
 
     /// Forgets a clip. If it has a file, that stays for recovery.
     pub(super) fn forget(&mut self, clip: u64) {
-        self.sheets.retain(|sheet| sheet.clip != clip);
+        self.open.retain(|open_file| open_file.clip != clip);
     }
 
     /// Completes a clip. When this returns, all of it is on the disk.
-    pub(super) fn finish(&mut self, last: Last) -> Result<Clip, RecordError> {
-        let Last { clip, begin, mut ending, topics, journals } = last;
-        if let Some((stem, about)) = begin {
-            self.begin(clip, &stem, &about)?;
+    pub(super) fn finish(&mut self, completion: ClipCompletion) -> Result<Clip, RecordError> {
+        let ClipCompletion { clip, begin, mut trailer, topics, journals } = completion;
+        if let Some((clip_name, clip_header)) = begin {
+            self.begin(clip, &clip_name, &clip_header)?;
         }
         for topic in &topics {
-            self.sheet(clip).file().declare(topic)?;
+            self.open_file(clip).file().declare(topic)?;
         }
         for (name, header, part) in journals {
             match part.write(&header) {
                 None => {}
-                Some(Ok(journal)) => ending.journals.push((name, journal)),
+                Some(Ok(journal)) => trailer.journals.push((name, journal)),
                 Some(Err(error)) => {
                     tracing::error!(lambda = %name, %error, "the journal of a clip cannot be written");
-                    ending
-                        .short
+                    trailer
+                        .incomplete
                         .push(format!("the journal of {name} could not be written: {error}"));
                 }
             }
         }
-        let index = self.sheets.iter().position(|sheet| sheet.clip == clip).expect("it was begun");
-        let sheet = self.sheets.swap_remove(index);
-        ending.thumbnail = sheet.jpeg;
-        sheet.file.expect("it was begun").finish(ending)
+        let index =
+            self.open.iter().position(|open_file| open_file.clip == clip).expect("it was begun");
+        let open_file = self.open.swap_remove(index);
+        trailer.thumbnail = open_file.jpeg;
+        open_file.file.expect("it was begun").finish(trailer)
     }
 
     /// Makes room for a clip that was finished, if there is a bound. What cannot be deleted stays,

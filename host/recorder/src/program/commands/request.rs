@@ -40,7 +40,7 @@ pub(super) enum CommandError {
 
 /// What is commanded.
 #[derive(Debug, PartialEq)]
-pub(super) struct Order {
+pub(super) struct CommandRequest {
     /// In whose name.
     pub(super) lambda: Option<String>,
     pub(super) trigger: Trigger,
@@ -49,24 +49,25 @@ pub(super) struct Order {
 /// The object in the text.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Text {
+struct CommandText {
     command: TriggerKind,
     label: String,
     lambda: Option<String>,
     score: Option<f64>,
 }
 
-impl Order {
+impl CommandRequest {
     /// What a message says, of [`MESSAGE_MAX`] bytes at most.
-    pub(super) fn read(cdr: &[u8], endian: Endian) -> Result<Order, CommandError> {
-        let Text { command: kind, label, lambda, score } = serde_json::from_str(text(cdr, endian)?)
-            .map_err(|source| CommandError::NoCommand { source })?;
+    pub(super) fn read(cdr: &[u8], endian: Endian) -> Result<CommandRequest, CommandError> {
+        let CommandText { command: kind, label, lambda, score } =
+            serde_json::from_str(text(cdr, endian)?)
+                .map_err(|source| CommandError::NoCommand { source })?;
         match label.len() {
             0 => return Err(CommandError::NoLabel),
             bytes if bytes > LABEL_MAX => return Err(CommandError::LongLabel { bytes }),
             _ => {}
         }
-        Ok(Order {
+        Ok(CommandRequest {
             lambda,
             trigger: Trigger { kind, label, score, attributes: serde_json::Map::new() },
         })
@@ -96,8 +97,8 @@ mod tests {
         [&len.to_le_bytes()[..], text.as_bytes(), &[0]].concat()
     }
 
-    fn read(text: &str) -> Result<Order, CommandError> {
-        Order::read(&message(text), Endian::Little)
+    fn read(text: &str) -> Result<CommandRequest, CommandError> {
+        CommandRequest::read(&message(text), Endian::Little)
     }
 
     /// Why a text is refused, with what JSON says of it.
@@ -126,7 +127,10 @@ mod tests {
         assert_eq!((order.lambda, order.trigger.score), (None, None));
         let mut big = message(r#"{"label":"x","command":"stop"}"#);
         big[..4].reverse();
-        assert_eq!(Order::read(&big, Endian::Big).unwrap().trigger.kind, TriggerKind::Stop);
+        assert_eq!(
+            CommandRequest::read(&big, Endian::Big).unwrap().trigger.kind,
+            TriggerKind::Stop
+        );
     }
 
     #[test]
@@ -163,16 +167,19 @@ mod tests {
         let good = message(r#"{"command":"event","label":"x"}"#);
         for len in 0..good.len() {
             assert!(
-                matches!(Order::read(&good[..len], Endian::Little), Err(CommandError::NoText)),
+                matches!(
+                    CommandRequest::read(&good[..len], Endian::Little),
+                    Err(CommandError::NoText)
+                ),
                 "{len}"
             );
         }
         let filled = [&good[..], &[0; 3]].concat();
-        assert!(Order::read(&filled, Endian::Little).is_ok());
+        assert!(CommandRequest::read(&filled, Endian::Little).is_ok());
         for (at, byte) in [(0, 255), (3, 255), (0, 0), (9, 255), (good.len() - 1, b'x')] {
             let mut bad = good.clone();
             bad[at] = byte;
-            let error = Order::read(&bad, Endian::Little).unwrap_err();
+            let error = CommandRequest::read(&bad, Endian::Little).unwrap_err();
             assert!(matches!(error, CommandError::NoText), "{at}: {error}");
         }
     }

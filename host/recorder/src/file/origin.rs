@@ -3,7 +3,7 @@
 use std::io::{self, BufReader, Read};
 use std::path::Path;
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 
 /// Who wrote a file.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -20,7 +20,7 @@ pub(super) enum Origin {
 /// Who wrote the file `path`.
 pub(super) fn origin(path: &Path) -> io::Result<Origin> {
     let header = header();
-    let mut file = BufReader::new(own_file::read(path)?);
+    let mut file = BufReader::new(safe_file::read(path)?);
     let mut begin = Vec::new();
     file.by_ref().take(header.len() as u64).read_to_end(&mut begin)?;
     let is_ours = begin

@@ -1,0 +1,45 @@
+//! How much somebody may ask for.
+
+use std::time::Instant;
+
+/// So much per second, and some at once.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct RateLimit {
+    per_s: f64,
+    most: f64,
+    left: f64,
+    since: Option<Instant>,
+}
+
+impl RateLimit {
+    pub(super) const fn of(per_s: f64, most: f64) -> RateLimit {
+        RateLimit { per_s, most, left: most, since: None }
+    }
+
+    /// Takes `amount`, if that much is left.
+    pub(super) fn take(&mut self, amount: f64, now: Instant) -> bool {
+        let passed = self.since.map_or(0.0, |since| now.duration_since(since).as_secs_f64());
+        self.left = (self.left + passed * self.per_s).min(self.most);
+        self.since = Some(now);
+        let fits = amount <= self.left;
+        self.left -= if fits { amount } else { 0.0 };
+        fits
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn a_rate_limit_is_used_up_and_recovers() {
+        let (mut limit, start) = (RateLimit::of(10.0, 100.0), Instant::now());
+        assert!(limit.take(60.0, start) && !limit.take(60.0, start) && limit.take(40.0, start));
+        assert!(!limit.take(5.0, start + Duration::from_millis(400)));
+        assert!(limit.take(5.0, start + Duration::from_millis(600)));
+        assert!(limit.take(100.0, start + Duration::from_secs(3600)));
+        assert!(!limit.take(1.0, start + Duration::from_secs(3600)), "not more than at once");
+    }
+}
