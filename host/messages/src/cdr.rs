@@ -1,58 +1,58 @@
-//! Reading classic CDR: a cursor that aligns, bounds-checks, and swaps bytes.
+//! Reads classic CDR: a cursor that aligns, checks bounds, and swaps bytes.
 //!
 //! The bytes are a payload without its four bytes of encapsulation; alignment counts from the first
-//! byte and is at most 8. Source: OMG CORBA 3.0, section 15.3, as DDS-XTypes calls XCDR1.
+//! byte and is at most 8. Source: OMG CORBA 3.0, section 15.3, called XCDR1 by DDS-XTypes.
 
 /// Byte order of a CDR payload.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, Default)]
 pub enum Endian {
-    /// Least significant byte first; what nearly every vehicle writes.
+    /// Least significant byte first, as on nearly every vehicle.
     #[default]
     Little,
     /// Most significant byte first.
     Big,
 }
 
-/// Why a field cannot be read from these bytes.
+/// Reasons why a field cannot be read from the bytes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CdrError {
     /// The message ends inside a value.
     #[error("message too short: {needed} bytes needed at offset {offset}, it has {have} there")]
     Short {
-        /// Where the value starts.
+        /// Start of the value.
         offset: usize,
-        /// How many bytes it takes.
+        /// Size of the value.
         needed: usize,
-        /// How many there are from `offset` to the end.
+        /// Bytes from `offset` to the end.
         have: usize,
     },
     /// A sequence claims more elements than the rest of the message could hold.
     #[error("sequence at offset {offset} claims {count} elements, only {have} bytes follow")]
     Count {
-        /// Where the sequence's count stands.
+        /// Offset of the sequence's count.
         offset: usize,
-        /// The count it claims.
+        /// The claimed count.
         count: usize,
         /// Bytes that follow the count.
         have: usize,
     },
     /// The path names an element that this message does not have.
-    #[error("element {index} asked for, the sequence at offset {offset} has {count}")]
+    #[error("element {index} requested, the sequence at offset {offset} has {count}")]
     Index {
-        /// Where the sequence's count stands.
+        /// Offset of the sequence's count.
         offset: usize,
-        /// The element that the path asks for.
+        /// The requested element.
         index: usize,
-        /// How many there are.
+        /// Number of elements.
         count: usize,
     },
     /// A string is not UTF-8.
     #[error("string at offset {offset} is not UTF-8")]
     NotUtf8 {
-        /// Where the characters start.
+        /// Offset of the characters.
         offset: usize,
     },
-    /// [`super::FieldPath::number`] was called on a path whose kind is no number.
+    /// [`super::FieldPath::number`] was called on a path whose kind is not a number.
     #[error("the field is not a number")]
     NotANumber,
 }
@@ -61,7 +61,7 @@ pub enum CdrError {
 #[derive(Copy, Clone)]
 pub(super) struct Cursor<'a> {
     bytes: &'a [u8],
-    /// May lie beyond the end after a skip; the next read then fails.
+    /// May be beyond the end after a skip; the next read then fails.
     pos: usize,
     endian: Endian,
 }
@@ -92,15 +92,15 @@ impl<'a> Cursor<'a> {
         self.endian
     }
 
-    /// Bytes from here to the end.
+    /// Returns the bytes from here to the end.
     pub(super) fn left(&self) -> usize {
         self.bytes.len().saturating_sub(self.pos)
     }
 
-    /// Moves on to a multiple of `to`, a power of two.
+    /// Moves to the next multiple of `to`, a power of two.
     pub(super) fn align(&mut self, to: usize) {
-        // Positions stay below twice the length of a slice, so this cannot overflow in practice;
-        // saturation makes it a read error if it ever did.
+        // Positions stay below twice the length of a slice, so this cannot overflow; if it did,
+        // saturation would make it a read error.
         self.pos = self.pos.saturating_add(to - 1) & !(to - 1);
     }
 
@@ -109,12 +109,12 @@ impl<'a> Cursor<'a> {
         self.pos = pos;
     }
 
-    /// Moves on by `n` bytes, which must exist.
+    /// Skips `n` bytes, which must exist.
     pub(super) fn skip(&mut self, n: usize) -> Result<(), CdrError> {
         self.take(n).map(|_| ())
     }
 
-    /// The next `n` bytes.
+    /// Returns the next `n` bytes.
     pub(super) fn take(&mut self, n: usize) -> Result<&'a [u8], CdrError> {
         let taken = self.pos.checked_add(n).and_then(|end| self.bytes.get(self.pos..end));
         match taken {
@@ -146,10 +146,10 @@ impl<'a> Cursor<'a> {
     read_scalar!(u8: u8, i8: i8, u16: u16, i16: i16, u32: u32, i32: i32, u64: u64, i64: i64,
         f32: f32, f64: f64);
 
-    /// The count in front of a sequence whose elements take at least `least` bytes each (not 0).
+    /// Reads the count of a sequence whose elements take at least `least` bytes each (not 0).
     ///
-    /// A count that the rest of the message cannot hold is refused here, before anyone loops or
-    /// allocates by it.
+    /// A count that the rest of the message cannot hold is an error here, before it controls a loop
+    /// or an allocation.
     pub(super) fn count(&mut self, least: usize) -> Result<usize, CdrError> {
         let count = self.u32()? as usize;
         if count > self.left() / least {
@@ -158,13 +158,13 @@ impl<'a> Cursor<'a> {
         Ok(count)
     }
 
-    /// Skips a string: its length, its characters and the zero behind them.
+    /// Skips a string: its length, its characters and the final zero.
     pub(super) fn skip_text(&mut self) -> Result<(), CdrError> {
         let len = self.u32()? as usize;
         self.skip(len)
     }
 
-    /// A string without the zero at its end. A length of 0, which some writers use, reads as empty.
+    /// Reads a string without its final zero. A length of 0, which some writers use, means empty.
     pub(super) fn text(&mut self) -> Result<&'a str, CdrError> {
         let len = self.u32()? as usize;
         let offset = self.pos;
@@ -173,9 +173,9 @@ impl<'a> Cursor<'a> {
         str::from_utf8(raw).map_err(|_| CdrError::NotUtf8 { offset })
     }
 
-    /// The `n` elements of `size` bytes each that start at the next multiple of `size`.
+    /// Returns the `n` elements of `size` bytes each that start at the next multiple of `size`.
     ///
-    /// No element means no padding either: CDR aligns an element when it writes one.
+    /// Without elements there is no padding: CDR aligns an element when it writes one.
     pub(super) fn elements(&mut self, n: usize, size: usize) -> Result<&'a [u8], CdrError> {
         if n == 0 {
             return Ok(&[]);

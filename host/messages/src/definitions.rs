@@ -1,14 +1,14 @@
-//! A message type and everything it refers to, resolved and measured.
+//! A message type with all types it refers to, resolved and measured.
 
 use std::collections::{HashMap, HashSet};
 
-use super::layout::{Layout, Table};
-use super::parse::{self, Count, Element, Field, Primitive};
+use super::layout::{Layout, SkipTable};
+use super::parse::{self, Count, Element, FieldDefinition, Primitive};
 
-/// How deep types may nest. ROS 2's own deepest (diagnostics, visualization) stay below 10.
+/// Nesting limit of types. ROS 2's own deepest (diagnostics, visualization) stay below 10.
 const MAX_DEPTH: usize = 32;
-/// How many fields a type may have once every nested type is written out. Nesting doubles cheaply,
-/// so a text of one page could otherwise ask for billions.
+/// Limit of fields of a type, those of nested types included. Each level of nesting can double
+/// them, so one page of text could otherwise define billions.
 const MAX_FIELDS: usize = 20_000;
 
 /// A message type with all types it refers to, ready for [`super::FieldPath::compile`].
@@ -23,15 +23,15 @@ pub struct Definitions {
 pub(super) struct Struct {
     /// `pkg/Type`.
     pub(super) name: String,
-    pub(super) fields: Vec<Field<usize>>,
+    pub(super) fields: Vec<FieldDefinition<usize>>,
     pub(super) layout: Layout,
-    /// The fewest bytes a value takes, without padding; at least 1.
+    /// Minimum size of a value in bytes, without padding; at least 1.
     pub(super) least: usize,
-    /// Fields with all nested ones written out.
+    /// Number of fields, those of nested types included.
     weight: usize,
 }
 
-/// Why a definition text cannot be used.
+/// Reasons why a definition text is invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MessageError {
     /// A line is not ros2msg.
@@ -39,9 +39,9 @@ pub enum MessageError {
     Syntax {
         /// Line number, from 1.
         line: usize,
-        /// The line, cut at 80 characters.
+        /// The line, truncated to 80 characters.
         text: String,
-        /// What was expected.
+        /// The expected form.
         wanted: &'static str,
     },
     /// A field has a type whose definition is not in the text.
@@ -51,16 +51,16 @@ pub enum MessageError {
         type_name: String,
         /// The field.
         field: String,
-        /// The type that is missing.
+        /// The missing type.
         missing: String,
     },
-    /// Two parts define the same type, differently.
+    /// Two parts define the same type differently.
     #[error("type `{type_name}` is defined twice, differently")]
     Conflict {
         /// The type.
         type_name: String,
     },
-    /// A type has two fields of one name.
+    /// A type has two fields with the same name.
     #[error("type `{type_name}` has two fields `{field}`")]
     DuplicateField {
         /// The type.
@@ -68,7 +68,7 @@ pub enum MessageError {
         /// The field.
         field: String,
     },
-    /// A type contains itself, which has no finite size.
+    /// A type contains itself, so that its size is infinite.
     #[error("type `{type_name}` contains itself")]
     Recursive {
         /// The type.
@@ -90,16 +90,16 @@ pub enum MessageError {
 
 impl Definitions {
     /// Parses the ros2msg text of `type_name` (`pkg/msg/Type` or `pkg/Type`): the fields of that
-    /// type, then, each behind a line of `=` and a line `MSG: pkg/Type`, those of the types it
-    /// refers to. `builtin_interfaces/Time` and `Duration` are known if the text leaves them out.
+    /// type, then those of the types it refers to, each after a line of `=` and a line `MSG:
+    /// pkg/Type`. `builtin_interfaces/Time` and `Duration` are built in.
     ///
     /// # Errors
     ///
     /// [`MessageError`] for malformed lines, missing or contradictory definitions, types that
-    /// contain themselves, and absurd depth or size.
+    /// contain themselves, and excessive depth or size.
     pub fn parse(type_name: &str, text: &str) -> Result<Self, MessageError> {
         let root = short_name(type_name);
-        let mut parts: HashMap<String, Vec<Field<String>>> = HashMap::new();
+        let mut parts: HashMap<String, Vec<FieldDefinition<String>>> = HashMap::new();
         for part in parse::parts(text)? {
             let name = part.name.map_or_else(|| root.clone(), short_name);
             match parts.get(&name) {
@@ -121,19 +121,19 @@ impl Definitions {
         Ok(Self { type_name: full_name(&root), structs: resolver.structs })
     }
 
-    /// The type's full name, `pkg/msg/Type`.
+    /// Returns the type's full name, `pkg/msg/Type`.
     pub fn type_name(&self) -> &str {
         &self.type_name
     }
 
-    /// The names of the type's own fields, in wire order.
+    /// Returns the names of the type's own fields, in wire order.
     pub fn fields(&self) -> impl Iterator<Item = &str> {
         self.root().fields.iter().map(|field| field.name.as_str())
     }
 
-    /// Whether both say the same of every message.
-    pub(super) fn says_as(&self, other: &Self) -> bool {
-        let all = |definitions: &Self| -> Vec<(String, Vec<Field<usize>>)> {
+    /// Returns whether both define the same fields.
+    pub(super) fn is_equivalent(&self, other: &Self) -> bool {
+        let all = |definitions: &Self| -> Vec<(String, Vec<FieldDefinition<usize>>)> {
             definitions.structs.iter().map(|one| (one.name.clone(), one.fields.clone())).collect()
         };
         // Both list a type before those that contain it, in the order of the fields.
@@ -144,13 +144,13 @@ impl Definitions {
         self.structs.last().expect("parse resolves the root or fails, and pushes it last")
     }
 
-    /// The type that a resolved field refers to.
+    /// Returns the type that a resolved field refers to.
     pub(super) fn get(&self, index: usize) -> &Struct {
         &self.structs[index]
     }
 }
 
-/// `pkg/msg/Type` as `pkg/Type`; anything else unchanged.
+/// Returns `pkg/msg/Type` as `pkg/Type`; anything else unchanged.
 pub fn short_name(type_name: &str) -> String {
     match type_name.split_once("/msg/") {
         Some((package, name)) => format!("{package}/{name}"),
@@ -158,7 +158,7 @@ pub fn short_name(type_name: &str) -> String {
     }
 }
 
-/// `pkg/Type` as `pkg/msg/Type`, the spelling of manifests and messages to people.
+/// Returns `pkg/Type` as `pkg/msg/Type`, the form of manifests and error messages.
 pub(super) fn full_name(short_name: &str) -> String {
     match short_name.split_once('/') {
         Some((package, name)) => format!("{package}/msg/{name}"),
@@ -166,9 +166,9 @@ pub(super) fn full_name(short_name: &str) -> String {
     }
 }
 
-fn seconds_and_nanoseconds() -> Vec<Field<String>> {
+fn seconds_and_nanoseconds() -> Vec<FieldDefinition<String>> {
     [("sec", Primitive::I32), ("nanosec", Primitive::U32)]
-        .map(|(name, primitive)| Field {
+        .map(|(name, primitive)| FieldDefinition {
             name: name.to_owned(),
             element: Element::Primitive(primitive),
             count: Count::One,
@@ -178,7 +178,7 @@ fn seconds_and_nanoseconds() -> Vec<Field<String>> {
 
 /// Turns names into indices, innermost types first.
 struct Resolver {
-    parts: HashMap<String, Vec<Field<String>>>,
+    parts: HashMap<String, Vec<FieldDefinition<String>>>,
     structs: Vec<Struct>,
     known: HashMap<String, usize>,
     /// The types being resolved, outermost first.
@@ -209,7 +209,7 @@ impl Resolver {
         }
         // rosidl gives a type without fields this one byte, since C has no empty structs.
         if fields.is_empty() {
-            fields.push(Field {
+            fields.push(FieldDefinition {
                 name: "structure_needs_at_least_one_member".to_owned(),
                 element: Element::Primitive(Primitive::U8),
                 count: Count::One,
@@ -223,8 +223,12 @@ impl Resolver {
         Ok(index)
     }
 
-    fn field(&mut self, owner: &str, field: Field<String>) -> Result<Field<usize>, MessageError> {
-        let Field { name, element, count } = field;
+    fn field(
+        &mut self,
+        owner: &str,
+        field: FieldDefinition<String>,
+    ) -> Result<FieldDefinition<usize>, MessageError> {
+        let FieldDefinition { name, element, count } = field;
         let element = match element {
             Element::Primitive(primitive) => Element::Primitive(primitive),
             Element::Text => Element::Text,
@@ -238,10 +242,10 @@ impl Resolver {
                 Element::Struct(self.resolve(&found)?)
             }
         };
-        Ok(Field { name, element, count })
+        Ok(FieldDefinition { name, element, count })
     }
 
-    /// A bare name means the owner's package, or the `Header` that ROS 1 habits left behind.
+    /// A bare name means the owner's package, or `std_msgs/Header`, as in ROS 1.
     fn lookup(&self, owner: &str, wanted: &str) -> Option<String> {
         let wanted = short_name(wanted);
         let candidates = match (wanted.contains('/'), owner.split_once('/')) {
@@ -254,13 +258,17 @@ impl Resolver {
         candidates.into_iter().find(|name| self.parts.contains_key(name))
     }
 
-    fn measure(&self, name: &str, fields: Vec<Field<usize>>) -> Result<Struct, MessageError> {
+    fn measure(
+        &self,
+        name: &str,
+        fields: Vec<FieldDefinition<usize>>,
+    ) -> Result<Struct, MessageError> {
         let too_large = || MessageError::TooLarge { type_name: name.to_owned() };
-        let mut layout = Some(Table::EMPTY);
+        let mut layout = Some(SkipTable::EMPTY);
         let (mut least, mut weight) = (0usize, 0usize);
         for field in &fields {
             let (element, element_least, element_weight) = match &field.element {
-                Element::Primitive(p) => (Layout::Fixed(Table::primitive(*p)), p.size(), 1),
+                Element::Primitive(p) => (Layout::Fixed(SkipTable::primitive(*p)), p.size(), 1),
                 Element::Text | Element::WideText => (Layout::Variable, 4, 1),
                 Element::Struct(index) => {
                     let inner = &self.structs[*index];
@@ -327,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn a_page_that_unfolds_to_billions_is_refused() {
+    fn a_page_that_expands_to_billions_of_fields_is_refused() {
         let mut text = "p/T0 x\n".to_owned();
         for level in 0..25 {
             text += &format!("===\nMSG: p/T{level}\np/T{0} a\np/T{0} b\n", level + 1);

@@ -1,4 +1,4 @@
-//! CDR for messages of our own: a writer knows what it writes, so this is little more than
+//! Writes CDR for Gleaner's own messages: their fields are known, so this is little more than
 //! alignment.
 
 /// A message as little-endian CDR, without the four bytes of encapsulation.
@@ -6,7 +6,7 @@
 pub struct CdrWriter(Vec<u8>);
 
 impl CdrWriter {
-    /// An empty message.
+    /// Creates an empty message.
     pub fn new() -> Self {
         Self::default()
     }
@@ -36,7 +36,7 @@ impl CdrWriter {
         values.iter().fold(self, |cdr, value| cdr.aligned(&value.to_le_bytes()))
     }
 
-    /// Adds a `string`. What is longer than 4 GiB is cut.
+    /// Adds a `string`, truncated to 4 GiB.
     pub fn string(&mut self, text: &str) -> &mut Self {
         let len = text.len().min(u32::MAX as usize - 1);
         self.u32(len as u32 + 1);
@@ -45,19 +45,18 @@ impl CdrWriter {
         self
     }
 
-    /// Adds a `builtin_interfaces/Time` of nanoseconds; what it cannot hold becomes the nearest
-    /// that it can.
+    /// Adds a `builtin_interfaces/Time` of nanoseconds, clamped to its range.
     pub fn time(&mut self, ns: i64) -> &mut Self {
         let seconds = ns.div_euclid(1_000_000_000).clamp(i32::MIN.into(), i32::MAX.into());
         self.i32(seconds as i32).u32(ns.rem_euclid(1_000_000_000) as u32)
     }
 
-    /// The message so far.
+    /// Returns the message so far.
     pub fn bytes(&self) -> &[u8] {
         &self.0
     }
 
-    /// Begins anew, in the same memory.
+    /// Clears the message, and keeps its memory.
     pub fn clear(&mut self) {
         self.0.clear();
     }

@@ -1,16 +1,16 @@
-//! How far a value of fixed size moves the reader on, padding included.
+//! Computes the size of values of fixed size, padding included.
 //!
-//! Padding depends on where the value starts, but only modulo 8, the largest alignment. So eight
-//! numbers say everything: any run of fixed-size fields, however long, is skipped by one table
-//! look-up and one addition, even behind a string whose length nobody knew beforehand.
+//! Padding depends on the start of the value, but only modulo 8, the largest alignment. So eight
+//! numbers suffice: any run of fixed-size fields, however long, is skipped by one table look-up and
+//! one addition, even after a string of unknown length.
 
 use super::parse::Primitive;
 
-/// Bytes from a start position `p` to the position behind the value, indexed by `p % 8`.
+/// Bytes from a start position `p` to the end of the value, indexed by `p % 8`.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub(super) struct Table([u32; 8]);
+pub(super) struct SkipTable([u32; 8]);
 
-impl Table {
+impl SkipTable {
     /// A value of no bytes.
     pub(super) const EMPTY: Self = Self([0; 8]);
 
@@ -18,13 +18,13 @@ impl Table {
         let size = primitive.size();
         let mut steps = [0; 8];
         for (start, step) in steps.iter_mut().enumerate() {
-            // At most 7 of padding and 8 of value.
+            // At most 7 bytes of padding and 8 of value.
             *step = (start.next_multiple_of(size) - start + size) as u32;
         }
         Self(steps)
     }
 
-    /// `self` and then `next`; `None` if that is 4 GiB or more.
+    /// Returns the table of `self` followed by `next`; `None` if that takes 4 GiB or more.
     pub(super) fn then(&self, next: &Self) -> Option<Self> {
         let mut steps = [0; 8];
         for (start, step) in steps.iter_mut().enumerate() {
@@ -34,7 +34,7 @@ impl Table {
         Some(Self(steps))
     }
 
-    /// `self`, `n` times in a row; `None` if that is 4 GiB or more.
+    /// Returns the table of `self` repeated `n` times; `None` if that takes 4 GiB or more.
     pub(super) fn times(&self, n: usize) -> Option<Self> {
         // Binary powers: `then` is associative, so 28 doublings cover the longest array.
         let (mut result, mut power, mut left) = (Self::EMPTY, *self, n);
@@ -50,16 +50,16 @@ impl Table {
         Some(result)
     }
 
-    /// The position behind the value when it starts at `pos`.
+    /// Returns the end of a value that starts at `pos`.
     #[inline]
     pub(super) fn after(&self, pos: usize) -> usize {
         pos.saturating_add(self.0[pos % 8] as usize)
     }
 
-    /// The position behind `n` of them in a row, in a bounded number of steps.
+    /// Returns the end of `n` values in a row, in a bounded number of steps.
     pub(super) fn after_times(&self, mut pos: usize, n: usize) -> usize {
-        // With eight residues, the ninth element at the latest starts like an earlier one; from
-        // there on the steps repeat.
+        // There are eight residues, so the ninth element at the latest starts like an earlier one,
+        // and from there on the steps repeat.
         let mut seen = [None; 8];
         let mut done = 0;
         while done < n {
@@ -68,7 +68,7 @@ impl Table {
                 let cycles = (n - done) / period;
                 pos = pos.saturating_add(cycles.saturating_mul(stride));
                 done += cycles * period;
-                // Fewer than a period is left: walk it without looking for cycles again.
+                // Less than a period is left: no more search for cycles.
                 for _ in done..n {
                     pos = self.after(pos);
                 }
@@ -81,11 +81,11 @@ impl Table {
     }
 }
 
-/// What is known of a value's size before seeing its bytes.
+/// The size of a value, as far as its type determines it.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Layout {
-    /// The same for every message.
-    Fixed(Table),
+    /// The same size in every message.
+    Fixed(SkipTable),
     /// Contains a string or a sequence.
     Variable,
 }
@@ -94,14 +94,15 @@ pub(super) enum Layout {
 mod tests {
     use super::*;
 
-    fn walked(table: &Table, start: usize, n: usize) -> usize {
+    fn walked(table: &SkipTable, start: usize, n: usize) -> usize {
         (0..n).fold(start, |pos, _| table.after(pos))
     }
 
     #[test]
     fn a_run_counts_its_padding() {
-        let byte_then_double =
-            Table::primitive(Primitive::U8).then(&Table::primitive(Primitive::F64)).unwrap();
+        let byte_then_double = SkipTable::primitive(Primitive::U8)
+            .then(&SkipTable::primitive(Primitive::F64))
+            .unwrap();
         assert_eq!(byte_then_double.after(0), 16);
         assert_eq!(byte_then_double.after(7), 16);
         assert_eq!(byte_then_double.after(8), 24);
@@ -109,11 +110,13 @@ mod tests {
 
     #[test]
     fn repeating_equals_walking_from_every_start() {
-        let odd = Table::primitive(Primitive::U32)
-            .then(&Table::primitive(Primitive::U8))
-            .and_then(|table| table.then(&Table::primitive(Primitive::U16)))
+        let odd = SkipTable::primitive(Primitive::U32)
+            .then(&SkipTable::primitive(Primitive::U8))
+            .and_then(|table| table.then(&SkipTable::primitive(Primitive::U16)))
             .unwrap();
-        let wide = Table::primitive(Primitive::F64).then(&Table::primitive(Primitive::U8)).unwrap();
+        let wide = SkipTable::primitive(Primitive::F64)
+            .then(&SkipTable::primitive(Primitive::U8))
+            .unwrap();
         for table in [odd, wide] {
             for start in 0..16 {
                 for n in [0, 1, 2, 3, 7, 8, 9, 10, 63, 64, 1000] {
@@ -127,7 +130,7 @@ mod tests {
 
     #[test]
     fn absurd_sizes_are_refused_instead_of_wrapping() {
-        let double = Table::primitive(Primitive::F64);
+        let double = SkipTable::primitive(Primitive::F64);
         let giant = double.times(1 << 28).unwrap();
         assert_eq!(giant.after(0), 1 << 31);
         assert_eq!(giant.times(2), None);

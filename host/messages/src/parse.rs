@@ -1,8 +1,8 @@
-//! The ros2msg text format: lines to fields, nothing resolved yet.
+//! Parses the ros2msg text format: lines become fields, with unresolved type names.
 //!
-//! Constants and default values are recognised and passed over: they are not in the bytes.
-//! Source: ROS 2 interface definition (design.ros2.org, article 110); the separator between parts
-//! is the one MCAP's `ros2msg` schema encoding defines.
+//! Constants and default values are recognised and skipped: they are not in the bytes. Source: ROS
+//! 2 interface definition (design.ros2.org, article 110); the separator between parts is that of
+//! MCAP's `ros2msg` schema encoding.
 
 use super::definitions::MessageError;
 
@@ -10,7 +10,7 @@ use super::definitions::MessageError;
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Primitive {
     Bool,
-    /// `uint8`, `byte` and `char`, which ROS 2 puts on the wire alike.
+    /// `uint8`, `byte` and `char`, which are the same on the wire.
     U8,
     I8,
     U16,
@@ -24,7 +24,7 @@ pub(super) enum Primitive {
 }
 
 impl Primitive {
-    /// Bytes on the wire, which is also the alignment.
+    /// Returns the size on the wire in bytes, which is also the alignment.
     pub(super) fn size(self) -> usize {
         match self {
             Self::Bool | Self::U8 | Self::I8 => 1,
@@ -35,16 +35,16 @@ impl Primitive {
     }
 }
 
-/// How many elements a field has.
+/// Number of elements of a field.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Count {
     One,
     Fixed(usize),
-    /// Bounded or not: the bound leaves no trace on the wire.
+    /// Bounded or not: the bound is not on the wire.
     Sequence,
 }
 
-/// The type of one element of a field, `S` being how a message type is referred to.
+/// The type of one element of a field. `S` is the form of a reference to a message type.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Element<S> {
     Primitive(Primitive),
@@ -55,26 +55,26 @@ pub(super) enum Element<S> {
 
 /// One field of a message type.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Field<S> {
+pub(super) struct FieldDefinition<S> {
     pub(super) name: String,
     pub(super) element: Element<S>,
     pub(super) count: Count,
 }
 
 /// One `MSG:` part, or the root, of a definition text.
-pub(super) struct Part<'t> {
-    /// As written behind `MSG:`; `None` for the root.
+pub(super) struct DefinitionPart<'t> {
+    /// The name after `MSG:`; `None` for the root.
     pub(super) name: Option<&'t str>,
-    pub(super) fields: Vec<Field<String>>,
+    pub(super) fields: Vec<FieldDefinition<String>>,
 }
 
-/// Longest array that a definition may fix, so that sizes stay far from overflow.
+/// Longest array of fixed length, so that sizes stay far from overflow.
 const MAX_FIXED: usize = 1 << 28;
 
 /// Splits a definition text into its parts and parses the fields of each.
-pub(super) fn parts(text: &str) -> Result<Vec<Part<'_>>, MessageError> {
-    let mut parts = vec![Part { name: None, fields: Vec::new() }];
-    // A separator opens a part; the line `MSG: pkg/Type` behind it names that part.
+pub(super) fn parts(text: &str) -> Result<Vec<DefinitionPart<'_>>, MessageError> {
+    let mut parts = vec![DefinitionPart { name: None, fields: Vec::new() }];
+    // A separator begins a part; the following line `MSG: pkg/Type` names it.
     let mut awaits_name = false;
     for (index, raw) in text.lines().enumerate() {
         let line = raw.trim();
@@ -89,7 +89,7 @@ pub(super) fn parts(text: &str) -> Result<Vec<Part<'_>>, MessageError> {
             let name = line.strip_prefix("MSG:").map(str::trim);
             let name =
                 name.ok_or_else(|| syntax(index, line, "`MSG: pkg/Type` after a separator"))?;
-            parts.push(Part { name: Some(name), fields: Vec::new() });
+            parts.push(DefinitionPart { name: Some(name), fields: Vec::new() });
             awaits_name = false;
             continue;
         }
@@ -101,9 +101,9 @@ pub(super) fn parts(text: &str) -> Result<Vec<Part<'_>>, MessageError> {
     Ok(parts)
 }
 
-/// The field that a line declares; `None` for blank lines, comments and constants.
-fn field(index: usize, line: &str) -> Result<Option<Field<String>>, MessageError> {
-    // A `#` inside a quoted default also cuts here: what it cuts is a value, which is not needed.
+/// Parses the field that a line declares; `None` for blank lines, comments and constants.
+fn field(index: usize, line: &str) -> Result<Option<FieldDefinition<String>>, MessageError> {
+    // A `#` inside a quoted default also cuts here: it cuts a value, which is not needed.
     let code = line.split('#').next().unwrap_or_default().trim();
     if code.is_empty() {
         return Ok(None);
@@ -124,7 +124,7 @@ fn field(index: usize, line: &str) -> Result<Option<Field<String>>, MessageError
     }
     let (element, count) =
         field_type(ty).ok_or_else(|| syntax(index, line, "a known type form"))?;
-    Ok(Some(Field { name: name.to_owned(), element, count }))
+    Ok(Some(FieldDefinition { name: name.to_owned(), element, count }))
 }
 
 fn field_type(ty: &str) -> Option<(Element<String>, Count)> {
@@ -176,7 +176,7 @@ fn element(base: &str) -> Option<Element<String>> {
 }
 
 fn syntax(index: usize, line: &str, wanted: &'static str) -> MessageError {
-    // The line comes from a file of unknown origin and may be huge.
+    // The line is untrusted and may be huge.
     MessageError::Syntax { line: index + 1, text: line.chars().take(80).collect(), wanted }
 }
 
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn every_type_form_is_understood() {
+    fn every_type_form_is_parsed() {
         use Primitive::{F64, U8};
         assert_eq!(one("float64 x"), Some((Element::Primitive(F64), Count::One)));
         assert_eq!(one("byte[] data"), Some((Element::Primitive(U8), Count::Sequence)));
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn constants_are_passed_over_and_defaults_ignored() {
+    fn constants_are_skipped_and_defaults_ignored() {
         for constant in ["int32 A=1", "int32 A = 0x10", "string S=\"a # b\"", "bool B=1"] {
             assert_eq!(one(constant), None, "{constant}");
         }

@@ -1,16 +1,16 @@
-//! Field paths: `a.b[3].c` to a skip program, with errors that say what would have been right.
+//! Compiles field paths such as `a.b[3].c` to a skip program; errors name the valid alternatives.
 
 use gleaner_rules::path::{Malformed, Segment, segments};
 
 use super::cdr::{CdrError, Cursor, Endian};
 use super::definitions::{Definitions, Struct, full_name};
-use super::layout::{Layout, Table};
-use super::parse::{Count, Element, Field};
+use super::layout::{Layout, SkipTable};
+use super::parse::{Count, Element, FieldDefinition};
 use super::program::{Leaf, Op, walk};
-use super::value::{Kind, Value};
-use gleaner_base::words::{hint, nearest};
+use super::value::{MessageValue, ValueKind};
+use gleaner_base::text::{hint, nearest};
 
-/// One field of one message type, compiled.
+/// A compiled path to one field of one message type.
 #[derive(Debug)]
 pub struct FieldPath {
     path: String,
@@ -19,22 +19,26 @@ pub struct FieldPath {
     leaf: Leaf,
 }
 
-/// Why a path names no readable field.
+/// Reasons why a path does not lead to a readable field.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PathError {
     /// The path is not of the form `a.b[3].c`.
     #[error(transparent)]
     Syntax(#[from] Malformed),
-    /// A type has no field of that name.
-    #[error("type `{type_name}` has no field `{field}`{}; it has: {}", hint(nearest), fields.join(", "))]
+    /// A type has no field of this name.
+    #[error(
+        "type `{type_name}` has no field `{field}`{}; it has: {}",
+        hint(nearest),
+        fields.join(", ")
+    )]
     NoSuchField {
         /// The type.
         type_name: String,
-        /// The field asked for.
+        /// The requested field.
         field: String,
-        /// The fields there are, in wire order.
+        /// The fields of the type, in wire order.
         fields: Vec<String>,
-        /// The closest of them, if one is close.
+        /// The most similar name, if one is similar.
         nearest: Option<String>,
     },
     /// The path ends at a message instead of a value.
@@ -47,7 +51,7 @@ pub enum PathError {
         /// That type's fields.
         fields: Vec<String>,
     },
-    /// The path passes through an array without saying which element.
+    /// The path passes through an array without an index.
     #[error("field `{field}` of `{path}` is an array; write `{field}[0]` and so on")]
     NeedsIndex {
         /// The path.
@@ -55,7 +59,7 @@ pub enum PathError {
         /// The array.
         field: String,
     },
-    /// The path goes on behind a value, or indexes something that is no array.
+    /// The path continues after a value, or indexes a field that is not an array.
     #[error("field `{field}` of `{path}` is a single value with nothing inside")]
     NothingInside {
         /// The path.
@@ -74,7 +78,7 @@ pub enum PathError {
         len: usize,
     },
     /// A `wstring` is in the way. ROS 2's implementations disagree on the width of its characters,
-    /// so neither it nor anything behind it can be found with certainty.
+    /// so neither it nor the fields after it can be located reliably.
     #[error(
         "`{path}` is or lies behind the wstring `{field}`, whose size on the wire is not defined"
     )]
@@ -91,7 +95,7 @@ impl FieldPath {
     ///
     /// # Errors
     ///
-    /// [`PathError`], naming the type and what it has instead.
+    /// [`PathError`], naming the type and its fields.
     pub fn compile(definitions: &Definitions, path: &str) -> Result<Self, PathError> {
         let segments = segments(path)?;
         let mut compiler = Compiler { definitions, path, ops: Vec::new() };
@@ -104,24 +108,24 @@ impl FieldPath {
         })
     }
 
-    /// Whether reading it may walk over much of a message, because elements of varying size lie
-    /// before the field.
+    /// Returns whether reading it may walk over much of a message, because elements of variable
+    /// size precede the field.
     pub fn walks(&self) -> bool {
         self.ops.iter().any(|op| matches!(op, Op::Each { .. } | Op::Times { .. }))
     }
 
-    /// The path as it was written.
+    /// Returns the path as written.
     pub fn path(&self) -> &str {
         &self.path
     }
 
-    /// The message type it was compiled for, `pkg/msg/Type`.
+    /// Returns the message type it was compiled for, `pkg/msg/Type`.
     pub fn type_name(&self) -> &str {
         &self.type_name
     }
 
-    /// What kind of value [`FieldPath::read`] returns.
-    pub fn kind(&self) -> Kind {
+    /// Returns the kind of value that [`FieldPath::read`] returns.
+    pub fn kind(&self) -> ValueKind {
         self.leaf.kind()
     }
 
@@ -129,9 +133,9 @@ impl FieldPath {
     ///
     /// # Errors
     ///
-    /// [`CdrError`] if the bytes are no such message up to and including the field; what lies
-    /// behind it is not looked at.
-    pub fn read<'a>(&self, cdr: &'a [u8], endian: Endian) -> Result<Value<'a>, CdrError> {
+    /// [`CdrError`] if the bytes up to and including the field are not such a message; later bytes
+    /// are not read.
+    pub fn read<'a>(&self, cdr: &'a [u8], endian: Endian) -> Result<MessageValue<'a>, CdrError> {
         let mut cursor = Cursor::new(cdr, endian);
         walk(&self.ops, &mut cursor)?;
         self.leaf.read(&mut cursor)
@@ -141,7 +145,7 @@ impl FieldPath {
     ///
     /// # Errors
     ///
-    /// As [`FieldPath::read`], and [`CdrError::NotANumber`] if [`Kind::is_number`] is false.
+    /// As [`FieldPath::read`], and [`CdrError::NotANumber`] if [`ValueKind::is_number`] is false.
     pub fn number(&self, cdr: &[u8], endian: Endian) -> Result<f64, CdrError> {
         let mut cursor = Cursor::new(cdr, endian);
         walk(&self.ops, &mut cursor)?;
@@ -156,14 +160,14 @@ struct Compiler<'d> {
 }
 
 impl Compiler<'_> {
-    /// Emits the steps from the start of `owner` to the field that `segments` name.
+    /// Emits the steps from the start of `owner` to the field named by `segments`.
     fn enter_struct(
         &mut self,
         owner: &Struct,
         segments: &[Segment<'_>],
     ) -> Result<Leaf, PathError> {
         let Some((Segment::Name(name), rest)) = segments.split_first() else {
-            // `a[0][1]`: an array of structs is indexed twice.
+            // `a[0][1]`: a second index on an array of structs.
             return Err(self.whole(owner));
         };
         let position = owner.fields.iter().position(|field| field.name == *name);
@@ -196,10 +200,10 @@ impl Compiler<'_> {
         }
     }
 
-    /// Emits the steps into one element of `field`, which starts here.
+    /// Emits the steps into one element of `field`, which starts at the current position.
     fn enter_element(
         &mut self,
-        field: &Field<usize>,
+        field: &FieldDefinition<usize>,
         rest: &[Segment<'_>],
     ) -> Result<Leaf, PathError> {
         match (&field.element, rest) {
@@ -217,7 +221,7 @@ impl Compiler<'_> {
 
     fn skip_to_element(
         &mut self,
-        field: &Field<usize>,
+        field: &FieldDefinition<usize>,
         count: Count,
         index: usize,
     ) -> Result<(), PathError> {
@@ -249,7 +253,7 @@ impl Compiler<'_> {
     }
 
     /// Emits the steps over a whole field.
-    fn skip(&mut self, field: &Field<usize>) -> Result<(), PathError> {
+    fn skip(&mut self, field: &FieldDefinition<usize>) -> Result<(), PathError> {
         let least = self.least(field);
         match (field.count, self.layout(field)) {
             (Count::One, Layout::Fixed(table)) => self.fixed(&table),
@@ -277,8 +281,8 @@ impl Compiler<'_> {
         Ok(())
     }
 
-    /// The steps over one element of `field`, which is of variable size.
-    fn element_body(&self, field: &Field<usize>) -> Result<Box<[Op]>, PathError> {
+    /// Returns the steps over one element of `field`, which is of variable size.
+    fn element_body(&self, field: &FieldDefinition<usize>) -> Result<Box<[Op]>, PathError> {
         let mut inner =
             Compiler { definitions: self.definitions, path: self.path, ops: Vec::new() };
         match &field.element {
@@ -295,7 +299,7 @@ impl Compiler<'_> {
     }
 
     /// Emits a run of fixed size, joined to the run before it if there is one.
-    fn fixed(&mut self, table: &Table) {
+    fn fixed(&mut self, table: &SkipTable) {
         if let Some(Op::Fixed(before)) = self.ops.last_mut()
             && let Some(joined) = before.then(table)
         {
@@ -305,15 +309,15 @@ impl Compiler<'_> {
         self.ops.push(Op::Fixed(*table));
     }
 
-    fn layout(&self, field: &Field<usize>) -> Layout {
+    fn layout(&self, field: &FieldDefinition<usize>) -> Layout {
         match &field.element {
-            Element::Primitive(primitive) => Layout::Fixed(Table::primitive(*primitive)),
+            Element::Primitive(primitive) => Layout::Fixed(SkipTable::primitive(*primitive)),
             Element::Text | Element::WideText => Layout::Variable,
             Element::Struct(index) => self.definitions.get(*index).layout,
         }
     }
 
-    fn least(&self, field: &Field<usize>) -> usize {
+    fn least(&self, field: &FieldDefinition<usize>) -> usize {
         match &field.element {
             Element::Primitive(primitive) => primitive.size(),
             Element::Text | Element::WideText => 4,
@@ -329,11 +333,11 @@ impl Compiler<'_> {
         }
     }
 
-    fn needs_index(&self, field: &Field<usize>) -> PathError {
+    fn needs_index(&self, field: &FieldDefinition<usize>) -> PathError {
         PathError::NeedsIndex { path: self.path.to_owned(), field: field.name.clone() }
     }
 
-    fn wide(&self, field: &Field<usize>) -> PathError {
+    fn wide(&self, field: &FieldDefinition<usize>) -> PathError {
         PathError::WideText { path: self.path.to_owned(), field: field.name.clone() }
     }
 }

@@ -1,31 +1,31 @@
-//! The skip program that a field path compiles to, and the walker that runs it.
+//! The skip program of a compiled field path, and its interpreter.
 
 use super::cdr::{CdrError, Cursor, Endian};
-use super::layout::Table;
+use super::layout::SkipTable;
 use super::parse::{Count, Primitive};
-use super::value::{Kind, Value};
+use super::value::{MessageValue, ValueKind};
 
 /// One step towards the field.
 #[derive(Debug)]
 pub(super) enum Op {
     /// Any run of fixed-size fields.
-    Fixed(Table),
+    Fixed(SkipTable),
     /// A string.
     Text,
-    /// A sequence of primitives of that many bytes each.
+    /// A sequence of primitives of this many bytes each.
     Primitives(usize),
     /// A sequence of fixed-size structs of at least `least` bytes each.
-    Structs { table: Table, least: usize },
-    /// A sequence of elements that vary in size, of at least `least` bytes each.
+    Structs { table: SkipTable, least: usize },
+    /// A sequence of elements of variable size, of at least `least` bytes each.
     Each { body: Box<[Op]>, least: usize },
-    /// `n` elements that vary in size, without a count in front.
+    /// `n` elements of variable size, without a count in front.
     Times { body: Box<[Op]>, n: usize },
-    /// The count of a sequence whose element `index` is wanted; the steps that follow skip those
+    /// The count of a sequence with element `index` on the path; the steps that follow skip those
     /// before it.
     Enter { index: usize, least: usize },
 }
 
-/// What stands at the end of the path.
+/// The element at the end of the path.
 #[derive(Copy, Clone, Debug)]
 pub(super) enum Leaf {
     Scalar(Primitive),
@@ -39,7 +39,7 @@ pub(super) enum Leaf {
 /// Runs `ops` from the cursor's position.
 ///
 /// A fixed run may end beyond the message: the next read then fails. Every loop body reads at least
-/// one count or string length, so no loop runs longer than the message has bytes.
+/// one count or string length, so the message bounds the number of iterations.
 pub(super) fn walk(ops: &[Op], cursor: &mut Cursor<'_>) -> Result<(), CdrError> {
     for op in ops {
         match op {
@@ -76,41 +76,42 @@ pub(super) fn walk(ops: &[Op], cursor: &mut Cursor<'_>) -> Result<(), CdrError> 
 }
 
 impl Leaf {
-    pub(super) fn kind(&self) -> Kind {
+    pub(super) fn kind(&self) -> ValueKind {
         match self {
-            Self::Scalar(Primitive::Bool) => Kind::Bool,
-            Self::Scalar(Primitive::F32 | Primitive::F64) => Kind::Real,
+            Self::Scalar(Primitive::Bool) => ValueKind::Bool,
+            Self::Scalar(Primitive::F32 | Primitive::F64) => ValueKind::Real,
             Self::Scalar(Primitive::U8 | Primitive::U16 | Primitive::U32 | Primitive::U64) => {
-                Kind::Unsigned
+                ValueKind::Unsigned
             }
-            Self::Scalar(_) => Kind::Signed,
-            Self::Text => Kind::Text,
-            Self::Array(Primitive::U8, _) => Kind::Bytes,
-            Self::Array(..) => Kind::Numbers,
-            Self::Texts(_) => Kind::Texts,
+            Self::Scalar(_) => ValueKind::Signed,
+            Self::Text => ValueKind::Text,
+            Self::Array(Primitive::U8, _) => ValueKind::Bytes,
+            Self::Array(..) => ValueKind::Numbers,
+            Self::Texts(_) => ValueKind::Texts,
         }
     }
 
-    pub(super) fn read<'a>(&self, cursor: &mut Cursor<'a>) -> Result<Value<'a>, CdrError> {
+    pub(super) fn read<'a>(&self, cursor: &mut Cursor<'a>) -> Result<MessageValue<'a>, CdrError> {
         Ok(match *self {
             Self::Scalar(primitive) => scalar(primitive, cursor)?,
-            Self::Text => Value::Text(cursor.text()?),
+            Self::Text => MessageValue::Text(cursor.text()?),
             Self::Array(primitive, count) => {
                 let n = elements(count, primitive.size(), cursor)?;
                 let raw = cursor.elements(n, primitive.size())?;
                 match primitive {
-                    Primitive::U8 => Value::Bytes(raw),
-                    _ => Value::Numbers(numbers(primitive, raw, cursor.endian())),
+                    Primitive::U8 => MessageValue::Bytes(raw),
+                    _ => MessageValue::Numbers(numbers(primitive, raw, cursor.endian())),
                 }
             }
             Self::Texts(count) => {
                 let n = elements(count, 4, cursor)?;
-                // A fixed count comes from the definition: allocate what the message can hold.
+                // A fixed count comes from the definition: allocate only for what the message can
+                // hold.
                 let mut texts = Vec::with_capacity(n.min(cursor.left() / 4));
                 for _ in 0..n {
                     texts.push(cursor.text()?);
                 }
-                Value::Texts(texts)
+                MessageValue::Texts(texts)
             }
         })
     }
@@ -144,23 +145,23 @@ fn elements(count: Count, least: usize, cursor: &mut Cursor<'_>) -> Result<usize
     }
 }
 
-fn scalar<'a>(primitive: Primitive, cursor: &mut Cursor<'a>) -> Result<Value<'a>, CdrError> {
+fn scalar<'a>(primitive: Primitive, cursor: &mut Cursor<'a>) -> Result<MessageValue<'a>, CdrError> {
     Ok(match primitive {
-        Primitive::Bool => Value::Bool(cursor.u8()? != 0),
-        Primitive::U8 => Value::Unsigned(cursor.u8()?.into()),
-        Primitive::U16 => Value::Unsigned(cursor.u16()?.into()),
-        Primitive::U32 => Value::Unsigned(cursor.u32()?.into()),
-        Primitive::U64 => Value::Unsigned(cursor.u64()?),
-        Primitive::I8 => Value::Signed(cursor.i8()?.into()),
-        Primitive::I16 => Value::Signed(cursor.i16()?.into()),
-        Primitive::I32 => Value::Signed(cursor.i32()?.into()),
-        Primitive::I64 => Value::Signed(cursor.i64()?),
-        Primitive::F32 => Value::Real(cursor.f32()?.into()),
-        Primitive::F64 => Value::Real(cursor.f64()?),
+        Primitive::Bool => MessageValue::Bool(cursor.u8()? != 0),
+        Primitive::U8 => MessageValue::Unsigned(cursor.u8()?.into()),
+        Primitive::U16 => MessageValue::Unsigned(cursor.u16()?.into()),
+        Primitive::U32 => MessageValue::Unsigned(cursor.u32()?.into()),
+        Primitive::U64 => MessageValue::Unsigned(cursor.u64()?),
+        Primitive::I8 => MessageValue::Signed(cursor.i8()?.into()),
+        Primitive::I16 => MessageValue::Signed(cursor.i16()?.into()),
+        Primitive::I32 => MessageValue::Signed(cursor.i32()?.into()),
+        Primitive::I64 => MessageValue::Signed(cursor.i64()?),
+        Primitive::F32 => MessageValue::Real(cursor.f32()?.into()),
+        Primitive::F64 => MessageValue::Real(cursor.f64()?),
     })
 }
 
-/// `raw` is a whole number of elements, as [`Cursor::elements`] cut it.
+/// `raw` is a whole number of elements, as [`Cursor::elements`] returns it.
 fn numbers(primitive: Primitive, raw: &[u8], endian: Endian) -> Vec<f64> {
     macro_rules! each {
         ($ty:ty) => {{

@@ -1,10 +1,10 @@
-//! Where message definitions come from when no recording carries them.
+//! Finds message definitions that no recording carries.
 //!
-//! A type is looked for in folders of the user, then among those that are bundled, then where ROS 2
-//! is installed. What is found is put together with all that it refers to, in the order and form in
-//! which MCAP files carry it.
+//! A type is searched in folders of the user, then among the bundled definitions, then in the
+//! installation of ROS 2. The result contains all types it refers to, in the order and form of MCAP
+//! files.
 //!
-//! What never happens here: a file being read whose path a type's name could choose. A name is
+//! The name of a type cannot choose the path of a file: it consists of letters, digits and `_`.
 //! letters, digits and `_`.
 
 use std::collections::{HashMap, HashSet};
@@ -16,31 +16,31 @@ use std::sync::{Arc, OnceLock};
 use super::definitions::{Definitions, MessageError, short_name};
 use super::parse::{self, Element};
 
-/// The largest file, the largest text and the most types. ROS 2's own stay below 20 KB, 40 KB and
-/// 30.
+/// Limits of the file size, of the text and of the number of types. ROS 2's own stay below 20 KB,
+/// 40 KB and 30.
 const MAX_FILE: usize = 1 << 20;
 const MAX_TEXT: usize = 8 << 20;
 const MAX_TYPES: usize = 256;
-/// The longest name of a package or of a type; longer ones are no names of files everywhere.
+/// Limit of the names of packages and types; not every file system takes longer ones.
 const MAX_NAME: usize = 128;
 
-/// `pkg/Type`, with its text.
+/// Bundled definitions: `pkg/Type`, each with its text.
 const BUNDLED: &str = include_str!("bundled.msgs");
 
-/// The places where message definitions are looked for.
+/// The places to search for message definitions.
 #[derive(Clone, Debug, Default)]
 pub struct Sources {
     folders: Vec<PathBuf>,
     ament_prefixes: Vec<PathBuf>,
 }
 
-/// Why the definitions of a type cannot be had, though something was found.
+/// Errors of finding the definitions of a type; that no place has it is not one.
 #[derive(Debug, thiserror::Error)]
 pub enum SourcesError {
-    /// What is no name of a message type is looked for nowhere.
+    /// The name is not that of a message type, so it was not searched.
     #[error("`{name}` is not the name of a message type, such as `std_msgs/msg/Header`")]
     Name {
-        /// The name, cut at 80 characters and without control characters.
+        /// The name, truncated to 80 characters and without control characters.
         name: String,
     },
     /// A file cannot be read.
@@ -50,53 +50,52 @@ pub enum SourcesError {
         type_name: String,
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// A file is no text, or more than 1 MiB of it.
+    /// A file is not text, or larger than 1 MiB.
     #[error("`{path}`, the definition of `{type_name}`, {what}")]
     NotText {
         /// The type.
         type_name: String,
         /// The file.
         path: PathBuf,
-        /// In which way.
+        /// The reason.
         what: &'static str,
     },
-    /// The definition that was found in a file, or what it comes to with all it refers to, makes no
-    /// sense.
+    /// The definition in a file, or the result with all types it refers to, is invalid.
     #[error("the definition of `{type_name}` cannot be used")]
     Unusable {
         /// The type.
         type_name: String,
-        /// What is wrong with it.
+        /// The cause.
         source: MessageError,
     },
-    /// A file holds several definitions.
-    #[error("the definition of `{type_name}` holds more than one type")]
+    /// A file contains several definitions.
+    #[error("the definition of `{type_name}` contains more than one type")]
     Several {
         /// The type.
         type_name: String,
     },
-    /// A type refers to one that is nowhere to be found.
-    #[error("`{type_name}` refers to `{missing}`, whose definition is not to be found")]
+    /// A type refers to one that cannot be found.
+    #[error("`{type_name}` refers to `{missing}`, whose definition cannot be found")]
     Missing {
         /// The type that refers to it.
         type_name: String,
         /// The type that is missing.
         missing: String,
     },
-    /// More than any sensible message.
+    /// The result exceeds the limits.
     #[error("the definition of `{type_name}` takes more than {MAX_TYPES} types or 8 MiB")]
     TooLarge {
-        /// The type that was asked for.
+        /// The requested type.
         type_name: String,
     },
 }
 
 impl Sources {
-    /// Looks in `folders` first, then among the bundled definitions, then below `ament_prefixes`,
-    /// each in this order.
+    /// Searches `folders` first, then the bundled definitions, then `ament_prefixes`, each in this
+    /// order.
     ///
     /// In a folder, `pkg/msg/Type` is `pkg/msg/Type.msg`, `pkg/Type.msg` or `Type.msg`; below a
     /// prefix, as ROS 2 installs it, `share/pkg/msg/Type.msg`.
@@ -104,24 +103,24 @@ impl Sources {
         Self { folders: folders.to_owned(), ament_prefixes: ament_prefixes.to_owned() }
     }
 
-    /// The ros2msg text of `type_name` (`pkg/msg/Type` or `pkg/Type`) with all types it refers to,
-    /// as [`Definitions::parse`] takes it; `None` if the type is nowhere.
+    /// Returns the ros2msg text of `type_name` (`pkg/msg/Type` or `pkg/Type`) with all types it
+    /// refers to, as [`Definitions::parse`] expects it; `None` if no place has the type.
     ///
     /// # Errors
     ///
-    /// [`SourcesError`] if it is no name, or if what was found cannot be read, is incomplete or
-    /// makes no sense.
+    /// [`SourcesError`] if the name is invalid, or if a file cannot be read, or its content is
+    /// incomplete or invalid.
     pub fn find(&self, type_name: &str) -> Result<Option<Arc<str>>, SourcesError> {
         let root = short_name(type_name);
         if !is_name(&root) {
             let shown = type_name.chars().filter(|c| !c.is_control()).take(80).collect();
             return Err(SourcesError::Name { name: shown });
         }
-        gather(&root, &|name| self.one(name))
+        collect_types(&root, &|name| self.find_type(name))
     }
 
-    /// The text of one type, without those it refers to. `name` is a name.
-    fn one(&self, name: &str) -> Result<Option<String>, SourcesError> {
+    /// Returns the text of one type, without those it refers to. `name` is a valid name.
+    fn find_type(&self, name: &str) -> Result<Option<String>, SourcesError> {
         let Some((package, leaf)) = name.split_once('/') else {
             return Ok(None);
         };
@@ -144,8 +143,8 @@ impl Sources {
                 return Ok(Some(text));
             }
         }
-        // Last, as it says no package: a `Header.msg` for a type of the lambda's own must not stand
-        // for that of all others.
+        // Last, as this path contains no package: a `Header.msg` for a type of the lambda's own
+        // must not replace the `Header` of all others.
         for folder in &self.folders {
             if let Some(text) = read(name, folder.join(&file))? {
                 return Ok(Some(text));
@@ -155,34 +154,37 @@ impl Sources {
     }
 }
 
-/// The text of `root`, which is a name, with all types it refers to. `one` has the text of one
-/// type, if there is one.
-pub(super) fn gather(root: &str, one: &One<'_>) -> Result<Option<Arc<str>>, SourcesError> {
-    let Some(text) = one(root)? else {
+/// Returns the text of `root`, a valid name, with all types it refers to. `find_type` returns the
+/// text of one type, if it exists.
+pub(super) fn collect_types(
+    root: &str,
+    find_type: &FindType<'_>,
+) -> Result<Option<Arc<str>>, SourcesError> {
+    let Some(text) = find_type(root)? else {
         return Ok(None);
     };
-    let mut gathered = Gathered { one, root, known: HashSet::new(), text: String::new() };
-    gathered.add(root, &text)?;
+    let mut collected =
+        TypeCollector { find_type, root, known: HashSet::new(), text: String::new() };
+    collected.add(root, &text)?;
     let unusable = |source| SourcesError::Unusable { type_name: root.to_owned(), source };
-    Definitions::parse(root, &gathered.text).map_err(unusable)?;
-    Ok(Some(gathered.text.into()))
+    Definitions::parse(root, &collected.text).map_err(unusable)?;
+    Ok(Some(collected.text.into()))
 }
 
-/// The text of one type, without those it refers to.
-type One<'s> = dyn Fn(&str) -> Result<Option<String>, SourcesError> + 's;
+/// Returns the text of one type, without those it refers to.
+type FindType<'s> = dyn Fn(&str) -> Result<Option<String>, SourcesError> + 's;
 
-/// A type and what it refers to, as far as they are known; depth first, each type where it is first
-/// needed.
-struct Gathered<'s> {
-    one: &'s One<'s>,
+/// Collects a type and the types it refers to; depth first, each type where it is first needed.
+struct TypeCollector<'s> {
+    find_type: &'s FindType<'s>,
     root: &'s str,
     known: HashSet<String>,
     text: String,
 }
 
-impl Gathered<'_> {
-    /// Goes as deep as there are types, at most [`MAX_TYPES`]. Types that contain themselves are
-    /// found by the parser later.
+impl TypeCollector<'_> {
+    /// Recurses at most [`MAX_TYPES`] deep. Types that contain themselves are found by the parser
+    /// later.
     fn add(&mut self, name: &str, text: &str) -> Result<(), SourcesError> {
         self.known.insert(name.to_owned());
         if self.known.len() > 1 {
@@ -208,8 +210,8 @@ impl Gathered<'_> {
         Ok(())
     }
 
-    /// Adds what `owner` calls `wanted`, by the rule of [`Definitions::parse`]: a bare name means
-    /// the owner's package, or the `Header` that ROS 1 habits left behind.
+    /// Adds the type that `owner` calls `wanted`, by the rule of [`Definitions::parse`]: a bare
+    /// name means the owner's package, or `std_msgs/Header`, as in ROS 1.
     fn refer(&mut self, owner: &str, wanted: &str) -> Result<(), SourcesError> {
         let wanted = short_name(wanted);
         let candidates = match (wanted.contains('/'), owner.split_once('/')) {
@@ -222,7 +224,7 @@ impl Gathered<'_> {
             if self.known.contains(&candidate) {
                 return Ok(());
             }
-            if let Some(text) = (self.one)(&candidate)? {
+            if let Some(text) = (self.find_type)(&candidate)? {
                 return self.add(&candidate, &text);
             }
         }
@@ -237,13 +239,13 @@ impl Gathered<'_> {
 fn bundled() -> &'static HashMap<&'static str, &'static str> {
     static INDEX: OnceLock<HashMap<&str, &str>> = OnceLock::new();
     INDEX.get_or_init(|| {
-        // What stands before the first `MSG:` is for people.
+        // The text before the first `MSG:` is a comment.
         let types = BUNDLED.split("MSG: ").skip(1);
-        types.filter_map(|one| one.split_once('\n')).collect()
+        types.filter_map(|part| part.split_once('\n')).collect()
     })
 }
 
-/// Whether `name` is `pkg/Type`, both of them letters, digits and `_`, and a letter first.
+/// Returns whether `name` is `pkg/Type`, both of letters, digits and `_`, beginning with a letter.
 pub(super) fn is_name(name: &str) -> bool {
     let is_word = |word: &str| {
         word.len() <= MAX_NAME
@@ -253,9 +255,9 @@ pub(super) fn is_name(name: &str) -> bool {
     name.split_once('/').is_some_and(|(package, leaf)| is_word(package) && is_word(leaf))
 }
 
-/// The text in `path`; `None` if there is no file.
+/// Reads the text in `path`; `None` if there is no file.
 fn read(type_name: &str, path: PathBuf) -> Result<Option<String>, SourcesError> {
-    // Asked first: to open a pipe would wait for its writer.
+    // Checked first: opening a pipe would wait for its writer.
     match std::fs::metadata(&path) {
         Ok(found) if found.is_file() => {}
         Ok(_) => return Ok(None),

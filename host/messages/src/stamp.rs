@@ -1,15 +1,15 @@
-//! The time stamp at the front of most messages, without a path.
+//! Reads the time stamp at the front of most messages, without a path.
 
 use super::cdr::{CdrError, Cursor, Endian};
 use super::definitions::{Definitions, Struct};
-use super::parse::{Count, Element, Field, Primitive};
+use super::parse::{Count, Element, FieldDefinition, Primitive};
 
 /// Reads `header.stamp`, or a leading `stamp`, of one message type.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct HeaderStamp(());
 
-/// A reader of the stamp, if the type begins with a `std_msgs/Header` or with a
-/// `builtin_interfaces/Time` named `stamp`: then it stands in the first eight bytes.
+/// Returns a reader of the stamp, if the type begins with a `std_msgs/Header` or with a
+/// `builtin_interfaces/Time` named `stamp`: then the stamp is in the first eight bytes.
 pub fn header_stamp(definitions: &Definitions) -> Option<HeaderStamp> {
     let inner = first(definitions, definitions.root())?;
     let is_stamped = match inner {
@@ -23,7 +23,7 @@ pub fn header_stamp(definitions: &Definitions) -> Option<HeaderStamp> {
 }
 
 impl HeaderStamp {
-    /// The stamp in ns.
+    /// Returns the stamp, in ns.
     ///
     /// # Errors
     ///
@@ -44,9 +44,9 @@ fn first<'d>(definitions: &'d Definitions, owner: &'d Struct) -> Option<(&'d str
     }
 }
 
-/// A drive may define the name otherwise: then what stands there is no stamp.
+/// A drive may define the type differently: then its bytes are not a stamp.
 fn is_time(found: &Struct) -> bool {
-    let is = |field: &Field<usize>, name: &str, primitive| {
+    let is = |field: &FieldDefinition<usize>, name: &str, primitive| {
         field.name == name
             && field.count == Count::One
             && matches!(&field.element, Element::Primitive(p) if *p == primitive)
@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn what_only_has_the_names_of_a_stamp_is_none() {
+    fn a_type_that_only_has_the_names_of_a_stamp_is_not_one() {
         let text = "builtin_interfaces/Time stamp\n===\nMSG: builtin_interfaces/Time\n";
         assert!(stamp_of(&format!("{text}int32 sec\nuint32 nanosec\n")).is_some());
         for other in [

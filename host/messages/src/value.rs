@@ -1,8 +1,8 @@
-//! What a field path reads.
+//! Values that field paths read.
 
-/// What kind of value a field path leads to, known before any message is seen.
+/// The kind of value that a field path leads to, known before any message is read.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
-pub enum Kind {
+pub enum ValueKind {
     /// `bool`.
     Bool,
     /// `int8` to `int64`.
@@ -21,8 +21,8 @@ pub enum Kind {
     Texts,
 }
 
-impl Kind {
-    /// Whether [`super::FieldPath::number`] can read it.
+impl ValueKind {
+    /// Returns whether [`super::FieldPath::number`] can read it.
     pub fn is_number(self) -> bool {
         matches!(self, Self::Bool | Self::Signed | Self::Unsigned | Self::Real)
     }
@@ -30,8 +30,8 @@ impl Kind {
 
 /// A field's value, borrowed from the message where possible.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Value<'a> {
-    /// Any byte but 0 reads as true.
+pub enum MessageValue<'a> {
+    /// A boolean; any byte but 0 is true.
     Bool(bool),
     /// A signed integer.
     Signed(i64),

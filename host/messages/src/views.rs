@@ -1,11 +1,11 @@
-//! The two image messages, read whole and borrowed.
+//! Views of the two image messages, borrowed from the bytes.
 
 use super::cdr::{CdrError, Cursor, Endian};
 
 /// A `sensor_msgs/msg/Image` without its header.
 ///
-/// Nothing is checked but the bounds of the message: `data` may be shorter or longer than
-/// `height * step`.
+/// Only the bounds of the message are checked: `data` may be shorter or longer than `height *
+/// step`.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct ImageView<'a> {
     /// Columns.
@@ -25,7 +25,7 @@ pub struct ImageView<'a> {
 /// A `sensor_msgs/msg/CompressedImage` without its header.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct CompressedView<'a> {
-    /// What the writer says of `data`, such as `jpeg` or `rgb8; jpeg compressed bgr8`.
+    /// Description of `data` by the writer, such as `jpeg` or `rgb8; jpeg compressed bgr8`.
     pub format: &'a str,
     /// The compressed file.
     pub data: &'a [u8],
@@ -36,7 +36,7 @@ impl<'a> ImageView<'a> {
     ///
     /// # Errors
     ///
-    /// [`CdrError`] if the bytes are no such message.
+    /// [`CdrError`] if the bytes are not such a message.
     pub fn read(cdr: &'a [u8], endian: Endian) -> Result<Self, CdrError> {
         let mut cursor = Cursor::new(cdr, endian);
         skip_header(&mut cursor)?;
@@ -53,7 +53,7 @@ impl<'a> CompressedView<'a> {
     ///
     /// # Errors
     ///
-    /// [`CdrError`] if the bytes are no such message.
+    /// [`CdrError`] if the bytes are not such a message.
     pub fn read(cdr: &'a [u8], endian: Endian) -> Result<Self, CdrError> {
         let mut cursor = Cursor::new(cdr, endian);
         skip_header(&mut cursor)?;
@@ -61,7 +61,7 @@ impl<'a> CompressedView<'a> {
     }
 }
 
-/// `std_msgs/Header`: a stamp of eight bytes and the frame's name.
+/// Skips a `std_msgs/Header`: a stamp of eight bytes and the name of the frame.
 fn skip_header(cursor: &mut Cursor<'_>) -> Result<(), CdrError> {
     cursor.skip(8)?;
     cursor.skip_text()

@@ -1,4 +1,4 @@
-//! The crate through its public interface: definitions, fields, and where definitions are found.
+//! Tests the crate through its public interface: definitions, fields, and sources of definitions.
 
 mod messages;
 mod sources;

@@ -1,11 +1,11 @@
-//! Definitions and field paths against bytes put together by hand.
+//! Tests definitions and field paths against bytes put together by hand.
 
 use std::sync::Arc;
 
 use gleaner_drives::Replay;
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Value,
-    header_stamp,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, MessageValue, PathError,
+    ValueKind, header_stamp,
 };
 use gleaner_transport::Transport;
 
@@ -41,7 +41,7 @@ MSG: test_msgs/Empty
 int32 NO_FIELDS=7
 ";
 
-/// A message of the type above; `pad` shifts everything behind its name.
+/// Encodes a message of the type above; `pad` shifts everything after its name.
 fn mixed(endian: Endian, pad: usize, items: usize) -> Vec<u8> {
     let item = |cdr: Cdr, n: usize| {
         let mut cdr = cdr.u8(n as u8).text(&"t".repeat(n)).f64(n as f64 + 0.5).u32(n as u32);
@@ -70,32 +70,32 @@ fn path(path: &str) -> FieldPath {
     FieldPath::compile(&definitions(), path).unwrap()
 }
 
-/// Each path with what it reads from `mixed(_, pad, 3)`.
-fn truths() -> Vec<(&'static str, Value<'static>)> {
+/// Each path with its value in `mixed(_, pad, 3)`.
+fn truths() -> Vec<(&'static str, MessageValue<'static>)> {
     vec![
-        ("flag", Value::Bool(true)),
-        ("items[0].id", Value::Unsigned(0)),
-        ("items[2].text", Value::Text("tt")),
-        ("items[2].weight", Value::Real(2.5)),
-        ("items[2].codes", Value::Numbers(vec![100.0, 101.0])),
-        ("items[2].codes[1]", Value::Unsigned(101)),
-        ("pair[1].weight", Value::Real(2.5)),
-        ("pair[1].codes[0]", Value::Unsigned(100)),
-        ("numbers", Value::Numbers(vec![1.25, -2.5])),
-        ("numbers[1]", Value::Real(-2.5)),
-        ("blob", Value::Bytes(b"blob")),
-        ("blob[3]", Value::Unsigned(b'b'.into())),
-        ("labels", Value::Texts(vec!["one", "two"])),
-        ("labels[1]", Value::Text("two")),
-        ("corners[2].x", Value::Real(2.0)),
-        ("corners[2].y", Value::Real(20.0)),
-        ("corners[1].tag", Value::Unsigned(1)),
-        ("k", Value::Numbers(vec![7.0, 8.0, 9.0])),
-        ("k[2]", Value::Real(9.0)),
-        ("shorts", Value::Numbers(vec![-1.0, -2.0, -3.0])),
-        ("shorts[2]", Value::Signed(-3)),
-        ("nothing.structure_needs_at_least_one_member", Value::Unsigned(0)),
-        ("last", Value::Signed(-99)),
+        ("flag", MessageValue::Bool(true)),
+        ("items[0].id", MessageValue::Unsigned(0)),
+        ("items[2].text", MessageValue::Text("tt")),
+        ("items[2].weight", MessageValue::Real(2.5)),
+        ("items[2].codes", MessageValue::Numbers(vec![100.0, 101.0])),
+        ("items[2].codes[1]", MessageValue::Unsigned(101)),
+        ("pair[1].weight", MessageValue::Real(2.5)),
+        ("pair[1].codes[0]", MessageValue::Unsigned(100)),
+        ("numbers", MessageValue::Numbers(vec![1.25, -2.5])),
+        ("numbers[1]", MessageValue::Real(-2.5)),
+        ("blob", MessageValue::Bytes(b"blob")),
+        ("blob[3]", MessageValue::Unsigned(b'b'.into())),
+        ("labels", MessageValue::Texts(vec!["one", "two"])),
+        ("labels[1]", MessageValue::Text("two")),
+        ("corners[2].x", MessageValue::Real(2.0)),
+        ("corners[2].y", MessageValue::Real(20.0)),
+        ("corners[1].tag", MessageValue::Unsigned(1)),
+        ("k", MessageValue::Numbers(vec![7.0, 8.0, 9.0])),
+        ("k[2]", MessageValue::Real(9.0)),
+        ("shorts", MessageValue::Numbers(vec![-1.0, -2.0, -3.0])),
+        ("shorts[2]", MessageValue::Signed(-3)),
+        ("nothing.structure_needs_at_least_one_member", MessageValue::Unsigned(0)),
+        ("last", MessageValue::Signed(-99)),
     ]
 }
 
@@ -124,7 +124,7 @@ fn every_prefix_of_a_message_gives_the_value_or_an_error() {
                     assert_eq!(value, truth, "{name} in the first {end} bytes");
                     complete = true;
                 }
-                Err(_) => assert!(!complete, "{name} was lost again at {end} bytes"),
+                Err(_) => assert!(!complete, "{name} cannot be read any more at {end} bytes"),
             }
         }
         assert!(complete, "{name}");
@@ -132,7 +132,7 @@ fn every_prefix_of_a_message_gives_the_value_or_an_error() {
 }
 
 #[test]
-fn any_byte_may_be_anything() {
+fn any_value_of_any_byte_is_harmless() {
     let bytes = mixed(Endian::Little, 5, 3);
     let paths: Vec<_> = truths().iter().map(|(name, _)| path(name)).collect();
     for at in 0..bytes.len() {
@@ -140,8 +140,8 @@ fn any_byte_may_be_anything() {
             let mut bytes = bytes.clone();
             bytes[at] = value;
             for path in &paths {
-                // Reading may fail or succeed; it ends, and holds no more than the message.
-                if let Ok(Value::Numbers(numbers)) = path.read(&bytes, Endian::Little) {
+                // Reading may fail or succeed; it ends, and allocates no more than the message.
+                if let Ok(MessageValue::Numbers(numbers)) = path.read(&bytes, Endian::Little) {
                     assert!(numbers.len() <= bytes.len());
                 }
             }
@@ -159,7 +159,7 @@ fn numbers_are_read_from_every_scalar() {
     assert_eq!(number("last"), Ok(-99.0));
     assert_eq!(number("name"), Err(CdrError::NotANumber));
     assert!(!path("name").kind().is_number());
-    assert_eq!(path("labels").kind(), Kind::Texts);
+    assert_eq!(path("labels").kind(), ValueKind::Texts);
 }
 
 #[test]
@@ -171,10 +171,10 @@ fn an_empty_sequence_needs_no_padding() {
 }
 
 #[test]
-fn an_element_that_is_not_there_is_named() {
+fn the_error_names_a_missing_element() {
     let bytes = mixed(Endian::Little, 0, 1);
-    let refused = path("items[4].id").read(&bytes, Endian::Little).unwrap_err();
-    assert!(matches!(refused, CdrError::Index { index: 4, count: 1, .. }));
+    let error = path("items[4].id").read(&bytes, Endian::Little).unwrap_err();
+    assert!(matches!(error, CdrError::Index { index: 4, count: 1, .. }));
 }
 
 #[test]
@@ -182,12 +182,12 @@ fn a_claimed_count_allocates_nothing() {
     let definitions = Definitions::parse("p/T", "float64[] values").unwrap();
     let values = FieldPath::compile(&definitions, "values").unwrap();
     let claim = [0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0];
-    let refused = values.read(&claim, Endian::Little).unwrap_err();
-    assert_eq!(refused, CdrError::Count { offset: 0, count: u32::MAX as usize, have: 4 });
+    let error = values.read(&claim, Endian::Little).unwrap_err();
+    assert_eq!(error, CdrError::Count { offset: 0, count: u32::MAX as usize, have: 4 });
 }
 
 #[test]
-fn wrong_paths_say_what_would_be_right() {
+fn errors_of_paths_name_the_valid_ones() {
     let refuse = |path: &str| FieldPath::compile(&definitions(), path).unwrap_err();
     assert_eq!(
         refuse("items[0].wieght").to_string(),
@@ -212,12 +212,12 @@ fn wrong_paths_say_what_would_be_right() {
 }
 
 #[test]
-fn a_wstring_blocks_only_what_lies_behind_it() {
+fn a_wstring_blocks_only_later_fields() {
     let definitions = Definitions::parse("p/T", "int8 before\nwstring w\nint8 behind").unwrap();
     assert!(FieldPath::compile(&definitions, "before").is_ok());
     for blocked in ["w", "behind"] {
-        let refused = FieldPath::compile(&definitions, blocked).unwrap_err();
-        assert!(matches!(refused, PathError::WideText { .. }));
+        let error = FieldPath::compile(&definitions, blocked).unwrap_err();
+        assert!(matches!(error, PathError::WideText { .. }));
     }
 }
 
@@ -263,7 +263,7 @@ fn the_image_view_agrees_with_the_field_paths() {
 }
 
 #[test]
-fn the_sample_drives_own_definitions_are_understood() {
+fn the_definitions_of_the_sample_drive_are_parsed() {
     let replay = Replay::open(&[sample_drive()]).unwrap();
     let of = |topic: &str| -> Arc<Definitions> { replay.definitions(topic).unwrap() };
     for (topic, type_name, number) in [

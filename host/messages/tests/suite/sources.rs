@@ -1,5 +1,5 @@
-//! Definitions of topics that bring none: from folders, from what is bundled, from where ROS 2 is
-//! installed.
+//! Tests definitions of topics that carry none: from folders, bundled ones, and those of an
+//! installed ROS 2.
 
 use std::path::{Path, PathBuf};
 use std::slice;
@@ -11,10 +11,10 @@ use gleaner_transport::Transport;
 
 use super::support::sample_drive;
 
-/// A folder of this test's own, removed with it.
-struct Folder(PathBuf);
+/// A folder for one test, removed when dropped.
+struct DefinitionsFolder(PathBuf);
 
-impl Folder {
+impl DefinitionsFolder {
     fn new() -> Self {
         static NEXT: AtomicUsize = AtomicUsize::new(0);
         let name =
@@ -35,14 +35,14 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for DefinitionsFolder {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
     }
 }
 
-fn in_folder(files: &[(&str, &str)]) -> (Folder, Sources) {
-    let folder = Folder::new();
+fn in_folder(files: &[(&str, &str)]) -> (DefinitionsFolder, Sources) {
+    let folder = DefinitionsFolder::new();
     for (name, text) in files {
         folder.write(name, text);
     }
@@ -54,14 +54,14 @@ fn bundled() -> Sources {
     Sources::new(&[], &[])
 }
 
-/// Names of all bundled types, taken from the file itself.
+/// Names of all bundled types, read from the file itself.
 fn bundled_names() -> Vec<String> {
     let text = include_str!("../../src/bundled.msgs");
     text.lines().filter_map(|line| line.strip_prefix("MSG: ")).map(str::to_owned).collect()
 }
 
 #[test]
-fn every_bundled_type_is_whole() {
+fn every_bundled_type_is_complete() {
     let names = bundled_names();
     assert!(names.len() > 130, "{}", names.len());
     for name in names {
@@ -92,7 +92,7 @@ fn the_types_of_sensors_and_vehicles_are_bundled() {
 }
 
 #[test]
-fn the_text_is_what_recordings_carry() {
+fn the_text_is_that_of_recordings() {
     let replay = Replay::open(&[sample_drive()]).unwrap();
     let topics = replay.topics();
     assert!(topics.len() >= 3);
@@ -119,8 +119,8 @@ fn a_type_is_found_in_each_of_the_three_places_in_a_folder() {
 }
 
 #[test]
-fn a_folder_wins_over_what_is_bundled_and_that_over_what_is_installed() {
-    let (folder, installed) = (Folder::new(), Folder::new());
+fn folders_precede_bundled_definitions_and_these_installed_ones() {
+    let (folder, installed) = (DefinitionsFolder::new(), DefinitionsFolder::new());
     folder.write("std_msgs/msg/Bool.msg", "bool ours");
     for (name, text) in [("std_msgs/msg/Bool", "bool theirs"), ("std_msgs/msg/Int8", "int8 theirs")]
     {
@@ -139,7 +139,7 @@ fn a_folder_wins_over_what_is_bundled_and_that_over_what_is_installed() {
 }
 
 #[test]
-fn a_type_that_is_nowhere_is_no_error() {
+fn a_type_that_no_place_has_is_not_an_error() {
     assert_eq!(bundled().find("nobody_msgs/msg/Nothing").unwrap(), None);
     let gone = Sources::new(&[PathBuf::from("no/such/folder")], &[PathBuf::from("nor/this")]);
     assert_eq!(gone.find("nobody_msgs/msg/Nothing").unwrap(), None);
@@ -163,8 +163,8 @@ fn a_name_that_could_be_a_path_is_refused() {
     ] {
         assert!(matches!(sources.find(name), Err(SourcesError::Name { .. })), "{name}");
     }
-    let said = sources.find("up/\u{1b}[2J").unwrap_err().to_string();
-    assert!(!said.contains('\u{1b}'), "{said}");
+    let error = sources.find("up/\u{1b}[2J").unwrap_err().to_string();
+    assert!(!error.contains('\u{1b}'), "{error}");
 }
 
 #[test]
@@ -176,19 +176,19 @@ fn a_file_cannot_lead_out_of_the_folder() {
 }
 
 #[test]
-fn what_is_missing_is_named_with_who_needs_it() {
+fn the_error_names_a_missing_type_and_its_referrer() {
     let (_folder, sources) = in_folder(&[("p/msg/A.msg", "B b"), ("p/msg/B.msg", "q/Gone[] x")]);
-    let said = sources.find("p/msg/A").unwrap_err().to_string();
-    assert_eq!(said, "`p/B` refers to `q/Gone`, whose definition is not to be found");
+    let error = sources.find("p/msg/A").unwrap_err().to_string();
+    assert_eq!(error, "`p/B` refers to `q/Gone`, whose definition cannot be found");
 }
 
 #[test]
-fn circles_depth_and_numbers_without_end_are_refused() {
+fn cycles_and_excessive_depth_or_size_are_refused() {
     let (_folder, sources) = in_folder(&[("p/msg/A.msg", "B b"), ("p/msg/B.msg", "A[] a")]);
     assert!(matches!(sources.find("p/msg/A"), Err(SourcesError::Unusable { .. })));
 
     let chain = |length: usize| {
-        let folder = Folder::new();
+        let folder = DefinitionsFolder::new();
         for n in 0..length {
             folder.write(&format!("p/msg/T{n}.msg"), format!("T{} x", n + 1));
         }
@@ -201,7 +201,7 @@ fn circles_depth_and_numbers_without_end_are_refused() {
     let (_folder, sources) = chain(300);
     assert!(matches!(sources.find("p/msg/T0"), Err(SourcesError::TooLarge { .. })));
 
-    let folder = Folder::new();
+    let folder = DefinitionsFolder::new();
     folder.write("p/msg/All.msg", (0..10).map(|n| format!("T{n} t{n}\n")).collect::<String>());
     for n in 0..10 {
         folder.write(&format!("p/msg/T{n}.msg"), "# some words\n".repeat(80_000) + "int8 x\n");
@@ -212,7 +212,7 @@ fn circles_depth_and_numbers_without_end_are_refused() {
 }
 
 #[test]
-fn a_file_that_is_no_definition_is_named() {
+fn the_error_names_an_invalid_file() {
     let (folder, sources) =
         in_folder(&[("p/msg/Bad.msg", "int8\n"), ("p/msg/Two.msg", "int8 x\n===\nMSG: p/B\n")]);
     folder.write("p/msg/Big.msg", vec![b'\n'; (1 << 20) + 1]);
@@ -222,5 +222,5 @@ fn a_file_that_is_no_definition_is_named() {
     assert!(matches!(sources.find("p/msg/Two"), Err(SourcesError::Several { .. })));
     assert!(matches!(sources.find("p/msg/Big"), Err(SourcesError::NotText { .. })));
     assert!(matches!(sources.find("p/msg/Latin"), Err(SourcesError::NotText { .. })));
-    assert_eq!(sources.find("p/msg/Folder").unwrap(), None);
+    assert_eq!(sources.find("p/msg/DefinitionsFolder").unwrap(), None);
 }

@@ -1,4 +1,4 @@
-//! Answers made by hand.
+//! Tests with responses made by hand.
 
 use super::*;
 
@@ -8,7 +8,7 @@ const HEADER: &str = "RIHS01_f49fb3ae2cf070f793645ff749683ac6b06203e41c891e17701
 /// Name, kind and nested type of each field, by type.
 type Types<'a> = &'a [(&'a str, &'a [(&'a str, u8, &'a str)])];
 
-const OF_HEADER: Types<'_> = &[
+const HEADER_TYPES: Types<'_> = &[
     ("std_msgs/msg/Header", &[("stamp", 1, "builtin_interfaces/msg/Time"), ("frame_id", 17, "")]),
     ("builtin_interfaces/msg/Time", &[("sec", 6, ""), ("nanosec", 7, "")]),
 ];
@@ -21,7 +21,7 @@ const TEXTS: &[(&str, &str, &str)] = &[
     ("builtin_interfaces/msg/Time", "msg", "int32 sec\nuint32 nanosec\n"),
 ];
 
-fn answer(types: Types<'_>, texts: &[(&str, &str, &str)]) -> Vec<u8> {
+fn response(types: Types<'_>, texts: &[(&str, &str, &str)]) -> Vec<u8> {
     let mut cdr = CdrWriter::new();
     cdr.u8(1).string("");
     for (n, (name, fields)) in types.iter().enumerate() {
@@ -44,20 +44,20 @@ fn answer(types: Types<'_>, texts: &[(&str, &str, &str)]) -> Vec<u8> {
     cdr.bytes().to_vec()
 }
 
-fn read(type_name: &str, hash: &str, cdr: &[u8]) -> Result<Described, String> {
-    Described::read(type_name, hash, cdr, Endian::Little).map_err(|error| chain(&error))
+fn read(type_name: &str, hash: &str, cdr: &[u8]) -> Result<DescribedDefinitions, String> {
+    DescribedDefinitions::read(type_name, hash, cdr, Endian::Little).map_err(|error| chain(&error))
 }
 
 #[test]
-fn the_hashes_are_those_that_ros_2_announces() {
-    let string = answer(&[("std_msgs/msg/String", &[("data", 17, "")])], &[]);
+fn the_hashes_are_those_of_ros_2() {
+    let string = response(&[("std_msgs/msg/String", &[("data", 17, "")])], &[]);
     assert_eq!(&*read("std_msgs/msg/String", STRING, &string).unwrap().text, "string data\n");
-    assert!(read("std_msgs/msg/Header", HEADER, &answer(OF_HEADER, &[])).is_ok());
+    assert!(read("std_msgs/msg/Header", HEADER, &response(HEADER_TYPES, &[])).is_ok());
 }
 
 #[test]
-fn texts_are_taken_where_they_say_what_the_fields_say() {
-    let described = read("std_msgs/Header", HEADER, &answer(OF_HEADER, TEXTS)).unwrap();
+fn texts_are_used_if_they_are_equivalent_to_the_fields() {
+    let described = read("std_msgs/Header", HEADER, &response(HEADER_TYPES, TEXTS)).unwrap();
     assert_eq!(described.without_texts, None);
     assert!(described.text.starts_with("# When and where.\n"), "{}", described.text);
     assert!(
@@ -68,7 +68,7 @@ fn texts_are_taken_where_they_say_what_the_fields_say() {
 }
 
 #[test]
-fn texts_that_are_missing_strange_or_lies_are_replaced_by_the_fields() {
+fn missing_invalid_or_wrong_texts_are_replaced_by_the_fields() {
     let root = |encoding: &'static str, text: &'static str| {
         [("std_msgs/msg/Header", encoding, text), TEXTS[1]]
     };
@@ -76,12 +76,12 @@ fn texts_that_are_missing_strange_or_lies_are_replaced_by_the_fields() {
     for (texts, why) in [
         (&[][..], "no `.msg` text"),
         (&root("idl", "module std_msgs {};")[..], "no `.msg` text"),
-        (&root("msg", "builtin_interfaces/Time stamp\nuint8[] frame_id\n"), "something else"),
+        (&root("msg", "builtin_interfaces/Time stamp\nuint8[] frame_id\n"), "differs from"),
         (&root("msg", "what is this"), "cannot be used"),
-        (&root("msg", "p/Gone stamp\nstring frame_id\n"), "not to be found"),
+        (&root("msg", "p/Gone stamp\nstring frame_id\n"), "cannot be found"),
         (&root("msg", "string a\n===\nMSG: std_msgs/Other\nstring b\n"), "more than one type"),
     ] {
-        let described = read("std_msgs/Header", HEADER, &answer(OF_HEADER, texts)).unwrap();
+        let described = read("std_msgs/Header", HEADER, &response(HEADER_TYPES, texts)).unwrap();
         assert!(described.text.starts_with(plain), "{}", described.text);
         assert!(
             described.without_texts.as_ref().unwrap().contains(why),
@@ -92,54 +92,56 @@ fn texts_that_are_missing_strange_or_lies_are_replaced_by_the_fields() {
 }
 
 #[test]
-fn what_is_of_another_hash_or_another_type_is_refused() {
+fn a_response_with_another_hash_or_type_is_refused() {
     let another = HEADER.replace('f', "0");
     assert!(
-        read("std_msgs/Header", &another, &answer(OF_HEADER, TEXTS)).unwrap_err().contains("hash")
+        read("std_msgs/Header", &another, &response(HEADER_TYPES, TEXTS))
+            .unwrap_err()
+            .contains("hash")
     );
-    let error = read("std_msgs/msg/String", HEADER, &answer(OF_HEADER, TEXTS)).unwrap_err();
-    assert!(error.contains("describes `std_msgs/Header` instead"), "{error}");
+    let error = read("std_msgs/msg/String", HEADER, &response(HEADER_TYPES, TEXTS)).unwrap_err();
+    assert!(error.contains("describes `std_msgs/Header`"), "{error}");
 }
 
 #[test]
-fn a_node_that_cannot_is_quoted() {
+fn the_error_quotes_the_reason_of_the_node() {
     let mut cdr = CdrWriter::new();
-    cdr.u8(0).string("Type not in use\n");
+    cdr.u8(0).string("TypeFields not in use\n");
     let error = read("std_msgs/Header", HEADER, cdr.bytes()).unwrap_err();
-    assert_eq!(error, "it answers that it cannot: \"Type not in use\\n\"");
+    assert_eq!(error, "the node refuses: \"TypeFields not in use\\n\"");
 }
 
 #[test]
-fn names_that_are_none_and_kinds_that_no_file_can_say_are_refused() {
+fn invalid_names_and_kinds_are_refused() {
     for name in ["", "a b", "a\nuint8 b", "a\"", "é"] {
         let types: Types<'_> = &[("p/msg/T", &[(name, 3, "")])];
         assert!(
-            read("p/T", "", &answer(types, &[])).unwrap_err().contains("a name in it is none"),
+            read("p/T", "", &response(types, &[])).unwrap_err().contains("invalid name"),
             "{name}"
         );
     }
     for nested in ["", "T", "../T", "p/msg/a/b", "p/T\n"] {
         let types: Types<'_> = &[("p/msg/T", &[("a", 1, nested)])];
-        let error = match read("p/T", "", &answer(types, &[])).unwrap_err() {
-            // Its hash is of no interest here.
-            error if error.contains("of hash RIHS01_") => {
+        let error = match read("p/T", "", &response(types, &[])).unwrap_err() {
+            // The right hash is in the error.
+            error if error.contains("with hash RIHS01_") => {
                 let hash =
                     error.split_whitespace().find(|word| word.starts_with("RIHS01_")).unwrap();
-                read("p/T", hash.trim_end_matches(','), &answer(types, &[])).unwrap_err()
+                read("p/T", hash.trim_end_matches(','), &response(types, &[])).unwrap_err()
             }
             error => error,
         };
-        assert!(error.contains("a name in it is none"), "{nested}: {error}");
+        assert!(error.contains("invalid name"), "{nested}: {error}");
     }
     for kind in [0, 12, 14, 19, 20, 23, 47, 48, 60, 192, 255] {
-        let field = Field { name: "a", kind, capacity: 1, text_capacity: 1, nested: "" };
-        assert!(matches!(in_msg(&field), Err(DescribedError::Kind { .. })), "{kind}");
+        let field = TypeField { name: "a", kind, capacity: 1, text_capacity: 1, nested: "" };
+        assert!(matches!(in_msg(&field), Err(TypeDescriptionError::Kind { .. })), "{kind}");
     }
 }
 
 #[test]
-fn every_kind_that_a_file_can_say_is_said() {
-    for (kind, nested, said) in [
+fn every_kind_that_a_file_can_express_is_generated() {
+    for (kind, nested, expected) in [
         (3, "", "uint8"),
         (11, "", "float64"),
         (1, "p/msg/T", "p/T"),
@@ -150,15 +152,15 @@ fn every_kind_that_a_file_can_say_is_said() {
         (144 + 16, "", "byte[]"),
     ] {
         assert_eq!(
-            in_msg(&Field { name: "a", kind, capacity: 9, text_capacity: 5, nested }).unwrap(),
-            said
+            in_msg(&TypeField { name: "a", kind, capacity: 9, text_capacity: 5, nested }).unwrap(),
+            expected
         );
     }
 }
 
 #[test]
-fn an_answer_that_is_cut_or_broken_anywhere_is_refused_or_read_and_nothing_else() {
-    let whole = answer(OF_HEADER, TEXTS);
+fn a_truncated_or_damaged_response_is_refused_or_read() {
+    let whole = response(HEADER_TYPES, TEXTS);
     for length in 0..whole.len() - 8 {
         assert!(read("std_msgs/Header", HEADER, &whole[..length]).is_err(), "{length} bytes");
     }
@@ -166,7 +168,7 @@ fn an_answer_that_is_cut_or_broken_anywhere_is_refused_or_read_and_nothing_else(
         for value in [0, 1, 0x7f, 0xff] {
             let mut broken = whole.clone();
             broken[at] = value;
-            // What is read has the hash, so it is the same but for its texts.
+            // A parsed response has the right hash, so only its texts can differ.
             if let Ok(described) = read("std_msgs/Header", HEADER, &broken) {
                 assert!(Definitions::parse("std_msgs/Header", &described.text).is_ok());
             }
@@ -176,11 +178,14 @@ fn an_answer_that_is_cut_or_broken_anywhere_is_refused_or_read_and_nothing_else(
 }
 
 #[test]
-fn a_question_is_as_the_service_has_it_behind_its_header() {
-    let plain = question("std_msgs/String", "H", None);
+fn a_request_has_the_form_of_the_service_after_its_header() {
+    let plain = request("std_msgs/String", "H", None);
     assert_eq!(plain, b"\x14\0\0\0std_msgs/msg/String\0\x02\0\0\0H\0\x01");
-    let headed = question("std_msgs/String", "H", Some(Header([1, 2])));
+    let headed = request("std_msgs/String", "H", Some(RequestHeader([1, 2])));
     assert_eq!(headed[16..], plain);
-    assert_eq!(Header::split(&headed, Endian::Little), Some((Header([1, 2]), plain.as_slice())));
-    assert_eq!(Header::split(&headed[..15], Endian::Little), None);
+    assert_eq!(
+        RequestHeader::split(&headed, Endian::Little),
+        Some((RequestHeader([1, 2]), plain.as_slice()))
+    );
+    assert_eq!(RequestHeader::split(&headed[..15], Endian::Little), None);
 }

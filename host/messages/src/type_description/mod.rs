@@ -1,16 +1,15 @@
-//! What a node says of a message type: the service
+//! Parses a node's description of a message type: the service
 //! `type_description_interfaces/srv/GetTypeDescription`, read from CDR.
 //!
-//! An answer has the fields of the type and of all it refers to, and often the texts that they were
-//! made from. The type's hash, which came by another way, is that of the fields; so the fields are
-//! believed if they have this hash, and the texts if they say the same as the fields. Nothing more
-//! is believed: all goes through the parser of every definition.
+//! A response contains the fields of the type and of all types it refers to, and often the texts
+//! that they were generated from. The hash of the type, received in another way, is that of the
+//! fields; so the fields are trusted if they have this hash, and the texts if they define the same
+//! fields. All of it still goes through the parser of all definitions.
 //!
-//! What never happens here: an allocation larger than the answer asks bytes for; a name taken for
-//! one that is none.
+//! Allocations are bounded by the size of the response, and every name is checked.
 //!
 //! Sources: REP 2016 and the `.msg` and `.srv` files of `type_description_interfaces`; the hash is
-//! SHA-256 of the fields as JSON, spelled as `rcl_calculate_type_hash` does.
+//! SHA-256 of the fields as JSON, in the form of `rcl_calculate_type_hash`.
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
@@ -22,59 +21,60 @@ use sha2::{Digest, Sha256};
 use super::cdr::{CdrError, Cursor, Endian};
 use super::definitions::{Definitions, full_name, short_name};
 use super::encode::CdrWriter;
-use super::sources::{SourcesError, gather, is_name};
+use super::sources::{SourcesError, collect_types, is_name};
 
-/// How hashes of the first, and so far only, version begin.
+/// Prefix of hashes of the first, and so far only, version.
 const VERSION: &str = "RIHS01_";
 /// The encoding of texts that are `.msg` files.
 const MSG: &str = "msg";
 
-/// By which rmw_cyclonedds tells whose question an answer belongs to, in front of both.
+/// The prefix by which rmw_cyclonedds matches a response to its request.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Header(pub [u64; 2]);
+pub struct RequestHeader(pub [u64; 2]);
 
-/// Definitions as a node described them.
+/// Definitions from the description of a node.
 #[derive(Debug)]
-pub struct Described {
-    /// The text of the type and of all it refers to, as [`Definitions::parse`] reads it.
+pub struct DescribedDefinitions {
+    /// The text of the type and all types it refers to, as [`Definitions::parse`] expects it.
     pub text: Arc<str>,
-    /// Why the texts that came along are not those, if they are not.
+    /// The reason why `text` was generated from the fields, if the texts of the response are not
+    /// used.
     pub without_texts: Option<String>,
 }
 
-/// Why an answer is of no use.
+/// Reasons why a response cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
-pub enum DescribedError {
-    #[error("the answer cannot be read: {0}")]
+pub enum TypeDescriptionError {
+    #[error("cannot parse the response: {0}")]
     Cdr(#[from] CdrError),
-    #[error("it answers that it cannot: {0:?}")]
+    #[error("the node refuses: {0:?}")]
     Refused(String),
-    #[error("it describes `{found}` instead")]
+    #[error("it describes `{found}`, not the requested type")]
     Another { found: String },
-    #[error("it describes a type of hash {found}, the writer announced {announced}")]
+    #[error("it describes a type with hash {found}, but the writer announced {announced}")]
     Hash { found: String, announced: String },
-    #[error("a name in it is none: {0:?}")]
+    #[error("it contains an invalid name: {0:?}")]
     Name(String),
-    #[error("field `{field}` is of kind {kind}, which no `.msg` file can say")]
+    #[error("field `{field}` has kind {kind}, which no `.msg` file can express")]
     Kind { field: String, kind: u8 },
-    #[error("what it describes cannot be used")]
+    #[error("its definition cannot be used")]
     Definition(#[from] SourcesError),
 }
 
-/// Asks for `type_name` of `hash`, with its texts; in front of it `header`, where there is one.
-pub fn question(type_name: &str, hash: &str, header: Option<Header>) -> Vec<u8> {
+/// Encodes a request for `type_name` with `hash`, texts included; preceded by `header`, if given.
+pub fn request(type_name: &str, hash: &str, header: Option<RequestHeader>) -> Vec<u8> {
     let mut cdr = CdrWriter::new();
     cdr.string(&full_name(&short_name(type_name))).string(hash).u8(1);
-    let header = header.map_or(Vec::new(), |Header(words)| {
+    let header = header.map_or(Vec::new(), |RequestHeader(words)| {
         words.iter().flat_map(|word| word.to_le_bytes()).collect()
     });
-    // 16 bytes: what follows stays aligned.
+    // The header has 16 bytes, so the rest stays aligned.
     [header, cdr.bytes().to_vec()].concat()
 }
 
-impl Header {
-    /// The header of an answer, and what follows it. `None` if it is too short for one.
+impl RequestHeader {
+    /// Splits a response into its header and the rest. `None` if it is too short.
     pub fn split(cdr: &[u8], endian: Endian) -> Option<(Self, &[u8])> {
         let mut cursor = Cursor::new(cdr, endian);
         let header = Self([cursor.u64().ok()?, cursor.u64().ok()?]);
@@ -82,47 +82,47 @@ impl Header {
     }
 }
 
-impl Described {
-    /// Definitions of `type_name` out of an answer, which has no header any more. `announced` is
-    /// the hash that it has to have.
+impl DescribedDefinitions {
+    /// Parses a response without header, which describes `type_name`. `announced` is the hash that
+    /// it must have.
     pub fn read(
         type_name: &str,
         announced: &str,
         cdr: &[u8],
         endian: Endian,
-    ) -> Result<Self, DescribedError> {
-        let answer = Answer::read(&mut Cursor::new(cdr, endian))?;
+    ) -> Result<Self, TypeDescriptionError> {
+        let response = TypeResponse::read(&mut Cursor::new(cdr, endian))?;
         let root = short_name(type_name);
-        let found = short_name(answer.types[0].name);
+        let found = short_name(response.types[0].name);
         if found != root {
-            return Err(DescribedError::Another { found: cut(&found) });
+            return Err(TypeDescriptionError::Another { found: cut(&found) });
         }
-        let found = hash(&answer.types)?;
+        let found = hash(&response.types)?;
         if found != announced {
-            return Err(DescribedError::Hash { found, announced: cut(announced) });
+            return Err(TypeDescriptionError::Hash { found, announced: cut(announced) });
         }
-        let from_fields = from_fields(&root, &answer.types)?;
-        Ok(match from_texts(&root, &answer, &from_fields) {
+        let from_fields = from_fields(&root, &response.types)?;
+        Ok(match from_texts(&root, &response, &from_fields) {
             Ok(text) => Self { text, without_texts: None },
             Err(why) => Self { text: from_fields, without_texts: Some(why) },
         })
     }
 }
 
-/// What a successful answer says, as it came.
-struct Answer<'a> {
-    /// The type that was asked for, then those it refers to.
-    types: Vec<Type<'a>>,
+/// A successful response, parsed but not checked.
+struct TypeResponse<'a> {
+    /// The requested type, then those it refers to.
+    types: Vec<TypeFields<'a>>,
     /// `pkg/Type`, encoding and text.
     texts: Vec<(String, &'a str, &'a str)>,
 }
 
-struct Type<'a> {
+struct TypeFields<'a> {
     name: &'a str,
-    fields: Vec<Field<'a>>,
+    fields: Vec<TypeField<'a>>,
 }
 
-struct Field<'a> {
+struct TypeField<'a> {
     name: &'a str,
     kind: u8,
     capacity: u64,
@@ -130,17 +130,17 @@ struct Field<'a> {
     nested: &'a str,
 }
 
-impl<'a> Answer<'a> {
-    fn read(cdr: &mut Cursor<'a>) -> Result<Self, DescribedError> {
+impl<'a> TypeResponse<'a> {
+    fn read(cdr: &mut Cursor<'a>) -> Result<Self, TypeDescriptionError> {
         let successful = cdr.u8()? != 0;
         let why = cdr.text()?;
         if !successful {
-            return Err(DescribedError::Refused(cut(why)));
+            return Err(TypeDescriptionError::Refused(cut(why)));
         }
-        let mut types = vec![Type::read(cdr)?];
-        // A name of no characters and a count.
+        let mut types = vec![TypeFields::read(cdr)?];
+        // Minimum size: an empty name and a count.
         for _ in 0..cdr.count(8)? {
-            types.push(Type::read(cdr)?);
+            types.push(TypeFields::read(cdr)?);
         }
         let mut texts = Vec::new();
         for _ in 0..cdr.count(12)? {
@@ -150,20 +150,20 @@ impl<'a> Answer<'a> {
     }
 }
 
-impl<'a> Type<'a> {
+impl<'a> TypeFields<'a> {
     fn read(cdr: &mut Cursor<'a>) -> Result<Self, CdrError> {
         let name = cdr.text()?;
         let mut fields = Vec::new();
-        // Three strings of no characters and 17 bytes of numbers.
+        // Minimum size: three empty strings and 17 bytes of numbers.
         for _ in 0..cdr.count(29)? {
-            let field = Field {
+            let field = TypeField {
                 name: cdr.text()?,
                 kind: cdr.u8()?,
                 capacity: cdr.u64()?,
                 text_capacity: cdr.u64()?,
                 nested: cdr.text()?,
             };
-            // Its default, which is not in the messages.
+            // Skip the default value, which is not in the messages.
             cdr.skip_text()?;
             fields.push(field);
         }
@@ -171,14 +171,15 @@ impl<'a> Type<'a> {
     }
 }
 
-/// The hash of types, whose names all are names: so nothing in the JSON has to be escaped.
-fn hash(types: &[Type<'_>]) -> Result<String, DescribedError> {
-    let one = |one: &Type<'_>| -> Result<String, DescribedError> {
+/// Returns the hash of types. Their names are valid, so nothing in the JSON has to be escaped.
+fn hash(types: &[TypeFields<'_>]) -> Result<String, TypeDescriptionError> {
+    let one = |one: &TypeFields<'_>| -> Result<String, TypeDescriptionError> {
         let name = a_type(one.name)?;
         let fields = one.fields.iter().map(|field| {
             let nested = if field.nested.is_empty() { "" } else { a_type(field.nested)? };
             Ok(format!(
-                "{{\"name\": \"{}\", \"type\": {{\"type_id\": {}, \"capacity\": {}, \"string_capacity\": {}, \
+                "{{\"name\": \"{}\", \"type\": {{\"type_id\": {}, \"capacity\": {}, \
+                 \"string_capacity\": {}, \
                  \"nested_type_name\": \"{nested}\"}}}}",
                 a_word(field.name)?,
                 field.kind,
@@ -186,10 +187,10 @@ fn hash(types: &[Type<'_>]) -> Result<String, DescribedError> {
                 field.text_capacity,
             ))
         });
-        let fields: Vec<String> = fields.collect::<Result<_, DescribedError>>()?;
+        let fields: Vec<String> = fields.collect::<Result<_, TypeDescriptionError>>()?;
         Ok(format!("{{\"type_name\": \"{name}\", \"fields\": [{}]}}", fields.join(", ")))
     };
-    let types: Vec<String> = types.iter().map(one).collect::<Result<_, DescribedError>>()?;
+    let types: Vec<String> = types.iter().map(one).collect::<Result<_, TypeDescriptionError>>()?;
     let json = format!(
         "{{\"type_description\": {}, \"referenced_type_descriptions\": [{}]}}",
         types[0],
@@ -202,8 +203,8 @@ fn hash(types: &[Type<'_>]) -> Result<String, DescribedError> {
     }))
 }
 
-/// What `.msg` files with these fields would say.
-fn from_fields(root: &str, types: &[Type<'_>]) -> Result<Arc<str>, DescribedError> {
+/// Generates the text of `.msg` files with these fields.
+fn from_fields(root: &str, types: &[TypeFields<'_>]) -> Result<Arc<str>, TypeDescriptionError> {
     let mut texts = HashMap::new();
     for one in types {
         let mut text = String::new();
@@ -212,35 +213,38 @@ fn from_fields(root: &str, types: &[Type<'_>]) -> Result<Arc<str>, DescribedErro
         }
         texts.insert(short_name(one.name), text);
     }
-    gathered(root, &texts)
+    collected(root, &texts)
 }
 
-/// The texts that came along, if they are there and say what `fields` says.
-fn from_texts(root: &str, answer: &Answer<'_>, fields: &str) -> Result<Arc<str>, String> {
-    let texts = answer.texts.iter().filter(|(_, encoding, _)| *encoding == MSG);
+/// Returns the texts of the response, if present and equivalent to `fields`.
+fn from_texts(root: &str, response: &TypeResponse<'_>, fields: &str) -> Result<Arc<str>, String> {
+    let texts = response.texts.iter().filter(|(_, encoding, _)| *encoding == MSG);
     let texts: HashMap<String, String> =
         texts.map(|(name, _, text)| (name.clone(), (*text).to_owned())).collect();
     if !texts.contains_key(root) {
-        return Err("it sent no `.msg` text".to_owned());
+        return Err("it contains no `.msg` text".to_owned());
     }
-    let text = gathered(root, &texts)
-        .map_err(|error| format!("the text that it sent cannot be used: {}", chain(&error)))?;
+    let text = collected(root, &texts)
+        .map_err(|error| format!("its text cannot be used: {}", chain(&error)))?;
     let parse = |text: &str| Definitions::parse(root, text).map_err(|error| error.to_string());
-    if !parse(&text)?.says_as(&parse(fields)?) {
-        return Err("the text that it sent says something else than the description".to_owned());
+    if !parse(&text)?.is_equivalent(&parse(fields)?) {
+        return Err("its text differs from its description".to_owned());
     }
     Ok(text)
 }
 
-fn gathered(root: &str, texts: &HashMap<String, String>) -> Result<Arc<str>, DescribedError> {
+fn collected(
+    root: &str,
+    texts: &HashMap<String, String>,
+) -> Result<Arc<str>, TypeDescriptionError> {
     let missing = || SourcesError::Missing { type_name: root.to_owned(), missing: root.to_owned() };
-    Ok(gather(root, &|name| Ok(texts.get(name).cloned()))?.ok_or_else(missing)?)
+    Ok(collect_types(root, &|name| Ok(texts.get(name).cloned()))?.ok_or_else(missing)?)
 }
 
-/// A field's type as a `.msg` file says it. The numbers are those of
+/// Returns a field's type in the form of a `.msg` file. The numbers are those of
 /// `type_description_interfaces/msg/FieldType`.
-fn in_msg(field: &Field<'_>) -> Result<String, DescribedError> {
-    let unknown = || DescribedError::Kind { field: cut(field.name), kind: field.kind };
+fn in_msg(field: &TypeField<'_>) -> Result<String, TypeDescriptionError> {
+    let unknown = || TypeDescriptionError::Kind { field: cut(field.name), kind: field.kind };
     let base = match field.kind % 48 {
         1 => short_name(a_type(field.nested)?),
         21 => format!("string<={}", field.text_capacity),
@@ -271,17 +275,17 @@ fn in_msg(field: &Field<'_>) -> Result<String, DescribedError> {
     })
 }
 
-fn a_type(name: &str) -> Result<&str, DescribedError> {
-    is_name(&short_name(name)).then_some(name).ok_or_else(|| DescribedError::Name(cut(name)))
+fn a_type(name: &str) -> Result<&str, TypeDescriptionError> {
+    is_name(&short_name(name)).then_some(name).ok_or_else(|| TypeDescriptionError::Name(cut(name)))
 }
 
-fn a_word(name: &str) -> Result<&str, DescribedError> {
+fn a_word(name: &str) -> Result<&str, TypeDescriptionError> {
     let is_word =
         !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
-    is_word.then_some(name).ok_or_else(|| DescribedError::Name(cut(name)))
+    is_word.then_some(name).ok_or_else(|| TypeDescriptionError::Name(cut(name)))
 }
 
-/// Enough of a foreign text to know it by.
+/// Truncates untrusted text for an error message.
 fn cut(text: &str) -> String {
     text.chars().take(160).collect()
 }
