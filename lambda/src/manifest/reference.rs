@@ -20,8 +20,8 @@ const SOURCES: [&str; 2] = [include_str!("types.rs"), include_str!("config.rs")]
 
 const BEGIN: &str = r##"# The manifest
 
-`lambda.toml`, in the folder of a lambda, declares when the lambda wakes, which topics it reads, what its clips contain,
-what it may use, and which settings it has. Only `[lambda]` and `[schedule]` are required.
+`lambda.toml` declares when a lambda wakes, which topics it reads, what its clips contain, what it may use,
+and its settings. It lies in the lambda's folder. Only `[lambda]` and `[schedule]` are required.
 
 ```toml
 [lambda]
